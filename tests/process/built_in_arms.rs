@@ -26,7 +26,7 @@ fn exercise(blueprint: &str, arms: &[Arm]) {
         let ready = run.err().lines().any(|line| line.contains(&format!("{}: SIMULATED", arm.name)));
         assert!(ready, "{} in\n{}", arm.name, run.err());
         if WITH_BRAKES.contains(&blueprint) {
-            assert!(run.err().lines().any(|line| line.contains("standby")), "{}", run.err());
+            assert_eq!(home.status()["arms"][0]["enabled"], false);
             assert_eq!(home.dimos(&format!("arm enable {}", arm.name)).with(0).out, format!("{}: ready\n", arm.name));
         }
         let start = home.positions(arm.name);
@@ -149,7 +149,7 @@ fn every_shipped_blueprint_is_without_mistakes_and_starts() {
         assert_eq!(blueprint["problem"], Value::Null, "{name}");
         home.dimos(&format!("check {name} --sim")).with(0);
         let started = home.dimos(&format!("run {name} --sim --no-record --duration 200ms")).with(0);
-        let phase = if WITH_BRAKES.contains(&name) { "standby" } else { "ready" };
+        let phase = if WITH_BRAKES.contains(&name) { "ur at sim, disabled" } else { "ready" };
         started.says(&[&format!("run {name}  "), phase, "duration reached"]);
     }
 }

@@ -117,7 +117,7 @@ fn position_case(bed: &Bed, kind: Kind, time: Duration) -> Vec<String> {
     std::thread::sleep(time);
     bed.rest();
     let (phase, cause) = bed.phase();
-    let (sent, delivered) = (bed.gate.sent(), bed.gate.delivered());
+    let (sent, delivered) = (bed.gate.sent(), bed.delivered(began));
     let mut verdicts = vec![bed.bounds.neighbours(&sent, began)];
     // A run hears of no frame that its bus took and somebody behind it lost.
     if kind != Kind::Wire(Stall::Drop) || bed.arm.name != "piper" {
@@ -140,6 +140,7 @@ fn position_case(bed: &Bed, kind: Kind, time: Duration) -> Vec<String> {
     }
     let failures: Vec<String> = verdicts.into_iter().filter_map(Result::err).collect();
     if !failures.is_empty() && std::env::var_os("DIMOS_WIRE_ARM").is_some() {
+        println!("{phase} ({cause})");
         let near = |at: dimos::clock::Mono| (-0.05..time.as_secs_f64() + 0.1).contains(&at.seconds_since(began));
         for command in delivered.iter().filter(|command| near(command.at)) {
             println!("{:8.1} ms {:?} {:?}", command.at.seconds_since(began) * 1e3, command.what, command.truth);

@@ -71,8 +71,8 @@ impl UrAdapter {
         })
     }
 
-    /// Sets an analogue output, 0 or 1, to a fraction of its range: of 0 to 10 V, or of 4 to 20 mA. Waits until the state
-    /// shows it.
+    /// Sets an analogue output, 0 or 1, to a fraction of its range: of 0 to 10 V, or of 4 to 20 mA. Waits until the
+    /// state shows it.
     pub fn set_analog_output(&mut self, number: u8, voltage: bool, fraction: f64) -> AdapterResult<()> {
         let value = if voltage { VOLTS * fraction } else { AMPERES.0 + (AMPERES.1 - AMPERES.0) * fraction };
         let close = 0.01 * if voltage { VOLTS } else { AMPERES.1 };

@@ -2,14 +2,16 @@
 
 use std::time::Duration;
 
+use super::primary::Primary;
 use super::protocol::inputs::Order;
 use super::protocol::status::program;
 use super::session::Session;
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult, Stop};
 
-/// Setpoints are not sent while none of the last ones was answered for this time.
-const MAX_UNANSWERED: Duration = Duration::from_millis(60);
+/// Setpoints are not sent while none of the last ones was answered for this time: longer than a CB3 controller needs, 3
+/// steps of 8 ms, and so short that an arm at top speed, which cannot catch up, follows within its tracking tolerance.
+const MAX_UNANSWERED: Duration = Duration::from_millis(40);
 /// How long a stop waits for the program's answer, and for what the dashboard does after that.
 const STOP_LIMIT: Duration = Duration::from_millis(300);
 const DASHBOARD_LIMIT: Duration = Duration::from_millis(700);
@@ -65,9 +67,11 @@ impl Session {
             return Ok(Stop::Confirmed);
         }
         // Another program, or ours does not run as it should.
+        // The primary interface takes it at once and does not answer; the dashboard may be slow, or not there.
+        let told = |primary: &mut Primary| !primary.read_only() && primary.run("stop program\n").is_ok();
+        let told = self.primary.as_mut().is_some_and(told);
         let asked = self.dashboard().and_then(|mut dashboard| dashboard.order("stop", "stopped"));
-        // The primary interface takes the same order.
-        let asked = asked.or_else(|error| self.run_program("stop program\n").map_err(|_| error));
+        let asked = if told { Ok(()) } else { asked };
         let sent = MonotonicClock.now();
         let done = |session: &mut Self| {
             let still = session.at_rest() && !session.program_exists() && session.state().1 > sent;

@@ -46,16 +46,16 @@ impl Session {
             )));
         }
         let limit = MonotonicClock.now().after(POWER_LIMIT);
-        if self.ready.is_none() {
-            self.end_leftover()?;
-        }
+        self.end_leftover()?;
         self.power_on(limit)?;
+        // One that was started meanwhile.
+        self.end_leftover()?;
         self.start(options)
     }
 
     /// Waits for the end of a program that an earlier connection of dimos has left; any other one is not replaced.
     fn end_leftover(&mut self) -> AdapterResult<()> {
-        if !self.program_exists() {
+        if self.ready.is_some() || !self.program_exists() {
             return Ok(());
         }
         // Only a program of dimos takes it; it also ends when orders do not come.

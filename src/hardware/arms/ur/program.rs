@@ -32,8 +32,8 @@ pub fn payload(mass: f64, cog: [f64; 3], inertia: Option<[f64; 6]>) -> String {
     beside("dimos_payload", &call)
 }
 
-/// Returns a program that sets the mounting by the direction of gravity in the base frame, a unit vector. The controller
-/// takes the acceleration that the base experiences: upright, that is along +z.
+/// Returns a program that sets the mounting by the direction of gravity in the base frame, a unit vector. The
+/// controller takes the acceleration that the base experiences: upright, that is along +z.
 pub fn mounting(gravity: [f64; 3]) -> String {
     let [x, y, z] = gravity.map(|v| 0.0 - STANDARD_GRAVITY * v);
     beside("dimos_mounting", &format!("set_gravity([{x}, {y}, {z}])"))

@@ -33,7 +33,7 @@ impl Session {
         }
         // Another safety mode is another stop: its error may be another one, too.
         if self.stopped.is_none_or(|stopped| stopped.mode != mode) {
-            self.stopped = Some(Stopped { mode, since: self.fresh_at, error: None });
+            self.stopped = Some(Stopped { mode, since: self.measured.arrived, error: None });
         }
         self.end_due |= self.ready.take().is_some();
     }

@@ -17,7 +17,7 @@ use super::rtde::Rtde;
 use super::safety::Stopped;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
-use crate::hardware::transport::device_time::DeviceTime;
+use crate::hardware::transport::measured::Measured;
 use crate::joint::JointLimits;
 
 /// A live controller sends its state 125 or 500 times per second. Without one for this time the connection is lost,
@@ -35,9 +35,6 @@ const ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
 const PRIMARY_PERIOD: Duration = Duration::from_millis(20);
 /// Timeout of a new connection to it.
 const PRIMARY_CONNECT: Duration = Duration::from_secs(1);
-/// Joint positions that jump by more than the arm can move plus this [rad] are accepted only when the next state
-/// agrees.
-const MAX_JUMP: f64 = 0.1;
 /// Joints slower than this are at rest [rad/s].
 const REST: f64 = 0.03;
 /// Slider positions from here on are full speed.
@@ -67,10 +64,7 @@ pub struct Session {
     outputs: Option<Outputs>,
     /// The newest state, when it was measured, and when it came.
     pub(super) state: State,
-    stamp: Mono,
-    pub(super) fresh_at: Mono,
-    device_time: DeviceTime,
-    suspect: bool,
+    pub(super) measured: Measured<6>,
     updated: Mono,
     primary_at: Mono,
     /// The present stop by the safety system.
@@ -99,8 +93,6 @@ impl Session {
     /// Starts from a first state. The arm counts as stopped until it is activated.
     pub fn new(device: Device, address: Address, rtde: Rtde, primary: Primary, first: State) -> Self {
         let arrived = rtde.arrived;
-        let mut device_time = DeviceTime::default();
-        let stamp = device_time.translate(nanoseconds(first.time), arrived);
         let mut session = Self {
             device,
             address,
@@ -108,10 +100,7 @@ impl Session {
             primary: Some(primary),
             outputs: None,
             state: first,
-            stamp,
-            fresh_at: arrived,
-            device_time,
-            suspect: false,
+            measured: Measured::new(Some(nanoseconds(first.time)), arrived),
             updated: Mono::ZERO,
             primary_at: Mono::ZERO,
             stopped: None,
@@ -139,7 +128,7 @@ impl Session {
 
     /// Returns the newest state, and when it was measured.
     pub fn state(&self) -> (&State, Mono) {
-        (&self.state, self.stamp)
+        (&self.state, self.measured.stamp)
     }
 
     /// Returns whether the motors are on and the brakes released.
@@ -185,7 +174,7 @@ impl Session {
             self.take(state);
         }
         let now = MonotonicClock.now();
-        if now.since(self.fresh_at) > STATE_TIMEOUT {
+        if now.since(self.measured.arrived) > STATE_TIMEOUT {
             return Err(AdapterError::Io(format!("ur at {} sent no new state for {STATE_TIMEOUT:?}", self.address)));
         }
         if now.since(self.primary_at) > PRIMARY_PERIOD || self.stopped.is_some_and(|stopped| stopped.error.is_none()) {
@@ -273,17 +262,13 @@ impl Session {
         }
         let arrived = self.rtde.arrived;
         let top = self.device.limits.velocity_max.iter().copied().fold(0.0, f64::max);
-        let reach = MAX_JUMP + 1.5 * top * arrived.since(self.fresh_at).as_secs_f64();
-        let jumps = state.position.iter().zip(&self.state.position).any(|(new, old)| (new - old).abs() > reach);
-        if jumps && !self.suspect {
-            self.suspect = true;
+        let time = Some(nanoseconds(state.time));
+        if !self.measured.take(&state.position, &self.state.position, top, time, arrived) {
             return;
         }
-        self.suspect = false;
-        self.stamp = self.device_time.translate(nanoseconds(state.time), arrived);
         // Every new echo is an answer. That of the newest order comes later than the next order.
         let echoed = state.count != self.state.count && self.count.wrapping_sub(state.count) >= 0;
-        (self.fresh_at, self.state) = (arrived, state);
+        self.state = state;
         if state.count == self.count {
             self.unanswered = None;
         } else if echoed && self.unanswered.is_some() {

@@ -60,7 +60,7 @@ fn inputs_outputs_load_and_joints_are_parts_of_the_arm() {
     let load = Load { mass: 1.5, center: [0.0, 0.02, 0.06], inertia: [0.01, 0.0, 0.0, 0.02, 0.0, 0.03] };
     adapter.payload().unwrap().write_payload(&load).unwrap();
     assert!(adapter.payload().unwrap().read_payload().unwrap().unwrap().agrees_with(&load));
-    // Hanging from the ceiling: the base is accelerated downwards where it stands upright.
+    // Mounted on the ceiling.
     adapter.payload().unwrap().write_mounting([0.0, 0.0, 1.0]).unwrap();
     until(&mut adapter, |_| emulator.gravity() == [0.0, 0.0, -9.82]);
 

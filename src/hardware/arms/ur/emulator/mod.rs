@@ -118,12 +118,9 @@ impl Default for SimOptions {
 impl SimOptions {
     /// Returns an error for values that the emulator cannot have.
     pub(super) fn check(&self, limits: &JointLimits) -> Result<(), ConfigError> {
-        let range = |name: &str, value: f64, most: f64| {
-            let what = || format!("{name} must be 0 to {most}, not {value}");
-            if (0.0..=most).contains(&value) { Ok(()) } else { Err(ConfigError::new(format!("sim.{name}"), what())) }
-        };
-        range("power_time", self.power_time, 60.0)?;
-        range("speed_slider", self.speed_slider, 1.0)?;
+        super::within("power_time", self.power_time, (0.0, 60.0))
+            .and_then(|()| super::within("speed_slider", self.speed_slider, (0.0, 1.0)))
+            .map_err(|error| error.within("sim"))?;
         self.common().check("ur", limits, PLAYABLE)
     }
 
