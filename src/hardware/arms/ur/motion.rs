@@ -9,9 +9,10 @@ use super::session::Session;
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult, Stop};
 
-/// Setpoints are not sent while none of the last ones was answered for this time: longer than a CB3 controller needs, 3
-/// steps of 8 ms, and so short that an arm at top speed, which cannot catch up, follows within its tracking tolerance.
-const MAX_UNANSWERED: Duration = Duration::from_millis(40);
+/// Setpoints are not sent while none of the last ones was answered for this time, of an e-Series and of a CB3
+/// controller: longer than 3 steps of 2 and of 8 ms, and so short that an arm at top speed, which cannot catch up,
+/// follows within its tracking tolerance.
+const MAX_UNANSWERED: [Duration; 2] = [Duration::from_millis(20), Duration::from_millis(40)];
 /// How long a stop waits for the program's answer, and for what the dashboard does after that.
 const STOP_LIMIT: Duration = Duration::from_millis(300);
 const DASHBOARD_LIMIT: Duration = Duration::from_millis(700);
@@ -35,7 +36,9 @@ impl Session {
     pub fn stream(&mut self, order: Order) -> AdapterResult<()> {
         self.update(Duration::ZERO)?;
         self.may_be_commanded()?;
-        if self.unanswered.is_some_and(|since| MonotonicClock.now().since(since) > MAX_UNANSWERED) {
+        let [e_series, cb3] = MAX_UNANSWERED;
+        let most = if self.device.model.is_cb3() { cb3 } else { e_series };
+        if self.unanswered.is_some_and(|since| MonotonicClock.now().since(since) > most) {
             return Err(AdapterError::Busy);
         }
         self.setpoint(order)
