@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use dimos::arm::{ArmCommand, ArmState, Link};
 use dimos::clock::{Clock, MonotonicClock};
-use dimos::control::tick_loop::next_deadline;
+use dimos::control::pace::next_deadline;
 use dimos::hardware::adapter::ManipulatorAdapter;
 use dimos::hardware::device::{Device, DeviceConfig};
 use dimos::joint::{ControlMode, MAX_DOF};

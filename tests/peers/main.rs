@@ -8,6 +8,7 @@ mod feetech_sdk;
 mod lerobot_bus;
 mod piper_kernel;
 mod piper_sdk;
+mod ur_control;
 mod ur_rtde;
 mod xarm_proxy;
 mod xarm_sdk;

@@ -41,4 +41,5 @@ mod so101_service;
 mod start_stages;
 mod stop_input;
 mod stops;
+mod ur_runs;
 mod xarm_runs;

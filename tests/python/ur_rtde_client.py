@@ -52,7 +52,7 @@ def use(address):
     start = receive.getActualQ()
     check(f"pose {start}", near(start, [0.3, -1.4, 1.5, -1.7, -1.5, 0.4]))
     check("modes", (receive.getRobotMode(), receive.getSafetyMode()) == (7, 1))
-    check("inputs", receive.getActualDigitalInputBits() == 1 << 3 | 1 << 9)
+    check("inputs", receive.getActualDigitalInputBits() == (1 << 18) - 1)
 
     control = rtde_control.RTDEControlInterface(address)
     check("its program runs", dashboard.running() and control.isProgramRunning())

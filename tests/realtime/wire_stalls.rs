@@ -1,4 +1,4 @@
-//! Commands to an arm whose wire stalls at full speed, judged on the wire: five arms, every kind of stall,
+//! Commands to an arm whose wire stalls at full speed, judged on the wire: six arms, every kind of stall,
 //! from 20 ms to 3 s. `DIMOS_WIRE=full` tries every kind with every length; otherwise each arm gets every kind and
 //! every length at least once. `DIMOS_WIRE_ARM=xarm` tries only that arm, and prints what went over the wire at a
 //! failure.
@@ -11,7 +11,7 @@ use dimos::hardware::sim::faults::{Fault, FaultKind};
 
 use crate::serial;
 use crate::support::wire;
-use crate::support::wire::arms::{Arm, Bed, PERIOD, PIPER, REMOTE, Setup, XARM, YOURARM};
+use crate::support::wire::arms::{Arm, Bed, PERIOD, PIPER, REMOTE, Setup, UR, XARM, YOURARM};
 use crate::support::wire::watch::Watch;
 use crate::support::wire::{Stall, now};
 
@@ -39,7 +39,7 @@ const SPOILT: Duration = Duration::from_millis(4);
 const REPETITIONS: usize = 5;
 
 fn arms() -> Vec<Arm> {
-    let all = [YOURARM, XARM, PIPER, REMOTE, wire::arms::serial(&serial::SPEC)];
+    let all = [YOURARM, XARM, PIPER, REMOTE, wire::arms::serial(&serial::SPEC), UR];
     let only = std::env::var("DIMOS_WIRE_ARM").ok();
     all.into_iter().filter(|arm| only.as_ref().is_none_or(|only| only == arm.name)).collect()
 }
@@ -117,7 +117,7 @@ fn position_case(bed: &Bed, kind: Kind, time: Duration) -> Vec<String> {
     std::thread::sleep(time);
     bed.rest();
     let (phase, cause) = bed.phase();
-    let (sent, delivered) = (bed.gate.sent(), bed.gate.delivered());
+    let (sent, delivered) = (bed.gate.sent(), bed.delivered(began));
     let mut verdicts = vec![bed.bounds.neighbours(&sent, began)];
     // A run hears of no frame that its bus took and somebody behind it lost.
     if kind != Kind::Wire(Stall::Drop) || bed.arm.name != "piper" {
@@ -140,6 +140,7 @@ fn position_case(bed: &Bed, kind: Kind, time: Duration) -> Vec<String> {
     }
     let failures: Vec<String> = verdicts.into_iter().filter_map(Result::err).collect();
     if !failures.is_empty() && std::env::var_os("DIMOS_WIRE_ARM").is_some() {
+        println!("{phase} ({cause})");
         let near = |at: dimos::clock::Mono| (-0.05..time.as_secs_f64() + 0.1).contains(&at.seconds_since(began));
         for command in delivered.iter().filter(|command| near(command.at)) {
             println!("{:8.1} ms {:?} {:?}", command.at.seconds_since(began) * 1e3, command.what, command.truth);

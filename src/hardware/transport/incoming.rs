@@ -13,7 +13,7 @@ pub(super) const BUFFER: usize = 4096;
 pub enum Scan<T> {
     /// The beginning of a frame: more bytes are needed.
     More,
-    /// This many bytes (at least 1) are not the expected frame.
+    /// This many bytes (at least 1) are not the expected frame. They may be more than have arrived.
     Skip(usize),
     /// The expected frame, and its length.
     Take(usize, T),
@@ -35,11 +35,13 @@ impl<T> Scan<T> {
 pub(super) struct Incoming {
     buffer: Vec<u8>,
     filled: Range<usize>,
+    /// Number of bytes to skip that have not arrived yet.
+    skip: usize,
 }
 
 impl Incoming {
     pub(super) fn new() -> Self {
-        Self { buffer: vec![0; BUFFER], filled: 0..0 }
+        Self { buffer: vec![0; BUFFER], filled: 0..0, skip: 0 }
     }
 
     /// Returns the first frame that `scan` takes from the received bytes. Skipped bytes are dropped.
@@ -71,6 +73,8 @@ impl Incoming {
         }
         let n = read(room)?.min(room.len());
         self.filled.end += n;
+        let skip = std::mem::take(&mut self.skip);
+        self.used(skip);
         Ok(n)
     }
 
@@ -102,9 +106,40 @@ impl Incoming {
     /// Discards all received bytes.
     pub(super) fn clear(&mut self) {
         self.filled = 0..0;
+        self.skip = 0;
     }
 
     fn used(&mut self, n: usize) {
-        self.filled.start = self.filled.start.saturating_add(n).min(self.filled.end);
+        let now = n.min(self.filled.len());
+        self.filled.start += now;
+        self.skip = n - now;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_skipped_may_not_have_arrived_yet() {
+        let mut incoming = Incoming::new();
+        // A byte that says how long its frame is; frames of more than 9 bytes are skipped.
+        let scan = |bytes: &[u8]| match bytes {
+            [length, ..] if *length >= 10 => Scan::Skip(usize::from(*length)),
+            [length, ..] if bytes.len() >= usize::from(*length) => Scan::Take(usize::from(*length), bytes.len()),
+            _ => Scan::More,
+        };
+        let arrive = |incoming: &mut Incoming, bytes: &[u8]| {
+            incoming.fill("test", |room| {
+                room[..bytes.len()].copy_from_slice(bytes);
+                Ok(bytes.len())
+            })
+        };
+        arrive(&mut incoming, &[20, 1, 1, 1]).unwrap();
+        assert_eq!(incoming.next(scan), None);
+        arrive(&mut incoming, &[1; 10]).unwrap();
+        assert_eq!(incoming.next(scan), None);
+        arrive(&mut incoming, &[[1; 6].as_slice(), &[3, 0, 0]].concat()).unwrap();
+        assert_eq!(incoming.next(scan), Some(3));
     }
 }

@@ -3,6 +3,7 @@
 pub mod can;
 pub mod device_time;
 mod incoming;
+pub mod measured;
 pub mod pty;
 pub mod request_reply;
 pub mod serial;

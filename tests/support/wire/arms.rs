@@ -4,8 +4,11 @@ use std::any::Any;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use dimos::clock::Mono;
+use dimos::hardware::arms::ur::emulator::UrEmulator;
 use dimos::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, EmulatorAddress, Registry};
 use dimos::hardware::sim::faults::Fault;
+use dimos::joint::Joints;
 use dimos::rpc::run_dir::RunDir;
 use dimos::runtime::{Record, Run};
 use serde_json::{Value, json};
@@ -14,7 +17,7 @@ use super::can::CanProxy;
 use super::judge::Bounds;
 use super::stream::Proxy;
 use super::watch::Watch;
-use super::{Gate, decode, lock};
+use super::{Gate, What, WireCommand, decode, lock};
 
 /// Nothing here takes longer.
 pub const TIMEOUT: Duration = Duration::from_secs(20);
@@ -68,6 +71,15 @@ pub const REMOTE: Arm = Arm {
     time_limit: Some(0.5),
 };
 
+/// Universal Robots' arm: a program on its controller follows registers.
+pub const UR: Arm = Arm {
+    name: "ur",
+    row: None,
+    ends: [[-2.7, -1.4, 1.5, -2.5, -1.5, -2.7], [2.7, -1.0, 1.9, 2.5, -1.1, 2.7]],
+    rounding: 1e-9,
+    time_limit: Some(0.2),
+};
+
 /// An arm on a serial line (`tests/support/serial_line`).
 pub fn serial(row: &'static AdapterSpec) -> Arm {
     Arm {
@@ -117,6 +129,25 @@ pub struct World {
     pub address: String,
     _proxy: Box<dyn Any>,
     emulator: Arc<Mutex<Box<dyn Emulator>>>,
+    /// Its program interpolates between the setpoints: what that commands is what moves the arm.
+    program: Option<Arc<UrEmulator>>,
+}
+
+/// An emulator of which a test also asks what its program does.
+struct Shared(Arc<UrEmulator>);
+
+impl Emulator for Shared {
+    fn address(&self) -> String {
+        self.0.address()
+    }
+
+    fn inject(&self, fault: Fault) -> Result<(), String> {
+        self.0.inject(fault)
+    }
+
+    fn true_positions(&self) -> Option<Joints> {
+        self.0.true_positions()
+    }
 }
 
 /// An arm, its wire, and a run that is up. Ends in this order.
@@ -134,7 +165,12 @@ impl World {
         let start = if setup.start.is_empty() { arm.ends[0].to_vec() } else { setup.start.clone() };
         let options = json!({ "sim": { "initial_positions": start, "faults": setup.faults } });
         let config = AdapterConfig { hardware_id: "arm".into(), address: "sim".into(), dof: 6, options };
-        let emulator = arm.spec().emulate.unwrap()(&config, &EmulatorAddress::InProcess).unwrap();
+        let place = EmulatorAddress::InProcess;
+        let program = (arm.name == "ur").then(|| Arc::new(UrEmulator::start(&config, &place).unwrap()));
+        let emulator = match &program {
+            Some(program) => Box::new(Shared(program.clone())),
+            None => arm.spec().emulate.unwrap()(&config, &place).unwrap(),
+        };
         let address = emulator.address();
         let emulator = Arc::new(Mutex::new(emulator));
         let watched = emulator.clone();
@@ -144,6 +180,7 @@ impl World {
         let (proxy, address): (Box<dyn Any>, String) = match arm.name {
             "yourarm" => boxed(Proxy::tcp(&address, &gate, decode::yourarm())),
             "xarm" => boxed(Proxy::xarm(&address, &gate, decode::xarm(6))),
+            "ur" => boxed(Proxy::ur(&address, &gate, decode::ur())),
             "remote" => {
                 let proxy = Proxy::tcp(address.trim_start_matches("tcp:"), &gate, decode::remote());
                 let address = format!("tcp:{}", proxy.address);
@@ -156,7 +193,7 @@ impl World {
             }
             _ => boxed(Proxy::serial(&address, &gate, decode::template())),
         };
-        Self { arm, gate, address, _proxy: proxy, emulator }
+        Self { arm, gate, address, _proxy: proxy, emulator, program }
     }
 
     /// Starts a run; or hands the world back, and why the run did not start.
@@ -201,6 +238,19 @@ impl Bed {
     /// Where the joints truly are [rad]; nothing where the emulator does not tell.
     pub fn truth(&self) -> Vec<f64> {
         self.world.truth()
+    }
+
+    /// What reached the arm; where its program interpolates, what that commanded from a little before `began`.
+    pub fn delivered(&self, began: Mono) -> Vec<WireCommand> {
+        let Some(program) = &self.world.program else { return self.gate.delivered() };
+        let recent = program.servoj().into_iter().filter(|(at, _)| at.seconds_since(began) > -0.2);
+        let command = |(at, goal): (Mono, [f64; 6])| WireCommand {
+            at,
+            connection: 0,
+            what: What::Position(goal.to_vec()),
+            truth: None,
+        };
+        recent.map(command).collect()
     }
 
     pub fn inject(&self, fault: Fault) {

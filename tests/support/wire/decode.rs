@@ -114,6 +114,27 @@ pub fn xarm(dof: usize) -> NewDecoder {
     })
 }
 
+/// RTDE of Universal Robots: a length, a type, for data the number of a recipe, and big-endian values. The first recipe
+/// of this adapter has a count, an order and six joints. After a stop another program begins.
+pub fn ur() -> NewDecoder {
+    by(|bytes| {
+        let Some([high, low, kind]) = bytes.first_chunk::<3>() else { return Front::More };
+        let length = usize::from(u16::from_be_bytes([*high, *low]));
+        if length < 3 {
+            return Front::Skip(1);
+        }
+        let Some(frame) = bytes.get(..length) else { return Front::More };
+        let joints = || frame[12..].as_chunks::<8>().0.iter().map(|b| f64::from_be_bytes(*b)).collect();
+        let what = match (kind, length, frame.get(11)) {
+            (b'U', 60, Some(1)) => Some(What::Position(joints())),
+            (b'U', 60, Some(2)) => Some(What::Velocity(joints())),
+            (b'U', 60, Some(3)) => Some(What::Enable(false)),
+            _ => None,
+        };
+        Front::Frame(length, what)
+    })
+}
+
 /// `docs/remote-adapter.md`: a JSON object a line.
 pub fn remote() -> NewDecoder {
     by(|bytes| {

@@ -50,6 +50,18 @@ impl Proxy {
         proxy
     }
 
+    /// In front of a controller of Universal Robots whose first port is that of `upstream`: RTDE, which carries the
+    /// commands, the dashboard, and the script's ports.
+    pub fn ur(upstream: &str, gate: &Gate, decoder: NewDecoder) -> Self {
+        let (host, first) = upstream.rsplit_once(':').unwrap();
+        let first = first.parse::<u16>().unwrap();
+        let ports = [5, 0, 2, 3, 4].map(|k| format!("{host}:{}", first + k));
+        let (listeners, address) = listen(&[5, 0, 2, 3, 4].map(|k| 29999 + k));
+        let mut proxy = Self { address: format!("{address}:29999"), closing: Arc::default(), threads: Vec::new() };
+        proxy.serve(listeners, &ports, gate, Some(decoder));
+        proxy
+    }
+
     /// In front of a controller on the serial line `upstream`.
     pub fn serial(upstream: &str, gate: &Gate, decoder: NewDecoder) -> Self {
         let pty = Arc::new(Pty::open().unwrap());

@@ -15,8 +15,8 @@ use super::session::Session;
 use super::{DOF, HOLDS_WHEN_DISABLED, MODES, Options, check};
 use crate::arm::Pose;
 use crate::hardware::adapter::{
-    AdapterError, AdapterResult, Cartesian, ForceTorque, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState,
-    Stop,
+    AdapterError, AdapterResult, Cartesian, ForceTorque, Io, JointMonitor, JointReading, ManipulatorAdapter,
+    ManipulatorInfo, Payload, RobotState, Stop,
 };
 use crate::hardware::adapter_util::{fill, finite};
 use crate::hardware::registry::AdapterConfig;
@@ -43,17 +43,17 @@ impl UrAdapter {
         Ok(Self { address, options: config.options()?, session: None, mode: ControlMode::ServoPosition, stopped: None })
     }
 
-    /// Calls `act` with the connection; drops a broken one.
+    /// Calls `act` with the connection; drops a broken one, with a stop as far as that is possible.
     pub(super) fn with<T>(&mut self, act: impl FnOnce(&mut Session) -> AdapterResult<T>) -> AdapterResult<T> {
         let result = act(self.session.as_mut().ok_or(AdapterError::NotConnected)?);
         if matches!(result, Err(AdapterError::Io(_))) {
-            self.disconnect();
+            self.discard_pending();
         }
         result
     }
 
     /// Returns the connection, with its state updated recently.
-    fn recent(&mut self) -> AdapterResult<&mut Session> {
+    pub(super) fn recent(&mut self) -> AdapterResult<&mut Session> {
         self.with(|session| session.update(RECENT))?;
         self.session.as_mut().ok_or(AdapterError::NotConnected)
     }
@@ -241,6 +241,18 @@ impl ManipulatorAdapter for UrAdapter {
     }
 
     fn cartesian(&mut self) -> Option<&mut dyn Cartesian> {
+        Some(self)
+    }
+
+    fn io(&mut self) -> Option<&mut dyn Io> {
+        Some(self)
+    }
+
+    fn payload(&mut self) -> Option<&mut dyn Payload> {
+        Some(self)
+    }
+
+    fn joint_monitor(&mut self) -> Option<&mut dyn JointMonitor> {
         Some(self)
     }
 }

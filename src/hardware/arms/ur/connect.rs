@@ -28,9 +28,10 @@ pub fn connect(address: &Address, options: &Options) -> AdapterResult<Session> {
     let (primary, major, configuration) = Primary::connect(address, limit).map_err(named)?;
     verify(address, options.model, configuration.kind, major)?;
     let left = limit.since(MonotonicClock.now());
-    let mut dashboard = Dashboard::connect(address, left.min(DASHBOARD)).map_err(named)?;
-    let serial = dashboard.ask("get serial number").map_err(named)?;
-    let serial = Some(serial).filter(|serial| !serial.is_empty() && serial.bytes().all(|byte| byte.is_ascii_digit()));
+    // Without a dashboard the arm is only read.
+    let serial = Dashboard::connect(address, left.min(DASHBOARD)).and_then(|mut board| board.ask("get serial number"));
+    let digits = |serial: &String| !serial.is_empty() && serial.bytes().all(|byte| byte.is_ascii_digit());
+    let serial = serial.ok().filter(digits);
     let left = limit.since(MonotonicClock.now());
     let first = rtde.next(left.min(FIRST_STATE)).map_err(named)?;
     let [major, minor, bugfix] = rtde.software;

@@ -31,8 +31,9 @@ fn line(bytes: &[u8]) -> Scan<String> {
 impl Dashboard {
     /// Connects and waits for the greeting.
     pub fn connect(address: &Address, timeout: Duration) -> AdapterResult<Self> {
-        let mut link = TcpLink::connect("the dashboard of ur", &address.port(Service::Dashboard), timeout)?;
-        let greeting = link.receive(GREETING.min(timeout), line)?;
+        let link = TcpLink::connect("the dashboard of ur", &address.port(Service::Dashboard), timeout);
+        let mut link = link.map_err(unreachable)?;
+        let greeting = link.receive(GREETING.min(timeout), line).map_err(unreachable)?;
         if !greeting.contains("Dashboard Server") {
             let what = format!("{} is not a dashboard: {greeting:?}", link.peer());
             return Err(AdapterError::Protocol(what));
@@ -40,10 +41,11 @@ impl Dashboard {
         Ok(Self { link })
     }
 
-    /// Sends a request and returns the answer.
+    /// Sends a request and returns the answer. After an error this connection is of no more use: a late answer would
+    /// be taken for the next one.
     pub fn ask(&mut self, request: &str) -> AdapterResult<String> {
-        self.link.send(format!("{request}\n").as_bytes())?;
-        self.link.receive(ANSWER, line)
+        let sent = self.link.send(format!("{request}\n").as_bytes());
+        sent.and_then(|()| self.link.receive(ANSWER, line)).map_err(unreachable)
     }
 
     /// Sends an order; `Rejected` unless the answer begins as expected.
@@ -60,6 +62,14 @@ impl Dashboard {
     /// switch.
     pub fn is_in_remote_control(&mut self, cb3: bool) -> AdapterResult<bool> {
         Ok(cb3 || self.ask("is in remote control")? != "false")
+    }
+}
+
+/// The state and the orders have connections of their own, which are not broken by this one.
+fn unreachable(error: AdapterError) -> AdapterError {
+    match error {
+        AdapterError::Io(text) => AdapterError::Rejected(text),
+        other => other,
     }
 }
 

@@ -34,7 +34,7 @@ fn recipes() {
 
 #[test]
 fn an_order() {
-    let order = inputs::order(1, 5, Order::Servo([0.0, -1.5, 2.0, 0.0, 0.0, 0.5]));
+    let order = inputs::order(1, 5, Order::Servo([0.0, -1.5, 2.0, 0.0, 0.0, 0.5]), &[0.0; 6]);
     let expected = "003c 55 01 00000005 00000001 0000000000000000 bff8000000000000 4000000000000000 \
                     0000000000000000 0000000000000000 3fe0000000000000";
     assert_eq!(order[..], hex(expected));

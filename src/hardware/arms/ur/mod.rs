@@ -14,15 +14,22 @@ mod golden;
 mod io;
 pub mod model;
 mod motion;
+mod outputs;
 mod power;
 mod primary;
-mod program;
+pub mod program;
 pub mod protocol;
 mod rtde;
 mod safety;
 mod session;
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod tests_others;
+#[cfg(test)]
+mod tests_power;
+#[cfg(test)]
+mod tests_stream;
 
 use std::time::Duration;
 
@@ -111,14 +118,18 @@ impl Default for Options {
 fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("ur", SPEC.dof)?;
     let options: Options = config.options()?;
-    let within = |name: &str, value: f64, (least, most): (f64, f64)| match value {
-        value if (least..=most).contains(&value) => Ok(()),
-        value => Err(ConfigError::new(name, format!("{name} is {least} to {most}, not {value}"))),
-    };
     within("lookahead_time", options.lookahead_time, (0.03, 0.2))?;
     within("gain", options.gain, (100.0, 2000.0))?;
     within("stop_deceleration", options.stop_deceleration, (1.0, 40.0))?;
     let limits = options.model.limits();
     options.sim.check(&limits)?;
     Ok(Checked { limits })
+}
+
+/// Returns an error for an option that is not between `least` and `most`.
+fn within(name: &str, value: f64, (least, most): (f64, f64)) -> Result<(), ConfigError> {
+    match value {
+        value if (least..=most).contains(&value) => Ok(()),
+        value => Err(ConfigError::new(name, format!("{name} is {least} to {most}, not {value}"))),
+    }
 }

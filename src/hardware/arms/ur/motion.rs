@@ -2,14 +2,17 @@
 
 use std::time::Duration;
 
+use super::primary::Primary;
 use super::protocol::inputs::Order;
 use super::protocol::status::program;
 use super::session::Session;
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult, Stop};
 
-/// Setpoints are not sent while none of the last ones was answered for this time.
-const MAX_UNANSWERED: Duration = Duration::from_millis(60);
+/// Setpoints are not sent while none of the last ones was answered for this time, of an e-Series and of a CB3
+/// controller: longer than 3 steps of 2 and of 8 ms, and so short that an arm at top speed, which cannot catch up,
+/// follows within its tracking tolerance.
+const MAX_UNANSWERED: [Duration; 2] = [Duration::from_millis(20), Duration::from_millis(40)];
 /// How long a stop waits for the program's answer, and for what the dashboard does after that.
 const STOP_LIMIT: Duration = Duration::from_millis(300);
 const DASHBOARD_LIMIT: Duration = Duration::from_millis(700);
@@ -33,7 +36,9 @@ impl Session {
     pub fn stream(&mut self, order: Order) -> AdapterResult<()> {
         self.update(Duration::ZERO)?;
         self.may_be_commanded()?;
-        if self.unanswered.is_some_and(|since| MonotonicClock.now().since(since) > MAX_UNANSWERED) {
+        let [e_series, cb3] = MAX_UNANSWERED;
+        let most = if self.device.model.is_cb3() { cb3 } else { e_series };
+        if self.unanswered.is_some_and(|since| MonotonicClock.now().since(since) > most) {
             return Err(AdapterError::Busy);
         }
         self.setpoint(order)
@@ -58,17 +63,21 @@ impl Session {
         let done = |session: &mut Self| {
             let (state, measured) = session.state();
             let echoed = state.count == count && state.program >= program::STOPPED;
-            let still = session.at_rest() && (!session.program_runs() || session.stopped.is_some());
+            let still = session.at_rest() && (!session.program_exists() || session.stopped.is_some());
             Ok((echoed || (still && measured > sent)).then_some(()))
         };
         if self.wait(STOP_LIMIT, done)?.is_some() {
             return Ok(Stop::Confirmed);
         }
         // Another program, or ours does not run as it should.
+        // The primary interface takes it at once and does not answer; the dashboard may be slow, or not there.
+        let told = |primary: &mut Primary| !primary.read_only() && primary.run("stop program\n").is_ok();
+        let told = self.primary.as_mut().is_some_and(told);
         let asked = self.dashboard().and_then(|mut dashboard| dashboard.order("stop", "stopped"));
+        let asked = if told { Ok(()) } else { asked };
         let sent = MonotonicClock.now();
         let done = |session: &mut Self| {
-            let still = session.at_rest() && !session.program_runs() && session.state().1 > sent;
+            let still = session.at_rest() && !session.program_exists() && session.state().1 > sent;
             Ok(still.then_some(()))
         };
         match self.wait(DASHBOARD_LIMIT, done)? {

@@ -12,8 +12,13 @@ use super::session::{FULL_SPEED, Session};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 
-/// How long enabling may take: power and brakes of a real arm take longer, and enabling again continues.
-const POWER_LIMIT: Duration = Duration::from_millis(6000);
+/// How long enabling may take before the program starts: power and brakes of a real arm take longer, and enabling again
+/// continues.
+const POWER_LIMIT: Duration = Duration::from_millis(5500);
+/// The brakes are released only if this much time is left: a release continues after this call.
+const BRAKE_TIME: Duration = Duration::from_secs(4);
+/// How long a program that an earlier connection has left may take to end: by order, or because no orders come.
+const LEFTOVER_LIMIT: Duration = Duration::from_millis(1200);
 /// How long the motors may take to go off.
 const OFF_LIMIT: Duration = Duration::from_secs(3);
 /// How long the program may take to start.
@@ -25,7 +30,8 @@ const RELEASE_LIMIT: Duration = Duration::from_secs(1);
 const RESTART_LIMIT: Duration = Duration::from_secs(5);
 
 impl Session {
-    /// Switches power on, releases the brakes, and starts the program. Nothing moves.
+    /// Switches power on, releases the brakes, and starts the program. The joints move slightly when their brakes are
+    /// released, and nothing moves otherwise.
     pub fn activate(&mut self, options: &Options) -> AdapterResult<()> {
         self.update(Duration::ZERO)?;
         self.fault()?;
@@ -39,11 +45,30 @@ impl Session {
                 100.0 * self.state.slider
             )));
         }
-        if self.ready.is_none() && self.program_runs() && !self.at_rest() {
-            return Err(AdapterError::Rejected("the arm is moving: another program commands it".into()));
-        }
-        self.power_on(MonotonicClock.now().after(POWER_LIMIT))?;
+        let limit = MonotonicClock.now().after(POWER_LIMIT);
+        self.end_leftover()?;
+        self.power_on(limit)?;
+        // One that was started meanwhile.
+        self.end_leftover()?;
         self.start(options)
+    }
+
+    /// Waits for the end of a program that an earlier connection of dimos has left; any other one is not replaced.
+    fn end_leftover(&mut self) -> AdapterResult<()> {
+        if self.ready.is_some() || !self.program_exists() {
+            return Ok(());
+        }
+        // Only a program of dimos takes it; it also ends when orders do not come.
+        self.order(Order::Stop)?;
+        self.unanswered = None;
+        let ended = self.wait(LEFTOVER_LIMIT, |session| Ok((!session.program_exists()).then_some(())))?;
+        ended.ok_or_else(|| {
+            AdapterError::Rejected(
+                "another program is on the controller, running or paused: enabling would end it\nhint: end it first: \
+                 `dimos stop`, then reset and enable the arm"
+                    .into(),
+            )
+        })
     }
 
     fn power_on(&mut self, limit: Mono) -> AdapterResult<()> {
@@ -56,45 +81,54 @@ impl Session {
         if self.enabled() {
             return Ok(());
         }
-        if self.state.robot_mode < robot::POWER_OFF || self.state.robot_mode > robot::RUNNING {
+        if !matches!(self.state.robot_mode, robot::POWER_OFF | robot::POWER_ON | robot::IDLE) {
             let name = robot_name(self.state.robot_mode);
             return Err(AdapterError::Rejected(format!("the controller is not ready: its robot mode is {name}")));
         }
-        let _ = dashboard.ask("close safety popup");
-        for (request, answer, mode) in
-            [("power on", "powering on", robot::IDLE), ("brake release", "brake releasing", robot::RUNNING)]
-        {
-            if self.state.robot_mode >= mode {
-                continue;
-            }
-            dashboard.order(request, answer)?;
-            let left = limit.since(MonotonicClock.now());
-            let reached = self.wait(left, |session| {
-                session.fault()?;
-                Ok((session.state.robot_mode >= mode).then_some(()))
-            })?;
-            if reached.is_none() {
-                let name = robot_name(self.state.robot_mode);
-                return Err(AdapterError::Rejected(format!(
-                    "the arm is still being switched on ({name}) after {POWER_LIMIT:?}\nhint: enable it again when the pendant \
-                     shows it on"
-                )));
-            }
+        let braked = self.state.robot_mode == robot::IDLE;
+        dashboard.ask("close safety popup")?;
+        if !braked {
+            dashboard.order("power on", "powering on")?;
+            self.reach(robot::IDLE, limit)?;
         }
-        Ok(())
+        // What is ordered continues after this call, and after the end of the run.
+        if !braked && limit.since(MonotonicClock.now()) < BRAKE_TIME {
+            return Err(AdapterError::Rejected(
+                "the arm is on, and its brakes hold: too little time was left to release them\nhint: enable it again"
+                    .into(),
+            ));
+        }
+        dashboard.order("brake release", "brake releasing")?;
+        self.reach(robot::RUNNING, limit)
     }
 
-    /// Starts the program, which replaces a running one.
+    /// Waits for a robot mode.
+    fn reach(&mut self, mode: i32, limit: Mono) -> AdapterResult<()> {
+        let reached = self.wait(limit.since(MonotonicClock.now()), |session| {
+            session.fault()?;
+            Ok((session.state.robot_mode >= mode).then_some(()))
+        })?;
+        reached.ok_or_else(|| {
+            let name = robot_name(self.state.robot_mode);
+            AdapterError::Rejected(format!(
+                "the arm is still being switched on ({name}) after {POWER_LIMIT:?}\nhint: enable it again when the pendant \
+                 shows it on"
+            ))
+        })
+    }
+
+    /// Starts the program, which replaces an earlier one of this session.
     fn start(&mut self, options: &Options) -> AdapterResult<()> {
         (self.ready, self.ended) = (None, None);
         // Any number that differs from that of the program before.
         let number = (MonotonicClock.now().0 >> 10) as i32 & i32::MAX;
         // What the registers hold from before is not an order for the new program.
         self.order(Order::Hold)?;
-        self.primary.run(&program::control(number, options))?;
+        let text = program::control(number, options, &self.device.limits);
+        self.run_program(&text)?;
         let started = self.wait(START_LIMIT, |session| {
             session.fault()?;
-            session.primary.check()?;
+            session.check_program()?;
             let holds = session.state.number == number && session.state.program == status::program::HOLDING;
             Ok((holds && session.program_runs() && session.state.count == session.count).then_some(()))
         })?;
@@ -111,7 +145,12 @@ impl Session {
 
     /// Stops, and switches power off: the brakes hold.
     pub fn disable(&mut self) -> AdapterResult<()> {
-        if self.program_runs() {
+        if self.foreign_change().is_some() && self.program_exists() {
+            return Err(AdapterError::Rejected(
+                "another program commands the arm\nhint: `dimos arm reset`, then disable it".into(),
+            ));
+        }
+        if self.program_exists() {
             self.stop()?;
         }
         (self.ready, self.ended) = (None, None);
@@ -130,7 +169,7 @@ impl Session {
             safety::PROTECTIVE_STOP => self.release(stopped.since),
             safety::VIOLATION | safety::FAULT => {
                 let mut dashboard = self.dashboard()?;
-                let _ = dashboard.ask("close safety popup");
+                dashboard.ask("close safety popup")?;
                 dashboard.order("restart safety", "restarting safety")?;
                 self.wait_until_safe(RESTART_LIMIT)
             }
@@ -151,18 +190,21 @@ impl Session {
         // It may have been paused after it was ended: by hand, at the pendant.
         self.end_program()?;
         let mut dashboard = self.dashboard()?;
-        let _ = dashboard.ask("close safety popup");
+        dashboard.ask("close safety popup")?;
         dashboard.order("unlock protective stop", "protective stop releasing")?;
         self.wait_until_safe(RELEASE_LIMIT)
     }
 
     /// Ends a running or paused program, and verifies that.
     fn end_program(&mut self) -> AdapterResult<()> {
-        if !self.program_runs() {
+        if !self.program_exists() {
             return Ok(());
         }
-        self.dashboard()?.order("stop", "stopped")?;
-        let ended = self.wait(RELEASE_LIMIT, |session| Ok((!session.program_runs()).then_some(())))?;
+        let asked = self.dashboard()?.order("stop", "stopped");
+        let ended = self.wait(RELEASE_LIMIT, |session| Ok((!session.program_exists()).then_some(())))?;
+        if ended.is_none() {
+            asked?;
+        }
         ended.ok_or_else(|| {
             AdapterError::Rejected(
                 "the paused program does not end, and would continue after the stop\nhint: end it at the pendant"

@@ -69,14 +69,12 @@ impl Primary {
         if let Some(why) = self.exception.take() {
             return Err(AdapterError::Rejected(format!("the controller refuses the program of dimos: {why}")));
         }
-        if self.read_only {
-            // A new connection is not read-only once the pendant is in remote control.
-            return Err(AdapterError::Io(
-                "the controller takes no programs from this connection: it was opened in local control\nhint: select \
-                 remote control at the pendant"
-                    .into(),
-            ));
-        }
         Ok(())
+    }
+
+    /// Returns whether the connection takes no programs: it was opened in local control. A new one does once the
+    /// pendant is in remote control.
+    pub fn read_only(&self) -> bool {
+        self.read_only
     }
 }

@@ -1,14 +1,20 @@
 //! The programs that the adapter sends to the controller. The text is in `control.script`.
 
 use super::Options;
+use crate::joint::JointLimits;
 
 /// The control program, with its constants to be filled in. A counter, checked in each step, ends it when orders no
 /// longer come: the controller's own watchdog would add nothing.
 const CONTROL: &str = include_str!("control.script");
+/// Acceleration of gravity, as the vendor's examples have it [m/s²].
+const STANDARD_GRAVITY: f64 = 9.82;
 
-/// Returns the control program. `number` distinguishes its state from that of an earlier one.
-pub fn control(number: i32, options: &Options) -> String {
+/// Returns the control program. `number` distinguishes its state from that of an earlier one; no joint goes faster than
+/// its top speed in `limits`.
+pub fn control(number: i32, options: &Options, limits: &JointLimits) -> String {
+    let speeds = limits.velocity_max.iter().map(f64::to_string).collect::<Vec<_>>().join(", ");
     CONTROL
+        .replace("@SPEEDS@", &speeds)
         .replace("@NUMBER@", &number.to_string())
         .replace("@LOOKAHEAD@", &options.lookahead_time.to_string())
         .replace("@GAIN@", &options.gain.to_string())
@@ -24,6 +30,13 @@ pub fn payload(mass: f64, cog: [f64; 3], inertia: Option<[f64; 6]>) -> String {
         None => format!("set_payload({mass}, [{}])", list(&cog)),
     };
     beside("dimos_payload", &call)
+}
+
+/// Returns a program that sets the mounting by the direction of gravity in the base frame, a unit vector. The
+/// controller takes the acceleration that the base experiences: upright, that is along +z.
+pub fn mounting(gravity: [f64; 3]) -> String {
+    let [x, y, z] = gravity.map(|v| 0.0 - STANDARD_GRAVITY * v);
+    beside("dimos_mounting", &format!("set_gravity([{x}, {y}, {z}])"))
 }
 
 /// Returns a program that sets the tool's supply voltage [V].
@@ -42,11 +55,11 @@ mod tests {
 
     #[test]
     fn the_control_program_is_complete() {
-        let text = control(7, &Options::default());
+        let text = control(7, &Options::default(), &crate::hardware::arms::ur::model::Model::Ur3e.limits());
         assert!(text.starts_with("def dimos_control():\n") && text.ends_with("\nend\n"));
         assert!(text.contains("\n  number = 7\n") && !text.contains('@'), "{text}");
         assert!(text.contains("servoj(q, 0, 0, step, 0.05, 500)") && text.contains("stopj(8)"), "{text}");
-        assert!(text.is_ascii() && text.lines().count() < 80);
+        assert!(text.is_ascii() && text.lines().count() < 120);
         // Every block is closed, and its lines are indented by two.
         let mut depth = 0_usize;
         for line in text.lines() {
@@ -61,6 +74,8 @@ mod tests {
     #[test]
     fn programs_beside_it_are_single_calls() {
         assert_eq!(tool_voltage(24), "sec dimos_tool():\n  set_tool_voltage(24)\nend\n");
+        let text = mounting([0.0, 0.0, -1.0]);
+        assert_eq!(text, "sec dimos_mounting():\n  set_gravity([0, 0, 9.82])\nend\n");
         let text = payload(1.5, [0.0, 0.01, 0.05], None);
         assert_eq!(text, "sec dimos_payload():\n  set_payload(1.5, [0, 0.01, 0.05])\nend\n");
         let text = payload(1.5, [0.0; 3], Some([0.1, 0.2, 0.3, 0.0, 0.0, 0.0]));

@@ -18,10 +18,8 @@ const REPLY: Duration = Duration::from_millis(700);
 pub struct Rtde {
     link: TcpLink,
     recipe: Recipe,
-    /// Numbers of the input recipes: orders, digital and analog outputs; `None`: another client has them.
+    /// Number of the input recipe of orders; `None`: another client has the registers.
     orders: Option<u8>,
-    digital: Option<u8>,
-    analog: Option<u8>,
     /// Software of the controller: major, minor, bugfix.
     pub software: [u32; 3],
     /// When the newest state was taken.
@@ -32,19 +30,35 @@ fn until(limit: Mono, most: Duration) -> Duration {
     limit.since(MonotonicClock.now()).min(most)
 }
 
+/// Sends a request and waits for the reply of the same kind.
+pub fn request(link: &mut TcpLink, limit: Mono, packet: &[u8], kind: u8) -> AdapterResult<Vec<u8>> {
+    link.send(packet)?;
+    link.receive(until(limit, REPLY), |bytes| reply(bytes, kind, <[u8]>::to_vec))
+}
+
+/// Connects, and agrees on the version of the protocol.
+pub fn open(address: &Address, limit: Mono) -> AdapterResult<TcpLink> {
+    let mut link = TcpLink::connect("ur", &address.port(Service::Rtde), until(limit, 2 * REPLY))?;
+    match request(&mut link, limit, &encode(kind::PROTOCOL, &VERSION.to_be_bytes()), kind::PROTOCOL)?[..] {
+        [1] => Ok(link),
+        _ => Err(AdapterError::Protocol(format!(
+            "the controller refuses version {VERSION} of RTDE: its software is too old (3.9 or 5.3 is needed)"
+        ))),
+    }
+}
+
+/// Claims inputs; returns the number of their recipe, or `None` if another client has one of them.
+pub fn claim(link: &mut TcpLink, limit: Mono, names: &str, types: &str) -> AdapterResult<Option<u8>> {
+    let answer = request(link, limit, &recipe(None, names), kind::INPUTS)?;
+    let (id, found) = answer.split_first().ok_or_else(|| malformed("inputs"))?;
+    Ok((found == types.as_bytes()).then_some(*id))
+}
+
 impl Rtde {
     /// Connects, agrees on the values, and starts the state.
     pub fn connect(address: &Address, limit: Mono) -> AdapterResult<Self> {
-        let mut link = TcpLink::connect("ur", &address.port(Service::Rtde), until(limit, 2 * REPLY))?;
-        let mut ask = |request: &[u8], kind: u8| -> AdapterResult<Vec<u8>> {
-            link.send(request)?;
-            link.receive(until(limit, REPLY), |bytes| reply(bytes, kind, <[u8]>::to_vec))
-        };
-        if ask(&encode(kind::PROTOCOL, &VERSION.to_be_bytes()), kind::PROTOCOL)? != [1] {
-            return Err(AdapterError::Protocol(format!(
-                "the controller refuses version {VERSION} of RTDE: its software is too old (3.5 or newer is needed)"
-            )));
-        }
+        let mut link = open(address, limit)?;
+        let mut ask = |packet: &[u8], kind: u8| request(&mut link, limit, packet, kind);
         let numbers = ask(&encode(kind::SOFTWARE, &[]), kind::SOFTWARE)?;
         let number = |i: usize| {
             let bytes = numbers.get(4 * i..4 * i + 4).and_then(|bytes| bytes.try_into().ok());
@@ -61,18 +75,11 @@ impl Rtde {
                 None => break,
             }
         }
-        let mut input = |names: &str, types: &str| -> AdapterResult<Option<u8>> {
-            let answer = ask(&recipe(None, names), kind::INPUTS)?;
-            let (id, found) = answer.split_first().ok_or_else(|| malformed("inputs"))?;
-            Ok((found == types.as_bytes()).then_some(*id))
-        };
-        let orders = input(inputs::ORDER, inputs::ORDER_TYPES)?;
-        let digital = input(inputs::DIGITAL, inputs::DIGITAL_TYPES)?;
-        let analog = input(inputs::ANALOG, inputs::ANALOG_TYPES)?;
-        if ask(&encode(kind::START, &[]), kind::START)? != [1] {
+        let orders = claim(&mut link, limit, inputs::ORDER, inputs::ORDER_TYPES)?;
+        if request(&mut link, limit, &encode(kind::START, &[]), kind::START)? != [1] {
             return Err(AdapterError::Protocol("the controller does not start its RTDE data".into()));
         }
-        Ok(Self { link, recipe: fields, orders, digital, analog, software, arrived: MonotonicClock.now() })
+        Ok(Self { link, recipe: fields, orders, software, arrived: MonotonicClock.now() })
     }
 
     /// Returns the newest of the states that have arrived since the last call, without waiting.
@@ -104,33 +111,26 @@ impl Rtde {
         }
     }
 
+    /// Returns whether the controller sends a value: older software lacks some.
+    pub fn has(&self, name: &str) -> bool {
+        self.recipe.has(name)
+    }
+
     /// Returns whether orders can be sent: no other client has the registers.
     pub fn takes_orders(&self) -> bool {
         self.orders.is_some()
     }
 
-    /// Sends an order.
-    pub fn order(&mut self, count: i32, order: Order) -> AdapterResult<()> {
+    /// Sends an order; `last` are the values of the order before.
+    pub fn order(&mut self, count: i32, order: Order, last: &[f64; 6]) -> AdapterResult<()> {
         let id = self.orders.ok_or_else(in_use)?;
-        self.link.send(&inputs::order(id, count, order))
-    }
-
-    /// Sets a digital output.
-    pub fn digital(&mut self, number: u8, on: bool) -> AdapterResult<()> {
-        let packet = inputs::digital(self.digital.ok_or_else(outputs_in_use)?, number, on);
-        self.link.send(&packet.ok_or_else(|| no_output("digital", number))?)
-    }
-
-    /// Sets an analog output.
-    pub fn analog(&mut self, number: u8, voltage: bool, fraction: f64) -> AdapterResult<()> {
-        let packet = inputs::analog(self.analog.ok_or_else(outputs_in_use)?, number, voltage, fraction);
-        self.link.send(&packet.ok_or_else(|| no_output("analog", number))?)
+        self.link.send(&inputs::order(id, count, order, last))
     }
 
     /// Sends a last order as far as possible without blocking, closes the connection and discards the rest.
-    pub fn abort(mut self, count: i32) {
+    pub fn abort(mut self, count: i32, last: &[f64; 6]) {
         if let Some(id) = self.orders {
-            self.link.send_now(&inputs::order(id, count, Order::Stop));
+            self.link.send_now(&inputs::order(id, count, Order::Stop, last));
         }
         self.link.abort();
     }
@@ -153,12 +153,4 @@ pub fn in_use() -> AdapterError {
          a fieldbus that uses them"
             .into(),
     )
-}
-
-fn outputs_in_use() -> AdapterError {
-    AdapterError::Rejected("another RTDE client has the outputs\nhint: end the other program that sets them".into())
-}
-
-fn no_output(kind: &str, number: u8) -> AdapterError {
-    AdapterError::Rejected(format!("there is no {kind} output {number} with that value"))
 }

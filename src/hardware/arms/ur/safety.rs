@@ -33,14 +33,15 @@ impl Session {
         }
         // Another safety mode is another stop: its error may be another one, too.
         if self.stopped.is_none_or(|stopped| stopped.mode != mode) {
-            self.stopped = Some(Stopped { mode, since: self.fresh_at, error: None });
+            self.stopped = Some(Stopped { mode, since: self.measured.arrived, error: None });
         }
         self.end_due |= self.ready.take().is_some();
     }
 
     /// Finds the error of the present stop.
     pub(super) fn see_error(&mut self) {
-        if let (Some(stopped), Some((code, argument, at))) = (&mut self.stopped, self.primary.error)
+        if let (Some(stopped), Some((code, argument, at))) =
+            (&mut self.stopped, self.primary.as_ref().and_then(|primary| primary.error))
             && stopped.error.is_none()
             && stopped.since.since(at) < ERROR_AGE
         {

@@ -8,6 +8,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use super::address::Address;
 use super::dashboard::Dashboard;
 use super::model::Model;
+use super::outputs::Outputs;
 use super::primary::Primary;
 use super::protocol::inputs::Order;
 use super::protocol::state::State;
@@ -16,7 +17,7 @@ use super::rtde::Rtde;
 use super::safety::Stopped;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
-use crate::hardware::transport::device_time::DeviceTime;
+use crate::hardware::transport::measured::Measured;
 use crate::joint::JointLimits;
 
 /// A live controller sends its state 125 or 500 times per second. Without one for this time the connection is lost,
@@ -28,13 +29,12 @@ const HEARTBEAT: Duration = Duration::from_millis(60);
 const SETTLED: Duration = Duration::from_secs(1);
 /// Bounds of the time without a velocity after which the arm is held.
 const HOLD_AFTER: (Duration, Duration) = (Duration::from_millis(50), Duration::from_millis(150));
-/// A program that does not answer orders for this time has failed.
+/// A program that does not answer orders for this time has failed, unless it decelerates: `stopj` blocks it.
 const ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
 /// Time between two reads of the primary interface.
 const PRIMARY_PERIOD: Duration = Duration::from_millis(20);
-/// Joint positions that jump by more than the arm can move plus this [rad] are accepted only when the next state
-/// agrees.
-const MAX_JUMP: f64 = 0.1;
+/// Timeout of a new connection to it.
+const PRIMARY_CONNECT: Duration = Duration::from_secs(1);
 /// Joints slower than this are at rest [rad/s].
 const REST: f64 = 0.03;
 /// Slider positions from here on are full speed.
@@ -58,13 +58,13 @@ pub struct Session {
     pub device: Device,
     pub(super) address: Address,
     pub(super) rtde: Rtde,
-    pub(super) primary: Primary,
+    /// `None` after the controller closed it, until the next program.
+    pub(super) primary: Option<Primary>,
+    /// Opened when the first output is set.
+    outputs: Option<Outputs>,
     /// The newest state, when it was measured, and when it came.
     pub(super) state: State,
-    stamp: Mono,
-    pub(super) fresh_at: Mono,
-    device_time: DeviceTime,
-    suspect: bool,
+    pub(super) measured: Measured<6>,
     updated: Mono,
     primary_at: Mono,
     /// The present stop by the safety system.
@@ -80,6 +80,10 @@ pub struct Session {
     pub(super) last: Order,
     sent_at: Mono,
     pub(super) unanswered: Option<Mono>,
+    /// Values of the last order that had some: its positions or velocities.
+    values: [f64; 6],
+    /// When the program was last seen to decelerate to a hold.
+    braking_at: Mono,
     /// When the last setpoint was sent, and the time between it and the one before.
     setpoint_at: Mono,
     interval: Duration,
@@ -89,18 +93,14 @@ impl Session {
     /// Starts from a first state. The arm counts as stopped until it is activated.
     pub fn new(device: Device, address: Address, rtde: Rtde, primary: Primary, first: State) -> Self {
         let arrived = rtde.arrived;
-        let mut device_time = DeviceTime::default();
-        let stamp = device_time.translate(nanoseconds(first.time), arrived);
         let mut session = Self {
             device,
             address,
             rtde,
-            primary,
+            primary: Some(primary),
+            outputs: None,
             state: first,
-            stamp,
-            fresh_at: arrived,
-            device_time,
-            suspect: false,
+            measured: Measured::new(Some(nanoseconds(first.time)), arrived),
             updated: Mono::ZERO,
             primary_at: Mono::ZERO,
             stopped: None,
@@ -112,6 +112,8 @@ impl Session {
             last: Order::Hold,
             sent_at: Mono::ZERO,
             unanswered: None,
+            values: first.position,
+            braking_at: Mono::ZERO,
             setpoint_at: Mono::ZERO,
             interval: HOLD_AFTER.1,
         };
@@ -126,7 +128,7 @@ impl Session {
 
     /// Returns the newest state, and when it was measured.
     pub fn state(&self) -> (&State, Mono) {
-        (&self.state, self.stamp)
+        (&self.state, self.measured.stamp)
     }
 
     /// Returns whether the motors are on and the brakes released.
@@ -134,9 +136,20 @@ impl Session {
         self.state.robot_mode == robot::RUNNING
     }
 
-    /// Returns whether a program runs or is paused.
+    /// Returns whether there is a program: it runs, is paused, or changes between that.
+    pub(super) fn program_exists(&self) -> bool {
+        self.state.status & bits::PROGRAM_RUNNING != 0 || self.state.runtime != status::STOPPED
+    }
+
+    /// Returns whether a program runs.
     pub(super) fn program_runs(&self) -> bool {
-        self.state.status & bits::PROGRAM_RUNNING != 0 && self.state.runtime != status::STOPPED
+        self.state.runtime == status::PLAYING
+    }
+
+    /// Returns whether the controller keeps the inertia of the payload.
+    pub(super) fn keeps_inertia(&self) -> bool {
+        let [major, minor, _] = self.rtde.software;
+        (major, minor) >= (5, 10)
     }
 
     /// Returns whether all joints are at rest.
@@ -161,15 +174,17 @@ impl Session {
             self.take(state);
         }
         let now = MonotonicClock.now();
-        if now.since(self.fresh_at) > STATE_TIMEOUT {
+        if now.since(self.measured.arrived) > STATE_TIMEOUT {
             return Err(AdapterError::Io(format!("ur at {} sent no new state for {STATE_TIMEOUT:?}", self.address)));
         }
         if now.since(self.primary_at) > PRIMARY_PERIOD || self.stopped.is_some_and(|stopped| stopped.error.is_none()) {
             self.primary_at = now;
-            self.primary.update()?;
-            self.see_error();
+            self.read_primary()?;
+            if self.outputs.as_mut().is_some_and(|outputs| outputs.drain().is_err()) {
+                self.outputs = None;
+            }
         }
-        if self.unanswered.is_some_and(|since| now.since(since) > ANSWER_TIMEOUT) {
+        if self.unanswered.is_some_and(|since| now.since(since.max(self.braking_at)) > ANSWER_TIMEOUT) {
             self.lose_program("the program on the controller does not answer");
         }
         if std::mem::take(&mut self.end_due) {
@@ -179,6 +194,67 @@ impl Session {
         self.keep_alive(now)
     }
 
+    /// Processes what has arrived on the primary interface. Controllers close it when the pendant takes control; the
+    /// state is not affected.
+    fn read_primary(&mut self) -> AdapterResult<()> {
+        match self.primary.as_mut().map(Primary::update) {
+            Some(Ok(())) => self.see_error(),
+            Some(Err(_)) => {
+                self.primary = None;
+                // A controller that closes all connections is another matter.
+                if let Some(state) = self.rtde.newest()? {
+                    self.take(state);
+                }
+                self.lose_program("the pendant took control, or the controller closed the primary interface");
+            }
+            None => {}
+        }
+        Ok(())
+    }
+
+    /// Sends a program, over a new connection where the controller closed the last one.
+    pub(super) fn run_program(&mut self, text: &str) -> AdapterResult<()> {
+        if self.primary.as_mut().is_none_or(|primary| primary.update().is_err() || primary.read_only()) {
+            let (primary, ..) =
+                Primary::connect(&self.address, MonotonicClock.now().after(PRIMARY_CONNECT)).map_err(refused)?;
+            self.primary = Some(primary);
+        }
+        self.primary.as_mut().map_or(Ok(()), |primary| primary.run(text)).map_err(refused)
+    }
+
+    /// Returns an error if the controller has refused the program that was sent.
+    pub(super) fn check_program(&mut self) -> AdapterResult<()> {
+        let Some(primary) = &mut self.primary else {
+            return Err(AdapterError::Rejected("the controller closed the primary interface".into()));
+        };
+        let checked = primary.check();
+        let read_only = primary.read_only();
+        if read_only || matches!(checked, Err(AdapterError::Io(_))) {
+            self.primary = None;
+        }
+        match checked {
+            Err(AdapterError::Io(text)) => Err(AdapterError::Rejected(text)),
+            Ok(()) if read_only => Err(AdapterError::Rejected(
+                "the controller takes no programs from a connection that was opened in local control\nhint: select \
+                 remote control at the pendant, then enable the arm again"
+                    .into(),
+            )),
+            checked => checked,
+        }
+    }
+
+    /// Calls `act` with the outputs, which are claimed first. What breaks there leaves the state and the orders alone.
+    pub(super) fn with_outputs(&mut self, act: impl FnOnce(&mut Outputs) -> AdapterResult<()>) -> AdapterResult<()> {
+        if self.outputs.is_none() {
+            self.outputs = Some(Outputs::connect(&self.address).map_err(refused)?);
+        }
+        let done = self.outputs.as_mut().map_or(Ok(()), act);
+        if done.is_err() {
+            self.outputs = None;
+        }
+        done.map_err(refused)
+    }
+
     /// Takes a state.
     fn take(&mut self, state: State) {
         if state.time == self.state.time {
@@ -186,17 +262,20 @@ impl Session {
         }
         let arrived = self.rtde.arrived;
         let top = self.device.limits.velocity_max.iter().copied().fold(0.0, f64::max);
-        let reach = MAX_JUMP + 1.5 * top * arrived.since(self.fresh_at).as_secs_f64();
-        let jumps = state.position.iter().zip(&self.state.position).any(|(new, old)| (new - old).abs() > reach);
-        if jumps && !self.suspect {
-            self.suspect = true;
+        let time = Some(nanoseconds(state.time));
+        if !self.measured.take(&state.position, &self.state.position, top, time, arrived) {
             return;
         }
-        self.suspect = false;
-        self.stamp = self.device_time.translate(nanoseconds(state.time), arrived);
-        (self.fresh_at, self.state) = (arrived, state);
+        // Every new echo is an answer. That of the newest order comes later than the next order.
+        let echoed = state.count != self.state.count && self.count.wrapping_sub(state.count) >= 0;
+        self.state = state;
         if state.count == self.count {
             self.unanswered = None;
+        } else if echoed && self.unanswered.is_some() {
+            self.unanswered = Some(arrived);
+        }
+        if state.program == program::HOLDING && !self.at_rest() {
+            self.braking_at = arrived;
         }
         self.see_safety();
         self.see_program();
@@ -212,7 +291,9 @@ impl Session {
             self.ready = None; // the motors' state says it
         } else if state.number == number && state.program == program::SILENT {
             self.lose_program("the program on the controller ended: no orders reached it in time");
-        } else if state.runtime == status::PAUSED {
+        } else if state.number == number && state.program == program::FAR {
+            self.lose_program("a setpoint was farther away than the arm moves in 0.2 s: the program ended");
+        } else if matches!(state.runtime, status::PAUSED | status::PAUSING) {
             self.lose_program("the program on the controller was paused");
         } else if !self.program_runs() || state.number != number || state.program >= program::STOPPED {
             self.lose_program("another client or the pendant ended the program on the controller");
@@ -246,7 +327,8 @@ impl Session {
     /// Sends an order.
     pub(super) fn order(&mut self, order: Order) -> AdapterResult<()> {
         self.count = self.count.wrapping_add(1);
-        self.rtde.order(self.count, order)?;
+        self.rtde.order(self.count, order, &self.values)?;
+        self.values = order.values().unwrap_or(self.values);
         self.sent_at = MonotonicClock.now();
         self.unanswered.get_or_insert(self.sent_at);
         self.last = order;
@@ -288,12 +370,20 @@ impl Session {
 
     /// Closes the connections, and discards unsent bytes.
     pub fn abort(self) {
-        self.rtde.abort(self.count.wrapping_add(1));
+        self.rtde.abort(self.count.wrapping_add(1), &self.values);
     }
 
     /// Returns what another client, or a person at the pendant, changed. `None` during a stop by the safety system.
     pub fn foreign_change(&self) -> Option<&'static str> {
         self.ended.filter(|_| self.stopped.is_none())
+    }
+}
+
+/// An error of a connection other than that of the state and the orders, which it does not break.
+fn refused(error: AdapterError) -> AdapterError {
+    match error {
+        AdapterError::Io(text) => AdapterError::Rejected(text),
+        other => other,
     }
 }
 

@@ -71,7 +71,8 @@ impl XArmAdapter {
     fn with<T>(&mut self, act: impl FnOnce(&mut Session) -> AdapterResult<T>) -> AdapterResult<T> {
         let result = act(self.session.as_mut().ok_or(AdapterError::NotConnected)?);
         if matches!(result, Err(AdapterError::Io(_))) {
-            self.disconnect();
+            // What has not left this computer must not reach the arm later.
+            self.discard_pending();
         }
         result
     }

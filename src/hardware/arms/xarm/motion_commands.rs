@@ -39,7 +39,7 @@ impl Session {
         self.receive()?;
         self.check_refusal()?;
         self.may_move(mode)?;
-        if self.refused_at.is_some_and(|refused| self.fresh_at <= refused) {
+        if self.refused_at.is_some_and(|refused| self.measured.arrived <= refused) {
             return Err(AdapterError::Busy);
         }
         self.control.post(command, Purpose::Motion)?;

@@ -18,7 +18,7 @@ use super::protocol::report::{Health, Motion};
 use super::stream::Stream;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
-use crate::hardware::transport::device_time::DeviceTime;
+use crate::hardware::transport::measured::Measured;
 use crate::joint::JointLimits;
 
 /// A live controller reports 100 or 250 times per second. Without a report for this time the connection is lost, even
@@ -30,9 +30,6 @@ const REPORT_DELAY: Duration = Duration::from_millis(20);
 const CONDITION_TIMEOUT: Duration = Duration::from_millis(1000);
 /// For this time after a setpoint, a gripper on the same connection is polled less.
 const STREAMING_TIME: Duration = Duration::from_secs(2);
-/// Joint positions that jump by more than the arm can move plus this [rad] are accepted only when the next report
-/// agrees.
-const MAX_JUMP: f64 = 0.1;
 
 /// What the arm is.
 pub struct Device {
@@ -87,10 +84,7 @@ pub struct Session {
     pub(super) known: Known,
     pub(super) motion: Motion,
     /// When the newest positions were measured, and when they arrived.
-    stamp: Mono,
-    pub(super) fresh_at: Mono,
-    device_time: DeviceTime,
-    suspect: bool,
+    pub(super) measured: Measured<7>,
     /// `None`: the arm was stopped, by this run or another client, and needs an activation.
     pub(super) ready: Option<Ready>,
     /// The ordered mode, after another client changed the mode, the state or the motors.
@@ -120,8 +114,6 @@ impl Session {
         gripper: Gripper,
     ) -> Self {
         let arrived = reports.arrived;
-        let mut device_time = DeviceTime::default();
-        let stamp = first.time_us.map_or(arrived, |us| device_time.translate(us.saturating_mul(1000), arrived));
         Self {
             device,
             control,
@@ -129,11 +121,8 @@ impl Session {
             reports,
             normal,
             known: Known { condition, gripper, answer: None },
+            measured: Measured::new(device_ns(&first), arrived),
             motion: first,
-            stamp,
-            fresh_at: arrived,
-            device_time,
-            suspect: false,
             ready: None,
             foreign: None,
             refused_at: None,
@@ -152,7 +141,7 @@ impl Session {
 
     /// Returns the newest report, and when its positions were measured.
     pub fn motion(&self) -> (&Motion, Mono) {
-        (&self.motion, self.stamp)
+        (&self.motion, self.measured.stamp)
     }
 
     /// Returns the rate of the reports [Hz].
@@ -177,7 +166,7 @@ impl Session {
 
     /// Returns force and torque at the sensor [N, Nm], once it is switched on.
     pub fn wrench(&self) -> Option<[f64; 6]> {
-        let measured = |since| self.fresh_at.since(since) > REPORT_DELAY;
+        let measured = |since| self.measured.arrived.since(since) > REPORT_DELAY;
         self.motion.wrench.filter(|_| self.wrench_since.is_some_and(measured))
     }
 
@@ -201,7 +190,7 @@ impl Session {
         }
         self.updated = now;
         self.receive()?;
-        if MonotonicClock.now().since(self.fresh_at) > REPORT_TIMEOUT {
+        if MonotonicClock.now().since(self.measured.arrived) > REPORT_TIMEOUT {
             return Err(AdapterError::Io(format!("{} sent nothing new for {REPORT_TIMEOUT:?}", self.reports.peer())));
         }
         if MonotonicClock.now().since(self.normal.arrived) > CONDITION_TIMEOUT {
@@ -263,19 +252,10 @@ impl Session {
         if motion.time_us.is_some() && motion.time_us == self.motion.time_us {
             return; // the same measurement again
         }
-        let arrived = self.reports.arrived;
-        let reach = MAX_JUMP + 1.5 * VELOCITY * arrived.since(self.fresh_at).as_secs_f64();
-        let jumps = motion.position.iter().zip(&self.motion.position).any(|(new, old)| (new - old).abs() > reach);
-        if jumps && !self.suspect {
-            self.suspect = true;
+        let (last, time, arrived) = (&self.motion.position, device_ns(&motion), self.reports.arrived);
+        if !self.measured.take(&motion.position, last, VELOCITY, time, arrived) {
             return;
         }
-        self.suspect = false;
-        self.stamp = match motion.time_us {
-            Some(us) => self.device_time.translate(us.saturating_mul(1000), arrived),
-            None => arrived,
-        };
-        self.fresh_at = arrived;
         self.motion = motion;
         if self.ready.is_some_and(|ready| !is_ready(motion.state) || motion.mode != ready.mode) {
             self.changed_by_another_client();
@@ -357,4 +337,9 @@ impl Session {
             code => Err(AdapterError::Fault { code: code.into(), text: self.known.condition.text() }),
         }
     }
+}
+
+/// Returns the control box's own time of a report [ns].
+fn device_ns(motion: &Motion) -> Option<u64> {
+    motion.time_us.map(|us| us.saturating_mul(1000))
 }

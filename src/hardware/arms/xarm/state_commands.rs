@@ -189,7 +189,7 @@ impl Session {
         let stopped = |state: &u8| (4..=6).contains(state);
         let confirmed = self.wait(STOP_LIMIT, |session| {
             let told = session.answer(number).and_then(|answer| answer.data().first().copied()).filter(stopped);
-            let shown = Some(session.motion.state).filter(stopped).filter(|_| session.fresh_at > sent);
+            let shown = Some(session.motion.state).filter(stopped).filter(|_| session.measured.arrived > sent);
             Ok(told.or(shown))
         })?;
         Ok(confirmed.map_or(Stop::Sent, |_| Stop::Confirmed))

@@ -1,7 +1,7 @@
 //! The emulated controller: power, safety, the running program and its registers. Time is passed in, and nothing here
 //! knows of connections' bytes.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
 use super::programs::{Program, Reach};
@@ -30,6 +30,10 @@ const STEPS: u32 = 10;
 pub(super) const REGISTERS: usize = 48;
 /// Messages that are kept for clients of the primary interface.
 const KEPT: usize = 64;
+/// Positions of servoj that are kept for tests.
+const SERVOJ_KEPT: usize = 20_000;
+/// All digital inputs: 8 standard, 8 configurable, 2 of the tool.
+const INPUTS: u64 = (1 << 18) - 1;
 
 /// Registers between clients and the program.
 #[derive(Debug, Clone)]
@@ -38,6 +42,17 @@ pub(super) struct Registers {
     pub double_in: [f64; REGISTERS],
     pub int_out: [i32; REGISTERS],
     pub double_out: [f64; REGISTERS],
+}
+
+impl Registers {
+    fn new() -> Self {
+        Self {
+            int_in: [0; REGISTERS],
+            double_in: [0.0; REGISTERS],
+            int_out: [0; REGISTERS],
+            double_out: [0.0; REGISTERS],
+        }
+    }
 }
 
 /// Outputs.
@@ -52,8 +67,12 @@ pub(super) struct Outputs {
 
 /// A client's connection.
 pub(super) struct Session {
-    /// Characters of a program or a command that is not complete.
+    /// Characters of a program or a command that is not complete; at the dashboard an answer that is late.
     pub text: String,
+    /// Opened in local control: it takes no programs, also later.
+    pub read_only: bool,
+    /// The controller closes it.
+    pub closing: bool,
     /// Number of the next message to send.
     pub next_message: u64,
     /// Reports so far.
@@ -77,13 +96,29 @@ pub struct Controller {
     pub(super) program: Option<Program>,
     pub(super) paused: bool,
     next_step: Mono,
+    /// Registers as the program has them. Inputs reach it one step after they arrive, and its outputs are reported one
+    /// step after it wrote them.
     pub(super) registers: Registers,
+    /// Inputs that have arrived, and outputs as they are reported.
+    pub(super) exchanged: Registers,
     pub(super) outputs: Outputs,
+    /// Digital inputs, and those that a fault pulls low.
+    inputs: (u64, u64),
     pub(super) payload: (f64, [f64; 3], [f64; 6]),
+    /// Acceleration of the base that balances gravity [m/s²], as programs set it.
+    pub(super) gravity: [f64; 3],
+    /// Positions that a program gave to servoj, and when.
+    pub(super) servoj: VecDeque<(Mono, [f64; DOF])>,
     pub(super) slider: f64,
     pub(super) remote: bool,
     pub(super) refuses_programs: bool,
     pub(super) hangs: bool,
+    /// The dashboard closes the connection instead of answering.
+    pub(super) breaks_dashboard: bool,
+    /// The dashboard sends the answer to this request together with the next one.
+    pub(super) late_answer: Option<&'static str>,
+    /// A paused program does not count as running in the status bits.
+    pub(super) hides_paused: bool,
     pub(super) wrong_model: bool,
     /// Joint positions, and the pose of the flange there.
     pose: ([f64; DOF], [f64; 6]),
@@ -109,18 +144,20 @@ impl Controller {
             program: None,
             paused: false,
             next_step: now,
-            registers: Registers {
-                int_in: [0; REGISTERS],
-                double_in: [0.0; REGISTERS],
-                int_out: [0; REGISTERS],
-                double_out: [0.0; REGISTERS],
-            },
-            outputs: Outputs::default(),
+            registers: Registers::new(),
+            exchanged: Registers::new(),
+            outputs: Outputs { voltage: 0b11, ..Outputs::default() },
+            inputs: (INPUTS, 0),
             payload: (0.0, [0.0; 3], [0.0; 6]),
+            gravity: [0.0, 0.0, 9.82],
+            servoj: VecDeque::new(),
             slider: options.speed_slider,
             remote: options.remote_control,
             refuses_programs: false,
             hangs: false,
+            breaks_dashboard: false,
+            late_answer: None,
+            hides_paused: false,
             wrong_model: false,
             pose: ([f64::NAN; DOF], [0.0; 6]),
             sessions: BTreeMap::new(),
@@ -137,10 +174,12 @@ impl Controller {
     pub(super) fn advance_to(&mut self, now: Mono) {
         let step = Duration::from_secs_f64(self.step_time());
         let mut steps = 0;
-        while self.program.is_some() && self.next_step <= now && steps < STEPS {
+        while self.next_step <= now && steps < STEPS {
             self.arm.advance(self.next_step);
             self.follow_arm();
+            (self.exchanged.int_out, self.exchanged.double_out) = (self.registers.int_out, self.registers.double_out);
             self.step_program();
+            (self.registers.int_in, self.registers.double_in) = (self.exchanged.int_in, self.exchanged.double_in);
             self.next_step = self.next_step.after(step);
             steps += 1;
         }
@@ -150,6 +189,7 @@ impl Controller {
         self.arm.advance(now);
         self.follow_arm();
         self.follow_power(now);
+        self.follow_inputs();
         if self.arm.take_fault(FaultKind::WrongModel).is_some() {
             self.wrong_model = true;
         }
@@ -183,6 +223,39 @@ impl Controller {
             if self.mode == RUNNING && self.arm.enable(true).is_err() {
                 self.power_off();
             }
+        }
+    }
+
+    /// Plays the fault of a digital input.
+    fn follow_inputs(&mut self) {
+        self.inputs.1 = 0;
+        if let Some(fault) = self.arm.take_fault(FaultKind::InputLow) {
+            let bit = 1_u64.checked_shl(fault.input.into()).unwrap_or(0);
+            if fault.duration > 0.0 {
+                self.inputs.1 = bit;
+            } else {
+                self.inputs.0 &= !bit;
+            }
+        }
+    }
+
+    /// Digital inputs, bits as in RTDE.
+    pub(super) fn digital_inputs(&self) -> u64 {
+        self.inputs.0 & !self.inputs.1
+    }
+
+    /// Sets the level of a digital input, as the device wired to it does.
+    pub(super) fn set_input(&mut self, number: u8, high: bool) {
+        let bit = INPUTS & 1_u64.checked_shl(number.into()).unwrap_or(0);
+        self.inputs.0 = if high { self.inputs.0 | bit } else { self.inputs.0 & !bit };
+    }
+
+    /// Changes between remote control and the pendant, which takes the script's ports away from their clients.
+    pub(super) fn set_remote_control(&mut self, remote: bool) {
+        self.remote = remote;
+        if !remote && !self.model.is_cb3() {
+            let scripts = self.sessions.iter_mut().filter(|((port, _), _)| super::takes_scripts(*port));
+            scripts.for_each(|(_, session)| session.closing = true);
         }
     }
 
@@ -277,7 +350,6 @@ impl Controller {
         self.stop_program();
         self.announce("PROGRAM_XXX_STARTED", program.name().to_owned());
         (self.program, self.paused) = (Some(program), false);
-        self.next_step = self.arm.now();
     }
 
     pub(super) fn stop_program(&mut self) {
@@ -288,6 +360,14 @@ impl Controller {
         }
     }
 
+    /// Pauses the running program: the arm decelerates to rest.
+    pub(super) fn pause_program(&mut self) {
+        if self.program.is_some() {
+            self.arm.stop();
+            self.paused = true;
+        }
+    }
+
     fn step_program(&mut self) {
         if self.paused || self.hangs || !self.may_move() {
             return;
@@ -295,6 +375,10 @@ impl Controller {
         let Some(mut program) = self.program.take() else { return };
         let step = self.step_time();
         let ended = program.step(&mut self.arm, &mut self.registers, &mut self.payload, step, self.model);
+        if let Some(goal) = program.servoed() {
+            self.servoj.push_back((self.arm.now(), goal));
+            self.servoj.drain(..self.servoj.len().saturating_sub(SERVOJ_KEPT));
+        }
         self.program = Some(program);
         if ended {
             self.stop_program();

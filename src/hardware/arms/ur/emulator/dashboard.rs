@@ -70,6 +70,7 @@ impl Controller {
                 self.restart_safety();
                 "Restarting safety"
             }
+            "stop" if self.program.is_none() => "Failed to execute: stop",
             "stop" => {
                 self.stop_program();
                 "Stopped"

@@ -79,7 +79,8 @@ impl Frame<'_> {
 
     fn status(&self) -> u32 {
         let controller = self.controller;
-        u32::from(controller.mode >= 5) | u32::from(controller.program.is_some()) << 1
+        let hidden = controller.paused && controller.hides_paused;
+        u32::from(controller.mode >= 5) | u32::from(controller.program.is_some() && !hidden) << 1
     }
 
     fn safety_bits(&self) -> u32 {
@@ -157,8 +158,7 @@ const OUTPUTS: &[(&str, Source)] = &[
     ("payload", |f| Value::F64(f.controller.payload.0)),
     ("payload_cog", |f| Value::V3(f.controller.payload.1)),
     ("payload_inertia", |f| Value::V6(f.controller.payload.2)),
-    // Digital input 3 and configurable input 1 (bit 9) are high.
-    ("actual_digital_input_bits", |_| Value::U64(1 << 3 | 1 << 9)),
+    ("actual_digital_input_bits", |f| Value::U64(f.controller.digital_inputs())),
     ("actual_digital_output_bits", |f| Value::U64(f.controller.outputs.digital)),
     ("analog_io_types", |f| Value::U32(0b11 | u32::from(f.controller.outputs.voltage) << 2)),
     ("standard_analog_input0", |_| Value::F64(1.5)),
@@ -217,7 +217,7 @@ impl Output {
     }
 
     pub fn value(self, frame: &Frame<'_>) -> Value {
-        let registers = &frame.controller.registers;
+        let registers = &frame.controller.exchanged;
         match self {
             Self::Other(source) => source(frame),
             Self::Int(n) => Value::I32(registers.int_out.get(n).copied().unwrap_or_default()),

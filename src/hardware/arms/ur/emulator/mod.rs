@@ -7,6 +7,7 @@
 mod controller;
 mod dashboard;
 mod fields;
+mod ours;
 mod ports;
 mod primary;
 mod programs;
@@ -14,6 +15,12 @@ mod rtde;
 mod scripts;
 #[cfg(test)]
 mod tests;
+
+/// Times of the emulated program, which are those of the adapter's text.
+#[cfg(test)]
+pub mod program_times {
+    pub use super::ours::{ENDS, FAR, FIRST, SPREAD, VELOCITY_ENDS};
+}
 
 use std::net::{IpAddr, SocketAddr, TcpListener};
 use std::time::Duration;
@@ -23,7 +30,7 @@ use serde::{Deserialize, Serialize};
 
 use super::address::{FIRST_PORT, PORTS, Service};
 use super::model::Model;
-use crate::clock::{Clock, MonotonicClock};
+use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::check::ConfigError;
 use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
@@ -51,10 +58,16 @@ const PLAYABLE: &[FaultKind] = &[
     FaultKind::Sag,
     FaultKind::Blocked,
     FaultKind::Pushed,
+    FaultKind::InputLow,
 ];
 /// The ports, in the order of their numbers here.
 const SERVICES: [Service; 5] =
     [Service::Dashboard, Service::Primary, Service::Secondary, Service::RealTime, Service::Rtde];
+/// Whether programs may come at a port, by its number here.
+fn takes_scripts(port: usize) -> bool {
+    matches!(SERVICES.get(port), Some(Service::Primary | Service::Secondary | Service::RealTime))
+}
+
 /// Most connections at once.
 const CLIENTS: usize = 32;
 /// Attempts to find consecutive free ports.
@@ -171,7 +184,7 @@ impl UrEmulator {
 
     /// Changes between remote control and the pendant.
     pub fn set_remote_control(&self, remote: bool) {
-        self.with(|controller| controller.remote = remote);
+        self.with(|controller| controller.set_remote_control(remote));
     }
 
     /// Stops the running program, as the pendant's button does.
@@ -187,6 +200,51 @@ impl UrEmulator {
     /// Ends the program's answers: it runs, and ignores every order.
     pub fn hang_program(&self, hang: bool) {
         self.with(|controller| controller.hangs = hang);
+    }
+
+    /// Lets the dashboard close connections instead of answering.
+    pub fn break_dashboard(&self, broken: bool) {
+        self.with(|controller| controller.breaks_dashboard = broken);
+    }
+
+    /// Withholds the answer to this request of the dashboard once, until the next one.
+    pub fn answer_late(&self, request: &'static str) {
+        self.with(|controller| controller.late_answer = Some(request));
+    }
+
+    /// Lets paused programs count as running in the status bits, or not: controllers may differ.
+    pub fn hide_paused_programs(&self, hide: bool) {
+        self.with(|controller| controller.hides_paused = hide);
+    }
+
+    /// Pauses the running program, as the pendant's button does.
+    pub fn press_pause(&self) {
+        self.with(Controller::pause_program);
+    }
+
+    /// Sets the robot mode, for one that only the pendant leads to.
+    pub fn set_robot_mode(&self, mode: i32) {
+        self.with(|controller| controller.mode = mode);
+    }
+
+    /// Sets the level of a digital input, bits as in RTDE.
+    pub fn set_input(&self, number: u8, high: bool) {
+        self.with(|controller| controller.set_input(number, high));
+    }
+
+    /// Returns the payload [kg] and its centre of gravity [m].
+    pub fn payload(&self) -> (f64, [f64; 3]) {
+        self.with(|controller| (controller.payload.0, controller.payload.1))
+    }
+
+    /// Returns the acceleration of the base that balances gravity, as programs set it [m/s²].
+    pub fn gravity(&self) -> [f64; 3] {
+        self.with(|controller| controller.gravity)
+    }
+
+    /// Returns the positions [rad] that the program gave to servoj, one a step, and when.
+    pub fn servoj(&self) -> Vec<(Mono, [f64; super::DOF])> {
+        self.with(|controller| controller.servoj.iter().copied().collect())
     }
 
     /// Returns the name of the running program.

@@ -45,7 +45,16 @@ impl stream::Controller for Controller {
             self.script_line(who, &line);
             return Scan::Take(end + 1, Delivery::Send);
         }
+        if self.breaks_dashboard {
+            return Scan::Take(end + 1, Delivery::HangUp);
+        }
         let reply = self.dashboard(line.trim());
+        if self.late_answer.take_if(|late| *late == line.trim()).is_some() {
+            self.sessions.entry(who).and_modify(|session| session.text = format!("{reply}\n"));
+            return Scan::Take(end + 1, Delivery::Silent);
+        }
+        let late = self.sessions.get_mut(&who).map(|session| std::mem::take(&mut session.text)).unwrap_or_default();
+        answer.extend(late.as_bytes());
         answer.extend(reply.as_bytes());
         answer.push(b'\n');
         Scan::Take(end + 1, if reply == "Disconnected" { Delivery::HangUp } else { self.lasting() })
@@ -60,7 +69,9 @@ impl stream::Controller for Controller {
 
     fn session_began(&mut self, port: usize, client: u64, now: Mono, greeting: &mut Vec<u8>) {
         let next_message = self.next_message();
-        let session = Session { text: String::new(), next_message, reports: 0, rtde: Rtde::default() };
+        let read_only = !self.remote && !self.model.is_cb3();
+        let (text, rtde) = (String::new(), Rtde::default());
+        let session = Session { text, read_only, closing: false, next_message, reports: 0, rtde };
         self.sessions.insert((port, client), session);
         match service(port) {
             Service::Rtde => self.arm.client_came(),
@@ -81,7 +92,7 @@ impl stream::Controller for Controller {
             Service::Dashboard => return Some(Delivery::Send),
             _ => {}
         }
-        let session = self.sessions.get_mut(&who)?;
+        let session = self.sessions.get_mut(&who).filter(|session| !session.closing)?;
         let first = session.next_message;
         session.reports += 1;
         let state_is_due = session.reports % STATE_EVERY == 1;

@@ -3,6 +3,7 @@
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 
 use super::controller::Registers;
+use super::ours::Ours;
 use crate::hardware::arms::ur::DOF;
 use crate::hardware::arms::ur::model::Model;
 use crate::hardware::sim::arm::{Refusal, SimArm};
@@ -21,7 +22,7 @@ const ASKED_ERROR: u16 = 50;
 #[derive(Debug, Clone)]
 pub(super) enum Program {
     /// The adapter's own.
-    Ours(Ours),
+    Ours(Box<Ours>),
     /// That of `ur_rtde`.
     Rtde(RtdeControl),
     /// One that does nothing, and ends.
@@ -52,18 +53,27 @@ impl Program {
             Self::Other(_) => true,
         }
     }
+
+    /// Returns the position that the last step gave to servoj, if it did.
+    pub fn servoed(&self) -> Option<[f64; DOF]> {
+        match self {
+            Self::Ours(program) => program.servoed(),
+            Self::Rtde(program) => program.last,
+            Self::Other(_) => None,
+        }
+    }
 }
 
-fn joints(arm: &SimArm) -> [f64; DOF] {
+pub(super) fn joints(arm: &SimArm) -> [f64; DOF] {
     arm.joints().0.first_chunk::<DOF>().copied().unwrap_or_default()
 }
 
-fn six(registers: &[f64], first: usize) -> [f64; DOF] {
+pub(super) fn six(registers: &[f64], first: usize) -> [f64; DOF] {
     std::array::from_fn(|i| registers.get(first + i).copied().unwrap_or_default())
 }
 
 /// Follows a setpoint; a jump is a protective stop.
-fn servo(arm: &mut SimArm, last: &mut Option<[f64; DOF]>, goal: &[f64; DOF], step: f64) {
+pub(super) fn servo(arm: &mut SimArm, last: &mut Option<[f64; DOF]>, goal: &[f64; DOF], step: f64) {
     let from = last.unwrap_or_else(|| joints(arm));
     if from.iter().zip(goal).any(|(a, b)| (a - b).abs() > JUMP * step) {
         arm.fail(JUMP_ERROR);
@@ -71,77 +81,6 @@ fn servo(arm: &mut SimArm, last: &mut Option<[f64; DOF]>, goal: &[f64; DOF], ste
     }
     if arm.servo(goal) != Err(Refusal::OutOfRange) {
         *last = Some(*goal);
-    }
-}
-
-/// The adapter's program.
-#[derive(Debug, Clone)]
-pub(super) struct Ours {
-    number: i32,
-    count: Option<i32>,
-    state: i32,
-    silent: u32,
-    left: u32,
-    goal: [f64; DOF],
-    setpoint: [f64; DOF],
-    last: Option<[f64; DOF]>,
-}
-
-impl Ours {
-    pub fn new(number: i32) -> Self {
-        Self { number, count: None, state: 1, silent: 0, left: 0, goal: [0.0; DOF], setpoint: [0.0; DOF], last: None }
-    }
-
-    fn step(&mut self, arm: &mut SimArm, registers: &mut Registers, step: f64) -> bool {
-        if self.state >= 10 {
-            return !arm.moving();
-        }
-        let now = registers.int_in[24];
-        let before = self.state;
-        let count = *self.count.get_or_insert(now);
-        if now == count {
-            self.silent += 1;
-            let time = f64::from(self.silent) * step;
-            if time > 1.0 {
-                self.state = 11;
-            } else if self.state == 3 && time > 0.2 {
-                self.state = 1;
-            }
-        } else {
-            self.goal = six(&registers.double_in, 24);
-            self.state = match registers.int_in[25] {
-                1 => 2,
-                2 => 3,
-                3 => 10,
-                _ => 1,
-            };
-            if self.state == 2 {
-                self.left = (self.silent + 1).min((0.03 / step).floor() as u32);
-                if before != 2 {
-                    (self.setpoint, self.last) = (joints(arm), None);
-                }
-            }
-            (self.silent, self.count) = (0, Some(now));
-        }
-        registers.int_out[24] = self.count.unwrap_or(now);
-        registers.int_out[25] = self.state;
-        registers.int_out[26] = self.number;
-        match self.state {
-            2 => {
-                if self.left > 0 {
-                    let left = f64::from(self.left);
-                    self.setpoint.iter_mut().zip(&self.goal).for_each(|(q, goal)| *q += (goal - *q) / left);
-                    self.left -= 1;
-                }
-                servo(arm, &mut self.last, &self.setpoint, step);
-            }
-            3 => {
-                let _ = arm.velocity_for(&self.goal, None);
-            }
-            _ if before > 1 => arm.stop(),
-            _ => {}
-        }
-        false
     }
 }
 

@@ -121,10 +121,10 @@ impl Controller {
             let outputs = &mut self.outputs;
             match input {
                 Input::Int(n) => {
-                    self.registers.int_in.iter_mut().skip(n).take(1).for_each(|r| *r = number as u32 as i32)
+                    self.exchanged.int_in.iter_mut().skip(n).take(1).for_each(|r| *r = number as u32 as i32)
                 }
                 Input::Double(n) => {
-                    self.registers.double_in.iter_mut().skip(n).take(1).for_each(|r| *r = f64::from_bits(number));
+                    self.exchanged.double_in.iter_mut().skip(n).take(1).for_each(|r| *r = f64::from_bits(number));
                 }
                 Input::DigitalMask(_) => masks.0 = number,
                 Input::Digital(first) => {

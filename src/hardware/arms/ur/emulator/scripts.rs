@@ -1,7 +1,8 @@
 //! Text on the script's ports: programs, programs that run beside them, and single commands.
 
 use super::controller::Controller;
-use super::programs::{Ours, Program, RtdeControl};
+use super::ours::Ours;
+use super::programs::{Program, RtdeControl};
 
 impl Controller {
     /// Takes the line of a connection that has arrived. A program ends with a line `end` at its margin.
@@ -9,26 +10,28 @@ impl Controller {
         let Some(session) = self.sessions.get_mut(&who) else { return };
         let begins = line.starts_with("def ") || line.starts_with("sec ");
         if session.text.is_empty() && !begins {
-            return self.command(line.trim());
+            return self.command(who, line.trim());
         }
         session.text.push_str(line);
         session.text.push('\n');
         if line.trim_end() == "end" {
             let text = std::mem::take(&mut session.text);
-            self.take_program(&text);
+            self.take_program(who, &text);
         }
     }
 
-    fn refused_in_local_control(&mut self) -> bool {
+    /// A connection that was opened in local control stays read-only.
+    fn is_refused(&mut self, who: (usize, u64)) -> bool {
         let local = !self.remote && !self.model.is_cb3();
-        if local {
+        let refused = local || self.sessions.get(&who).is_some_and(|session| session.read_only);
+        if refused {
             self.report_error(210, 2);
         }
-        local
+        refused
     }
 
-    fn take_program(&mut self, text: &str) {
-        if self.refused_in_local_control() {
+    fn take_program(&mut self, who: (usize, u64), text: &str) {
+        if self.is_refused(who) {
             return;
         }
         let (kind, head) = text.split_once(' ').unwrap_or_default();
@@ -36,8 +39,7 @@ impl Controller {
         match (kind, name.as_str()) {
             ("sec", _) => text.lines().for_each(|line| self.statement(line.trim())),
             (_, "dimos_control") => {
-                let number = text.lines().find_map(|line| line.trim().strip_prefix("number = ")?.parse().ok());
-                self.run(Program::Ours(Ours::new(number.unwrap_or_default())));
+                self.run(Program::Ours(Box::new(Ours::new(text))));
             }
             (_, "rtde_control") => {
                 // The registers keep what an earlier program has left.
@@ -57,6 +59,7 @@ impl Controller {
             .filter_map(|word| word.parse().ok())
             .collect();
         match (name, &values[..]) {
+            ("set_gravity", [x, y, z]) => self.gravity = [*x, *y, *z],
             ("set_payload", [mass, x, y, z]) => (self.payload.0, self.payload.1) = (*mass, [*x, *y, *z]),
             ("set_target_payload", [mass, x, y, z, inertia @ ..]) => {
                 (self.payload.0, self.payload.1) = (*mass, [*x, *y, *z]);
@@ -68,8 +71,8 @@ impl Controller {
     }
 
     /// Executes a command outside of a program.
-    fn command(&mut self, line: &str) {
-        if line.is_empty() || self.refused_in_local_control() {
+    fn command(&mut self, who: (usize, u64), line: &str) {
+        if line.is_empty() || self.is_refused(who) {
             return;
         }
         match line {

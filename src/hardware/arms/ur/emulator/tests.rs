@@ -130,8 +130,15 @@ fn programs_are_started_and_end_and_local_control_refuses_them() {
     script.write_all(b"def hello():\n  textmsg(1)\nend\n").unwrap();
     until(&mut script, b"PROGRAM_XXX_STARTEDhello");
     until(&mut script, b"PROGRAM_XXX_STOPPEDhello");
+    // The pendant takes the connection away, and what is opened now stays read-only.
     emulator.set_remote_control(false);
-    script.write_all(b"def again():\n  textmsg(1)\nend\n").unwrap();
-    until(&mut script, &[6, 0, 0, 0, 210]);
-    assert_eq!(emulator.program(), None);
+    while script.read(&mut [0; 4096]).unwrap() > 0 {}
+    let mut script = connect(&emulator, Service::Primary);
+    for remote in [false, true] {
+        emulator.set_remote_control(remote);
+        script = if remote { script } else { connect(&emulator, Service::Primary) };
+        script.write_all(b"def again():\n  textmsg(1)\nend\n").unwrap();
+        until(&mut script, &[6, 0, 0, 0, 210]);
+        assert_eq!(emulator.program(), None);
+    }
 }

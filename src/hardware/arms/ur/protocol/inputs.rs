@@ -17,6 +17,14 @@ pub enum Order {
 }
 
 impl Order {
+    /// Its positions or velocities.
+    pub fn values(self) -> Option<[f64; 6]> {
+        match self {
+            Self::Servo(values) | Self::Speed(values) => Some(values),
+            Self::Hold | Self::Stop => None,
+        }
+    }
+
     /// Its number in the program.
     fn code(self) -> i32 {
         match self {
@@ -48,13 +56,11 @@ pub const ANALOG_TYPES: &str = "UINT8,UINT8,DOUBLE,DOUBLE";
 /// Length of an order's packet.
 pub const ORDER_LENGTH: usize = HEADER + 1 + 8 + 48;
 
-/// Returns the packet of an order, for the input recipe `id`. `count` differs from that of the order before.
-pub fn order(id: u8, count: i32, order: Order) -> [u8; ORDER_LENGTH] {
+/// Returns the packet of an order, for the input recipe `id`. `count` differs from that of the order before. An order
+/// without values carries `last`, those of the order before: what a step reads while the registers change is no jump.
+pub fn order(id: u8, count: i32, order: Order, last: &[f64; 6]) -> [u8; ORDER_LENGTH] {
     let mut packet = [0; ORDER_LENGTH];
-    let values = match order {
-        Order::Servo(values) | Order::Speed(values) => values,
-        Order::Hold | Order::Stop => [0.0; 6],
-    };
+    let values = order.values().unwrap_or(*last);
     let numbers = [count, order.code()];
     let content = numbers.iter().flat_map(|n| n.to_be_bytes()).chain(values.iter().flat_map(|v| v.to_be_bytes()));
     let header = (ORDER_LENGTH as u16).to_be_bytes().into_iter().chain([kind::DATA, id]);
@@ -92,12 +98,12 @@ mod tests {
 
     #[test]
     fn orders_are_registers() {
-        let packet = order(1, 0x0102, Order::Servo([1.0, 0.0, 0.0, 0.0, 0.0, -2.0]));
+        let packet = order(1, 0x0102, Order::Servo([1.0, 0.0, 0.0, 0.0, 0.0, -2.0]), &[9.0; 6]);
         assert_eq!(packet[..12], [0, 60, b'U', 1, 0, 0, 1, 2, 0, 0, 0, 1]);
         assert_eq!((&packet[12..20], &packet[52..]), (&1f64.to_be_bytes()[..], &(-2f64).to_be_bytes()[..]));
-        let stop = order(1, -1, Order::Stop);
+        let stop = order(1, -1, Order::Stop, &[1.0, 0.0, 0.0, 0.0, 0.0, -2.0]);
         assert_eq!(stop[4..12], [0xFF, 0xFF, 0xFF, 0xFF, 0, 0, 0, 3]);
-        assert!(stop[12..].iter().all(|byte| *byte == 0));
+        assert_eq!(stop[12..], packet[12..], "the values of the order before");
         assert_eq!(ORDER.split(',').count(), ORDER_TYPES.split(',').count());
     }
 

@@ -10,8 +10,12 @@ const CONFIGURATION: u8 = 6;
 const VERSION: u8 = 3;
 const ERROR: u8 = 6;
 const EXCEPTION: u8 = 10;
-/// Shortest and longest packet.
-const SIZES: std::ops::RangeInclusive<usize> = 5..=4096;
+/// Shortest packet, the longest one that is decoded, and the longest one there may be.
+const SHORTEST: usize = 5;
+const DECODED: usize = 4096;
+const LONGEST: usize = 1 << 20;
+/// Types of packets are below this.
+const KINDS: u8 = 64;
 /// Levels of errors, from which on one is kept: 2 is a warning, which every protective stop has.
 pub const WARNING: i32 = 2;
 /// Added to the level of an error for the vendor's developers.
@@ -59,8 +63,11 @@ pub enum Packet {
 pub fn scan(bytes: &[u8]) -> Scan<Packet> {
     let [a, b, c, d, kind, ..] = bytes else { return Scan::More };
     let size = i32::from_be_bytes([*a, *b, *c, *d]) as usize;
-    if !SIZES.contains(&size) {
+    if !(SHORTEST..=LONGEST).contains(&size) || *kind >= KINDS {
         return Scan::Skip(1);
+    }
+    if size > DECODED {
+        return Scan::Skip(size);
     }
     match bytes.get(5..size) {
         None => Scan::More,
@@ -164,6 +171,14 @@ mod tests {
         assert_eq!((found.kind, found.ranges[2], found.speeds[4]), (7, (-2.0, 2.0), 2.0));
         assert_eq!(scan(&packet(STATE, &part(0, &[1; 42]))), Scan::Take(52, Packet::Other));
         assert_eq!(scan(&packet(STATE, &[0, 0, 9, 9, 0])), Scan::Take(10, Packet::Other), "a part that is cut off");
+    }
+
+    #[test]
+    fn long_packets_are_skipped_as_a_whole() {
+        let bytes = packet(STATE, &[0; 9000]);
+        assert_eq!(scan(&bytes[..100]), Scan::Skip(9005));
+        let absurd = [&(1_i32 << 21).to_be_bytes()[..], &[STATE, 0]].concat();
+        assert_eq!(scan(&absurd), Scan::Skip(1));
     }
 
     #[test]

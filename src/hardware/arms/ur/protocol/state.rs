@@ -197,6 +197,11 @@ impl Recipe {
         self.fields().map(|(_, field)| field.name).collect::<Vec<_>>().join(",")
     }
 
+    /// Returns whether the controller sends a value.
+    pub fn has(self, name: &str) -> bool {
+        self.fields().any(|(_, field)| field.name == name)
+    }
+
     /// Returns the length of a packet with these values.
     pub fn length(self) -> usize {
         super::rtde::HEADER + 1 + self.fields().map(|(_, field)| field.kind.length()).sum::<usize>()

@@ -4,6 +4,8 @@
 pub mod robot {
     /// The motors have no power.
     pub const POWER_OFF: i32 = 3;
+    /// The motors' supply is on.
+    pub const POWER_ON: i32 = 4;
     /// Powered; the brakes hold.
     pub const IDLE: i32 = 5;
     /// Powered; the brakes are released.
@@ -28,7 +30,7 @@ pub mod safety {
 
 /// Bits of the robot's status.
 pub mod bits {
-    /// A program runs, or is paused.
+    /// A program runs. Whether this includes a paused one is not documented.
     pub const PROGRAM_RUNNING: u32 = 1 << 1;
 }
 
@@ -40,12 +42,18 @@ pub mod program {
     pub const STOPPED: i32 = 10;
     /// Decelerates and ends: no orders came.
     pub const SILENT: i32 = 11;
+    /// Decelerates and ends: a setpoint was too far away.
+    pub const FAR: i32 = 12;
 }
 
-/// State of the run time of a paused program.
-pub const PAUSED: u32 = 4;
 /// State of the run time without a program.
 pub const STOPPED: u32 = 1;
+/// State of the run time of a program that runs.
+pub const PLAYING: u32 = 2;
+/// State of the run time of a program that is being paused.
+pub const PAUSING: u32 = 3;
+/// State of the run time of a paused program.
+pub const PAUSED: u32 = 4;
 
 /// Returns whether a safety mode lets the arm move.
 pub fn moves(mode: i32) -> bool {

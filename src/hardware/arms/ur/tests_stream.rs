@@ -1,0 +1,149 @@
+//! Streams of setpoints, judged by what the program on the emulated controller gave to servoj.
+
+use std::time::{Duration, Instant};
+
+use serde_json::json;
+
+use super::adapter::UrAdapter;
+use super::emulator::UrEmulator;
+use super::tests::{positions, ready, text, until};
+use super::{DOF, Options};
+use crate::hardware::adapter::{AdapterError, ManipulatorAdapter, Stop};
+use crate::joint::ControlMode;
+
+/// Setpoints that may be withheld because this computer was stalled, of 60 to 300.
+const FEW: usize = 6;
+
+/// Largest step of joint 1 between two positions of servoj [rad].
+fn largest_step(emulator: &UrEmulator) -> f64 {
+    let points = emulator.servoj();
+    points.windows(2).map(|pair| (pair[1].1[0] - pair[0].1[0]).abs()).fold(0.0, f64::max)
+}
+
+/// Sends a setpoint every `period` that moves joint 1 at `speed` [rad/s], but none for `gap` in the middle. Returns the
+/// last one, and how many were refused.
+fn with_gap(adapter: &mut UrAdapter, speed: f64, period: Duration, gap: Duration) -> ([f64; DOF], usize) {
+    let start = positions(adapter);
+    let (mut goal, mut refused, began) = (start, 0, Instant::now());
+    let half = Duration::from_millis(300);
+    let mut next = began;
+    while began.elapsed() < 2 * half + gap {
+        let past = next.duration_since(began);
+        goal[0] = start[0] + speed * past.as_secs_f64();
+        if past < half || past >= half + gap {
+            refused += usize::from(adapter.write_joint_positions(&goal, 1.0).is_err());
+            positions(adapter);
+        }
+        next += period;
+        std::thread::sleep(next.saturating_duration_since(Instant::now()));
+    }
+    (goal, refused)
+}
+
+#[test]
+fn after_a_gap_the_arm_catches_up_within_its_speed_limits() {
+    for (model, speed, gap) in [("ur5e", 2.5, 20), ("ur5e", 2.0, 50), ("ur5e", 0.5, 40), ("ur10", 1.5, 45)] {
+        let (mut adapter, emulator) = ready(json!({"model": model}));
+        let (top, step) = (adapter.get_limits().unwrap().velocity_max[0], 1.0 / adapter.get_info().native_rate);
+        let (goal, refused) = with_gap(&mut adapter, speed, Duration::from_millis(4), Duration::from_millis(gap));
+        assert!(refused < FEW, "{model}: {refused} refused");
+        until(&mut adapter, |adapter| (positions(adapter)[0] - goal[0]).abs() < 1e-3);
+        let largest = largest_step(&emulator);
+        assert!(largest <= top * step + 1e-9, "{model} {gap} ms: {:.2} rad/s, limit {top:.2}", largest / step);
+        // More than twice the speed where this computer was stalled, too; `tests/peers/ur_control.rs` has no stalls.
+        assert!(largest <= 5.0 * speed * step, "{model} {gap} ms: {:.2} rad/s for {speed} rad/s", largest / step);
+    }
+}
+
+#[test]
+fn a_steady_stream_is_as_fast_as_it_is_commanded() {
+    for period in [2, 4, 8, 10] {
+        let (mut adapter, emulator) = ready(json!({}));
+        let (goal, refused) = with_gap(&mut adapter, 0.5, Duration::from_millis(period), Duration::ZERO);
+        assert!(refused < FEW, "{refused} refused");
+        until(&mut adapter, |adapter| (positions(adapter)[0] - goal[0]).abs() < 1e-3);
+        let points = emulator.servoj();
+        // Over 50 ms: this computer sends some setpoints late.
+        let ways = points.windows(26).map(|part| (part[25].1[0] - part[0].1[0]).abs() / 0.05);
+        let fastest = ways.fold(0.0, f64::max);
+        assert!(fastest < 1.4, "every {period} ms: {fastest:.2} rad/s for 0.5 rad/s");
+    }
+}
+
+#[test]
+fn orders_may_be_answered_some_ticks_later() {
+    // A CB3 controller answers 2 to 3 steps of 8 ms later.
+    let (mut adapter, emulator) = ready(json!({"model": "ur5"}));
+    let (goal, refused) = with_gap(&mut adapter, 0.5, Duration::from_millis(4), Duration::ZERO);
+    assert!(refused < FEW, "{refused} setpoints are withheld");
+    until(&mut adapter, |adapter| (positions(adapter)[0] - goal[0]).abs() < 1e-3);
+    assert_eq!((adapter.foreign_change(), emulator.program().as_deref()), (None, Some("dimos_control")));
+}
+
+#[test]
+fn a_setpoint_far_away_ends_the_program() {
+    let (mut adapter, emulator) = ready(json!({}));
+    let start = positions(&mut adapter);
+    let mut goal = start;
+    goal[1] += 1.5;
+    adapter.write_joint_positions(&goal, 1.0).unwrap();
+    until(&mut adapter, |adapter| adapter.foreign_change().is_some());
+    let what = adapter.foreign_change().unwrap();
+    assert!(what.contains("a setpoint was farther away than the arm moves in 0.2 s"), "{what}");
+    until(&mut adapter, |_| emulator.program().is_none());
+    assert!((positions(&mut adapter)[1] - start[1]).abs() < 1e-3, "it has not moved");
+}
+
+#[test]
+fn a_long_stop_is_no_program_that_hangs() {
+    let (mut adapter, emulator) = ready(json!({"stop_deceleration": 1.0}));
+    adapter.set_control_mode(ControlMode::Velocity).unwrap();
+    for _ in 0..40 {
+        adapter.write_joint_velocities(&[1.4, 0.0, 0.0, 0.0, 0.0, 0.0]).unwrap();
+        std::thread::sleep(Duration::from_millis(5));
+        positions(&mut adapter);
+    }
+    // No more velocities: the program decelerates for more than a second, and cannot answer meanwhile.
+    let began = Instant::now();
+    until(&mut adapter, |adapter| adapter.state().unwrap().velocity[0].abs() < 0.01);
+    assert!(began.elapsed() > Duration::from_secs(1), "{:?}", began.elapsed());
+    std::thread::sleep(Duration::from_millis(20));
+    until(&mut adapter, |adapter| adapter.write_joint_velocities(&[0.0; DOF]).is_ok());
+    assert_eq!((adapter.foreign_change(), emulator.program().as_deref()), (None, Some("dimos_control")));
+    assert_eq!(adapter.write_stop(), Ok(Stop::Confirmed));
+}
+
+#[test]
+fn a_program_that_hangs_or_is_refused_is_reported() {
+    let (mut adapter, emulator) = ready(json!({}));
+    emulator.hang_program(true);
+    let here = positions(&mut adapter);
+    adapter.write_joint_positions(&here, 1.0).unwrap();
+    std::thread::sleep(Duration::from_millis(80));
+    assert_eq!(adapter.write_joint_positions(&here, 1.0), Err(AdapterError::Busy), "nothing more behind a silence");
+    until(&mut adapter, |adapter| adapter.foreign_change().is_some());
+    assert!(adapter.foreign_change().unwrap().contains("does not answer"));
+    // A stop is not confirmed by a program that hangs, but by the dashboard.
+    assert_eq!(adapter.write_stop(), Ok(Stop::Confirmed));
+    assert_eq!(emulator.program(), None);
+    emulator.hang_program(false);
+    emulator.refuse_programs(true);
+    let refused = text(adapter.activate().unwrap_err());
+    assert!(refused.starts_with("the controller refuses the program of dimos: line 1: compile_error"), "{refused}");
+}
+
+/// The emulator carries out the program without interpreting it: both have the same times.
+#[test]
+fn the_emulators_program_has_the_times_of_the_text() {
+    use super::emulator::program_times as times;
+    let text = super::program::control(1, &Options::default(), &super::model::Model::Ur5e.limits());
+    for part in [
+        format!("silent * step > {:?}:\n        state = 11", times::ENDS),
+        format!("state == 3 and silent * step > {:?}:", times::VELOCITY_ENDS),
+        format!("most = floor({:?} / step)", times::SPREAD),
+        format!("left = floor({:?} / step)", times::FIRST),
+        format!("> {:?} * fastest[i]", times::FAR),
+    ] {
+        assert!(text.contains(&part), "{part:?} in\n{text}");
+    }
+}
