@@ -14,8 +14,10 @@ use super::smoothing::{Fade, Smoothing};
 const IN_TIME: Duration = Duration::from_micros(600);
 /// Consecutive setpoints in time after which they are the answers.
 const IN_STEP: u32 = 50;
-/// Consecutive states without a setpoint after which states are answered without one: 20 would end the motion.
-const OUT_OF_STEP: u32 = 8;
+/// States without a setpoint count this much, those with one count back by one. From the sum on, states are answered
+/// without one: 20 in a row without an answer would end the motion.
+const UNANSWERED: u32 = 4;
+const OUT_OF_STEP: u32 = 32;
 /// A stream of velocities that ends is a hold after this time [states].
 const VELOCITY_ENDS: u64 = 100;
 /// States that were missed at once are made up for, up to this number.
@@ -101,7 +103,10 @@ impl Follower {
         }
         if self.direct {
             self.slipped |= skipped;
-            self.unanswered = if skipped { self.unanswered + missed as u32 } else { 0 };
+            self.unanswered = match skipped {
+                true => self.unanswered + UNANSWERED * missed as u32,
+                false => self.unanswered.saturating_sub(1),
+            };
             if self.waiting {
                 return Some(self.answer(state));
             }

@@ -92,10 +92,4 @@ impl Hand {
         };
         self.tcp.send(&request(self.last_id, order))
     }
-
-    /// Ends a motion.
-    pub fn stop(&mut self) -> AdapterResult<()> {
-        self.last_id = self.last_id.wrapping_add(1);
-        self.tcp.send(&request(self.last_id, Request::Stop))
-    }
 }

@@ -22,6 +22,8 @@ pub enum Model {
 
 /// Share of the vendor's acceleration and jerk that the coordinator uses. The rest is for what smooths setpoints.
 const SHARE: f64 = 0.7;
+/// Share of the speeds that the vendor suggests for an FR3 which the controller allows everywhere in the suggested range.
+const EVERYWHERE: f64 = 0.95;
 /// Jerk limit as a multiple of the acceleration limit [1/s].
 const JERK: f64 = 500.0;
 
@@ -106,7 +108,7 @@ impl Model {
     }
 
     /// Returns the published limits. With `full`, up to the ends of the joints' ranges: an FR3 then slows down near
-    /// them. Otherwise the range and the speed that the vendor suggests for planners, at which it never does.
+    /// them. Otherwise the range and nearly the speed that the vendor suggests for planners, at which it never does.
     pub fn limits(self, full: bool) -> JointLimits {
         let ranges = self.ranges();
         let of = |value: fn(&JointRange) -> f64| ranges.iter().map(value).collect::<Vec<_>>();
@@ -120,7 +122,7 @@ impl Model {
         if self == Self::Fr3 && !full {
             limits.position_lower = vec![-2.3476, -1.5454, -2.4937, -2.7714, -2.5100, 0.7773, -2.7045];
             limits.position_upper = vec![2.3476, 1.5454, 2.4937, -0.4226, 2.5100, 4.2841, 2.7045];
-            limits.velocity_max = vec![2.0, 1.0, 1.5, 1.25, 3.0, 1.5, 3.0];
+            limits.velocity_max = [2.0, 1.0, 1.5, 1.25, 3.0, 1.5, 3.0].map(|velocity| EVERYWHERE * velocity).to_vec();
         }
         limits
     }

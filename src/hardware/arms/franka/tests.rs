@@ -60,6 +60,12 @@ fn positions(adapter: &mut FrankaAdapter) -> [f64; DOF] {
     positions
 }
 
+fn pass_states(adapter: &mut FrankaAdapter, count: usize) {
+    for _ in 0..count {
+        next(adapter);
+    }
+}
+
 /// A smooth way from 0 to 1 in time from 0 to 1.
 fn ease(t: f64) -> f64 {
     let t = t.clamp(0.0, 1.0);
@@ -73,7 +79,7 @@ fn stream(adapter: &mut FrankaAdapter, way: f64, every: usize, seconds: f64) -> 
     let at = |i: usize| start.map(|q| q + way * ease(i as f64 / steps as f64));
     for i in 0..steps {
         adapter.write_joint_positions(&at(i), 1.0).unwrap();
-        (0..every).for_each(|_| drop(next(adapter)));
+        pass_states(adapter, every);
     }
     adapter.write_joint_positions(&at(steps), 1.0).unwrap();
     at(steps)
@@ -92,7 +98,7 @@ fn setpoints_at_any_rate_arrive() {
             let here = positions(&mut adapter);
             for _ in 0..100 {
                 adapter.write_joint_positions(&here, 1.0).unwrap();
-                (0..every).for_each(|_| drop(next(&mut adapter)));
+                pass_states(&mut adapter, every);
             }
             let goal = stream(&mut adapter, way, every, 0.8);
             until(&mut adapter, |adapter| positions(adapter).iter().zip(&goal).all(|(a, b)| (a - b).abs() < 1e-3));
@@ -109,7 +115,7 @@ fn setpoints_at_any_rate_arrive() {
 fn a_setpoint_after_each_state_is_its_answer() {
     let (mut adapter, emulator) = ready(json!({}));
     let here = positions(&mut adapter);
-    let mut write = |adapter: &mut FrankaAdapter| {
+    let write = |adapter: &mut FrankaAdapter| {
         next(adapter);
         adapter.write_joint_positions(&here, 1.0).unwrap();
         adapter.session.as_ref().unwrap().motion.as_ref().unwrap().follower.is_direct()

@@ -5,8 +5,9 @@ use crate::hardware::transport::Scan;
 
 /// Version of the interface.
 pub const VERSION: u16 = 3;
-/// Length of a header and of a state [bytes].
+/// Length of a header [bytes].
 const HEADER: usize = 10;
+/// Length of a state [bytes].
 pub const STATE: usize = 23;
 
 /// A command.
@@ -18,8 +19,6 @@ pub enum Request {
     Grasp(f64, f64, f64),
     /// Opens or closes to a width [m] at a speed [m/s].
     Move(f64, f64),
-    /// Ends a motion.
-    Stop,
 }
 
 /// Tolerances of a grasp [m]: an object of any width counts.
@@ -32,7 +31,6 @@ pub fn request(id: u32, request: Request) -> Vec<u8> {
         Request::Connect(port) => (0_u16, [VERSION.to_le_bytes(), port.to_le_bytes()].concat()),
         Request::Grasp(width, speed, force) => (2, floats(&[width, ANY_WIDTH, ANY_WIDTH, speed, force])),
         Request::Move(width, speed) => (3, floats(&[width, speed])),
-        Request::Stop => (4, Vec::new()),
     };
     let length = (HEADER + values.len()) as u32;
     [&code.to_le_bytes()[..], &id.to_le_bytes(), &length.to_le_bytes(), &values].concat()
