@@ -186,7 +186,10 @@ fn fr3_and_fer_have_the_controllers_kinematics_and_limits() {
         for (i, joint) in model.joints.iter().filter(|joint| joint.is_independent()).enumerate() {
             let found = (joint.limits.lower, joint.limits.upper, joint.limits.velocity);
             let expected = (limits.position_lower[i], limits.position_upper[i], limits.velocity_max[i]);
-            assert!((found.0 - expected.0).abs() + (found.1 - expected.1).abs() < 1e-9, "{name} {found:?} {expected:?}");
+            assert!(
+                (found.0 - expected.0).abs() + (found.1 - expected.1).abs() < 1e-9,
+                "{name} {found:?} {expected:?}"
+            );
             assert!((found.2 - expected.2).abs() < 1e-4, "{name} {found:?} {expected:?}");
         }
     }

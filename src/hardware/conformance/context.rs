@@ -21,7 +21,7 @@ const FAULT_AT: f64 = 1.0;
 const ROOM: Duration = Duration::from_secs(1);
 
 /// Rate of the states of an arm whose controller is the clock: it ends a motion whose states are not answered [Hz].
-const CLOCKED: f64 = 1000.0;
+pub(super) const CLOCKED: f64 = 1000.0;
 
 /// Waits. The states of an arm whose controller is the clock are read meanwhile, as the device thread does.
 pub fn pause(adapter: &mut dyn ManipulatorAdapter, time: Duration) {

@@ -70,6 +70,7 @@ impl Follower {
         }
     }
 
+    #[cfg(test)]
     /// Returns whether setpoints are sent as answers when they come.
     pub fn is_direct(&self) -> bool {
         self.direct

@@ -7,7 +7,7 @@ use serde_json::json;
 
 use super::SPEC;
 use super::adapter::FrankaAdapter;
-use super::emulator::FrankaEmulator;
+use super::emulator::{Datagram, FrankaEmulator};
 use super::protocol::DOF;
 use crate::arm::Load;
 use crate::hardware::adapter::{AdapterError, Cartesian, Gripper, JointReading, ManipulatorAdapter, Payload, Stop};
@@ -124,7 +124,7 @@ fn a_setpoint_after_each_state_is_its_answer() {
     while !write(&mut adapter) {
         assert!(began.elapsed() < Duration::from_secs(10));
     }
-    emulator.record_commands();
+    emulator.record();
     let before = adapter.link_quality().unwrap().0.answers;
     for _ in 0..100 {
         write(&mut adapter);
@@ -133,7 +133,11 @@ fn a_setpoint_after_each_state_is_its_answer() {
     // One each, unless the computer was busy.
     assert!((50..=101).contains(&answers), "{answers}");
     std::thread::sleep(Duration::from_millis(5));
-    let commands = emulator.commands();
+    let command = |datagram| match datagram {
+        Datagram::Command(bytes) => Some(bytes),
+        Datagram::State(_) => None,
+    };
+    let commands: Vec<Vec<u8>> = emulator.traffic().into_iter().filter_map(command).collect();
     let ids: Vec<&[u8]> = commands.iter().map(|bytes| &bytes[..8]).collect();
     assert!(ids.windows(2).all(|pair| pair[0] != pair[1]), "no state is answered twice");
     assert!(commands.iter().all(|bytes| bytes.len() == 371));

@@ -51,6 +51,15 @@ pub(super) struct Motion {
     pub begun: bool,
 }
 
+/// A datagram, as tests see it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Datagram {
+    /// A state that was sent.
+    State(Vec<u8>),
+    /// A command that came.
+    Command(Vec<u8>),
+}
+
 /// What happened so far.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Figures {
@@ -111,7 +120,7 @@ pub struct Control {
     pub(super) cut: Option<Delivery>,
     last_state: Vec<u8>,
     pub(super) figures: Figures,
-    pub(super) commands: Trace<Vec<u8>>,
+    pub(super) traffic: Trace<Datagram>,
 }
 
 impl Control {
@@ -155,7 +164,7 @@ impl Control {
             cut: None,
             last_state: Vec::new(),
             figures: Figures::default(),
-            commands: Trace::default(),
+            traffic: Trace::default(),
         };
         control.q_d = std::array::from_fn(|i| control.kept(positions.get(i).copied().unwrap_or_default()));
         Ok(control)
@@ -318,6 +327,7 @@ impl Control {
                 // The highest byte of the first joint's position.
                 let spot = if self.wide() { 8 + 148 * 8 - 1 } else { 8 + 148 * 4 - 1 };
                 delivery.damage(&mut state, b"\x00noise", spot);
+                self.traffic.push(|| Datagram::State(state.clone()));
                 return Some(state);
             }
         }

@@ -36,7 +36,7 @@ use crate::hardware::sim::tcp_server::{Port, TcpServer, cannot_listen, ports_in_
 use crate::joint::{JointLimits, Joints};
 use clock::Network;
 use control::Control;
-pub use control::Figures;
+pub use control::{Datagram, Figures};
 
 /// The faults that the controller can play.
 const PLAYABLE: &[FaultKind] = &[
@@ -211,14 +211,14 @@ impl FrankaEmulator {
         self.with(|control| control.hand.homed = homed);
     }
 
-    /// Begins to record the commands that come.
-    pub fn record_commands(&self) {
-        self.with(|control| control.commands.start());
+    /// Begins to record datagrams.
+    pub fn record(&self) {
+        self.with(|control| control.traffic.start());
     }
 
-    /// Returns the commands that came since then.
-    pub fn commands(&self) -> Vec<Vec<u8>> {
-        self.with(|control| control.commands.entries())
+    /// Returns the datagrams since then.
+    pub fn traffic(&self) -> Vec<Datagram> {
+        self.with(|control| control.traffic.entries())
     }
 }
 

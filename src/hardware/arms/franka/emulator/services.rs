@@ -2,7 +2,7 @@
 
 use std::net::SocketAddr;
 
-use super::control::{Control, DOF, IDLE, MOVE, Motion, Who};
+use super::control::{Control, DOF, Datagram, IDLE, MOVE, Motion, Who};
 use super::urdf;
 use super::wire::{self, Ended};
 use crate::hardware::arms::franka::model::Model;
@@ -172,7 +172,7 @@ impl Control {
 
     /// Takes a datagram: a command counts if it answers the state that was sent last.
     pub(super) fn take_command(&mut self, bytes: &[u8]) {
-        self.commands.push(|| bytes.to_vec());
+        self.traffic.push(|| Datagram::Command(bytes.to_vec()));
         match wire::command(bytes, self.wide()) {
             Some((id, command)) if id == self.id && self.motion.is_some() && self.command.is_none() => {
                 self.command = Some(command);
