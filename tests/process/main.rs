@@ -16,6 +16,7 @@ mod daemon;
 mod disk;
 mod fault_table;
 mod first_run;
+mod franka_run;
 mod gripper_joint;
 mod jog;
 mod joint_status;

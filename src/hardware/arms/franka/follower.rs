@@ -18,6 +18,8 @@ const IN_STEP: u32 = 50;
 /// without one: 20 in a row without an answer would end the motion.
 const UNANSWERED: u32 = 4;
 const OUT_OF_STEP: u32 = 32;
+/// A smaller jump is none: a filtered one causes less than the acceleration limit [rad].
+const JUMP: f64 = 2e-5;
 /// A stream of velocities that ends is a hold after this time [states].
 const VELOCITY_ENDS: u64 = 100;
 /// States that were missed at once are made up for, up to this number.
@@ -108,11 +110,8 @@ impl Follower {
                 true => self.unanswered + UNANSWERED * missed as u32,
                 false => self.unanswered.saturating_sub(1),
             };
-            if self.waiting {
-                return Some(self.answer(state));
-            }
             if self.unanswered < OUT_OF_STEP {
-                return None;
+                return if self.waiting { Some(self.answer(state)) } else { None };
             }
             (self.direct, self.in_step) = (false, 0);
             self.smoothing.restart(&self.goal);
@@ -141,7 +140,11 @@ impl Follower {
                 let [q, v, base, offset] = [&state.q_d, &state.dq_d, &base, &offset].map(|values| at(values, i));
                 q + v * PERIOD / self.gain - base - offset
             });
-            self.fade.add(&jump);
+            if jump.iter().any(|jump: &f64| jump.abs() > JUMP) {
+                self.fade.add(&jump);
+                // Setpoints that slip again and again are at another rate.
+                self.unanswered += if self.direct { UNANSWERED } else { 0 };
+            }
         }
         let offset = self.fade.value();
         std::array::from_fn(|i| at(&base, i) + at(&offset, i))
@@ -151,3 +154,7 @@ impl Follower {
 fn at(values: &[f64; DOF], joint: usize) -> f64 {
     values.get(joint).copied().unwrap_or_default()
 }
+
+#[cfg(test)]
+#[path = "follower_tests.rs"]
+mod tests;
