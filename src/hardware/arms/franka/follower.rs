@@ -107,14 +107,15 @@ impl Follower {
         if self.direct {
             self.slipped |= skipped;
             self.unanswered = match skipped {
-                true => self.unanswered + UNANSWERED * missed as u32,
+                true => self.unanswered + UNANSWERED,
                 false => self.unanswered.saturating_sub(1),
             };
             if self.unanswered < OUT_OF_STEP {
                 return if self.waiting { Some(self.answer(state)) } else { None };
             }
-            (self.direct, self.in_step) = (false, 0);
-            self.smoothing.restart(&self.goal);
+            (self.direct, self.in_step, self.slipped) = (false, 0, true);
+            let change = if self.velocity { [0.0; DOF] } else { state.dq_d.map(|v| v * PERIOD) };
+            self.smoothing.restart_moving(&self.goal, &change);
         } else if self.in_step >= IN_STEP && self.smoothing.rests_at(&self.goal) {
             (self.direct, self.unanswered) = (true, 0);
         }

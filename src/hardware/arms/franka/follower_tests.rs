@@ -36,7 +36,7 @@ fn run(times: &[f64], lost: impl Fn(u64) -> bool) -> Seen {
     let (mut known, mut known_at) = (controller, 0.0);
     let mut seen = Seen { lag: 0.0, error: 0.0, acceleration: 0.0, unanswered: 0, direct: false };
     let mut times = times.iter().copied().peekable();
-    for cycle in 0..2500_u64 {
+    for cycle in 0..2390_u64 {
         let came = cycle as f64 * 1e-3 + 1e-4;
         let mut answer = None;
         if !lost(cycle) {
@@ -140,5 +140,5 @@ fn a_tick_that_misses_periods_is_caught_up_gently() {
     // For 50 ms: a run would have held the arm; here it is slowed down, and goes on.
     let times: Vec<f64> = every(1e-3, 3e-4).into_iter().filter(|t| !(0.9..0.95).contains(t)).collect();
     let seen = run(&times, |_| false);
-    assert!(!seen.direct && seen.error < 1e-3, "{seen:?}");
+    assert!(seen.error < 1e-5 && seen.acceleration < 9.0, "{seen:?}");
 }

@@ -32,6 +32,20 @@ impl Smoothing {
         self.stages.iter_mut().flatten().for_each(|entry| *entry = *value);
     }
 
+    /// Starts over in a motion that came to `value` with a constant change per state, with the longest averages: what
+    /// ends abruptly is slowed down as gently as they can.
+    pub fn restart_moving(&mut self, value: &[f64; DOF], change: &[f64; DOF]) {
+        (self.length, self.next) = (LONGEST, 0);
+        for (number, stage) in self.stages.iter_mut().enumerate() {
+            let late = (number * (LONGEST - 1)) as f64 / 2.0;
+            for (i, entry) in stage.iter_mut().enumerate() {
+                // The first entry is the oldest one.
+                let back = late + (LONGEST - 1 - i) as f64;
+                *entry = std::array::from_fn(|j| at(value, j) - at(change, j) * back);
+            }
+        }
+    }
+
     /// Fits the averages to the time between two setpoints [states], if nothing moves.
     pub fn fit(&mut self, interval: u64, value: &[f64; DOF]) {
         let interval = interval.clamp(1, LONGEST as u64) as usize;
@@ -123,12 +137,23 @@ mod tests {
         let mut smoothing = Smoothing::new(&[0.0; DOF]);
         smoothing.fit(10, &[0.0; DOF]);
         // 1 rad/s, in setpoints every 10 ms; one of them comes 1 ms late.
-        let setpoint = |i: usize| (i - usize::from(i % 10 == 0 && i == 250)) / 10;
+        let setpoint = |i: usize| (i - usize::from(i == 250)) / 10;
         let values: Vec<f64> = (0..500).map(|i| smoothing.push(&[setpoint(i) as f64 * 0.01; DOF])[3]).collect();
         let (acceleration, jerk) = largest(&values[100..]);
         assert!(acceleration < 4.0 && jerk < 4000.0, "{acceleration} rad/s², {jerk} rad/s³");
         // The average of steps is half a step below the line, and the smoothing 1.5 × 20 states late.
         assert!((values[499] - (0.499 - 0.0045 - 0.0285)).abs() < 1e-6, "{}", values[499]);
+    }
+
+    #[test]
+    fn a_motion_is_taken_over() {
+        let mut smoothing = Smoothing::new(&[0.0; DOF]);
+        smoothing.restart_moving(&[1.0; DOF], &[0.001; DOF]);
+        let values: Vec<f64> =
+            (1..=300).map(|i| smoothing.push(&[1.0 + 0.001 * f64::from(i.min(50)); DOF])[0]).collect();
+        let (acceleration, _) = largest(&values);
+        assert!((values[1] - values[0] - 0.001).abs() < 1e-9 && (values[299] - 1.05).abs() < 1e-9);
+        assert!(acceleration < 12.5, "{acceleration} rad/s²");
     }
 
     #[test]
