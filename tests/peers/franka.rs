@@ -14,8 +14,8 @@ use dimos::hardware::registry::{AdapterConfig, EmulatorAddress};
 
 use crate::support::python::python_with;
 
-/// Runs `tests/python/franka_client.py` on an emulator at this loopback address. Returns what was sent both ways; `None`
-/// where the client is not installed.
+/// Runs `tests/python/franka_client.py` on an emulator at this loopback address. Returns what was sent both ways;
+/// `None` where the client is not installed.
 fn client(model: &str, address: &str, package: &str) -> Option<(Vec<Datagram>, Figures)> {
     let python = python_with(&[package])?;
     // Python is no real-time client: it may lose more commands than a real controller allows.

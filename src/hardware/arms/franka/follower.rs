@@ -143,7 +143,7 @@ impl Follower {
             });
             if jump.iter().any(|jump: &f64| jump.abs() > JUMP) {
                 self.fade.add(&jump);
-                // Setpoints that slip again and again are at another rate.
+                // Setpoints that slip repeatedly are at another rate.
                 self.unanswered += if self.direct { UNANSWERED } else { 0 };
             }
         }

@@ -25,8 +25,8 @@ struct Seen {
     direct: bool,
 }
 
-/// Writes setpoints at `times` [s], in order. States come every millisecond, and 0.1 ms later to the follower; those for
-/// which `lost` is true never do.
+/// Writes setpoints at `times` [s], in order. States come every millisecond, and 0.1 ms later to the follower; those
+/// for which `lost` is true never do.
 fn run(times: &[f64], lost: impl Fn(u64) -> bool) -> Seen {
     let (model, first) = (Model::Fr3, State { id: 1000, ..State::default() });
     let shaping = Shaping::new(100.0, Some(model.ranges()));
@@ -133,11 +133,11 @@ fn lost_states_are_made_up_for() {
 
 #[test]
 fn a_tick_that_misses_periods_is_caught_up_gently() {
-    // It stood still for 5 ms at full speed: the goal is late from then on.
+    // The computer was stalled for 5 ms at full speed: the goal is late from then on.
     let times: Vec<f64> = every(1e-3, 3e-4).into_iter().filter(|t| !(0.9..0.905).contains(t)).collect();
     let seen = run(&times, |_| false);
     assert!(seen.direct && seen.error < 1e-5 && seen.acceleration < 5.0, "{seen:?}");
-    // For 50 ms: a run would have held the arm; here it is slowed down, and goes on.
+    // For 50 ms: a run would have held the arm; here it is slowed down, and continues.
     let times: Vec<f64> = every(1e-3, 3e-4).into_iter().filter(|t| !(0.9..0.95).contains(t)).collect();
     let seen = run(&times, |_| false);
     assert!(seen.error < 1e-5 && seen.acceleration < 9.0, "{seen:?}");

@@ -1,4 +1,4 @@
-//! The hand: a connection of its own to the next port.
+//! The hand: its own connection, to the next port.
 
 use std::net::UdpSocket;
 use std::time::Duration;

@@ -1,9 +1,9 @@
 //! Franka Robotics: FR3, and FER (Panda).
 //!
-//! The controller is the clock: it sends its state every millisecond, and takes one command in answer to each. `protocol/`
-//! has the bytes, `connect`, `session` and `motion` the connection and what is ordered, `follower` and `smoothing` make
-//! one value for each state from the tick's setpoints, `shaping` is what the vendor's client does to each command,
-//! `gripper` the hand, `adapter` the adapter trait, `emulator/` the controller's side.
+//! The controller is the clock: it sends its state every millisecond, and takes one command in answer to each.
+//! `protocol/` has the bytes, `connect`, `session` and `motion` the connection and what is ordered, `follower` and
+//! `smoothing` make one value for each state from the tick's setpoints, `shaping` is what the vendor's client does to
+//! each command, `gripper` the hand, `adapter` the adapter trait, `emulator/` the controller's side.
 
 pub mod adapter;
 mod connect;

@@ -22,7 +22,8 @@ pub enum Model {
 
 /// Share of the vendor's acceleration and jerk that the coordinator uses. The rest is for what smooths setpoints.
 const SHARE: f64 = 0.7;
-/// Share of the speeds that the vendor suggests for an FR3 which the controller allows everywhere in the suggested range.
+/// Share of the speeds that the vendor suggests for an FR3 which the controller allows everywhere in the suggested
+/// range.
 const EVERYWHERE: f64 = 0.95;
 /// Jerk limit as a multiple of the acceleration limit [1/s].
 const JERK: f64 = 500.0;

@@ -20,7 +20,7 @@ use crate::hardware::transport::tcp::TcpLink;
 
 /// Without a state for this time the connection is lost.
 const STATE_TIMEOUT: Duration = Duration::from_millis(500);
-/// Time between two looks at the TCP connection, and the age of a state from which it is looked at every time.
+/// Time between two checks of the TCP connection, and the age of a state from which it is checked every time.
 const TCP_PERIOD: Duration = Duration::from_millis(20);
 const LATE_STATE: Duration = Duration::from_millis(5);
 /// Timeout of a service.

@@ -1,6 +1,6 @@
 //! What the vendor's client does to each command before it is sent: a low-pass filter, then limits of velocity,
-//! acceleration and jerk. Both continue from the controller's desired values, so that what it made up for a lost command
-//! is no jump.
+//! acceleration and jerk. Both continue from the controller's desired values, so that what it made up for a lost
+//! command is no jump.
 
 use super::model::JointRange;
 use super::protocol::DOF;

@@ -10,9 +10,9 @@ use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::sim::tcp_server::TcpServer;
 use crate::rt::host;
 
-/// A cycle that begins later than this leaves its client too little time: the clock goes on from there.
+/// A cycle that begins later than this leaves its client too little time: the clock continues from there.
 const LATE: Duration = Duration::from_micros(300);
-/// The hand's state is sent every so many cycles.
+/// Cycles between two states of the hand.
 const HAND: u64 = 10;
 /// Longest command that is received [bytes], and the most of them in a cycle.
 const BUFFER: usize = 512;

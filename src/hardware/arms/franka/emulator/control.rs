@@ -93,7 +93,7 @@ pub struct Control {
     pub(super) errors: u64,
     pub(super) reason: u64,
     pub(super) motion: Option<Motion>,
-    /// Desired values: the last command, or what stands in for it.
+    /// Desired values: the last command, or what replaces a lost one.
     pub(super) q_d: [f64; DOF],
     pub(super) dq_d: [f64; DOF],
     pub(super) ddq_d: [f64; DOF],

@@ -1,5 +1,5 @@
-//! What the controller makes of a command, or of none: desired values, judged by backward differences. Nothing is clamped
-//! or smoothed.
+//! What the controller makes of a command, or of none: desired values, judged by backward differences. Nothing is
+//! clamped or smoothed.
 
 use super::control::{CYCLE, Command, Control, DOF, IDLE, REFLEX};
 use super::wire::Ended;

@@ -1,8 +1,9 @@
-//! The emulator of a controller with its arm, for `address: sim`, for tests, and for other clients such as the vendor's.
+//! The emulator of a controller with its arm, for `address: sim`, for tests, and for other clients such as the
+//! vendor's.
 //!
-//! Written from the protocol, and shares no code with the adapter besides the models' dimensions and limits. It keeps the
-//! controller's rules: a command counts only if it answers the state that was sent last, before the next one is sent;
-//! what it commands is judged, and never made smoother.
+//! Written from the protocol, and shares no code with the adapter besides the models' dimensions and limits. It keeps
+//! the controller's rules: a command counts only if it answers the state that was sent last, before the next one is
+//! sent; what it commands is judged, and never made smoother.
 
 mod clock;
 mod control;

@@ -1,5 +1,5 @@
-//! What comes and goes at the TCP ports: 0 the arm's, 1 the hand's. Answers are sent with the next look for them, because
-//! some come long after their commands.
+//! What comes and goes at the TCP ports: 0 the arm's, 1 the hand's. Answers are sent with the next look for them,
+//! because some come long after their commands.
 
 use super::control::{Control, Who};
 use crate::clock::Mono;

@@ -1,8 +1,8 @@
 //! The command that answers a state, over UDP.
 //!
-//! Number of the state (u64), then f64: joint positions 7, joint velocities 7, pose 16, twist 6, elbow 2; then two bytes
-//! (elbow valid, motion finished); torques 7; in interface 10 one byte (torques finished). What a motion does not use is
-//! zero.
+//! Number of the state (u64), then f64: joint positions 7, joint velocities 7, pose 16, twist 6, elbow 2; then two
+//! bytes (elbow valid, motion finished); torques 7; in interface 10 one byte (torques finished). What a motion does not
+//! use is zero.
 
 use super::{DOF, Interface};
 

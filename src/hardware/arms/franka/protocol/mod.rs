@@ -1,5 +1,5 @@
-//! The bytes of the Franka Control Interface. TCP port 1337 takes commands; the controller sends its state over UDP every
-//! millisecond, and takes a command in answer to each. All values are little-endian and packed.
+//! The bytes of the Franka Control Interface. TCP port 1337 takes commands; the controller sends its state over UDP
+//! every millisecond, and takes a command in answer to each. All values are little-endian and packed.
 //!
 //! | interface | arm, client of the vendor | state | command |
 //! |---|---|---|---|

@@ -1,6 +1,6 @@
 //! Commands over TCP: a header of 12 bytes (command, number, whole length: u32 each), then values; the answer repeats
-//! command and number, then has one byte of status and, for some, more. A motion is answered twice: when it has started,
-//! and when it has ended.
+//! command and number, then has one byte of status and, for some, more. A motion is answered twice: when it has
+//! started, and when it has ended.
 
 use super::{DOF, Interface};
 use crate::hardware::transport::Scan;

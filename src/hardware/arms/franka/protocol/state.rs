@@ -1,7 +1,7 @@
 //! The state that the controller sends every millisecond.
 //!
-//! Message number (u64), then numbers in one width (f64 in interface 5, f32 in interface 10), then modes and error flags
-//! (bytes), then the success rate. Interface 10 has 36 numbers of accelerometers more, at the end of the numbers.
+//! Message number (u64), then numbers in one width (f64 in interface 5, f32 in interface 10), then modes and error
+//! flags (bytes), then the success rate. Interface 10 has 36 numbers of accelerometers more, at the end of the numbers.
 
 use super::errors::ERRORS;
 use super::{DOF, Interface};
