@@ -35,6 +35,8 @@ pub struct Follower {
     waiting: bool,
     goal_at: u64,
     any: bool,
+    /// States between the last two setpoints.
+    interval: u64,
     smoothing: Smoothing,
     fade: Fade,
     /// Whether setpoints are answers.
@@ -60,6 +62,7 @@ impl Follower {
             waiting: false,
             goal_at: state.id,
             any: false,
+            interval: 1,
             smoothing: Smoothing::new(&goal),
             fade: Fade::default(),
             direct: false,
@@ -85,8 +88,10 @@ impl Follower {
         self.in_step = if interval == 1 && in_time { self.in_step + 1 } else { 0 };
         self.slipped |= self.direct && interval != 1;
         self.goal_at = state.id;
+        let before = std::mem::replace(&mut self.interval, interval);
         if self.any {
-            self.smoothing.fit(interval.max(1), &self.goal);
+            // A pause is no interval.
+            self.smoothing.fit(interval.min(before).max(1), &self.goal);
         } else if !self.velocity {
             // The first setpoint may be the measured position, which is not quite the desired one.
             self.smoothing.restart(goal);

@@ -111,6 +111,13 @@ fn setpoints_of_any_other_rate_are_smoothed() {
 }
 
 #[test]
+fn a_pause_changes_nothing() {
+    let times: Vec<f64> = every(3e-3, 7e-4).into_iter().filter(|t| !(0.05..0.28).contains(t)).collect();
+    let seen = run(&times, |_| false);
+    assert!(seen.lag < 0.04 && seen.error < 1e-6, "{seen:?}");
+}
+
+#[test]
 fn a_phase_that_jitters_or_drifts_is_no_jump() {
     // About as each state comes: before or after it.
     let jitter: Vec<f64> = every(1e-3, 1e-4).iter().zip(noise()).map(|(t, noise)| t + 6e-5 * noise).collect();

@@ -52,7 +52,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     wire_units: "rad, m",
     native_rate: NATIVE_RATE,
     accuracy: 0.005,
-    lag: 0.02,
+    lag: 0.045,
     stale_after: Duration::from_millis(50),
     address: AddressForm {
         form: "HOST[:PORT]",
