@@ -20,6 +20,8 @@ macro_rules! robots {
 }
 
 robots!(
+    "fer",
+    "fr3",
     "lite6",
     "lite6_gripper",
     "piper",

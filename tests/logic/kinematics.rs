@@ -141,28 +141,56 @@ fn a_position_alone_is_enough_when_asked() {
     }
 }
 
-/// The description and the emulated controller have the same flange.
-#[test]
-fn a_ur5e_has_the_controllers_kinematics() {
-    use dimos::hardware::arms::ur::model::Model;
-    use dimos::robot::builtin;
-
-    let model = from_text("ur5e", builtin::text("ur5e").unwrap()).unwrap();
+/// Fails unless a description has the flange where an emulated controller has it.
+fn has_the_flange(name: &str, tip: &str, of: impl Fn(&[f64]) -> nalgebra::Isometry3<f64>) {
+    let model = from_text(name, dimos::robot::builtin::text(name).unwrap()).unwrap();
     let kinematics = Kinematics::whole(&model).unwrap();
-    let tool = model.link_index("tool0").unwrap();
+    let tool = model.link_index(tip).unwrap();
     let (mut random, mut frames) = (Random::new(5), kinematics.frames());
     for _ in 0..20 {
         let q = random_q(&kinematics, &mut random);
         kinematics.forward(&q, &mut frames);
         let found = kinematics.link_frame(tool, &frames);
-        let links = q.iter().enumerate().map(|(joint, position)| Model::Ur5e.link(joint, *position).unwrap());
-        let expected = links.reduce(|pose, link| pose * link).unwrap();
+        let expected = of(&q);
         let turn = expected.rotation.to_rotation_matrix();
         for r in 0..3 {
             assert!((found.translation[r] - expected.translation.vector[r]).abs() < 1e-9);
             for c in 0..3 {
                 assert!((found.matrix3.col(c)[r] - turn[(r, c)]).abs() < 1e-9);
             }
+        }
+    }
+}
+
+#[test]
+fn a_ur5e_has_the_controllers_kinematics() {
+    use dimos::hardware::arms::ur::model::Model;
+
+    has_the_flange("ur5e", "tool0", |q| {
+        let links = q.iter().enumerate().map(|(joint, position)| Model::Ur5e.link(joint, *position).unwrap());
+        links.reduce(|pose, link| pose * link).unwrap()
+    });
+}
+
+#[test]
+fn fr3_and_fer_have_the_controllers_kinematics_and_limits() {
+    use dimos::hardware::arms::franka::model::Model;
+
+    for (name, arm) in [("fr3", Model::Fr3), ("fer", Model::Fer)] {
+        has_the_flange(name, "flange", |q| {
+            let links = q.iter().enumerate().map(|(joint, position)| Model::link(joint, *position).unwrap());
+            links.reduce(|pose, link| pose * link).unwrap() * nalgebra::Translation3::new(0.0, 0.0, Model::FLANGE)
+        });
+        let model = from_text(name, dimos::robot::builtin::text(name).unwrap()).unwrap();
+        let limits = arm.limits(false);
+        for (i, joint) in model.joints.iter().filter(|joint| joint.is_independent()).enumerate() {
+            let found = (joint.limits.lower, joint.limits.upper, joint.limits.velocity);
+            let expected = (limits.position_lower[i], limits.position_upper[i], limits.velocity_max[i]);
+            assert!(
+                (found.0 - expected.0).abs() + (found.1 - expected.1).abs() < 1e-9,
+                "{name} {found:?} {expected:?}"
+            );
+            assert!((found.2 - expected.2).abs() < 1e-4, "{name} {found:?} {expected:?}");
         }
     }
 }

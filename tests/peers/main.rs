@@ -5,6 +5,7 @@ mod support;
 
 mod can_kernel;
 mod feetech_sdk;
+mod franka;
 mod lerobot_bus;
 mod piper_kernel;
 mod piper_sdk;

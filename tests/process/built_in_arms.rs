@@ -84,6 +84,7 @@ fn grip(home: &Home, arm: &str, opening: f64) {
 
 const PIPER: &[f64] = &[0.4, 0.9, -0.9, -0.2, 0.3, 0.3];
 const SO101: &[f64] = &[0.3, -0.4, 0.5, 0.2, -0.6];
+const FR3: &[f64] = &[0.4, -0.4, -0.2, -2.1, 0.2, 1.9, 0.6];
 const UR5E: &[f64] = &[0.4, -1.3, 1.4, -1.6, -1.4, 0.3];
 const XARM6: &[f64] = &[0.2, -0.5, -0.9, 0.1, 1.3, -0.1];
 const XARM7: &[f64] = &[0.2, -0.4, 0.1, 0.8, 0.0, 1.2, -0.1];
@@ -121,6 +122,11 @@ fn coordinator_piper() {
 #[test]
 fn coordinator_so101() {
     exercise("coordinator-so101", &[Arm { name: "arm", target: SO101, gripper: Some(0.1) }]);
+}
+
+#[test]
+fn coordinator_fr3() {
+    exercise("coordinator-fr3", &[Arm { name: "arm", target: FR3, gripper: None }]);
 }
 
 #[test]

@@ -3,6 +3,8 @@
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult, JointReading, ManipulatorAdapter};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, EmulatorAddress};
@@ -17,6 +19,27 @@ const FAULT_AT: f64 = 1.0;
 
 /// Maximum wait for room for a setpoint.
 const ROOM: Duration = Duration::from_secs(1);
+
+/// Rate of the states of an arm whose controller is the clock: it ends a motion whose states are not answered [Hz].
+pub(super) const CLOCKED: f64 = 1000.0;
+
+/// Waits. The states of an arm whose controller is the clock are read meanwhile, as the device thread does.
+pub fn pause(adapter: &mut dyn ManipulatorAdapter, time: Duration) {
+    let until = Instant::now() + time;
+    if adapter.state_fd().is_none() || adapter.get_info().native_rate < CLOCKED {
+        return std::thread::sleep(time);
+    }
+    loop {
+        let left = until.saturating_duration_since(Instant::now());
+        let Some(states) = adapter.state_fd().filter(|_| !left.is_zero()) else { return std::thread::sleep(left) };
+        let timeout = Timespec { tv_sec: left.as_secs() as i64, tv_nsec: left.subsec_nanos().into() };
+        let came = poll(&mut [PollFd::from_borrowed_fd(states, PollFlags::IN)], Some(&timeout));
+        if came.is_ok_and(|ready| ready > 0) && adapter.read_joints(&mut JointReading::default()).is_err() {
+            // A broken connection stays readable.
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+}
 
 /// Retries a write while two setpoints are unacknowledged, as the device thread does.
 pub fn when_there_is_room(mut write: impl FnMut() -> AdapterResult<()>) -> AdapterResult<()> {
@@ -162,7 +185,7 @@ impl Context {
             if !matches!(result, Err(AdapterError::Rejected(_))) || Instant::now() > end {
                 return result;
             }
-            std::thread::sleep(Duration::from_millis(5));
+            pause(&mut *self.adapter, Duration::from_millis(5));
         }
     }
 
@@ -187,7 +210,7 @@ impl Context {
         if self.adapter.get_control_mode() == ControlMode::ServoPosition {
             for i in 1..=50 {
                 self.command(&between(start, goal, f64::from(i) / 50.0), 1.0)?;
-                std::thread::sleep(Duration::from_millis(10));
+                pause(&mut *self.adapter, Duration::from_millis(10));
             }
         } else {
             self.command(goal, 0.5)?;
@@ -220,7 +243,7 @@ impl Context {
             if MonotonicClock.now().since(asked) > WAIT_TIMEOUT {
                 return Err(format!("read_joints: no newer state within {WAIT_TIMEOUT:?}"));
             }
-            std::thread::sleep(Duration::from_millis(1));
+            pause(&mut *self.adapter, Duration::from_millis(1));
         }
     }
 
@@ -318,7 +341,7 @@ impl Context {
             if Instant::now() > end {
                 return Err(format!("{what}: not within {WAIT_TIMEOUT:?}"));
             }
-            std::thread::sleep(Duration::from_millis(5));
+            pause(&mut *self.adapter, Duration::from_millis(5));
         }
         Ok(())
     }
@@ -327,7 +350,7 @@ impl Context {
     pub fn standstill(&mut self) -> Result<Vec<f64>, String> {
         let mut last = self.positions()?;
         self.until("standstill", |context| {
-            std::thread::sleep(Duration::from_millis(50));
+            pause(&mut *context.adapter, Duration::from_millis(50));
             let now = context.positions()?;
             let still = farthest(&now, &last) <= context.rest();
             last = now;
@@ -339,7 +362,7 @@ impl Context {
     /// Checks for a third of a second that no joint moves by more than `most` [rad].
     pub fn stays(&mut self, from: &[f64], most: f64) -> Result<(), String> {
         for _ in 0..33 {
-            std::thread::sleep(Duration::from_millis(10));
+            pause(&mut *self.adapter, Duration::from_millis(10));
             let moved = farthest(&self.positions()?, from);
             if moved > most {
                 return Err(format!("the arm moved by {moved:.6} rad"));

@@ -2,7 +2,7 @@
 
 use super::Check;
 use super::Needs::{Faults, Motion, Nothing};
-use super::context::{Context, farthest, require};
+use super::context::{Context, farthest, pause, require};
 use super::streamed_state;
 use crate::hardware::adapter::{AdapterError, JointReading};
 use crate::hardware::sim::faults::{Fault, FaultKind};
@@ -78,7 +78,7 @@ fn stamps(context: &mut Context) -> Result<(), String> {
         require(stamp >= last, || format!("{stamp:?} after {last:?}"))?;
         require(stamp <= MonotonicClock.now(), || format!("{stamp:?} is in the future"))?;
         last = stamp;
-        std::thread::sleep(std::time::Duration::from_millis(2));
+        pause(&mut *context.adapter, std::time::Duration::from_millis(2));
     }
     Ok(())
 }

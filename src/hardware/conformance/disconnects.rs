@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use super::Check;
 use super::Needs::Faults;
-use super::context::{Context, farthest, require};
+use super::context::{Context, farthest, pause, require};
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, JointReading, Stop};
 use crate::hardware::sim::faults::{Fault, FaultKind};
@@ -104,9 +104,9 @@ fn in_motion(context: &mut Context) -> Result<(), String> {
     cut(context)?;
     reconnect(context)?;
     // An arm that stops on its own needs some time.
-    std::thread::sleep(Duration::from_millis(300));
+    pause(&mut *context.adapter, Duration::from_millis(300));
     let here = context.positions()?;
-    std::thread::sleep(Duration::from_millis(100));
+    pause(&mut *context.adapter, Duration::from_millis(100));
     let continued = farthest(&context.positions()?, &here) > 0.002;
     context.stop()?;
     let stopped = context.standstill()?;
@@ -137,7 +137,7 @@ fn while_streaming(context: &mut Context) -> Result<(), String> {
     for _ in 0..20 {
         point.iter_mut().zip(&step).for_each(|(value, step)| *value += step);
         context.command(&point, 1.0)?;
-        std::thread::sleep(Duration::from_millis(10));
+        pause(&mut *context.adapter, Duration::from_millis(10));
     }
     cut(context)?;
     let refused = context.adapter.write_joint_positions(&point, 1.0);

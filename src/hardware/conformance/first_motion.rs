@@ -12,11 +12,12 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-use super::context::farthest;
+use super::context::{CLOCKED, farthest, pause};
 use super::lag::{Lag, Trace};
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, JointReading, ManipulatorAdapter};
 use crate::joint::ControlMode;
+use crate::rt::host;
 
 /// How far each joint moves to either side [rad]: 2°.
 pub const REACH: f64 = 2.0 * DEGREE;
@@ -166,6 +167,10 @@ struct FirstMotion<'a> {
 impl FirstMotion<'_> {
     /// Runs `motions` and restores the state of the motors.
     fn run(mut self, motions: impl FnOnce(&mut Self) -> Result<(), FirstMotionEnd>) -> Motion {
+        if self.adapter.get_info().native_rate >= CLOCKED {
+            // It wants an answer every millisecond: as in a device thread.
+            host::enter_realtime(host::DEVICE_PRIORITY);
+        }
         let was_on = self.adapter.read_enabled().unwrap_or(true);
         match catch_unwind(AssertUnwindSafe(|| motions(&mut self))) {
             Ok(Ok(())) => {}
@@ -175,6 +180,18 @@ impl FirstMotion<'_> {
         }
         self.leave_arm(was_on);
         self.motion
+    }
+
+    /// Returns the lag of the last motion. Its computation may take longer than an arm waits for an answer.
+    fn lag(&mut self) -> Option<f64> {
+        let (trace, adapter) = (self.trace.as_ref()?, &mut *self.adapter);
+        std::thread::scope(|scope| {
+            let computed = scope.spawn(|| trace.lag());
+            while !computed.is_finished() {
+                pause(adapter, Duration::from_millis(2));
+            }
+            computed.join().ok().flatten()
+        })
     }
 
     /// Measures the lag of each joint [s].
@@ -191,7 +208,7 @@ impl FirstMotion<'_> {
                 }
                 self.trace = Some(Trace::default());
                 self.move_out_and_back(joint, mode)?;
-                lag = self.trace.as_ref().and_then(Trace::lag);
+                lag = self.lag();
                 if lag.is_some() {
                     break;
                 }

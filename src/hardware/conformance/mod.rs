@@ -25,6 +25,7 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use crate::hardware::registry::AdapterSpec;
+use crate::rt::host;
 use crate::sync::{lock, panic_text};
 
 /// Effect of a check on the arm.
@@ -119,6 +120,9 @@ pub fn run_on(subject: &Subject, check: &Check) -> (Outcome, Option<String>) {
 
 /// Maximum number of parallel checks of an emulated arm: they mostly wait for motion.
 const MAX_PARALLEL: usize = 12;
+/// The same for an arm whose controller is the clock: it wants an answer every millisecond, and ends a motion without
+/// answers. Its checks run with the priority of a device thread.
+const MAX_CLOCKED: usize = 2;
 
 /// A check, its result, and its finding for the report.
 pub type Made = (&'static Check, Outcome, Option<String>);
@@ -134,10 +138,18 @@ pub fn run_all(
     let next = AtomicUsize::new(0);
     let made = Mutex::new(Vec::new());
     // A real device has one connection: one check at a time.
-    let workers = if subject.real { 1 } else { MAX_PARALLEL };
+    let clocked = subject.row.native_rate >= context::CLOCKED;
+    let workers = match (subject.real, clocked) {
+        (true, _) => 1,
+        (false, true) => MAX_CLOCKED,
+        (false, false) => MAX_PARALLEL,
+    };
     std::thread::scope(|scope| {
         for _ in 0..workers {
             scope.spawn(|| {
+                if clocked {
+                    host::enter_realtime(host::DEVICE_PRIORITY);
+                }
                 loop {
                     let index = next.fetch_add(1, Ordering::Relaxed);
                     let Some(check) = checks.get(index).filter(|_| !interrupted()) else { return };

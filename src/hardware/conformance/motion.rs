@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use super::Check;
 use super::Needs::Motion;
-use super::context::{Context, between, farthest, require};
+use super::context::{Context, between, farthest, pause, require};
 use crate::hardware::adapter::JointReading;
 use crate::joint::ControlMode;
 
@@ -120,7 +120,7 @@ fn compare_velocities(context: &mut Context, from: &[f64], to: &[f64]) -> Result
         if servo {
             context.command(&between(from, to, f64::from(i) / f64::from(POINTS)), 1.0)?;
         }
-        std::thread::sleep(Duration::from_millis(10));
+        pause(&mut *context.adapter, Duration::from_millis(10));
         let reading = context.joints()?;
         let now = reading.stamp.map_or(began.elapsed().as_secs_f64(), |stamp| stamp.0 as f64 * 1e-9);
         if let Some((then, before)) = last {
@@ -152,7 +152,7 @@ fn stream_velocities(context: &mut Context) -> Result<(), String> {
     let mut end = (start, Instant::now());
     for i in 0..40 {
         context.command_velocities(&wanted)?;
-        std::thread::sleep(Duration::from_millis(10));
+        pause(&mut *context.adapter, Duration::from_millis(10));
         let reading = context.joints()?;
         let positions = reading.position.get(..wanted.len()).unwrap_or_default().to_vec();
         end = (positions, Instant::now());

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use super::Check;
 use super::Needs::{Faults, Motion};
-use super::context::{Context, farthest, require};
+use super::context::{Context, farthest, pause, require};
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, JointReading, Stop};
 use crate::hardware::device::gripper::GripperStop;
@@ -91,7 +91,7 @@ fn stop_ends_streaming(context: &mut Context) -> Result<(), String> {
     };
     for i in 1..=40 {
         context.command(&point(f64::from(i) / 40.0), 1.0)?;
-        std::thread::sleep(Duration::from_millis(10));
+        pause(&mut *context.adapter, Duration::from_millis(10));
     }
     context.stop()?;
     let stopped = context.standstill()?;
@@ -111,7 +111,7 @@ fn stop_ends_velocity(context: &mut Context) -> Result<(), String> {
     let wanted: Vec<f64> = start.iter().zip(&away).map(|(a, b)| SPEED.copysign(b - a)).collect();
     for _ in 0..30 {
         context.command_velocities(&wanted)?;
-        std::thread::sleep(Duration::from_millis(10));
+        pause(&mut *context.adapter, Duration::from_millis(10));
     }
     let moving = farthest(&context.positions()?, &start);
     require(moving > 0.003, || format!("0.3 s at {SPEED} rad/s moved it by {moving:.4} rad"))?;
@@ -192,7 +192,7 @@ fn stop_gripper_on_its_way(context: &mut Context, target: f64) -> Result<Option<
 }
 
 fn gripper_stays(context: &mut Context, stopped: f64) -> Result<(), String> {
-    std::thread::sleep(Duration::from_millis(300));
+    pause(&mut *context.adapter, Duration::from_millis(300));
     let now = context.gripper()?.unwrap_or(f64::NAN);
     require((now - stopped).abs() < 0.001, || format!("it moved from {stopped:.4} to {now:.4} m"))
 }

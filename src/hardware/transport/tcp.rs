@@ -131,6 +131,11 @@ impl TcpLink {
         &self.peer
     }
 
+    /// Returns the addresses of this side and of the peer.
+    pub fn addresses(&self) -> std::io::Result<(SocketAddr, SocketAddr)> {
+        Ok((self.stream.local_addr()?, self.stream.peer_addr()?))
+    }
+
     /// Sends all of `bytes`.
     pub fn send(&mut self, bytes: &[u8]) -> AdapterResult<()> {
         self.stream.write_all(bytes).map_err(|e| broken(&self.peer, &e))

@@ -6,7 +6,7 @@ use super::excursion::MOVE_TIMEOUT;
 use super::{DEGREE, FirstMotion, FirstMotionEnd};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, JointReading};
-use crate::hardware::conformance::context::farthest;
+use crate::hardware::conformance::context::{farthest, pause};
 
 /// Maximum age of a state [s].
 const MAX_STATE_AGE: f64 = 0.5;
@@ -42,8 +42,8 @@ impl FirstMotion<'_> {
         Ok((positions.to_vec(), reading, at))
     }
 
-    pub(super) fn pause(&self) -> Result<(), FirstMotionEnd> {
-        std::thread::sleep(PERIOD);
+    pub(super) fn pause(&mut self) -> Result<(), FirstMotionEnd> {
+        pause(self.adapter, PERIOD);
         if (self.interrupted)() { Err(FirstMotionEnd::Interrupted) } else { Ok(()) }
     }
 
@@ -68,7 +68,7 @@ impl FirstMotion<'_> {
     pub(super) fn wait_for_standstill(&mut self) -> Result<Vec<f64>, FirstMotionEnd> {
         let mut last = self.read()?.0;
         self.until(MOVE_TIMEOUT, "the arm does not stop within 15 s", |it| {
-            std::thread::sleep(Duration::from_millis(100));
+            pause(it.adapter, Duration::from_millis(100));
             let now = it.read()?.0;
             let still = farthest(&now, &last) < 0.05 * DEGREE;
             last = now;

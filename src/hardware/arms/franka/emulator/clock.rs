@@ -1,0 +1,110 @@
+//! The controller's clock: a thread with absolute deadlines, one cycle and one state each. It never waits for a client.
+
+use std::net::{SocketAddr, UdpSocket};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use super::control::Control;
+use crate::clock::{Clock, MonotonicClock};
+use crate::hardware::sim::tcp_server::TcpServer;
+use crate::rt::host;
+
+/// A cycle that begins later than this leaves its client too little time: the clock continues from there.
+const LATE: Duration = Duration::from_micros(300);
+/// Cycles between two states of the hand.
+const HAND: u64 = 10;
+/// Longest command that is received [bytes], and the most of them in a cycle.
+const BUFFER: usize = 512;
+const MOST: usize = 64;
+
+/// What the network does to datagrams, each way: shares from 0 to 1.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Network {
+    pub lose: f64,
+    pub repeat: f64,
+    pub reorder: f64,
+}
+
+/// Datagrams on their way.
+struct Way {
+    network: Network,
+    random: u64,
+    /// One that the next one overtakes.
+    held: Option<(SocketAddr, Vec<u8>)>,
+}
+
+impl Way {
+    fn new(network: Network, seed: u64) -> Self {
+        Self { network, random: seed, held: None }
+    }
+
+    /// Returns true in a share of all calls.
+    fn chance(&mut self, share: f64) -> bool {
+        if share <= 0.0 {
+            return false;
+        }
+        self.random ^= self.random << 13;
+        self.random ^= self.random >> 7;
+        self.random ^= self.random << 17;
+        ((self.random >> 11) as f64 / (1_u64 << 53) as f64) < share
+    }
+
+    /// Passes a datagram on: once, twice, after the next one, or not at all.
+    fn pass(&mut self, at: SocketAddr, bytes: &[u8], mut to: impl FnMut(SocketAddr, &[u8])) {
+        if self.chance(self.network.lose) {
+            return;
+        }
+        if self.held.is_none() && self.chance(self.network.reorder) {
+            self.held = Some((at, bytes.to_vec()));
+            return;
+        }
+        to(at, bytes);
+        if self.chance(self.network.repeat) {
+            to(at, bytes);
+        }
+        if let Some((at, bytes)) = self.held.take() {
+            to(at, &bytes);
+        }
+    }
+}
+
+/// Runs until `ends`. `drift` is how much slower than ours the clock is, as a fraction.
+pub(super) fn run(
+    server: &Arc<TcpServer<Control>>,
+    socket: &UdpSocket,
+    ends: &AtomicBool,
+    (network, drift): (Network, f64),
+) {
+    host::enter_realtime(host::EMULATOR_PRIORITY);
+    let period = Duration::from_secs_f64(super::control::CYCLE * (1.0 + drift));
+    let (mut states, mut commands) = (Way::new(network, 0x9E37_79B9), Way::new(network, 0x7F4A_7C15));
+    let mut buffer = [0; BUFFER];
+    let mut due = MonotonicClock.now().after(period);
+    while !ends.load(Ordering::Acquire) {
+        host::sleep_until(due);
+        let now = MonotonicClock.now();
+        let late = now.since(due) > LATE;
+        if late {
+            due = now;
+        }
+        let (state, hand) = server.with(|control, _| {
+            control.figures.late_wakes += u64::from(late);
+            for _ in 0..MOST {
+                let Ok((length, from)) = socket.recv_from(&mut buffer) else { break };
+                let bytes = buffer.get(..length).unwrap_or_default();
+                commands.pass(from, bytes, |_, bytes| control.take_command(bytes));
+            }
+            let state = control.cycle(now);
+            let hand = if control.id.is_multiple_of(HAND) { control.hand.state() } else { None };
+            (state, hand)
+        });
+        if let Some((to, bytes)) = state {
+            states.pass(to, &bytes, |to, bytes| drop(socket.send_to(bytes, to)));
+        }
+        if let Some((to, bytes)) = hand {
+            let _ = socket.send_to(&bytes, to);
+        }
+        due = due.after(period);
+    }
+}

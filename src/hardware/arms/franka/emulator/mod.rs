@@ -1,0 +1,260 @@
+//! The emulator of a controller with its arm, for `address: sim`, for tests, and for other clients such as the
+//! vendor's.
+//!
+//! Written from the protocol, and shares no code with the adapter besides the models' dimensions and limits. It keeps
+//! the controller's rules: a command counts only if it answers the state that was sent last, before the next one is
+//! sent; what it commands is judged, and never made smoother.
+
+mod clock;
+mod control;
+mod hand;
+mod judge;
+mod ports;
+mod services;
+#[cfg(test)]
+mod tests;
+mod urdf;
+mod wire;
+
+use std::net::{IpAddr, SocketAddr, TcpListener, UdpSocket};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::model::Model;
+use super::protocol::{DOF, PORT};
+use crate::clock::{Clock, MonotonicClock};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
+use crate::hardware::check::ConfigError;
+use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
+use crate::hardware::sim::arm;
+use crate::hardware::sim::faults::{Fault, FaultKind};
+use crate::hardware::sim::tcp_server::{Port, TcpServer, cannot_listen, ports_in_a_row};
+use crate::joint::{JointLimits, Joints};
+use clock::Network;
+use control::Control;
+pub use control::{Datagram, Figures};
+
+/// The faults that the controller can play.
+const PLAYABLE: &[FaultKind] = &[
+    FaultKind::Stall,
+    FaultKind::Silent,
+    FaultKind::Disconnect,
+    FaultKind::ErrorCode,
+    FaultKind::Estop,
+    FaultKind::PowerLoss,
+    FaultKind::Nan,
+    FaultKind::ZeroState,
+    FaultKind::Garbage,
+    FaultKind::Corrupt,
+    FaultKind::Truncated,
+    FaultKind::WrongModel,
+    FaultKind::Frozen,
+    FaultKind::Blocked,
+    FaultKind::Pushed,
+];
+/// Most connections at once, to arm and hand.
+const CLIENTS: usize = 8;
+/// Attempts to find two consecutive free ports.
+const ATTEMPTS: u32 = 200;
+/// Time between two looks for answers that are due.
+const ANSWERS: Duration = Duration::from_millis(1);
+
+/// Settings of the emulator.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct SimOptions {
+    /// Joint positions at power-up [rad], one per joint; a pose of its own when empty.
+    pub initial_positions: Vec<f64>,
+    /// Lag of the joints behind the commands, 0 to 0.5 [s].
+    #[schemars(range(min = 0, max = 0.5))]
+    pub lag: f64,
+    /// How far below its target a joint rests under load, 0 to 0.1 [rad].
+    #[schemars(range(min = 0, max = 0.1))]
+    pub droop: f64,
+    /// Share of the states, and of the commands, that the network loses, 0 to 1.
+    #[schemars(range(min = 0, max = 1))]
+    pub lose: f64,
+    /// Share of them that come twice, 0 to 1.
+    #[schemars(range(min = 0, max = 1))]
+    pub repeat: f64,
+    /// Share of them that the next one overtakes, 0 to 1.
+    #[schemars(range(min = 0, max = 1))]
+    pub reorder: f64,
+    /// How much slower than this computer's the controller's clock is, -1000 to 1000 [ppm].
+    #[schemars(range(min = -1000, max = 1000))]
+    pub drift: f64,
+    /// Commands lost in a row that end a motion, 1 to 1000; a real controller: 20. More for a computer that is too busy
+    /// for 1 kHz.
+    #[schemars(range(min = 1, max = 1000))]
+    pub lost_limit: u32,
+    /// Faults, and when they begin (seconds after the first connection).
+    pub faults: Vec<Fault>,
+}
+
+impl Default for SimOptions {
+    fn default() -> Self {
+        Self {
+            initial_positions: Vec::new(),
+            lag: 0.004,
+            droop: 0.0,
+            lose: 0.0,
+            repeat: 0.0,
+            reorder: 0.0,
+            drift: 0.0,
+            lost_limit: 20,
+            faults: Vec::new(),
+        }
+    }
+}
+
+impl SimOptions {
+    /// Returns an error for values that the emulator cannot have.
+    pub(super) fn check(&self, limits: &JointLimits) -> Result<(), ConfigError> {
+        let range = |name: &str, value: f64, (least, most): (f64, f64)| {
+            let what = || format!("{name} must be {least} to {most}, not {value}");
+            if (least..=most).contains(&value) { Ok(()) } else { Err(ConfigError::new(format!("sim.{name}"), what())) }
+        };
+        range("lose", self.lose, (0.0, 1.0))?;
+        range("repeat", self.repeat, (0.0, 1.0))?;
+        range("reorder", self.reorder, (0.0, 1.0))?;
+        range("drift", self.drift, (-1000.0, 1000.0))?;
+        range("lost_limit", self.lost_limit.into(), (1.0, 1000.0))?;
+        self.common().check("franka", limits, PLAYABLE)
+    }
+
+    fn common(&self) -> arm::SimOptions {
+        let Self { initial_positions, lag, droop, faults, .. } = self.clone();
+        arm::SimOptions { initial_positions, lag, droop, faults }
+    }
+}
+
+/// A running emulator. Ends when it is dropped.
+pub struct FrankaEmulator {
+    server: Arc<TcpServer<Control>>,
+    address: SocketAddr,
+    ends: Arc<AtomicBool>,
+    clock: Option<JoinHandle<()>>,
+}
+
+impl FrankaEmulator {
+    /// Starts an emulator at `place` of the arm that a configuration describes.
+    pub fn start(config: &AdapterConfig, place: &EmulatorAddress) -> AdapterResult<Self> {
+        config.check(super::check)?;
+        let options: super::Options = config.options()?;
+        let ip = place.tcp(PORT)?.ip();
+        let (first, listeners) = match place {
+            EmulatorAddress::InProcess => (0..ATTEMPTS)
+                .find_map(|_| listen(ip, 0).ok())
+                .ok_or_else(|| AdapterError::Io(format!("franka emulator: no two consecutive free ports at {ip}")))?,
+            _ => listen(ip, PORT).map_err(|e| cannot_listen("franka emulator", SocketAddr::new(ip, PORT), &e))?,
+        };
+        let serve = |e: std::io::Error| AdapterError::Io(format!("franka emulator: cannot serve: {e}"));
+        let mut control = Control::new(options.model, &options.sim, MonotonicClock.now())?;
+        if ip.is_ipv6() {
+            control.clients_at = ip;
+        }
+        let socket = UdpSocket::bind((ip, 0)).map_err(serve)?;
+        socket.set_nonblocking(true).map_err(serve)?;
+        let ports = listeners.into_iter().map(|listener| (listener, Port::Sessions(ANSWERS))).collect();
+        let server = Arc::new(TcpServer::with_ports("franka", control, ports, CLIENTS).map_err(serve)?);
+        let ends = Arc::new(AtomicBool::new(false));
+        let sim = options.sim;
+        let network = Network { lose: sim.lose, repeat: sim.repeat, reorder: sim.reorder };
+        let (shared, end) = (server.clone(), ends.clone());
+        let clock = std::thread::Builder::new()
+            .name("franka-sim-clock".to_owned())
+            .spawn(move || clock::run(&shared, &socket, &end, (network, sim.drift * 1e-6)))
+            .map_err(serve)?;
+        Ok(Self { server, address: SocketAddr::new(ip, first), ends, clock: Some(clock) })
+    }
+
+    fn with<T>(&self, act: impl FnOnce(&mut Control) -> T) -> T {
+        self.server.with(|control, _| act(control))
+    }
+
+    /// Returns what happened so far.
+    pub fn figures(&self) -> Figures {
+        self.with(|control| control.figures)
+    }
+
+    /// Applies external torques to the joints [Nm].
+    pub fn push(&self, torques: [f64; DOF]) {
+        self.with(|control| control.external = torques);
+    }
+
+    /// Presses or releases the user stop.
+    pub fn user_stop(&self, pressed: bool) {
+        self.with(|control| control.user_stop(pressed));
+    }
+
+    /// Presses or releases the guiding button.
+    pub fn guide(&self, pressed: bool) {
+        self.with(|control| control.guide(pressed));
+    }
+
+    /// Returns the stiffness of the joints [Nm/rad], and the upper thresholds of external torques [Nm].
+    pub fn settings(&self) -> ([f64; DOF], [f64; DOF]) {
+        self.with(|control| (control.impedance, control.thresholds.1))
+    }
+
+    /// Puts an object between the fingers [m], or takes it away.
+    pub fn place_object(&self, width: Option<f64>) {
+        self.with(|control| control.hand.object = width);
+    }
+
+    /// Sets whether the hand has been homed.
+    pub fn set_homed(&self, homed: bool) {
+        self.with(|control| control.hand.homed = homed);
+    }
+
+    /// Begins to record datagrams.
+    pub fn record(&self) {
+        self.with(|control| control.traffic.start());
+    }
+
+    /// Returns the datagrams since then.
+    pub fn traffic(&self) -> Vec<Datagram> {
+        self.with(|control| control.traffic.entries())
+    }
+}
+
+impl Drop for FrankaEmulator {
+    fn drop(&mut self) {
+        self.ends.store(true, Ordering::Release);
+        if let Some(clock) = self.clock.take() {
+            let _ = clock.join();
+        }
+    }
+}
+
+/// Listens at two ports from `first`; from any free port if that is 0.
+fn listen(ip: IpAddr, first: u16) -> std::io::Result<(u16, Vec<TcpListener>)> {
+    let all = ports_in_a_row(ip, first, 2)?;
+    let first = all.first().map_or(Ok(0), |listener| listener.local_addr().map(|at| at.port()))?;
+    Ok((first, all))
+}
+
+impl Emulator for FrankaEmulator {
+    fn address(&self) -> String {
+        self.address.to_string()
+    }
+
+    fn inject(&self, fault: Fault) -> Result<(), String> {
+        self.server.inject(fault)
+    }
+
+    fn true_positions(&self) -> Option<Joints> {
+        self.server.true_positions()
+    }
+}
+
+/// Returns the limits within which the emulated joints move: the controller's, with a drive that is stronger.
+fn limits(model: Model) -> JointLimits {
+    let limits = model.limits(true);
+    JointLimits { acceleration_max: vec![40.0; DOF], ..limits }
+}

@@ -1,0 +1,95 @@
+//! The hand: its own connection, to the next port.
+
+use std::net::UdpSocket;
+use std::time::Duration;
+
+use super::Options;
+use super::protocol::gripper::{Request, STATE, VERSION, request, scan, state};
+use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
+use crate::hardware::transport::tcp::{Endpoint, TcpLink};
+
+/// Timeout of the connection and of its answer.
+const ANSWER: Duration = Duration::from_millis(700);
+/// The width is unknown after this time without a state.
+const STALE: Duration = Duration::from_millis(500);
+/// Widths below this close the hand [m].
+const CLOSED: f64 = 0.001;
+/// Widest opening according to the data sheet [m].
+pub const RANGE: (f64, f64) = (0.0, 0.08);
+
+/// A connected hand.
+pub struct Hand {
+    tcp: TcpLink,
+    udp: UdpSocket,
+    last_id: u32,
+    /// Width, largest width [m], and when they came.
+    newest: Option<(f64, f64, Mono)>,
+    speed: f64,
+    force: f64,
+}
+
+impl Hand {
+    /// Connects to the hand of the arm at `arm`.
+    pub fn connect(arm: &Endpoint, options: &Options) -> AdapterResult<Self> {
+        let at = Endpoint { host: arm.host.clone(), port: arm.port.saturating_add(1) };
+        let mut tcp = TcpLink::connect("franka gripper", &at, ANSWER)?;
+        let io = |e: std::io::Error| AdapterError::Io(format!("franka gripper at {at}: cannot receive states: {e}"));
+        let (here, _) = tcp.addresses().map_err(io)?;
+        let udp = UdpSocket::bind((here.ip(), 0)).map_err(io)?;
+        udp.set_nonblocking(true).map_err(io)?;
+        tcp.send(&request(1, Request::Connect(udp.local_addr().map_err(io)?.port())))?;
+        match tcp.receive(ANSWER, scan)? {
+            (_, 0) => {}
+            _ => {
+                let what = format!("franka gripper at {at}: it has another version of the interface than {VERSION}");
+                return Err(AdapterError::Rejected(what));
+            }
+        }
+        let (speed, force) = (options.gripper_speed, options.gripper_force);
+        Ok(Self { tcp, udp, last_id: 1, newest: None, speed, force })
+    }
+
+    fn update(&mut self) -> AdapterResult<()> {
+        let mut buffer = [0; 2 * STATE];
+        for _ in 0..64 {
+            let Ok(length) = self.udp.recv(&mut buffer) else { break };
+            if let Some((width, most)) = state(buffer.get(..length).unwrap_or_default()) {
+                self.newest = Some((width, most, MonotonicClock.now()));
+            }
+        }
+        // Answers come when a motion ends; the width shows how.
+        while self.tcp.poll(scan)?.is_some() {}
+        Ok(())
+    }
+
+    fn known(&self) -> Option<(f64, f64)> {
+        let (width, most, at) = self.newest?;
+        (MonotonicClock.now().since(at) < STALE).then_some((width, most))
+    }
+
+    /// Returns the width [m], if it is known.
+    pub fn width(&mut self) -> AdapterResult<Option<f64>> {
+        self.update()?;
+        Ok(self.known().map(|(width, _)| width))
+    }
+
+    /// Moves the fingers to a width [m]. Closing grasps, with the force of the blueprint.
+    pub fn move_to(&mut self, width: f64) -> AdapterResult<()> {
+        self.update()?;
+        let (_, most) = self.known().ok_or_else(|| AdapterError::Timeout("the gripper sends no state".into()))?;
+        if most <= 0.0 {
+            let what = "the gripper was not homed since it was switched on\nhint: home it in the vendor's Desk";
+            return Err(AdapterError::Rejected(what.into()));
+        }
+        if !(0.0..=most + CLOSED).contains(&width) {
+            return Err(AdapterError::Rejected(format!("the gripper opens 0 to {most:.3} m, not {width} m")));
+        }
+        self.last_id = self.last_id.wrapping_add(1);
+        let order = match width < CLOSED && self.force > 0.0 {
+            true => Request::Grasp(width, self.speed, self.force),
+            false => Request::Move(width.min(most), self.speed),
+        };
+        self.tcp.send(&request(self.last_id, order))
+    }
+}
