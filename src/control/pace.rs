@@ -106,6 +106,10 @@ impl Pacer {
             if !early {
                 return Some(self.prompted(woke, stamp.min(woke)));
             }
+            if self.silent {
+                // It sends again, in another phase: the next tick is that of its next state.
+                (self.due, self.silent) = (stamp.min(woke).after(self.period), false);
+            }
         }
         (woke >= self.latest()).then(|| self.unprompted(woke))
     }
@@ -249,11 +253,21 @@ mod tests {
             assert_eq!(pacer.latest(), at);
             assert_eq!(now_and_skipped(pacer.begin(at, Some((1, ms(100.0))))), Some((at, 0, true)));
         }
-        // It sends again: within half a period of the latest tick nothing begins.
+        // It sends again, in another phase: within half a period of the latest tick nothing begins.
         assert_eq!(pacer.begin(ms(154.0), Some((2, ms(154.0)))), None);
-        let start = pacer.begin(ms(156.0), Some((3, ms(156.0))));
-        assert_eq!(now_and_skipped(start), Some((ms(156.0), 0, false)));
-        assert_eq!(pacer.latest(), ms(166.0).after(P / 3));
+        assert_eq!(pacer.latest(), ms(164.0).after(P / 3));
+        for k in 0..5u8 {
+            let at = ms(164.0 + 10.0 * f64::from(k));
+            assert_eq!(now_and_skipped(pacer.begin(at, Some((3 + u64::from(k), at)))), Some((at, 0, false)));
+        }
+    }
+
+    #[test]
+    fn a_state_half_a_period_after_the_tick_without_one_begins_the_next() {
+        let mut pacer = device(P);
+        pacer.begin(ms(100.0), Some((1, ms(100.0))));
+        assert!(pacer.begin(ms(113.4), Some((1, ms(100.0)))).is_some_and(|start| start.unprompted));
+        assert_eq!(now_and_skipped(pacer.begin(ms(118.4), Some((2, ms(118.4))))), Some((ms(118.4), 0, false)));
     }
 
     #[test]
