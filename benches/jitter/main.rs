@@ -2,6 +2,7 @@
 //! it.
 
 mod cyclictest;
+mod device_clock;
 mod ours;
 #[path = "../support/mod.rs"]
 #[allow(dead_code, reason = "shared with the other benchmark")]
@@ -71,6 +72,10 @@ fn main() -> ExitCode {
         if let Err(e) = compare(rate, effort, yardstick) {
             support::skipped(&format!("{rate} Hz: {e}"));
         }
+    }
+    println!("From a state of an emulated Franka controller to the command that answers it, in µs.\n");
+    if let Err(e) = device_clock::compare(effort) {
+        support::skipped(&format!("device clock: {e}"));
     }
     effort.end()
 }

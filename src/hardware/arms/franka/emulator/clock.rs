@@ -5,9 +5,12 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+
 use super::control::Control;
-use crate::clock::{Clock, MonotonicClock};
+use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::sim::tcp_server::TcpServer;
+use crate::rt::histogram::Histogram;
 use crate::rt::host;
 
 /// A cycle that begins later than this leaves its client too little time: the clock continues from there.
@@ -69,20 +72,44 @@ impl Way {
     }
 }
 
-/// Runs until `ends`. `drift` is how much slower than ours the clock is, as a fraction.
+/// Returns whether a command has arrived, once it has; `false` at `due`.
+fn readable_before(socket: &UdpSocket, due: Mono) -> bool {
+    let left = due.since(MonotonicClock.now());
+    let timeout = Timespec { tv_sec: 0, tv_nsec: left.subsec_nanos().into() };
+    !left.is_zero() && matches!(poll(&mut [PollFd::new(socket, PollFlags::IN)], Some(&timeout)), Ok(1..))
+}
+
+/// Runs until `ends`. `drift` is how much slower than ours the clock is, as a fraction; `answers` gets the time from each
+/// state to the command that was used.
 pub(super) fn run(
     server: &Arc<TcpServer<Control>>,
     socket: &UdpSocket,
     ends: &AtomicBool,
     (network, drift): (Network, f64),
+    answers: &Histogram,
 ) {
     host::enter_realtime(host::EMULATOR_PRIORITY);
     let period = Duration::from_secs_f64(super::control::CYCLE * (1.0 + drift));
     let (mut states, mut commands) = (Way::new(network, 0x9E37_79B9), Way::new(network, 0x7F4A_7C15));
     let mut buffer = [0; BUFFER];
     let mut due = MonotonicClock.now().after(period);
+    let mut sent = due;
     while !ends.load(Ordering::Acquire) {
-        host::sleep_until(due);
+        // Commands are taken as they come: when they came is measured.
+        while readable_before(socket, due) {
+            let now = MonotonicClock.now();
+            server.with(|control, _| {
+                for _ in 0..MOST {
+                    let Ok((length, from)) = socket.recv_from(&mut buffer) else { break };
+                    let bytes = buffer.get(..length).unwrap_or_default();
+                    commands.pass(from, bytes, |_, bytes| {
+                        if control.take_command(bytes) {
+                            answers.record(now.since(sent).as_nanos() as u64);
+                        }
+                    });
+                }
+            });
+        }
         let now = MonotonicClock.now();
         let late = now.since(due) > LATE;
         if late {
@@ -90,15 +117,11 @@ pub(super) fn run(
         }
         let (state, hand) = server.with(|control, _| {
             control.figures.late_wakes += u64::from(late);
-            for _ in 0..MOST {
-                let Ok((length, from)) = socket.recv_from(&mut buffer) else { break };
-                let bytes = buffer.get(..length).unwrap_or_default();
-                commands.pass(from, bytes, |_, bytes| control.take_command(bytes));
-            }
             let state = control.cycle(now);
             let hand = if control.id.is_multiple_of(HAND) { control.hand.state() } else { None };
             (state, hand)
         });
+        sent = MonotonicClock.now();
         if let Some((to, bytes)) = state {
             states.pass(to, &bytes, |to, bytes| drop(socket.send_to(bytes, to)));
         }

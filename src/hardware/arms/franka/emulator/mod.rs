@@ -35,6 +35,7 @@ use crate::hardware::sim::arm;
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::sim::tcp_server::{Port, TcpServer, cannot_listen, ports_in_a_row};
 use crate::joint::{JointLimits, Joints};
+use crate::rt::histogram::{self, Histogram};
 use clock::Network;
 use control::Control;
 pub use control::{Datagram, Figures};
@@ -138,6 +139,7 @@ pub struct FrankaEmulator {
     server: Arc<TcpServer<Control>>,
     address: SocketAddr,
     ends: Arc<AtomicBool>,
+    answers: Arc<Histogram>,
     clock: Option<JoinHandle<()>>,
 }
 
@@ -165,12 +167,13 @@ impl FrankaEmulator {
         let ends = Arc::new(AtomicBool::new(false));
         let sim = options.sim;
         let network = Network { lose: sim.lose, repeat: sim.repeat, reorder: sim.reorder };
-        let (shared, end) = (server.clone(), ends.clone());
+        let answers = Arc::new(Histogram::default());
+        let (shared, end, times) = (server.clone(), ends.clone(), answers.clone());
         let clock = std::thread::Builder::new()
             .name("franka-sim-clock".to_owned())
-            .spawn(move || clock::run(&shared, &socket, &end, (network, sim.drift * 1e-6)))
+            .spawn(move || clock::run(&shared, &socket, &end, (network, sim.drift * 1e-6), &times))
             .map_err(serve)?;
-        Ok(Self { server, address: SocketAddr::new(ip, first), ends, clock: Some(clock) })
+        Ok(Self { server, address: SocketAddr::new(ip, first), ends, answers, clock: Some(clock) })
     }
 
     fn with<T>(&self, act: impl FnOnce(&mut Control) -> T) -> T {
@@ -180,6 +183,11 @@ impl FrankaEmulator {
     /// Returns what happened so far.
     pub fn figures(&self) -> Figures {
         self.with(|control| control.figures)
+    }
+
+    /// Returns the time from each state to the command that answered it.
+    pub fn answer_times(&self) -> histogram::Figures {
+        self.answers.figures()
     }
 
     /// Applies external torques to the joints [Nm].

@@ -170,14 +170,16 @@ impl Control {
         self.answers.push((who, wire::answer(code, id, status, &[])));
     }
 
-    /// Takes a datagram: a command counts if it answers the state that was sent last.
-    pub(super) fn take_command(&mut self, bytes: &[u8]) {
+    /// Takes a datagram: a command counts if it answers the state that was sent last. Returns whether it does.
+    pub(super) fn take_command(&mut self, bytes: &[u8]) -> bool {
         self.traffic.push(|| Datagram::Command(bytes.to_vec()));
         match wire::command(bytes, self.wide()) {
             Some((id, command)) if id == self.id && self.motion.is_some() && self.command.is_none() => {
                 self.command = Some(command);
+                return true;
             }
             _ => self.figures.unused += 1,
         }
+        false
     }
 }
