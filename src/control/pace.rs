@@ -307,4 +307,29 @@ mod tests {
         let start = pacer.begin(ms(100.0), Some((1, ms(400.0)))).unwrap();
         assert_eq!(start.time.now, ms(100.0));
     }
+
+    #[test]
+    fn on_the_grid_an_overrun_is_reported_with_the_lateness_that_caused_it() {
+        let mut pacer = Pacer::new(Source::Host, ms(90.0), P);
+        let mut at = |woke: f64| {
+            let TickTime { now, next, skipped, late_ns, woke_late_ns } = pacer.begin(ms(woke), None).unwrap().time;
+            (now, next, skipped, late_ns / 1_000_000, woke_late_ns / 1_000_000)
+        };
+        assert_eq!(at(100.0), (ms(100.0), ms(110.0), 0, 0, 0));
+        // Late by more than half a period: the next deadline is skipped, and reported by the tick after it.
+        assert_eq!(at(118.0), (ms(110.0), ms(130.0), 0, 8, 8));
+        assert_eq!(at(131.0), (ms(130.0), ms(140.0), 1, 8, 1));
+        // Late by two periods.
+        assert_eq!(at(163.0), (ms(160.0), ms(170.0), 2, 23, 23));
+        assert_eq!(at(170.0), (ms(170.0), ms(180.0), 0, 0, 0));
+    }
+
+    #[test]
+    fn limits_of_what_is_too_early() {
+        let mut pacer = device(P);
+        pacer.begin(ms(100.0), Some((1, ms(100.0))));
+        assert!(pacer.begin(ms(105.0), Some((2, ms(105.0)))).is_some(), "half a period after the last");
+        // Its time may be that of half a cycle before the tick is due.
+        assert!(pacer.begin(ms(112.0), Some((3, ms(110.0)))).is_some());
+    }
 }

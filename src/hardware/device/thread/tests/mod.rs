@@ -2,6 +2,7 @@
 
 mod commands;
 mod connection;
+mod parts;
 mod readings;
 
 use std::sync::mpsc::{Receiver, Sender, channel};
