@@ -218,6 +218,7 @@ mod tests {
             let start = pacer.begin(woke, Some((u64::from(k) + 1, ms(stamp)))).unwrap();
             assert_eq!((start.time.now, start.time.skipped, start.unprompted), (ms(stamp), 0, false), "state {k}");
             assert_eq!(start.time.woke_late_ns, woke.0 - ms(stamp).0);
+            assert_eq!(start.time.late_ns, start.time.woke_late_ns);
             assert_eq!(start.time.next, ms(stamp).after(P));
         }
     }
@@ -291,6 +292,7 @@ mod tests {
         // It was stalled, and the arm silent.
         let start = pacer.begin(ms(196.0), Some((6, ms(150.0)))).unwrap();
         assert_eq!(now_and_skipped(Some(start)), Some((ms(160.0).after(P / 3).after(P * 3), 3, true)));
+        assert_eq!(start.time.next, ms(200.0));
     }
 
     #[test]

@@ -172,12 +172,32 @@ fn nothing_is_discarded_without_a_pending_setpoint() {
     bench.advance(Duration::from_secs(1));
     bench.worker.discard_if_stale(&mut bench.adapter);
     assert!(bench.worker.connected);
-    // A delay of this thread that no one tolerates does not excuse anything.
-    bench.worker.resend = true;
-    bench.worker.late = Duration::from_millis(100);
-    bench.advance(bench.worker.config.state_timeout());
-    bench.worker.discard_if_stale(&mut bench.adapter);
-    assert!(!bench.worker.connected);
+}
+
+#[test]
+fn a_delay_of_this_thread_that_is_too_long_excuses_nothing() {
+    let discarded = |late: Duration| {
+        let mut bench = Bench::enabled();
+        bench.hold_at(0.0);
+        bench.worker.resend = true;
+        bench.worker.late = late;
+        bench.advance(bench.worker.config.state_timeout() + PERIOD);
+        bench.worker.discard_if_stale(&mut bench.adapter);
+        !bench.worker.connected
+    };
+    assert!(!discarded(Duration::from_millis(99)));
+    assert!(discarded(Duration::from_millis(100)));
+}
+
+#[test]
+fn an_arm_that_takes_setpoints_but_no_stop_is_faulted() {
+    let mut bench = Bench::enabled();
+    for _ in 0..3 {
+        bench.arm.fail("write_stop", AdapterError::Rejected("busy".into()));
+        bench.tick(|c| (c.mode, c.stop_seq) = (Some(ControlMode::Position), 1));
+    }
+    assert_eq!(bench.count("write_joint_positions"), 3);
+    assert_eq!(bench.states.read().link, Link::Faulted);
 }
 
 #[test]

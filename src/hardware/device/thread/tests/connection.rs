@@ -180,7 +180,7 @@ fn motors_go_off_when_the_arm_is_at_rest_or_after_a_second() {
     let wait = |speed: f64| {
         let mut bench = Bench::enabled();
         let (began, arm) = (bench.now(), bench.arm.clone());
-        let at = move |now: Mono| drop(arm.clone().positions(&[speed * now.seconds_since(Mono::ZERO), 0.0, 0.0]));
+        let at = move |now: Mono| drop(arm.clone().positions(&[1.0 + speed * now.seconds_since(Mono::ZERO), 0.0, 0.0]));
         bench.worker.config.clock = Arc::new(Changing(bench.clock.clone(), at));
         bench.stepping(Duration::from_millis(2), |b| b.worker.wait_for_standstill(&mut b.adapter));
         bench.now().since(began)
@@ -215,4 +215,17 @@ fn errors_of_the_connection_end_it_and_others_do_not() {
     bench.worker.after_error(&mut bench.adapter, &AdapterError::Timeout("no answer".into()));
     assert!(!bench.worker.connected);
     assert!(!bench.worker.plausible.stable(bench.worker.state.stamp));
+}
+
+#[test]
+fn an_arm_that_is_lost_with_its_first_reading_counts_as_no_reconnect() {
+    let mut bench = Bench::enabled();
+    bench.worker.mark_lost();
+    bench.worker.trouble("lost");
+    bench.arm.fail("read_joint_positions", AdapterError::NotConnected);
+    bench.advance(Duration::from_millis(500));
+    bench.cycle();
+    assert_eq!((bench.count("connect"), bench.worker.connected), (1, false));
+    assert_eq!(bench.worker.health.reconnects.load(Relaxed), 0);
+    assert!(!bench.notes().iter().any(|note| note.starts_with("over")));
 }

@@ -25,8 +25,8 @@ fn fail_reads(bench: &mut Bench, times: u32) -> ArmState {
 fn an_arm_is_stale_after_its_time_and_three_failures_and_up_with_one_state() {
     let mut bench = Bench::connected();
     let seq = bench.cycle().seq;
-    assert_eq!(fail_reads(&mut bench, 4).link, Link::Up, "40 ms");
-    let state = fail_reads(&mut bench, 2);
+    assert_eq!(fail_reads(&mut bench, 5).link, Link::Up, "50 ms");
+    let state = fail_reads(&mut bench, 1);
     assert_eq!((state.link, state.seq), (Link::Stale, seq), "60 ms, limit 50 ms");
     assert_eq!(bench.worker.health.read_errors.load(Relaxed), 6);
     assert_eq!(bench.notes(), ["no state: no answer"], "once");
@@ -99,12 +99,19 @@ fn the_time_of_a_reading_is_averaged() {
 
 #[test]
 fn where_each_read_costs_a_round_trip_one_more_value_is_read_per_cycle() {
-    let arm = MockAdapter::new(DOF).gripper(0.02).force_torque([1.0; 6]);
+    let arm = MockAdapter::new(DOF).gripper(0.02).force_torque([1.0; 6]).pose(crate::arm::Pose::default());
     let mut bench = Bench::new(arm);
     bench.worker.connect(&mut bench.adapter).unwrap();
     bench.worker.whole_state_at_once = false;
     bench.worker.turn = 0;
-    let others = ["read_error", "read_enabled", "read_gripper_position", "read_force_torque", "read_state"];
+    let others = [
+        "read_error",
+        "read_enabled",
+        "read_gripper_position",
+        "read_force_torque",
+        "read_cartesian_position",
+        "read_state",
+    ];
     let mut read = Vec::new();
     for _ in 0..6 {
         bench.arm.clear_calls();
@@ -118,7 +125,7 @@ fn where_each_read_costs_a_round_trip_one_more_value_is_read_per_cycle() {
         vec!["read_enabled"],
         vec!["read_gripper_position"],
         vec!["read_force_torque"],
-        vec![],
+        vec!["read_cartesian_position"],
         vec!["read_state"],
     ];
     assert_eq!(read, turns);
@@ -229,4 +236,44 @@ fn what_the_adapter_reports_of_others_is_taken_once() {
     bench.worker.ordered_mode = Some(ControlMode::Velocity);
     bench.worker.take_foreign_change(Some("another mode"));
     assert_eq!(bench.worker.state.interference, Interference::Mode);
+}
+
+#[test]
+fn the_rate_of_states_is_that_of_their_intervals() {
+    let mut bench = Bench::connected();
+    for _ in 0..200 {
+        bench.advance(PERIOD);
+        bench.cycle();
+    }
+    let rate = bench.worker.health.rate();
+    assert!((rate - 100.0).abs() < 1.0, "{rate} Hz");
+}
+
+#[test]
+fn only_new_states_of_the_arm_that_clocks_the_ticks_start_one() {
+    let wake = Wake::new().unwrap();
+    let mut bench = Bench::with(MockAdapter::new(DOF), |config| config.pace = Some(wake.clone()));
+    bench.worker.connect(&mut bench.adapter).unwrap();
+    assert!(wake.wait(Duration::ZERO), "the first one");
+    bench.advance(PERIOD);
+    bench.cycle();
+    assert!(wake.wait(Duration::ZERO));
+    bench.cycle();
+    assert!(!wake.wait(Duration::ZERO), "nothing was read");
+    fail_reads(&mut bench, 1);
+    assert!(!wake.wait(Duration::ZERO));
+}
+
+#[test]
+fn setpoints_start_at_the_arm_once_its_motors_were_off() {
+    let mut bench = Bench::enabled();
+    bench.hold_at(0.0);
+    drop(bench.arm.clone().enabled(false).positions(&[0.3, 0.0, 0.0]));
+    bench.advance(PERIOD);
+    bench.cycle();
+    drop(bench.arm.clone().enabled(true));
+    bench.advance(PERIOD);
+    bench.cycle();
+    bench.hold_at(0.3);
+    assert_eq!(bench.written(), [0.0, 0.3]);
 }

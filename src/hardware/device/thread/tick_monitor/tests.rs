@@ -109,6 +109,12 @@ fn a_tick_that_has_ended_hangs() {
 #[test]
 fn a_silent_tick_that_uses_the_processor_all_along_hangs() {
     let mut bench = moving();
+    // What it used before its latest heartbeat does not count.
+    let idle = bench.beat.cpu_time().unwrap();
+    while bench.beat.cpu_time().unwrap() - idle < 40 * MS {
+        std::hint::black_box(0);
+    }
+    bench.beat.beat(bench.beat.last().unwrap().after(PERIOD));
     let last = bench.beat.last().unwrap();
     bench.worker.see_tick(last, Duration::ZERO);
     // This thread is the tick, and computes. The virtual time of the observations is its processor time.
@@ -138,4 +144,36 @@ fn a_silent_tick_that_waits_does_not_hang_and_stalls_are_not_judged() {
     bench.worker.see_tick(last.after(70 * MS), 2 * MS);
     assert!(!bench.worker.tick.hangs, "this thread was stalled itself");
     assert_eq!(bench.worker.tick.observed.map(|(at, _)| at), Some(last.after(70 * MS)));
+}
+
+#[test]
+fn observations_are_five_milliseconds_apart() {
+    let mut bench = moving();
+    let last = bench.beat.last().unwrap();
+    let mut observed = |silence: Duration| {
+        bench.worker.see_tick(last.after(silence), Duration::ZERO);
+        bench.worker.tick.observed.map(|(at, _)| at.since(last))
+    };
+    assert_eq!(observed(PERIOD), None);
+    assert_eq!(observed(11 * MS), Some(11 * MS));
+    assert_eq!(observed(15 * MS), Some(11 * MS));
+    assert_eq!(observed(16 * MS), Some(16 * MS));
+}
+
+#[test]
+fn a_tick_that_used_the_processor_but_now_waits_does_not_hang() {
+    let mut bench = moving();
+    let last = bench.beat.last().unwrap();
+    let used = bench.beat.cpu_time().unwrap();
+    // Since its heartbeat it has used 100 ms, of the latest 10 ms three.
+    bench.worker.see_tick(last, Duration::ZERO);
+    bench.worker.tick.cpu_time = Some(used.saturating_sub(100 * MS));
+    while bench.beat.cpu_time().unwrap() - used < 3 * MS {
+        std::hint::black_box(0);
+    }
+    let before = bench.beat.cpu_time().unwrap().saturating_sub(3 * MS);
+    bench.worker.tick.cpu_time = Some(Duration::ZERO);
+    bench.worker.tick.observed = Some((last.after(50 * MS), before));
+    bench.worker.see_tick(last.after(60 * MS), Duration::ZERO);
+    assert!(!bench.worker.tick.hangs);
 }
