@@ -17,6 +17,7 @@ mod device_clock;
 mod disk;
 mod fault_table;
 mod first_run;
+mod gripper_force;
 mod gripper_joint;
 mod jog;
 mod joint_status;
