@@ -16,17 +16,51 @@ struct RequestMessage {
 #[derive(Debug, Deserialize)]
 #[serde(rename_all = "snake_case")]
 enum LoggedRequest {
-    Execute { task: u16, motion: u64, trajectory: JointTrajectory },
-    Cancel { task: Option<u16> },
-    Servo { task: u16, target: Vec<Option<f64>> },
-    Velocity { task: u16, target: Vec<Option<f64>> },
-    Pose { task: u16, position: [Option<f64>; 3], orientation: [Option<f64>; 4] },
-    Twist { task: u16, linear: [Option<f64>; 3], angular: [Option<f64>; 3], tool: bool },
-    Stop { arm: Option<u16> },
-    Reset { arm: u16 },
-    Ready { arm: u16 },
-    Park { arm: u16 },
-    Gripper { arm: u16, opening: Option<f64>, #[serde(default, deserialize_with = "present")] force: Option<f64> },
+    Execute {
+        task: u16,
+        motion: u64,
+        trajectory: JointTrajectory,
+    },
+    Cancel {
+        task: Option<u16>,
+    },
+    Servo {
+        task: u16,
+        target: Vec<Option<f64>>,
+    },
+    Velocity {
+        task: u16,
+        target: Vec<Option<f64>>,
+    },
+    Pose {
+        task: u16,
+        position: [Option<f64>; 3],
+        orientation: [Option<f64>; 4],
+    },
+    Twist {
+        task: u16,
+        linear: [Option<f64>; 3],
+        angular: [Option<f64>; 3],
+        tool: bool,
+    },
+    Stop {
+        arm: Option<u16>,
+    },
+    Reset {
+        arm: u16,
+    },
+    Ready {
+        arm: u16,
+    },
+    Park {
+        arm: u16,
+    },
+    Gripper {
+        arm: u16,
+        opening: Option<f64>,
+        #[serde(default, deserialize_with = "present")]
+        force: Option<f64>,
+    },
     Shutdown {},
 }
 

@@ -267,7 +267,10 @@ impl Service {
                 let info = self.gripper_info((*a).into()).unwrap_or_default();
                 let (least, most) = info.force_range.unwrap_or_default();
                 error
-                    .hint(format!("give {least} to {most} {}, or no force for the one set in the arm", info.force_unit.name()))
+                    .hint(format!(
+                        "give {least} to {most} {}, or no force for the one set in the arm",
+                        info.force_unit.name()
+                    ))
                     .data(serde_json::json!({"arm": arm(a), "force": force, "range": [least, most]}))
             }
             Outcome::NoGripperForce(_) => error.hint("command its position without a force"),

@@ -301,14 +301,14 @@ impl<const MISTAKE: u8> Gripper for Wrong<MISTAKE> {
         Ok(position.map(|metres| if MISTAKE == GRIPPER_IN_MILLIMETRES { 1000.0 * metres } else { metres }))
     }
     fn get_gripper_force_range(&mut self) -> Option<(f64, f64)> {
-        let range = self.inner.gripper().and_then(|gripper| gripper.get_gripper_force_range());
-        if MISTAKE == FORCE_CONTROL_ONLY_CLAIMED { Some((1.0, 10.0)) } else { range }
+        self.inner.gripper().and_then(|gripper| gripper.get_gripper_force_range())
     }
     fn write_gripper_position_with_force(&mut self, position: f64, force: f64) -> AdapterResult<()> {
         let gripper = self.inner.gripper().ok_or(AdapterError::Unsupported)?;
         let (least, most) = gripper.get_gripper_force_range().ok_or(AdapterError::Unsupported)?;
-        self.force = Some(force);
+        self.force = (least..=most).contains(&force).then_some(force);
         match MISTAKE {
+            FORCE_CONTROL_ONLY_CLAIMED => Err(AdapterError::Unsupported),
             FORCE_CLAMPS => gripper.write_gripper_position_with_force(position, force.max(least).min(most)),
             FORCE_IS_LOST if (least..=most).contains(&force) => gripper.write_gripper_position(position),
             _ => gripper.write_gripper_position_with_force(position, force),
@@ -374,7 +374,7 @@ fn each_mistake_is_found_by_the_check_for_it() {
         (Wrong::<FORCE_CLAMPS>::SPEC, "gripper_force_is_kept"),
         (Wrong::<FORCE_IS_LOST>::WIRED, "gripper_force_is_kept"),
         (Wrong::<FORCE_REMAINS>::WIRED, "gripper_force_is_kept"),
-        (Wrong::<FORCE_CONTROL_ONLY_CLAIMED>::PUSHED, "gripper_force_is_kept"),
+        (Wrong::<FORCE_CONTROL_ONLY_CLAIMED>::SPEC, "gripper_force_is_kept"),
         (Wrong::<ENABLES_ON_CONNECT>::WIRED, "cut_when_disabled"),
         (Wrong::<CLAIMS_TO_BE_CONNECTED>::WIRED, "cut_when_enabled"),
         (Wrong::<STALE_STATE_AFTER_CONNECT>::WIRED, "cut_when_enabled"),

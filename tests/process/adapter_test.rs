@@ -91,7 +91,9 @@ fn the_small_motion_stays_small_and_leaves_the_arm_as_it_was() {
                 target
             }
             Request::ServoJoints(target) => target,
-            Request::VelocityJoints(_) | Request::MoveCartesian(..) | Request::Gripper(_) | Request::Grip(..) => panic!("{request:?}"),
+            Request::VelocityJoints(_) | Request::MoveCartesian(..) | Request::Gripper(_) | Request::Grip(..) => {
+                panic!("{request:?}")
+            }
             _ => continue,
         };
         moves += 1;

@@ -87,7 +87,11 @@ fn a_force_that_the_gripper_cannot_have_is_refused_and_moves_nothing() {
     for force in ["0.5", "60.5", "-3"] {
         let refused = home.dimos(&format!("arm gripper arm 0.02 --force {force}")).with(1);
         let range = "hint: give 1 to 60 N, or no force for the one set in the arm";
-        refused.says(&[&format!("a force of {force} is outside the range of the gripper of arm"), "[OUT_OF_LIMITS]", range]);
+        refused.says(&[
+            &format!("a force of {force} is outside the range of the gripper of arm"),
+            "[OUT_OF_LIMITS]",
+            range,
+        ]);
     }
     home.dimos("arm gripper arm 0.09 --force 10").with(1).says(&["0.09 m is not within 0 to 0.08 m", "hint: "]);
     home.dimos("arm gripper arm 0.02 --force strong").with(2);

@@ -101,7 +101,9 @@ fn force(context: &mut Context) -> Result<(), String> {
     };
     let Some((least, most)) = info.force_range else {
         let result = command(context, target, 1.0);
-        require(result == Err(AdapterError::Unsupported), || format!("no force control, but writing gives {result:?}"))?;
+        require(result == Err(AdapterError::Unsupported), || {
+            format!("no force control, but writing gives {result:?}")
+        })?;
         rests(context, info.unit, start)?;
         return context.found("no force control");
     };
@@ -114,18 +116,20 @@ fn force(context: &mut Context) -> Result<(), String> {
     }
     rests(context, info.unit, start)?;
     let reached = |context: &Context| context.emulator.as_ref().and_then(|emulator| emulator.gripper_force());
-    context.command_gripper(start)?;
+    // A command has reached the arm once the gripper is at its target.
+    context.command_gripper(target)?;
+    arrives(context, info.unit, target)?;
     let own = reached(context);
     let (low, middle) = (least + (most - least) / 8.0, (least + most) / 2.0);
-    for (position, force) in [(target, middle), (start, low), (target, low)] {
+    for (position, force) in [(start, middle), (target, low)] {
         command(context, position, force).map_err(|e| format!("write_gripper_position_with_force: {e}"))?;
         arrives(context, info.unit, position)?;
         let reached = reached(context);
         let same = reached.is_none_or(|reached| (reached - force).abs() <= (most - least) / 1000.0);
         require(same, || format!("{force} {unit} was commanded, the arm has {reached:?} {unit}"))?;
     }
-    context.command_gripper(target)?;
-    context.joints()?;
+    context.command_gripper(start)?;
+    arrives(context, info.unit, start)?;
     let after = reached(context);
     require(after == own, || format!("without a force the arm has {own:?} {unit}, after a force {after:?} {unit}"))?;
     let measured = context.adapter.gripper().map_or(Ok(None), |gripper| gripper.read_gripper_force());

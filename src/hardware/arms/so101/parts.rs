@@ -2,9 +2,9 @@
 
 use std::f64::consts::TAU;
 
+use super::DOF;
 use super::adapter::So101Adapter;
 use super::protocol::TURN;
-use super::DOF;
 use crate::arm::{GripperUnit, JointStatus};
 use crate::hardware::adapter::{AdapterError, AdapterResult, Gripper, JointMonitor};
 use crate::hardware::adapter_util::{fill, within};

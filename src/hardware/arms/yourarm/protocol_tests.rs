@@ -116,9 +116,9 @@ fn noise_damage_and_foreign_replies_are_skipped() {
 
 #[test]
 fn a_state_that_is_not_finite_or_has_other_joints_is_refused() {
-    let mut data = bytes(golden::STATE_REPLY)[9..123].to_vec();
+    let mut data = bytes(golden::STATE_AND_FORCE_REPLY)[9..127].to_vec();
     assert!(State::decode(&data).is_some());
-    assert!(State::decode(&data[..113]).is_none());
+    assert!(State::decode(&data[..117]).is_none());
     data[11] = 7;
     assert!(State::decode(&data).is_none(), "7 joints");
     data[11] = 6;
