@@ -29,6 +29,9 @@ named! {
         /// Torque of the jaw, or of the motor that drives the fingers [Nm].
         #[serde(rename = "Nm")]
         NewtonMeters = "Nm",
+        /// Part of the device's largest force, which its vendor does not state [%].
+        #[serde(rename = "%")]
+        Percent = "%",
     }
 }
 

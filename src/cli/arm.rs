@@ -48,7 +48,7 @@ enum Action {
         /// Opening [m], angle [rad] of a rotary gripper, `open`, or `close`; `dimos status` shows the range
         #[arg(value_name = "POSITION", value_parser = opening, allow_negative_numbers = true)]
         opening: Opening,
-        /// Largest force [N or Nm; `dimos status` shows unit and range]; default: the one set in the arm
+        /// Largest force [N, Nm or %; `dimos status` shows unit and range]; default: the one set in the arm
         #[arg(long, value_name = "FORCE", value_parser = finite, allow_negative_numbers = true)]
         force: Option<f64>,
     },

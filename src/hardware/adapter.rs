@@ -298,8 +298,7 @@ pub trait ManipulatorAdapter: Send {
 /// assert!(fingers.write_gripper_position(0.09).is_err());
 /// ```
 pub trait Gripper {
-    /// Returns the unit of positions: metres of opening, or radians for a rotary jaw. The same for the whole life of the
-    /// adapter.
+    /// Returns the unit of positions: metres of opening, or radians for a rotary jaw. Never changes.
     fn get_gripper_unit(&self) -> GripperUnit {
         GripperUnit::Meters
     }
@@ -308,28 +307,29 @@ pub trait Gripper {
     /// Commands the position [m or rad], with the force that is set in the device. `Rejected` outside the range: then
     /// nothing moves.
     fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()>;
-    /// Returns the position when closed and when open [m or rad], according to the data sheet or the calibration; `None`
-    /// if unknown.
+    /// Returns the position when closed and when open [m or rad], according to data sheet or calibration; `None` if
+    /// unknown.
     fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
         None
     }
-    /// Returns the unit of forces: N, or Nm for a rotary jaw and for a device that states the torque of its motor.
+    /// Returns the unit of forces: by default N, and Nm for a rotary jaw. A device may also state the torque of its
+    /// motor, or percent. Never changes.
     fn get_gripper_force_unit(&self) -> ForceUnit {
         match self.get_gripper_unit() {
             GripperUnit::Meters => ForceUnit::Newtons,
             GripperUnit::Radians => ForceUnit::NewtonMeters,
         }
     }
-    /// Returns the smallest and the largest force that can be commanded [N or Nm]; `None` without force control.
+    /// Returns the smallest and the largest force that can be commanded [their unit]; `None` without force control.
     fn get_gripper_force_range(&mut self) -> Option<(f64, f64)> {
         None
     }
-    /// Commands the position [m or rad] with a largest force [N or Nm]. `Rejected` outside either range: then nothing
+    /// Commands the position [m or rad] with a largest force [its unit]. `Rejected` outside either range: then nothing
     /// moves. The force is that of this command: the next one without a force has the device's own again.
     fn write_gripper_position_with_force(&mut self, _position: f64, _force: f64) -> AdapterResult<()> {
         Err(AdapterError::Unsupported)
     }
-    /// Returns the measured force [N or Nm]; `None` if the device measures none. Must not allocate.
+    /// Returns the measured force [its unit]; `None` if the device measures none. Must not allocate.
     fn read_gripper_force(&mut self) -> AdapterResult<Option<f64>> {
         Ok(None)
     }

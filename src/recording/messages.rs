@@ -267,7 +267,7 @@ message! {
         stop_input_open: bool,
         /// The device's own time of the measurement, on its own clock [ns]; empty if not reported.
         device_ns: Vec<u64>,
-        /// Measured force of the gripper [N or Nm, by its force unit in coordinator.json]; empty if not reported.
+        /// Measured force of the gripper, in the unit in coordinator.json; empty if not reported.
         gripper_force: Vec<f64>,
     }
 }
@@ -333,7 +333,7 @@ message! {
         next_tick_ns: u64,
         /// Number of starts of commanded motion: after enabling and after a change of mode.
         start_seq: u32,
-        /// Largest force of the gripper command [N or Nm, by its force unit in coordinator.json]; empty: the device's own.
+        /// Largest force of the gripper command, in the unit in coordinator.json; empty: the device's own.
         gripper_force: Vec<f64>,
     }
 }

@@ -128,7 +128,7 @@ pub struct Gripper {
     pub arm: String,
     /// Position: the opening [m], or the angle [rad] of a rotary gripper (`gripper_unit` in `status`).
     pub position: f64,
-    /// Largest force [N or Nm, `gripper_force_unit` in `status`]; default: the one set in the device.
+    /// Largest force [`gripper_force_unit` in `status`]; default: the one set in the device.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub force: Option<f64>,
 }
@@ -143,7 +143,7 @@ pub struct GripperReply {
     /// Largest force [`force_unit`]; absent: the one set in the device.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub force: Option<f64>,
-    /// Unit of the force: `N` or `Nm`; absent without a force.
+    /// Unit of the force: `N`, `Nm` or `%`; absent without a force.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub force_unit: Option<String>,
 }

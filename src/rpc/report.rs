@@ -172,7 +172,7 @@ pub struct ArmReport {
     /// Smallest and largest force of a gripper command [`gripper_force_unit`]; absent without force control.
     #[serde(default)]
     pub gripper_force_range: Option<[f64; 2]>,
-    /// Unit of its gripper's force: `N` or `Nm`; absent without a gripper.
+    /// Unit of its gripper's force: `N`, `Nm` or `%`; absent without a gripper.
     #[serde(default)]
     pub gripper_force_unit: Option<String>,
     /// Measured force of its gripper [`gripper_force_unit`]; absent if it measures none.
@@ -333,7 +333,7 @@ pub struct ArmStateReport {
     /// Measured force of the gripper [`gripper_force_unit`]; absent if it measures none.
     #[serde(default)]
     pub gripper_force: Option<f64>,
-    /// Unit of the gripper's force: `N` or `Nm`; absent without a gripper.
+    /// Unit of the gripper's force: `N`, `Nm` or `%`; absent without a gripper.
     #[serde(default)]
     pub gripper_force_unit: Option<String>,
     /// End-effector pose in the arm's base frame.

@@ -328,7 +328,7 @@ impl<const MISTAKE: u8> Gripper for Wrong<MISTAKE> {
         }
         let gripper = self.inner.gripper().ok_or(AdapterError::Unsupported)?;
         match (MISTAKE, self.force) {
-            (GRIPPER_CLAMPS, _) => gripper.write_gripper_position(position.max(0.0).min(0.08)),
+            (GRIPPER_CLAMPS, _) => gripper.write_gripper_position(position.clamp(0.0, 0.08)),
             (FORCE_REMAINS, Some(force)) => gripper.write_gripper_position_with_force(position, force),
             _ => gripper.write_gripper_position(position),
         }

@@ -361,7 +361,7 @@ fn a_gripper_that_goes_on_after_a_stop_is_held() {
     bench.end();
 }
 
-/// The stop of a Piper does not reach its gripper either: it is held with the torque of its command, not with the one of
+/// The stop of a Piper does not reach its gripper either: it is held with the torque of its command, not with that of
 /// the options.
 #[test]
 fn a_gripper_is_held_with_the_force_of_its_command() {

@@ -208,3 +208,9 @@ class SimArmAdapter:
 
 def register(registry) -> None:
     registry.register("simarm", SimArmAdapter)
+
+
+class RotaryGripperAdapter(SimArmAdapter):
+    """The same arm, whose gripper has an angle."""
+
+    gripper_unit = "rad"

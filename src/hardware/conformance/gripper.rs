@@ -125,7 +125,7 @@ fn force(context: &mut Context) -> Result<(), String> {
         command(context, position, force).map_err(|e| format!("write_gripper_position_with_force: {e}"))?;
         arrives(context, info.unit, position)?;
         let reached = reached(context);
-        let same = reached.is_none_or(|reached| (reached - force).abs() <= (most - least) / 1000.0);
+        let same = reached.is_none_or(|reached| (reached - force).abs() <= (most - least) / 100.0);
         require(same, || format!("{force} {unit} was commanded, the arm has {reached:?} {unit}"))?;
     }
     context.command_gripper(start)?;

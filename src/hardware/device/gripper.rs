@@ -1,4 +1,4 @@
-//! Holds a gripper that still moves after a stop of the arm, with the force it was commanded with. A gripper at rest, for
+//! Holds a gripper that still moves after a stop of the arm, with the force of its last command. A gripper at rest, for
 //! example on a workpiece, gets no new target: that would loosen its grip.
 
 use std::time::Duration;
@@ -8,7 +8,7 @@ use crate::clock::Mono;
 
 /// How long the gripper is monitored after a stop.
 const WATCH: Duration = Duration::from_secs(2);
-/// Smallest change of the position that counts as motion rather than noise or compliance [m], and of a rotary jaw [rad].
+/// Smallest change of the position that counts as motion rather than noise or compliance [m]; of a rotary jaw [rad].
 const STEP: f64 = 0.000_25;
 const ROTARY_STEP: f64 = 0.005;
 

@@ -168,7 +168,8 @@ impl Controller {
         }
     }
 
-    /// Bit 0 of `action`: on, and to this stroke [0.001 mm] with at most this torque [mNm]; bit 1: errors are cleared before that.
+    /// Bit 0 of `action`: on, and to this stroke [0.001 mm] with at most this torque [mNm]; bit 1: errors are cleared
+    /// before that.
     fn grip(&mut self, stroke: i32, torque: u16, action: u8) {
         self.gripper.max_force = f64::from(torque.min(5000)) * 1e-3;
         if action & 2 != 0 {

@@ -248,6 +248,10 @@ impl Emulator for XArmEmulator {
     fn true_positions(&self) -> Option<Joints> {
         self.server.true_positions()
     }
+
+    fn gripper_force(&self) -> Option<f64> {
+        self.server.with(|controller, _| controller.tool.force())
+    }
 }
 
 /// Fault of the reports of port 30000.
