@@ -333,8 +333,8 @@ class Client:
         return LoopReport(sent, missed, worst, time.monotonic() - start)
 
     def gripper(self, arm: str, opening: Union[float, str], force: Optional[float] = None) -> None:
-        """Moves a gripper to a position (an opening [m], or the angle [rad] of a rotary one), to "open" or "close"; with
-        a largest `force` [N or Nm] if it has force control."""
+        """Moves a gripper to a position (an opening [m], or the angle [rad] of a rotary one), to "open" or "close", with a
+        largest `force` (unit and range are in `status`) if it has force control."""
         if opening in ("open", "close"):
             found = next((a for a in self.status()["arms"] if a["hardware_id"] == arm), {})
             if found.get("gripper_range") is None:
