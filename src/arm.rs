@@ -1,6 +1,7 @@
 //! Data between an arm's device thread and the tick: the latest state one way, the latest command the other. Plain
 //! data of fixed size, so that neither side ever allocates or waits.
 
+mod gripper;
 mod io;
 mod joint_status;
 mod load;
@@ -13,6 +14,7 @@ use crate::clock::Mono;
 use crate::joint::{ControlMode, Joints, MAX_DOF};
 use crate::named::named;
 
+pub use gripper::{ForceUnit, GripperInfo, GripperUnit};
 pub use io::{AnalogUnit, IoInfo, IoState, MAX_ANALOG, MAX_DIGITAL, OutputValue, StopInput, channel};
 pub use joint_status::JointStatus;
 pub use load::{Load, UPRIGHT};
@@ -127,8 +129,10 @@ pub struct ArmState {
     pub velocity_source: VelocitySource,
     /// Joint torques [Nm], where the arm reports them.
     pub effort: Option<Joints>,
-    /// Gripper opening [m], where there is a gripper.
+    /// Gripper position [m, or rad for a rotary gripper], where there is a gripper.
     pub gripper: Option<f64>,
+    /// Measured force of the gripper, in its force unit, where it measures one.
+    pub gripper_force: Option<f64>,
     /// End-effector pose, where the arm reports it.
     pub pose: Option<Pose>,
     /// Force and torque at the sensor [N, N, N, Nm, Nm, Nm], where there is one.
@@ -166,6 +170,7 @@ impl Default for ArmState {
             velocity_source: VelocitySource::Absent,
             effort: None,
             gripper: None,
+            gripper_force: None,
             pose: None,
             wrench: None,
             mode: ControlMode::Position,
@@ -191,8 +196,10 @@ pub struct ArmCommand {
     pub mode: Option<ControlMode>,
     /// Joint positions [rad] or velocities [rad/s], by `mode`.
     pub values: Joints,
-    /// Gripper opening [m]; written when `gripper_seq` changes.
+    /// Gripper position [m, or rad for a rotary gripper]; written when `gripper_seq` changes.
     pub gripper: f64,
+    /// Largest force of the gripper, in its force unit; `None`: the one set in the device.
+    pub gripper_force: Option<f64>,
     /// Counts the gripper commands; 0 = none yet.
     pub gripper_seq: u32,
     /// Counts the stops ordered from the arm's controller, e.g. when a latched hold is entered.
@@ -213,6 +220,7 @@ impl Default for ArmCommand {
             mode: None,
             values: [0.0; MAX_DOF],
             gripper: 0.0,
+            gripper_force: None,
             gripper_seq: 0,
             stop_seq: 0,
             next_tick: Mono::ZERO,

@@ -27,6 +27,8 @@ pub enum Call {
     WriteCartesianPosition(Pose, f64),
     /// `write_gripper_position` [m]
     WriteGripperPosition(f64),
+    /// `write_gripper_position_with_force` [m, N]
+    WriteGripperPositionWithForce(f64, f64),
 }
 
 impl Call {
@@ -40,6 +42,7 @@ impl Call {
             Self::WriteEnable(_) => "write_enable",
             Self::WriteCartesianPosition(..) => "write_cartesian_position",
             Self::WriteGripperPosition(_) => "write_gripper_position",
+            Self::WriteGripperPositionWithForce(..) => "write_gripper_position_with_force",
         }
     }
 }
@@ -66,6 +69,8 @@ const METHODS: &[&str] = &[
     "write_cartesian_position",
     "read_gripper_position",
     "write_gripper_position",
+    "write_gripper_position_with_force",
+    "read_gripper_force",
     "read_force_torque",
 ];
 
@@ -358,6 +363,19 @@ impl Gripper for MockAdapter {
 
     fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
         self.called(Call::WriteGripperPosition(position)).map(|_| ())
+    }
+
+    /// 0 to 40 N.
+    fn get_gripper_force_range(&mut self) -> Option<(f64, f64)> {
+        Some((0.0, 40.0))
+    }
+
+    fn write_gripper_position_with_force(&mut self, position: f64, force: f64) -> AdapterResult<()> {
+        self.called(Call::WriteGripperPositionWithForce(position, force)).map(|_| ())
+    }
+
+    fn read_gripper_force(&mut self) -> AdapterResult<Option<f64>> {
+        Ok(self.asked("read_gripper_force")?.gripper.map(|_| 0.0))
     }
 }
 

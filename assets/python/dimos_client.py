@@ -73,10 +73,13 @@ class JointState:
 class ArmState(JointState):
     """An arm after a tick."""
     age: Optional[float] = None  # s, of its joints
-    gripper: Optional[float] = None  # m, opening
+    gripper: Optional[float] = None  # m of opening, or rad of a rotary jaw
     xyz: Optional[List[float]] = None  # m, end effector in the base frame
     rpy: Optional[List[float]] = None  # rad, fixed axes
     wrench: Optional[List[float]] = None  # N, N, N, Nm, Nm, Nm
+    gripper_unit: Optional[str] = None  # "m" or "rad"
+    gripper_force: Optional[float] = None  # measured, in gripper_force_unit
+    gripper_force_unit: Optional[str] = None  # "N" or "Nm"
 
 
 @dataclass(frozen=True)
@@ -235,7 +238,8 @@ class Client:
         values = [[j[key] for j in found["joints"]] for key in ("name", "position", "velocity", "effort")]
         pose, age = found["pose"] or {}, found["age_ms"]
         more = (age and age / 1000, found["gripper"], pose.get("xyz"), pose.get("rpy"), found["wrench"])
-        return ArmState(reply["tick"], reply["stamp"], *values, 0, *more)
+        grip = (found.get(key) for key in ("gripper_unit", "gripper_force", "gripper_force_unit"))
+        return ArmState(reply["tick"], reply["stamp"], *values, 0, *more, *grip)
 
     def joint_states(self, rate: Optional[float] = None) -> Iterator[JointState]:
         """The joints of all arms after every tick, or at `rate` [Hz]. Close the iterator, or leave its loop, to end."""
@@ -328,14 +332,15 @@ class Client:
             self._unsubscribe(number)
         return LoopReport(sent, missed, worst, time.monotonic() - start)
 
-    def gripper(self, arm: str, opening: Union[float, str]) -> None:
-        """Moves a gripper to an opening [m], or to "open" or "close"."""
+    def gripper(self, arm: str, opening: Union[float, str], force: Optional[float] = None) -> None:
+        """Moves a gripper to a position (an opening [m], or the angle [rad] of a rotary one), to "open" or "close", with a
+        largest `force` (unit and range are in `status`) if it has force control."""
         if opening in ("open", "close"):
             found = next((a for a in self.status()["arms"] if a["hardware_id"] == arm), {})
             if found.get("gripper_range") is None:
-                raise Refused("UNSUPPORTED", f"{arm} does not say how far it opens", "give the opening in metres")
+                raise Refused("UNSUPPORTED", f"{arm} does not say how far it opens", "give a number")
             opening = found["gripper_range"][opening == "open"]
-        self.call("gripper", arm=arm, position=opening)
+        self.call("gripper", arm=arm, position=opening, force=force)
 
     def io(self, arm: str) -> Dict[str, Any]:
         """Digital and analogue inputs and outputs of an arm, as docs/rpc.md says."""

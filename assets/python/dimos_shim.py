@@ -3,7 +3,8 @@
 import argparse, contextlib, ctypes, enum, errno, importlib, itertools, json, math, os, pathlib, platform, select
 import signal, socket, struct, sys, time
 SILENCE, LONGEST = 0.5, 16384  # a commanded arm is stopped after this time without a request [s]; bytes of a line
-FEEDBACK, EXTRAS = ["read_joint_velocities", "read_joint_efforts"], ["modes", "gripper_range", "holds_when_disabled"]
+FEEDBACK = ["read_joint_velocities", "read_joint_efforts"]
+EXTRAS = ["modes", "gripper_range", "gripper_unit", "holds_when_disabled"]
 READS = ["read_error", "read_enabled", "get_control_mode", "read_state", "read_gripper_position",
          "read_cartesian_position", "read_force_torque", *FEEDBACK]
 ACTS = ["activate", "deactivate", "write_enable", "set_control_mode", "write_stop", "write_clear_errors"]

@@ -58,6 +58,7 @@ impl Bed {
             limits: limits.clone(),
             modes: vec![ControlMode::ServoPosition, ControlMode::Velocity],
             gripper: true,
+            gripper_info: Default::default(),
             own_velocity: Vec::new(),
             read_period: Duration::from_millis(10),
             write_period: Duration::from_millis(10),

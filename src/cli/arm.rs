@@ -41,13 +41,16 @@ enum Action {
     },
     /// Clear a latched hold or a fault; moves nothing, enables nothing
     Reset(ArmArgs),
-    /// Open or close the gripper
+    /// Open or close the gripper, with a largest force if it has force control
     Gripper {
         #[command(flatten)]
         which: ArmArgs,
-        /// Opening [m], or `open`, or `close`
-        #[arg(value_name = "OPENING", value_parser = opening, allow_negative_numbers = true)]
+        /// Opening [m], angle [rad] of a rotary gripper, `open`, or `close`; `dimos status` shows the range
+        #[arg(value_name = "POSITION", value_parser = opening, allow_negative_numbers = true)]
         opening: Opening,
+        /// Largest force [N, Nm or %; `dimos status` shows unit and range]; default: the one set in the arm
+        #[arg(long, value_name = "FORCE", value_parser = finite, allow_negative_numbers = true)]
+        force: Option<f64>,
     },
     /// List serial ports, and find the arm's by unplugging it or by asking each; no run needed
     FindPort(find_port::Args),
@@ -73,11 +76,11 @@ pub struct ArmArgs {
     pub target_run: Target,
 }
 
-/// Requested opening of a gripper.
+/// Requested position of a gripper.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Opening {
-    /// This opening [m].
-    Metres(f64),
+    /// This position [m or rad].
+    Position(f64),
     /// Fully open.
     Open,
     /// Closed.
@@ -88,14 +91,14 @@ fn opening(text: &str) -> std::result::Result<Opening, String> {
     match text {
         "open" => Ok(Opening::Open),
         "close" => Ok(Opening::Close),
-        _ => finite(text).map(Opening::Metres).map_err(|e| format!("{e}; give metres, `open` or `close`")),
+        _ => finite(text).map(Opening::Position).map_err(|e| format!("{e}; give m or rad, `open` or `close`")),
     }
 }
 
 impl Opening {
-    /// Returns the opening in metres: the run knows the gripper's range.
+    /// Returns the position [m or rad]: the run knows the gripper's range.
     fn of(self, client: &mut Client, arm: &str) -> Result<f64> {
-        if let Self::Metres(position) = self {
+        if let Self::Position(position) = self {
             return Ok(position);
         }
         let reported = client.call(Status {})?.arms.into_iter().find(|a| a.hardware_id == arm);
@@ -107,7 +110,7 @@ impl Opening {
             None => Ok(0.0),
             Some(_) => {
                 let what = format!("{arm} has no gripper, or does not report its range");
-                Err(Failure::new(Exit::Failed, what).hint(format!("give it in metres: dimos arm gripper {arm} 0.04")))
+                Err(Failure::new(Exit::Failed, what).hint(format!("give it as a number: dimos arm gripper {arm} 0.04")))
             }
         }
     }
@@ -125,7 +128,7 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
             }
             Ok(Exit::Ok)
         }
-        Action::Gripper { which, opening } => gripper(which, *opening),
+        Action::Gripper { which, opening, force } => gripper(which, *opening, *force),
         Action::Io(args) => parts::io(args),
         Action::Payload(args) => parts::payload(args),
         Action::FindPort(args) => find_port::run(args, registry),
@@ -149,14 +152,16 @@ fn phase(which: &ArmArgs, request: impl Method<Reply = ArmReply>) -> Result {
     Ok(Exit::Ok)
 }
 
-fn gripper(which: &ArmArgs, opening: Opening) -> Result {
+fn gripper(which: &ArmArgs, opening: Opening, force: Option<f64>) -> Result {
     let (mut client, arm) = (which.target_run.connect()?, which.arm.clone());
     let position = opening.of(&mut client, &arm)?;
-    let done = client.call(Gripper { arm, position })?;
+    let done = client.call(Gripper { arm, position, force })?;
     if which.target_run.json {
         output::json(&done);
     } else {
-        output::line(format_args!("{}: gripper to {position:.4} m", which.arm));
+        let unit = done.force_unit.as_deref().unwrap_or_default();
+        let force = done.force.map_or_else(String::new, |force| format!(", force at most {force} {unit}"));
+        output::line(format_args!("{}: gripper to {position:.4} {}{force}", which.arm, done.unit));
     }
     Ok(Exit::Ok)
 }

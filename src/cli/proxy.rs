@@ -158,7 +158,8 @@ fn info(client: &mut Client, status: &StatusReport, arm: &ArmReport) -> Result<A
     Ok(ArmInfo {
         arm: arm.hardware_id.clone(),
         limits: arm.position_limits.clone(),
-        gripper_range: arm.gripper_range,
+        // The SDK's gripper opens by a width.
+        gripper_range: arm.gripper_range.filter(|_| arm.gripper_unit.as_deref() == Some("m")),
         trajectory: trajectory.map(|task| task.name.clone()),
         servo: stream("servo"),
         velocity: stream("velocity"),

@@ -101,7 +101,8 @@ fn of_arm(arm: &ArmStateReport) -> Vec<String> {
     }
     lines.extend(table.lines());
     if let Some(gripper) = arm.gripper {
-        lines.push(format!("gripper  {gripper:.4} m"));
+        let unit = arm.gripper_unit.as_deref().unwrap_or("m");
+        lines.push(format!("gripper  {gripper:.4} {unit}{}", force(arm)));
     }
     if let Some(pose) = arm.pose {
         let ([x, y, z], [roll, pitch, yaw]) = (pose.xyz, pose.rpy);
@@ -111,6 +112,12 @@ fn of_arm(arm: &ArmStateReport) -> Vec<String> {
         lines.push(format!("wrench   force {fx:.2} {fy:.2} {fz:.2} N, torque {tx:.3} {ty:.3} {tz:.3} Nm"));
     }
     lines
+}
+
+/// Returns the measured force of the gripper; empty if it measures none.
+fn force(arm: &ArmStateReport) -> String {
+    let unit = arm.gripper_force_unit.as_deref().unwrap_or_default();
+    arm.gripper_force.map_or_else(String::new, |force| format!(", force {force:.2} {unit}"))
 }
 
 /// Returns the source of a velocity unless it is measured.

@@ -251,6 +251,9 @@ fn print_arms(arms: &[ArmReport]) {
         for line in joint_lines(&arm.joints) {
             output::line(format_args!("  {name}: {line}"));
         }
+        if let Some(line) = gripper_line(arm) {
+            output::line(format_args!("  {name}: {line}"));
+        }
         if let Some(load) = &arm.payload {
             output::line(format_args!("  {name}: payload {}", payload_text(load)));
         }
@@ -280,6 +283,16 @@ fn print_arms(arms: &[ArmReport]) {
             output::line(format_args!("  {name} counted {}", counted.join(", ")));
         }
     }
+}
+
+/// Returns ranges and measured force of an arm's gripper; `None` without one, or if nothing is known of it.
+fn gripper_line(arm: &ArmReport) -> Option<String> {
+    let (unit, force_unit) = (arm.gripper_unit.as_deref()?, arm.gripper_force_unit.as_deref().unwrap_or_default());
+    let range = arm.gripper_range.map(|[closed, open]| format!("{closed:.4} {unit} closed, {open:.4} {unit} open"));
+    let commands = arm.gripper_force_range.map(|[least, most]| format!("force {least} to {most} {force_unit}"));
+    let measured = arm.gripper_force.map(|force| format!("measured force {force:.2} {force_unit}"));
+    let parts: Vec<String> = [range, commands, measured].into_iter().flatten().collect();
+    (!parts.is_empty()).then(|| format!("gripper {}", parts.join("; ")))
 }
 
 /// Prints the tasks as a table.

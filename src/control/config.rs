@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::arm::Supervision;
+use crate::arm::{GripperInfo, Supervision};
 use crate::joint::{ControlMode, JointLimits};
 
 pub use super::task_config::{TaskConfig, TaskKind};
@@ -23,7 +23,7 @@ pub const ACTIVATION_RAMP: Duration = Duration::from_millis(200);
 
 /// Config version: of the form of [`CoordinatorConfig`] and of the rules of the tick. The same configuration, states
 /// and requests give the same commands only under the same version. Increase it with every change of either.
-pub const CONFIG_VERSION: u32 = 4;
+pub const CONFIG_VERSION: u32 = 5;
 
 /// Config version of logs that have none.
 pub const FIRST_CONFIG_VERSION: u32 = 1;
@@ -66,6 +66,9 @@ pub struct ArmConfig {
     pub modes: Vec<ControlMode>,
     /// Whether it has a gripper.
     pub gripper: bool,
+    /// Units and ranges of that gripper.
+    #[serde(default)]
+    pub gripper_info: GripperInfo,
     /// Its own velocity limits, before the blueprint narrows them [rad/s]; empty: `limits` are its own.
     #[serde(default)]
     pub own_velocity: Vec<f64>,

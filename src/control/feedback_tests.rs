@@ -12,6 +12,7 @@ fn config() -> ArmConfig {
         limits: JointLimits::uniform(2, 3.0, 1.0).with_defaults(),
         modes: vec![ControlMode::ServoPosition],
         gripper: false,
+        gripper_info: Default::default(),
         own_velocity: Vec::new(),
         read_period: PERIOD,
         write_period: PERIOD,

@@ -73,8 +73,10 @@ pub enum Request {
     Gripper {
         /// The arm.
         arm: u16,
-        /// Opening [m].
+        /// Position [m, or rad for a rotary gripper].
         opening: f64,
+        /// Largest force, in the gripper's force unit; `None`: the device's own.
+        force: Option<f64>,
     },
     /// The run shuts down: decelerate all arms to rest and refuse further requests.
     Shutdown,

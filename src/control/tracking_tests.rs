@@ -15,6 +15,7 @@ fn tracking() -> Tracking {
         limits: JointLimits::uniform(2, 3.0, 1.0).with_defaults(),
         modes: vec![ControlMode::ServoPosition, ControlMode::Velocity],
         gripper: false,
+        gripper_info: Default::default(),
         own_velocity: Vec::new(),
         read_period: PERIOD,
         write_period: PERIOD,

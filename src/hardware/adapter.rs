@@ -16,7 +16,7 @@ mod payload;
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
-use crate::arm::Pose;
+use crate::arm::{ForceUnit, GripperInfo, GripperUnit, Pose};
 use crate::clock::Mono;
 use crate::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
 
@@ -269,8 +269,8 @@ pub trait ManipulatorAdapter: Send {
     }
 }
 
-/// A gripper whose fingers move along one axis. The adapter usually implements it itself, and
-/// [`ManipulatorAdapter::gripper`] returns `Some(self)`.
+/// A gripper with one degree of freedom: fingers along one axis, or a rotary jaw. The adapter usually implements it
+/// itself, and [`ManipulatorAdapter::gripper`] returns `Some(self)`.
 ///
 /// ```
 /// use dimos::hardware::adapter::{AdapterError, AdapterResult, Gripper};
@@ -298,13 +298,60 @@ pub trait ManipulatorAdapter: Send {
 /// assert!(fingers.write_gripper_position(0.09).is_err());
 /// ```
 pub trait Gripper {
-    /// Returns the opening [m]; `None` while it is unknown. Must not allocate.
+    /// Returns the unit of positions: metres of opening, or radians for a rotary jaw. Never changes.
+    fn get_gripper_unit(&self) -> GripperUnit {
+        GripperUnit::Meters
+    }
+    /// Returns the position [m or rad]; `None` while it is unknown. Must not allocate.
     fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>>;
-    /// Commands the opening [m].
+    /// Commands the position [m or rad], with the force that is set in the device. `Rejected` outside the range: then
+    /// nothing moves.
     fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()>;
-    /// Returns the opening when closed and when open [m], according to the data sheet; `None` if unknown.
+    /// Returns the position when closed and when open [m or rad], according to data sheet or calibration; `None` if
+    /// unknown.
     fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
         None
+    }
+    /// Returns the unit of forces: by default N, and Nm for a rotary jaw. A device may also state the torque of its
+    /// motor, or percent. Never changes.
+    fn get_gripper_force_unit(&self) -> ForceUnit {
+        match self.get_gripper_unit() {
+            GripperUnit::Meters => ForceUnit::Newtons,
+            GripperUnit::Radians => ForceUnit::NewtonMeters,
+        }
+    }
+    /// Returns the smallest and the largest force that can be commanded [their unit]; `None` without force control.
+    fn get_gripper_force_range(&mut self) -> Option<(f64, f64)> {
+        None
+    }
+    /// Commands the position [m or rad] with a largest force [its unit]. `Rejected` outside either range: then nothing
+    /// moves. The force is that of this command: the next one without a force has the device's own again.
+    fn write_gripper_position_with_force(&mut self, _position: f64, _force: f64) -> AdapterResult<()> {
+        Err(AdapterError::Unsupported)
+    }
+    /// Returns the measured force [its unit]; `None` if the device measures none. Must not allocate.
+    fn read_gripper_force(&mut self) -> AdapterResult<Option<f64>> {
+        Ok(None)
+    }
+}
+
+impl dyn Gripper + '_ {
+    /// Returns units and ranges.
+    pub fn info(&mut self) -> GripperInfo {
+        GripperInfo {
+            unit: self.get_gripper_unit(),
+            range: self.get_gripper_range(),
+            force_unit: self.get_gripper_force_unit(),
+            force_range: self.get_gripper_force_range(),
+        }
+    }
+
+    /// Commands the position, with a largest force if there is one.
+    pub fn command(&mut self, position: f64, force: Option<f64>) -> AdapterResult<()> {
+        match force {
+            Some(force) => self.write_gripper_position_with_force(position, force),
+            None => self.write_gripper_position(position),
+        }
     }
 }
 

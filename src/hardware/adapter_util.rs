@@ -18,6 +18,14 @@ pub fn finite<const N: usize>(values: &[f64]) -> AdapterResult<[f64; N]> {
     }
 }
 
+/// Returns a commanded value that is within its range; `Rejected` otherwise, with `what` it is and its unit.
+pub fn within(what: &str, value: f64, (least, most): (f64, f64), unit: &str) -> AdapterResult<f64> {
+    if (least..=most).contains(&value) {
+        return Ok(value);
+    }
+    Err(AdapterError::Rejected(format!("{what} {value} {unit} is not within {least} to {most} {unit}")))
+}
+
 /// Reads an option that is a fraction above 0 and at most 1, for `#[serde(deserialize_with = "fraction")]`.
 pub fn fraction<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
     above_zero(deserializer, 1.0)

@@ -77,6 +77,11 @@ pub trait Emulator: Send {
     fn true_positions(&self) -> Option<Joints> {
         None
     }
+    /// Returns the largest force that its gripper was given, in the unit of the adapter's force; `None` if it has no
+    /// gripper with force control.
+    fn gripper_force(&self) -> Option<f64> {
+        None
+    }
 }
 
 /// Where an emulator listens.

@@ -9,7 +9,7 @@ use crate::telemetry::{ArmSample, TickSample};
 /// Returns whether two states differ in the fields of `ArmInput`. NaN differs from itself: a superfluous message is
 /// better than a lost one.
 pub(super) fn input_differs(a: &ArmState, b: &ArmState) -> bool {
-    let values = |s: &ArmState| (s.gripper, s.pose, s.wrench, s.effort.is_some(), s.velocity_source);
+    let values = |s: &ArmState| (s.gripper, s.gripper_force, s.pose, s.wrench, s.effort.is_some(), s.velocity_source);
     let flags = |s: &ArmState| (s.seq, s.stamp, s.mode, s.enabled, s.error, s.link, s.self_held, s.written);
     let more = |s: &ArmState| (s.interference, s.own_delay_ns, s.stop_input_open, s.device_ns);
     values(a) != values(b) || flags(a) != flags(b) || more(a) != more(b)
@@ -17,7 +17,8 @@ pub(super) fn input_differs(a: &ArmState, b: &ArmState) -> bool {
 
 /// Returns whether two commands differ in the fields of `ArmOutput`, except for counters that change on their own.
 pub(super) fn output_differs(a: &ArmCommand, b: &ArmCommand) -> bool {
-    let parts = |c: &ArmCommand| (c.mode, c.gripper.to_bits(), c.gripper_seq, c.stop_seq, c.start_seq);
+    let gripper = |c: &ArmCommand| (c.gripper.to_bits(), c.gripper_force.map(f64::to_bits), c.gripper_seq);
+    let parts = |c: &ArmCommand| (c.mode, gripper(c), c.stop_seq, c.start_seq);
     parts(a) != parts(b)
 }
 
@@ -43,6 +44,7 @@ pub(super) fn input(header: &Header, tick: u64, s: &ArmState) -> ArmInput {
         own_delay_ns: s.own_delay_ns,
         stop_input_open: s.stop_input_open,
         device_ns: s.device_ns.into_iter().collect(),
+        gripper_force: s.gripper_force.into_iter().collect(),
     }
 }
 
@@ -58,6 +60,7 @@ pub(super) fn output(header: &Header, tick: u64, c: &ArmCommand) -> ArmOutput {
         stop_seq: c.stop_seq,
         next_tick_ns: c.next_tick.0,
         start_seq: c.start_seq,
+        gripper_force: c.gripper_force.into_iter().collect(),
     }
 }
 

@@ -39,7 +39,7 @@ message! {
         header: Header,
         /// Joint names.
         name: Vec<String>,
-        /// [rad], of a gripper [m].
+        /// [rad], of a gripper [m, or rad if it is rotary].
         position: Vec<f64>,
         /// [rad/s].
         velocity: Vec<f64>,
@@ -241,7 +241,7 @@ message! {
         velocity_source: String,
         /// Whether the arm reported efforts.
         has_effort: bool,
-        /// Gripper opening [m]; empty if not reported.
+        /// Gripper position [m, or rad for a rotary gripper]; empty if not reported.
         gripper: Vec<f64>,
         /// End-effector pose in the arm's base frame: x, y, z [m], roll, pitch, yaw [rad]; empty if not reported.
         pose: Vec<f64>,
@@ -267,6 +267,8 @@ message! {
         stop_input_open: bool,
         /// The device's own time of the measurement, on its own clock [ns]; empty if not reported.
         device_ns: Vec<u64>,
+        /// Measured force of the gripper, in the unit in coordinator.json; empty if not reported.
+        gripper_force: Vec<f64>,
     }
 }
 
@@ -321,7 +323,7 @@ message! {
         seq: u64,
         /// The control mode of the command; empty if the arm is not commanded.
         mode: String,
-        /// Gripper opening [m]; meaningless while gripper_seq is 0.
+        /// Gripper position [m, or rad for a rotary gripper]; meaningless while gripper_seq is 0.
         gripper: f64,
         /// Counts gripper commands.
         gripper_seq: u32,
@@ -331,5 +333,7 @@ message! {
         next_tick_ns: u64,
         /// Number of starts of commanded motion: after enabling and after a change of mode.
         start_seq: u32,
+        /// Largest force of the gripper command, in the unit in coordinator.json; empty: the device's own.
+        gripper_force: Vec<f64>,
     }
 }

@@ -270,6 +270,7 @@ impl TickLog {
                 header: header.clone(),
                 name: vec![format!("{id}_gripper")],
                 position: vec![opening],
+                effort: state.gripper_force.into_iter().collect(),
                 ..Default::default()
             };
             log.publish(&format!("/gripper/{id}"), time, &message)?;

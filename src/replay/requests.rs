@@ -1,6 +1,6 @@
 //! Converts logged requests back to requests: the inverse of `runtime::dispatch`.
 
-use serde::Deserialize;
+use serde::{Deserialize, Deserializer};
 
 use crate::control::request::{Goal, Motion, Request};
 use crate::joint::{Joints, joints_of};
@@ -16,18 +16,57 @@ struct RequestMessage {
 #[derive(Debug, Deserialize)]
 #[serde(rename_all = "snake_case")]
 enum LoggedRequest {
-    Execute { task: u16, motion: u64, trajectory: JointTrajectory },
-    Cancel { task: Option<u16> },
-    Servo { task: u16, target: Vec<Option<f64>> },
-    Velocity { task: u16, target: Vec<Option<f64>> },
-    Pose { task: u16, position: [Option<f64>; 3], orientation: [Option<f64>; 4] },
-    Twist { task: u16, linear: [Option<f64>; 3], angular: [Option<f64>; 3], tool: bool },
-    Stop { arm: Option<u16> },
-    Reset { arm: u16 },
-    Ready { arm: u16 },
-    Park { arm: u16 },
-    Gripper { arm: u16, opening: Option<f64> },
+    Execute {
+        task: u16,
+        motion: u64,
+        trajectory: JointTrajectory,
+    },
+    Cancel {
+        task: Option<u16>,
+    },
+    Servo {
+        task: u16,
+        target: Vec<Option<f64>>,
+    },
+    Velocity {
+        task: u16,
+        target: Vec<Option<f64>>,
+    },
+    Pose {
+        task: u16,
+        position: [Option<f64>; 3],
+        orientation: [Option<f64>; 4],
+    },
+    Twist {
+        task: u16,
+        linear: [Option<f64>; 3],
+        angular: [Option<f64>; 3],
+        tool: bool,
+    },
+    Stop {
+        arm: Option<u16>,
+    },
+    Reset {
+        arm: u16,
+    },
+    Ready {
+        arm: u16,
+    },
+    Park {
+        arm: u16,
+    },
+    Gripper {
+        arm: u16,
+        opening: Option<f64>,
+        #[serde(default, deserialize_with = "present")]
+        force: Option<f64>,
+    },
     Shutdown {},
+}
+
+/// Reads a number that is there: null is one that was not finite.
+fn present<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<f64>, D::Error> {
+    Option::<f64>::deserialize(deserializer).map(|value| Some(value.unwrap_or(f64::NAN)))
 }
 
 /// The id of any request.
@@ -72,7 +111,9 @@ fn request(logged: LoggedRequest, joints: &[String]) -> Result<Request, String> 
         LoggedRequest::Reset { arm } => Request::Reset { arm },
         LoggedRequest::Ready { arm } => Request::Enabled { arm },
         LoggedRequest::Park { arm } => Request::PrepareDisable { arm },
-        LoggedRequest::Gripper { arm, opening } => Request::Gripper { arm, opening: opening.unwrap_or(f64::NAN) },
+        LoggedRequest::Gripper { arm, opening, force } => {
+            Request::Gripper { arm, opening: opening.unwrap_or(f64::NAN), force }
+        }
         LoggedRequest::Shutdown {} => Request::Shutdown,
     })
 }
@@ -117,7 +158,9 @@ mod tests {
             Request::Reset { arm: 1 },
             Request::Enabled { arm: 0 },
             Request::PrepareDisable { arm: 2 },
-            Request::Gripper { arm: 1, opening: 0.1 + 0.2 },
+            Request::Gripper { arm: 1, opening: 0.1 + 0.2, force: None },
+            Request::Gripper { arm: 1, opening: -0.1 - 0.2, force: Some(0.1 + 0.2) },
+            Request::Gripper { arm: 0, opening: 0.04, force: Some(f64::NAN) },
             Request::Shutdown,
         ] {
             let logged = log_of(&request);

@@ -178,7 +178,7 @@ methods! {
     /// Decelerates the arm to rest and disables the motors. An arm without brakes falls.
     "arm_disable" ArmDisable -> ArmReply;
     /// Commands a gripper.
-    "gripper" Gripper -> Done, check Gripper::valid;
+    "gripper" Gripper -> GripperReply, check Gripper::valid;
     /// Levels of an arm's digital and analogue inputs and outputs.
     "arm_io" ArmIo -> IoReport;
     /// Sets digital and analogue outputs of an arm, and reads them back.

@@ -126,13 +126,31 @@ impl Method for Release {
 pub struct Gripper {
     /// The arm's `hardware_id`.
     pub arm: String,
-    /// Opening [m].
+    /// Position: the opening [m], or the angle [rad] of a rotary gripper (`gripper_unit` in `status`).
     pub position: f64,
+    /// Largest force [`gripper_force_unit` in `status`]; default: the one set in the device.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub force: Option<f64>,
+}
+
+/// Reply to `gripper`: what was commanded.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+pub struct GripperReply {
+    /// Position [`unit`].
+    pub position: f64,
+    /// Unit of the position: `m` of opening, or `rad` of a rotary jaw.
+    pub unit: String,
+    /// Largest force [`force_unit`]; absent: the one set in the device.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub force: Option<f64>,
+    /// Unit of the force: `N`, `Nm` or `%`; absent without a force.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub force_unit: Option<String>,
 }
 
 impl Gripper {
     pub(super) fn valid(&self) -> Result<(), String> {
         finite("position", &[self.position])?;
-        if self.position < 0.0 { Err(format!("position is {}, must not be negative", self.position)) } else { Ok(()) }
+        finite("force", self.force.as_slice())
     }
 }

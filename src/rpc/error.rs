@@ -107,7 +107,10 @@ impl Code {
             Outcome::WrongTask(_) => Some(Self::WrongTask),
             Outcome::NonFinite(_) => Some(Self::NonFinite),
             Outcome::InvalidTarget(_) => Some(Self::InvalidParams),
-            Outcome::OutOfLimits(..) | Outcome::GripperOutOfLimits(..) => Some(Self::OutOfLimits),
+            Outcome::OutOfLimits(..) | Outcome::GripperOutOfLimits(..) | Outcome::GripperForceOutOfLimits(..) => {
+                Some(Self::OutOfLimits)
+            }
+            Outcome::NoGripperForce(_) => Some(Self::Unsupported),
             Outcome::NoGripper(_) => Some(Self::NoGripper),
             Outcome::ShuttingDown => Some(Self::ShuttingDown),
         }

@@ -162,9 +162,22 @@ pub struct ArmReport {
     /// Holder of its lease; absent without one.
     #[serde(default)]
     pub commander: Option<CommanderReport>,
-    /// Closed and open position of its gripper [m]; absent without a gripper, or if the adapter does not report it.
+    /// Closed and open position of its gripper [`gripper_unit`]; absent without a gripper, or if the adapter does not
+    /// report it.
     #[serde(default)]
     pub gripper_range: Option<[f64; 2]>,
+    /// Unit of its gripper's position: `m` of opening, or `rad` of a rotary jaw; absent without a gripper.
+    #[serde(default)]
+    pub gripper_unit: Option<String>,
+    /// Smallest and largest force of a gripper command [`gripper_force_unit`]; absent without force control.
+    #[serde(default)]
+    pub gripper_force_range: Option<[f64; 2]>,
+    /// Unit of its gripper's force: `N`, `Nm` or `%`; absent without a gripper.
+    #[serde(default)]
+    pub gripper_force_unit: Option<String>,
+    /// Measured force of its gripper [`gripper_force_unit`]; absent if it measures none.
+    #[serde(default)]
+    pub gripper_force: Option<f64>,
     /// Its digital and analogue inputs and outputs, as read last; absent without any.
     #[serde(default)]
     pub io: Option<IoReport>,
@@ -312,8 +325,17 @@ pub struct ArmStateReport {
     pub age_ms: Option<f64>,
     /// Its joints, in order.
     pub joints: Vec<JointReport>,
-    /// Gripper opening [m].
+    /// Gripper position [`gripper_unit`].
     pub gripper: Option<f64>,
+    /// Unit of the gripper's position: `m` of opening, or `rad` of a rotary jaw; absent without a gripper.
+    #[serde(default)]
+    pub gripper_unit: Option<String>,
+    /// Measured force of the gripper [`gripper_force_unit`]; absent if it measures none.
+    #[serde(default)]
+    pub gripper_force: Option<f64>,
+    /// Unit of the gripper's force: `N`, `Nm` or `%`; absent without a gripper.
+    #[serde(default)]
+    pub gripper_force_unit: Option<String>,
     /// End-effector pose in the arm's base frame.
     pub pose: Option<PoseReport>,
     /// Force and torque [N, N, N, Nm, Nm, Nm].

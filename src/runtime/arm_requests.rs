@@ -7,13 +7,13 @@ use std::time::{Duration, Instant};
 
 use super::dispatch::log_of;
 use super::service::{Service, internal};
-use crate::arm::Link;
+use crate::arm::{GripperInfo, Link};
 use crate::control::request::Request;
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::device::{Answer, Device};
 use crate::joint::STANDSTILL;
 use crate::message::Message;
-use crate::rpc::api::{self, Done, Reply};
+use crate::rpc::api::{self, Reply};
 use crate::rpc::{Code, RpcError};
 use crate::telemetry::describe::cause_text;
 use crate::telemetry::{ArmSample, Outcome, Phase};
@@ -199,17 +199,25 @@ impl Service {
             return self.refusal(&Outcome::NoGripper(arm)).map_or_else(|| Err(internal()), Err);
         }
         let device = self.device(arm)?;
+        let info = self.gripper_info(arm.into()).unwrap_or_default();
+        let unit = info.unit.name();
         let _turn = self.grippers.get(arm as usize).ok_or_else(internal)?.lock().await;
-        self.ask(Request::Gripper { arm, opening: call.position }).await?;
+        self.ask(Request::Gripper { arm, opening: call.position, force: call.force }).await?;
         let order = self.arm_view(arm as usize).ok_or_else(internal)?.command.gripper_seq;
         let gone = |view: &ArmSample| matches!(view.state.link, Link::Down | Link::Faulted);
         let gone = || self.seen(arm, gone).map(|()| Err(AdapterError::NotConnected));
         let look = || device.health().gripper_answer(order).or_else(gone);
         match self.until(Instant::now() + ORDER_LIMIT, look).await {
-            Some(Ok(())) => Ok(Reply::Gripper(Done {})),
+            Some(Ok(())) => Ok(Reply::Gripper(api::GripperReply {
+                position: call.position,
+                unit: unit.to_owned(),
+                force: call.force,
+                force_unit: call.force.map(|_| info.force_unit.name().to_owned()),
+            })),
             Some(Err(error)) => {
                 let message = Message::of(format!("{} refused the gripper order: {error}", call.arm));
-                let (what, hint) = message.or_hint("`dimos state` shows the gripper's opening now, in metres");
+                let hint = format!("`dimos state` shows the gripper's position now [{unit}], `dimos status` its range");
+                let (what, hint) = message.or_hint(hint);
                 Err(RpcError::new(Code::DeviceRefused, what).hint(hint))
             }
             None => {
@@ -217,6 +225,11 @@ impl Service {
                 Err(RpcError::new(Code::NoAnswer, what).hint("`dimos status` shows the arm's connection"))
             }
         }
+    }
+
+    /// Returns units and ranges of an arm's gripper; `None` without one.
+    pub(super) fn gripper_info(&self, arm: usize) -> Option<GripperInfo> {
+        self.parts.connected.get(arm).and_then(|connected| connected.gripper)
     }
 
     /// Returns `Some` once an arm is in a condition.

@@ -56,6 +56,7 @@ pub(super) fn coordinator_config(
                 limits: limits.clone(),
                 modes: said.info.modes.to_vec(),
                 gripper: arm.adapter.gripper,
+                gripper_info: said.gripper.unwrap_or_default(),
                 own_velocity: said.limits.velocity_max.clone(),
                 read_period: said.read_period,
                 write_period: said.write_period,

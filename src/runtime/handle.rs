@@ -123,9 +123,14 @@ impl Handle {
         self.call(ArmDisable { arm: arm.to_owned(), now: true })
     }
 
-    /// Commands the opening of a gripper [m].
+    /// Commands the position of a gripper: its opening [m], or the angle [rad] of a rotary one.
     pub fn gripper(&self, arm: &str, position: f64) -> Result<(), RpcError> {
-        self.call(Gripper { arm: arm.to_owned(), position }).map(drop)
+        self.call(Gripper { arm: arm.to_owned(), position, force: None }).map(drop)
+    }
+
+    /// Commands the position of a gripper [m or rad] with a largest force, in its force unit [N or Nm].
+    pub fn gripper_with_force(&self, arm: &str, position: f64, force: f64) -> Result<(), RpcError> {
+        self.call(Gripper { arm: arm.to_owned(), position, force: Some(force) }).map(drop)
     }
 
     /// Sends the next target of a servo task [rad], one value per joint of the task; repeat it within the task's

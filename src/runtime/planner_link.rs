@@ -281,9 +281,9 @@ impl Service {
             let values = if commanded { view.command.values } else { view.state.position };
             let known = arm.joints.iter().cloned().zip(values).filter(|(_, value)| value.is_finite());
             positions.extend(known);
-            let range = self.parts.connected.get(index).and_then(|connected| connected.gripper_range);
+            let range = self.gripper_info(index).and_then(|info| info.range);
             if let (Some(opening), Some((closed, open))) = (view.state.gripper, range)
-                && open > closed
+                && open != closed
             {
                 let part = ((opening - closed) / (open - closed)).clamp(0.0, 1.0);
                 grippers.extend(arm.joints.iter().map(|joint| (joint.clone(), part)));

@@ -64,7 +64,7 @@ impl Service {
     fn arm_report(&self, index: usize) -> Option<ArmReport> {
         let (arm, device) = (self.parts.blueprint.arms.get(index)?, self.parts.devices.get(index)?);
         let (view, health, now) = (self.arm_view(index)?, device.health(), self.now());
-        let Connected { info, gripper_range, io, .. } = self.parts.connected.get(index)?;
+        let Connected { info, gripper, io, .. } = self.parts.connected.get(index)?;
         let faults = health.episodes().into_iter().map(|e| FaultReport {
             since: now.seconds_since(e.since),
             over: e.until.is_some(),
@@ -98,7 +98,11 @@ impl Service {
             native_rate_hz: info.native_rate,
             faults: faults.collect(),
             commander: None, // filled in by the connection
-            gripper_range: gripper_range.map(|(closed, open)| [closed, open]),
+            gripper_range: gripper.and_then(|gripper| gripper.range).map(<[f64; 2]>::from),
+            gripper_unit: gripper.map(|gripper| gripper.unit.name().to_owned()),
+            gripper_force_range: gripper.and_then(|gripper| gripper.force_range).map(<[f64; 2]>::from),
+            gripper_force_unit: gripper.map(|gripper| gripper.force_unit.name().to_owned()),
+            gripper_force: view.state.gripper_force,
             io: io.zip(health.details().io).map(|(info, state)| self.io_report(index, &info, &state)),
             joints: self.joint_status(index, &health.details()),
             payload: health.details().payload.map(LoadReport::from),
@@ -146,7 +150,7 @@ impl Service {
     pub fn state(&self) -> StateReport {
         let arms = self.parts.blueprint.arms.iter().enumerate().filter_map(|(i, arm)| {
             let view = self.arm_view(i)?;
-            let (s, known) = (&view.state, view.state.seq > 0);
+            let (s, known, gripper) = (&view.state, view.state.seq > 0, self.gripper_info(i));
             let joints = arm.joints.iter().enumerate().map(|(j, name)| JointReport {
                 name: name.clone(),
                 position: s.position.get(j).copied().filter(|_| known),
@@ -161,6 +165,9 @@ impl Service {
                 age_ms: self.age_ms(s),
                 joints: joints.collect(),
                 gripper: s.gripper,
+                gripper_unit: gripper.map(|gripper| gripper.unit.name().to_owned()),
+                gripper_force: s.gripper_force,
+                gripper_force_unit: gripper.map(|gripper| gripper.force_unit.name().to_owned()),
                 pose: s.pose.map(|p| PoseReport { xyz: p.xyz, rpy: p.rpy }),
                 wrench: s.wrench,
             })
@@ -254,8 +261,19 @@ impl Service {
                 .hint("limits are the arm's own, narrowed by `limits` in the blueprint")
                 .data(serde_json::json!({"joint": names.joint(*joint), "by": by})),
             Outcome::GripperOutOfLimits(a, opening) => error
-                .hint("`dimos status --json` shows its range [m] as `gripper_range`")
+                .hint("`dimos status` shows its range")
                 .data(serde_json::json!({"arm": arm(a), "opening": opening})),
+            Outcome::GripperForceOutOfLimits(a, force) => {
+                let info = self.gripper_info((*a).into()).unwrap_or_default();
+                let (least, most) = info.force_range.unwrap_or_default();
+                error
+                    .hint(format!(
+                        "give {least} to {most} {}, or no force for the one set in the arm",
+                        info.force_unit.name()
+                    ))
+                    .data(serde_json::json!({"arm": arm(a), "force": force, "range": [least, most]}))
+            }
+            Outcome::NoGripperForce(_) => error.hint("command its position without a force"),
             Outcome::WrongTask(_) => error.hint("`dimos status` lists the tasks and their types"),
             _ => error,
         })

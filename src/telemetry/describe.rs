@@ -144,11 +144,13 @@ fn request(id: u64, outcome: Outcome, names: &Names) -> Described {
             d.joint = Some(names.joint(joint));
             d.values = vec![by];
         }
-        Outcome::GripperOutOfLimits(arm, opening) => {
+        Outcome::GripperOutOfLimits(arm, value) | Outcome::GripperForceOutOfLimits(arm, value) => {
             d.arm = Some(names.arm(arm));
-            d.values = vec![opening];
+            d.values = vec![value];
         }
-        Outcome::StartStateUnavailable(arm) | Outcome::NoGripper(arm) => d.arm = Some(names.arm(arm)),
+        Outcome::StartStateUnavailable(arm) | Outcome::NoGripper(arm) | Outcome::NoGripperForce(arm) => {
+            d.arm = Some(names.arm(arm));
+        }
         Outcome::ArmNotReady(arm, _, cause) | Outcome::ArmLatched(arm, cause) | Outcome::StillFaulted(arm, cause) => {
             d.arm = Some(names.arm(arm));
             d.values = code(cause);
@@ -179,8 +181,12 @@ pub fn outcome_text(outcome: &Outcome, names: &Names) -> String {
             format!("the target of {} is outside its limits by {by:.4}", names.joint(joint))
         }
         Outcome::GripperOutOfLimits(arm, opening) => {
-            format!("the gripper of {} cannot open to {opening:.4} m: the opening must be 0 m or more", names.arm(arm))
+            format!("the gripper of {} cannot go to {opening:.4}: an opening must be 0 m or more", names.arm(arm))
         }
+        Outcome::GripperForceOutOfLimits(arm, force) => {
+            format!("a force of {force} is outside the range of the gripper of {}", names.arm(arm))
+        }
+        Outcome::NoGripperForce(arm) => format!("the gripper of {} has no force control", names.arm(arm)),
         Outcome::InvalidTarget(task) => {
             format!("the target of task {} is not finite, or its orientation is invalid", names.task(task))
         }
@@ -371,7 +377,7 @@ mod tests {
         assert_eq!((d.request, d.status), (Some(7), "START_STATE_MISMATCH"));
         assert_eq!(d.text, "request 7: the trajectory starts 0.5000 rad (28.65°) from the position of left_joint1");
         let d = describe(&Event::Request(8, Outcome::GripperOutOfLimits(1, -0.01)), &names());
-        let text = "request 8: the gripper of right cannot open to -0.0100 m: the opening must be 0 m or more";
+        let text = "request 8: the gripper of right cannot go to -0.0100: an opening must be 0 m or more";
         assert_eq!((d.text.as_str(), d.status), (text, "OUT_OF_LIMITS"));
         assert_eq!((d.arm.as_deref(), d.joint, d.values), (Some("right"), None, vec![-0.01]));
     }

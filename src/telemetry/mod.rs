@@ -288,8 +288,12 @@ pub enum Outcome {
     NonFinite(u16),
     /// A target is outside the joint's limits: joint, by how much [rad or rad/s].
     OutOfLimits(u16, f64),
-    /// A gripper opening is negative or not finite: the arm, the opening [m].
+    /// A gripper position is not finite, or an opening negative: the arm, the position [m or rad].
     GripperOutOfLimits(u16, f64),
+    /// A gripper force is outside its range: the arm, the force [N or Nm].
+    GripperForceOutOfLimits(u16, f64),
+    /// The gripper has no force control: the arm.
+    NoGripperForce(u16),
     /// The target is not finite, or its orientation is invalid: the task.
     InvalidTarget(u16),
     /// The arm has no gripper: the arm.
@@ -313,7 +317,8 @@ impl Outcome {
             Self::StillFaulted(..) => "STILL_FAULTED",
             Self::WrongTask(_) => "WRONG_TASK",
             Self::NonFinite(_) => "NON_FINITE",
-            Self::OutOfLimits(..) | Self::GripperOutOfLimits(..) => "OUT_OF_LIMITS",
+            Self::OutOfLimits(..) | Self::GripperOutOfLimits(..) | Self::GripperForceOutOfLimits(..) => "OUT_OF_LIMITS",
+            Self::NoGripperForce(_) => "UNSUPPORTED",
             Self::InvalidTarget(_) => "INVALID_TARGET",
             Self::NoGripper(_) => "NO_GRIPPER",
             Self::ShuttingDown => "SHUTTING_DOWN",

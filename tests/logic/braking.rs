@@ -38,6 +38,7 @@ fn config() -> CoordinatorConfig {
         limits: limits.with_defaults(),
         modes: vec![ControlMode::ServoPosition],
         gripper: false,
+        gripper_info: Default::default(),
         own_velocity: Vec::new(),
         read_period: Duration::from_millis(10),
         write_period: Duration::from_millis(10),

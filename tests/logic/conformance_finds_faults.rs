@@ -47,6 +47,12 @@ const ENABLES_AT_OLD_GOAL: u8 = 29;
 const VELOCITIES_SCALED: u8 = 30;
 const TAKES_LATE_ANSWERS: u8 = 31;
 const ENABLED_BY_ONE_MOTOR: u8 = 32;
+const GRIPPER_IN_MILLIMETRES: u8 = 33;
+const GRIPPER_CLAMPS: u8 = 34;
+const FORCE_CLAMPS: u8 = 35;
+const FORCE_IS_LOST: u8 = 36;
+const FORCE_REMAINS: u8 = 37;
+const FORCE_CONTROL_ONLY_CLAIMED: u8 = 38;
 const NO_MISTAKE: u8 = 255;
 
 /// The modes of an arm that takes only setpoints.
@@ -61,6 +67,8 @@ struct Wrong<const MISTAKE: u8> {
     stopped: bool,
     /// Where the gripper was sent [m].
     gripper: f64,
+    /// With which force.
+    force: Option<f64>,
     /// The last reading.
     last: Option<JointReading>,
     /// The last positions it was sent to [rad].
@@ -105,6 +113,7 @@ impl<const MISTAKE: u8> Wrong<MISTAKE> {
             connections: 0,
             stopped: false,
             gripper: 0.0,
+            force: None,
             last: None,
             goal: None,
             late: false,
@@ -288,7 +297,25 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
 
 impl<const MISTAKE: u8> Gripper for Wrong<MISTAKE> {
     fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
-        self.inner.gripper().map_or(Ok(None), |gripper| gripper.read_gripper_position())
+        let position = self.inner.gripper().map_or(Ok(None), |gripper| gripper.read_gripper_position())?;
+        Ok(position.map(|metres| if MISTAKE == GRIPPER_IN_MILLIMETRES { 1000.0 * metres } else { metres }))
+    }
+    fn get_gripper_force_range(&mut self) -> Option<(f64, f64)> {
+        self.inner.gripper().and_then(|gripper| gripper.get_gripper_force_range())
+    }
+    fn write_gripper_position_with_force(&mut self, position: f64, force: f64) -> AdapterResult<()> {
+        let gripper = self.inner.gripper().ok_or(AdapterError::Unsupported)?;
+        let (least, most) = gripper.get_gripper_force_range().ok_or(AdapterError::Unsupported)?;
+        self.force = (least..=most).contains(&force).then_some(force);
+        match MISTAKE {
+            FORCE_CONTROL_ONLY_CLAIMED => Err(AdapterError::Unsupported),
+            FORCE_CLAMPS => gripper.write_gripper_position_with_force(position, force.max(least).min(most)),
+            FORCE_IS_LOST if (least..=most).contains(&force) => gripper.write_gripper_position(position),
+            _ => gripper.write_gripper_position_with_force(position, force),
+        }
+    }
+    fn read_gripper_force(&mut self) -> AdapterResult<Option<f64>> {
+        self.inner.gripper().map_or(Ok(None), |gripper| gripper.read_gripper_force())
     }
     fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
         self.inner.gripper().and_then(|gripper| gripper.get_gripper_range())
@@ -299,7 +326,12 @@ impl<const MISTAKE: u8> Gripper for Wrong<MISTAKE> {
             STOP_LOCKS_GRIPPER if self.stopped => return Err(AdapterError::Rejected("stopped".into())),
             _ => self.gripper = position,
         }
-        self.inner.gripper().ok_or(AdapterError::Unsupported)?.write_gripper_position(position)
+        let gripper = self.inner.gripper().ok_or(AdapterError::Unsupported)?;
+        match (MISTAKE, self.force) {
+            (GRIPPER_CLAMPS, _) => gripper.write_gripper_position(position.clamp(0.0, 0.08)),
+            (FORCE_REMAINS, Some(force)) => gripper.write_gripper_position_with_force(position, force),
+            _ => gripper.write_gripper_position(position),
+        }
     }
 }
 
@@ -337,6 +369,12 @@ fn each_mistake_is_found_by_the_check_for_it() {
         (Wrong::<STOP_IS_FINAL>::WIRED, "stop_is_no_fault"),
         (Wrong::<GRIPPER_IGNORES_STOP>::WIRED, "stop_holds_the_gripper"),
         (Wrong::<STOP_LOCKS_GRIPPER>::SPEC, "stop_holds_the_gripper"),
+        (Wrong::<GRIPPER_IN_MILLIMETRES>::SPEC, "gripper_is_in_its_unit"),
+        (Wrong::<GRIPPER_CLAMPS>::WIRED, "gripper_range_is_kept"),
+        (Wrong::<FORCE_CLAMPS>::SPEC, "gripper_force_is_kept"),
+        (Wrong::<FORCE_IS_LOST>::WIRED, "gripper_force_is_kept"),
+        (Wrong::<FORCE_REMAINS>::WIRED, "gripper_force_is_kept"),
+        (Wrong::<FORCE_CONTROL_ONLY_CLAIMED>::SPEC, "gripper_force_is_kept"),
         (Wrong::<ENABLES_ON_CONNECT>::WIRED, "cut_when_disabled"),
         (Wrong::<CLAIMS_TO_BE_CONNECTED>::WIRED, "cut_when_enabled"),
         (Wrong::<STALE_STATE_AFTER_CONNECT>::WIRED, "cut_when_enabled"),
@@ -378,6 +416,8 @@ fn without_a_mistake_the_same_checks_pass() {
         (Wrong::<NO_MISTAKE>::WIRED, "late_answers_are_not_new"),
         (Wrong::<NO_MISTAKE>::WIRED, "enabled_means_every_motor"),
         (Wrong::<NO_MISTAKE>::WIRED, "stop_without_answer"),
+        (Wrong::<NO_MISTAKE>::WIRED, "gripper_range_is_kept"),
+        (Wrong::<NO_MISTAKE>::WIRED, "gripper_force_is_kept"),
     ] {
         let check = checks().find(|check| check.name == name).unwrap();
         assert_eq!(run(&row, check, Some(counting::allocations)), Outcome::Passed, "{name}");

@@ -1,6 +1,6 @@
 //! What the coordinator does with trajectories, streams, stops and arms, on a virtual clock.
 
-use dimos::arm::VelocitySource;
+use dimos::arm::{GripperUnit, VelocitySource};
 use dimos::control::config::*;
 use dimos::control::request::Request;
 use dimos::joint::ControlMode;
@@ -283,20 +283,46 @@ fn grippers_open_on_request_and_only_where_there_is_one() {
     let mut without = arm("bare", 6);
     (with.gripper, without.gripper) = (true, false);
     let mut rig = Rig::new(100.0, vec![with, without], one(trajectory()));
-    assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: 0.04 }).name(), "ARM_NOT_READY");
+    assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: 0.04, force: None }).name(), "ARM_NOT_READY");
     rig.make_ready();
-    assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: 0.04 }), Outcome::Accepted);
+    assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: 0.04, force: None }), Outcome::Accepted);
     assert_eq!((rig.arms[0].gripper, rig.commands[0].gripper_seq), (0.04, 1));
-    assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: 0.0 }), Outcome::Accepted, "closed");
-    assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: 0.04 }), Outcome::Accepted);
-    assert_eq!(rig.ask(Request::Gripper { arm: 1, opening: 0.04 }), Outcome::NoGripper(1));
+    assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: 0.0, force: None }), Outcome::Accepted, "closed");
+    assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: 0.04, force: None }), Outcome::Accepted);
+    assert_eq!(rig.ask(Request::Gripper { arm: 1, opening: 0.04, force: None }), Outcome::NoGripper(1));
     for unfit in [f64::NAN, f64::INFINITY, -0.1] {
-        assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: unfit }).name(), "OUT_OF_LIMITS");
+        assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: unfit, force: None }).name(), "OUT_OF_LIMITS");
     }
     // The gripper is refused, not a joint of the arm.
-    let negative = rig.ask(Request::Gripper { arm: 0, opening: -0.1 });
+    let negative = rig.ask(Request::Gripper { arm: 0, opening: -0.1, force: None });
     assert_eq!(negative, Outcome::GripperOutOfLimits(0, -0.1));
     assert_eq!(rig.arms[0].gripper, 0.04);
+}
+
+#[test]
+fn a_gripper_takes_forces_within_its_range_and_a_rotary_one_any_angle() {
+    let (mut strong, mut rotary) = (arm("strong", 6), arm("rotary", 6));
+    (strong.gripper, rotary.gripper) = (true, true);
+    strong.gripper_info.force_range = Some((1.0, 40.0));
+    rotary.gripper_info.unit = GripperUnit::Radians;
+    let mut rig = Rig::new(100.0, vec![strong, rotary], one(trajectory()));
+    rig.make_ready();
+    let grip = |arm, opening, force| Request::Gripper { arm, opening, force };
+    assert_eq!(rig.ask(grip(0, 0.04, Some(40.0))), Outcome::Accepted);
+    let command = rig.commands[0];
+    assert_eq!((command.gripper, command.gripper_force, command.gripper_seq), (0.04, Some(40.0), 1));
+    for force in [0.9, 40.1, -2.0, f64::INFINITY] {
+        assert_eq!(rig.ask(grip(0, 0.02, Some(force))), Outcome::GripperForceOutOfLimits(0, force));
+    }
+    assert_eq!(rig.ask(grip(0, 0.02, Some(f64::NAN))).name(), "OUT_OF_LIMITS");
+    assert_eq!((rig.commands[0].gripper, rig.commands[0].gripper_seq), (0.04, 1), "a refused one moves nothing");
+    assert_eq!(rig.ask(grip(0, 0.02, None)), Outcome::Accepted);
+    assert_eq!(rig.commands[0].gripper_force, None, "a force is that of its command only");
+    assert_eq!(rig.ask(grip(1, -0.3, None)), Outcome::Accepted);
+    assert_eq!(rig.commands[1].gripper, -0.3);
+    assert_eq!(rig.ask(grip(1, -0.2, Some(1.0))), Outcome::NoGripperForce(1));
+    assert_eq!(rig.ask(grip(1, f64::NAN, None)).name(), "OUT_OF_LIMITS");
+    assert_eq!((rig.commands[1].gripper, rig.commands[1].gripper_seq), (-0.3, 1));
 }
 
 #[test]

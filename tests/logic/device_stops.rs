@@ -10,6 +10,7 @@ use dimos::clock::{Clock, Mono, MonotonicClock};
 use dimos::hardware::adapter::{
     AdapterError, AdapterResult, Io, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
 };
+use dimos::hardware::arms::piper::{self, emulator::PiperEmulator};
 use dimos::hardware::arms::xarm::{self, emulator::XArmEmulator};
 use dimos::hardware::device::{Device, DeviceConfig};
 use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
@@ -355,6 +356,45 @@ fn a_gripper_that_goes_on_after_a_stop_is_held() {
         std::thread::sleep(Duration::from_millis(300));
         assert!(held < 0.0849, "stopped at {at_the_stop} m, it continued to {held} m");
         assert!((emulator.gripper() - held).abs() < 1e-6, "held");
+        Ok(())
+    });
+    bench.end();
+}
+
+/// The stop of a Piper does not reach its gripper either: it is held with the torque of its command, not with that of
+/// the options.
+#[test]
+fn a_gripper_is_held_with_the_force_of_its_command() {
+    let options = serde_json::json!({ "gripper_torque": 1.0 });
+    let mut config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: 6, options };
+    let emulator = PiperEmulator::start(&config, &EmulatorAddress::InProcess).unwrap();
+    config.address = emulator.address();
+    let mut bench = bench_of((piper::SPEC.create)(&config).unwrap(), MockAdapter::new(6), 200.0);
+    let send = |bench: &mut Bench, opening: f64, force: Option<f64>| {
+        bench.tick(|command| {
+            (command.gripper, command.gripper_force, command.gripper_seq) = (opening, force, command.gripper_seq + 1);
+        });
+    };
+    let opening = |bench: &mut Bench| bench.states.read().gripper.unwrap_or(f64::NAN);
+    Watch::of_processors().unless_stalled(|| {
+        send(&mut bench, 0.0, None);
+        bench.until("it is closed", |bench| opening(bench) < 1e-4);
+        send(&mut bench, 0.07, Some(2.5));
+        bench.until("it opens", |bench| opening(bench) > 0.005);
+        emulator.record();
+        bench.tick(|command| command.stop_seq += 1);
+        let sent = bench.command.stop_seq;
+        bench.until("the stop", |bench| bench.device.health().stop_sent.load(Relaxed) == sent);
+        let at_the_stop = opening(&mut bench);
+        if at_the_stop >= 0.05 {
+            bench.device.activate().wait(LIMIT).unwrap();
+            return Err(format!("the stop reached the arm with the gripper at {at_the_stop} m"));
+        }
+        std::thread::sleep(Duration::from_millis(500));
+        let orders: Vec<_> = emulator.trace().into_iter().filter(|(_, frame)| frame.id == 0x159).collect();
+        let [(_, hold)] = orders[..] else { panic!("{orders:?}") };
+        assert_eq!(hold.data[4..7], [0x09, 0xC4, 1], "2500 mNm, on");
+        assert!(opening(&mut bench) < 0.069, "stopped at {at_the_stop} m, it continued to {} m", opening(&mut bench));
         Ok(())
     });
     bench.end();

@@ -7,7 +7,7 @@ use std::hash::Hasher;
 use std::path::Path;
 use std::time::Duration;
 
-use dimos::arm::{Interference, Link};
+use dimos::arm::{GripperInfo, GripperUnit, Interference, Link};
 use dimos::control::config::*;
 use dimos::control::request::Request;
 use dimos::robot::random::Random;
@@ -143,7 +143,8 @@ impl Scenario {
             }
             (37, _) => {
                 let arm = self.random.below(3) as u16;
-                self.rig.send(Request::Gripper { arm, opening: self.random.between(0.0, 0.1) });
+                let force = (self.random.below(2) == 0).then(|| self.random.between(0.0, 50.0));
+                self.rig.send(Request::Gripper { arm, opening: self.random.between(-0.01, 0.1), force });
             }
             _ => self.enable(),
         }
@@ -244,7 +245,9 @@ impl Scenario {
             self.tick();
             for (command, sample) in self.rig.commands.iter().zip(&self.rig.samples) {
                 command.values.iter().for_each(|value| commands.write_u64(value.to_bits()));
-                for number in [command.seq, command.gripper.to_bits(), command.next_tick.0, command.at.0] {
+                let force = command.gripper_force.unwrap_or(f64::NAN);
+                let bits = [command.gripper, force].map(f64::to_bits);
+                for number in [command.seq, command.next_tick.0, command.at.0].into_iter().chain(bits) {
                     commands.write_u64(number);
                 }
                 for number in [command.gripper_seq, command.stop_seq, command.start_seq] {
@@ -269,6 +272,10 @@ fn arm_of(name: &str, dof: usize, random: &mut Random) -> ArmConfig {
     arm.limits.acceleration_max = (0..dof).map(|_| random.between(2.0, 10.0)).collect();
     arm.limits.jerk_max = (0..dof).map(|_| random.between(10.0, 200.0)).collect();
     arm.gripper = random.below(2) == 0;
+    if random.below(2) == 0 {
+        arm.gripper_info = GripperInfo { unit: GripperUnit::Radians, ..Default::default() };
+    }
+    arm.gripper_info.force_range = (random.below(2) == 0).then_some((1.0, 40.0));
     if random.below(2) == 0 {
         arm.own_velocity = vec![2.5; dof];
     }

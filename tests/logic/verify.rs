@@ -12,7 +12,9 @@ use dimos::control::request::{Goal, Request};
 use dimos::control::task_spec::TaskTable;
 use dimos::hardware::registry::Registry;
 use dimos::joint::{JointLimits, joints_of, make_joints};
+use dimos::recording::cdr::Encoder;
 use dimos::recording::messages::{ArmOutput, JointState, Text, Tick};
+use dimos::recording::wire::{Field, Message};
 use dimos::replay::recorded::RecordedError;
 use dimos::replay::verify::{Finding, Verification};
 use dimos::robot::kinematics::Kinematics;
@@ -65,7 +67,7 @@ fn eventful(folder: &Path) -> (PathBuf, u64) {
     go(&mut run, 0.6); // refused: it is executing already
     steps(&mut run, 30);
     run.ask(Request::Cancel { task: Some(0) });
-    run.ask(Request::Gripper { arm: 0, opening: 0.1 + 0.2 });
+    run.ask(Request::Gripper { arm: 0, opening: 0.1 + 0.2, force: Some(0.1 + 0.7) });
     steps(&mut run, 60);
     for k in 0..80 {
         // A stream at 50 Hz, then a jump in it.
@@ -242,6 +244,22 @@ fn a_changed_number_of_starts_is_found() {
 }
 
 #[test]
+fn a_changed_force_of_the_gripper_is_found() {
+    let folder = tempfile::tempdir().unwrap();
+    let (log, _) = eventful(folder.path());
+    let copy = folder.path().join("copy.mcap");
+    rewrite(&log, &copy, |topic, bytes| {
+        let mut output = (topic == "/dimos/outputs/arm").then(|| ArmOutput::decode(bytes).unwrap())?;
+        output.gripper_force.iter_mut().for_each(ulp);
+        let mut out = Encoder::default();
+        output.put(&mut out);
+        Some(out.bytes().to_vec())
+    });
+    let d = first_difference(&copy);
+    assert_eq!((d.what, d.arm.as_deref()), ("force of the gripper command", Some("arm")));
+}
+
+#[test]
 fn a_changed_request_or_time_shows_in_what_came_of_it() {
     let folder = tempfile::tempdir().unwrap();
     let (log, _) = eventful(folder.path());
@@ -382,7 +400,7 @@ fn exercise(name: &str, dof: usize) {
     let motion = begin(&mut client, vec![0.0; dof]);
     client.call(api::Cancel::default()).unwrap();
     motion.map(|motion| wait_for_end(&mut client, motion));
-    let _ = client.call(api::Gripper { arm: "arm".into(), position: 0.03 });
+    let _ = client.call(api::Gripper { arm: "arm".into(), position: 0.03, force: Some(7.5) });
     begin(&mut client, vec![0.25; dof]);
     client.call(api::Stop { arm: None }).unwrap();
     let _ = client.call(api::ArmReset { arm: "arm".into() });

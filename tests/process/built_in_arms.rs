@@ -10,7 +10,7 @@ struct Arm {
     name: &'static str,
     /// Where it is sent [rad].
     target: &'static [f64],
-    /// How far its gripper opens [m].
+    /// How far its gripper opens [m, or rad for a rotary one].
     gripper: Option<f64>,
 }
 
@@ -77,7 +77,7 @@ fn grip(home: &Home, arm: &str, opening: f64) {
         eventually(&format!("{arm} {word}"), || {
             let state = home.dimos("state --json").with(0).json();
             let arm = state["arms"].as_array().unwrap().iter().find(|a| a["hardware_id"] == arm).unwrap();
-            arm["gripper"].as_f64().is_some_and(|now| (now - position).abs() < 0.002)
+            arm["gripper"].as_f64().is_some_and(|now| (now - position).abs() < 0.003)
         });
     }
 }
@@ -121,7 +121,7 @@ fn coordinator_piper() {
 
 #[test]
 fn coordinator_so101() {
-    exercise("coordinator-so101", &[Arm { name: "arm", target: SO101, gripper: Some(0.1) }]);
+    exercise("coordinator-so101", &[Arm { name: "arm", target: SO101, gripper: Some(1.92) }]);
 }
 
 #[test]

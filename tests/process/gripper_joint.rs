@@ -51,14 +51,31 @@ fn clearance(home: &Home) -> (f64, String) {
 
 #[test]
 fn fingers_are_planned_for_where_they_are_measured() {
-    let home = home("gripper_joint: {joint: left_finger, closed: 0, open: 1.2}");
+    fingers_follow(&home(FINGER));
+}
+
+/// The jaw of an SO-101 has an angle, which goes from closed to open like an opening.
+#[test]
+fn the_angle_of_a_rotary_gripper_is_mapped_as_well() {
+    let home = home(FINGER);
+    let sim = "options: {sim: {initial_positions: [0, 0, 0, 0, 0, 0.5]}}";
+    let arm = format!("[arm_turn, arm_b, arm_c, arm_d, arm_e], adapter_type: so101, address: sim, {sim}}}");
+    let blueprint = BLUEPRINT.replace("[arm_turn], adapter_type: mock}", &arm).replace("GRIPPER", FINGER);
+    home.write("tongs.yaml", &blueprint.replace("joint_names: {hardware: arm}", "joint_names: [arm_turn]"));
+    fingers_follow(&home);
+}
+
+/// The fingers turn by 1.2 rad while the gripper opens.
+const FINGER: &str = "gripper_joint: {joint: left_finger, closed: 0, open: 1.2}";
+
+fn fingers_follow(home: &Home) {
     let _run = home.run("tongs.yaml --no-record");
     home.dimos("arm gripper arm close").with(0);
-    eventually("the gripper is closed", || clearance(&home).0 > 0.15);
+    eventually("the gripper is closed", || clearance(home).0 > 0.15);
     home.dimos("arm gripper arm open").with(0);
     // The right finger, which follows the left one by `mimic`, now points at the post.
-    eventually("the gripper is open", || clearance(&home).0 < 0.12);
-    assert!(clearance(&home).1.contains("arm/right"), "{:?}", clearance(&home));
+    eventually("the gripper is open", || clearance(home).0 < 0.12);
+    assert!(clearance(home).1.contains("arm/right"), "{:?}", clearance(home));
 }
 
 #[test]

@@ -31,7 +31,7 @@ fn joints_are_in_status_and_in_the_log_and_are_read_rarely() {
     std::thread::sleep(std::time::Duration::from_secs(2));
     let trace = arm.trace();
     let count = |request: Request| trace.iter().filter(|r| r.request == request).count();
-    let (status, states) = (count(Request::GetJointStatus), count(Request::GetState));
+    let (status, states) = (count(Request::GetJointStatus), count(Request::GetState(true)));
     assert!((1..=6).contains(&status) && states > 20 * status, "{status} of {states} in 2 s");
 
     arm.inject(Fault { joint: 3, ..Fault::new(FaultKind::MotorOff) }).unwrap();

@@ -208,3 +208,17 @@ class SimArmAdapter:
 
 def register(registry) -> None:
     registry.register("simarm", SimArmAdapter)
+
+
+class RotaryGripperAdapter(SimArmAdapter):
+    """The same arm with a rotary gripper."""
+
+    gripper_unit = "rad"
+    angle = 0.0
+
+    def read_gripper_position(self) -> float | None:
+        return self.angle
+
+    def write_gripper_position(self, position: float) -> bool:
+        self.angle = position
+        return True

@@ -129,9 +129,13 @@ def grips_and_stops(robot):
     robot.gripper("arm", "open")
     while abs(robot.state("arm").gripper - 0.08) > 1e-3:
         pass
-    robot.gripper("arm", 0.02)
+    robot.gripper("arm", 0.02, force=12.5)
     while abs(robot.state("arm").gripper - 0.02) > 1e-3:
         pass
+    state = robot.state("arm")
+    assert (state.gripper_unit, state.gripper_force, state.gripper_force_unit) == ("m", 0.0, "N"), state
+    too_strong = refused(dimos.Refused, "OUT_OF_LIMITS", lambda: robot.gripper("arm", 0.04, force=1000))
+    assert "to 40 N" in too_strong.hint, too_strong.hint
     robot.velocity("velocity_arm", [0.1, 0, 0, 0, 0, 0])
     robot.settle()
     assert robot.stop() == {"arm": "confirmed"}

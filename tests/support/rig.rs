@@ -70,6 +70,7 @@ pub fn arm(name: &str, dof: usize) -> ArmConfig {
         limits,
         modes: vec![ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity],
         gripper: true,
+        gripper_info: Default::default(),
         own_velocity: Vec::new(),
         read_period: Duration::from_millis(10),
         write_period: Duration::from_millis(10),

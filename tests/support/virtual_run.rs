@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
 use std::time::Duration;
 
-use dimos::arm::{ArmState, Link, Supervision, VelocitySource};
+use dimos::arm::{ArmState, GripperInfo, Link, Supervision, VelocitySource};
 use dimos::clock::{Mono, WallOffset};
 use dimos::control::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, TaskConfig, TaskKind, TrajectoryParams};
 use dimos::control::coordinator::{Coordinator, TickTime};
@@ -34,6 +34,7 @@ pub fn one_arm(dof: usize) -> CoordinatorConfig {
         limits: JointLimits::uniform(dof, 3.0, 2.0).with_defaults(),
         modes: vec![ControlMode::ServoPosition, ControlMode::Velocity],
         gripper: true,
+        gripper_info: GripperInfo { force_range: Some((0.0, 40.0)), ..Default::default() },
         own_velocity: Vec::new(),
         read_period: Duration::from_millis(10),
         write_period: Duration::from_millis(10),

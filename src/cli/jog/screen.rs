@@ -167,7 +167,8 @@ fn pose(state: Option<&ArmStateReport>) -> Vec<Line> {
         lines.push(Line::default().and(text));
     }
     if let Some(gripper) = state.gripper {
-        lines.push(Line::default().and(format!("gripper {gripper:.4} m")));
+        let unit = state.gripper_unit.as_deref().unwrap_or("m");
+        lines.push(Line::default().and(format!("gripper {gripper:.4} {unit}")));
     }
     lines
 }

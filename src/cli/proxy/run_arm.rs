@@ -401,7 +401,7 @@ impl ControlledArm for RunArm {
         let Some([closed, open]) = self.info.gripper_range else { return };
         let position = opening.max(closed.min(open)).min(closed.max(open));
         self.gripper_ordered = Some(Instant::now());
-        self.send(&Gripper { arm: self.info.arm.clone(), position });
+        self.send(&Gripper { arm: self.info.arm.clone(), position, force: None });
     }
 
     fn set_load(&mut self, [mass, x, y, z]: [f32; 4]) -> Result<(), Refusal> {

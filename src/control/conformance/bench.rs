@@ -305,6 +305,7 @@ fn config(spec: &TaskSpec, robot: &TaskKinematics) -> CoordinatorConfig {
         limits: JointLimits::uniform(DOF, 2.9, 2.0).with_defaults(),
         modes: vec![ControlMode::ServoPosition, ControlMode::Velocity],
         gripper: false,
+        gripper_info: Default::default(),
         own_velocity: Vec::new(),
         read_period: Duration::from_millis(10),
         write_period: Duration::from_millis(10),

@@ -1,6 +1,7 @@
 //! How the coordinator handles requests, each with one outcome.
 
 use super::Coordinator;
+use crate::arm::GripperUnit;
 use crate::clock::Mono;
 use crate::control::arm_control::ArmControl;
 use crate::control::request::{Envelope, Motion, Request};
@@ -36,7 +37,7 @@ impl Coordinator {
                 self.end_tasks_of_held_arms();
                 outcome
             }
-            Request::Gripper { arm, opening } => self.gripper(arm, opening),
+            Request::Gripper { arm, opening, force } => self.gripper(arm, opening, force),
         };
         self.output.report(Event::Request(envelope.id, outcome));
     }
@@ -123,17 +124,25 @@ impl Coordinator {
         Ok(())
     }
 
-    fn gripper(&mut self, arm: u16, opening: f64) -> Outcome {
+    fn gripper(&mut self, arm: u16, opening: f64, force: Option<f64>) -> Outcome {
         let Some(a) = self.arms.get_mut(arm as usize) else { return Outcome::StartStateUnavailable(arm) };
         if !a.config().gripper {
             return Outcome::NoGripper(arm);
         }
-        if !opening.is_finite() || opening < 0.0 {
+        let info = a.config().gripper_info;
+        // The angle of a rotary jaw may be negative.
+        if !opening.is_finite() || (info.unit == GripperUnit::Meters && opening < 0.0) {
             return Outcome::GripperOutOfLimits(arm, opening);
+        }
+        match (force, info.force_range) {
+            (None, _) => {}
+            (Some(_), None) => return Outcome::NoGripperForce(arm),
+            (Some(force), Some((least, most))) if (least..=most).contains(&force) => {}
+            (Some(force), Some(_)) => return Outcome::GripperForceOutOfLimits(arm, force),
         }
         match a.failsafe.admits(arm) {
             Ok(()) => {
-                a.set_gripper(opening);
+                a.set_gripper(opening, force);
                 Outcome::Accepted
             }
             Err(outcome) => outcome,

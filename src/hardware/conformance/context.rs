@@ -277,14 +277,14 @@ impl Context {
         self.adapter.read_error().map_err(|e| format!("read_error: {e}"))
     }
 
-    /// Returns the gripper's opening [m], as the device reports it after this call; `None` without a gripper.
+    /// Returns the gripper's position [m or rad], as the device reports it after this call; `None` without a gripper.
     pub fn gripper(&mut self) -> Result<Option<f64>, String> {
         self.joints()?;
         let opening = self.adapter.gripper().map_or(Ok(None), |gripper| gripper.read_gripper_position());
         opening.map_err(|e| format!("read_gripper_position: {e}"))
     }
 
-    /// Commands the gripper's opening [m].
+    /// Commands the gripper's position [m or rad].
     pub fn command_gripper(&mut self, opening: f64) -> Result<(), String> {
         let gripper = self.adapter.gripper().ok_or(AdapterError::Unsupported);
         let result = gripper.and_then(|gripper| gripper.write_gripper_position(opening));

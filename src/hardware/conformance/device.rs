@@ -22,7 +22,6 @@ pub const CHECKS: &[Check] = &[
         "its parts answer; velocities in no mode of it are Unsupported",
         optional_parts,
     ),
-    Check::new(Motion, "gripper_is_in_metres", "the gripper moves to its target", gripper),
 ];
 
 fn reads_agree(context: &mut Context) -> Result<(), String> {
@@ -165,15 +164,4 @@ fn optional_parts(context: &mut Context) -> Result<(), String> {
         })?;
     }
     Ok(())
-}
-
-fn gripper(context: &mut Context) -> Result<(), String> {
-    context.ready(context.first_mode())?;
-    let Some(start) = context.gripper()? else {
-        return context.skip("it has no gripper");
-    };
-    require((-0.01..0.5).contains(&start), || format!("an opening of {start} m"))?;
-    let target = if start > 0.02 { start / 2.0 } else { start + 0.01 };
-    context.command_gripper(target)?;
-    context.until("the gripper", |context| Ok(context.gripper()?.is_some_and(|now| (now - target).abs() < 0.001)))
 }

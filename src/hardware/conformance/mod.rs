@@ -9,6 +9,7 @@ mod disconnects;
 mod faults;
 pub mod figures;
 pub mod first_motion;
+mod gripper;
 mod identity;
 pub mod lag;
 mod lifecycle;
@@ -81,6 +82,7 @@ pub fn checks() -> impl Iterator<Item = &'static Check> {
         lifecycle::CHECKS,
         device::CHECKS,
         parts::CHECKS,
+        gripper::CHECKS,
         streamed_state::CHECKS,
         motion::CHECKS,
         stops::CHECKS,

@@ -5,6 +5,8 @@ use std::time::Duration;
 use super::Check;
 use super::Needs::{Faults, Motion};
 use super::context::{Context, farthest, pause, require};
+use super::gripper::in_unit;
+use crate::arm::GripperUnit;
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, JointReading, Stop};
 use crate::hardware::device::gripper::GripperStop;
@@ -39,7 +41,7 @@ const SILENCE: f64 = 60.0;
 const SLOW: f64 = 0.1;
 /// Speed of the stream that is stopped [rad/s].
 const SPEED: f64 = 0.1;
-/// Minimum remaining travel of the gripper for a stop to reach it in motion [m].
+/// Minimum remaining travel of the gripper for a stop to reach it in motion [m; see `in_unit`].
 const GRIPPER_ROOM: f64 = 0.02;
 /// Maximum travel after a stop at `SPEED` [rad].
 const COASTING: f64 = 0.008;
@@ -149,26 +151,26 @@ fn stop_holds_gripper(context: &mut Context) -> Result<(), String> {
     if context.gripper()?.is_none() {
         return context.skip("it has no gripper");
     }
-    let Some((closed, open)) = context.adapter.gripper().and_then(|gripper| gripper.get_gripper_range()) else {
-        return context.skip("the range of its gripper is unknown");
-    };
+    let info = context.adapter.gripper().map(|gripper| gripper.info()).unwrap_or_default();
+    let Some((closed, open)) = info.range else { return context.skip("the range of its gripper is unknown") };
     // On a busy machine the gripper may arrive before the stop: then the check is repeated in the other direction.
     for target in [open, closed, open, closed, open] {
-        if let Some(stopped) = stop_gripper_on_its_way(context, target)? {
-            return gripper_stays(context, stopped);
+        if let Some(stopped) = stop_gripper_on_its_way(context, target, info.unit)? {
+            return gripper_stays(context, stopped, info.unit);
         }
     }
     context.skip("its gripper is too fast to be stopped in motion")
 }
 
 /// Moves the gripper and stops it. Returns where it stopped; `None` if it had arrived.
-fn stop_gripper_on_its_way(context: &mut Context, target: f64) -> Result<Option<f64>, String> {
+fn stop_gripper_on_its_way(context: &mut Context, target: f64, unit: GripperUnit) -> Result<Option<f64>, String> {
+    let length = |metres| in_unit(unit, metres);
     let left = |opening: Option<f64>| opening.map_or(0.0, |opening| (target - opening).abs());
     context.command_gripper(target)?;
     let way = left(context.gripper()?);
-    context.until("the gripper's motion", |context| Ok(left(context.gripper()?) < 0.95 * way.max(0.01)))?;
-    if left(context.gripper()?) < GRIPPER_ROOM {
-        context.until("the gripper's arrival", |context| Ok(left(context.gripper()?) < 0.001))?;
+    context.until("the gripper's motion", |context| Ok(left(context.gripper()?) < 0.95 * way.max(length(0.01))))?;
+    if left(context.gripper()?) < length(GRIPPER_ROOM) {
+        context.until("the gripper's arrival", |context| Ok(left(context.gripper()?) < length(0.001)))?;
         context.activate()?;
         return Ok(None);
     }
@@ -178,7 +180,7 @@ fn stop_gripper_on_its_way(context: &mut Context, target: f64) -> Result<Option<
     let mut rest = (context.gripper()?, MonotonicClock.now());
     context.until("the gripper's rest", |context| {
         let (opening, now) = (context.gripper()?, MonotonicClock.now());
-        if let Some(here) = opening.and_then(|opening| stop.observe(opening, now)) {
+        if let Some(here) = opening.and_then(|opening| stop.observe(opening, unit, now)) {
             context.command_gripper(here).map_err(|e| format!("holding the gripper: {e}"))?;
         }
         if left(opening) != left(rest.0) {
@@ -187,14 +189,15 @@ fn stop_gripper_on_its_way(context: &mut Context, target: f64) -> Result<Option<
         Ok(now.since(rest.1) > Duration::from_millis(400))
     })?;
     let went = left(rest.0);
-    require(went > 0.002, || format!("it moved to {target} m in spite of a stop"))?;
+    require(went > length(0.002), || format!("it moved to {target} {} in spite of a stop", unit.name()))?;
     Ok(rest.0)
 }
 
-fn gripper_stays(context: &mut Context, stopped: f64) -> Result<(), String> {
+fn gripper_stays(context: &mut Context, stopped: f64, unit: GripperUnit) -> Result<(), String> {
     pause(&mut *context.adapter, Duration::from_millis(300));
     let now = context.gripper()?.unwrap_or(f64::NAN);
-    require((now - stopped).abs() < 0.001, || format!("it moved from {stopped:.4} to {now:.4} m"))
+    let stayed = (now - stopped).abs() < in_unit(unit, 0.001);
+    require(stayed, || format!("it moved from {stopped:.4} to {now:.4} {}", unit.name()))
 }
 
 fn stop_without_answer(context: &mut Context) -> Result<(), String> {

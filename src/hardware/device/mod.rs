@@ -22,7 +22,7 @@ use std::time::Duration;
 pub use details::Details;
 pub use health::{Episode, Health, Note};
 
-use crate::arm::{ArmCommand, ArmState, IoInfo, IoState, Load, OutputValue, StopInput, Supervision};
+use crate::arm::{ArmCommand, ArmState, GripperInfo, IoInfo, IoState, Load, OutputValue, StopInput, Supervision};
 use crate::clock::Clock;
 use crate::hardware::adapter::{AdapterError, AdapterResult, ManipulatorAdapter, ManipulatorInfo};
 use crate::joint::{JointLimits, Joints};
@@ -103,8 +103,8 @@ pub struct Connected {
     pub info: ManipulatorInfo,
     /// Joint limits.
     pub limits: JointLimits,
-    /// Opening of its gripper when closed and when open [m], if known.
-    pub gripper_range: Option<(f64, f64)>,
+    /// Units and ranges of its gripper, if it has one.
+    pub gripper: Option<GripperInfo>,
     /// Its digital and analogue inputs and outputs, if it has any.
     pub io: Option<IoInfo>,
     /// Calibration offsets of its joints [rad], if it reports them.

@@ -1,43 +1,68 @@
 //! Gripper of a simulated arm.
 
-/// A gripper with finite speed.
+/// A gripper with finite speed. It presses on an object between its fingers with the largest force that it was given.
 #[derive(Debug, Clone, Copy)]
 pub struct Gripper {
-    /// Opening [m].
+    /// Position [m or rad].
     pub position: f64,
+    /// Largest force, in the unit of its force; 0 for a gripper without force control.
+    pub max_force: f64,
     target: f64,
     max: f64,
     speed: f64,
+    /// Position at which the fingers touch an object; 0 without one.
+    object: f64,
 }
 
 impl Gripper {
-    /// Creates a gripper that opens to `max` [m] at `speed` [m/s]; initially half open.
+    /// Creates a gripper that opens to `max` [m or rad] at `speed` [m/s or rad/s]; initially half open.
     pub fn new(max: f64, speed: f64) -> Self {
-        Self { position: max / 2.0, target: max / 2.0, max, speed }
+        Self { position: max / 2.0, max_force: 0.0, target: max / 2.0, max, speed, object: 0.0 }
     }
 
-    /// Moves to an opening [m].
+    /// Returns the same gripper with a largest force.
+    pub fn with_force(self, max_force: f64) -> Self {
+        Self { max_force, ..self }
+    }
+
+    /// Moves to a position [m or rad].
     pub fn move_to(&mut self, target: f64) {
         if target.is_finite() {
             self.target = target.clamp(0.0, self.max);
         }
     }
 
-    /// Stops where it is.
+    /// Stops where it is; a grip is kept.
     pub fn stop(&mut self) {
-        self.target = self.position;
+        if !self.gripping() {
+            self.target = self.position;
+        }
+    }
+
+    /// Puts an object of this width [m or rad] between the fingers, if they are wide enough open; 0 takes it away.
+    pub fn put_object(&mut self, width: f64) {
+        self.object = width.clamp(0.0, self.position);
     }
 
     /// Returns whether it is moving.
     pub fn moving(&self) -> bool {
-        self.position != self.target
+        self.position != self.target && !self.gripping()
+    }
+
+    /// Returns the force on the object [unit of its force]: 0 unless it grips one.
+    pub fn force(&self) -> f64 {
+        if self.gripping() { self.max_force } else { 0.0 }
     }
 
     /// Advances by `dt` [s].
     pub fn advance(&mut self, dt: f64) {
-        let reach = self.speed * dt.max(0.0);
-        let error = self.target - self.position;
-        self.position = if error.abs() <= reach { self.target } else { self.position + reach.copysign(error) };
+        let (reach, goal) = (self.speed * dt.max(0.0), self.target.max(self.object));
+        let error = goal - self.position;
+        self.position = if error.abs() <= reach { goal } else { self.position + reach.copysign(error) };
+    }
+
+    fn gripping(&self) -> bool {
+        self.position == self.object && self.target < self.object
     }
 }
 
@@ -54,5 +79,21 @@ mod tests {
         assert!(gripper.moving());
         gripper.advance(10.0);
         assert_eq!((gripper.position, gripper.moving()), (0.08, false));
+    }
+
+    #[test]
+    fn an_object_stops_the_fingers_and_feels_the_largest_force() {
+        let mut gripper = Gripper::new(0.08, 0.1).with_force(12.0);
+        gripper.put_object(0.03);
+        gripper.move_to(0.01);
+        gripper.advance(0.05);
+        assert!(gripper.moving() && gripper.force() == 0.0, "on the way");
+        gripper.advance(1.0);
+        assert_eq!((gripper.position, gripper.moving(), gripper.force()), (0.03, false, 12.0));
+        gripper.stop();
+        assert_eq!(gripper.force(), 12.0, "a stop keeps the grip");
+        gripper.move_to(0.05);
+        gripper.advance(1.0);
+        assert_eq!((gripper.position, gripper.force()), (0.05, 0.0));
     }
 }

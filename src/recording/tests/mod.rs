@@ -63,6 +63,7 @@ fn state(arm: u16, tick: u64) -> ArmState {
             [(tick as usize + usize::from(arm)) % 3],
         effort: (arm == 0 && tick % 4 > 1).then(|| joints_of(&[1.5, 2.5, x])),
         gripper: (arm == 0).then_some(0.04 + x * 1e-3),
+        gripper_force: (arm == 0).then_some(7.0 + x),
         pose: (tick % 3 == 1).then_some(Pose { xyz: [x, 0.2, 0.3], rpy: [0.0, -1.0, x] }),
         wrench: (arm == 1 && tick > 3).then_some([1.0, 2.0, x, 4.0, 5.0, 6.0]),
         mode: if tick > 5 { ControlMode::ServoPosition } else { ControlMode::Velocity },
@@ -169,6 +170,7 @@ fn with_values(input: &ArmInput, states: Option<&JointState>, skip: usize, dof: 
         velocity_source: source,
         effort: (input.has_effort && known).then(|| pick(&states.unwrap().effort)),
         gripper: input.gripper.first().copied(),
+        gripper_force: input.gripper_force.first().copied(),
         pose: (!input.pose.is_empty())
             .then(|| Pose { xyz: input.pose[..3].try_into().unwrap(), rpy: input.pose[3..].try_into().unwrap() }),
         wrench: (!input.wrench.is_empty()).then(|| input.wrench.clone().try_into().unwrap()),

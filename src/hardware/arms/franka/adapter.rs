@@ -7,7 +7,7 @@ use std::os::fd::BorrowedFd;
 use nalgebra::{Matrix3, Rotation3};
 
 use super::connect::connect;
-use super::gripper::{Hand, RANGE};
+use super::gripper::{FORCES, Hand, RANGE};
 use super::protocol::{DOF, PORT};
 use super::session::{LinkCounts, Session};
 use super::{HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, check};
@@ -268,11 +268,19 @@ impl Gripper for FrankaAdapter {
     }
 
     fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
-        self.with_hand(|hand| hand.move_to(position))
+        self.with_hand(|hand| hand.move_to(position, None))
     }
 
     fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
         Some(RANGE)
+    }
+
+    fn get_gripper_force_range(&mut self) -> Option<(f64, f64)> {
+        Some(FORCES)
+    }
+
+    fn write_gripper_position_with_force(&mut self, position: f64, force: f64) -> AdapterResult<()> {
+        self.with_hand(|hand| hand.move_to(position, Some(force)))
     }
 }
 

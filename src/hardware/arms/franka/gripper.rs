@@ -15,6 +15,8 @@ const ANSWER: Duration = Duration::from_millis(700);
 const STALE: Duration = Duration::from_millis(500);
 /// Widths below this close the hand [m].
 const CLOSED: f64 = 0.001;
+/// Forces that can be commanded: the largest is the continuous one of the data sheet [N].
+pub const FORCES: (f64, f64) = (1.0, 70.0);
 /// Widest opening according to the data sheet [m].
 pub const RANGE: (f64, f64) = (0.0, 0.08);
 
@@ -74,8 +76,13 @@ impl Hand {
         Ok(self.known().map(|(width, _)| width))
     }
 
-    /// Moves the fingers to a width [m]. Closing grasps, with the force of the blueprint.
-    pub fn move_to(&mut self, width: f64) -> AdapterResult<()> {
+    /// Moves the fingers to a width [m]; with a force [N] it grasps what is between them. Closing always grasps, by
+    /// default with the force of the blueprint.
+    pub fn move_to(&mut self, width: f64, force: Option<f64>) -> AdapterResult<()> {
+        if let Some(force) = force.filter(|force| !(FORCES.0..=FORCES.1).contains(force)) {
+            let what = format!("the gripper grasps with {} to {} N, not {force} N", FORCES.0, FORCES.1);
+            return Err(AdapterError::Rejected(what));
+        }
         self.update()?;
         let (_, most) = self.known().ok_or_else(|| AdapterError::Timeout("the gripper sends no state".into()))?;
         if most <= 0.0 {
@@ -86,9 +93,10 @@ impl Hand {
             return Err(AdapterError::Rejected(format!("the gripper opens 0 to {most:.3} m, not {width} m")));
         }
         self.last_id = self.last_id.wrapping_add(1);
-        let order = match width < CLOSED && self.force > 0.0 {
-            true => Request::Grasp(width, self.speed, self.force),
-            false => Request::Move(width.min(most), self.speed),
+        let closing = (width < CLOSED && self.force > 0.0).then_some(self.force);
+        let order = match force.or(closing) {
+            Some(force) => Request::Grasp(width.min(most), self.speed, force),
+            None => Request::Move(width.min(most), self.speed),
         };
         self.tcp.send(&request(self.last_id, order))
     }

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use super::device::{Device, GRIPPER_MAX};
+use super::device::{Device, GRIPPER_DEFAULT_FORCE, GRIPPER_FORCE, GRIPPER_MAX};
 use super::options::Options;
 use super::{MODES, NATIVE_RATE, check, limits};
 use crate::arm::{IoInfo, IoState, JointStatus, Load};
@@ -11,7 +11,7 @@ use crate::hardware::adapter::{
     AdapterError, AdapterResult, ForceTorque, Gripper, Io, JointMonitor, JointReading, ManipulatorAdapter,
     ManipulatorInfo, Payload, RobotState, Stop,
 };
-use crate::hardware::adapter_util::fill;
+use crate::hardware::adapter_util::{fill, within};
 use crate::hardware::registry::AdapterConfig;
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::sim::io::{MAX_VOLTAGE, SimIo};
@@ -21,7 +21,7 @@ use crate::joint::{ControlMode, JointLimits, MAX_DOF};
 pub struct MockArm {
     options: Options,
     dof: usize,
-    device: Device,
+    pub(super) device: Device,
     /// The last reading, for the fault `frozen`.
     measured: Option<JointReading>,
 }
@@ -228,15 +228,25 @@ impl Gripper for MockArm {
     }
 
     fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
+        self.write_gripper_position_with_force(position, GRIPPER_DEFAULT_FORCE)
+    }
+
+    fn get_gripper_force_range(&mut self) -> Option<(f64, f64)> {
+        Some(GRIPPER_FORCE)
+    }
+
+    fn write_gripper_position_with_force(&mut self, position: f64, force: f64) -> AdapterResult<()> {
         self.device.write_motion()?;
-        if !(0.0..=GRIPPER_MAX).contains(&position) {
-            return Err(AdapterError::Rejected(format!(
-                "gripper opening {position} m is not within 0 to {} m",
-                GRIPPER_MAX
-            )));
-        }
+        within("gripper opening", position, (0.0, GRIPPER_MAX), "m")?;
+        within("gripper force", force, GRIPPER_FORCE, "N")?;
+        self.device.gripper.max_force = force;
         self.device.gripper.move_to(position);
         Ok(())
+    }
+
+    fn read_gripper_force(&mut self) -> AdapterResult<Option<f64>> {
+        self.device.answer()?;
+        Ok(Some(self.device.gripper.force()))
     }
 }
 

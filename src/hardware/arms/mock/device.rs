@@ -17,6 +17,9 @@ use crate::joint::Joints;
 
 /// Maximum opening of the gripper [m].
 pub const GRIPPER_MAX: f64 = 0.08;
+/// Smallest and largest force of the gripper, and the one for a command without a force [N].
+pub const GRIPPER_FORCE: (f64, f64) = (1.0, 40.0);
+pub const GRIPPER_DEFAULT_FORCE: f64 = 20.0;
 /// Speed of the gripper [m/s].
 const GRIPPER_SPEED: f64 = 0.1;
 /// How fast an arm without brakes sinks while disabled [rad/s].
@@ -46,7 +49,7 @@ impl Device {
         Ok(Self {
             // Targets outside the limits are accepted; the joints stop at the limits.
             arm: arm.with_plant(plant).with_tolerance(f64::INFINITY),
-            gripper: Gripper::new(GRIPPER_MAX, GRIPPER_SPEED),
+            gripper: Gripper::new(GRIPPER_MAX, GRIPPER_SPEED).with_force(GRIPPER_DEFAULT_FORCE),
             io: SimIo::default(),
             load: Load::default(),
             gravity: UPRIGHT,

@@ -39,7 +39,7 @@ pub struct Options {
     /// Time constant with which joints follow what is commanded [s]; 0 = at once.
     #[schemars(range(min = 0, max = 10))]
     pub lag: f64,
-    /// Whether it has a gripper (0 to 0.08 m).
+    /// Whether it has a gripper (0 to 0.08 m, 1 to 40 N).
     pub gripper: bool,
     /// Whether it reports joint velocities.
     pub velocity_feedback: bool,

@@ -135,6 +135,19 @@ fn gripper_and_optional_parts() {
     clock.advance(ms(100));
     assert!((arm.read_gripper_position().unwrap().unwrap() - 0.05).abs() < 1e-12, "0.1 m/s from half open");
     assert!(matches!(arm.write_gripper_position(0.1), Err(AdapterError::Rejected(_))));
+    assert_eq!(arm.get_gripper_force_range(), Some((1.0, 40.0)));
+    for (position, force) in [(0.02, 0.5), (0.02, 40.1), (0.02, f64::NAN), (0.1, 5.0)] {
+        let refused = arm.write_gripper_position_with_force(position, force);
+        assert!(matches!(refused, Err(AdapterError::Rejected(_))), "{position} m, {force} N");
+    }
+    arm.device.gripper.put_object(0.03);
+    arm.write_gripper_position_with_force(0.02, 5.0).unwrap();
+    clock.advance(ms(1000));
+    assert_eq!((arm.read_gripper_position(), arm.read_gripper_force()), (Ok(Some(0.03)), Ok(Some(5.0))));
+    arm.write_stop().unwrap();
+    assert_eq!(arm.read_gripper_force(), Ok(Some(5.0)), "a stop keeps the grip");
+    arm.write_gripper_position(0.02).unwrap();
+    assert_eq!(arm.read_gripper_force(), Ok(Some(20.0)), "without a force it has its own");
     assert!(arm.cartesian().is_none() && arm.force_torque().is_none());
     let (mut bare, _) = ready(serde_json::json!({"gripper": false, "force_torque": true}), ControlMode::Position);
     assert!(bare.gripper().is_none());

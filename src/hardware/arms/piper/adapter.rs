@@ -18,7 +18,7 @@ use super::protocol::{self, DOF, WireJoints, millidegrees, radians};
 use super::session::{ESTOP, Session};
 use super::wire::{Wire, WireCounts};
 use super::{Follow, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, check};
-use crate::arm::{JointStatus, Pose};
+use crate::arm::{ForceUnit, JointStatus, Pose};
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, Gripper, JointMonitor, JointReading, ManipulatorAdapter, ManipulatorInfo,
@@ -45,6 +45,9 @@ const QUARTER_CURRENT: (u8, u8, u8) = (1, 8, 2);
 /// Bit of a driver's status that is no error: the motor is on.
 const ENABLED: u8 = 0x40;
 
+/// Smallest and largest torque of the gripper's motor that can be commanded [Nm].
+const GRIPPER_TORQUE: (f64, f64) = (0.001, 5.0);
+
 const MICRO: f64 = 1e-6;
 const MILLI: f64 = 1e-3;
 
@@ -53,6 +56,8 @@ pub struct PiperAdapter {
     arm: Session,
     options: Options,
     mode: ControlMode,
+    /// Largest torque of the last gripper command [mNm]; initially that of the options.
+    gripper_torque: u16,
 }
 
 impl PiperAdapter {
@@ -62,7 +67,8 @@ impl PiperAdapter {
         let address = config.parse_address(CanAddress::parse)?;
         let options: Options = config.options()?;
         let arm = Session::new(config.hardware_id.clone(), address, options.gripper.stroke().is_some());
-        Ok(Self { arm, options, mode: ControlMode::Position })
+        let gripper_torque = millinewtonmeters(options.gripper_torque);
+        Ok(Self { arm, options, mode: ControlMode::Position, gripper_torque })
     }
 
     /// Returns the counts since the connection was made: frames of the arm, and of the bus.
@@ -80,11 +86,6 @@ impl PiperAdapter {
             (ControlMode::ServoPosition, Follow::Direct) => protocol::Follow::Direct,
             _ => protocol::Follow::Smooth,
         }
-    }
-
-    /// Returns the maximum closing torque of the gripper [mNm].
-    fn gripper_torque(&self) -> u16 {
-        (self.options.gripper_torque / MILLI).round() as u16
     }
 
     /// Velocities [rad/s]; `None` if a motor has not reported its own recently.
@@ -307,7 +308,7 @@ impl ManipulatorAdapter for PiperAdapter {
         self.arm.send(&[protocol::clear_errors()])?;
         if let Some(gripper) = self.arm.feedback.gripper.filter(|_| self.arm.feedback.gripper_errors().next().is_some())
         {
-            let frame = protocol::clear_gripper(gripper.stroke, self.gripper_torque(), gripper.enabled());
+            let frame = protocol::clear_gripper(gripper.stroke, self.gripper_torque, gripper.enabled());
             self.arm.send(&[frame])?;
         }
         let asked = MonotonicClock.now();
@@ -343,6 +344,11 @@ impl ManipulatorAdapter for PiperAdapter {
     }
 }
 
+/// Torque of the wire [mNm] from ours [Nm].
+fn millinewtonmeters(torque: f64) -> u16 {
+    (torque / MILLI).round() as u16
+}
+
 impl JointMonitor for PiperAdapter {
     /// From feedback that has arrived. A motor's current is absent while it is not reported, or its unit is unknown.
     fn read_joint_status(&mut self, joints: &mut [JointStatus]) -> AdapterResult<()> {
@@ -373,12 +379,34 @@ impl Gripper for PiperAdapter {
     }
 
     fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
+        self.write_gripper_position_with_force(position, self.options.gripper_torque)
+    }
+
+    /// The vendor states the torque of the gripper's motor, not the force of its fingers.
+    fn get_gripper_force_unit(&self) -> ForceUnit {
+        ForceUnit::NewtonMeters
+    }
+
+    fn get_gripper_force_range(&mut self) -> Option<(f64, f64)> {
+        Some(GRIPPER_TORQUE)
+    }
+
+    fn read_gripper_force(&mut self) -> AdapterResult<Option<f64>> {
+        Ok(self.arm.known()?.gripper.map(|gripper| f64::from(gripper.torque) * MILLI))
+    }
+
+    fn write_gripper_position_with_force(&mut self, position: f64, force: f64) -> AdapterResult<()> {
         let stroke = self.options.gripper.stroke().ok_or(AdapterError::Unsupported)?;
         if !(0.0..=stroke).contains(&position) {
             return Err(self.arm.refuse(format!("gripper opening {position} m is not within 0 to {stroke} m")));
         }
+        let (least, most) = GRIPPER_TORQUE;
+        if !(least..=most).contains(&force) {
+            return Err(self.arm.refuse(format!("gripper torque {force} Nm is not within {least} to {most} Nm")));
+        }
         self.arm.may_move()?;
-        self.arm.send(&[protocol::gripper_target((position / MICRO).round() as i32, self.gripper_torque())])
+        self.gripper_torque = millinewtonmeters(force);
+        self.arm.send(&[protocol::gripper_target((position / MICRO).round() as i32, self.gripper_torque)])
     }
 }
 

@@ -147,6 +147,8 @@ impl Driver {
 pub struct Gripper {
     /// Opening [0.001 mm].
     pub stroke: i32,
+    /// Torque of its motor [mNm].
+    pub torque: i16,
     /// Bits: 0 low voltage, 1 motor hot, 2 overcurrent, 3 driver hot, 4 sensor, 5 driver error, 6 enabled, 7 homed.
     pub status: u8,
 }
@@ -224,7 +226,7 @@ pub fn decode(frame: &CanFrame) -> FeedbackFrame {
         }),
         0x2A2..=0x2A4 => FeedbackFrame::Pose(from(0x2A2), two),
         0x2A5..=0x2A7 => FeedbackFrame::Joints(from(0x2A5), two),
-        0x2A8 => FeedbackFrame::Gripper(Gripper { stroke: two[0], status: g }),
+        0x2A8 => FeedbackFrame::Gripper(Gripper { stroke: two[0], torque: i16::from_be_bytes([e, f]), status: g }),
         0x251..=0x256 => {
             let motor = Motor { speed: i16::from_be_bytes([a, b]), current: i16::from_be_bytes([c, d]) };
             FeedbackFrame::Motor(from(0x251), motor)

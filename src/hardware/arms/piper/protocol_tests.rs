@@ -27,7 +27,7 @@ fn feedback_is_read_from_the_golden_bytes() {
         assert_eq!(read(golden::POSE_FEEDBACK[part]), FeedbackFrame::Pose(part, two(POSE)));
         assert_eq!(read(golden::JOINT_FEEDBACK[part]), FeedbackFrame::Joints(part, two(JOINTS)));
     }
-    let gripper = Gripper { stroke: 42_500, status: 0xC0 };
+    let gripper = Gripper { stroke: 42_500, torque: -500, status: 0xC0 };
     assert_eq!(read(golden::GRIPPER_FEEDBACK), FeedbackFrame::Gripper(gripper));
     assert_eq!(read(golden::MOTOR_1), FeedbackFrame::Motor(0, Motor { speed: -1500, current: 2000 }));
     assert_eq!(read(golden::MOTOR_6), FeedbackFrame::Motor(5, Motor { speed: 1, current: -1 }));

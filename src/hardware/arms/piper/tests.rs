@@ -168,6 +168,20 @@ fn the_gripper_counts_in_metres_and_knows_its_size() {
         });
         let [(_, frame)] = emulator.trace()[..] else { panic!("one frame") };
         assert_eq!((two(&frame)[0], &frame.data[4..]), ((stroke * 1e6) as i32, &[0x09, 0xC4, 1, 0][..]), "2500 mNm");
+        for torque in [0.0, 5.1, f64::NAN] {
+            let error = arm.write_gripper_position_with_force(0.0, torque).unwrap_err().to_string();
+            assert!(error.ends_with("Nm is not within 0.001 to 5 Nm"), "{error}");
+        }
+        emulator.put_object(0.04);
+        emulator.record();
+        arm.write_gripper_position_with_force(0.02, 1.25).unwrap();
+        until("the grip", || {
+            read(&mut arm).unwrap();
+            arm.read_gripper_force() == Ok(Some(1.25))
+        });
+        assert_eq!(arm.read_gripper_position(), Ok(Some(0.04)));
+        let [(_, frame)] = emulator.trace()[..] else { panic!("one frame") };
+        assert_eq!((two(&frame)[0], &frame.data[4..]), (20_000, &[0x04, 0xE2, 1, 0][..]), "1250 mNm");
         let error = arm.write_gripper_position(stroke + 0.001).unwrap_err().to_string();
         assert!(error.ends_with(&format!("m is not within 0 to {stroke} m")), "{error}");
     }

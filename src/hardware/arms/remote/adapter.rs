@@ -10,7 +10,7 @@ use super::address::Address;
 use super::protocol::{Act, Command, Description, Measured, WirePose};
 use super::session::Session;
 use super::{MODES, NATIVE_RATE, check, limits, same_modes};
-use crate::arm::Pose;
+use crate::arm::{GripperUnit, Pose};
 use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo,
     RobotState, Stop,
@@ -304,6 +304,10 @@ impl Gripper for RemoteAdapter {
         self.recent(|state| state.gripper)
     }
 
+    fn get_gripper_unit(&self) -> GripperUnit {
+        self.last.as_ref().and_then(|described| described.gripper_unit).unwrap_or_default()
+    }
+
     fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
         self.last.as_ref()?.gripper_range
     }
@@ -311,7 +315,7 @@ impl Gripper for RemoteAdapter {
     fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
         let timeout = self.late()?;
         if !position.is_finite() {
-            return Err(AdapterError::Rejected(format!("a gripper opening of {position} m")));
+            return Err(AdapterError::Rejected(format!("a gripper position of {position}")));
         }
         self.act(&Act::Gripper(position), timeout)
     }

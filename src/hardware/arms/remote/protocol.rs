@@ -8,7 +8,7 @@ use std::io::Write as _;
 use serde::de::{Deserializer, Error as _, SeqAccess, Visitor};
 use serde::{Deserialize, Serialize};
 
-use crate::arm::Pose;
+use crate::arm::{GripperUnit, Pose};
 use crate::hardware::adapter::AdapterError;
 use crate::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
 
@@ -41,7 +41,7 @@ pub enum Act {
     Stop,
     /// `write_clear_errors`
     ClearErrors,
-    /// `write_gripper_position` [m]
+    /// `write_gripper_position` [m or rad]
     Gripper(f64),
     /// `write_cartesian_position`, with a fraction of the top speed.
     Cartesian(WirePose, f64),
@@ -190,7 +190,7 @@ pub struct Measured {
     /// The mode that the device is in.
     #[serde(default, rename = "get_control_mode")]
     pub mode: Option<ControlMode>,
-    /// Gripper opening [m].
+    /// Gripper position [m or rad].
     #[serde(default, rename = "read_gripper_position")]
     pub gripper: Option<f64>,
     /// End-effector pose.
@@ -344,9 +344,12 @@ pub struct Description {
     pub holds_when_disabled: Option<bool>,
     /// `get_limits` [rad, rad/s, rad/s², rad/s³]
     pub limits: Limits,
-    /// How far its gripper closes and opens [m].
+    /// Position of its gripper when closed and when open [m or rad].
     #[serde(default)]
     pub gripper_range: Option<(f64, f64)>,
+    /// Unit of its gripper's position; m where it does not say.
+    #[serde(default)]
+    pub gripper_unit: Option<GripperUnit>,
     /// The names of the reads that answer something: which optional parts there are.
     #[serde(default)]
     pub parts: Vec<String>,

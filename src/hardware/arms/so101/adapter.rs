@@ -1,6 +1,6 @@
 //! The SO-101 adapter: the adapter protocol on one side, the servos' line on the other.
 //!
-//! Wire: counts and counts/s. Here: rad, rad/s, m. One request reads the whole state of all servos;
+//! Wire: counts and counts/s. Here: rad, rad/s. One request reads the whole state of all servos;
 //! [`ManipulatorAdapter::read_joints`] makes it, and what is read right after is answered from it.
 
 use std::f64::consts::TAU;

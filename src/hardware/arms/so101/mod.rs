@@ -40,8 +40,6 @@ const MODES: &[ControlMode] = &[ControlMode::ServoPosition, ControlMode::Positio
 const NATIVE_RATE: f64 = 100.0;
 /// Without power the arm falls: its gears do not hold it.
 const HOLDS_WHEN_DISABLED: bool = false;
-/// Opening of the gripper at its tips when it is open [m].
-const GRIPPER_MAX: f64 = 0.1;
 /// Rate of the line, where an address names none [bit/s].
 const BAUD: u32 = 1_000_000;
 /// Top speed [rad/s], acceleration [rad/s²] and jerk [rad/s³] of every joint: less than a servo's 45 rpm without load.

@@ -2,12 +2,12 @@
 
 use std::f64::consts::TAU;
 
+use super::DOF;
 use super::adapter::So101Adapter;
 use super::protocol::TURN;
-use super::{DOF, GRIPPER_MAX};
-use crate::arm::JointStatus;
+use crate::arm::{GripperUnit, JointStatus};
 use crate::hardware::adapter::{AdapterError, AdapterResult, Gripper, JointMonitor};
-use crate::hardware::adapter_util::fill;
+use crate::hardware::adapter_util::{fill, within};
 
 /// Unit of the servos' currents [A].
 const AMPERE: f64 = 6.5e-3;
@@ -33,25 +33,27 @@ impl JointMonitor for So101Adapter {
     }
 }
 
+/// The jaw's angle counts from closed, the lower end of its range: wherever the calibration has its zero.
 impl Gripper for So101Adapter {
+    fn get_gripper_unit(&self) -> GripperUnit {
+        GripperUnit::Radians
+    }
+
     fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
         let position = self.recent()?.get(DOF).map_or(0, |servo| servo.position);
-        let range = self.range(DOF);
-        Ok(Some(f64::from(position - range.low) / f64::from(range.high - range.low) * GRIPPER_MAX))
+        Ok(Some(f64::from(position - self.range(DOF).low) * TAU / TURN))
     }
 
     fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
-        if !(0.0..=GRIPPER_MAX).contains(&position) {
-            return Err(AdapterError::Rejected(format!("the gripper opens 0 to {GRIPPER_MAX} m, not {position} m")));
-        }
+        let range = self.range(DOF);
+        let open = f64::from(range.high - range.low) * TAU / TURN;
+        within("gripper angle", position, (0.0, open), "rad")?;
         // Goals that were written since the last state are in the servos only.
         let servos = self.fetch()?;
         if !servos.get(DOF).is_some_and(|servo| servo.on) {
             return Err(AdapterError::Rejected("the motor of the gripper is off".into()));
         }
-        let range = self.range(DOF);
-        let goal = f64::from(range.low) + position / GRIPPER_MAX * f64::from(range.high - range.low);
-        let goal = goal.round() as i32;
+        let goal = range.low + (position * TURN / TAU).round() as i32;
         self.gripper_goal = Some(goal);
         let mut goals = servos.map(|servo| servo.goal);
         goals.iter_mut().skip(DOF).for_each(|to| *to = goal);
@@ -59,6 +61,7 @@ impl Gripper for So101Adapter {
     }
 
     fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
-        Some((0.0, GRIPPER_MAX))
+        let range = self.range(DOF);
+        Some((0.0, f64::from(range.high - range.low) * TAU / TURN))
     }
 }

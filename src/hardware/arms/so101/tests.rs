@@ -7,6 +7,7 @@ use serde_json::json;
 use super::adapter::So101Adapter;
 use super::emulator::{Servos, start};
 use super::{DOF, SPEC};
+use crate::arm::GripperUnit;
 use crate::hardware::adapter::{AdapterError, Gripper, ManipulatorAdapter, Stop};
 use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use crate::hardware::sim::faults::{Fault, FaultKind};
@@ -59,7 +60,7 @@ fn a_lost_a_damaged_and_a_late_answer_cost_no_reading() {
 }
 
 #[test]
-fn joints_and_gripper_move_in_radians_and_metres() {
+fn joints_and_gripper_move_in_radians() {
     for echo in [false, true] {
         let (mut adapter, servos) = arm(json!({"echo": echo, "sim": {"echo": echo}}));
         adapter.connect().unwrap();
@@ -70,13 +71,17 @@ fn joints_and_gripper_move_in_radians_and_metres() {
         let near = |found: &[f64]| found.iter().zip(goal).all(|(a, b)| (a - b).abs() < 2e-3);
         until(|| near(&positions(&mut adapter)));
         assert!(near(&servos.true_positions().unwrap()[..DOF]));
-        adapter.write_gripper_position(0.07).unwrap();
-        until(|| (adapter.read_gripper_position().unwrap().unwrap() - 0.07).abs() < 1e-3);
+        let (closed, open) = adapter.get_gripper_range().unwrap();
+        assert_eq!((adapter.get_gripper_unit(), closed), (GripperUnit::Radians, 0.0));
+        assert!((open - 1.92).abs() < 2e-3, "−0.175 to 1.745 rad: {open}");
+        adapter.write_gripper_position(1.3).unwrap();
+        until(|| (adapter.read_gripper_position().unwrap().unwrap() - 1.3).abs() < 2e-3);
         assert!(near(&positions(&mut adapter)), "the joints stay");
-        // 0.07 of 0.1 m, between −0.175 and 1.745 rad.
-        assert!((servos.true_positions().unwrap()[DOF] - 1.169).abs() < 0.03);
+        // Closed is at −0.175 rad of the servo.
+        assert!((servos.true_positions().unwrap()[DOF] - 1.125).abs() < 3e-3);
         assert_eq!(adapter.write_stop(), Ok(Stop::Confirmed));
-        assert!(adapter.write_gripper_position(0.11).is_err());
+        assert!(adapter.write_gripper_position(open + 0.01).is_err() && adapter.write_gripper_position(-0.01).is_err());
+        assert_eq!(adapter.write_gripper_position_with_force(1.0, 0.5), Err(AdapterError::Unsupported));
     }
 }
 
@@ -142,7 +147,7 @@ fn a_stop_leaves_the_gripper_its_grip_and_joints_that_droop_their_goals() {
     adapter.activate().unwrap();
     adapter.set_control_mode(ControlMode::Position).unwrap();
     adapter.write_joint_positions(&[0.2, -0.3, 0.4, -0.1, 0.5], 1.0).unwrap();
-    adapter.write_gripper_position(0.08).unwrap();
+    adapter.write_gripper_position(1.5).unwrap();
     until(|| adapter.read_state().unwrap().state >> 8 != 0);
     until(|| adapter.read_state().unwrap().state >> 8 == 0);
     // A workpiece in the gripper: it cannot close.
@@ -150,7 +155,7 @@ fn a_stop_leaves_the_gripper_its_grip_and_joints_that_droop_their_goals() {
     adapter.write_gripper_position(0.0).unwrap();
     until(|| adapter.read_state().unwrap().state >> 8 == 0);
     let held = goals(&servos);
-    assert!(adapter.read_gripper_position().unwrap().unwrap() > 0.06, "the workpiece keeps it open");
+    assert!(adapter.read_gripper_position().unwrap().unwrap() > 1.2, "the workpiece keeps it open");
     assert_eq!(adapter.write_stop(), Ok(Stop::Confirmed));
     assert_eq!(goals(&servos), held, "at rest");
     // The same while a joint moves.

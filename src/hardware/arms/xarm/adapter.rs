@@ -11,11 +11,11 @@ use super::connect::{connect, ends_velocities};
 pub use super::control::Counts;
 use super::model::{Model, VELOCITY};
 use super::protocol::commands::{Command, WireJoints};
-use super::protocol::gripper::GripperKind;
+use super::protocol::gripper::{FORCE_RANGE_G2, GripperKind};
 use super::report_validity::measured;
 use super::session::Session;
 use super::{HOLDS_WHEN_DISABLED, MODES, MODES_WITHOUT_VELOCITY, Options, check, model_of};
-use crate::arm::{JointStatus, Load, Pose};
+use crate::arm::{ForceUnit, JointStatus, Load, Pose};
 use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, JointMonitor, JointReading, ManipulatorAdapter,
     ManipulatorInfo, Payload, RobotState, Stop,
@@ -403,6 +403,19 @@ impl Gripper for XArmAdapter {
 
     fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
         self.with(|session| session.gripper().go_to(position))
+    }
+
+    /// The vendor gives the force of a G2 as a number from 1 to 100.
+    fn get_gripper_force_unit(&self) -> ForceUnit {
+        ForceUnit::Percent
+    }
+
+    fn get_gripper_force_range(&mut self) -> Option<(f64, f64)> {
+        (self.options.gripper == GripperKind::XarmG2).then_some(FORCE_RANGE_G2)
+    }
+
+    fn write_gripper_position_with_force(&mut self, position: f64, force: f64) -> AdapterResult<()> {
+        self.with(|session| session.gripper().grip(position, force))
     }
 }
 

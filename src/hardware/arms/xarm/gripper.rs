@@ -8,9 +8,10 @@ use std::time::Duration;
 
 use super::errors::gripper_text;
 use super::protocol::frame::Response;
-use super::protocol::gripper::{GripperKind, Rtu, decode_error, decode_position};
+use super::protocol::gripper::{FORCE_G2, FORCE_RANGE_G2, GripperKind, Rtu, decode_error, decode_position};
 use crate::clock::Mono;
 use crate::hardware::adapter::{AdapterError, AdapterResult};
+use crate::hardware::adapter_util::within;
 
 /// Period of polling, and while the gripper does not answer.
 const POLL: Duration = Duration::from_millis(100);
@@ -34,7 +35,8 @@ enum Step {
     Enable,
     Mode,
     Speed,
-    Go(i32),
+    /// To these pulses with this force [%].
+    Go(i32, u16),
     Error,
     Position,
 }
@@ -45,7 +47,8 @@ pub struct Gripper {
     kind: GripperKind,
     /// The next step before it takes targets; `None` when it is ready.
     wake: Option<Step>,
-    wanted: Option<i32>,
+    /// Pulses and force [%].
+    wanted: Option<(i32, u16)>,
     clear: bool,
     under_way: Option<(Step, Rtu, Mono)>,
     pulses: Option<i32>,
@@ -82,8 +85,24 @@ impl Gripper {
         self.pulses.map(|pulses| self.kind.opening(pulses))
     }
 
+    /// Returns the smallest and the largest force [%]; `None` for a gripper without force control.
+    pub fn force_range(&self) -> Option<(f64, f64)> {
+        (self.kind == GripperKind::XarmG2).then_some(FORCE_RANGE_G2)
+    }
+
+    /// Queues a move to an opening [m] with a largest force [%].
+    pub fn grip(&mut self, opening: f64, force: f64) -> AdapterResult<()> {
+        let range = self.force_range().ok_or(AdapterError::Unsupported)?;
+        let force = within("gripper force", force, range, "%")?;
+        self.go(opening, force.round() as u16)
+    }
+
     /// Queues a move to an opening [m].
     pub fn go_to(&mut self, opening: f64) -> AdapterResult<()> {
+        self.go(opening, FORCE_G2)
+    }
+
+    fn go(&mut self, opening: f64, force: u16) -> AdapterResult<()> {
         let widest = self.kind.widest().ok_or(AdapterError::Unsupported)?;
         if !(0.0..=widest).contains(&opening) {
             return Err(AdapterError::Rejected(format!("the gripper opens 0 to {widest} m, not {opening} m")));
@@ -95,7 +114,7 @@ impl Gripper {
             let text = format!("gripper: {}", gripper_text(self.error));
             return Err(AdapterError::Fault { code: self.error.into(), text });
         }
-        self.wanted = Some(self.kind.pulses(opening));
+        self.wanted = Some((self.kind.pulses(opening), force));
         Ok(())
     }
 
@@ -141,7 +160,7 @@ impl Gripper {
             Step::Enable => Rtu::enable(),
             Step::Mode => Rtu::position_mode(),
             Step::Speed => Rtu::speed(),
-            Step::Go(pulses) => Rtu::go(self.kind, pulses),
+            Step::Go(pulses, force) => Rtu::go(self.kind, pulses, force),
             Step::Error => Rtu::read_error(),
             Step::Position => Rtu::read_position(),
         };
@@ -154,8 +173,8 @@ impl Gripper {
         if self.clear && !silent {
             return Some(Step::Clear);
         }
-        if let Some(pulses) = self.wanted.filter(|_| !silent) {
-            return Some(self.wake.unwrap_or(Step::Go(pulses)));
+        if let Some((pulses, force)) = self.wanted.filter(|_| !silent) {
+            return Some(self.wake.unwrap_or(Step::Go(pulses, force)));
         }
         if now < self.next_poll && (silent || now >= self.watched_until) {
             return None;
@@ -175,9 +194,9 @@ impl Gripper {
             Step::Enable => self.wake = Some(Step::Mode),
             Step::Mode if self.kind == GripperKind::Xarm => self.wake = Some(Step::Speed),
             Step::Mode | Step::Speed => self.wake = None,
-            Step::Go(pulses) => {
+            Step::Go(pulses, force) => {
                 self.same = 0;
-                self.wanted = self.wanted.filter(|wanted| *wanted != pulses);
+                self.wanted = self.wanted.filter(|wanted| *wanted != (pulses, force));
                 self.polls = ERROR_EVERY - 1; // its error shows whether it accepted the target
                 self.next_poll = Mono::ZERO;
             }

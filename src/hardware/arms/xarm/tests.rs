@@ -11,7 +11,7 @@ use super::adapter::XArmAdapter;
 use super::emulator::XArmEmulator;
 use crate::arm::Pose;
 use crate::hardware::adapter::{AdapterError, Cartesian, ForceTorque, Gripper, JointReading, ManipulatorAdapter, Stop};
-use crate::hardware::conformance::{Outcome, Subject, checks, run_on};
+use crate::hardware::conformance::{Check, Outcome, Subject, checks, run_on};
 use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::joint::ControlMode;
@@ -356,10 +356,11 @@ fn an_arm_in_error_is_disabled_all_the_same() {
 }
 
 #[test]
-fn a_stop_holds_a_moving_gripper() {
-    let check = checks().find(|check| check.name == "stop_holds_the_gripper").unwrap();
-    for gripper in ["xarm", "xarm_g2"] {
+fn grippers_conform() {
+    let gripper = |check: &&Check| check.name.contains("gripper");
+    assert_eq!(checks().filter(gripper).count(), 4);
+    for (check, gripper) in checks().filter(gripper).flat_map(|check| [(check, "xarm"), (check, "xarm_g2")]) {
         let subject = Subject { config: config("", 6, json!({ "gripper": gripper })), ..Subject::emulated(&SPEC) };
-        assert_eq!(run_on(&subject, check).0, Outcome::Passed, "{gripper}");
+        assert_eq!(run_on(&subject, check).0, Outcome::Passed, "{gripper}: {}", check.name);
     }
 }

@@ -10,14 +10,14 @@ use std::time::Duration;
 
 use super::frame::{self, MAX_FRAME, Reply, Status};
 use super::protocol::{self, Command, DOF, Hello, Mode, WireJoints};
-use super::{HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, check, limits};
+use super::{GRIPPER_FORCE, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, check, limits};
 use crate::arm::{AnalogUnit, IoInfo, IoState, JointStatus, Load, Pose};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, Gripper, Io, JointMonitor, JointReading, ManipulatorAdapter,
     ManipulatorInfo, Payload, RobotState, Stop,
 };
-use crate::hardware::adapter_util::{fault, fill, finite};
+use crate::hardware::adapter_util::{fault, fill, finite, within};
 use crate::hardware::registry::AdapterConfig;
 use crate::hardware::transport::device_time::DeviceTime;
 use crate::hardware::transport::request_reply::{RequestReply, Retry};
@@ -355,12 +355,29 @@ impl Gripper for YourArmAdapter {
     }
 
     fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
-        if !(0.0..=super::GRIPPER_MAX).contains(&position) {
-            let max = super::GRIPPER_MAX;
-            return Err(AdapterError::Rejected(format!("gripper opening {position} m is not within 0 to {max} m")));
-        }
-        self.command(&Command::Gripper(position * MM_PER_M))
+        self.command(&Command::Gripper(millimetres(position)?))
     }
+
+    // The rest is for a gripper with force control.
+
+    fn get_gripper_force_range(&mut self) -> Option<(f64, f64)> {
+        Some(GRIPPER_FORCE)
+    }
+
+    fn write_gripper_position_with_force(&mut self, position: f64, force: f64) -> AdapterResult<()> {
+        let opening = millimetres(position)?;
+        self.command(&Command::Grip(opening, within("gripper force", force, GRIPPER_FORCE, "N")?))
+    }
+
+    fn read_gripper_force(&mut self) -> AdapterResult<Option<f64>> {
+        let state = self.recent()?;
+        Ok(state.gripper_fitted.then_some(state.gripper_force))
+    }
+}
+
+/// Opening of the gripper [mm] from ours [m].
+fn millimetres(opening: f64) -> AdapterResult<f64> {
+    Ok(within("gripper opening", opening, (0.0, super::GRIPPER_MAX), "m")? * MM_PER_M)
 }
 
 impl JointMonitor for YourArmAdapter {

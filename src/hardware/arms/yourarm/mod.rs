@@ -37,6 +37,8 @@ const HOLDS_WHEN_DISABLED: bool = true;
 
 /// Maximum opening of the gripper [m].
 const GRIPPER_MAX: f64 = 0.08;
+/// Smallest and largest force of the gripper [N].
+const GRIPPER_FORCE: (f64, f64) = (1.0, 60.0);
 
 /// YourArm's row in the adapter table.
 pub const SPEC: AdapterSpec = AdapterSpec {

@@ -48,8 +48,10 @@ pub enum Command {
         /// Target x, y, z [mm], roll, pitch, yaw [deg].
         pose: [f64; 6],
     },
-    /// Gripper opening [mm].
+    /// Gripper opening [mm], with the force of power-up.
     Gripper(f64),
+    /// Gripper opening [mm] and largest force [N].
+    Grip(f64, f64),
     /// Load at the flange: mass [kg], centre x, y, z [mm], inertia xx, xy, xz, yy, yz, zz [kg·m²].
     SetPayload([f64; 10]),
     /// That load.
@@ -85,6 +87,7 @@ impl Command {
             Self::VelocityJoints(_) => 0x12,
             Self::MoveCartesian { .. } => 0x13,
             Self::Gripper(_) => 0x20,
+            Self::Grip(..) => 0x25,
             Self::SetPayload(_) => 0x21,
             Self::GetPayload => 0x22,
             Self::SetMounting(_) => 0x23,
@@ -111,6 +114,7 @@ impl Command {
             Self::VelocityJoints(_) => "VELOCITY_JOINTS",
             Self::MoveCartesian { .. } => "MOVE_CARTESIAN",
             Self::Gripper(_) => "GRIPPER",
+            Self::Grip(..) => "GRIP",
             Self::SetPayload(_) => "SET_PAYLOAD",
             Self::GetPayload => "GET_PAYLOAD",
             Self::SetMounting(_) => "SET_MOUNTING",
@@ -148,11 +152,15 @@ impl Mode {
     }
 }
 
+/// Payload of GET_STATE that asks for the gripper's force as well.
+const WITH_FORCE: u8 = 1;
+
 /// Writes the frame of a command into `frame`; the answer is the part that was written.
 pub fn encode<'a>(command: &Command, sequence: u16, frame: &'a mut [u8; MAX_FRAME]) -> &'a [u8] {
     let mut out = Writer::new(frame);
     match command {
-        Command::Hello | Command::GetState | Command::ClearError | Command::Stop => {}
+        Command::Hello | Command::ClearError | Command::Stop => {}
+        Command::GetState => out.put(&[WITH_FORCE]),
         Command::GetIo | Command::GetPayload | Command::GetMounting => {}
         Command::GetJointStatus | Command::GetOffsets => {}
         Command::SetPayload(load) => out.floats(load),
@@ -169,6 +177,7 @@ pub fn encode<'a>(command: &Command, sequence: u16, frame: &'a mut [u8; MAX_FRAM
             out.floats(pose);
         }
         Command::Gripper(opening) => out.floats(&[*opening]),
+        Command::Grip(opening, force) => out.floats(&[*opening, *force]),
         Command::SetDigital(output, high) => out.put(&[*output, u8::from(*high)]),
         Command::SetAnalog(output, volts) => {
             out.put(&[*output]);
@@ -265,6 +274,8 @@ pub struct State {
     pub gripper: f64,
     /// Flange x, y, z [mm], roll, pitch, yaw [deg].
     pub pose: [f64; 6],
+    /// Measured force of the gripper [N].
+    pub gripper_force: f64,
 }
 
 impl State {
@@ -288,6 +299,7 @@ impl State {
             torques: data.floats()?,
             gripper: data.float()?,
             pose: data.floats()?,
+            gripper_force: data.float()?,
         };
         data.is_empty().then_some(decoded)
     }

@@ -9,7 +9,7 @@ fn commands_are_the_golden_bytes() {
     let mut frame = [0; MAX_FRAME];
     for (command, sequence, golden) in [
         (Command::Hello, 1, golden::HELLO),
-        (Command::GetState, 2, golden::GET_STATE),
+        (Command::GetState, 21, golden::GET_STATE_AND_FORCE),
         (Command::SetMode(Mode::Servo), 3, golden::SET_MODE),
         (Command::Enable(true), 4, golden::ENABLE),
         (Command::ClearError, 5, golden::CLEAR_ERROR),
@@ -19,6 +19,7 @@ fn commands_are_the_golden_bytes() {
         (Command::VelocityJoints([1.5, 0.0, 0.0, 0.0, 0.0, -90.0]), 9, golden::VELOCITY_JOINTS),
         (Command::MoveCartesian { speed: 50.0, pose: POSE }, 10, golden::MOVE_CARTESIAN),
         (Command::Gripper(42.5), 11, golden::GRIPPER),
+        (Command::Grip(42.5, 12.5), 22, golden::GRIP),
         (Command::SetPayload(golden::LOAD), 15, golden::SET_PAYLOAD),
         (Command::GetPayload, 16, golden::GET_PAYLOAD),
         (Command::SetMounting([0.0, 0.0, 1.0]), 17, golden::SET_MOUNTING),
@@ -41,8 +42,8 @@ fn replies_are_read_from_the_golden_bytes() {
     let hello = Hello { model: MODEL.into(), dof: 6, firmware: [2, 1, 3], serial };
     assert_eq!((length, Hello::decode(reply_to_hello.data)), (reply.len(), Some(hello)));
 
-    let reply = bytes(golden::STATE_REPLY);
-    let Scan::Take(_, state) = scan(&reply, 0x02, 2) else { panic!("no reply") };
+    let reply = bytes(golden::STATE_AND_FORCE_REPLY);
+    let Scan::Take(_, state) = scan(&reply, 0x02, 21) else { panic!("no reply") };
     let expected = State {
         time_us: 123_456_789,
         state: 2,
@@ -55,8 +56,9 @@ fn replies_are_read_from_the_golden_bytes() {
         torques: [0.5, -0.5, 1.0, -1.0, 2.0, -2.0],
         gripper: 42.5,
         pose: POSE,
+        gripper_force: 12.25,
     };
-    assert_eq!(State::decode(state.data), Some(expected));
+    assert_eq!((State::decode(state.data), State::decode(&state.data[..114])), (Some(expected), None));
 
     let reply = bytes(golden::IN_ERROR_REPLY);
     let Scan::Take(_, refusal) = scan(&reply, 0x11, 8) else { panic!("no reply") };
@@ -114,9 +116,9 @@ fn noise_damage_and_foreign_replies_are_skipped() {
 
 #[test]
 fn a_state_that_is_not_finite_or_has_other_joints_is_refused() {
-    let mut data = bytes(golden::STATE_REPLY)[9..123].to_vec();
+    let mut data = bytes(golden::STATE_AND_FORCE_REPLY)[9..127].to_vec();
     assert!(State::decode(&data).is_some());
-    assert!(State::decode(&data[..113]).is_none());
+    assert!(State::decode(&data[..117]).is_none());
     data[11] = 7;
     assert!(State::decode(&data).is_none(), "7 joints");
     data[11] = 6;

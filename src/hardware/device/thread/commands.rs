@@ -147,9 +147,13 @@ impl Worker {
             Err(AdapterError::Rejected("the arm is held; `arm enable` makes it ready again".to_owned()))
         } else {
             self.gripper_stop.end();
+            let (position, force) = (command.gripper, command.gripper_force);
             let gripper = adapter.gripper().ok_or(AdapterError::Unsupported);
-            gripper.and_then(|gripper| gripper.write_gripper_position(command.gripper))
+            gripper.and_then(|gripper| gripper.command(position, force))
         };
+        if result.is_ok() {
+            self.gripper_stop.commanded(command.gripper_force);
+        }
         match &result {
             Ok(()) => {}
             Err(error @ (AdapterError::Rejected(_) | AdapterError::Unsupported | AdapterError::Fault { .. })) => {
@@ -166,13 +170,14 @@ impl Worker {
         self.health.answer_gripper(command.gripper_seq, result);
     }
 
-    /// Holds a gripper that continues to move after a stop of the joints.
+    /// Holds a gripper that continues to move after a stop of the joints, with the force of its last command.
     pub(super) fn hold_gripper(&mut self, adapter: &mut dyn ManipulatorAdapter) {
         let now = self.config.clock.now();
-        let Some(here) = self.state.gripper.and_then(|opening| self.gripper_stop.observe(opening, now)) else { return };
-        let Some(gripper) = adapter.gripper() else { return };
-        let (closed, open) = gripper.get_gripper_range().unwrap_or((0.0, f64::MAX));
-        if let Err(error) = gripper.write_gripper_position(here.max(closed).min(open)) {
+        let (Some(position), Some(gripper)) = (self.state.gripper, adapter.gripper()) else { return };
+        let Some(here) = self.gripper_stop.observe(position, gripper.get_gripper_unit(), now) else { return };
+        // Closed may be the larger position of a rotary jaw.
+        let (a, b) = gripper.get_gripper_range().unwrap_or((f64::MIN, f64::MAX));
+        if let Err(error) = gripper.command(here.max(a.min(b)).min(a.max(b)), self.gripper_stop.force()) {
             self.trouble(&format!("the gripper cannot be held: {error}"));
         }
     }

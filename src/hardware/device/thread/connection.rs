@@ -50,14 +50,14 @@ impl Worker {
         let write_period = self.config.write_period(adapter.set_point_period());
         self.guard.set_period(write_period);
         let read_period = self.config.read_period();
-        let gripper_range = adapter.gripper().and_then(|gripper| gripper.get_gripper_range());
+        let gripper = adapter.gripper().map(|gripper| gripper.info());
         let io = adapter.io().map(|io| io.get_io());
         let has_payload = adapter.payload().is_some();
         let payload_resets = adapter.payload().is_some_and(|payload| payload.resets_controller());
         Ok(Connected {
             info,
             limits,
-            gripper_range,
+            gripper,
             io,
             calibration_offsets,
             streams: adapter.state_fd().is_some(),

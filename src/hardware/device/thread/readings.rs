@@ -76,7 +76,11 @@ impl Worker {
             self.state.enabled = adapter.read_enabled()?;
         }
         if all || turn == 2 {
-            self.state.gripper = adapter.gripper().map_or(Ok(None), |gripper| gripper.read_gripper_position())?;
+            let gripper = adapter.gripper();
+            (self.state.gripper, self.state.gripper_force) = match gripper {
+                Some(gripper) => (gripper.read_gripper_position()?, gripper.read_gripper_force()?),
+                None => (None, None),
+            };
             self.hold_gripper(adapter);
         }
         if all || turn == 3 {

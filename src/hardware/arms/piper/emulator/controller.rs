@@ -152,7 +152,7 @@ impl Controller {
                     self.move_joints(six(self.joints));
                 }
             }
-            Request::Gripper(stroke, _, action) => self.grip(stroke, action),
+            Request::Gripper(stroke, torque, action) => self.grip(stroke, torque, action),
             Request::Role(0xFA) => self.leading = true,
             Request::Role(0xFC) => self.leading = false,
             Request::Role(_) => {}
@@ -168,8 +168,10 @@ impl Controller {
         }
     }
 
-    /// Bit 0 of `action`: on, and to this stroke [0.001 mm]; bit 1: errors are cleared before that.
-    fn grip(&mut self, stroke: i32, action: u8) {
+    /// Bit 0 of `action`: on, and to this stroke [0.001 mm] with at most this torque [mNm]; bit 1: errors are cleared
+    /// before that.
+    fn grip(&mut self, stroke: i32, torque: u16, action: u8) {
+        self.gripper.max_force = f64::from(torque.min(5000)) * 1e-3;
         if action & 2 != 0 {
             self.gripper_errors = 0;
         }

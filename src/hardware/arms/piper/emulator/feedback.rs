@@ -41,7 +41,8 @@ impl Controller {
         out.extend(wire::triple(0x2A5, positions.map(millidegrees)));
         if self.has_gripper {
             let on = if self.gripper_on { 0x40 } else { 0 };
-            out.push(wire::gripper(stroke, 0, 0x80 | on | self.gripper_errors)); // it knows its zero
+            let torque = if self.gripper_on { (self.gripper.force() * 1e3).round() as i16 } else { 0 };
+            out.push(wire::gripper(stroke, torque, 0x80 | on | self.gripper_errors)); // it knows its zero
         }
         let efforts = first(&self.arm.efforts());
         let milli = |value: f64| (value * 1e3).round() as i32;

@@ -191,6 +191,11 @@ impl PiperEmulator {
         self.server.sent()
     }
 
+    /// Puts an object of this width [m] between the fingers of the gripper; 0 takes it away.
+    pub fn put_object(&self, width: f64) {
+        self.server.with(|controller, _| controller.gripper.put_object(width));
+    }
+
     /// How many frames its bus did not take.
     pub fn not_taken(&self) -> u64 {
         self.server.not_taken()
@@ -208,5 +213,9 @@ impl Emulator for PiperEmulator {
 
     fn true_positions(&self) -> Option<Joints> {
         self.server.true_positions()
+    }
+
+    fn gripper_force(&self) -> Option<f64> {
+        self.server.with(|controller, _| controller.has_gripper.then_some(controller.gripper.max_force))
     }
 }

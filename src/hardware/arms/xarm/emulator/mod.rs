@@ -230,6 +230,10 @@ impl Emulator for XArmEmulator {
     fn true_positions(&self) -> Option<Joints> {
         self.server.true_positions()
     }
+
+    fn gripper_force(&self) -> Option<f64> {
+        self.server.with(|controller, _| controller.tool.force())
+    }
 }
 
 /// The control box with another arm behind it than the simulated one. Ends when it is dropped.

@@ -51,6 +51,11 @@ impl Tool {
         self.gripper.position
     }
 
+    /// Largest force that a G2 was given [%]; `None` for another gripper.
+    pub fn force(&self) -> Option<f64> {
+        (self.kind == GripperKind::XarmG2).then_some(self.gripper.max_force)
+    }
+
     /// Reads a register of the tool board.
     pub fn read(&self, register: u16) -> i32 {
         if register & 0x0FFF == 0x0A0B { self.baud } else { 0 }
@@ -110,8 +115,9 @@ impl Tool {
             (0x0303, [high, low]) => self.speed = u16::from_be_bytes([*high, *low]),
             (0x0109, _) => self.error = 0,
             (0x0700, [a, b, c, d]) => self.go(i32::from_be_bytes([*a, *b, *c, *d])),
-            (0x0C00, [_, on, _, _, _, _, a, b, c, d]) => {
+            (0x0C00, [_, on, _, _, f0, f1, a, b, c, d]) => {
                 self.enabled |= *on == 1;
+                self.gripper.max_force = u16::from_be_bytes([*f0, *f1]).into();
                 self.go(i32::from_be_bytes([*a, *b, *c, *d]));
             }
             _ => {}

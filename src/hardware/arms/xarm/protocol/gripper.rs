@@ -25,10 +25,13 @@ const ERROR: u16 = 0x000F;
 const CLEAR: u16 = 0x0109;
 const MOVE_G2: u16 = 0x0C00;
 
-/// Speeds that the adapter uses [the gripper's own units], and the force of a G2 [%].
+/// Speeds that the adapter uses [the gripper's own units].
 const SPEED_G1: u16 = 2000;
 const SPEED_G2: u16 = 1868; // 100 mm/s
-const FORCE_G2: u16 = 50;
+/// Force of a G2 for a command without a force, as the vendor's SDK has it; the smallest and the largest force [%].
+pub const FORCE_G2: u16 = 50;
+/// See [`FORCE_G2`].
+pub const FORCE_RANGE_G2: (f64, f64) = (1.0, 100.0);
 
 /// The register of the tool board that holds its baud rate, and the index of 2 Mbit/s, which the grippers need.
 pub const BAUD_REGISTER: u16 = 0x0A0B;
@@ -128,12 +131,12 @@ impl Rtu {
         Self::write(SPEED, &SPEED_G1.to_be_bytes())
     }
 
-    /// Moves to a position [pulses].
-    pub fn go(kind: GripperKind, pulses: i32) -> Self {
+    /// Moves to a position [pulses], a G2 with this largest force [%].
+    pub fn go(kind: GripperKind, pulses: i32, force: u16) -> Self {
         let [a, b, c, d] = pulses.to_be_bytes();
         match kind {
             GripperKind::XarmG2 => {
-                let ([s0, s1], [f0, f1]) = (SPEED_G2.to_be_bytes(), FORCE_G2.to_be_bytes());
+                let ([s0, s1], [f0, f1]) = (SPEED_G2.to_be_bytes(), force.to_be_bytes());
                 Self::write(MOVE_G2, &[0, 1, s0, s1, f0, f1, a, b, c, d])
             }
             _ => Self::write(TARGET, &[a, b, c, d]),

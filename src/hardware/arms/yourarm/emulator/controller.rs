@@ -21,8 +21,10 @@ use crate::pose;
 const INITIAL: [f64; DOF] = [0.0, -0.3, 0.6, 0.0, 0.8, 0.0];
 /// In velocity mode the arm stops when no velocity arrives for this long [s].
 const VELOCITY_TIMEOUT: f64 = 0.2;
-/// Speed of the gripper [m/s].
+/// Speed of the gripper [m/s], its smallest and largest force, and the one at power-up [N].
 const GRIPPER_SPEED: f64 = 0.1;
+const GRIPPER_FORCE: std::ops::RangeInclusive<f64> = 1.0..=60.0;
+const POWER_UP_FORCE: f64 = 30.0;
 /// Largest load at the flange [kg].
 const MAX_LOAD: f32 = 5.0;
 /// Rated torque of each joint [Nm], and torque per motor current [Nm/A].
@@ -52,7 +54,7 @@ pub struct Received {
 /// The controller's memory.
 pub struct Controller {
     pub(super) arm: SimArm,
-    gripper: Gripper,
+    pub(super) gripper: Gripper,
     pub(super) io: SimIo,
     /// Load at the flange [kg, mm, kg·m²], and direction of gravity in the base frame.
     pub(super) load: [f32; 10],
@@ -70,7 +72,7 @@ impl Controller {
         let arm = SimArm::new("yourarm", &limits(), &options, PLAYABLE, now)?;
         Ok(Self {
             arm: arm.with_velocity_timeout(VELOCITY_TIMEOUT),
-            gripper: Gripper::new(GRIPPER_MAX, GRIPPER_SPEED),
+            gripper: Gripper::new(GRIPPER_MAX, GRIPPER_SPEED).with_force(POWER_UP_FORCE),
             io: SimIo::default(),
             load: [0.0; 10],
             gravity: [0.0, 0.0, -1.0],
@@ -97,9 +99,9 @@ impl Controller {
                 let model = if other { "YOURARM-6L" } else { "YOURARM-6" };
                 reply(out, frame, status, |out| put_hello(out, model, dof, [2, 1, 3], "YA6-00042"));
             }
-            (Ok(()), Ok(Request::GetState)) => {
+            (Ok(()), Ok(Request::GetState(with_force))) => {
                 let report = self.report();
-                reply(out, frame, status, |out| put_report(out, &report));
+                reply(out, frame, status, |out| put_report(out, &report, with_force));
             }
             (Ok(()), Ok(Request::GetPayload)) => reply(out, frame, status, |out| put_floats(out, &self.load)),
             (Ok(()), Ok(Request::GetMounting)) => reply(out, frame, status, |out| put_floats(out, &self.gravity)),
@@ -166,18 +168,22 @@ impl Controller {
                 let joints = Links.inverse(&goal, &first(&arm.joints().0)).ok_or(Refusal::OutOfRange)?;
                 arm.move_to(&joints, f64::from(speed) / 100.0)
             }
-            Request::Gripper(mm) => {
-                arm.ready()?;
-                let opening = f64::from(mm) / 1000.0;
-                if !(0.0..=GRIPPER_MAX + 1e-6).contains(&opening) {
-                    return Err(Refusal::OutOfRange);
-                }
-                self.gripper.move_to(opening);
-                Ok(())
-            }
+            Request::Gripper(mm) => self.grip(mm, POWER_UP_FORCE),
+            Request::Grip(mm, newtons) => self.grip(mm, newtons.into()),
             // Read only, or handled by `execute`.
             _ => Ok(()),
         }
+    }
+
+    fn grip(&mut self, mm: f32, force: f64) -> Result<(), Refusal> {
+        self.arm.ready()?;
+        let opening = f64::from(mm) / 1000.0;
+        if !(0.0..=GRIPPER_MAX + 1e-6).contains(&opening) || !GRIPPER_FORCE.contains(&force) {
+            return Err(Refusal::OutOfRange);
+        }
+        self.gripper.max_force = force;
+        self.gripper.move_to(opening);
+        Ok(())
     }
 
     /// Condition of the drives: temperature [°C], current [A], voltage [V], load [%], and error.
@@ -222,6 +228,7 @@ impl Controller {
                 pitch.to_degrees() as f32,
                 yaw.to_degrees() as f32,
             ],
+            force: self.gripper.force() as f32,
         };
         self.reported = Some(report);
         report

@@ -65,6 +65,11 @@ impl YourArmEmulator {
         self.server.with(|controller, _| controller.load)
     }
 
+    /// Puts an object of this width [m] between the fingers of the gripper; 0 takes it away.
+    pub fn put_object(&self, width: f64) {
+        self.server.with(|controller, _| controller.gripper.put_object(width));
+    }
+
     /// Forgets the load, as at power-up.
     pub fn forget_load(&self) {
         self.server.with(|controller, _| controller.load = [0.0; 10]);
@@ -112,5 +117,9 @@ impl Emulator for YourArmEmulator {
 
     fn true_positions(&self) -> Option<Joints> {
         self.server.true_positions()
+    }
+
+    fn gripper_force(&self) -> Option<f64> {
+        Some(self.server.with(|controller, _| controller.gripper.max_force))
     }
 }

@@ -23,8 +23,8 @@ pub mod status {
 pub enum Request {
     /// 0x01
     Hello,
-    /// 0x02
-    GetState,
+    /// 0x02; with 1 as payload also the gripper's force.
+    GetState(bool),
     /// 0x03: 0 position, 1 servo, 2 velocity.
     SetMode(u8),
     /// 0x04
@@ -43,6 +43,8 @@ pub enum Request {
     MoveCartesian(f32, [f32; 6]),
     /// 0x20: opening [mm].
     Gripper(f32),
+    /// 0x25: opening [mm], largest force [N].
+    Grip(f32, f32),
     /// 0x21: mass [kg], centre [mm], inertia [kg·m²].
     SetPayload([f32; 10]),
     /// 0x22
@@ -73,6 +75,7 @@ impl Request {
                 | Self::VelocityJoints(_)
                 | Self::MoveCartesian(..)
                 | Self::Gripper(_)
+                | Self::Grip(..)
         )
     }
 }
@@ -114,7 +117,11 @@ fn understand(opcode: u8, payload: &[u8]) -> Result<Request, u8> {
     let empty = |request| if payload.is_empty() { Ok(request) } else { Err(status::MALFORMED) };
     match opcode {
         0x01 => empty(Request::Hello),
-        0x02 => empty(Request::GetState),
+        0x02 => match *payload {
+            [] => Ok(Request::GetState(false)),
+            [1] => Ok(Request::GetState(true)),
+            _ => Err(status::MALFORMED),
+        },
         0x03 => one_byte(payload).filter(|mode| *mode <= 2).map(Request::SetMode).ok_or(status::MALFORMED),
         0x04 => one_byte(payload).filter(|on| *on <= 1).map(|on| Request::Enable(on == 1)).ok_or(status::MALFORMED),
         0x05 => empty(Request::ClearError),
@@ -129,6 +136,7 @@ fn understand(opcode: u8, payload: &[u8]) -> Result<Request, u8> {
         0x11 => floats(payload).map(Request::ServoJoints),
         0x12 => floats(payload).map(Request::VelocityJoints),
         0x20 => floats::<1>(payload).map(|[opening]| Request::Gripper(opening)),
+        0x25 => floats::<2>(payload).map(|[opening, force]| Request::Grip(opening, force)),
         0x21 => floats(payload).map(Request::SetPayload),
         0x22 => empty(Request::GetPayload),
         0x23 => floats(payload).map(Request::SetMounting),
@@ -204,6 +212,8 @@ pub struct Report {
     pub gripper: f32,
     /// [mm, deg]
     pub pose: [f32; 6],
+    /// Force of the gripper [N].
+    pub force: f32,
 }
 
 /// Writes a reply into `out`, which keeps its room: header, status, what `data` adds, checksum.
@@ -230,14 +240,15 @@ pub fn put_hello(out: &mut Vec<u8>, model: &str, dof: u8, firmware: [u8; 3], ser
     text(out, serial);
 }
 
-/// Adds the data of a GET_STATE reply.
-pub fn put_report(out: &mut Vec<u8>, report: &Report) {
+/// Adds the data of a GET_STATE reply, with the gripper's force if the client asked for it.
+pub fn put_report(out: &mut Vec<u8>, report: &Report, with_force: bool) {
     out.extend(report.time_us.to_le_bytes());
     let flags = u8::from(report.enabled) + 2 + 4 * u8::from(report.estop);
     out.extend([report.state, report.mode, flags, 6]);
     out.extend(report.error.to_le_bytes());
     let numbers = report.joints.as_flattened().iter().chain([&report.gripper]).chain(&report.pose);
-    for number in numbers {
+    let force = [&report.force].into_iter().filter(|_| with_force);
+    for number in numbers.chain(force) {
         out.extend(number.to_bits().to_le_bytes());
     }
 }
@@ -272,7 +283,8 @@ mod tests {
         let (joints, pose) = (JOINTS.map(|v| v as f32), POSE.map(|v| v as f32));
         for (golden, opcode, sequence, request) in [
             (golden::HELLO, 0x01, 1, Request::Hello),
-            (golden::GET_STATE, 0x02, 2, Request::GetState),
+            (golden::GET_STATE, 0x02, 2, Request::GetState(false)),
+            (golden::GET_STATE_AND_FORCE, 0x02, 21, Request::GetState(true)),
             (golden::SET_MODE, 0x03, 3, Request::SetMode(1)),
             (golden::ENABLE, 0x04, 4, Request::Enable(true)),
             (golden::CLEAR_ERROR, 0x05, 5, Request::ClearError),
@@ -282,6 +294,7 @@ mod tests {
             (golden::VELOCITY_JOINTS, 0x12, 9, Request::VelocityJoints([1.5, 0.0, 0.0, 0.0, 0.0, -90.0])),
             (golden::MOVE_CARTESIAN, 0x13, 10, Request::MoveCartesian(50.0, pose)),
             (golden::GRIPPER, 0x20, 11, Request::Gripper(42.5)),
+            (golden::GRIP, 0x25, 22, Request::Grip(42.5, 12.5)),
             (golden::SET_PAYLOAD, 0x21, 15, Request::SetPayload(golden::LOAD.map(|v| v as f32))),
             (golden::GET_PAYLOAD, 0x22, 16, Request::GetPayload),
             (golden::SET_MOUNTING, 0x23, 17, Request::SetMounting([0.0, 0.0, 1.0])),
@@ -315,9 +328,14 @@ mod tests {
             joints: [JOINTS.map(|v| v as f32), [1.0, -2.0, 3.0, -4.0, 5.0, -6.0], [0.5, -0.5, 1.0, -1.0, 2.0, -2.0]],
             gripper: 42.5,
             pose: POSE.map(|v| v as f32),
+            force: 12.25,
         };
-        reply(&mut out, &frame(2, 2), 0, |out| put_report(out, &report));
-        assert_eq!(out, bytes(golden::STATE_REPLY));
+        reply(&mut out, &frame(2, 2), 0, |out| put_report(out, &report, false));
+        assert_eq!(out, bytes(golden::STATE_REPLY), "an older client asks for no force");
+        reply(&mut out, &frame(2, 21), 0, |out| put_report(out, &report, true));
+        assert_eq!(out, bytes(golden::STATE_AND_FORCE_REPLY));
+        reply(&mut out, &frame(0x25, 22), status::OUT_OF_RANGE, |out| out.extend([0, 0]));
+        assert_eq!(out, bytes(golden::GRIP_REFUSED));
         reply(&mut out, &frame(3, 3), status::MOVING, |out| out.extend([0, 0]));
         assert_eq!(out, bytes(golden::MOVING_REPLY));
         reply(&mut out, &frame(0x11, 8), status::IN_ERROR, |out| out.extend([2, 0]));
@@ -350,6 +368,8 @@ mod tests {
         assert_eq!(understand(0x31, &[0, 2]), Err(status::MALFORMED));
         assert_eq!(understand(0x32, &[]), Err(status::MALFORMED));
         assert_eq!(understand(0x11, &[0; 20]), Err(status::MALFORMED));
+        assert_eq!(understand(0x02, &[2]), Err(status::MALFORMED));
+        assert_eq!(understand(0x25, &[0; 4]), Err(status::MALFORMED));
         assert_eq!(understand(0x20, &f32::NAN.to_le_bytes()), Err(status::MALFORMED));
         assert_eq!(scan(b"xYA"), Scan::Skip(1));
     }
