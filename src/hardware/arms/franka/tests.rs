@@ -293,6 +293,11 @@ fn the_hand_moves_grasps_and_must_be_homed() {
     adapter.write_gripper_position(0.0).unwrap();
     until(&mut adapter, |adapter| adapter.read_gripper_position().unwrap() == Some(0.03));
     assert!(text(adapter.write_gripper_position(0.2).unwrap_err()).contains("opens 0 to 0.080 m"));
+    assert!(text(adapter.write_gripper_position_with_force(0.01, 71.0).unwrap_err()).contains("1 to 70 N"));
+    adapter.write_gripper_position(0.05).unwrap();
+    until(&mut adapter, |adapter| adapter.read_gripper_position().unwrap() == Some(0.05));
+    adapter.write_gripper_position_with_force(0.01, 30.0).unwrap();
+    until(&mut adapter, |adapter| adapter.read_gripper_position().unwrap() == Some(0.03));
     emulator.set_homed(false);
     let homed = |adapter: &mut FrankaAdapter| adapter.write_gripper_position(0.05);
     until(&mut adapter, |adapter| homed(adapter).is_err());
