@@ -106,7 +106,7 @@ impl Pacer {
             if !early {
                 return Some(self.prompted(woke, stamp.min(woke)));
             }
-            if self.silent {
+            if self.silent && stamp.after(self.period) > woke {
                 // It sends again, in another phase: the next tick is that of its next state.
                 (self.due, self.silent) = (stamp.min(woke).after(self.period), false);
             }
@@ -261,6 +261,17 @@ mod tests {
             let at = ms(164.0 + 10.0 * f64::from(k));
             assert_eq!(now_and_skipped(pacer.begin(at, Some((3 + u64::from(k), at)))), Some((at, 0, false)));
         }
+    }
+
+    #[test]
+    fn a_state_that_is_late_by_more_than_a_period_does_not_move_the_grid() {
+        let mut pacer = device(P);
+        pacer.begin(ms(100.0), Some((1, ms(100.0))));
+        assert!(pacer.begin(ms(113.4), Some((1, ms(100.0)))).is_some_and(|start| start.unprompted));
+        for k in 0..5u8 {
+            assert_eq!(pacer.begin(ms(114.0), Some((2 + u64::from(k), ms(101.0 + 0.5 * f64::from(k))))), None);
+        }
+        assert_eq!(now_and_skipped(pacer.begin(ms(120.0), Some((7, ms(103.5))))), Some((ms(120.0), 0, true)));
     }
 
     #[test]

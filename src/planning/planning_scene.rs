@@ -279,6 +279,7 @@ mod tests {
             base_pose: nalgebra::Isometry3::translation(1.0, 2.0, 3.0),
             base_link: "base".into(),
             end_effector_link: "l".into(),
+            flange_link: None,
             joints: vec!["j".into()],
             coordinator_joints: vec!["arm_j".into()],
             gripper_joint: Some(GripperJoint { joint: "slide".into(), closed: 0.0, open: 0.2 }),

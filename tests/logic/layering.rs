@@ -42,6 +42,9 @@ const PARTS: &[(&str, &str, &str)] = &[
     ("blueprint", "control", "task_robot"),
     ("blueprint", "control", "task_spec"),
     ("blueprint", "planning", "config"),
+    // Unit tests of the device thread have the mock adapter of out-of-tree tests.
+    ("hardware", "testing", "Call"),
+    ("hardware", "testing", "MockAdapter"),
 ];
 
 /// The mock arm panics when a test's script of faults says so.

@@ -197,7 +197,8 @@ fn a_stop_by_another_program_ends_the_wait_of_the_client() {
 #[test]
 fn arms_with_other_joints_and_of_other_makes_are_served_too() {
     for (blueprint, scenario) in [("coordinator-xarm7", "seven"), ("coordinator-ur5e", "other_make")] {
-        let Some(cell) = Cell::start(blueprint, "--no-record") else { return };
+        let enabled = "--no-record --set hardware.arm.auto_enable=true";
+        let Some(cell) = Cell::start(blueprint, enabled) else { return };
         ends_well(cell.client(scenario).0);
     }
 }

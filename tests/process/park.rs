@@ -170,7 +170,7 @@ fn a_stop_and_a_second_signal_end_the_way_to_the_park_pose() {
 fn a_lost_terminal_parks_nothing() {
     let rig = Rig::new();
     let ended = rig.home.run("parked.yaml --no-record").end(Signal::HUP);
-    ended.with(129).says(&["SIGHUP: decelerating to rest, then releasing", "arm: motors stay on and hold the pose"]);
+    ended.with(130).says(&["SIGHUP: decelerating to rest, then releasing", "arm: motors stay on and hold the pose"]);
     assert!(rig.motors_on() && rig.off(&START) < 0.01);
 }
 

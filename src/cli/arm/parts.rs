@@ -86,8 +86,8 @@ pub fn io(args: &IoArgs) -> Result {
     Ok(Exit::Ok)
 }
 
-/// Returns the condition of joints as lines of text: one per quantity, the joints in order; errors of the drives only if
-/// one has an error.
+/// Returns the condition of joints as lines of text: one per quantity, the joints in order; errors of the drives only
+/// if one has an error.
 pub fn joint_lines(joints: &[JointStatusReport]) -> Vec<String> {
     type Value = fn(&JointStatusReport) -> Option<f64>;
     let quantities: [(&str, usize, Value); 6] = [

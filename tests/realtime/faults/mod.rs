@@ -69,13 +69,15 @@ fn setpoints(trace: &[Received]) -> Vec<(Mono, [f64; 6])> {
     trace.iter().filter_map(one).collect()
 }
 
-/// The largest velocity and acceleration of any joint on the wire, as fractions of their limits.
+/// The largest velocity and acceleration of any joint on the wire, as fractions of their limits. After a gap of more
+/// than two periods, when this computer was stalled, the arm has stopped, and setpoints begin from rest (`wire_stalls`).
 fn wire_extremes(trace: &[Received]) -> (f64, f64) {
-    let points: Vec<[f64; 6]> = setpoints(trace).into_iter().map(|(_, degrees)| degrees).collect();
+    let points = setpoints(trace);
     let (mut speed, mut change) = (0.0_f64, 0.0_f64);
     for w in points.windows(3) {
-        for (j, top) in TOP_SPEED.iter().enumerate() {
-            let (a, b) = (w[1][j] - w[0][j], w[2][j] - w[1][j]);
+        let gap = w.windows(2).any(|pair| pair[1].0.seconds_since(pair[0].0) > 2.5 * PERIOD);
+        for (j, top) in TOP_SPEED.iter().enumerate().filter(|_| !gap) {
+            let (a, b) = (w[1].1[j] - w[0].1[j], w[2].1[j] - w[1].1[j]);
             speed = speed.max(((b.abs() - 2.0 * ROUNDING) / PERIOD) / top);
             let most = ACCELERATION.to_degrees() * PERIOD * PERIOD;
             change = change.max(((b - a).abs() - 4.0 * ROUNDING) / most);

@@ -79,8 +79,8 @@ fn readable_before(socket: &UdpSocket, due: Mono) -> bool {
     !left.is_zero() && matches!(poll(&mut [PollFd::new(socket, PollFlags::IN)], Some(&timeout)), Ok(1..))
 }
 
-/// Runs until `ends`. `drift` is how much slower than ours the clock is, as a fraction; `answers` gets the time from each
-/// state to the command that was used.
+/// Runs until `ends`. `drift` is how much slower than ours the clock is, as a fraction; `answers` gets the time from
+/// each state to the command that was used.
 pub(super) fn run(
     server: &Arc<TcpServer<Control>>,
     socket: &UdpSocket,

@@ -93,7 +93,7 @@ fn a_change_of_mode_may_be_refused_for_a_second() {
     bench.arm.fail("set_control_mode", refused());
     bench.tick(velocity);
     assert_eq!(bench.worker.health.write_errors.load(Relaxed), 1);
-    // The second is counted anew once the mode was taken, or no mode is wanted.
+    // The second starts again once the mode was taken, or no mode is wanted.
     bench.tick(velocity);
     bench.tick(|c| c.mode = Some(ControlMode::Position));
     bench.arm.fail("set_control_mode", refused());

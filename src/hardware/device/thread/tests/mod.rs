@@ -20,7 +20,8 @@ use crate::rt::heartbeat::Heartbeat;
 use crate::rt::slot::{SlotReader, SlotWriter, slot};
 use crate::rt::wake::Wake;
 use crate::sync::lock;
-use crate::testing::{Call, MockAdapter};
+use crate::testing::Call;
+use crate::testing::MockAdapter;
 
 /// Number of joints of the mock arm.
 const DOF: usize = 3;

@@ -154,7 +154,7 @@ fn an_error_is_trouble_until_it_is_cleared() {
     assert_eq!((state.error, bench.worker.health.error_text().as_str()), (7, "overload"));
     bench.advance(PERIOD);
     bench.cycle();
-    assert_eq!(bench.notes(), ["the arm reports error 7: overload"], "once, and not over: it still stands");
+    assert_eq!(bench.notes(), ["the arm reports error 7: overload"], "once, and not over");
     bench.arm.clone().error(0, "");
     bench.advance(PERIOD);
     assert_eq!(bench.cycle().error, 0);
