@@ -20,6 +20,8 @@ const UNANSWERED: u32 = 4;
 const OUT_OF_STEP: u32 = 32;
 /// A smaller jump is none: a filtered one causes less than the acceleration limit [rad].
 const JUMP: f64 = 2e-5;
+/// Joints whose desired speed is lower are at rest [rad/s].
+const REST: f64 = 1e-4;
 /// A stream of velocities that ends is a hold after this time [states].
 const VELOCITY_ENDS: u64 = 100;
 /// States that were missed at once are made up for, up to this number.
@@ -119,6 +121,11 @@ impl Follower {
                 return if self.waiting { Some(self.answer(state)) } else { None };
             }
             (self.direct, self.in_step, self.slipped) = (false, 0, true);
+            // At rest nothing ends abruptly: the next motion is not to lag by the longest averages.
+            if state.dq_d.iter().all(|v| v.abs() < REST) {
+                self.smoothing = Smoothing::new(&self.goal);
+                return Some(self.answer(state));
+            }
             let change = if self.velocity { [0.0; DOF] } else { state.dq_d.map(|v| v * PERIOD) };
             self.smoothing.restart_moving(&self.goal, &change);
         } else if self.in_step >= IN_STEP && self.smoothing.rests_at(&self.goal) {

@@ -149,3 +149,34 @@ fn a_tick_that_misses_periods_is_caught_up_gently() {
     let seen = run(&times, |_| false);
     assert!(seen.error < 1e-5 && seen.acceleration < 9.0, "{seen:?}");
 }
+
+#[test]
+fn what_slips_at_rest_does_not_delay_the_next_motion() {
+    // Desired speeds of an arm at rest are rounded.
+    let mut state = State { id: 1000, dq_d: [1e-6; DOF], ..State::default() };
+    let mut follower = Follower::new(&state, false, 1.0);
+    let mut goal = state.q_d;
+    let (in_time, late) = (Duration::from_micros(200), Duration::from_micros(800));
+    for _ in 0..120 {
+        state.id += 1;
+        follower.state(&state);
+        follower.setpoint(&goal, &state, in_time);
+    }
+    assert!(follower.is_direct());
+    for _ in 0..12 {
+        state.id += 3;
+        follower.state(&state);
+        follower.setpoint(&goal, &state, in_time);
+    }
+    assert!(!follower.is_direct());
+    let mut answer = goal;
+    for _ in 0..200 {
+        state.id += 1;
+        answer = follower.state(&state).unwrap();
+        goal[0] += 0.001;
+        follower.setpoint(&goal, &state, late);
+    }
+    // 1 rad/s, so a distance is a time.
+    let lag = goal[0] - answer[0];
+    assert!(lag < 0.03, "{lag} s");
+}
