@@ -70,7 +70,8 @@ fn setpoints(trace: &[Received]) -> Vec<(Mono, [f64; 6])> {
 }
 
 /// The largest velocity and acceleration of any joint on the wire, as fractions of their limits. After a gap of more
-/// than two periods, when this computer was stalled, the arm has stopped, and setpoints begin from rest (`wire_stalls`).
+/// than two periods, when this computer was stalled, the arm has stopped, and setpoints begin from rest:
+/// `wire_stalls` judges that.
 fn wire_extremes(trace: &[Received]) -> (f64, f64) {
     let points = setpoints(trace);
     let (mut speed, mut change) = (0.0_f64, 0.0_f64);
