@@ -6,9 +6,9 @@ use rustix::process::Signal;
 
 use crate::support::program::Home;
 
-/// The computer of a test may be busy: more commands may be lost in a row than a real controller allows.
+/// A controller that waits for late commands: the computer of a test may be busy.
 fn emulator() -> FrankaEmulator {
-    let options = serde_json::json!({"sim": {"lost_limit": 200}});
+    let options = serde_json::json!({"sim": {"patience": 0.1}});
     let config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: 7, options };
     FrankaEmulator::start(&config, &EmulatorAddress::InProcess).unwrap()
 }

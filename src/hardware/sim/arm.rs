@@ -77,6 +77,11 @@ pub trait HasArm {
         self.arm().advance(now);
     }
 
+    /// Returns the time of the arm at `now`: another one where the controller's clock starts the cycles.
+    fn time(&self, now: Mono) -> Mono {
+        now
+    }
+
     /// Returns the true joint positions [rad] and velocities [rad/s] at `now`.
     fn joints_at(&mut self, now: Mono) -> (Joints, Joints) {
         self.advance(now);

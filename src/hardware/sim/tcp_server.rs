@@ -132,7 +132,10 @@ impl<C: Controller + HasArm> Emulator for TcpServer<C> {
     }
 
     fn inject(&self, fault: Fault) -> Result<(), String> {
-        self.with(|controller, now| controller.arm().inject(fault, now))
+        self.with(|controller, now| {
+            let now = controller.time(now);
+            controller.arm().inject(fault, now)
+        })
     }
 
     fn true_positions(&self) -> Option<Joints> {

@@ -18,6 +18,8 @@ const IN_STEP: u32 = 50;
 /// without one: 20 in a row without an answer would end the motion.
 const UNANSWERED: u32 = 4;
 const OUT_OF_STEP: u32 = 32;
+/// Setpoints that are missing for longer have ended [states]; up to here they only come irregularly.
+const PAUSE: u64 = 5;
 /// A smaller jump is none: a filtered one causes less than the acceleration limit [rad].
 const JUMP: f64 = 2e-5;
 /// Joints whose desired speed is lower are at rest [rad/s].
@@ -127,7 +129,7 @@ impl Follower {
                 return Some(self.answer(state));
             }
             let change = if self.velocity { [0.0; DOF] } else { state.dq_d.map(|v| v * PERIOD) };
-            self.smoothing.restart_moving(&self.goal, &change);
+            self.smoothing.restart_moving(&self.goal, &change, state.id.saturating_sub(self.goal_at) > PAUSE);
         } else if self.in_step >= IN_STEP && self.smoothing.rests_at(&self.goal) {
             (self.direct, self.unanswered) = (true, 0);
         }

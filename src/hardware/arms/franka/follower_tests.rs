@@ -151,6 +151,17 @@ fn a_tick_that_misses_periods_is_caught_up_gently() {
 }
 
 #[test]
+fn setpoints_that_come_irregularly_for_a_while_lag_little_afterwards() {
+    // For 60 ms every third tick is late by 0.8 ms: its state has no setpoint, the next one has two.
+    let late = |i: usize| (850..910).contains(&i) && i.is_multiple_of(3);
+    let times = every(1e-3, 3e-4);
+    let times: Vec<f64> = times.iter().enumerate().map(|(i, t)| if late(i) { t + 8e-4 } else { *t }).collect();
+    let seen = run(&times, |_| false);
+    assert!(!seen.direct || seen.error < 1e-6, "{seen:?}");
+    assert!(seen.lag < 0.04 && seen.acceleration < 9.0 && seen.error < 1e-5, "{seen:?}");
+}
+
+#[test]
 fn what_slips_at_rest_does_not_delay_the_next_motion() {
     // Desired speeds of an arm at rest are rounded.
     let mut state = State { id: 1000, dq_d: [1e-6; DOF], ..State::default() };

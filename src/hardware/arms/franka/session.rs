@@ -59,6 +59,8 @@ pub(super) struct Motion {
     sent: u64,
     /// The state that was answered last, and the positions that were sent.
     answered: u64,
+    /// The newest state: those before it were counted.
+    counted: u64,
     positions: [f64; DOF],
     /// It is to end: answers hold, and say so.
     pub finishing: bool,
@@ -236,8 +238,9 @@ impl Session {
             let lost = !motion.velocity && motion.positions.iter().zip(&self.state.q_d).any(apart);
             self.counts.lost_answers += u64::from(lost && motion.sent > 1);
         } else if motion.sent > 0 {
-            self.counts.unanswered += self.state.id.saturating_sub(motion.answered + 1);
+            self.counts.unanswered += self.state.id.saturating_sub(motion.counted.max(motion.answered + 1));
         }
+        motion.counted = self.state.id;
         let answer = if motion.finishing {
             Some(if motion.velocity { [0.0; DOF] } else { self.state.q_d })
         } else {
@@ -275,8 +278,10 @@ impl Session {
 
     pub(super) fn begin(&mut self, id: u32, velocity: bool) {
         let follower = Follower::new(&self.state, velocity, self.shaping.gain);
-        let (sent, answered, positions) = (0, self.state.id, self.state.q_d);
-        self.motion = Some(Box::new(Motion { velocity, id, follower, sent, answered, positions, finishing: false }));
+        let (id_now, positions) = (self.state.id, self.state.q_d);
+        let motion =
+            Motion { velocity, id, follower, sent: 0, answered: id_now, counted: id_now, positions, finishing: false };
+        self.motion = Some(Box::new(motion));
         self.see_motion();
     }
 

@@ -32,15 +32,16 @@ impl Smoothing {
         self.stages.iter_mut().flatten().for_each(|entry| *entry = *value);
     }
 
-    /// Starts over in a motion that came to `value` with a constant change per state, with the longest averages: what
-    /// ends abruptly is slowed down as gently as they can.
-    pub fn restart_moving(&mut self, value: &[f64; DOF], change: &[f64; DOF]) {
-        (self.length, self.next) = (LONGEST, 0);
+    /// Starts over in a motion that came to `value` with a constant change per state. A motion that `ends` abruptly gets
+    /// the longest averages, which slow it down as gently as they can; one that continues the shortest, which lag least.
+    pub fn restart_moving(&mut self, value: &[f64; DOF], change: &[f64; DOF], ends: bool) {
+        let length = if ends { LONGEST } else { SHORTEST };
+        (self.length, self.next) = (length, 0);
         for (number, stage) in self.stages.iter_mut().enumerate() {
-            let late = (number * (LONGEST - 1)) as f64 / 2.0;
-            for (i, entry) in stage.iter_mut().enumerate() {
+            let late = (number * (length - 1)) as f64 / 2.0;
+            for (i, entry) in stage.iter_mut().take(length).enumerate() {
                 // The first entry is the oldest one.
-                let back = late + (LONGEST - 1 - i) as f64;
+                let back = late + (length - 1 - i) as f64;
                 *entry = std::array::from_fn(|j| at(value, j) - at(change, j) * back);
             }
         }
@@ -148,7 +149,7 @@ mod tests {
     #[test]
     fn a_motion_is_taken_over() {
         let mut smoothing = Smoothing::new(&[0.0; DOF]);
-        smoothing.restart_moving(&[1.0; DOF], &[0.001; DOF]);
+        smoothing.restart_moving(&[1.0; DOF], &[0.001; DOF], true);
         let values: Vec<f64> =
             (1..=300).map(|i| smoothing.push(&[1.0 + 0.001 * f64::from(i.min(50)); DOF])[0]).collect();
         let (acceleration, _) = largest(&values);

@@ -15,10 +15,10 @@ use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::joint::ControlMode;
 
-/// An adapter and its controller. The computer of a test may be busy: more commands may be lost than on a real one.
+/// An adapter and its controller, which waits for late commands: the computer of a test may be busy.
 fn arm(mut options: serde_json::Value) -> (FrankaAdapter, FrankaEmulator) {
     let sim = options.as_object_mut().unwrap().entry("sim").or_insert(json!({}));
-    sim.as_object_mut().unwrap().entry("lost_limit").or_insert(json!(200));
+    sim.as_object_mut().unwrap().entry("patience").or_insert(json!(0.1));
     let mut config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: DOF, options };
     let emulator = FrankaEmulator::start(&config, &EmulatorAddress::InProcess).unwrap();
     config.address = emulator.address();
@@ -49,9 +49,11 @@ fn until(adapter: &mut FrankaAdapter, mut done: impl FnMut(&mut FrankaAdapter) -
     }
 }
 
+/// Passes time of the controller's clock.
 fn pass(adapter: &mut FrankaAdapter, time: Duration) {
-    let began = Instant::now();
-    until(adapter, |_| began.elapsed() >= time);
+    let cycle = |adapter: &FrankaAdapter| adapter.session.as_ref().unwrap().state.id;
+    let end = cycle(adapter) + time.as_millis() as u64;
+    until(adapter, |adapter| cycle(adapter) >= end);
 }
 
 fn positions(adapter: &mut FrankaAdapter) -> [f64; DOF] {
@@ -243,7 +245,7 @@ fn the_user_stop_and_guiding_are_reported_and_not_undone() {
 
 #[test]
 fn without_answers_the_controller_ends_the_motion() {
-    let (mut adapter, emulator) = ready(json!({"sim": {"lost_limit": 20}}));
+    let (mut adapter, emulator) = ready(json!({"sim": {"patience": 0.0}}));
     pass(&mut adapter, Duration::from_millis(50));
     // As if this process hung.
     std::thread::sleep(Duration::from_millis(100));

@@ -1,4 +1,5 @@
-//! The controller's clock: a thread with absolute deadlines, one cycle and one state each. It never waits for a client.
+//! The controller's clock: a thread with absolute deadlines, one cycle and one state each. It waits for a client only if
+//! it is told to have patience.
 
 use std::net::{SocketAddr, UdpSocket};
 use std::sync::Arc;
@@ -72,6 +73,15 @@ impl Way {
     }
 }
 
+/// How the clock runs.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Pace {
+    /// How much slower than this computer's clock it is, as a fraction.
+    pub drift: f64,
+    /// Longest wait for the command that answers a state, after the next cycle is due.
+    pub patience: Duration,
+}
+
 /// Returns whether a command has arrived, once it has; `false` at `due`.
 fn readable_before(socket: &UdpSocket, due: Mono) -> bool {
     let left = due.since(MonotonicClock.now());
@@ -79,25 +89,27 @@ fn readable_before(socket: &UdpSocket, due: Mono) -> bool {
     !left.is_zero() && matches!(poll(&mut [PollFd::new(socket, PollFlags::IN)], Some(&timeout)), Ok(1..))
 }
 
-/// Runs until `ends`. `drift` is how much slower than ours the clock is, as a fraction; `answers` gets the time from
-/// each state to the command that was used.
+/// Runs until `ends`. `answers` gets the time from each state to the command that was used.
 pub(super) fn run(
     server: &Arc<TcpServer<Control>>,
     socket: &UdpSocket,
     ends: &AtomicBool,
-    (network, drift): (Network, f64),
+    (network, pace): (Network, Pace),
     answers: &Histogram,
 ) {
     host::enter_realtime(host::EMULATOR_PRIORITY);
-    let period = Duration::from_secs_f64(super::control::CYCLE * (1.0 + drift));
+    let period = Duration::from_secs_f64(super::control::CYCLE * (1.0 + pace.drift));
     let (mut states, mut commands) = (Way::new(network, 0x9E37_79B9), Way::new(network, 0x7F4A_7C15));
     let mut buffer = [0; BUFFER];
     let mut due = MonotonicClock.now().after(period);
     let mut sent = due;
+    // Whether a state of a motion is on its way to a client, and nothing has come from there since.
+    let mut awaited = false;
     while !ends.load(Ordering::Acquire) {
         // Commands are taken as they come: when they came is measured.
-        while readable_before(socket, due) {
+        while readable_before(socket, if awaited { due.after(pace.patience) } else { due }) {
             let now = MonotonicClock.now();
+            awaited = false;
             server.with(|control, _| {
                 for _ in 0..MOST {
                     let Ok((length, from)) = socket.recv_from(&mut buffer) else { break };
@@ -115,15 +127,16 @@ pub(super) fn run(
         if late {
             due = now;
         }
-        let (state, hand) = server.with(|control, _| {
+        let (state, hand, moves) = server.with(|control, _| {
             control.figures.late_wakes += u64::from(late);
-            let state = control.cycle(now);
+            let state = control.cycle();
             let hand = if control.id.is_multiple_of(HAND) { control.hand.state() } else { None };
-            (state, hand)
+            (state, hand, control.motion.is_some())
         });
         sent = MonotonicClock.now();
+        awaited = false;
         if let Some((to, bytes)) = state {
-            states.pass(to, &bytes, |to, bytes| drop(socket.send_to(bytes, to)));
+            states.pass(to, &bytes, |to, bytes| awaited |= socket.send_to(bytes, to).is_ok() && moves);
         }
         if let Some((to, bytes)) = hand {
             let _ = socket.send_to(&bytes, to);

@@ -1,7 +1,8 @@
-//! The emulated controller: one cycle every millisecond. Time is passed in, and nothing here knows of sockets.
+//! The emulated controller: one cycle every millisecond of its own time. Nothing here knows of sockets.
 
 use std::collections::VecDeque;
 use std::net::{IpAddr, SocketAddr};
+use std::time::Duration;
 
 use super::hand::Hand;
 use super::wire;
@@ -105,7 +106,6 @@ pub struct Control {
     /// Answers that are due.
     pub(super) answers: Vec<(Who, Vec<u8>)>,
     pub(super) lost_in_row: u32,
-    pub(super) lost_limit: u32,
     pub(super) history: VecDeque<bool>,
     /// Mass, centre and inertia of the load.
     pub(super) load: [f64; 13],
@@ -115,6 +115,8 @@ pub struct Control {
     pub(super) external: [f64; DOF],
     pub(super) hand: Hand,
     pub(super) wrong_model: bool,
+    /// Time of this cycle: each is as long as any other, however late this computer begins it.
+    time: Mono,
     silent_until: Mono,
     /// How the connections end.
     pub(super) cut: Option<Delivery>,
@@ -152,7 +154,6 @@ impl Control {
             recovery: None,
             answers: Vec::new(),
             lost_in_row: 0,
-            lost_limit: options.lost_limit,
             history: VecDeque::with_capacity(100),
             load: [0.0; 13],
             impedance: [3000.0, 3000.0, 3000.0, 2500.0, 2500.0, 2000.0, 2000.0],
@@ -160,6 +161,7 @@ impl Control {
             external: [0.0; DOF],
             hand: Hand::new(),
             wrong_model: false,
+            time: now,
             silent_until: Mono::ZERO,
             cut: None,
             last_state: Vec::new(),
@@ -181,9 +183,10 @@ impl Control {
     }
 
     /// Makes one cycle. Returns the state to send, and where to.
-    pub fn cycle(&mut self, now: Mono) -> Option<(SocketAddr, Vec<u8>)> {
+    pub fn cycle(&mut self) -> Option<(SocketAddr, Vec<u8>)> {
         self.figures.cycles += 1;
-        self.arm.advance(now);
+        self.time = self.time.after(Duration::from_secs_f64(CYCLE));
+        self.arm.advance(self.time);
         self.see_faults();
         self.step_motion();
         if self.arm.enabled() {
@@ -199,7 +202,7 @@ impl Control {
         self.answers.extend(finished);
         self.id += 1;
         let (_, address) = self.client?;
-        self.deliver(now).map(|state| (address, state))
+        self.deliver().map(|state| (address, state))
     }
 
     /// Whether the arm may be moved by hand: without a motion, only brakes or another hand hold it.
@@ -302,10 +305,10 @@ impl Control {
     // --- States ---
 
     /// Returns the state of this cycle, as faults of the wire leave it.
-    fn deliver(&mut self, now: Mono) -> Option<Vec<u8>> {
+    fn deliver(&mut self) -> Option<Vec<u8>> {
         match self.arm.delivery() {
             Delivery::Silent => return None,
-            Delivery::Stall(time) => self.silent_until = now.after(time),
+            Delivery::Stall(time) => self.silent_until = self.time.after(time),
             delivery @ (Delivery::Disconnect(_) | Delivery::PowerLoss(_)) => {
                 self.cut = Some(delivery);
                 match delivery {
@@ -315,7 +318,7 @@ impl Control {
                 return None;
             }
             delivery => {
-                if now < self.silent_until {
+                if self.time < self.silent_until {
                     return None;
                 }
                 if self.arm.take_fault(FaultKind::Frozen).is_some() && !self.last_state.is_empty() {
@@ -371,4 +374,8 @@ impl HasArm for Control {
 
     /// The cycle advances the arm.
     fn advance(&mut self, _now: Mono) {}
+
+    fn time(&self, _now: Mono) -> Mono {
+        self.time
+    }
 }

@@ -18,6 +18,8 @@ const START: f64 = 1e-3;
 const FINISHED: f64 = 0.02;
 /// Number of cycles of the success rate.
 const HISTORY: usize = 100;
+/// Commands lost in a row that end a motion.
+const MOST_LOST: u32 = 20;
 
 impl Control {
     /// Steps the desired values.
@@ -27,7 +29,7 @@ impl Control {
             return self.brake();
         }
         self.count(command.is_some());
-        if self.lost_in_row >= self.lost_limit {
+        if self.lost_in_row >= MOST_LOST {
             return self.fail(COMMUNICATION);
         }
         let error = match command {

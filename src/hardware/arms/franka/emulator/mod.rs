@@ -36,7 +36,7 @@ use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::sim::tcp_server::{Port, TcpServer, cannot_listen, ports_in_a_row};
 use crate::joint::{JointLimits, Joints};
 use crate::rt::histogram::{self, Histogram};
-use clock::Network;
+use clock::{Network, Pace};
 use control::Control;
 pub use control::{Datagram, Figures};
 
@@ -89,10 +89,10 @@ pub struct SimOptions {
     /// How much slower than this computer's the controller's clock is, -1000 to 1000 [ppm].
     #[schemars(range(min = -1000, max = 1000))]
     pub drift: f64,
-    /// Commands lost in a row that end a motion, 1 to 1000; a real controller: 20. More for a computer that is too busy
-    /// for 1 kHz.
-    #[schemars(range(min = 1, max = 1000))]
-    pub lost_limit: u32,
+    /// How long the controller's clock waits for a command that is late, 0 to 0.1 [s]; a real one does not wait. For a
+    /// computer that is too busy for 1 kHz.
+    #[schemars(range(min = 0, max = 0.1))]
+    pub patience: f64,
     /// Faults, and when they begin (seconds after the first connection).
     pub faults: Vec<Fault>,
 }
@@ -107,7 +107,7 @@ impl Default for SimOptions {
             repeat: 0.0,
             reorder: 0.0,
             drift: 0.0,
-            lost_limit: 20,
+            patience: 0.0,
             faults: Vec::new(),
         }
     }
@@ -124,7 +124,7 @@ impl SimOptions {
         range("repeat", self.repeat, (0.0, 1.0))?;
         range("reorder", self.reorder, (0.0, 1.0))?;
         range("drift", self.drift, (-1000.0, 1000.0))?;
-        range("lost_limit", self.lost_limit.into(), (1.0, 1000.0))?;
+        range("patience", self.patience, (0.0, 0.1))?;
         self.common().check("franka", limits, PLAYABLE)
     }
 
@@ -167,11 +167,12 @@ impl FrankaEmulator {
         let ends = Arc::new(AtomicBool::new(false));
         let sim = options.sim;
         let network = Network { lose: sim.lose, repeat: sim.repeat, reorder: sim.reorder };
+        let pace = Pace { drift: sim.drift * 1e-6, patience: Duration::from_secs_f64(sim.patience) };
         let answers = Arc::new(Histogram::default());
         let (shared, end, times) = (server.clone(), ends.clone(), answers.clone());
         let clock = std::thread::Builder::new()
             .name("franka-sim-clock".to_owned())
-            .spawn(move || clock::run(&shared, &socket, &end, (network, sim.drift * 1e-6), &times))
+            .spawn(move || clock::run(&shared, &socket, &end, (network, pace), &times))
             .map_err(serve)?;
         Ok(Self { server, address: SocketAddr::new(ip, first), ends, answers, clock: Some(clock) })
     }

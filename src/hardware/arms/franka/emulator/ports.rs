@@ -33,9 +33,8 @@ impl stream::Controller for Control {
 
     fn client_gone(&mut self, _now: Mono) {}
 
-    fn session_began(&mut self, port: usize, _client: u64, now: Mono, _greeting: &mut Vec<u8>) {
+    fn session_began(&mut self, port: usize, _client: u64, _now: Mono, _greeting: &mut Vec<u8>) {
         if port == 0 {
-            self.arm.advance(now);
             self.arm.client_came();
         }
     }
