@@ -98,7 +98,7 @@ impl TaskBody for Joystick {
         for (((q, v), target), &joint) in state.zip(&self.target).zip(cx.joints) {
             let view = cx.joint(joint);
             let resting = stopping || target.abs() < self.params.dead_band;
-            let wanted = if resting { 0.0 } else { within(*target, view.velocity_limit) };
+            let wanted = if resting { 0.0 } else { within(*target, cx.pace * view.velocity_limit) };
             let most = self.params.acceleration.min(view.acceleration) * cx.dt;
             *v += within(wanted - *v, most);
             let next = *q + *v * cx.dt;
@@ -113,6 +113,10 @@ impl TaskBody for Joystick {
 
     fn end(&mut self) {
         (self.target, self.cancelled) = (Joints::default(), false);
+    }
+
+    fn obeys_speed(&self) -> bool {
+        true
     }
 
     fn cancel(&mut self) -> OnCancel {

@@ -51,6 +51,20 @@ pub fn speed(text: &str) -> std::result::Result<f64, String> {
     if (lowest..=1.0).contains(&value) { Ok(value) } else { Err(format!("must be within {lowest}–1")) }
 }
 
+/// Parses a speed override: `0.3` or `30%`.
+pub fn override_of_speed(text: &str) -> std::result::Result<f64, String> {
+    let lowest = crate::control::speed_override::LOWEST;
+    let value = match text.strip_suffix('%') {
+        Some(percent) => finite(percent)? / 100.0,
+        None => finite(text)?,
+    };
+    match value {
+        _ if (lowest..=1.0).contains(&value) => Ok(value),
+        _ if value > 1.0 && !text.ends_with('%') => Err(format!("must be within {lowest}–1, or with a % sign")),
+        _ => Err(format!("must be within {lowest}–1, or {:.0}–100%", lowest * 100.0)),
+    }
+}
+
 /// Parses a rate per second.
 pub fn rate(text: &str) -> std::result::Result<f64, String> {
     let value = finite(text)?;

@@ -41,7 +41,12 @@ pub fn follow(client: &mut Client, motion: u64, task: &str, signals: &Signals, j
             continue;
         }
         bar.set_position((report.progress.clamp(0.0, 1.0) * 1000.0) as u64);
-        bar.set_message(format!("{:.1} s left", report.remaining.max(0.0)));
+        let left = format!("{:.1} s left", report.remaining.max(0.0));
+        bar.set_message(match &report.speed {
+            Some(speed) if speed.paused => format!("{left}, PAUSED (dimos resume)"),
+            Some(speed) => format!("{left} at {:.0} % of the speed", speed.fraction * 100.0),
+            None => left,
+        });
         if report.done {
             break report;
         }

@@ -77,7 +77,7 @@ fn robot_goal(text: &str) -> std::result::Result<PlanGoal, String> {
 /// Settings of the search and the speed.
 #[derive(Debug, Clone, clap::Args)]
 pub struct Search {
-    /// Fraction of the velocity and acceleration limits to use, 0.1–1
+    /// Fraction of the velocity and acceleration limits to use, 0.01–1
     #[arg(long, value_name = "FRACTION", default_value_t = DEFAULT_SPEED, value_parser = speed)]
     pub speed: f64,
     /// Move the end effector on a straight line to --pose

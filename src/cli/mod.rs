@@ -27,12 +27,14 @@ pub mod motion;
 mod other_users;
 pub mod output;
 pub mod plan;
+pub mod pose;
 pub mod preview;
 pub mod proxy;
 pub mod replay;
 pub mod run;
 pub mod run_record;
 pub mod schema;
+pub mod speed;
 pub mod state;
 pub mod status;
 pub mod stop;
@@ -93,10 +95,18 @@ enum Command {
     World(world::Args),
     /// Decelerate running motions to rest, and end planning
     Cancel(cancel::Args),
+    /// Show or set the speed of all motions: a fraction, as 0.3 or 30%
+    Speed(speed::Args),
+    /// Pause all motions on their paths
+    Pause(speed::PauseArgs),
+    /// Continue paused motions
+    Resume(speed::PauseArgs),
     /// Hold arms at once and keep them held until `arm reset`: an operational stop
     Stop(stop::Args),
     /// Enable, disable or reset an arm, move its gripper; find, set up and calibrate one without a run
     Arm(arm::Args),
+    /// Save where the arms are under a name, for `move --named`; list and remove saved poses
+    Pose(pose::Args),
     /// Drive an arm from the keyboard, in the terminal
     Jog(jog::Args),
     /// List tasks, query one, or stream targets to it
@@ -265,6 +275,10 @@ fn built_in(cli: &Cli, catalog: Catalog<'_>) -> exit::Result {
         Command::Execute(args) => execute::run(args),
         Command::World(args) => world::run(args),
         Command::Cancel(args) => cancel::run(args),
+        Command::Pose(args) => pose::run(args),
+        Command::Speed(args) => speed::run(args),
+        Command::Pause(args) => speed::pause(args, true),
+        Command::Resume(args) => speed::pause(args, false),
         Command::Stop(args) => stop::run(args),
         Command::Arm(args) => arm::run(args, registry),
         Command::Jog(args) => jog::run(args),

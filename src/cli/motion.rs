@@ -6,7 +6,7 @@ use super::exit::{Exit, Failure, Result};
 use super::follow::{Signals, follow};
 use super::goal::{Goal, Search, has_planner, plan, show};
 use super::output;
-use crate::rpc::api::{ExecutePlan, Move};
+use crate::rpc::api::{ExecutePlan, Move, Poses, State};
 use crate::rpc::client::Client;
 
 /// Arguments of `move`.
@@ -22,7 +22,7 @@ pub struct Args {
     #[command(flatten)]
     pub search: Search,
     /// Move straight in joint space even if the run has a planner: not collision-checked
-    #[arg(long, conflicts_with_all = ["pose", "named", "several"])]
+    #[arg(long, conflicts_with_all = ["pose", "several"])]
     pub direct: bool,
     /// If an obstacle blocks the motion, stop, plan again and continue
     #[arg(long, conflicts_with_all = ["direct", "no_wait"])]
@@ -67,16 +67,40 @@ fn plan_and_begin(args: &Args, client: &mut Client, signals: &Signals) -> Result
 }
 
 fn begin_direct(args: &Args, client: &mut Client, signals: &Signals) -> Result<Begun> {
-    let (Some(arm), Some(target)) = (&args.arm, args.goal.joints()) else {
-        let failure = Failure::new(Exit::Failed, "poses, names and --goal need a planner, and this run has none");
+    let target = match (&args.arm, args.goal.joints(), &args.goal.named) {
+        (Some(arm), Some(target), _) => Some((arm, target.to_vec())),
+        (Some(arm), None, Some(name)) => Some((arm, saved(client, arm, name)?)),
+        _ => None,
+    };
+    let Some((arm, target)) = target else {
+        let failure = Failure::new(Exit::Failed, "--pose and --goal need a planner, and this run has none");
         return Err(failure.hint("run a planner blueprint, such as yourarm-planner, or give joint positions"));
     };
     signals.check()?;
-    let begun = client.call(Move::new(arm.clone(), target.to_vec(), args.search.speed))?;
+    let begun = client.call(Move::new(arm.clone(), target, args.search.speed))?;
     output::note(format_args!(
         "motion {} on {}: {:.2} s, direct, not collision-checked",
         begun.motion, begun.task, begun.duration
     ));
     let reply = serde_json::to_value(&begun).unwrap_or_default();
     Ok((begun.motion, begun.task, reply))
+}
+
+/// Returns the positions of an arm's joints in a saved pose [rad].
+fn saved(client: &mut Client, arm: &str, name: &str) -> Result<Vec<f64>> {
+    let poses = client.call(Poses {})?.poses;
+    let Some(pose) = poses.get(name) else {
+        let names: Vec<&str> = poses.keys().map(String::as_str).collect();
+        let known = if names.is_empty() { "none is saved".to_owned() } else { format!("saved: {}", names.join(", ")) };
+        let failure = Failure::new(Exit::Usage, format!("no saved pose {name}; {known}"));
+        return Err(failure.hint("save where the arm is: dimos pose save NAME; names of a blueprint need a planner"));
+    };
+    let state = client.call(State {})?;
+    let joints = state.arms.iter().find(|a| a.hardware_id == arm).map(|a| a.joints.as_slice()).unwrap_or_default();
+    let position = |joint: &str| pose.values().find_map(|arm| arm.get(joint)).copied();
+    let found: Option<Vec<f64>> = joints.iter().map(|joint| position(&joint.name)).collect();
+    found.filter(|found| !found.is_empty()).ok_or_else(|| {
+        Failure::new(Exit::Usage, format!("the saved pose {name} has no position of {arm}'s joints"))
+            .hint(format!("save it again: dimos pose save {name} {arm}"))
+    })
 }

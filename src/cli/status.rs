@@ -9,7 +9,8 @@ use super::banner::at_exit;
 use super::exit::{Exit, Result};
 use super::output::{self, Table, Tone, number, span, toned};
 use super::run_record::{RunRecord, RunState};
-use crate::rpc::api::Status;
+use super::speed::describe;
+use crate::rpc::api::{SpeedReport, Status};
 use crate::rpc::client::{Client, ClientError};
 use crate::rpc::report::{ArmReport, Percentiles, PlannerStatus, StatusReport, TaskReport};
 use crate::rpc::run_dir::LiveRun;
@@ -175,6 +176,10 @@ fn print(r: &StatusReport) {
     }
     output::line("");
     print_arms(&r.arms);
+    if r.speed != SpeedReport::default() {
+        output::line("");
+        output::line(describe(&r.speed));
+    }
     output::line("");
     print_tasks(&r.tasks);
     output::line("");

@@ -138,8 +138,9 @@ impl Limiter {
         self.request_velocity = 0.0;
     }
 
-    /// Returns the position to command for a requested position [rad], `dt` [s] after the last command.
-    pub fn follow_position(&mut self, target: f64, dt: f64) -> Result<Limited, Refusal> {
+    /// Returns the position to command for a requested position [rad], `dt` [s] after the last command. `speed`: fraction
+    /// of the velocity limit that applies, 0 to 1.
+    pub fn follow_position(&mut self, target: f64, dt: f64, speed: f64) -> Result<Limited, Refusal> {
         if let Some(refusal) = self.refuses(target, false) {
             return Err(refusal);
         }
@@ -155,7 +156,7 @@ impl Limiter {
         let (lower, upper) = self.range();
         let goal = target.clamp(lower, upper);
         let asked = (goal - self.position) / dt;
-        let b = self.bounds;
+        let b = Bounds { velocity: self.bounds.velocity * speed, ..self.bounds };
         let change = b.acceleration * dt;
         let possible = asked.abs() <= b.velocity * (1.0 + ROUNDING)
             && (asked - self.velocity).abs() <= change * (1.0 + ROUNDING) + ROUNDING
@@ -189,13 +190,14 @@ impl Limiter {
     }
 
     /// Returns the velocity to command for a requested velocity [rad/s]. `at`: lowest and highest position that the
-    /// joint may have by now [rad], given the commands since it was measured.
-    pub fn follow_velocity(&mut self, target: f64, at: (f64, f64), dt: f64) -> Result<Limited, Refusal> {
+    /// joint may have by now [rad], given the commands since it was measured. `speed`: fraction of the velocity limit
+    /// that applies, 0 to 1.
+    pub fn follow_velocity(&mut self, target: f64, at: (f64, f64), dt: f64, speed: f64) -> Result<Limited, Refusal> {
         if !target.is_finite() {
             return Err(Refusal::NonFinite);
         }
         self.forget_request();
-        let b = self.bounds;
+        let b = Bounds { velocity: self.bounds.velocity * speed, ..self.bounds };
         let change = b.acceleration * dt;
         let slowest = self.speeds_inside(b.lower, b.upper, at.0, dt).0;
         let fastest = self.speeds_inside(b.lower, b.upper, at.1, dt).1;

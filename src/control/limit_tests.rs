@@ -56,7 +56,7 @@ fn a_step_of_exactly_the_largest_one_is_no_jump() {
 fn a_task_that_takes_over_is_compared_with_the_command() {
     let mut l = limiter();
     for k in 1..=3 {
-        l.follow_position(0.15 * k as f64, DT).unwrap();
+        l.follow_position(0.15 * k as f64, DT, 1.0).unwrap();
     }
     assert!(l.position() < 0.01, "the command is far behind the requests: {}", l.position());
     assert_eq!(l.refuses(0.0, true), None);
@@ -73,7 +73,7 @@ fn requests_exactly_at_a_limit_are_not_limited() {
     for _ in 0..100 {
         v = f64::min(v + 4.0 * DT, 1.5);
         q += v * DT;
-        let out = l.follow_position(q, DT).unwrap();
+        let out = l.follow_position(q, DT, 1.0).unwrap();
         assert_eq!((out.value, out.by), (q, None), "at {v} rad/s");
     }
     assert_eq!(v, 1.5);
@@ -84,14 +84,14 @@ fn the_limit_that_changed_a_command_is_named() {
     let by = |velocity: f64, target: f64| {
         let mut l = limiter();
         l.rewind(0.0, velocity);
-        l.follow_position(target, DT).unwrap().by
+        l.follow_position(target, DT, 1.0).unwrap().by
     };
     assert_eq!(by(0.0, 1.5 * DT), Some((LimitKind::Acceleration, 1.5 / DT)), "the top speed at once");
     assert_eq!(by(1.5, 1.6 * DT).map(|(kind, _)| kind), Some(LimitKind::Velocity));
     assert_eq!(by(1.5, 1.5 * DT), None);
     let mut l = limiter();
     l.seed(1.98);
-    assert_eq!(l.follow_position(2.0, DT).unwrap().by, Some((LimitKind::Position, 2.0)));
+    assert_eq!(l.follow_position(2.0, DT, 1.0).unwrap().by, Some((LimitKind::Position, 2.0)));
 }
 
 /// At both ends: a joint that runs towards its limit brakes with its acceleration and then is at rest there.
@@ -103,7 +103,7 @@ fn a_joint_brakes_before_each_of_its_limits() {
         for _ in 0..600 {
             target = f64::min(target + 1.5 * DT, 2.5);
             let before = l.velocity();
-            l.follow_position(side * target, DT).unwrap();
+            l.follow_position(side * target, DT, 1.0).unwrap();
             assert!(side * l.position() <= 1.99 + 1e-12 && (l.velocity() - before).abs() <= 4.0 * DT + 1e-9);
             fastest = fastest.max(side * l.velocity());
         }
@@ -117,7 +117,7 @@ fn what_is_possible_passes_bit_for_bit() {
     for k in 0..500 {
         let t = k as f64 * DT;
         let q = 0.5 * (1.0 - (1.2 * t).cos());
-        assert_eq!(l.follow_position(q, DT), Ok(Limited { value: q, by: None }));
+        assert_eq!(l.follow_position(q, DT, 1.0), Ok(Limited { value: q, by: None }));
     }
 }
 
@@ -126,7 +126,7 @@ fn a_step_is_followed_within_limits_without_overshoot_and_met() {
     let mut l = limiter();
     let (mut last, mut last_v) = (0.0, 0.0);
     for _ in 0..200 {
-        let out = l.follow_position(0.15, DT).unwrap();
+        let out = l.follow_position(0.15, DT, 1.0).unwrap();
         let v = (out.value - last) / DT;
         assert!(v.abs() <= 1.5 * (1.0 + 1e-9) && (v - last_v).abs() <= 4.0 * DT * (1.0 + 1e-6) + 1e-9);
         assert!(out.value <= 0.15 + 1e-12);
@@ -141,7 +141,7 @@ fn a_stream_that_starts_at_speed_is_caught_up_with_and_not_refused() {
     let mut gap = 0.0f64;
     for k in 1..300 {
         let target = 0.4 * DT * k as f64;
-        gap = (target - l.follow_position(target, DT).unwrap().value).abs();
+        gap = (target - l.follow_position(target, DT, 1.0).unwrap().value).abs();
     }
     assert!(gap < 1e-9, "{gap}");
 }
@@ -149,10 +149,10 @@ fn a_stream_that_starts_at_speed_is_caught_up_with_and_not_refused() {
 #[test]
 fn a_jump_is_refused_and_changes_nothing() {
     let mut l = limiter();
-    l.follow_position(0.01, DT).unwrap();
+    l.follow_position(0.01, DT, 1.0).unwrap();
     let before = l;
-    assert_eq!(l.follow_position(0.3, DT), Err(Refusal::Jump(0.3 - 0.01)));
-    assert_eq!(l.follow_position(f64::NAN, DT), Err(Refusal::NonFinite));
+    assert_eq!(l.follow_position(0.3, DT, 1.0), Err(Refusal::Jump(0.3 - 0.01)));
+    assert_eq!(l.follow_position(f64::NAN, DT, 1.0), Err(Refusal::NonFinite));
     assert_eq!((l.position, l.velocity), (before.position, before.velocity));
 }
 
@@ -160,10 +160,10 @@ fn a_jump_is_refused_and_changes_nothing() {
 fn a_joint_outside_its_range_may_stay_or_come_in() {
     let mut l = limiter();
     l.seed(2.3);
-    assert_eq!(l.follow_position(2.3, DT).unwrap().value, 2.3);
-    assert!(l.follow_position(2.35, DT).unwrap().value <= 2.3);
+    assert_eq!(l.follow_position(2.3, DT, 1.0).unwrap().value, 2.3);
+    assert!(l.follow_position(2.35, DT, 1.0).unwrap().value <= 2.3);
     for k in 0..400 {
-        let q = l.follow_position(2.3 - 0.002 * k as f64, DT).unwrap().value;
+        let q = l.follow_position(2.3 - 0.002 * k as f64, DT, 1.0).unwrap().value;
         assert!(q <= 2.3);
     }
     assert!(l.position() < 1.99);
@@ -173,7 +173,7 @@ fn a_joint_outside_its_range_may_stay_or_come_in() {
 fn a_moving_joint_without_requests_decelerates_within_its_limit() {
     let mut l = limiter();
     for k in 1..100 {
-        l.follow_position(0.5 * (DT * k as f64).powi(2) * 2.0, DT).unwrap();
+        l.follow_position(0.5 * (DT * k as f64).powi(2) * 2.0, DT, 1.0).unwrap();
     }
     let mut v = l.velocity();
     while !l.at_rest() {
@@ -197,7 +197,7 @@ proptest! {
         let (mut target, mut last, mut last_v) = (start, start, 0.0);
         for s in steps {
             target += s;
-            let q = match l.follow_position(target, DT) {
+            let q = match l.follow_position(target, DT, 1.0) {
                 Ok(out) => out.value,
                 Err(_) => { target = l.position(); l.hold_position(DT) }
             };
@@ -216,7 +216,7 @@ proptest! {
         l.seed(0.0);
         let (mut q, mut last) = (0.0, 0.0);
         for t in targets {
-            let v = l.follow_velocity(t, (q, q), DT).unwrap().value;
+            let v = l.follow_velocity(t, (q, q), DT, 1.0).unwrap().value;
             prop_assert!(v.abs() <= 1.5 && (v - last).abs() <= 4.0 * DT + 1e-12);
             q += v * DT;
             last = v;
@@ -230,8 +230,8 @@ proptest! {
         let mut l = limiter();
         l.seed(0.1);
         for t in targets {
-            if let Ok(out) = l.follow_position(t, DT) { prop_assert!(out.value.is_finite()); }
-            if let Ok(out) = l.follow_velocity(t, (0.1, 0.1), DT) { prop_assert!(out.value.is_finite()); }
+            if let Ok(out) = l.follow_position(t, DT, 1.0) { prop_assert!(out.value.is_finite()); }
+            if let Ok(out) = l.follow_velocity(t, (0.1, 0.1), DT, 1.0) { prop_assert!(out.value.is_finite()); }
             prop_assert!(l.hold_position(DT).is_finite());
         }
     }

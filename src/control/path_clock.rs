@@ -1,38 +1,26 @@
-//! Time along a path. It runs at rate 1, slows down for a cancel, and after a gap restarts from rest at the arm's point
-//! of the path. The path stays the same: only the time along it is scaled, within acceleration and jerk limits.
+//! Time along a path. It runs at rate 1, or slower with a speed override; it slows down for a cancel, and after a gap
+//! restarts from rest at the arm's point of the path. The path stays the same: only the time along it is scaled, within
+//! acceleration and jerk limits.
 
+use super::rate::{Rate, RateLimits};
 use crate::clock::Mono;
 
 /// Number of ticks whose time along the path is kept.
 const KEPT: usize = 64;
-/// Fraction of the limits that a start from rest uses; the remainder is for the path's curvature and for rounding.
-const SHARE: f64 = 0.9;
-
-/// Limits of the change of the rate, so that no joint exceeds its limits.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct RateLimits {
-    /// Maximum change of the rate [1/s].
-    pub first: f64,
-    /// Maximum change of that change [1/s²].
-    pub second: f64,
-}
-
 /// Time along a path.
 #[derive(Debug, Clone)]
 pub struct PathClock {
     /// Time along the path [s].
     elapsed: f64,
     /// Time along the path per second.
-    rate: f64,
-    /// Its change [1/s].
-    change: f64,
+    rate: Rate,
     kept: [(Mono, f64); KEPT],
     next: usize,
 }
 
 impl Default for PathClock {
     fn default() -> Self {
-        Self { elapsed: 0.0, rate: 1.0, change: 0.0, kept: [(Mono::ZERO, 0.0); KEPT], next: 0 }
+        Self { elapsed: 0.0, rate: Rate::new(1.0), kept: [(Mono::ZERO, 0.0); KEPT], next: 0 }
     }
 }
 
@@ -44,17 +32,17 @@ impl PathClock {
 
     /// Returns the time along the path per second.
     pub fn rate(&self) -> f64 {
-        self.rate
+        self.rate.value()
     }
 
-    /// Returns whether it runs at full rate.
-    pub fn full(&self) -> bool {
-        self.rate >= 1.0
+    /// Returns whether it runs at this rate.
+    pub fn runs_at(&self, rate: f64) -> bool {
+        self.rate() == rate
     }
 
-    /// Starts a path, at full rate: every path starts from rest.
-    pub fn start(&mut self) {
-        *self = Self::default();
+    /// Starts a path, at this rate at once: every path starts from rest.
+    pub fn start(&mut self, rate: f64) {
+        *self = Self { rate: Rate::new(rate), ..Self::default() };
     }
 
     /// Keeps the point of the path that the tick of `now` commands.
@@ -71,7 +59,7 @@ impl PathClock {
         if let Some((_, elapsed)) = known {
             self.elapsed = *elapsed;
         }
-        (self.rate, self.change) = (0.0, 0.0);
+        self.rate = Rate::new(0.0);
         if let Some(mark) = self.kept.iter_mut().find(|(when, _)| *when == now) {
             mark.1 = self.elapsed;
         }
@@ -79,28 +67,17 @@ impl PathClock {
 
     /// Advances by a step of `dt` [s].
     pub fn advance(&mut self, dt: f64) {
-        self.elapsed += dt * self.rate;
+        self.elapsed += dt * self.rate();
     }
 
     /// Reduces the rate by `by`.
     pub fn slow_down(&mut self, by: f64) {
-        (self.rate, self.change) = (self.rate - by, 0.0);
+        self.rate = Rate::new(self.rate() - by);
     }
 
-    /// Raises the rate towards 1 over a step of `dt` [s].
-    pub fn speed_up(&mut self, limits: RateLimits, dt: f64) {
-        if self.full() {
-            return;
-        }
-        let (first, second) = (SHARE * limits.first, SHARE * limits.second);
-        // The fastest change from which the rate still reaches 1 with zero change.
-        let arriving = (2.0 * second * (1.0 - self.rate).max(0.0)).sqrt();
-        let wanted = first.min(arriving);
-        self.change += (wanted - self.change).clamp(-second * dt, second * dt);
-        self.rate += self.change.max(0.0) * dt;
-        if self.rate >= 1.0 - 1e-9 || !self.rate.is_finite() {
-            (self.rate, self.change) = (1.0, 0.0);
-        }
+    /// Changes the rate towards `target` over a step of `dt` [s].
+    pub fn approach(&mut self, target: f64, limits: RateLimits, dt: f64) {
+        self.rate.approach(target, limits, dt);
     }
 }
 
@@ -130,8 +107,8 @@ mod tests {
         let (mut clock, limits, dt) = (PathClock::default(), RateLimits { first: 5.0, second: 100.0 }, 0.01);
         clock.rewind(Mono::ZERO, Mono::ZERO);
         let (mut rate, mut change, mut steps) = (0.0, 0.0, 0);
-        while !clock.full() {
-            clock.speed_up(limits, dt);
+        while !clock.runs_at(1.0) {
+            clock.approach(1.0, limits, dt);
             let now = (clock.rate() - rate) / dt;
             assert!(now <= 5.0 + 1e-9 && (now - change).abs() <= 100.0 * dt + 1e-6, "{now} after {change}");
             (rate, change, steps) = (clock.rate(), now, steps + 1);

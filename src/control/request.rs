@@ -78,6 +78,16 @@ pub enum Request {
         /// Largest force, in the gripper's force unit; `None`: the device's own.
         force: Option<f64>,
     },
+    /// Set the speed override.
+    Speed {
+        /// Fraction of the speed, 0.01 to 1.
+        fraction: f64,
+    },
+    /// Pause all motions on their paths, or resume them.
+    Pause {
+        /// Whether they are to pause.
+        on: bool,
+    },
     /// The run shuts down: decelerate all arms to rest and refuse further requests.
     Shutdown,
 }

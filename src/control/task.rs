@@ -2,10 +2,24 @@
 
 use super::config::TaskConfig;
 use super::request::Motion;
+use super::speed_override::SpeedOverride;
 use super::task_body::{Claim, Context, Demand, JointView, OnCancel, OnLoss, Step, Target, TargetKind, TaskBody};
 use super::task_spec::TaskSpec;
 use crate::clock::Mono;
 use crate::telemetry::{Outcome, Reason, TaskState, TaskView};
+
+/// What all tasks are given in a tick.
+#[derive(Debug, Clone, Copy)]
+pub struct Tick<'a> {
+    /// The tick's time.
+    pub now: Mono,
+    /// Length of the control step [s].
+    pub dt: f64,
+    /// The speed override.
+    pub speed: SpeedOverride,
+    /// All joints of all arms.
+    pub views: &'a [JointView],
+}
 
 /// A task of a coordinator.
 #[derive(Debug)]
@@ -58,6 +72,11 @@ impl Task {
         self.motion.as_ref().map_or(&self.joints, |motion| &motion.joints)
     }
 
+    /// Returns whether it obeys the speed override itself.
+    pub fn obeys_speed(&self) -> bool {
+        self.body.obeys_speed()
+    }
+
     /// Returns whether it executes or decelerates.
     pub fn is_active(&self) -> bool {
         matches!(self.state, TaskState::Executing | TaskState::Cancelling)
@@ -88,11 +107,11 @@ impl Task {
     }
 
     /// Passes a target to the body. Returns whether the task becomes active with it.
-    pub fn accept(&mut self, now: Mono, dt: f64, views: &[JointView], target: &Target<'_>) -> Result<bool, Outcome> {
+    pub fn accept(&mut self, tick: &Tick<'_>, target: &Target<'_>) -> Result<bool, Outcome> {
         if !self.takes.contains(&target.kind()) {
             return Err(Outcome::WrongTask(self.index));
         }
-        let (cx, body, _) = self.parts(now, dt, views);
+        let (cx, body, _) = self.parts(tick);
         body.accept(&cx, target)?;
         // A target during the deceleration after a cancel: continues from the present motion.
         let begins = self.state != TaskState::Executing;
@@ -106,34 +125,31 @@ impl Task {
         self.motion.replace(motion)
     }
 
-    fn parts<'a>(
-        &'a mut self,
-        now: Mono,
-        dt: f64,
-        views: &'a [JointView],
-    ) -> (Context<'a>, &'a mut dyn TaskBody, &'a mut Vec<Claim>) {
+    fn parts<'a>(&'a mut self, tick: &Tick<'a>) -> (Context<'a>, &'a mut dyn TaskBody, &'a mut Vec<Claim>) {
         let cx = Context {
-            now,
-            dt,
+            now: tick.now,
+            dt: tick.dt,
+            speed: tick.speed.target(),
+            pace: tick.speed.of_streams(),
             task: self.index,
             joints: &self.joints,
             active: matches!(self.state, TaskState::Executing | TaskState::Cancelling),
             granted: self.granted,
             motion: self.motion.as_deref(),
-            views,
+            views: tick.views,
         };
         (cx, self.body.as_mut(), &mut self.claims)
     }
 
     /// Fills in the claims of this tick. Returns a finished motion, to be freed on another thread.
-    pub fn compute(&mut self, now: Mono, dt: f64, views: &[JointView]) -> Option<Box<Motion>> {
+    pub fn compute(&mut self, tick: &Tick<'_>) -> Option<Box<Motion>> {
         self.claims.clear();
         self.demand = Demand::Nothing;
         if !self.is_active() {
             return None;
         }
         self.demand = self.demands;
-        let (cx, body, claims) = self.parts(now, dt, views);
+        let (cx, body, claims) = self.parts(tick);
         match body.compute(&cx, claims) {
             Step::Continue => None,
             Step::ContinueFor(reason) => {

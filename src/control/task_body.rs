@@ -40,6 +40,11 @@ pub struct Context<'a> {
     pub now: Mono,
     /// Length of the control step [s].
     pub dt: f64,
+    /// Speed override: the fraction of its speed that a motion is to have, 0 while paused. A task that
+    /// [obeys it](TaskBody::obeys_speed) changes to it within its limits.
+    pub speed: f64,
+    /// Fraction of the velocity limits of streams: follows `speed` smoothly.
+    pub pace: f64,
     /// Index of the task, for outcomes that name it.
     pub task: u16,
     /// The task's joints: indices over all arms' joints, in the blueprint's order.
@@ -189,6 +194,12 @@ pub trait TaskBody: std::fmt::Debug + Send {
     fn lose(&mut self, joints: &[u16], joint: u16) -> OnLoss {
         let _ = (joints, joint);
         OnLoss::End
+    }
+
+    /// Returns whether the body itself obeys [`Context::speed`] or [`Context::pace`]. For one that does not, the
+    /// velocity limits of its joints are scaled.
+    fn obeys_speed(&self) -> bool {
+        false
     }
 
     /// No command reached an arm since the tick of `at`: continues from the command of that tick, from rest. The next

@@ -34,6 +34,10 @@ pub struct Pulse {
     pub skipped: AtomicU64,
     /// Number of ticks that this computer's clock began because the arm that clocks them was silent.
     pub unprompted: AtomicU64,
+    /// Fraction of the speed override, as bits.
+    pub speed: AtomicU64,
+    /// Whether all motions are paused.
+    pub paused: AtomicBool,
     /// Whether the thread runs with SCHED_FIFO.
     pub fifo: AtomicBool,
     /// Whether no command moves an arm.
@@ -158,6 +162,8 @@ pub fn run(
         for (slot, view) in ports.task_views.iter_mut().zip(&output.tasks) {
             slot.write(view);
         }
+        pulse.speed.store(output.speed.fraction.to_bits(), Ordering::Relaxed);
+        pulse.paused.store(output.speed.paused, Ordering::Relaxed);
         // After the views: they show the effect of a request when its client gets the outcome.
         let mut replied = false;
         for event in &output.events {

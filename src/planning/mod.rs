@@ -15,6 +15,7 @@ mod constant_corner_speed;
 mod goals;
 pub mod ik;
 mod jerk_limit;
+mod legs;
 pub mod nearest;
 pub mod padded;
 pub mod path;

@@ -49,8 +49,13 @@ pub fn between(a: &[f64], b: &[f64], t: f64, out: &mut [f64]) {
 
 /// Returns a path without repeated configurations and without those on the line between their neighbours.
 pub fn tidy(path: &[Vec<f64>]) -> Path {
-    let mut tidy: Path = Vec::with_capacity(path.len());
-    for q in path {
+    tidy_with_indices(path).0
+}
+
+/// Returns a [tidy] path, and the index in `path` of each of its configurations.
+pub fn tidy_with_indices(path: &[Vec<f64>]) -> (Path, Vec<usize>) {
+    let (mut tidy, mut kept) = (Path::with_capacity(path.len()), Vec::with_capacity(path.len()));
+    for (i, q) in path.iter().enumerate() {
         if tidy.last().is_some_and(|last| distance(last, q) < 1e-12) {
             continue;
         }
@@ -58,9 +63,11 @@ pub fn tidy(path: &[Vec<f64>]) -> Path {
             let (first, second, whole) = (distance(before, middle), distance(middle, q), distance(before, q));
             if first + second - whole < 1e-12 * whole.max(1.0) {
                 tidy.pop();
+                kept.pop();
             }
         }
         tidy.push(q.clone());
+        kept.push(i);
     }
-    tidy
+    (tidy, kept)
 }

@@ -5,16 +5,15 @@ use std::time::Instant;
 
 use nalgebra::{Isometry3, Vector3};
 
-use super::goals;
+use super::legs::{joined, legs};
 use super::padded::{GivenUp, Near, Padded};
-use super::path::{Path, between, distance, length, unwind};
-use super::path_planner::{PlanError, PlanSettings, plan};
+use super::path::{Path, between, distance, length};
+use super::path_planner::PlanError;
 use super::planning_scene::{PlannedRobot, PlanningScene};
 use super::start_contact::{EscapePath, passes};
-use super::timing::{TimingSettings, bounds, time};
+use super::timing::{bounds, time_within};
 use crate::collision::world::World;
 use crate::collision::{CollisionChecker, Stop};
-use crate::robot::kinematics::frame;
 use crate::robot::model::Limits;
 use crate::trajectory::{JointTrajectory, TrajectoryPoint};
 
@@ -54,6 +53,10 @@ pub struct PlanRequest {
     pub speed: f64,
     /// Seed of all random numbers.
     pub seed: u64,
+    /// Goals that the motion passes before, in order, for the same robots.
+    pub through: Vec<Vec<(usize, Goal)>>,
+    /// How far away an end effector may pass them [m]; 0: the motion rests at each.
+    pub blend: f64,
 }
 
 /// A planned motion.
@@ -134,48 +137,24 @@ pub fn solve(
     let moving: Vec<usize> = request.goals.iter().map(|(robot, _)| *robot).collect();
     let mut stage = stage(setup, world, &moving, &request.positions, setup.padding + EXTRA_PADDING)?;
     stage.checker.give_up(Near::Start, &stage.start);
-    let began = Instant::now();
     let lap = |times: &mut BTreeMap<String, f64>, name: &str, since: Instant| {
         times.insert(name.to_owned(), since.elapsed().as_secs_f64());
         Instant::now()
     };
-    let (path, fraction) = match request.goals.as_slice() {
-        [(_, Goal::Line(target))] => {
-            let (path, fraction) = goals::line(&mut stage, &frame(target), stop)?;
-            lap(&mut times, "search", began);
-            (path, Some(fraction))
-        }
-        several if several.iter().any(|(_, goal)| matches!(goal, Goal::Line(_))) => {
-            return Err(PlanFailure::new("a straight line is planned for one robot at a time"));
-        }
-        wanted => {
-            let goals = goals::configurations(&mut stage, wanted, request.seed, stop)?;
-            for goal in &goals {
-                let mut goal = goal.clone();
-                unwind(&mut goal, &stage.start, stage.checker.turns());
-                stage.checker.give_up(Near::Goal, &goal);
-            }
-            lap(&mut times, "ik", began);
-            let settings = PlanSettings { seed: request.seed, ..PlanSettings::default() };
-            let start = stage.start.clone();
-            let found =
-                plan(&mut stage.checker, &start, &goals, &settings, stop).map_err(|e| failure_for(&stage, &e))?;
-            times.insert("search".into(), found.search_time.as_secs_f64());
-            times.insert("shorten".into(), found.shorten_time.as_secs_f64());
-            (found.path, None)
-        }
-    };
+    let legs = legs(&mut stage, request, stop, &mut times)?;
+    let fraction = legs.last().filter(|_| legs.len() == 1).and_then(|leg| leg.fraction);
+    let (path, deviation) = joined(&stage, &legs, request.blend);
     let timing = Instant::now();
     let trajectory = match length(&path) < GOAL_TOLERANCE {
         true => rest(&stage.joints, &path),
-        false => timed(&mut stage, &path, request.speed, fraction.is_some(), stop)?,
+        false => timed(&mut stage, &path, &deviation, request.speed, stop)?,
     };
     let looking = lap(&mut times, "timing", timing);
     let clearance = clearance(&mut stage.checker, &path, stop);
     lap(&mut times, "clearance", looking);
     let escape_path = EscapePath::of(&mut stage.checker, &path);
     // Only one of several goals was reached.
-    let reached = |center: &[f64]| path.last().is_some_and(|end| distance(end, center) < SAME_CONFIGURATION);
+    let reached = |center: &[f64]| path.iter().any(|at| distance(at, center) < SAME_CONFIGURATION);
     let at_end = |given_up: &&GivenUp| given_up.near != Near::Goal || reached(&given_up.center);
     let given_up = stage.checker.given_up().iter().filter(at_end).cloned().collect();
     let (robots, padding) = (stage.indices, setup.padding);
@@ -213,7 +192,7 @@ pub(super) fn stage<'a>(
 }
 
 /// Converts a path planner's error to a failure with joint names.
-fn failure_for(stage: &Stage<'_>, error: &PlanError) -> PlanFailure {
+pub(super) fn failure_for(stage: &Stage<'_>, error: &PlanError) -> PlanFailure {
     match error {
         PlanError::Outside { which, joint, position, lower, upper } => {
             let name = stage.joints.get(*joint).map_or("a joint", String::as_str);
@@ -250,8 +229,8 @@ fn rest(joints: &[String], path: &Path) -> JointTrajectory {
 fn timed(
     stage: &mut Stage<'_>,
     path: &Path,
+    deviation: &[f64],
     speed: f64,
-    line: bool,
     stop: &Stop,
 ) -> Result<JointTrajectory, PlanFailure> {
     let bounds = bounds(&stage.joints, &stage.limits).map_err(|e| PlanFailure::new(e.to_string()))?;
@@ -265,13 +244,10 @@ fn timed(
             b
         })
         .collect();
-    // The corners of a line are so flat that blending keeps to the line.
-    let deviation = if line { 1e-3 } else { TimingSettings::default().deviation };
-    let settings = TimingSettings { deviation, speed: 1.0 };
     let checker = &mut stage.checker;
     let escape_path = EscapePath::of(checker, path);
     let free = |a: &[f64], b: &[f64]| passes(checker, escape_path.as_ref(), a, b, stop);
-    let timed = time(&stage.joints, path, &bounds, &settings, free);
+    let timed = time_within(&stage.joints, path, &bounds, deviation, 1.0, free);
     timed.map(|timed| timed.trajectory).map_err(|e| late(stop).unwrap_or_else(|| PlanFailure::new(e.to_string())))
 }
 

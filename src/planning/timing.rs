@@ -10,7 +10,7 @@ use crate::trajectory::{JointTrajectory, TrajectoryError, TrajectoryPoint};
 
 use super::blend::{Curve, curves};
 use super::jerk_limit::averaged;
-use super::path::{Path, tidy};
+use super::path::{Path, tidy_with_indices};
 use super::topp::{GridPoint, JointBound, parameterize};
 use super::verify::{Excess, excess};
 
@@ -91,6 +91,19 @@ pub fn time(
     path: &[Vec<f64>],
     bounds: &[JointBound],
     settings: &TimingSettings,
+    free: impl FnMut(&[f64], &[f64]) -> bool,
+) -> Result<Timed, TimingError> {
+    time_within(names, path, bounds, &vec![settings.deviation; path.len()], settings.speed, free)
+}
+
+/// Times a path as [`time`] does, with a maximum deviation for each of its configurations [rad, Euclidean over all
+/// joints]. Where it is 0 the motion rests.
+pub fn time_within(
+    names: &[String],
+    path: &[Vec<f64>],
+    bounds: &[JointBound],
+    deviation: &[f64],
+    speed: f64,
     mut free: impl FnMut(&[f64], &[f64]) -> bool,
 ) -> Result<Timed, TimingError> {
     let dof = names.len();
@@ -98,20 +111,21 @@ pub fn time(
     if let Some(at) = path.iter().position(bad) {
         return Err(TimingError::Shape(at, dof));
     }
-    if !(settings.speed > 0.0 && settings.speed <= 1.0) {
-        return Err(TimingError::Speed(settings.speed));
+    if !(speed > 0.0 && speed <= 1.0) {
+        return Err(TimingError::Speed(speed));
     }
-    let path = tidy(path);
+    let (path, kept) = tidy_with_indices(path);
     if path.len() < 2 || bounds.len() != dof {
         return Err(TimingError::NoMotion);
     }
-    let mut deviation = vec![settings.deviation.max(0.0); path.len()];
+    let of = |i: &usize| deviation.get(*i).copied().unwrap_or(0.0).max(0.0);
+    let mut deviation: Vec<f64> = kept.iter().map(of).collect();
     let rounded = round_corners(&path, &mut deviation, &mut free);
-    let mut timed = emit(names, &path, bounds, &rounded, deviation, settings.speed)?;
+    let mut timed = emit(names, &path, bounds, &rounded, deviation, speed)?;
     if free_throughout(&timed.trajectory, &mut free).is_err() {
         // Between its points the trajectory deviates slightly from a blended curve. Without blending it does not.
         let sharp = vec![0.0; path.len()];
-        timed = emit(names, &path, bounds, &curves(&path, &sharp), sharp, settings.speed)?;
+        timed = emit(names, &path, bounds, &curves(&path, &sharp), sharp, speed)?;
         free_throughout(&timed.trajectory, &mut free)?;
     }
     Ok(timed)

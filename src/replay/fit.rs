@@ -131,7 +131,7 @@ mod tests {
         let mut rows = vec![vec![0.0]; 5];
         for k in 0..600 {
             let target = [0.15, -0.02, 0.09, 0.12][k / 40 % 4] + 0.05 * (k as f64 * 0.3).sin();
-            let q = limiter.follow_position(target, DT).map_or_else(|_| limiter.hold_position(DT), |l| l.value);
+            let q = limiter.follow_position(target, DT, 1.0).map_or_else(|_| limiter.hold_position(DT), |l| l.value);
             rows.push(vec![q]);
         }
         for _ in 0..100 {

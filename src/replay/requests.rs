@@ -61,6 +61,12 @@ enum LoggedRequest {
         #[serde(default, deserialize_with = "present")]
         force: Option<f64>,
     },
+    Speed {
+        fraction: Option<f64>,
+    },
+    Pause {
+        on: bool,
+    },
     Shutdown {},
 }
 
@@ -114,6 +120,8 @@ fn request(logged: LoggedRequest, joints: &[String]) -> Result<Request, String> 
         LoggedRequest::Gripper { arm, opening, force } => {
             Request::Gripper { arm, opening: opening.unwrap_or(f64::NAN), force }
         }
+        LoggedRequest::Speed { fraction } => Request::Speed { fraction: fraction.unwrap_or(f64::NAN) },
+        LoggedRequest::Pause { on } => Request::Pause { on },
         LoggedRequest::Shutdown {} => Request::Shutdown,
     })
 }
@@ -161,6 +169,8 @@ mod tests {
             Request::Gripper { arm: 1, opening: 0.1 + 0.2, force: None },
             Request::Gripper { arm: 1, opening: -0.1 - 0.2, force: Some(0.1 + 0.2) },
             Request::Gripper { arm: 0, opening: 0.04, force: Some(f64::NAN) },
+            Request::Speed { fraction: 0.1 + 0.2 },
+            Request::Pause { on: true },
             Request::Shutdown,
         ] {
             let logged = log_of(&request);

@@ -20,6 +20,7 @@ pub use super::motion_api::*;
 pub use super::parts_api::*;
 pub use super::planner_api::*;
 use super::planner_proxy::PlannerProxy;
+pub use super::poses_api::*;
 use super::report::{MotionReport, StateReport, StatusReport};
 use super::schema::MethodSchema;
 use super::streams::Streams;
@@ -34,7 +35,7 @@ pub const RESERVED_CONNECTIONS: usize = 8;
 /// Maximum number of subscriptions of a connection.
 pub const MAX_SUBSCRIPTIONS: usize = 16;
 /// Minimum `speed` of a motion, as a fraction of the limits.
-pub const MIN_SPEED: f64 = 0.1;
+pub const MIN_SPEED: f64 = 0.01;
 
 /// A boxed future, for trait objects.
 pub type BoxFuture<'a, T> = Pin<Box<dyn Future<Output = T> + Send + 'a>>;
@@ -169,6 +170,9 @@ methods! {
     /// Ends motions by decelerating within limits: those of a task, of an arm, or all. With a plan, ends its planning
     /// only.
     "cancel" Cancel -> CancelReply, check Cancel::valid;
+    /// Reads or sets the speed override: all motions run at a fraction of their speed, or pause on their paths. Needs no
+    /// lease.
+    "speed" Speed -> SpeedReport, check Speed::valid;
     /// Holds one arm or all at once: tasks end, arms are held until `arm_reset`. An operational stop.
     "stop" Stop -> StopReply;
     /// Clears a latched hold or a fault. Moves nothing, enables nothing.
@@ -187,6 +191,12 @@ methods! {
     "arm_payload" ArmPayload -> PayloadReply;
     /// Sets the load at an arm's flange, and reads it back. The arm must be at rest.
     "arm_payload_set" ArmPayloadSet -> PayloadReply, check ArmPayloadSet::valid;
+    /// The saved poses of the run's blueprint.
+    "poses" Poses -> PosesReport;
+    /// Saves the measured joint positions of arms under a name, for the goal `named` of `plan`.
+    "pose_save" PoseSave -> PoseSaved, check PoseSave::valid;
+    /// Removes a saved pose.
+    "pose_remove" PoseRemove -> Done;
     /// Next target of a servo task; repeat it within the task's timeout.
     "servo" Servo -> Done, check Servo::valid;
     /// Next target of a velocity task; repeat it within the task's timeout.

@@ -59,12 +59,15 @@ pub(super) fn need(request: &Request) -> Need<'_> {
         Request::ArmPayloadSet(p) => Need::NoOtherHolder(Subject::Arm(&p.arm)),
         Request::Attach(Attach { mass: Some(_), .. }) | Request::Detach(_) => Need::NoOtherHolderOfLoad,
         Request::ArmIoSet(io) => Need::NoOtherHolder(Subject::Arm(&io.arm)),
+        Request::Poses(_) | Request::PoseSave(_) | Request::PoseRemove(_) => Need::Nothing,
         Request::Status(_) | Request::State(_) | Request::Motion(_) | Request::ArmIo(_) => Need::Nothing,
         Request::ArmPayload(_) => Need::Nothing,
         Request::ExecutePlan(e) => Need::Plan(e.plan),
         Request::Plan(_) | Request::Planning(_) | Request::Preview(_) | Request::Planner(_) => Need::Nothing,
         Request::World(_) | Request::WorldAdd(_) | Request::WorldMove(_) | Request::WorldRemove(_) => Need::Nothing,
         Request::Attach(_) => Need::Nothing,
+        // Who watches an arm may slow it down, whoever moves it.
+        Request::Speed(_) => Need::Nothing,
         Request::Cancel(_) | Request::Stop(_) | Request::Shutdown(_) => Need::Nothing,
     }
 }

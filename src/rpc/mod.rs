@@ -28,6 +28,7 @@ mod parts_api;
 mod planner_api;
 pub mod planner_proxy;
 pub mod planner_stub;
+mod poses_api;
 pub mod report;
 pub mod run_dir;
 pub mod schema;

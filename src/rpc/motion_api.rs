@@ -6,6 +6,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::api::{MIN_SPEED, finite};
+use crate::control::speed_override::LOWEST;
 use crate::joint::MAX_DOF;
 use crate::trajectory::MAX_DURATION;
 
@@ -17,7 +18,7 @@ pub struct Move {
     pub arm: String,
     /// Target of its joints [rad], one value per joint of the arm.
     pub target: Vec<f64>,
-    /// Fraction of the velocity and acceleration limits to use, 0.1–1.
+    /// Fraction of the velocity and acceleration limits to use, 0.01–1.
     #[serde(default = "default_speed")]
     pub speed: f64,
     /// Velocity that no joint exceeds [rad/s], besides the limits; `speed` scales it too.
@@ -196,6 +197,42 @@ pub struct CancelReply {
     /// Whether planning was cancelled.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub planning: bool,
+}
+
+/// Parameters of `speed`: what is absent stays as it is.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Speed {
+    /// Fraction of the speed of all motions, 0.01–1.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fraction: Option<f64>,
+    /// Whether all motions are to pause on their paths.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub paused: Option<bool>,
+}
+
+impl Speed {
+    pub(super) fn valid(&self) -> Result<(), String> {
+        match self.fraction.filter(|fraction| !(LOWEST..=1.0).contains(fraction)) {
+            Some(fraction) => Err(format!("fraction is {fraction}, must be within {LOWEST}–1")),
+            None => Ok(()),
+        }
+    }
+}
+
+/// The speed override of a run: reply to `speed`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct SpeedReport {
+    /// Fraction of the speed of all motions, 0.01–1.
+    pub fraction: f64,
+    /// Whether all motions are paused.
+    pub paused: bool,
+}
+
+impl Default for SpeedReport {
+    fn default() -> Self {
+        Self { fraction: 1.0, paused: false }
+    }
 }
 
 /// Parameters of `servo`.

@@ -67,7 +67,7 @@ pub struct PlanGoal {
 pub struct Plan {
     /// Goals of the robots, at most one each. Robots without a goal do not move.
     pub goals: Vec<PlanGoal>,
-    /// Fraction of the velocity and acceleration limits to use, 0.1–1.
+    /// Fraction of the velocity and acceleration limits to use, 0.01–1.
     #[serde(default = "default_speed")]
     pub speed: f64,
     /// Seed of the search; the same request from the same state with the same seed gives the same plan.

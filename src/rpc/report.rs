@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::api::{IoReport, LoadReport};
+use super::api::{IoReport, LoadReport, SpeedReport};
 
 /// Reply to `status`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
@@ -37,6 +37,9 @@ pub struct StatusReport {
     pub recorder: Option<RecorderReport>,
     /// The arms, in the blueprint's order.
     pub arms: Vec<ArmReport>,
+    /// The speed override.
+    #[serde(default)]
+    pub speed: SpeedReport,
     /// The tasks, in the blueprint's order.
     pub tasks: Vec<TaskReport>,
     /// The planner; absent without one.
@@ -383,8 +386,11 @@ pub struct MotionReport {
     pub progress: f64,
     /// Time since its start [s].
     pub elapsed: f64,
-    /// Time until its planned end [s].
+    /// Time until its planned end [s], with the present speed override; of its whole speed while paused.
     pub remaining: f64,
+    /// The speed override, if it slows the motion.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub speed: Option<SpeedReport>,
     /// Why it did not reach its goal.
     pub error: Option<String>,
     /// Whether an obstacle blocked it and it is being replanned; meanwhile it is not done.

@@ -81,7 +81,10 @@ impl Dispatcher {
         request: Request,
         note: impl FnOnce(u64, Mono) -> Note,
     ) -> Result<oneshot::Receiver<Outcome>, SendError> {
-        let ends_motion = matches!(request, Request::Stop { .. } | Request::Cancel { .. } | Request::Shutdown);
+        let ends_motion = matches!(
+            request,
+            Request::Stop { .. } | Request::Cancel { .. } | Request::Pause { on: true } | Request::Shutdown
+        );
         let id = self.next_id();
         let (sender, receiver) = oneshot::channel();
         // Made before the lock: a stop never waits for the text of another request.
@@ -152,6 +155,8 @@ pub fn log_of(request: &Request) -> Value {
         Request::Gripper { arm, opening, force } => {
             json!({"gripper": {"arm": arm, "opening": opening, "force": force}})
         }
+        Request::Speed { fraction } => json!({"speed": {"fraction": fraction}}),
+        Request::Pause { on } => json!({"pause": {"on": on}}),
         Request::Shutdown => json!({"shutdown": {}}),
     }
 }

@@ -29,6 +29,7 @@ mod planner_port;
 mod recheck;
 mod replan;
 mod reports;
+mod saved_poses;
 mod service;
 mod service_manager;
 mod start;

@@ -24,7 +24,8 @@ impl PlannerPort {
         let setup = self.thread.setup();
         let goals = plan.goals.iter().map(|goal| goal_of(setup, goal)).collect::<Result<Vec<_>, _>>()?;
         let positions = all_positions(setup, moment)?;
-        let request = PlanRequest { goals, positions, speed: plan.speed, seed: plan.seed };
+        let request =
+            PlanRequest { goals, positions, speed: plan.speed, seed: plan.seed, through: Vec::new(), blend: 0.0 };
         let id = moment.plan;
         self.thread.begin(id, request, plan.timeout.map(Duration::from_secs_f64)).map_err(|why| {
             let error = RpcError::new(Code::Planning, why.to_string());

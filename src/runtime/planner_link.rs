@@ -111,9 +111,10 @@ impl Service {
                 self.execute_released(&planner, released, replan).await
             }
             Call::Planner(_) => self.planner_report(&planner, limit).await.map(Reply::Planner),
-            Call::Plan(ref plan) => {
-                let (number, plan) = (self.parts.dispatcher.next_id(), plan.clone());
-                let begun = planner.answer(call, self.moment(number), limit).await?;
+            Call::Plan(plan) => {
+                let plan = self.with_saved_poses(plan).await?;
+                let number = self.parts.dispatcher.next_id();
+                let begun = planner.answer(Call::Plan(plan.clone()), self.moment(number), limit).await?;
                 self.remember_request(number, plan);
                 Ok(begun)
             }
@@ -178,6 +179,11 @@ impl Service {
     }
 
     /// Returns the planner's report, with the progress of its last motion.
+    /// Returns the planner's robots.
+    pub(super) async fn robots(&self) -> Result<Vec<api::RobotReport>, RpcError> {
+        Ok(self.planner_report(&self.planner()?, QUERY_TIMEOUT).await?.robots)
+    }
+
     async fn planner_report(&self, planner: &Planner<'_>, limit: Duration) -> Result<PlannerReport, RpcError> {
         let Reply::Planner(mut report) =
             planner.answer(Call::Planner(api::Planner {}), Moment::default(), limit).await?

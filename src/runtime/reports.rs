@@ -8,7 +8,7 @@ use super::service::Service;
 use crate::arm::{ArmState, VelocitySource};
 use crate::clock::WallOffset;
 use crate::hardware::device::Connected;
-use crate::rpc::api::LoadReport;
+use crate::rpc::api::{LoadReport, SpeedReport};
 use crate::rpc::report::*;
 use crate::rpc::streams::{EventReport, JointState, Level};
 use crate::rpc::{Code, RpcError};
@@ -56,9 +56,18 @@ impl Service {
                 error: stats.failed.load(Relaxed).then(|| "a write failed: the log has ended".to_owned()),
             }),
             arms: (0..parts.config.arms.len()).filter_map(|i| self.arm_report(i)).collect(),
+            speed: self.speed_override(),
             tasks: (0..parts.config.tasks.len()).filter_map(|i| self.task_report(i)).collect(),
             planner: None, // filled in by the `status` method
         }
+    }
+
+    /// Returns the speed override.
+    pub(super) fn speed_override(&self) -> SpeedReport {
+        let pulse = &self.parts.pulse;
+        // 0 before the first tick.
+        let fraction = Some(f64::from_bits(pulse.speed.load(Relaxed))).filter(|fraction| *fraction > 0.0);
+        SpeedReport { fraction: fraction.unwrap_or(1.0), paused: pulse.paused.load(Relaxed) }
     }
 
     fn arm_report(&self, index: usize) -> Option<ArmReport> {
@@ -208,6 +217,9 @@ impl Service {
             None => None,
         };
         let Some(end) = end else {
+            let speed = self.speed_override();
+            report.remaining /= speed.fraction;
+            report.speed = Some(speed).filter(|speed| *speed != SpeedReport::default());
             let state = if view.motion == number { view.state } else { TaskState::Executing };
             report.state = state.name().to_owned();
             return Ok(report);

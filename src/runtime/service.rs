@@ -275,6 +275,17 @@ impl Service {
         Ok(Reply::Cancel(api::CancelReply { tasks, planning }))
     }
 
+    /// Sets the speed override, and returns it.
+    async fn set_speed(&self, call: api::Speed) -> Result<api::SpeedReport, RpcError> {
+        if let Some(fraction) = call.fraction {
+            self.ask(Request::Speed { fraction }).await?;
+        }
+        if let Some(on) = call.paused {
+            self.ask(Request::Pause { on }).await?;
+        }
+        Ok(self.speed_override())
+    }
+
     async fn answer(&self, call: Call) -> Result<Reply, RpcError> {
         let changes = !matches!(call, Call::Status(_) | Call::State(_) | Call::Motion(_));
         if changes && self.is_closed() {
@@ -308,6 +319,7 @@ impl Service {
             Call::Attach(attach) => self.attach(attach).await,
             Call::Detach(detach) => self.detach(detach).await,
             Call::Cancel(c) => self.cancel(c).await,
+            Call::Speed(speed) => self.set_speed(speed).await.map(Reply::Speed),
             Call::Stop(s) => self.stop(s).await,
             Call::ArmReset(a) => self.reset(a.arm).await,
             Call::ArmEnable(a) => self.enable(a.arm).await,
@@ -317,6 +329,9 @@ impl Service {
             Call::ArmPayloadSet(p) => self.set_payload(p).await,
             Call::ArmIo(io) => self.io(&io.arm).await.map(Reply::ArmIo),
             Call::ArmIoSet(io) => self.set_io(io).await,
+            Call::Poses(_) => self.poses().await.map(Reply::Poses),
+            Call::PoseSave(save) => self.save_pose(save).await.map(Reply::PoseSave),
+            Call::PoseRemove(remove) => self.remove_pose(remove).await.map(|()| Reply::PoseRemove(Done {})),
             Call::Servo(s) => self.stream(s.task, s.positions, true).await.map(|()| Reply::Servo(Done {})),
             Call::Velocity(v) => self.stream(v.task, v.velocities, false).await.map(|()| Reply::Velocity(Done {})),
             Call::Twist(twist) => self.twist(&twist).await.map(Reply::Twist),

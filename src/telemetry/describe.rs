@@ -116,6 +116,14 @@ pub fn describe(event: &Event, names: &Names) -> Described {
             let d = plain("overrun", Severity::Warn, "skipped", text);
             Described { values: vec![f64::from(skipped), late_ns as f64], ..d }
         }
+        Event::Speed(fraction, paused) => {
+            let percent = fraction * 100.0;
+            let (status, text) = match paused {
+                true => ("paused", format!("all motions are paused; speed {percent:.0} % afterwards")),
+                false => ("set", format!("speed {percent:.0} %")),
+            };
+            Described { values: vec![fraction], ..plain("speed", Severity::Info, status, text) }
+        }
         Event::Degraded => {
             let text = "ten consecutive ticks were late by a period or more".into();
             plain("degraded", Severity::Error, "late", text)

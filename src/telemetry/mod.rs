@@ -257,6 +257,8 @@ pub enum Event {
     Limited(u16, LimitKind, f64),
     /// Periods were skipped: number, lateness of the tick [ns].
     Overrun(u32, u64),
+    /// The speed override changed: the fraction, and whether all motions are paused.
+    Speed(f64, bool),
     /// Ten consecutive ticks were late by a period or more.
     Degraded,
 }

@@ -142,7 +142,14 @@ fn motion(setup: &PlanningScene, checker: &mut ExactChecker, random: &mut Random
     };
     let (start, goal) = (random_free()?, random_free()?);
     let (speed, seed) = (random.between(0.2, 1.0), random.bits());
-    let request = pipeline::PlanRequest { goals: vec![(0, Goal::Joints(goal))], positions: vec![start], speed, seed };
+    let request = pipeline::PlanRequest {
+        goals: vec![(0, Goal::Joints(goal))],
+        positions: vec![start],
+        speed,
+        seed,
+        through: Vec::new(),
+        blend: 0.0,
+    };
     let stop = Stop::new(Some(std::time::Instant::now() + Duration::from_secs(2)), None);
     solve(setup, &setup.world, &request, &stop).ok().filter(|found| found.trajectory.duration() > 0.5)
 }

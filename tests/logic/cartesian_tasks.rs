@@ -375,3 +375,31 @@ fn a_stop_ends_it_and_a_velocity_task_hands_the_arm_over() {
     assert_eq!(rig.tasks[1].state, TaskState::Executing);
     assert!(rig.speed(0) > 0.05);
 }
+
+#[test]
+fn the_speed_override_slows_an_end_effector_and_pauses_it_on_its_way() {
+    let mut rig = rig();
+    let limits = CartesianParams::default();
+    rig.ask(Request::Speed { fraction: 0.3 });
+    rig.run_for(1.0);
+    let mut before = commanded(&rig);
+    let mut fastest = 0.0f64;
+    stream(&mut rig, TWISTS, twist([limits.max_linear_velocity, 0.0, 0.0], [0.0; 3]), 0.6, |rig| {
+        let now = commanded(rig);
+        fastest = fastest.max(between(&before, &now).0 / 0.01);
+        before = now;
+    });
+    let slow = 0.3 * limits.max_linear_velocity;
+    assert!((fastest - slow).abs() < 0.02 * slow, "{fastest} m/s instead of {slow} m/s");
+
+    rig.run_for(1.0);
+    let goal = DAffine3::from_translation(DVec3::new(0.0, 0.05, 0.0)) * commanded(&rig);
+    rig.ask(Request::Pause { on: true });
+    rig.run_for(1.0);
+    let start = commanded(&rig);
+    stream(&mut rig, POSES, pose_of(&goal), 0.6, |_| {});
+    assert_eq!(between(&start, &commanded(&rig)).0, 0.0, "paused");
+    rig.ask(Request::Pause { on: false });
+    stream(&mut rig, POSES, pose_of(&goal), 2.0, |_| {});
+    assert!(between(&goal, &commanded(&rig)).0 < 1e-6);
+}

@@ -36,6 +36,7 @@ mod planning;
 mod planning_timing;
 mod robot_models;
 mod rpc;
+mod speed_override;
 mod surface;
 mod task_conformance;
 mod templates;

@@ -66,6 +66,13 @@ fn eventful(folder: &Path) -> (PathBuf, u64) {
     go(&mut run, 0.5);
     go(&mut run, 0.6); // refused: it is executing already
     steps(&mut run, 30);
+    run.ask(Request::Speed { fraction: 0.1 + 0.2 });
+    run.ask(Request::Pause { on: true });
+    steps(&mut run, 7);
+    run.ask(Request::Pause { on: false });
+    steps(&mut run, 7);
+    run.ask(Request::Speed { fraction: 1.0 });
+    steps(&mut run, 7);
     run.ask(Request::Cancel { task: Some(0) });
     run.ask(Request::Gripper { arm: 0, opening: 0.1 + 0.2, force: Some(0.1 + 0.7) });
     steps(&mut run, 60);

@@ -88,6 +88,10 @@ fn poses_lines_and_seeds() {
     home.dimos("plan arm --pose 1.5 0 0.35 --rpy 3.14 0.2 0 --linear")
         .with(1)
         .says(&["% of the straight line", "hint: "]);
+    // Saved poses are goals as those of the blueprint are, whose names they cannot have.
+    home.dimos("pose save home").with(1).says(&["arm has a named pose home in the blueprint"]);
+    home.dimos("pose save near-table").with(0).shows(&["near-table saved", "near-table  arm"]);
+    let saved = home.positions("arm");
     // A detour around a post is searched, with the same result for the same seed.
     home.dimos("move arm --named home").with(0);
     home.dimos("world add post --box 0.04 0.04 0.4 --at 0.22 0.12 0.2").with(0);
@@ -101,6 +105,8 @@ fn poses_lines_and_seeds() {
     assert!(first == again && first != other);
     home.dimos("execute").with(0);
     is_at(&home, "arm", &[1.0, -0.3, 0.6, 0.0, 0.8, 0.0]);
+    home.dimos("move arm --named near-table").with(0);
+    is_at(&home, "arm", &saved);
 }
 
 #[test]

@@ -81,6 +81,60 @@ fn tasks_are_listed_and_asked() {
 }
 
 #[test]
+fn a_motion_is_slowed_down_paused_and_resumed_and_its_log_verifies() {
+    let home = Home::new();
+    let run = home.run("coordinator-yourarm");
+    assert_eq!(home.dimos("speed").with(0).out, "speed 100 %\n");
+    home.dimos("speed 150%").with(2).says(&["0.01–1", "1–100%"]);
+    home.dimos("speed 30").with(2).says(&["with a % sign"]);
+    let moving = home.dimos("move arm 0.9 -0.3 0.6 0 0.8 0 --speed 0.3 --no-wait --json").with(0).json();
+    let motion = moving["motion"].as_u64().unwrap();
+    assert_eq!(home.dimos("pause").with(0).out, "paused; at 100 % of the speed after `dimos resume`\n");
+    assert_eq!(home.dimos("speed 50% --json").with(0).json()["paused"], true);
+    let task = || home.dimos("task invoke traj_arm state --json").with(0).json();
+    eventually("the arm rests on its path", || {
+        let (before, after) = (home.positions("arm"), home.positions("arm"));
+        before == after && before[0] < 0.85
+    });
+    assert_eq!(task()["state"], "EXECUTING");
+    home.dimos("status").with(0).shows(&["paused; at 50 % of the speed"]);
+    assert_eq!(home.dimos("resume").with(0).out, "speed 50 %\n");
+    eventually("it arrives", || task()["state"] == "COMPLETED");
+    assert_eq!(task()["motion"], motion);
+    assert!((home.positions("arm")[0] - 0.9).abs() < 1e-3);
+    home.dimos("down").with(0);
+    drop(run);
+    home.dimos("replay --last --verify").with(0).shows(&["reproducible"]);
+}
+
+#[test]
+fn a_pose_is_saved_and_is_a_goal_without_a_planner_too() {
+    let (home, _run) = up();
+    home.dimos("pose list").with(0).says(&["no pose is saved", "hint: "]);
+    home.dimos("move arm 0.3 -0.2 --speed 1").with(0);
+    home.dimos("pose save grasp arm").with(0).shows(&["grasp saved", "0.3000 -0.2000"]);
+    home.dimos("move arm 0 0 --speed 1").with(0);
+    home.dimos("pose save grasp.2").with(0);
+    home.dimos("move arm --named grasp --speed 1").with(0).says(&["direct, not collision-checked"]);
+    assert!((home.positions("arm")[0] - 0.3).abs() < 1e-3);
+    assert!(home.dimos("pose save grasp arm").with(0).out.contains("in place of the earlier one"));
+    let poses = home.dimos("pose list --json").with(0).json();
+    assert_eq!(poses["poses"]["grasp.2"]["bare"]["bare_joint1"], 0.0);
+    assert!(std::fs::read_to_string(poses["file"].as_str().unwrap()).unwrap().starts_with("# Saved with"));
+    home.dimos("move bare --named grasp").with(2).says(&["has no position of bare's joints", "hint: "]);
+    home.dimos("move arm --named grsp").with(2).says(&["no saved pose grsp; saved: grasp, grasp.2"]);
+    home.dimos("pose save a/b").with(2).says(&["letters, digits"]);
+    home.dimos("pose save x rarm").with(2).says(&["did you mean `arm`?"]);
+    home.dimos("pose remove grap").with(2).says(&["did you mean `grasp`?"]);
+    home.dimos("pose remove grasp").with(0);
+    home.dimos("move arm --named grasp").with(2);
+    // What is not a list of poses is not overwritten.
+    std::fs::write(poses["file"].as_str().unwrap(), "poses: [1").unwrap();
+    home.dimos("pose save x").with(1).says(&["is not a list of saved poses", "hint: correct the file"]);
+    assert_eq!(std::fs::read_to_string(poses["file"].as_str().unwrap()).unwrap(), "poses: [1");
+}
+
+#[test]
 fn targets_are_streamed_from_a_file() {
     let (home, _run) = up();
     let ramp: String = (0..=50).map(|i| format!("{}, {}\n", f64::from(i) * 0.004, f64::from(i) * -0.002)).collect();

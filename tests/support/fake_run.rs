@@ -58,6 +58,7 @@ impl FakeBackend {
             progress: polls as f64 / 10.0,
             elapsed: 0.4,
             remaining: 0.1,
+            speed: None,
             error: (state == "ABORTED").then(|| "arm_joint1 was 0.2000 rad off the path".into()),
             replanning: false,
             next: None,
@@ -171,6 +172,7 @@ pub fn status() -> StatusReport {
         uptime: 123.4,
         tick_rate: 100.0,
         simulated: true,
+        speed: Default::default(),
         log: Some("/tmp/test.mcap".into()),
         realtime: vec![RealtimeReport {
             what: "SCHED_FIFO 80 for the tick".into(),

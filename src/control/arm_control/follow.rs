@@ -56,9 +56,9 @@ impl ArmControl {
                     let limited = match mode {
                         ControlMode::Velocity => {
                             let within = ahead.as_ref().and_then(|a| a.get(j)).copied().unwrap_or((at, at));
-                            limiter.follow_velocity(ask.value, within, dt)
+                            limiter.follow_velocity(ask.value, within, dt, ask.speed)
                         }
-                        _ => limiter.follow_position(ask.value, dt),
+                        _ => limiter.follow_position(ask.value, dt, ask.speed),
                     };
                     match limited {
                         Ok(limited) => {

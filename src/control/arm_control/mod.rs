@@ -65,6 +65,8 @@ pub struct JointRequest {
     pub value: f64,
     /// Whether another task won the joint in the previous tick.
     pub new_task: bool,
+    /// Fraction of the velocity limit that applies, 0 to 1.
+    pub speed: f64,
 }
 
 /// Result of an arm's requests.

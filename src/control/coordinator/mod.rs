@@ -12,8 +12,9 @@ use super::arm_control::{ArmControl, JointRequest, Routed};
 use super::config::CoordinatorConfig;
 use super::limit::Refusal;
 use super::request::Envelope;
+use super::speed_override::SpeedOverride;
 use super::stalls::Stalls;
-use super::task::Task;
+use super::task::{Task, Tick};
 use super::task_body::JointView;
 use crate::arm::ArmState;
 use crate::clock::Mono;
@@ -44,6 +45,7 @@ pub struct Coordinator {
     joints: Vec<JointView>,
     overruns_in_a_row: u32,
     stalls: Stalls,
+    speed: SpeedOverride,
     shutting_down: bool,
     started: bool,
     output: TickOutput,
@@ -75,6 +77,7 @@ impl Coordinator {
             arm_of,
             overruns_in_a_row: 0,
             stalls: Stalls::default(),
+            speed: SpeedOverride::default(),
             shutting_down: false,
             started: false,
         }
@@ -212,9 +215,11 @@ impl Coordinator {
     }
 
     fn compute(&mut self, now: Mono) {
+        self.speed.advance(self.period);
+        let tick = Tick { now, dt: self.period, speed: self.speed, views: &self.joints };
         for (t, task) in self.tasks.iter_mut().enumerate() {
             let before = (task.state, task.reason);
-            let motion = task.compute(now, self.period, &self.joints);
+            let motion = task.compute(&tick);
             self.output.retired.extend(motion);
             if before != (task.state, task.reason) {
                 self.output.report(Event::Task(t as u16, task.state, task.reason));
@@ -229,13 +234,15 @@ impl Coordinator {
         for i in 0..self.arms.len() {
             let Some(arm) = self.arms.get_mut(i) else { continue };
             let (first, dof) = (arm.first(), arm.config().dof);
-            let arbiter = &self.arbiter;
+            let (arbiter, tasks, pace) = (&self.arbiter, &self.tasks, self.speed.of_streams());
             let output = &mut self.output;
             let routed = arm.route(
                 arbiter.demand(i),
                 |j| {
-                    let (_, value) = arbiter.winner(first + j)?;
-                    Some(JointRequest { value, new_task: arbiter.winner_changed(first + j) })
+                    let (task, value) = arbiter.winner(first + j)?;
+                    let scales = tasks.get(task as usize).is_some_and(|task| !task.obeys_speed());
+                    let speed = if scales { pace } else { 1.0 };
+                    Some(JointRequest { value, new_task: arbiter.winner_changed(first + j), speed })
                 },
                 self.period,
                 time.now,
@@ -277,6 +284,7 @@ impl Coordinator {
     }
 
     fn publish(&mut self) {
+        self.output.speed = self.speed;
         for (i, arm) in self.arms.iter().enumerate() {
             if let Some(command) = self.output.commands.get_mut(i) {
                 *command = *arm.command();

@@ -5,6 +5,8 @@ use crate::arm::GripperUnit;
 use crate::clock::Mono;
 use crate::control::arm_control::ArmControl;
 use crate::control::request::{Envelope, Motion, Request};
+use crate::control::speed_override::SpeedOverride;
+use crate::control::task::Tick;
 use crate::control::task_body::Target;
 use crate::telemetry::{Cause, Event, Outcome, Reason, TaskState};
 
@@ -37,6 +39,8 @@ impl Coordinator {
                 self.end_tasks_of_held_arms();
                 outcome
             }
+            Request::Speed { fraction } => self.change_speed(|speed| speed.set(fraction)),
+            Request::Pause { on } => self.change_speed(|speed| speed.paused = on),
             Request::Gripper { arm, opening, force } => self.gripper(arm, opening, force),
         };
         self.output.report(Event::Request(envelope.id, outcome));
@@ -58,6 +62,15 @@ impl Coordinator {
             Some(arm) if arm as usize >= self.arms.len() => return Outcome::StartStateUnavailable(arm),
             Some(arm) => self.hold(arm as usize, Cause::Operator, now),
             None => (0..self.arms.len()).for_each(|i| self.hold(i, Cause::Operator, now)),
+        }
+        Outcome::Accepted
+    }
+
+    fn change_speed(&mut self, change: impl FnOnce(&mut SpeedOverride)) -> Outcome {
+        let before = self.speed;
+        change(&mut self.speed);
+        if self.speed != before {
+            self.output.report(Event::Speed(self.speed.fraction, self.speed.paused));
         }
         Outcome::Accepted
     }
@@ -105,8 +118,9 @@ impl Coordinator {
             Target::Trajectory(motion) => &motion.joints,
             _ => &t.joints,
         })?;
+        let tick = Tick { now, dt: self.period, speed: self.speed, views: &self.joints };
         let t = self.tasks.get_mut(task as usize).ok_or(Outcome::WrongTask(task))?;
-        if t.accept(now, self.period, &self.joints, target)? {
+        if t.accept(&tick, target)? {
             self.output.report(Event::Task(task, TaskState::Executing, Reason::None));
         }
         Ok(())

@@ -3,6 +3,7 @@
 use crate::arm::ArmCommand;
 use crate::clock::Mono;
 use crate::control::request::Motion;
+use crate::control::speed_override::SpeedOverride;
 use crate::telemetry::{ArmSample, Event, TaskView};
 
 /// The times of a tick.
@@ -29,6 +30,8 @@ pub struct TickOutput {
     pub arms: Vec<ArmSample>,
     /// One view per task.
     pub tasks: Vec<TaskView>,
+    /// The speed override.
+    pub speed: SpeedOverride,
     /// Events of the tick.
     pub events: Vec<Event>,
     /// Motions that ended, to be freed on another thread.
@@ -44,6 +47,7 @@ impl TickOutput {
             commands: vec![ArmCommand::default(); arms],
             arms: Vec::with_capacity(arms),
             tasks: vec![TaskView::default(); tasks],
+            speed: SpeedOverride::default(),
             events: Vec::with_capacity(events),
             retired: Vec::with_capacity(motions),
             events_lost: 0,

@@ -33,7 +33,14 @@ fn walled() -> PlanningScene {
 
 fn turn(from: f64, to: f64, seed: u64) -> PlanRequest {
     let at = |angle| [&[angle], &HOME[1..]].concat();
-    PlanRequest { goals: vec![(0, Goal::Joints(at(to)))], positions: vec![at(from)], speed: 0.5, seed }
+    PlanRequest {
+        goals: vec![(0, Goal::Joints(at(to)))],
+        positions: vec![at(from)],
+        speed: 0.5,
+        seed,
+        through: Vec::new(),
+        blend: 0.0,
+    }
 }
 
 fn outcome(planner: &PlannerThread, id: u64) -> Progress {

@@ -83,8 +83,9 @@ impl TaskBody for CartesianTask {
         }
         let (wanted, way) = match target.filter(|_| !self.slowing) {
             None => (Velocity::default(), None),
-            Some(Tracked::Twist(twist)) => (twist, None),
-            Some(Tracked::ToolTwist(Velocity { linear, angular })) => {
+            Some(Tracked::Twist(twist)) => (slowed(self.effector.params(), twist, cx.pace), None),
+            Some(Tracked::ToolTwist(twist)) => {
+                let Velocity { linear, angular } = slowed(self.effector.params(), twist, cx.pace);
                 let turn = self.effector.pose().matrix3;
                 (Velocity { linear: turn * linear, angular: turn * angular }, None)
             }
@@ -94,7 +95,7 @@ impl TaskBody for CartesianTask {
                     linear: pose.translation - from.translation,
                     angular: rotation_between(&from.matrix3, &pose.matrix3),
                 };
-                (towards(self.effector.params(), &way, cx.dt), Some(way))
+                (towards(self.effector.params(), &way, cx.pace, cx.dt), Some(way))
             }
         };
         self.effector.advance(cx, &wanted, way.as_ref(), claims);
@@ -110,6 +111,10 @@ impl TaskBody for CartesianTask {
         OnCancel::Decelerate
     }
 
+    fn obeys_speed(&self) -> bool {
+        true
+    }
+
     fn describe(&self, view: &mut TaskView) {
         if matches!(view.state, TaskState::Executing | TaskState::Cancelling) {
             view.bound = self.effector.bound();
@@ -117,17 +122,28 @@ impl TaskBody for CartesianTask {
     }
 }
 
-/// Returns the twist for the remaining way, so that translation and rotation end together and at rest.
-fn towards(p: &CartesianParams, way: &Velocity, dt: f64) -> Velocity {
+/// Returns a twist within this fraction of its limits. One that is too fast is scaled as a whole, to keep its direction.
+fn slowed(p: &CartesianParams, twist: Velocity, pace: f64) -> Velocity {
+    let over = seconds(&twist, p.max_linear_velocity, p.max_angular_velocity);
+    if pace >= 1.0 || over <= pace {
+        return twist;
+    }
+    let share = pace / over;
+    Velocity { linear: twist.linear * share, angular: twist.angular * share }
+}
+
+/// Returns the twist for the remaining way, so that translation and rotation end together and at rest. `pace`: fraction
+/// of the velocity limits.
+fn towards(p: &CartesianParams, way: &Velocity, pace: f64, dt: f64) -> Velocity {
     let (far, turned) = (way.linear.length(), way.angular.length());
     // Fraction of the way per second.
     let rate = |length: f64, fastest: f64, acceleration: f64| match length > GOAL_TOLERANCE {
         true => braking_speed(length, APPROACH * acceleration, dt).min(fastest) / length,
         false => f64::INFINITY,
     };
-    let rate = rate(far, p.max_linear_velocity, p.max_linear_acceleration).min(rate(
+    let rate = rate(far, pace * p.max_linear_velocity, p.max_linear_acceleration).min(rate(
         turned,
-        p.max_angular_velocity,
+        pace * p.max_angular_velocity,
         p.max_angular_acceleration,
     ));
     if !rate.is_finite() {

@@ -108,13 +108,18 @@ impl EndEffector {
             if speed > 0.0 { size(way) / speed } else { f64::INFINITY }
         });
         let (joints, model) = (cx.joints, self.robot.kinematics.limits());
-        for ((bounds, own), &joint) in self.bounds.iter_mut().zip(model).zip(joints) {
+        let own = self.bounds.iter_mut().zip(model).zip(&self.joints.velocity);
+        for (((bounds, own), speed), &joint) in own.zip(joints) {
             let view = cx.joint(joint);
+            let acceleration = own.acceleration.unwrap_or(f64::INFINITY).min(view.acceleration);
+            // The speed override slows a joint no faster than it can decelerate.
+            let velocity = own.velocity.min(view.velocity_limit);
+            let slowed = (velocity * cx.pace).max(speed.abs() - 0.9 * acceleration * cx.dt).min(velocity);
             *bounds = JointBounds {
                 lower: own.lower.max(view.lower),
                 upper: own.upper.min(view.upper),
-                velocity: own.velocity.min(view.velocity_limit),
-                acceleration: own.acceleration.unwrap_or(f64::INFINITY).min(view.acceleration),
+                velocity: slowed,
+                acceleration,
             };
         }
         let step = self.stepper.step(&mut self.joints, &TargetTwist { linear, angular, horizon }, &self.bounds, cx.dt);

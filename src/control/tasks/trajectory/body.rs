@@ -2,7 +2,8 @@
 
 use super::params::TrajectoryParams;
 use crate::clock::Mono;
-use crate::control::path_clock::{PathClock, RateLimits};
+use crate::control::path_clock::PathClock;
+use crate::control::rate::RateLimits;
 use crate::control::request::Motion;
 use crate::control::task_body::{Claim, Context, OnCancel, Step, Target, TaskBody};
 use crate::joint::TICK_STANDSTILL;
@@ -63,7 +64,7 @@ impl TrajectoryTask {
     /// Starts a motion.
     fn start(&mut self, cx: &Context<'_>, motion: &Motion) {
         self.cursor = Cursor::default();
-        self.clock.start();
+        self.clock.start(cx.speed);
         (self.slowing, self.begun, self.at_end, self.settling) = (false, false, false, 0.0);
         self.samples.clear();
         self.samples.resize(motion.joints.len(), Sample::default());
@@ -147,8 +148,8 @@ impl TaskBody for TrajectoryTask {
             if self.clock.rate() <= 0.0 || self.clock.elapsed() >= duration {
                 return Step::End(TaskState::Aborted, Reason::Cancelled);
             }
-        } else if granted && !self.clock.full() {
-            self.clock.speed_up(rate_limits(cx, motion, &self.samples, self.clock.rate()), cx.dt);
+        } else if granted && !self.clock.runs_at(cx.speed) {
+            self.clock.approach(cx.speed, rate_limits(cx, motion, &self.samples, self.clock.rate()), cx.dt);
         }
         if granted && self.at_end {
             self.settling += cx.dt;
@@ -176,6 +177,10 @@ impl TaskBody for TrajectoryTask {
     fn cancel(&mut self) -> OnCancel {
         self.slowing = true;
         OnCancel::Decelerate
+    }
+
+    fn obeys_speed(&self) -> bool {
+        true
     }
 
     fn rewind(&mut self, at: Mono, now: Mono) {

@@ -1,0 +1,139 @@
+//! The legs of a motion: one to each waypoint, and one to the goals.
+
+use std::collections::BTreeMap;
+use std::time::Instant;
+
+use super::goals;
+use super::padded::Near;
+use super::path::{Path, distance, unwind};
+use super::path_planner::{PlanSettings, plan};
+use super::pipeline::{Goal, PlanFailure, PlanRequest, Stage, failure_for};
+use super::timing::TimingSettings;
+use crate::collision::{CollisionChecker, Stop};
+use crate::robot::kinematics::frame;
+
+/// Maximum deviation at the corners of a straight line, and at a waypoint [rad].
+const LINE_DEVIATION: f64 = 1e-3;
+const MOST_DEVIATION: f64 = 0.5;
+
+/// The way to one goal.
+pub(super) struct Leg {
+    path: Path,
+    /// The part of a straight line that was followed.
+    pub fraction: Option<f64>,
+}
+
+/// Plans the way through all waypoints to the goals.
+pub(super) fn legs(
+    stage: &mut Stage<'_>,
+    request: &PlanRequest,
+    stop: &Stop,
+    times: &mut BTreeMap<String, f64>,
+) -> Result<Vec<Leg>, PlanFailure> {
+    let begin = stage.start.clone();
+    let mut legs: Vec<Leg> = Vec::new();
+    for (i, goals) in request.through.iter().chain([&request.goals]).enumerate() {
+        if let Some(at) = legs.last().and_then(|leg| leg.path.last()) {
+            stage.start.clone_from(at);
+        }
+        let found = leg(stage, goals, request.seed, stop, times).map_err(|failure| match request.through.is_empty() {
+            true => failure,
+            false => PlanFailure { what: format!("waypoint {}: {}", i + 1, failure.what), ..failure },
+        });
+        legs.push(found?);
+    }
+    stage.start = begin;
+    Ok(legs)
+}
+
+/// Plans the way from the stage's start to goals.
+fn leg(
+    stage: &mut Stage<'_>,
+    goals: &[(usize, Goal)],
+    seed: u64,
+    stop: &Stop,
+    times: &mut BTreeMap<String, f64>,
+) -> Result<Leg, PlanFailure> {
+    let began = Instant::now();
+    let mut took = |name: &str, time: f64| *times.entry(name.to_owned()).or_default() += time;
+    match goals {
+        [(_, Goal::Line(target))] => {
+            let (path, fraction) = goals::line(stage, &frame(target), stop)?;
+            took("search", began.elapsed().as_secs_f64());
+            Ok(Leg { path, fraction: Some(fraction) })
+        }
+        several if several.iter().any(|(_, goal)| matches!(goal, Goal::Line(_))) => {
+            Err(PlanFailure::new("a straight line is planned for one robot at a time"))
+        }
+        wanted => {
+            let goals = goals::configurations(stage, wanted, seed, stop)?;
+            for goal in &goals {
+                let mut goal = goal.clone();
+                unwind(&mut goal, &stage.start, stage.checker.turns());
+                stage.checker.give_up(Near::Goal, &goal);
+            }
+            took("ik", began.elapsed().as_secs_f64());
+            let settings = PlanSettings { seed, ..PlanSettings::default() };
+            let start = stage.start.clone();
+            let found =
+                plan(&mut stage.checker, &start, &goals, &settings, stop).map_err(|e| failure_for(stage, &e))?;
+            took("search", found.search_time.as_secs_f64());
+            took("shorten", found.shorten_time.as_secs_f64());
+            Ok(Leg { path: found.path, fraction: None })
+        }
+    }
+}
+
+/// Joins the legs to one path, with the maximum deviation at each of its configurations [rad]. At a waypoint it is that
+/// at which an end effector passes at the distance `blend` [m].
+pub(super) fn joined(stage: &Stage<'_>, legs: &[Leg], blend: f64) -> (Path, Vec<f64>) {
+    let (mut path, mut deviation) = (Path::new(), Vec::new());
+    for leg in legs {
+        if let ([.., before, at], Some(after)) = (path.as_slice(), leg.path.get(1)) {
+            let passes = waypoint_deviation(stage, before, at, after, blend);
+            deviation.pop();
+            deviation.push(passes);
+        }
+        // The corners of a line are so flat that blending keeps to the line.
+        let own = if leg.fraction.is_some() { LINE_DEVIATION } else { TimingSettings::default().deviation };
+        let skip = usize::from(!path.is_empty());
+        path.extend(leg.path.iter().skip(skip).cloned());
+        deviation.resize(path.len(), own);
+    }
+    (path, deviation)
+}
+
+/// Returns the deviation [rad] at a corner at which no end effector passes farther away than `blend` [m].
+fn waypoint_deviation(stage: &Stage<'_>, before: &[f64], at: &[f64], after: &[f64], blend: f64) -> f64 {
+    let (to, from) = (distance(before, at).max(1e-12), distance(at, after).max(1e-12));
+    let turn: Vec<f64> = before.iter().zip(at).zip(after).map(|((a, b), c)| (c - b) / from - (b - a) / to).collect();
+    let size = turn.iter().map(|t| t * t).sum::<f64>().sqrt();
+    if blend <= 0.0 || size < 1e-9 {
+        return 0.0;
+    }
+    let farthest = |deviation: f64| {
+        let blended: Vec<f64> = at.iter().zip(&turn).map(|(q, t)| q + t / size * deviation).collect();
+        let (mut first, mut most) = (0, 0.0_f64);
+        for robot in &stage.robots {
+            let own = first..first + robot.joints.len();
+            first = own.end;
+            let place = |q: &[f64]| {
+                let kinematics = &robot.body.kinematics;
+                let mut frames = kinematics.frames();
+                kinematics.forward(q.get(own.clone()).unwrap_or_default(), &mut frames);
+                kinematics.link_frame(robot.end_effector, &frames).translation
+            };
+            most = most.max(place(at).distance(place(&blended)));
+        }
+        most
+    };
+    let mut deviation = MOST_DEVIATION;
+    for _ in 0..6 {
+        let distance = farthest(deviation);
+        if distance <= blend {
+            break;
+        }
+        deviation *= 0.99 * blend / distance;
+    }
+    deviation
+}
