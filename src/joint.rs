@@ -31,6 +31,9 @@ pub fn joints_of(values: &[f64]) -> Joints {
     out
 }
 
+/// Lowest fraction of the speed that a motion can be given.
+pub const LOWEST_SPEED: f64 = 0.01;
+
 /// Returns the highest speed [rad/s] of a step of `dt` [s] that ends within `distance` [rad] when the steps after it
 /// decelerate by `acceleration` [rad/s²] each. Exact in discrete time: with n more steps before the last one,
 /// distance / dt = (n + 1) v − c n (n + 1) / 2, where c is the change of velocity per step.

@@ -53,7 +53,7 @@ pub fn speed(text: &str) -> std::result::Result<f64, String> {
 
 /// Parses a speed override: `0.3` or `30%`.
 pub fn override_of_speed(text: &str) -> std::result::Result<f64, String> {
-    let lowest = crate::control::speed_override::LOWEST;
+    let lowest = crate::rpc::api::MIN_SPEED;
     let value = match text.strip_suffix('%') {
         Some(percent) => finite(percent)? / 100.0,
         None => finite(text)?,

@@ -138,8 +138,8 @@ impl Limiter {
         self.request_velocity = 0.0;
     }
 
-    /// Returns the position to command for a requested position [rad], `dt` [s] after the last command. `speed`: fraction
-    /// of the velocity limit that applies, 0 to 1.
+    /// Returns the position to command for a requested position [rad], `dt` [s] after the last command. `speed`:
+    /// fraction of the velocity limit that applies, 0 to 1.
     pub fn follow_position(&mut self, target: f64, dt: f64, speed: f64) -> Result<Limited, Refusal> {
         if let Some(refusal) = self.refuses(target, false) {
             return Err(refusal);

@@ -4,16 +4,15 @@
 //! the same, and with it the proof that it is free. For streams the velocity limits are scaled.
 
 use super::rate::{Rate, RateLimits};
+use crate::joint::LOWEST_SPEED;
 
-/// Lowest override.
-pub const LOWEST: f64 = 0.01;
 /// How fast the velocity limits of streams change: all of them in about 0.6 s.
 const CHANGE: RateLimits = RateLimits { first: 3.0, second: 20.0 };
 
 /// The override.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SpeedOverride {
-    /// Fraction of the speed, [`LOWEST`] to 1.
+    /// Fraction of the speed, [`LOWEST_SPEED`] to 1.
     pub fraction: f64,
     /// Whether all motions are paused.
     pub paused: bool,
@@ -28,10 +27,10 @@ impl Default for SpeedOverride {
 }
 
 impl SpeedOverride {
-    /// Sets the fraction, at least [`LOWEST`] and at most 1. What is not a number changes nothing.
+    /// Sets the fraction, at least [`LOWEST_SPEED`] and at most 1. What is not a number changes nothing.
     pub fn set(&mut self, fraction: f64) {
         if !fraction.is_nan() {
-            self.fraction = fraction.clamp(LOWEST, 1.0);
+            self.fraction = fraction.clamp(LOWEST_SPEED, 1.0);
         }
     }
 
@@ -74,7 +73,7 @@ mod tests {
     #[test]
     fn a_fraction_is_kept_within_its_range() {
         let mut speed = SpeedOverride::default();
-        for (asked, set) in [(0.3, 0.3), (f64::NAN, 0.3), (7.0, 1.0), (-1.0, LOWEST), (f64::INFINITY, 1.0)] {
+        for (asked, set) in [(0.3, 0.3), (f64::NAN, 0.3), (7.0, 1.0), (-1.0, LOWEST_SPEED), (f64::INFINITY, 1.0)] {
             speed.set(asked);
             assert_eq!(speed.fraction, set, "{asked}");
         }

@@ -6,7 +6,6 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::api::{MIN_SPEED, finite};
-use crate::control::speed_override::LOWEST;
 use crate::joint::MAX_DOF;
 use crate::trajectory::MAX_DURATION;
 
@@ -213,8 +212,8 @@ pub struct Speed {
 
 impl Speed {
     pub(super) fn valid(&self) -> Result<(), String> {
-        match self.fraction.filter(|fraction| !(LOWEST..=1.0).contains(fraction)) {
-            Some(fraction) => Err(format!("fraction is {fraction}, must be within {LOWEST}–1")),
+        match self.fraction.filter(|fraction| !(MIN_SPEED..=1.0).contains(fraction)) {
+            Some(fraction) => Err(format!("fraction is {fraction}, must be within {MIN_SPEED}–1")),
             None => Ok(()),
         }
     }

@@ -19,7 +19,7 @@ use crate::support::python::python_with;
 fn client(model: &str, address: &str, package: &str) -> Option<(Vec<Datagram>, Figures)> {
     let python = python_with(&[package])?;
     // Python is no real-time client: the controller waits for its commands.
-    let options = serde_json::json!({"model": model, "sim": {"patience": 0.1}});
+    let options = serde_json::json!({"model": model, "sim": {"command_wait": 0.1}});
     let config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: 7, options };
     let place: IpAddr = address.parse().unwrap();
     let emulator = FrankaEmulator::start(&config, &EmulatorAddress::Bind(place)).unwrap();

@@ -89,7 +89,7 @@ fn poses_lines_and_seeds() {
         .with(1)
         .says(&["% of the straight line", "hint: "]);
     // Saved poses are goals as those of the blueprint are, whose names they cannot have.
-    home.dimos("pose save home").with(1).says(&["arm has a named pose home in the blueprint"]);
+    home.dimos("pose save home").with(2).says(&["arm has a named pose home in the blueprint"]);
     home.dimos("pose save near-table").with(0).shows(&["near-table saved", "near-table  arm"]);
     let saved = home.positions("arm");
     // A detour around a post is searched, with the same result for the same seed.

@@ -122,7 +122,8 @@ impl TaskBody for CartesianTask {
     }
 }
 
-/// Returns a twist within this fraction of its limits. One that is too fast is scaled as a whole, to keep its direction.
+/// Returns a twist within this fraction of its limits. One that is too fast is scaled as a whole: it keeps its
+/// direction.
 fn slowed(p: &CartesianParams, twist: Velocity, pace: f64) -> Velocity {
     let over = seconds(&twist, p.max_linear_velocity, p.max_angular_velocity);
     if pace >= 1.0 || over <= pace {

@@ -18,7 +18,7 @@ use crate::joint::ControlMode;
 /// An adapter and its controller, which waits for late commands: the computer of a test may be busy.
 fn arm(mut options: serde_json::Value) -> (FrankaAdapter, FrankaEmulator) {
     let sim = options.as_object_mut().unwrap().entry("sim").or_insert(json!({}));
-    sim.as_object_mut().unwrap().entry("patience").or_insert(json!(0.1));
+    sim.as_object_mut().unwrap().entry("command_wait").or_insert(json!(0.1));
     let mut config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: DOF, options };
     let emulator = FrankaEmulator::start(&config, &EmulatorAddress::InProcess).unwrap();
     config.address = emulator.address();
@@ -245,7 +245,7 @@ fn the_user_stop_and_guiding_are_reported_and_not_undone() {
 
 #[test]
 fn without_answers_the_controller_ends_the_motion() {
-    let (mut adapter, emulator) = ready(json!({"sim": {"patience": 0.0}}));
+    let (mut adapter, emulator) = ready(json!({"sim": {"command_wait": 0.0}}));
     pass(&mut adapter, Duration::from_millis(50));
     // As if this process hung.
     std::thread::sleep(Duration::from_millis(100));

@@ -1,5 +1,5 @@
-//! The controller's clock: a thread with absolute deadlines, one cycle and one state each. It waits for a client only if
-//! it is told to have patience.
+//! The controller's clock: a thread with absolute deadlines, one cycle and one state each. It waits for a client's
+//! command only where the settings say so.
 
 use std::net::{SocketAddr, UdpSocket};
 use std::sync::Arc;
@@ -79,7 +79,7 @@ pub(super) struct Pace {
     /// How much slower than this computer's clock it is, as a fraction.
     pub drift: f64,
     /// Longest wait for the command that answers a state, after the next cycle is due.
-    pub patience: Duration,
+    pub command_wait: Duration,
 }
 
 /// Returns whether a command has arrived, once it has; `false` at `due`.
@@ -107,7 +107,7 @@ pub(super) fn run(
     let mut awaited = false;
     while !ends.load(Ordering::Acquire) {
         // Commands are taken as they come: when they came is measured.
-        while readable_before(socket, if awaited { due.after(pace.patience) } else { due }) {
+        while readable_before(socket, if awaited { due.after(pace.command_wait) } else { due }) {
             let now = MonotonicClock.now();
             awaited = false;
             server.with(|control, _| {

@@ -92,7 +92,7 @@ pub struct SimOptions {
     /// How long the controller's clock waits for a command that is late, 0 to 0.1 [s]; a real one does not wait. For a
     /// computer that is too busy for 1 kHz.
     #[schemars(range(min = 0, max = 0.1))]
-    pub patience: f64,
+    pub command_wait: f64,
     /// Faults, and when they begin (seconds after the first connection).
     pub faults: Vec<Fault>,
 }
@@ -107,7 +107,7 @@ impl Default for SimOptions {
             repeat: 0.0,
             reorder: 0.0,
             drift: 0.0,
-            patience: 0.0,
+            command_wait: 0.0,
             faults: Vec::new(),
         }
     }
@@ -124,7 +124,7 @@ impl SimOptions {
         range("repeat", self.repeat, (0.0, 1.0))?;
         range("reorder", self.reorder, (0.0, 1.0))?;
         range("drift", self.drift, (-1000.0, 1000.0))?;
-        range("patience", self.patience, (0.0, 0.1))?;
+        range("command_wait", self.command_wait, (0.0, 0.1))?;
         self.common().check("franka", limits, PLAYABLE)
     }
 
@@ -167,7 +167,7 @@ impl FrankaEmulator {
         let ends = Arc::new(AtomicBool::new(false));
         let sim = options.sim;
         let network = Network { lose: sim.lose, repeat: sim.repeat, reorder: sim.reorder };
-        let pace = Pace { drift: sim.drift * 1e-6, patience: Duration::from_secs_f64(sim.patience) };
+        let pace = Pace { drift: sim.drift * 1e-6, command_wait: Duration::from_secs_f64(sim.command_wait) };
         let answers = Arc::new(Histogram::default());
         let (shared, end, times) = (server.clone(), ends.clone(), answers.clone());
         let clock = std::thread::Builder::new()
