@@ -21,23 +21,29 @@ const POLL_PERIOD: Duration = Duration::from_millis(20);
 #[group(id = "goal", required = true, multiple = true)]
 pub struct Goal {
     /// Target positions of its joints [rad], one per joint
-    #[arg(value_name = "POSITION", value_parser = finite, allow_negative_numbers = true, conflicts_with_all = ["pose", "named"])]
+    #[arg(value_name = "POSITION", value_parser = finite, allow_negative_numbers = true, conflicts_with_all = ["tcp", "named"])]
     pub joints: Vec<f64>,
-    /// Target position of the end effector in `map`: x, y, z [m]; orientation is free unless --rpy or --quat is given
-    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite, allow_negative_numbers = true)]
+    /// Target position of the tool centre point: x, y, z [m]; orientation is free unless --rpy or --quat is given
+    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite, allow_negative_numbers = true, group = "tcp")]
     pub pose: Option<Vec<f64>>,
-    /// Target roll, pitch, yaw of the end effector about fixed axes [rad]
-    #[arg(long, value_names = ["R", "P", "Y"], num_args = 3, value_parser = finite, allow_negative_numbers = true, requires = "pose")]
+    /// Move the tool centre point by x, y, z [m] along the axes of --frame; --rpy or --quat turns it about them
+    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite, allow_negative_numbers = true, group = "tcp")]
+    pub by: Option<Vec<f64>>,
+    /// Roll, pitch, yaw about fixed axes [rad]
+    #[arg(long, value_names = ["R", "P", "Y"], num_args = 3, value_parser = finite, allow_negative_numbers = true, requires = "tcp")]
     pub rpy: Option<Vec<f64>>,
-    /// Target orientation of the end effector as a quaternion x, y, z, w
-    #[arg(long, value_names = ["X", "Y", "Z", "W"], num_args = 4, value_parser = finite, allow_negative_numbers = true, requires = "pose", conflicts_with = "rpy")]
+    /// Orientation as a quaternion x, y, z, w
+    #[arg(long, value_names = ["X", "Y", "Z", "W"], num_args = 4, value_parser = finite, allow_negative_numbers = true, requires = "tcp", conflicts_with = "rpy")]
     pub quat: Option<Vec<f64>>,
+    /// Frame of --pose or --by: map (default), base, tool, or an object of the world
+    #[arg(long, value_name = "FRAME", requires = "tcp")]
+    pub frame: Option<String>,
     /// Named pose
-    #[arg(long, value_name = "NAME", conflicts_with = "pose")]
+    #[arg(long, value_name = "NAME", conflicts_with = "tcp")]
     pub named: Option<String>,
     /// Goal of one of several robots in a common motion (repeatable): left=0.1,-0.3,0.6,0,0.8,0 or left=named:home or
     /// left=pose:x,y,z or, with roll, pitch, yaw or a quaternion, left=pose:x,y,z,r,p,y or left=pose:x,y,z,qx,qy,qz,qw
-    #[arg(long = "goal", value_name = "ROBOT=GOAL", value_parser = robot_goal, conflicts_with_all = ["joints", "pose", "named"])]
+    #[arg(long = "goal", value_name = "ROBOT=GOAL", value_parser = robot_goal, conflicts_with_all = ["joints", "tcp", "named"])]
     pub several: Vec<PlanGoal>,
 }
 
@@ -80,8 +86,8 @@ pub struct Search {
     /// Fraction of the velocity and acceleration limits to use, 0.1–1
     #[arg(long, value_name = "FRACTION", default_value_t = DEFAULT_SPEED, value_parser = speed)]
     pub speed: f64,
-    /// Move the end effector on a straight line to --pose
-    #[arg(long, requires = "pose")]
+    /// Move the tool centre point on a straight line to --pose or by --by
+    #[arg(long, requires = "tcp")]
     pub linear: bool,
     /// Seed of the search: the same request with the same seed gives the same plan
     #[arg(long, value_name = "N", default_value_t = 0)]
@@ -100,15 +106,19 @@ impl Goal {
     /// Returns the goals for the planner; `robot` is the robot of positions, pose and name.
     pub fn of(&self, robot: Option<&str>, search: &Search) -> Vec<PlanGoal> {
         let Some(robot) = robot else { return self.several.clone() };
-        let pose = self.pose.as_deref().and_then(|xyz| xyz.try_into().ok()).map(|xyz| PoseSpec {
-            xyz,
-            rpy: self.rpy.as_deref().and_then(|rpy| rpy.try_into().ok()),
-            quat: self.quat.as_deref().and_then(|quat| quat.try_into().ok()),
-        });
+        let spec = |xyz: &Option<Vec<f64>>| {
+            xyz.as_deref().and_then(|xyz| xyz.try_into().ok()).map(|xyz| PoseSpec {
+                xyz,
+                rpy: self.rpy.as_deref().and_then(|rpy| rpy.try_into().ok()),
+                quat: self.quat.as_deref().and_then(|quat| quat.try_into().ok()),
+            })
+        };
         vec![PlanGoal {
             robot: robot.to_owned(),
             joints: self.joints().map(<[f64]>::to_vec),
-            pose,
+            pose: spec(&self.pose),
+            by: spec(&self.by),
+            frame: self.frame.clone(),
             named: self.named.clone(),
             linear: search.linear,
         }]

@@ -22,7 +22,7 @@ pub struct Args {
     #[command(flatten)]
     pub search: Search,
     /// Move straight in joint space even if the run has a planner: not collision-checked
-    #[arg(long, conflicts_with_all = ["pose", "named", "several"])]
+    #[arg(long, conflicts_with_all = ["tcp", "named", "several"])]
     pub direct: bool,
     /// If an obstacle blocks the motion, stop, plan again and continue
     #[arg(long, conflicts_with_all = ["direct", "no_wait"])]

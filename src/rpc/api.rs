@@ -187,6 +187,10 @@ methods! {
     "arm_payload" ArmPayload -> PayloadReply;
     /// Sets the load at an arm's flange, and reads it back. The arm must be at rest.
     "arm_payload_set" ArmPayloadSet -> PayloadReply, check ArmPayloadSet::valid;
+    /// The tool centre point of an arm.
+    "arm_tool" ArmTool -> ArmToolReply;
+    /// Sets the tool of an arm, in the planner and in the tasks that move its end effector. The arm must be at rest.
+    "arm_tool_set" ArmToolSet -> ArmToolReply, check ArmToolSet::valid;
     /// Next target of a servo task; repeat it within the task's timeout.
     "servo" Servo -> Done, check Servo::valid;
     /// Next target of a velocity task; repeat it within the task's timeout.

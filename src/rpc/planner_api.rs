@@ -9,8 +9,9 @@ use serde::{Deserialize, Serialize};
 
 use super::api::finite;
 use super::motion_api::{Trajectory, default_speed, valid_speed};
+use super::report::{TcpReport, ToolReport};
 
-/// A pose in the frame `map`.
+/// A pose; in the frame `map` unless another is given with it.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PoseSpec {
@@ -41,7 +42,7 @@ impl PoseSpec {
     }
 }
 
-/// Goal of one robot: exactly one of `joints`, `pose`, `named`.
+/// Goal of one robot: exactly one of `joints`, `pose`, `by`, `named`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PlanGoal {
@@ -50,13 +51,21 @@ pub struct PlanGoal {
     /// Joint positions [rad], in the order of the robot's `joint_names`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub joints: Option<Vec<f64>>,
-    /// Target pose of its end effector; without `rpy` and `quat` the orientation is free.
+    /// Target pose of its tool centre point; without `rpy` and `quat` the orientation is free.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pose: Option<PoseSpec>,
+    /// Motion of its tool centre point from its present pose: `xyz` along the axes of `frame`, then the rotation about
+    /// them; without `rpy` and `quat` it keeps its orientation.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub by: Option<PoseSpec>,
+    /// Frame of `pose` or `by`: `map` (default), `base` (the robot's base link), `tool` (its tool centre point now), or an
+    /// object of the world.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub frame: Option<String>,
     /// One of its named poses.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub named: Option<String>,
-    /// Whether the end effector moves to `pose` on a straight line.
+    /// Whether the tool centre point moves there on a straight line.
     #[serde(default)]
     pub linear: bool,
 }
@@ -88,15 +97,20 @@ impl Plan {
             if self.goals.iter().take(index).any(|other| other.robot == goal.robot) {
                 return Err(format!("{field}: {} has a goal already", goal.robot));
             }
-            let given = [goal.joints.is_some(), goal.pose.is_some(), goal.named.is_some()];
+            let given = [goal.joints.is_some(), goal.pose.is_some(), goal.by.is_some(), goal.named.is_some()];
             if given.iter().filter(|given| **given).count() != 1 {
-                return Err(format!("{field} must have one of joints, pose, named"));
+                return Err(format!("{field} must have one of joints, pose, by, named"));
             }
-            if goal.linear && goal.pose.is_none() {
+            let is_pose = goal.pose.is_some() || goal.by.is_some();
+            if goal.linear && !is_pose {
                 return Err(format!("{field}: linear needs a pose"));
+            }
+            if goal.frame.is_some() && !is_pose {
+                return Err(format!("{field}: frame needs a pose"));
             }
             finite(&format!("{field}.joints"), goal.joints.as_deref().unwrap_or_default())?;
             goal.pose.map_or(Ok(()), |pose| pose.valid(&format!("{field}.pose")))?;
+            goal.by.map_or(Ok(()), |by| by.valid(&format!("{field}.by")))?;
         }
         valid_speed(self.speed)?;
         match self.timeout {
@@ -210,8 +224,11 @@ pub struct PreviewReply {
     pub summary: PlanSummary,
     /// The motion, with the coordinator's joint names.
     pub trajectory: Trajectory,
-    /// For each robot, the position of its end effector at each point of the trajectory: x, y, z [m] in `map`.
+    /// For each robot, the position of its tool centre point at each point of the trajectory: x, y, z [m] in `map`.
     pub end_effectors: BTreeMap<String, Vec<[f64; 3]>>,
+    /// For each robot, its tool centre point.
+    #[serde(default)]
+    pub tcps: BTreeMap<String, TcpReport>,
 }
 
 /// Parameters of `execute_plan`.
@@ -282,6 +299,9 @@ pub struct RobotReport {
     pub name: String,
     /// The link of pose goals.
     pub end_effector_link: String,
+    /// The tool on it; absent: none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tool: Option<ToolReport>,
     /// The coordinator's joints, in the order of joint goals.
     pub joints: Vec<String>,
     /// Lower and upper position limits [rad]; `null` for a joint without limits.

@@ -126,7 +126,7 @@ fn the_end_effector_moves_along_the_axes_of_its_keys() {
     let jog = terminal.start(&rig.home, "jog arm");
     terminal.until("CARTESIAN along the axes of the base");
     terminal.until("task twist_arm IDLE  at rest");
-    let mut pose = || rig.watcher.call(State {}).unwrap().arms[0].pose.unwrap();
+    let mut pose = || rig.watcher.call(State {}).unwrap().arms[0].pose.clone().unwrap();
     for (key, axis, sign) in
         [("w", 0, 1.0), ("s", 0, -1.0), ("a", 1, 1.0), ("D", 1, -1.0), ("q", 2, 1.0), ("e", 2, -1.0)]
     {
