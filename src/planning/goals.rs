@@ -18,8 +18,8 @@ const SOLUTIONS: usize = 8;
 const ATTEMPTS: usize = 200;
 /// Tolerance of a pose goal [m, rad].
 const POSE_TOLERANCE: f64 = 1e-5;
-/// Distance [m] and rotation [rad] from the present pose within which a robot that is slightly outside its limits counts
-/// as being at a pose.
+/// Distance [m] and rotation [rad] from the present pose within which a robot that is slightly outside its limits
+/// counts as being at a pose.
 const SAME_PLACE: f64 = 5e-4;
 const SAME_TURN: f64 = 1.7e-3;
 /// Largest distance outside the limits for that [rad]: as for the start of a plan.

@@ -58,8 +58,8 @@ pub struct PlanGoal {
     /// them; without `rpy` and `quat` it keeps its orientation.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub by: Option<PoseSpec>,
-    /// Frame of `pose` or `by`: `map` (default), `base` (the robot's base link), `tool` (its tool centre point now), or an
-    /// object of the world.
+    /// Frame of `pose` or `by`: `map` (default), `base` (the robot's base link), `tool` (its tool centre point now), or
+    /// an object of the world.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub frame: Option<String>,
     /// One of its named poses.

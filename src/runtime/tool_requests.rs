@@ -79,7 +79,7 @@ impl Service {
         Ok(())
     }
 
-    /// Gives the tools of an attached planner to the tasks that move the same links. A task that is active keeps its own.
+    /// Gives the tools of an attached planner to the tasks that move the same links. An active task keeps its own.
     pub(super) fn take_planner_tools(&self, models: &[TcpModel]) {
         for (arm, names) in (0..).zip(&self.parts.names.arms) {
             let Some(model) = models.iter().find(|model| model.moves(&names.joints)) else { continue };

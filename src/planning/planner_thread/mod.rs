@@ -76,7 +76,7 @@ impl PlannerThread {
         &self.setup
     }
 
-    /// Returns the robots with the joints that are not planned at their latest measured positions, and with their tools.
+    /// Returns the robots with the joints that are not planned at their latest measured positions, and with tools.
     pub fn now(&self) -> Arc<PlanningScene> {
         lock(&self.now).clone()
     }

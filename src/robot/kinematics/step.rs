@@ -118,7 +118,7 @@ impl Stepper {
         Self { link, settings, frames: kinematics.frames(), columns: [[0.0; 6]; MAX_DOF], kinematics }
     }
 
-    /// Moves the frame whose steps are computed, added by [`Kinematics::attach_frame`]: it is at `offset` in the frame of
+    /// Moves the frame whose steps are computed, added by [`Kinematics::attach_frame`], to `offset` in the frame of
     /// `link`. Does not allocate.
     pub fn move_frame(&mut self, link: usize, offset: &DAffine3) {
         self.kinematics.move_frame(self.link, link, offset);
