@@ -256,7 +256,7 @@ fn print_arms(arms: &[ArmReport]) {
             output::line(format_args!("  {name}: {line}"));
         }
         if let Some(tcp) = &arm.tcp {
-            output::line(format_args!("  {name}: pose of {} in map", tcp_text(tcp)));
+            output::line(format_args!("  {name}: poses in map are those of {}", tcp_text(tcp)));
         }
         if let Some(load) = &arm.payload {
             output::line(format_args!("  {name}: payload {}", payload_text(load)));

@@ -1,6 +1,6 @@
 //! Tool centre points: the pose of each arm, computed from its measured joints. The model is that of the planner's
-//! robot, in this process or attached; without one, that of a task that moves the arm's end effector, whose root is then
-//! `map`.
+//! robot, in this process or attached; without one, that of a task that moves the arm's end effector, whose root is
+//! then `map`.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

@@ -177,7 +177,7 @@ fn the_screen_shows_the_arm_in_80_columns_and_in_few() {
     // There is no task for the end effector: it begins with joints and says why.
     terminal.until("twist_arm, type: eef_twist, joint_names: {hardware: arm}");
     terminal.until("ms old");
-    terminal.until("pose  xyz");
+    terminal.until("pose  flange in base (device)");
     let text = terminal.text();
     let lines: Vec<&str> = text.lines().collect();
     assert!(lines[0].starts_with("jog arm  run jogged  SIMULATED  state "), "{text}");

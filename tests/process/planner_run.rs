@@ -52,7 +52,7 @@ fn a_plan_is_shown_then_carried_out() {
     assert!(planned.out.contains("clearance") && planned.out.contains("rad long"), "{}", planned.out);
     is_at(&home, "arm", &HOME);
     let shown = home.dimos("preview --out plan.json").with(0);
-    assert!(shown.out.contains("arm_joint6") && shown.out.contains("arm x y z [m]"), "{}", shown.out);
+    assert!(shown.out.contains("arm_joint6") && shown.out.contains("arm: flange in map [m]"), "{}", shown.out);
     home.dimos("execute").with(0).says(&["planned, collision-checked"]);
     is_at(&home, "arm", &[0.3, -0.2, 0.5, 0.0, 0.4, 0.0]);
     // The file is a trajectory like any other, from where the plan began.
@@ -116,7 +116,7 @@ fn what_cannot_be_planned_is_refused_in_words() {
         ("plan arm --named hme", 2, &["no named pose named `hme`", "did you mean `home`?"]),
         ("plan amr --named home", 1, &["UNKNOWN_ROBOT", "did you mean `arm`?"]),
         ("plan arm --pose 0.3 0 0.3 --quat 1 1 0 0", 2, &["goals[0].pose.quat has length 1.414"]),
-        ("plan arm 0 0 0 0 0 0 --linear", 2, &["linear needs a pose"]),
+        ("plan arm 0 0 0 0 0 0 --linear", 2, &["--pose <X> <Y> <Z>|--by <X> <Y> <Z>"]),
         ("plan arm", 2, &["required"]),
         ("preview", 1, &["UNKNOWN_PLAN", "hint: `dimos plan` makes one"]),
         ("preview 4711", 1, &["UNKNOWN_PLAN"]),

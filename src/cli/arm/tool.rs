@@ -50,7 +50,7 @@ pub fn run(args: &Args) -> Result {
 pub fn tcp_text(tcp: &TcpReport) -> String {
     let three = |values: [f64; 3]| values.map(|v| fixed(v, 4)).join(" ");
     match &tcp.tool {
-        None => format!("{}, without a tool", tcp.link),
+        None => format!("{} (no tool)", tcp.link),
         Some(tool) => format!("{} at xyz {} m, rpy {} rad", tcp.name(), three(tool.xyz), three(tool.rpy)),
     }
 }

@@ -219,8 +219,8 @@ impl Kinematics {
         frames.get(body).copied().unwrap_or(DAffine3::IDENTITY) * offset
     }
 
-    /// Adds a frame that is fixed to a link, as one more link; returns its index. `offset`: its pose in the frame of the
-    /// link.
+    /// Adds a frame that is fixed to a link, as one more link; returns its index. `offset`: its pose in the link's
+    /// frame.
     pub fn attach_frame(&mut self, link: usize, offset: &DAffine3) -> usize {
         self.links.push((self.body_of(link), self.offset_of(link) * *offset));
         self.links.len() - 1
