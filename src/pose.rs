@@ -10,10 +10,24 @@ pub fn from_xyz_rpy(xyz: [f64; 3], [roll, pitch, yaw]: [f64; 3]) -> Isometry3<f6
     Isometry3::from_parts(xyz.into(), UnitQuaternion::from_euler_angles(roll, pitch, yaw))
 }
 
-/// Returns position [m] and roll, pitch, yaw [rad] of a pose.
+/// Cosine of the pitch below which roll and yaw turn about the same axis: the yaw is then all of it.
+const GIMBAL_LOCK: f64 = 1e-7;
+
+/// Returns position [m] and roll, pitch, yaw [rad] of a pose. At a pitch of ±π/2 the roll is zero.
 pub fn to_xyz_rpy(pose: &Isometry3<f64>) -> ([f64; 3], [f64; 3]) {
-    let (roll, pitch, yaw) = pose.rotation.euler_angles();
+    let r = pose.rotation.to_rotation_matrix();
+    let cos_pitch = r[(0, 0)].hypot(r[(1, 0)]);
+    let pitch = (-r[(2, 0)]).atan2(cos_pitch);
+    let (roll, yaw) = match cos_pitch > GIMBAL_LOCK {
+        true => (r[(2, 1)].atan2(r[(2, 2)]), r[(1, 0)].atan2(r[(0, 0)])),
+        false => (0.0, (-r[(0, 1)]).atan2(r[(1, 1)])),
+    };
     (pose.translation.vector.into(), [roll, pitch, yaw])
+}
+
+/// Returns the name of the point whose pose is an arm's: a link, or the tool on it.
+pub fn tcp_name(link: &str, tool: bool) -> String {
+    if tool { format!("the tool on {link}") } else { link.to_owned() }
 }
 
 /// Returns the pose with this position [m] and this orientation: the quaternion, which is normalized, else roll, pitch
@@ -50,6 +64,25 @@ mod tests {
         let (xyz, rpy) = ([0.1, -0.2, 0.3], [0.4, -0.5, 2.6]);
         let (there, back) = to_xyz_rpy(&from_xyz_rpy(xyz, rpy));
         assert!(there == xyz && back.iter().zip(rpy).all(|(a, b)| (a - b).abs() < 1e-12), "{back:?}");
+    }
+
+    /// Gimbal lock is common: a gripper that points forwards.
+    #[test]
+    fn angles_of_a_level_tool_give_the_same_orientation() {
+        for pitch in [FRAC_PI_2, -FRAC_PI_2] {
+            for k in 0..200 {
+                let off = 1e-9 * f64::from(k - 100) * f64::from(k % 7);
+                let turns = UnitQuaternion::from_euler_angles(0.1 * f64::from(k), pitch + off, 0.03 * f64::from(k));
+                // Rounding of a product of rotations, as in forward kinematics.
+                let pose = Isometry3::from_parts(
+                    Translation3::identity(),
+                    turns * UnitQuaternion::from_euler_angles(0.3, 0.0, 0.0),
+                );
+                let (_, rpy) = to_xyz_rpy(&pose);
+                let error = from_xyz_rpy([0.0; 3], rpy).rotation.angle_to(&pose.rotation);
+                assert!(error < 2e-7, "{k}: {rpy:?} is {error} rad off");
+            }
+        }
     }
 
     #[test]

@@ -74,12 +74,14 @@ class ArmState(JointState):
     """An arm after a tick."""
     age: Optional[float] = None  # s, of its joints
     gripper: Optional[float] = None  # m of opening, or rad of a rotary jaw
-    xyz: Optional[List[float]] = None  # m, end effector in the base frame
+    xyz: Optional[List[float]] = None  # m, of the tool centre point in `frame`; None if the run has no model of the arm
     rpy: Optional[List[float]] = None  # rad, fixed axes
     wrench: Optional[List[float]] = None  # N, N, N, Nm, Nm, Nm
     gripper_unit: Optional[str] = None  # "m" or "rad"
     gripper_force: Optional[float] = None  # measured, in gripper_force_unit
     gripper_force_unit: Optional[str] = None  # "N" or "Nm"
+    link: Optional[str] = None  # the link of the model, or that of the tool, whose pose xyz and rpy are
+    frame: Optional[str] = None  # "map"
 
 
 @dataclass(frozen=True)
@@ -239,7 +241,7 @@ class Client:
         pose, age = found["pose"] or {}, found["age_ms"]
         more = (age and age / 1000, found["gripper"], pose.get("xyz"), pose.get("rpy"), found["wrench"])
         grip = (found.get(key) for key in ("gripper_unit", "gripper_force", "gripper_force_unit"))
-        return ArmState(reply["tick"], reply["stamp"], *values, 0, *more, *grip)
+        return ArmState(reply["tick"], reply["stamp"], *values, 0, *more, *grip, pose.get("link"), pose.get("frame"))
 
     def joint_states(self, rate: Optional[float] = None) -> Iterator[JointState]:
         """The joints of all arms after every tick, or at `rate` [Hz]. Close the iterator, or leave its loop, to end."""

@@ -76,8 +76,12 @@ pub struct RobotEntry {
     /// The link that `base_pose` places.
     #[serde(default = "base_link")]
     pub base_link: String,
-    /// The link that pose goals refer to.
+    /// The link whose pose is that of the arm, with `tool`.
     pub end_effector_link: Located<String>,
+    /// Pose of the tool centre point in the frame of `end_effector_link`; default: the link itself. Every pose of the
+    /// arm is that of this point. `dimos arm tool` changes it in a run.
+    #[serde(default)]
+    pub tool: Option<Located<PoseEntry>>,
     /// The link whose frame is that of the arm's flange, in which the controller takes the centre of a load. Needed for
     /// `attach` with a mass.
     #[serde(default)]

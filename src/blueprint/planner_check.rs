@@ -33,6 +33,7 @@ pub(super) fn check(
             }
         }
         pose(checker, &robot.base_pose);
+        robot.tool.iter().for_each(|tool| pose(checker, tool));
         let task = task(checker, robot, tasks);
         joints(checker, robot, described, hardware, task);
         named_poses(checker, robot, described);

@@ -58,6 +58,7 @@ fn robot(checker: &Checker<'_>, typed: &Located<RobotEntry>, described: &Describ
         base_pose: isometry(&typed.base_pose),
         base_link: typed.base_link.clone(),
         end_effector_link: typed.end_effector_link.value.clone(),
+        tool: typed.tool.as_ref().map(|tool| isometry(tool)),
         flange_link: typed.flange_link.as_ref().map(|link| link.value.clone()),
         coordinator_joints: joints.iter().map(ours).collect(),
         joints,

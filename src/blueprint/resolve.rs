@@ -137,6 +137,8 @@ pub struct TaskRobot {
     pub joints: Vec<String>,
     /// The link that the task moves.
     pub link: String,
+    /// Pose of the tool centre point in the frame of that link; `None`: the link itself.
+    pub tool: Option<nalgebra::Isometry3<f64>>,
     /// Its base pose if it is a robot of the planner; otherwise everything is in the frame of the model's root.
     pub base: Option<Base>,
 }

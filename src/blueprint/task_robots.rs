@@ -74,6 +74,7 @@ fn robot(
             },
             joints: mapped.unwrap_or_else(|| joints.to_vec()),
             link: String::new(),
+            tool: None,
             base: None,
         },
         (None, Some(planned)) => of_planner(planned, joints, mapped),
@@ -95,6 +96,8 @@ fn robot(
         }
         None => {}
     }
+    // The tool is on a link: a task with another link moves that link.
+    robot.tool = planned.filter(|planned| planned.end_effector_link == robot.link).and_then(|planned| planned.tool);
     check(checker, pos, &robot, joints);
     Some(robot)
 }
@@ -114,6 +117,7 @@ fn of_planner(planned: &RobotConfig, joints: &[String], mapped: Option<Vec<Strin
         },
         joints: mapped.unwrap_or_else(|| joints.iter().map(model_name).collect()),
         link: planned.end_effector_link.clone(),
+        tool: None,
         base: Some((planned.base_link.clone(), planned.base_pose)),
     }
 }
@@ -238,12 +242,11 @@ impl TaskRobot {
         let joints = self.joints.iter().map(joint).collect::<Result<Vec<_>, _>>()?;
         let kinematics = Kinematics::new(&model, &joints, &[]).map_err(|e| e.to_string())?;
         let mut robot = TaskKinematics::new(kinematics, link(&self.link)?);
+        robot.tool = self.tool.as_ref().map_or(FramePose::SAME, FramePose::from);
         if let Some((base_link, base_pose)) = &self.base {
             let rest = model.positions(&HashMap::new());
             let base = model.link_poses(&rest).get(link(base_link)?).copied().unwrap_or_default();
-            let root = base_pose * base.inverse();
-            robot.root =
-                FramePose { position: root.translation.vector.into(), orientation: root.rotation.coords.into() };
+            robot.root = FramePose::from(&(base_pose * base.inverse()));
             robot.base = base.rotation.coords.into();
         }
         Ok(robot)

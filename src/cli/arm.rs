@@ -1,5 +1,5 @@
-//! `dimos arm enable|disable|reset|gripper|io|payload ARM`: motors, latch, gripper and optional parts of an arm in a
-//! run; `find-port`, `setup-motors`, `calibrate` and `configure`: work on an arm without a run, directly on its bus.
+//! `dimos arm enable|disable|reset|gripper|io|payload|tool ARM`: motors, latch, gripper and optional parts of an arm in
+//! a run; `find-port`, `setup-motors`, `calibrate` and `configure`: work on an arm without a run, directly on its bus.
 
 mod bus;
 mod calibrate;
@@ -8,6 +8,7 @@ mod find_port;
 mod live_table;
 pub(super) mod parts;
 mod setup_motors;
+pub(super) mod tool;
 
 use clap::Subcommand;
 
@@ -64,6 +65,8 @@ enum Action {
     Io(parts::IoArgs),
     /// Show the load at the flange, or set it: the arm must be at rest
     Payload(parts::PayloadArgs),
+    /// Show the tool centre point, whose pose is the arm's, or set it: the arm must be at rest
+    Tool(tool::Args),
 }
 
 /// Which arm.
@@ -131,6 +134,7 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
         Action::Gripper { which, opening, force } => gripper(which, *opening, *force),
         Action::Io(args) => parts::io(args),
         Action::Payload(args) => parts::payload(args),
+        Action::Tool(args) => tool::run(args),
         Action::FindPort(args) => find_port::run(args, registry),
         Action::SetupMotors(args) => setup_motors::run(args, registry),
         Action::Calibrate(args) => calibrate::run(args, registry),

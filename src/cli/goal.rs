@@ -21,24 +21,37 @@ const POLL_PERIOD: Duration = Duration::from_millis(20);
 #[group(id = "goal", required = true, multiple = true)]
 pub struct Goal {
     /// Target positions of its joints [rad], one per joint
-    #[arg(value_name = "POSITION", value_parser = finite, allow_negative_numbers = true, conflicts_with_all = ["pose", "named"])]
+    #[arg(value_name = "POSITION", value_parser = finite, allow_negative_numbers = true, conflicts_with_all = ["tcp", "named"])]
     pub joints: Vec<f64>,
-    /// Target position of the end effector in `map`: x, y, z [m]; orientation is free unless --rpy or --quat is given
-    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite, allow_negative_numbers = true)]
+    /// Target position of the tool centre point: x, y, z [m]; orientation is free unless --rpy or --quat is given
+    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite, allow_negative_numbers = true, group = "tcp")]
     pub pose: Option<Vec<f64>>,
-    /// Target roll, pitch, yaw of the end effector about fixed axes [rad]
-    #[arg(long, value_names = ["R", "P", "Y"], num_args = 3, value_parser = finite, allow_negative_numbers = true, requires = "pose")]
+    /// Move the tool centre point by x, y, z [m] along the axes of --frame; --rpy or --quat turns it about them
+    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite, allow_negative_numbers = true, group = "tcp")]
+    pub by: Option<Vec<f64>>,
+    /// Roll, pitch, yaw about fixed axes [rad]
+    #[arg(long, value_names = ["R", "P", "Y"], num_args = 3, value_parser = finite, allow_negative_numbers = true, requires = "tcp")]
     pub rpy: Option<Vec<f64>>,
-    /// Target orientation of the end effector as a quaternion x, y, z, w
-    #[arg(long, value_names = ["X", "Y", "Z", "W"], num_args = 4, value_parser = finite, allow_negative_numbers = true, requires = "pose", conflicts_with = "rpy")]
+    /// Orientation as a quaternion x, y, z, w
+    #[arg(long, value_names = ["X", "Y", "Z", "W"], num_args = 4, value_parser = finite, allow_negative_numbers = true, requires = "tcp", conflicts_with = "rpy")]
     pub quat: Option<Vec<f64>>,
+    /// Frame of --pose or --by: map (default), base, tool, or an object of the world
+    #[arg(long, value_name = "FRAME", requires = "tcp")]
+    pub frame: Option<String>,
     /// Named pose
-    #[arg(long, value_name = "NAME", conflicts_with = "pose")]
+    #[arg(long, value_name = "NAME", conflicts_with = "tcp")]
     pub named: Option<String>,
     /// Goal of one of several robots in a common motion (repeatable): left=0.1,-0.3,0.6,0,0.8,0 or left=named:home or
     /// left=pose:x,y,z or, with roll, pitch, yaw or a quaternion, left=pose:x,y,z,r,p,y or left=pose:x,y,z,qx,qy,qz,qw
-    #[arg(long = "goal", value_name = "ROBOT=GOAL", value_parser = robot_goal, conflicts_with_all = ["joints", "pose", "named"])]
+    #[arg(long = "goal", value_name = "ROBOT=GOAL", value_parser = robot_goal, conflicts_with_all = ["joints", "tcp", "named"])]
     pub several: Vec<PlanGoal>,
+    /// One motion through these waypoints; the last is the goal. Each is a named pose, joints as 0.1,-0.3,0.6,0,0.8,0, or
+    /// pose:x,y,z,r,p,y (also with x,y,z or a quaternion); line:… is reached on a straight line
+    #[arg(long, value_name = "WAYPOINT", num_args = 2.., value_parser = waypoint, allow_negative_numbers = true, conflicts_with_all = ["joints", "tcp", "named", "several"])]
+    pub through: Vec<PlanGoal>,
+    /// How far away the tool centre point may pass the waypoints [m]; 0: it stops at each
+    #[arg(long, value_name = "DISTANCE", default_value_t = 0.0, value_parser = finite, requires = "through")]
+    pub blend: f64,
 }
 
 /// Parses a robot and its goal, as in `--goal`.
@@ -46,32 +59,49 @@ fn robot_goal(text: &str) -> std::result::Result<PlanGoal, String> {
     let form = "must be ROBOT=GOAL, such as left=named:home or left=0.1,-0.3,0.6,0,0.8,0";
     let (robot, goal) =
         text.split_once('=').filter(|(robot, goal)| !robot.is_empty() && !goal.is_empty()).ok_or(form)?;
-    let numbers = |list: &str| -> std::result::Result<Vec<f64>, String> {
-        list.split(',').map(|n| finite(n.trim()).map_err(|e| format!("{n:?}: {e}"))).collect()
-    };
     let mut planned = PlanGoal { robot: robot.to_owned(), ..PlanGoal::default() };
     match goal.split_once(':') {
         None => planned.joints = Some(numbers(goal)?),
         Some(("named", name)) => planned.named = Some(name.to_owned()),
-        Some(("pose", list)) => {
-            let (mut rpy, mut quat) = (None, None);
-            let xyz = match *numbers(list)? {
-                [x, y, z] => [x, y, z],
-                [x, y, z, roll, pitch, yaw] => {
-                    rpy = Some([roll, pitch, yaw]);
-                    [x, y, z]
-                }
-                [x, y, z, qx, qy, qz, qw] => {
-                    quat = Some([qx, qy, qz, qw]);
-                    [x, y, z]
-                }
-                _ => return Err("a pose has 3, 6 or 7 numbers: x,y,z, then roll,pitch,yaw or qx,qy,qz,qw".into()),
-            };
-            planned.pose = Some(PoseSpec { xyz, rpy, quat });
-        }
+        Some(("pose", list)) => planned.pose = Some(pose(list)?),
         Some(_) => return Err(form.into()),
     }
     Ok(planned)
+}
+
+/// Parses a waypoint, as in `--through`. It gets its robot later.
+fn waypoint(text: &str) -> std::result::Result<PlanGoal, String> {
+    let mut planned = PlanGoal::default();
+    match text.split_once(':') {
+        Some(("pose", list)) => planned.pose = Some(pose(list)?),
+        Some(("line", list)) => (planned.pose, planned.linear) = (Some(pose(list)?), true),
+        Some(("named", name)) => planned.named = Some(name.to_owned()),
+        Some(_) => return Err("must be a name, joints as 0.1,-0.3,…, pose:x,y,z,… or line:x,y,z,…".into()),
+        None if text.contains(',') => planned.joints = Some(numbers(text)?),
+        None => planned.named = Some(text.to_owned()),
+    }
+    Ok(planned)
+}
+
+fn numbers(list: &str) -> std::result::Result<Vec<f64>, String> {
+    list.split(',').map(|n| finite(n.trim()).map_err(|e| format!("{n:?}: {e}"))).collect()
+}
+
+fn pose(list: &str) -> std::result::Result<PoseSpec, String> {
+    let (mut rpy, mut quat) = (None, None);
+    let xyz = match *numbers(list)? {
+        [x, y, z] => [x, y, z],
+        [x, y, z, roll, pitch, yaw] => {
+            rpy = Some([roll, pitch, yaw]);
+            [x, y, z]
+        }
+        [x, y, z, qx, qy, qz, qw] => {
+            quat = Some([qx, qy, qz, qw]);
+            [x, y, z]
+        }
+        _ => return Err("a pose has 3, 6 or 7 numbers: x,y,z, then roll,pitch,yaw or qx,qy,qz,qw".into()),
+    };
+    Ok(PoseSpec { xyz, rpy, quat })
 }
 
 /// Settings of the search and the speed.
@@ -80,8 +110,8 @@ pub struct Search {
     /// Fraction of the velocity and acceleration limits to use, 0.01–1
     #[arg(long, value_name = "FRACTION", default_value_t = DEFAULT_SPEED, value_parser = speed)]
     pub speed: f64,
-    /// Move the end effector on a straight line to --pose
-    #[arg(long, requires = "pose")]
+    /// Move the tool centre point on a straight line to --pose or by --by
+    #[arg(long, requires = "tcp")]
     pub linear: bool,
     /// Seed of the search: the same request with the same seed gives the same plan
     #[arg(long, value_name = "N", default_value_t = 0)]
@@ -98,27 +128,43 @@ impl Goal {
     }
 
     /// Returns the goals for the planner; `robot` is the robot of positions, pose and name.
-    pub fn of(&self, robot: Option<&str>, search: &Search) -> Vec<PlanGoal> {
+    fn of(&self, robot: Option<&str>, search: &Search) -> Vec<PlanGoal> {
         let Some(robot) = robot else { return self.several.clone() };
-        let pose = self.pose.as_deref().and_then(|xyz| xyz.try_into().ok()).map(|xyz| PoseSpec {
-            xyz,
-            rpy: self.rpy.as_deref().and_then(|rpy| rpy.try_into().ok()),
-            quat: self.quat.as_deref().and_then(|quat| quat.try_into().ok()),
-        });
+        if let Some(last) = self.through.last() {
+            return vec![PlanGoal { robot: robot.to_owned(), ..last.clone() }];
+        }
+        let spec = |xyz: &Option<Vec<f64>>| {
+            xyz.as_deref().and_then(|xyz| xyz.try_into().ok()).map(|xyz| PoseSpec {
+                xyz,
+                rpy: self.rpy.as_deref().and_then(|rpy| rpy.try_into().ok()),
+                quat: self.quat.as_deref().and_then(|quat| quat.try_into().ok()),
+            })
+        };
         vec![PlanGoal {
             robot: robot.to_owned(),
             joints: self.joints().map(<[f64]>::to_vec),
-            pose,
+            pose: spec(&self.pose),
+            by: spec(&self.by),
+            frame: self.frame.clone(),
             named: self.named.clone(),
             linear: search.linear,
         }]
     }
 }
 
-impl Search {
+impl Goal {
     /// Returns a planning request.
-    pub fn plan(&self, goals: Vec<PlanGoal>) -> Plan {
-        Plan { goals, speed: self.speed, seed: self.seed, timeout: self.timeout.map(|t| t.as_secs_f64()) }
+    pub fn plan(&self, robot: Option<&str>, search: &Search) -> Plan {
+        let before = self.through.split_last().map(|(_, before)| before).unwrap_or_default();
+        let own = |goal: &PlanGoal| PlanGoal { robot: robot.unwrap_or_default().to_owned(), ..goal.clone() };
+        Plan {
+            goals: self.of(robot, search),
+            speed: search.speed,
+            seed: search.seed,
+            timeout: search.timeout.map(|t| t.as_secs_f64()),
+            through: before.iter().map(own).collect(),
+            blend: self.blend,
+        }
     }
 }
 

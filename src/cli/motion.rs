@@ -22,7 +22,7 @@ pub struct Args {
     #[command(flatten)]
     pub search: Search,
     /// Move straight in joint space even if the run has a planner: not collision-checked
-    #[arg(long, conflicts_with_all = ["pose", "several"])]
+    #[arg(long, conflicts_with_all = ["tcp", "several"])]
     pub direct: bool,
     /// If an obstacle blocks the motion, stop, plan again and continue
     #[arg(long, conflicts_with_all = ["direct", "no_wait"])]
@@ -54,7 +54,7 @@ pub fn run(args: &Args) -> Result {
 type Begun = (u64, String, serde_json::Value);
 
 fn plan_and_begin(args: &Args, client: &mut Client, signals: &Signals) -> Result<Begun> {
-    let request = args.search.plan(args.goal.of(args.arm.as_deref(), &args.search));
+    let request = args.goal.plan(args.arm.as_deref(), &args.search);
     let planned = plan(client, request, signals)?;
     if !args.target_run.json {
         show(&planned);
@@ -73,7 +73,7 @@ fn begin_direct(args: &Args, client: &mut Client, signals: &Signals) -> Result<B
         _ => None,
     };
     let Some((arm, target)) = target else {
-        let failure = Failure::new(Exit::Failed, "--pose and --goal need a planner, and this run has none");
+        let failure = Failure::new(Exit::Failed, "poses, --goal and --through need a planner, and this run has none");
         return Err(failure.hint("run a planner blueprint, such as yourarm-planner, or give joint positions"));
     };
     signals.check()?;

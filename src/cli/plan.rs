@@ -12,6 +12,7 @@ use super::output;
 Next: `dimos preview` shows the plan, `dimos execute` executes it. `dimos move` plans and executes in one step.
   dimos plan arm 0.3 -0.2 0.5 0 0.4 0
   dimos plan arm --pose 0.3 0.1 0.4 --rpy 0 1.57 0
+  dimos plan arm --by 0 0 -0.05 --frame tool                              back by 5 cm along the tool's z axis
   dimos plan arm --named home
   dimos plan --goal left=named:home --goal right=0.5,-0.3,0.6,0,0.8,0     both arms in one motion")]
 pub struct Args {
@@ -33,7 +34,7 @@ pub struct Args {
 pub fn run(args: &Args) -> Result {
     let mut client = args.target_run.connect()?;
     let signals = Signals::watch();
-    let request = args.search.plan(args.goal.of(args.robot.as_deref(), &args.search));
+    let request = args.goal.plan(args.robot.as_deref(), &args.search);
     let planned = plan(&mut client, request, &signals)?;
     if args.target_run.json {
         output::json(&serde_json::json!({

@@ -9,6 +9,7 @@ use super::exit::{Exit, Result};
 use super::goal::{Planned, show};
 use super::output::{self, Table, fixed};
 use crate::rpc::api::{Preview, PreviewReply};
+use crate::rpc::report::TcpReport;
 
 /// Rows of the table.
 const ROWS: usize = 12;
@@ -47,7 +48,8 @@ pub fn run(args: &Args) -> Result {
 /// Returns samples of the motion, its ends included.
 fn table(reply: &PreviewReply) -> Table {
     let names = reply.trajectory.joint_names.iter().map(|name| format!(">{name}"));
-    let ends = reply.end_effectors.keys().map(|robot| format!(">{robot} x y z [m]"));
+    let tcp = |robot| reply.tcps.get(robot).map_or_else(|| "end effector".to_owned(), TcpReport::name);
+    let ends = reply.end_effectors.keys().map(|robot| format!(">{robot}: {} in map [m]", tcp(robot)));
     let headings: Vec<String> = std::iter::once(">TIME s".to_owned()).chain(names).chain(ends).collect();
     let mut table = Table::new(&headings.iter().map(String::as_str).collect::<Vec<_>>());
     let points = &reply.trajectory.points;

@@ -6,9 +6,9 @@ use std::time::{Duration, Instant};
 
 use super::arguments::{Target, rate};
 use super::exit::{Exit, Result};
-use super::output::{Table, number};
+use super::output::{Table, fixed, number};
 use crate::rpc::api::State;
-use crate::rpc::report::{ArmStateReport, JointReport, StateReport};
+use crate::rpc::report::{ArmStateReport, JointReport, PoseReport, StateReport};
 
 /// Arguments of `state`.
 #[derive(Debug, clap::Args)]
@@ -104,14 +104,18 @@ fn of_arm(arm: &ArmStateReport) -> Vec<String> {
         let unit = arm.gripper_unit.as_deref().unwrap_or("m");
         lines.push(format!("gripper  {gripper:.4} {unit}{}", force(arm)));
     }
-    if let Some(pose) = arm.pose {
-        let ([x, y, z], [roll, pitch, yaw]) = (pose.xyz, pose.rpy);
-        lines.push(format!("pose     xyz {x:.4} {y:.4} {z:.4} m, rpy {roll:.4} {pitch:.4} {yaw:.4} rad"));
-    }
+    let poses = [(&arm.pose, ""), (&arm.device_pose, " (device)")];
+    lines.extend(poses.iter().filter_map(|(pose, whose)| Some(pose_line(pose.as_ref()?, whose))));
     if let Some([fx, fy, fz, tx, ty, tz]) = arm.wrench {
         lines.push(format!("wrench   force {fx:.2} {fy:.2} {fz:.2} N, torque {tx:.3} {ty:.3} {tz:.3} Nm"));
     }
     lines
+}
+
+/// Returns a pose with enough digits for `dimos move ARM --pose … --rpy …` to move nothing.
+fn pose_line(pose: &PoseReport, whose: &str) -> String {
+    let three = |values: [f64; 3]| values.map(|v| fixed(v, 6)).join(" ");
+    format!("pose     {}{whose}  xyz {} m  rpy {} rad", pose.label(), three(pose.xyz), three(pose.rpy))
 }
 
 /// Returns the measured force of the gripper; empty if it measures none.

@@ -4,6 +4,7 @@ use serde::Serialize;
 
 use super::arguments::Target;
 use super::arm::parts::{io_lines, joint_lines, payload_text};
+use super::arm::tool::tcp_text;
 use super::attach;
 use super::banner::at_exit;
 use super::exit::{Exit, Result};
@@ -258,6 +259,9 @@ fn print_arms(arms: &[ArmReport]) {
         }
         if let Some(line) = gripper_line(arm) {
             output::line(format_args!("  {name}: {line}"));
+        }
+        if let Some(tcp) = &arm.tcp {
+            output::line(format_args!("  {name}: poses in map are those of {}", tcp_text(tcp)));
         }
         if let Some(load) = &arm.payload {
             output::line(format_args!("  {name}: payload {}", payload_text(load)));

@@ -1,6 +1,7 @@
 //! Requests to the coordinator. They arrive through a ring. The tick frees nothing: a motion that ended leaves it
 //! through [`TickOutput::retired`](super::coordinator::TickOutput).
 
+use super::task_robot::FramePose;
 use crate::joint::Joints;
 use crate::trajectory::Spline;
 
@@ -48,6 +49,13 @@ pub enum Request {
         task: u16,
         /// The goal.
         goal: Goal,
+    },
+    /// Another tool for the end effector of a Cartesian task that is not active.
+    Tool {
+        /// The task.
+        task: u16,
+        /// Pose of the tool centre point in the frame of the task's link.
+        tool: FramePose,
     },
     /// Latch the hold of an arm, or of all.
     Stop {

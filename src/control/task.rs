@@ -4,6 +4,7 @@ use super::config::TaskConfig;
 use super::request::Motion;
 use super::speed_override::SpeedOverride;
 use super::task_body::{Claim, Context, Demand, JointView, OnCancel, OnLoss, Step, Target, TargetKind, TaskBody};
+use super::task_robot::FramePose;
 use super::task_spec::TaskSpec;
 use crate::clock::Mono;
 use crate::telemetry::{Outcome, Reason, TaskState, TaskView};
@@ -204,6 +205,16 @@ impl Task {
                 OnCancel::End => self.end(TaskState::Idle, Reason::StreamEnded),
             }),
             _ => None,
+        }
+    }
+
+    /// Replaces the tool of its end effector, or rejects it with the outcome for the client.
+    pub fn set_tool(&mut self, tool: &FramePose) -> Result<(), Outcome> {
+        match () {
+            () if !tool.is_valid() => Err(Outcome::InvalidTarget(self.index)),
+            () if self.is_active() => Err(Outcome::AlreadyExecuting(self.index)),
+            () if self.body.set_tool(tool) => Ok(()),
+            () => Err(Outcome::WrongTask(self.index)),
         }
     }
 

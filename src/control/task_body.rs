@@ -4,6 +4,7 @@
 //! The coordinator keeps the motion of a trajectory and frees it on another thread.
 
 use super::request::{Goal, Motion};
+use super::task_robot::FramePose;
 use crate::clock::Mono;
 use crate::joint::Joints;
 use crate::telemetry::{Outcome, Reason, TaskState, TaskView};
@@ -211,6 +212,12 @@ pub trait TaskBody: std::fmt::Debug + Send {
     /// Returns the target with which a task with `auto_start` begins; `None`: it waits for a client.
     fn first_target(&self) -> Option<Target<'static>> {
         None
+    }
+
+    /// Replaces the tool of the end effector; `false`: the type moves none. Called only while the task is not active.
+    fn set_tool(&mut self, tool: &FramePose) -> bool {
+        let _ = tool;
+        false
     }
 
     /// Adds to the status: motion, progress, the limit that slows the end effector.

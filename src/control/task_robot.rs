@@ -2,6 +2,8 @@
 
 use std::collections::BTreeMap;
 
+use glamx::{DAffine3, DQuat, DVec3};
+use nalgebra::Isometry3;
 use serde::{Deserialize, Serialize};
 
 use crate::robot::kinematics::Kinematics;
@@ -38,6 +40,13 @@ pub struct TaskKinematics {
     /// Orientation of the base, along whose axes twists are given, in the frame of the model's root: quaternion x, y,
     /// z, w.
     pub base: [f64; 4],
+    /// Pose of the tool centre point, which the task moves, in the frame of the link.
+    #[serde(default = "same")]
+    pub tool: FramePose,
+}
+
+fn same() -> FramePose {
+    FramePose::SAME
 }
 
 /// Pose of a frame in another frame.
@@ -55,12 +64,30 @@ pub const NO_ROTATION: [f64; 4] = [0.0, 0.0, 0.0, 1.0];
 impl FramePose {
     /// Identity.
     pub const SAME: Self = Self { position: [0.0; 3], orientation: NO_ROTATION };
+
+    /// Returns whether it is finite and its quaternion has length 1.
+    pub fn is_valid(&self) -> bool {
+        let length = self.orientation.iter().map(|v| v * v).sum::<f64>();
+        self.position.iter().all(|v| v.is_finite()) && (0.98..1.02).contains(&length)
+    }
+
+    /// Returns it as a rotation matrix and translation.
+    pub fn frame(&self) -> DAffine3 {
+        let turn = DQuat::from_array(self.orientation).normalize();
+        DAffine3::from_rotation_translation(turn, DVec3::from_array(self.position))
+    }
+}
+
+impl From<&Isometry3<f64>> for FramePose {
+    fn from(pose: &Isometry3<f64>) -> Self {
+        Self { position: pose.translation.vector.into(), orientation: pose.rotation.coords.into() }
+    }
 }
 
 impl TaskKinematics {
     /// Creates the kinematics of a robot whose poses and twists are in the frame of its root.
     pub fn new(kinematics: Kinematics, link: usize) -> Self {
-        Self { kinematics, link, root: FramePose::SAME, base: NO_ROTATION }
+        Self { kinematics, link, root: FramePose::SAME, base: NO_ROTATION, tool: FramePose::SAME }
     }
 
     /// Checks that a task with this number of joints can use it. The error names the problem.
@@ -72,6 +99,7 @@ impl TaskKinematics {
             () if !turned(&self.base) || !turned(&self.root.orientation) => {
                 Err("the quaternion of a frame does not have length 1".to_owned())
             }
+            () if !self.tool.is_valid() => Err("its tool is not a pose".to_owned()),
             () => Ok(()),
         }
     }

@@ -7,6 +7,7 @@ use std::time::Duration;
 use nalgebra::Isometry3;
 
 use crate::collision::body::MeshMode;
+use crate::pose::tcp_name;
 use crate::robot::Source;
 
 /// A planner.
@@ -47,6 +48,8 @@ pub struct RobotConfig {
     pub base_link: String,
     /// The link that pose goals refer to.
     pub end_effector_link: String,
+    /// Pose of the tool centre point in the frame of that link; `None`: the link itself.
+    pub tool: Option<Isometry3<f64>>,
     /// The link of the arm's flange, where a load is measured from.
     pub flange_link: Option<String>,
     /// Planned joints by their names in the model, from the base.
@@ -83,6 +86,11 @@ pub struct GripperJoint {
 }
 
 impl RobotConfig {
+    /// Returns the name of the point whose pose is the robot's: its end-effector link, or the tool on it.
+    pub fn tcp_name(&self) -> String {
+        tcp_name(&self.end_effector_link, self.tool.is_some())
+    }
+
     /// Returns the files of its description.
     pub fn source(&self) -> Source {
         Source {
@@ -113,6 +121,7 @@ impl RobotConfig {
             base_pose: Isometry3::identity(),
             base_link: "base_link".into(),
             end_effector_link: "flange".into(),
+            tool: None,
             flange_link: Some("flange".into()),
             coordinator_joints: joints.iter().map(|joint| format!("arm_{joint}")).collect(),
             joints,

@@ -3,11 +3,12 @@
 use super::cartesian::{LineSettings, straight_line};
 use super::ik::{Ik, IkSettings};
 use super::padded::Near;
-use super::path::Path;
+use super::path::{Path, distance};
 use super::pipeline::{Goal, PlanFailure, Stage, late};
 use super::planning_scene::PlannedRobot;
 use crate::collision::{CollisionChecker, Stop};
 use crate::robot::kinematics::frame;
+use crate::robot::kinematics::step::rotation_between;
 use crate::robot::model::JointKind;
 use glamx::DAffine3;
 
@@ -17,6 +18,12 @@ const SOLUTIONS: usize = 8;
 const ATTEMPTS: usize = 200;
 /// Tolerance of a pose goal [m, rad].
 const POSE_TOLERANCE: f64 = 1e-5;
+/// Distance [m] and rotation [rad] from the present pose within which a robot that is slightly outside its limits
+/// counts as being at a pose.
+const SAME_PLACE: f64 = 5e-4;
+const SAME_TURN: f64 = 1.7e-3;
+/// Largest distance outside the limits for that [rad]: as for the start of a plan.
+const LIMIT_TOLERANCE: f64 = 0.02;
 /// Part of a straight line that counts as complete.
 const COMPLETE: f64 = 1.0 - 1e-9;
 
@@ -82,7 +89,10 @@ fn reached(
     stop: &Stop,
 ) -> Result<Path, PlanFailure> {
     let in_root = robot.body.base.inverse() * *target;
-    let mut ik = Ik::new(&robot.body.kinematics, robot.end_effector);
+    let mut ik = Ik::new(&robot.body.kinematics, robot.tcp());
+    if let Some(own) = already_there(robot, &mut ik, &in_root, near, settings) {
+        return Ok(vec![own]);
+    }
     // Those that keep the padding; otherwise those that touch nothing.
     for padded in [true, false] {
         if let Ok(several) = ik.solve(&in_root, near, settings, |q| free(q, padded), stop) {
@@ -94,8 +104,26 @@ fn reached(
             return PlanFailure::cancelled();
         }
         PlanFailure::new(format!("{}: {failure}", robot.config.name))
-            .hint("poses are those of `end_effector_link` in the frame `map` [m, rad]")
+            .hint(format!("the pose is that of {} in map [m, rad]", robot.config.tcp_name()))
     })
+}
+
+/// Returns the present configuration if the robot is at the pose: a goal that needs no motion. Slightly outside its
+/// limits, its nearest configuration inside; another solution of the pose would be a large motion.
+fn already_there(
+    robot: &PlannedRobot,
+    ik: &mut Ik<'_>,
+    target: &DAffine3,
+    own: &[f64],
+    settings: &IkSettings,
+) -> Option<Vec<f64>> {
+    let inside: Vec<f64> = own.iter().zip(&robot.limits).map(|(q, l)| q.max(l.lower).min(l.upper)).collect();
+    let is_inside = inside == own;
+    let (far, turned) = if is_inside { (settings.position, settings.rotation) } else { (SAME_PLACE, SAME_TURN) };
+    let is_at = ik.pose(own);
+    let turn = rotation_between(&is_at.matrix3, &target.matrix3).length();
+    let there = is_at.translation.distance(target.translation) <= far && (settings.position_only || turn <= turned);
+    (there && (is_inside || distance(&inside, own) <= LIMIT_TOLERANCE)).then_some(inside)
 }
 
 /// Follows the straight line of the only moving robot's end effector as far as possible; returns the path and the part
@@ -111,13 +139,12 @@ pub(super) fn line(stage: &mut Stage<'_>, target: &DAffine3, stop: &Stop) -> Res
     }
     // The end is known only after following the line.
     let settings = LineSettings::default();
-    let ahead = straight_line(&kinematics, robot.end_effector, &start, &in_root, &settings, |_, _| true);
+    let ahead = straight_line(&kinematics, robot.tcp(), &start, &in_root, &settings, |_, _| true);
     if let Some(goal) = ahead.path.last().filter(|_| ahead.fraction >= COMPLETE) {
         checker.give_up(Near::Goal, goal);
     }
-    let line = straight_line(&kinematics, robot.end_effector, &start, &in_root, &settings, |a, b| {
-        checker.motion_is_free(a, b, stop)
-    });
+    let line =
+        straight_line(&kinematics, robot.tcp(), &start, &in_root, &settings, |a, b| checker.motion_is_free(a, b, stop));
     if line.fraction >= COMPLETE {
         return Ok((line.path, 1.0));
     }

@@ -117,12 +117,7 @@ fn waypoint_deviation(stage: &Stage<'_>, before: &[f64], at: &[f64], after: &[f6
         for robot in &stage.robots {
             let own = first..first + robot.joints.len();
             first = own.end;
-            let place = |q: &[f64]| {
-                let kinematics = &robot.body.kinematics;
-                let mut frames = kinematics.frames();
-                kinematics.forward(q.get(own.clone()).unwrap_or_default(), &mut frames);
-                kinematics.link_frame(robot.end_effector, &frames).translation
-            };
+            let place = |q: &[f64]| robot.tcp_pose(q.get(own.clone()).unwrap_or_default()).translation;
             most = most.max(place(at).distance(place(&blended)));
         }
         most

@@ -4,7 +4,8 @@
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
-use glamx::DVec3;
+use glamx::{DAffine3, DVec3};
+use nalgebra::Isometry3;
 
 use super::config::{CLOUD_RADIUS, JointBounds, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
 use super::unplanned_joints::{Measured, idle};
@@ -14,7 +15,7 @@ use crate::collision::cloud::Cloud;
 use crate::collision::world::{Obstacle, Robot, World};
 use crate::collision::{Solid, ply};
 use crate::joint::DEFAULT_ACCELERATION;
-use crate::robot::kinematics::{Kinematics, frame};
+use crate::robot::kinematics::{Kinematics, KinematicsError, frame};
 use crate::robot::load;
 use crate::robot::mesh::Mesh;
 use crate::robot::model::{Limits, RobotModel};
@@ -36,7 +37,7 @@ pub struct PlannedRobot {
     pub model: Arc<RobotModel>,
     /// Indices of the planned joints in the model.
     pub joints: Vec<usize>,
-    /// Index of the link that pose goals refer to.
+    /// Index of the end-effector link in the model.
     pub end_effector: usize,
     /// Limits of the planned joints.
     pub limits: Vec<Limits>,
@@ -127,7 +128,7 @@ pub fn whole(model: RobotModel, allowed: Vec<(String, String)>) -> Result<Robot,
         kinematics: Arc::new(Kinematics::whole(&model).map_err(|e| e.to_string())?),
         solids: solids(&model, MeshMode::Hull).map_err(|e| e.to_string())?,
         model: Arc::new(model),
-        base: glamx::DAffine3::IDENTITY,
+        base: DAffine3::IDENTITY,
         padding: 0.0,
         allowed,
     })
@@ -165,7 +166,8 @@ impl PlannedRobot {
         let solids = solids_of(&model, shape).map_err(|e| e.to_string())?;
         let idle = idle(config, &model, &joints, &Measured::default());
         let posed = model.positions(&idle);
-        let kinematics = Kinematics::new(&model, &joints, &posed).map_err(|e| e.to_string())?;
+        let tool = tool_frame(config.tool.as_ref());
+        let kinematics = compiled(&model, &joints, &posed, end_effector, &tool).map_err(|e| e.to_string())?;
         let limits = kinematics.limits().to_vec();
         let base_in_model = model.link_poses(&posed).get(base).copied().unwrap_or_default();
         let model = Arc::new(model);
@@ -210,11 +212,42 @@ impl PlannedRobot {
             joint.limits.acceleration = Some(own.acceleration.map_or(b.acceleration, |a| a.min(b.acceleration)));
             joint.limits.jerk = Some(own.jerk.map_or(b.jerk, |jerk| jerk.min(b.jerk)));
         }
-        let kinematics = Kinematics::new(&model, &self.joints, &self.rest).map_err(|e| e.to_string())?;
+        let kinematics = self.compiled(&model, &self.rest).map_err(|e| e.to_string())?;
         self.limits = kinematics.limits().to_vec();
         self.model = Arc::new(model);
         self.body = Robot { model: self.model.clone(), kinematics: Arc::new(kinematics), ..self.body.clone() };
         Ok(())
+    }
+
+    /// Returns the index of the tool centre point in the kinematics of [`body`](Self::body): the frame of every pose of
+    /// the robot. Without a tool it coincides with the end-effector link.
+    pub fn tcp(&self) -> usize {
+        self.model.links.len()
+    }
+
+    /// Returns the pose of the tool centre point in the frame `map` at these positions of the planned joints [rad].
+    pub fn tcp_pose(&self, positions: &[f64]) -> DAffine3 {
+        let kinematics = &self.body.kinematics;
+        let mut frames = kinematics.frames();
+        kinematics.forward_from(&self.body.base, positions, &mut frames);
+        kinematics.link_frame(self.tcp(), &frames)
+    }
+
+    /// Returns the pose of the base link in the frame `map`.
+    pub fn base_pose(&self) -> DAffine3 {
+        frame(&self.config.base_pose)
+    }
+
+    /// Replaces the tool.
+    pub fn set_tool(&mut self, tool: Option<Isometry3<f64>>) {
+        self.config.tool = tool;
+        let (tcp, offset) = (self.tcp(), tool_frame(tool.as_ref()));
+        Arc::make_mut(&mut self.body.kinematics).move_frame(tcp, self.end_effector, &offset);
+    }
+
+    /// Compiles the kinematics of the planned joints, with the tool centre point.
+    pub(super) fn compiled(&self, model: &RobotModel, rest: &[f64]) -> Result<Kinematics, KinematicsError> {
+        compiled(model, &self.joints, rest, self.end_effector, &tool_frame(self.config.tool.as_ref()))
     }
 
     /// Builds the robot's collision geometry with all joints fixed at these positions.
@@ -226,6 +259,23 @@ impl PlannedRobot {
         let kinematics = Kinematics::new(&self.model, &[], &rest).map_err(|e| e.to_string())?;
         Ok(Robot { kinematics: Arc::new(kinematics), ..self.body.clone() })
     }
+}
+
+fn tool_frame(tool: Option<&Isometry3<f64>>) -> DAffine3 {
+    tool.map_or(DAffine3::IDENTITY, frame)
+}
+
+/// Compiles a model for these joints, with the tool centre point as one more link.
+fn compiled(
+    model: &RobotModel,
+    joints: &[usize],
+    rest: &[f64],
+    link: usize,
+    tool: &DAffine3,
+) -> Result<Kinematics, KinematicsError> {
+    let mut kinematics = Kinematics::new(model, joints, rest)?;
+    kinematics.attach_frame(link, tool);
+    Ok(kinematics)
 }
 
 fn joint(model: &RobotModel, name: &str) -> Result<usize, String> {
@@ -276,7 +326,7 @@ mod tests {
         std::fs::write(&model_path, ON_A_SLIDE).unwrap();
         let config = RobotConfig {
             model_path,
-            base_pose: nalgebra::Isometry3::translation(1.0, 2.0, 3.0),
+            base_pose: Isometry3::translation(1.0, 2.0, 3.0),
             base_link: "base".into(),
             end_effector_link: "l".into(),
             flange_link: None,

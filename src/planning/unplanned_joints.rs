@@ -7,7 +7,6 @@ use std::collections::{BTreeMap, HashMap};
 use super::config::RobotConfig;
 use super::planning_scene::{PlannedRobot, PlanningScene};
 use crate::collision::world::Robot;
-use crate::robot::kinematics::Kinematics;
 use crate::robot::model::RobotModel;
 
 /// Changes below this are measurement noise [rad or m].
@@ -32,7 +31,7 @@ impl PlanningScene {
             if rest.iter().zip(&robot.rest).all(|(a, b)| (a - b).abs() <= NOISE) {
                 continue;
             }
-            let Ok(kinematics) = Kinematics::new(&robot.model, &robot.joints, &rest) else { continue };
+            let Ok(kinematics) = robot.compiled(&robot.model, &rest) else { continue };
             robot.body = Robot { kinematics: kinematics.into(), ..robot.body.clone() };
             robot.rest = rest;
             changed = true;

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Deserializer};
 
 use crate::control::request::{Goal, Motion, Request};
+use crate::control::task_robot::FramePose;
 use crate::joint::{Joints, joints_of};
 use crate::trajectory::{JointTrajectory, Spline};
 
@@ -42,6 +43,11 @@ enum LoggedRequest {
         linear: [Option<f64>; 3],
         angular: [Option<f64>; 3],
         tool: bool,
+    },
+    Tool {
+        task: u16,
+        position: [Option<f64>; 3],
+        orientation: [Option<f64>; 4],
     },
     Stop {
         arm: Option<u16>,
@@ -113,6 +119,10 @@ fn request(logged: LoggedRequest, joints: &[String]) -> Result<Request, String> 
             let goal = Goal::Twist { linear: numbers(linear), angular: numbers(angular), tool };
             Request::CartesianTarget { task, goal }
         }
+        LoggedRequest::Tool { task, position, orientation } => {
+            let tool = FramePose { position: numbers(position), orientation: numbers(orientation) };
+            Request::Tool { task, tool }
+        }
         LoggedRequest::Stop { arm } => Request::Stop { arm },
         LoggedRequest::Reset { arm } => Request::Reset { arm },
         LoggedRequest::Ready { arm } => Request::Enabled { arm },
@@ -160,6 +170,10 @@ mod tests {
             Request::CartesianTarget {
                 task: 4,
                 goal: Goal::Twist { linear: [0.1 + 0.2, -0.0, 1e300], angular: [0.0, f64::NAN, 1.0], tool: true },
+            },
+            Request::Tool {
+                task: 5,
+                tool: FramePose { position: [0.1 + 0.2, -0.0, 0.12], orientation: [0.0, f64::NAN, 0.6, 0.8] },
             },
             Request::Stop { arm: None },
             Request::Stop { arm: Some(1) },

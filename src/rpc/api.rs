@@ -197,6 +197,10 @@ methods! {
     "pose_save" PoseSave -> PoseSaved, check PoseSave::valid;
     /// Removes a saved pose.
     "pose_remove" PoseRemove -> Done;
+    /// The tool centre point of an arm.
+    "arm_tool" ArmTool -> ArmToolReply;
+    /// Sets the tool of an arm, in the planner and in the tasks that move its end effector. The arm must be at rest.
+    "arm_tool_set" ArmToolSet -> ArmToolReply, check ArmToolSet::valid;
     /// Next target of a servo task; repeat it within the task's timeout.
     "servo" Servo -> Done, check Servo::valid;
     /// Next target of a velocity task; repeat it within the task's timeout.

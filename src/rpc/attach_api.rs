@@ -11,6 +11,8 @@ use serde_json::Value;
 use super::api::{Done, Method};
 use super::error::RpcError;
 use super::motion_api::Trajectory;
+use super::planner_api::PoseSpec;
+use super::report::TcpReport;
 
 /// Name of the stream of requests to an attached planner.
 pub const PLANNER_REQUESTS: &str = "planner_requests";
@@ -38,6 +40,23 @@ pub struct RegisteredRobot {
     /// The trajectory task that executes its motions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub task: Option<String>,
+    /// Its model, with which the run computes its poses.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub model: Option<RegisteredModel>,
+}
+
+/// The kinematics of a robot of an attached planner.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct RegisteredModel {
+    /// Kinematics of its joints, as in a log.
+    pub kinematics: Value,
+    /// Index of its end-effector link in the kinematics.
+    pub index: usize,
+    /// Pose of the model's root in `map`.
+    pub root: PoseSpec,
+    /// Its tool centre point.
+    pub tcp: TcpReport,
 }
 
 /// Reply to `register_planner`.

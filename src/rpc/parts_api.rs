@@ -1,4 +1,5 @@
-//! Parameters and replies of the methods for an arm's optional parts: inputs and outputs, the load at the flange.
+//! Parameters and replies of the methods for an arm's optional parts: inputs and outputs, the load at the flange, the
+//! tool.
 
 use std::collections::BTreeMap;
 
@@ -6,6 +7,8 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::api::finite;
+use super::planner_api::PoseSpec;
+use super::report::TcpReport;
 use crate::arm::{Load, OutputValue, channel};
 
 /// Parameters of `arm_io`.
@@ -100,6 +103,39 @@ pub struct LoadReport {
     pub center: [f64; 3],
     /// Inertia about the centre of mass: xx, xy, xz, yy, yz, zz [kg·m²]; zeros if unknown.
     pub inertia: [f64; 6],
+}
+
+/// Parameters of `arm_tool`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ArmTool {
+    /// The arm's `hardware_id`.
+    pub arm: String,
+}
+
+/// Parameters of `arm_tool_set`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ArmToolSet {
+    /// The arm's `hardware_id`.
+    pub arm: String,
+    /// Pose of the tool centre point in the frame of the end-effector link; null: no tool.
+    pub tool: Option<PoseSpec>,
+}
+
+impl ArmToolSet {
+    pub(super) fn valid(&self) -> Result<(), String> {
+        self.tool.map_or(Ok(()), |tool| tool.valid("tool"))
+    }
+}
+
+/// Reply to `arm_tool` and `arm_tool_set`.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+pub struct ArmToolReply {
+    /// The arm.
+    pub arm: String,
+    /// Its tool centre point.
+    pub tcp: TcpReport,
 }
 
 impl From<Load> for LoadReport {

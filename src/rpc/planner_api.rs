@@ -9,8 +9,9 @@ use serde::{Deserialize, Serialize};
 
 use super::api::finite;
 use super::motion_api::{Trajectory, default_speed, valid_speed};
+use super::report::{TcpReport, ToolReport};
 
-/// A pose in the frame `map`.
+/// A pose; in the frame `map` unless another is given with it.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PoseSpec {
@@ -41,7 +42,7 @@ impl PoseSpec {
     }
 }
 
-/// Goal of one robot: exactly one of `joints`, `pose`, `named`.
+/// Goal of one robot: exactly one of `joints`, `pose`, `by`, `named`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PlanGoal {
@@ -50,13 +51,21 @@ pub struct PlanGoal {
     /// Joint positions [rad], in the order of the robot's `joint_names`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub joints: Option<Vec<f64>>,
-    /// Target pose of its end effector; without `rpy` and `quat` the orientation is free.
+    /// Target pose of its tool centre point; without `rpy` and `quat` the orientation is free.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pose: Option<PoseSpec>,
+    /// Motion of its tool centre point from its present pose: `xyz` along the axes of `frame`, then the rotation about
+    /// them; without `rpy` and `quat` it keeps its orientation.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub by: Option<PoseSpec>,
+    /// Frame of `pose` or `by`: `map` (default), `base` (the robot's base link), `tool` (its tool centre point now), or
+    /// an object of the world.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub frame: Option<String>,
     /// One of its named poses.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub named: Option<String>,
-    /// Whether the end effector moves to `pose` on a straight line.
+    /// Whether the tool centre point moves there on a straight line.
     #[serde(default)]
     pub linear: bool,
 }
@@ -76,6 +85,34 @@ pub struct Plan {
     /// Maximum planning time [s]; default: the blueprint's `planning_timeout`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub timeout: Option<f64>,
+    /// Waypoints that the motion passes before the goal, in order; for the robot of the only goal.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub through: Vec<PlanGoal>,
+    /// How far away its tool centre point may pass them, 0–1 [m]; 0: it stops at each.
+    #[serde(default)]
+    pub blend: f64,
+}
+
+/// Farthest that a waypoint may be passed [m].
+const MAX_BLEND: f64 = 1.0;
+
+impl PlanGoal {
+    fn valid(&self, field: &str) -> Result<(), String> {
+        let given = [self.joints.is_some(), self.pose.is_some(), self.by.is_some(), self.named.is_some()];
+        if given.iter().filter(|given| **given).count() != 1 {
+            return Err(format!("{field} must have one of joints, pose, by, named"));
+        }
+        let is_pose = self.pose.is_some() || self.by.is_some();
+        if self.linear && !is_pose {
+            return Err(format!("{field}: linear needs a pose"));
+        }
+        if self.frame.is_some() && !is_pose {
+            return Err(format!("{field}: frame needs a pose"));
+        }
+        finite(&format!("{field}.joints"), self.joints.as_deref().unwrap_or_default())?;
+        self.pose.map_or(Ok(()), |pose| pose.valid(&format!("{field}.pose")))?;
+        self.by.map_or(Ok(()), |by| by.valid(&format!("{field}.by")))
+    }
 }
 
 impl Plan {
@@ -88,15 +125,20 @@ impl Plan {
             if self.goals.iter().take(index).any(|other| other.robot == goal.robot) {
                 return Err(format!("{field}: {} has a goal already", goal.robot));
             }
-            let given = [goal.joints.is_some(), goal.pose.is_some(), goal.named.is_some()];
-            if given.iter().filter(|given| **given).count() != 1 {
-                return Err(format!("{field} must have one of joints, pose, named"));
+            goal.valid(&field)?;
+        }
+        for (index, waypoint) in self.through.iter().enumerate() {
+            let field = format!("through[{index}]");
+            waypoint.valid(&field)?;
+            if self.goals.len() != 1 || self.goals.iter().any(|goal| goal.robot != waypoint.robot) {
+                return Err(format!("{field}: waypoints are for the robot of the only goal"));
             }
-            if goal.linear && goal.pose.is_none() {
-                return Err(format!("{field}: linear needs a pose"));
+            if waypoint.by.is_some() || self.goals.iter().any(|goal| goal.by.is_some()) {
+                return Err(format!("{field}: a motion `by` begins at the present pose, not at a waypoint"));
             }
-            finite(&format!("{field}.joints"), goal.joints.as_deref().unwrap_or_default())?;
-            goal.pose.map_or(Ok(()), |pose| pose.valid(&format!("{field}.pose")))?;
+        }
+        if !(0.0..=MAX_BLEND).contains(&self.blend) {
+            return Err(format!("blend is {} m, must be within 0–{MAX_BLEND}", self.blend));
         }
         valid_speed(self.speed)?;
         match self.timeout {
@@ -210,8 +252,11 @@ pub struct PreviewReply {
     pub summary: PlanSummary,
     /// The motion, with the coordinator's joint names.
     pub trajectory: Trajectory,
-    /// For each robot, the position of its end effector at each point of the trajectory: x, y, z [m] in `map`.
+    /// For each robot, the position of its tool centre point at each point of the trajectory: x, y, z [m] in `map`.
     pub end_effectors: BTreeMap<String, Vec<[f64; 3]>>,
+    /// For each robot, its tool centre point.
+    #[serde(default)]
+    pub tcps: BTreeMap<String, TcpReport>,
 }
 
 /// Parameters of `execute_plan`.
@@ -282,6 +327,9 @@ pub struct RobotReport {
     pub name: String,
     /// The link of pose goals.
     pub end_effector_link: String,
+    /// The tool on it; absent: none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tool: Option<ToolReport>,
     /// The coordinator's joints, in the order of joint goals.
     pub joints: Vec<String>,
     /// Lower and upper position limits [rad]; `null` for a joint without limits.

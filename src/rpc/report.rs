@@ -3,10 +3,12 @@
 
 use std::collections::BTreeMap;
 
+use nalgebra::Isometry3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::api::{IoReport, LoadReport, SpeedReport};
+use crate::pose::{tcp_name, to_xyz_rpy};
 
 /// Reply to `status`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
@@ -190,6 +192,9 @@ pub struct ArmReport {
     /// The load at the flange that its controller reports, or that was set; absent if it takes none.
     #[serde(default)]
     pub payload: Option<LoadReport>,
+    /// The point whose pose `state` reports and pose goals are for; absent if the run has no model of the arm.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tcp: Option<TcpReport>,
     /// Lower and upper position limits of its joints [rad], in their order.
     #[serde(default)]
     pub position_limits: Vec<[f64; 2]>,
@@ -339,8 +344,11 @@ pub struct ArmStateReport {
     /// Unit of the gripper's force: `N`, `Nm` or `%`; absent without a gripper.
     #[serde(default)]
     pub gripper_force_unit: Option<String>,
-    /// End-effector pose in the arm's base frame.
+    /// Pose of its tool centre point in `map`, computed from the measured joints; absent if the run has no model of it.
     pub pose: Option<PoseReport>,
+    /// Pose that the device reports: its flange in its base; absent if it reports none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub device_pose: Option<PoseReport>,
     /// Force and torque [N, N, N, Nm, Nm, Nm].
     pub wrench: Option<[f64; 6]>,
 }
@@ -362,13 +370,62 @@ pub struct JointReport {
     pub command: Option<f64>,
 }
 
-/// An end-effector pose in the arm's base frame.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+/// A pose: of what, in which frame.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct PoseReport {
+    /// The link of the model; `flange` in a device's own pose.
+    #[serde(default)]
+    pub link: String,
+    /// Tool on the link, whose centre point has the pose; absent: the link itself has it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tool: Option<ToolReport>,
+    /// Reference frame: `map`, or `base` in a device's own pose.
+    #[serde(default)]
+    pub frame: String,
     /// x, y, z [m].
     pub xyz: [f64; 3],
     /// roll, pitch, yaw [rad], fixed axes.
     pub rpy: [f64; 3],
+}
+
+impl PoseReport {
+    /// Returns whose pose it is, and in which frame: `link_tcp in map`.
+    pub fn label(&self) -> String {
+        format!("{} in {}", tcp_name(&self.link, self.tool.is_some()), self.frame)
+    }
+}
+
+/// Pose of a tool centre point in the frame of its link.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+pub struct ToolReport {
+    /// x, y, z [m].
+    pub xyz: [f64; 3],
+    /// roll, pitch, yaw [rad], fixed axes.
+    pub rpy: [f64; 3],
+}
+
+impl From<&Isometry3<f64>> for ToolReport {
+    fn from(tool: &Isometry3<f64>) -> Self {
+        let (xyz, rpy) = to_xyz_rpy(tool);
+        Self { xyz, rpy }
+    }
+}
+
+/// The point whose pose is an arm's.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+pub struct TcpReport {
+    /// The end-effector link of the model.
+    pub link: String,
+    /// The tool on it; absent: the point is the link's origin.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tool: Option<ToolReport>,
+}
+
+impl TcpReport {
+    /// Returns the point's name: `link_tcp`, or `the tool on link_tcp`.
+    pub fn name(&self) -> String {
+        tcp_name(&self.link, self.tool.is_some())
+    }
 }
 
 /// Reply to `motion`.

@@ -12,6 +12,7 @@ use tokio::sync::oneshot;
 
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::control::request::{Envelope, Goal, Motion, Request};
+use crate::control::task_robot::FramePose;
 use crate::recording::notes::{Note, Notes};
 use crate::rt::host;
 use crate::rt::wake::Wake;
@@ -146,6 +147,9 @@ pub fn log_of(request: &Request) -> Value {
         }
         Request::CartesianTarget { task, goal: Goal::Twist { linear, angular, tool } } => {
             json!({"twist": {"task": task, "linear": linear, "angular": angular, "tool": tool}})
+        }
+        Request::Tool { task, tool: FramePose { position, orientation } } => {
+            json!({"tool": {"task": task, "position": position, "orientation": orientation}})
         }
         Request::Stop { arm } => json!({"stop": {"arm": arm}}),
         Request::Reset { arm } => json!({"reset": {"arm": arm}}),

@@ -102,7 +102,7 @@ impl Service {
     }
 
     /// Returns an error while an arm moves or executes a motion.
-    fn rests(&self, arm: u16) -> Result<(), RpcError> {
+    pub(super) fn rests(&self, arm: u16) -> Result<(), RpcError> {
         let joints = self.joints_of_arm(arm);
         let tasks = self.parts.config.tasks.iter().enumerate();
         let mut of_arm = tasks.filter(|(_, task)| task.joints.iter().any(|j| joints.contains(j)));
@@ -118,7 +118,7 @@ impl Service {
             None if speed > STANDSTILL => format!("{name} moves at {speed:.2} rad/s"),
             None => return Ok(()),
         };
-        Err(RpcError::new(Code::ArmNotReady, what).hint("a payload is set at rest: wait, or end the motion first"))
+        Err(RpcError::new(Code::ArmNotReady, what).hint("this is done at rest: wait, or end the motion first"))
     }
 
     /// Attaches an object to a robot; with a mass, the arm's controller is set to carry it.

@@ -4,8 +4,11 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::planner_port::{PlannerPort, isometry, positions_of, robot_index, run_blocking};
+use nalgebra::Isometry3;
+
+use super::planner_port::{PlannerPort, positions_of, robot_index, run_blocking};
 use super::service::internal;
+use super::tcp::TcpModel;
 use crate::collision::Stop;
 use crate::planning::padded::GivenUp;
 use crate::planning::path::length;
@@ -13,6 +16,7 @@ use crate::planning::pipeline::{Goal, PlanRequest, PlannedMotion};
 use crate::planning::planner_thread::{BeginError, Job, Progress};
 use crate::planning::planning_scene::{PlannedRobot, PlanningScene};
 use crate::rpc::api::{self, Moment, PlanSummary, ReleasedPlan};
+use crate::rpc::report::ToolReport;
 use crate::rpc::{Code, RpcError};
 
 /// Timeout for checking whether a plan is still collision-free; after that it is not executed.
@@ -21,11 +25,12 @@ const REVIEW_LIMIT: Duration = Duration::from_secs(2);
 impl PlannerPort {
     pub(super) fn begin_plan(&self, plan: &api::Plan, moment: &Moment) -> Result<api::PlanReply, RpcError> {
         self.measured(moment);
-        let setup = self.thread.setup();
-        let goals = plan.goals.iter().map(|goal| goal_of(setup, goal)).collect::<Result<Vec<_>, _>>()?;
-        let positions = all_positions(setup, moment)?;
-        let request =
-            PlanRequest { goals, positions, speed: plan.speed, seed: plan.seed, through: Vec::new(), blend: 0.0 };
+        let scene = self.thread.now();
+        let goals = plan.goals.iter().map(|goal| self.goal_of(&scene, goal, moment)).collect::<Result<Vec<_>, _>>()?;
+        let positions = all_positions(&scene, moment)?;
+        let waypoint = |goal| Ok(vec![self.goal_of(&scene, goal, moment)?]);
+        let through = plan.through.iter().map(waypoint).collect::<Result<Vec<_>, RpcError>>()?;
+        let request = PlanRequest { goals, positions, speed: plan.speed, seed: plan.seed, through, blend: plan.blend };
         let id = moment.plan;
         self.thread.begin(id, request, plan.timeout.map(Duration::from_secs_f64)).map_err(|why| {
             let error = RpcError::new(Code::Planning, why.to_string());
@@ -37,10 +42,42 @@ impl PlannerPort {
         Ok(api::PlanReply { plan: id })
     }
 
+    fn goal_of(&self, scene: &PlanningScene, goal: &api::PlanGoal, moment: &Moment) -> Result<(usize, Goal), RpcError> {
+        let index = robot_index(scene, &goal.robot)?;
+        let robot = scene.robots.get(index).ok_or_else(internal)?;
+        let config = &robot.config;
+        let joints = |values: &[f64]| {
+            if values.len() == config.joints.len() {
+                return Ok(Goal::Joints(values.to_vec()));
+            }
+            let what = format!("{} has {} joints, the goal {} values", config.name, config.joints.len(), values.len());
+            Err(RpcError::new(Code::InvalidParams, what).hint("give one position [rad] per joint, in order"))
+        };
+        let any_turn = goal.pose.is_some_and(|pose| pose.rpy.is_none() && pose.quat.is_none());
+        let goal = match (&goal.joints, &goal.named, self.goal_pose(robot, goal, moment)?) {
+            (Some(values), _, _) => joints(values)?,
+            (_, Some(name), _) => {
+                let names: Vec<&String> = config.named_poses.keys().collect();
+                let unknown = || RpcError::unknown(Code::InvalidParams, "named pose", name, &names);
+                joints(config.named_poses.get(name).ok_or_else(unknown)?)?
+            }
+            // On a line, any orientation is the present one.
+            (_, _, Some(pose)) if goal.linear && any_turn => {
+                let now = self.tcp_in_map(robot, moment)?;
+                Goal::Line(Isometry3::from_parts(pose.translation, now.rotation))
+            }
+            (_, _, Some(pose)) if goal.linear => Goal::Line(pose),
+            (_, _, Some(pose)) if any_turn => Goal::Position(pose.translation.vector),
+            (_, _, Some(pose)) => Goal::Pose(pose),
+            _ => return Err(internal()),
+        };
+        Ok((index, goal))
+    }
+
     pub(super) fn preview(&self, plan: Option<u64>) -> Result<api::PreviewReply, RpcError> {
         let (job, found) = found(self, plan)?;
         let setup = self.thread.now();
-        let mut end_effectors = BTreeMap::new();
+        let (mut end_effectors, mut tcps) = (BTreeMap::new(), BTreeMap::new());
         let mut first = 0;
         for &index in &found.robots {
             let Some(robot) = setup.robots.get(index) else { continue };
@@ -49,14 +86,15 @@ impl PlannerPort {
             let place = |point: &crate::trajectory::TrajectoryPoint, frames: &mut Vec<_>| {
                 let own = point.positions.get(first..first + robot.joints.len()).unwrap_or_default();
                 kinematics.forward_from(&robot.body.base, own, frames);
-                kinematics.link_frame(robot.end_effector, frames).translation.to_array()
+                kinematics.link_frame(robot.tcp(), frames).translation.to_array()
             };
             let way = found.trajectory.points.iter().map(|point| place(point, &mut frames)).collect();
             end_effectors.insert(robot.config.name.clone(), way);
+            tcps.insert(robot.config.name.clone(), TcpModel::of(robot).report());
             first += robot.joints.len();
         }
         let summary = summary(&job, &found);
-        Ok(api::PreviewReply { plan: job.id, summary, trajectory: api_trajectory(&found), end_effectors })
+        Ok(api::PreviewReply { plan: job.id, summary, trajectory: api_trajectory(&found), end_effectors, tcps })
     }
 
     /// Returns a plan for the coordinator to execute, if it is still collision-free.
@@ -96,6 +134,7 @@ impl PlannerPort {
         let robot = |robot: &PlannedRobot| api::RobotReport {
             name: robot.config.name.clone(),
             end_effector_link: robot.config.end_effector_link.clone(),
+            tool: robot.config.tool.as_ref().map(ToolReport::from),
             joints: robot.config.coordinator_joints.clone(),
             limits: robot
                 .limits
@@ -112,7 +151,7 @@ impl PlannerPort {
         api::PlannerReport {
             state: state.to_owned(),
             error,
-            robots: self.thread.setup().robots.iter().map(robot).collect(),
+            robots: self.thread.now().robots.iter().map(robot).collect(),
             plan: self.thread.newest(true).map(|job| job.id),
             always_touching,
         }
@@ -123,31 +162,6 @@ impl PlannerPort {
 pub(super) fn all_positions(setup: &PlanningScene, moment: &Moment) -> Result<Vec<Vec<f64>>, RpcError> {
     let configs = setup.robots.iter().map(|robot| &robot.config);
     configs.map(|robot| positions_of(&robot.name, &robot.coordinator_joints, moment)).collect()
-}
-
-fn goal_of(setup: &PlanningScene, goal: &api::PlanGoal) -> Result<(usize, Goal), RpcError> {
-    let index = robot_index(setup, &goal.robot)?;
-    let config = &setup.robots.get(index).ok_or_else(internal)?.config;
-    let joints = |values: &[f64]| {
-        if values.len() == config.joints.len() {
-            return Ok(Goal::Joints(values.to_vec()));
-        }
-        let what = format!("{} has {} joints, the goal {} values", config.name, config.joints.len(), values.len());
-        Err(RpcError::new(Code::InvalidParams, what).hint("give one position [rad] per joint, in order"))
-    };
-    let goal = match (&goal.joints, &goal.named, &goal.pose) {
-        (Some(values), _, _) => joints(values)?,
-        (_, Some(name), _) => {
-            let names: Vec<&String> = config.named_poses.keys().collect();
-            let unknown = || RpcError::unknown(Code::InvalidParams, "named pose", name, &names);
-            joints(config.named_poses.get(name).ok_or_else(unknown)?)?
-        }
-        (_, _, Some(pose)) if goal.linear => Goal::Line(isometry(pose)),
-        (_, _, Some(pose)) if pose.rpy.is_none() && pose.quat.is_none() => Goal::Position(pose.xyz.into()),
-        (_, _, Some(pose)) => Goal::Pose(isometry(pose)),
-        _ => return Err(internal()),
-    };
-    Ok((index, goal))
 }
 
 pub(super) fn job(port: &PlannerPort, plan: Option<u64>) -> Result<Job, RpcError> {

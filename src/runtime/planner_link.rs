@@ -2,13 +2,14 @@
 //! the run, limits the waiting time, and executes plans. The tick is not involved.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use serde_json::Value;
 
 use super::planner_port::PlannerPort;
 use super::service::{Service, internal};
+use super::tcp::TcpModel;
 use crate::control::config::CoordinatorConfig;
 use crate::control::limit::Bounds;
 use crate::control::task_body::TargetKind;
@@ -36,6 +37,8 @@ const STATUS_TIMEOUT: Duration = Duration::from_millis(500);
 pub(super) struct Attached {
     name: String,
     robots: Vec<api::RegisteredRobot>,
+    /// The models of the robots, with their present tools.
+    pub(super) models: Mutex<Vec<TcpModel>>,
     line: Arc<PlannerProxy>,
 }
 
@@ -238,8 +241,10 @@ impl Service {
         if self.parts.planner.is_some() {
             return Err(has("its blueprint's own".into()));
         }
+        let mut models = Vec::new();
         for robot in &planner.robots {
             self.fits(robot)?;
+            models.extend(TcpModel::registered(robot).map_err(|what| RpcError::new(Code::InvalidParams, what))?);
         }
         let joints = planner.robots.iter().flat_map(|robot| &robot.joints);
         let mut limits = command_limits(&self.parts.names, &self.parts.config);
@@ -250,7 +255,9 @@ impl Service {
             return Err(has(format!("{}{process}", other.name)));
         }
         tracing::info!("planner {} attached", planner.name);
-        *attached = Some(Arc::new(Attached { name: planner.name, robots: planner.robots, line }));
+        self.take_planner_tools(&models);
+        let models = Mutex::new(models);
+        *attached = Some(Arc::new(Attached { name: planner.name, robots: planner.robots, models, line }));
         *lock(&self.executed) = None;
         Ok(Registered { run: self.parts.run.clone(), limits })
     }

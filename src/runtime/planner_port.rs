@@ -9,6 +9,7 @@ use nalgebra::Isometry3;
 use super::plan_requests::job;
 use super::recheck::Released;
 use super::service::internal;
+use super::tcp::TcpModel;
 use super::world_requests::typed;
 use crate::planning::config::{JointBounds, PlannerConfig};
 use crate::planning::pipeline::solve;
@@ -16,7 +17,9 @@ use crate::planning::planner_thread::{PlannerThread, Solver};
 use crate::planning::planning_scene::PlanningScene;
 use crate::planning::unplanned_joints::Measured;
 use crate::pose;
-use crate::rpc::api::{CancelReply, CommandLimits, Moment, PoseSpec, RegisteredRobot, Reply, WorldObject};
+use crate::rpc::api::{
+    ArmToolReply, ArmToolSet, CancelReply, CommandLimits, Moment, PoseSpec, RegisteredRobot, Reply, WorldObject,
+};
 use crate::rpc::api::{Request as Call, WorldAdd, WorldReport};
 use crate::rpc::{Code, RpcError};
 use crate::sync::lock;
@@ -75,12 +78,21 @@ impl PlannerPort {
                 Ok(Reply::World(WorldReport { objects }))
             }
             Call::WorldAdd(WorldAdd(object)) => self.put(object).await.map(Reply::WorldAdd),
+            Call::ArmToolSet(call) => self.set_tool(&call).map(Reply::ArmToolSet),
             Call::WorldMove(call) => self.move_to(&call).map(Reply::WorldMove),
             Call::WorldRemove(call) => self.remove(call.name.as_deref()).map(Reply::WorldRemove),
             Call::Attach(call) => self.attach(&call, moment).map(Reply::Attach),
             Call::Detach(call) => self.detach(&call.name, moment).map(Reply::Detach),
             _ => Err(internal()),
         }
+    }
+
+    /// Replaces the tool of a robot; `arm` is the robot's name.
+    fn set_tool(&self, call: &ArmToolSet) -> Result<ArmToolReply, RpcError> {
+        let robot = robot_index(self.thread.setup(), &call.arm)?;
+        self.thread.set_tool(robot, call.tool.as_ref().map(isometry));
+        let tcp = self.thread.now().robots.get(robot).map(|robot| TcpModel::of(robot).report());
+        Ok(ArmToolReply { arm: call.arm.clone(), tcp: tcp.ok_or_else(internal)? })
     }
 }
 
@@ -90,6 +102,7 @@ pub fn registered(setup: &PlanningScene) -> Vec<RegisteredRobot> {
         name: robot.config.name.clone(),
         joints: robot.config.coordinator_joints.clone(),
         task: robot.config.task.clone(),
+        model: Some(TcpModel::of(robot).to_register()),
     };
     setup.robots.iter().map(robot).collect()
 }

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use super::motions::UnderWay;
 use super::service::{Service, internal};
 use crate::joint::STANDSTILL;
-use crate::rpc::api::{ExecutePlan, Plan, Planning, Reply, Request as Call};
+use crate::rpc::api::{ExecutePlan, Plan, PlanGoal, Planner, Planning, Reply, Request as Call};
 use crate::rpc::{Code, RpcError};
 use crate::sync::lock;
 use crate::telemetry::{Phase, TaskState};
@@ -17,6 +17,12 @@ const REST_TIMEOUT: Duration = Duration::from_secs(10);
 const POLL_PERIOD: Duration = Duration::from_millis(10);
 /// Maximum number of requests for plans kept.
 const REMEMBERED: usize = 64;
+
+/// Returns whether a goal depends on where its robot was, or on an object that may move.
+fn is_relative(goal: &PlanGoal) -> bool {
+    let fixed = matches!(goal.frame.as_deref(), None | Some("map" | "base"));
+    goal.by.is_some() || !fixed
+}
 
 impl Service {
     /// Keeps the request of a plan.
@@ -51,7 +57,10 @@ impl Service {
     async fn plan_again(&self, motion: &UnderWay) -> Result<u64, RpcError> {
         self.rested(motion).await?;
         let unknown = || RpcError::new(Code::UnknownPlan, "the request of this plan is no longer known");
-        let request = lock(&self.plan_requests).get(&motion.plan).cloned().ok_or_else(unknown)?;
+        let mut request = lock(&self.plan_requests).get(&motion.plan).cloned().ok_or_else(unknown)?;
+        if request.goals.iter().any(is_relative) {
+            self.resolve(&mut request, motion.plan).await?;
+        }
         let Reply::Plan(begun) = self.planner_call(Call::Plan(request)).await? else { return Err(internal()) };
         loop {
             if let Err(ended) = self.may_go_on(motion) {
@@ -73,6 +82,24 @@ impl Service {
             Reply::ExecutePlan(begun) => Ok(begun.motion),
             _ => Err(internal()),
         }
+    }
+
+    /// Replaces goals that depend on where the arm was by the joint positions that their plan found.
+    async fn resolve(&self, request: &mut Plan, plan: u64) -> Result<(), RpcError> {
+        let Reply::Planner(planner) = self.planner_call(Call::Planner(Planner {})).await? else {
+            return Err(internal());
+        };
+        let Reply::Planning(report) = self.planner_call(Call::Planning(Planning { plan })).await? else {
+            return Err(internal());
+        };
+        let found = report.summary.ok_or_else(internal)?;
+        for goal in request.goals.iter_mut().filter(|goal| is_relative(goal)) {
+            let robot = planner.robots.iter().find(|robot| robot.name == goal.robot).ok_or_else(internal)?;
+            let at = |joint| found.joints.iter().position(|j| j == joint).and_then(|at| found.goal.get(at).copied());
+            let joints = robot.joints.iter().map(at).collect::<Option<Vec<f64>>>().ok_or_else(internal)?;
+            *goal = PlanGoal { robot: goal.robot.clone(), joints: Some(joints), ..PlanGoal::default() };
+        }
+        Ok(())
     }
 
     /// Waits until the motion has ended and its arms are at rest.

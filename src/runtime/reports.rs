@@ -5,6 +5,7 @@ use std::time::Instant;
 
 use super::motions::{End, Next};
 use super::service::Service;
+use super::tcp::TcpModel;
 use crate::arm::{ArmState, VelocitySource};
 use crate::clock::WallOffset;
 use crate::hardware::device::Connected;
@@ -55,7 +56,12 @@ impl Service {
                 dropped: stats.dropped.load(Relaxed) + pulse.dropped.load(Relaxed),
                 error: stats.failed.load(Relaxed).then(|| "a write failed: the log has ended".to_owned()),
             }),
-            arms: (0..parts.config.arms.len()).filter_map(|i| self.arm_report(i)).collect(),
+            arms: self
+                .tcp_models()
+                .iter()
+                .enumerate()
+                .filter_map(|(i, tcp)| self.arm_report(i, tcp.as_ref()))
+                .collect(),
             speed: self.speed_override(),
             tasks: (0..parts.config.tasks.len()).filter_map(|i| self.task_report(i)).collect(),
             planner: None, // filled in by the `status` method
@@ -70,7 +76,7 @@ impl Service {
         SpeedReport { fraction: fraction.unwrap_or(1.0), paused: pulse.paused.load(Relaxed) }
     }
 
-    fn arm_report(&self, index: usize) -> Option<ArmReport> {
+    fn arm_report(&self, index: usize, tcp: Option<&TcpModel>) -> Option<ArmReport> {
         let (arm, device) = (self.parts.blueprint.arms.get(index)?, self.parts.devices.get(index)?);
         let (view, health, now) = (self.arm_view(index)?, device.health(), self.now());
         let Connected { info, gripper, io, .. } = self.parts.connected.get(index)?;
@@ -115,6 +121,7 @@ impl Service {
             io: io.zip(health.details().io).map(|(info, state)| self.io_report(index, &info, &state)),
             joints: self.joint_status(index, &health.details()),
             payload: health.details().payload.map(LoadReport::from),
+            tcp: tcp.map(TcpModel::report),
             position_limits: self.position_limits(index),
             on_exit: arm.on_exit.name().to_owned(),
             holds_when_disabled: info.holds_when_disabled,
@@ -157,6 +164,7 @@ impl Service {
 
     /// Returns the reply to `state`.
     pub fn state(&self) -> StateReport {
+        let mut poses = self.tcp_poses();
         let arms = self.parts.blueprint.arms.iter().enumerate().filter_map(|(i, arm)| {
             let view = self.arm_view(i)?;
             let (s, known, gripper) = (&view.state, view.state.seq > 0, self.gripper_info(i));
@@ -177,7 +185,14 @@ impl Service {
                 gripper_unit: gripper.map(|gripper| gripper.unit.name().to_owned()),
                 gripper_force: s.gripper_force,
                 gripper_force_unit: gripper.map(|gripper| gripper.force_unit.name().to_owned()),
-                pose: s.pose.map(|p| PoseReport { xyz: p.xyz, rpy: p.rpy }),
+                pose: poses.get_mut(i).and_then(Option::take),
+                device_pose: s.pose.map(|p| PoseReport {
+                    link: "flange".to_owned(),
+                    tool: None,
+                    frame: "base".to_owned(),
+                    xyz: p.xyz,
+                    rpy: p.rpy,
+                }),
                 wrench: s.wrench,
             })
         });

@@ -145,7 +145,7 @@ impl Service {
     /// Replaces the names of saved poses in a planning request by their positions. Names that the planner knows stay.
     pub(super) async fn with_saved_poses(&self, mut plan: api::Plan) -> Result<api::Plan, RpcError> {
         let named = |goal: &api::PlanGoal| goal.named.is_some();
-        if !plan.goals.iter().any(named) {
+        if !plan.goals.iter().chain(&plan.through).any(named) {
             return Ok(plan);
         }
         let file = self.pose_file()?;
@@ -154,7 +154,7 @@ impl Service {
             return Ok(plan);
         }
         let robots = self.robots().await?;
-        for goal in &mut plan.goals {
+        for goal in plan.goals.iter_mut().chain(&mut plan.through) {
             let Some(pose) = goal.named.as_ref().and_then(|name| saved.get(name)) else { continue };
             let Some(robot) = robots.iter().find(|robot| robot.name == goal.robot) else { continue };
             if goal.named.as_ref().is_some_and(|name| robot.named_poses.contains_key(name)) {

@@ -7,6 +7,8 @@ use std::sync::mpsc::Sender;
 use std::sync::{Arc, Mutex, OnceLock, Weak};
 use std::time::{Duration, Instant};
 
+use nalgebra::Isometry3;
+
 use super::Ending;
 use super::dispatch::{Dispatcher, SendError, log_of};
 use super::late_stops::LateStops;
@@ -78,6 +80,8 @@ pub struct Service {
     pub(super) attached: Mutex<Option<Arc<Attached>>>,
     /// The last executed plan, and its motion.
     pub(super) executed: Mutex<Option<(u64, u64)>>,
+    /// Per task, the tool of its end effector.
+    pub(super) task_tools: Mutex<Vec<Option<Isometry3<f64>>>>,
     /// Requests of plans, by the plans' numbers.
     pub(super) plan_requests: Mutex<BTreeMap<u64, api::Plan>>,
     pub(super) me: Weak<Self>,
@@ -95,6 +99,7 @@ impl Service {
             progress: Progress::default(),
             grippers: parts.devices.iter().map(|_| tokio::sync::Mutex::default()).collect(),
             details_logged: Mutex::new(vec![Details::default(); parts.devices.len()]),
+            task_tools: Mutex::new(parts.blueprint.tasks.iter().map(|task| task.robot.as_ref()?.tool).collect()),
             held_loads: parts.devices.iter().map(|_| tokio::sync::Mutex::default()).collect(),
             parts,
             started: Instant::now(),
@@ -327,6 +332,8 @@ impl Service {
             Call::Gripper(g) => self.gripper(g).await,
             Call::ArmPayload(p) => self.payload(&p.arm).await.map(Reply::ArmPayload),
             Call::ArmPayloadSet(p) => self.set_payload(p).await,
+            Call::ArmTool(t) => self.tool(&t.arm).map(Reply::ArmTool),
+            Call::ArmToolSet(t) => self.set_tool(t).await,
             Call::ArmIo(io) => self.io(&io.arm).await.map(Reply::ArmIo),
             Call::ArmIoSet(io) => self.set_io(io).await,
             Call::Poses(_) => self.poses().await.map(Reply::Poses),

@@ -123,7 +123,7 @@ impl PlannerPort {
 }
 
 /// Returns the present pose of a robot's link in the frame `map`.
-fn link_pose(robot: &PlannedRobot, link: &str, moment: &Moment) -> Result<Isometry3<f64>, RpcError> {
+pub(super) fn link_pose(robot: &PlannedRobot, link: &str, moment: &Moment) -> Result<Isometry3<f64>, RpcError> {
     let index = link_index(robot, link)?;
     let kinematics = &robot.body.kinematics;
     let mut frames = kinematics.frames();

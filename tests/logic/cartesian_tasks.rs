@@ -403,3 +403,32 @@ fn the_speed_override_slows_an_end_effector_and_pauses_it_on_its_way() {
     stream(&mut rig, POSES, pose_of(&goal), 2.0, |_| {});
     assert!(between(&goal, &commanded(&rig)).0 < 1e-6);
 }
+
+/// The pose of the tool centre point is the goal, and a twist in the tool's axes turns about it.
+#[test]
+fn a_tool_is_what_moves_and_is_replaced_only_at_rest() {
+    let turn = DQuat::from_rotation_y(0.5);
+    let tool = FramePose { position: [0.0, 0.05, 0.1], orientation: turn.to_array() };
+    let mut rig = rig_at(&HOME, TaskKinematics { tool, ..robot() }, &CartesianParams::default());
+    let mut goal = HOME;
+    goal[0] += 0.2;
+    stream(&mut rig, POSES, pose_of(&(flange(&goal) * tool.frame())), 4.0, |_| {});
+    let (distance, angle) = between(&commanded(&rig), &flange(&goal));
+    assert!(distance < 1e-6 && angle < 1e-6, "{distance} {angle}");
+
+    let set = |task, tool| Request::Tool { task, tool };
+    assert_eq!(rig.ask(set(POSES, FramePose::SAME)), Outcome::AlreadyExecuting(POSES));
+    assert_eq!(rig.ask(set(2, tool)), Outcome::WrongTask(2));
+    assert_eq!(rig.ask(set(77, tool)), Outcome::WrongTask(77));
+    let long = FramePose { position: [f64::NAN; 3], ..tool };
+    assert_eq!(rig.ask(set(TWISTS, long)), Outcome::InvalidTarget(TWISTS));
+    for _ in 0..100 {
+        rig.tick();
+    }
+    assert_eq!(rig.ask(set(TWISTS, tool)), Outcome::Accepted);
+    let tip = |rig: &Rig| commanded(rig) * tool.frame();
+    let before = tip(&rig);
+    stream(&mut rig, TWISTS, Goal::Twist { linear: [0.0; 3], angular: [0.0, 0.0, 0.3], tool: true }, 1.0, |_| {});
+    let (distance, angle) = between(&before, &tip(&rig));
+    assert!(distance < 1e-3 && angle > 0.1, "its centre point stays: {distance} m, {angle} rad");
+}

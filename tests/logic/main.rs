@@ -34,6 +34,7 @@ mod older_logs;
 mod pages;
 mod planning;
 mod planning_timing;
+mod poses;
 mod robot_models;
 mod rpc;
 mod speed_override;

@@ -46,7 +46,11 @@ impl Cell {
     /// Plans to an angle of the first joint.
     fn plan(&self, angle: f64, speed: f64) -> u64 {
         let goal = PlanGoal { robot: "arm".into(), joints: Some(at(angle)), ..PlanGoal::default() };
-        let plan = self.run.call(Plan { goals: vec![goal], speed, seed: 0, timeout: None }).unwrap().plan;
+        let plan = self
+            .run
+            .call(Plan { goals: vec![goal], speed, seed: 0, timeout: None, through: Vec::new(), blend: 0.0 })
+            .unwrap()
+            .plan;
         eventually("planning ends", || self.run.call(Planning { plan }).unwrap().state != "PLANNING");
         assert_eq!(self.run.call(Planning { plan }).unwrap().state, "PLANNED");
         plan

@@ -126,7 +126,7 @@ fn the_end_effector_moves_along_the_axes_of_its_keys() {
     let jog = terminal.start(&rig.home, "jog arm");
     terminal.until("CARTESIAN along the axes of the base");
     terminal.until("task twist_arm IDLE  at rest");
-    let mut pose = || rig.watcher.call(State {}).unwrap().arms[0].pose.unwrap();
+    let mut pose = || rig.watcher.call(State {}).unwrap().arms[0].pose.clone().unwrap();
     for (key, axis, sign) in
         [("w", 0, 1.0), ("s", 0, -1.0), ("a", 1, 1.0), ("D", 1, -1.0), ("q", 2, 1.0), ("e", 2, -1.0)]
     {
@@ -177,7 +177,7 @@ fn the_screen_shows_the_arm_in_80_columns_and_in_few() {
     // There is no task for the end effector: it begins with joints and says why.
     terminal.until("twist_arm, type: eef_twist, joint_names: {hardware: arm}");
     terminal.until("ms old");
-    terminal.until("pose  xyz");
+    terminal.until("pose  flange in base (device)");
     let text = terminal.text();
     let lines: Vec<&str> = text.lines().collect();
     assert!(lines[0].starts_with("jog arm  run jogged  SIMULATED  state "), "{text}");

@@ -33,6 +33,7 @@ mod planner_attach;
 mod planner_faults;
 mod planner_run;
 mod planner_world;
+mod poses;
 mod python_client;
 mod readers;
 mod remote_peers;

@@ -28,6 +28,7 @@ planner:
     - name: arm
       model_path: builtin:yourarm
       end_effector_link: flange
+      tool: {xyz: [0, 0, 0.1]}
       joint_names: [joint1, joint2, joint3, joint4, joint5, joint6]
       joint_prefix: arm_
       coordinator_task_name: traj_arm
@@ -84,9 +85,19 @@ fn every_verb_goes_on_addressing_one_run() {
     let planned = home.dimos("plan arm 0.3 -0.2 0.5 0 0.4 0").with(0).says(&["nothing has moved"]);
     assert!(planned.out.contains("clearance"), "{}", planned.out);
     let preview = home.dimos("preview --json").with(0).json();
-    assert!(preview["end_effectors"]["arm"].as_array().unwrap().len() > 2, "{preview}");
+    let path = preview["end_effectors"]["arm"].as_array().unwrap();
+    assert!(path.len() > 2, "{preview}");
     home.dimos("execute").with(0).says(&["planned, collision-checked"]);
     is_at(&home, &[0.3, -0.2, 0.5, 0.0, 0.4, 0.0]);
+    // The run has the attached planner's model: it shows where the tool is, as the planner means it.
+    home.dimos("state").with(0).shows(&["the tool on flange in map"]);
+    let state = home.dimos("state --json").with(0).json();
+    let shown = [0, 1, 2].map(|i| state["arms"][0]["pose"]["xyz"][i].as_f64().unwrap());
+    let end = path.last().unwrap();
+    assert!((0..3).all(|i| (shown[i] - end[i].as_f64().unwrap()).abs() < 5e-4), "{shown:?} for {end}");
+    home.dimos("arm tool arm --none").with(0).shows(&["arm: flange (no tool)"]);
+    home.dimos("state").with(0).shows(&["pose     flange in map"]);
+    home.dimos("arm tool arm --xyz 0 0 0.2").with(0).shows(&["the tool on flange at xyz 0.0000 0.0000 0.2000 m"]);
     home.dimos("move arm --named home").with(0).says(&["planned, collision-checked"]);
     assert!(home.dimos("world list").with(0).out.contains("table"));
     home.dimos("world add cup --cylinder 0.03 0.1 --at 0.3 0.3 0.4").with(0);

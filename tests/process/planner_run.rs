@@ -52,7 +52,7 @@ fn a_plan_is_shown_then_carried_out() {
     assert!(planned.out.contains("clearance") && planned.out.contains("rad long"), "{}", planned.out);
     is_at(&home, "arm", &HOME);
     let shown = home.dimos("preview --out plan.json").with(0);
-    assert!(shown.out.contains("arm_joint6") && shown.out.contains("arm x y z [m]"), "{}", shown.out);
+    assert!(shown.out.contains("arm_joint6") && shown.out.contains("arm: flange in map [m]"), "{}", shown.out);
     home.dimos("execute").with(0).says(&["planned, collision-checked"]);
     is_at(&home, "arm", &[0.3, -0.2, 0.5, 0.0, 0.4, 0.0]);
     // The file is a trajectory like any other, from where the plan began.
@@ -107,6 +107,53 @@ fn poses_lines_and_seeds() {
     is_at(&home, "arm", &[1.0, -0.3, 0.6, 0.0, 0.8, 0.0]);
     home.dimos("move arm --named near-table").with(0);
     is_at(&home, "arm", &saved);
+    home.dimos("world remove post").with(0);
+    passes_waypoints(&home);
+}
+
+/// One motion through waypoints: it stops at each, or passes within `--blend` of it.
+fn passes_waypoints(home: &Home) {
+    home.dimos("move arm --named home").with(0);
+    let through = "--through 0.5,-0.3,0.6,0,0.8,0 0.5,-0.1,0.4,0.3,0.8,0 line:0.35,0.05,0.35,3.14,0.2,0 near-table";
+    let planned = |options: &str| {
+        let plan = home.dimos(&format!("plan arm {through} {options} --json")).with(0).json();
+        (plan["summary"]["duration"].as_f64().unwrap(), home.dimos("preview --json").with(0).json())
+    };
+    // Largest joint distance of the closest point to the waypoint [rad], and the speed there [rad/s].
+    let closest = |preview: &Value, waypoint: [f64; 6]| {
+        let points = preview["trajectory"]["points"].as_array().unwrap();
+        let list = |point: &Value, what| -> Vec<f64> {
+            point[what].as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect()
+        };
+        let most = |values: &[f64]| values.iter().fold(0.0_f64, |most, v| most.max(v.abs()));
+        let away = |point: &Value| {
+            let off: Vec<f64> = list(point, "positions").iter().zip(waypoint).map(|(q, w)| q - w).collect();
+            (most(&off), most(&list(point, "velocities")))
+        };
+        points.iter().map(away).min_by(|a, b| a.0.total_cmp(&b.0)).unwrap()
+    };
+    let waypoint = [0.5, -0.1, 0.4, 0.3, 0.8, 0.0];
+    let (slow, exact) = planned("");
+    let (off, speed) = closest(&exact, waypoint);
+    assert!(off < 1e-6 && speed < 1e-6, "{off} rad, {speed} rad/s");
+    let (fast, blended) = planned("--blend 0.03");
+    let (off, speed) = closest(&blended, waypoint);
+    assert!(off > 1e-3 && off < 0.2 && speed > 0.05, "{off} rad, {speed} rad/s");
+    assert!(fast < 0.9 * slow, "{fast} s instead of {slow} s");
+    let tip =
+        |preview: &Value| -> Vec<[f64; 3]> { serde_json::from_value(preview["end_effectors"]["arm"].clone()).unwrap() };
+    let at = exact["trajectory"]["points"].as_array().unwrap().iter().position(|point| {
+        let q: Vec<f64> = serde_json::from_value(point["positions"].clone()).unwrap();
+        q.iter().zip(waypoint).all(|(q, w)| (q - w).abs() < 1e-6)
+    });
+    let place = tip(&exact)[at.unwrap()];
+    let distance = |p: &[f64; 3]| p.iter().zip(place).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
+    let nearest = tip(&blended).iter().map(distance).fold(f64::MAX, f64::min);
+    assert!(nearest < 0.03 + 1e-3, "{nearest} m from the waypoint");
+    home.dimos("execute").with(0);
+    home.dimos(&format!("plan arm {through} 1,2")).with(1).says(&["6 joints, the goal 2 values"]);
+    home.dimos("plan arm --through home 0.1,0.2,0,0,0,9 home").with(1).says(&["waypoint 2: "]);
+    home.dimos("plan arm --through home").with(2);
 }
 
 #[test]
@@ -122,7 +169,7 @@ fn what_cannot_be_planned_is_refused_in_words() {
         ("plan arm --named hme", 2, &["no named pose named `hme`", "did you mean `home`?"]),
         ("plan amr --named home", 1, &["UNKNOWN_ROBOT", "did you mean `arm`?"]),
         ("plan arm --pose 0.3 0 0.3 --quat 1 1 0 0", 2, &["goals[0].pose.quat has length 1.414"]),
-        ("plan arm 0 0 0 0 0 0 --linear", 2, &["linear needs a pose"]),
+        ("plan arm 0 0 0 0 0 0 --linear", 2, &["--pose <X> <Y> <Z>|--by <X> <Y> <Z>"]),
         ("plan arm", 2, &["required"]),
         ("preview", 1, &["UNKNOWN_PLAN", "hint: `dimos plan` makes one"]),
         ("preview 4711", 1, &["UNKNOWN_PLAN"]),

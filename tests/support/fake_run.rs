@@ -241,7 +241,13 @@ pub fn state() -> StateReport {
             gripper_unit: Some("m".into()),
             gripper_force: None,
             gripper_force_unit: Some("N".into()),
-            pose: Some(PoseReport { xyz: [0.1, 0.2, 0.3], rpy: [0.0; 3] }),
+            pose: Some(PoseReport {
+                link: "link_tcp".into(),
+                frame: "map".into(),
+                xyz: [0.1, 0.2, 0.3],
+                ..PoseReport::default()
+            }),
+            device_pose: None,
             wrench: None,
         }],
     }

@@ -161,9 +161,11 @@ fn joint_row(
 fn pose(state: Option<&ArmStateReport>) -> Vec<Line> {
     let Some(state) = state else { return Vec::new() };
     let mut lines = Vec::new();
-    if let Some(pose) = state.pose {
+    if let Some(pose) = state.pose.as_ref().or(state.device_pose.as_ref()) {
         let three = |values: [f64; 3], digits| values.map(|v| fixed(v, digits)).join(" ");
-        let text = format!("pose  xyz {} m  rpy {} rad", three(pose.xyz, 4), three(pose.rpy, 3));
+        let whose = if state.pose.is_some() { "" } else { " (device)" };
+        lines.push(Line::default().and(format!("pose  {}{whose}", pose.label())));
+        let text = format!("      xyz {} m  rpy {} rad", three(pose.xyz, 4), three(pose.rpy, 3));
         lines.push(Line::default().and(text));
     }
     if let Some(gripper) = state.gripper {
@@ -282,7 +284,13 @@ mod tests {
             state: Some(ArmStateReport {
                 age_ms: Some(4.0),
                 joints: (0..joints).map(joint).collect(),
-                pose: Some(PoseReport { xyz: [0.25, 0.0, 0.36], rpy: [3.0, 0.47, 3.0] }),
+                pose: Some(PoseReport {
+                    link: "link_tcp".into(),
+                    frame: "map".into(),
+                    xyz: [0.25, 0.0, 0.36],
+                    rpy: [3.0, 0.47, 3.0],
+                    ..Default::default()
+                }),
                 gripper: Some(0.04),
                 ..Default::default()
             }),
@@ -333,7 +341,8 @@ mod tests {
             "arm_joint7",
             "2.0000",
             "114.6",
-            "pose  xyz 0.2500",
+            "pose  link_tcp in map",
+            "xyz 0.2500",
             "W/S +/-x",
             "Y/H +/-yaw",
             "Esc leave",

@@ -120,7 +120,8 @@ impl View {
                 }
             }
         }
-        self.pose = arm.pose.map(|pose| from_xyz_rpy(pose.xyz, pose.rpy));
+        // As the vendor's program expects it: in the arm's base.
+        self.pose = arm.device_pose.as_ref().map(|pose| from_xyz_rpy(pose.xyz, pose.rpy));
         self.wrench = arm.wrench.map(|values| values.map(|value| value as f32));
         self.gripper = arm.gripper.map(|opening| match self.gripper {
             Some((before, at)) if (before - opening).abs() < 1e-4 => (before, at),

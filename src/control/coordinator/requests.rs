@@ -29,6 +29,10 @@ impl Coordinator {
             Request::Servo { task, target } => self.offer(now, task, &Target::Positions(target)),
             Request::Velocity { task, target } => self.offer(now, task, &Target::Velocities(target)),
             Request::CartesianTarget { task, goal } => self.offer(now, task, &Target::EndEffector(goal)),
+            Request::Tool { task, tool } => match self.tasks.get_mut(task as usize) {
+                Some(t) => t.set_tool(&tool).err().unwrap_or(Outcome::Accepted),
+                None => Outcome::WrongTask(task),
+            },
             Request::Reset { arm } => self.with_arm(arm, |a| a.reset(arm, now)),
             Request::Enabled { arm } => self.with_arm(arm, |a| a.activate(arm, now)),
             Request::PrepareDisable { arm } => {

@@ -9,6 +9,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use nalgebra::Isometry3;
+
 use super::ahead::{Blocked, look_ahead};
 use super::pipeline::{PlanFailure, PlanRequest, PlannedMotion, solve};
 use super::planning_scene::PlanningScene;
@@ -33,7 +35,7 @@ const JOIN_TIMEOUT: Duration = Duration::from_secs(2);
 /// A running planner thread. Shuts down when dropped.
 pub struct PlannerThread {
     setup: Arc<PlanningScene>,
-    /// `setup` with the joints that are not planned at their latest measured positions.
+    /// `setup` with the joints that are not planned at their latest measured positions, and with the present tools.
     now: Mutex<Arc<PlanningScene>>,
     /// The world and its change count.
     world: Mutex<(World, u64)>,
@@ -69,12 +71,12 @@ impl PlannerThread {
         Ok(Self { setup, now, world, shared, solver, timeout, worker })
     }
 
-    /// Returns the robots.
+    /// Returns the robots as they were at the start.
     pub fn setup(&self) -> &PlanningScene {
         &self.setup
     }
 
-    /// Returns the robots with the joints that are not planned at their latest measured positions.
+    /// Returns the robots with the joints that are not planned at their latest measured positions, and with tools.
     pub fn now(&self) -> Arc<PlanningScene> {
         lock(&self.now).clone()
     }
@@ -86,6 +88,14 @@ impl PlannerThread {
             *now = Arc::new(changed);
             lock(&self.world).1 += 1;
         }
+    }
+
+    /// Replaces the tool of a robot (index). A request that is being planned keeps the previous one.
+    pub fn set_tool(&self, robot: usize, tool: Option<Isometry3<f64>>) {
+        let mut now = lock(&self.now);
+        let mut changed = (**now).clone();
+        changed.robots.get_mut(robot).into_iter().for_each(|robot| robot.set_tool(tool));
+        *now = Arc::new(changed);
     }
 
     /// Changes the world. A request that is being planned keeps its copy.

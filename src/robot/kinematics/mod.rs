@@ -219,6 +219,21 @@ impl Kinematics {
         frames.get(body).copied().unwrap_or(DAffine3::IDENTITY) * offset
     }
 
+    /// Adds a frame that is fixed to a link, as one more link; returns its index. `offset`: its pose in the link's
+    /// frame.
+    pub fn attach_frame(&mut self, link: usize, offset: &DAffine3) -> usize {
+        self.links.push((self.body_of(link), self.offset_of(link) * *offset));
+        self.links.len() - 1
+    }
+
+    /// Moves a frame that [`attach_frame`](Self::attach_frame) added. Does not allocate.
+    pub fn move_frame(&mut self, frame: usize, link: usize, offset: &DAffine3) {
+        let (body, place) = (self.body_of(link), self.offset_of(link) * *offset);
+        if let Some(moved) = self.links.get_mut(frame) {
+            *moved = (body, place);
+        }
+    }
+
     /// Returns the body of a link.
     pub fn body_of(&self, link: usize) -> usize {
         self.links.get(link).map_or(0, |l| l.0)

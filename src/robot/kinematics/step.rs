@@ -118,6 +118,12 @@ impl Stepper {
         Self { link, settings, frames: kinematics.frames(), columns: [[0.0; 6]; MAX_DOF], kinematics }
     }
 
+    /// Moves the frame whose steps are computed, added by [`Kinematics::attach_frame`], to `offset` in the frame of
+    /// `link`. Does not allocate.
+    pub fn move_frame(&mut self, link: usize, offset: &DAffine3) {
+        self.kinematics.move_frame(self.link, link, offset);
+    }
+
     /// Returns the kinematics.
     pub fn kinematics(&self) -> &Kinematics {
         &self.kinematics

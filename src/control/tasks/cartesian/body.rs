@@ -8,7 +8,7 @@ use super::params::CartesianParams;
 use crate::clock::Mono;
 use crate::control::request::Goal;
 use crate::control::task_body::{Claim, Context, OnCancel, Step, Target, TaskBody};
-use crate::control::task_robot::TaskKinematics;
+use crate::control::task_robot::{FramePose, TaskKinematics};
 use crate::joint::braking_speed;
 use crate::robot::kinematics::step::rotation_between;
 use crate::telemetry::{Outcome, Reason, TaskState, TaskView};
@@ -115,6 +115,11 @@ impl TaskBody for CartesianTask {
         true
     }
 
+    fn set_tool(&mut self, tool: &FramePose) -> bool {
+        self.effector.set_tool(tool);
+        true
+    }
+
     fn describe(&self, view: &mut TaskView) {
         if matches!(view.state, TaskState::Executing | TaskState::Cancelling) {
             view.bound = self.effector.bound();
@@ -160,10 +165,7 @@ fn tracked(effector: &EndEffector, goal: &Goal) -> Option<Tracked> {
         Goal::Pose { position, orientation } => {
             let turn = DQuat::from_array(orientation);
             let good = (turn.length() - 1.0).abs() <= QUATERNION_SLACK && DVec3::from_array(position).is_finite();
-            let root = DAffine3::from_rotation_translation(
-                DQuat::from_array(robot.root.orientation).normalize(),
-                DVec3::from_array(robot.root.position),
-            );
+            let root = robot.root.frame();
             let pose = DAffine3::from_rotation_translation(turn.normalize(), DVec3::from_array(position));
             good.then(|| Tracked::Pose(root.inverse() * pose))
         }

@@ -5,7 +5,7 @@ use glamx::{DAffine3, DVec3};
 
 use super::params::CartesianParams;
 use crate::control::task_body::{Claim, Context};
-use crate::control::task_robot::TaskKinematics;
+use crate::control::task_robot::{FramePose, TaskKinematics};
 use crate::joint::MAX_DOF;
 use crate::robot::kinematics::step::{Bound as Bounded, JointBounds, JointMotion, StepSettings, Stepper, TargetTwist};
 use crate::telemetry::Bound;
@@ -40,8 +40,10 @@ pub struct EndEffector {
 impl EndEffector {
     /// Creates an end effector at rest.
     pub fn new(params: CartesianParams, robot: TaskKinematics) -> Self {
+        let mut kinematics = robot.kinematics.clone();
+        let tcp = kinematics.attach_frame(robot.link, &robot.tool.frame());
         Self {
-            stepper: Stepper::new(robot.kinematics.clone(), robot.link, StepSettings::default()),
+            stepper: Stepper::new(kinematics, tcp, StepSettings::default()),
             params,
             robot,
             joints: JointMotion::default(),
@@ -59,6 +61,12 @@ impl EndEffector {
     /// Returns its robot.
     pub fn robot(&self) -> &TaskKinematics {
         &self.robot
+    }
+
+    /// Replaces its tool.
+    pub fn set_tool(&mut self, tool: &FramePose) {
+        self.robot.tool = *tool;
+        self.stepper.move_frame(self.robot.link, &tool.frame());
     }
 
     /// Returns the limit that slows it at present.
@@ -85,7 +93,7 @@ impl EndEffector {
         })
     }
 
-    /// Returns its commanded pose, in the frame of the model's root.
+    /// Returns the commanded pose of its tool centre point, in the frame of the model's root.
     pub fn pose(&mut self) -> DAffine3 {
         self.stepper.pose(&self.joints.position)
     }

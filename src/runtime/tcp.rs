@@ -1,0 +1,143 @@
+//! Tool centre points: the pose of each arm, computed from its measured joints. The model is that of the planner's
+//! robot, in this process or attached; without one, that of a task that moves the arm's end effector, whose root is
+//! then `map`.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use glamx::DAffine3;
+use nalgebra::Isometry3;
+
+use super::planner_port::{isometry, spec};
+use super::service::Service;
+use crate::planning::planning_scene::PlannedRobot;
+use crate::robot::kinematics::{Kinematics, frame, pose};
+use crate::rpc::api::{RegisteredModel, RegisteredRobot};
+use crate::rpc::report::{PoseReport, TcpReport, ToolReport};
+use crate::sync::lock;
+
+/// The reference frame of all poses.
+pub(super) const MAP: &str = "map";
+
+/// The model of an arm's tool centre point.
+#[derive(Debug, Clone)]
+pub(super) struct TcpModel {
+    /// Name of the planner's robot; `None`: the model is a task's.
+    pub robot: Option<String>,
+    /// Names of its joints in the coordinator.
+    joints: Vec<String>,
+    kinematics: Arc<Kinematics>,
+    /// Index of the end-effector link in the kinematics.
+    index: usize,
+    /// Pose of the model's root in `map`.
+    root: DAffine3,
+    /// Name of the end-effector link.
+    pub link: String,
+    /// Pose of the tool centre point in the link's frame.
+    pub tool: Option<Isometry3<f64>>,
+}
+
+impl TcpModel {
+    /// Returns the model of a planning robot.
+    pub fn of(robot: &PlannedRobot) -> Self {
+        Self {
+            robot: Some(robot.config.name.clone()),
+            joints: robot.config.coordinator_joints.clone(),
+            kinematics: robot.body.kinematics.clone(),
+            index: robot.end_effector,
+            root: robot.body.base,
+            link: robot.config.end_effector_link.clone(),
+            tool: robot.config.tool,
+        }
+    }
+
+    /// Returns the model of an attached planner's robot, if it registered one. The error names what is wrong with it.
+    pub fn registered(robot: &RegisteredRobot) -> Result<Option<Self>, String> {
+        let Some(RegisteredModel { kinematics, index, root, tcp }) = &robot.model else { return Ok(None) };
+        let read = serde_json::from_value::<Kinematics>(kinematics.clone());
+        let kinematics = read.map_err(|e| format!("the kinematics of {}: {e}", robot.name))?;
+        if kinematics.dof() != robot.joints.len() || *index >= kinematics.links() {
+            return Err(format!("the kinematics of {} have other joints or links than the robot", robot.name));
+        }
+        Ok(Some(Self {
+            robot: Some(robot.name.clone()),
+            joints: robot.joints.clone(),
+            kinematics: Arc::new(kinematics),
+            index: *index,
+            root: frame(&isometry(root)),
+            link: tcp.link.clone(),
+            tool: tcp.tool.map(|tool| crate::pose::from_xyz_rpy(tool.xyz, tool.rpy)),
+        }))
+    }
+
+    /// Returns it for the registration of an attached planner.
+    pub fn to_register(&self) -> RegisteredModel {
+        let (kinematics, root) = (serde_json::to_value(&*self.kinematics).unwrap_or_default(), spec(&pose(&self.root)));
+        RegisteredModel { kinematics, index: self.index, root, tcp: self.report() }
+    }
+
+    /// Returns the point's report.
+    pub fn report(&self) -> TcpReport {
+        TcpReport { link: self.link.clone(), tool: self.tool.as_ref().map(ToolReport::from) }
+    }
+
+    /// Returns whether the robot has one of these joints.
+    pub fn moves(&self, joints: &[String]) -> bool {
+        self.joints.iter().any(|joint| joints.contains(joint))
+    }
+
+    /// Returns the point's pose in `map` at these positions [rad]; `None` if one is missing.
+    fn pose(&self, positions: &BTreeMap<String, f64>) -> Option<PoseReport> {
+        let q: Vec<f64> = self.joints.iter().map(|joint| positions.get(joint).copied()).collect::<Option<_>>()?;
+        let mut frames = self.kinematics.frames();
+        self.kinematics.forward_from(&self.root, &q, &mut frames);
+        let link = pose(&self.kinematics.link_frame(self.index, &frames));
+        let (xyz, rpy) = crate::pose::to_xyz_rpy(&(link * self.tool.unwrap_or_default()));
+        let TcpReport { link, tool } = self.report();
+        Some(PoseReport { link, tool, frame: MAP.to_owned(), xyz, rpy })
+    }
+}
+
+impl Service {
+    /// Returns the model of each arm's tool centre point.
+    pub(super) fn tcp_models(&self) -> Vec<Option<TcpModel>> {
+        let planned: Vec<TcpModel> = match (&self.parts.planner, &*lock(&self.attached)) {
+            (Some(port), _) => port.thread.now().robots.iter().map(TcpModel::of).collect(),
+            (None, Some(attached)) => lock(&attached.models).clone(),
+            (None, None) => Vec::new(),
+        };
+        let model = |joints: &Vec<String>| {
+            planned.iter().find(|model| model.moves(joints)).cloned().or_else(|| self.tcp_of_task(joints))
+        };
+        self.parts.names.arms.iter().map(|arm| model(&arm.joints)).collect()
+    }
+
+    /// Returns the model of the first task that moves the end effector of an arm with these joints.
+    fn tcp_of_task(&self, joints: &[String]) -> Option<TcpModel> {
+        let tools = lock(&self.task_tools);
+        let tasks = self.parts.config.tasks.iter().zip(&self.parts.blueprint.tasks).zip(tools.iter());
+        { tasks }.find_map(|((config, task), tool)| {
+            let (robot, about) = (config.kind.robot.as_ref()?, task.robot.as_ref()?);
+            let model = TcpModel {
+                robot: None,
+                joints: config.joints.iter().map(|joint| self.parts.names.joint(*joint)).collect(),
+                kinematics: Arc::new(robot.kinematics.clone()),
+                index: robot.link,
+                root: robot.root.frame(),
+                link: about.link.clone(),
+                tool: *tool,
+            };
+            model.moves(joints).then_some(model)
+        })
+    }
+
+    /// Returns the pose of each arm's tool centre point at the measured positions.
+    pub(super) fn tcp_poses(&self) -> Vec<Option<PoseReport>> {
+        let mut measured = BTreeMap::new();
+        for (index, arm) in self.parts.names.arms.iter().enumerate() {
+            let Some(view) = self.arm_view(index).filter(|view| view.state.seq > 0) else { continue };
+            measured.extend(arm.joints.iter().cloned().zip(view.state.position));
+        }
+        self.tcp_models().iter().map(|model| model.as_ref()?.pose(&measured)).collect()
+    }
+}
