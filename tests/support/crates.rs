@@ -29,7 +29,8 @@ pub fn share_builds(folder: &Path) {
         symlink(checkout.join(name), root.join(name)).unwrap();
     }
     let target = programs().parent().unwrap().to_owned();
-    [root, folder].map(|at| symlink(&target, at.join("target")).unwrap());
+    symlink(&target, root.join("target")).unwrap();
+    symlink(&target, folder.join("target")).unwrap();
     fs::copy(checkout.join("Cargo.lock"), root.join("Cargo.lock")).unwrap();
     let used = fs::read_to_string(checkout.join("Cargo.toml")).unwrap();
     let workspace = format!("{used}\n[workspace]\nmembers = [{:?}]\n", folder.file_name().unwrap());

@@ -21,7 +21,9 @@
 //! ```
 //!
 //! The test then starts its own executable again, inside the guest, for that one test, and the body runs there.
-//! The guest boots as long as most tests take: [`parts_in_guest`] makes several in one. [`VCAN`] sets up `vcan0` and `vcan1`; [`VXCAN`] also the pairs `can0`–`sim0` and `can1`–`sim1`: what one end of a
+//! The guest boots as long as most tests take: [`parts_in_guest`] makes several in one.
+//!
+//! [`VCAN`] sets up `vcan0` and `vcan1`; [`VXCAN`] also the pairs `can0`–`sim0` and `can1`–`sim1`: what one end of a
 //! pair sends, the other hears. A vendor's SDK that sends without local loopback needs a pair: the SDK on `can0`
 //! (`Command::new(".venv/bin/python")` in the body; the checkout is the working directory), the emulator on `sim0`.
 //! [`run`] runs a shell script instead. [`sh`] runs a command in the body: `uml::sh("ip link set vcan0 down")`.
@@ -112,8 +114,11 @@ pub struct Part {
 
 /// The table of parts: `name: setup;`, each the name of a function.
 macro_rules! parts {
-    ($($name:ident: $setup:expr;)*) => { [$($crate::support::uml::Part { name: stringify!($name), setup: $setup, body: $name }),*] };
+    ($($name:ident: $setup:expr;)*) => {
+        [$($crate::support::uml::Part { name: stringify!($name), setup: $setup, body: $name }),*]
+    };
 }
+#[allow(unused_imports, reason = "each test binary uses a part")]
 pub(crate) use parts;
 
 /// Removes all CAN interfaces. With one end of a pair, the other goes too.

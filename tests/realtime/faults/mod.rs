@@ -1,6 +1,6 @@
 //! The faults of `docs/faults.md` that need a process, a wire or a real clock. A test's name begins with the id of its
-//! fault. Each test prints what it measured. Faults that need none of these are in `tests/logic/faults`. `DIMOS_REPEATS` is the
-//! number of measurements of a reaction time (3).
+//! fault. Each test prints what it measured. Faults that need none of these are in `tests/logic/faults`.
+//! `DIMOS_REPEATS` is the number of measurements of a reaction time (3).
 
 mod arms;
 mod process;
