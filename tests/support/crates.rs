@@ -7,6 +7,8 @@ use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use rustix::fs::{AtFlags, CWD, Timespec, Timestamps, utimensat};
+
 /// The checkout that is tested.
 pub const CHECKOUT: &str = env!("CARGO_MANIFEST_DIR");
 /// What cargo looks at in it.
@@ -25,8 +27,11 @@ pub fn share_builds(folder: &Path) {
         return;
     }
     let (checkout, root) = (Path::new(CHECKOUT), folder.parent().unwrap());
+    // Cargo takes the time of a link for a change of the folder.
+    let old = Timestamps { last_access: Timespec::default(), last_modification: Timespec { tv_sec: 1, tv_nsec: 0 } };
     for name in SOURCES {
         symlink(checkout.join(name), root.join(name)).unwrap();
+        utimensat(CWD, root.join(name), &old, AtFlags::SYMLINK_NOFOLLOW).unwrap();
     }
     let target = programs().parent().unwrap().to_owned();
     symlink(&target, root.join("target")).unwrap();

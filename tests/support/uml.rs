@@ -113,6 +113,7 @@ pub struct Part {
 }
 
 /// The table of parts: `name: setup;`, each the name of a function.
+#[allow(unused_macros, reason = "each test binary uses a part")]
 macro_rules! parts {
     ($($name:ident: $setup:expr;)*) => {
         [$($crate::support::uml::Part { name: stringify!($name), setup: $setup, body: $name }),*]
