@@ -131,4 +131,5 @@ soak:
 	DIMOS_SOAK=120 DIMOS_SOAK_ALL=1 cargo test --release --locked --test realtime stalls_soak -- --nocapture --test-threads 1
 	DIMOS_STALLS=200 cargo test --release --locked --test realtime stalls:: -- --skip wire_stalls --nocapture --test-threads 1
 	DIMOS_WIRE=full cargo test --release --locked --test realtime wire_stalls -- --nocapture --test-threads 1
+	DIMOS_REPEATS=20 cargo test --release --locked --test realtime faults:: -- --nocapture --test-threads 1
 	DIMOS_BRAKING=1000 cargo test --locked --test logic braking

@@ -33,7 +33,8 @@ fn blueprints() -> io::Result<()> {
     let root = PathBuf::from(env::var("CARGO_MANIFEST_DIR").unwrap_or_default());
     let out = PathBuf::from(env::var("OUT_DIR").unwrap_or_default());
     let folder = root.join("blueprints");
-    println!("cargo::rerun-if-changed={}", folder.display());
+    // Relative, as all that cargo compares: a build in a folder of another name is the same build.
+    println!("cargo::rerun-if-changed=blueprints");
 
     let mut files: Vec<PathBuf> = fs::read_dir(&folder)?.map(|e| e.map(|e| e.path())).collect::<Result<_, _>>()?;
     files.retain(|path| path.extension().is_some_and(|ext| ext == "yaml"));

@@ -1,6 +1,6 @@
 //! Planned motions with an obstacle that appears in their way, without real time: each is cancelled as a run cancels
 //! it, brakes along its path in the coordinator's ticks, and keeps the padding until it is at rest. `DIMOS_BRAKING` is
-//! the number of motions (200), `SEED` repeats a run.
+//! the number of motions (80), `SEED` repeats a run.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -215,7 +215,7 @@ fn planned_motions_keep_the_jerk_limit_in_what_is_commanded() {
 #[test]
 fn cancelled_motions_brake_before_an_obstacle_in_their_way() {
     let number = |variable, otherwise| std::env::var(variable).ok().and_then(|s| s.parse().ok()).unwrap_or(otherwise);
-    let (seed, cases) = (number("SEED", 9), number("DIMOS_BRAKING", 200) as usize);
+    let (seed, cases) = (number("SEED", 9), number("DIMOS_BRAKING", 80) as usize);
     println!("SEED={seed}");
     let mut random = Random::new(seed);
     let setup = setup();

@@ -408,7 +408,7 @@ fn each_mistake_is_found_by_the_check_for_it() {
 /// What was found above was the mistake, and not the wrapping.
 #[test]
 fn without_a_mistake_the_same_checks_pass() {
-    for (row, name) in [
+    let cases: &[(AdapterSpec, &str)] = &[
         (Wrong::<NO_MISTAKE>::FALLING, "disabled_arms_do_not_move"),
         (Wrong::<NO_MISTAKE>::PUSHED, "reads_do_not_allocate"),
         (Wrong::<NO_MISTAKE>::WIRED, "enabling_moves_nothing"),
@@ -418,10 +418,13 @@ fn without_a_mistake_the_same_checks_pass() {
         (Wrong::<NO_MISTAKE>::WIRED, "stop_without_answer"),
         (Wrong::<NO_MISTAKE>::WIRED, "gripper_range_is_kept"),
         (Wrong::<NO_MISTAKE>::WIRED, "gripper_force_is_kept"),
-    ] {
-        let check = checks().find(|check| check.name == name).unwrap();
-        assert_eq!(run(&row, check, Some(counting::allocations)), Outcome::Passed, "{name}");
-    }
+    ];
+    std::thread::scope(|scope| {
+        for (row, name) in cases {
+            let check = checks().find(|check| check.name == *name).unwrap();
+            scope.spawn(move || assert_eq!(run(row, check, Some(counting::allocations)), Outcome::Passed, "{name}"));
+        }
+    });
 }
 
 /// The small slow motion of a wrong arm, which begins to be interrupted at the `looks`th look.

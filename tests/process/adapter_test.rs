@@ -28,14 +28,15 @@ fn requests(emulator: &YourArmEmulator) -> Vec<Request> {
 }
 
 #[test]
-fn the_whole_suite_runs_on_the_emulator() {
+fn checks_run_on_the_emulator_and_are_reported() {
     let home = Home::new();
-    let report = home.dimos("adapter test yourarm --address sim --report r.md --json").with(0).json();
+    // All of them are run by `adding_an_arm`, and for every arm by `conformance`.
+    let report = home.dimos("adapter test yourarm --address sim --only stop --report r.md --json").with(0).json();
     assert_eq!((&report["simulated"], &report["passed"]), (&true.into(), &true.into()));
     let checks = report["checks"].as_array().unwrap();
     let count = |outcome: &str| checks.iter().filter(|check| check["outcome"] == outcome).count();
     assert_eq!(count("failed"), 0, "{checks:#?}");
-    assert!(count("passed") >= 45, "{checks:#?}");
+    assert!(count("passed") >= 8, "{checks:#?}");
     assert!(report["figures"]["rate"].as_f64().unwrap() > 20.0);
     assert_eq!(report["arm"]["serial"], "YA6-00042");
     let text = std::fs::read_to_string(home.path().join("r.md")).unwrap();
@@ -105,36 +106,40 @@ fn the_small_motion_stays_small_and_leaves_the_arm_as_it_was() {
     assert!(!emulator.enabled());
 }
 
-/// What is measured is what was emulated: the median of the joints, which does not depend on a moment in which this
-/// machine was busy.
+/// The accuracy is tested where the lag is computed; here, what goes over the wire, as far as the second joint.
 #[test]
-fn the_lag_of_an_arm_is_measured() {
-    let (emulator, address) = arm(&SimOptions { lag: 0.037, ..SimOptions::default() });
+fn the_lag_of_an_arm_is_measured_by_a_small_stream() {
+    let (emulator, address) = arm(&SimOptions::default());
     let home = Home::new();
     let line = format!("adapter test yourarm --address {address} --only row --lag");
     home.dimos(&line).with(2).says(&["--lag moves the arm", "hint: add --allow-motion"]);
     assert!(!requests(&emulator).iter().any(|request| matches!(request, Request::Enable(_))));
-    let report = home.dimos(&format!("{line} --allow-motion --yes --json --report r.md")).with(0).json();
-    let lag = &report["lag"];
-    let median = lag["median"].as_f64().unwrap();
-    assert!((median - 0.037).abs() < 0.002, "{lag:#}");
-    assert!(lag["largest"].as_f64().unwrap() >= median && lag["row"] == 0.03, "{lag:#}");
-    assert_eq!(lag["joints"].as_array().unwrap().len(), 6);
-    let text = std::fs::read_to_string(home.path().join("r.md")).unwrap();
-    assert!(text.contains(" ms (row: 30 ms; set hardware.arm.lag: 0.0"), "{text}");
+    let test = home.start(&format!("{line} --allow-motion --yes"));
+    test.until("lag of joint 2");
+    test.end(Signal::INT).with(130);
     let streamed = |request: &Request| match request {
         Request::ServoJoints(target) => target.iter().zip(START).all(|(a, b)| (a - b).abs() < 2.01),
         other => !other.moves(),
     };
-    assert!(requests(&emulator).iter().all(streamed));
+    let asked = requests(&emulator);
+    assert!(asked.iter().all(streamed), "{asked:?}");
+    assert!(asked.iter().filter(|request| request.moves()).count() > 100, "{asked:?}");
     assert!(!emulator.enabled());
 }
 
-/// A mock arm needs no confirmation: nothing can be damaged.
+/// What is measured is what was emulated. A mock arm needs no confirmation: nothing can be damaged.
 #[test]
 fn the_lag_of_a_mock_is_measured_without_a_question() {
-    let ended = Home::new().dimos("adapter test mock --dof 1 --only row --lag").with(0);
-    assert!(ended.out.contains(" ms (row: 20 ms; set hardware.arm.lag: 0.0"), "{}", ended.out);
+    let home = Home::new();
+    let line = "adapter test mock --dof 1 --option lag=0.037 --only row --lag --json --report r.md";
+    let report = home.dimos(line).with(0).json();
+    let lag = &report["lag"];
+    let median = lag["median"].as_f64().unwrap();
+    assert!((median - 0.037).abs() < 0.002, "{lag:#}");
+    assert!(lag["largest"].as_f64().unwrap() >= median && lag["row"] == 0.02, "{lag:#}");
+    assert_eq!(lag["joints"].as_array().unwrap().len(), 1);
+    let text = std::fs::read_to_string(home.path().join("r.md")).unwrap();
+    assert!(text.contains(" ms (row: 20 ms; set hardware.arm.lag: 0.0"), "{text}");
 }
 
 #[test]

@@ -126,7 +126,9 @@ fn coordinator_so101() {
 
 #[test]
 fn coordinator_fr3() {
-    exercise("coordinator-fr3", &[Arm { name: "arm", target: FR3, gripper: None }]);
+    // Its controller waits for late commands: the computer of a test may be busy.
+    let patient = "coordinator-fr3 --set hardware.arm.options.sim.patience=0.1";
+    exercise(patient, &[Arm { name: "arm", target: FR3, gripper: None }]);
 }
 
 #[test]
@@ -153,7 +155,6 @@ fn every_shipped_blueprint_is_without_mistakes_and_starts() {
     for blueprint in shipped {
         let name = blueprint["name"].as_str().unwrap();
         assert_eq!(blueprint["problem"], Value::Null, "{name}");
-        home.dimos(&format!("check {name} --sim")).with(0);
         let started = home.dimos(&format!("run {name} --sim --no-record --duration 200ms")).with(0);
         let phase = if WITH_BRAKES.contains(&name) { "ur at sim, disabled" } else { "ready" };
         started.says(&[&format!("run {name}  "), phase, "duration reached"]);

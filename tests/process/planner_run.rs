@@ -345,8 +345,9 @@ fn moves_to_a_pose_and_home(blueprint: &str, arms: &[(&str, &str)]) {
     let _run = home.run(&format!("{blueprint} --sim --no-record"));
     for (arm, pose) in arms {
         home.dimos(&format!("move {arm} --pose {pose} --speed 1")).with(0);
-        home.dimos(&format!("move {arm} --named home --speed 1")).with(0).says(&["planned, collision-checked"]);
     }
+    let goals: Vec<String> = arms.iter().map(|(arm, _)| format!("--goal {arm}=named:home")).collect();
+    home.dimos(&format!("move {} --speed 1", goals.join(" "))).with(0).says(&["planned, collision-checked"]);
 }
 
 macro_rules! shipped {

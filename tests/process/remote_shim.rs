@@ -146,7 +146,7 @@ fn an_adapter_of_the_guide_conforms_behind_the_shim() {
             let mine = std::iter::from_fn(|| all.get(next.fetch_add(1, Ordering::Relaxed)).copied());
             mine.map(|check| (check, run(&row, check, None))).collect::<Vec<_>>()
         };
-        let lanes: Vec<_> = (0..3).map(|_| scope.spawn(lane)).collect();
+        let lanes: Vec<_> = (0..5).map(|_| scope.spawn(lane)).collect();
         lanes.into_iter().flat_map(|lane| lane.join().unwrap()).collect()
     });
     let mut failures = Vec::new();

@@ -26,7 +26,7 @@ const TOP_SPEED: [f64; 6] = [180.0, 180.0, 180.0, 360.0, 360.0, 360.0];
 const ACCELERATION: f64 = 10.0;
 
 fn times() -> usize {
-    std::env::var("DIMOS_STALLS").ok().and_then(|n| n.parse().ok()).unwrap_or(4)
+    std::env::var("DIMOS_STALLS").ok().and_then(|n| n.parse().ok()).unwrap_or(2)
 }
 
 /// The emulator in its own process, the wire in this one, and a run in a third.

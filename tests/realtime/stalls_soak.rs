@@ -2,7 +2,7 @@
 //! real-time permission: no arm is held. Only a hold at which a processor ran no program at all for 100 ms (the host of
 //! a virtual machine did not schedule it) is not counted: it is printed, the arm is reset, and the soak continues.
 //! Every other hold fails it; how long an ordinary thread of the test waited for a processor at that time is printed.
-//! `DIMOS_SOAK` is the duration [s] (10), `DIMOS_SOAK_BUSY` the number of busy processes (8), `DIMOS_SOAK_ALL=1` takes
+//! `DIMOS_SOAK` is the duration [s] (5), `DIMOS_SOAK_BUSY` the number of busy processes (8), `DIMOS_SOAK_ALL=1` takes
 //! every shipped blueprint.
 
 use std::collections::{HashMap, HashSet};
@@ -228,7 +228,7 @@ fn watched(names: &[String], realtime: bool, time: f64, idle: &mut Vec<String>) 
 
 fn soak(realtime: bool) {
     let (host, ordinary) = (Watch::of_processors(), Watch::of_ordinary_threads());
-    let time = number("DIMOS_SOAK", 10.0);
+    let time = number("DIMOS_SOAK", 5.0);
     // A few at a time: all of them share two cores with the busy ones.
     let (mut holds, mut idle) = (Vec::new(), Vec::new());
     blueprints().chunks(3).for_each(|names| holds.extend(watched(names, realtime, time, &mut idle)));

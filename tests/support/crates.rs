@@ -1,39 +1,53 @@
-//! Builds crates that use this checkout, in its own `target` folder: what is built there already is used again, and
-//! dimos itself is compiled once for all of them.
+//! Builds crates that use this checkout with what is built for this test. Cargo takes a build for the same if package,
+//! version, features and profile are, and the path from the root of the workspace: so a crate and a copy of the
+//! checkout's manifest, beside links to its sources, are made one workspace. Nothing of dimos is compiled again.
 
 use std::fs;
+use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use rustix::fs::{AtFlags, CWD, Timespec, Timestamps, utimensat};
+
 /// The checkout that is tested.
 pub const CHECKOUT: &str = env!("CARGO_MANIFEST_DIR");
-
-/// Only the code of these crates is of interest: dimos needs no debug information and is not compiled again.
-const CONFIG: &str = "[build]\nincremental = false\n\n[profile.dev.package.dimos]\ndebug = false\n";
+/// What cargo looks at in it.
+const SOURCES: [&str; 7] = ["assets", "benches", "blueprints", "build.rs", "src", "tests", ".git"];
 
 /// The folder of the programs that cargo builds for this test.
 pub fn programs() -> PathBuf {
     Path::new(env!("CARGO_BIN_EXE_dimos")).parent().unwrap().to_owned()
 }
 
-/// Lets the crate in a folder use what is built for this test. The same versions and the same features of all
-/// libraries: Cargo.lock is the checkout's, and its development dependencies, which enable features of others, are
-/// added to those of the crate.
+/// Lets the crate in a folder use what is built for this test; the folder above becomes the workspace. The same
+/// versions and the same features of all libraries: Cargo.lock is the checkout's, and its development dependencies,
+/// which enable features of others, are added to those of the crate.
 pub fn share_builds(folder: &Path) {
     if folder.join("target").exists() {
         return;
     }
-    let checkout = Path::new(CHECKOUT);
-    fs::copy(checkout.join("Cargo.lock"), folder.join("Cargo.lock")).unwrap();
-    std::os::unix::fs::symlink(programs().parent().unwrap(), folder.join("target")).unwrap();
-    fs::create_dir_all(folder.join(".cargo")).unwrap();
-    fs::write(folder.join(".cargo/config.toml"), CONFIG).unwrap();
+    let (checkout, root) = (Path::new(CHECKOUT), folder.parent().unwrap());
+    // Cargo takes the time of a link for a change of the folder.
+    let old = Timestamps { last_access: Timespec::default(), last_modification: Timespec { tv_sec: 1, tv_nsec: 0 } };
+    for name in SOURCES {
+        symlink(checkout.join(name), root.join(name)).unwrap();
+        utimensat(CWD, root.join(name), &old, AtFlags::SYMLINK_NOFOLLOW).unwrap();
+    }
+    let target = programs().parent().unwrap().to_owned();
+    symlink(&target, root.join("target")).unwrap();
+    symlink(&target, folder.join("target")).unwrap();
+    fs::copy(checkout.join("Cargo.lock"), root.join("Cargo.lock")).unwrap();
     let used = fs::read_to_string(checkout.join("Cargo.toml")).unwrap();
+    let workspace = format!("{used}\n[workspace]\nmembers = [{:?}]\n", folder.file_name().unwrap());
+    fs::write(root.join("Cargo.toml"), workspace).unwrap();
     let used = used.split("[dev-dependencies]\n").nth(1).unwrap().split("\n[").next().unwrap();
     let manifest = fs::read_to_string(folder.join("Cargo.toml")).unwrap();
-    assert_eq!(manifest.matches("[dependencies]\n").count(), 1, "{manifest}");
+    let path = format!("path = {:?} }}", fs::canonicalize(checkout).unwrap());
+    for once in ["[dependencies]\n", &path] {
+        assert_eq!(manifest.matches(once).count(), 1, "{once} in {manifest}");
+    }
     let manifest = manifest.replace("[dependencies]\n", &format!("[dependencies]\n{}\n", used.trim()));
-    fs::write(folder.join("Cargo.toml"), manifest).unwrap();
+    fs::write(folder.join("Cargo.toml"), manifest.replace(&path, "path = \"..\" }")).unwrap();
 }
 
 /// Removes what the cargo that runs this test has set. With its `CARGO_PKG_NAME` or `OUT_DIR`, build scripts such as
@@ -42,9 +56,11 @@ pub fn without_cargo_settings(command: &mut Command) -> &mut Command {
     for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("CARGO_") && name != "CARGO_HOME") {
         command.env_remove(name);
     }
-    // As many jobs as the outer build may have.
-    if let Some(jobs) = std::env::var_os("CARGO_BUILD_JOBS") {
-        command.env("CARGO_BUILD_JOBS", jobs);
+    // As many jobs as the outer build may have, and builds of the same kind.
+    for name in ["CARGO_BUILD_JOBS", "CARGO_INCREMENTAL"] {
+        if let Some(value) = std::env::var_os(name) {
+            command.env(name, value);
+        }
     }
     command.env_remove("OUT_DIR").env("CARGO_NET_OFFLINE", "true")
 }

@@ -21,6 +21,8 @@
 //! ```
 //!
 //! The test then starts its own executable again, inside the guest, for that one test, and the body runs there.
+//! The guest boots as long as most tests take: [`parts_in_guest`] makes several in one.
+//!
 //! [`VCAN`] sets up `vcan0` and `vcan1`; [`VXCAN`] also the pairs `can0`–`sim0` and `can1`–`sim1`: what one end of a
 //! pair sends, the other hears. A vendor's SDK that sends without local loopback needs a pair: the SDK on `can0`
 //! (`Command::new(".venv/bin/python")` in the body; the checkout is the working directory), the emulator on `sim0`.
@@ -91,7 +93,7 @@ pub struct Ran {
 /// Runs `body` in a guest: here, it starts the guest with the same test; in the guest, it runs the body. `module` is
 /// the test's `module_path!()`, `name` the name of its function.
 pub fn in_guest(module: &str, name: &str, guest: &Guest, body: impl FnOnce()) {
-    if std::env::var_os(INSIDE).is_some() {
+    if inside() {
         return body();
     }
     let name = module.split_once("::").map_or(name.to_owned(), |(_, inner)| format!("{inner}::{name}"));
@@ -101,6 +103,57 @@ pub fn in_guest(module: &str, name: &str, guest: &Guest, body: impl FnOnce()) {
     assert_eq!(ran.status, 0, "in the guest:\n{}", ran.output);
     assert!(ran.output.contains("1 passed"), "no test is named {name}:\n{}", ran.output);
     println!("{}", ran.output);
+}
+
+/// What one of several tests in one guest does, after its setup, without the interfaces of the part before.
+pub struct Part {
+    pub name: &'static str,
+    pub setup: &'static str,
+    pub body: fn(),
+}
+
+/// The table of parts: `name: setup;`, each the name of a function.
+#[allow(unused_macros, reason = "each test binary uses a part")]
+macro_rules! parts {
+    ($($name:ident: $setup:expr;)*) => {
+        [$($crate::support::uml::Part { name: stringify!($name), setup: $setup, body: $name }),*]
+    };
+}
+#[allow(unused_imports, reason = "each test binary uses a part")]
+pub(crate) use parts;
+
+/// Removes all CAN interfaces. With one end of a pair, the other goes too.
+const CLEAR: &str = "
+    for link in $(ls /sys/class/net); do case $link in *can*|sim*)
+        [ ! -e /sys/class/net/$link ] || ip link del $link || [ ! -e /sys/class/net/$link ];; esac; done\n";
+
+/// Runs parts one after another in one guest, all of them even if one fails. Like [`in_guest`].
+pub fn parts_in_guest(module: &str, name: &str, guest: &Guest, parts: &[Part]) {
+    in_guest(module, name, guest, || {
+        let fails = |part: &&Part| {
+            let began = Instant::now();
+            println!("--- {}", part.name);
+            let made = std::panic::catch_unwind(|| {
+                sh(&format!("{CLEAR}{}", part.setup));
+                (part.body)();
+            });
+            println!("{}: {:.1} s", if made.is_ok() { "passed" } else { "FAILED" }, began.elapsed().as_secs_f64());
+            made.is_err()
+        };
+        let failed: Vec<&str> = parts.iter().filter(fails).map(|part| part.name).collect();
+        assert!(failed.is_empty(), "{} parts failed: {}", failed.len(), failed.join(", "));
+    });
+}
+
+/// Whether this is the guest.
+pub fn inside() -> bool {
+    std::env::var_os(INSIDE).is_some()
+}
+
+/// Returns what `test` says when it fails; `None` if it does not, as without tools.
+pub fn failure(test: impl FnOnce() + std::panic::UnwindSafe) -> Option<String> {
+    let panic = std::panic::catch_unwind(test).err()?;
+    Some(*panic.downcast::<String>().expect("a message"))
 }
 
 /// Runs a shell script in a guest, as root, in the checkout; the first command that fails ends it. `None`, and a word

@@ -1,5 +1,6 @@
 //! The faults of `docs/faults.md` that need a process, a wire or a real clock. A test's name begins with the id of its
 //! fault. Each test prints what it measured. Faults that need none of these are in `tests/logic/faults`.
+//! `DIMOS_REPEATS` is the number of measurements of a reaction time (3).
 
 mod arms;
 mod process;
@@ -22,7 +23,9 @@ const ACCELERATION: f64 = 10.0;
 /// Rounding error of an angle on the wire [deg]: half a step of an f32 near 270.
 const ROUNDING: f64 = 1.6e-5;
 /// Measurements of a reaction time. Their median is judged: a single one depends more on the machine than on the run.
-const REPEATS: usize = 5;
+fn repeats() -> usize {
+    std::env::var("DIMOS_REPEATS").ok().and_then(|n| n.parse().ok()).unwrap_or(3)
+}
 
 fn now() -> Mono {
     MonotonicClock.now()
@@ -40,7 +43,7 @@ fn at(arm: &YourArmEmulator) -> String {
 /// Measures a reaction time several times, prints all figures [ms] and judges their median.
 #[track_caller]
 fn within(what: &str, limit_ms: f64, mut measure: impl FnMut() -> f64) {
-    judge(what, limit_ms, (0..REPEATS).map(|_| measure()).collect());
+    judge(what, limit_ms, (0..repeats()).map(|_| measure()).collect());
 }
 
 #[track_caller]

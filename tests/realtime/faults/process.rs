@@ -135,7 +135,7 @@ fn f22_a_tick_that_hangs_leaves_the_arm_held_and_ends_the_run() {
 
 #[test]
 fn a_tick_that_gets_no_processor_for_70_ms_holds_no_arm() {
-    for _ in 0..REPEATS {
+    for _ in 0..repeats() {
         let home = Home::new();
         let arm = arm();
         let mut child = moving_child(&home, &arm, "wait");
@@ -155,7 +155,7 @@ fn a_tick_that_gets_no_processor_for_70_ms_holds_no_arm() {
 
 #[test]
 fn f24_what_was_logged_before_kill_9_can_be_read() {
-    const KILLS: usize = 10;
+    const KILLS: usize = 6;
     let mut random = random();
     let mut losses = Vec::new();
     for kill in 0..KILLS {

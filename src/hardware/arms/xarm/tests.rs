@@ -359,8 +359,13 @@ fn an_arm_in_error_is_disabled_all_the_same() {
 fn grippers_conform() {
     let gripper = |check: &&Check| check.name.contains("gripper");
     assert_eq!(checks().filter(gripper).count(), 4);
-    for (check, gripper) in checks().filter(gripper).flat_map(|check| [(check, "xarm"), (check, "xarm_g2")]) {
-        let subject = Subject { config: config("", 6, json!({ "gripper": gripper })), ..Subject::emulated(&SPEC) };
-        assert_eq!(run_on(&subject, check).0, Outcome::Passed, "{gripper}: {}", check.name);
-    }
+    std::thread::scope(|scope| {
+        for (check, gripper) in checks().filter(gripper).flat_map(|check| [(check, "xarm"), (check, "xarm_g2")]) {
+            scope.spawn(move || {
+                let config = config("", 6, json!({ "gripper": gripper }));
+                let subject = Subject { config, ..Subject::emulated(&SPEC) };
+                assert_eq!(run_on(&subject, check).0, Outcome::Passed, "{gripper}: {}", check.name);
+            });
+        }
+    });
 }

@@ -6,7 +6,7 @@ use super::emulator::Withhold;
 use super::tests::{config, pair, read, ready, sent, set};
 use super::{MODES_WITHOUT_VELOCITY, SPEC};
 use crate::hardware::adapter::ManipulatorAdapter;
-use crate::hardware::conformance::{Outcome, Subject, checks, run_on};
+use crate::hardware::conformance::{Outcome, Subject, checks, run_all};
 use crate::hardware::registry::{AdapterSpec, Emulator};
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::joint::ControlMode;
@@ -32,15 +32,8 @@ fn other_models_options_and_firmwares_conform_too() {
             _ => false,
         };
         let all: Vec<_> = checks().filter(|check| !differs(check.name)).collect();
-        // Some at a time: each has an emulator of its own that reports 250 times a second.
-        for some in all.chunks(16) {
-            std::thread::scope(|scope| {
-                let threads: Vec<_> = some.iter().map(|c| (c.name, scope.spawn(|| run_on(&subject, c).0))).collect();
-                for (name, thread) in threads {
-                    let outcome = thread.join().unwrap();
-                    assert!(!matches!(outcome, Outcome::Failed(_)), "{options} {name}: {outcome:?}");
-                }
-            });
+        for (check, outcome, _) in run_all(&subject, &all, &|_, _| (), &|| false) {
+            assert!(!matches!(outcome, Outcome::Failed(_)), "{options} {}: {outcome:?}", check.name);
         }
     }
 }
