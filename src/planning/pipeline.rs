@@ -3,16 +3,17 @@
 use std::collections::BTreeMap;
 use std::time::Instant;
 
+use glamx::DVec3;
 use nalgebra::{Isometry3, Vector3};
 
 use super::goals;
 use super::padded::{GivenUp, Near, Padded};
 use super::path::{Path, between, distance, length, unwind};
-use super::path_planner::{PlanError, PlanSettings, plan};
+use super::path_planner::{PlanError, PlanSettings, describe_outside, plan};
 use super::planning_scene::{PlannedRobot, PlanningScene};
 use super::start_contact::{EscapePath, passes};
 use super::timing::{TimingSettings, bounds, time};
-use crate::collision::world::World;
+use crate::collision::world::{Robot, World};
 use crate::collision::{CollisionChecker, Stop};
 use crate::robot::kinematics::frame;
 use crate::robot::model::Limits;
@@ -27,6 +28,8 @@ const SAME_CONFIGURATION: f64 = 1e-3;
 /// Additional padding during the search [m]: between the points of its trajectory, a motion deviates slightly from the
 /// checked path and must still pass a later check.
 const EXTRA_PADDING: f64 = 2e-4;
+/// Distance at which nothing can touch [m].
+const OUT_OF_REACH: f64 = 1e5;
 /// Duration of the motion of robots that are already at the goal [s].
 const STATIONARY_DURATION: f64 = 0.1;
 
@@ -74,6 +77,8 @@ pub struct PlannedMotion {
     pub padding: f64,
     /// Exceptions from the padding.
     pub given_up: Vec<GivenUp>,
+    /// Joints of the goal that were moved to their limits: name, requested and used position [rad or m].
+    pub clamped: Vec<(String, f64, f64)>,
     /// The part of a straight line that was followed.
     pub fraction: Option<f64>,
     /// Duration of each stage [s].
@@ -121,6 +126,8 @@ pub(super) struct Stage<'a> {
     pub start: Vec<f64>,
     /// Checker of all robots and obstacles.
     pub checker: Padded,
+    /// One checker per moving robot, without the other moving ones; empty if only one robot moves.
+    pub apart: Vec<Padded>,
 }
 
 /// Plans a motion. The same scene, world and request give the same motion unless the timeout is reached.
@@ -139,6 +146,7 @@ pub fn solve(
         times.insert(name.to_owned(), since.elapsed().as_secs_f64());
         Instant::now()
     };
+    let mut clamped = Vec::new();
     let (path, fraction) = match request.goals.as_slice() {
         [(_, Goal::Line(target))] => {
             let (path, fraction) = goals::line(&mut stage, &frame(target), stop)?;
@@ -160,6 +168,9 @@ pub fn solve(
             let start = stage.start.clone();
             let found =
                 plan(&mut stage.checker, &start, &goals, &settings, stop).map_err(|e| failure_for(&stage, &e))?;
+            let used = |joint: usize| Some((stage.joints.get(joint)?.clone(), *found.path.last()?.get(joint)?));
+            let moved = found.clamped.iter().filter_map(|(joint, asked)| Some((*asked, used(*joint)?)));
+            clamped = moved.map(|(asked, (joint, used))| (joint, asked, used)).collect();
             times.insert("search".into(), found.search_time.as_secs_f64());
             times.insert("shorten".into(), found.shorten_time.as_secs_f64());
             (found.path, None)
@@ -179,7 +190,7 @@ pub fn solve(
     let at_end = |given_up: &&GivenUp| given_up.near != Near::Goal || reached(&given_up.center);
     let given_up = stage.checker.given_up().iter().filter(at_end).cloned().collect();
     let (robots, padding) = (stage.indices, setup.padding);
-    Ok(PlannedMotion { robots, path, trajectory, clearance, escape_path, padding, given_up, fraction, times })
+    Ok(PlannedMotion { robots, path, trajectory, clearance, escape_path, padding, given_up, clamped, fraction, times })
 }
 
 /// Builds the scene of one request: `moving` robots by index, all others fixed at their positions [rad], with `padding`
@@ -208,8 +219,34 @@ pub(super) fn stage<'a>(
         limits.extend_from_slice(&robot.limits);
         start.extend_from_slice(at);
     }
+    let several = if indices.len() > 1 { indices.as_slice() } else { &[] };
+    let apart = several.iter().map(|own| apart(setup, world, &bodies, (*own, moving), positions, padding));
+    let apart = apart.collect::<Result<_, _>>()?;
     let checker = Padded::new(world.with_robots(bodies).snapshot(), padding);
-    Ok(Stage { robots, indices, joints, limits, start, checker })
+    Ok(Stage { robots, indices, joints, limits, start, checker, apart })
+}
+
+/// Returns the checker of one moving robot alone with everything that does not move.
+fn apart(
+    setup: &PlanningScene,
+    world: &World,
+    bodies: &[Robot],
+    (own, moving): (usize, &[usize]),
+    positions: &[Vec<f64>],
+    padding: f64,
+) -> Result<Padded, PlanFailure> {
+    let mut bodies = bodies.to_vec();
+    for other in moving.iter().filter(|other| **other != own) {
+        let (Some(robot), Some(at), Some(body)) =
+            (setup.robots.get(*other), positions.get(*other), bodies.get_mut(*other))
+        else {
+            continue;
+        };
+        *body = robot.fixed_at(at).map_err(PlanFailure::new)?;
+        // Out of reach with what it holds: held objects refer to their robot by its number.
+        body.base.translation += DVec3::splat(OUT_OF_REACH);
+    }
+    Ok(Padded::new(world.with_robots(bodies).snapshot(), padding))
 }
 
 /// Converts a path planner's error to a failure with joint names.
@@ -219,8 +256,8 @@ fn failure_for(stage: &Stage<'_>, error: &PlanError) -> PlanFailure {
             let name = stage.joints.get(*joint).map_or("a joint", String::as_str);
             let kinds = stage.robots.iter().flat_map(|robot| robot.body.kinematics.kinds());
             let unit = { kinds }.nth(*joint).map_or("rad", |kind| kind.unit());
-            let limits = format!("{lower:.4} … {upper:.4} {unit}");
-            PlanFailure::new(format!("{which}: {name} at {position:.4} {unit} is outside its limits {limits}"))
+            let position = describe_outside(*position, *lower, *upper, &format!(" {unit}"));
+            PlanFailure::new(format!("{which}: {name} is at {position}"))
                 .hint("the narrower limits of model and arm apply, and commands stay 0.01 rad inside those of the arm; `dimos state` shows the joint positions")
         }
         PlanError::Collides { which: "start", .. } => PlanFailure::new(error.to_string())

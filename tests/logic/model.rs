@@ -131,7 +131,7 @@ fn what_urdf_rs_takes_for_a_robot_is_checked_all_the_same() {
         RobotModel::try_from(&robot).unwrap_err().to_string()
     };
     assert!(with(&|robot| robot.joints[1].child.link = "link1".into()).contains("two parents"));
-    assert!(with(&|robot| robot.joints[0].joint_type = urdf_rs::JointType::Floating).contains("are not supported"));
+    assert!(with(&|robot| robot.joints[3].joint_type = urdf_rs::JointType::Floating).contains("are not supported"));
     assert!(with(&|robot| drop(robot.joints.pop())).contains("both have no parent"));
 }
 
