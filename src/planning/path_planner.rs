@@ -76,7 +76,7 @@ pub enum PlanError {
     #[error("no goal given")]
     NoGoal,
     /// A position is outside its limits.
-    #[error("joint {joint} of the {which} is at {}", describe_outside(*.position, *.lower, *.upper, ""))]
+    #[error("joint {joint} of the {which} is at {}", describe_outside(*.position, *.lower, *.upper))]
     Outside {
         /// "start" or "goal".
         which: &'static str,
@@ -108,12 +108,16 @@ pub enum PlanError {
     Exhausted(SearchCount),
 }
 
-/// Returns a position and the limits that it is outside of, with enough digits to tell them apart.
-pub(super) fn describe_outside(position: f64, lower: f64, upper: f64, unit: &str) -> String {
+/// Returns the number of digits that tell a position from the limit that it exceeds.
+pub(super) fn digits_outside(position: f64, lower: f64, upper: f64) -> usize {
     let limit = if position < lower { lower } else { upper };
     let same = |digits: &usize| format!("{position:.digits$}") == format!("{limit:.digits$}");
-    let digits = 4 + (4..9).take_while(same).count();
-    format!("{position:.digits$}{unit}, outside {lower:.digits$} to {upper:.digits$}{unit}")
+    4 + (4..9).take_while(same).count()
+}
+
+fn describe_outside(position: f64, lower: f64, upper: f64) -> String {
+    let digits = digits_outside(position, lower, upper);
+    format!("{position:.digits$}, outside {lower:.digits$} to {upper:.digits$}")
 }
 
 fn describe_contacts(contacts: &[Contact]) -> String {

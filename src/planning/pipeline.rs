@@ -9,7 +9,7 @@ use nalgebra::{Isometry3, Vector3};
 use super::goals;
 use super::padded::{GivenUp, Near, Padded};
 use super::path::{Path, between, distance, length, unwind};
-use super::path_planner::{PlanError, PlanSettings, describe_outside, plan};
+use super::path_planner::{PlanError, PlanSettings, digits_outside, plan};
 use super::planning_scene::{PlannedRobot, PlanningScene};
 use super::start_contact::{EscapePath, passes};
 use super::timing::{TimingSettings, bounds, time};
@@ -256,8 +256,9 @@ fn failure_for(stage: &Stage<'_>, error: &PlanError) -> PlanFailure {
             let name = stage.joints.get(*joint).map_or("a joint", String::as_str);
             let kinds = stage.robots.iter().flat_map(|robot| robot.body.kinematics.kinds());
             let unit = { kinds }.nth(*joint).map_or("rad", |kind| kind.unit());
-            let position = describe_outside(*position, *lower, *upper, &format!(" {unit}"));
-            PlanFailure::new(format!("{which}: {name} is at {position}"))
+            let digits = digits_outside(*position, *lower, *upper);
+            let limits = format!("{lower:.digits$} … {upper:.digits$} {unit}");
+            PlanFailure::new(format!("{which}: {name} at {position:.digits$} {unit} is outside its limits {limits}"))
                 .hint("the narrower limits of model and arm apply, and commands stay 0.01 rad inside those of the arm; `dimos state` shows the joint positions")
         }
         PlanError::Collides { which: "start", .. } => PlanFailure::new(error.to_string())

@@ -27,7 +27,7 @@ const SAME: f64 = 0.01;
 
 impl Ik<'_> {
     /// Same as [`Ik::solve`], but searches for the closest solution to `near` in a bounded number of attempts: for six
-    /// joints all branches are usually found, for more the closest point of each branch. Costs about 1–3 ms.
+    /// joints all branches are usually found, for more the closest point of each branch. Takes about five times as long.
     pub fn closest(
         &mut self,
         target: &DAffine3,

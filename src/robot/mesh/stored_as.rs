@@ -19,7 +19,7 @@ pub(super) fn refuse_other_files(bytes: &[u8]) -> Result<(), String> {
         let hint = "download the file itself: on GitHub, its `raw` address";
         return Err(format!("this is a web page, not a mesh\nhint: {hint}"));
     }
-    if bytes.is_empty() { Err("the file is empty".to_owned()) } else { Ok(()) }
+    Ok(())
 }
 
 /// Checks that an STL file is text, or binary of the length that its header states: a truncated or padded file would
