@@ -53,7 +53,7 @@ pub fn unpack(part: &Path, name: &str, to: &Path) -> Result<(), AssetError> {
     let mut file = File::open(part).map_err(in_part)?;
     let kind = kind(&mut file, name).map_err(in_part)?;
     let size = file.metadata().map_err(in_part)?.len();
-    let bytes = size.saturating_mul(MAX_RATIO).max(SMALL).min(MAX_BYTES);
+    let bytes = size.saturating_mul(MAX_RATIO).clamp(SMALL, MAX_BYTES);
     let mut budget = Budget { bytes, most: bytes, entries: MAX_ENTRIES };
     match kind {
         Kind::Tar => untar(BufReader::new(file), to, &mut budget),

@@ -43,10 +43,11 @@ fn a_goal_at_a_rounded_limit_is_moved_to_the_limit_and_reported() {
 
 #[test]
 fn a_position_and_its_limit_are_shown_with_digits_that_differ() {
-    let (lower, upper) = (-3.14159, 3.14159);
+    let pi = std::f64::consts::PI;
+    let upper = (pi * 1e5).floor() / 1e5;
+    let lower = -upper;
     let shown = |position| PlanError::Outside { which: "goal", joint: 6, position, lower, upper }.to_string();
     assert_eq!(shown(3.5), "joint 6 of the goal is at 3.5000, outside -3.1416 to 3.1416");
-    let pi = std::f64::consts::PI;
     assert_eq!(shown(pi), "joint 6 of the goal is at 3.141593, outside -3.141590 to 3.141590");
     assert_eq!(shown(-pi), "joint 6 of the goal is at -3.141593, outside -3.141590 to 3.141590");
 }

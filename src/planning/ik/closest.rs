@@ -21,9 +21,10 @@ const MAX_STEP: f64 = 0.3;
 const MIN_PART: f64 = 1.0 / 64.0;
 /// A motion shorter than this makes no difference [rad or m].
 const MIN_MOTION: f64 = 1e-6;
-/// Solutions closer to each other than this count as one: steps towards the seed from several starts end close to each
-/// other [rad].
+/// Solutions closer to each other than this count as one [rad].
 const SAME: f64 = 0.01;
+/// The same for redundant arms: steps towards the seed from several starts end beside each other.
+const SAME_BRANCH: f64 = 0.3;
 
 impl Ik<'_> {
     /// Same as [`Ik::solve`], but searches for the closest solution to `near` in a bounded number of attempts: for six
@@ -50,13 +51,19 @@ impl Ik<'_> {
                 found.push(self.q.clone());
             }
         }
-        let moved: Vec<Vec<f64>> = found.iter().map(|q| self.approach(target, near, q, settings)).collect();
-        found.extend(moved);
+        for q in &mut found {
+            let moved = self.approach(target, near, q, settings);
+            if valid(&moved) {
+                *q = moved;
+            }
+        }
         found.retain(|q| valid(q));
         found.sort_by(|a, b| distance(near, a).total_cmp(&distance(near, b)));
+        let task = if settings.position_only { 3 } else { 6 };
+        let same = if near.len() > task { SAME_BRANCH } else { SAME };
         let mut apart: Vec<Vec<f64>> = Vec::new();
         for q in found {
-            if !apart.iter().any(|other| distance(other, &q) < SAME) {
+            if !apart.iter().any(|other| distance(other, &q) < same) {
                 apart.push(q);
             }
         }
