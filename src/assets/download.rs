@@ -11,7 +11,7 @@ use ureq::http::{Response, StatusCode};
 use ureq::tls::{Certificate, RootCerts, TlsConfig};
 
 use super::fetch::percent_decoded;
-use super::{AssetError, Progress};
+use super::{AssetError, Progress, without_password};
 
 /// Maximum file size [bytes].
 pub const MAX_BYTES: u64 = 4 << 30;
@@ -45,6 +45,7 @@ impl From<AssetError> for Interruption {
 /// Downloads a file to `part`, which may hold its beginning already.
 pub fn download(url: &str, part: &Path, progress: &mut dyn Progress) -> Result<(), AssetError> {
     if let Some(path) = url.strip_prefix("file://") {
+        let path = path.strip_prefix("localhost").unwrap_or(path);
         return copy(&PathBuf::from(percent_decoded(path)), part, progress);
     }
     let agent = agent(url.starts_with("https://"))?;
@@ -102,6 +103,10 @@ fn agent(encrypted: bool) -> Result<Agent, AssetError> {
         .timeout_per_read(Some(RECEIVE_TIMEOUT))
         .timeout_recv_body(Some(MAX_DURATION));
     if encrypted {
+        if let Some(file) = std::env::var_os("SSL_CERT_FILE").filter(|file| !Path::new(file).is_file()) {
+            let error = AssetError::new(format!("SSL_CERT_FILE: there is no file {}", Path::new(&file).display()));
+            return Err(error.hint("unset it to use the system's certificates, or correct its path"));
+        }
         // The system's certificates, so that a company's own CA is trusted as elsewhere on this computer.
         let found = rustls_native_certs::load_native_certs();
         let trusted: Vec<_> = found.certs.iter().map(|c| Certificate::from_der(c.as_ref()).to_owned()).collect();
@@ -131,7 +136,7 @@ fn connection(
     let request = if have > 0 { request.header("range", format!("bytes={have}-")) } else { request };
     let mut response = request.call().map_err(|error| unreachable(url, &error))?;
     let status = response.status();
-    let status_text = format!("{url}: the server answered {status}");
+    let status_text = format!("{}: the server answered {status}", without_password(url));
     match status {
         StatusCode::OK => {
             // The whole file, whatever was requested.
@@ -215,29 +220,43 @@ fn full_length<T>(response: &Response<T>) -> Option<u64> {
     range.strip_prefix("bytes */")?.trim().parse().ok()
 }
 
-/// Returns the error of a failed request.
+/// Returns the error of a failed request. Only failures that may pass are temporary.
 fn unreachable(url: &str, error: &ureq::Error) -> Interruption {
-    let offline = "if this computer is usually offline, run `dimos model assets fetch BLUEPRINT` while it is online";
-    let what = match error {
-        ureq::Error::HostNotFound => "unknown host name".to_owned(),
-        ureq::Error::ConnectionFailed => "the server cannot be reached".to_owned(),
-        ureq::Error::Timeout(_) => format!("no answer from the server ({error})"),
-        ureq::Error::BadUri(_) | ureq::Error::Http(_) => {
-            return Interruption::Permanent(AssetError::new(format!("{url} is not a valid address: {error}")));
-        }
-        ureq::Error::Rustls(_) | ureq::Error::Tls(_) => {
-            let error = AssetError::new(format!("{url}: no trusted connection: {error}"));
-            return Interruption::Permanent(
-                error.hint("set SSL_CERT_FILE to the certificates to trust, if they are not the system's"),
-            );
-        }
-        ureq::Error::Io(e) if e.get_ref().is_some_and(|inner| inner.is::<rustls::Error>()) => {
-            let error = AssetError::new(format!("{url}: no trusted connection: {e}"));
-            return Interruption::Permanent(
-                error.hint("set SSL_CERT_FILE to the certificates to trust, if they are not the system's"),
-            );
-        }
-        other => other.to_string(),
+    let (shown, encrypted) = (without_password(url), url.starts_with("https://"));
+    let permanent = |what: String, hint: &str| {
+        Interruption::Permanent(AssetError::new(format!("{shown}: {what}")).hint(hint.to_owned()))
     };
-    Interruption::Temporary(AssetError::new(format!("{url}: {what}")).hint(offline))
+    let temporary = |what: String, hint: &str| {
+        Interruption::Temporary(AssetError::new(format!("{shown}: {what}")).hint(hint.to_owned()))
+    };
+    let offline = "if this computer is usually offline, run `dimos model assets fetch BLUEPRINT` while it is online";
+    let address = "check the address: `url` in the blueprint's assets";
+    let certificates = "set SSL_CERT_FILE to the certificates to trust, if they are not the system's";
+    let other_protocol = match encrypted {
+        true => "the server does not speak TLS at this port: http:// instead of https://?",
+        false => "the server does not speak HTTP at this port: https:// instead of http://?",
+    };
+    let untrusted = |error: &rustls::Error| match error {
+        rustls::Error::InvalidMessage(_) => permanent(format!("no encrypted connection: {error}"), other_protocol),
+        _ => permanent(format!("no trusted connection: {error}"), certificates),
+    };
+    match error {
+        ureq::Error::HostNotFound => temporary("unknown host name".to_owned(), offline),
+        ureq::Error::ConnectionFailed => temporary("the server cannot be reached".to_owned(), offline),
+        ureq::Error::Timeout(_) => temporary(format!("no answer from the server ({error})"), offline),
+        ureq::Error::TooManyRedirects => permanent("the server redirects in a circle".to_owned(), address),
+        ureq::Error::BadUri(_) | ureq::Error::Http(_) => permanent(format!("not a valid address: {error}"), address),
+        ureq::Error::Protocol(_) => permanent(format!("the answer is not HTTP: {error}"), other_protocol),
+        ureq::Error::Rustls(error) => untrusted(error),
+        ureq::Error::Tls(_) => permanent(format!("no trusted connection: {error}"), certificates),
+        ureq::Error::Io(e) => match e.get_ref().and_then(|inner| inner.downcast_ref::<rustls::Error>()) {
+            Some(error) => untrusted(error),
+            None if e.kind() == io::ErrorKind::ConnectionRefused => {
+                let hint = "nothing listens at this address and port: check both, and whether the server runs";
+                temporary("connection refused".to_owned(), hint)
+            }
+            None => temporary(e.to_string(), offline),
+        },
+        other => temporary(other.to_string(), offline),
+    }
 }

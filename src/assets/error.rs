@@ -42,6 +42,7 @@ impl AssetError {
     /// Creates the error of a file with another checksum.
     #[cfg(feature = "fetch")]
     pub(super) fn other_file(url: &str, wanted: &str, found: &str) -> Self {
+        let url = super::without_password(url);
         let error = Self::new(format!("{url}: the SHA-256 of the file is {found}, expected {wanted}"));
         error.hint("if this is the intended file, update the checksum in the blueprint; the download was discarded")
     }

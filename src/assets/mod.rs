@@ -14,6 +14,8 @@ mod error;
 #[cfg(feature = "fetch")]
 mod fetch;
 #[cfg(feature = "fetch")]
+mod links;
+#[cfg(feature = "fetch")]
 mod unpack;
 
 #[cfg(test)]
@@ -46,6 +48,18 @@ pub struct Asset {
     pub sha256: String,
     /// Position in the blueprint: `cell.yaml:12:3`.
     pub place: String,
+}
+
+/// Returns a URL for messages: without the password that it may contain.
+pub fn without_password(url: &str) -> String {
+    let shown = || {
+        let (scheme, rest) = url.split_once("://")?;
+        let host = rest.split(['/', '?', '#']).next().unwrap_or_default();
+        let (login, _) = host.rsplit_once('@')?;
+        let (user, _) = login.split_once(':')?;
+        Some(format!("{scheme}://{user}:***{}", rest.get(login.len()..)?))
+    };
+    shown().unwrap_or_else(|| url.to_owned())
 }
 
 /// Receives the progress of a download.

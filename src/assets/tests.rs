@@ -203,8 +203,10 @@ fn an_unreachable_server_or_a_missing_file_is_reported() {
     let (folder, cache) = cache();
     let nobody = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
     let error = cache.fetch(&asset(&format!("http://{nobody}/a.zip"), b""), &mut NoProgress).unwrap_err();
-    assert!(error.what.contains(&nobody.to_string()), "{error}");
-    assert!(error.hint.unwrap().contains("dimos model assets fetch"));
+    assert!(error.what.contains(&format!("{nobody}/a.zip: connection refused")), "{error}");
+    assert!(error.hint.unwrap().contains("check both, and whether the server runs"));
+    let secret = cache.fetch(&asset(&format!("http://me:secret@{nobody}/a.zip"), b""), &mut NoProgress).unwrap_err();
+    assert!(secret.what.contains("http://me:***@") && !secret.what.contains("secret"), "{secret}");
 
     let server = FileServer::new(Vec::new(), &[Misdeed::Status(404)]);
     let error = cache.fetch(&asset(&server.url("a.zip"), b""), &mut NoProgress).unwrap_err();
@@ -236,9 +238,13 @@ fn archives_with_links_or_paths_outside_their_folder_are_rejected() {
         ("leads out", tar_gz(&[("ok", FILE, "1"), ("../evil", FILE, "2")])),
         ("leads out", tar_gz(&[("a/../../evil", FILE, "2")])),
         ("leads out", tar_gz(&[("/evil", FILE, "2")])),
-        ("is a link", tar_gz(&[("a", link, "/etc/passwd")])),
-        ("is a link", tar_gz(&[("a", link, ".."), ("a/evil", FILE, "2")])),
-        ("is a link", tar_gz(&[("a", tar::EntryType::Link, "/etc/passwd")])),
+        ("leads out of the archive", tar_gz(&[("a", link, "/etc/passwd")])),
+        ("leads out of the archive", tar_gz(&[("a", link, ".."), ("a/evil", FILE, "2")])),
+        ("leads out of the archive", tar_gz(&[("d/a", link, "../../evil")])),
+        ("leads out of the archive", tar_gz(&[("a", tar::EntryType::Link, "/etc/passwd")])),
+        ("a folder that contains it", tar_gz(&[("d/f", FILE, "1"), ("d/a", link, ".")])),
+        ("a folder that contains it", tar_gz(&[("f", FILE, "1"), ("d/a", link, "..")])),
+        ("unpacked (100 times the archive)", tar_gz(&[("bomb", FILE, &"0".repeat(70 << 20))])),
         ("neither file nor folder", tar_gz(&[("a", tar::EntryType::Fifo, "")])),
         ("leads out", zip_of(&[("ok", "1"), ("../evil", "2")])),
         ("leads out", zip_of(&[("/evil", "2")])),
@@ -260,7 +266,108 @@ fn archives_with_links_or_paths_outside_their_folder_are_rejected() {
     link.add_symlink("a", "/etc/passwd", zip::write::SimpleFileOptions::default()).unwrap();
     let bytes = link.finish().unwrap().into_inner();
     let error = cache.fetch(&asset(&put(folder.path(), "l.zip", &bytes), &bytes), &mut NoProgress).unwrap_err();
-    assert!(error.what.contains("is a link"), "{error}");
+    assert!(error.what.contains("leads out of the archive"), "{error}");
+}
+
+#[test]
+fn links_within_an_archive_become_copies() {
+    let (folder, cache) = cache();
+    let (link, hard) = (tar::EntryType::Symlink, tar::EntryType::Link);
+    let tar = tar_gz(&[
+        ("arm/urdf/second", link, "first.urdf"),
+        ("arm/urdf/first.urdf", link, "../robot.urdf"),
+        ("arm/robot.urdf", FILE, "<robot/>"),
+        ("arm/hard.urdf", hard, "arm/robot.urdf"),
+        ("arm/all", link, "meshes/"),
+        ("arm/meshes/a.stl", FILE, "solid"),
+        ("arm/lost", link, "not/part/of/it"),
+    ]);
+    let asset = asset(&put(folder.path(), "arm.tar.gz", &tar), &tar);
+    let at = cache.fetch(&asset, &mut NoProgress).unwrap().join("arm");
+    for (name, text) in [
+        ("urdf/second", "<robot/>"),
+        ("urdf/first.urdf", "<robot/>"),
+        ("hard.urdf", "<robot/>"),
+        ("all/a.stl", "solid"),
+    ] {
+        assert_eq!(fs::read_to_string(at.join(name)).unwrap(), text, "{name}");
+        assert!(!fs::symlink_metadata(at.join(name)).unwrap().is_symlink(), "{name}");
+    }
+    assert!(!at.join("lost").exists());
+}
+
+#[test]
+fn a_tar_is_unpacked_and_other_archives_are_refused_by_their_type() {
+    let (folder, cache) = cache();
+    let mut tar = Vec::new();
+    io::Read::read_to_end(&mut flate2::read::GzDecoder::new(&tar_gz(&[("a/b", FILE, "1")])[..]), &mut tar).unwrap();
+    let at = cache.fetch(&asset(&put(folder.path(), "a.tar", &tar), &tar), &mut NoProgress).unwrap();
+    assert_eq!(fs::read_to_string(at.join("a/b")).unwrap(), "1");
+    for (name, start) in [("a.tar.xz", &b"\xfd7zXZ\0"[..]), ("a.tar.bz2", b"BZh9"), ("a.tzst", b"\x28\xb5\x2f\xfd")] {
+        let bytes = [start, &noise(600)].concat();
+        let error = cache.fetch(&asset(&put(folder.path(), name, &bytes), &bytes), &mut NoProgress).unwrap_err();
+        assert!(error.what.contains("are not supported") && error.hint.unwrap().contains("tar.gz"), "{}", error.what);
+    }
+}
+
+#[test]
+fn a_damaged_gzip_checksum_is_found() {
+    let (folder, cache) = cache();
+    let mut bytes = tar_gz(&[("a", FILE, "text")]);
+    let crc = bytes.len() - 8;
+    bytes[crc] ^= 1;
+    let error = cache.fetch(&asset(&put(folder.path(), "a.tar.gz", &bytes), &bytes), &mut NoProgress).unwrap_err();
+    assert!(error.what.contains("the archive is damaged"), "{error}");
+}
+
+#[test]
+fn a_local_file_may_name_its_host() {
+    let (folder, cache) = cache();
+    let url = put(folder.path(), "a.urdf", b"<robot/>").replace("file://", "file://localhost");
+    assert!(cache.fetch(&asset(&url, b"<robot/>"), &mut NoProgress).unwrap().join("a.urdf").is_file());
+}
+
+#[test]
+fn wrong_protocols_and_circular_redirects_are_reported_at_once() {
+    use std::io::{BufRead, BufReader};
+    let (_folder, cache) = cache();
+    // Answers each connection with the same bytes, after the first line of a request.
+    let answering = |answer: String| {
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let address = listener.local_addr().unwrap();
+        let answer = answer.replace("HERE", &address.to_string());
+        std::thread::spawn(move || {
+            for mut client in listener.incoming().take(12).flatten() {
+                let mut line = Vec::new();
+                let _ = BufReader::new(&client).read_until(b'\n', &mut line);
+                let _ = client.write_all(answer.as_bytes());
+            }
+        });
+        address
+    };
+    let redirect = "HTTP/1.1 302 Found\r\nlocation: http://HERE/a\r\ncontent-length: 0\r\nconnection: close\r\n\r\n";
+    for (scheme, answer, what, hint) in [
+        ("http", redirect, "redirects in a circle", "check the address"),
+        ("http", "\x15\x03\x01\0\x02\x02\x46", "", "https:// instead of http://?"),
+    ] {
+        let url = format!("{scheme}://{}/a.zip", answering(answer.to_owned()));
+        let mut log = ProgressLog::default();
+        let error = cache.fetch(&asset(&url, b""), &mut log).unwrap_err();
+        assert!(error.what.contains(what) && error.hint.as_ref().unwrap().contains(hint), "{error:?}");
+        assert!(log.notes.is_empty(), "tried once: {:?}", log.notes);
+    }
+}
+
+#[test]
+fn passwords_are_not_shown() {
+    for (url, shown) in [
+        ("https://me:pw@host/a:b@c", "https://me:***@host/a:b@c"),
+        ("https://me@host/a", "https://me@host/a"),
+        ("file:///a:b@c", "file:///a:b@c"),
+        ("http://u:p:q@h:80/", "http://u:***@h:80/"),
+    ] {
+        assert_eq!(without_password(url), shown);
+    }
 }
 
 #[test]

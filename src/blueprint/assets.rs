@@ -130,7 +130,7 @@ fn address(checker: &mut Checker<'_>, url: &Located<String>) {
             let diag = Diag::error(format!("{} is not the URL of a file", quote(url)));
             checker.error(url.at, diag.hint("it starts with https://, http:// or file://"));
         }
-        Some(rest) if url.starts_with("file://") && !rest.starts_with('/') => {
+        Some(rest) if url.starts_with("file://") && !rest.starts_with('/') && !rest.starts_with("localhost/") => {
             let diag = Diag::error(format!("{} has no absolute path", quote(url)));
             checker.error(url.at, diag.hint("write file:// and the absolute path: file:///home/you/robot.zip"));
         }

@@ -4,7 +4,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::exit::{Exit, Failure, Result};
 use super::output;
-use crate::assets::{Asset, AssetError, Cache, Progress};
+use crate::assets::{Asset, AssetError, Cache, Progress, without_password};
 use crate::blueprint::Blueprint;
 
 /// Downloads missing assets of a blueprint; returns whether there were any.
@@ -18,7 +18,7 @@ pub fn missing(blueprint: &Blueprint) -> Result<bool> {
 
 /// Downloads an asset.
 pub fn one(asset: &Asset) -> Result<std::path::PathBuf> {
-    output::note(format_args!("fetching {} from {}", asset.name, asset.url));
+    output::note(format_args!("fetching {} from {}", asset.name, without_password(&asset.url)));
     let mut bar = Bar::new(&asset.name);
     let fetched = Cache::standard().fetch(asset, &mut bar);
     bar.0.finish_and_clear();

@@ -244,6 +244,10 @@ pub fn show(planned: &Planned) {
         (Some(clearance), None) => output::line(format_args!("  clearance {} mm", fixed(clearance * 1e3, 1))),
         _ => {}
     }
+    for clamped in &s.goal_clamped {
+        let (joint, used, requested) = (&clamped.joint, fixed(clamped.used, 6), fixed(clamped.requested, 6));
+        output::line(format_args!("  goal of {joint}: {used}, its limit, instead of {requested}"));
+    }
     for given_up in &s.padding_given_up {
         let where_ = match given_up.near.as_str() {
             "everywhere" => "in every configuration".to_owned(),

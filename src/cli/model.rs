@@ -1,10 +1,13 @@
 //! `dimos model …`: inspect robot descriptions. Needs no run.
 
 mod assets;
+mod chain;
 mod check;
+mod collide;
 mod fk;
 mod ik;
 mod info;
+mod meshes;
 
 use std::path::PathBuf;
 
@@ -35,6 +38,8 @@ enum Verb {
     Fk(fk::Args),
     /// Inverse kinematics: joint positions for a pose of a link
     Ik(ik::Args),
+    /// Distances of links at joint positions: what touches, what is close
+    Collide(collide::Args),
     /// Assets of a blueprint: list, fetch, clean
     Assets(assets::Args),
 }
@@ -91,14 +96,22 @@ impl File {
     /// Returns the robot; prints its mistakes and warnings to stderr.
     fn robot(&self, meshes: Meshes) -> Result<(RobotModel, Loaded)> {
         let mut loaded = self.load(meshes);
+        let Some(model) = loaded.model.take() else { return Err(self.refuse(&loaded)) };
         let text = loaded.render(output::colour(&std::io::stderr()));
         if !text.is_empty() {
             output::note(text.trim_end());
         }
-        match loaded.model.take() {
-            Some(model) => Ok((model, loaded)),
-            None => Err(Failure::usage(format!("{} has mistakes", self.file.display()))),
+        Ok((model, loaded))
+    }
+
+    /// Returns the failure of a description with mistakes, after printing them; of a file that cannot be read, the
+    /// reason.
+    fn refuse(&self, loaded: &Loaded) -> Failure {
+        if let Some(diag) = loaded.unreadable() {
+            return Failure { hint: diag.hint.clone(), ..Failure::usage(diag.message.clone()) };
         }
+        output::note(loaded.render(output::colour(&std::io::stderr())).trim_end());
+        Failure::usage(format!("{} has mistakes", self.file.display()))
     }
 }
 
@@ -111,6 +124,7 @@ pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
         Verb::Expand(file) => expand(file),
         Verb::Fk(args) => fk::run(args),
         Verb::Ik(args) => ik::run(args),
+        Verb::Collide(args) => collide::run(args),
         Verb::Assets(args) => assets::run(args, catalog),
     }
 }
@@ -118,13 +132,11 @@ pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
 /// Prints the URDF even of a robot with mistakes: it helps to find them.
 fn expand(file: &File) -> Result {
     let loaded = file.load(Meshes::Ignore);
+    let Some(urdf) = loaded.urdf() else { return Err(file.refuse(&loaded)) };
     let text = loaded.render(output::colour(&std::io::stderr()));
     if !text.is_empty() {
         output::note(text.trim_end());
     }
-    let Some(urdf) = loaded.urdf() else {
-        return Err(Failure::usage(format!("{} cannot be expanded", file.file.display())));
-    };
     if file.json {
         output::json(&serde_json::json!({"urdf": urdf, "files": loaded.files}));
     } else {

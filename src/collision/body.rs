@@ -9,9 +9,12 @@ use serde::Deserialize;
 
 use crate::robot::kinematics::frame;
 use crate::robot::mesh;
-use crate::robot::model::{Geometry, RobotModel};
+use crate::robot::model::{Geometry, RobotModel, Shape};
 
 use super::shape::{Mesh, ShapeError, Solid};
+
+/// Distance below which two centres are the same [m].
+const SAME_CENTER: f64 = 1e-6;
 
 /// Collision geometry of links that are described by meshes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, JsonSchema)]
@@ -61,7 +64,7 @@ pub fn solids(model: &RobotModel, mode: MeshMode) -> Result<Vec<Vec<Solid>>, Bod
 /// the mesh files.
 pub fn solids_of(model: &RobotModel, mode: impl Fn(&str) -> MeshMode) -> Result<Vec<Vec<Solid>>, BodyError> {
     let link = |link: &crate::robot::model::Link| {
-        let solid = |(i, shape): (usize, &crate::robot::model::Shape)| {
+        let solid = |(i, shape): (usize, &Shape)| {
             let bad = |error| BodyError::Shape { link: link.name.clone(), number: i + 1, error };
             let at = frame(&shape.origin);
             let one = match &shape.geometry {
@@ -77,10 +80,35 @@ pub fn solids_of(model: &RobotModel, mode: impl Fn(&str) -> MeshMode) -> Result<
             };
             one.map(|solid| vec![solid]).map_err(bad)
         };
-        let all = link.collisions.iter().enumerate().map(solid).collect::<Result<Vec<_>, _>>()?;
+        let shapes = with_capsules(&link.collisions);
+        let all = shapes.iter().map(|(number, shape)| (*number, shape)).map(solid).collect::<Result<Vec<_>, _>>()?;
         Ok(all.into_iter().flatten().collect())
     };
     model.links.iter().map(link).collect()
+}
+
+/// Returns the shapes of a link with their numbers, where a cylinder with a sphere of its radius at each end is one
+/// capsule: URDF has none, so that descriptions compose them. One capsule is faster to check than three shapes.
+fn with_capsules(shapes: &[Shape]) -> Vec<(usize, Shape)> {
+    let mut all: Vec<(usize, Shape)> = shapes.iter().cloned().enumerate().collect();
+    for (number, shape) in shapes.iter().enumerate() {
+        let Geometry::Cylinder { radius, length } = shape.geometry else { continue };
+        let end = |part: f64| {
+            let center = shape.origin * nalgebra::Point3::new(0.0, 0.0, part * length);
+            all.iter().find(|(_, other)| {
+                let same = matches!(other.geometry, Geometry::Sphere { radius: own } if (own - radius).abs() < 1e-9);
+                same && (other.origin.translation.vector - center.coords).norm() < SAME_CENTER
+            })
+        };
+        if let (Some((first, _)), Some((last, _))) = (end(-0.5), end(0.5)) {
+            let ends = [*first, *last];
+            all.retain(|(other, _)| !ends.contains(other));
+            if let Some((_, own)) = all.iter_mut().find(|(other, _)| *other == number) {
+                own.geometry = Geometry::Capsule { radius, length };
+            }
+        }
+    }
+    all
 }
 
 /// Returns the solids of a mesh: one, unless it is decomposed.

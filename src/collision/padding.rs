@@ -17,6 +17,12 @@ impl ExactChecker {
         self
     }
 
+    /// Sets the padding of all pairs [m], those of links of one robot included: to measure what is close.
+    pub fn with_margin(mut self, margin: f64) -> Self {
+        self.pads.fill(margin);
+        self
+    }
+
     /// Returns the padding of a pair [m], by its index in [`closer_than_padding`](Self::closer_than_padding).
     pub fn pad(&self, pair: usize) -> f64 {
         self.pads.get(pair).copied().unwrap_or(0.0)

@@ -157,6 +157,25 @@ fn pairs_that_always_touch_are_reported_by_name() {
 
 /// A motion reported as free is free at ten times any sampling density; a blocked one touches.
 #[test]
+fn a_cylinder_with_a_sphere_at_each_end_is_one_capsule() {
+    let shapes = |second: f64| {
+        let sphere = |z: f64, r: f64| {
+            format!("<collision><origin xyz='0 {z} 1'/><geometry><sphere radius='{r}'/></geometry></collision>")
+        };
+        let text = format!(
+            "<robot name='r'><link name='l'>{}<collision><origin xyz='0 0.2 1' rpy='1.5707963267948966 0 0'/><geometry>\
+             <cylinder radius='0.1' length='0.4'/></geometry></collision>{}</link></robot>",
+            sphere(0.0, 0.1),
+            sphere(0.4, second)
+        );
+        solids(&from_text("r.urdf", &text).unwrap(), MeshMode::Hull).unwrap().remove(0)
+    };
+    let [capsule] = &shapes(0.1)[..] else { panic!("{} solids", shapes(0.1).len()) };
+    assert!(matches!(capsule.core, super::shape::Core::Segment { half } if (half - 0.2).abs() < 1e-12));
+    assert_eq!((capsule.radius, shapes(0.11).len()), (0.1, 3));
+}
+
+#[test]
 fn a_free_motion_is_free_between_samples() {
     let mut random = Random::new(21);
     let (mut free, mut blocked) = (0, 0);

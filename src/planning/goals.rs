@@ -2,10 +2,11 @@
 
 use super::cartesian::{LineSettings, straight_line};
 use super::ik::{Ik, IkSettings};
-use super::padded::Near;
-use super::path::{Path, distance};
+use super::padded::{Near, Padded};
+use super::path::{Path, between, distance};
 use super::pipeline::{Goal, PlanFailure, Stage, late};
 use super::planning_scene::PlannedRobot;
+use crate::collision::report::{Contact, Pair};
 use crate::collision::{CollisionChecker, Stop};
 use crate::robot::kinematics::frame;
 use crate::robot::kinematics::step::rotation_between;
@@ -24,11 +25,14 @@ const SAME_PLACE: f64 = 5e-4;
 const SAME_TURN: f64 = 1.7e-3;
 /// Largest distance outside the limits for that [rad]: as for the start of a plan.
 const LIMIT_TOLERANCE: f64 = 0.02;
+/// Configurations checked on the piece of a line that is not free, to find what blocks it.
+const BLOCK_SAMPLES: u32 = 100;
 /// Part of a straight line that counts as complete.
 const COMPLETE: f64 = 1.0 - 1e-9;
 
-/// Returns goal configurations of all moving robots, several for a pose goal. Those of a single robot are
-/// collision-free if any is; otherwise the search reports what touches.
+/// Returns goal configurations of all moving robots, several for a pose goal. Those of one robot collide neither with
+/// itself nor with anything that is fixed, if any does not; otherwise the search reports what touches. Several moving
+/// robots may still collide with each other.
 pub(super) fn configurations(
     stage: &mut Stage<'_>,
     wanted: &[(usize, Goal)],
@@ -38,14 +42,12 @@ pub(super) fn configurations(
     // One list of configurations per robot; a combination of one from each is a goal of all.
     let mut all: Path = vec![Vec::new()];
     let mut first = 0;
-    let alone = stage.robots.len() == 1;
-    for (robot, index) in stage.robots.iter().zip(&stage.indices) {
+    for (number, (robot, index)) in stage.robots.iter().zip(&stage.indices).enumerate() {
         let own = stage.start.get(first..first + robot.joints.len()).unwrap_or_default().to_vec();
         first += robot.joints.len();
         let goal = wanted.iter().find(|(wanted, _)| wanted == index).map(|(_, goal)| goal);
-        let checker = &mut stage.checker;
-        let mut free =
-            |q: &[f64], padded: bool| !alone || if padded { checker.is_free(q) } else { checker.touches_nothing(q) };
+        let checker = stage.apart.get_mut(number).unwrap_or(&mut stage.checker);
+        let mut free = |q: &[f64], padded: bool| if padded { checker.is_free(q) } else { checker.touches_nothing(q) };
         let several = match goal {
             Some(Goal::Joints(values)) => {
                 // If the model's joint is continuous but the arm's range is limited, whole turns are the same goal.
@@ -143,16 +145,57 @@ pub(super) fn line(stage: &mut Stage<'_>, target: &DAffine3, stop: &Stop) -> Res
     if let Some(goal) = ahead.path.last().filter(|_| ahead.fraction >= COMPLETE) {
         checker.give_up(Near::Goal, goal);
     }
-    let line =
-        straight_line(&kinematics, robot.tcp(), &start, &in_root, &settings, |a, b| checker.motion_is_free(a, b, stop));
+    let mut blocked = None;
+    let line = straight_line(&kinematics, robot.tcp(), &start, &in_root, &settings, |a, b| {
+        let free = checker.motion_is_free(a, b, stop);
+        if !free {
+            blocked = Some([a.to_vec(), b.to_vec()]);
+        }
+        free
+    });
     if line.fraction >= COMPLETE {
         return Ok((line.path, 1.0));
     }
     if let Some(failure) = late(stop) {
         return Err(failure);
     }
+    let mut ik = Ik::new(&kinematics, robot.tcp());
+    let contact = blocked.and_then(|[a, b]| describe_block(checker, &mut ik, (&a, &b), &ahead.path, &in_root));
     let reason = line.shortfall.map_or_else(String::new, |shortfall| format!(": {shortfall}"));
+    let reason = contact.map_or(reason, |contact| format!(": {contact}"));
     let part = 100.0 * line.fraction;
     Err(PlanFailure::new(format!("only {part:.1} % of the straight line is possible{reason}"))
         .hint("omit --linear for any collision-free path, or choose a closer pose"))
+}
+
+/// Returns where on a line which pair blocks it, and how close or deep that pair would get on the whole line: `blocked`
+/// is the piece that is not free, `whole` the line without regard to collisions.
+fn describe_block(
+    checker: &mut Padded,
+    ik: &mut Ik<'_>,
+    (a, b): (&[f64], &[f64]),
+    whole: &Path,
+    target: &DAffine3,
+) -> Option<String> {
+    let mut q = a.to_vec();
+    let first = (0..=BLOCK_SAMPLES).find_map(|k| {
+        between(a, b, f64::from(k) / f64::from(BLOCK_SAMPLES), &mut q);
+        checker.contacts(&q).into_iter().next()
+    })?;
+    let start = ik.pose(whole.first()?).translation;
+    let (along, length) = (ik.pose(&q).translation.distance(start), target.translation.distance(start));
+    let of_pair = |contact: &Contact| contact.pair == first.pair;
+    let mut least = first.distance;
+    for q in whole {
+        least = checker.contacts(q).iter().filter(|contact| of_pair(contact)).fold(least, |d, c| d.min(c.distance));
+    }
+    let kind = if matches!(first.pair, Pair::Links(..)) { "link" } else { "obstacle" };
+    let place =
+        if length > 1e-3 { format!("after {:.0} of {:.0} mm ", along * 1e3, length * 1e3) } else { String::new() };
+    let (link, other) = (&first.link, &first.other);
+    let closest = match least {
+        least if least > 0.0 => format!("within {:.1} mm (padding {:.1} mm)", least * 1e3, checker.padding() * 1e3),
+        least => format!("{:.1} mm deep", -least * 1e3),
+    };
+    Some(format!("{place}link {link:?} would come too close to {kind} {other:?}, on the whole line {closest}"))
 }

@@ -2,6 +2,8 @@
 //! configurations, until enough solutions are found. Every returned configuration reaches the pose within the
 //! tolerances, is inside the limits, and passes the caller's test; otherwise the failure says what is missing.
 
+mod closest;
+
 use glamx::{DAffine3, DVec3};
 
 use crate::collision::checker::Stop;

@@ -21,6 +21,8 @@ pub(super) struct Leg {
     path: Path,
     /// The part of a straight line that was followed.
     pub fraction: Option<f64>,
+    /// Joints of its goal that were moved to their limits: name, requested and used position [rad or m].
+    pub clamped: Vec<(String, f64, f64)>,
 }
 
 /// Plans the way through all waypoints to the goals.
@@ -60,7 +62,7 @@ fn leg(
         [(_, Goal::Line(target))] => {
             let (path, fraction) = goals::line(stage, &frame(target), stop)?;
             took("search", began.elapsed().as_secs_f64());
-            Ok(Leg { path, fraction: Some(fraction) })
+            Ok(Leg { path, fraction: Some(fraction), clamped: Vec::new() })
         }
         several if several.iter().any(|(_, goal)| matches!(goal, Goal::Line(_))) => {
             Err(PlanFailure::new("a straight line is planned for one robot at a time"))
@@ -77,9 +79,12 @@ fn leg(
             let start = stage.start.clone();
             let found =
                 plan(&mut stage.checker, &start, &goals, &settings, stop).map_err(|e| failure_for(stage, &e))?;
+            let used = |joint: usize| Some((stage.joints.get(joint)?.clone(), *found.path.last()?.get(joint)?));
+            let moved = found.clamped.iter().filter_map(|(joint, asked)| Some((*asked, used(*joint)?)));
+            let clamped = moved.map(|(asked, (joint, used))| (joint, asked, used)).collect();
             took("search", found.search_time.as_secs_f64());
             took("shorten", found.shorten_time.as_secs_f64());
-            Ok(Leg { path: found.path, fraction: None })
+            Ok(Leg { path: found.path, fraction: None, clamped })
         }
     }
 }

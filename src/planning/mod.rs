@@ -34,6 +34,8 @@ pub mod unplanned_joints;
 pub mod verify;
 
 #[cfg(test)]
+mod request_tests;
+#[cfg(test)]
 mod tests;
 #[cfg(test)]
 mod turning_tests;

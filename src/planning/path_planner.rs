@@ -23,6 +23,9 @@ pub struct PlanSettings {
     pub shortcut: ShortcutSettings,
     /// Maximum violation of a limit at the start [rad or m]; the motion begins by moving back inside.
     pub limit_tolerance: f64,
+    /// Maximum violation of a limit at the goal [rad or m]; the goal is moved to the limit. Covers rounded limits, such
+    /// as 3.14159 for π.
+    pub goal_tolerance: f64,
     /// Maximum penetration depth at the start [m]; the motion begins by moving out of contact.
     pub contact_tolerance: f64,
 }
@@ -34,6 +37,7 @@ impl Default for PlanSettings {
             search: RrtSettings::default(),
             shortcut: ShortcutSettings::default(),
             limit_tolerance: 0.02,
+            goal_tolerance: 1e-3,
             contact_tolerance: MAX_START_DEPTH,
         }
     }
@@ -46,6 +50,8 @@ pub struct Plan {
     pub path: Path,
     /// Its length [rad].
     pub length: f64,
+    /// Joints of the goal that were moved to their limits: index and requested position [rad or m].
+    pub clamped: Vec<(usize, f64)>,
     /// Whether the straight line was free.
     pub straight: bool,
     /// The seed used.
@@ -70,7 +76,7 @@ pub enum PlanError {
     #[error("no goal given")]
     NoGoal,
     /// A position is outside its limits.
-    #[error("joint {joint} of the {which} is at {position:.4}, outside {lower:.4} to {upper:.4}")]
+    #[error("joint {joint} of the {which} is at {}", describe_outside(*.position, *.lower, *.upper))]
     Outside {
         /// "start" or "goal".
         which: &'static str,
@@ -102,6 +108,18 @@ pub enum PlanError {
     Exhausted(SearchCount),
 }
 
+/// Returns the number of digits that tell a position from the limit that it exceeds.
+pub(super) fn digits_outside(position: f64, lower: f64, upper: f64) -> usize {
+    let limit = if position < lower { lower } else { upper };
+    let same = |digits: &usize| format!("{position:.digits$}") == format!("{limit:.digits$}");
+    4 + (4..9).take_while(same).count()
+}
+
+fn describe_outside(position: f64, lower: f64, upper: f64) -> String {
+    let digits = digits_outside(position, lower, upper);
+    format!("{position:.digits$}, outside {lower:.digits$} to {upper:.digits$}")
+}
+
 fn describe_contacts(contacts: &[Contact]) -> String {
     let first: Vec<String> = contacts.iter().take(3).map(Contact::to_string).collect();
     let more = contacts.len().saturating_sub(3);
@@ -121,7 +139,7 @@ pub fn plan<C: CollisionChecker>(
     let looked = checker.checks();
     let lead = lead_in(checker, start, settings, stop)?;
     let from = lead.last().map_or(start, Vec::as_slice).to_vec();
-    let goals = usable_goals(checker, &from, goals)?;
+    let (goals, clamped) = usable_goals(checker, &from, goals, settings)?;
     let straight = goals.iter().find(|goal| checker.motion_is_free(&from, goal, stop));
     let mut count = SearchCount::default();
     let found = match straight {
@@ -140,7 +158,9 @@ pub fn plan<C: CollisionChecker>(
     let search_time = began.elapsed();
     let mut path = shorten(checker, &found, &settings.shortcut, settings.seed, stop);
     path.splice(..1, lead);
+    let reached = goals.iter().position(|goal| path.last() == Some(goal));
     Ok(Plan {
+        clamped: reached.and_then(|goal| clamped.get(goal).cloned()).unwrap_or_default(),
         length: length(&path),
         path,
         straight: straight.is_some(),
@@ -209,27 +229,37 @@ fn escape<C: CollisionChecker>(checker: &mut C, from: &[f64], depth: f64, seed: 
     None
 }
 
-/// Returns the goals inside the limits and free, the nearest first, or why there are none. For continuous joints, the
-/// nearest of the equivalent positions is used.
-fn usable_goals<C: CollisionChecker>(checker: &mut C, from: &[f64], goals: &[Vec<f64>]) -> Result<Path, PlanError> {
-    let mut usable: Path = Vec::new();
+/// Joints of one goal that were moved to their limits: index and requested position [rad or m].
+type Clamped = Vec<(usize, f64)>;
+
+/// Returns the goals inside the limits and free, the nearest first, each with its joints that were moved to their
+/// limits; or why there are none. For continuous joints, the nearest of the equivalent positions is used.
+fn usable_goals<C: CollisionChecker>(
+    checker: &mut C,
+    from: &[f64],
+    goals: &[Vec<f64>],
+    settings: &PlanSettings,
+) -> Result<(Path, Vec<Clamped>), PlanError> {
+    let mut usable: Vec<(Vec<f64>, Clamped)> = Vec::new();
     let mut why = PlanError::NoGoal;
     for goal in goals {
         check_shape(checker, "goal", goal)?;
         let mut goal = goal.clone();
         unwind(&mut goal, from, checker.turns());
         let inside = clamped(checker, &goal);
-        let far = goal.iter().zip(&inside).position(|(a, b)| (a - b).abs() > 1e-6);
+        let moved = goal.iter().zip(&inside).enumerate().filter(|(_, (a, b))| a != b);
+        let clamped: Clamped = moved.map(|(joint, (asked, _))| (joint, *asked)).collect();
+        let far = goal.iter().zip(&inside).position(|(a, b)| (a - b).abs() > settings.goal_tolerance);
         if let Some(joint) = far {
             why = outside(checker, "goal", joint, goal[joint]);
         } else if !checker.is_free(&inside) {
             why = PlanError::Collides { which: "goal", contacts: checker.contacts(&inside) };
         } else {
-            usable.push(inside);
+            usable.push((inside, clamped));
         }
     }
-    usable.sort_by(|a, b| distance(from, a).total_cmp(&distance(from, b)));
-    if usable.is_empty() { Err(why) } else { Ok(usable) }
+    usable.sort_by(|(a, _), (b, _)| distance(from, a).total_cmp(&distance(from, b)));
+    if usable.is_empty() { Err(why) } else { Ok(usable.into_iter().unzip()) }
 }
 
 fn check_shape<C: CollisionChecker>(checker: &C, which: &'static str, q: &[f64]) -> Result<(), PlanError> {

@@ -3,16 +3,17 @@
 use std::collections::BTreeMap;
 use std::time::Instant;
 
+use glamx::DVec3;
 use nalgebra::{Isometry3, Vector3};
 
 use super::legs::{joined, legs};
 use super::padded::{GivenUp, Near, Padded};
 use super::path::{Path, between, distance, length};
-use super::path_planner::PlanError;
+use super::path_planner::{PlanError, digits_outside};
 use super::planning_scene::{PlannedRobot, PlanningScene};
 use super::start_contact::{EscapePath, passes};
 use super::timing::{bounds, time_within};
-use crate::collision::world::World;
+use crate::collision::world::{Robot, World};
 use crate::collision::{CollisionChecker, Stop};
 use crate::robot::model::Limits;
 use crate::trajectory::{JointTrajectory, TrajectoryPoint};
@@ -26,6 +27,8 @@ const SAME_CONFIGURATION: f64 = 1e-3;
 /// Additional padding during the search [m]: between the points of its trajectory, a motion deviates slightly from the
 /// checked path and must still pass a later check.
 const EXTRA_PADDING: f64 = 2e-4;
+/// Distance at which nothing can touch [m].
+const OUT_OF_REACH: f64 = 1e5;
 /// Duration of the motion of robots that are already at the goal [s].
 const STATIONARY_DURATION: f64 = 0.1;
 
@@ -77,6 +80,8 @@ pub struct PlannedMotion {
     pub padding: f64,
     /// Exceptions from the padding.
     pub given_up: Vec<GivenUp>,
+    /// Joints of the goal that were moved to their limits: name, requested and used position [rad or m].
+    pub clamped: Vec<(String, f64, f64)>,
     /// The part of a straight line that was followed.
     pub fraction: Option<f64>,
     /// Duration of each stage [s].
@@ -124,6 +129,8 @@ pub(super) struct Stage<'a> {
     pub start: Vec<f64>,
     /// Checker of all robots and obstacles.
     pub checker: Padded,
+    /// One checker per moving robot, without the other moving ones; empty if only one robot moves.
+    pub apart: Vec<Padded>,
 }
 
 /// Plans a motion. The same scene, world and request give the same motion unless the timeout is reached.
@@ -144,6 +151,7 @@ pub fn solve(
     let legs = legs(&mut stage, request, stop, &mut times)?;
     let fraction = legs.last().filter(|_| legs.len() == 1).and_then(|leg| leg.fraction);
     let (path, deviation) = joined(&stage, &legs, request.blend);
+    let clamped = legs.iter().flat_map(|leg| leg.clamped.iter().cloned()).collect();
     let timing = Instant::now();
     let trajectory = match length(&path) < GOAL_TOLERANCE {
         true => rest(&stage.joints, &path),
@@ -158,7 +166,7 @@ pub fn solve(
     let at_end = |given_up: &&GivenUp| given_up.near != Near::Goal || reached(&given_up.center);
     let given_up = stage.checker.given_up().iter().filter(at_end).cloned().collect();
     let (robots, padding) = (stage.indices, setup.padding);
-    Ok(PlannedMotion { robots, path, trajectory, clearance, escape_path, padding, given_up, fraction, times })
+    Ok(PlannedMotion { robots, path, trajectory, clearance, escape_path, padding, given_up, clamped, fraction, times })
 }
 
 /// Builds the scene of one request: `moving` robots by index, all others fixed at their positions [rad], with `padding`
@@ -187,8 +195,34 @@ pub(super) fn stage<'a>(
         limits.extend_from_slice(&robot.limits);
         start.extend_from_slice(at);
     }
+    let several = if indices.len() > 1 { indices.as_slice() } else { &[] };
+    let apart = several.iter().map(|own| apart(setup, world, &bodies, (*own, moving), positions, padding));
+    let apart = apart.collect::<Result<_, _>>()?;
     let checker = Padded::new(world.with_robots(bodies).snapshot(), padding);
-    Ok(Stage { robots, indices, joints, limits, start, checker })
+    Ok(Stage { robots, indices, joints, limits, start, checker, apart })
+}
+
+/// Returns the checker of one moving robot alone with everything that does not move.
+fn apart(
+    setup: &PlanningScene,
+    world: &World,
+    bodies: &[Robot],
+    (own, moving): (usize, &[usize]),
+    positions: &[Vec<f64>],
+    padding: f64,
+) -> Result<Padded, PlanFailure> {
+    let mut bodies = bodies.to_vec();
+    for other in moving.iter().filter(|other| **other != own) {
+        let (Some(robot), Some(at), Some(body)) =
+            (setup.robots.get(*other), positions.get(*other), bodies.get_mut(*other))
+        else {
+            continue;
+        };
+        *body = robot.fixed_at(at).map_err(PlanFailure::new)?;
+        // Out of reach with what it holds: held objects refer to their robot by its number.
+        body.base.translation += DVec3::splat(OUT_OF_REACH);
+    }
+    Ok(Padded::new(world.with_robots(bodies).snapshot(), padding))
 }
 
 /// Converts a path planner's error to a failure with joint names.
@@ -198,8 +232,9 @@ pub(super) fn failure_for(stage: &Stage<'_>, error: &PlanError) -> PlanFailure {
             let name = stage.joints.get(*joint).map_or("a joint", String::as_str);
             let kinds = stage.robots.iter().flat_map(|robot| robot.body.kinematics.kinds());
             let unit = { kinds }.nth(*joint).map_or("rad", |kind| kind.unit());
-            let limits = format!("{lower:.4} … {upper:.4} {unit}");
-            PlanFailure::new(format!("{which}: {name} at {position:.4} {unit} is outside its limits {limits}"))
+            let digits = digits_outside(*position, *lower, *upper);
+            let limits = format!("{lower:.digits$} … {upper:.digits$} {unit}");
+            PlanFailure::new(format!("{which}: {name} at {position:.digits$} {unit} is outside its limits {limits}"))
                 .hint("the narrower limits of model and arm apply, and commands stay 0.01 rad inside those of the arm; `dimos state` shows the joint positions")
         }
         PlanError::Collides { which: "start", .. } => PlanFailure::new(error.to_string())

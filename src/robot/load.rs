@@ -1,17 +1,17 @@
 //! Loads a description, from disk or built in, and collects everything wrong with it.
 
 use std::collections::BTreeMap;
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde_json::json;
 
+use crate::message::Message;
 use crate::robot::model::RobotModel;
 use crate::robot::packages::{Packages, absolute};
 use crate::robot::srdf::{self, Semantics};
 use crate::robot::urdf::{self, Meshes};
 use crate::robot::xml::{self, Calls, Document};
-use crate::robot::{builtin, joint_limits, xacro};
+use crate::robot::{builtin, encoding, joint_limits, xacro};
 use crate::yaml::{Diag, Label, Report, Severity, Tree, render};
 
 /// A description and how to read it.
@@ -71,6 +71,12 @@ impl Loaded {
     /// Returns whether there are errors.
     pub fn has_errors(&self) -> bool {
         self.tree.has_errors()
+    }
+
+    /// Returns why the description could not be read at all; `None` if it was, and the mistakes are in it.
+    pub fn unreadable(&self) -> Option<&Diag> {
+        let positioned = |diag: &&Diag| diag.severity == Severity::Error && diag.at.is_none();
+        self.tree.diags().iter().find(positioned).filter(|_| self.document.is_none())
     }
 
     /// Adds a diagnostic found later, in a file that the description refers to.
@@ -136,9 +142,7 @@ fn expanded(
         let expansion = xacro::expand(&mut loaded.tree, path, document, packages, &source.xacro_args)?;
         loaded.files.extend(expansion.files.into_iter().skip(1));
         for (name, near) in expansion.unknown_args.into_iter().filter(|_| main) {
-            let what = format!("there is no xacro:arg `{name}`: the argument has no effect");
-            let diag = Diag::warning(what).at(Label::start_of(id));
-            loaded.tree.report(diag.maybe_hint(near.map(|near| format!("did you mean `{near}`?"))));
+            loaded.tree.report(xacro::unknown_argument(&name, near.as_deref(), id));
         }
         return Some((expansion.document, expansion.calls));
     }
@@ -159,22 +163,14 @@ fn text_of(path: &Path, loaded: &mut Loaded) -> Option<String> {
         loaded.tree.report(Diag::error(format!("unknown built-in robot `{robot}`")).maybe_hint(hint));
         return None;
     }
-    let refused = |what: String| format!("{}: {what}", path.display());
-    let read = || {
-        let size = fs::metadata(path).map_err(|e| refused(e.to_string()))?.len();
-        if size > xml::MAX_BYTES as u64 {
-            return Err(refused(format!("the file is larger than {} MiB", xml::MAX_BYTES >> 20)));
-        }
-        let bytes = fs::read(path).map_err(|e| refused(e.to_string()))?;
-        String::from_utf8(bytes).map_err(|_| refused("the file is not UTF-8".to_owned()))
-    };
-    match read() {
+    match encoding::read(path, xml::MAX_BYTES as u64) {
         Ok(text) => {
             loaded.files.push(absolute(path));
             Some(text)
         }
-        Err(what) => {
-            loaded.tree.report(Diag::error(what));
+        Err(why) => {
+            let Message { what, hint } = why.into();
+            loaded.tree.report(Diag::error(format!("{}: {what}", path.display())).maybe_hint(hint));
             None
         }
     }

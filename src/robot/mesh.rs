@@ -1,6 +1,7 @@
 //! Triangle meshes from STL, OBJ and Collada files: vertices merged, finite, in metres.
 
 mod collada;
+mod stored_as;
 
 use std::collections::HashMap;
 use std::fs;
@@ -53,16 +54,21 @@ impl Mesh {
 
     /// Reads a file's bytes; the extension of `name` decides the format.
     pub fn from_bytes(bytes: &[u8], name: &Path, scale: Vector3<f64>) -> Result<Self, String> {
+        stored_as::refuse_other_files(bytes)?;
         let ending = name.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
         let corners = match ending.as_str() {
             "dae" => collada::read(bytes)?,
-            "stl" => foreign(|| mesh_loader::stl::from_slice(bytes))?,
+            "stl" => {
+                stored_as::check_stl(bytes)?;
+                foreign(|| mesh_loader::stl::from_slice(bytes))?
+            }
             "obj" => foreign(|| {
                 // Materials are not needed: no other file is opened.
                 mesh_loader::obj::from_slice(bytes, None::<&Path>, |_: &Path| -> std::io::Result<Vec<u8>> {
                     Ok(Vec::new())
                 })
-            })?,
+            })
+            .map_err(stored_as::obj_error)?,
             other => {
                 let what = format!("meshes of type `{other}` cannot be read\nhint: convert it to STL, OBJ or DAE");
                 return Err(what);
@@ -102,6 +108,12 @@ impl Mesh {
             return Err("no triangles".to_owned());
         }
         Ok(mesh)
+    }
+
+    /// Returns the extents of the bounding box along x, y, z [m].
+    pub fn extents(&self) -> Vector3<f64> {
+        let (low, high) = self.bounds();
+        high - low
     }
 
     /// Returns the lowest and highest corner of the bounding box [m].

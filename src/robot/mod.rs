@@ -8,6 +8,7 @@
 //! Every element keeps its position in the source, through includes and macros, so that diagnostics point at it.
 
 pub mod builtin;
+mod encoding;
 pub mod interchange;
 mod joint_limits;
 pub mod kinematics;

@@ -263,6 +263,39 @@ impl RobotModel {
         Some(joints)
     }
 
+    /// Returns the indices of the joints on the way from one link to another: up to the link that carries both, then
+    /// down.
+    pub fn path(&self, from: usize, to: usize) -> Vec<usize> {
+        let to_root = |mut link: usize| {
+            let mut joints = Vec::new();
+            while let Some(joint) = self.parent_joint(link) {
+                joints.push(link - 1);
+                link = joint.parent;
+            }
+            joints
+        };
+        let (mut up, mut down) = (to_root(from), to_root(to));
+        while up.last().is_some_and(|last| down.last() == Some(last)) {
+            up.pop();
+            down.pop();
+        }
+        up.extend(down.into_iter().rev());
+        up
+    }
+
+    /// Returns the independent joints that move some joints: themselves, or the leaders of mimic joints, each once.
+    pub fn independent_of(&self, joints: &[usize]) -> Vec<usize> {
+        let mut independent = Vec::new();
+        for joint in joints {
+            let Some(own) = self.joints.get(*joint).filter(|own| own.is_movable()) else { continue };
+            let leader = own.mimic.map_or(*joint, |mimic| mimic.leader);
+            if !independent.contains(&leader) {
+                independent.push(leader);
+            }
+        }
+        independent
+    }
+
     /// Returns the positions of all joints from those of independent ones by name; joints not named are at zero, mimic
     /// joints follow.
     pub fn positions(&self, named: &HashMap<String, f64>) -> Vec<f64> {

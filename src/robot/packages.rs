@@ -5,19 +5,26 @@
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Component, Path, PathBuf};
+use std::sync::OnceLock;
 
 use percent_encoding::percent_decode_str;
 
 /// Maximum number of parent folders searched for a description's own package.
 const MAX_PARENTS: usize = 8;
+/// Maximum depth of a package below a folder of `ROS_PACKAGE_PATH`.
+const MAX_DEPTH: usize = 5;
+/// Maximum number of folders searched below `ROS_PACKAGE_PATH`.
+const MAX_FOLDERS: usize = 50_000;
 
 /// Locations of packages.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Packages {
     /// By name: `package_paths` of a blueprint, `--package`.
     named: BTreeMap<String, PathBuf>,
-    /// Folders of packages, from `ROS_PACKAGE_PATH`.
+    /// Folders that contain packages at any depth, from `ROS_PACKAGE_PATH`.
     ros: Vec<PathBuf>,
+    /// The packages in them; searched once, when the first is needed.
+    crawled: OnceLock<BTreeMap<String, PathBuf>>,
     /// Prefixes, from `AMENT_PREFIX_PATH`.
     ament: Vec<PathBuf>,
 }
@@ -48,10 +55,13 @@ impl Packages {
                 false => Err(format!("the folder given for package `{package}` does not exist: {}", folder.display())),
             };
         }
-        let ros = self.ros.iter().flat_map(|folder| {
+        let crawled = self.crawled.get_or_init(|| crawl(&self.ros)).get(package).cloned();
+        // A folder without package.xml, too.
+        let direct = self.ros.iter().flat_map(|folder| {
             let itself = is_package(folder, package).then(|| folder.clone());
             itself.into_iter().chain([folder.join(package)])
         });
+        let ros = crawled.into_iter().chain(direct);
         let ament = self.ament.iter().map(|prefix| prefix.join("share").join(package));
         if let Some(found) = ros.chain(ament).find(|folder| folder.is_dir()) {
             return Ok(absolute(&found));
@@ -107,11 +117,48 @@ fn is_package(folder: &Path, package: &str) -> bool {
     if folder.file_name().is_some_and(|name| name == package) {
         return true;
     }
+    name_in_manifest(folder).is_some_and(|name| name == package)
+}
+
+/// Returns the name in a folder's `package.xml`.
+fn name_in_manifest(folder: &Path) -> Option<String> {
     let manifest = folder.join("package.xml");
     let small = fs::metadata(&manifest).is_ok_and(|m| m.is_file() && m.len() < 1 << 20);
     let text = if small { fs::read_to_string(manifest).unwrap_or_default() } else { String::new() };
-    let name = text.split_once("<name>").and_then(|(_, rest)| rest.split_once("</name>"));
-    name.is_some_and(|(name, _)| name.trim() == package)
+    let (_, rest) = text.split_once("<name>")?;
+    rest.split_once("</name>").map(|(name, _)| name.trim().to_owned())
+}
+
+/// Returns the packages below some folders by the names in their `package.xml`, as ROS 1 searches them: a package
+/// contains no others, a folder with `CATKIN_IGNORE` none at all, and of two with the same name the first one counts.
+fn crawl(folders: &[PathBuf]) -> BTreeMap<String, PathBuf> {
+    let (mut found, mut visited) = (BTreeMap::new(), 0);
+    for folder in folders {
+        let mut open = vec![(absolute(folder), 0)];
+        while let Some((folder, depth)) = open.pop() {
+            visited += 1;
+            if visited > MAX_FOLDERS || folder.join("CATKIN_IGNORE").exists() {
+                continue;
+            }
+            if folder.join("package.xml").is_file() {
+                if let Some(name) = name_in_manifest(&folder) {
+                    found.entry(name).or_insert(folder);
+                }
+                continue;
+            }
+            if depth == MAX_DEPTH {
+                continue;
+            }
+            let entries = fs::read_dir(&folder).into_iter().flatten().flatten();
+            let hidden = |entry: &fs::DirEntry| entry.file_name().as_encoded_bytes().starts_with(b".");
+            let mut inside: Vec<PathBuf> =
+                entries.filter(|e| !hidden(e)).map(|e| e.path()).filter(|path| path.is_dir()).collect();
+            // The last is next: in the order of their names.
+            inside.sort_by(|a, b| b.cmp(a));
+            open.extend(inside.into_iter().map(|path| (path, depth + 1)));
+        }
+    }
+    found
 }
 
 /// Returns an absolute path without `.` and `..`, normalized as text.
@@ -162,7 +209,32 @@ mod tests {
             named: [("g".to_owned(), root.join("given"))].into(),
             ros: vec![root.join("ros")],
             ament: vec![root.join("ament")],
+            crawled: OnceLock::new(),
         }
+    }
+
+    #[test]
+    fn packages_of_a_ros_1_workspace_are_found_at_any_depth_by_the_name_in_their_manifest() {
+        let folder = tempfile::tempdir().unwrap();
+        let root = absolute(folder.path());
+        let package = |path: &str, name: &str| {
+            fs::create_dir_all(root.join(path)).unwrap();
+            fs::write(root.join(path).join("package.xml"), format!("<package>\n<name> {name} </name></package>"))
+                .unwrap();
+        };
+        package("src/some_repo/robots/z_description", "z_description");
+        package("src/foo_description", "my_foo_description");
+        package("src/foo_description/inner", "inner");
+        package("src/ignored/hidden", "hidden");
+        fs::write(root.join("src/ignored/CATKIN_IGNORE"), "").unwrap();
+        package("src/a/b/c/d/e/f", "too_deep");
+        package("other/z_description", "z_description");
+        let ros = vec![root.join("src"), root.join("other")];
+        let packages = Packages { ros, ..Packages::default() };
+        let find = |name: &str| packages.find(name, Path::new("/")).ok();
+        assert_eq!(find("z_description"), Some(root.join("src/some_repo/robots/z_description")));
+        assert_eq!(find("my_foo_description"), Some(root.join("src/foo_description")));
+        assert_eq!([find("inner"), find("hidden"), find("too_deep")], [None, None, None]);
     }
 
     #[test]

@@ -1,11 +1,13 @@
-//! SRDF: groups, named poses, end effectors, allowed collision pairs.
+//! SRDF: groups, named poses, end effectors, passive joints, allowed collision pairs.
 //!
 //! An SRDF is often shared by variants of a robot: unknown links and joints are warnings.
 
+mod checks;
+
 use std::collections::BTreeSet;
 
-use crate::robot::model::RobotModel;
-use crate::robot::xml::{Attribute, Calls, Element};
+use crate::robot::model::{Joint, RobotModel};
+use crate::robot::xml::{Attribute, Calls, Element, SourcePos};
 use crate::yaml::{Diag, Tree, did_you_mean};
 
 /// Contents of an SRDF.
@@ -17,6 +19,8 @@ pub struct Semantics {
     pub poses: Vec<NamedPose>,
     /// End effectors.
     pub end_effectors: Vec<EndEffector>,
+    /// Joints without a motor: they belong to no group.
+    pub passive: Vec<String>,
     /// Allowed collision pairs.
     pub disabled: Vec<DisabledPair>,
 }
@@ -45,6 +49,17 @@ pub struct NamedPose {
     pub group: String,
     /// Joints and their positions [rad or m].
     pub positions: Vec<(String, f64)>,
+    /// Position of its name in the SRDF.
+    pub at: SourcePos,
+}
+
+impl NamedPose {
+    /// Returns the first joint outside its limits, and its position [rad or m].
+    pub fn outside<'r>(&self, robot: &'r RobotModel) -> Option<(&'r Joint, f64)> {
+        let joint = |name: &str| robot.joint_index(name).and_then(|index| robot.joints.get(index));
+        let mut all = self.positions.iter().filter_map(|(name, q)| Some((joint(name)?, *q)));
+        all.find(|(joint, q)| !(joint.limits.lower - 1e-9..=joint.limits.upper + 1e-9).contains(q))
+    }
 }
 
 /// An end effector.
@@ -72,7 +87,8 @@ pub struct DisabledPair {
 }
 
 impl Semantics {
-    /// Returns the indices of the independent joints of a group, in tree order; `None` for an unknown group.
+    /// Returns the indices of the independent joints of a group, in tree order, without passive ones; `None` for an
+    /// unknown group.
     pub fn group_joints(&self, robot: &RobotModel, group: &str) -> Option<Vec<usize>> {
         let mut joints = BTreeSet::new();
         let mut open = vec![group];
@@ -92,7 +108,8 @@ impl Semantics {
             }
             open.extend(group.groups.iter().map(String::as_str));
         }
-        let own = |i: &usize| robot.joints.get(*i).is_some_and(|j| j.is_independent());
+        let passive = |name: &String| self.passive.contains(name);
+        let own = |i: &usize| robot.joints.get(*i).is_some_and(|j| j.is_independent() && !passive(&j.name));
         Some(joints.into_iter().filter(own).collect())
     }
 
@@ -117,37 +134,67 @@ impl Semantics {
 
 /// Reads an SRDF for a robot.
 pub fn read(root: &Element, robot: &RobotModel, tree: &mut Tree, calls: &Calls) -> Option<Semantics> {
-    let mut reader = Reader { robot, tree, calls, missing: 0 };
+    let mut reader = Reader { robot, tree, calls, missing: Vec::new() };
     if root.name != "robot" {
         let what = format!("the root element is `{}`, not `robot`", root.name);
         reader.tree.report(Diag::error(what).at(root.at.label()).hint("an SRDF starts with <robot name=\"…\">"));
         return None;
     }
     let mut out = Semantics::default();
+    // As in MoveIt: links without default checks, pairs of theirs that are checked all the same.
+    let (mut unchecked, mut enabled) = (Vec::new(), Vec::new());
     for element in root.elements() {
         match element.name.as_str() {
             "group" => out.groups.extend(reader.group(element)),
             "group_state" => out.poses.extend(reader.pose(element)),
             "end_effector" => out.end_effectors.extend(reader.end_effector(element)),
+            "passive_joint" => out.passive.extend(reader.named(element, "name", true)),
             "disable_collisions" => out.disabled.extend(reader.pair(element)),
+            "disable_default_collisions" => unchecked.extend(reader.named(element, "link", false)),
+            "enable_collisions" => enabled.extend(reader.pair(element)),
             _ => {}
         }
     }
+    out.disabled.extend(disabled_by_default(robot, &unchecked, &enabled, &out.disabled));
+    reader.check_name(root);
+    reader.check_elements(root);
     reader.check_groups(root, &out);
-    if reader.missing > 0 {
-        let pairs = if reader.missing == 1 { "pair" } else { "pairs" };
-        let what = format!("{} {pairs} of `disable_collisions` with links that this robot lacks", reader.missing);
-        reader.tree.report(Diag::warning(what).at(root.at.label()));
+    reader.check_duplicates(root);
+    reader.check_cycles(root, &out);
+    if let [first, rest @ ..] = &reader.missing[..] {
+        let (count, pairs) = (rest.len() + 1, if rest.is_empty() { "pair" } else { "pairs" });
+        let what = format!("{count} {pairs} of `disable_collisions` with links that this robot lacks");
+        let diag = Diag::warning(what).at(first.label());
+        reader.tree.report(if rest.is_empty() { diag } else { diag.note("this is the first of them") });
     }
     Some(out)
+}
+
+/// Returns the pairs of links that `disable_default_collisions` allows, without those enabled again.
+fn disabled_by_default(
+    robot: &RobotModel,
+    unchecked: &[String],
+    enabled: &[DisabledPair],
+    disabled: &[DisabledPair],
+) -> Vec<DisabledPair> {
+    let is = |pair: &DisabledPair, a: &str, b: &str| (pair.a == a && pair.b == b) || (pair.a == b && pair.b == a);
+    let mut pairs: Vec<DisabledPair> = Vec::new();
+    for a in unchecked {
+        for b in robot.links.iter().map(|link| &link.name).filter(|b| *b != a) {
+            if !enabled.iter().chain(disabled).chain(&pairs).any(|pair| is(pair, a, b)) {
+                pairs.push(DisabledPair { a: a.clone(), b: b.clone(), reason: "Default".to_owned() });
+            }
+        }
+    }
+    pairs
 }
 
 struct Reader<'t> {
     robot: &'t RobotModel,
     tree: &'t mut Tree,
     calls: &'t Calls,
-    /// Pairs of links that the robot lacks.
-    missing: usize,
+    /// Positions of pairs of links that the robot lacks.
+    missing: Vec<SourcePos>,
 }
 
 impl Reader<'_> {
@@ -202,7 +249,7 @@ impl Reader<'_> {
     }
 
     fn pose(&mut self, element: &Element) -> Option<NamedPose> {
-        let name = self.needed(element, "name")?.value.clone();
+        let Attribute { value: name, at, .. } = self.needed(element, "name")?.clone();
         let group = self.needed(element, "group")?.value.clone();
         let mut positions = Vec::new();
         for joint in element.named("joint") {
@@ -216,7 +263,7 @@ impl Reader<'_> {
                 }
             }
         }
-        Some(NamedPose { name, group, positions })
+        Some(NamedPose { name, group, positions, at })
     }
 
     fn end_effector(&mut self, element: &Element) -> Option<EndEffector> {
@@ -232,7 +279,7 @@ impl Reader<'_> {
         let a = self.needed(element, "link1")?.value.clone();
         let b = self.needed(element, "link2")?.value.clone();
         if self.robot.link_index(&a).is_none() || self.robot.link_index(&b).is_none() {
-            self.missing += 1;
+            self.missing.push(element.at);
             return None;
         }
         let reason = element.attribute("reason").map(|r| r.value.clone()).unwrap_or_default();
@@ -254,70 +301,4 @@ impl Reader<'_> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::robot::{urdf, xml};
-
-    fn robot() -> RobotModel {
-        let joint = |n: usize| {
-            format!(
-                "<joint name='j{n}' type='revolute'><parent link='l{}'/><child link='l{n}'/>\
-                 <limit lower='-1' upper='1' velocity='1'/></joint>",
-                n - 1
-            )
-        };
-        let links: String = (0..5).map(|n| format!("<link name='l{n}'/>")).collect();
-        let joints: String = (1..5).map(joint).collect();
-        urdf::from_text("t", &format!("<robot name='t'>{links}{joints}</robot>")).unwrap()
-    }
-
-    fn semantics(body: &str) -> (Option<Semantics>, String) {
-        let mut tree = Tree::new();
-        let source = tree.add_source("t.srdf", format!("<robot name='t'>{body}</robot>"));
-        let document = xml::parse(&mut tree, source).unwrap();
-        let out = read(&document.root, &robot(), &mut tree, &Calls::default());
-        let text = tree.diags().iter().map(|d| crate::yaml::render(&tree, d, false) + "\n").collect();
-        (out, text)
-    }
-
-    #[test]
-    fn groups_poses_and_pairs_are_read() {
-        let (out, text) = semantics(
-            "<group name='arm'><chain base_link='l0' tip_link='l2'/></group>\
-             <group name='hand'><joint name='j4'/><link name='l3'/></group>\
-             <group name='all'><group name='arm'/><group name='hand'/><group name='all'/></group>\
-             <group_state name='home' group='arm'><joint name='j1' value='0.5'/><joint name='j2' value='-0.25'/></group_state>\
-             <end_effector name='tool' group='hand' parent_link='l2'/>\
-             <virtual_joint name='v' type='fixed' parent_frame='w' child_link='l0'/>\
-             <disable_collisions link1='l0' link2='l1' reason='Adjacent'/><disable_collisions link1='l0' link2='x'/>",
-        );
-        let out = out.unwrap();
-        assert_eq!(out.group_joints(&robot(), "arm"), Some(vec![0, 1]));
-        assert_eq!(out.group_joints(&robot(), "hand"), Some(vec![2, 3]));
-        assert_eq!(out.group_joints(&robot(), "all"), Some(vec![0, 1, 2, 3]));
-        assert_eq!(out.group_joints(&robot(), "none"), None);
-        assert_eq!(out.poses[0].positions, [("j1".to_owned(), 0.5), ("j2".to_owned(), -0.25)]);
-        let of = |joints: &[&str]| joints.iter().map(|j| (*j).to_owned()).collect::<Vec<_>>();
-        assert_eq!(out.poses_of(&of(&["j2", "j1"])), [("home", vec![-0.25, 0.5])]);
-        assert_eq!((out.poses_of(&of(&["j1", "j3"])), out.poses_of(&[])), (vec![], vec![]));
-        assert_eq!((out.end_effectors.len(), out.disabled.len()), (1, 1));
-        assert!(text.contains("1 pair of") && !text.contains("error"), "{text}");
-    }
-
-    #[test]
-    fn wrong_names_are_found() {
-        for (body, what) in [
-            ("<group name='a'><joint name='j9'/></group>", "this robot has no joint `j9`"),
-            ("<group name='a'><chain base_link='l2' tip_link='l0'/></group>", "is not below"),
-            ("<group_state name='h' group='b'/>", "unknown group `b`"),
-            (
-                "<group name='a'/><group_state name='h' group='a'><joint name='j1' value='x'/></group_state>",
-                "is not a joint position",
-            ),
-            ("<group/>", "this `group` has no `name`"),
-        ] {
-            let (_, text) = semantics(body);
-            assert!(text.contains(what), "{what}\n{text}");
-        }
-    }
-}
+mod tests;

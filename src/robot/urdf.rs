@@ -7,7 +7,7 @@ mod numbers;
 mod shapes;
 mod tree;
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::path::PathBuf;
 
 use nalgebra::{Unit, Vector3};
@@ -25,6 +25,8 @@ pub enum Meshes {
     /// Look for each: a missing collision mesh is an error, a missing visual mesh a warning.
     #[default]
     Find,
+    /// Look for each: a missing one is a warning, for uses that show what is there.
+    Mark,
     /// Do not look for files: for uses that need no shapes.
     Ignore,
 }
@@ -40,7 +42,8 @@ pub fn read(
     meshes: Meshes,
     resolve: &Resolve<'_>,
 ) -> Option<RobotModel> {
-    let mut reader = Reader { tree, calls, meshes, resolve, materials: HashMap::new(), errors: 0 };
+    let mut reader =
+        Reader { tree, calls, meshes, resolve, materials: HashMap::new(), carried: HashSet::new(), errors: 0 };
     let model = reader.robot(root);
     model.filter(|_| reader.errors == 0)
 }
@@ -64,6 +67,8 @@ struct Reader<'t> {
     resolve: &'t Resolve<'t>,
     /// Colours by material name.
     materials: HashMap<String, [f64; 4]>,
+    /// Links that a joint carries.
+    carried: HashSet<String>,
     errors: usize,
 }
 
@@ -122,6 +127,8 @@ impl Reader<'_> {
         }
         let name = self.needed(root, "name").map(|(name, _)| name.to_owned());
         self.collect_materials(root);
+        let children = root.named("joint").filter_map(|joint| joint.child("child")?.attribute("link"));
+        self.carried = children.map(|link| link.value.clone()).collect();
         let mut links = Vec::new();
         let mut joints = Vec::new();
         for element in root.elements() {
@@ -192,6 +199,11 @@ impl Reader<'_> {
             "revolute" => Some(JointKind::Revolute),
             "continuous" => Some(JointKind::Continuous),
             "prismatic" => Some(JointKind::Prismatic),
+            "floating" | "planar" if self.is_at_root(element) => {
+                let diag = Diag::warning(format!("this {word} joint at the root counts as fixed"));
+                self.report(at, diag.hint("an arm's base does not move; a planner's `base_pose` places it"));
+                Some(JointKind::Fixed)
+            }
             "floating" | "planar" | "spherical" => {
                 let diag = Diag::error(format!("joints of type `{word}` are not supported"));
                 self.report(at, diag.hint("an arm's joints are revolute, continuous, prismatic or fixed"));
@@ -203,6 +215,12 @@ impl Reader<'_> {
                 None
             }
         }
+    }
+
+    /// Returns whether a joint's parent is a link that no joint carries.
+    fn is_at_root(&self, joint: &Element) -> bool {
+        let parent = joint.child("parent").and_then(|parent| parent.attribute("link"));
+        parent.is_some_and(|link| !self.carried.contains(&link.value))
     }
 
     fn axis(&mut self, element: &Element) -> Option<Unit<Vector3<f64>>> {

@@ -31,7 +31,7 @@ use std::path::{Path, PathBuf};
 use crate::message::Message;
 use crate::robot::packages::Packages;
 use crate::robot::xml::{Calls, Document, SourcePos};
-use crate::yaml::{Diag, SourceId, Tree};
+use crate::yaml::{Diag, Label, SourceId, Tree};
 
 /// Namespace declaration that marks a file as xacro.
 const NAMESPACE: &str = "xmlns:xacro";
@@ -78,6 +78,13 @@ pub fn expand(
     };
     tree.report(Diag::error(failed).at(SourcePos { source, ..SourcePos::default() }.label()));
     None
+}
+
+/// Returns the warning about an argument that no file declares, with a similar name.
+pub fn unknown_argument(name: &str, near: Option<&str>, source: SourceId) -> Diag {
+    let what = format!("there is no xacro:arg `{name}`: the argument has no effect");
+    let diag = Diag::warning(what).at(Label::start_of(source));
+    diag.maybe_hint(near.map(|near| format!("did you mean `{near}`?")))
 }
 
 /// Why an expansion failed.

@@ -212,6 +212,9 @@ pub struct PlanSummary {
     /// Pairs that do not keep the padding, and where.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub padding_given_up: Vec<PaddingGivenUp>,
+    /// Joints of the goal that were moved to their limits.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub goal_clamped: Vec<GoalClamped>,
     /// Feasible fraction of a straight line (0–1].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fraction: Option<f64>,
@@ -232,6 +235,17 @@ pub struct PaddingGivenUp {
     pub other: String,
     /// Their distance there [m]; negative if they touch.
     pub distance: f64,
+}
+
+/// A joint of a goal slightly outside its limits: the motion ends at the limit.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct GoalClamped {
+    /// The coordinator's joint.
+    pub joint: String,
+    /// Requested position [rad, or m for prismatic joints].
+    pub requested: f64,
+    /// Position of the limit.
+    pub used: f64,
 }
 
 /// Parameters of `preview`.

@@ -226,6 +226,7 @@ fn summary(job: &Job, found: &PlannedMotion) -> PlanSummary {
         closest: found.clearance.as_ref().map(|(_, pair)| pair.clone()),
         padding: found.padding,
         padding_given_up: found.given_up.iter().map(given_up).collect(),
+        goal_clamped: found.clamped.iter().map(clamped).collect(),
         fraction: found.fraction,
         seed: job.request.seed,
         times: found.times.clone(),
@@ -236,6 +237,10 @@ fn given_up(given_up: &GivenUp) -> api::PaddingGivenUp {
     let GivenUp { near, link, other, distance, .. } = given_up;
     let (near, link, other) = (near.name().to_owned(), link.clone(), other.clone());
     api::PaddingGivenUp { near, link, other, distance: *distance }
+}
+
+fn clamped((joint, requested, used): &(String, f64, f64)) -> api::GoalClamped {
+    api::GoalClamped { joint: joint.clone(), requested: *requested, used: *used }
 }
 
 /// Converts a trajectory to its rpc type.

@@ -29,6 +29,7 @@ mod guards_virtual;
 mod kinematics;
 mod layering;
 mod model;
+mod model_verbs;
 mod no_alloc;
 mod older_logs;
 mod pages;

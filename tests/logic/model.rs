@@ -1,8 +1,7 @@
-//! Robot descriptions: the vendors' in `../shared`, the built-in ones, and the verbs that show them.
+//! Robot descriptions: the vendors' in `../shared`, and the built-in ones.
 
 use std::collections::HashMap;
-use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::path::PathBuf;
 
 use dimos::robot::mesh::Mesh;
 use dimos::robot::urdf::Meshes;
@@ -131,7 +130,7 @@ fn what_urdf_rs_takes_for_a_robot_is_checked_all_the_same() {
         RobotModel::try_from(&robot).unwrap_err().to_string()
     };
     assert!(with(&|robot| robot.joints[1].child.link = "link1".into()).contains("two parents"));
-    assert!(with(&|robot| robot.joints[0].joint_type = urdf_rs::JointType::Floating).contains("are not supported"));
+    assert!(with(&|robot| robot.joints[3].joint_type = urdf_rs::JointType::Floating).contains("are not supported"));
     assert!(with(&|robot| drop(robot.joints.pop())).contains("both have no parent"));
 }
 
@@ -257,134 +256,4 @@ fn every_robot_built_in_is_sound() {
     }
     let wrong = load(&Source::new("builtin:xarm66")).render(false);
     assert!(wrong.contains("unknown built-in robot `xarm66`") && wrong.contains("lite6, lite6_gripper"), "{wrong}");
-}
-
-struct Ended {
-    code: i32,
-    out: String,
-    err: String,
-}
-
-fn dimos(arguments: &[&str]) -> Ended {
-    let output = Command::new(env!("CARGO_BIN_EXE_dimos")).arg("model").args(arguments).output().unwrap();
-    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-    Ended { code: output.status.code().unwrap(), out: text(&output.stdout), err: text(&output.stderr) }
-}
-
-#[test]
-fn joints_are_found_for_a_pose_and_what_is_missing_is_said() {
-    let pose = ["--pose", "0.35", "0.05", "0.3", "--rpy", "3.1", "-.1", "0.2"];
-    let ik = dimos(&[&["ik", "builtin:yourarm"], &pose[..]].concat());
-    assert_eq!(ik.code, 0, "{}", ik.err);
-    let joints: Vec<&str> = ik.out.lines().nth(1).unwrap().split_whitespace().collect();
-    let fk = dimos(&[&["fk", "builtin:yourarm"], &joints[..]].concat());
-    assert!(fk.out.contains("xyz   0.350000 0.050000 0.300000  m"), "{}", fk.out);
-    assert!(fk.out.contains("rpy   3.1000") && fk.out.contains(" 0.2000"), "{}", fk.out);
-    // From where the solution is nearest to: another seed, another arm of the same hand.
-    let seed: Vec<String> = joints.iter().map(|q| (q.parse::<f64>().unwrap() + 0.1).to_string()).collect();
-    let seed: Vec<&str> = seed.iter().map(String::as_str).collect();
-    let near = dimos(&[&["ik", "builtin:yourarm"], &pose[..], &["--json", "--seed"], &seed[..]].concat());
-    let near: serde_json::Value = serde_json::from_str(&near.out).unwrap();
-    assert!(near["reached"] == true && near["position_error"].as_f64().unwrap() < 1e-6, "{near}");
-    for (q, expected) in near["positions"].as_array().unwrap().iter().zip(&joints) {
-        assert!((q.as_f64().unwrap() - expected.parse::<f64>().unwrap()).abs() < 1e-3, "{near} {joints:?}");
-    }
-    let far = dimos(&["ik", "builtin:yourarm", "--pose", "2", "0", "0.3"]);
-    assert!(far.code == 1 && far.err.contains("no IK solution after") && far.err.contains("mm"), "{}", far.err);
-    let far = dimos(&["ik", "builtin:yourarm", "--pose", "2", "0", "0.3", "--json"]);
-    let report: serde_json::Value = serde_json::from_str(&far.out).unwrap();
-    assert!(
-        far.code == 1 && report["reached"] == false && report["position_error"].as_f64().unwrap() > 1.0,
-        "{report}"
-    );
-    for wrong in [
-        &["ik", "builtin:yourarm"][..],
-        &["ik", "builtin:yourarm", "--pose", "0.3", "0", "0.3", "--quat", "0", "0", "0", "2"],
-        &["ik", "builtin:yourarm", "--pose", "0.3", "0", "0.3", "--seed", "0"],
-        &["ik", "builtin:yourarm", "--pose", "0.3", "0", "0.3", "--link", "flnge"],
-    ] {
-        assert_eq!(dimos(wrong).code, 2, "{wrong:?}");
-    }
-}
-
-#[test]
-fn verbs_show_a_robot() {
-    let info = dimos(&["info", "builtin:xarm6_gripper"]);
-    assert_eq!((info.code, info.err.as_str()), (0, ""));
-    for what in ["7 of them independent", "-178.2", "follows drive_joint", "link2 → link3", "cylinder r"] {
-        assert!(info.out.contains(what), "{what}\n{}", info.out);
-    }
-    let json: serde_json::Value = serde_json::from_str(&dimos(&["info", "builtin:piper", "--json"]).out).unwrap();
-    assert_eq!(json["joints"][2]["lower"], -2.9670597);
-    let tree = dimos(&["tree", "builtin:yourarm_gripper"]).out;
-    assert!(tree.contains("├─ finger_left  (finger_joint, prismatic)") && tree.contains("└─ tcp"), "{tree}");
-    let fk = dimos(&["fk", "builtin:yourarm", "0", "0", "0", "0", "0", "-.5", "--link", "flange"]);
-    assert!(fk.out.contains("xyz   0.400000 0.000000 0.550000  m"), "{}{}", fk.out, fk.err);
-    let wrong = dimos(&["fk", "builtin:yourarm", "0", "--link", "flange"]);
-    assert!(wrong.code == 2 && wrong.err.contains("takes 6 positions, found 1"), "{}", wrong.err);
-    let expanded = dimos(&["expand", "builtin:yourarm"]).out;
-    assert!(expanded.contains("<joint name=\"joint1\" type=\"revolute\">"), "{expanded}");
-}
-
-#[test]
-fn check_reports_everything_at_once() {
-    let folder = tempfile::tempdir().unwrap();
-    let file = folder.path().join("r.urdf");
-    let shape = |tag: &str, mesh: &str| format!("<{tag}><geometry><mesh filename='{mesh}'/></geometry></{tag}>");
-    let body = format!(
-        "<robot name='r'>\n<link name='a'>{}{}</link>\n<link name='b'/>\n<joint name='j' type='revolute'><parent link='a'/>\
-         <child link='b'/><axis xyz='0 0 0'/>\n<limit lower='1' upper='-1' velocity='1'/></joint></robot>",
-        shape("visual", "package://nowhere/a.stl"),
-        shape("collision", "gone.stl"),
-    );
-    std::fs::write(&file, &body).unwrap();
-    let path = file.to_str().unwrap();
-    let found = dimos(&["check", path]);
-    assert_eq!(found.code, 2);
-    for what in [
-        "this axis is zero",
-        "r.urdf:5:15",
-        "above the upper limit",
-        "collision mesh not found",
-        "--package nowhere=FOLDER",
-    ] {
-        assert!(found.err.contains(what), "{what}\n{}", found.err);
-    }
-    let json: serde_json::Value = serde_json::from_str(&dimos(&["check", path, "--json"]).out).unwrap();
-    assert_eq!((json["valid"].as_bool(), json["problems"].as_array().unwrap().len()), (Some(false), 4));
-    // A collision mesh that is there but broken is found too; a visual one only warned of.
-    std::fs::write(folder.path().join("gone.stl"), "solid\nendsolid").unwrap();
-    let fine =
-        body.replace("axis xyz='0 0 0'", "axis xyz='0 0 1'").replace("lower='1' upper='-1'", "lower='-1' upper='1'");
-    std::fs::write(&file, &fine).unwrap();
-    let found = dimos(&["check", path]);
-    assert!(found.code == 2 && found.err.contains("unusable mesh"), "{}", found.err);
-    assert_eq!(dimos(&["check", "no/such/file.urdf"]).code, 2);
-    assert_eq!(dimos(&["check", "builtin:lite6"]).code, 0);
-}
-
-#[test]
-fn xacro_and_srdf_work_from_the_command_line() {
-    let Some(root) = shared::shared("xacro") else { return };
-    let package = format!("xarm_description={}", root.join("pkgs/xarm_description").display());
-    let file = root.join("pkgs/xarm_description/urdf/xarm_device.urdf.xacro");
-    let srdf = root.join("pkgs/xarm_description/srdf/xarm.srdf.xacro");
-    let file = file.to_str().unwrap();
-    let common = ["--package", &package, "--xacro-arg", "dof:=6", "--xacro-arg", "limited:=true"];
-    let tree = dimos(&[&["tree", file][..], &common].concat());
-    assert!(tree.code == 0 && tree.out.contains("link6  (joint6, revolute)"), "{}{}", tree.out, tree.err);
-    let typo = dimos(&["tree", file, "--package", &package, "--xacro-arg", "dof:=6", "--xacro-arg", "limted:=true"]);
-    assert!(typo.err.contains("did you mean `limited`?"), "{}", typo.err);
-    let loaded = load(&Source {
-        packages: [("xarm_description".to_owned(), root.join("pkgs/xarm_description"))].into(),
-        xacro_args: [("dof".to_owned(), "6".to_owned())].into(),
-        srdf: Some(srdf),
-        meshes: Meshes::Ignore,
-        ..Source::new(Path::new(file))
-    });
-    let robot = loaded.model.as_ref().unwrap_or_else(|| panic!("{}", loaded.render(false)));
-    let group = loaded.semantics.groups.iter().find(|g| g.name == "xarm6").unwrap();
-    assert_eq!(loaded.semantics.group_joints(robot, &group.name).unwrap().len(), 6);
-    assert!(loaded.semantics.poses.iter().any(|p| p.positions.len() == 6), "{:?}", loaded.semantics.poses);
-    assert!(loaded.semantics.disabled.len() > 5);
 }

@@ -238,6 +238,21 @@ fn mistakes_stand_where_they_were_written_with_the_way_there() {
 fn functions_that_are_left_out_are_named() {
     let folder = tempfile::tempdir().unwrap();
     for (expression, what) in [
+        ("abs(-1)", "name 'abs' is not defined"),
+        ("abs(-1)", "hint: xacro knows it as python.abs"),
+        ("sum([1])", "name 'sum' is not defined"),
+        ("tuple([1])", "name 'tuple' is not defined"),
+        ("zip([1], [2])", "name 'zip' is not defined"),
+        ("any([1])", "name 'any' is not defined"),
+        ("all([1])", "name 'all' is not defined"),
+        ("reversed([1])", "name 'reversed' is not defined"),
+        ("isinstance(1, int)", "name 'isinstance' is not defined"),
+        ("divmod(7, 2)", "name 'divmod' is not defined"),
+        ("set([1])", "name 'set' is not defined"),
+        ("enumerate([1])", "enumerate() of Python is not supported"),
+        ("filter(None, [1])", "filter() of Python is not supported"),
+        ("ord('a')", "ord() of Python is not supported"),
+        ("repr(1)", "repr() of Python is not supported"),
         ("cosh(1)", "the function cosh() of Python is not supported"),
         ("python.enumerate([1])", "python.enumerate is not supported; the functions of python are list, dict,"),
         ("math.gcd(4, 6)", "math.gcd is not supported; the functions of math are acos, asin,"),
@@ -248,6 +263,21 @@ fn functions_that_are_left_out_are_named() {
         let found = mistakes(&write(folder.path(), "t.xacro", &format!("<a b=\"${{{expression}}}\"/>")));
         assert!(found.contains(what), "{expression}:\n{found}");
     }
+}
+
+#[test]
+fn a_misspelt_argument_is_reported_with_the_mistake_that_it_causes() {
+    let folder = tempfile::tempdir().unwrap();
+    let path =
+        write(folder.path(), "t.xacro", "<xacro:arg name='limited' default='x'/>\n<a b='${1 / $(arg limited)}'/>");
+    let with = |name: &str| {
+        let xacro_args = BTreeMap::from([(name.to_owned(), "2".to_owned())]);
+        load(&Source { meshes: Meshes::Ignore, xacro_args, ..Source::new(&path) }).render(false)
+    };
+    let found = with("limted");
+    assert!(found.contains("error") && found.contains("there is no xacro:arg `limted`"), "{found}");
+    assert!(found.contains("did you mean `limited`?"), "{found}");
+    assert!(!with("other").contains("`other`"), "files after the mistake may declare it");
 }
 
 #[test]

@@ -127,8 +127,8 @@ fn coordinator_so101() {
 #[test]
 fn coordinator_fr3() {
     // Its controller waits for late commands: the computer of a test may be busy.
-    let patient = "coordinator-fr3 --set hardware.arm.options.sim.patience=0.1";
-    exercise(patient, &[Arm { name: "arm", target: FR3, gripper: None }]);
+    let slow = "coordinator-fr3 --set hardware.arm.options.sim.command_wait=0.1";
+    exercise(slow, &[Arm { name: "arm", target: FR3, gripper: None }]);
 }
 
 #[test]

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use clap::Subcommand;
 use serde_json::json;
 
-use crate::assets::{Asset, Cache};
+use crate::assets::{Asset, Cache, without_password};
 use crate::blueprint::{Blueprint, Catalog, Overrides};
 use crate::cli::arguments::setting;
 use crate::cli::exit::{Exit, Result};
@@ -105,7 +105,7 @@ fn show(blueprint: &Blueprint, as_json: bool) {
         let all = blueprint.assets.iter().map(|used| {
             let (asset, (state, bytes)) = (&used.asset, state(&used.asset));
             let folder = (state == "here").then(|| cache.folder(&asset.sha256));
-            json!({"name": asset.name, "url": asset.url, "sha256": asset.sha256, "used": used.used, "state": state,
+            json!({"name": asset.name, "url": without_password(&asset.url), "sha256": asset.sha256, "used": used.used, "state": state,
                 "bytes": bytes, "folder": folder})
         });
         return output::json(&all.collect::<Vec<_>>());
@@ -123,7 +123,7 @@ fn show(blueprint: &Blueprint, as_json: bool) {
             toned(state, tone),
             bytes.map_or_else(|| "-".to_owned(), |bytes| bytes.to_string()).into(),
             if used.used { "yes" } else { "no" }.into(),
-            asset.url.as_str().into(),
+            without_password(&asset.url).into(),
             folder.into(),
         ]);
     }

@@ -1,96 +1,101 @@
 //! `dimos model fk`: the pose of a link at joint positions.
 
+use std::time::Duration;
+
+use nalgebra::Isometry3;
 use serde_json::json;
 
 use super::File;
+use super::chain::Chain;
 use crate::cli::arguments::finite;
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output;
+use crate::cli::targets::{Source, Width};
 use crate::pose::to_xyz_rpy;
 use crate::robot::RobotModel;
 use crate::robot::urdf::Meshes;
-use crate::yaml::did_you_mean;
 
 /// Arguments of `model fk`.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "The joints are the independent ones between the two links, in order from the base.")]
+#[command(after_help = "\
+The joints are the independent ones between the two links, in order from the base. Neither link must be below the
+other.
+With --stdin a line is a configuration, as numbers or a JSON array, and prints x y z [m] and a quaternion x y z w.")]
 pub struct Args {
     #[command(flatten)]
     file: File,
     /// Joint positions [rad, or m for prismatic joints]
     #[arg(value_name = "Q", value_parser = finite, allow_negative_numbers = true)]
     positions: Vec<f64>,
-    /// Link whose pose is printed; default: the end of the longest chain
+    /// Link whose pose is printed; default: the end of the arm
     #[arg(long, value_name = "NAME")]
     link: Option<String>,
     /// Reference link of the pose; default: the root
     #[arg(long, value_name = "NAME")]
     base: Option<String>,
+    /// Read configurations from stdin, one per line
+    #[arg(long, conflicts_with = "positions")]
+    stdin: bool,
 }
 
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
     let (robot, _) = args.file.robot(Meshes::Ignore)?;
-    let base = args.base.as_deref().map_or(Ok(0), |name| index(&robot, name))?;
-    let tip = args.link.as_deref().map_or_else(|| Ok(deepest(&robot)), |name| index(&robot, name))?;
-    let name = |link: usize| robot.links.get(link).map_or("?", |l| l.name.as_str());
-    let Some(chain) = robot.chain(base, tip) else {
-        return Err(Failure::usage(format!("`{}` is not below `{}`", name(tip), name(base))));
-    };
-    let moving: Vec<&str> = chain
-        .iter()
-        .filter_map(|i| robot.joints.get(*i))
-        .filter(|joint| joint.is_independent())
-        .map(|joint| joint.name.as_str())
-        .collect();
-    if moving.len() != args.positions.len() {
-        let what = format!("`{}` takes {} positions, found {}", name(tip), moving.len(), args.positions.len());
-        return Err(Failure::usage(what).hint(format!("the joints are: {}", moving.join(" "))));
+    let chain = Chain::between(&robot, args.base.as_deref(), args.link.as_deref())?;
+    if args.stdin {
+        return batch(args, &robot, &chain);
     }
-    for (joint, q) in moving.iter().zip(&args.positions) {
-        let joint = robot.joint_index(joint).and_then(|i| robot.joints.get(i));
-        if let Some(joint) = joint.filter(|j| *q < j.limits.lower || *q > j.limits.upper) {
-            let (name, unit, limits) = (&joint.name, joint.kind.unit(), joint.limits);
-            output::note(format_args!(
-                "warning: {name} at {q} {unit} is outside its limits {:.4} to {:.4} {unit}",
-                limits.lower, limits.upper
-            ));
-        }
+    if chain.joints.len() != args.positions.len() {
+        let (link, takes, found) = (chain.name(chain.link), chain.joints.len(), args.positions.len());
+        let failure = Failure::usage(format!("`{link}` takes {takes} positions, found {found}"));
+        return Err(failure.hint(format!("the joints are: {}", chain.names().join(" "))));
     }
-    let named = moving.iter().map(|joint| (*joint).to_owned()).zip(args.positions.iter().copied()).collect();
-    let poses = robot.link_poses(&robot.positions(&named));
-    let at = |link: usize| poses.get(link).copied().unwrap_or_default();
-    let pose = at(base).inverse() * at(tip);
-    let (xyz, rpy) = to_xyz_rpy(&pose);
-    let q = pose.rotation.quaternion().coords;
+    chain.outside(&args.positions).iter().for_each(output::note);
+    let pose = pose(&robot, &chain, &args.positions);
     if args.file.json {
-        output::json(&json!({
-            "link": name(tip), "base": name(base), "joints": moving, "positions": args.positions,
-            "xyz": xyz, "rpy": rpy, "quat_xyzw": q.as_slice(),
-        }));
+        output::json(&report(&chain, &args.positions, &pose));
         return Ok(Exit::Ok);
     }
-    let row = |values: &[f64]| values.iter().map(|v| output::fixed(*v, 6)).collect::<Vec<_>>().join(" ");
-    output::line(format_args!("{} in {}", name(tip), name(base)));
+    let (xyz, rpy) = to_xyz_rpy(&pose);
+    output::line(format_args!("{} in {}", chain.name(chain.link), chain.name(chain.base)));
     output::line(format_args!("xyz   {}  m", row(&xyz)));
     output::line(format_args!("rpy   {}  rad", row(&rpy)));
-    output::line(format_args!("quat  {}  x y z w", row(q.as_slice())));
+    output::line(format_args!("quat  {}  x y z w", row(pose.rotation.quaternion().coords.as_slice())));
     Ok(Exit::Ok)
 }
 
-pub(super) fn index(robot: &RobotModel, name: &str) -> Result<usize> {
-    robot.link_index(name).ok_or_else(|| {
-        let hint = did_you_mean(name, robot.links.iter().map(|l| l.name.as_str()), "the links are");
-        Failure { hint, ..Failure::usage(format!("{} has no link `{name}`", robot.name)) }
+/// Prints a line per configuration of stdin.
+fn batch(args: &Args, robot: &RobotModel, chain: &Chain<'_>) -> Result {
+    let mut configurations = Source::stdin(Width::Joints(chain.joints.len()));
+    while !configurations.is_over() {
+        let Some(positions) = configurations.next(Duration::from_secs(1))? else { continue };
+        let pose = pose(robot, chain, &positions);
+        if args.file.json {
+            output::json(&report(chain, &positions, &pose));
+        } else {
+            let (xyz, _) = to_xyz_rpy(&pose);
+            output::line(row(&[&xyz, pose.rotation.quaternion().coords.as_slice()].concat()));
+        }
+    }
+    Ok(Exit::Ok)
+}
+
+/// Returns the pose of the chain's link in its base, all other joints at zero.
+fn pose(robot: &RobotModel, chain: &Chain<'_>, positions: &[f64]) -> Isometry3<f64> {
+    let named = chain.names().into_iter().map(str::to_owned).zip(positions.iter().copied()).collect();
+    let poses = robot.link_poses(&robot.positions(&named));
+    let at = |link: usize| poses.get(link).copied().unwrap_or_default();
+    at(chain.base).inverse() * at(chain.link)
+}
+
+fn report(chain: &Chain<'_>, positions: &[f64], pose: &Isometry3<f64>) -> serde_json::Value {
+    let (xyz, rpy) = to_xyz_rpy(pose);
+    json!({
+        "link": chain.name(chain.link), "base": chain.name(chain.base), "joints": chain.names(),
+        "positions": positions, "xyz": xyz, "rpy": rpy, "quat_xyzw": pose.rotation.quaternion().coords.as_slice(),
     })
 }
 
-/// Returns the first link with the longest chain of joints.
-pub(super) fn deepest(robot: &RobotModel) -> usize {
-    let mut depths = vec![0; robot.links.len()];
-    for joint in &robot.joints {
-        depths[joint.child] = depths[joint.parent] + 1;
-    }
-    let most = depths.iter().max().copied().unwrap_or(0);
-    depths.iter().position(|d| *d == most).unwrap_or(0)
+fn row(values: &[f64]) -> String {
+    values.iter().map(|v| output::fixed(*v, 6)).collect::<Vec<_>>().join(" ")
 }

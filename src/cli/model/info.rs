@@ -1,26 +1,27 @@
 //! `dimos model info` and `tree`: the structure of a robot.
 
-use std::collections::HashMap;
-use std::path::PathBuf;
-
 use serde_json::{Value, json};
 
 use super::File;
-use crate::cli::exit::{Exit, Result};
+use super::meshes::MeshSizes;
+use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output::{self, Table};
 use crate::pose::to_xyz_rpy;
-use crate::robot::mesh::Mesh;
 use crate::robot::srdf::Semantics;
 use crate::robot::urdf::Meshes;
 use crate::robot::{Geometry, Joint, RobotModel, Shape};
 
 /// Runs `info`.
 pub(super) fn info(file: &File) -> Result {
-    let (robot, loaded) = file.robot(Meshes::Find)?;
-    let mut meshes = MeshCounts::default();
+    let (robot, loaded) = file.robot(Meshes::Mark)?;
+    let mut meshes = MeshSizes::default();
+    for diag in meshes.mistakes(&robot, loaded.document.as_ref()) {
+        let hint = diag.hint.map(|hint| format!("\nhint: {hint}")).unwrap_or_default();
+        output::note(format_args!("warning: {}{hint}", diag.message));
+    }
     if file.json {
         output::json(&to_json(&robot, &loaded.semantics, &mut meshes));
-        return Ok(Exit::Ok);
+        return complete(&robot, &mut meshes);
     }
     let independent = robot.independent_joints().len();
     let (links, joints) = (robot.links.len(), robot.joints.len());
@@ -55,7 +56,21 @@ pub(super) fn info(file: &File) -> Result {
     }
     table.print();
     print_semantics(&robot, &loaded.semantics);
-    Ok(Exit::Ok)
+    complete(&robot, &mut meshes)
+}
+
+/// Returns a failure if collision meshes are missing or unreadable: the table shows which.
+fn complete(robot: &RobotModel, meshes: &mut MeshSizes) -> Result {
+    let collisions = robot.links.iter().flat_map(|link| &link.collisions);
+    let lacks = |shape: &&Shape| match &shape.geometry {
+        Geometry::Mesh(mesh) => !matches!(meshes.of(mesh), Some(Ok(_))),
+        _ => false,
+    };
+    match collisions.filter(lacks).count() {
+        0 => Ok(Exit::Ok),
+        1 => Err(Failure::usage("a collision mesh is missing or unreadable")),
+        more => Err(Failure::usage(format!("{more} collision meshes are missing or unreadable"))),
+    }
 }
 
 fn joint_row(robot: &RobotModel, joint: &Joint) -> Vec<String> {
@@ -97,7 +112,8 @@ fn print_semantics(robot: &RobotModel, semantics: &Semantics) {
     table.print();
     for pose in &semantics.poses {
         let values: Vec<String> = pose.positions.iter().map(|(joint, q)| format!("{joint} {q}")).collect();
-        output::line(format_args!("pose {} of {}: {}", pose.name, pose.group, values.join(", ")));
+        let outside = if pose.outside(robot).is_some() { " (OUTSIDE THE LIMITS)" } else { "" };
+        output::line(format_args!("pose {} of {}: {}{outside}", pose.name, pose.group, values.join(", ")));
     }
     for tool in &semantics.end_effectors {
         output::line(format_args!("end effector {}: {} on {}", tool.name, tool.group, tool.parent_link));
@@ -110,24 +126,12 @@ fn joint_names(robot: &RobotModel, semantics: &Semantics, group: &str) -> Vec<St
     joints.iter().filter_map(|i| robot.joints.get(*i)).map(|j| j.name.clone()).collect()
 }
 
-/// Numbers of triangles; each file is read once.
-#[derive(Debug, Default)]
-struct MeshCounts(HashMap<PathBuf, Option<usize>>);
-
-impl MeshCounts {
-    fn of(&mut self, geometry: &Geometry) -> Option<usize> {
-        let Geometry::Mesh(mesh) = geometry else { return None };
-        let path = mesh.path.clone()?;
-        *self.0.entry(path).or_insert_with(|| Mesh::load(mesh).ok().map(|m| m.triangles.len()))
-    }
-}
-
-fn shapes(shapes: &[Shape], meshes: &mut MeshCounts) -> String {
+fn shapes(shapes: &[Shape], meshes: &mut MeshSizes) -> String {
     let words: Vec<String> = shapes.iter().map(|shape| described(&shape.geometry, meshes)).collect();
     words.join(", ")
 }
 
-fn described(geometry: &Geometry, meshes: &mut MeshCounts) -> String {
+fn described(geometry: &Geometry, meshes: &mut MeshSizes) -> String {
     match geometry {
         Geometry::Box { size } => format!("box {} × {} × {} m", size.x, size.y, size.z),
         Geometry::Sphere { radius } => format!("sphere r {radius} m"),
@@ -135,9 +139,10 @@ fn described(geometry: &Geometry, meshes: &mut MeshCounts) -> String {
         Geometry::Capsule { radius, length } => format!("capsule r {radius} l {length} m"),
         Geometry::Mesh(mesh) => {
             let name = mesh.uri.rsplit('/').next().unwrap_or(&mesh.uri);
-            match meshes.of(geometry) {
-                Some(triangles) => format!("{name} ({triangles} triangles)"),
-                None => format!("{name} (not read)"),
+            match meshes.of(mesh) {
+                Some(Ok(size)) => format!("{name} ({} triangles, {})", size.triangles, size.shown()),
+                Some(Err(_)) => format!("{name} (UNREADABLE)"),
+                None => format!("{name} (NOT FOUND)"),
             }
         }
     }
@@ -184,7 +189,7 @@ fn branch(robot: &RobotModel, link: usize) -> Value {
     json!({"name": robot.links.get(link).map(|l| l.name.as_str()), "children": children})
 }
 
-fn to_json(robot: &RobotModel, semantics: &Semantics, meshes: &mut MeshCounts) -> Value {
+fn to_json(robot: &RobotModel, semantics: &Semantics, meshes: &mut MeshSizes) -> Value {
     let name = |link: usize| robot.links.get(link).map(|l| l.name.as_str());
     let finite = |value: f64| Some(value).filter(|v| v.is_finite());
     let pose = |p: &nalgebra::Isometry3<f64>| {
@@ -215,9 +220,13 @@ fn to_json(robot: &RobotModel, semantics: &Semantics, meshes: &mut MeshCounts) -
             Geometry::Sphere { radius } => json!({"sphere": {"radius": radius}}),
             Geometry::Cylinder { radius, length } => json!({"cylinder": {"radius": radius, "length": length}}),
             Geometry::Capsule { radius, length } => json!({"capsule": {"radius": radius, "length": length}}),
-            Geometry::Mesh(m) => json!({"mesh": {
-                "uri": m.uri, "path": m.path, "scale": m.scale.as_slice(), "triangles": meshes.of(&s.geometry),
-            }}),
+            Geometry::Mesh(m) => {
+                let size = meshes.of(m).and_then(|size| size.as_ref().ok());
+                json!({"mesh": {
+                    "uri": m.uri, "path": m.path, "scale": m.scale.as_slice(),
+                    "triangles": size.map(|size| size.triangles), "extents": size.map(|size| size.extents.as_slice()),
+                }})
+            }
         };
         json!({"origin": pose(&s.origin), "geometry": what})
     };

@@ -79,6 +79,14 @@ fn every_format_gives_the_same_mesh() {
 }
 
 #[test]
+fn a_line_break_after_the_triangles_of_a_binary_file_is_accepted() {
+    for end in ["\n", "\r\n"] {
+        let bytes = [binary_stl(b""), end.as_bytes().to_vec()].concat();
+        assert_eq!(read("a.stl", &bytes, ONE).unwrap().triangles.len(), 4, "{end:?}");
+    }
+}
+
+#[test]
 fn scales_apply_and_mirrors_stay_right_side_out() {
     for (scale, high) in [([0.001, 0.001, 0.001], 0.003), ([1.0, -1.0, 1.0], 3.0), ([-1.0, -1.0, 2.0], 6.0)] {
         let mesh = read("a.stl", &binary_stl(b""), scale.into()).unwrap();
@@ -124,10 +132,26 @@ fn unusable_files_are_rejected() {
     nan[96..100].copy_from_slice(&f32::NAN.to_le_bytes());
     let mut short = binary_stl(b"");
     short.truncate(120);
+    // Cut between two triangles, and with one too many: the length alone looks like that of a whole file.
+    let mut cut = binary_stl(b"solid t");
+    cut.truncate(84 + 2 * 50);
+    let padded = [binary_stl(b""), vec![7; 50]].concat();
+    let mut bogus = binary_stl(b"");
+    bogus[80..84].copy_from_slice(&4_000_000_000_u32.to_le_bytes());
+    let pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n".to_vec();
+    let page = b"\n<!DOCTYPE html>\n<html><body>404</body></html>".to_vec();
     let own = "<node id='n'><instance_node url='#n'/></node>";
     for (name, bytes, what) in [
         ("a.stl", nan, "a vertex at NaN"),
-        ("a.stl", short, ""),
+        ("a.stl", short, "the file is truncated or not STL: its header declares 4 triangles (284 bytes), it has 120"),
+        ("a.stl", cut, "its header declares 4 triangles (284 bytes), it has 184 bytes"),
+        ("a.stl", padded, "the file is damaged: its header declares 4 triangles (284 bytes), it has 334 bytes"),
+        ("a.stl", bogus, "declares 4000000000 triangles (200000000084 bytes)"),
+        ("a.stl", b"shorter than a header".to_vec(), "truncated: 21 bytes"),
+        ("a.stl", pointer.clone(), "this is a Git LFS pointer"),
+        ("a.dae", pointer, "run `git lfs pull`"),
+        ("a.obj", page, "this is a web page"),
+        ("a.obj", b"v 1 2 3\nv 1 2 4\nv 1 3 4\nf 0 1 2\n".to_vec(), "count from 1"),
         ("a.stl", Vec::new(), ""),
         ("a.ply", Vec::new(), "meshes of type `ply` cannot be read"),
         ("a.obj", b"v 1 2 3\nf 1 2 9\n".to_vec(), ""),

@@ -35,6 +35,10 @@ impl Reader<'_> {
         let Some(shape) = element.elements().next() else {
             return self.unusable(element.at, collides, "this geometry is empty".to_owned());
         };
+        if collides && has_no_extent(shape) {
+            self.warn(shape.at, format!("this {} has no extent: it is left out", shape.name));
+            return None;
+        }
         let length = |reader: &mut Self, name: &str| {
             let (_, at) = reader.needed(shape, name)?;
             let value = reader.number_or(shape, name, 0.0)?;
@@ -81,12 +85,15 @@ impl Reader<'_> {
             return self.unusable(at, collides, "a scale of zero is not allowed".to_owned());
         }
         let mut path = None;
-        if self.meshes == Meshes::Find {
+        if self.meshes != Meshes::Ignore {
             match (self.resolve)(uri) {
                 Ok(found) => path = Some(found),
                 Err(why) => {
                     let Message { what, hint } = why.into();
                     let diag = match collides {
+                        true if self.meshes == Meshes::Mark => {
+                            Diag::warning(format!("collision mesh not found: {what}"))
+                        }
                         true => Diag::error(format!("collision mesh not found: {what}")),
                         false => Diag::warning(format!("visual mesh not found, it is not shown: {what}")),
                     };
@@ -142,4 +149,17 @@ impl Reader<'_> {
         let inertia = Matrix3::new(xx, xy, xz, xy, yy, yz, xz, yz, zz);
         Some(Inertial { origin: origin?, mass: kilograms, inertia })
     }
+}
+
+/// Returns whether all extents of a shape are zero: vendors write that for links that do not collide.
+fn has_no_extent(shape: &Element) -> bool {
+    let names: &[&str] = match shape.name.as_str() {
+        "box" => &["size"],
+        "sphere" => &["radius"],
+        "cylinder" | "capsule" => &["radius", "length"],
+        _ => return false,
+    };
+    let zero = |text: &str| text.parse::<f64>() == Ok(0.0);
+    let mut extents = names.iter().map(|name| shape.attribute(name).map(|a| a.value.trim()).unwrap_or_default());
+    extents.all(|extent| !extent.is_empty() && extent.split_whitespace().all(zero))
 }

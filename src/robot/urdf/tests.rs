@@ -43,6 +43,9 @@ fn a_tree_is_put_in_order() {
     assert_eq!(model.independent_joints(), [0, 2]);
     assert_eq!(model.chain(0, 3), Some(vec![0, 1, 2]));
     assert_eq!(model.chain(1, 4), None);
+    // From d up to a, and down to e, which follows j1.
+    assert_eq!((model.path(3, 4), model.path(1, 3), model.path(2, 2)), (vec![2, 1, 0, 3], vec![1, 2], vec![]));
+    assert_eq!(model.independent_of(&[2, 1, 0, 3]), [2, 0]);
     let at = model.positions(&[("j1".to_owned(), 0.25), ("j3".to_owned(), -0.04)].into());
     assert_eq!(at, [0.25, 0.0, -0.04, 1.0]);
     let tip = model.link_poses(&[0.0, 0.0, -0.04, 0.0])[3];
@@ -64,7 +67,15 @@ fn mistakes_are_reported_with_their_position() {
         (joint("fixed", "").replace("child link='b'", "child link='c'"), "the child link `c` does not exist", ""),
         (joint("fixed", "").replace("parent link='a'", "parent link='aa'"), "the parent link `aa` does not exist", ""),
         (joint("fixd", ""), "unknown joint type", "t.urdf:1"),
-        (joint("planar", ""), "joints of type `planar` are not supported", ""),
+        (
+            robot(&format!(
+                "{TWO}<link name='c'/><joint name='k' type='fixed'><parent link='a'/><child link='b'/></joint>\
+                            <joint name='j' type='planar'><parent link='b'/><child link='c'/></joint>"
+            )),
+            "joints of type `planar` are not supported",
+            "",
+        ),
+        (joint("spherical", ""), "joints of type `spherical` are not supported", ""),
         (joint("revolute", ""), "this revolute joint has no `limit`", ""),
         (limits("<limit velocity='1' effort='1'/>"), "neither `lower` nor `upper`", ""),
         (limits("<limit lower='-1' upper='1'/>"), "this limit has no `velocity`", ""),
@@ -143,6 +154,29 @@ fn what_exporters_write_is_accepted() {
     let Geometry::Mesh(mesh) = &visuals[1].geometry else { panic!("{visuals:?}") };
     assert_eq!((mesh.uri.as_str(), mesh.scale), ("package://p/x.stl", Vector3::new(1.0, -1.0, 0.001)));
     assert_eq!(model.links[0].collisions[0].geometry, Geometry::Capsule { radius: 1.0, length: 2.0 });
+}
+
+#[test]
+fn a_floating_root_counts_as_fixed_and_shapes_without_extent_are_left_out() {
+    let empty = |shape: &str| format!("<link name='a'><collision><geometry>{shape}</geometry></collision></link>");
+    for (text, what) in [
+        (joint("floating", ""), "this floating joint at the root counts as fixed"),
+        (joint("planar", ""), "this planar joint at the root counts as fixed"),
+        (robot(&empty("<box size='0 0.0 0'/>")), "this box has no extent: it is left out"),
+        (robot(&empty("<sphere radius='0'/>")), "this sphere has no extent"),
+        (robot(&empty("<cylinder radius='0' length='0'/>")), "this cylinder has no extent"),
+    ] {
+        let mut tree = Tree::new();
+        let source = tree.add_source("t.urdf", text.clone());
+        let document = crate::robot::xml::parse(&mut tree, source).unwrap();
+        let refuse: &Resolve<'_> = &|uri| Err(uri.to_owned());
+        let model = read(&document.root, &mut tree, &Calls::default(), Meshes::Ignore, refuse).expect(what);
+        let found = &tree.diags()[0];
+        assert!(found.message.contains(what) && tree.diags().len() == 1 && found.at.is_some(), "{text}: {found:?}");
+        assert!(model.links[0].collisions.is_empty() && model.independent_joints().is_empty());
+    }
+    // A plate without thickness is a mistake, not an empty shape.
+    assert!(report(&robot(&empty("<box size='1 1 0'/>"))).contains("must be positive"));
 }
 
 #[test]

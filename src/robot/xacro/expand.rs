@@ -7,7 +7,7 @@ use std::rc::Rc;
 use super::evaluate::Evaluated;
 use super::scope::{Block, Entry, Macros, Scopes};
 use super::value::Value;
-use super::{Expansion, ExpansionError, Result};
+use super::{Expansion, ExpansionError, Result, unknown_argument};
 use crate::robot::packages::{Packages, absolute, plain};
 use crate::robot::xml::{Calls, Document, Element, Node};
 use crate::yaml::{Diag, Tree, closest};
@@ -85,13 +85,17 @@ impl<'t> Expander<'t> {
             document.root.set("xmlns", target.value, target.at);
         }
         let done = self.element(&mut document.root, Env { symbols: 0, macros: 0 });
+        let unknown = self.given.keys().filter(|name| !self.declared.contains(*name));
+        let near = |name: &str| closest(name, self.declared.iter().map(String::as_str)).map(str::to_owned);
+        let unknown_args: Vec<_> = unknown.map(|name| (name.clone(), near(name))).collect();
         if let Err(trouble) = done {
+            // A misspelt argument may be the cause. The files after the mistake may declare others.
+            for (name, near) in unknown_args.iter().filter(|(_, near)| near.is_some()) {
+                self.tree.report(unknown_argument(name, near.as_deref(), source));
+            }
             self.tree.report(trouble.diag(&self.calls, source));
             return None;
         }
-        let unknown = self.given.keys().filter(|name| !self.declared.contains(*name));
-        let near = |name: &str| closest(name, self.declared.iter().map(String::as_str)).map(str::to_owned);
-        let unknown_args = unknown.map(|name| (name.clone(), near(name))).collect();
         Some(Expansion { document, calls: self.calls, files: self.read, unknown_args })
     }
 

@@ -6,7 +6,7 @@ use std::rc::Rc;
 use super::evaluate::{Evaluated, Interpreter, MAX_LENGTH, hashable, items, pair_work};
 use super::value::{Dict, Value, integer};
 
-/// Names available to every expression, and in the module `python`.
+/// Built-ins of the module `python`.
 const PYTHON: &[&str] = &[
     "list",
     "dict",
@@ -32,6 +32,9 @@ const PYTHON: &[&str] = &[
     "tuple",
     "zip",
 ];
+/// Those that an expression may also call without the module name. The original defines no others.
+const BUILT_IN: &[&str] =
+    &["list", "dict", "map", "len", "str", "float", "int", "bool", "min", "max", "round", "sorted", "range"];
 const MATH: &[&str] = &[
     "acos", "asin", "atan", "atan2", "ceil", "copysign", "cos", "degrees", "exp", "fabs", "floor", "fmod", "hypot",
     "isnan", "log", "log10", "pow", "radians", "sin", "sqrt", "tan", "trunc",
@@ -57,8 +60,11 @@ const OMITTED: &str = "acosh asinh atanh cbrt comb complex cosh dist enumerate e
     frexp frozenset fsum gamma gcd hash isclose isfinite isinf issubclass isqrt lcm ldexp lgamma log1p log2 modf \
     nextafter ord perm prod remainder repr sinh slice tanh type ulp vars";
 
-/// Says that a global name is unknown, or of a function that is left out.
+/// Says that a global name is unknown, or of a function that is left out, or needs its module's name.
 pub(super) fn undefined(name: &str) -> String {
+    if PYTHON.contains(&name) {
+        return format!("name '{name}' is not defined\nhint: xacro knows it as python.{name}");
+    }
     match OMITTED.split_whitespace().any(|omitted| omitted == name) {
         true => format!("the function {name}() of Python is not supported"),
         false => format!("name '{name}' is not defined"),
@@ -78,7 +84,7 @@ pub(super) fn undefined_in(module: &str, name: &str) -> String {
 /// Returns a global name.
 pub(super) fn global(name: &str) -> Option<Value> {
     let module = ["math", "python", "xacro"].into_iter().find(|m| *m == name).map(Value::Module);
-    module.or_else(|| find(PYTHON, name)).or_else(|| in_module("math", name)).or_else(|| find(BARE, name))
+    module.or_else(|| find(BUILT_IN, name)).or_else(|| in_module("math", name)).or_else(|| find(BARE, name))
 }
 
 /// Returns a name of a module.

@@ -11,6 +11,7 @@ use super::scope::{Entry, MacroEntry};
 use super::value::Value;
 use super::yaml11;
 use super::{ExpansionError, Result};
+use crate::robot::encoding;
 use crate::robot::xml::{self, Document, Element, Node};
 
 /// Maximum nesting of includes.
@@ -95,12 +96,7 @@ impl Expander<'_> {
         if self.read.len() >= MAX_FILES {
             return Err(named(format!("more than {MAX_FILES} files")));
         }
-        let size = fs::metadata(path).map_err(|e| named(e.to_string()))?.len();
-        if size > most {
-            return Err(named(format!("the file is larger than {} MiB", most >> 20)));
-        }
-        let bytes = fs::read(path).map_err(|e| named(e.to_string()))?;
-        let text = String::from_utf8(bytes).map_err(|_| named("the file is not UTF-8".to_owned()))?;
+        let text = encoding::read(path, most).map_err(named)?;
         self.read.push(path.to_owned());
         Ok(text)
     }

@@ -98,21 +98,24 @@ fn revolute(out: &mut String, number: usize, joint: Joint, height: f64) {
 fn shapes(joint: Joint, length: f64, radius: f64) -> Vec<String> {
     match joint {
         Joint::Roll => vec![cylinder(radius, length, length / 2.0)],
-        // A housing across, and the link's own length.
-        Joint::Pitch => vec![
-            format!(
+        // A housing across, and the link's own length as a capsule.
+        Joint::Pitch => {
+            let (own, straight) = (millimetres(0.8 * radius), millimetres(length - 1.6 * radius));
+            // Half a millimetre is the finest step.
+            let end = |sign: f64| sphere(own, (1e4 * (length + sign * straight) / 2.0).round() / 1e4);
+            let housing = format!(
                 "<origin xyz=\"0 0 0\" rpy=\"1.5707963267948966 0 0\"/><geometry>\
                  <cylinder radius=\"{radius}\" length=\"{}\"/></geometry>",
                 millimetres(2.4 * radius)
-            ),
-            format!(
-                "<origin xyz=\"0 0 {}\"/><geometry><capsule radius=\"{}\" length=\"{}\"/></geometry>",
-                length / 2.0,
-                millimetres(0.8 * radius),
-                millimetres(length - 1.6 * radius)
-            ),
-        ],
+            );
+            vec![housing, cylinder(own, straight, length / 2.0), end(-1.0), end(1.0)]
+        }
     }
+}
+
+/// A sphere on the z axis at a height.
+fn sphere(radius: f64, middle: f64) -> String {
+    format!("<origin xyz=\"0 0 {middle}\"/><geometry><sphere radius=\"{radius}\"/></geometry>")
 }
 
 /// A cylinder about z with its middle at a height.

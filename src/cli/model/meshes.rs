@@ -1,0 +1,112 @@
+//! Mesh files of a description: each is read once; their sizes, and what is wrong with them.
+
+use std::collections::HashMap;
+use std::path::PathBuf;
+
+use nalgebra::Vector3;
+
+use crate::message::Message;
+use crate::robot::mesh::Mesh;
+use crate::robot::model::MeshFile;
+use crate::robot::xml::Document;
+use crate::robot::{Geometry, RobotModel, Shape};
+use crate::yaml::{Diag, Label};
+
+/// Extent above which the unit of a mesh is doubted [m].
+const LARGE: f64 = 10.0;
+/// Extent below which the unit of a mesh is doubted [m].
+const SMALL: f64 = 1e-4;
+
+/// Size of a mesh.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Size {
+    /// Number of triangles.
+    pub triangles: usize,
+    /// Extents along x, y, z, after scaling [m].
+    pub extents: Vector3<f64>,
+}
+
+impl Size {
+    /// Returns why the unit of the mesh is doubtful, and the likely cause.
+    fn doubt(&self) -> Option<(String, &'static str)> {
+        let most = self.extents.amax();
+        let shown = self.shown();
+        if most > LARGE {
+            let hint = "a URDF is in metres: if the file is in millimetres, add scale=\"0.001 0.001 0.001\"";
+            return Some((format!("extends over {shown}"), hint));
+        }
+        let hint = "is it scaled twice? a file in metres needs no scale";
+        (most < SMALL).then(|| (format!("extends over only {shown}"), hint))
+    }
+
+    /// Returns the extents as text.
+    pub fn shown(&self) -> String {
+        // Four significant digits of the largest one.
+        let digits = (3.0 - self.extents.amax().log10().floor()).clamp(0.0, 12.0) as usize;
+        let [x, y, z] = [self.extents.x, self.extents.y, self.extents.z];
+        format!("{x:.digits$} × {y:.digits$} × {z:.digits$} m")
+    }
+}
+
+/// The meshes read so far, by file and scale.
+#[derive(Debug, Default)]
+pub(super) struct MeshSizes(HashMap<(PathBuf, [u64; 3]), Result<Size, String>>);
+
+impl MeshSizes {
+    /// Returns the size of a mesh, or why it cannot be read; `None` if its file was not found.
+    pub fn of(&mut self, mesh: &MeshFile) -> Option<&Result<Size, String>> {
+        let path = mesh.path.clone()?;
+        let scale = [mesh.scale.x, mesh.scale.y, mesh.scale.z].map(f64::to_bits);
+        let read = || {
+            let mesh = Mesh::load(mesh)?;
+            Ok(Size { triangles: mesh.triangles.len(), extents: mesh.extents() })
+        };
+        Some(self.0.entry((path, scale)).or_insert_with(read))
+    }
+
+    /// Returns the number of triangles of all meshes read.
+    pub fn triangles(&self) -> usize {
+        self.0.values().flatten().map(|size| size.triangles).sum()
+    }
+
+    /// Returns what is wrong with the meshes of a robot, each once: an unreadable collision mesh is an error, a
+    /// visual one and an unlikely size are warnings. Positions are those in the expanded description.
+    pub fn mistakes(&mut self, robot: &RobotModel, document: Option<&Document>) -> Vec<Diag> {
+        let mut diags: Vec<Diag> = Vec::new();
+        for link in &robot.links {
+            let collisions = link.collisions.iter().map(|shape| (shape, true));
+            for (shape, collides) in collisions.chain(link.visuals.iter().map(|shape| (shape, false))) {
+                let Shape { geometry: Geometry::Mesh(mesh), .. } = shape else { continue };
+                let diag = match self.of(mesh) {
+                    Some(Ok(size)) => size.doubt().map(|(what, hint)| {
+                        Diag::warning(format!("the mesh of the link `{}` {what}: {}", link.name, mesh.uri)).hint(hint)
+                    }),
+                    Some(Err(why)) => {
+                        let Message { what, hint } = why.clone().into();
+                        let what = format!("unusable mesh of the link `{}`: {what}", link.name);
+                        let diag = if collides { Diag::error(what) } else { Diag::warning(what) };
+                        Some(diag.maybe_hint(hint))
+                    }
+                    None => None,
+                };
+                let Some(mut diag) = diag else { continue };
+                diag.at = document.and_then(|document| place(document, &link.name, &mesh.uri, collides));
+                let known = |other: &Diag| other.message == diag.message && other.severity == diag.severity;
+                if !diags.iter().any(known) {
+                    diags.push(diag);
+                }
+            }
+        }
+        diags
+    }
+}
+
+/// Returns the position of a mesh's file name in a description.
+fn place(document: &Document, link: &str, uri: &str, collides: bool) -> Option<Label> {
+    let named = |element: &&crate::robot::xml::Element| element.attribute("name").is_some_and(|a| a.value == link);
+    let link = document.root.named("link").find(named)?;
+    let shapes = link.named(if collides { "collision" } else { "visual" });
+    let files = shapes.filter_map(|shape| shape.child("geometry")?.child("mesh")?.attribute("filename"));
+    let mut files = files.filter(|file| file.value == uri);
+    files.next().map(|file| file.at.label())
+}

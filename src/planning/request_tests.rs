@@ -1,0 +1,116 @@
+//! Requests with goals at their limits, straight lines that are blocked, and several arms.
+
+use nalgebra::{Isometry3, Translation3};
+
+use super::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
+use super::goals::configurations;
+use super::path_planner::PlanError;
+use super::pipeline::{Goal, PlanRequest, PlannedMotion, solve, stage};
+use super::planning_scene::PlanningScene;
+use crate::collision::{CollisionChecker, Stop};
+use crate::robot::kinematics::pose;
+use crate::robot::random::Random;
+
+fn scene(robots: Vec<RobotConfig>, objects: Vec<ObjectConfig>) -> PlanningScene {
+    PlanningScene::load(&PlannerConfig { robots, objects, ..PlannerConfig::default() }).unwrap()
+}
+
+fn ask(scene: &PlanningScene, goal: Goal, start: &[f64]) -> Result<PlannedMotion, String> {
+    let request = PlanRequest { goals: vec![(0, goal)], positions: vec![start.to_vec()], speed: 1.0, seed: 0 };
+    solve(scene, &scene.world, &request, &Stop::never()).map_err(|failure| failure.what)
+}
+
+/// Returns the pose of a robot's end effector in the frame `map`.
+fn flange(scene: &PlanningScene, robot: usize, q: &[f64]) -> Isometry3<f64> {
+    let robot = &scene.robots[robot];
+    let mut frames = robot.body.kinematics.frames();
+    robot.body.kinematics.forward_from(&robot.body.base, q, &mut frames);
+    pose(&robot.body.kinematics.link_frame(robot.end_effector, &frames))
+}
+
+#[test]
+fn a_goal_at_a_rounded_limit_is_moved_to_the_limit_and_reported() {
+    let scene = scene(vec![RobotConfig::yourarm()], Vec::new());
+    let (start, upper) = ([0.0, 0.0, 0.5, 0.0, 0.0, 0.0], scene.robots[0].limits[0].upper);
+    let to = |first: f64| ask(&scene, Goal::Joints([&[first], &start[1..]].concat()), &start);
+    let motion = to(upper + 5e-4).unwrap();
+    assert_eq!(motion.path.last().unwrap()[0], upper);
+    assert_eq!(motion.clamped, [("arm_joint1".to_owned(), upper + 5e-4, upper)]);
+    assert_eq!(to(upper).unwrap().clamped, []);
+    let refused = to(upper + 2e-3).unwrap_err();
+    assert!(refused.contains("arm_joint1 at 2.") && refused.contains("is outside its limits"), "{refused}");
+}
+
+#[test]
+fn a_position_and_its_limit_are_shown_with_digits_that_differ() {
+    let pi = std::f64::consts::PI;
+    let upper = (pi * 1e5).floor() / 1e5;
+    let lower = -upper;
+    let shown = |position| PlanError::Outside { which: "goal", joint: 6, position, lower, upper }.to_string();
+    assert_eq!(shown(3.5), "joint 6 of the goal is at 3.5000, outside -3.1416 to 3.1416");
+    assert_eq!(shown(pi), "joint 6 of the goal is at 3.141593, outside -3.141590 to 3.141590");
+    assert_eq!(shown(-pi), "joint 6 of the goal is at -3.141593, outside -3.141590 to 3.141590");
+}
+
+#[test]
+fn a_blocked_straight_line_names_the_pair_and_where_it_is() {
+    let start = [0.0, -0.2, 0.8, 0.0, 0.6, 0.0];
+    let empty = scene(vec![RobotConfig::yourarm()], Vec::new());
+    let from = flange(&empty, 0, &start);
+    let target = Translation3::new(0.0, 0.25, 0.0) * from;
+    assert_eq!(ask(&empty, Goal::Line(target), &start).unwrap().fraction, Some(1.0));
+    let ball = ObjectConfig {
+        name: "ball".into(),
+        shape: ObjectShape::Sphere(0.03),
+        pose: (Translation3::new(0.0, 0.2, 0.0) * from).translation.into(),
+        padding: 0.0,
+    };
+    let blocked = scene(vec![RobotConfig::yourarm()], vec![ball]);
+    let failure = ask(&blocked, Goal::Line(target), &start).unwrap_err();
+    let (place, _) = failure.split_once(" of 250 mm link ").unwrap_or_else(|| panic!("{failure}"));
+    let along: f64 = place.rsplit_once("after ").unwrap().1.parse().unwrap();
+    assert!((50.0..200.0).contains(&along), "{failure}");
+    assert!(failure.contains("would come too close to obstacle \"ball\"") && failure.contains("mm deep"), "{failure}");
+}
+
+#[test]
+fn goals_of_several_arms_touch_nothing_that_is_fixed() {
+    let arm = |name: &str, y: f64| RobotConfig {
+        name: name.into(),
+        base_pose: Isometry3::translation(0.0, y, 0.0),
+        coordinator_joints: (1..=6).map(|k| format!("{name}_joint{k}")).collect(),
+        ..RobotConfig::yourarm()
+    };
+    let table = ObjectConfig {
+        name: "table".into(),
+        shape: ObjectShape::Box([3.0, 6.0, 0.1]),
+        pose: Isometry3::translation(0.9, 0.0, 0.05),
+        padding: 0.0,
+    };
+    // The base is just above the table.
+    let mut arms = vec![arm("left", 1.0), arm("right", -1.0)];
+    arms.iter_mut().for_each(|arm| arm.base_pose.translation.z = 0.102);
+    let scene = scene(arms, vec![table]);
+    let home = vec![vec![0.0; 6]; 2];
+    let mut random = Random::new(4);
+    let (mut looked, mut several) = (0, 0);
+    for _ in 0..200 {
+        let mut stage = stage(&scene, &scene.world, &[0, 1], &home, 0.0).unwrap();
+        let known: Vec<f64> = scene.robots[0].limits.iter().map(|l| random.between(l.lower, l.upper)).collect();
+        if !stage.checker.is_free(&[known.clone(), known.clone()].concat()) {
+            continue;
+        }
+        looked += 1;
+        if looked > 8 {
+            break;
+        }
+        let goals = [0, 1].map(|robot| (robot, Goal::Pose(flange(&scene, robot, &known))));
+        let found = configurations(&mut stage, &goals, 0, &Stop::never()).unwrap();
+        several += usize::from(found.len() > 2);
+        for q in found {
+            let contacts = stage.checker.contacts(&q);
+            assert!(contacts.is_empty(), "{contacts:?}");
+        }
+    }
+    assert!(looked > 5 && several > 0, "{looked} {several}");
+}
