@@ -159,8 +159,8 @@ methods! {
     "status" Status -> StatusReport;
     /// The latest joint states and commands.
     "state" State -> StateReport;
-    /// Moves an arm to a joint target, directly: not collision-checked. Replies when the motion begins; `motion`
-    /// reports its progress.
+    /// Moves an arm to a joint target, directly: not collision-checked; in a run with a planner only with `direct`.
+    /// Ends the client's own streams to the arm. Replies when the motion begins; `motion` reports its progress.
     "move" Move -> MoveReply, check Move::valid;
     /// Follows a trajectory. Replies when the motion begins.
     "execute" Execute -> ExecuteReply, check Execute::valid;

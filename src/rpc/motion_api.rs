@@ -26,6 +26,10 @@ pub struct Move {
     /// Acceleration that no joint exceeds [rad/s²], besides the limits; scaled by the square of `speed`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub max_acceleration: Option<f64>,
+    /// Required if the run has a planner: the motion is not collision-checked. `plan` and `execute_plan` move around
+    /// obstacles.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub direct: bool,
 }
 
 /// Default fraction of the limits for a motion.
@@ -42,9 +46,15 @@ pub(super) fn valid_speed(speed: f64) -> Result<(), String> {
 }
 
 impl Move {
-    /// Creates a request without further caps.
+    /// Creates a request without further caps, for a run without a planner.
     pub fn new(arm: impl Into<String>, target: impl Into<Vec<f64>>, speed: f64) -> Self {
-        Self { arm: arm.into(), target: target.into(), speed, max_velocity: None, max_acceleration: None }
+        let (arm, target) = (arm.into(), target.into());
+        Self { arm, target, speed, max_velocity: None, max_acceleration: None, direct: false }
+    }
+
+    /// Creates a request for a motion that is not collision-checked, also in a run with a planner.
+    pub fn direct(arm: impl Into<String>, target: impl Into<Vec<f64>>, speed: f64) -> Self {
+        Self { direct: true, ..Self::new(arm, target, speed) }
     }
 
     pub(super) fn valid(&self) -> Result<(), String> {
@@ -77,6 +87,9 @@ pub struct MoveReply {
     pub start: Vec<f64>,
     /// Target positions [rad].
     pub target: Vec<f64>,
+    /// Whether the motion was checked for collisions: a direct one is not.
+    #[serde(default)]
+    pub collision_checked: bool,
 }
 
 /// Parameters of `execute`.

@@ -78,6 +78,8 @@ pub struct Service {
     pub(super) attached: Mutex<Option<Arc<Attached>>>,
     /// The last executed plan, and its motion.
     pub(super) executed: Mutex<Option<(u64, u64)>>,
+    /// Per task, whether a client has sent it a target since its stream was last ended for a motion.
+    pub(super) streamed: Vec<AtomicBool>,
     /// Requests of plans, by the plans' numbers.
     pub(super) plan_requests: Mutex<BTreeMap<u64, api::Plan>>,
     pub(super) me: Weak<Self>,
@@ -96,6 +98,7 @@ impl Service {
             grippers: parts.devices.iter().map(|_| tokio::sync::Mutex::default()).collect(),
             details_logged: Mutex::new(vec![Details::default(); parts.devices.len()]),
             held_loads: parts.devices.iter().map(|_| tokio::sync::Mutex::default()).collect(),
+            streamed: parts.config.tasks.iter().map(|_| AtomicBool::default()).collect(),
             parts,
             started: Instant::now(),
             motions: Mutex::default(),
