@@ -191,6 +191,8 @@ methods! {
     "servo" Servo -> Done, check Servo::valid;
     /// Next target of a velocity task; repeat it within the task's timeout.
     "velocity" Velocity -> Done, check Velocity::valid;
+    /// Next chunk of a chunk task: positions with times, as a learned policy makes them.
+    "chunk" Chunk -> ChunkReply, check Chunk::valid;
     /// Next target of an `eef_twist` task; repeat it within the task's timeout.
     "twist" Twist -> Done, check Twist::valid;
     /// Next target of a `cartesian_ik` task; repeat it within the task's timeout.

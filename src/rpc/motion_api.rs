@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::api::{MIN_SPEED, finite};
 use crate::joint::MAX_DOF;
-use crate::trajectory::MAX_DURATION;
+use crate::trajectory::{MAX_ACTIONS, MAX_DURATION};
 
 /// Parameters of `move`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -240,5 +240,48 @@ pub struct Velocity {
 impl Velocity {
     pub(super) fn valid(&self) -> Result<(), String> {
         finite("velocities", &self.velocities)
+    }
+}
+
+/// Parameters of `chunk`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Chunk {
+    /// The chunk task's name.
+    pub task: String,
+    /// Joint positions [rad], one row per action, in the order of the task's joints.
+    pub actions: Vec<Vec<f64>>,
+    /// Time between two actions [s].
+    pub period: f64,
+    /// Time of the first action, on the clock of `stamp` in `state` and in joint states [s since 1970]; default: now.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub start: Option<f64>,
+}
+
+/// Reply to `chunk`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub struct ChunkReply {
+    /// Number of its actions.
+    pub actions: usize,
+    /// Number of those that were skipped because their time was over; with all of them, nothing has changed.
+    pub late: usize,
+}
+
+impl Chunk {
+    pub(super) fn valid(&self) -> Result<(), String> {
+        let (count, width) = (self.actions.len(), self.actions.first().map_or(0, Vec::len));
+        if !(2..=MAX_ACTIONS).contains(&count) {
+            return Err(format!("actions has {count} rows, must have 2 to {MAX_ACTIONS}"));
+        }
+        for (index, action) in self.actions.iter().enumerate() {
+            finite(&format!("actions[{index}]"), action)?;
+            if action.len() != width {
+                return Err(format!("actions[{index}] has {} values, the first {width}", action.len()));
+            }
+        }
+        if !(0.001..=1.0).contains(&self.period) {
+            return Err(format!("period is {} s, must be within 0.001–1", self.period));
+        }
+        finite("start", &[self.start.unwrap_or_default()])
     }
 }

@@ -322,6 +322,7 @@ impl Service {
             Call::ArmIoSet(io) => self.set_io(io).await,
             Call::Servo(s) => self.stream(s.task, s.positions, true).await.map(|()| Reply::Servo(Done {})),
             Call::Velocity(v) => self.stream(v.task, v.velocities, false).await.map(|()| Reply::Velocity(Done {})),
+            Call::Chunk(chunk) => self.chunk(chunk).await.map(Reply::Chunk),
             Call::Twist(twist) => self.twist(&twist).await.map(Reply::Twist),
             Call::Pose(pose) => self.pose(&pose).await.map(Reply::Pose),
             Call::Shutdown(_) => {

@@ -18,10 +18,15 @@ impl Service {
     /// Sends a target to a task, and remembers that a client streams to it.
     async fn target(&self, task: u16, request: Request) -> Result<(), RpcError> {
         self.ask(request).await?;
+        self.streams_to(task);
+        Ok(())
+    }
+
+    /// Remembers that a client streams to a task.
+    pub(super) fn streams_to(&self, task: u16) {
         if let Some(streamed) = self.streamed.get(task as usize) {
             streamed.store(true, Ordering::Release);
         }
-        Ok(())
     }
 
     /// Ends the streams that clients have sent to tasks with these joints, and waits until the commands of their arms
@@ -58,7 +63,7 @@ impl Service {
             let of = |values: &crate::joint::Joints| values.iter().take(dof).copied().collect::<Vec<f64>>();
             let values = of(&command.values);
             let rests = if mode.is_position() {
-                // The same view may be looked at twice: only another tick's command shows that nothing moves.
+                // The same view may come twice: only another tick's command shows that nothing moves.
                 last.is_some_and(|last| last.seq != command.seq && of(&last.values) == values)
             } else {
                 values.iter().all(|velocity| velocity.abs() <= AT_REST)

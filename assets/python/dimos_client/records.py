@@ -111,6 +111,13 @@ class Grip:
 
 
 @dataclass(frozen=True)
+class ChunkReport:
+    """What became of a chunk."""
+    actions: int
+    late: int  # of them, skipped because their time was over; if all are late, nothing has changed
+
+
+@dataclass(frozen=True)
 class LoopReport:
     """How a policy loop kept its time."""
     sent: int  # targets that the run took

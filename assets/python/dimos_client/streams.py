@@ -10,7 +10,7 @@ from typing import Any, Callable, Deque, Dict, Generator, List, Optional, Sequen
 
 from .connection import Connection
 from .errors import ConnectionLost, Refused
-from .records import JointState, LoopReport, Pose, joint_state, numbers
+from .records import ChunkReport, JointState, LoopReport, Pose, joint_state, numbers
 
 IN_FLIGHT = 16  # targets that may wait for their reply
 BRAKING = 7.0  # s within which every arm is at rest after a cancel
@@ -48,6 +48,15 @@ class Streams(Connection):
              quat: Optional[Sequence[float]] = None) -> None:
         """Sends a cartesian_ik task its next pose [m], with `rpy` [rad] or `quat` (x, y, z, w); as `servo`."""
         self._target("pose", {"task": task, **Pose(xyz, rpy, quat).params()})
+
+    def chunk(self, task: str, actions: Sequence[Sequence[float]], period: float,
+              start: Optional[float] = None) -> ChunkReport:
+        """Sends a chunk task its next horizon: joint positions [rad], `period` [s] apart, the first at `start`, a
+        `stamp` of a joint state (default: now). It replaces the rest of the chunk before it from its start on."""
+        rows = [numbers(action) for action in actions]
+        reply = self.call("chunk", task=task, actions=rows, period=period, start=start)
+        self._streams.add(task)
+        return ChunkReport(reply["actions"], reply["late"])
 
     def settle(self) -> None:
         """Waits until all targets that were sent are answered; raises the first refusal."""

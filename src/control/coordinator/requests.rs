@@ -18,7 +18,7 @@ impl Coordinator {
             }
             Request::Stop { arm } => self.stop(arm, now),
             Request::Cancel { task } => self.cancel(task),
-            Request::Execute { motion, .. } if self.shutting_down => {
+            Request::Execute { motion, .. } | Request::Chunk { motion, .. } if self.shutting_down => {
                 self.output.retired.push(motion);
                 Outcome::ShuttingDown
             }
@@ -26,6 +26,11 @@ impl Coordinator {
             Request::Execute { task, motion } => self.execute(now, task, motion),
             Request::Servo { task, target } => self.offer(now, task, &Target::Positions(target)),
             Request::Velocity { task, target } => self.offer(now, task, &Target::Velocities(target)),
+            Request::Chunk { task, start, motion } => {
+                let outcome = self.offer(now, task, &Target::Chunk(&motion, start));
+                self.output.retired.push(motion);
+                outcome
+            }
             Request::CartesianTarget { task, goal } => self.offer(now, task, &Target::EndEffector(goal)),
             Request::Reset { arm } => self.with_arm(arm, |a| a.reset(arm, now)),
             Request::Enabled { arm } => self.with_arm(arm, |a| a.activate(arm, now)),
