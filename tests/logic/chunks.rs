@@ -48,11 +48,10 @@ impl Trace {
     fn steepest(&self) -> (f64, f64) {
         let dt: f64 = 0.01;
         let (mut jerk, mut acceleration) = (0.0_f64, 0.0_f64);
-        for q in self.0.windows(4) {
-            for j in 0..6 {
-                let third = q[3][j] - 3.0 * q[2][j] + 3.0 * q[1][j] - q[0][j];
-                jerk = jerk.max(third.abs() / dt.powi(3));
-                acceleration = acceleration.max((q[2][j] - 2.0 * q[1][j] + q[0][j]).abs() / dt.powi(2));
+        for ticks in self.0.windows(4) {
+            for q in (0..6).map(|j| [0, 1, 2, 3].map(|k| ticks[k][j])) {
+                jerk = jerk.max((q[3] - 3.0 * q[2] + 3.0 * q[1] - q[0]).abs() / dt.powi(3));
+                acceleration = acceleration.max((q[2] - 2.0 * q[1] + q[0]).abs() / dt.powi(2));
             }
         }
         (jerk, acceleration)
