@@ -33,7 +33,8 @@ mkdir -p "$root/share/bash-completion/completions" "$root/$zsh" "$root/share/fis
 "$dimos" completions fish >"$root/share/fish/vendor_completions.d/dimos.fish"
 
 file 644 blueprints/*.yaml "$root/share/dimos/blueprints"
-file 644 assets/python/*.py "$root/share/dimos/python"
+file 644 assets/python/*.py assets/python/pyproject.toml "$root/share/dimos/python"
+file 644 assets/python/dimos_client/*.py assets/python/dimos_client/py.typed "$root/share/dimos/python/dimos_client"
 file 644 assets/blueprint.schema.json "$root/share/dimos"
 file 644 README.md "$root/share/doc/dimos"
 file 644 docs/*.md "$root/share/doc/dimos/docs"

@@ -9,6 +9,9 @@ use serde::{Deserialize, Serialize};
 /// Maximum duration of a trajectory from a client or a file [s].
 pub const MAX_DURATION: f64 = 24.0 * 3600.0;
 
+/// Maximum number of actions of a chunk, which a policy makes from one observation.
+pub const MAX_ACTIONS: usize = 256;
+
 /// A trajectory as clients send it and files store it.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

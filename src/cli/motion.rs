@@ -77,7 +77,8 @@ fn begin_direct(args: &Args, client: &mut Client, signals: &Signals) -> Result<B
         return Err(failure.hint("run a planner blueprint, such as yourarm-planner, or give joint positions"));
     };
     signals.check()?;
-    let begun = client.call(Move::new(arm.clone(), target, args.search.speed))?;
+    let request = Move { direct: args.direct, ..Move::new(arm.clone(), target, args.search.speed) };
+    let begun = client.call(request)?;
     output::note(format_args!(
         "motion {} on {}: {:.2} s, direct, not collision-checked",
         begun.motion, begun.task, begun.duration

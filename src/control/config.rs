@@ -10,6 +10,7 @@ use crate::joint::{ControlMode, JointLimits};
 pub use super::task_config::{TaskConfig, TaskKind};
 pub use super::task_robot::{FramePose, NO_ROTATION, TaskKinematics};
 pub use super::tasks::cartesian::CartesianParams;
+pub use super::tasks::chunk::ChunkParams;
 pub use super::tasks::servo::ServoParams;
 pub use super::tasks::trajectory::TrajectoryParams;
 pub use super::tasks::velocity::VelocityParams;

@@ -2,6 +2,7 @@
 //! through [`TickOutput::retired`](super::coordinator::TickOutput).
 
 use super::task_robot::FramePose;
+use crate::clock::Mono;
 use crate::joint::Joints;
 use crate::trajectory::Spline;
 
@@ -42,6 +43,15 @@ pub enum Request {
         task: u16,
         /// Velocities [rad/s].
         target: Joints,
+    },
+    /// New chunk of a chunk task.
+    Chunk {
+        /// The task.
+        task: u16,
+        /// The time of its first point.
+        start: Mono,
+        /// Its curve; the points are equally spaced in time. The task copies it.
+        motion: Box<Motion>,
     },
     /// New goal of a Cartesian task: a pose or a twist, by the task's type.
     CartesianTarget {

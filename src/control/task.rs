@@ -103,7 +103,8 @@ impl Task {
                 let odd = self.joints.iter().zip(values).find(|(_, v)| !v.is_finite());
                 odd.map_or(Ok(()), |(&joint, _)| Err(Outcome::NonFinite(joint)))
             }
-            Target::EndEffector(_) => Ok(()),
+            Target::Chunk(motion, _) if motion.joints != self.joints => Err(Outcome::WrongTask(self.index)),
+            Target::Chunk(..) | Target::EndEffector(_) => Ok(()),
         }
     }
 

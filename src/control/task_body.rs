@@ -97,6 +97,8 @@ pub enum Target<'a> {
     Positions(Joints),
     /// Velocities of the task's joints, in their order [rad/s]; all finite.
     Velocities(Joints),
+    /// Points for the task's joints, in their order, from this time on.
+    Chunk(&'a Motion, Mono),
     /// A pose or a twist of the end effector; any values.
     EndEffector(Goal),
 }
@@ -108,6 +110,7 @@ impl Target<'_> {
             Self::Trajectory(_) => TargetKind::Trajectory,
             Self::Positions(_) => TargetKind::Positions,
             Self::Velocities(_) => TargetKind::Velocities,
+            Self::Chunk(..) => TargetKind::Chunk,
             Self::EndEffector(Goal::Pose { .. }) => TargetKind::Pose,
             Self::EndEffector(Goal::Twist { .. }) => TargetKind::Twist,
         }
@@ -123,6 +126,8 @@ pub enum TargetKind {
     Positions,
     /// Joint velocities.
     Velocities,
+    /// Joint positions with times.
+    Chunk,
     /// A pose of the end effector.
     Pose,
     /// A twist of the end effector.
@@ -131,7 +136,8 @@ pub enum TargetKind {
 
 impl TargetKind {
     /// All kinds.
-    pub const ALL: [Self; 5] = [Self::Trajectory, Self::Positions, Self::Velocities, Self::Pose, Self::Twist];
+    pub const ALL: [Self; 6] =
+        [Self::Trajectory, Self::Positions, Self::Velocities, Self::Chunk, Self::Pose, Self::Twist];
 
     /// Returns the rpc method that sends one.
     pub fn method(self) -> &'static str {
@@ -139,6 +145,7 @@ impl TargetKind {
             Self::Trajectory => "execute",
             Self::Positions => "servo",
             Self::Velocities => "velocity",
+            Self::Chunk => "chunk",
             Self::Pose => "pose",
             Self::Twist => "twist",
         }

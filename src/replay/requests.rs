@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Deserializer};
 
+use crate::clock::Mono;
 use crate::control::request::{Goal, Motion, Request};
 use crate::control::task_robot::FramePose;
 use crate::joint::{Joints, joints_of};
@@ -32,6 +33,11 @@ enum LoggedRequest {
     Velocity {
         task: u16,
         target: Vec<Option<f64>>,
+    },
+    Chunk {
+        task: u16,
+        start: u64,
+        trajectory: JointTrajectory,
     },
     Pose {
         task: u16,
@@ -102,11 +108,10 @@ pub fn read(json: &str, joints: &[String]) -> Result<(u64, Result<Request, Strin
 fn request(logged: LoggedRequest, joints: &[String]) -> Result<Request, String> {
     Ok(match logged {
         LoggedRequest::Execute { task, motion, trajectory } => {
-            let spline = Spline::new(&trajectory).map_err(|e| e.to_string())?;
-            let index = |name: &String| joints.iter().position(|j| j == name).map(|j| j as u16);
-            let found: Option<Vec<u16>> = trajectory.joint_names.iter().map(index).collect();
-            let joints = found.ok_or("the trajectory has a joint that no arm has")?;
-            Request::Execute { task, motion: Box::new(Motion { id: motion, joints, spline }) }
+            Request::Execute { task, motion: along(motion, &trajectory, joints)? }
+        }
+        LoggedRequest::Chunk { task, start, trajectory } => {
+            Request::Chunk { task, start: Mono(start), motion: along(0, &trajectory, joints)? }
         }
         LoggedRequest::Cancel { task } => Request::Cancel { task },
         LoggedRequest::Servo { task, target } => Request::Servo { task, target: values(&target) },
@@ -134,6 +139,14 @@ fn request(logged: LoggedRequest, joints: &[String]) -> Result<Request, String> 
         LoggedRequest::Pause { on } => Request::Pause { on },
         LoggedRequest::Shutdown {} => Request::Shutdown,
     })
+}
+
+fn along(id: u64, trajectory: &JointTrajectory, joints: &[String]) -> Result<Box<Motion>, String> {
+    let spline = Spline::new(trajectory).map_err(|e| e.to_string())?;
+    let index = |name: &String| joints.iter().position(|j| j == name).map(|j| j as u16);
+    let found: Option<Vec<u16>> = trajectory.joint_names.iter().map(index).collect();
+    let joints = found.ok_or("the trajectory has a joint that no arm has")?;
+    Ok(Box::new(Motion { id, joints, spline }))
 }
 
 /// JSON has no infinities and no NaN: values that were not finite are null. The tick rejects the request all the same.
@@ -210,6 +223,10 @@ mod tests {
         let (_, request) = read(&logged.to_string(), &names).unwrap();
         let Ok(Request::Execute { task: 1, motion }) = request else { panic!("{request:?}") };
         assert_eq!(*motion, Motion { id: 5, joints: vec![1, 0], spline: Spline::new(&trajectory).unwrap() });
+        let chunk = json!({"id": 9, "request": {"chunk": {"task": 1, "start": 7, "trajectory": trajectory}}});
+        let (_, request) = read(&chunk.to_string(), &names).unwrap();
+        let Ok(Request::Chunk { task: 1, start: Mono(7), motion }) = request else { panic!("{request:?}") };
+        assert_eq!(*motion, Motion { id: 0, joints: vec![1, 0], spline: Spline::new(&trajectory).unwrap() });
         let (_, unknown) = read(&logged.to_string(), &names[..1]).unwrap();
         assert!(unknown.unwrap_err().contains("joint"));
     }

@@ -160,8 +160,8 @@ methods! {
     "status" Status -> StatusReport;
     /// The latest joint states and commands.
     "state" State -> StateReport;
-    /// Moves an arm to a joint target, directly: not collision-checked. Replies when the motion begins; `motion`
-    /// reports its progress.
+    /// Moves an arm to a joint target, directly: not collision-checked; in a run with a planner only with `direct`.
+    /// Ends the client's own streams to the arm. Replies when the motion begins; `motion` reports its progress.
     "move" Move -> MoveReply, check Move::valid;
     /// Follows a trajectory. Replies when the motion begins.
     "execute" Execute -> ExecuteReply, check Execute::valid;
@@ -205,6 +205,8 @@ methods! {
     "servo" Servo -> Done, check Servo::valid;
     /// Next target of a velocity task; repeat it within the task's timeout.
     "velocity" Velocity -> Done, check Velocity::valid;
+    /// Next chunk of a chunk task: positions with times, as a learned policy makes them.
+    "chunk" Chunk -> ChunkReply, check Chunk::valid;
     /// Next target of an `eef_twist` task; repeat it within the task's timeout.
     "twist" Twist -> Done, check Twist::valid;
     /// Next target of a `cartesian_ik` task; repeat it within the task's timeout.

@@ -39,6 +39,8 @@ pub enum Code {
     NoPlanner,
     /// The run already has a planner.
     HasPlanner,
+    /// The run has a planner, and the motion is not planned: plan it, or ask for a direct motion.
+    NotPlanned,
     /// No such robot in the planner.
     UnknownRobot,
     /// No such plan, or it is too old.

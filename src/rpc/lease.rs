@@ -51,6 +51,7 @@ pub(super) fn need(request: &Request) -> Need<'_> {
         Request::Execute(e) => Need::Lease(Subject::Joints(&e.trajectory.joint_names)),
         Request::Servo(s) => Need::Lease(Subject::Task(&s.task)),
         Request::Velocity(v) => Need::Lease(Subject::Task(&v.task)),
+        Request::Chunk(c) => Need::Lease(Subject::Task(&c.task)),
         Request::Twist(t) => Need::Lease(Subject::Task(&t.task)),
         Request::Pose(p) => Need::Lease(Subject::Task(&p.task)),
         Request::ArmReset(a) => Need::NoOtherHolder(Subject::Arm(&a.arm)),

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::api::{MIN_SPEED, finite};
 use crate::joint::MAX_DOF;
-use crate::trajectory::MAX_DURATION;
+use crate::trajectory::{MAX_ACTIONS, MAX_DURATION};
 
 /// Parameters of `move`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -26,6 +26,10 @@ pub struct Move {
     /// Acceleration that no joint exceeds [rad/s²], besides the limits; scaled by the square of `speed`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub max_acceleration: Option<f64>,
+    /// Required if the run has a planner: the motion is not collision-checked. `plan` and `execute_plan` move around
+    /// obstacles.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub direct: bool,
 }
 
 /// Default fraction of the limits for a motion.
@@ -42,9 +46,15 @@ pub(super) fn valid_speed(speed: f64) -> Result<(), String> {
 }
 
 impl Move {
-    /// Creates a request without further caps.
+    /// Creates a request without further caps, for a run without a planner.
     pub fn new(arm: impl Into<String>, target: impl Into<Vec<f64>>, speed: f64) -> Self {
-        Self { arm: arm.into(), target: target.into(), speed, max_velocity: None, max_acceleration: None }
+        let (arm, target) = (arm.into(), target.into());
+        Self { arm, target, speed, max_velocity: None, max_acceleration: None, direct: false }
+    }
+
+    /// Creates a request for a motion that is not collision-checked, also in a run with a planner.
+    pub fn direct(arm: impl Into<String>, target: impl Into<Vec<f64>>, speed: f64) -> Self {
+        Self { direct: true, ..Self::new(arm, target, speed) }
     }
 
     pub(super) fn valid(&self) -> Result<(), String> {
@@ -77,6 +87,9 @@ pub struct MoveReply {
     pub start: Vec<f64>,
     /// Target positions [rad].
     pub target: Vec<f64>,
+    /// Whether the motion was checked for collisions: a direct one is not.
+    #[serde(default)]
+    pub collision_checked: bool,
 }
 
 /// Parameters of `execute`.
@@ -263,5 +276,48 @@ pub struct Velocity {
 impl Velocity {
     pub(super) fn valid(&self) -> Result<(), String> {
         finite("velocities", &self.velocities)
+    }
+}
+
+/// Parameters of `chunk`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Chunk {
+    /// The chunk task's name.
+    pub task: String,
+    /// Joint positions [rad], one row per action, in the order of the task's joints.
+    pub actions: Vec<Vec<f64>>,
+    /// Time between two actions [s].
+    pub period: f64,
+    /// Time of the first action, on the clock of `stamp` in `state` and in joint states [s since 1970]; default: now.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub start: Option<f64>,
+}
+
+/// Reply to `chunk`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub struct ChunkReply {
+    /// Number of its actions.
+    pub actions: usize,
+    /// Number of those that were skipped because their time was over; with all of them, nothing has changed.
+    pub late: usize,
+}
+
+impl Chunk {
+    pub(super) fn valid(&self) -> Result<(), String> {
+        let (count, width) = (self.actions.len(), self.actions.first().map_or(0, Vec::len));
+        if !(2..=MAX_ACTIONS).contains(&count) {
+            return Err(format!("actions has {count} rows, must have 2 to {MAX_ACTIONS}"));
+        }
+        for (index, action) in self.actions.iter().enumerate() {
+            finite(&format!("actions[{index}]"), action)?;
+            if action.len() != width {
+                return Err(format!("actions[{index}] has {} values, the first {width}", action.len()));
+            }
+        }
+        if !(0.001..=1.0).contains(&self.period) {
+            return Err(format!("period is {} s, must be within 0.001–1", self.period));
+        }
+        finite("start", &[self.start.unwrap_or_default()])
     }
 }

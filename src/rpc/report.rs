@@ -456,6 +456,9 @@ pub struct MotionReport {
     /// Number of the motion that continues it around the obstacle.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub next: Option<u64>,
+    /// Whether it executes a plan: a direct motion and a trajectory of a client are not collision-checked.
+    #[serde(default)]
+    pub collision_checked: bool,
     /// When done: final error of each joint.
     pub deviation: Option<Vec<Deviation>>,
 }

@@ -142,6 +142,7 @@ pub fn log_of(request: &Request) -> Value {
         Request::Cancel { task } => json!({"cancel": {"task": task}}),
         Request::Servo { task, target } => json!({"servo": {"task": task, "target": target}}),
         Request::Velocity { task, target } => json!({"velocity": {"task": task, "target": target}}),
+        Request::Chunk { task, start, .. } => json!({"chunk": {"task": task, "start": start.0}}),
         Request::CartesianTarget { task, goal: Goal::Pose { position, orientation } } => {
             json!({"pose": {"task": task, "position": position, "orientation": orientation}})
         }

@@ -41,9 +41,10 @@ impl Handle {
         self.service.state()
     }
 
-    /// Moves an arm from its present position to joint positions [rad], directly: not collision-checked. `speed` is a
-    /// fraction of the velocity and acceleration limits, 0.01–1. Returns when the motion begins; [`wait`](Self::wait)
-    /// waits for its end. An error if a limit is exceeded, the arm is not ready, or its task is executing already.
+    /// Moves an arm from its present position to joint positions [rad], directly: not collision-checked; refused if the
+    /// run has a planner (call [`Move::direct`] then). `speed` is a fraction of the velocity and acceleration limits,
+    /// 0.01–1. Returns when the motion begins; [`wait`](Self::wait) waits for its end. An error if a limit is exceeded,
+    /// the arm is not ready, or its task is executing already.
     pub fn move_arm(&self, arm: &str, target: &[f64], speed: f64) -> Result<MoveReply, RpcError> {
         self.call(Move::new(arm, target, speed))
     }

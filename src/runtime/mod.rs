@@ -10,6 +10,7 @@ mod arm_requests;
 mod arms;
 mod attached;
 mod builder;
+mod chunk_requests;
 mod control_config;
 pub(crate) mod device_lock;
 mod dispatch;

@@ -41,7 +41,22 @@ impl Service {
     }
 
     pub(super) async fn move_arm(&self, call: api::Move) -> Result<Reply, RpcError> {
+        let arm = self.arm_index(&call.arm)?;
+        if !call.direct {
+            self.needs_no_plan(&call.arm)?;
+        }
+        self.end_streams(&self.joints_of_arm(arm).collect::<Vec<_>>()).await?;
         self.move_within(call, Duration::MAX).await
+    }
+
+    /// Refuses a motion that is not collision-checked if the run has a planner, also one that has disconnected.
+    fn needs_no_plan(&self, arm: &str) -> Result<(), RpcError> {
+        match self.planner() {
+            Ok(_) => Err(RpcError::new(Code::NotPlanned, format!("a direct motion of {arm} is not collision-checked"))
+                .hint("this run has a planner: `plan`, then `execute_plan`; or ask for it with `direct`: true")),
+            Err(RpcError { code: Code::NoPlanner, data: None, .. }) => Ok(()),
+            Err(gone) => Err(gone),
+        }
     }
 
     /// Moves an arm, if that takes at most `longest`.
@@ -87,11 +102,23 @@ impl Service {
             joints: names,
             start,
             target: call.target,
+            collision_checked: false,
         }))
     }
 
     pub(super) async fn execute(&self, call: api::Execute) -> Result<Reply, RpcError> {
+        self.end_streams(&self.joints_named(&call.trajectory.joint_names)?).await?;
         self.execute_as(call, None).await.map(Reply::Execute)
+    }
+
+    /// Returns the indices of joints over all arms' joints.
+    pub(super) fn joints_named(&self, names: &[String]) -> Result<Vec<u16>, RpcError> {
+        let all: Vec<&String> = self.parts.names.arms.iter().flat_map(|a| &a.joints).collect();
+        let index = |name: &String| match all.iter().position(|joint| *joint == name) {
+            Some(joint) => Ok(joint as u16),
+            None => Err(RpcError::unknown(Code::InvalidTrajectory, "joint", name, &all)),
+        };
+        names.iter().map(index).collect()
     }
 
     /// Executes a trajectory, as the motion of a plan if it comes from one.
@@ -101,14 +128,7 @@ impl Service {
         plan: Option<Carries>,
     ) -> Result<api::ExecuteReply, RpcError> {
         let trajectory = trajectory_of(call.trajectory);
-        let all: Vec<&String> = self.parts.names.arms.iter().flat_map(|a| &a.joints).collect();
-        let mut joints = Vec::new();
-        for name in &trajectory.joint_names {
-            match all.iter().position(|j| *j == name) {
-                Some(j) => joints.push(j as u16),
-                None => return Err(RpcError::unknown(Code::InvalidTrajectory, "joint", name, &all)),
-            }
-        }
+        let joints = self.joints_named(&trajectory.joint_names)?;
         let task = match &call.task {
             Some(name) => self.task_index(name)?,
             None => self.trajectory_task(&joints)?,

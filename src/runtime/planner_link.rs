@@ -91,7 +91,8 @@ impl Planner<'_> {
 }
 
 impl Service {
-    fn planner(&self) -> Result<Planner<'_>, RpcError> {
+    /// Returns the run's planner; an error without one, with data if one has disconnected.
+    pub(super) fn planner(&self) -> Result<Planner<'_>, RpcError> {
         if let Some(port) = &self.parts.planner {
             return Ok(Planner::Own(port));
         }
@@ -110,6 +111,7 @@ impl Service {
         match call {
             Call::ExecutePlan(execute) => {
                 let released = planner.release(execute.plan, self.moment(0)).await?;
+                self.end_streams(&self.joints_named(&released.trajectory.joint_names)?).await?;
                 let replan = execute.replan.then_some(execute.presence);
                 self.execute_released(&planner, released, replan).await
             }

@@ -213,8 +213,8 @@ impl Service {
         let Some((planned, end)) = motions.get(number) else {
             return Err(RpcError::new(Code::UnknownMotion, format!("no motion {number}, or too long ago")));
         };
-        let mut report =
-            MotionReport { motion: number, task: self.parts.names.task(planned.task), ..Default::default() };
+        let (task, collision_checked) = (self.parts.names.task(planned.task), planned.plan.is_some());
+        let mut report = MotionReport { motion: number, task, collision_checked, ..Default::default() };
         let view = self.task_view(planned.task as usize);
         if view.motion == number {
             (report.progress, report.elapsed, report.remaining) = (view.progress, view.elapsed, view.remaining);

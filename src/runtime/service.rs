@@ -82,6 +82,8 @@ pub struct Service {
     pub(super) executed: Mutex<Option<(u64, u64)>>,
     /// Per task, the tool of its end effector.
     pub(super) task_tools: Mutex<Vec<Option<Isometry3<f64>>>>,
+    /// Per task, whether a client has sent it a target since its stream was last ended for a motion.
+    pub(super) streamed: Vec<AtomicBool>,
     /// Requests of plans, by the plans' numbers.
     pub(super) plan_requests: Mutex<BTreeMap<u64, api::Plan>>,
     pub(super) me: Weak<Self>,
@@ -101,6 +103,7 @@ impl Service {
             details_logged: Mutex::new(vec![Details::default(); parts.devices.len()]),
             task_tools: Mutex::new(parts.blueprint.tasks.iter().map(|task| task.robot.as_ref()?.tool).collect()),
             held_loads: parts.devices.iter().map(|_| tokio::sync::Mutex::default()).collect(),
+            streamed: parts.config.tasks.iter().map(|_| AtomicBool::default()).collect(),
             parts,
             started: Instant::now(),
             motions: Mutex::default(),
@@ -341,6 +344,7 @@ impl Service {
             Call::PoseRemove(remove) => self.remove_pose(remove).await.map(|()| Reply::PoseRemove(Done {})),
             Call::Servo(s) => self.stream(s.task, s.positions, true).await.map(|()| Reply::Servo(Done {})),
             Call::Velocity(v) => self.stream(v.task, v.velocities, false).await.map(|()| Reply::Velocity(Done {})),
+            Call::Chunk(chunk) => self.chunk(chunk).await.map(Reply::Chunk),
             Call::Twist(twist) => self.twist(&twist).await.map(Reply::Twist),
             Call::Pose(pose) => self.pose(&pose).await.map(Reply::Pose),
             Call::Shutdown(_) => {

@@ -17,6 +17,7 @@ mod blueprints;
 mod braking;
 mod can_bus;
 mod cartesian_tasks;
+mod chunks;
 mod conformance;
 mod conformance_finds_faults;
 mod conformance_pushed;

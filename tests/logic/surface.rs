@@ -164,8 +164,11 @@ fn exit_codes() {
 
 #[test]
 fn python_client() {
-    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("assets/python/dimos_client.py");
-    unchanged("python", &source::python(&fs::read_to_string(file).unwrap()));
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("assets/python/dimos_client");
+    let files = ["errors", "records", "connection", "streams", "planning", "client"];
+    let text = |name: &str| fs::read_to_string(folder.join(name).with_extension("py")).unwrap();
+    let lines: Vec<String> = files.iter().flat_map(|name| source::python(&text(name))).collect();
+    unchanged("python", &lines);
 }
 
 /// What an adapter implements.

@@ -119,7 +119,8 @@ fn the_tarball_and_the_debian_package_install_and_run() {
         ("zsh/vendor-completions/_dimos", "#compdef dimos"),
         ("fish/vendor_completions.d/dimos.fish", "complete -c dimos"),
         ("doc/dimos/copyright", "Apache License"),
-        ("dimos/python/dimos_client.py", "class Client"),
+        ("dimos/python/dimos_client/client.py", "class Client"),
+        ("dimos/python/pyproject.toml", "dimos-client"),
         ("../lib/systemd/system/dimos@.service", "ExecStart=/usr/bin/dimos run %i"),
     ] {
         assert!(fs::read_to_string(share.join(file)).unwrap().contains(says), "{file}");

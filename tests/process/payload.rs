@@ -53,7 +53,7 @@ fn an_attached_object_of_known_mass_is_carried_and_taken_back() {
     eventually("status has it", || home.status()["arms"][0]["payload"]["mass"].as_f64() == Some(2.0));
 
     // Not while it moves, and what it cannot carry stays where it is.
-    home.client().call(Move::new("arm", [0.9, -0.3, 0.6, 0.0, 0.8, 0.0], 0.2)).unwrap();
+    home.client().call(Move::direct("arm", [0.9, -0.3, 0.6, 0.0, 0.8, 0.0], 0.2)).unwrap();
     home.dimos("world detach ball").with(1).says(&["is executing", "hint: "]);
     home.dimos("arm payload arm --mass 1").with(1).says(&["is executing"]);
     assert_eq!(load(&arm)[0], 2.0);

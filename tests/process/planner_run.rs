@@ -2,7 +2,9 @@
 
 use std::time::Instant;
 
-use dimos::rpc::api::{ArmEnable, ArmReset, ExecutePlan, Lease, Motion, Plan, PlanGoal, Planning, Status};
+use dimos::rpc::Code;
+use dimos::rpc::api::{ArmEnable, ArmReset, ExecutePlan, Lease, Motion, Move, Plan, PlanGoal, Planning, Status};
+use dimos::rpc::client::ClientError;
 use rustix::process::Signal;
 use serde_json::Value;
 
@@ -61,6 +63,11 @@ fn a_plan_is_shown_then_carried_out() {
     home.dimos("execute plan.json").with(0);
     is_at(&home, "arm", &[0.3, -0.2, 0.5, 0.0, 0.4, 0.0]);
     home.dimos("move arm --named home --direct").with(2);
+    // Programs ask for a direct motion, too.
+    let aside = Move::new("arm", [0.5, -0.3, 0.6, 0.0, 0.8, 0.0], 1.0);
+    let Err(ClientError::Refused(refused)) = home.client().call(aside) else { panic!("it is not planned") };
+    assert_eq!(refused.code, Code::NotPlanned);
+    is_at(&home, "arm", &[0.3, -0.2, 0.5, 0.0, 0.4, 0.0]);
     home.dimos("move arm 0 -0.3 0.6 0 0.8 0 --direct").with(0).says(&["direct, not collision-checked"]);
     // Who is there already is no failure: `move --named home` may be said twice.
     home.dimos("move arm --named home").with(0);

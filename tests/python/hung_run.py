@@ -1,4 +1,4 @@
-"""Tries assets/python/dimos_client.py against runs that hang: everything that waits has a bound."""
+"""Tries assets/python/dimos_client against runs that hang: everything that waits has a bound."""
 
 import faulthandler
 import json
@@ -9,9 +9,10 @@ import time
 from pathlib import Path
 
 import dimos_client as dimos
+from dimos_client import client
 
 TIMEOUT = 0.3
-dimos._STALLED = 0.3
+client.STALLED = 0.3
 faulthandler.dump_traceback_later(60, exit=True)  # ends a wait without a bound
 
 

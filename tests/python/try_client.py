@@ -1,4 +1,4 @@
-"""Tries assets/python/dimos_client.py against a live run of tests/process/python_client.rs; fails at the first difference from its page."""
+"""Tries assets/python/dimos_client against a live run of tests/process/python_client.rs; fails at the first difference from its page."""
 
 import itertools
 import math
@@ -50,6 +50,9 @@ def a_slow_reader_is_told(robot):
 def moves(robot):
     report = robot.move("arm", READY, speed=0.5)
     assert report["state"] == "COMPLETED" and near(robot.state("arm").position, READY, 0.02)
+    assert report["collision_checked"] is False, "this run has no planner"
+    refused(dimos.Refused, "NO_PLANNER", lambda: robot.move("arm", named="home"))
+    refused(dimos.Refused, "INVALID_PARAMS", lambda: robot.move("arm", named="home", direct=True))
     held = refused(dimos.LeaseHeld, "LEASE_HELD", lambda: Client.connect().move("arm", READY))
     assert held.data["pid"] == os.getpid() and "try_client.py" in held.data["program"], held.data
     far = refused(dimos.OutOfLimits, "OUT_OF_LIMITS", lambda: robot.move("arm", [99.0] + READY[1:]))
@@ -61,6 +64,26 @@ def moves(robot):
     robot.cancel("arm")
     failed = refused(dimos.MotionFailed, "ABORTED", lambda: robot.wait(begun["motion"]))
     assert failed.data["done"]
+
+
+def task_state(robot, name):
+    return next(task["state"] for task in robot.status()["tasks"] if task["name"] == name)
+
+
+def a_move_ends_the_streams_of_its_client(robot):
+    """Also while these move the arm."""
+    for _ in range(10):
+        here = robot.state("arm").position
+        robot.servo("servo_arm", [here[0] + 0.01] + here[1:])
+        time.sleep(0.02)
+    assert robot.move("arm", READY)["state"] == "COMPLETED"
+    robot.velocity("velocity_arm", [0.3, 0, 0, 0, 0, 0])
+    time.sleep(0.15)
+    robot.call("move", arm="arm", target=READY)  # any client of the protocol
+    assert task_state(robot, "velocity_arm") == "IDLE"
+    while task_state(robot, "traj_arm") == "EXECUTING":
+        time.sleep(0.02)
+    assert task_state(robot, "traj_arm") == "COMPLETED"
 
 
 def follows_a_policy(robot, watcher):
@@ -77,10 +100,26 @@ def follows_a_policy(robot, watcher):
     report = robot.follow("servo_arm", policy, rate=50, duration=4)
     print(f"50 Hz: {report}")
     assert report.sent == len(asked) and report.sent + report.missed in range(199, 202), report
-    watcher.status()  # afterwards all events so far have arrived
-    events = [m["data"] for m in watcher._queues[seen] if m["data"].get("task") == "servo_arm"]
-    assert [event["text"] for event in events] == ["task servo_arm is EXECUTING"], events
+    texts = []
+    while "task servo_arm is IDLE: its stream was ended" not in texts:  # events come a little later
+        watcher.status()
+        texts = [m["data"]["text"] for m in watcher._queues[seen] if m["data"].get("task") == "servo_arm"]
+    assert texts == ["task servo_arm is EXECUTING", "task servo_arm is IDLE: its stream was ended"], texts
+    robot.move("arm", READY)  # at once: the stream has ended with its loop
     refused(dimos.Refused, "UNKNOWN_TASK", lambda: robot.follow("servo", lambda s, t: [0.0], duration=1))
+
+    def fails(state, t):
+        if t > 0.2:
+            raise ZeroDivisionError
+        return policy(state, t)
+
+    home.clear()
+    try:
+        robot.follow("servo_arm", fails, rate=50)
+    except ZeroDivisionError:
+        assert task_state(robot, "servo_arm") == "IDLE"
+    else:
+        raise AssertionError("the policy's error is raised")
     robot.servo("servo_arm", [1.0])
     refused(dimos.Refused, "INVALID_PARAMS", robot.settle)
     robot.cancel()
@@ -126,12 +165,13 @@ def sets_outputs_and_payload(robot):
 
 
 def grips_and_stops(robot):
-    robot.gripper("arm", "open")
-    while abs(robot.state("arm").gripper - 0.08) > 1e-3:
-        pass
-    robot.gripper("arm", 0.02, force=12.5)
-    while abs(robot.state("arm").gripper - 0.02) > 1e-3:
-        pass
+    opened = robot.gripper("arm", "open")
+    assert (opened.outcome, opened.unit, opened.holding) == ("open", "m", False), opened
+    assert abs(opened.position - 0.08) < 1e-3
+    assert robot.gripper("arm", 0.02, force=12.5).outcome == "reached"
+    assert robot.gripper("arm", 0.03, wait=False).outcome == "moving"
+    assert robot.gripper("arm", "close").outcome == "closed"
+    refused(dimos.Refused, "INVALID_PARAMS", lambda: robot.gripper("arm", "wide"))
     state = robot.state("arm")
     assert (state.gripper_unit, state.gripper_force, state.gripper_force_unit) == ("m", 0.0, "N"), state
     too_strong = refused(dimos.Refused, "OUT_OF_LIMITS", lambda: robot.gripper("arm", 0.04, force=1000))
@@ -151,6 +191,7 @@ with Client.connect() as robot, Client.connect("scripts") as watcher:
     a_slow_reader_is_told(watcher)
     moves(robot)
     follows_a_policy(robot, watcher)
+    a_move_ends_the_streams_of_its_client(robot)
     moves_the_end_effector(robot)
     sets_outputs_and_payload(robot)
     grips_and_stops(robot)

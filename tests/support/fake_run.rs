@@ -62,6 +62,7 @@ impl FakeBackend {
             error: (state == "ABORTED").then(|| "arm_joint1 was 0.2000 rad off the path".into()),
             replanning: false,
             next: None,
+            collision_checked: false,
             deviation: done.then(|| vec![joint("arm_joint1", 0.3, 0.3004), joint("arm_joint2", -0.2, -0.1)]),
         }
     }
@@ -101,6 +102,7 @@ impl Backend for FakeBackend {
                     joints: vec!["arm_joint1".into(), "arm_joint2".into()],
                     start: vec![0.0, 0.0],
                     target: m.target,
+                    collision_checked: false,
                 }),
                 Request::Execute(e) => Reply::Execute(ExecuteReply {
                     motion: 8,

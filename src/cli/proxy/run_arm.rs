@@ -356,7 +356,7 @@ impl ControlledArm for RunArm {
         let caps = (Some(speed).filter(|v| *v > 0.0), Some(acceleration).filter(|a| *a > 0.0));
         let (max_velocity, max_acceleration) = caps;
         let arm = self.info.arm.clone();
-        let reply = self.ask(&Move { max_velocity, max_acceleration, ..Move::new(arm, target, 1.0) })?;
+        let reply = self.ask(&Move { max_velocity, max_acceleration, ..Move::direct(arm, target, 1.0) })?;
         self.leased = true;
         self.motion = Some(reply.motion);
         self.link.shared.view().motion = Some(reply.motion);

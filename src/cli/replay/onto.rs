@@ -142,7 +142,7 @@ impl Driver<'_> {
         }
         for approach in &self.plan.approaches {
             let target = target(approach, &state);
-            let go = Move::new(approach.arm.clone(), target, APPROACH_SPEED);
+            let go = Move::direct(approach.arm.clone(), target, APPROACH_SPEED);
             let begun = self.run.call(go)?;
             let (arm, duration) = (&approach.arm, begun.duration);
             self.show.note(format_args!("approach: {arm} moves to the start of the motion, {duration:.1} s, directly"));

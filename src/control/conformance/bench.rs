@@ -13,6 +13,7 @@ use crate::control::task::Task;
 use crate::control::task_body::{Demand, TargetKind};
 use crate::control::task_robot::TaskKinematics;
 use crate::control::task_spec::{TaskSpec, TaskTable};
+use crate::control::tasks::chunk::curve;
 use crate::joint::{ControlMode, JointLimits, Joints, MAX_DOF, joints_of};
 use crate::robot::kinematics::Kinematics;
 use crate::robot::{Source, load};
@@ -200,6 +201,7 @@ impl Bench {
             TargetKind::Trajectory => Request::Execute { task: TESTED, motion: self.motion()? },
             TargetKind::Positions => Request::Servo { task: TESTED, target: each(&|home| home + swing) },
             TargetKind::Velocities => Request::Velocity { task: TESTED, target: each(&|_| 0.2) },
+            TargetKind::Chunk => Request::Chunk { task: TESTED, start: self.now, motion: self.chunk()? },
             TargetKind::Pose => {
                 let mut frames = self.robot.kinematics.frames();
                 self.robot.kinematics.forward(&HOME, &mut frames);
@@ -220,7 +222,7 @@ impl Bench {
     pub fn not_finite(kind: TargetKind) -> Option<Request> {
         let (task, odd) = (TESTED, f64::NAN);
         Some(match kind {
-            TargetKind::Trajectory => return None,
+            TargetKind::Trajectory | TargetKind::Chunk => return None,
             TargetKind::Positions => Request::Servo { task, target: [odd; MAX_DOF] },
             TargetKind::Velocities => Request::Velocity { task, target: [odd; MAX_DOF] },
             TargetKind::Pose => Request::CartesianTarget {
@@ -245,6 +247,20 @@ impl Bench {
         let joint_names = (0..DOF).map(|j| j.to_string()).collect();
         let given = JointTrajectory { joint_names, points: vec![point(0.0, 0.0), point(2.0, 0.3)] };
         let spline = Spline::new(&given).map_err(|e| e.to_string())?;
+        Ok(Box::new(Motion { id: self.next_id, joints: (0..DOF as u16).collect(), spline }))
+    }
+
+    /// A chunk of the next second of the swing.
+    fn chunk(&self) -> Result<Box<Motion>, String> {
+        let period = 1.0 / 30.0;
+        let action = |k: u32| {
+            let swing = 0.1 * (1.0 - (std::f64::consts::PI * (self.streamed + f64::from(k) * period)).cos());
+            HOME.map(|home| home + swing).to_vec()
+        };
+        let names: Vec<String> = (0..DOF).map(|j| j.to_string()).collect();
+        let actions: Vec<Vec<f64>> = (0..30).map(action).collect();
+        let limits = JointLimits::uniform(DOF, 2.9, 2.0).with_defaults();
+        let spline = Spline::new(&curve(&names, &actions, period, &limits)).map_err(|e| e.to_string())?;
         Ok(Box::new(Motion { id: self.next_id, joints: (0..DOF as u16).collect(), spline }))
     }
 

@@ -20,7 +20,7 @@ impl Coordinator {
             }
             Request::Stop { arm } => self.stop(arm, now),
             Request::Cancel { task } => self.cancel(task),
-            Request::Execute { motion, .. } if self.shutting_down => {
+            Request::Execute { motion, .. } | Request::Chunk { motion, .. } if self.shutting_down => {
                 self.output.retired.push(motion);
                 Outcome::ShuttingDown
             }
@@ -28,6 +28,11 @@ impl Coordinator {
             Request::Execute { task, motion } => self.execute(now, task, motion),
             Request::Servo { task, target } => self.offer(now, task, &Target::Positions(target)),
             Request::Velocity { task, target } => self.offer(now, task, &Target::Velocities(target)),
+            Request::Chunk { task, start, motion } => {
+                let outcome = self.offer(now, task, &Target::Chunk(&motion, start));
+                self.output.retired.push(motion);
+                outcome
+            }
             Request::CartesianTarget { task, goal } => self.offer(now, task, &Target::EndEffector(goal)),
             Request::Tool { task, tool } => match self.tasks.get_mut(task as usize) {
                 Some(t) => t.set_tool(&tool).err().unwrap_or(Outcome::Accepted),

@@ -1,6 +1,7 @@
 //! The built-in types of tasks: one folder and one row each.
 
 pub mod cartesian;
+pub mod chunk;
 pub mod servo;
 pub mod trajectory;
 pub mod velocity;
@@ -9,4 +10,4 @@ use super::task_spec::TaskSpec;
 
 /// The built-in types, in the order of the reference.
 pub const TABLE: &[TaskSpec] =
-    &[trajectory::SPEC, servo::SPEC, velocity::SPEC, cartesian::CARTESIAN_IK, cartesian::EEF_TWIST];
+    &[trajectory::SPEC, servo::SPEC, velocity::SPEC, chunk::SPEC, cartesian::CARTESIAN_IK, cartesian::EEF_TWIST];

@@ -1,0 +1,198 @@
+"""The client: moves arms, grips, stops."""
+
+from __future__ import annotations
+
+import time
+from typing import Any, Dict, List, Mapping, Optional, Sequence, Set, Union
+
+from .errors import ArmNotReady, MotionFailed, Refused
+from .planning import Goals, Planning, goals_of, plan_number
+from .records import ArmState, Goal, Grip, Plan, Pose, numbers
+
+STALLED = 15.0  # s without progress, after which `wait` cancels a motion
+GRIP_STARTS = 1.0  # s within which a gripper begins to move
+GRIP_SETTLES = 0.3  # s without motion after which a gripper is at rest
+GRIP_TOLERANCE = 0.01  # of its range: nearer positions are the same
+GRIP_LIMIT = 20.0  # s after which a gripper that still moves is given up
+
+
+class Client(Planning):
+    """A connection to a run."""
+    def state(self, arm: str) -> ArmState:
+        """The latest state of an arm."""
+        reply = self.call("state")
+        if (found := next((a for a in reply["arms"] if a["hardware_id"] == arm), None)) is None:
+            raise Refused("UNKNOWN_ARM", f"no arm named {arm}", "`dimos status` lists the arms")
+        name, position, velocity, effort = ([joint[key] for joint in found["joints"]]
+                                            for key in ("name", "position", "velocity", "effort"))
+        pose, age = found["pose"] or {}, found["age_ms"]
+        return ArmState(reply["tick"], reply["stamp"], name, position, velocity, effort, 0, age and age / 1000,
+                        found["gripper"], pose.get("xyz"), pose.get("rpy"), found["wrench"], found.get("gripper_unit"),
+                        found.get("gripper_force"), found.get("gripper_force_unit"), pose.get("link"),
+                        pose.get("frame"))
+
+    def move(self, arm: Goals, target: Optional[Sequence[float]] = None, speed: float = 0.5, wait: bool = True, *,
+             named: Optional[str] = None, pose: Optional[Pose] = None, linear: bool = False, direct: bool = False,
+             replan: bool = False, seed: int = 0, timeout: Optional[float] = None) -> Dict[str, Any]:
+        """Moves an arm to `target` [rad], a `named` pose or a `pose`, or several together, as `plan`; `speed`: 0.01–1
+        of the limits. With a planner in the run the motion is planned around obstacles, and after `replan` planned
+        again when the world changes; `direct` moves straight in joint space, not collision-checked. Without a planner
+        it is direct: `collision_checked` in the result says which. Ends this client's own streams to the arm."""
+        goals = goals_of(arm, Goal(target, named, pose, linear))
+        plain = isinstance(arm, str) and target is not None and not (named or pose or linear)
+        joints = numbers(target) if plain and target is not None else []
+        if direct and not joints:
+            raise Refused("INVALID_PARAMS", "a direct motion goes to joint positions", "give `target`")
+        if not direct:
+            try:
+                self._end_streams(self._streams_to(goals))
+                planned = self.plan(arm, target, named=named, pose=pose, linear=linear, speed=speed, seed=seed,
+                                    timeout=timeout)
+                return self.execute(planned, wait=wait, replan=replan)
+            except Refused as error:
+                if not (error.code == "NO_PLANNER" and error.data is None and joints):
+                    raise  # also when a planner was there and has gone
+        begun = self.call("move", arm=arm, target=joints, speed=speed, direct=direct or None)
+        return self.wait(begun["motion"]) if wait else begun
+
+    def _streams_to(self, goals: Dict[str, Goal]) -> Set[str]:
+        """The tasks to which this client streams, and whose joints a planned motion needs."""
+        if not (self._streams or self._targets):
+            return set()
+        robots = self.call("planner")["robots"]
+        joints = {joint for robot in robots if robot["name"] in goals for joint in robot["joints"]}
+        return {task["name"] for task in self.status()["tasks"] if joints & set(task["joints"])}
+
+    def execute(self, motion: Union[Plan, int, Mapping[str, Any], None] = None, task: Optional[str] = None,
+                wait: bool = True, *, replan: bool = False) -> Dict[str, Any]:
+        """Executes a plan (by default the newest), or follows a trajectory: joint_names, and points of
+        time_from_start [s], positions [rad], velocities [rad/s]. A trajectory is not collision-checked."""
+        if motion is None or isinstance(motion, (Plan, int)):
+            begun = self.call("execute_plan", plan=plan_number(motion), replan=replan or None)
+        else:
+            begun = self.call("execute", trajectory=dict(motion), task=task)
+        return self.wait(begun["motion"]) if wait else begun
+
+    def wait(self, motion: int) -> Dict[str, Any]:
+        """Waits for a motion's end, and for that of the one that continues it around an obstacle. Ctrl-C cancels it,
+        and so do 15 s without progress. Raises MotionFailed when it ended elsewhere than it should."""
+        report, elapsed, deadline = self.call("motion", motion=motion), None, 0.0
+        try:
+            while not report["done"] or report.get("next"):
+                if report["elapsed"] != elapsed or report.get("replanning"):
+                    elapsed, deadline = report["elapsed"], time.monotonic() + STALLED
+                elif time.monotonic() > deadline:
+                    raise MotionFailed(report["state"], f"no progress within {STALLED:g} s: cancelled", data=report)
+                if report["done"]:
+                    motion = report["next"]
+                else:
+                    time.sleep(0.02)
+                report = self.call("motion", motion=motion)
+        except (KeyboardInterrupt, MotionFailed):
+            self.cancel(task=report["task"])
+            raise
+        if report["state"] != "COMPLETED":
+            raise MotionFailed(report["state"], report["error"] or "it ended before its goal", data=report)
+        return report
+
+    def gripper(self, arm: str, opening: Union[float, str], force: Optional[float] = None, wait: bool = True) -> Grip:
+        """Moves a gripper to a position (an opening [m], or the angle [rad] of a rotary one), to "open" or "close",
+        with a largest `force` (unit and range are in `status`) if it has force control. Waits until the fingers rest,
+        and returns where and why: `outcome`. They hold something if they stopped while closing."""
+        span: Optional[List[float]] = self._report(arm).get("gripper_range")
+        if isinstance(opening, str):
+            if opening not in ("open", "close"):
+                raise Refused("INVALID_PARAMS", f"a gripper cannot {opening}", 'give "open", "close" or a number')
+            if span is None:
+                raise Refused("UNSUPPORTED", f"{arm} does not say how far it opens", "give a number")
+            opening = span[opening == "open"]
+        begin = self.state(arm).gripper
+        self.call("gripper", arm=arm, position=opening, force=force)
+        state = self._fingers_at_rest(arm, opening, _same(span)) if wait else self.state(arm)
+        outcome = _outcome(begin, state.gripper, opening, span) if wait else "moving"
+        if outcome in ("holding", "blocked"):
+            if self._report(arm).get("phase") == "held":  # a stop holds the fingers, too
+                raise ArmNotReady("ARM_LATCHED", f"{arm} was held while its gripper moved", "`reset`, then `enable`")
+        position = opening if state.gripper is None else state.gripper
+        return Grip(position, state.gripper_unit or "m", outcome, state.gripper_force, state.gripper_force_unit)
+
+    def _report(self, arm: str) -> Dict[str, Any]:
+        arms: List[Dict[str, Any]] = self.status()["arms"]
+        return next((report for report in arms if report["hardware_id"] == arm), {})
+
+    def _fingers_at_rest(self, arm: str, target: float, same: float) -> ArmState:
+        last, since, deadline = None, time.monotonic(), time.monotonic() + GRIP_LIMIT
+        settles = GRIP_STARTS
+        while True:
+            state = self.state(arm)
+            at, now = state.gripper, time.monotonic()
+            if at is None:
+                raise Refused("NO_GRIPPER", f"{arm} no longer reports its gripper", "`dimos status` may say why")
+            if last is None or abs(at - last) > same / 10:
+                settles = GRIP_STARTS if last is None else GRIP_SETTLES
+                last, since = at, now
+            if now - since >= (GRIP_SETTLES if abs(at - target) <= same else settles):
+                return state
+            if now > deadline:
+                raise MotionFailed("NO_ANSWER", f"the gripper of {arm} still moves after {GRIP_LIMIT:g} s")
+            time.sleep(0.02)
+
+    def io(self, arm: str) -> Dict[str, Any]:
+        """Digital and analogue inputs and outputs of an arm, as docs/rpc.md says."""
+        return self.call("arm_io", arm=arm)
+
+    def set_io(self, arm: str, **outputs: float) -> Dict[str, Any]:
+        """Sets outputs, `do3=1` or `ao0=2.5`; the levels that are read back."""
+        return self.call("arm_io_set", arm=arm, outputs=outputs)
+
+    def payload(self, arm: str) -> Optional[Dict[str, Any]]:
+        """The load at the flange that the controller reports: mass [kg], center [m], inertia [kg·m²]."""
+        load: Optional[Dict[str, Any]] = self.call("arm_payload", arm=arm)["payload"]
+        return load
+
+    def set_payload(self, arm: str, mass: float, center: Sequence[float] = (0, 0, 0)) -> Optional[Dict[str, Any]]:
+        """Sets the load of everything at the flange [kg, m], at rest; what the controller then reports."""
+        reply = self.call("arm_payload_set", arm=arm, mass=mass, center=numbers(center))
+        load: Optional[Dict[str, Any]] = reply["payload"]
+        return load
+
+    def cancel(self, arm: Optional[str] = None, task: Optional[str] = None) -> Dict[str, str]:
+        """Ends motions by decelerating: of an arm, of a task, or all; without a task also planning."""
+        ended: Dict[str, str] = self.call("cancel", arm=arm, task=task)["tasks"]
+        return ended
+
+    def speed(self, fraction: Optional[float] = None, paused: Optional[bool] = None) -> Dict[str, Any]:
+        """Sets the speed override of the run (0.01–1), pauses or resumes all motions; `fraction` and `paused` now."""
+        return self.call("speed", fraction=fraction, paused=paused)
+
+    def save_pose(self, name: str, *arms: str) -> Dict[str, Any]:
+        """Saves where arms are, by default all, as a named pose. What was saved [rad], by arm and joint."""
+        saved: Dict[str, Any] = self.call("pose_save", name=name, arms=list(arms))["pose"]
+        return saved
+
+    def stop(self, arm: Optional[str] = None) -> Dict[str, str]:
+        """Latched hold at once, of an arm or of all: an operational stop. Per arm `confirmed`, or not."""
+        stopped: Dict[str, str] = self.call("stop", arm=arm)["arms"]
+        return stopped
+
+    def reset(self, arm: str) -> str:
+        """Clears a latched hold or a fault. Moves nothing, enables nothing. The arm's phase."""
+        return str(self.call("arm_reset", arm=arm)["phase"])
+
+    def enable(self, arm: str) -> str:
+        """Enables the motors and makes the arm ready, where it is. The arm's phase."""
+        return str(self.call("arm_enable", arm=arm)["phase"])
+
+
+def _same(span: Optional[List[float]]) -> float:
+    """Difference of positions of a gripper that counts as none [m or rad]."""
+    return GRIP_TOLERANCE * abs(span[1] - span[0]) if span else 1e-3
+
+
+def _outcome(begin: Optional[float], at: Optional[float], target: float, span: Optional[List[float]]) -> str:
+    closed, opened = span or (0.0, float("inf"))
+    same = _same(span)
+    if at is None or abs(at - target) <= same:
+        return "closed" if abs(target - closed) <= same else "open" if abs(target - opened) <= same else "reached"
+    closing = (target - (at if begin is None else begin)) * (opened - closed) < 0
+    return "holding" if closing else "blocked"

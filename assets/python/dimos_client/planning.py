@@ -1,0 +1,105 @@
+"""Plans around obstacles, and the world that they avoid."""
+
+from __future__ import annotations
+
+import os
+import time
+from typing import Any, Dict, List, Mapping, Optional, Sequence, Union
+
+from .errors import PlanningFailed, Refused
+from .records import Goal, Plan, Pose, numbers
+from .streams import Streams
+
+Goals = Union[str, Mapping[str, Goal]]  # an arm, whose goal follows, or the goals of several
+
+
+class Planning(Streams):
+    """A connection that plans. All of this needs a planner in the run, else Refused with the code NO_PLANNER."""
+    def plan(self, arm: Goals, target: Optional[Sequence[float]] = None, *, named: Optional[str] = None,
+             pose: Optional[Pose] = None, linear: bool = False, speed: float = 0.5, seed: int = 0,
+             timeout: Optional[float] = None) -> Plan:
+        """Plans a collision-free motion from where the arm is, and waits for the plan; moves nothing. The goal is one
+        of `target` (joints [rad]), a `named` pose, or a `pose` of the end effector, on a straight line if `linear`.
+        Several arms move together: `plan({"left": Goal(named="home"), "right": Goal(named="home")})`."""
+        goals = goals_of(arm, Goal(target, named, pose, linear))
+        params = [goal.params(name) for name, goal in goals.items()]
+        number: int = self.call("plan", goals=params, speed=speed, seed=seed, timeout=timeout)["plan"]
+        try:
+            while (report := self.call("planning", plan=number))["state"] == "PLANNING":
+                time.sleep(0.01)
+        except BaseException:  # Ctrl-C, too
+            self.cancel_plan(number)
+            raise
+        if report["state"] != "PLANNED":
+            raise PlanningFailed(report["state"], report.get("error") or "there is no plan", report.get("hint"), report)
+        return Plan(number, report["elapsed"], report["summary"])
+
+    def cancel_plan(self, plan: Union[Plan, int]) -> bool:
+        """Ends the planning of a plan, and no motion. Whether it was being planned."""
+        return bool(self.call("cancel", plan=plan_number(plan)).get("planning", False))
+
+    def preview(self, plan: Union[Plan, int, None] = None) -> Dict[str, Any]:
+        """A plan, by default the newest, in full: `trajectory`, and per arm the path of its end effector [m] in
+        `end_effectors`."""
+        return self.call("preview", plan=plan_number(plan))
+
+    def named_poses(self, arm: str) -> Dict[str, List[float]]:
+        """The named poses of an arm [rad]."""
+        robots = {robot["name"]: robot for robot in self.call("planner")["robots"]}
+        if arm not in robots:
+            raise Refused("UNKNOWN_ROBOT", f"the planner has no robot named {arm}", f"it has {', '.join(robots)}")
+        poses: Dict[str, List[float]] = robots[arm]["named_poses"]
+        return poses
+
+    def world_add(self, name: str, *, box: Optional[Sequence[float]] = None, sphere: Optional[float] = None,
+                  cylinder: Optional[Sequence[float]] = None, mesh: Optional[str] = None, cloud: Optional[str] = None,
+                  xyz: Sequence[float] = (0, 0, 0), rpy: Optional[Sequence[float]] = None,
+                  quat: Optional[Sequence[float]] = None, padding: float = 0.0) -> None:
+        """Adds an obstacle, or replaces the one of its name: a `box` (edges x, y, z), `sphere` (radius), `cylinder`
+        (radius, length along z), `mesh` or `cloud` (a file), with its centre at `xyz` in `map` [m]."""
+        shapes = {"box": None if box is None else numbers(box), "sphere": sphere,
+                  "cylinder": None if cylinder is None else numbers(cylinder),
+                  "mesh": mesh and os.path.abspath(mesh), "cloud": cloud and os.path.abspath(cloud)}
+        given = {key: value for key, value in shapes.items() if value is not None}
+        if len(given) != 1:
+            hint = "give one of box, sphere, cylinder, mesh, cloud"
+            raise Refused("INVALID_PARAMS", f"{name} has {len(given)} shapes", hint)
+        self.call("world_add", name=name, shape=given, pose=Pose(xyz, rpy, quat).params(), padding=padding)
+
+    def world_move(self, name: str, xyz: Sequence[float], rpy: Optional[Sequence[float]] = None,
+                   quat: Optional[Sequence[float]] = None) -> None:
+        """Moves an obstacle."""
+        self.call("world_move", name=name, pose=Pose(xyz, rpy, quat).params())
+
+    def world_remove(self, name: Optional[str] = None) -> None:
+        """Removes an object or, without a name, all that no arm holds."""
+        self.call("world_remove", name=name)
+
+    def world_list(self) -> List[Dict[str, Any]]:
+        """The objects: name, shape, pose, padding, and `held_by` (arm, link)."""
+        objects: List[Dict[str, Any]] = self.call("world")["objects"]
+        return objects
+
+    def attach(self, name: str, arm: str, link: Optional[str] = None, touch_links: Sequence[str] = (),
+               mass: Optional[float] = None) -> Dict[str, Any]:
+        """Attaches an object, where it is, to a `link` of an arm (default: its end effector), which may touch it and so
+        may `touch_links`. With `mass` [kg] the arm's controller is set to carry it: the reply has load and payload."""
+        return self.call("attach", name=name, robot=arm, link=link, touch_links=list(touch_links), mass=mass)
+
+    def detach(self, name: str) -> None:
+        """Detaches an object; it remains where it is."""
+        self.call("detach", name=name)
+
+
+def plan_number(plan: Union[Plan, int, None]) -> Optional[int]:
+    """The number of a plan."""
+    return plan.number if isinstance(plan, Plan) else plan
+
+
+def goals_of(arm: Goals, goal: Goal) -> Dict[str, Goal]:
+    """The goals of one arm or of several, by arm."""
+    if isinstance(arm, str):
+        return {arm: goal}
+    if goal.linear or any(given is not None for given in (goal.joints, goal.named, goal.pose)):
+        raise Refused("INVALID_PARAMS", "several arms have a goal each", "give none besides them")
+    return dict(arm)

@@ -1,0 +1,138 @@
+"""What the client takes and returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Dict, List, Optional, Sequence
+
+
+def numbers(values: Sequence[float]) -> List[float]:
+    """Plain numbers, also of an array of another library."""
+    return [float(value) for value in values]
+
+
+@dataclass(frozen=True)
+class JointState:
+    """Joints after a tick, all lists in the order of `name`."""
+    tick: int
+    stamp: float  # s since 1970
+    name: List[str]
+    position: List[Optional[float]]  # rad
+    velocity: List[Optional[float]]  # rad/s
+    effort: List[Optional[float]]  # Nm
+    lost: int = 0  # messages that this reader missed just before, because it was too slow
+
+    def only(self, names: Sequence[str]) -> JointState:
+        """The same for these joints, in this order."""
+        of = [self.name.index(name) for name in names]
+        position, velocity, effort = ([v[k] for k in of] for v in (self.position, self.velocity, self.effort))
+        return JointState(self.tick, self.stamp, list(names), position, velocity, effort, self.lost)
+
+
+@dataclass(frozen=True)
+class ArmState(JointState):
+    """An arm after a tick."""
+    age: Optional[float] = None  # s, of its joints
+    gripper: Optional[float] = None  # m of opening, or rad of a rotary jaw
+    xyz: Optional[List[float]] = None  # m, of the tool centre point in `frame`; None without a model of the arm
+    rpy: Optional[List[float]] = None  # rad, fixed axes
+    wrench: Optional[List[float]] = None  # N, N, N, Nm, Nm, Nm
+    gripper_unit: Optional[str] = None  # "m" or "rad"
+    gripper_force: Optional[float] = None  # measured, in gripper_force_unit
+    gripper_force_unit: Optional[str] = None  # "N" or "Nm"
+    link: Optional[str] = None  # the link of the model, or that of the tool, whose pose xyz and rpy are
+    frame: Optional[str] = None  # "map"
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A pose of an arm's tool centre point, or of an object; in the frame `map` unless a goal has another one."""
+    xyz: Sequence[float]  # m
+    rpy: Optional[Sequence[float]] = None  # rad, fixed axes; without rpy and quat the orientation is free
+    quat: Optional[Sequence[float]] = None  # x, y, z, w
+
+    def params(self) -> Dict[str, Any]:
+        """The pose as a parameter of a request."""
+        given = {"xyz": self.xyz, "rpy": self.rpy, "quat": self.quat}
+        return {key: numbers(value) for key, value in given.items() if value is not None}
+
+
+@dataclass(frozen=True)
+class Goal:
+    """Goal of an arm: one of `joints` [rad], `named`, `pose`."""
+    joints: Optional[Sequence[float]] = None
+    named: Optional[str] = None
+    pose: Optional[Pose] = None
+    linear: bool = False  # the tool centre point moves to `pose` on a straight line
+    frame: Optional[str] = None  # of `pose`: "map" (default), "base", "tool", or an object of the world
+
+    def params(self, arm: str) -> Dict[str, Any]:
+        """The goal as a parameter of `plan`."""
+        goal: Dict[str, Any] = {"robot": arm}
+        if self.joints is not None:
+            goal["joints"] = numbers(self.joints)
+        if self.named is not None:
+            goal["named"] = self.named
+        if self.pose is not None:
+            goal["pose"] = self.pose.params()
+        if self.linear:
+            goal["linear"] = True
+        if self.frame is not None:
+            goal["frame"] = self.frame
+        return goal
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A motion that was planned, and has not moved anything."""
+    number: int
+    elapsed: float  # s of planning
+    summary: Dict[str, Any]  # joints, start, goal, duration, clearance, …: docs/rpc.md
+
+    @property
+    def duration(self) -> float:
+        """Duration of the motion [s]."""
+        return float(self.summary["duration"])
+
+    @property
+    def clearance(self) -> Optional[float]:
+        """Smallest distance to an obstacle or between links [m]; None if nothing is near."""
+        return self.summary.get("clearance")
+
+
+@dataclass(frozen=True)
+class Grip:
+    """A gripper after a command."""
+    position: float  # in `unit`
+    unit: str  # "m" or "rad"
+    outcome: str  # "open", "closed" or "reached"; "holding" (stopped while closing), "blocked" (opening); "moving"
+    force: Optional[float] = None  # measured, in `force_unit`
+    force_unit: Optional[str] = None  # "N", "Nm" or "%"
+
+    @property
+    def holding(self) -> bool:
+        """Whether something is between the fingers: they stopped before the commanded position while closing."""
+        return self.outcome == "holding"
+
+
+@dataclass(frozen=True)
+class ChunkReport:
+    """What became of a chunk."""
+    actions: int
+    late: int  # of them, skipped because their time was over; if all are late, nothing has changed
+
+
+@dataclass(frozen=True)
+class LoopReport:
+    """How a policy loop kept its time."""
+    sent: int  # targets that the run took
+    missed: int  # periods that were missed because the policy or the computer took longer than one
+    worst: float  # s, the latest start of a period
+    seconds: float  # s, how long the loop ran
+
+
+def joint_state(message: Dict[str, Any]) -> JointState:
+    """The joint state of a stream's message."""
+    data = message["data"]
+    return JointState(data["tick"], data["stamp"], data["name"], data["position"], data["velocity"], data["effort"],
+                      message.get("lost", 0))
