@@ -252,7 +252,7 @@ class Client:
             yield message["data"]
 
     def move(self, arm: str, target: Sequence[float], speed: float = 0.5, wait: bool = True) -> Dict[str, Any]:
-        """Moves an arm to `target` [rad], directly: not collision-checked. `speed`: 0.1–1 of its limits."""
+        """Moves an arm to `target` [rad], directly: not collision-checked. `speed`: 0.01–1 of its limits."""
         begun = self.call("move", arm=arm, target=list(target), speed=speed)
         return self.wait(begun["motion"]) if wait else begun
 

@@ -34,7 +34,7 @@ pub const RESERVED_CONNECTIONS: usize = 8;
 /// Maximum number of subscriptions of a connection.
 pub const MAX_SUBSCRIPTIONS: usize = 16;
 /// Minimum `speed` of a motion, as a fraction of the limits.
-pub const MIN_SPEED: f64 = 0.1;
+pub const MIN_SPEED: f64 = 0.01;
 
 /// A boxed future, for trait objects.
 pub type BoxFuture<'a, T> = Pin<Box<dyn Future<Output = T> + Send + 'a>>;

@@ -47,6 +47,8 @@ pub enum Code {
     PlanOutdated,
     /// No such object in the world.
     UnknownObject,
+    /// The object does not allow the request: an arm holds it, or none does.
+    WrongObject,
     /// The planner is busy with another request.
     Planning,
     /// No trajectory task covers these joints.
