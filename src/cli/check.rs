@@ -44,8 +44,13 @@ pub fn load_to_run(name: &str, overrides: &Overrides, catalog: Catalog<'_>) -> R
     }
 }
 
-/// Returns the failure of a blueprint with mistakes, after printing them.
+/// Returns the failure of a run whose blueprint has mistakes, after printing them.
 pub fn refuse(loaded: &Loaded) -> Failure {
+    Failure { what: "the blueprint has mistakes: nothing was connected".to_owned(), ..mistakes(loaded) }
+}
+
+/// Returns the failure of a blueprint with mistakes, after printing them.
+pub fn mistakes(loaded: &Loaded) -> Failure {
     output::note(loaded.render(output::colour(&std::io::stderr())).trim_end());
     Failure::usage("the blueprint has mistakes").data(loaded.to_json())
 }
@@ -72,7 +77,7 @@ pub fn report(name: &str, overrides: &Overrides, catalog: Catalog<'_>, as_json: 
         output::json(&document);
         return Ok(if summary.is_some() && robots.is_ok() { Exit::Ok } else { Exit::Usage });
     }
-    let Some(summary) = summary else { return Err(refuse(&loaded)) };
+    let Some(summary) = summary else { return Err(mistakes(&loaded)) };
     print_warnings(&loaded);
     let robots = robots.map_err(Failure::usage)?;
     print(&summary);

@@ -1,4 +1,5 @@
-//! `dimos completions SHELL`: the script by which a shell completes this program's words ([`complete`](super::complete)).
+//! `dimos completions SHELL`: the script by which a shell asks this program for completions
+//! ([`complete`](super::complete)).
 
 use anyhow::Context;
 use clap_complete::Shell;

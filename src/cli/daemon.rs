@@ -238,11 +238,35 @@ fn of_arms(report: &StatusReport, value: fn(&ArmReport) -> Option<String>) -> BT
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::rpc::report::{CauseReport, DeviceError};
 
     #[test]
     fn the_new_process_gets_the_same_arguments() {
         let own = ["/bin/dimos", "run", "-d", "x", "--", "y"].map(OsString::from);
         let expected = ["run", "--text-log", "f.log", "-d", "x", "--", "y"].map(OsString::from);
         assert_eq!(arguments(own.into_iter(), Path::new("f.log")), expected);
+    }
+
+    #[test]
+    fn an_arm_that_is_held_is_a_failure_with_its_cause() {
+        let cause = CauseReport { name: "device_fault".into(), text: "the arm reports error 1".into() };
+        let error = Some(DeviceError { code: 1, text: "E-stop line open".into() });
+        let ready = ArmReport { hardware_id: "left".into(), phase: "ready".into(), ..ArmReport::default() };
+        let held =
+            ArmReport { hardware_id: "right".into(), phase: "held".into(), cause: Some(cause), error, ..ready.clone() };
+        let up = |arms: Vec<ArmReport>| {
+            let (ours, theirs) = UnixStream::pair().unwrap();
+            let starter = StartingProcess { stream: theirs, text_log: "text.log".into() };
+            starter.up(&StatusReport { run: "cell".into(), arms, ..StatusReport::default() }, None, None);
+            let mut line = String::new();
+            BufReader::new(ours).read_line(&mut line).unwrap();
+            let StartMessage::Up(up) = serde_json::from_str(&line).unwrap() else { panic!("{line}") };
+            up
+        };
+        assert_eq!(not_ready(&up(vec![ready.clone()])), None);
+        let failure = not_ready(&up(vec![ready, held])).unwrap();
+        assert_eq!(failure.exit, Exit::Failed);
+        let expected = "run cell is up, but not ready: right is held: the arm reports error 1: E-stop line open";
+        assert_eq!(failure.what, expected);
     }
 }

@@ -13,10 +13,10 @@ use crate::rpc::client::Client;
 #[derive(Debug, clap::Args)]
 #[command(
     override_usage = "\
-dimos move [OPTIONS] ARM Q…
-       dimos move [OPTIONS] ARM --named NAME
-       dimos move [OPTIONS] ARM --pose X Y Z [--rpy R P Y | --quat X Y Z W] [--linear]
-       dimos move [OPTIONS] --goal ARM=GOAL…",
+dimos move ARM Q… [OPTIONS]
+       dimos move ARM --named NAME [OPTIONS]
+       dimos move ARM --pose X Y Z [--rpy R P Y | --quat X Y Z W] [OPTIONS]
+       dimos move --goal ARM=GOAL… [OPTIONS]",
     after_help = "\
 With a planner in the run the motion is planned and collision-free; without one it is direct, not collision-checked, and \
 its goal is given as joint positions.

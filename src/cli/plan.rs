@@ -10,10 +10,10 @@ use super::output;
 #[derive(Debug, clap::Args)]
 #[command(
     override_usage = "\
-dimos plan [OPTIONS] ARM Q…
-       dimos plan [OPTIONS] ARM --named NAME
-       dimos plan [OPTIONS] ARM --pose X Y Z [--rpy R P Y | --quat X Y Z W] [--linear]
-       dimos plan [OPTIONS] --goal ARM=GOAL…",
+dimos plan ARM Q… [OPTIONS]
+       dimos plan ARM --named NAME [OPTIONS]
+       dimos plan ARM --pose X Y Z [--rpy R P Y | --quat X Y Z W] [OPTIONS]
+       dimos plan --goal ARM=GOAL… [OPTIONS]",
     after_help = "\
 Next: `dimos preview` shows the plan, `dimos execute` executes it. `dimos move` plans and executes in one step.
 

@@ -69,6 +69,10 @@ impl PoseArgs {
 
 /// Arguments of `world add`.
 #[derive(Debug, clap::Args)]
+#[command(override_usage = "\
+dimos world add NAME --at X Y Z [--rpy R P Y] SHAPE [OPTIONS]
+       SHAPE: --box X Y Z | --sphere RADIUS | --cylinder RADIUS LENGTH
+            | --mesh FILE | --cloud FILE")]
 #[command(group = clap::ArgGroup::new("shape").required(true).args(["cuboid", "sphere", "cylinder", "mesh", "cloud"]))]
 pub struct AddArgs {
     /// Name of the object; replaces an object of the same name

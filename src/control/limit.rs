@@ -204,7 +204,7 @@ impl Limiter {
         let before = self.velocity;
         self.velocity = inside.clamp(self.velocity - change, self.velocity + change);
         self.position = (at.0 + at.1) / 2.0;
-        // What was commanded, in the unit of the limit: the position that the velocity leads to, the acceleration to it.
+        // In the unit of the limit: the position that the commanded velocity leads to, the acceleration to reach it.
         let by = if capped != target {
             Some((LimitKind::Velocity, target))
         } else if inside != capped {

@@ -43,6 +43,8 @@ pub enum Code {
     UnknownRobot,
     /// No such plan, or it is too old.
     UnknownPlan,
+    /// There is no plan yet, or planning found none; the message says why.
+    NoPlan,
     /// The world has changed since the plan was made, and now blocks it.
     PlanOutdated,
     /// No such object in the world.

@@ -231,11 +231,9 @@ fn sim_gives_every_arm_its_emulator() {
 fn a_simulated_arm_may_be_silent_for_100_ms() {
     let stale_after = |sim: bool, set: &[&str]| {
         let set = set.iter().map(|&s| s.to_owned()).collect();
-        let loaded = load(
-            &find("coordinator-xarm7").unwrap(),
-            &Overrides { set, sim, ..Overrides::default() },
-            &Registry::builtin(),
-        );
+        let address = vec![("arm".to_owned(), "192.168.1.185".to_owned())];
+        let overrides = Overrides { set, sim, address };
+        let loaded = load(&find("coordinator-xarm7").unwrap(), &overrides, &Registry::builtin());
         loaded.blueprint.unwrap().arms[0].supervision.stale_after.as_millis()
     };
     assert_eq!(stale_after(false, &[]), 50);

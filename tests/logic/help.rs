@@ -47,7 +47,7 @@ fn no_epilogue_is_wrapped_in_its_source() {
 #[test]
 fn usage_lines_have_the_order_that_is_parsed() {
     for (line, usage) in
-        [("dimos move", "dimos move [OPTIONS] ARM Q…"), ("dimos plan arm --rpy 0 0 0", "dimos plan [OPTIONS] ARM Q…")]
+        [("dimos move", "dimos move ARM Q… [OPTIONS]"), ("dimos plan arm --rpy 0 0 0", "dimos plan ARM Q… [OPTIONS]")]
     {
         let error = dimos::cli::command().try_get_matches_from(line.split(' ')).unwrap_err();
         let text = error.to_string();

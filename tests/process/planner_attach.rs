@@ -173,7 +173,7 @@ fn a_run_that_goes_away_is_waited_for() {
     planner.until(AGAIN);
     // The world is as it was; the plans of the run that is gone are gone with it.
     assert!(home.dimos("world list").with(0).out.contains("post"));
-    home.dimos("execute").with(1).says(&["UNKNOWN_PLAN"]);
+    home.dimos("execute").with(1).says(&["NO_PLAN"]);
     home.dimos("move arm --named home").with(0).says(&["planned, collision-checked"]);
     // The same when the run has no time for a word, more than once.
     run.signal(Signal::KILL);

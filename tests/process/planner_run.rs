@@ -118,9 +118,9 @@ fn what_cannot_be_planned_is_refused_in_words() {
         ("plan arm --pose 0.3 0 0.3 --quat 1 1 0 0", 2, &["goals[0].pose.quat has length 1.414"]),
         ("plan arm 0 0 0 0 0 0 --linear", 2, &["linear needs a pose"]),
         ("plan arm", 2, &["required"]),
-        ("preview", 1, &["UNKNOWN_PLAN", "hint: `dimos plan` makes one"]),
-        ("preview 4711", 1, &["UNKNOWN_PLAN"]),
-        ("execute --plan 4711", 1, &["UNKNOWN_PLAN"]),
+        ("preview", 1, &["NO_PLAN", "hint: `dimos plan` makes one"]),
+        ("preview 4711", 2, &["UNKNOWN_PLAN"]),
+        ("execute --plan 4711", 2, &["UNKNOWN_PLAN"]),
     ];
     // The way home has made plans: the ones that are asked about here are gone with a new run.
     for (arguments, code, words) in table.iter().filter(|(arguments, ..)| *arguments != "preview") {
@@ -136,7 +136,7 @@ fn what_cannot_be_planned_is_refused_in_words() {
     fresh.write("lab.yaml", BLUEPRINT);
     let _run = fresh.run("lab.yaml --no-record");
     fresh.dimos("preview").with(1).says(table[10].2);
-    fresh.dimos("execute").with(1).says(&["UNKNOWN_PLAN"]);
+    fresh.dimos("execute").with(1).says(&["NO_PLAN"]);
 }
 
 #[test]

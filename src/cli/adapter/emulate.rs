@@ -182,8 +182,8 @@ fn announce(args: &Args, row: &AdapterSpec, dof: usize, address: &str, registry:
         _ => address.to_owned(),
     };
     let program = program();
-    let command = runnable(args, row, dof, &given, registry)
-        .map(|name| format!("{program} run {name} --address arm={given}"));
+    let command =
+        runnable(args, row, dof, &given, registry).map(|name| format!("{program} run {name} --address arm={given}"));
     if args.json {
         output::json(&json!({
             "event": "started",

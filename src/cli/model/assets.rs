@@ -49,7 +49,7 @@ impl BlueprintArgs {
         let loaded = check::load(&self.blueprint, &Overrides { set, ..Overrides::default() }, catalog)?;
         match loaded.blueprint {
             Some(blueprint) => Ok(blueprint),
-            None => Err(check::refuse(&loaded)),
+            None => Err(check::mistakes(&loaded)),
         }
     }
 }
