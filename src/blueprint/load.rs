@@ -10,13 +10,15 @@ use crate::blueprint::registry::{Found, SearchPath};
 use crate::blueprint::resolve::{Blueprint, Checker, resolve};
 use crate::blueprint::schema::BlueprintFile;
 use crate::hardware::registry::{Registry, SIM};
-use crate::yaml::{self, Diag, Keyed, Label, Missing, NodeId, Report, Severity, Tree, quote, read};
+use crate::yaml::{self, Diag, Keyed, Label, Missing, NodeId, Report, Severity, Tree, did_you_mean, quote, read};
 
 /// Changes of a blueprint by command-line options.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Overrides {
     /// `--set path=value`, in the order given.
     pub set: Vec<String>,
+    /// `--address arm=address`: names of arms and their addresses; they win over those of the blueprint and of `set`.
+    pub address: Vec<(String, String)>,
     /// `--sim`: replaces every arm by its emulator. An error if the adapter of a real arm has none.
     pub sim: bool,
 }
@@ -140,6 +142,9 @@ fn read_blueprint(
     for argument in &overrides.set {
         yaml::set(tree, root, argument, &RULES);
     }
+    for (arm, address) in &overrides.address {
+        use_address(tree, root, arm, address);
+    }
     if overrides.sim {
         simulate(tree, root, catalog.adapters);
     }
@@ -154,6 +159,23 @@ fn read_blueprint(
     }
     blueprint.source_yaml = merged_yaml(tree, root, &blueprint.name);
     Some(blueprint)
+}
+
+/// `--address`: sets the address of one arm. An arm that the blueprint does not have is an error.
+fn use_address(tree: &mut Tree, root: NodeId, arm: &str, address: &str) {
+    let argument = format!("{arm}={address}");
+    let source = tree.add_source("--address", &argument);
+    let hardware = tree.get(root, "hardware").map(|list| tree.items(list).to_vec()).unwrap_or_default();
+    let id = |entry: &NodeId| tree.get(*entry, "hardware_id").and_then(|node| tree.text(node)).map(str::to_owned);
+    let arms: Vec<(String, NodeId)> = hardware.iter().filter_map(|entry| Some((id(entry)?, *entry))).collect();
+    match arms.iter().find(|(id, _)| id == arm) {
+        Some((_, entry)) => tree.put_text(*entry, "address", address, (source, arm.len() + 1..argument.len())),
+        None => {
+            let at = Label { source, range: 0..arm.len(), text: String::new() };
+            let hint = did_you_mean(arm, arms.iter().map(|(id, _)| id.as_str()), "its arms are");
+            tree.report(Diag::error(format!("the blueprint has no arm {}", quote(arm))).at(at).maybe_hint(hint));
+        }
+    }
 }
 
 /// `--sim`: sets the address of every arm to its emulator. A real arm without an emulator is an error.

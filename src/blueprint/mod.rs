@@ -32,7 +32,7 @@ pub use json_schema::{full_schema, json_schema};
 pub use limits::{JointOverride, LimitsEntry};
 pub use load::{Loaded, Overrides, load, load_from};
 pub use parts::{InputLevel, MountingEntry, PayloadEntry, StopInputEntry};
-pub use registry::{FindError, Found, Listing, SearchPath, Source, embed, find, list};
+pub use registry::{FindError, Found, Listing, SearchPath, Source, embed, find, list, names};
 pub use resolve::{Arm, Blueprint, Task, TaskRobot, UsedAsset};
 pub use schema::{CoordinatorConfig, OnExit, RecordingConfig, RpcConfig};
 pub use summary::{ArmSummary, JointSummary, Limit, Origin, Summary, TaskSummary};

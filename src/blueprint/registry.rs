@@ -10,7 +10,7 @@ use serde::Serialize;
 
 use crate::blueprint::catalog::Catalog;
 use crate::blueprint::load::{Overrides, load_from};
-use crate::yaml::{MAX_BYTES, did_you_mean, quote};
+use crate::yaml::{MAX_BYTES, closest, quote};
 
 /// Names and texts of the blueprints in the binary, embedded by `build.rs` from `blueprints/`.
 const EMBEDDED: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/blueprints.rs"));
@@ -188,9 +188,18 @@ impl SearchPath {
     }
 
     fn hint(&self, wanted: &str) -> String {
+        let beside = EXTENSIONS.iter().map(|ext| format!("{wanted}.{ext}")).find(|file| Path::new(file).is_file());
+        if let Some(file) = beside {
+            return format!("there is a file of that name: use `{file}`");
+        }
+        if Path::new(wanted).extension().is_some() {
+            return "a blueprint is a YAML file: NAME.yaml or NAME.yml".to_owned();
+        }
         let names = self.names();
-        let meant = did_you_mean(wanted, names.iter().map(|(name, _)| name.as_str()), "there are");
-        meant.unwrap_or_else(|| "give the path of a YAML file".to_owned())
+        match closest(wanted, names.iter().map(|(name, _)| name.as_str())) {
+            Some(name) => format!("did you mean `{name}`?"),
+            None => "`dimos list-blueprints` shows the names; a file is given by its path".to_owned(),
+        }
     }
 
     fn cannot_open(&self, path: &Path, error: &io::Error) -> FindError {
@@ -262,6 +271,11 @@ pub struct Listing {
 /// Returns the file of a name or path; searches the folders of [`SearchPath::from_env`].
 pub fn find(name_or_path: &str) -> Result<Found, FindError> {
     SearchPath::from_env().find(name_or_path)
+}
+
+/// Returns the names of all blueprints that can be run by name; reads none of them.
+pub fn names() -> Vec<String> {
+    SearchPath::from_env().names().into_iter().map(|(name, _)| name).collect()
 }
 
 /// Returns all blueprints that can be run by name, from the folders of [`SearchPath::from_env`].

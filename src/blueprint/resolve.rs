@@ -107,6 +107,13 @@ pub struct Arm {
     pub limits: Vec<JointOverride>,
 }
 
+impl Arm {
+    /// Returns whether commands reach a device: it is neither an emulator nor an arm in memory.
+    pub fn is_real(&self) -> bool {
+        !self.simulated && self.adapter.transport != "memory"
+    }
+}
+
 /// A task.
 #[derive(Debug, Clone)]
 pub struct Task {

@@ -147,7 +147,7 @@ fn arm(arm: &Arm) -> ArmSummary {
         adapter: arm.adapter_type.clone(),
         level: arm.adapter.level.name().to_owned(),
         address: arm.address.clone(),
-        simulated: arm.simulated,
+        simulated: !arm.is_real(),
         auto_enable: arm.auto_enable,
         on_exit: arm.on_exit,
         on_exit_from: if arm.on_exit_given { Origin::Blueprint } else { Origin::Default },

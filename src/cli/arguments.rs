@@ -5,6 +5,7 @@ use std::time::Duration;
 use clap::Args;
 
 use super::exit::Result;
+use crate::blueprint::Overrides;
 use crate::rpc::client::{self, Client};
 use crate::rpc::run_dir::{LiveRun, RunDir};
 
@@ -12,11 +13,33 @@ use crate::rpc::run_dir::{LiveRun, RunDir};
 #[derive(Debug, Clone, PartialEq, Eq, Default, Args)]
 pub struct Target {
     /// The run to talk to; needed only when several are live
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "RUN")]
     pub run: Option<String>,
-    /// Print JSON
+    /// Print JSON, errors too
     #[arg(long)]
     pub json: bool,
+}
+
+/// Arguments that change a blueprint before it is used.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Args)]
+pub struct Changes {
+    /// Use the arm at this address instead of the blueprint's: arm=192.168.1.185, arm=can0, arm=sim (repeatable)
+    #[arg(long, value_name = "ARM=ADDRESS", value_parser = arm_address)]
+    pub address: Vec<(String, String)>,
+    /// Change a field of the blueprint: coordinator.tick_rate=250, hardware.arm.limits.velocity=0.5 (repeatable)
+    #[arg(long, value_name = "PATH=VALUE", value_parser = setting)]
+    pub set: Vec<(String, String)>,
+    /// Simulate all arms, whatever addresses the blueprint has
+    #[arg(long, conflicts_with = "address")]
+    pub sim: bool,
+}
+
+impl Changes {
+    /// Returns the changes as overrides of the blueprint.
+    pub fn overrides(&self) -> Overrides {
+        let set = self.set.iter().map(|(path, value)| format!("{path}={value}")).collect();
+        Overrides { set, address: self.address.clone(), sim: self.sim }
+    }
 }
 
 impl Target {
@@ -66,18 +89,39 @@ pub fn override_of_speed(text: &str) -> std::result::Result<f64, String> {
 }
 
 /// Parses a rate per second.
-pub fn rate(text: &str) -> std::result::Result<f64, String> {
+pub fn hertz(text: &str) -> std::result::Result<f64, String> {
     let value = finite(text)?;
     if (0.1..=2000.0).contains(&value) { Ok(value) } else { Err("must be within 0.1–2000 Hz".into()) }
 }
 
-/// Parses a duration with its unit: `10s`, `500ms`, `1m 30s`.
+/// Parses a duration above zero: `10s`, `500ms`, `1m 30s`, or a number of seconds.
 pub fn duration(text: &str) -> std::result::Result<Duration, String> {
-    let hint = "give a unit: 10s, 500ms, 2m";
-    let span: jiff::SignedDuration = text.parse().map_err(|_| hint.to_owned())?;
-    match Duration::try_from(span) {
-        Ok(duration) if !duration.is_zero() => Ok(duration),
-        _ => Err("must be greater than zero".into()),
+    match time(text)? {
+        Duration::ZERO => Err("must be greater than zero".into()),
+        duration => Ok(duration),
+    }
+}
+
+/// Parses a time: `10s`, `500ms`, `1m 30s`, or a number of seconds; zero is allowed.
+pub fn time(text: &str) -> std::result::Result<Duration, String> {
+    let wrong = || "not a duration: write 10s, 500ms, 2m, or a number of seconds".to_owned();
+    match text.parse::<f64>() {
+        Ok(seconds) if seconds < 0.0 => Err("must not be negative".into()),
+        Ok(seconds) => Duration::try_from_secs_f64(seconds).map_err(|_| wrong()),
+        Err(_) => {
+            let span: jiff::SignedDuration = text.parse().map_err(|_| wrong())?;
+            Duration::try_from(span).map_err(|_| "must not be negative".into())
+        }
+    }
+}
+
+/// Parses `arm=address`, as in `--address arm=192.168.1.185`.
+pub fn arm_address(text: &str) -> std::result::Result<(String, String), String> {
+    match text.split_once('=') {
+        Some((arm, address)) if !arm.trim().is_empty() && !address.trim().is_empty() => {
+            Ok((arm.trim().to_owned(), address.trim().to_owned()))
+        }
+        _ => Err("must be ARM=ADDRESS, such as arm=192.168.1.185".into()),
     }
 }
 
@@ -86,5 +130,23 @@ pub fn setting(text: &str) -> std::result::Result<(String, String), String> {
     match text.split_once('=') {
         Some((path, value)) if !path.trim().is_empty() => Ok((path.trim().to_owned(), value.to_owned())),
         _ => Err("must be PATH=VALUE, such as coordinator.tick_rate=250".into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn durations_are_seconds_or_have_a_unit() {
+        for (text, milliseconds) in
+            [("10s", 10_000), ("500ms", 500), ("2m", 120_000), ("1m 30s", 90_000), ("1.5", 1500), ("10", 10_000)]
+        {
+            assert_eq!(duration(text), Ok(Duration::from_millis(milliseconds)), "{text}");
+        }
+        assert_eq!(time("0"), Ok(Duration::ZERO));
+        for wrong in ["", "-1", "nan", "inf", "-2s", "soon", "0", "0s"] {
+            assert!(duration(wrong).is_err(), "{wrong}");
+        }
     }
 }

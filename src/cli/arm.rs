@@ -122,11 +122,13 @@ impl Opening {
 /// Runs the verb.
 pub fn run(args: &Args, registry: &Registry) -> Result {
     match &args.action {
-        Action::Enable(which) => phase(which, ArmEnable { arm: which.arm.clone() }),
-        Action::Disable { which, now } => phase(which, ArmDisable { arm: which.arm.clone(), now: *now }),
+        Action::Enable(which) => phase(which, ArmEnable { arm: which.arm.clone() }).map(|_| Exit::Ok),
+        Action::Disable { which, now } => {
+            phase(which, ArmDisable { arm: which.arm.clone(), now: *now }).map(|_| Exit::Ok)
+        }
         Action::Reset(which) => {
-            phase(which, ArmReset { arm: which.arm.clone() })?;
-            if !which.target_run.json {
+            let phase = phase(which, ArmReset { arm: which.arm.clone() })?;
+            if !which.target_run.json && phase != "ready" {
                 output::note(format_args!("to make it ready for motion: dimos arm enable {}", which.arm));
             }
             Ok(Exit::Ok)
@@ -142,8 +144,8 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
     }
 }
 
-/// Sends a request that changes the arm's phase, and prints the phase that it has then.
-fn phase(which: &ArmArgs, request: impl Method<Reply = ArmReply>) -> Result {
+/// Sends a request that changes the arm's phase; prints and returns the phase that it has then.
+fn phase(which: &ArmArgs, request: impl Method<Reply = ArmReply>) -> Result<String> {
     let reply = which.target_run.connect()?.call(request)?;
     if which.target_run.json {
         output::json(&reply);
@@ -153,7 +155,7 @@ fn phase(which: &ArmArgs, request: impl Method<Reply = ArmReply>) -> Result {
             output::note(format_args!("{}: {note}", reply.arm));
         }
     }
-    Ok(Exit::Ok)
+    Ok(reply.phase)
 }
 
 fn gripper(which: &ArmArgs, opening: Opening, force: Option<f64>) -> Result {

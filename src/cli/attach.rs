@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use serde_json::json;
 
+use super::banner;
 use super::exit::{Exit, Failure, Result};
 use super::run::Args;
 use super::run_record::RunRecord;
@@ -15,7 +16,7 @@ use crate::blueprint::Blueprint;
 use crate::planning::config::RobotConfig;
 use crate::rpc::api::Status;
 use crate::rpc::client::{self, Client, ClientError};
-use crate::rpc::report::StatusReport;
+use crate::rpc::report::{ArmReport, StatusReport};
 use crate::rpc::run_dir::{Claim, LiveRun, RunDir};
 use crate::runtime::{AttachedPlanner, Ending, LinkEvent};
 
@@ -24,6 +25,8 @@ pub struct Attached {
     name: String,
     blueprint: String,
     run: LiveRun,
+    /// The arms of the run.
+    arms: Vec<ArmReport>,
     planner: AttachedPlanner,
     /// Its name among the planners; released when it ends.
     _claim: Claim,
@@ -110,8 +113,13 @@ fn mismatch(run: &StatusReport, args: &Args, blueprint: &Blueprint) -> Mismatch 
             Some(its) if its.adapter != arm.adapter_type => {
                 mismatch.differs.push(format!("{id} is of type {}, not {}", its.adapter, arm.adapter_type));
             }
-            Some(its) if args.sim && !its.simulated => mismatch.differs.push(format!("{id} is not simulated")),
-            Some(_) => {}
+            Some(its) if args.changes.sim && !its.simulated => mismatch.differs.push(format!("{id} is not simulated")),
+            Some(its) => {
+                let asked = args.changes.address.iter().rfind(|(arm, _)| arm == id).map(|(_, address)| address);
+                if let Some(asked) = asked.filter(|asked| **asked != its.address) {
+                    mismatch.differs.push(format!("{id} is at {}, not {asked}", its.address));
+                }
+            }
         }
     }
     mismatch.missing.extend(robots.clone().filter_map(|robot| missing_task(run, robot)));
@@ -156,7 +164,9 @@ impl Attached {
         };
         let planner = AttachedPlanner::start(&name, &config, &run.socket, on_event)
             .map_err(|e| Failure::new(Exit::Failed, e.to_string()).hint(e.hint()))?;
-        Ok(Self { name, blueprint: blueprint.name.clone(), run, planner, _claim: claim, ending: channel() })
+        let status = Client::connect(&run.name, &run.socket).and_then(|mut client| client.call(Status {}));
+        let arms = status.map(|status| status.arms).unwrap_or_default();
+        Ok(Self { name, blueprint: blueprint.name.clone(), run, arms, planner, _claim: claim, ending: channel() })
     }
 
     /// Returns the planner's status for run records.
@@ -215,6 +225,10 @@ impl Attached {
         }
         terminal.note(format_args!("planner {}  (pid {pid}, dimos {})", self.name, crate::VERSION));
         terminal.note(format_args!("  attached to run {}", self.run.name));
+        for arm in &self.arms {
+            let standing = banner::standing(arm.simulated, &arm.address);
+            terminal.note(format_args!("  arm        {}: {standing}, {}", arm.hardware_id, arm.adapter));
+        }
         for robot in self.planner.robots() {
             let task = robot.task.as_deref().unwrap_or("the task that has its joints");
             terminal.note(format_args!("  robot      {}: {} joints, moved by {task}", robot.name, robot.joints.len()));
@@ -226,23 +240,13 @@ impl Attached {
 /// Maximum time for a planner to end after SIGTERM.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Returns the planner with this name, attached or waiting for its run; without a name, the only one.
-pub fn find(name: Option<&str>) -> Option<LiveRun> {
-    let mut all = live();
-    match name {
-        Some(name) => all.into_iter().find(|planner| planner.name == name),
-        None if all.len() == 1 => all.pop(),
-        None => None,
-    }
-}
-
 /// Returns the live planners in their own processes.
 pub fn live() -> Vec<LiveRun> {
     RunDir::standard().planners().runs().unwrap_or_default()
 }
 
 /// Ends a planner, like a signal from its terminal.
-pub fn end(planner: &LiveRun) -> Result {
+pub fn end(planner: &LiveRun, as_json: bool) -> Result {
     use rustix::process::{Pid, PidfdFlags, Signal, pidfd_open, pidfd_send_signal};
     let failed = |what: String| Failure::new(Exit::Failed, format!("planner {}: {what}", planner.name));
     let pid = Pid::from_raw(planner.pid as i32).ok_or_else(|| failed("it is still starting".into()))?;
@@ -258,6 +262,9 @@ pub fn end(planner: &LiveRun) -> Result {
         }
         std::thread::sleep(Duration::from_millis(20));
     }
-    super::output::note(format_args!("planner {} ended", planner.name));
+    match as_json {
+        true => super::output::json(&json!({"ended": planner.name, "pid": planner.pid})),
+        false => super::output::note(format_args!("planner {} ended", planner.name)),
+    }
     Ok(Exit::Ok)
 }

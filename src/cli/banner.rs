@@ -28,14 +28,16 @@ pub(super) fn print(terminal: &Terminal, report: &StatusReport, socket: &Path, e
 
 /// Returns the banner's lines.
 pub fn text(report: &StatusReport, socket: &Path, end: &str) -> Vec<String> {
-    let simulated = if report.simulated { "  SIMULATED" } else { "" };
-    let mut lines = vec![format!("run {}{simulated}  (pid {}, dimos {})", report.run, report.pid, report.version)];
+    let heading = heading(report);
+    let mut lines = vec![format!("{heading}  (pid {}, dimos {})", report.pid, report.version)];
     let mut row = |what: &str, text: String| lines.push(format!("  {what:<10} {text}"));
     row("blueprint", report.blueprint.clone());
     for arm in &report.arms {
-        let standing = if arm.simulated { "SIMULATED, " } else { "" };
-        let address = if arm.address.is_empty() { String::new() } else { format!(" at {}", arm.address) };
-        row("arm", format!("{}: {standing}{}{address}, {}", arm.hardware_id, arm.adapter, arm.phase));
+        let standing = standing(arm.simulated, &arm.address);
+        row("arm", format!("{}: {standing}, {}, {}", arm.hardware_id, arm.adapter, arm.phase));
+        if let Some(cause) = cause(arm) {
+            row("", format!("{}: {cause}", arm.phase));
+        }
         row("", format!("at exit: {}", at_exit(arm)));
     }
     let clock = Some(&report.ticks.clock).filter(|clock| clock.starts_with("device"));
@@ -48,6 +50,27 @@ pub fn text(report: &StatusReport, socket: &Path, end: &str) -> Vec<String> {
     row("socket", socket.display().to_string());
     lines.push(end.into());
     lines
+}
+
+/// Returns the first words about a run: its name, and in capitals whether it is simulated.
+pub fn heading(report: &StatusReport) -> String {
+    format!("run {}  {}", report.run, report.standing()).trim_end().to_owned()
+}
+
+/// Returns what a command moves: `SIMULATED`, or `REAL ARM at 192.168.1.185`.
+pub fn standing(simulated: bool, address: &str) -> String {
+    match (simulated, address) {
+        (true, _) => "SIMULATED".to_owned(),
+        (false, "") => "REAL ARM".to_owned(),
+        (false, address) => format!("REAL ARM at {address}"),
+    }
+}
+
+/// Returns why an arm is held, with the text of its error; `None` if it is not held.
+pub fn cause(arm: &ArmReport) -> Option<String> {
+    let cause = &arm.cause.as_ref()?.text;
+    let error = arm.error.as_ref().filter(|error| cause.ends_with(&format!("error {}", error.code)));
+    Some(error.map_or_else(|| cause.clone(), |error| format!("{cause}: {}", error.text)))
 }
 
 /// Describes the motors after the end of the run.
@@ -97,6 +120,7 @@ pub fn realtime(measure: &RealtimeReport) -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::rpc::report::CauseReport;
 
     #[test]
     fn the_banner_shows_arms_motors_real_time_and_log() {
@@ -112,6 +136,15 @@ mod tests {
             holds_when_disabled,
             ..Default::default()
         };
+        let cause = CauseReport { name: "device_error".into(), text: "the arm reports error 1: E-stop".into() };
+        let real = ArmReport {
+            adapter: "xarm".into(),
+            address: "192.168.1.185".into(),
+            simulated: false,
+            phase: "held".into(),
+            cause: Some(cause),
+            ..arm("disable", false)
+        };
         let missing = RealtimeReport { what: "SCHED_FIFO".into(), granted: false, remedy: Some("ulimit -r 80".into()) };
         let report = StatusReport {
             run: "coordinator-yourarm".into(),
@@ -121,15 +154,16 @@ mod tests {
             tick_rate: 100.0,
             simulated: true,
             realtime: vec![missing],
-            arms: vec![arm("hold", false), arm("disable", false)],
+            arms: vec![arm("hold", false), real],
             ..Default::default()
         };
         let expected = "\
-run coordinator-yourarm  SIMULATED  (pid 42, dimos 0.1.0)
+run coordinator-yourarm  PARTLY SIMULATED  (pid 42, dimos 0.1.0)
   blueprint  coordinator-yourarm
-  arm        arm: SIMULATED, yourarm at sim, ready
+  arm        arm: SIMULATED, yourarm, ready
              at exit: motors stay on and hold the pose
-  arm        arm: SIMULATED, yourarm at sim, ready
+  arm        arm: REAL ARM at 192.168.1.185, xarm, held
+             held: the arm reports error 1: E-stop
              at exit: motors off; it FALLS unless supported
   tick       100 Hz
   real time  SCHED_FIFO: NOT granted

@@ -4,10 +4,10 @@ mod robots;
 
 use serde_json::json;
 
-use super::arguments::setting;
+use super::arguments::Changes;
 use super::exit::{Exit, Failure, Result};
-use super::fetch;
 use super::output::{self, Table};
+use super::{banner, fetch};
 use crate::blueprint::{self, Catalog, Limit, Loaded, OnExit, Overrides, Summary};
 
 /// Arguments of `check`.
@@ -16,12 +16,9 @@ pub struct Args {
     /// The blueprint: a name that `list-blueprints` shows, or a file
     #[arg(value_name = "NAME|PATH")]
     pub blueprint: String,
-    /// Change a field of the blueprint first: hardware.arm.address=192.168.1.100 (repeatable)
-    #[arg(long, value_name = "PATH=VALUE", value_parser = setting)]
-    pub set: Vec<(String, String)>,
-    /// Simulate all arms
-    #[arg(long)]
-    pub sim: bool,
+    /// Changes of the blueprint
+    #[command(flatten)]
+    pub changes: Changes,
     /// Print JSON
     #[arg(long)]
     pub json: bool,
@@ -29,8 +26,7 @@ pub struct Args {
 
 /// Runs the verb.
 pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
-    let set = args.set.iter().map(|(path, value)| format!("{path}={value}")).collect();
-    report(&args.blueprint, &Overrides { set, sim: args.sim }, catalog, args.json)
+    report(&args.blueprint, &args.changes.overrides(), catalog, args.json)
 }
 
 /// Finds and reads a blueprint; its mistakes are in the result.
@@ -48,10 +44,15 @@ pub fn load_to_run(name: &str, overrides: &Overrides, catalog: Catalog<'_>) -> R
     }
 }
 
-/// Returns the failure of a blueprint with mistakes, after printing them.
+/// Returns the failure of a run whose blueprint has mistakes, after printing them.
 pub fn refuse(loaded: &Loaded) -> Failure {
+    Failure { what: "the blueprint has mistakes: nothing was connected".to_owned(), ..mistakes(loaded) }
+}
+
+/// Returns the failure of a blueprint with mistakes, after printing them.
+pub fn mistakes(loaded: &Loaded) -> Failure {
     output::note(loaded.render(output::colour(&std::io::stderr())).trim_end());
-    Failure::usage("the blueprint has mistakes: nothing was connected")
+    Failure::usage("the blueprint has mistakes").data(loaded.to_json())
 }
 
 /// Prints the warnings of a blueprint.
@@ -76,7 +77,7 @@ pub fn report(name: &str, overrides: &Overrides, catalog: Catalog<'_>, as_json: 
         output::json(&document);
         return Ok(if summary.is_some() && robots.is_ok() { Exit::Ok } else { Exit::Usage });
     }
-    let Some(summary) = summary else { return Err(refuse(&loaded)) };
+    let Some(summary) = summary else { return Err(mistakes(&loaded)) };
     print_warnings(&loaded);
     let robots = robots.map_err(Failure::usage)?;
     print(&summary);
@@ -95,10 +96,9 @@ fn print(summary: &Summary) {
     output::line(format_args!("{}: {}", summary.name, summary.description));
     output::line(format_args!("files: {}; tick: {rate} Hz", summary.files.join(", ")));
     for arm in &summary.arms {
-        let address = if arm.address.is_empty() { String::new() } else { format!(" at {}", arm.address) };
-        let simulated = if arm.simulated { ", SIMULATED" } else { "" };
+        let standing = banner::standing(arm.simulated, &arm.address);
         output::line("");
-        output::line(format_args!("arm {}: {}{address}{simulated}", arm.hardware_id, arm.adapter));
+        output::line(format_args!("arm {}: {standing}, {}", arm.hardware_id, arm.adapter));
         let motors = if arm.auto_enable { "enabled at start" } else { "not enabled at start" };
         let exit = match arm.on_exit {
             OnExit::Hold => "stay on and hold the pose",
@@ -108,7 +108,7 @@ fn print(summary: &Summary) {
         };
         output::line(format_args!("  motors: {motors}; at exit they {exit} ({})", arm.on_exit_from.name()));
         let mut table =
-            Table::new(&["  JOINT", ">LOWER rad", ">UPPER rad", ">rad/s", ">rad/s²", ">rad/s³", "WHERE FROM"]);
+            Table::new(&["  JOINT", ">LOWER rad", ">UPPER rad", ">rad/s", ">rad/s²", ">rad/s³", "~WHERE FROM"]);
         for joint in &arm.joints {
             let limits = [
                 joint.position_lower,
@@ -125,7 +125,7 @@ fn print(summary: &Summary) {
         table.print();
     }
     output::line("");
-    let mut table = Table::new(&["TASK", "TYPE", ">PRIORITY", "JOINTS"]);
+    let mut table = Table::new(&["TASK", "TYPE", ">PRIORITY", "~JOINTS"]);
     for task in &summary.tasks {
         let kind = task.kind.clone();
         table.row([task.name.clone(), kind, task.priority.to_string(), task.joints.join(" ")]);

@@ -20,13 +20,12 @@ use anyhow::Context;
 use serde::{Deserialize, Serialize};
 
 use super::exit::{Exit, Failure, Result};
-use super::run::Args;
+use super::run::{Args, check_name};
 use super::run_record::last_lines;
-use super::{check, output};
+use super::{banner, check, output};
 use crate::blueprint::Catalog;
 use crate::recording::files::{self, KEPT_LOGS};
-use crate::rpc::report::StatusReport;
-use crate::rpc::run_dir;
+use crate::rpc::report::{ArmReport, StatusReport};
 
 /// Last line of the banner of a run without a terminal.
 pub const HOW_TO_END: &str = "Run `dimos down` for a controlled stop.";
@@ -42,6 +41,12 @@ pub struct Up {
     pub simulated: bool,
     /// The phase of each arm.
     pub arms: BTreeMap<String, String>,
+    /// Addresses of the real arms.
+    #[serde(default)]
+    pub real_arms: BTreeMap<String, String>,
+    /// Why arms are not ready, although their motors were to be enabled.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub causes: BTreeMap<String, String>,
     /// Its log, if one is written.
     pub log: Option<String>,
     /// Its text log.
@@ -64,11 +69,11 @@ enum StartMessage {
 /// Starts the run in its own process and waits until it is up.
 pub fn start(args: &Args, catalog: Catalog<'_>) -> Result {
     // Print mistakes here, on the user's terminal, in colour.
-    let loaded = check::load_to_run(&args.blueprint, &args.overrides(), catalog)?;
+    let loaded = check::load_to_run(&args.blueprint, &args.changes.overrides(), catalog)?;
     let Some(blueprint) = &loaded.blueprint else { return Err(check::refuse(&loaded)) };
     check::print_warnings(&loaded);
     let run = args.name.as_ref().unwrap_or(&blueprint.name);
-    run_dir::check_name(run).map_err(|e| Failure::new(Exit::Failed, e.to_string()).hint(e.hint()))?;
+    check_name(run)?;
     let text_log = new_text_log(run)?;
     let (mut child, ours) = spawn(&text_log).context("cannot start the run's process")?;
     let mut line = String::new();
@@ -79,13 +84,13 @@ pub fn start(args: &Args, catalog: Catalog<'_>) -> Result {
     match message {
         Some(StartMessage::Up(up)) => {
             print(&up, args.json);
-            Ok(Exit::Ok)
+            not_ready(&up).map_or(Ok(Exit::Ok), Err)
         }
         Some(StartMessage::Failed { exit, what, hint }) => {
             let _ = child.wait();
             // The reply already carries the error.
             let _ = std::fs::remove_file(&text_log);
-            Err(Failure { exit: Exit::of(exit), what, hint })
+            Err(Failure::new(Exit::of(exit), what).maybe_hint(hint))
         }
         None => Err(crash_failure(run, &mut child, &text_log)),
     }
@@ -140,20 +145,34 @@ fn crash_failure(run: &str, child: &mut Child, text_log: &Path) -> Failure {
     Failure::new(Exit::Failed, what).hint(format!("its text log: {}", text_log.display()))
 }
 
+/// Returns the failure of a run that is up with arms that are held; `None` without one.
+fn not_ready(up: &Up) -> Option<Failure> {
+    let causes: Vec<String> = up.causes.iter().map(|(arm, cause)| format!("{arm} is held: {cause}")).collect();
+    let arm = up.causes.keys().next()?;
+    let what = format!("run {} is up, but not ready: {}", up.run, causes.join("; "));
+    let hint = format!("`dimos arm reset {arm}`, then `dimos arm enable {arm}`; `dimos down {}` ends the run", up.run);
+    Some(Failure::new(Exit::Failed, what).hint(hint))
+}
+
 fn print(up: &Up, json: bool) {
     if json {
         return output::json(up);
     }
-    let simulated = if up.simulated { "  SIMULATED" } else { "" };
     let what = if up.attached.is_some() { "planner " } else { "run     " };
-    output::line(format_args!("{what}  {}{simulated}", up.run));
+    let standing = match (up.simulated, up.real_arms.is_empty()) {
+        (false, _) => "",
+        (true, true) => "  SIMULATED",
+        (true, false) => "  PARTLY SIMULATED",
+    };
+    output::line(format_args!("{what}  {}{standing}", up.run));
     output::line(format_args!("pid       {}", up.pid));
     if let Some(run) = &up.attached {
         output::line(format_args!("text log  {}", up.text_log.display()));
         return output::note(format_args!("attached to run {run}; end it with: dimos down {}", up.run));
     }
     for (arm, phase) in &up.arms {
-        output::line(format_args!("arm       {arm}: {phase}"));
+        let real = up.real_arms.get(arm).map_or_else(String::new, |address| banner::standing(false, address) + ", ");
+        output::line(format_args!("arm       {arm}: {real}{phase}"));
     }
     output::line(format_args!("log       {}", up.log.as_deref().unwrap_or("none")));
     output::line(format_args!("text log  {}", up.text_log.display()));
@@ -187,7 +206,9 @@ impl StartingProcess {
             run: report.run.clone(),
             pid: report.pid,
             simulated: report.simulated,
-            arms: report.arms.iter().map(|arm| (arm.hardware_id.clone(), arm.phase.clone())).collect(),
+            arms: of_arms(report, |arm| Some(arm.phase.clone())),
+            real_arms: of_arms(report, |arm| Some(arm.address.clone()).filter(|_| !arm.simulated)),
+            causes: of_arms(report, banner::cause),
             log: report.log.clone(),
             text_log,
             socket: socket.map(PathBuf::from),
@@ -198,7 +219,7 @@ impl StartingProcess {
 
     /// Reports why the run is not up.
     pub fn failed(self, failure: &Failure) {
-        let Failure { exit, what, hint } = failure.clone();
+        let Failure { exit, what, hint, .. } = failure.clone();
         // Ignore a command that has exited.
         let _ = self.send(&StartMessage::Failed { exit: exit as u8, what, hint });
     }
@@ -209,14 +230,43 @@ impl StartingProcess {
     }
 }
 
+/// Returns a value of each arm that has one.
+fn of_arms(report: &StatusReport, value: fn(&ArmReport) -> Option<String>) -> BTreeMap<String, String> {
+    report.arms.iter().filter_map(|arm| Some((arm.hardware_id.clone(), value(arm)?))).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::rpc::report::{CauseReport, DeviceError};
 
     #[test]
     fn the_new_process_gets_the_same_arguments() {
         let own = ["/bin/dimos", "run", "-d", "x", "--", "y"].map(OsString::from);
         let expected = ["run", "--text-log", "f.log", "-d", "x", "--", "y"].map(OsString::from);
         assert_eq!(arguments(own.into_iter(), Path::new("f.log")), expected);
+    }
+
+    #[test]
+    fn an_arm_that_is_held_is_a_failure_with_its_cause() {
+        let cause = CauseReport { name: "device_fault".into(), text: "the arm reports error 1".into() };
+        let error = Some(DeviceError { code: 1, text: "E-stop line open".into() });
+        let ready = ArmReport { hardware_id: "left".into(), phase: "ready".into(), ..ArmReport::default() };
+        let held =
+            ArmReport { hardware_id: "right".into(), phase: "held".into(), cause: Some(cause), error, ..ready.clone() };
+        let up = |arms: Vec<ArmReport>| {
+            let (ours, theirs) = UnixStream::pair().unwrap();
+            let starter = StartingProcess { stream: theirs, text_log: "text.log".into() };
+            starter.up(&StatusReport { run: "cell".into(), arms, ..StatusReport::default() }, None, None);
+            let mut line = String::new();
+            BufReader::new(ours).read_line(&mut line).unwrap();
+            let StartMessage::Up(up) = serde_json::from_str(&line).unwrap() else { panic!("{line}") };
+            up
+        };
+        assert_eq!(not_ready(&up(vec![ready.clone()])), None);
+        let failure = not_ready(&up(vec![ready, held])).unwrap();
+        assert_eq!(failure.exit, Exit::Failed);
+        let expected = "run cell is up, but not ready: right is held: the arm reports error 1: E-stop line open";
+        assert_eq!(failure.what, expected);
     }
 }

@@ -76,7 +76,7 @@ pub fn run(args: &Args) -> Result {
 }
 
 fn print(findings: &[Finding]) {
-    let mut table = Table::new(&["CHECK", "", "FOUND"]);
+    let mut table = Table::new(&["CHECK", "", "~FOUND"]);
     for finding in findings {
         let level = match finding.level {
             Level::Ok => toned("ok", Tone::Good),

@@ -2,6 +2,8 @@
 
 use std::time::{Duration, Instant};
 
+use serde_json::json;
+
 use super::attach;
 use super::exit::{Exit, Failure, Result};
 use super::output;
@@ -19,11 +21,15 @@ const POLL_PERIOD: Duration = Duration::from_millis(20);
 /// Arguments of `down`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// Run to end, or the planner attached to one; needed only when several runs are live
+    /// Run to end, or planner in its own process; needed only when several runs are live
+    #[arg(value_name = "RUN")]
     pub name: Option<String>,
-    /// Run to end (same as the positional NAME)
-    #[arg(long, value_name = "NAME", conflicts_with = "name")]
+    /// The same as the argument RUN
+    #[arg(long, value_name = "RUN", conflicts_with = "name")]
     pub run: Option<String>,
+    /// Print JSON, errors too
+    #[arg(long)]
+    pub json: bool,
 }
 
 /// Runs the verb: sends the request, waits until the run has ended, and prints the result.
@@ -32,10 +38,18 @@ pub fn run(args: &Args) -> Result {
     let name = args.name.as_deref().or(args.run.as_deref());
     let found = match find(&folder, name) {
         Ok(found) => found,
-        // A planner in its own process is not a run. Without a name it is ended only if no run is live.
+        // A planner in its own process is not a run: only its name ends it.
         Err(failure) => {
-            let planner = attach::find(name).filter(|_| name.is_some() || failure.exit != Exit::Usage);
-            return planner.map_or(Err(failure), |planner| attach::end(&planner));
+            return match (name, attach::live()) {
+                (Some(name), planners) => match planners.iter().find(|planner| planner.name == name) {
+                    Some(planner) => attach::end(planner, args.json),
+                    None => Err(failure),
+                },
+                (None, planners) if failure.exit != Exit::Usage && !planners.is_empty() => {
+                    Err(only_planners(&planners))
+                }
+                (None, _) => Err(failure),
+            };
         }
     };
     let mut client = Client::connect(&found.name, &found.socket)?;
@@ -43,7 +57,8 @@ pub fn run(args: &Args) -> Result {
     let requested = Instant::now();
     // Afterwards, and over the same connection: a slow report delays no shutdown, and is that of the run that ends. One
     // that has ended already reports nothing.
-    let parks = client.call(Status {}).is_ok_and(|status| status.arms.iter().any(|arm| arm.on_exit == "park"));
+    let status = client.call(Status {}).unwrap_or_default();
+    let parks = status.arms.iter().any(|arm| arm.on_exit == "park");
     let timeout = if parks { PARKING_TIMEOUT } else { SHUTDOWN_TIMEOUT };
     // The name is free before the process has written its last lines.
     let recorded = || RunRecord::of(&found.name).filter(|record| record.pid == found.pid);
@@ -67,10 +82,27 @@ pub fn run(args: &Args) -> Result {
             }
             let log = record.as_ref().and_then(|record| record.log.as_ref());
             let log = log.map_or_else(String::new, |log| format!("; log: {}", log.display()));
+            let planner = status.planner.and_then(|planner| planner.attached).map(|planner| planner.name);
+            if args.json {
+                let log = record.as_ref().and_then(|record| record.log.as_ref());
+                output::json(&json!({"ended": found.name, "pid": found.pid, "log": log, "waiting_planner": planner}));
+                return Ok(Exit::Ok);
+            }
             output::note(format_args!("{} ended{log}", found.name));
+            if let Some(name) = planner {
+                output::note(format_args!("planner {name} waits for another run; to end it: dimos down {name}"));
+            }
             Ok(Exit::Ok)
         }
     }
+}
+
+/// Returns the failure of `down` without a name where only planners are left.
+fn only_planners(planners: &[LiveRun]) -> Failure {
+    let names: Vec<&str> = planners.iter().map(|planner| planner.name.as_str()).collect();
+    let what = format!("no run is live; planners wait for one: {}", names.join(", "));
+    let hint = names.iter().map(|name| format!("dimos down {name}")).collect::<Vec<_>>().join("; ");
+    Failure::new(Exit::Failed, what).hint(hint)
 }
 
 /// Returns the selected run; for one that has ended, its failure.

@@ -2,6 +2,8 @@
 
 use std::fmt::Display;
 
+use serde_json::{Value, json};
+
 use crate::message::Message;
 use crate::rpc::client::ClientError;
 use crate::rpc::{Code, RpcError};
@@ -50,6 +52,20 @@ impl Exit {
         Self::ALL.iter().map(|(exit, _)| *exit).find(|exit| *exit as u8 == code).unwrap_or(Self::Failed)
     }
 
+    /// Returns its name in the errors of `--json`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Ok => "OK",
+            Self::Failed => "FAILED",
+            Self::Usage => "USAGE",
+            Self::Hardware => "HARDWARE",
+            Self::Fault => "FAULT",
+            Self::Log => "LOG",
+            Self::Interrupted => "INTERRUPTED",
+            Self::Terminated => "TERMINATED",
+        }
+    }
+
     /// Returns the exit code after a signal.
     pub fn by_signal(signal: i32) -> Self {
         if signal == libc::SIGTERM { Self::Terminated } else { Self::Interrupted }
@@ -66,6 +82,10 @@ pub struct Failure {
     pub what: String,
     /// What to do about it.
     pub hint: Option<String>,
+    /// Code of the run that refused a request: `UNKNOWN_ARM`. Empty for failures of this program itself.
+    pub code: String,
+    /// Further data for programs: what a run sent with its refusal, or the mistakes of a blueprint.
+    pub data: Option<Box<Value>>,
 }
 
 /// Result of a verb.
@@ -74,13 +94,13 @@ pub type Result<T = Exit> = std::result::Result<T, Failure>;
 impl Failure {
     /// Creates a failure without a hint.
     pub fn new(exit: Exit, what: impl Into<String>) -> Self {
-        Self { exit, what: what.into(), hint: None }
+        Self { exit, what: what.into(), hint: None, code: String::new(), data: None }
     }
 
     /// Creates a failure from the text of an error, which may end with a hint.
     pub fn of(exit: Exit, error: impl Display) -> Self {
         let Message { what, hint } = Message::of(error);
-        Self { exit, what, hint }
+        Self::new(exit, what).maybe_hint(hint)
     }
 
     /// Creates a failure for wrong arguments or a wrong file.
@@ -92,6 +112,23 @@ impl Failure {
     pub fn hint(mut self, hint: impl Into<String>) -> Self {
         self.hint = Some(hint.into());
         self
+    }
+
+    /// Adds a hint if there is one.
+    pub fn maybe_hint(self, hint: Option<String>) -> Self {
+        Self { hint: hint.or(self.hint), ..self }
+    }
+
+    /// Adds data for programs.
+    pub fn data(self, data: Value) -> Self {
+        Self { data: Some(Box::new(data)), ..self }
+    }
+
+    /// Returns the failure as `--json` prints it: `{"error": {"code", "message", "hint", "data"}}`. Without a code of a
+    /// run it is the name of the exit code.
+    pub fn to_json(&self) -> Value {
+        let code = if self.code.is_empty() { self.exit.name() } else { &self.code };
+        json!({"error": {"code": code, "message": self.what, "hint": self.hint, "data": self.data}})
     }
 }
 
@@ -116,18 +153,38 @@ impl From<ClientError> for Failure {
             ClientError::Refused(refusal) => exit_of(refusal.code),
             _ => Exit::Failed,
         };
-        let what = match &error {
-            ClientError::Refused(RpcError { code, message, .. }) => format!("{message} [{}]", code.name()),
-            _ => error.to_string(),
-        };
-        Self { exit, what, hint: error.hint() }
+        let failure = Self::new(exit, error.to_string()).maybe_hint(error.hint());
+        match error {
+            ClientError::Refused(RpcError { code, message, data, .. }) => {
+                let message = if code == Code::InvalidParams { without_params(message) } else { message };
+                Self { what: message, code: code.name().to_owned(), data: data.map(Box::new), ..failure }
+            }
+            _ => failure,
+        }
     }
 }
 
-/// Returns the exit code of a refusal; a mistake in the arguments is a usage error.
+/// Returns the text about wrong parameters without the names of the rpc method and of its lists, which a user of the
+/// command line did not type: `params of "plan": goals[0].pose.quat has length 0` → `pose.quat has length 0`.
+fn without_params(message: String) -> String {
+    let Some((_, what)) = message.strip_prefix("params of ").and_then(|rest| rest.split_once("\": ")) else {
+        return message;
+    };
+    what.replace("goals[0].", "")
+}
+
+/// Returns the exit code of a refusal: a name that the run does not know and a mistake in the arguments are usage
+/// errors, everything else is a failure.
 fn exit_of(code: Code) -> Exit {
     match code {
-        Code::UnknownArm | Code::UnknownTask | Code::InvalidParams | Code::InvalidTrajectory => Exit::Usage,
+        Code::UnknownArm
+        | Code::UnknownTask
+        | Code::UnknownRobot
+        | Code::UnknownObject
+        | Code::UnknownPlan
+        | Code::UnknownMotion
+        | Code::InvalidParams
+        | Code::InvalidTrajectory => Exit::Usage,
         _ => Exit::Failed,
     }
 }
@@ -143,6 +200,31 @@ mod tests {
         let codes: Vec<u8> = Exit::ALL.iter().map(|(exit, _)| *exit as u8).collect();
         assert_eq!(codes, [0, 1, 2, 3, 4, 5, 130, 143]);
         assert_eq!((Exit::of(5), Exit::of(101)), (Exit::Log, Exit::Failed));
+    }
+
+    #[test]
+    fn unknown_names_are_usage_errors_and_refusals_are_failures() {
+        use Code::*;
+        let exit = |code| Failure::from(ClientError::Refused(RpcError::new(code, "what"))).exit;
+        for unknown in [UnknownArm, UnknownTask, UnknownRobot, UnknownObject, UnknownPlan, InvalidParams] {
+            assert_eq!(exit(unknown), Exit::Usage, "{unknown:?}");
+        }
+        for refused in [ArmLatched, LeaseHeld, NoPlanner, OutOfLimits, PlanOutdated, DeviceRefused] {
+            assert_eq!(exit(refused), Exit::Failed, "{refused:?}");
+        }
+    }
+
+    #[test]
+    fn a_refusal_as_json_has_code_message_hint_and_data() {
+        let refusal =
+            RpcError::new(Code::InvalidParams, "params of \"plan\": goals[0].pose.quat has length 0, must be 1");
+        let failure = Failure::from(ClientError::Refused(RpcError { data: Some(json!({"at": 3})), ..refusal }));
+        let error = json!({"code": "INVALID_PARAMS", "message": "pose.quat has length 0, must be 1", "hint": null,
+            "data": {"at": 3}});
+        assert_eq!(failure.to_json(), json!({"error": error}));
+        let own = Failure::usage("no such arm").hint("there is `left`").to_json();
+        let error = json!({"code": "USAGE", "message": "no such arm", "hint": "there is `left`", "data": null});
+        assert_eq!(own, json!({"error": error}));
     }
 
     #[test]

@@ -27,7 +27,7 @@ pub fn one(asset: &Asset) -> Result<std::path::PathBuf> {
 
 /// Converts an error of an asset to a failure.
 pub fn failure(error: AssetError) -> Failure {
-    Failure { exit: Exit::Failed, what: error.what, hint: error.hint }
+    Failure::new(Exit::Failed, error.what).maybe_hint(error.hint)
 }
 
 /// Hidden if stderr is not a terminal.

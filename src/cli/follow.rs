@@ -5,11 +5,12 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::{ProgressBar, ProgressFinish, ProgressStyle};
 
+use super::banner;
 use super::exit::{Exit, Failure, Result};
 use super::output::{self, Table, Tone, fixed, toned};
-use crate::rpc::api::{Cancel, Motion};
+use crate::rpc::api::{Cancel, Motion, Status};
 use crate::rpc::client::Client;
 use crate::rpc::report::{Deviation, MotionReport};
 
@@ -25,7 +26,7 @@ pub struct Signals(Arc<AtomicUsize>);
 
 /// Waits for the end of a motion of `task` and prints it. A signal cancels the motion first.
 pub fn follow(client: &mut Client, motion: u64, task: &str, signals: &Signals, json: bool) -> Result {
-    let bar = ProgressBar::new(1000);
+    let bar = ProgressBar::new(1000).with_finish(ProgressFinish::AndClear);
     if let Ok(style) = ProgressStyle::with_template("{prefix} [{bar:40}] {percent:>3} % {msg}") {
         bar.set_style(style.progress_chars("=> "));
     }
@@ -70,9 +71,21 @@ pub fn follow(client: &mut Client, motion: u64, task: &str, signals: &Signals, j
         _ => {
             let why = report.error.unwrap_or_else(|| "it ended before its goal".into());
             let failure = Failure::new(Exit::Failed, format!("motion {motion}: {}: {why}", report.state));
-            Err(failure.hint("`dimos status` shows what the arm and the task wait for"))
+            Err(failure
+                .hint(held(client).unwrap_or_else(|| "`dimos status` shows what the arm and the task wait for".into())))
         }
     }
+}
+
+/// Returns which arms of the run are held and why, with the way out; `None` without one.
+fn held(client: &mut Client) -> Option<String> {
+    let arms = client.call(Status {}).ok()?.arms;
+    let held = arms.iter().filter(|arm| arm.phase == "held");
+    let lines = held.filter_map(|arm| {
+        let name = &arm.hardware_id;
+        Some(format!("{name} is held: {}; dimos arm reset {name}, then dimos arm enable {name}", banner::cause(arm)?))
+    });
+    Some(lines.collect::<Vec<_>>().join("; ")).filter(|text| !text.is_empty())
 }
 
 impl Signals {

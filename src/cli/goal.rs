@@ -3,7 +3,7 @@
 use std::thread::sleep;
 use std::time::Duration;
 
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::{ProgressBar, ProgressFinish, ProgressStyle};
 
 use super::arguments::{finite, speed};
 use super::exit::{Exit, Failure, Result};
@@ -20,20 +20,20 @@ const POLL_PERIOD: Duration = Duration::from_millis(20);
 #[derive(Debug, Clone, clap::Args)]
 #[group(id = "goal", required = true, multiple = true)]
 pub struct Goal {
-    /// Target positions of its joints [rad], one per joint
-    #[arg(value_name = "POSITION", value_parser = finite, allow_negative_numbers = true, conflicts_with_all = ["tcp", "named"])]
+    /// Target positions of its joints [rad], one per joint, base first
+    #[arg(value_name = "Q", value_parser = position, allow_negative_numbers = true, conflicts_with_all = ["tcp", "named"])]
     pub joints: Vec<f64>,
     /// Target position of the tool centre point: x, y, z [m]; orientation is free unless --rpy or --quat is given
-    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite, allow_negative_numbers = true, group = "tcp")]
+    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = coordinate, allow_negative_numbers = true, group = "tcp")]
     pub pose: Option<Vec<f64>>,
     /// Move the tool centre point by x, y, z [m] along the axes of --frame; --rpy or --quat turns it about them
-    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite, allow_negative_numbers = true, group = "tcp")]
+    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = coordinate, allow_negative_numbers = true, group = "tcp")]
     pub by: Option<Vec<f64>>,
     /// Roll, pitch, yaw about fixed axes [rad]
-    #[arg(long, value_names = ["R", "P", "Y"], num_args = 3, value_parser = finite, allow_negative_numbers = true, requires = "tcp")]
+    #[arg(long, value_names = ["R", "P", "Y"], num_args = 3, value_parser = coordinate, allow_negative_numbers = true, requires = "tcp")]
     pub rpy: Option<Vec<f64>>,
     /// Orientation as a quaternion x, y, z, w
-    #[arg(long, value_names = ["X", "Y", "Z", "W"], num_args = 4, value_parser = finite, allow_negative_numbers = true, requires = "tcp", conflicts_with = "rpy")]
+    #[arg(long, value_names = ["X", "Y", "Z", "W"], num_args = 4, value_parser = coordinate, allow_negative_numbers = true, requires = "tcp", conflicts_with = "rpy")]
     pub quat: Option<Vec<f64>>,
     /// Frame of --pose or --by: map (default), base, tool, or an object of the world
     #[arg(long, value_name = "FRAME", requires = "tcp")]
@@ -41,9 +41,9 @@ pub struct Goal {
     /// Named pose
     #[arg(long, value_name = "NAME", conflicts_with = "tcp")]
     pub named: Option<String>,
-    /// Goal of one of several robots in a common motion (repeatable): left=0.1,-0.3,0.6,0,0.8,0 or left=named:home or
+    /// Goal of one of several arms in a common motion (repeatable): left=0.1,-0.3,0.6,0,0.8,0 or left=named:home or
     /// left=pose:x,y,z or, with roll, pitch, yaw or a quaternion, left=pose:x,y,z,r,p,y or left=pose:x,y,z,qx,qy,qz,qw
-    #[arg(long = "goal", value_name = "ROBOT=GOAL", value_parser = robot_goal, conflicts_with_all = ["joints", "tcp", "named"])]
+    #[arg(long = "goal", value_name = "ARM=GOAL", value_parser = arm_goal, conflicts_with_all = ["joints", "tcp", "named"])]
     pub several: Vec<PlanGoal>,
     /// One motion through these waypoints; the last is the goal. Each is a named pose, joints as 0.1,-0.3,0.6,0,0.8,0, or
     /// pose:x,y,z,r,p,y (also with x,y,z or a quaternion); line:… is reached on a straight line
@@ -54,13 +54,36 @@ pub struct Goal {
     pub blend: f64,
 }
 
-/// Parses a robot and its goal, as in `--goal`.
-fn robot_goal(text: &str) -> std::result::Result<PlanGoal, String> {
-    let form = "must be ROBOT=GOAL, such as left=named:home or left=0.1,-0.3,0.6,0,0.8,0";
+/// Parses a joint position; a name and a list get a hint at what was probably meant.
+fn position(text: &str) -> std::result::Result<f64, String> {
+    let separate = text.split(',').all(|part| part.trim().parse::<f64>().is_ok());
+    finite(text).map_err(|wrong| match text.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '_' | '-')) {
+        _ if text.contains(',') && separate => format!("{wrong}: separate the positions by blanks"),
+        true if text.starts_with(|c: char| c.is_ascii_alphabetic()) && text.parse::<f64>().is_err() => {
+            format!("{wrong}: a named pose is given with --named {text}")
+        }
+        _ => wrong,
+    })
+}
+
+/// Parses a coordinate; a list with commas gets a hint.
+fn coordinate(text: &str) -> std::result::Result<f64, String> {
+    finite(text).map_err(|wrong| match text.contains(',') {
+        true => format!("{wrong}: separate the numbers by blanks: {}", text.replace(',', " ")),
+        false => wrong,
+    })
+}
+
+/// Parses an arm and its goal, as in `--goal`.
+fn arm_goal(text: &str) -> std::result::Result<PlanGoal, String> {
+    let form = "must be ARM=GOAL, such as left=named:home or left=0.1,-0.3,0.6,0,0.8,0";
     let (robot, goal) =
         text.split_once('=').filter(|(robot, goal)| !robot.is_empty() && !goal.is_empty()).ok_or(form)?;
     let mut planned = PlanGoal { robot: robot.to_owned(), ..PlanGoal::default() };
     match goal.split_once(':') {
+        None if goal.starts_with(|c: char| c.is_ascii_alphabetic()) && finite(goal).is_err() && !goal.contains(',') => {
+            return Err(format!("{goal:?} is not a number: a named pose is {robot}=named:{goal}"));
+        }
         None => planned.joints = Some(numbers(goal)?),
         Some(("named", name)) => planned.named = Some(name.to_owned()),
         Some(("pose", list)) => planned.pose = Some(pose(list)?),
@@ -116,7 +139,7 @@ pub struct Search {
     /// Seed of the search: the same request with the same seed gives the same plan
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
-    /// Maximum planning time, such as 5s; default: the blueprint's planning_timeout
+    /// Maximum planning time: 5s, or a number of seconds; default: the blueprint's planning_timeout
     #[arg(long, value_name = "TIME", value_parser = super::arguments::duration)]
     pub timeout: Option<Duration>,
 }
@@ -190,7 +213,7 @@ pub struct Planned {
 /// Requests a plan and waits for it. A signal cancels planning.
 pub fn plan(client: &mut Client, request: Plan, signals: &Signals) -> Result<Planned> {
     let begun = client.call(request)?;
-    let bar = ProgressBar::new_spinner();
+    let bar = ProgressBar::new_spinner().with_finish(ProgressFinish::AndClear);
     if let Ok(style) = ProgressStyle::with_template("{spinner} planning {msg}") {
         bar.set_style(style);
     }
@@ -226,22 +249,17 @@ pub fn plan(client: &mut Client, request: Plan, signals: &Signals) -> Result<Pla
 pub fn show(planned: &Planned) {
     let s = &planned.summary;
     output::line(format_args!(
-        "plan {}: {:.2} s, {:.3} rad long, {} waypoints, found in {:.0} ms (seed {})",
-        planned.plan,
-        s.duration,
-        s.length,
-        s.waypoints,
-        planned.elapsed * 1e3,
-        s.seed
+        "plan {}: {:.2} s, {:.3} rad long, {} waypoints, found in {:.3} s (seed {})",
+        planned.plan, s.duration, s.length, s.waypoints, planned.elapsed, s.seed
     ));
     if let Some(fraction) = s.fraction.filter(|fraction| *fraction < 1.0) {
         output::line(format_args!("  straight line: {} % of the way", fixed(fraction * 100.0, 1)));
     }
     match (s.clearance, &s.closest) {
         (Some(clearance), Some([a, b])) => {
-            output::line(format_args!("  clearance {} mm, between {a} and {b}", fixed(clearance * 1e3, 1)));
+            output::line(format_args!("  clearance {} m, between {a} and {b}", fixed(clearance, 4)));
         }
-        (Some(clearance), None) => output::line(format_args!("  clearance {} mm", fixed(clearance * 1e3, 1))),
+        (Some(clearance), None) => output::line(format_args!("  clearance {} m", fixed(clearance, 4))),
         _ => {}
     }
     for clamped in &s.goal_clamped {
@@ -253,8 +271,8 @@ pub fn show(planned: &Planned) {
             "everywhere" => "in every configuration".to_owned(),
             near => format!("near the {near}"),
         };
-        let (link, other, distance) = (&given_up.link, &given_up.other, fixed(given_up.distance * 1e3, 1));
-        let padding = fixed(s.padding * 1e3, 1);
-        output::line(format_args!("  less than {padding} mm {where_}: {link} is {distance} mm from {other} there"));
+        let (link, other, distance) = (&given_up.link, &given_up.other, fixed(given_up.distance, 4));
+        let padding = fixed(s.padding, 4);
+        output::line(format_args!("  less than {padding} m {where_}: {link} is {distance} m from {other} there"));
     }
 }

@@ -33,12 +33,12 @@ use watch::Watch;
 /// Arguments of `jog`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
-W/S A/D Q/E move the end effector along x, y, z, R/F T/G Y/H rotate it about them (roll, pitch, yaw); B: axes of the base
-or of the tool. Tab: single joints: 1-9 select one, +/- or the arrows move it. [ ] speed, Space rest, X latched stop, Esc
-leave. Hold a key to move: the arm decelerates to rest within 0.25 s of the last key press, or at key-up if the terminal
+W/S A/D Q/E move the end effector along x, y, z, R/F T/G Y/H rotate it about them (roll, pitch, yaw); B: axes of the base \
+or of the tool. Tab: single joints: 1-9 select one, +/- or the arrows move it. [ ] speed, Space rest, X latched stop, Esc \
+leave. Hold a key to move: the arm decelerates to rest within 0.25 s of the last key press, or at key-up if the terminal \
 reports it (kitty keyboard protocol).
 
-Needs a task of type eef_twist, and one of type velocity (or servo) for single joints; the blueprints keyboard-teleop-…
+Needs a task of type eef_twist, and one of type velocity (or servo) for single joints; the blueprints keyboard-teleop-… \
 have both.
 Not collision-checked. This is not a safety function: keep the arm's own stop within reach.")]
 pub struct Args {

@@ -5,13 +5,16 @@ use serde_json::json;
 use super::exit::{Exit, Result};
 use super::output::{self, Table};
 use crate::hardware::registry::{Absent, AdapterConfig, AdapterSpec, Registry};
-use crate::joint::JointLimits;
+use crate::joint::{JointLimits, MAX_DOF};
 
 /// Arguments of `list-adapters`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
-LEVEL  how far it is proven: works (compiles, connects), conformant (passes the suite against a double),
-       emulated (passes it against an emulator of its real wire format; `address: sim` starts that)
+LEVEL  how far it is proven
+         works       compiles, connects
+         conformant  passes the conformance suite against a test double
+         emulated    passes it against an emulator of its real wire format, which
+                     `address: sim` starts
 HOLDS  whether the arm keeps its pose when its motors are disabled")]
 pub struct Args {
     /// Print JSON
@@ -31,7 +34,7 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
 
 /// Returns the table, and a paragraph for each adapter.
 fn lines(registry: &Registry) -> Vec<String> {
-    let mut table = Table::new(&["NAME", "LEVEL", "TRANSPORT", ">DOF", "UNITS", ">RATE Hz", "ADDRESS", "HOLDS"]);
+    let mut table = Table::new(&["NAME", "LEVEL", "TRANSPORT", ">DOF", "UNITS", ">RATE Hz", "HOLDS"]);
     for row in registry.rows() {
         table.row([
             row.name.to_owned(),
@@ -40,22 +43,23 @@ fn lines(registry: &Registry) -> Vec<String> {
             dof(row),
             row.wire_units.to_owned(),
             format!("{:.0}", row.native_rate),
-            row.address.form.to_owned(),
             if row.holds_when_disabled { "yes" } else { "no, falls" }.to_owned(),
         ]);
     }
     for absent in registry.absent() {
-        let nothing = ["-"; 6].map(str::to_owned);
+        let nothing = ["-"; 5].map(str::to_owned);
         table.row([absent.name.to_owned(), "not in this build".to_owned()].into_iter().chain(nothing));
     }
     let mut lines = table.lines();
     for row in registry.rows() {
         lines.extend([String::new(), format!("{}: {}", row.name, row.about)]);
+        lines.push(format!("  address: {}", row.address.form));
         lines.push(format!("  modes: {}", modes(row).join(", ")));
-        if let Some((dof, limits)) = limits(row) {
-            let fastest = limits.velocity_max.iter().copied().fold(0.0, f64::max).to_degrees();
+        // The limits of an adapter for any number of joints are those of no arm.
+        if let Some((dof, limits)) = limits(row).filter(|_| row.dof.1 < MAX_DOF) {
+            let fastest = limits.velocity_max.iter().copied().fold(0.0, f64::max);
             let joints = if dof == 1 { "joint" } else { "joints" };
-            lines.push(format!("  limits: {dof} {joints}, up to {fastest:.0}°/s"));
+            lines.push(format!("  limits: {dof} {joints}, up to {fastest:.2} rad/s ({:.0}°/s)", fastest.to_degrees()));
         }
         lines.push(format!("  options: {}", options(row).join(", ")));
     }

@@ -4,7 +4,7 @@ use serde_json::json;
 
 use super::exit::{Exit, Result};
 use super::output::{self, Table};
-use crate::blueprint::{self, Catalog};
+use crate::blueprint::{self, Catalog, Source};
 
 /// Arguments of `list-blueprints`.
 #[derive(Debug, clap::Args)]
@@ -25,14 +25,22 @@ pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
         output::json(&rows.collect::<Vec<_>>());
         return Ok(Exit::Ok);
     }
-    let mut table = Table::new(&["NAME", "SOURCE", "ARMS", "DESCRIPTION"]);
+    let mut table = Table::new(&["NAME", "SOURCE", "~ARMS", "~DESCRIPTION"]);
     for b in all {
         let about = match b.problem {
             Some(problem) => output::toned(format!("wrong: {problem}"), output::Tone::Bad),
             None => b.description.into(),
         };
-        table.row([b.name.into(), b.source.to_string().into(), b.arms.join(", ").into(), about]);
+        table.row([b.name.into(), folder(&b.source).into(), b.arms.join(", ").into(), about]);
     }
     table.print();
     Ok(Exit::Ok)
+}
+
+/// Returns where a blueprint is: the folder of its file, whose name is that of the blueprint.
+fn folder(source: &Source) -> String {
+    match source {
+        Source::Path(path) => path.parent().unwrap_or(path).display().to_string(),
+        Source::Embedded => source.to_string(),
+    }
 }

@@ -1,7 +1,7 @@
 //! `dimos logs [RUN] [-f]`: the text log of a run without a terminal, live or ended.
 
 use std::fs::File;
-use std::io::{self, Read, Write};
+use std::io::{self, Read};
 use std::path::Path;
 use std::time::Duration;
 
@@ -20,9 +20,10 @@ const POLL_PERIOD: Duration = Duration::from_millis(100);
 #[derive(Debug, clap::Args)]
 pub struct Args {
     /// Run to show; default: the only live run, otherwise the most recent one
+    #[arg(value_name = "RUN")]
     pub name: Option<String>,
-    /// Run to show (same as the positional NAME)
-    #[arg(long, value_name = "NAME", conflicts_with = "name")]
+    /// The same as the argument RUN
+    #[arg(long, value_name = "RUN", conflicts_with = "name")]
     pub run: Option<String>,
     /// Follow the log until the run ends
     #[arg(short, long)]
@@ -44,7 +45,14 @@ pub fn run(args: &Args) -> Result {
         return Err(Failure::new(Exit::Failed, what).hint("runs started with `dimos run --daemon` have one"));
     };
     show(path, || args.follow && record.lives()).with_context(|| path.display().to_string())?;
-    Ok(Exit::Ok)
+    match RunRecord::of(&record.run).filter(|now| args.follow && now.pid == record.pid) {
+        Some(now) if now.state() == RunState::Crashed => {
+            let what =
+                format!("{} crashed: its process (pid {}) is gone without a record of its end", now.run, now.pid);
+            Err(Failure::new(Exit::Fault, what).hint("`dimos status` shows what is known of it"))
+        }
+        _ => Ok(Exit::Ok),
+    }
 }
 
 /// Returns the record of the named run, or of the default one.
@@ -88,9 +96,8 @@ fn show(path: &Path, grows: impl Fn() -> bool) -> io::Result<()> {
             if read == 0 {
                 break;
             }
-            let printed = io::stdout().lock().write_all(buffer.get(..read).unwrap_or_default());
-            if printed.and_then(|()| io::stdout().flush()).is_err() {
-                return Ok(()); // The pipe is closed.
+            if !output::data(buffer.get(..read).unwrap_or_default()) {
+                return Ok(());
             }
         }
         if !goes_on {

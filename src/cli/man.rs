@@ -1,9 +1,14 @@
-//! `dimos man`: the manual pages.
+//! `dimos man`: the manual pages. Each has the sections that manual pages are read for: examples, exit status, files,
+//! environment.
 
-use std::io::{self, Write};
-use std::path::PathBuf;
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
+use clap::Command;
+use clap_mangen::Man;
+use clap_mangen::roff::{Roff, bold, roman};
 
 use super::exit::{Exit, Result};
 use super::output;
@@ -19,19 +24,115 @@ pub struct Args {
     dir: Option<PathBuf>,
 }
 
+/// Examples of the first page.
+const EXAMPLES: &[(&str, &str)] = &[
+    ("dimos run coordinator-yourarm", "a simulated arm; in a second terminal:"),
+    ("dimos status", "arms, tasks, timing, faults"),
+    ("dimos move arm 0.3 -0.2 0.5 0 0.4 0", "one position per joint [rad]"),
+    ("dimos stop", "an operational stop of all arms"),
+    ("dimos run xarm6-planner --address arm=192.168.1.185", "a real arm, with a planner"),
+    ("dimos plan arm --named home; dimos preview; dimos execute", "plan, look, move"),
+    ("dimos run -d NAME; dimos logs -f; dimos down", "a run in the background"),
+    ("dimos status --json", "for programs; an error is {\"error\": {\"code\", \"message\", \"hint\", \"data\"}}"),
+];
+
+/// Files that the program reads and writes.
+const FILES: &[(&str, &str)] = &[
+    ("$XDG_RUNTIME_DIR/dimos/RUN.sock", "socket of a live run; without the variable in /tmp/dimos-UID"),
+    ("$XDG_STATE_HOME/dimos/RUN-TIME.mcap", "log of a run; ~/.local/state without the variable"),
+    ("$XDG_STATE_HOME/dimos/RUN-TIME.log", "text log of a run that was started with --daemon"),
+    ("$XDG_STATE_HOME/dimos/RUN.json", "record of the latest run of that name: how it ended"),
+    ("$XDG_CACHE_HOME/dimos", "downloaded robot descriptions; ~/.cache without the variable"),
+    ("./blueprints, $XDG_CONFIG_HOME/dimos/blueprints", "blueprints that are run by name"),
+];
+
+/// Environment variables that the program reads.
+const ENVIRONMENT: &[(&str, &str)] = &[
+    ("DIMOS_BLUEPRINT_PATH", "further folders with blueprints, separated by colons"),
+    ("DIMOS_LOG", "level of the text log: error, warn (default), info, debug"),
+    ("NO_COLOR", "if set and not empty: no colours"),
+    ("XDG_RUNTIME_DIR, XDG_STATE_HOME, XDG_CACHE_HOME, XDG_CONFIG_HOME", "folders, see FILES"),
+];
+
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
-    let command = super::command();
+    let mut command = super::command().disable_help_subcommand(true);
+    command.build();
     let Some(dir) = &args.dir else {
-        let mut page = Vec::new();
-        let rendered = clap_mangen::Man::new(command).render(&mut page);
-        rendered.context("cannot render the manual page")?;
-        // A closed pipe is not an error.
-        let _ = io::stdout().lock().write_all(&page);
+        let page = page(&command, true).context("cannot render the manual page")?;
+        output::data(&page);
         return Ok(Exit::Ok);
     };
-    let pages = std::fs::create_dir_all(dir).and_then(|()| clap_mangen::generate_to(command, dir));
+    let pages = fs::create_dir_all(dir).and_then(|()| write_pages(&command, dir, true));
     pages.with_context(|| dir.display().to_string())?;
     output::note(format_args!("pages are in {}", dir.display()));
     Ok(Exit::Ok)
+}
+
+/// Writes the page of a verb and those of the verbs below it.
+fn write_pages(command: &Command, dir: &Path, is_first: bool) -> io::Result<()> {
+    fs::write(dir.join(Man::new(command.clone()).get_filename()), page(command, is_first)?)?;
+    let verbs = command.get_subcommands().filter(|verb| !verb.is_hide_set());
+    verbs.into_iter().try_for_each(|verb| write_pages(verb, dir, false))
+}
+
+/// Returns the page of a verb.
+fn page(command: &Command, is_first: bool) -> io::Result<Vec<u8>> {
+    let man = Man::new(command.clone());
+    let mut page = Vec::new();
+    man.render_title(&mut page)?;
+    man.render_name_section(&mut page)?;
+    man.render_synopsis_section(&mut page)?;
+    man.render_description_section(&mut page)?;
+    if command.get_arguments().any(|arg| !arg.is_hide_set()) {
+        man.render_options_section(&mut page)?;
+    }
+    if command.has_subcommands() {
+        man.render_subcommands_section(&mut page)?;
+    }
+    let mut roff = Roff::default();
+    let epilogue = command.get_after_long_help().or(command.get_after_help());
+    // The epilogue of the first page repeats its sections.
+    let epilogue = epilogue.filter(|_| !is_first).map(ToString::to_string).unwrap_or_default();
+    notes(&mut roff, &epilogue);
+    if is_first {
+        table(&mut roff, "EXAMPLES", EXAMPLES);
+    }
+    let codes: Vec<_> = Exit::ALL.iter().map(|(exit, meaning)| ((*exit as u8).to_string(), *meaning)).collect();
+    table(&mut roff, "EXIT STATUS", &codes.iter().map(|(code, meaning)| (code.as_str(), *meaning)).collect::<Vec<_>>());
+    table(&mut roff, "FILES", FILES);
+    table(&mut roff, "ENVIRONMENT", ENVIRONMENT);
+    roff.to_writer(&mut page)?;
+    if is_first {
+        man.render_version_section(&mut page)?;
+    }
+    Ok(page)
+}
+
+/// Adds an epilogue: examples are its indented lines, notes everything else.
+fn notes(roff: &mut Roff, epilogue: &str) {
+    let (examples, notes): (Vec<&str>, Vec<&str>) = epilogue.lines().partition(|line| line.starts_with("  dimos "));
+    if notes.iter().any(|line| !line.trim().is_empty()) {
+        roff.control("SH", ["NOTES"]);
+        for line in notes {
+            match line.trim() {
+                "" => roff.control("PP", []),
+                text if line.starts_with(' ') => roff.control("br", []).text([roman(text)]),
+                text => roff.text([roman(text)]).control("br", []),
+            };
+        }
+    }
+    if !examples.is_empty() {
+        roff.control("SH", ["EXAMPLES"]);
+        for line in examples {
+            roff.text([bold(line.trim())]).control("br", []);
+        }
+    }
+}
+
+fn table(roff: &mut Roff, title: &str, rows: &[(&str, &str)]) {
+    roff.control("SH", [title]);
+    for (name, meaning) in rows {
+        roff.control("TP", []).text([bold(*name)]).text([roman(*meaning)]);
+    }
 }

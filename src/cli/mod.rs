@@ -8,6 +8,7 @@ mod attach;
 pub mod banner;
 pub mod cancel;
 pub mod check;
+pub mod complete;
 pub mod completions;
 pub mod daemon;
 pub mod doctor;
@@ -250,17 +251,52 @@ pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
 }
 
 fn command_line(catalog: Catalog<'_>) -> ExitCode {
-    // Usage errors, `--help` and `--version` end here, with 2 or 0.
-    let arguments = command().get_matches_from(std::env::args_os().map(spelled_out));
-    let result = match added(verbs(), &arguments) {
-        Some((verb, own)) => (verb.run)(own),
-        None => built_in(&Cli::from_arg_matches(&arguments).unwrap_or_else(|error| error.exit()), catalog),
+    // First of all: it changes the environment, and no thread may read that meanwhile.
+    complete::answer(catalog);
+    let typed = separated(std::env::args_os()).into_iter().map(spelled_out).collect::<Vec<_>>();
+    let json = typed.iter().take_while(|word| *word != "--").any(|word| word == "--json");
+    let result = match command().try_get_matches_from(&typed) {
+        Ok(arguments) => dispatch(&arguments, catalog),
+        // `--help` and `--version`.
+        Err(error) if !error.use_stderr() => {
+            output::written(error.print());
+            Ok(exit::Exit::Ok)
+        }
+        Err(error) if json => Err(usage_failure(&error)),
+        // Usage errors end here, with 2.
+        Err(error) => error.exit(),
     };
     let exit = result.unwrap_or_else(|failure| {
-        output::failure(&failure);
+        match json {
+            true => output::json(&failure.to_json()),
+            false => output::failure(&failure),
+        }
         failure.exit
     });
-    ExitCode::from(exit as u8)
+    match output::finish() {
+        Ok(()) => ExitCode::from(exit as u8),
+        Err(failure) => {
+            output::failure(&failure);
+            let exit = if exit == exit::Exit::Ok { failure.exit } else { exit };
+            ExitCode::from(exit as u8)
+        }
+    }
+}
+
+fn dispatch(arguments: &ArgMatches, catalog: Catalog<'_>) -> exit::Result {
+    match added(verbs(), arguments) {
+        Some((verb, own)) => (verb.run)(own),
+        None => built_in(&Cli::from_arg_matches(arguments).unwrap_or_else(|error| error.exit()), catalog),
+    }
+}
+
+/// Returns a usage error of the parser as a failure: its message without the usage, its tip as the hint.
+fn usage_failure(error: &clap::Error) -> exit::Failure {
+    let text = error.render().to_string();
+    let line = |prefix: &str| text.lines().find_map(|line| line.trim().strip_prefix(prefix)).map(str::to_owned);
+    let what: Vec<&str> = text.lines().take_while(|line| !line.trim().is_empty()).map(str::trim).collect();
+    let what = what.join(" ");
+    exit::Failure::usage(what.trim_start_matches("error: ")).maybe_hint(line("tip: ").or_else(|| line("hint: ")))
 }
 
 fn built_in(cli: &Cli, catalog: Catalog<'_>) -> exit::Result {
@@ -297,6 +333,25 @@ fn built_in(cli: &Cli, catalog: Catalog<'_>) -> exit::Result {
         Command::Schema(args) => schema::run(args, catalog),
         Command::Replay(args) => replay::run(args, catalog),
     }
+}
+
+/// Options whose numbers may also be separated by commas, as those of `--goal`.
+const LISTS: [&str; 4] = ["--pose", "--rpy", "--quat", "--at"];
+
+/// Separates numbers behind one of [`LISTS`] that were typed with commas: `--pose 0.3,0.1,0.4`.
+fn separated(arguments: impl Iterator<Item = OsString>) -> Vec<OsString> {
+    let mut words: Vec<OsString> = Vec::new();
+    for argument in arguments {
+        let in_list = words.last().is_some_and(|last| LISTS.iter().any(|list| last == *list));
+        let parts = argument.to_str().filter(|text| in_list && text.contains(','));
+        match parts.map(|text| text.split(',').map(|part| part.trim().to_owned()).collect::<Vec<_>>()) {
+            Some(parts) if parts.iter().all(|part| part.parse::<f64>().is_ok()) => {
+                words.extend(parts.into_iter().map(OsString::from));
+            }
+            _ => words.push(argument),
+        }
+    }
+    words
 }
 
 /// Negative numbers in plain decimals: of `-0.5`, `-.5` and `-5e-1` the parser takes only the first for a number.
@@ -349,19 +404,32 @@ mod tests {
     #[test]
     fn arguments_of_run_are_read() {
         let args: run::Args = read("a --set x.y=1 --set z= --duration 1m30s --record f.mcap --name n --sim").unwrap();
-        assert_eq!(args.set, [("x.y".into(), "1".into()), ("z".into(), String::new())]);
+        assert_eq!(args.changes.set, [("x.y".into(), "1".into()), ("z".into(), String::new())]);
         assert_eq!(args.duration, Some(std::time::Duration::from_secs(90)));
-        assert_eq!((args.blueprint.as_str(), args.name.as_deref(), args.sim), ("a", Some("n"), true));
+        assert_eq!((args.blueprint.as_str(), args.name.as_deref(), args.changes.sim), ("a", Some("n"), true));
         for wrong in [
             "",
             "a --set x",
             "a --set =1",
-            "a --duration 10",
+            "a --address arm",
+            "a --address arm=",
+            "a --address arm=10.0.0.1 --sim",
+            "a --duration soon",
             "a --duration -1s",
             "a --duration 0s",
             "a --record f --no-record",
         ] {
             assert_eq!(read::<run::Args>(wrong).unwrap_err().exit_code(), 2, "{wrong:?}");
+        }
+    }
+
+    #[test]
+    fn numbers_of_a_pose_may_be_separated_by_commas() {
+        let read = |line: &str| -> Vec<OsString> { separated(line.split(' ').map(OsString::from)) };
+        let words = |line: &str| line.split(' ').map(OsString::from).collect::<Vec<_>>();
+        assert_eq!(read("move a --pose 0.3,-.1,0.4 --rpy 0 1 0"), words("move a --pose 0.3 -.1 0.4 --rpy 0 1 0"));
+        for same in ["move a --pose 0.3,x,0.4", "move a 0.3,0.1", "move --goal a=0.1,0.2", "run --set x=1,2"] {
+            assert_eq!(read(same), words(same));
         }
     }
 

@@ -11,8 +11,23 @@ use crate::rpc::client::Client;
 
 /// Arguments of `move`.
 #[derive(Debug, clap::Args)]
+#[command(
+    override_usage = "\
+dimos move ARM Q… [OPTIONS]
+       dimos move ARM --named NAME [OPTIONS]
+       dimos move ARM --pose X Y Z [--rpy R P Y | --quat X Y Z W] [OPTIONS]
+       dimos move --goal ARM=GOAL… [OPTIONS]",
+    after_help = "\
+With a planner in the run the motion is planned and collision-free; without one it is direct, not collision-checked, and \
+its goal is given as joint positions.
+
+  dimos move arm 0.3 -0.2 0.5 0 0.4 0
+  dimos move arm --pose 0.3 0.1 0.4 --rpy 0 1.57 0
+  dimos move arm --named home
+  dimos move --goal left=named:home --goal right=0.5,-0.3,0.6,0,0.8,0"
+)]
 pub struct Args {
-    /// Name of the arm (hardware_id), also its robot's name in the planner; with several arms use --goal for each
+    /// Name of the arm (hardware_id); with several arms use --goal for each
     #[arg(required_unless_present = "several", conflicts_with = "several")]
     pub arm: Option<String>,
     /// Goal of the motion

@@ -3,19 +3,53 @@
 use std::fmt::Display;
 use std::io::{self, IsTerminal, Write};
 use std::os::fd::AsFd;
+use std::sync::OnceLock;
 
 use comfy_table::presets::NOTHING;
-use comfy_table::{Attribute, Cell, CellAlignment, Color, ContentArrangement};
+use comfy_table::{Attribute, Cell, CellAlignment, Color, ColumnConstraint, ContentArrangement, Width};
 use serde::Serialize;
 
-use super::exit::Failure;
+use super::exit::{Exit, Failure};
 
 /// Minimum width of a squeezed table [columns]; below, the terminal wraps the lines.
 const MIN_COLUMNS: u16 = 40;
+/// Minimum width of a column whose text may wrap [columns]: no word of it is longer.
+const MIN_TEXT: u16 = 20;
 
-/// Prints a line of data to stdout. A closed pipe (`| head`) is not an error.
+/// The first failed write to stdout.
+static FAILED_WRITE: OnceLock<String> = OnceLock::new();
+
+/// Prints a line of data to stdout. [`finish`] reports a write that failed.
 pub fn line(text: impl Display) {
-    let _ = writeln!(io::stdout().lock(), "{text}");
+    written(writeln!(io::stdout().lock(), "{text}"));
+}
+
+/// Prints data as it is to stdout; returns whether it still can be written.
+pub fn data(bytes: &[u8]) -> bool {
+    let mut out = io::stdout().lock();
+    written(out.write_all(bytes).and_then(|()| out.flush()))
+}
+
+/// Takes note of the result of a write to stdout; returns whether it succeeded. A closed pipe (`| head`) is no failure.
+pub fn written(result: io::Result<()>) -> bool {
+    if let Err(error) = &result
+        && error.kind() != io::ErrorKind::BrokenPipe
+    {
+        let _ = FAILED_WRITE.set(error.to_string());
+    }
+    result.is_ok()
+}
+
+/// Writes what is left to stdout. The failure: something of it could not be written.
+pub fn finish() -> Result<(), Failure> {
+    written(io::stdout().lock().flush());
+    match FAILED_WRITE.get() {
+        None => Ok(()),
+        Some(error) => {
+            let what = format!("cannot write to standard output: {error}");
+            Err(Failure::new(Exit::Failed, what).hint("what was printed is not complete"))
+        }
+    }
 }
 
 /// Prints a value to stdout as one line of JSON.
@@ -32,7 +66,8 @@ pub fn note(text: impl Display) {
 /// Prints why a verb failed, to stderr.
 pub fn failure(failure: &Failure) {
     let (on, off) = if colour(&io::stderr()) { ("\x1b[1;31m", "\x1b[0m") } else { ("", "") };
-    note(format_args!("{on}error:{off} {}", failure.what));
+    let code = if failure.code.is_empty() { String::new() } else { format!(" [{}]", failure.code) };
+    note(format_args!("{on}error:{off} {}{code}", failure.what));
     if let Some(hint) = &failure.hint {
         note(format_args!("hint: {hint}"));
     }
@@ -64,34 +99,42 @@ pub fn toned(text: impl Display, tone: Tone) -> Cell {
     Cell::new(text).fg(colour)
 }
 
-/// Returns whether it is a terminal that reports its width and is wide enough for columns. Pseudo-terminals (`script`,
-/// a container) may report 0.
-fn has_width(out: impl AsFd) -> bool {
-    rustix::termios::tcgetwinsize(out).is_ok_and(|size| size.ws_col >= MIN_COLUMNS)
+/// Returns the width of a terminal that reports one and is wide enough for columns. Pseudo-terminals (`script`, a
+/// container) may report 0.
+fn width(out: impl AsFd) -> Option<u16> {
+    rustix::termios::tcgetwinsize(out).ok().map(|size| size.ws_col).filter(|columns| *columns >= MIN_COLUMNS)
 }
 
 /// A table without borders: aligned columns, two spaces apart.
 pub struct Table(comfy_table::Table);
 
 impl Table {
-    /// Creates a table with these headings. A leading `>` aligns the column to the right.
+    /// Creates a table with these headings. A leading `>` aligns the column to the right, a leading `~` lets its text
+    /// wrap at blanks on a narrow terminal; all other columns, and the names in them, stay whole.
     pub fn new(headings: &[&str]) -> Self {
+        Self::of_width(headings, width(io::stdout()))
+    }
+
+    fn of_width(headings: &[&str], width: Option<u16>) -> Self {
         let mut table = comfy_table::Table::new();
         table.load_style(NOTHING);
-        if has_width(io::stdout()) {
-            // Long cells wrap within their column.
-            table.set_content_arrangement(ContentArrangement::Dynamic);
+        if let Some(width) = width {
+            table.set_content_arrangement(ContentArrangement::Dynamic).set_width(width);
         }
         if !colour(&io::stdout()) {
             table.force_no_tty();
         }
-        let title = |h: &&str| Cell::new(h.trim_start_matches('>')).add_attribute(Attribute::Bold);
+        let title = |h: &&str| Cell::new(h.trim_start_matches(['>', '~'])).add_attribute(Attribute::Bold);
         table.set_header(headings.iter().map(title).collect::<Vec<_>>());
         for (column, heading) in table.column_iter_mut().zip(headings) {
             column.set_padding((0, 2));
             if heading.starts_with('>') {
                 column.set_cell_alignment(CellAlignment::Right);
             }
+            column.set_constraint(match heading.starts_with('~') {
+                true => ColumnConstraint::LowerBoundary(Width::Fixed(MIN_TEXT)),
+                false => ColumnConstraint::ContentWidth,
+            });
         }
         Self(table)
     }
@@ -145,11 +188,30 @@ mod tests {
     #[test]
     fn a_terminal_without_a_width_squeezes_no_table() {
         let terminal = std::fs::File::options().read(true).write(true).open("/dev/ptmx").unwrap();
-        assert!(!has_width(&terminal), "a new one has no size");
-        for (columns, enough) in [(80, true), (1, false), (0, false)] {
+        assert_eq!(width(&terminal), None, "a new one has no size");
+        for (columns, usable) in [(80, Some(80)), (1, None), (0, None)] {
             tcsetwinsize(&terminal, Winsize { ws_row: 24, ws_col: columns, ws_xpixel: 0, ws_ypixel: 0 }).unwrap();
-            assert_eq!(has_width(&terminal), enough, "{columns}");
+            assert_eq!(width(&terminal), usable, "{columns}");
         }
-        assert!(!has_width(std::fs::File::open("/dev/null").unwrap()));
+        assert_eq!(width(std::fs::File::open("/dev/null").unwrap()), None);
+    }
+
+    #[test]
+    fn a_narrow_table_wraps_texts_and_keeps_names_whole() {
+        let mut table = Table::of_width(&["NAME", "~ARMS", "~DESCRIPTION"], Some(80));
+        table.row([
+            "keyboard-teleop-xarm6",
+            "left_arm (xarm, 7 joints), right_arm (xarm, 6 joints)",
+            "a text of several words",
+        ]);
+        let lines = table.lines();
+        assert!(lines.len() > 2 && lines.iter().all(|line| line.chars().count() <= 80), "{lines:?}");
+        let words: Vec<&str> = lines.iter().flat_map(|line| line.split_whitespace()).collect();
+        for word in ["keyboard-teleop-xarm6", "right_arm", "several"] {
+            assert!(words.contains(&word), "{word} in {lines:?}");
+        }
+        let mut names = Table::of_width(&["JOINT", "ADDRESS"], Some(40));
+        names.row(["left_arm_joint1", "INTERFACE|slcan:/dev/ttyX[@BITRATE]"]);
+        assert_eq!(names.lines()[1], "left_arm_joint1  INTERFACE|slcan:/dev/ttyX[@BITRATE]", "wider than the terminal");
     }
 }

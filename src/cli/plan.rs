@@ -8,16 +8,24 @@ use super::output;
 
 /// Arguments of `plan`.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "\
+#[command(
+    override_usage = "\
+dimos plan ARM Q… [OPTIONS]
+       dimos plan ARM --named NAME [OPTIONS]
+       dimos plan ARM --pose X Y Z [--rpy R P Y | --quat X Y Z W] [OPTIONS]
+       dimos plan --goal ARM=GOAL… [OPTIONS]",
+    after_help = "\
 Next: `dimos preview` shows the plan, `dimos execute` executes it. `dimos move` plans and executes in one step.
+
   dimos plan arm 0.3 -0.2 0.5 0 0.4 0
   dimos plan arm --pose 0.3 0.1 0.4 --rpy 0 1.57 0
   dimos plan arm --by 0 0 -0.05 --frame tool                              back by 5 cm along the tool's z axis
   dimos plan arm --named home
-  dimos plan --goal left=named:home --goal right=0.5,-0.3,0.6,0,0.8,0     both arms in one motion")]
+  dimos plan --goal left=named:home --goal right=0.5,-0.3,0.6,0,0.8,0"
+)]
 pub struct Args {
     /// Name of the arm in the planner; with several arms use --goal for each
-    #[arg(required_unless_present = "several", conflicts_with = "several")]
+    #[arg(value_name = "ARM", required_unless_present = "several", conflicts_with = "several")]
     pub robot: Option<String>,
     /// Goal of the motion
     #[command(flatten)]

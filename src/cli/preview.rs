@@ -7,12 +7,12 @@ use anyhow::Context;
 use super::arguments::Target;
 use super::exit::{Exit, Result};
 use super::goal::{Planned, show};
-use super::output::{self, Table, fixed};
+use super::output::{self, Table, fixed, number};
 use crate::rpc::api::{Preview, PreviewReply};
 use crate::rpc::report::TcpReport;
 
-/// Rows of the table.
-const ROWS: usize = 12;
+/// Columns of the table: samples of the motion.
+const COLUMNS: usize = 8;
 
 /// Arguments of `preview`.
 #[derive(Debug, clap::Args)]
@@ -45,24 +45,28 @@ pub fn run(args: &Args) -> Result {
     Ok(Exit::Ok)
 }
 
-/// Returns samples of the motion, its ends included.
+/// Returns samples of the motion, its ends included: a row per joint and coordinate, a column per time, so that any
+/// number of joints fits on a narrow terminal.
 fn table(reply: &PreviewReply) -> Table {
-    let names = reply.trajectory.joint_names.iter().map(|name| format!(">{name}"));
     let tcp = |robot| reply.tcps.get(robot).map_or_else(|| "end effector".to_owned(), TcpReport::name);
-    let ends = reply.end_effectors.keys().map(|robot| format!(">{robot}: {} in map [m]", tcp(robot)));
-    let headings: Vec<String> = std::iter::once(">TIME s".to_owned()).chain(names).chain(ends).collect();
-    let mut table = Table::new(&headings.iter().map(String::as_str).collect::<Vec<_>>());
     let points = &reply.trajectory.points;
     let last = points.len().saturating_sub(1);
-    let rows = ROWS.min(points.len());
-    for row in 0..rows {
-        let index = if rows > 1 { row * last / (rows - 1) } else { 0 };
-        let Some(point) = points.get(index) else { continue };
-        let mut cells = vec![fixed(point.time_from_start, 2)];
-        cells.extend(point.positions.iter().map(|p| fixed(*p, 3)));
-        let place = |path: &Vec<[f64; 3]>| path.get(index).map(|xyz| xyz.map(|v| fixed(v, 3)).join(" "));
-        cells.extend(reply.end_effectors.values().map(|path| place(path).unwrap_or_default()));
-        table.row(cells);
+    let columns = COLUMNS.min(points.len());
+    let index = |column: usize| if columns > 1 { column * last / (columns - 1) } else { 0 };
+    let shown: Vec<usize> = (0..columns).map(index).collect();
+    let times =
+        shown.iter().filter_map(|i| points.get(*i)).map(|point| format!(">{} s", fixed(point.time_from_start, 2)));
+    let headings: Vec<String> = std::iter::once("rad, m".to_owned()).chain(times).collect();
+    let mut table = Table::new(&headings.iter().map(String::as_str).collect::<Vec<_>>());
+    for (joint, name) in reply.trajectory.joint_names.iter().enumerate() {
+        let at = |i: &usize| points.get(*i).and_then(|point| point.positions.get(joint)).copied();
+        table.row([name.clone()].into_iter().chain(shown.iter().map(|i| number(at(i), 3))));
+    }
+    for (arm, path) in &reply.end_effectors {
+        for (axis, letter) in ["x", "y", "z"].iter().enumerate() {
+            let at = |i: &usize| path.get(*i).and_then(|xyz| xyz.get(axis)).copied();
+            table.row([format!("{arm}: {} {letter}", tcp(arm))].into_iter().chain(shown.iter().map(|i| number(at(i), 3))));
+        }
     }
     table
 }

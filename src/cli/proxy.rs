@@ -48,11 +48,11 @@ pub struct Args {
 enum Protocol {
     /// Serve an arm of a run to programs that use the SDK of UFACTORY's xArm
     #[command(after_help = "\
-The program connects to the address of --listen. Mode 0 (set_servo_angle) needs a trajectory task, mode 1
-(set_servo_angle_j) a servo task, mode 4 (vc_set_joint_velocity) a velocity task, each with all joints of the arm. The
-arm may be of any make with 5, 6 or 7 joints. set_state(4) and emergency_stop() are `dimos stop ARM`; afterwards
+The program connects to the address of --listen. Mode 0 (set_servo_angle) needs a trajectory task, mode 1 \
+(set_servo_angle_j) a servo task, mode 4 (vc_set_joint_velocity) a velocity task, each with all joints of the arm. The \
+arm may be of any make with 5, 6 or 7 joints. set_state(4) and emergency_stop() are `dimos stop ARM`; afterwards \
 clean_error() and motion_enable(True) are `dimos arm reset` and `dimos arm enable`. Moves are not collision-checked.
-Ports 502, 503 and 30000 to 30003; port 502 needs root, CAP_NET_BIND_SERVICE, or
+Ports 502, 503 and 30000 to 30003; port 502 needs root, CAP_NET_BIND_SERVICE, or \
 sysctl net.ipv4.ip_unprivileged_port_start=502.")]
     Xarm(Xarm),
 }

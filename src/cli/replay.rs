@@ -13,7 +13,7 @@ use std::time::Duration;
 use clap::Args;
 use thiserror::Error;
 
-use super::arguments::setting;
+use super::arguments::{Changes, duration, time};
 use super::exit::{Exit, Failure, Result};
 use crate::blueprint::Catalog;
 use crate::recording::files;
@@ -44,13 +44,13 @@ pub struct ReplayArgs {
     #[arg(long)]
     pub last: bool,
     /// Speed factor: 2 plays or moves twice as fast
-    #[arg(short, long, value_name = "FACTOR", default_value = "1", value_parser = rate)]
+    #[arg(short, long, value_name = "FACTOR", default_value = "1", value_parser = rate, alias = "speed")]
     pub rate: f64,
     /// Repeat from the start
     #[arg(short, long = "loop")]
     pub looping: bool,
     /// Start this long after the first message, e.g. 1.5, 10s or 2m
-    #[arg(long, value_name = "TIME", default_value = "0", value_parser = duration)]
+    #[arg(long, value_name = "TIME", default_value = "0", value_parser = time)]
     pub start_offset: Duration,
     /// Play this much of the log, e.g. 1.5, 10s or 2m
     #[arg(long, value_name = "TIME", value_parser = duration)]
@@ -78,12 +78,9 @@ pub struct OntoArgs {
     /// Allow real arms to move; by default only simulated arms do
     #[arg(long, requires = "blueprint")]
     pub allow_motion: bool,
-    /// Change a field of the blueprint: hardware.arm.address=192.168.1.100 (repeatable)
-    #[arg(long, value_name = "PATH=VALUE", value_parser = setting, requires = "blueprint")]
-    pub set: Vec<(String, String)>,
-    /// Simulate all arms of the blueprint
-    #[arg(long, requires = "blueprint")]
-    pub sim: bool,
+    /// Changes of the blueprint
+    #[command(flatten)]
+    pub changes: Changes,
     /// Name of the run; default: the blueprint's name
     #[arg(long, value_name = "RUN", requires = "blueprint")]
     pub name: Option<String>,
@@ -98,15 +95,6 @@ pub struct OntoArgs {
 fn rate(text: &str) -> std::result::Result<f64, String> {
     let rate: f64 = text.parse().map_err(|_| "not a number".to_owned())?;
     if (1e-3..=1e6).contains(&rate) { Ok(rate) } else { Err("must be between 0.001 and 1000000".into()) }
-}
-
-/// Parses a time in seconds, or with a unit.
-fn duration(text: &str) -> std::result::Result<Duration, String> {
-    let wrong = || "not a duration: write 1.5, 500ms, 10s or 2m".to_owned();
-    match text.parse::<f64>() {
-        Ok(seconds) => Duration::try_from_secs_f64(seconds).map_err(|_| wrong()),
-        Err(_) => text.parse::<jiff::SignedDuration>().ok().and_then(|d| d.try_into().ok()).ok_or_else(wrong),
-    }
 }
 
 /// Why a log cannot be played as requested.
@@ -145,16 +133,21 @@ fn try_run(args: &ReplayArgs, catalog: Catalog<'_>) -> anyhow::Result<Exit> {
     }
     let mut log = LogReader::open(&path)?;
     let part = choose(args, log.info(), &path)?;
+    if args.onto.blueprint.is_none() && args.onto.changes != Changes::default() {
+        return Err(Failure::usage("--address, --set and --sim change the blueprint of --onto").into());
+    }
     if let Some(blueprint) = &args.onto.blueprint {
         return Ok(onto::run(args, blueprint, &path, &part, catalog)?);
     }
+    // Times count from the beginning of the log, also of a part of it.
+    let began = log.info().span.map_or(part.from, |(start, _)| start);
     let out = io::stdout();
     let tty = out.is_terminal();
     let mut view: Box<dyn View> = if args.json {
         Box::new(JsonLines::new(out.lock()))
     } else {
         eprintln!("{}", headline(&path, log.info()));
-        if tty { Box::new(Live::new(out.lock(), &part)) } else { Box::new(Plain::new(out.lock(), part.from)) }
+        if tty { Box::new(Live::new(out.lock(), &part)) } else { Box::new(Plain::new(out.lock(), began)) }
     };
     let end = play(&mut log, &part, view.as_mut(), &mut RealTime)?;
     drop(view);
@@ -206,17 +199,6 @@ fn headline(path: &Path, info: &LogInfo) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn times_are_seconds_or_have_a_unit() {
-        assert_eq!(duration("1.5"), Ok(Duration::from_millis(1500)));
-        assert_eq!(duration("10s"), Ok(Duration::from_secs(10)));
-        assert_eq!(duration("500ms"), Ok(Duration::from_millis(500)));
-        assert_eq!(duration("2m"), Ok(Duration::from_secs(120)));
-        for wrong in ["", "-1", "nan", "inf", "-2s", "soon"] {
-            assert!(duration(wrong).is_err(), "{wrong}");
-        }
-    }
 
     #[test]
     fn rates_are_positive_numbers() {

@@ -11,15 +11,16 @@ use serde::Serialize;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
 
-use super::arguments::{duration, setting};
+use super::arguments::{Changes, duration};
 use super::attach::{self, Attached};
 use super::daemon::StartingProcess;
 use super::exit::{Exit, Failure, Result};
 use super::run_record::RunRecord;
 use super::text_log::Terminal;
 use super::{banner, check, daemon};
-use crate::blueprint::{Catalog, Overrides};
+use crate::blueprint::Catalog;
 use crate::rpc::report::StatusReport;
+use crate::rpc::run_dir;
 use crate::runtime::{Ended, Ending, Options, Record, Run, ServiceManager};
 
 /// Arguments of `run`.
@@ -28,13 +29,10 @@ pub struct Args {
     /// The blueprint: a name that `list-blueprints` shows, or a file
     #[arg(value_name = "NAME|PATH")]
     pub blueprint: String,
-    /// Change a field of the blueprint: hardware.arm.address=192.168.1.100 (repeatable)
-    #[arg(long, value_name = "PATH=VALUE", value_parser = setting)]
-    pub set: Vec<(String, String)>,
-    /// Simulate all arms
-    #[arg(long)]
-    pub sim: bool,
-    /// Stop the run after this time: 10s, 2m
+    /// Changes of the blueprint
+    #[command(flatten)]
+    pub changes: Changes,
+    /// Stop the run after this time: 10s, 2m, or a number of seconds
     #[arg(long, value_name = "TIME", value_parser = duration)]
     pub duration: Option<Duration>,
     /// Write the log to this file
@@ -67,11 +65,6 @@ pub struct Args {
 }
 
 impl Args {
-    /// Returns the changes of the blueprint by arguments.
-    pub fn overrides(&self) -> Overrides {
-        Overrides { set: self.set.iter().map(|(path, value)| format!("{path}={value}")).collect(), sim: self.sim }
-    }
-
     fn options(&self) -> Options {
         let record = match &self.record {
             Some(path) => Record::To(path.clone()),
@@ -85,7 +78,7 @@ impl Args {
 /// Runs the verb.
 pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
     if args.check {
-        return check::report(&args.blueprint, &args.overrides(), catalog, args.json);
+        return check::report(&args.blueprint, &args.changes.overrides(), catalog, args.json);
     }
     match &args.text_log {
         None if args.daemon => daemon::start(args, catalog),
@@ -141,8 +134,14 @@ enum Up {
     Planner(Box<Attached>),
 }
 
+/// Fails if a run cannot have this name.
+pub(super) fn check_name(name: &str) -> Result<()> {
+    run_dir::check_name(name).map_err(|e| Failure::usage(e.to_string()).hint(e.hint()))
+}
+
 fn bring_up(args: &Args, catalog: Catalog<'_>) -> Result<(Up, Signals, Terminal)> {
-    let loaded = check::load_to_run(&args.blueprint, &args.overrides(), catalog)?;
+    args.name.as_deref().map(check_name).transpose()?;
+    let loaded = check::load_to_run(&args.blueprint, &args.changes.overrides(), catalog)?;
     let Some(blueprint) = &loaded.blueprint else { return Err(check::refuse(&loaded)) };
     check::print_warnings(&loaded);
     // Watched before anything is connected: a signal during startup ends the run, controlled, as soon as it is up.

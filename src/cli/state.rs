@@ -4,9 +4,9 @@ use std::io::{self, IsTerminal, Write};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use super::arguments::{Target, rate};
+use super::arguments::{Target, hertz};
 use super::exit::{Exit, Result};
-use super::output::{Table, fixed, number};
+use super::output::{self, Table, fixed, number};
 use crate::rpc::api::State;
 use crate::rpc::report::{ArmStateReport, JointReport, PoseReport, StateReport};
 
@@ -17,8 +17,8 @@ pub struct Args {
     #[arg(long)]
     pub watch: bool,
     /// Rate of --watch [Hz]
-    #[arg(long, value_name = "HZ", default_value_t = 10.0, value_parser = rate, requires = "watch")]
-    pub rate: f64,
+    #[arg(long, value_name = "HZ", default_value_t = 10.0, value_parser = hertz, requires = "watch", alias = "rate")]
+    pub hz: f64,
     /// Which run
     #[command(flatten)]
     pub target_run: Target,
@@ -28,7 +28,7 @@ pub struct Args {
 pub fn run(args: &Args) -> Result {
     let mut client = args.target_run.connect()?;
     let mut screen = Screen::new(args.watch && io::stdout().is_terminal());
-    let period = Duration::from_secs_f64(1.0 / args.rate);
+    let period = Duration::from_secs_f64(1.0 / args.hz);
     let mut next = Instant::now();
     loop {
         let report = client.call(State {})?;
@@ -36,8 +36,7 @@ pub fn run(args: &Args) -> Result {
             true => vec![serde_json::to_string(&report).unwrap_or_default()],
             false => table(&report),
         };
-        // The pipe is closed (`| head`).
-        if screen.show(&lines).is_err() || !args.watch {
+        if !output::written(screen.show(&lines)) || !args.watch {
             return Ok(Exit::Ok);
         }
         next = (next + period).max(Instant::now());
@@ -48,28 +47,43 @@ pub fn run(args: &Args) -> Result {
 /// Output of --watch: redrawn in place on a terminal, appended elsewhere.
 struct Screen {
     live: bool,
-    drawn: usize,
+    /// Lengths of the lines on the terminal [columns].
+    drawn: Vec<usize>,
 }
 
 impl Screen {
     fn new(live: bool) -> Self {
-        Self { live, drawn: 0 }
+        Self { live, drawn: Vec::new() }
     }
 
     fn show(&mut self, lines: &[String]) -> io::Result<()> {
-        let mut text = match self.live && self.drawn > 0 {
-            true => format!("\x1b[{}A\x1b[J", self.drawn),
+        // A terminal that has become narrower has wrapped the lines that are there.
+        let width = rustix::termios::tcgetwinsize(io::stdout()).map_or(0, |size| usize::from(size.ws_col));
+        let rows = |length: &usize| if width == 0 { 1 } else { length.div_ceil(width).max(1) };
+        let mut text = match self.live && !self.drawn.is_empty() {
+            true => format!("\x1b[{}A\x1b[J", self.drawn.iter().map(rows).sum::<usize>()),
             false => String::new(),
         };
         for line in lines {
             text.push_str(line);
             text.push('\n');
         }
-        self.drawn = lines.len();
+        self.drawn = lines.iter().map(|line| columns(line)).collect();
         let mut out = io::stdout().lock();
         out.write_all(text.as_bytes())?;
         out.flush()
     }
+}
+
+/// Returns the columns that a line takes: colours take none.
+fn columns(line: &str) -> usize {
+    let mut escaped = false;
+    let is_shown = |c: &char| {
+        let shown = !escaped && *c != '\x1b';
+        escaped = *c == '\x1b' || (escaped && *c != 'm');
+        shown
+    };
+    line.chars().filter(is_shown).count()
 }
 
 fn table(report: &StateReport) -> Vec<String> {
@@ -127,4 +141,15 @@ fn force(arm: &ArmStateReport) -> String {
 /// Returns the source of a velocity unless it is measured.
 fn source(joint: &JointReport) -> &str {
     if joint.velocity_source == "estimated" { "estimated" } else { "" }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn colours_take_no_columns() {
+        assert_eq!(columns("\x1b[1mJOINT\x1b[0m  \x1b[31m0.5\x1b[0m"), 10);
+        assert_eq!(columns("µs"), 2);
+    }
 }

@@ -6,7 +6,7 @@ use super::arguments::Target;
 use super::arm::parts::{io_lines, joint_lines, payload_text};
 use super::arm::tool::tcp_text;
 use super::attach;
-use super::banner::at_exit;
+use super::banner::{self, at_exit};
 use super::exit::{Exit, Result};
 use super::output::{self, Table, Tone, number, span, toned};
 use super::run_record::{RunRecord, RunState};
@@ -18,33 +18,55 @@ use crate::rpc::run_dir::LiveRun;
 
 /// Arguments of `status`.
 #[derive(Debug, clap::Args)]
+#[command(after_help = "\
+What needs attention comes first: arms that are held, faults, tasks that were aborted, a log that ended, real-time measures \
+that the system did not grant. -v adds what is read, counted and measured.")]
 pub struct Args {
+    /// Run to show in full
+    #[arg(value_name = "RUN", conflicts_with = "run")]
+    pub name: Option<String>,
+    /// Add condition of the joints, inputs and outputs, counters, and p99.9 of the timing
+    #[arg(short, long)]
+    pub verbose: bool,
     /// Which run
     #[command(flatten)]
     pub target_run: Target,
 }
 
-/// A run in the overview; it may not answer.
+/// An entry of the overview. Every entry has a name under `run`, `pid`, `state`, `arms` and `log`.
 #[derive(Serialize)]
 #[serde(untagged)]
 enum RunEntry {
-    Answered(Box<StatusReport>),
+    Answered {
+        state: &'static str,
+        #[serde(flatten)]
+        report: Box<StatusReport>,
+    },
     NoReply {
         run: String,
         pid: u32,
+        state: &'static str,
         error: String,
+        arms: [(); 0],
+        log: Option<String>,
     },
-    FailedRun(FailedRun),
+    Failed(FailedRun),
     /// A planner in its own process without its run.
     Waits {
-        planner: String,
+        run: String,
         pid: u32,
+        state: &'static str,
+        arms: [(); 0],
+        log: Option<String>,
     },
 }
 
 /// A run that crashed, or that a fault or the end of its log ended, and that has not been started again.
 #[derive(Serialize)]
 struct FailedRun {
+    /// `crashed`, `fault` or `log_ended`.
+    state: &'static str,
+    arms: [(); 0],
     /// The run and its end.
     #[serde(flatten)]
     record: RunRecord,
@@ -54,26 +76,27 @@ struct FailedRun {
     last_words: Vec<String>,
 }
 
-/// Runs the verb: the named run, or the only one, in full; several as a list. `--json` without `--run` always prints a
+/// Runs the verb: the named run, or the only one, in full; several as a list. `--json` without a name always prints a
 /// list.
 pub fn run(args: &Args) -> Result {
-    let mut runs = args.target_run.named_or_all().map_err(|failure| {
-        let dead = args.target_run.run.as_deref().and_then(RunRecord::of).and_then(|record| record.failure());
+    let target = Target { run: args.name.clone().or(args.target_run.run.clone()), ..args.target_run };
+    let mut runs = target.named_or_all().map_err(|failure| {
+        let dead = target.run.as_deref().and_then(RunRecord::of).and_then(|record| record.failure());
         dead.unwrap_or(failure)
     })?;
-    if args.target_run.run.is_some() || (runs.len() == 1 && !args.target_run.json) {
+    if target.run.is_some() || (runs.len() == 1 && !target.json) {
         let Some(run) = runs.pop() else { return Ok(Exit::Ok) };
         let report = request_status(&run)?;
-        if args.target_run.json {
+        if target.json {
             output::json(&report);
             return Ok(Exit::Ok);
         }
-        print(&report);
-        if args.target_run.run.is_none() {
+        print(&report, args.verbose);
+        if target.run.is_none() {
             failed_runs(&[run]).iter().for_each(print_failed);
         }
     } else {
-        overview(runs, args.target_run.json);
+        overview(runs, target.json);
     }
     Ok(Exit::Ok)
 }
@@ -81,12 +104,15 @@ pub fn run(args: &Args) -> Result {
 /// Returns the runs that failed and have not been started again.
 fn failed_runs(live: &[LiveRun]) -> Vec<FailedRun> {
     let dead = RunRecord::all().into_iter().filter(|r| !live.iter().any(|l| l.name == r.run) && r.ended_abnormally());
-    dead.map(|record| FailedRun {
-        crashed: record.state() == RunState::Crashed,
-        last_words: record.last_words(),
-        record,
-    })
-    .collect()
+    let failed = |record: RunRecord| {
+        let state = match record.state() {
+            RunState::Crashed => "crashed",
+            RunState::Ended(end) if Exit::of(end.exit) == Exit::Log => "log_ended",
+            _ => "fault",
+        };
+        FailedRun { state, arms: [], crashed: state == "crashed", last_words: record.last_words(), record }
+    };
+    dead.map(failed).collect()
 }
 
 fn print_failed(failed: &FailedRun) {
@@ -102,38 +128,43 @@ fn request_status(run: &LiveRun) -> std::result::Result<StatusReport, ClientErro
 fn overview(runs: Vec<LiveRun>, json: bool) {
     let failed_runs = failed_runs(&runs);
     let answers = runs.into_iter().map(|run| match request_status(&run) {
-        Ok(report) => RunEntry::Answered(Box::new(report)),
-        Err(error) => RunEntry::NoReply { run: run.name, pid: run.pid, error: error.to_string() },
+        Ok(report) => RunEntry::Answered { state: "live", report: Box::new(report) },
+        Err(error) => RunEntry::NoReply {
+            run: run.name,
+            pid: run.pid,
+            state: "no_reply",
+            error: error.to_string(),
+            arms: [],
+            log: None,
+        },
     });
-    let mut found: Vec<RunEntry> = answers.chain(failed_runs.into_iter().map(RunEntry::FailedRun)).collect();
-    let waiting =
-        waiting(found.iter().filter_map(|found| if let RunEntry::Answered(r) = found { Some(&**r) } else { None }));
-    found.extend(waiting.into_iter().map(|p| RunEntry::Waits { planner: p.name, pid: p.pid }));
+    let mut found: Vec<RunEntry> = answers.chain(failed_runs.into_iter().map(RunEntry::Failed)).collect();
+    let waiting = waiting(found.iter().filter_map(answered));
+    let state = "waiting_planner";
+    found.extend(waiting.into_iter().map(|p| RunEntry::Waits { run: p.name, pid: p.pid, state, arms: [], log: None }));
     if json {
         return output::json(&found);
     }
     if found.is_empty() {
         return output::note("no run is live\nhint: start one: dimos run coordinator-yourarm");
     }
-    let mut table = Table::new(&["RUN", ">PID", "UP", "BLUEPRINT", "ARMS", "LOG"]);
+    let mut table = Table::new(&["RUN", ">PID", "UP", "BLUEPRINT", "~ARMS", "LOG"]);
     for found in &found {
         match found {
-            RunEntry::Answered(r) => {
+            RunEntry::Answered { report: r, .. } => {
                 let arms: Vec<String> = r.arms.iter().map(|a| format!("{} {}", a.hardware_id, a.phase)).collect();
                 let log = r.log.clone().unwrap_or_else(|| "-".into());
-                let simulated = if r.simulated { " SIMULATED" } else { "" };
-                let arms = arms.join(", ") + simulated;
+                let arms = format!("{} {}", arms.join(", "), r.standing()).trim_end().to_owned();
                 table.row([r.run.clone(), r.pid.to_string(), span(r.uptime), r.blueprint.clone(), arms, log]);
             }
-            RunEntry::NoReply { run, pid, error } => {
+            RunEntry::NoReply { run, pid, error, .. } => {
                 let [pid, error] = [pid.to_string(), error.clone()];
                 table.row([run.as_str(), &pid, "-", "-", &error, "-"]);
             }
-            RunEntry::FailedRun(FailedRun { record, crashed, .. }) => {
-                let end = record.end.as_ref().map(|end| Exit::of(end.exit));
-                let how = match end {
-                    _ if *crashed => "CRASHED",
-                    Some(Exit::Log) => "LOG ENDED",
+            RunEntry::Failed(FailedRun { record, state, .. }) => {
+                let how = match *state {
+                    "crashed" => "CRASHED",
+                    "log_ended" => "LOG ENDED",
                     _ => "FAULT",
                 };
                 let how = toned(how, Tone::Bad);
@@ -141,42 +172,43 @@ fn overview(runs: Vec<LiveRun>, json: bool) {
                 let [run, pid, blueprint] = [record.run.clone(), record.pid.to_string(), record.blueprint.clone()];
                 table.row([run.into(), pid.into(), "-".into(), blueprint.into(), how, log.into()]);
             }
-            RunEntry::Waits { planner, pid } => {
+            RunEntry::Waits { run, pid, .. } => {
                 let pid = pid.to_string();
-                table.row([planner.as_str(), &pid, "-", "-", "a planner waiting for its run", "-"]);
+                table.row([run.as_str(), &pid, "-", "-", "a planner waiting for its run", "-"]);
             }
         }
     }
     table.print();
-    let answered = found.iter().filter_map(|found| if let RunEntry::Answered(r) = found { Some(r) } else { None });
-    let planners: Vec<_> = answered.filter_map(|r| Some((r.run.as_str(), r.planner.as_ref()?))).collect();
+    let planners: Vec<_> =
+        found.iter().filter_map(answered).filter_map(|r| Some((r.run.as_str(), r.planner.as_ref()?))).collect();
     if !planners.is_empty() {
         output::line("");
         print_planners(planners.into_iter());
     }
     for found in &found {
-        if let RunEntry::FailedRun(failed) = found {
+        if let RunEntry::Failed(failed) = found {
             print_failed(failed);
         }
     }
 }
 
-fn print(r: &StatusReport) {
-    let simulated = if r.simulated { "  SIMULATED" } else { "" };
-    output::line(format_args!("run {}{simulated}", r.run));
+/// Returns the report of a run that answered.
+fn answered(entry: &RunEntry) -> Option<&StatusReport> {
+    if let RunEntry::Answered { report, .. } = entry { Some(report) } else { None }
+}
+
+fn print(r: &StatusReport, verbose: bool) {
+    output::line(banner::heading(r));
+    let trouble = attention(r);
+    trouble.iter().for_each(|text| output::line(format_args!("  ! {text}")));
     let blueprint = &r.blueprint;
     output::line(format_args!("  pid {}, up {}, blueprint {blueprint}, dimos {}", r.pid, span(r.uptime), r.version));
-    match (&r.log, &r.recorder) {
-        (Some(log), Some(recorder)) => {
-            let cut = recorder.error.as_ref().map(|e| format!("; ENDED: {e}")).unwrap_or_default();
-            let (messages, dropped) = (recorder.messages, recorder.dropped);
-            output::line(format_args!("  log {log}"));
-            output::line(format_args!("  {messages} messages logged, {dropped} dropped{cut}"));
-        }
-        _ => output::line("  no log"),
+    output::line(format_args!("  log {}", r.log.as_deref().unwrap_or("none")));
+    if let Some(recorder) = r.recorder.as_ref().filter(|recorder| verbose || recorder.dropped > 0) {
+        output::line(format_args!("  {} messages logged, {} dropped", recorder.messages, recorder.dropped));
     }
     output::line("");
-    print_arms(&r.arms);
+    print_arms(&r.arms, verbose);
     if r.speed != SpeedReport::default() {
         output::line("");
         output::line(describe(&r.speed));
@@ -188,7 +220,47 @@ fn print(r: &StatusReport) {
         print_planners([(r.run.as_str(), planner)].into_iter());
         output::line("");
     }
-    print_timing(r);
+    print_timing(r, verbose);
+}
+
+/// Returns what needs attention, most urgent first, each with what to do if that is known.
+fn attention(r: &StatusReport) -> Vec<String> {
+    let mut lines = Vec::new();
+    for arm in &r.arms {
+        let name = &arm.hardware_id;
+        if let Some(cause) = banner::cause(arm) {
+            lines.push(format!("{name} is {}: {cause}", arm.phase));
+            if arm.phase == "held" {
+                lines.push(format!("  hint: dimos arm reset {name}, then dimos arm enable {name}"));
+            }
+        }
+        if let Some(error) = &arm.error {
+            lines.push(format!("{name} reports error {}: {}", error.code, error.text));
+        }
+        if arm.stop_pending {
+            lines.push(format!("{name}: a stop is pending; it is sent after the reconnect"));
+        }
+        for joint in &arm.joints {
+            if let Some(code) = joint.error.filter(|code| *code != 0) {
+                lines.push(format!("the drive of {} reports error {code}", joint.name));
+            }
+        }
+        if arm.link != "up" {
+            lines.push(format!("{name}: its connection is {}", arm.link));
+        }
+    }
+    for task in r.tasks.iter().filter(|task| matches!(task.state.as_str(), "ABORTED" | "FAULT")) {
+        let why = task.reason.as_deref().unwrap_or("unknown reason");
+        lines.push(format!("{} is {}: {why}", task.name, task.state));
+    }
+    if let Some(error) = r.planner.as_ref().and_then(|planner| planner.error.as_ref()) {
+        lines.push(format!("planner: {error}"));
+    }
+    if let Some(error) = r.recorder.as_ref().and_then(|recorder| recorder.error.as_ref()) {
+        lines.push(format!("the log ENDED: {error}"));
+    }
+    lines.extend(r.realtime.iter().filter(|measure| !measure.granted).flat_map(banner::realtime));
+    lines
 }
 
 /// Returns the planners in their own processes that are attached to none of these runs.
@@ -218,7 +290,7 @@ fn print_planners<'r>(planners: impl Iterator<Item = (&'r str, &'r PlannerStatus
     errors.iter().for_each(|error| output::line(format_args!("  {error}")));
 }
 
-fn print_arms(arms: &[ArmReport]) {
+fn print_arms(arms: &[ArmReport], verbose: bool) {
     let mut table = Table::new(&["ARM", "PHASE", "LINK", "MOTORS", "MODE", ">AGE ms", ">RATE Hz", ">NATIVE Hz"]);
     for arm in arms {
         let good = |well: bool| if well { Tone::Good } else { Tone::Bad };
@@ -241,20 +313,13 @@ fn print_arms(arms: &[ArmReport]) {
     table.print();
     for arm in arms {
         let name = &arm.hardware_id;
-        let simulated = if arm.simulated { "SIMULATED, " } else { "" };
-        let address = if arm.address.is_empty() { String::new() } else { format!(" at {}", arm.address) };
-        output::line(format_args!("  {name}: {simulated}{}{address}; at exit: {}", arm.adapter, at_exit(arm)));
-        if let Some(cause) = &arm.cause {
-            output::line(format_args!("  {name} is {}: {}", arm.phase, cause.text));
-        }
-        if arm.stop_pending {
-            output::line(format_args!("  {name}: a stop is pending; it is sent after the reconnect"));
-        }
-        if let Some(codes) = &arm.device_state {
+        let standing = banner::standing(arm.simulated, &arm.address);
+        output::line(format_args!("  {name}: {standing}, {}; at exit: {}", arm.adapter, at_exit(arm)));
+        if let Some(codes) = arm.device_state.as_ref().filter(|_| verbose) {
             let (state, mode) = (codes.state, codes.mode);
             output::line(format_args!("  {name}: device state {state}, mode {mode} (the vendor's numbers)"));
         }
-        for line in joint_lines(&arm.joints) {
+        for line in joint_lines(&arm.joints).iter().filter(|_| verbose) {
             output::line(format_args!("  {name}: {line}"));
         }
         if let Some(line) = gripper_line(arm) {
@@ -266,11 +331,8 @@ fn print_arms(arms: &[ArmReport]) {
         if let Some(load) = &arm.payload {
             output::line(format_args!("  {name}: payload {}", payload_text(load)));
         }
-        if let Some(io) = &arm.io {
+        if let Some(io) = arm.io.as_ref().filter(|_| verbose) {
             io_lines(io).iter().for_each(|line| output::line(format_args!("  {name}: {line}")));
-        }
-        if let Some(error) = &arm.error {
-            output::line(format_args!("  {name} reports error {}: {}", error.code, error.text));
         }
         for fault in &arm.faults {
             let over = if fault.over { "over" } else { "active" };
@@ -288,7 +350,7 @@ fn print_arms(arms: &[ArmReport]) {
             .filter(|(_, n)| **n > 0)
             .map(|(what, n)| format!("{n} {}", what.replace('_', " ")))
             .collect();
-        if !counted.is_empty() {
+        if verbose && !counted.is_empty() {
             output::line(format_args!("  {name} counted {}", counted.join(", ")));
         }
     }
@@ -344,13 +406,19 @@ fn joints(names: &[String]) -> String {
     }
 }
 
-fn print_timing(r: &StatusReport) {
+fn print_timing(r: &StatusReport, verbose: bool) {
     let t = &r.ticks;
     let clocked = if t.clock.starts_with("device") { format!(", {}", t.clock) } else { String::new() };
     let heading = format!("TICK {:.0} Hz{clocked}", r.tick_rate);
-    let mut table = Table::new(&[&heading, ">p50 µs", ">p99 µs", ">p99.9 µs", ">max µs"]);
+    let shown = |[p50, p99, p99_9, max]: [String; 4]| match verbose {
+        true => vec![p50, p99, p99_9, max],
+        false => vec![p50, p99, max],
+    };
+    let headings: Vec<String> =
+        [heading].into_iter().chain(shown(["p50", "p99", "p99.9", "max"].map(|q| format!(">{q} µs")))).collect();
+    let mut table = Table::new(&headings.iter().map(String::as_str).collect::<Vec<_>>());
     let mut row = |what: &str, p: &Percentiles| {
-        let figures = [p.p50, p.p99, p.p99_9, p.max].map(|v| format!("{v:.1}"));
+        let figures = shown([p.p50, p.p99, p.p99_9, p.max].map(|v| format!("{v:.1}")));
         table.row([what.to_owned()].into_iter().chain(figures));
     };
     row("lateness", &t.lateness_us);
@@ -360,7 +428,7 @@ fn print_timing(r: &StatusReport) {
     if !clocked.is_empty() {
         output::line(format_args!("  ticks without a state of the arm that clocks them: {}", t.without_state));
     }
-    for text in r.realtime.iter().flat_map(super::banner::realtime) {
+    for text in r.realtime.iter().filter(|measure| verbose && measure.granted).flat_map(banner::realtime) {
         output::line(format_args!("  {text}"));
     }
 }

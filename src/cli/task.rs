@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use clap::{Subcommand, ValueEnum};
 
-use super::arguments::{Target, rate};
+use super::arguments::{Target, hertz};
 use super::exit::{Exit, Failure, Result};
 use super::follow::Signals;
 use super::targets::{Source, Width};
@@ -45,10 +45,10 @@ enum Action {
     },
     /// Stream targets to a task, one per line, from a file or stdin
     #[command(after_help = "\
-A line is a JSON array, or numbers separated by blanks or commas: one per joint of the task, rad for a servo task, rad/s for a
-velocity task; for an eef_twist task x y z [m/s] and the angular velocity about x y z [rad/s], in the base frame; for a
-cartesian_ik task x y z [m] and roll pitch yaw [rad] or a quaternion x y z w. Empty lines and those that begin with # are
-skipped. At most one target per tick takes effect. At the end of the stream a servo task holds the last target, all others
+A line is a JSON array, or numbers separated by blanks or commas: one per joint of the task, rad for a servo task, rad/s for a \
+velocity task; for an eef_twist task x y z [m/s] and the angular velocity about x y z [rad/s], in the base frame; for a \
+cartesian_ik task x y z [m] and roll pitch yaw [rad] or a quaternion x y z w. Empty lines and those that begin with # are \
+skipped. At most one target per tick takes effect. At the end of the stream a servo task holds the last target, all others \
 decelerate to rest.")]
     Stream {
         /// Name of the task
@@ -56,8 +56,8 @@ decelerate to rest.")]
         /// File with the targets; default, or with -: stdin
         file: Option<PathBuf>,
         /// Targets per second [Hz]; default: 50 from a file, as they arrive from stdin
-        #[arg(long, value_name = "HZ", value_parser = rate)]
-        rate: Option<f64>,
+        #[arg(long, value_name = "HZ", value_parser = hertz, alias = "rate")]
+        hz: Option<f64>,
         #[command(flatten)]
         target_run: Target,
     },
@@ -85,7 +85,7 @@ pub fn run(args: &Args) -> Result {
             Ok(Exit::Ok)
         }
         Action::Invoke { task, method, target_run } => invoke(task, *method, target_run),
-        Action::Stream { task, file, rate, target_run } => {
+        Action::Stream { task, file, hz, target_run } => {
             let mut client = target_run.connect()?;
             let report = find(&mut client, task)?;
             let targets = Targets::of(&report)?;
@@ -95,8 +95,8 @@ pub fn run(args: &Args) -> Result {
                 Targets::Positions | Targets::Velocities => Width::Joints(report.joints.len()),
             };
             let (source, rate) = match file.as_deref().filter(|path| path.as_os_str() != "-") {
-                Some(path) => (Source::file(path, width)?, rate.or(Some(FILE_RATE))),
-                None => (Source::stdin(width), *rate),
+                Some(path) => (Source::file(path, width)?, hz.or(Some(FILE_RATE))),
+                None => (Source::stdin(width), *hz),
             };
             stream(&mut client, &report, targets, source, rate, target_run.json)
         }

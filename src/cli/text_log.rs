@@ -83,15 +83,12 @@ impl Terminal {
 
 fn write(items: &Receiver<Item>, lost: &AtomicU64) {
     for item in items {
-        // A closed pipe is not an error.
-        let _ = match item {
-            Item::Note(line) => io::stderr().write_all(&line),
-            Item::Data(line) => io::stdout().write_all(&line),
-            Item::Flush(done) => {
-                let _ = done.send(());
-                Ok(())
-            }
-        };
+        match item {
+            // A closed pipe is not an error.
+            Item::Note(line) => drop(io::stderr().write_all(&line)),
+            Item::Data(line) => drop(super::output::data(&line)),
+            Item::Flush(done) => drop(done.send(())),
+        }
         let missing = lost.swap(0, Ordering::Relaxed);
         if missing > 0 {
             let _ = writeln!(io::stderr(), "({missing} lines were dropped: the terminal was too slow)");

@@ -1,9 +1,9 @@
-//! `dimos world`: the planner's obstacles, and the objects that robots hold.
+//! `dimos world`: the planner's obstacles, and the objects that arms hold.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use super::arguments::{Target, finite};
 use super::arm::parts::payload_text;
@@ -35,7 +35,7 @@ pub enum Command {
     Remove(RemoveArgs),
     /// Add the objects of a YAML file: a map of names as under `planner.world`
     Load(LoadArgs),
-    /// Attach an object to a robot at its current pose
+    /// Attach an object to an arm at its current pose
     Attach(AttachArgs),
     /// Detach an object; it stays at its current pose
     Detach(DetachArgs),
@@ -69,6 +69,10 @@ impl PoseArgs {
 
 /// Arguments of `world add`.
 #[derive(Debug, clap::Args)]
+#[command(override_usage = "\
+dimos world add NAME --at X Y Z [--rpy R P Y] SHAPE [OPTIONS]
+       SHAPE: --box X Y Z | --sphere RADIUS | --cylinder RADIUS LENGTH
+            | --mesh FILE | --cloud FILE")]
 #[command(group = clap::ArgGroup::new("shape").required(true).args(["cuboid", "sphere", "cylinder", "mesh", "cloud"]))]
 pub struct AddArgs {
     /// Name of the object; replaces an object of the same name
@@ -141,7 +145,8 @@ pub struct LoadArgs {
 pub struct AttachArgs {
     /// Name of the object
     pub name: String,
-    /// Robot that holds it
+    /// Arm that holds it, by its name in the planner
+    #[arg(value_name = "ARM")]
     pub robot: String,
     /// Link that holds it; default: the end-effector link
     #[arg(long)]
@@ -179,25 +184,33 @@ pub fn run(args: &Args) -> Result {
                 padding: a.padding,
                 held_by: None,
             };
-            a.target_run.connect()?.call(WorldAdd(object))?;
-            done(format_args!("{} is in the world", a.name), a.target_run.json);
+            let mut client = a.target_run.connect()?;
+            let replaced = replaced(&mut client, &[&a.name])?;
+            client.call(WorldAdd(object))?;
+            let how = if replaced.is_empty() { "added" } else { "replaced" };
+            done(format_args!("{} {how}", a.name), json!({how: [a.name]}), a.target_run.json);
         }
         Command::Move(a) => {
             a.target_run.connect()?.call(WorldMove { name: a.name.clone(), pose: a.at.pose() })?;
-            done(format_args!("{} moved", a.name), a.target_run.json);
+            done(format_args!("{} moved", a.name), json!({"moved": a.name}), a.target_run.json);
         }
         Command::Remove(a) => {
             a.target_run.connect()?.call(WorldRemove { name: a.name.clone() })?;
-            done(format_args!("{} removed", a.name.as_deref().unwrap_or("all objects")), a.target_run.json);
+            let what = a.name.as_deref().unwrap_or("all objects that no arm holds");
+            done(format_args!("{what} removed"), json!({"removed": a.name, "all": a.all}), a.target_run.json);
         }
         Command::Load(a) => {
             // Reads the whole file first: a mistake in its last object changes nothing.
             let objects = load(&a.file)?;
             let mut client = a.target_run.connect()?;
+            let names: Vec<&str> = objects.iter().map(|object| object.name.as_str()).collect();
+            let replaced = replaced(&mut client, &names)?;
             for object in &objects {
                 client.call(WorldAdd(object.clone()))?;
             }
-            done(format_args!("{} objects are in the world", objects.len()), a.target_run.json);
+            let added: Vec<&str> = names.iter().filter(|name| !replaced.iter().any(|r| r == *name)).copied().collect();
+            let text = format!("{} objects added, {} replaced", added.len(), replaced.len());
+            done(format_args!("{text}"), json!({"added": added, "replaced": replaced}), a.target_run.json);
         }
         Command::Attach(a) => {
             let (name, robot) = (a.name.clone(), a.robot.clone());
@@ -216,17 +229,23 @@ pub fn run(args: &Args) -> Result {
         }
         Command::Detach(a) => {
             a.target_run.connect()?.call(Detach { name: a.name.clone() })?;
-            done(format_args!("{} detached", a.name), a.target_run.json);
+            done(format_args!("{} detached", a.name), json!({"detached": a.name}), a.target_run.json);
         }
     }
     Ok(Exit::Ok)
 }
 
-fn done(what: std::fmt::Arguments<'_>, json: bool) {
+fn done(what: std::fmt::Arguments<'_>, data: Value, json: bool) {
     match json {
-        true => output::json(&serde_json::json!({})),
+        true => output::json(&data),
         false => output::line(what),
     }
+}
+
+/// Returns those of these names that objects in the world have.
+fn replaced(client: &mut Client, names: &[&str]) -> Result<Vec<String>> {
+    let there = client.call(World {})?.objects.into_iter().map(|object| object.name);
+    Ok(there.filter(|name| names.contains(&name.as_str())).collect())
 }
 
 fn shape(args: &AddArgs) -> Result<ShapeSpec> {
@@ -252,10 +271,18 @@ fn load(file: &Path) -> Result<Vec<WorldObject>> {
     let text = std::fs::read_to_string(file).map_err(|e| wrong(e.to_string()))?;
     let folder = file.parent().unwrap_or(Path::new(""));
     // Converted to JSON: a shape is written as in a blueprint, `shape: {box: […]}`.
-    let typed: BTreeMap<String, Value> = serde_yaml::from_str(&text).map_err(|e| wrong(e.to_string()))?;
-    let entry = |(name, value)| match serde_json::from_value::<WorldEntry>(value) {
+    let typed: BTreeMap<String, Value> = serde_yaml::from_str(&text).map_err(|e| match e.location() {
+        Some(at) => Failure::usage(format!("{}:{}:{}: {e}", file.display(), at.line(), at.column())),
+        None => wrong(e.to_string()),
+    })?;
+    let entry = |(name, value): (String, Value)| match serde_json::from_value::<WorldEntry>(value) {
         Ok(entry) => Ok((name, entry)),
-        Err(e) => Err(wrong(format!("{name}: {e}"))),
+        Err(e) => {
+            let line =
+                text.lines().position(|line| line.trim_start().starts_with(&format!("{name}:"))).unwrap_or(0) + 1;
+            Err(Failure::usage(format!("{}:{line}: {name}: {e}", file.display()))
+                .hint("an object is written as under `planner.world` in a blueprint"))
+        }
     };
     let mut objects = typed.into_iter().map(entry).collect::<Result<BTreeMap<_, _>>>()?;
     let resolve = |path: &mut String| full_path(&folder.join(&path)).map(|full| *path = full);
@@ -290,6 +317,11 @@ fn list(client: &mut Client, json: bool) -> Result<()> {
         output::note("the world is empty: add an object with `dimos world add`");
     } else {
         table.print();
+        if world.objects.iter().any(|object| object.held_by.is_some()) {
+            output::note(
+                "the position of a held object is in the frame of the link that holds it, all others in `map`",
+            );
+        }
     }
     Ok(())
 }

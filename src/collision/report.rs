@@ -35,9 +35,9 @@ impl fmt::Display for Contact {
         let Self { link, other, distance, .. } = self;
         let kind = if matches!(self.pair, Pair::Links(..)) { "link" } else { "obstacle" };
         if *distance > 0.0 {
-            write!(f, "link {link:?} is {:.1} mm from {kind} {other:?}", distance * 1e3)
+            write!(f, "link {link:?} is {distance:.4} m from {kind} {other:?}")
         } else {
-            write!(f, "link {link:?} is {:.1} mm deep in {kind} {other:?}", -distance * 1e3)
+            write!(f, "link {link:?} is {:.4} m deep in {kind} {other:?}", -distance)
         }
     }
 }

@@ -64,7 +64,7 @@ fn contacts_report_names_and_depth() {
     assert_eq!(contacts.len(), 1, "{contacts:?}");
     assert_eq!((contacts[0].link.as_str(), contacts[0].other.as_str()), ("l3", "post"));
     assert!((contacts[0].distance + 0.02).abs() < 1e-9);
-    assert_eq!(contacts[0].to_string(), "link \"l3\" is 20.0 mm deep in obstacle \"post\"");
+    assert_eq!(contacts[0].to_string(), "link \"l3\" is 0.0200 m deep in obstacle \"post\"");
     assert!(!checker.is_free(&[0.0; 3]) && checker.is_free(&[-1.0, 0.0, 0.0]));
     // The other links are farther away than this one.
     let near = checker.clearance(&[-0.1, 0.0, 0.0]).unwrap();

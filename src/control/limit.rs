@@ -203,14 +203,16 @@ impl Limiter {
         let fastest = self.speeds_inside(b.lower, b.upper, at.1, dt).1;
         let capped = target.clamp(-b.velocity, b.velocity);
         let inside = capped.clamp(slowest, fastest);
+        let before = self.velocity;
         self.velocity = inside.clamp(self.velocity - change, self.velocity + change);
         self.position = (at.0 + at.1) / 2.0;
+        // In the unit of the limit: the position that the commanded velocity leads to, the acceleration to reach it.
         let by = if capped != target {
             Some((LimitKind::Velocity, target))
         } else if inside != capped {
-            Some((LimitKind::Position, target))
+            Some((LimitKind::Position, self.position + target * dt))
         } else if self.velocity != inside {
-            Some((LimitKind::Acceleration, target))
+            Some((LimitKind::Acceleration, (target - before) / dt))
         } else {
             None
         };

@@ -9,6 +9,16 @@ fn limiter() -> Limiter {
     Limiter::new(Bounds::inside(-2.0, 2.0, 1.5, 4.0))
 }
 
+/// What was commanded is reported in the unit of the limit that applied, also of a velocity.
+#[test]
+fn a_limited_velocity_is_reported_in_the_unit_of_its_limit() {
+    let by = |target: f64, at: f64| limiter().follow_velocity(target, (at, at), DT).unwrap().by;
+    assert_eq!(by(0.2, 0.0), Some((LimitKind::Acceleration, 0.2 / DT)), "rad/s²: 0.2 rad/s within one tick");
+    assert_eq!(by(1.6, 0.0), Some((LimitKind::Velocity, 1.6)), "rad/s");
+    assert_eq!(by(0.5, 1.9999), Some((LimitKind::Position, 1.9999 + 0.5 * DT)), "rad");
+    assert_eq!(by(0.03, 0.0), None);
+}
+
 proptest! {
     #[test]
     fn far_from_a_limit_needs_no_exact_answer(v in 0.0..8.0f64, a in 0.1..60.0f64, more in 0.0..0.5f64, dt in 0.0005..0.05f64) {

@@ -105,7 +105,7 @@ fn is_straight(way: &[(f64, Vec<f64>)]) -> bool {
 
 /// Describes a contact; if nothing touches, adds the padding that is violated.
 pub(super) fn describe_contact(contact: &Contact, padding: f64) -> String {
-    let kept = format!(", closer than the padding of {:.1} mm", padding * 1e3);
+    let kept = format!(", closer than the padding of {padding:.4} m");
     format!("{contact}{}", if contact.distance > 0.0 { kept } else { String::new() })
 }
 

@@ -65,7 +65,7 @@ impl IkFailure {
         if self.rejected > 0 {
             return format!("all {} configurations that reach the pose collide ({n} attempts)", self.rejected);
         }
-        let missing = format!("{:.1} mm and {:.2}°", self.position * 1e3, self.rotation.to_degrees());
+        let missing = format!("{:.4} m and {:.2}°", self.position, self.rotation.to_degrees());
         let limit = self.limit.as_ref().map(|(_, joint)| format!("; limited by joint {joint:?}"));
         let stopped = if self.stopped { ", stopped early" } else { "" };
         format!(

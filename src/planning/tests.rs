@@ -155,5 +155,5 @@ fn a_start_in_slight_contact_is_escaped_and_a_deep_one_is_reported() {
     assert!(found.path.len() == 3 && found.path[1][0] < 0.0, "{:?}", found.path);
     assert!(from(-0.01).unwrap().straight);
     let error = from(0.01).unwrap_err();
-    assert!(error.to_string().contains("10.0 mm deep in obstacle \"post\""), "{error}");
+    assert!(error.to_string().contains("0.0100 m deep in obstacle \"post\""), "{error}");
 }

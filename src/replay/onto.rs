@@ -116,7 +116,7 @@ pub struct Plan {
 
 /// Returns whether an arm of a blueprint is real: neither emulated nor a mock.
 pub fn is_real(arm: &Arm) -> bool {
-    !arm.simulated && arm.adapter.transport != "memory"
+    arm.is_real()
 }
 
 /// Assigns a motion to the arms and tasks of a blueprint, joint by joint of the same name.

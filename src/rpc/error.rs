@@ -45,10 +45,14 @@ pub enum Code {
     UnknownRobot,
     /// No such plan, or it is too old.
     UnknownPlan,
+    /// There is no plan yet, or planning found none; the message says why.
+    NoPlan,
     /// The world has changed since the plan was made, and now blocks it.
     PlanOutdated,
     /// No such object in the world.
     UnknownObject,
+    /// The object does not allow the request: an arm holds it, or none does.
+    WrongObject,
     /// The planner is busy with another request.
     Planning,
     /// No trajectory task covers these joints.

@@ -27,7 +27,7 @@ pub struct StatusReport {
     pub uptime: f64,
     /// Ticks per second [Hz].
     pub tick_rate: f64,
-    /// Whether an emulator replaces any of the arms.
+    /// Whether any of the arms is an emulator, or an ideal arm in memory.
     pub simulated: bool,
     /// Path of the log; absent without one.
     pub log: Option<String>,
@@ -47,6 +47,17 @@ pub struct StatusReport {
     /// The planner; absent without one.
     #[serde(default)]
     pub planner: Option<PlannerStatus>,
+}
+
+impl StatusReport {
+    /// Returns `SIMULATED` if all arms are, `PARTLY SIMULATED` if some are; empty if all are real.
+    pub fn standing(&self) -> &'static str {
+        match (self.simulated, self.arms.iter().all(|arm| arm.simulated)) {
+            (false, _) => "",
+            (true, true) => "SIMULATED",
+            (true, false) => "PARTLY SIMULATED",
+        }
+    }
 }
 
 /// The planner in `status`.
@@ -136,7 +147,7 @@ pub struct ArmReport {
     pub adapter: String,
     /// Address of its device.
     pub address: String,
-    /// Whether an emulator replaces it.
+    /// Whether it is an emulator, or an ideal arm in memory.
     pub simulated: bool,
     /// State of the connection: `down`, `up`, `stale`, `faulted`.
     pub link: String,

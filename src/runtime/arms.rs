@@ -163,7 +163,9 @@ fn unfit(arm: &Arm, error: &AdapterError) -> StartError {
 fn hardware(arm: &Arm, error: &AdapterError) -> StartError {
     let (id, form) = (&arm.hardware_id, arm.adapter.address.form);
     let general = match arm.adapter.emulate {
-        Some(_) => format!("is it powered, and is `hardware.{id}.address` right ({form})? To try without it: --sim"),
+        Some(_) => format!(
+            "is it powered, and is `hardware.{id}.address` right ({form})? To try without it: --address {id}=sim"
+        ),
         None => format!("see `hardware.{id}` in the blueprint"),
     };
     let (what, hint) = Message::of(error).or_hint(general);

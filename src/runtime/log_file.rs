@@ -79,7 +79,7 @@ pub(super) fn metadata(blueprint: &Blueprint, config: &CoordinatorConfig) -> BTr
         ("tick_rate".to_owned(), blueprint.coordinator.tick_rate.to_string()),
         ("dimos_version".to_owned(), crate::VERSION.to_owned()),
         (CONFIG_VERSION_KEY.to_owned(), config.version.to_string()),
-        ("simulated".to_owned(), blueprint.arms.iter().any(|a| a.simulated).to_string()),
+        ("simulated".to_owned(), blueprint.arms.iter().any(|arm| !arm.is_real()).to_string()),
     ])
 }
 

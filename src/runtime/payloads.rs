@@ -159,7 +159,7 @@ impl Service {
                 // One that no robot holds any longer, after an error or in a planner that was started again, still
                 // weighs on the controller.
                 let detached = match self.planner_call(Call::Detach(call)).await {
-                    Err(error) if !matches!(error.code, Code::UnknownObject | Code::InvalidParams) => {
+                    Err(error) if !matches!(error.code, Code::UnknownObject | Code::WrongObject) => {
                         return Err(error);
                     }
                     detached => detached,

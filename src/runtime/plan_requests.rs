@@ -172,7 +172,7 @@ pub(super) fn job(port: &PlannerPort, plan: Option<u64>) -> Result<Job, RpcError
     job.ok_or_else(|| match plan {
         Some(id) => RpcError::new(Code::UnknownPlan, format!("there is no plan {id}, or it is too long ago"))
             .hint("`dimos plan` makes one"),
-        None => RpcError::new(Code::UnknownPlan, "there is no plan yet").hint("`dimos plan` makes one"),
+        None => RpcError::new(Code::NoPlan, "there is no plan yet").hint("`dimos plan` makes one"),
     })
 }
 
@@ -182,7 +182,7 @@ pub(super) fn found(port: &PlannerPort, plan: Option<u64>) -> Result<(Job, Arc<P
         Progress::Found(found, _) => Ok((job.clone(), found.clone())),
         Progress::Planning(_) => Err(RpcError::new(Code::Planning, format!("plan {} is not ready yet", job.id))),
         Progress::Failed(failure, _) => {
-            Err(RpcError::new(Code::UnknownPlan, format!("plan {} was not found: {}", job.id, failure.what)))
+            Err(RpcError::new(Code::NoPlan, format!("plan {} was not found: {}", job.id, failure.what)))
         }
     }
 }

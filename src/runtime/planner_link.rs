@@ -172,7 +172,7 @@ impl Service {
             None => match answer(Call::Planner(api::Planner {})).await? {
                 Reply::Planner(PlannerReport { plan: Some(newest), .. }) => newest,
                 _ => {
-                    let none = RpcError::new(Code::UnknownPlan, "there is no plan yet");
+                    let none = RpcError::new(Code::NoPlan, "there is no plan yet");
                     return Err(none.hint("`dimos plan` makes one"));
                 }
             },

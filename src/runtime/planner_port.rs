@@ -125,7 +125,7 @@ pub(super) async fn run_blocking<T: Send + 'static>(work: impl FnOnce() -> T + S
 
 pub(super) fn robot_index(setup: &PlanningScene, name: &str) -> Result<usize, RpcError> {
     let names: Vec<&str> = setup.robots.iter().map(|robot| robot.config.name.as_str()).collect();
-    setup.robot(name).ok_or_else(|| RpcError::unknown(Code::UnknownRobot, "robot", name, &names))
+    setup.robot(name).ok_or_else(|| RpcError::unknown(Code::UnknownRobot, "planned arm", name, &names))
 }
 
 pub(super) fn isometry(spec: &PoseSpec) -> Isometry3<f64> {

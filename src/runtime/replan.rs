@@ -72,7 +72,7 @@ impl Service {
             match report.state.as_str() {
                 "PLANNING" => tokio::time::sleep(POLL_PERIOD).await,
                 "PLANNED" => break,
-                _ => return Err(RpcError::new(Code::UnknownPlan, report.error.unwrap_or(report.state))),
+                _ => return Err(RpcError::new(Code::NoPlan, report.error.unwrap_or(report.state))),
             }
         }
         self.may_go_on(motion)?;

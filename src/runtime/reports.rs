@@ -31,7 +31,7 @@ impl Service {
             started: rfc3339(started),
             uptime: self.started.elapsed().as_secs_f64(),
             tick_rate: parts.config.rate,
-            simulated: parts.blueprint.arms.iter().any(|a| a.simulated),
+            simulated: parts.blueprint.arms.iter().any(|arm| !arm.is_real()),
             log: parts.log.as_ref().map(|p| p.display().to_string()),
             realtime: parts
                 .grants
@@ -98,7 +98,7 @@ impl Service {
             hardware_id: arm.hardware_id.clone(),
             adapter: arm.adapter_type.clone(),
             address: arm.address.clone(),
-            simulated: arm.simulated,
+            simulated: !arm.is_real(),
             link: view.state.link.name().to_owned(),
             phase: view.phase.name().to_owned(),
             cause: (view.cause != Cause::None)
@@ -178,7 +178,7 @@ impl Service {
             });
             Some(ArmStateReport {
                 hardware_id: arm.hardware_id.clone(),
-                simulated: arm.simulated,
+                simulated: !arm.is_real(),
                 age_ms: self.age_ms(s),
                 joints: joints.collect(),
                 gripper: s.gripper,

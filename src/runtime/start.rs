@@ -279,6 +279,7 @@ fn watchdog_ping(manager: Option<&ServiceManager>) -> Box<dyn FnMut() + Send> {
 /// Returns a line about the run.
 fn status_line(report: &StatusReport) -> String {
     let arms: Vec<String> = report.arms.iter().map(|a| format!("{} {}", a.hardware_id, a.phase)).collect();
-    let simulated = if report.simulated { ", SIMULATED" } else { "" };
-    format!("{}: {}{simulated}", report.run, arms.join(", "))
+    let standing = Some(report.standing()).filter(|text| !text.is_empty());
+    let parts: Vec<&str> = arms.iter().map(String::as_str).chain(standing).collect();
+    format!("{}: {}", report.run, parts.join(", "))
 }

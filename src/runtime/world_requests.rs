@@ -67,7 +67,7 @@ impl PlannerPort {
         let objects = &mut *lock(&self.objects);
         let mut object = known(objects, name)?;
         let Some([robot, link]) = object.held_by.take() else {
-            return Err(wrong(format!("no robot holds {name}")));
+            return Err(RpcError::new(Code::WrongObject, format!("no arm holds {name}")));
         };
         let robot = setup.robots.get(robot_index(setup, &robot)?).ok_or_else(internal)?;
         let at = link_pose(robot, &link, moment)? * isometry(&object.pose);
@@ -185,9 +185,8 @@ fn known(objects: &Objects, name: &str) -> Result<WorldObject, RpcError> {
 
 fn not_held(objects: &Objects, name: &str) -> Result<(), RpcError> {
     match objects.get(name).and_then(|object| object.held_by.as_ref()) {
-        Some([robot, _]) => {
-            Err(wrong(format!("{robot} holds {name}")).hint(format!("`dimos world detach {name}` lets go of it")))
-        }
+        Some([robot, _]) => Err(RpcError::new(Code::WrongObject, format!("{robot} holds {name}"))
+            .hint(format!("`dimos world detach {name}` lets go of it"))),
         None => Ok(()),
     }
 }

@@ -175,7 +175,7 @@ pub fn outcome_text(outcome: &Outcome, names: &Names) -> String {
         Outcome::AlreadyStopped => "there was no motion to cancel".into(),
         Outcome::AlreadyExecuting(task) => format!("task {} is executing already", names.task(task)),
         Outcome::StartStateMismatch(joint, by) => {
-            format!("the trajectory starts {} from the position of {}", angle(by), names.joint(joint))
+            format!("the first point or target is {} from the position of {}", angle(by), names.joint(joint))
         }
         Outcome::StartStateUnavailable(arm) => format!("no recent state of {}", names.arm(arm)),
         Outcome::ArmNotReady(arm, phase, cause) => {
@@ -383,7 +383,10 @@ mod tests {
     fn a_refused_request_carries_its_id_and_status() {
         let d = describe(&Event::Request(7, Outcome::StartStateMismatch(0, 0.5)), &names());
         assert_eq!((d.request, d.status), (Some(7), "START_STATE_MISMATCH"));
-        assert_eq!(d.text, "request 7: the trajectory starts 0.5000 rad (28.65°) from the position of left_joint1");
+        assert_eq!(
+            d.text,
+            "request 7: the first point or target is 0.5000 rad (28.65°) from the position of left_joint1"
+        );
         let d = describe(&Event::Request(8, Outcome::GripperOutOfLimits(1, -0.01)), &names());
         let text = "request 8: the gripper of right cannot go to -0.0100: an opening must be 0 m or more";
         assert_eq!((d.text.as_str(), d.status), (text, "OUT_OF_LIMITS"));

@@ -154,7 +154,7 @@ proptest! {
     fn arguments_are_survived(pieces in prop::collection::vec(prop::sample::select(&[
         "hardware", "arm", ".", "=", "tasks", "0", "address", "{", "[", "]", "&a", "*a", "\n", ": ", "'", "é", "sim", "joints",
     ][..]), 0..12)) {
-        let overrides = Overrides { set: vec![pieces.concat()], sim: true };
+        let overrides = Overrides { set: vec![pieces.concat()], sim: true, ..Overrides::default() };
         survives(good()[0].as_bytes(), &overrides);
     }
 }

@@ -24,8 +24,19 @@ A blueprint is a YAML file that defines the arms, tasks, planner and log of a ru
 `./blueprints`, the folders of `$DIMOS_BLUEPRINT_PATH`, `~/.config/dimos/blueprints` and the binary, in this order.
 Units are SI: rad, rad/s, m, s, Hz.
 
-`--set path=value` changes one value for one run; entries of lists are addressed by their id:
-`--set hardware.arm.address=192.168.1.100`, `--set coordinator.tick_rate=250`. `--sim` uses every arm's emulator.
+Every shipped blueprint has `address: sim`: it runs on the arms' emulators, and the banner says SIMULATED. `--address
+arm=192.168.1.185` uses the arm `arm` at this address for one run (repeatable; the same as `--set
+hardware.arm.address=192.168.1.185`); the banner then says `REAL ARM at 192.168.1.185`. For good, give the address in a
+blueprint of your own: it wins over that of an included one, also over `sim`.
+
+```yaml
+include: [coordinator-xarm6]
+hardware: [{hardware_id: arm, address: 192.168.1.185}]
+```
+
+`--set path=value` changes one value for one run; entries of lists are addressed by their id: `--set
+coordinator.tick_rate=250`. `--sim` uses every arm's emulator, whatever the blueprint says. No environment variable
+changes an address.
 
 Blueprints are YAML 1.2: booleans are `true` and `false` (`yes` is a text). Keys must be unique, numbers finite, and a
 file has at most 1 MiB.

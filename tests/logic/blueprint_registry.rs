@@ -63,7 +63,8 @@ fn unknown_names_get_a_hint() {
     );
     let error = search.find(&format!("{}/", dir.path().display())).unwrap_err();
     assert!(error.message.contains("it is a folder"), "{error}");
-    assert!(find("no-such-blueprint-anywhere").unwrap_err().hint.contains("coordinator-mock"));
+    assert!(find("no-such-blueprint-anywhere").unwrap_err().hint.contains("`dimos list-blueprints`"));
+    assert!(find("no-such-file.md").unwrap_err().hint.contains("a YAML file"));
 }
 
 #[test]

@@ -37,14 +37,43 @@ fn shipped_blueprints_have_no_mistakes() {
         let adapters = if has_arms { &builtin } else { &fake };
         let loaded = load(&find(name).unwrap(), &Overrides::default(), adapters);
         let text = loaded.render(false);
-        // Keys for the end effector and for single joints are not pressed at once.
-        let warned = name.starts_with("keyboard-teleop-") && !text.contains("error:");
-        assert!(text.is_empty() || warned, "{name}: {text}");
+        assert!(text.is_empty(), "{name}: {text}");
         let blueprint = loaded.blueprint.unwrap();
+        assert!(blueprint.arms.iter().all(|arm| !arm.is_real()), "{name} must run without hardware");
         assert_eq!(blueprint.name, name);
         assert!(!blueprint.description.is_empty());
         assert!(blueprint.sources[0].1.starts_with("# yaml-language-server: $schema="), "{name}");
     }
+}
+
+/// A real arm is one option away, or one line in a blueprint that includes a shipped one; both win over `sim`.
+#[test]
+fn an_address_makes_an_arm_real() {
+    let addresses = |loaded: Loaded| -> Vec<(String, bool)> {
+        let text = loaded.render(false);
+        let blueprint = loaded.blueprint.unwrap_or_else(|| panic!("{text}"));
+        blueprint.arms.iter().map(|arm| (arm.address.clone(), arm.is_real())).collect()
+    };
+    let with = |name: &str, address: &[(&str, &str)]| {
+        let address = address.iter().map(|(arm, at)| ((*arm).to_owned(), (*at).to_owned())).collect();
+        load(&find(name).unwrap(), &Overrides { address, ..Overrides::default() }, &Registry::builtin())
+    };
+    let at = |address: &str| (address.to_owned(), address != "sim");
+    assert_eq!(addresses(with("coordinator-xarm6", &[("arm", "192.168.1.185")])), [at("192.168.1.185")]);
+    assert_eq!(addresses(with("keyboard-teleop-xarm7", &[("arm", "192.168.1.185")])), [at("192.168.1.185")]);
+    let one = with("coordinator-dual-xarm", &[("right_arm", "192.168.1.186")]);
+    assert_eq!(addresses(one), [at("sim"), at("192.168.1.186")]);
+    let wrong = with("coordinator-xarm6", &[("amr", "192.168.1.185")]).render(false);
+    assert!(wrong.contains("the blueprint has no arm `amr`") && wrong.contains("did you mean `arm`?"), "{wrong}");
+    assert!(with("coordinator-xarm6", &[("arm", "192.168.1.185:x")]).errors() == 1, "its form is checked");
+
+    let folder = tempfile::tempdir().unwrap();
+    let own = folder.path().join("cell.yaml");
+    fs::write(&own, "include: [coordinator-xarm6]\nhardware: [{hardware_id: arm, address: 192.168.1.185}]\n").unwrap();
+    let found = find(own.to_str().unwrap()).unwrap();
+    let load_own = |overrides: Overrides| load(&found, &overrides, &Registry::builtin());
+    assert_eq!(addresses(load_own(Overrides::default())), [at("192.168.1.185")]);
+    assert_eq!(addresses(load_own(Overrides { sim: true, ..Overrides::default() })), [at("sim")]);
 }
 
 /// Mistakes in options that only the built-in arms can find, each located like any other.
@@ -66,7 +95,8 @@ fn options_that_do_not_fit_are_located() {
 fn limits_are_those_of_the_model() {
     let joint = |name: &str, overrides: &[&str]| {
         let set = overrides.iter().map(|text| (*text).to_owned()).collect();
-        let loaded = load(&find(name).unwrap(), &Overrides { set, sim: true }, &Registry::builtin());
+        let loaded =
+            load(&find(name).unwrap(), &Overrides { set, sim: true, ..Overrides::default() }, &Registry::builtin());
         assert_eq!(loaded.render(false), "", "{name}");
         let lower = Summary::of(&loaded.blueprint.unwrap()).arms[0].joints[2].position_lower.unwrap().value;
         (lower * 1e6).round() / 1e6
@@ -160,7 +190,7 @@ fn tasks_count_joints_over_all_arms() {
 }
 
 fn set(arguments: &[&str]) -> Loaded {
-    let overrides = Overrides { set: arguments.iter().map(|s| (*s).to_owned()).collect(), sim: false };
+    let overrides = Overrides { set: arguments.iter().map(|s| (*s).to_owned()).collect(), ..Overrides::default() };
     load(&find("coordinator-yourarm").unwrap(), &overrides, &fake_arms::registry())
 }
 
@@ -191,7 +221,8 @@ fn mistakes_in_set_are_shown_in_the_argument() {
 #[test]
 fn sim_gives_every_arm_its_emulator() {
     let found = find("coordinator-yourarm").unwrap();
-    let overrides = Overrides { set: vec!["hardware.arm.address=10.0.0.1".to_owned()], sim: true };
+    let overrides =
+        Overrides { set: vec!["hardware.arm.address=10.0.0.1".to_owned()], sim: true, ..Overrides::default() };
     let blueprint = load(&found, &overrides, &fake_arms::registry()).blueprint.unwrap();
     assert!(blueprint.arms[0].simulated);
 }
@@ -200,7 +231,9 @@ fn sim_gives_every_arm_its_emulator() {
 fn a_simulated_arm_may_be_silent_for_100_ms() {
     let stale_after = |sim: bool, set: &[&str]| {
         let set = set.iter().map(|&s| s.to_owned()).collect();
-        let loaded = load(&find("coordinator-xarm7").unwrap(), &Overrides { set, sim }, &Registry::builtin());
+        let address = vec![("arm".to_owned(), "192.168.1.185".to_owned())];
+        let overrides = Overrides { set, sim, address };
+        let loaded = load(&find("coordinator-xarm7").unwrap(), &overrides, &Registry::builtin());
         loaded.blueprint.unwrap().arms[0].supervision.stale_after.as_millis()
     };
     assert_eq!(stale_after(false, &[]), 50);
@@ -220,7 +253,7 @@ fn sim_refuses_an_arm_that_would_stay_real() {
 
 #[test]
 fn the_written_blueprint_reads_back_the_same() {
-    let overrides = Overrides { set: vec!["description=\"yes\"".to_owned()], sim: true };
+    let overrides = Overrides { set: vec!["description=\"yes\"".to_owned()], sim: true, ..Overrides::default() };
     let first = load_fixture("full.yaml", &overrides);
     assert_eq!(first.render(false), "");
     let first = first.blueprint.unwrap();
@@ -240,7 +273,8 @@ fn the_written_blueprint_reads_back_the_same() {
 
 #[test]
 fn a_live_view_is_warned_of_and_runs_all_the_same() {
-    let in_planner = Overrides { set: vec!["planner.visualization.port=7000".to_owned()], sim: true };
+    let in_planner =
+        Overrides { set: vec!["planner.visualization.port=7000".to_owned()], sim: true, ..Overrides::default() };
     let in_planner = load(&find("yourarm-planner").unwrap(), &in_planner, &fake_arms::registry());
     for loaded in [set(&["view.port=7000"]), in_planner] {
         assert_eq!((loaded.errors(), loaded.warnings()), (0, 1), "{}", loaded.render(false));

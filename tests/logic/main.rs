@@ -27,6 +27,7 @@ mod english;
 mod faults;
 mod gaps;
 mod guards_virtual;
+mod help;
 mod kinematics;
 mod layering;
 mod model;

@@ -359,7 +359,7 @@ fn blueprint(name: &str, set: &[&str]) -> Blueprint {
     let set = set.iter().map(|s| (*s).to_owned()).collect();
     let registry = Registry::builtin();
     let found = dimos::blueprint::find(name).unwrap_or_else(|e| panic!("{}", e.message));
-    let loaded = dimos::blueprint::load(&found, &Overrides { set, sim: false }, &registry);
+    let loaded = dimos::blueprint::load(&found, &Overrides { set, ..Overrides::default() }, &registry);
     loaded.blueprint.clone().unwrap_or_else(|| panic!("{}", loaded.render(false)))
 }
 

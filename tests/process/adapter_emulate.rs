@@ -23,7 +23,7 @@ fn a_run_in_another_process_moves_the_emulated_arm() {
     let emulator = emulate(&home, &format!("yourarm --bind {address}"));
     let said = emulator.out();
     let command = said.lines().find_map(|line| line.trim().strip_prefix("reach it")).unwrap().trim().to_owned();
-    assert_eq!(command, format!("dimos run coordinator-yourarm --set hardware.arm.address={address}"));
+    assert_eq!(command, format!("dimos run coordinator-yourarm --address arm={address}"));
     assert!(said.contains("yourarm SIMULATED at"), "{said}");
 
     let run = home.run(&format!("{} --no-record", command.strip_prefix("dimos run ").unwrap()));

@@ -145,7 +145,7 @@ fn coordinator_piper_xarm() {
     exercise("coordinator-piper-xarm", &arms);
 }
 
-/// Everything that `dimos list-blueprints` offers runs as its header says: with emulated arms.
+/// Everything that `dimos list-blueprints` offers runs as it stands, without hardware: with emulated arms.
 #[test]
 fn every_shipped_blueprint_is_without_mistakes_and_starts() {
     let home = Home::new();
@@ -155,9 +155,11 @@ fn every_shipped_blueprint_is_without_mistakes_and_starts() {
     for blueprint in shipped {
         let name = blueprint["name"].as_str().unwrap();
         assert_eq!(blueprint["problem"], Value::Null, "{name}");
-        let started = home.dimos(&format!("run {name} --sim --no-record --duration 200ms")).with(0);
-        let phase = if WITH_BRAKES.contains(&name) { "ur at sim, disabled" } else { "ready" };
-        started.says(&[&format!("run {name}  "), phase, "duration reached"]);
+        let checked = home.dimos(&format!("check {name}")).with(0);
+        assert_eq!(checked.err, "", "{name} has warnings");
+        let started = home.dimos(&format!("run {name} --no-record --duration 0.2")).with(0);
+        let phase = if WITH_BRAKES.contains(&name) { "SIMULATED, ur, disabled" } else { "ready" };
+        started.says(&[&format!("run {name}  SIMULATED"), phase, "duration reached"]);
     }
 }
 
@@ -165,7 +167,7 @@ fn every_shipped_blueprint_is_without_mistakes_and_starts() {
 #[cfg(feature = "can")]
 fn a_piper_that_cannot_be_reached_or_leads_is_reported_in_one_line() {
     let home = Home::new();
-    let nowhere = "run coordinator-piper --no-record --set hardware.arm.address=nosuchcan7";
+    let nowhere = "run coordinator-piper --no-record --address arm=nosuchcan7";
     home.dimos(nowhere).with(3).says(&["nosuchcan7", "hint: "]);
     home.write(
         "leader.yaml",

@@ -104,7 +104,7 @@ fn a_failed_start_is_reported_with_its_exit_code() {
     let home = Home::new();
     home.dimos("run -d no-such-blueprint").with(2).says(&["error: ", "hint: "]);
     home.dimos(&format!("run -d {RUN} --set coordinator.tick_rate=-1")).with(2).says(&["tick_rate"]);
-    home.dimos(&format!("run -d {RUN} --name ../x")).with(1).says(&["cannot be the name of a run"]);
+    home.dimos(&format!("run -d {RUN} --name ../x")).with(2).says(&["cannot be the name of a run"]);
     let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
     let unreachable = format!("run -d coordinator-yourarm --set hardware.arm.address={port}");
     let ended = home.dimos(&unreachable).with(3).says(&["error: arm: ", "hint: "]);

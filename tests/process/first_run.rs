@@ -16,7 +16,7 @@ const THERE: &str = "move arm 0.3 -0.2 0.5 0 0.4 0";
 fn the_banner_tells_all_and_status_and_state_answer() {
     let home = Home::new();
     let run = home.run(RUN);
-    for part in ["run coordinator-yourarm  SIMULATED", "arm: SIMULATED, yourarm at sim, ready", "at exit: ", "100 Hz"] {
+    for part in ["run coordinator-yourarm  SIMULATED", "arm: SIMULATED, yourarm, ready", "at exit: ", "100 Hz"] {
         assert!(run.err().contains(part), "no {part:?} in\n{}", run.err());
     }
     let log = &home.logs()[0];

@@ -21,7 +21,7 @@ fn joints_are_in_status_and_in_the_log_and_are_read_rarely() {
     assert!((30.5..40.0).contains(&second["temperature"].as_f64().unwrap()), "{second}");
     let offset = second["calibration_offset"].as_f64().unwrap();
     assert!((offset - (-2.0_f64).to_radians()).abs() < 1e-6, "{offset} rad");
-    home.dimos("status").with(0).shows(&[
+    home.dimos("status -v").with(0).shows(&[
         "arm: temperature °C: 3",
         "arm: supply V: 48.0 48.0",
         "calibration offset rad: ",
@@ -36,7 +36,7 @@ fn joints_are_in_status_and_in_the_log_and_are_read_rarely() {
 
     arm.inject(Fault { joint: 3, ..Fault::new(FaultKind::MotorOff) }).unwrap();
     eventually("the drive's error", || joint(2)["error"] == 7);
-    home.dimos("status").with(0).shows(&["drive error: 0 0 7 0 0 0"]);
+    home.dimos("status -v").with(0).shows(&["the drive of arm_joint3 reports error 7", "drive error: 0 0 7 0 0 0"]);
     home.dimos("down").with(0);
     drop(run);
 

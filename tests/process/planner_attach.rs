@@ -107,7 +107,7 @@ fn every_verb_goes_on_addressing_one_run() {
     home.dimos("world move cup --at 0.6 0.6 0.6").with(0);
     home.dimos("world remove cup").with(0);
     home.dimos("plan arm --named hme").with(2).says(&["did you mean `home`?"]);
-    home.dimos("execute --plan 4711").with(1).says(&["UNKNOWN_PLAN"]);
+    home.dimos("execute --plan 4711").with(2).says(&["UNKNOWN_PLAN"]);
 
     // The run says who plans for it; the planner is not a run.
     let status = home.status();
@@ -184,7 +184,7 @@ fn a_run_that_goes_away_is_waited_for() {
     planner.until(AGAIN);
     // The world is as it was; the plans of the run that is gone are gone with it.
     assert!(home.dimos("world list").with(0).out.contains("post"));
-    home.dimos("execute").with(1).says(&["UNKNOWN_PLAN"]);
+    home.dimos("execute").with(1).says(&["NO_PLAN"]);
     home.dimos("move arm --named home").with(0).says(&["planned, collision-checked"]);
     // The same when the run has no time for a word, more than once.
     run.signal(Signal::KILL);
@@ -204,9 +204,10 @@ fn a_run_that_goes_away_is_waited_for() {
     planner.end(Signal::TERM).with(143);
     // One that waits for a run is ended like one that has one.
     let planner = self::planner(&home, "--duration 60s");
-    home.dimos("down cell").with(0);
+    home.dimos("down cell").with(0).says(&["planner lab waits for another run; to end it: dimos down lab"]);
     planner.until("FAULT: run cell");
-    home.dimos("down").with(0).says(&["planner lab ended"]);
+    home.dimos("down").with(1).says(&["no run is live; planners wait for one: lab", "hint: dimos down lab"]);
+    home.dimos("down lab").with(0).says(&["planner lab ended"]);
     planner.wait().with(143);
 }
 

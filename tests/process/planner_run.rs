@@ -174,13 +174,13 @@ fn what_cannot_be_planned_is_refused_in_words() {
         ("plan arm 9 0 0 0 0 0", 1, &["goal: arm_joint1 at 9.0000 rad is outside its limits", "hint: "]),
         ("plan arm 0 0 0", 2, &["arm has 6 joints, the goal 3 values"]),
         ("plan arm --named hme", 2, &["no named pose named `hme`", "did you mean `home`?"]),
-        ("plan amr --named home", 1, &["UNKNOWN_ROBOT", "did you mean `arm`?"]),
+        ("plan amr --named home", 2, &["UNKNOWN_ROBOT", "did you mean `arm`?"]),
         ("plan arm --pose 0.3 0 0.3 --quat 1 1 0 0", 2, &["goals[0].pose.quat has length 1.414"]),
         ("plan arm 0 0 0 0 0 0 --linear", 2, &["--pose <X> <Y> <Z>|--by <X> <Y> <Z>"]),
         ("plan arm", 2, &["required"]),
-        ("preview", 1, &["UNKNOWN_PLAN", "hint: `dimos plan` makes one"]),
-        ("preview 4711", 1, &["UNKNOWN_PLAN"]),
-        ("execute --plan 4711", 1, &["UNKNOWN_PLAN"]),
+        ("preview", 1, &["NO_PLAN", "hint: `dimos plan` makes one"]),
+        ("preview 4711", 2, &["UNKNOWN_PLAN"]),
+        ("execute --plan 4711", 2, &["UNKNOWN_PLAN"]),
     ];
     // The way home has made plans: the ones that are asked about here are gone with a new run.
     for (arguments, code, words) in table.iter().filter(|(arguments, ..)| *arguments != "preview") {
@@ -196,7 +196,7 @@ fn what_cannot_be_planned_is_refused_in_words() {
     fresh.write("lab.yaml", BLUEPRINT);
     let _run = fresh.run("lab.yaml --no-record");
     fresh.dimos("preview").with(1).says(table[10].2);
-    fresh.dimos("execute").with(1).says(&["UNKNOWN_PLAN"]);
+    fresh.dimos("execute").with(1).says(&["NO_PLAN"]);
 }
 
 #[test]
@@ -204,7 +204,12 @@ fn a_plan_is_refused_when_the_arm_or_the_world_is_not_as_it_was() {
     let (home, _run) = up();
     home.dimos("plan arm 0.8 -0.3 0.6 0 0.8 0").with(0);
     home.dimos("move arm 0.3 -0.3 0.6 0 0.8 0 --direct").with(0);
-    home.dimos("execute").with(1).says(&["START_STATE_MISMATCH", "the trajectory starts 0.3", "arm_joint1", "hint: "]);
+    home.dimos("execute").with(1).says(&[
+        "START_STATE_MISMATCH",
+        "the first point or target is 0.3",
+        "arm_joint1",
+        "hint: ",
+    ]);
     is_at(&home, "arm", &[0.3, -0.3, 0.6, 0.0, 0.8, 0.0]);
     // An obstacle that came after the plan.
     home.dimos("plan arm -0.6 -0.3 0.6 0 0.8 0").with(0);

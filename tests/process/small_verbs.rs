@@ -34,7 +34,7 @@ fn fed(home: &Home, arguments: &str) -> Started {
 #[test]
 fn watching_the_state_goes_on_until_nobody_reads() {
     let (home, run) = up();
-    let mut command = home.command("state --watch --json --rate 50");
+    let mut command = home.command("state --watch --json --hz 50");
     let mut watch = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
     let mut lines = BufReader::new(watch.stdout.take().unwrap()).lines();
     let states: Vec<Value> = (0..5).map(|_| serde_json::from_str(&lines.next().unwrap().unwrap()).unwrap()).collect();
@@ -43,12 +43,12 @@ fn watching_the_state_goes_on_until_nobody_reads() {
     drop(lines);
     assert!(watch.wait().unwrap().success(), "its reader has gone");
 
-    let tables = home.start("state --watch --rate 50");
+    let tables = home.start("state --watch --hz 50");
     eventually("tables follow each other", || tables.out().matches("JOINT").count() > 3);
     assert!(!tables.out().contains('\x1b'), "no terminal, no redraw");
     run.end(Signal::TERM);
     tables.wait().with(1).says(&["error: run \"verbs\"", "hint: "]);
-    home.dimos("state --rate 5").with(2);
+    home.dimos("state --hz 5").with(2);
 }
 
 #[test]
@@ -139,7 +139,7 @@ fn targets_are_streamed_from_a_file() {
     let (home, _run) = up();
     let ramp: String = (0..=50).map(|i| format!("{}, {}\n", f64::from(i) * 0.004, f64::from(i) * -0.002)).collect();
     home.write("ramp.csv", &format!("# two joints\n\n{ramp}"));
-    let said = home.dimos("task stream servo_arm ramp.csv --rate 100 --json").with(0).json();
+    let said = home.dimos("task stream servo_arm ramp.csv --hz 100 --json").with(0).json();
     assert_eq!((&said["task"], &said["targets"]), (&"servo_arm".into(), &51.into()));
     assert!(said["seconds"].as_f64().unwrap() >= 0.5, "{said}");
     eventually("the last target is reached and held", || {
@@ -197,7 +197,7 @@ fn targets_are_streamed_from_stdin_and_a_stream_that_ends_leaves_the_arm_at_rest
 fn a_streamer_that_is_killed_gives_up_its_lease_and_its_stream_goes_stale() {
     let (home, _run) = up();
     let mut watcher = home.client();
-    let mut stream = fed(&home, "task stream velocity_arm --rate 50");
+    let mut stream = fed(&home, "task stream velocity_arm --hz 50");
     let mut input = stream.stdin();
     let mut feed = || input.write_all(b"0.1 0\n").unwrap();
     eventually("the arm moves", || {
@@ -220,15 +220,141 @@ fn completions_and_manual_know_the_verbs() {
     let home = Home::new();
     for shell in ["bash", "zsh", "fish"] {
         let script = home.dimos(&format!("completions {shell}")).with(0).out;
-        assert!(script.contains("list-adapters") && script.contains("gripper"), "{shell}");
+        assert!(script.contains("DIMOS_COMPLETE") && script.contains("dimos"), "{shell}: {script}");
     }
     home.dimos("completions tcsh").with(2);
     let page = home.dimos("man").with(0).out;
     assert!(page.starts_with(".ie") && page.contains("list\\-adapters"), "{page}");
     home.dimos("man --dir pages").with(0);
     for page in ["dimos.1", "dimos-move.1", "dimos-task-stream.1"] {
-        assert!(home.path().join("pages").join(page).exists(), "{page}");
+        let text = std::fs::read_to_string(home.path().join("pages").join(page)).unwrap();
+        for section in ["EXIT STATUS", "FILES", "ENVIRONMENT"] {
+            assert!(
+                text.contains(&format!(".SH \"{section}\"")) || text.contains(&format!(".SH {section}")),
+                "{page}: {section}"
+            );
+        }
+        assert!(text.contains("EXAMPLES") || page.contains("stream"), "{page}");
+        assert!(!text.contains("EXTRA"), "{page}");
     }
+}
+
+/// bash itself completes: with the script that `dimos completions bash` prints, words as its readline has them.
+#[test]
+fn bash_completes_what_exists_now() {
+    let (home, _run) = up();
+    let offered = |line: &str| -> Vec<String> {
+        let words: Vec<&str> = line.split(' ').collect();
+        let script = format!(
+            "source <(dimos completions bash); COMP_WORDS=({line} {empty}); COMP_CWORD={at}; COMP_TYPE=9; \
+             _clap_complete_dimos dimos \"{last}\" x; echo -n \"${{COMPREPLY[*]}}\"",
+            empty = if line.ends_with(' ') { "''" } else { "" },
+            at = words.len() - 1,
+            last = words.last().unwrap(),
+        );
+        let mut bash = std::process::Command::new("bash");
+        let program = std::path::Path::new(env!("CARGO_BIN_EXE_dimos")).parent().unwrap();
+        let path = std::env::join_paths(
+            [program.to_owned()].into_iter().chain(std::env::split_paths(&std::env::var_os("PATH").unwrap())),
+        );
+        let ended = Started::of(home.settle(bash.args(["-c", &script]).env("PATH", path.unwrap()))).wait().with(0);
+        assert_eq!(ended.err, "", "{line}");
+        ended.out.split([' ', '\u{b}', '\n']).map(str::to_owned).collect()
+    };
+    let has = |line: &str, word: &str| {
+        let offered = offered(line);
+        assert!(offered.iter().any(|w| w == word), "{line:?}: no {word} in {offered:?}");
+    };
+    has("dimos run coord", "coordinator-xarm6");
+    has("dimos run verb", "verbs.yaml");
+    has("dimos down ", "verbs");
+    has("dimos state --run ", "verbs");
+    has("dimos move ", "bare");
+    has("dimos arm gripper ", "arm");
+    has("dimos task stream serv", "servo_arm");
+    has("dimos adapter test you", "yourarm");
+    has("dimos jo", "jog");
+}
+
+/// A failed write to stdout is a failure; a closed pipe is none.
+#[test]
+fn what_could_not_be_printed_is_an_error() {
+    let (home, _run) = up();
+    home.write("log.txt", "");
+    let full = || Stdio::from(std::fs::File::options().write(true).open("/dev/full").unwrap());
+    let verbs = [
+        "status",
+        "status --json",
+        "state",
+        "state --watch",
+        "state --json",
+        "task list",
+        "list-adapters",
+        "list-blueprints",
+        "list-blueprints --json",
+        "check verbs.yaml",
+        "check verbs.yaml --json",
+        "schema",
+        "schema --rpc",
+        "completions bash",
+        "man",
+        "doctor",
+        "model info builtin:yourarm",
+        "model expand builtin:yourarm",
+        "model tree builtin:yourarm",
+        "model fk builtin:yourarm 0 0 0 0 0 0",
+        "cancel --json",
+        "arm reset arm",
+        "stop --json",
+        "adapter emulate yourarm --fault list",
+        "state --run nope --json",
+        "--help",
+        "--version",
+    ];
+    for verb in verbs {
+        let mut command = home.command(verb);
+        let mut child = command.stdout(full()).stderr(Stdio::piped()).spawn().unwrap();
+        let mut said = String::new();
+        std::io::Read::read_to_string(&mut child.stderr.take().unwrap(), &mut said).unwrap();
+        let code = child.wait().unwrap().code();
+        let expected = if verb.contains("nope") { 2 } else { 1 };
+        assert_eq!(code, Some(expected), "{verb}: {said}");
+        assert!(said.contains("No space left on device") || said.contains("no space left"), "{verb}: {said}");
+    }
+    for verb in ["status", "list-adapters", "man", "schema"] {
+        let (reader, writer) = std::io::pipe().unwrap();
+        drop(reader);
+        let ended = home.command(verb).stdout(writer).stderr(Stdio::null()).status().unwrap();
+        assert_eq!(ended.code(), Some(0), "{verb}");
+    }
+}
+
+#[test]
+fn errors_of_json_are_json_and_positional_names_select_a_run() {
+    let (home, _run) = up();
+    let error = |line: &str, exit: i32| home.dimos(line).with(exit).json()["error"].take();
+    let unknown = error("move rarm 0 0 --json", 2);
+    assert_eq!(
+        (&unknown["code"], &unknown["hint"]),
+        (&"UNKNOWN_ARM".into(), &"did you mean `arm`?".into()),
+        "{unknown}"
+    );
+    assert_eq!(error("state --run nope --json", 2)["code"], "USAGE");
+    assert_eq!(error("move arm home --json", 2)["message"].as_str().unwrap().matches("--named home").count(), 1);
+    assert_eq!(error("plan arm 0 0 --json", 1)["code"], "NO_PLANNER");
+    assert_eq!(error("run nope --json", 2)["code"], "USAGE");
+    home.write("bad.yaml", "hardware: [{hardware_id: arm, adapter_type: mokc, joints: {prefix: arm, count: 2}}]");
+    let wrong = error("run bad.yaml --json", 2);
+    assert_eq!(wrong["data"]["errors"], 1, "{wrong}");
+    home.dimos("run verbs.yaml --name bad/.. --no-record").with(2);
+
+    assert!(home.dimos("status verbs").with(0).out.starts_with("run verbs  SIMULATED"), "mock arms are in memory");
+    assert_eq!(home.dimos("status verbs --json").with(0).json()["run"], "verbs");
+    home.dimos("status nope").with(2);
+    for entry in home.dimos("status --json").with(0).json().as_array().unwrap() {
+        assert!(["run", "pid", "state", "arms", "log"].iter().all(|key| entry.get(key).is_some()), "{entry}");
+    }
+    home.dimos("state --watch --rate 50 --json --run nope").with(2);
 }
 
 #[test]

@@ -111,7 +111,7 @@ fn list_faults(args: &Args, row: &AdapterSpec) -> Result {
     // At an address that disturbs no other program; for a bus, one with the faults that it can play on any.
     let place = if row.transport == "can" { EmulatorAddress::Pty } else { EmulatorAddress::InProcess };
     let (emulator, _) = start(args, row, &place)?;
-    let mut table = Table::new(&["KIND", "WHAT GOES WRONG"]);
+    let mut table = Table::new(&["KIND", "~WHAT GOES WRONG"]);
     for (kind, about) in FaultKind::all() {
         // One in the far future only asks whether it can be played.
         if emulator.inject(Fault::new(kind).at(1e6)).is_ok() {
@@ -182,8 +182,8 @@ fn announce(args: &Args, row: &AdapterSpec, dof: usize, address: &str, registry:
         _ => address.to_owned(),
     };
     let program = program();
-    let command = runnable(args, row, dof, &given, registry)
-        .map(|name| format!("{program} run {name} --set hardware.arm.address={given}"));
+    let command =
+        runnable(args, row, dof, &given, registry).map(|name| format!("{program} run {name} --address arm={given}"));
     if args.json {
         output::json(&json!({
             "event": "started",
@@ -225,7 +225,7 @@ fn runnable(args: &Args, row: &AdapterSpec, dof: usize, address: &str, registry:
     names.into_iter().find(|name| {
         let Ok(found) = blueprint::find(name) else { return false };
         let set = vec![format!("hardware.arm.address={address}")];
-        let loaded = blueprint::load(&found, &blueprint::Overrides { set, sim: false }, registry);
+        let loaded = blueprint::load(&found, &blueprint::Overrides { set, ..Default::default() }, registry);
         let model = |arm: &blueprint::Arm| arm.options.get("model").and_then(Value::as_str).map(str::to_owned);
         let fits = |arm: &blueprint::Arm| {
             arm.adapter_type == row.name

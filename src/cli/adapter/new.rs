@@ -29,15 +29,15 @@ const REPOSITORY: &str = env!("CARGO_PKG_REPOSITORY");
 /// Arguments of `adapter new`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
-Writes a crate of its own, DIR/NAME: an adapter, an emulator, tests, a robot description, two
-blueprints, and a program that is `dimos` with one arm more. It compiles, passes the conformance
-suite, runs and plans at once, with a made-up wire format and a made-up shape: search it for
+Writes a crate of its own, DIR/NAME: an adapter, an emulator, tests, a robot description, two \
+blueprints, and a program that is `dimos` with one arm more. It compiles, passes the conformance \
+suite, runs and plans at once, with a made-up wire format and a made-up shape: search it for \
 `YOUR ARM`. Nothing is ever written over.
 
   dimos adapter new acme --dof 6 --transport tcp
   cd acme && cargo test && cargo run -- run coordinator-acme
 
-With --in-tree the same goes into a checkout of dimos: src/hardware/arms/NAME, assets/robots and
+With --in-tree the same goes into a checkout of dimos: src/hardware/arms/NAME, assets/robots and \
 blueprints. It prints the lines that you add to the tables of arms and of robots.
 
 docs/adding-an-arm.md goes through it step by step.")]

@@ -27,7 +27,7 @@ const WATCH: Duration = Duration::from_secs(2);
 /// Arguments of `adapter test`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
-Without --allow-motion nothing is enabled and nothing moves. With it, and only when no check failed, after a question,
+Without --allow-motion nothing is enabled and nothing moves. With it, and only when no check failed, after a question, \
 each joint goes 2° to either side and back, one after the other, at 5 % of its top speed; whatever is odd, and Ctrl-C, ends that by a stop.
 With --lag this motion is streamed as setpoints, and the lag is measured: the time from a setpoint to the motion that follows it.
 Stay within reach of the arm's own E-stop button.

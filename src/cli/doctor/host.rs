@@ -19,9 +19,9 @@ const MIN_FREE_SPACE: u64 = 1 << 30;
 const FAST_CLOCKS: &[&str] = &["tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter"];
 
 const RT_KERNEL: &str = "sudo apt install linux-image-rt-amd64      # Debian; Ubuntu: sudo pro enable realtime-kernel";
-const RTPRIO: &str = "sudo groupadd -f realtime && sudo usermod -aG realtime $USER && echo '@realtime - rtprio 95' | sudo tee -a /etc/security/limits.d/99-realtime.conf      # then log in again";
-const MEMLOCK: &str = "sudo groupadd -f realtime && sudo usermod -aG realtime $USER && echo '@realtime - memlock unlimited' | sudo tee -a /etc/security/limits.d/99-realtime.conf      # then log in again";
-const LATENCY: &str = "echo 'KERNEL==\"cpu_dma_latency\", GROUP=\"realtime\", MODE=\"0660\"' | sudo tee /etc/udev/rules.d/99-cpu-dma-latency.rules && sudo udevadm control --reload && sudo udevadm trigger --name-match=cpu_dma_latency";
+const RTPRIO: &str = "sudo groupadd -f realtime && sudo usermod -aG realtime $USER && echo '@realtime - rtprio 95' | sudo tee -a /etc/security/limits.d/90-realtime.conf      # then log in again";
+const MEMLOCK: &str = "sudo groupadd -f realtime && sudo usermod -aG realtime $USER && echo '@realtime - memlock unlimited' | sudo tee -a /etc/security/limits.d/90-realtime.conf      # then log in again";
+const LATENCY: &str = "echo 'KERNEL==\"cpu_dma_latency\", GROUP=\"realtime\", MODE=\"0660\"' | sudo tee /etc/udev/rules.d/90-cpu-dma-latency.rules && sudo udevadm control --reload && sudo udevadm trigger --name-match=cpu_dma_latency";
 const GOVERNOR: &str = "echo performance | sudo tee /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor";
 const CLOCK: &str = "echo tsc | sudo tee /sys/devices/system/clocksource/clocksource0/current_clocksource      # lasts until the next boot";
 
@@ -85,9 +85,12 @@ impl Host {
         match limit {
             _ if self.has_capability(23) => Finding::ok("rtprio", "any priority (CAP_SYS_NICE)"),
             None => Finding::ok("rtprio", "any priority"),
-            Some(most) => {
-                Finding::of(most >= wanted, "rtprio", format!("priorities up to {most}, {wanted} are used"), RTPRIO)
-            }
+            Some(most) => Finding::of(
+                most >= wanted,
+                "rtprio",
+                format!("real-time priorities up to {most} are allowed; a run uses up to {wanted}"),
+                RTPRIO,
+            ),
         }
     }
 
@@ -208,7 +211,7 @@ fn sockets() -> Finding {
         Ok(claim) => {
             drop(claim);
             let live = folder.runs().map_or(0, |runs| runs.len());
-            Finding::ok(check, format!("{shown}, {live} live runs"))
+            Finding::ok(check, format!("{shown}, {live} live {}", if live == 1 { "run" } else { "runs" }))
         }
         Err(e) => Finding::bad(check, e.to_string(), e.hint()),
     }

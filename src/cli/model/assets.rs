@@ -46,10 +46,10 @@ struct BlueprintArgs {
 impl BlueprintArgs {
     fn load(&self, catalog: Catalog<'_>) -> Result<Blueprint> {
         let set = self.set.iter().map(|(path, value)| format!("{path}={value}")).collect();
-        let loaded = check::load(&self.blueprint, &Overrides { set, sim: false }, catalog)?;
+        let loaded = check::load(&self.blueprint, &Overrides { set, ..Overrides::default() }, catalog)?;
         match loaded.blueprint {
             Some(blueprint) => Ok(blueprint),
-            None => Err(check::refuse(&loaded)),
+            None => Err(check::mistakes(&loaded)),
         }
     }
 }

@@ -105,7 +105,7 @@ fn print_semantics(robot: &RobotModel, semantics: &Semantics) {
         return;
     }
     output::line("");
-    let mut table = Table::new(&["GROUP", "JOINTS"]);
+    let mut table = Table::new(&["GROUP", "~JOINTS"]);
     for group in &semantics.groups {
         table.row([group.name.clone(), joint_names(robot, semantics, &group.name).join(" ")]);
     }

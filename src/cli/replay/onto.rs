@@ -11,7 +11,7 @@ use serde::Serialize;
 
 use super::ReplayArgs;
 use super::player::Part as Span;
-use crate::blueprint::{Blueprint, Catalog, Overrides};
+use crate::blueprint::{Blueprint, Catalog};
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::follow::{Signals, show_deviation};
 use crate::cli::text_log::Terminal;
@@ -36,8 +36,7 @@ const REST_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Drives the arms of a blueprint along a part of a log.
 pub fn run(args: &ReplayArgs, onto: &str, log: &Path, span: &Span, catalog: Catalog<'_>) -> Result {
-    let set = args.onto.set.iter().map(|(path, value)| format!("{path}={value}")).collect();
-    let loaded = check::load_to_run(onto, &Overrides { set, sim: args.onto.sim }, catalog)?;
+    let loaded = check::load_to_run(onto, &args.onto.changes.overrides(), catalog)?;
     let Some(mut blueprint) = loaded.blueprint.clone() else { return Err(check::refuse(&loaded)) };
     check::print_warnings(&loaded);
     let motion = RecordedMotion::read(log, span.from, span.to).map_err(split)?;
@@ -105,7 +104,7 @@ impl From<Failure> for End {
 impl From<RpcError> for End {
     fn from(error: RpcError) -> Self {
         let what = format!("{} [{}]", error.message, error.code.name());
-        Self::Failed(Failure { exit: Exit::Failed, what, hint: error.hint })
+        Self::Failed(Failure::new(Exit::Failed, what).maybe_hint(error.hint))
     }
 }
 

@@ -49,7 +49,7 @@ fn child_whose_tick_breaks() {
     let (how, address) = how.split_once(' ').map(|(how, address)| (how.to_owned(), address.to_owned())).unwrap();
     let found = dimos::blueprint::find(RUN).ok().unwrap();
     let set = vec![format!("hardware.arm.address={address}")];
-    let overrides = dimos::blueprint::Overrides { set, sim: false };
+    let overrides = dimos::blueprint::Overrides { set, ..Default::default() };
     let loaded = dimos::blueprint::load(&found, &overrides, &Registry::with(&[]));
     let (broken, broke) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU64::new(0)));
     let (flag, when) = (broken.clone(), broke.clone());

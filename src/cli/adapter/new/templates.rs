@@ -205,7 +205,7 @@ mod tests {
         assert!(planner.contains("joint_names: [joint1, joint2, joint3, joint4, joint5, joint6, joint7, joint8]"));
         assert!(planner.contains("home: [0, 0.4, 0, 0.4, 0, 0.4, 0, 0.4]"), "{planner}");
         assert!(text("robots/acme_2.urdf").contains("<robot name=\"acme_2\">"));
-        assert!(text("README.md").contains("hardware.arm.address=can0"));
+        assert!(text("README.md").contains("--address arm=can0"));
         assert!(files.iter().all(|(_, text)| !text.contains("acme_2_2") && !text.contains("DIMOS")));
     }
 

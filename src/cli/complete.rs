@@ -1,0 +1,151 @@
+//! Completion by the shell: at each Tab the script that `dimos completions` prints calls this program with the words
+//! typed so far, and it answers with what exists now: blueprints, runs, arms, tasks, named poses, objects, adapters.
+
+use std::collections::BTreeSet;
+use std::ffi::OsStr;
+use std::sync::OnceLock;
+use std::sync::mpsc::channel;
+use std::time::Duration;
+
+use clap::{Arg, Command};
+use clap_complete::CompleteEnv;
+use clap_complete::engine::{
+    ArgValueCandidates, ArgValueCompleter, CompletionCandidate, PathCompleter, ValueCompleter,
+};
+
+use super::run_record::RunRecord;
+use crate::blueprint::{self, Catalog};
+use crate::rpc::api::{Planner, Status, World};
+use crate::rpc::client::Client;
+use crate::rpc::report::StatusReport;
+use crate::rpc::run_dir::RunDir;
+
+/// Environment variable by which the script asks for completions; its value is the shell.
+pub const VARIABLE: &str = "DIMOS_COMPLETE";
+/// Maximum wait for the runs: a Tab must not hang with one of them.
+const TIMEOUT: Duration = Duration::from_millis(500);
+
+/// Names of the adapters of this program.
+static ADAPTERS: OnceLock<Vec<String>> = OnceLock::new();
+
+/// Answers the shell and exits if it asks for completions. Call it before any thread is started: it removes
+/// [`VARIABLE`] from the environment.
+pub fn answer(catalog: Catalog<'_>) {
+    let _ = ADAPTERS.set(catalog.adapters.names().into_iter().map(|name| name.to_string()).collect());
+    CompleteEnv::with_factory(|| with_candidates(super::command())).var(VARIABLE).complete();
+}
+
+/// Returns the command line with the candidates of each argument's values.
+fn with_candidates(command: Command) -> Command {
+    let verb = command.get_name().to_owned();
+    command.mut_args(|arg| candidates(&verb, arg)).mut_subcommands(with_candidates)
+}
+
+fn candidates(verb: &str, arg: Arg) -> Arg {
+    let of = |all: fn() -> BTreeSet<String>| {
+        ArgValueCandidates::new(move || all().into_iter().map(CompletionCandidate::new).collect())
+    };
+    let value = arg.get_value_names().and_then(|names| names.first()).map(|name| name.as_str().to_owned());
+    match (arg.get_id().as_str(), verb) {
+        ("blueprint", _) => arg.add(ArgValueCompleter::new(blueprints as fn(&OsStr) -> Vec<CompletionCandidate>)),
+        ("arm" | "robot", _) => arg.add(of(arms)),
+        ("task", _) => arg.add(of(tasks)),
+        ("named", _) => arg.add(of(named_poses)),
+        ("run" | "attach", _) if arg.get_action().takes_values() => arg.add(of(runs)),
+        ("name", "down" | "status") => arg.add(of(runs_and_planners)),
+        ("name", "logs") => arg.add(of(recorded_runs)),
+        ("name", "move" | "remove" | "attach" | "detach") => arg.add(of(objects)),
+        ("name", "test" | "emulate") => arg.add(of(adapters)),
+        _ if value.as_deref() == Some("ADAPTER") => arg.add(of(adapters)),
+        _ => arg,
+    }
+}
+
+fn adapters() -> BTreeSet<String> {
+    ADAPTERS.get().into_iter().flatten().cloned().collect()
+}
+
+/// Returns the blueprints that are run by name, and YAML files.
+fn blueprints(typed: &OsStr) -> Vec<CompletionCandidate> {
+    let typed_text = typed.to_string_lossy();
+    let names = blueprint::names().into_iter().filter(|name| name.starts_with(&*typed_text));
+    let is_yaml = |path: &std::path::Path| path.extension().is_some_and(|e| e == "yaml" || e == "yml");
+    let files = PathCompleter::any().filter(is_yaml).complete(typed);
+    names.map(CompletionCandidate::new).chain(files).collect()
+}
+
+fn runs() -> BTreeSet<String> {
+    RunDir::standard().runs().unwrap_or_default().into_iter().map(|run| run.name).collect()
+}
+
+fn runs_and_planners() -> BTreeSet<String> {
+    let planners = super::attach::live().into_iter().map(|planner| planner.name);
+    runs().into_iter().chain(planners).collect()
+}
+
+fn recorded_runs() -> BTreeSet<String> {
+    RunRecord::all().into_iter().map(|record| record.run).chain(runs()).collect()
+}
+
+fn arms() -> BTreeSet<String> {
+    statuses().into_iter().flat_map(|status| status.arms).map(|arm| arm.hardware_id).collect()
+}
+
+fn tasks() -> BTreeSet<String> {
+    statuses().into_iter().flat_map(|status| status.tasks).map(|task| task.name).collect()
+}
+
+fn statuses() -> Vec<StatusReport> {
+    of_each_run(|client| client.call(Status {}).ok())
+}
+
+fn named_poses() -> BTreeSet<String> {
+    let replies = of_each_run(|client| client.call(Planner {}).ok());
+    replies.into_iter().flat_map(|reply| reply.robots).flat_map(|robot| robot.named_poses.into_keys()).collect()
+}
+
+fn objects() -> BTreeSet<String> {
+    let replies = of_each_run(|client| client.call(World {}).ok());
+    replies.into_iter().flat_map(|reply| reply.objects).map(|object| object.name).collect()
+}
+
+/// Asks each live run; those that have not answered within [`TIMEOUT`] are left out.
+fn of_each_run<T: Send + 'static>(ask: fn(&mut Client) -> Option<T>) -> Vec<T> {
+    let (sender, replies) = channel();
+    let live = RunDir::standard().runs().unwrap_or_default();
+    for run in live {
+        let sender = sender.clone();
+        std::thread::spawn(move || {
+            if let Some(reply) = Client::connect(&run.name, &run.socket).ok().as_mut().and_then(ask) {
+                let _ = sender.send(reply);
+            }
+        });
+    }
+    drop(sender);
+    let until = std::time::Instant::now() + TIMEOUT;
+    let next = || replies.recv_timeout(until.saturating_duration_since(std::time::Instant::now())).ok();
+    std::iter::from_fn(next).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What the engine offers for the last of these words.
+    fn offered(words: &[&str]) -> Vec<String> {
+        let mut command = with_candidates(crate::cli::command());
+        let arguments = words.iter().map(|word| (*word).into()).collect();
+        let found = clap_complete::engine::complete(&mut command, arguments, words.len() - 1, None).unwrap();
+        found.iter().map(|candidate| candidate.get_value().to_string_lossy().into_owned()).collect()
+    }
+
+    #[test]
+    fn blueprints_and_adapters_are_offered() {
+        assert!(offered(&["dimos", "run", "coordinator-x"]).contains(&"coordinator-xarm6".to_owned()));
+        let _ = ADAPTERS.set(vec!["xarm".into(), "yourarm".into()]);
+        assert_eq!(offered(&["dimos", "adapter", "test", "you"]), ["yourarm"]);
+        assert_eq!(offered(&["dimos", "arm", "calibrate", "xa"]), ["xarm"]);
+        assert_eq!(offered(&["dimos", "list-ad"]), ["list-adapters"]);
+        assert!(offered(&["dimos", "run", "x", "--addr"]).contains(&"--address".to_owned()));
+    }
+}
