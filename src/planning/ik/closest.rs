@@ -28,7 +28,8 @@ const SAME_BRANCH: f64 = 0.3;
 
 impl Ik<'_> {
     /// Same as [`Ik::solve`], but searches for the closest solution to `near` in a bounded number of attempts: for six
-    /// joints all branches are usually found, for more the closest point of each branch. Takes about five times as long.
+    /// joints all branches are usually found, for more the closest point of each branch. Takes up to eight times as
+    /// long.
     pub fn closest(
         &mut self,
         target: &DAffine3,
