@@ -65,7 +65,9 @@ fn table(reply: &PreviewReply) -> Table {
     for (arm, path) in &reply.end_effectors {
         for (axis, letter) in ["x", "y", "z"].iter().enumerate() {
             let at = |i: &usize| path.get(*i).and_then(|xyz| xyz.get(axis)).copied();
-            table.row([format!("{arm}: {} {letter}", tcp(arm))].into_iter().chain(shown.iter().map(|i| number(at(i), 3))));
+            table.row(
+                [format!("{arm}: {} {letter}", tcp(arm))].into_iter().chain(shown.iter().map(|i| number(at(i), 3))),
+            );
         }
     }
     table

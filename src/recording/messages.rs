@@ -243,7 +243,7 @@ message! {
         has_effort: bool,
         /// Gripper position [m, or rad for a rotary gripper]; empty if not reported.
         gripper: Vec<f64>,
-        /// The device's own pose, of its flange in its base: x, y, z [m], roll, pitch, yaw [rad]; empty if not reported.
+        /// The device's pose, of its flange in its base: x, y, z [m], roll, pitch, yaw [rad]; empty if not reported.
         pose: Vec<f64>,
         /// Force [N] and torque [Nm] at the sensor; empty if not reported.
         wrench: Vec<f64>,

@@ -98,10 +98,7 @@ fn a_printed_pose_is_where_the_arm_is() {
     assert!(all.len() >= 5, "{:?}", all.iter().map(|(name, _)| name).collect::<Vec<_>>());
     let tool = from_xyz_rpy([0.02, -0.01, 0.11], [0.1, -0.7, 1.2]);
     for (name, mut config) in all {
-        config
-            .robots
-            .iter_mut()
-            .for_each(|robot| robot.base_pose = robot.base_pose * from_xyz_rpy([0.0, 0.0, 0.1], [0.0, 0.0, 0.4]));
+        config.robots.iter_mut().for_each(|robot| robot.base_pose *= from_xyz_rpy([0.0, 0.0, 0.1], [0.0, 0.0, 0.4]));
         for tool in [None, Some(tool)] {
             config.robots.iter_mut().for_each(|robot| robot.tool = tool);
             let scene = PlanningScene::load(&config).unwrap();
@@ -167,7 +164,7 @@ fn a_tool_is_where_a_pose_goal_brings_it() {
     let own = at(&scene.robots[0], &home);
     assert!((own.translation.vector - (bare * tool).translation.vector).norm() < 1e-9);
     let goal = own * from_xyz_rpy([0.0; 3], [0.0, 0.0, 0.3]);
-    let found = plan(&scene, &[home.clone()], 0, goal).unwrap();
+    let found = plan(&scene, std::slice::from_ref(&home), 0, goal).unwrap();
     let to = at(&scene.robots[0], found.path.last().unwrap());
     assert!((to.translation.vector - own.translation.vector).norm() < 1e-4, "{to} for {goal}");
     assert!(to.rotation.angle_to(&goal.rotation) < 1e-3);
