@@ -438,7 +438,7 @@ fn a_goal_at_a_limit_is_refused_when_it_is_planned() {
             assert!(goal.as_array().unwrap().iter().all(|q| q.as_f64().unwrap().abs() <= 1.49 + 1e-9), "{goal}");
             home.dimos("execute").with(0);
         } else {
-            planned.with(1).says(&["no IK solution after"]);
+            planned.with(1).shows(&["no IK solution after"]);
         }
     }
 }
