@@ -268,7 +268,8 @@ fn command_line(catalog: Catalog<'_>) -> ExitCode {
     };
     let exit = result.unwrap_or_else(|failure| {
         match json {
-            true => output::json(&failure.to_json()),
+            // Not on stdout, which may have data already: a motion that was aborted has its report there.
+            true => output::note(failure.to_json()),
             false => output::failure(&failure),
         }
         failure.exit

@@ -145,7 +145,7 @@ fn coordinator_piper_xarm() {
     exercise("coordinator-piper-xarm", &arms);
 }
 
-/// Everything that `dimos list-blueprints` offers runs as it stands, without hardware: with emulated arms.
+/// Everything that `dimos list-blueprints` offers runs unchanged and without hardware: with emulated arms.
 #[test]
 fn every_shipped_blueprint_is_without_mistakes_and_starts() {
     let home = Home::new();

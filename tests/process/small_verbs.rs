@@ -332,7 +332,11 @@ fn what_could_not_be_printed_is_an_error() {
 #[test]
 fn errors_of_json_are_json_and_positional_names_select_a_run() {
     let (home, _run) = up();
-    let error = |line: &str, exit: i32| home.dimos(line).with(exit).json()["error"].take();
+    let error = |line: &str, exit: i32| {
+        let ended = home.dimos(line).with(exit);
+        assert_eq!(ended.out, "", "{line}");
+        serde_json::from_str::<Value>(ended.err.lines().last().unwrap()).unwrap()["error"].take()
+    };
     let unknown = error("move rarm 0 0 --json", 2);
     assert_eq!(
         (&unknown["code"], &unknown["hint"]),
