@@ -66,7 +66,9 @@ fn table(reply: &PreviewReply) -> Table {
         for (axis, letter) in ["x", "y", "z"].iter().enumerate() {
             let at = |i: &usize| path.get(*i).and_then(|xyz| xyz.get(axis)).copied();
             table.row(
-                [format!("{arm}: {} in map {letter}", tcp(arm))].into_iter().chain(shown.iter().map(|i| number(at(i), 3))),
+                [format!("{arm}: {} in map {letter}", tcp(arm))]
+                    .into_iter()
+                    .chain(shown.iter().map(|i| number(at(i), 3))),
             );
         }
     }

@@ -12,7 +12,7 @@ fn limiter() -> Limiter {
 /// What was commanded is reported in the unit of the limit that applied, also of a velocity.
 #[test]
 fn a_limited_velocity_is_reported_in_the_unit_of_its_limit() {
-    let by = |target: f64, at: f64| limiter().follow_velocity(target, (at, at), DT).unwrap().by;
+    let by = |target: f64, at: f64| limiter().follow_velocity(target, (at, at), DT, 1.0).unwrap().by;
     assert_eq!(by(0.2, 0.0), Some((LimitKind::Acceleration, 0.2 / DT)), "rad/s²: 0.2 rad/s within one tick");
     assert_eq!(by(1.6, 0.0), Some((LimitKind::Velocity, 1.6)), "rad/s");
     assert_eq!(by(0.5, 1.9999), Some((LimitKind::Position, 1.9999 + 0.5 * DT)), "rad");

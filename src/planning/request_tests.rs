@@ -16,7 +16,14 @@ fn scene(robots: Vec<RobotConfig>, objects: Vec<ObjectConfig>) -> PlanningScene 
 }
 
 fn ask(scene: &PlanningScene, goal: Goal, start: &[f64]) -> Result<PlannedMotion, String> {
-    let request = PlanRequest { goals: vec![(0, goal)], positions: vec![start.to_vec()], speed: 1.0, seed: 0 };
+    let request = PlanRequest {
+        goals: vec![(0, goal)],
+        positions: vec![start.to_vec()],
+        speed: 1.0,
+        seed: 0,
+        through: Vec::new(),
+        blend: 0.0,
+    };
     solve(scene, &scene.world, &request, &Stop::never()).map_err(|failure| failure.what)
 }
 

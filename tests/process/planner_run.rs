@@ -168,14 +168,14 @@ fn what_cannot_be_planned_is_refused_in_words() {
     let (home, _run) = up();
     home.dimos("world add box --box 0.1 0.1 0.2 --at 0.4 0 0.1").with(0);
     let table: &[(&str, i32, &[&str])] = &[
-        ("plan arm --pose 0.4 0 0.1", 1, &["the goal collides: link \"arm/", "mm deep in obstacle \"box\"", "hint: "]),
+        ("plan arm --pose 0.4 0 0.1", 1, &["the goal collides: link \"arm/", " m deep in obstacle \"box\"", "hint: "]),
         ("plan arm 0 1.5 1.5 0 0 0", 1, &["the goal collides: link \"arm/", "deep in link \"arm/"]),
-        ("plan arm --pose 5 0 0.3 --rpy 0 0 0", 1, &["arm: no IK solution after ", "mm", "hint: "]),
+        ("plan arm --pose 5 0 0.3 --rpy 0 0 0", 1, &["arm: no IK solution after ", " m and ", "hint: "]),
         ("plan arm 9 0 0 0 0 0", 1, &["goal: arm_joint1 at 9.0000 rad is outside its limits", "hint: "]),
         ("plan arm 0 0 0", 2, &["arm has 6 joints, the goal 3 values"]),
         ("plan arm --named hme", 2, &["no named pose named `hme`", "did you mean `home`?"]),
         ("plan amr --named home", 2, &["UNKNOWN_ROBOT", "did you mean `arm`?"]),
-        ("plan arm --pose 0.3 0 0.3 --quat 1 1 0 0", 2, &["goals[0].pose.quat has length 1.414"]),
+        ("plan arm --pose 0.3 0 0.3 --quat 1 1 0 0", 2, &["pose.quat has length 1.414"]),
         ("plan arm 0 0 0 0 0 0 --linear", 2, &["--pose <X> <Y> <Z>|--by <X> <Y> <Z>"]),
         ("plan arm", 2, &["required"]),
         ("preview", 1, &["NO_PLAN", "hint: `dimos plan` makes one"]),
@@ -461,10 +461,10 @@ fn several_arms_are_sent_together_from_the_command_line() {
     home.dimos("plan --goal left=pose:0.35,0.4,0.3,3.14,0,0 --goal right=pose:0.35,-0.4,0.3").with(0);
     home.dimos("plan --goal left=pose:0.35,0.4,0.3,1,0,0,0").with(0);
     for (arguments, words) in [
-        ("plan --goal left", "must be ROBOT=GOAL"),
+        ("plan --goal left", "must be ARM=GOAL"),
         ("plan --goal left=home", "not a number"),
         ("plan --goal left=pose:1,2", "a pose has 3, 6 or 7 numbers"),
-        ("plan --goal left=pos:1,2,3", "must be ROBOT=GOAL"),
+        ("plan --goal left=pos:1,2,3", "must be ARM=GOAL"),
         ("plan left --goal right=named:home", "cannot be used with"),
         ("move --goal left=named:home --direct", "cannot be used with"),
         ("plan --goal left=named:home --named home", "cannot be used with"),
