@@ -105,21 +105,16 @@ fn is_at(home: &Home, goal: &[f64]) {
 
 /// The conformance suite over the table of that checkout.
 const SUITE: &str = r#"
-use real::hardware::conformance::{Outcome, checks, run};
+use real::hardware::conformance::{Outcome, Subject, checks, run_all};
 
 #[test]
 fn the_table_conforms() {
     let table = skeleton::hardware::arms::TABLE;
     assert_eq!(table.len(), 3);
     for row in table {
-        std::thread::scope(|scope| {
-            for check in checks() {
-                scope.spawn(move || match run(row, check, None) {
-                    Outcome::Failed(why) => panic!("{} {}: {why}", row.name, check.name),
-                    outcome => println!("{} {}: {outcome:?}", row.name, check.name),
-                });
-            }
-        });
+        for (check, outcome, _) in run_all(&Subject::emulated(row), &checks().collect::<Vec<_>>(), &|_, _| (), &|| false) {
+            assert!(!matches!(outcome, Outcome::Failed(_)), "{} {}: {outcome:?}", row.name, check.name);
+        }
     }
 }
 "#;

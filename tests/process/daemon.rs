@@ -71,7 +71,8 @@ fn it_returns_when_the_arms_are_up_and_prints_run_pid_and_logs() {
     for (report, is) in [("run", &status["run"]), ("pid", &status["pid"]), ("log", &status["log"])] {
         assert_eq!(&daemon.report[report], is);
     }
-    assert!(text(&daemon.text_log()).contains("run coordinator-mock"));
+    // An ordinary thread writes it.
+    eventually("the banner is in the text log", || text(&daemon.text_log()).contains("run coordinator-mock"));
     let report = home.dimos(&format!("run -d --duration 2m --no-record {RUN} --name plain")).with(0);
     for part in ["run       plain", "pid       ", "arm       arm: ready", "log       none", "text log  "] {
         assert!(report.out.contains(part), "no {part:?} in\n{}", report.out);
