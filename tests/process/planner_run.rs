@@ -392,7 +392,14 @@ fn two_arms_move_in_one_plan_and_keep_clear_of_each_other() {
             joints: Some(joints.into()),
             ..PlanGoal::default()
         };
-        Plan { goals: vec![goal("left", left), goal("right", right)], speed: 1.0, seed: 3, timeout: None }
+        Plan {
+            goals: vec![goal("left", left), goal("right", right)],
+            speed: 1.0,
+            seed: 3,
+            timeout: None,
+            through: Vec::new(),
+            blend: 0.0,
+        }
     };
     let turned = |angle| [angle, -0.3, 0.6, 0.0, 0.8, 0.0];
     let mut planned = |plan: Plan| {
