@@ -115,7 +115,7 @@ impl TaskBody for Joystick {
         (self.target, self.cancelled) = (Joints::default(), false);
     }
 
-    fn obeys_speed(&self) -> bool {
+    fn applies_speed(&self) -> bool {
         true
     }
 

@@ -45,8 +45,8 @@ pub struct Goal {
     /// left=pose:x,y,z or, with roll, pitch, yaw or a quaternion, left=pose:x,y,z,r,p,y or left=pose:x,y,z,qx,qy,qz,qw
     #[arg(long = "goal", value_name = "ARM=GOAL", value_parser = arm_goal, conflicts_with_all = ["joints", "tcp", "named"])]
     pub several: Vec<PlanGoal>,
-    /// One motion through these waypoints; the last is the goal. Each is a named pose, joints as 0.1,-0.3,0.6,0,0.8,0, or
-    /// pose:x,y,z,r,p,y (also with x,y,z or a quaternion); line:… is reached on a straight line
+    /// One motion through these waypoints; the last is the goal. Each is a named pose, joints as 0.1,-0.3,0.6,0,0.8,0,
+    /// or pose:x,y,z,r,p,y (also with x,y,z or a quaternion); line:… is reached on a straight line
     #[arg(long, value_name = "WAYPOINT", num_args = 2.., value_parser = waypoint, allow_negative_numbers = true, conflicts_with_all = ["joints", "tcp", "named", "several"])]
     pub through: Vec<PlanGoal>,
     /// How far away the tool centre point may pass the waypoints [m]; 0: it stops at each

@@ -73,9 +73,9 @@ impl Task {
         self.motion.as_ref().map_or(&self.joints, |motion| &motion.joints)
     }
 
-    /// Returns whether it obeys the speed override itself.
-    pub fn obeys_speed(&self) -> bool {
-        self.body.obeys_speed()
+    /// Returns whether it applies the speed override itself.
+    pub fn applies_speed(&self) -> bool {
+        self.body.applies_speed()
     }
 
     /// Returns whether it executes or decelerates.

@@ -42,7 +42,7 @@ pub struct Context<'a> {
     /// Length of the control step [s].
     pub dt: f64,
     /// Speed override: the fraction of its speed that a motion is to have, 0 while paused. A task that
-    /// [obeys it](TaskBody::obeys_speed) changes to it within its limits.
+    /// [applies it](TaskBody::applies_speed) changes to it within its limits.
     pub speed: f64,
     /// Fraction of the velocity limits of streams: follows `speed` smoothly.
     pub pace: f64,
@@ -204,9 +204,9 @@ pub trait TaskBody: std::fmt::Debug + Send {
         OnLoss::End
     }
 
-    /// Returns whether the body itself obeys [`Context::speed`] or [`Context::pace`]. For one that does not, the
-    /// velocity limits of its joints are scaled.
-    fn obeys_speed(&self) -> bool {
+    /// Returns whether the body itself applies [`Context::speed`] or [`Context::pace`]. For one that does not,
+    /// the velocity limits of its joints are scaled.
+    fn applies_speed(&self) -> bool {
         false
     }
 

@@ -170,8 +170,8 @@ methods! {
     /// Ends motions by decelerating within limits: those of a task, of an arm, or all. With a plan, ends its planning
     /// only.
     "cancel" Cancel -> CancelReply, check Cancel::valid;
-    /// Reads or sets the speed override: all motions run at a fraction of their speed, or pause on their paths. Needs no
-    /// lease.
+    /// Reads or sets the speed override: all motions run at a fraction of their speed, or pause on their paths. Needs
+    /// no lease.
     "speed" Speed -> SpeedReport, check Speed::valid;
     /// Holds one arm or all at once: tasks end, arms are held until `arm_reset`. An operational stop.
     "stop" Stop -> StopReply;

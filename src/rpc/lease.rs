@@ -68,7 +68,7 @@ pub(super) fn need(request: &Request) -> Need<'_> {
         Request::Plan(_) | Request::Planning(_) | Request::Preview(_) | Request::Planner(_) => Need::Nothing,
         Request::World(_) | Request::WorldAdd(_) | Request::WorldMove(_) | Request::WorldRemove(_) => Need::Nothing,
         Request::Attach(_) => Need::Nothing,
-        // Who watches an arm may slow it down, whoever moves it.
+        // Who watches an arm may slow it down, also one that another client moves.
         Request::Speed(_) => Need::Nothing,
         Request::Cancel(_) | Request::Stop(_) | Request::Shutdown(_) => Need::Nothing,
     }

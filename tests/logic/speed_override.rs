@@ -1,5 +1,5 @@
-//! The speed override on a virtual clock: motions slow down and pause on their paths, streams keep slower limits. The rig
-//! checks that no command breaks a limit of the arm.
+//! The speed override on a virtual clock: motions slow down and pause on their paths, streams keep slower limits. The
+//! rig checks that no command breaks a limit of the arm.
 
 use dimos::control::point_to_point::point_to_point;
 use dimos::control::request::{Motion, Request};

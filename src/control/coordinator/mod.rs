@@ -240,7 +240,7 @@ impl Coordinator {
                 arbiter.demand(i),
                 |j| {
                     let (task, value) = arbiter.winner(first + j)?;
-                    let scales = tasks.get(task as usize).is_some_and(|task| !task.obeys_speed());
+                    let scales = tasks.get(task as usize).is_some_and(|task| !task.applies_speed());
                     let speed = if scales { pace } else { 1.0 };
                     Some(JointRequest { value, new_task: arbiter.winner_changed(first + j), speed })
                 },

@@ -111,7 +111,7 @@ impl TaskBody for CartesianTask {
         OnCancel::Decelerate
     }
 
-    fn obeys_speed(&self) -> bool {
+    fn applies_speed(&self) -> bool {
         true
     }
 

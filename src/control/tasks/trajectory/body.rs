@@ -179,7 +179,7 @@ impl TaskBody for TrajectoryTask {
         OnCancel::Decelerate
     }
 
-    fn obeys_speed(&self) -> bool {
+    fn applies_speed(&self) -> bool {
         true
     }
 

@@ -32,8 +32,9 @@ impl Smoothing {
         self.stages.iter_mut().flatten().for_each(|entry| *entry = *value);
     }
 
-    /// Starts over in a motion that came to `value` with a constant change per state. A motion that `ends` abruptly gets
-    /// the longest averages, which slow it down as gently as they can; one that continues the shortest, which lag least.
+    /// Starts over in a motion that came to `value` with a constant change per state. A motion that `ends` abruptly
+    /// gets the longest averages, which slow it down as gently as they can; one that continues gets the shortest,
+    /// which lag least.
     pub fn restart_moving(&mut self, value: &[f64; DOF], change: &[f64; DOF], ends: bool) {
         let length = if ends { LONGEST } else { SHORTEST };
         (self.length, self.next) = (length, 0);
