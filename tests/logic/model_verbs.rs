@@ -50,7 +50,7 @@ fn joints_are_found_for_a_pose_and_what_is_missing_is_said() {
         assert!((q.as_f64().unwrap() - expected.parse::<f64>().unwrap()).abs() < 1e-3, "{near} {joints:?}");
     }
     let far = dimos(&["ik", "builtin:yourarm", "--pose", "2", "0", "0.3"]);
-    assert!(far.code == 1 && far.err.contains("no IK solution after") && far.err.contains("mm"), "{}", far.err);
+    assert!(far.code == 1 && far.err.contains("no IK solution after") && far.err.contains(" m and "), "{}", far.err);
     let far = dimos(&["ik", "builtin:yourarm", "--pose", "2", "0", "0.3", "--json"]);
     let report: serde_json::Value = serde_json::from_str(&far.out).unwrap();
     assert!(

@@ -6,7 +6,7 @@ use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
 use dimos::hardware::registry::Emulator;
 use dimos::planning::planning_scene::{PlanningScene, obstacle};
 use dimos::rpc::api::{
-    ExecutePlan, Plan, PlanGoal, Planning, PoseSpec, Preview, ShapeSpec, WorldAdd, WorldObject, WorldRemove,
+    ExecutePlan, Move, Plan, PlanGoal, Planning, PoseSpec, Preview, ShapeSpec, WorldAdd, WorldObject, WorldRemove,
 };
 use dimos::rpc::run_dir::RunDir;
 use dimos::runtime::{Builder, Record, Run};
@@ -33,7 +33,7 @@ fn up() -> Cell {
     let setup = PlanningScene::load(blueprint().check().blueprint.unwrap().planner.as_ref().unwrap()).unwrap();
     let run = blueprint().folder(RunDir::at(folder.path())).start().unwrap();
     let cell = Cell { run, arm, setup, _folder: folder };
-    let begun = cell.run.move_arm("arm", &HOME, 1.0).unwrap();
+    let begun = cell.run.call(Move { direct: true, ..Move::new("arm", HOME, 1.0) }).unwrap();
     assert_eq!(cell.run.wait(begun.motion).unwrap().state, "COMPLETED");
     cell
 }

@@ -115,9 +115,9 @@ fn the_tarball_and_the_debian_package_install_and_run() {
         assert!(done(Command::new("gzip").arg("-dc").arg(&page)).contains(".TH "), "{verb}");
     }
     for (file, says) in [
-        ("bash-completion/completions/dimos", "complete -F _dimos"),
+        ("bash-completion/completions/dimos", "COMPLETE="),
         ("zsh/vendor-completions/_dimos", "#compdef dimos"),
-        ("fish/vendor_completions.d/dimos.fish", "complete -c dimos"),
+        ("fish/vendor_completions.d/dimos.fish", "--command dimos"),
         ("doc/dimos/copyright", "Apache License"),
         ("dimos/python/dimos_client/client.py", "class Client"),
         ("dimos/python/pyproject.toml", "dimos-client"),

@@ -12,7 +12,7 @@ use dimos::hardware::sim::faults::{Fault, FaultKind};
 use dimos::planning::pipeline::{self, solve};
 use dimos::planning::planning_scene::PlanningScene;
 use dimos::rpc::Code;
-use dimos::rpc::api::{ExecutePlan, Plan, PlanGoal, Planner, Planning};
+use dimos::rpc::api::{ExecutePlan, Move, Plan, PlanGoal, Planner, Planning};
 use dimos::rpc::report::TickReport;
 use dimos::rpc::run_dir::RunDir;
 use dimos::runtime::{Record, Run};
@@ -68,7 +68,9 @@ fn f23_a_planner_that_panics_or_never_ends_costs_that_request_only() {
     let mut goal = 0.0;
     host.unless_stalled(|| {
         goal = 2.5 - goal;
-        let motion = run.move_arm("arm", &[goal, 0.0, 0.0, 0.0, 0.0, 0.0], 0.1).map_err(|e| e.to_string())?;
+        let motion = run
+            .call(Move { direct: true, ..Move::new("arm", [goal, 0.0, 0.0, 0.0, 0.0, 0.0], 0.1) })
+            .map_err(|e| e.to_string())?;
         let (before, began) = (run.status().ticks, Instant::now());
         let (_, state, error) = planned(&run, to(0.5, PANICS));
         assert!(state == "FAILED" && error.contains("a bug in the planner"), "{error}");

@@ -46,7 +46,7 @@ fn what_state_prints_can_be_pasted() {
     home.dimos(&format!("move arm {pasted}")).with(0);
     stays(&home, "arm", &before);
     let preview = home.dimos("preview").with(0).out;
-    assert!(preview.contains("arm: link_tcp in map [m]"), "{preview}");
+    assert!(preview.contains("arm: link_tcp in map x"), "{preview}");
     let shown = home.dimos("state").with(0).out;
     assert!(shown.contains("flange in base (device)"), "{shown}");
     home.dimos("status").with(0).shows(&["arm: poses in map are those of link_tcp (no tool)"]);
@@ -77,7 +77,7 @@ fn poses_in_frames_and_with_a_tool() {
     home.dimos(&format!("move left --pose {} --rpy {} --frame cup", words(xyz), words(rpy))).with(0);
     stays(&home, "left", &before);
     home.dimos("move left --pose 0 0 0 --frame cpu")
-        .with(1)
+        .with(2)
         .says(&["no frame or object named `cpu`", "did you mean `cup`?"]);
     home.dimos("move left --named home --frame tool").with(2);
 

@@ -18,8 +18,8 @@ use crate::robot::urdf::Meshes;
 /// Arguments of `model collide`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
-The joints are all independent ones in the order of `model info`, or those of the group; the others are at the position
-in their limits that is closest to zero. Neighbouring links, the pairs of the SRDF's disable_collisions and links that
+The joints are all independent ones in the order of `model info`, or those of the group; the others are at the position \
+in their limits that is closest to zero. Neighbouring links, the pairs of the SRDF's disable_collisions and links that \
 touch in every configuration are not checked, as in a plan. Exit code 1 if links touch.")]
 pub struct Args {
     #[command(flatten)]

@@ -18,7 +18,7 @@ use crate::robot::urdf::Meshes;
 /// Arguments of `model fk`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
-The joints are the independent ones between the two links, in order from the base. Neither link must be below the
+The joints are the independent ones between the two links, in order from the base. Neither link must be below the \
 other.
 With --stdin a line is a configuration, as numbers or a JSON array, and prints x y z [m] and a quaternion x y z w.")]
 pub struct Args {

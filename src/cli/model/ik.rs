@@ -20,8 +20,8 @@ use crate::robot::urdf::Meshes;
 /// Arguments of `model ik`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
-The joints are the independent ones between base and link, in order from the base, as in `model fk`; all others are at
-zero. The solution closest to the seed that a bounded search finds is printed, with its distance (Euclidean over the
+The joints are the independent ones between base and link, in order from the base, as in `model fk`; all others are at \
+zero. The solution closest to the seed that a bounded search finds is printed, with its distance (Euclidean over the \
 joints). Collisions are not checked: `model collide` does that. The same call gives the same answer.")]
 pub struct Args {
     #[command(flatten)]
