@@ -83,7 +83,7 @@ fn pylibfranka_moves_the_emulated_fr3_and_its_commands_are_the_adapters() {
         for Answer { state, bytes } in answers {
             let values = seven(&bytes, from);
             let target = if from == 8 { Target::Positions(values) } else { Target::Velocities(values) };
-            let ours = encode(state.id, &none.shape(&target, &state, false), bytes[313] != 0);
+            let ours = encode(state.id, &none.shape(&target, &state, false, None), bytes[313] != 0);
             assert_eq!(sent(Model::Fr3.interface(), &ours), bytes, "{state:?}");
         }
     }
@@ -123,7 +123,7 @@ fn libfranka_moves_the_emulated_fer_and_shapes_its_commands_as_the_adapter() {
             if bytes[313] != 0 {
                 break;
             }
-            let ours = encode(state.id, &shaping.shape(&setpoints(first, t), state, i == 0), false);
+            let ours = encode(state.id, &shaping.shape(&setpoints(first, t), state, i == 0, None), false);
             let (a, b) = (seven(&ours, from), seven(bytes, from));
             let apart = a.iter().zip(&b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
             assert!(apart < 1e-9, "{t} s: {apart}\n{a:?}\n{b:?}\n{state:?}");

@@ -112,7 +112,7 @@ fn poses_lines_and_seeds() {
     assert!(first == again && first != other);
     home.dimos("execute").with(0);
     is_at(&home, "arm", &[1.0, -0.3, 0.6, 0.0, 0.8, 0.0]);
-    home.dimos("move arm --named near-table").with(0);
+    home.dimos("move arm --named near-table --speed 1").with(0);
     is_at(&home, "arm", &saved);
     home.dimos("world remove post").with(0);
     passes_waypoints(&home);
@@ -120,7 +120,7 @@ fn poses_lines_and_seeds() {
 
 /// One motion through waypoints: it stops at each, or passes within `--blend` of it.
 fn passes_waypoints(home: &Home) {
-    home.dimos("move arm --named home").with(0);
+    home.dimos("move arm --named home --speed 1").with(0);
     let through = "--through 0.5,-0.3,0.6,0,0.8,0 0.5,-0.1,0.4,0.3,0.8,0 line:0.35,0.05,0.35,3.14,0.2,0 near-table";
     let planned = |options: &str| {
         let plan = home.dimos(&format!("plan arm {through} {options} --speed 1 --json")).with(0).json();
@@ -157,8 +157,7 @@ fn passes_waypoints(home: &Home) {
     let distance = |p: &[f64; 3]| p.iter().zip(place).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
     let nearest = tip(&blended).iter().map(distance).fold(f64::MAX, f64::min);
     assert!(nearest < 0.03 + 1e-3, "{nearest} m from the waypoint");
-    home.dimos("execute").with(0);
-    home.dimos(&format!("plan arm {through} 1,2")).with(1).says(&["6 joints, the goal 2 values"]);
+    home.dimos(&format!("plan arm {through} 1,2")).with(2).says(&["6 joints, the goal 2 values"]);
     home.dimos("plan arm --through home 0.1,0.2,0,0,0,9 home").with(1).says(&["waypoint 2: "]);
     home.dimos("plan arm --through home").with(2);
 }

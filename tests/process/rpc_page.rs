@@ -91,7 +91,8 @@ impl Player {
     fn like(&mut self, shown: &Value) -> Value {
         loop {
             let mut line = String::new();
-            assert!(self.0.read_line(&mut line).unwrap() > 0, "closed before {shown}");
+            let read = self.0.read_line(&mut line).unwrap_or_else(|e| panic!("{e}: no {shown}"));
+            assert!(read > 0, "closed before {shown}");
             let real: Value = serde_json::from_str(&line).unwrap();
             let kind = |v: &Value| (v.get("stream").cloned(), v["data"].get("kind").cloned(), v.get("id").cloned());
             if kind(&real) == kind(shown) {

@@ -3,7 +3,7 @@
 use super::*;
 use crate::hardware::arms::franka::model::Model;
 use crate::hardware::arms::franka::protocol::command::Target;
-use crate::hardware::arms::franka::shaping::Shaping;
+use crate::hardware::arms::franka::shaping::{Pace, Shaping};
 
 /// Where the first joint is to be at a time [s]: at rest for 0.3 s, then 0.5 rad in 1.2 s.
 fn goal(t: f64) -> f64 {
@@ -33,6 +33,7 @@ fn run(times: &[f64], lost: impl Fn(u64) -> bool) -> Seen {
     let mut controller = State { q_d: [0.0, 0.0, 0.0, -1.5, 0.0, 1.5, 0.0], ..first };
     let base = controller.q_d;
     let mut follower = Follower::new(&controller, false, shaping.gain);
+    let (mut pace, mut answered) = (Pace::default(), controller.id);
     let (mut known, mut known_at) = (controller, 0.0);
     let mut seen = Seen { lag: 0.0, error: 0.0, acceleration: 0.0, unanswered: 0, direct: false };
     let mut times = times.iter().copied().peekable();
@@ -54,7 +55,11 @@ fn run(times: &[f64], lost: impl Fn(u64) -> bool) -> Seen {
         // A command uses the state that it answers; without one the controller keeps its acceleration.
         let before = controller;
         let speeds: [f64; DOF] = match answer.filter(|_| known.id == before.id) {
-            Some(values) => match shaping.shape(&Target::Positions(values), &before, cycle == 0) {
+            Some(values) => match {
+                pace.take(&values, before.id - answered);
+                answered = before.id;
+                shaping.shape(&Target::Positions(values), &before, cycle == 0, Some(&pace))
+            } {
                 Target::Positions(q) => std::array::from_fn(|i| (q[i] - before.q_d[i]) / PERIOD),
                 Target::Velocities(_) => unreachable!(),
             },

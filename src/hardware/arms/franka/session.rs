@@ -13,7 +13,7 @@ use super::protocol::errors;
 use super::protocol::service::{Answer, Reader, Service, refusal, request};
 use super::protocol::state::{State, generator, mode};
 use super::protocol::{DOF, Interface};
-use super::shaping::Shaping;
+use super::shaping::{Pace, Shaping};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::transport::tcp::TcpLink;
@@ -62,6 +62,8 @@ pub(super) struct Motion {
     /// The newest state: those before it were counted.
     counted: u64,
     positions: [f64; DOF],
+    /// How fast the answers move before filter and limits.
+    pace: Pace,
     /// It is to end: answers hold, and say so.
     pub finishing: bool,
 }
@@ -263,7 +265,8 @@ impl Session {
             return;
         }
         let target = if motion.velocity { Target::Velocities(*values) } else { Target::Positions(*values) };
-        let shaped = self.shaping.shape(&target, &self.state, motion.sent == 0);
+        motion.pace.take(values, self.state.id.saturating_sub(motion.answered));
+        let shaped = self.shaping.shape(&target, &self.state, motion.sent == 0, Some(&motion.pace));
         let bytes = command::encode(self.state.id, &shaped, motion.finishing);
         // A datagram that is not sent is lost, as others are.
         let sent = self.udp.send(command::sent(self.interface, &bytes)).is_ok();
@@ -278,10 +281,10 @@ impl Session {
 
     pub(super) fn begin(&mut self, id: u32, velocity: bool) {
         let follower = Follower::new(&self.state, velocity, self.shaping.gain);
-        let (id_now, positions) = (self.state.id, self.state.q_d);
-        let motion =
-            Motion { velocity, id, follower, sent: 0, answered: id_now, counted: id_now, positions, finishing: false };
-        self.motion = Some(Box::new(motion));
+        let State { id: now, q_d: positions, .. } = self.state;
+        let (sent, answered, counted, pace, finishing) = (0, now, now, Pace::default(), false);
+        self.motion =
+            Some(Box::new(Motion { velocity, id, follower, sent, answered, counted, positions, pace, finishing }));
         self.see_motion();
     }
 

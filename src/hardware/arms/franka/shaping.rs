@@ -6,6 +6,7 @@ use super::model::JointRange;
 use super::protocol::DOF;
 use super::protocol::command::Target;
 use super::protocol::state::State;
+use crate::joint::braking_speed;
 
 /// Time between two commands [s].
 pub const PERIOD: f64 = 0.001;
@@ -13,8 +14,39 @@ pub const PERIOD: f64 = 0.001;
 const OFF: f64 = 1000.0;
 /// The limits are this much narrower than the controller's.
 const MARGIN: f64 = 0.001;
+/// Part of the acceleration limit for approaching a target that is far away; the remainder is for the jerk limit.
+const BRAKING: f64 = 0.8;
+/// Share of the newest velocity in the average of the wanted positions' velocity.
+const AVERAGING: f64 = 0.1;
 /// Commands in a row whose loss an FER is to survive at constant acceleration.
 const LOST: f64 = 3.0;
+
+/// How fast wanted positions move.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Pace {
+    before: Option<[f64; DOF]>,
+    /// Velocities from the last position to this one, and their moving average [rad/s].
+    now: [f64; DOF],
+    average: [f64; DOF],
+}
+
+impl Pace {
+    /// Takes the wanted positions [rad] of a state, `periods` after the last ones.
+    pub fn take(&mut self, wanted: &[f64; DOF], periods: u64) {
+        let before = self.before.replace(*wanted).unwrap_or(*wanted);
+        let time = periods.max(1) as f64 * PERIOD;
+        self.now = std::array::from_fn(|i| (at(wanted, i) - at(&before, i)) / time);
+        self.average =
+            std::array::from_fn(|i| at(&self.average, i) + AVERAGING * (at(&self.now, i) - at(&self.average, i)));
+    }
+
+    /// Returns the velocity of a joint's wanted positions [rad/s] that agrees best with `wanted`: the average where they
+    /// come irregularly.
+    fn nearest(&self, joint: usize, wanted: f64) -> f64 {
+        let (now, average) = (at(&self.now, joint), at(&self.average, joint));
+        if (wanted - now).abs() <= (wanted - average).abs() { now } else { average }
+    }
+}
 
 /// Filter and limits.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -32,14 +64,20 @@ impl Shaping {
         Self { gain, limits }
     }
 
-    /// Returns the command that answers a state. The first one of a motion is not filtered.
-    pub fn shape(&self, target: &Target, state: &State, first: bool) -> Target {
+    /// Returns the command that answers a state. The first one of a motion is not filtered. `pace`: how fast the wanted
+    /// positions move, so that an arm that is far from them brakes in time; without it the vendor's limits alone count,
+    /// with which it would swing about them.
+    pub fn shape(&self, target: &Target, state: &State, first: bool, pace: Option<&Pace>) -> Target {
         match target {
             Target::Positions(wanted) => Target::Positions(std::array::from_fn(|i| {
                 let [q, v, a] = [&state.q_d, &state.dq_d, &state.ddq_d].map(|values| at(values, i));
                 let filtered = if first { at(wanted, i) } else { self.filter(at(wanted, i), q) };
                 match self.limits.as_ref().and_then(|limits| limits.get(i)) {
-                    Some(range) => q + limit(range, q, v, a, (filtered - q) / PERIOD) * PERIOD,
+                    Some(range) => {
+                        let wanted = (filtered - q) / PERIOD;
+                        let wanted = pace.map_or(wanted, |pace| braked(range, wanted, pace.nearest(i, wanted)));
+                        q + limit(range, q, v, a, wanted) * PERIOD
+                    }
                     None => filtered,
                 }
             })),
@@ -61,6 +99,16 @@ impl Shaping {
 
 fn at(values: &[f64; DOF], joint: usize) -> f64 {
     values.get(joint).copied().unwrap_or_default()
+}
+
+/// Returns the velocity at which the joint can still brake to that of its target. `wanted` leads there in one period,
+/// and is kept if the acceleration for that is no more than an ordinary one.
+fn braked(range: &JointRange, wanted: f64, pace: f64) -> f64 {
+    let (excess, acceleration) = (wanted - pace, BRAKING * range.acceleration);
+    if excess.abs() <= acceleration * PERIOD {
+        return wanted;
+    }
+    pace + excess.signum() * braking_speed(excess.abs() * PERIOD, acceleration, PERIOD)
 }
 
 /// Returns the velocity closest to `wanted` that the limits allow after velocity `v` and acceleration `a` at position
@@ -94,7 +142,7 @@ mod tests {
         for i in 0..steps {
             let target = if velocity { Target::Velocities(wanted(i)) } else { Target::Positions(wanted(i)) };
             let before = state;
-            state.dq_d = match shaping.shape(&target, &state, i == 0) {
+            state.dq_d = match shaping.shape(&target, &state, i == 0, None) {
                 Target::Positions(q) => std::array::from_fn(|j| (q[j] - before.q_d[j]) / PERIOD),
                 Target::Velocities(v) => v,
             };
@@ -127,6 +175,29 @@ mod tests {
             let state = run(model, &shaping, true, |i| [if i < 150 { 9.0 } else { -9.0 }; DOF], 300);
             assert!(state.dq_d[4] < 1.0, "{state:?}");
         }
+    }
+
+    /// With the vendor's limits alone it would swing about a position that is far away for ever.
+    #[test]
+    fn a_position_far_away_is_reached_without_swinging() {
+        let shaping = Shaping::new(100.0, Some(Model::Fr3.ranges()));
+        let target = [0.4, -0.2, 0.05, -1.9, 0.01, 1.2, 0.3];
+        let mut state = State { q_d: [0.0, 0.0, 0.0, -1.5, 0.0, 1.5, 0.0], ..State::default() };
+        let (mut pace, mut farthest) = (Pace::default(), 0.0_f64);
+        for i in 0..700 {
+            pace.take(&target, 1);
+            let before = state;
+            let Target::Positions(q) = shaping.shape(&Target::Positions(target), &state, i == 0, Some(&pace)) else {
+                unreachable!()
+            };
+            state.q_d = q;
+            state.dq_d = std::array::from_fn(|j| (q[j] - before.q_d[j]) / PERIOD);
+            state.ddq_d = std::array::from_fn(|j| (state.dq_d[j] - before.dq_d[j]) / PERIOD);
+            farthest = farthest.max(q[0] - target[0]);
+        }
+        assert!(farthest < 2e-3, "{farthest} rad beyond");
+        assert!(state.q_d.iter().zip(&target).all(|(q, target)| (q - target).abs() < 1e-4), "{state:?}");
+        assert!(state.dq_d.iter().all(|v| v.abs() < 1e-3), "{state:?}");
     }
 
     #[test]
