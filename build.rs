@@ -1,4 +1,4 @@
-//! What the build tells the program: its version with the commit, and the shipped blueprints.
+//! What the build tells the program: its version with the commit, the shipped blueprints, and the texts that it packs.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -7,7 +7,8 @@ use std::{env, fs, io};
 fn main() -> io::Result<()> {
     println!("cargo::rerun-if-changed=build.rs");
     version();
-    blueprints()
+    blueprints()?;
+    packed()
 }
 
 /// Sets `DIMOS_VERSION`: the package's version, with the commit where there is one: `0.1.0 (1d8ac97f)`.
@@ -46,4 +47,34 @@ fn blueprints() -> io::Result<()> {
     };
     let rows: String = files.iter().map(row).collect();
     fs::write(out.join("blueprints.rs"), format!("&[\n{rows}]\n"))
+}
+
+/// Deflates the texts that are seldom needed, and writes the table of their names that `src/packed.rs` includes.
+fn packed() -> io::Result<()> {
+    let out = PathBuf::from(env::var("OUT_DIR").unwrap_or_default());
+    let mut files = vec![PathBuf::from("assets/rpc.schema.json")];
+    for folder in ["assets/robots", "assets/templates"] {
+        println!("cargo::rerun-if-changed={folder}");
+        collect(Path::new(folder), &mut files)?;
+    }
+    println!("cargo::rerun-if-changed=assets/rpc.schema.json");
+    files.sort();
+    let mut rows = String::new();
+    for (number, file) in files.iter().enumerate() {
+        let text = fs::read(file)?;
+        let deflated = out.join(format!("{number}.deflated"));
+        fs::write(&deflated, miniz_oxide::deflate::compress_to_vec(&text, 9))?;
+        let name = file.strip_prefix("assets").unwrap_or(file).display().to_string();
+        rows += &format!("    ({name:?}, include_bytes!({:?})),\n", deflated.display().to_string());
+    }
+    fs::write(out.join("packed.rs"), format!("&[\n{rows}]\n"))
+}
+
+/// Adds the files below a folder.
+fn collect(folder: &Path, files: &mut Vec<PathBuf>) -> io::Result<()> {
+    for entry in fs::read_dir(folder)? {
+        let path = entry?.path();
+        if path.is_dir() { collect(&path, files)? } else { files.push(path) }
+    }
+    Ok(())
 }

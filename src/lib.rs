@@ -37,6 +37,7 @@ pub mod clock;
 pub mod joint;
 pub mod message;
 mod named;
+mod packed;
 pub mod pose;
 pub mod sync;
 pub mod telemetry;

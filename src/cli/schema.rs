@@ -5,6 +5,7 @@ use serde_json::Value;
 use super::exit::{Exit, Result};
 use super::output;
 use crate::blueprint::{self, Catalog};
+use crate::packed;
 
 /// Arguments of `schema`.
 #[derive(Debug, clap::Args)]
@@ -15,11 +16,11 @@ pub struct Args {
 }
 
 /// What [`crate::rpc::schema::json_schema`] returns, made by a test: the program is smaller without what makes it.
-const RPC: &str = include_str!("../../assets/rpc.schema.json");
+const RPC: &str = "rpc.schema.json";
 
 /// Runs the verb.
 pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
-    let rpc = || serde_json::from_str(RPC).unwrap_or_default();
+    let rpc = || packed::text(RPC).and_then(|text| serde_json::from_str(text).ok()).unwrap_or_default();
     let schema: Value = if args.rpc { rpc() } else { blueprint::json_schema(catalog) };
     // A value made of maps and lists always encodes.
     output::line(serde_json::to_string_pretty(&schema).unwrap_or_default());

@@ -2,6 +2,8 @@
 
 use std::sync::OnceLock;
 
+use crate::packed;
+
 /// Prefix of a built-in robot's name in place of a path: `builtin:xarm6`.
 pub const PREFIX: &str = "builtin:";
 
@@ -9,13 +11,6 @@ macro_rules! robots {
     ($($name:literal),* $(,)?) => {
         /// Names of the robots shipped with this crate.
         pub const NAMES: &[&str] = &[$($name),*];
-
-        fn shipped(name: &str) -> Option<&'static str> {
-            match name {
-                $($name => Some(include_str!(concat!("../../assets/robots/", $name, ".urdf"))),)*
-                _ => None,
-            }
-        }
     };
 }
 
@@ -53,7 +48,7 @@ fn more() -> impl Iterator<Item = (&'static str, &'static str)> {
 
 /// Returns the URDF of a built-in or embedded robot.
 pub fn text(name: &str) -> Option<&'static str> {
-    more().find(|(own, _)| *own == name).map(|(_, text)| text).or_else(|| shipped(name))
+    more().find(|(own, _)| *own == name).map(|(_, text)| text).or_else(|| packed::text(&format!("robots/{name}.urdf")))
 }
 
 /// Returns all names, shipped and embedded.

@@ -7,10 +7,11 @@ use std::path::{Path, PathBuf};
 /// Every module of `src/`, with the modules that it may use besides itself. `ALL`: everything above it.
 const ALL: &[&str] = &["*"];
 const VOCABULARY: &[&str] =
-    &["message", "named", "sync", "joint", "arm", "trajectory", "pose", "clock", "telemetry", "yaml"];
+    &["message", "named", "packed", "sync", "joint", "arm", "trajectory", "pose", "clock", "telemetry", "yaml"];
 const LAYERS: &[(&str, &[&str])] = &[
     ("message", &[]),
     ("named", &[]),
+    ("packed", &[]),
     ("sync", &[]),
     ("joint", &[]),
     ("arm", &[]),

@@ -6,34 +6,29 @@
 use super::Transport;
 use super::description;
 use super::name::Name;
+use crate::packed;
 
-macro_rules! arm {
-    ($folder:literal $($more:literal)*) => {
-        [
-            ("mod.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/mod.rs"))),
-            ("adapter.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/adapter.rs"))),
-            ("protocol.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/protocol.rs"))),
-            ("golden.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/golden.rs"))),
-            ("emulator.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/emulator.rs"))),
-            $(($more, include_str!(concat!("../../../../assets/templates/", $folder, "/", $more))),)*
-        ]
-    };
-}
+/// Files of an arm in its template.
+const COMMON: &[&str] = &["mod.rs", "adapter.rs", "protocol.rs", "golden.rs", "emulator.rs"];
+const TCP: (&str, &[&str]) = ("tcp", &["wire.rs"]);
+const CAN: (&str, &[&str]) = ("can", &[]);
+const SERIAL: (&str, &[&str]) = ("serial", &["wire.rs", "calibration.rs"]);
 
-const TCP: &[(&str, &str)] = &arm!("tcp" "wire.rs");
-const CAN: &[(&str, &str)] = &arm!("can");
-const SERIAL: &[(&str, &str)] = &arm!("serial" "wire.rs" "calibration.rs");
-
-const BLUEPRINT: &str = include_str!("../../../../assets/templates/blueprint.yaml");
-const PLANNER: &str = include_str!("../../../../assets/templates/planner.yaml");
-/// What a crate has besides: its path in the crate, and its text.
+const BLUEPRINT: &str = "blueprint.yaml";
+const PLANNER: &str = "planner.yaml";
+/// What a crate has besides: its path in the crate, and its template.
 const CRATE: [(&str, &str); 5] = [
-    ("Cargo.toml", include_str!("../../../../assets/templates/crate/manifest.toml")),
-    ("README.md", include_str!("../../../../assets/templates/crate/README.md")),
-    (".gitignore", include_str!("../../../../assets/templates/crate/gitignore")),
-    ("src/main.rs", include_str!("../../../../assets/templates/crate/main.rs")),
-    ("tests/conformance.rs", include_str!("../../../../assets/templates/crate/conformance.rs")),
+    ("Cargo.toml", "crate/manifest.toml"),
+    ("README.md", "crate/README.md"),
+    (".gitignore", "crate/gitignore"),
+    ("src/main.rs", "crate/main.rs"),
+    ("tests/conformance.rs", "crate/conformance.rs"),
 ];
+
+/// Returns a template. All are there: a test asks for each.
+fn template(name: &str) -> &'static str {
+    packed::text(&format!("templates/{name}")).unwrap_or_default()
+}
 
 /// The arm that is to be written.
 #[derive(Debug, Clone)]
@@ -50,13 +45,13 @@ impl Arm {
     /// The files of a crate of its own, with their paths below its folder. `dimos` is where the crate finds dimos, as
     /// the manifest writes it: `path = "…"`.
     pub fn own_crate(&self, dimos: &str) -> Vec<(String, String)> {
-        let sources = self.sources().iter().map(|(file, text)| {
-            let file = if *file == "mod.rs" { "lib.rs" } else { file };
+        let sources = self.sources().map(|(file, text)| {
+            let file = if file == "mod.rs" { "lib.rs" } else { file };
             (format!("src/{file}"), self.code(text))
         });
         let rest = CRATE.iter().map(|(file, text)| match file.ends_with(".rs") {
-            true => ((*file).to_owned(), self.code(text)),
-            false => ((*file).to_owned(), self.words(text).replace("DIMOS", dimos)),
+            true => ((*file).to_owned(), self.code(template(text))),
+            false => ((*file).to_owned(), self.words(template(text)).replace("DIMOS", dimos)),
         });
         let robot = (format!("robots/{}.urdf", self.name.snake), self.urdf("src/lib.rs"));
         rest.chain(sources).chain(self.blueprints()).chain([robot]).collect()
@@ -65,7 +60,7 @@ impl Arm {
     /// The new files in a checkout of dimos, with their paths below it.
     pub fn in_tree(&self) -> Vec<(String, String)> {
         let folder = format!("src/hardware/arms/{}", self.name.snake);
-        let sources = self.sources().iter().map(|(file, text)| {
+        let sources = self.sources().map(|(file, text)| {
             let text = self.code(text).replace("dimos::", "crate::");
             (format!("{folder}/{file}"), text)
         });
@@ -85,7 +80,7 @@ impl Arm {
 
     fn blueprints(&self) -> [(String, String); 2] {
         [(self.blueprint(), BLUEPRINT), (self.planner(), PLANNER)]
-            .map(|(name, text)| (format!("blueprints/{name}.yaml"), self.words(text)))
+            .map(|(name, text)| (format!("blueprints/{name}.yaml"), self.words(template(text))))
     }
 
     fn urdf(&self, limits_in: &str) -> String {
@@ -93,12 +88,13 @@ impl Arm {
         description::urdf(&self.name.snake, &about, self.dof, limits_in)
     }
 
-    fn sources(&self) -> &'static [(&'static str, &'static str)] {
-        match self.transport {
+    fn sources(&self) -> impl Iterator<Item = (&'static str, &'static str)> {
+        let (folder, more) = match self.transport {
             Transport::Tcp => TCP,
             Transport::Can => CAN,
             Transport::Serial => SERIAL,
-        }
+        };
+        COMMON.iter().chain(more).map(move |file| (*file, template(&format!("{folder}/{file}"))))
     }
 
     /// Rust code of this arm.
@@ -177,9 +173,11 @@ mod tests {
     fn an_arm_like_the_template_is_the_template() {
         for (transport, sources) in [(Transport::Tcp, TCP), (Transport::Can, CAN), (Transport::Serial, SERIAL)] {
             let files = arm("acme", 6, transport).own_crate("path = \"x\"");
-            for (file, text) in sources {
+            let (folder, more) = sources;
+            for file in COMMON.iter().chain(more) {
                 let path = if *file == "mod.rs" { "src/lib.rs".to_owned() } else { format!("src/{file}") };
-                assert!(files.contains(&(path, (*text).to_owned())), "{file}");
+                let text = template(&format!("{folder}/{file}"));
+                assert!(!text.is_empty() && files.contains(&(path, text.to_owned())), "{file}");
             }
         }
     }
@@ -206,7 +204,9 @@ mod tests {
         assert!(planner.contains("home: [0, 0.4, 0, 0.4, 0, 0.4, 0, 0.4]"), "{planner}");
         assert!(text("robots/acme_2.urdf").contains("<robot name=\"acme_2\">"));
         assert!(text("README.md").contains("--address arm=can0"));
-        assert!(files.iter().all(|(_, text)| !text.contains("acme_2_2") && !text.contains("DIMOS")));
+        assert!(
+            files.iter().all(|(_, text)| !text.is_empty() && !text.contains("acme_2_2") && !text.contains("DIMOS"))
+        );
     }
 
     #[test]
