@@ -127,7 +127,7 @@ fn coordinator_so101() {
 #[test]
 fn coordinator_fr3() {
     // Its controller waits for late commands: the computer of a test may be busy.
-    let slow = "coordinator-fr3 --set hardware.arm.options.sim.command_wait=0.1";
+    let slow = "coordinator-fr3 --set hardware.arm.options.sim.command_wait=0.02";
     exercise(slow, &[Arm { name: "arm", target: FR3, gripper: None }]);
 }
 

@@ -8,7 +8,7 @@ use crate::support::program::Home;
 
 /// A controller that waits for late commands: the computer of a test may be busy.
 fn emulator() -> FrankaEmulator {
-    let options = serde_json::json!({"sim": {"command_wait": 0.1}});
+    let options = serde_json::json!({"sim": {"command_wait": 0.02}});
     let config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: 7, options };
     FrankaEmulator::start(&config, &EmulatorAddress::InProcess).unwrap()
 }

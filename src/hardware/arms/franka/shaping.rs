@@ -40,8 +40,8 @@ impl Pace {
             std::array::from_fn(|i| at(&self.average, i) + AVERAGING * (at(&self.now, i) - at(&self.average, i)));
     }
 
-    /// Returns the velocity of a joint's wanted positions [rad/s] that agrees best with `wanted`: the average where they
-    /// come irregularly.
+    /// Returns the velocity of a joint's wanted positions [rad/s] that agrees best with `wanted`: the average where
+    /// they come irregularly.
     fn nearest(&self, joint: usize, wanted: f64) -> f64 {
         let (now, average) = (at(&self.now, joint), at(&self.average, joint));
         if (wanted - now).abs() <= (wanted - average).abs() { now } else { average }
