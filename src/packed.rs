@@ -1,5 +1,5 @@
-//! Texts of `assets` that are seldom needed: robots, templates, the protocol's schema. They are deflated in the program,
-//! which is smaller for it, and unpacked when they are asked for.
+//! Texts of `assets` that are seldom needed: robots, templates, the protocol's schema. They are deflated in the
+//! program, which is smaller for it, and unpacked when they are asked for.
 
 use std::collections::BTreeMap;
 use std::sync::Mutex;
