@@ -56,8 +56,7 @@ mod tests {
 
     #[test]
     fn the_limits_of_streams_follow_smoothly() {
-        let mut speed = SpeedOverride::default();
-        speed.paused = true;
+        let mut speed = SpeedOverride { paused: true, ..SpeedOverride::default() };
         let (mut before, mut ticks) = (1.0, 0);
         while speed.of_streams() > 0.0 {
             speed.advance(0.01);

@@ -55,14 +55,14 @@ fn run(times: &[f64], lost: impl Fn(u64) -> bool) -> Seen {
         // A command uses the state that it answers; without one the controller keeps its acceleration.
         let before = controller;
         let speeds: [f64; DOF] = match answer.filter(|_| known.id == before.id) {
-            Some(values) => match {
+            Some(values) => {
                 pace.take(&values, before.id - answered);
                 answered = before.id;
-                shaping.shape(&Target::Positions(values), &before, cycle == 0, Some(&pace))
-            } {
-                Target::Positions(q) => std::array::from_fn(|i| (q[i] - before.q_d[i]) / PERIOD),
-                Target::Velocities(_) => unreachable!(),
-            },
+                match shaping.shape(&Target::Positions(values), &before, cycle == 0, Some(&pace)) {
+                    Target::Positions(q) => std::array::from_fn(|i| (q[i] - before.q_d[i]) / PERIOD),
+                    Target::Velocities(_) => unreachable!(),
+                }
+            }
             None => {
                 seen.unanswered += 1;
                 std::array::from_fn(|i| before.dq_d[i] + before.ddq_d[i] * PERIOD)
