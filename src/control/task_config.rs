@@ -89,7 +89,7 @@ fn among(params: &mut Value) -> Result<Option<Box<TaskKinematics>>, serde_json::
     let Some(params) = params.as_object_mut().filter(|params| params.contains_key("kinematics")) else {
         return Ok(None);
     };
-    let robot = ["kinematics", "link", "root", "base", "tool"].into_iter();
+    let robot = ["kinematics", "link", "root", "base"].into_iter();
     let robot: Map<String, Value> = robot.filter_map(|key| params.remove_entry(key)).collect();
     serde_json::from_value(Value::Object(robot)).map(Some)
 }
