@@ -125,7 +125,7 @@ fn a_pose_is_saved_and_is_a_goal_without_a_planner_too() {
     home.dimos("move arm --named grsp").with(2).says(&["no saved pose grsp; saved: grasp, grasp.2"]);
     home.dimos("pose save a/b").with(2).says(&["letters, digits"]);
     home.dimos("pose save x rarm").with(2).says(&["did you mean `arm`?"]);
-    home.dimos("pose remove grap").with(2).says(&["did you mean `grasp`?"]);
+    home.dimos("pose remove graspp").with(2).says(&["did you mean `grasp`?"]);
     home.dimos("pose remove grasp").with(0);
     home.dimos("move arm --named grasp").with(2);
     // What is not a list of poses is not overwritten.
