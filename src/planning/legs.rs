@@ -15,6 +15,8 @@ use crate::robot::kinematics::frame;
 /// Maximum deviation at the corners of a straight line, and at a waypoint [rad].
 const LINE_DEVIATION: f64 = 1e-3;
 const MOST_DEVIATION: f64 = 0.5;
+/// Shortest piece at a waypoint that is blended [rad].
+const SHORTEST_BLENDED: f64 = 0.01;
 
 /// The way to one goal.
 pub(super) struct Leg {
@@ -113,7 +115,8 @@ fn waypoint_deviation(stage: &Stage<'_>, before: &[f64], at: &[f64], after: &[f6
     let (to, from) = (distance(before, at).max(1e-12), distance(at, after).max(1e-12));
     let turn: Vec<f64> = before.iter().zip(at).zip(after).map(|((a, b), c)| (c - b) / from - (b - a) / to).collect();
     let size = turn.iter().map(|t| t * t).sum::<f64>().sqrt();
-    if blend <= 0.0 || size < 1e-9 {
+    // A blend of so short a piece would take longer than a stop.
+    if blend <= 0.0 || size < 1e-9 || to.min(from) < SHORTEST_BLENDED {
         return 0.0;
     }
     let farthest = |deviation: f64| {

@@ -157,6 +157,9 @@ fn passes_waypoints(home: &Home) {
     let distance = |p: &[f64; 3]| p.iter().zip(place).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
     let nearest = tip(&blended).iter().map(distance).fold(f64::MAX, f64::min);
     assert!(nearest < 0.03 + 1e-3, "{nearest} m from the waypoint");
+    let short = "--through 0.2,-0.3,0.6,0,0.8,0 0.2,-0.300000004,0.600000007,0,0.800000009,0 --blend 0.02 --json";
+    let plan = home.dimos(&format!("plan arm {short}")).with(0).json();
+    assert!(plan["summary"]["duration"].as_f64().unwrap() < 2.0, "a short piece takes no time: {plan}");
     home.dimos(&format!("plan arm {through} 1,2")).with(2).says(&["6 joints, the goal 2 values"]);
     home.dimos("plan arm --through home 0.1,0.2,0,0,0,9 home").with(1).says(&["waypoint 2: "]);
     home.dimos("plan arm --through home").with(2);
