@@ -7,6 +7,8 @@ READERS := tests/readers
 SYSTEM_TOOLS := cyclictest linux.uml insmod ip tc cansend
 SYSTEM_PACKAGES := rt-tests user-mode-linux kmod iproute2 can-utils
 
+# A comma in the argument of a function.
+, := ,
 TARGET := $(or $(CARGO_TARGET_DIR),target)
 # Where the stripped program, its debug file and the packages go.
 SHIPPED := $(TARGET)/shipped
@@ -14,6 +16,11 @@ SHIPPED := $(TARGET)/shipped
 LARGEST := 12000000
 # For all users where root installs, else for this user.
 PREFIX ?= $(if $(filter 0,$(shell id -u)),/usr/local,$(HOME)/.local)
+# The shipped program contains equal functions once (Rust's own linker, which is the default on x86-64, does that), no
+# paths of the computer that built it, and of zstd's compressors that of level 1, which logs are written with.
+EQUAL_ONCE = $(if $(filter x86_64-unknown-linux-gnu,$(shell rustc --print host-tuple)),-Clink-arg=-Wl$(,)--icf=all)
+SHORT_PATHS := --remap-path-prefix=$(or $(CARGO_HOME),$(HOME)/.cargo)/registry/src/=
+LEVEL_1 := $(foreach kind,DFAST GREEDY LAZY LAZY2 BTLAZY2 BTOPT BTULTRA,-DZSTD_EXCLUDE_$(kind)_BLOCK_COMPRESSOR)
 # Without objcopy the linker drops the debug information.
 STRIP := $(if $(shell command -v objcopy),,CARGO_PROFILE_DIST_STRIP=symbols)
 
@@ -36,7 +43,7 @@ dist: shipped
 # The optimized program without debug information, and its debug file.
 shipped:
 	@echo "building dimos as it is shipped: several minutes" >&2
-	$(STRIP) cargo build --profile dist --locked --bin dimos
+	$(STRIP) CFLAGS="$(LEVEL_1)" RUSTFLAGS="$(EQUAL_ONCE) $(SHORT_PATHS)" cargo build --profile dist --locked --bin dimos
 	packaging/strip.sh $(TARGET)/dist/dimos $(SHIPPED)
 	@size=$$(stat -c %s $(SHIPPED)/dimos); [ $$size -le $(LARGEST) ] || \
 	{ echo "error: the program has $$size bytes (limit $(LARGEST))" >&2; exit 1; }

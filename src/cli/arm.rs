@@ -1,4 +1,4 @@
-//! `dimos arm enable|disable|reset|gripper|io|payload|tool ARM`: motors, latch, gripper and optional parts of an arm in
+//! `dimos arm enable|disable|reset|teach|gripper|io|payload|tool ARM`: motors, latch, gripper and optional parts of an arm in
 //! a run; `find-port`, `setup-motors`, `calibrate` and `configure`: work on an arm without a run, directly on its bus.
 
 mod bus;
@@ -8,6 +8,7 @@ mod find_port;
 mod live_table;
 pub(super) mod parts;
 mod setup_motors;
+mod teach;
 pub(super) mod tool;
 
 use clap::Subcommand;
@@ -42,6 +43,8 @@ enum Action {
     },
     /// Clear a latched hold or a fault; moves nothing, enables nothing
     Reset(ArmArgs),
+    /// Lead the arm by hand, and record the motion
+    Teach(teach::Args),
     /// Open or close the gripper, with a largest force if it has force control
     Gripper {
         #[command(flatten)]
@@ -134,6 +137,7 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
             Ok(Exit::Ok)
         }
         Action::Gripper { which, opening, force } => gripper(which, *opening, *force),
+        Action::Teach(args) => teach::run(args),
         Action::Io(args) => parts::io(args),
         Action::Payload(args) => parts::payload(args),
         Action::Tool(args) => tool::run(args),

@@ -26,11 +26,24 @@ pub struct Signals(Arc<AtomicUsize>);
 
 /// Waits for the end of a motion of `task` and prints it. A signal cancels the motion first.
 pub fn follow(client: &mut Client, motion: u64, task: &str, signals: &Signals, json: bool) -> Result {
+    let cancel = Cancel { task: Some(task.to_owned()), ..Cancel::default() };
+    follow_until(client, motion, task, &cancel, signals, json)
+}
+
+/// As [`follow`]; a signal sends this request. `name` labels the progress bar.
+pub fn follow_until(
+    client: &mut Client,
+    motion: u64,
+    name: &str,
+    cancel: &Cancel,
+    signals: &Signals,
+    json: bool,
+) -> Result {
     let bar = ProgressBar::new(1000).with_finish(ProgressFinish::AndClear);
     if let Ok(style) = ProgressStyle::with_template("{prefix} [{bar:40}] {percent:>3} % {msg}") {
         bar.set_style(style.progress_chars("=> "));
     }
-    bar.set_prefix(task.to_owned());
+    bar.set_prefix(name.to_owned());
     let mut cancelled: Option<Instant> = None;
     let mut motion = motion;
     let report = loop {
@@ -53,7 +66,7 @@ pub fn follow(client: &mut Client, motion: u64, task: &str, signals: &Signals, j
         }
         if cancelled.is_none() && signals.last().is_some() {
             bar.suspend(|| output::note(format_args!("cancelling motion {motion}: the arm decelerates")));
-            client.call(Cancel { task: Some(task.to_owned()), ..Cancel::default() })?;
+            client.call(cancel.clone())?;
             cancelled = Some(Instant::now());
         }
         if cancelled.is_some_and(|since| since.elapsed() > REST_TIMEOUT) {

@@ -150,24 +150,30 @@ impl Goal {
         (!self.joints.is_empty()).then_some(&self.joints)
     }
 
+    /// Returns the pose, if it is the goal.
+    pub fn pose(&self) -> Option<PoseSpec> {
+        self.spec(&self.pose)
+    }
+
+    fn spec(&self, xyz: &Option<Vec<f64>>) -> Option<PoseSpec> {
+        xyz.as_deref().and_then(|xyz| xyz.try_into().ok()).map(|xyz| PoseSpec {
+            xyz,
+            rpy: self.rpy.as_deref().and_then(|rpy| rpy.try_into().ok()),
+            quat: self.quat.as_deref().and_then(|quat| quat.try_into().ok()),
+        })
+    }
+
     /// Returns the goals for the planner; `robot` is the robot of positions, pose and name.
     fn of(&self, robot: Option<&str>, search: &Search) -> Vec<PlanGoal> {
         let Some(robot) = robot else { return self.several.clone() };
         if let Some(last) = self.through.last() {
             return vec![PlanGoal { robot: robot.to_owned(), ..last.clone() }];
         }
-        let spec = |xyz: &Option<Vec<f64>>| {
-            xyz.as_deref().and_then(|xyz| xyz.try_into().ok()).map(|xyz| PoseSpec {
-                xyz,
-                rpy: self.rpy.as_deref().and_then(|rpy| rpy.try_into().ok()),
-                quat: self.quat.as_deref().and_then(|quat| quat.try_into().ok()),
-            })
-        };
         vec![PlanGoal {
             robot: robot.to_owned(),
             joints: self.joints().map(<[f64]>::to_vec),
-            pose: spec(&self.pose),
-            by: spec(&self.by),
+            pose: self.spec(&self.pose),
+            by: self.spec(&self.by),
             frame: self.frame.clone(),
             named: self.named.clone(),
             linear: search.linear,

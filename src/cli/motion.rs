@@ -3,10 +3,10 @@
 
 use super::arguments::Target;
 use super::exit::{Exit, Failure, Result};
-use super::follow::{Signals, follow};
+use super::follow::{Signals, follow, follow_until};
 use super::goal::{Goal, Search, has_planner, plan, show};
 use super::output;
-use crate::rpc::api::{ExecutePlan, Move, Poses, State};
+use crate::rpc::api::{Cancel, ExecutePlan, Move, MoveNative, Poses, State};
 use crate::rpc::client::Client;
 
 /// Arguments of `move`.
@@ -37,8 +37,12 @@ pub struct Args {
     #[command(flatten)]
     pub search: Search,
     /// Move straight in joint space even if the run has a planner: not collision-checked
-    #[arg(long, conflicts_with_all = ["tcp", "several"])]
+    #[arg(long, conflicts_with = "several")]
     pub direct: bool,
+    /// Let the arm's own controller move to --pose: not collision-checked; with a planner in the run only with --direct.
+    /// --frame controller gives the pose in the controller's own frame
+    #[arg(long, requires = "pose", conflicts_with_all = ["joints", "named", "by", "several", "through", "linear", "replan"])]
+    pub native: bool,
     /// If an obstacle blocks the motion, stop, plan again and continue
     #[arg(long, conflicts_with_all = ["direct", "no_wait"])]
     pub replan: bool,
@@ -54,6 +58,9 @@ pub struct Args {
 pub fn run(args: &Args) -> Result {
     let mut client = args.target_run.connect()?;
     let signals = Signals::watch();
+    if args.native {
+        return move_native(args, &mut client, &signals);
+    }
     let planned = !args.direct && has_planner(&mut client)?;
     let (motion, task, reply) =
         if planned { plan_and_begin(args, &mut client, &signals)? } else { begin_direct(args, &mut client, &signals)? };
@@ -64,6 +71,32 @@ pub fn run(args: &Args) -> Result {
         output::json(&reply);
     }
     Ok(Exit::Ok)
+}
+
+/// Lets the arm's own controller move it.
+fn move_native(args: &Args, client: &mut Client, signals: &Signals) -> Result {
+    let (Some(arm), Some(pose)) = (&args.arm, args.goal.pose()) else { return Ok(Exit::Usage) };
+    let controller_frame = match args.goal.frame.as_deref() {
+        None | Some("map") => false,
+        Some("controller") => true,
+        Some(other) => return Err(Failure::usage(format!("--native takes --frame map or controller, not {other}"))),
+    };
+    signals.check()?;
+    let request =
+        MoveNative { arm: arm.clone(), pose, controller_frame, speed: args.search.speed, direct: args.direct };
+    let begun = client.call(request)?;
+    let (motion, percent) = (begun.motion, begun.speed * 100.0);
+    output::note(format_args!(
+        "motion {motion} by {arm}'s own controller at {percent:.0} % of its top speed: not collision-checked"
+    ));
+    if args.no_wait {
+        if args.target_run.json {
+            output::json(&begun);
+        }
+        return Ok(Exit::Ok);
+    }
+    let cancel = Cancel { arm: Some(arm.clone()), ..Cancel::default() };
+    follow_until(client, motion, arm, &cancel, signals, args.target_run.json)
 }
 
 type Begun = (u64, String, serde_json::Value);
@@ -88,6 +121,10 @@ fn begin_direct(args: &Args, client: &mut Client, signals: &Signals) -> Result<B
         _ => None,
     };
     let Some((arm, target)) = target else {
+        if args.direct {
+            let failure = Failure::usage("--direct takes joint positions, or --named with a saved pose");
+            return Err(failure.hint("leave it out for a planned motion, or add --native to --pose"));
+        }
         let failure = Failure::new(Exit::Failed, "poses, --goal and --through need a planner, and this run has none");
         return Err(failure.hint("run a planner blueprint, such as yourarm-planner, or give joint positions"));
     };

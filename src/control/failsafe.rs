@@ -4,12 +4,14 @@
 //! ```text
 //!             ready (request)          ramp over
 //! Disabled ─────────────────▶ Activating ───────▶ Ready ──stop, fault──▶ Held ──reset──▶ Standby ──ready──▶ Activating
+//!                                                   │ lead                                  ▲
+//!                                                   └────▶ Led ──prepare to disable─────────┘
 //! ```
 
 use super::config::ACTIVATION_RAMP;
 use crate::arm::{ArmState, Interference, Link};
 use crate::clock::Mono;
-use crate::telemetry::{Age, Cause, Outcome, Phase};
+use crate::telemetry::{Age, Cause, LedBy, Outcome, Phase};
 
 /// Phase of one arm.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -17,11 +19,13 @@ pub struct Failsafe {
     phase: Phase,
     cause: Cause,
     since: Mono,
+    /// What moves the arm while it is led.
+    led_by: LedBy,
 }
 
 impl Default for Failsafe {
     fn default() -> Self {
-        Self { phase: Phase::Unknown, cause: Cause::None, since: Mono::ZERO }
+        Self { phase: Phase::Unknown, cause: Cause::None, since: Mono::ZERO, led_by: LedBy::Hand }
     }
 }
 
@@ -61,8 +65,13 @@ impl Failsafe {
         self.cause
     }
 
+    /// Returns what moves the arm; `None` while nothing but this program does.
+    pub fn led_by(&self) -> Option<LedBy> {
+        (self.phase == Phase::Led).then_some(self.led_by)
+    }
+
     fn enter(&mut self, phase: Phase, cause: Cause, now: Mono) {
-        *self = Self { phase, cause, since: now };
+        *self = Self { phase, cause, since: now, led_by: self.led_by };
     }
 
     /// Takes the arm's state. Returns whether the phase or its cause changed.
@@ -90,8 +99,9 @@ impl Failsafe {
                     self.enter(Phase::Held, cause, now);
                 }
             }
-            Phase::Activating | Phase::Ready => match trouble(state, fresh) {
+            Phase::Activating | Phase::Ready | Phase::Led => match trouble(state, fresh) {
                 Some(cause) => self.enter(Phase::Held, cause, now),
+                None if self.led_by() == Some(LedBy::HandMotorsOff) => {}
                 None if !state.enabled => self.enter(Phase::Held, Cause::PowerLost, now),
                 None if self.phase == Phase::Activating && now.since(self.since) >= ACTIVATION_RAMP => {
                     self.enter(Phase::Ready, Cause::None, now);
@@ -108,7 +118,7 @@ impl Failsafe {
         let holds = match self.phase {
             Phase::Held | Phase::Unknown => false,
             Phase::Disabled => cause == Cause::Operator,
-            Phase::Standby | Phase::Activating | Phase::Ready => true,
+            Phase::Standby | Phase::Activating | Phase::Ready | Phase::Led => true,
         };
         if holds {
             self.enter(Phase::Held, cause, now);
@@ -117,8 +127,28 @@ impl Failsafe {
 
     /// The arm will be disabled: refuses motion from now on, without a latch.
     pub fn prepare_disable(&mut self, now: Mono) {
-        if matches!(self.phase, Phase::Activating | Phase::Ready) {
+        if matches!(self.phase, Phase::Activating | Phase::Ready | Phase::Led) {
             self.enter(Phase::Standby, Cause::None, now);
+        }
+    }
+
+    /// The arm will be led: from `Ready`, or with the motors off from `Disabled`.
+    pub fn lead(&mut self, by: LedBy, arm: u16, state: &ArmState, fresh: Freshness, now: Mono) -> Outcome {
+        let from = if by == LedBy::HandMotorsOff { Phase::Disabled } else { Phase::Ready };
+        if self.phase == Phase::Held {
+            return Outcome::ArmLatched(arm, self.cause);
+        }
+        if self.phase != from {
+            return Outcome::ArmNotReady(arm, self.phase, self.cause);
+        }
+        match trouble(state, fresh) {
+            Some(Cause::Stale(_) | Cause::LinkLost) => Outcome::StartStateUnavailable(arm),
+            Some(cause) => Outcome::StillFaulted(arm, cause),
+            None => {
+                self.led_by = by;
+                self.enter(Phase::Led, Cause::None, now);
+                Outcome::Accepted
+            }
         }
     }
 
@@ -142,6 +172,8 @@ impl Failsafe {
         match self.phase {
             Phase::Activating | Phase::Ready => Outcome::Accepted,
             Phase::Held => Outcome::ArmLatched(arm, self.cause),
+            // It is stopped first, so that it holds where it is.
+            Phase::Led => Outcome::ArmNotReady(arm, self.phase, self.cause),
             Phase::Unknown | Phase::Disabled | Phase::Standby => match trouble(state, fresh) {
                 Some(Cause::Stale(_) | Cause::LinkLost) => Outcome::StartStateUnavailable(arm),
                 Some(cause) => Outcome::StillFaulted(arm, cause),

@@ -4,6 +4,7 @@
 use super::task_robot::FramePose;
 use crate::clock::Mono;
 use crate::joint::Joints;
+use crate::telemetry::LedBy;
 use crate::trajectory::Spline;
 
 /// A request with its id. `Event::Request` with the same id has the outcome.
@@ -82,10 +83,17 @@ pub enum Request {
         /// The arm.
         arm: u16,
     },
-    /// The arm will be disabled: decelerate it to rest and refuse motion.
+    /// The arm will be disabled: decelerate it to rest and refuse motion. A led arm gets its own stop.
     PrepareDisable {
         /// The arm.
         arm: u16,
+    },
+    /// The arm will be led: it gets no more setpoints. It must be at rest, without an active task.
+    Lead {
+        /// The arm.
+        arm: u16,
+        /// What moves it.
+        by: LedBy,
     },
     /// Open or close a gripper.
     Gripper {

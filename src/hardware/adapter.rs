@@ -3,12 +3,13 @@
 //! All values are in SI units: rad, rad/s, Nm, m, N. A new arm implements the methods without a default body, and
 //! overrides the others if its device has the feature; the defaults report a missing feature. Features that only some
 //! arms have are separate traits: [`Gripper`], [`ForceTorque`], [`Cartesian`], [`Io`],
-//! [`Payload`], [`JointMonitor`].
+//! [`Payload`], [`JointMonitor`], [`HandGuiding`].
 //!
 //! A device is either polled, or streams its state. For the second kind, [`ManipulatorAdapter::state_fd`] returns the
 //! descriptor on which the state arrives: the device thread then reads when data has arrived, so the age of the state
 //! depends on the device only.
 
+mod hand_guiding;
 mod io;
 mod joint_monitor;
 mod payload;
@@ -20,6 +21,7 @@ use crate::arm::{ForceUnit, GripperInfo, GripperUnit, Pose};
 use crate::clock::Mono;
 use crate::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
 
+pub use hand_guiding::HandGuiding;
 pub use io::Io;
 pub use joint_monitor::JointMonitor;
 pub use payload::Payload;
@@ -267,6 +269,10 @@ pub trait ManipulatorAdapter: Send {
     fn joint_monitor(&mut self) -> Option<&mut dyn JointMonitor> {
         None
     }
+    /// Returns the arm's guiding by hand; `None` if it has none. Does not change while the arm is connected.
+    fn hand_guiding(&mut self) -> Option<&mut dyn HandGuiding> {
+        None
+    }
 }
 
 /// A gripper with one degree of freedom: fingers along one axis, or a rotary jaw. The adapter usually implements it
@@ -366,7 +372,8 @@ pub trait Cartesian {
     /// Returns the end-effector pose; `None` while it is unknown. Must not allocate.
     fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>>;
     /// Commands an end-effector pose; the device plans the motion. `velocity` as in
-    /// [`ManipulatorAdapter::write_joint_positions`].
+    /// [`ManipulatorAdapter::write_joint_positions`]. Called in mode [`ControlMode::Position`]; no setpoint follows
+    /// until the arm is activated again.
     fn write_cartesian_position(&mut self, _pose: &Pose, _velocity: f64) -> AdapterResult<()> {
         Err(AdapterError::Unsupported)
     }

@@ -25,6 +25,17 @@ named! {
     }
 }
 
+/// How an arm may be led by hand, for `dimos arm teach`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Teach {
+    /// Its controller compensates gravity: [`HandGuiding`](crate::hardware::adapter::HandGuiding).
+    HandGuiding,
+    /// With its motors off, supported by the hand that leads it: only for a light arm.
+    MotorsOff,
+    /// It may not, for this reason: a sentence without full stop.
+    No(&'static str),
+}
+
 /// The form of an adapter's `address`.
 #[derive(Debug, Clone, Copy)]
 pub struct AddressForm {
@@ -146,6 +157,8 @@ pub struct AdapterSpec {
     pub address: AddressForm,
     /// Whether the arm keeps its pose when its motors are disabled (brakes), or falls.
     pub holds_when_disabled: bool,
+    /// How it may be led by hand.
+    pub teach: Teach,
     /// Whether it can have a gripper.
     pub gripper: bool,
     /// The adapter's own options.

@@ -6,6 +6,7 @@ use crate::clock::Mono;
 use crate::control::request::{Goal, Motion, Request};
 use crate::control::task_robot::FramePose;
 use crate::joint::{Joints, joints_of};
+use crate::telemetry::LedBy;
 use crate::trajectory::{JointTrajectory, Spline};
 
 /// A message of `/dimos/requests`.
@@ -66,6 +67,10 @@ enum LoggedRequest {
     },
     Park {
         arm: u16,
+    },
+    Lead {
+        arm: u16,
+        by: LedBy,
     },
     Gripper {
         arm: u16,
@@ -132,6 +137,7 @@ fn request(logged: LoggedRequest, joints: &[String]) -> Result<Request, String> 
         LoggedRequest::Reset { arm } => Request::Reset { arm },
         LoggedRequest::Ready { arm } => Request::Enabled { arm },
         LoggedRequest::Park { arm } => Request::PrepareDisable { arm },
+        LoggedRequest::Lead { arm, by } => Request::Lead { arm, by },
         LoggedRequest::Gripper { arm, opening, force } => {
             Request::Gripper { arm, opening: opening.unwrap_or(f64::NAN), force }
         }
@@ -193,6 +199,7 @@ mod tests {
             Request::Reset { arm: 1 },
             Request::Enabled { arm: 0 },
             Request::PrepareDisable { arm: 2 },
+            Request::Lead { arm: 1, by: LedBy::HandMotorsOff },
             Request::Gripper { arm: 1, opening: 0.1 + 0.2, force: None },
             Request::Gripper { arm: 1, opening: -0.1 - 0.2, force: Some(0.1 + 0.2) },
             Request::Gripper { arm: 0, opening: 0.04, force: Some(f64::NAN) },

@@ -179,6 +179,11 @@ methods! {
     "arm_reset" ArmReset -> ArmReply;
     /// Enables the motors at the current position and makes the arm ready for motion.
     "arm_enable" ArmEnable -> ArmReply;
+    /// Lets the arm be led by hand, at rest: `arm_enable` ends that.
+    "arm_teach" ArmTeach -> ArmReply;
+    /// Lets the arm's own controller move it to a pose: not collision-checked; in a run with a planner only with
+    /// `direct`. Replies when the motion begins; `motion` reports its end.
+    "move_native" MoveNative -> NativeReply, check MoveNative::valid;
     /// Decelerates the arm to rest and disables the motors. An arm without brakes falls.
     "arm_disable" ArmDisable -> ArmReply;
     /// Commands a gripper.

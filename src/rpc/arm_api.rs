@@ -6,6 +6,8 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::api::{Method, finite};
+use super::motion_api::{default_speed, valid_speed};
+use super::planner_api::PoseSpec;
 
 /// Parameters of `stop`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
@@ -62,6 +64,53 @@ pub struct ArmEnable {
     pub arm: String,
 }
 
+/// Parameters of `arm_teach`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ArmTeach {
+    /// The arm's `hardware_id`.
+    pub arm: String,
+    /// Somebody holds the arm: required for one that is led with its motors off.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub support_the_arm: bool,
+}
+
+/// Parameters of `move_native`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct MoveNative {
+    /// The arm's `hardware_id`.
+    pub arm: String,
+    /// Pose of the tool centre point in `map`; in a run without a model of the arm, and with `controller_frame`, the
+    /// pose that the controller itself reports. Without an orientation it keeps the present one.
+    pub pose: PoseSpec,
+    /// The pose is the controller's own, in its own base frame.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub controller_frame: bool,
+    /// Fraction of the controller's top speed, 0.01–1; the speed override scales it when the motion begins.
+    #[serde(default = "default_speed")]
+    pub speed: f64,
+    /// Required if the run has a planner: the motion is not collision-checked.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub direct: bool,
+}
+
+impl MoveNative {
+    pub(super) fn valid(&self) -> Result<(), String> {
+        self.pose.valid("pose")?;
+        valid_speed(self.speed)
+    }
+}
+
+/// Reply to `move_native`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct NativeReply {
+    /// The motion's number, for `motion`.
+    pub motion: u64,
+    /// Fraction of the top speed that the controller was given.
+    pub speed: f64,
+}
+
 /// Parameters of `arm_disable`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
@@ -73,7 +122,7 @@ pub struct ArmDisable {
     pub now: bool,
 }
 
-/// Reply to `arm_reset`, `arm_enable` and `arm_disable`.
+/// Reply to `arm_reset`, `arm_enable`, `arm_teach` and `arm_disable`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct ArmReply {
     /// The arm's `hardware_id`.

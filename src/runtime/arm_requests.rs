@@ -109,7 +109,11 @@ impl Service {
                 return self.refusal(&outcome).map_or_else(|| Err(internal()), Err);
             }
             Phase::Ready | Phase::Activating => {}
-            _ => {
+            phase => {
+                if phase == Phase::Led {
+                    self.led_arm_rests(&id, arm)?;
+                    self.end_lead(&id, arm).await?;
+                }
                 order(self.device(arm)?.activate()).await.map_err(|e| refused(&id, "was not enabled", &e))?;
                 self.ask(Request::Enabled { arm }).await?;
             }

@@ -156,6 +156,7 @@ pub fn log_of(request: &Request) -> Value {
         Request::Reset { arm } => json!({"reset": {"arm": arm}}),
         Request::Enabled { arm } => json!({"ready": {"arm": arm}}),
         Request::PrepareDisable { arm } => json!({"park": {"arm": arm}}),
+        Request::Lead { arm, by } => json!({"lead": {"arm": arm, "by": by}}),
         Request::Gripper { arm, opening, force: None } => json!({"gripper": {"arm": arm, "opening": opening}}),
         Request::Gripper { arm, opening, force } => {
             json!({"gripper": {"arm": arm, "opening": opening, "force": force}})

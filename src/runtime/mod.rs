@@ -17,6 +17,7 @@ mod dispatch;
 mod goal_frames;
 mod handle;
 mod in_process;
+mod lead_requests;
 mod late_stops;
 mod log_file;
 mod log_throttle;

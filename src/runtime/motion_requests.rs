@@ -50,7 +50,7 @@ impl Service {
     }
 
     /// Refuses a motion that is not collision-checked if the run has a planner, also one that has disconnected.
-    fn needs_no_plan(&self, arm: &str) -> Result<(), RpcError> {
+    pub(super) fn needs_no_plan(&self, arm: &str) -> Result<(), RpcError> {
         match self.planner() {
             Ok(_) => Err(RpcError::new(Code::NotPlanned, format!("a direct motion of {arm} is not collision-checked"))
                 .hint("this run has a planner: `plan`, then `execute_plan`; or ask for it with `direct`: true")),

@@ -7,19 +7,21 @@ use crate::rpc::api::Presence;
 use crate::telemetry::{Reason, TaskState};
 use crate::trajectory::Spline;
 
+/// The task of a native motion: none, the arm's own controller executes it.
+pub const NATIVE: u16 = u16::MAX;
 /// Maximum number of motions kept.
 const REMEMBERED: usize = 256;
 
 /// A motion as it was sent to the coordinator.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Planned {
-    /// The task that executes it.
+    /// The task that executes it, or [`NATIVE`].
     pub task: u16,
     /// Its joints: indices over all arms' joints.
     pub joints: Vec<u16>,
-    /// Goal positions [rad].
+    /// Goal positions [rad]; none for a native motion.
     pub goal: Vec<f64>,
-    /// Planned duration [s].
+    /// Planned duration; of a native motion, its duration once it has ended [s].
     pub duration: f64,
     /// The plan that it executes, and its trajectory, for planned motions.
     pub plan: Option<Carried>,
@@ -105,6 +107,22 @@ impl Motions {
         }
         let running = self.0.values_mut().find(|(planned, end)| planned.task == task && end.is_none());
         if let Some((planned, end)) = running {
+            let at = |j: &u16| positions.get(*j as usize).copied().unwrap_or(f64::NAN);
+            *end = Some(End { state, reason, actual: planned.joints.iter().map(at).collect() });
+        }
+    }
+
+    /// Ends a native motion after `elapsed` [s]. `positions`: as in [`Motions::task_changed`]; `why`: why it did not
+    /// reach its goal.
+    pub fn end(
+        &mut self,
+        number: u64,
+        (state, reason, why): (TaskState, Reason, Option<String>),
+        elapsed: f64,
+        positions: &[f64],
+    ) {
+        if let Some((planned, end)) = self.0.get_mut(&number) {
+            (planned.duration, planned.blocked) = (elapsed, why);
             let at = |j: &u16| positions.get(*j as usize).copied().unwrap_or(f64::NAN);
             *end = Some(End { state, reason, actual: planned.joints.iter().map(at).collect() });
         }

@@ -3,7 +3,7 @@
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::Instant;
 
-use super::motions::{End, Next};
+use super::motions::{End, NATIVE, Next};
 use super::service::Service;
 use super::tcp::TcpModel;
 use crate::arm::{ArmState, VelocitySource};
@@ -213,11 +213,15 @@ impl Service {
         let Some((planned, end)) = motions.get(number) else {
             return Err(RpcError::new(Code::UnknownMotion, format!("no motion {number}, or too long ago")));
         };
-        let (task, collision_checked) = (self.parts.names.task(planned.task), planned.plan.is_some());
+        let task = if planned.task == NATIVE { "native".to_owned() } else { self.parts.names.task(planned.task) };
+        let collision_checked = planned.plan.is_some();
         let mut report = MotionReport { motion: number, task, collision_checked, ..Default::default() };
         let view = self.task_view(planned.task as usize);
         if view.motion == number {
             (report.progress, report.elapsed, report.remaining) = (view.progress, view.elapsed, view.remaining);
+        }
+        if planned.task == NATIVE {
+            report.elapsed = planned.duration;
         }
         let over = !matches!(view.state, TaskState::Executing | TaskState::Cancelling);
         let end = match end {
@@ -277,6 +281,7 @@ impl Service {
                 .data(serde_json::json!({"joint": names.joint(*joint), "distance": distance})),
             Outcome::StartStateUnavailable(_) => error.hint("`dimos status` shows its link and the age of its state"),
             Outcome::ArmNotReady(a, ..) => error.hint(format!("make it ready: `dimos arm enable {}`", arm(a))),
+            Outcome::ArmMoving(_) => error.hint("again when it is at rest"),
             Outcome::ArmLatched(a, _) => {
                 let a = arm(a);
                 error.hint(format!("when it may move again: `dimos arm reset {a}`, then `dimos arm enable {a}`"))

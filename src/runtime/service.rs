@@ -70,6 +70,8 @@ pub struct Service {
     pub(super) progress: Progress,
     /// One gripper order per arm at a time, so that each gets its own answer.
     pub(super) grippers: Vec<tokio::sync::Mutex<()>>,
+    /// Per arm, the number of the motion that its own controller makes; 0 = none.
+    pub(super) natives: Vec<AtomicU64>,
     /// Per arm, the numbers of the slowly changing values that were logged last.
     pub(super) details_logged: Mutex<Vec<Details>>,
     /// Per arm, the objects that it holds and whose mass is known. Locked while a load is set.
@@ -100,6 +102,7 @@ impl Service {
         Self {
             progress: Progress::default(),
             grippers: parts.devices.iter().map(|_| tokio::sync::Mutex::default()).collect(),
+            natives: parts.devices.iter().map(|_| AtomicU64::default()).collect(),
             details_logged: Mutex::new(vec![Details::default(); parts.devices.len()]),
             task_tools: Mutex::new(parts.blueprint.tasks.iter().map(|task| task.robot.as_ref()?.tool).collect()),
             held_loads: parts.devices.iter().map(|_| tokio::sync::Mutex::default()).collect(),
@@ -278,6 +281,9 @@ impl Service {
                 tasks.insert(config.name.clone(), outcome.name().to_owned());
             }
         }
+        if task.is_none() && self.cancel_natives(|native| arm.is_none_or(|arm| arm == native)).await? {
+            tasks.insert("native".to_owned(), Outcome::Cancelled.name().to_owned());
+        }
         // Last: a planner in another process may be slow.
         let planning = call.task.is_none() && self.cancel_planning(None).await;
         Ok(Reply::Cancel(api::CancelReply { tasks, planning }))
@@ -290,6 +296,10 @@ impl Service {
         }
         if let Some(on) = call.paused {
             self.ask(Request::Pause { on }).await?;
+            // A controller of an arm knows no pause: its motion ends.
+            if on {
+                self.cancel_natives(|_| true).await?;
+            }
         }
         Ok(self.speed_override())
     }
@@ -331,6 +341,8 @@ impl Service {
             Call::Stop(s) => self.stop(s).await,
             Call::ArmReset(a) => self.reset(a.arm).await,
             Call::ArmEnable(a) => self.enable(a.arm).await,
+            Call::ArmTeach(a) => self.teach(a).await,
+            Call::MoveNative(m) => self.move_native(m).await,
             Call::ArmDisable(a) => self.disable(a.arm, a.now).await,
             Call::Gripper(g) => self.gripper(g).await,
             Call::ArmPayload(p) => self.payload(&p.arm).await.map(Reply::ArmPayload),

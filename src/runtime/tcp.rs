@@ -30,7 +30,7 @@ pub(super) struct TcpModel {
     /// Index of the end-effector link in the kinematics.
     index: usize,
     /// Pose of the model's root in `map`.
-    root: DAffine3,
+    pub root: DAffine3,
     /// Name of the end-effector link.
     pub link: String,
     /// Pose of the tool centre point in the link's frame.

@@ -156,7 +156,10 @@ fn request(id: u64, outcome: Outcome, names: &Names) -> Described {
             d.arm = Some(names.arm(arm));
             d.values = vec![value];
         }
-        Outcome::StartStateUnavailable(arm) | Outcome::NoGripper(arm) | Outcome::NoGripperForce(arm) => {
+        Outcome::StartStateUnavailable(arm)
+        | Outcome::ArmMoving(arm)
+        | Outcome::NoGripper(arm)
+        | Outcome::NoGripperForce(arm) => {
             d.arm = Some(names.arm(arm));
         }
         Outcome::ArmNotReady(arm, _, cause) | Outcome::ArmLatched(arm, cause) | Outcome::StillFaulted(arm, cause) => {
@@ -181,6 +184,7 @@ pub fn outcome_text(outcome: &Outcome, names: &Names) -> String {
         Outcome::ArmNotReady(arm, phase, cause) => {
             format!("{} is not ready: {}{}", names.arm(arm), phase.name(), because(cause))
         }
+        Outcome::ArmMoving(arm) => format!("{} still moves", names.arm(arm)),
         Outcome::ArmLatched(arm, cause) => format!("{} is held{}: reset it first", names.arm(arm), because(cause)),
         Outcome::StillFaulted(arm, cause) => format!("{} cannot be reset yet{}", names.arm(arm), because(cause)),
         Outcome::WrongTask(task) => format!("task {} does not support this request", names.task(task)),
@@ -296,6 +300,13 @@ pub fn cause_text(cause: Cause) -> String {
         Cause::PositionJump(joint, by) => {
             format!("the position of joint {} jumped by {}", joint + 1, angle(by))
         }
+        Cause::LedTooFast(joint, velocity) => format!(
+            "the controller moved joint {} at {velocity:.3} rad/s, beyond 1.1 times its velocity limit",
+            joint + 1
+        ),
+        Cause::LedOutOfRange(joint, position) => {
+            format!("the controller moved joint {} to {position:.4} rad, outside its range", joint + 1)
+        }
         Cause::MovedWhileActivating(joint, by) => {
             format!("joint {} moved by {} while the arm was being enabled", joint + 1, angle(by))
         }
@@ -329,7 +340,11 @@ fn because(cause: Cause) -> String {
 fn code(cause: Cause) -> Vec<f64> {
     match cause {
         Cause::Fault(code) => vec![f64::from(code)],
-        Cause::Tracking(_, by) | Cause::PositionJump(_, by) | Cause::MovedWhileActivating(_, by) => vec![by],
+        Cause::Tracking(_, by)
+        | Cause::PositionJump(_, by)
+        | Cause::MovedWhileActivating(_, by)
+        | Cause::LedTooFast(_, by)
+        | Cause::LedOutOfRange(_, by) => vec![by],
         _ => Vec::new(),
     }
 }

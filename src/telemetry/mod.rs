@@ -3,6 +3,8 @@
 
 pub mod describe;
 
+use serde::{Deserialize, Serialize};
+
 use crate::arm::{ArmCommand, ArmState};
 use crate::clock::Mono;
 use crate::named::named;
@@ -73,6 +75,22 @@ named! {
         Held = "held",
         /// Reset after a latched hold: waits for `enable`. Holds, if powered.
         Standby = "standby",
+        /// Moved by hand, or by its own controller: gets no setpoints. Ended by `enable`, `disable` or a stop.
+        Led = "led",
+    }
+}
+
+named! {
+    /// What moves an arm in [`Phase::Led`].
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+    #[serde(rename_all = "snake_case")]
+    pub enum LedBy {
+        /// A hand, with the motors on: the controller compensates gravity.
+        Hand = "hand",
+        /// A hand, with the motors off: the arm is supported by that hand only.
+        HandMotorsOff = "hand_motors_off",
+        /// Its controller, to a pose that it was given.
+        Controller = "controller",
     }
 }
 
@@ -118,6 +136,10 @@ pub enum Cause {
     PositionJump(u16, f64),
     /// A joint of the arm moved this far while the arm was being enabled [rad].
     MovedWhileActivating(u16, f64),
+    /// The arm's controller moved a joint (counted from 0) at this velocity, beyond 1.1 times its limit [rad/s].
+    LedTooFast(u16, f64),
+    /// The arm's controller moved a joint (counted from 0) to this position, outside its range [rad].
+    LedOutOfRange(u16, f64),
     /// The arm is in a mode that this run did not order.
     ModeChanged,
     /// The motors were enabled, and not by this run.
@@ -153,6 +175,8 @@ impl Cause {
             Self::Tracking(..) => "tracking",
             Self::PositionJump(..) => "position_jump",
             Self::MovedWhileActivating(..) => "moved_while_activating",
+            Self::LedTooFast(..) => "led_too_fast",
+            Self::LedOutOfRange(..) => "led_out_of_range",
             Self::ModeChanged => "mode_changed",
             Self::PowerChanged => "power_changed",
             Self::StoppedElsewhere => "stopped_elsewhere",
@@ -280,6 +304,8 @@ pub enum Outcome {
     StartStateUnavailable(u16),
     /// The arm is not ready for motion: arm, its phase and cause.
     ArmNotReady(u16, Phase, Cause),
+    /// The arm still moves: the arm.
+    ArmMoving(u16),
     /// The arm's latch must be reset first: arm, cause.
     ArmLatched(u16, Cause),
     /// The cause of the arm's latch persists: arm, cause.
@@ -315,6 +341,7 @@ impl Outcome {
             Self::StartStateMismatch(..) => "START_STATE_MISMATCH",
             Self::StartStateUnavailable(_) => "START_STATE_UNAVAILABLE",
             Self::ArmNotReady(..) => "ARM_NOT_READY",
+            Self::ArmMoving(..) => "ARM_MOVING",
             Self::ArmLatched(..) => "ARM_LATCHED",
             Self::StillFaulted(..) => "STILL_FAULTED",
             Self::WrongTask(_) => "WRONG_TASK",

@@ -11,7 +11,7 @@ pub mod protocol;
 use std::time::Duration;
 
 use dimos::hardware::check::{Checked, ConfigError};
-use dimos::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
+use dimos::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use dimos::hardware::sim::arm::SimOptions;
 use dimos::hardware::sim::can_server::PLAYABLE;
 use dimos::hardware::transport::can::CanAddress;
@@ -49,6 +49,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
         check: |address| CanAddress::parse(address).map(|address| address.to_string()),
     },
     holds_when_disabled: HOLDS_WHEN_DISABLED,
+    teach: Teach::No("not implemented"),
     gripper: false,
     options: OptionsSpec::of::<Options>(),
     check,

@@ -14,7 +14,7 @@ pub mod wire;
 use std::time::Duration;
 
 use dimos::hardware::check::{Checked, ConfigError};
-use dimos::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
+use dimos::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use dimos::hardware::sim::arm::SimOptions;
 use dimos::joint::{ControlMode, JointLimits};
 use schemars::JsonSchema;
@@ -57,6 +57,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
         check: |address| wire::address(address).map(|address| address.to_string()),
     },
     holds_when_disabled: HOLDS_WHEN_DISABLED,
+    teach: Teach::No("not implemented"),
     gripper: true,
     options: OptionsSpec::of::<Options>(),
     check,

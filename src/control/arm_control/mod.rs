@@ -3,11 +3,13 @@
 //!
 //! ```text
 //! state ─▶ feedback ─▶ tracking ─▶ failsafe ─▶ phase ─┬─ ready ────────▶ follow ──┬─▶ command
-//!                                                     └─ held, standby ▶ rest ────┘
+//!                                                     ├─ held, standby ▶ rest ────┤
+//!                                                     └─ led ──────────▶ led (none)
 //! ```
 
 mod delivery;
 mod follow;
+mod led;
 mod rest;
 
 use std::time::Duration;
@@ -56,6 +58,8 @@ pub struct ArmControl {
     /// The arm is on its way back to the last setpoint before a gap.
     returning: bool,
     rest: Rest,
+    /// Consecutive ticks in which the arm's own controller moved a joint too fast.
+    led_too_fast: u8,
 }
 
 /// Request to one joint in this tick.
@@ -111,6 +115,7 @@ impl ArmControl {
             gap_since: None,
             returning: false,
             rest: Rest::default(),
+            led_too_fast: 0,
         }
     }
 
@@ -189,6 +194,10 @@ impl ArmControl {
                 let velocity = self.command.mode == Some(ControlMode::Velocity);
                 self.tracking.supervise(velocity, state, dt)
             }
+            Phase::Led => {
+                self.tracking.pause();
+                self.led_trouble()
+            }
             _ => {
                 self.tracking.pause();
                 None
@@ -262,6 +271,10 @@ impl ArmControl {
             }
             Phase::Activating => {
                 self.follow(Demand::Nothing, ask, dt, report);
+                Routed::NotReady
+            }
+            Phase::Led => {
+                self.follow_measured();
                 Routed::NotReady
             }
             Phase::Ready => self.follow(demand, ask, dt, report),

@@ -16,6 +16,8 @@ impl Coordinator {
         let outcome = match envelope.request {
             Request::Shutdown => {
                 self.shutting_down = true;
+                let led = self.arms.iter_mut().filter(|arm| arm.failsafe.led_by().is_some());
+                led.for_each(|arm| arm.prepare_disable(now));
                 self.cancel(None)
             }
             Request::Stop { arm } => self.stop(arm, now),
@@ -42,12 +44,16 @@ impl Coordinator {
             Request::Enabled { arm } => self.with_arm(arm, |a| a.activate(arm, now)),
             Request::PrepareDisable { arm } => {
                 let outcome = self.with_arm(arm, |a| {
-                    a.failsafe.prepare_disable(now);
+                    a.prepare_disable(now);
                     Outcome::Accepted
                 });
                 self.end_tasks_of_held_arms();
                 outcome
             }
+            Request::Lead { arm, by } => match self.task_of_arm(arm) {
+                Some(task) => Outcome::AlreadyExecuting(task),
+                None => self.with_arm(arm, |a| a.lead(by, arm, now)),
+            },
             Request::Speed { fraction } => self.change_speed(|speed| speed.set(fraction)),
             Request::Pause { on } => self.change_speed(|speed| speed.paused = on),
             Request::Gripper { arm, opening, force } => self.gripper(arm, opening, force),
@@ -64,6 +70,13 @@ impl Coordinator {
             self.output.report(Event::Arm(arm, a.failsafe.phase(), a.failsafe.cause()));
         }
         outcome
+    }
+
+    /// Returns the first active task that moves a joint of an arm.
+    fn task_of_arm(&self, arm: u16) -> Option<u16> {
+        let moves = |joint: &u16| self.arm_of.get(usize::from(*joint)) == Some(&arm);
+        let active = self.tasks.iter().position(|task| task.is_active() && task.moving_joints().iter().any(moves));
+        active.map(|task| task as u16)
     }
 
     fn stop(&mut self, arm: Option<u16>, now: Mono) -> Outcome {

@@ -22,7 +22,9 @@ use std::time::Duration;
 pub use details::Details;
 pub use health::{Episode, Health, Note};
 
-use crate::arm::{ArmCommand, ArmState, GripperInfo, IoInfo, IoState, Load, OutputValue, StopInput, Supervision};
+use crate::arm::{
+    ArmCommand, ArmState, GripperInfo, IoInfo, IoState, Load, OutputValue, Pose, StopInput, Supervision,
+};
 use crate::clock::Clock;
 use crate::hardware::adapter::{AdapterError, AdapterResult, ManipulatorAdapter, ManipulatorInfo};
 use crate::joint::{JointLimits, Joints};
@@ -131,6 +133,8 @@ enum Order {
     SetOutput(OutputValue, SyncSender<AdapterResult<()>>),
     ReadPayload(SyncSender<AdapterResult<Option<Load>>>),
     SetPayload(Load, SyncSender<AdapterResult<Option<Load>>>),
+    Guide(SyncSender<AdapterResult<()>>),
+    MoveNative(Pose, f64, SyncSender<AdapterResult<()>>),
     Finish { disable: bool, reply: SyncSender<AdapterResult<()>> },
 }
 
@@ -225,6 +229,19 @@ impl Device {
     /// if the controller reports another load. Repeated whenever the motors are enabled.
     pub fn set_payload(&self, load: Load) -> Answer<Option<Load>> {
         self.order(|reply| Order::SetPayload(load, reply))
+    }
+
+    /// Lets the arm be guided by hand. `Unsupported` for an arm that cannot be. The tick must command nothing; `activate`
+    /// ends it.
+    pub fn guide(&self) -> Answer<()> {
+        self.order(Order::Guide)
+    }
+
+    /// Lets the arm's own controller move its end effector to a pose in the controller's base frame, at a fraction of
+    /// its top speed; the answer comes when the motion begins. `Unsupported` for an arm without such a motion. The tick
+    /// must command nothing; `activate` ends it.
+    pub fn move_native(&self, pose: Pose, speed: f64) -> Answer<()> {
+        self.order(|reply| Order::MoveNative(pose, speed, reply))
     }
 
     /// Returns the thread's wake deadline.

@@ -2,6 +2,7 @@
 
 mod commands;
 mod connection;
+mod lead;
 mod payload;
 mod readings;
 mod slow_readings;
@@ -90,6 +91,8 @@ pub(super) struct Worker {
     /// The tick, as seen by this thread.
     tick: tick_monitor::Seen,
     slow: slow_readings::Slow,
+    /// The arm is led, or about to be.
+    lead: lead::Lead,
     /// The load to set whenever the motors are enabled.
     payload: Option<Load>,
     last_read: Mono,
@@ -141,6 +144,7 @@ impl Worker {
             write_errors: 0,
             plausible: Plausible::default(),
             slow: slow_readings::Slow::default(),
+            lead: lead::Lead::default(),
             payload,
             last_read: Mono::ZERO,
             next_read: Mono::ZERO,
@@ -201,6 +205,7 @@ impl Worker {
             self.send_command(adapter);
             self.check_tick();
             self.stop(adapter);
+            self.begin_to_lead(adapter);
             self.discard_if_stale(adapter);
             if self.connected && (arrived || self.config.clock.now() >= self.next_read) {
                 self.read(adapter);
@@ -259,6 +264,10 @@ impl Worker {
             }
             Order::SetPayload(load, reply) => {
                 let _ = reply.send(self.set_payload(adapter, &load));
+            }
+            Order::Guide(reply) => self.lead.order(lead::Way::Hand, reply, self.config.clock.now()),
+            Order::MoveNative(pose, speed, reply) => {
+                self.lead.order(lead::Way::To(pose, speed), reply, self.config.clock.now());
             }
             Order::Finish { disable, reply } => {
                 let _ = reply.send(self.finish(adapter, disable));

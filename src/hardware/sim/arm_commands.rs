@@ -25,6 +25,9 @@ impl SimArm {
         if on && self.error != 0 {
             return Err(Refusal::InError);
         }
+        if self.mode == ControlMode::Impedance {
+            self.plant.stop();
+        }
         (0..self.dof()).for_each(|joint| self.enable_joint(joint, on));
         Ok(())
     }
@@ -48,6 +51,14 @@ impl SimArm {
             return Err(Refusal::InError);
         }
         self.error = 0;
+        Ok(())
+    }
+
+    /// Lets the arm be guided by hand until it is stopped or enabled; only while it is at rest.
+    pub fn guide(&mut self) -> Result<(), Refusal> {
+        self.ready()?;
+        self.set_mode(ControlMode::Impedance)?;
+        self.plant.guide();
         Ok(())
     }
 

@@ -14,8 +14,10 @@ impl SimArm {
         if let Some(fault) = self.take_fault(FaultKind::ErrorCode) {
             self.fail(fault.code);
         }
-        if let Some(fault) = self.take_fault(FaultKind::Pushed) {
-            self.plant.push(fault.joint.saturating_sub(1), fault.amount);
+        let pushed = self.take_fault(FaultKind::Pushed).map(|fault| (fault.joint.saturating_sub(1), fault));
+        self.plant.hand(pushed.filter(|(_, f)| f.duration > 0.0).map(|(joint, f)| (joint, f.amount / f.duration)));
+        if let Some((joint, fault)) = pushed.filter(|(_, fault)| fault.duration == 0.0) {
+            self.plant.push(joint, fault.amount);
         }
         if let Some(fault) = self.take_fault(FaultKind::MotorOff) {
             self.plant.enable_joint(fault.joint.saturating_sub(1), false);

@@ -52,7 +52,8 @@ pub enum FaultKind {
     Sag,
     /// Joint number `joint` does not move for `duration`.
     Blocked,
-    /// Joint number `joint` is moved by `amount` [rad], as by hand. A joint whose motor is on does not give way.
+    /// Joint number `joint` is moved by `amount` [rad], as by hand: at once, or evenly during `duration`. A joint whose
+    /// motor is on does not give way, unless the arm is guided by hand.
     Pushed,
     /// The motor of joint number `joint` loses its power; the other motors keep theirs.
     MotorOff,

@@ -41,6 +41,8 @@ pub enum Drive {
     Servo,
     /// Keeps a velocity.
     Velocity,
+    /// Motors on, gravity compensated: gives way to a hand.
+    Guided,
 }
 
 /// Up to [`MAX_DOF`] joints with their motors.
@@ -246,10 +248,26 @@ impl Plant {
         }
     }
 
-    /// Moves a joint (index from 0) by `amount` [rad], as by hand: a joint whose motor is on does not give way.
+    /// Moves a joint (index from 0) by `amount` [rad] at once, as by hand: a joint that is driven does not give way.
     pub fn push(&mut self, joint: usize, amount: f64) {
-        if let Some(joint) = self.active_mut().get_mut(joint).filter(|joint| !joint.on) {
+        let guided = self.drive == Drive::Guided;
+        if let Some(joint) = self.active_mut().get_mut(joint).filter(|joint| guided || !joint.on) {
             joint.position = (joint.position + amount).max(joint.lower).min(joint.upper);
+        }
+    }
+
+    /// A hand moves a joint (index from 0) at `velocity` [rad/s] from now on; `None`: no hand moves any.
+    pub fn hand(&mut self, moved: Option<(usize, f64)>) {
+        for (i, joint) in self.active_mut().iter_mut().enumerate() {
+            joint.hand = moved.filter(|(moved, _)| *moved == i).map_or(0.0, |(_, velocity)| velocity);
+        }
+    }
+
+    /// Gives way to a hand from now on; no effect while disabled.
+    pub fn guide(&mut self) {
+        self.stop();
+        if self.drive != Drive::Disabled {
+            self.drive = Drive::Guided;
         }
     }
 
@@ -311,11 +329,11 @@ impl Plant {
         let fallen = |joint: &Joint| self.fall == 0.0 || joint.fallen();
         let arrived = |joint: &Joint| match self.drive {
             _ if !joint.on => fallen(joint),
-            Drive::Disabled | Drive::Stop => true,
+            Drive::Disabled | Drive::Stop | Drive::Guided => true,
             Drive::Position | Drive::Servo => joint.position == joint.target,
             Drive::Velocity => joint.target == 0.0,
         };
-        self.sag <= 0.0 && self.active().iter().all(|joint| joint.velocity == 0.0 && arrived(joint))
+        self.sag <= 0.0 && self.active().iter().all(|joint| joint.velocity == 0.0 && joint.hand == 0.0 && arrived(joint))
     }
 
     fn step(&mut self, h: f64) {
@@ -328,8 +346,12 @@ impl Plant {
                 continue;
             }
             match (if joint.on { drive } else { Drive::Disabled }, tracking) {
+                (Drive::Disabled | Drive::Guided, _) if joint.hand != 0.0 => {
+                    joint.velocity = joint.hand;
+                    joint.travel(h);
+                }
                 (Drive::Disabled, _) => joint.fall(fall, h),
-                (Drive::Stop, _) => joint.accelerate(0.0, joint.acceleration, h),
+                (Drive::Stop | Drive::Guided, _) => joint.accelerate(0.0, joint.acceleration, h),
                 (Drive::Position, _) => joint.approach(joint.velocity_max * speed, 0.0, 0.0, joint.acceleration, h),
                 (Drive::Servo, Tracking::Lag(lag)) => {
                     let pace = if pause { 0.0 } else { joint.pace };

@@ -25,6 +25,8 @@ pub(super) struct Joint {
     /// Time in which an ideal joint has not moved although it could have [s].
     pub credit: f64,
     pub blocked: bool,
+    /// Velocity at which a hand moves it [rad/s].
+    pub hand: f64,
     /// Where it stops when it falls [rad]; `None`: friction holds it.
     pub rest: Option<f64>,
 }

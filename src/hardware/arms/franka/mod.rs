@@ -28,7 +28,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::hardware::check::{Checked, ConfigError};
-use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use crate::hardware::transport::tcp::Endpoint;
 use crate::joint::ControlMode;
 use model::Model;
@@ -60,6 +60,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
         check: |address| Endpoint::parse(address, PORT).map(|address| address.to_string()),
     },
     holds_when_disabled: HOLDS_WHEN_DISABLED,
+    teach: Teach::No("its controller guides it only with the buttons at its wrist, while no program controls it"),
     gripper: true,
     options: OptionsSpec::of::<Options>(),
     check,

@@ -8,7 +8,7 @@ use super::{MODES, NATIVE_RATE, check, limits};
 use crate::arm::{IoInfo, IoState, JointStatus, Load};
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{
-    AdapterError, AdapterResult, ForceTorque, Gripper, Io, JointMonitor, JointReading, ManipulatorAdapter,
+    AdapterError, AdapterResult, ForceTorque, Gripper, HandGuiding, Io, JointMonitor, JointReading, ManipulatorAdapter,
     ManipulatorInfo, Payload, RobotState, Stop,
 };
 use crate::hardware::adapter_util::{fill, within};
@@ -214,6 +214,17 @@ impl ManipulatorAdapter for MockArm {
 
     fn joint_monitor(&mut self) -> Option<&mut dyn JointMonitor> {
         Some(self)
+    }
+
+    fn hand_guiding(&mut self) -> Option<&mut dyn HandGuiding> {
+        Some(self)
+    }
+}
+
+impl HandGuiding for MockArm {
+    fn begin_hand_guiding(&mut self) -> AdapterResult<()> {
+        self.device.write()?;
+        self.device.arm.guide().map_err(|refusal| self.device.arm.rejected(refusal))
     }
 }
 

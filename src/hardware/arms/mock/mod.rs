@@ -12,7 +12,7 @@ pub use options::Options;
 use std::time::Duration;
 
 use crate::hardware::check::{Checked, ConfigError};
-use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use crate::joint::{ControlMode, JointLimits, MAX_DOF};
 use std::f64::consts::PI;
 
@@ -37,6 +37,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     stale_after: Duration::from_millis(50),
     address: AddressForm { form: "none", required: false, check: |address| Ok(address.to_owned()) },
     holds_when_disabled: true,
+    teach: Teach::HandGuiding,
     gripper: true,
     options: OptionsSpec::of::<Options>(),
     check,

@@ -30,7 +30,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::hardware::adapter_util::{above_zero, fraction};
 use crate::hardware::check::{Checked, ConfigError};
-use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use crate::hardware::transport::can::{self, address::FORMS};
 use crate::joint::{ControlMode, JointLimits};
 
@@ -58,6 +58,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     stale_after: Duration::from_millis(50),
     address: AddressForm { form: FORMS, required: true, check: can::check },
     holds_when_disabled: HOLDS_WHEN_DISABLED,
+    teach: Teach::No("its drag-teaching is begun with the button on the arm, and the arm falls without its motors"),
     gripper: true,
     options: OptionsSpec::of::<Options>(),
     check,

@@ -19,7 +19,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::hardware::check::{Checked, ConfigError};
-use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use crate::hardware::sim::arm::SimOptions;
 use crate::joint::{ControlMode, JointLimits, MAX_DOF};
 use address::Address;
@@ -50,6 +50,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     },
     // Unknown before the connection; the default must be the safe one.
     holds_when_disabled: false,
+    teach: Teach::No("its protocol has no hand guiding"),
     gripper: true,
     options: OptionsSpec::of::<Options>(),
     check,

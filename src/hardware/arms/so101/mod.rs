@@ -26,7 +26,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::hardware::check::{Checked, ConfigError};
-use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use crate::hardware::transport::serial::SerialAddress;
 use crate::joint::{ControlMode, JointLimits};
 use calibration::Calibration;
@@ -66,6 +66,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
         check: |address| SerialAddress::parse(address, BAUD).map(|address| address.to_string()),
     },
     holds_when_disabled: HOLDS_WHEN_DISABLED,
+    teach: Teach::MotorsOff,
     gripper: true,
     options: OptionsSpec::of::<Options>(),
     check,

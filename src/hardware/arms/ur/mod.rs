@@ -37,7 +37,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::hardware::check::{Checked, ConfigError};
-use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use crate::joint::ControlMode;
 use address::Address;
 use model::Model;
@@ -70,6 +70,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
         check: |address| Address::parse(address).map(|address| address.to_string()),
     },
     holds_when_disabled: HOLDS_WHEN_DISABLED,
+    teach: Teach::No("its freedrive is begun on the teach pendant, while no program controls it"),
     gripper: false,
     options: OptionsSpec::of::<Options>(),
     check,

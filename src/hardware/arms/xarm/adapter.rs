@@ -17,7 +17,7 @@ use super::session::Session;
 use super::{HOLDS_WHEN_DISABLED, MODES, MODES_WITHOUT_VELOCITY, Options, check, model_of};
 use crate::arm::{ForceUnit, JointStatus, Load, Pose};
 use crate::hardware::adapter::{
-    AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, JointMonitor, JointReading, ManipulatorAdapter,
+    AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, HandGuiding, JointMonitor, JointReading, ManipulatorAdapter,
     ManipulatorInfo, Payload, RobotState, Stop,
 };
 use crate::hardware::registry::AdapterConfig;
@@ -26,6 +26,7 @@ use crate::joint::{ControlMode, JointLimits, joints_of};
 /// The controller's modes that the adapter uses.
 const PLANNED: u8 = 0;
 const SERVO: u8 = 1;
+const GUIDED: u8 = 2;
 const JOINT_VELOCITY: u8 = 4;
 
 /// Maximum age of the state that answers further reads of a cycle.
@@ -206,7 +207,7 @@ impl ManipulatorAdapter for XArmAdapter {
             PLANNED => ControlMode::Position,
             SERVO => ControlMode::ServoPosition,
             JOINT_VELOCITY => ControlMode::Velocity,
-            2 | 3 => ControlMode::Impedance,
+            GUIDED | 3 => ControlMode::Impedance,
             5 => ControlMode::CartesianVelocity,
             _ => ControlMode::Cartesian,
         }
@@ -349,6 +350,17 @@ impl ManipulatorAdapter for XArmAdapter {
     fn joint_monitor(&mut self) -> Option<&mut dyn JointMonitor> {
         let known = self.session.as_ref().is_some_and(|session| session.condition().motors.is_some());
         if known { Some(self) } else { None }
+    }
+
+    fn hand_guiding(&mut self) -> Option<&mut dyn HandGuiding> {
+        Some(self)
+    }
+}
+
+impl HandGuiding for XArmAdapter {
+    fn begin_hand_guiding(&mut self) -> AdapterResult<()> {
+        self.target = None;
+        self.with(|session| session.set_mode(GUIDED))
     }
 }
 

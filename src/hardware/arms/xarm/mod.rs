@@ -42,7 +42,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::hardware::adapter_util::fraction;
 use crate::hardware::check::{Checked, ConfigError};
-use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use crate::joint::ControlMode;
 use address::Address;
 use model::Model;
@@ -79,6 +79,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
         check: |address| Address::parse(address).map(|address| address.to_string()),
     },
     holds_when_disabled: HOLDS_WHEN_DISABLED,
+    teach: Teach::HandGuiding,
     gripper: true,
     options: OptionsSpec::of::<Options>(),
     check,

@@ -20,7 +20,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::hardware::adapter_util::fraction;
 use crate::hardware::check::{Checked, ConfigError};
-use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use crate::hardware::sim::arm::SimOptions;
 use crate::hardware::sim::io::PLAYABLE;
 use crate::hardware::transport::tcp::Endpoint;
@@ -59,6 +59,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
         check: |address| Endpoint::parse(address, protocol::PORT).map(|endpoint| endpoint.to_string()),
     },
     holds_when_disabled: HOLDS_WHEN_DISABLED,
+    teach: Teach::No("its protocol has no hand guiding, and the arm falls without its motors"),
     gripper: true,
     options: OptionsSpec::of::<Options>(),
     check,

@@ -33,7 +33,7 @@ impl Worker {
 
     /// Returns whether commands of the tick currently move the arm.
     pub(super) fn moving(&self) -> bool {
-        self.connected && self.last.mode.is_some() && !self.state.self_held
+        self.connected && (self.last.mode.is_some() || self.lead.active) && !self.state.self_held
     }
 
     pub(super) fn send_command(&mut self, adapter: &mut dyn ManipulatorAdapter) {
@@ -126,6 +126,7 @@ impl Worker {
         match adapter.write_stop() {
             Ok(stop) => {
                 self.stop_pending = false;
+                self.lead.end("the arm was stopped");
                 let interference = self.state.interference;
                 self.expect_nothing(power);
                 self.state.interference = interference;

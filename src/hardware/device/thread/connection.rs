@@ -122,6 +122,7 @@ impl Worker {
         }
         self.configure(adapter)?;
         self.expect_nothing(None);
+        self.lead.end("the arm was enabled");
         adapter.activate()?;
         let limit = self.config.clock.now().after(ACTIVATION_TIMEOUT);
         while !adapter.read_enabled()? {
@@ -191,6 +192,7 @@ impl Worker {
     /// Marks the connection as lost and schedules the first attempt to reconnect.
     pub(super) fn mark_lost(&mut self) {
         self.connected = false;
+        self.lead.end("the connection was lost");
         self.plausible.reset();
         self.state.link = Link::Faulted;
         self.reconnect = (self.config.clock.now().after(BACK_OFF.0), BACK_OFF.0);

@@ -65,6 +65,10 @@ pub trait ControlledArm: Send + 'static {
     }
     /// Decelerates to rest.
     fn stop(&mut self);
+    /// Gives way to a hand until it is stopped.
+    fn guide(&mut self) -> Result<(), Refusal> {
+        Err(Refusal::NotNow)
+    }
     /// Stops as the client's stop does.
     fn operational_stop(&mut self) {
         self.stop();
@@ -193,6 +197,10 @@ impl ControlledArm for SimArm {
 
     fn stop(&mut self) {
         self.stop();
+    }
+
+    fn guide(&mut self) -> Result<(), Refusal> {
+        self.guide().map_err(not_now)
     }
 
     fn go(&mut self, target: &[f64; 7], speed: f64, _acceleration: f64) -> Result<(), Refusal> {

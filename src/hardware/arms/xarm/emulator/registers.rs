@@ -10,6 +10,8 @@ use crate::hardware::sim::faults::FaultKind;
 use crate::hardware::sim::reach::Chain;
 use std::time::Duration;
 
+/// The mode of guiding by hand.
+const GUIDED: u8 = 2;
 /// Warnings.
 const QUEUE_FULL: u8 = 11;
 const BAD_PARAMETER: u8 = 12;
@@ -193,6 +195,9 @@ impl<A: ControlledArm> Controller<A> {
         match wanted {
             0 if self.arm.is_ready() => {
                 self.arm.begin()?;
+                if self.mode == GUIDED {
+                    self.arm.guide()?;
+                }
                 if self.state == state::PAUSED
                     && let Some(halted) = self.current.take()
                 {

@@ -1,0 +1,77 @@
+//! An arm that is led: by hand, or by its own controller. It gets no setpoints; the limiters follow what is measured, so
+//! that the next start is where the arm is.
+
+use super::ArmControl;
+use crate::clock::Mono;
+use crate::telemetry::{Cause, LedBy, Outcome, Phase};
+
+/// A joint that the arm's controller moves may have this much more than its velocity limit.
+const OVERSPEED: f64 = 1.1;
+/// Consecutive ticks above that: one velocity may be an estimate from noisy positions.
+const TOO_FAST_TICKS: u8 = 2;
+
+impl ArmControl {
+    /// The arm will be led. It must be at rest; its own controller may only start from within its range.
+    pub fn lead(&mut self, by: LedBy, arm: u16, now: Mono) -> Outcome {
+        let commanded = by != LedBy::HandMotorsOff && self.failsafe.phase() == Phase::Ready;
+        if commanded && !self.at_standstill() {
+            return Outcome::ArmMoving(arm);
+        }
+        if by == LedBy::Controller
+            && let Some((joint, _, excess)) = self.out_of_range()
+        {
+            return Outcome::OutOfLimits((self.first + joint) as u16, excess);
+        }
+        let outcome = self.failsafe.lead(by, arm, self.feedback.state(), self.feedback.freshness(), now);
+        if outcome == Outcome::Accepted {
+            self.command.mode = None;
+            self.holds_written = false;
+            self.led_too_fast = 0;
+        }
+        outcome
+    }
+
+    /// Refuses motion from now on. A led arm gets a stop from its own controller, unless its motors are off.
+    pub fn prepare_disable(&mut self, now: Mono) {
+        let led = self.failsafe.led_by().is_some_and(|by| by != LedBy::HandMotorsOff);
+        self.failsafe.prepare_disable(now);
+        self.rest.stop_pending |= led;
+    }
+
+    /// Takes the limiters to where the joints are.
+    pub(super) fn follow_measured(&mut self) {
+        self.command.mode = None;
+        for (limiter, q) in self.limiters.iter_mut().zip(&self.feedback.state().position) {
+            limiter.seed(*q);
+        }
+    }
+
+    /// Returns the cause for a hold if the arm's controller moves a joint too fast or out of its range. A hand may do
+    /// both.
+    pub(super) fn led_trouble(&mut self) -> Option<Cause> {
+        if self.failsafe.led_by() != Some(LedBy::Controller) || !self.feedback.is_usable() {
+            return None;
+        }
+        if let Some((joint, position, _)) = self.out_of_range() {
+            return Some(Cause::LedOutOfRange(joint as u16, position));
+        }
+        let velocities = self.feedback.state().velocity.iter().zip(&self.limiters).enumerate();
+        let too_fast = { velocities }.find(|(_, (v, limiter))| v.abs() > OVERSPEED * limiter.bounds().velocity);
+        let Some((joint, (velocity, _))) = too_fast else {
+            self.led_too_fast = 0;
+            return None;
+        };
+        self.led_too_fast += 1;
+        (self.led_too_fast >= TOO_FAST_TICKS).then_some(Cause::LedTooFast(joint as u16, *velocity))
+    }
+
+    /// Returns the first joint outside its range, its position, and how far outside it is [rad].
+    fn out_of_range(&self) -> Option<(usize, f64, f64)> {
+        let limits = &self.config.limits;
+        let range = limits.position_lower.iter().zip(&limits.position_upper);
+        { self.feedback.state().position.iter().zip(range).enumerate() }.find_map(|(joint, (q, (lower, upper)))| {
+            let excess = (lower - q).max(q - upper);
+            (excess > self.config.supervision.accuracy).then_some((joint, *q, excess))
+        })
+    }
+}
