@@ -4,7 +4,7 @@ use serde_json::json;
 
 use super::exit::{Exit, Result};
 use super::output::{self, Table};
-use crate::hardware::registry::{Absent, AdapterConfig, AdapterSpec, Registry};
+use crate::hardware::registry::{Absent, AdapterConfig, AdapterSpec, Registry, Teach};
 use crate::joint::{JointLimits, MAX_DOF};
 
 /// Arguments of `list-adapters`.
@@ -15,7 +15,8 @@ LEVEL  how far it is proven
          conformant  passes the conformance suite against a test double
          emulated    passes it against an emulator of its real wire format, which
                      `address: sim` starts
-HOLDS  whether the arm keeps its pose when its motors are disabled")]
+HOLDS  whether the arm keeps its pose when its motors are disabled
+TEACH  how it is led by hand (dimos arm teach)")]
 pub struct Args {
     /// Print JSON
     #[arg(long)]
@@ -34,7 +35,7 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
 
 /// Returns the table, and a paragraph for each adapter.
 fn lines(registry: &Registry) -> Vec<String> {
-    let mut table = Table::new(&["NAME", "LEVEL", "TRANSPORT", ">DOF", "UNITS", ">RATE Hz", "HOLDS"]);
+    let mut table = Table::new(&["NAME", "LEVEL", "TRANSPORT", ">DOF", "UNITS", ">RATE Hz", "HOLDS", "TEACH"]);
     for row in registry.rows() {
         table.row([
             row.name.to_owned(),
@@ -44,10 +45,11 @@ fn lines(registry: &Registry) -> Vec<String> {
             row.wire_units.to_owned(),
             format!("{:.0}", row.native_rate),
             if row.holds_when_disabled { "yes" } else { "no, falls" }.to_owned(),
+            teach(row).to_owned(),
         ]);
     }
     for absent in registry.absent() {
-        let nothing = ["-"; 5].map(str::to_owned);
+        let nothing = ["-"; 6].map(str::to_owned);
         table.row([absent.name.to_owned(), "not in this build".to_owned()].into_iter().chain(nothing));
     }
     let mut lines = table.lines();
@@ -74,6 +76,14 @@ fn dof(row: &AdapterSpec) -> String {
     match row.dof {
         (least, most) if least == most => least.to_string(),
         (least, most) => format!("{least}–{most}"),
+    }
+}
+
+fn teach(row: &AdapterSpec) -> &'static str {
+    match row.teach {
+        Teach::HandGuiding => "hand guiding",
+        Teach::MotorsOff => "motors off",
+        Teach::No(_) => "no",
     }
 }
 
@@ -112,6 +122,7 @@ fn to_json(row: &AdapterSpec) -> serde_json::Value {
         "native_rate_hz": row.native_rate,
         "address": {"form": row.address.form, "required": row.address.required},
         "holds_when_disabled": row.holds_when_disabled,
+        "teach": teach(row),
         "options": options(row),
         "limits": limits(row).map(|(dof, limits)| json!({
             "dof": dof,

@@ -31,7 +31,7 @@ fn troubles() -> Vec<(ArmState, Freshness, Cause)> {
 
 /// An arm in this phase since `at(0)`, with nothing wrong.
 fn in_phase(phase: Phase) -> Failsafe {
-    Failsafe { phase, cause: Cause::None, since: at(0) }
+    Failsafe { phase, cause: Cause::None, since: at(0), ..Failsafe::default() }
 }
 
 #[test]
@@ -123,7 +123,7 @@ fn the_first_cause_of_a_hold_stays_and_only_an_operator_holds_a_disabled_arm() {
 #[test]
 fn a_reset_is_refused_while_the_cause_persists() {
     for (state, fresh, cause) in troubles() {
-        let mut arm = Failsafe { phase: Phase::Held, cause: Cause::Operator, since: at(0) };
+        let mut arm = Failsafe { phase: Phase::Held, cause: Cause::Operator, since: at(0), ..Failsafe::default() };
         let outcome = arm.reset(3, &state, fresh, at(10));
         // The hold of a device thread ends when the motors are enabled.
         if cause == Cause::HeartbeatLost {
@@ -133,7 +133,7 @@ fn a_reset_is_refused_while_the_cause_persists() {
         }
     }
     for (enabled, phase) in [(true, Phase::Standby), (false, Phase::Disabled)] {
-        let mut arm = Failsafe { phase: Phase::Held, cause: Cause::Jump, since: at(0) };
+        let mut arm = Failsafe { phase: Phase::Held, cause: Cause::Jump, since: at(0), ..Failsafe::default() };
         assert_eq!(arm.reset(0, &ArmState { enabled, ..healthy() }, FRESH, at(10)), Outcome::Accepted);
         assert_eq!((arm.phase(), arm.cause()), (phase, Cause::None));
     }
@@ -159,7 +159,7 @@ fn an_arm_is_enabled_only_with_a_fresh_state_without_trouble_and_with_power() {
         assert_eq!(arm.on_enabled(1, &healthy(), FRESH, at(10)), Outcome::Accepted);
         assert_eq!((arm.phase(), arm.since), (Phase::Activating, at(10)));
     }
-    let mut held = Failsafe { phase: Phase::Held, cause: Cause::Jump, since: at(0) };
+    let mut held = Failsafe { phase: Phase::Held, cause: Cause::Jump, since: at(0), ..Failsafe::default() };
     assert_eq!(held.on_enabled(1, &healthy(), FRESH, at(10)), Outcome::ArmLatched(1, Cause::Jump));
     for phase in [Phase::Activating, Phase::Ready] {
         let mut arm = in_phase(phase);
@@ -174,7 +174,7 @@ fn a_task_may_move_an_arm_only_when_it_is_ready() {
         assert_eq!(in_phase(phase).admits(2), Err(Outcome::ArmNotReady(2, phase, Cause::None)));
     }
     assert_eq!(in_phase(Phase::Ready).admits(2), Ok(()));
-    let held = Failsafe { phase: Phase::Held, cause: Cause::Overrun, since: at(0) };
+    let held = Failsafe { phase: Phase::Held, cause: Cause::Overrun, since: at(0), ..Failsafe::default() };
     assert_eq!(held.admits(2), Err(Outcome::ArmLatched(2, Cause::Overrun)));
     for (phase, after) in [
         (Phase::Ready, Phase::Standby),

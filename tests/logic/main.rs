@@ -8,6 +8,7 @@ mod support;
 static ALLOCATOR: dimos::rt::counting::Counting = dimos::rt::counting::Counting;
 
 mod adding_a_task;
+mod arm_led;
 mod arm_phases;
 mod blueprint_fuzz;
 mod blueprint_one_mistake;

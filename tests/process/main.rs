@@ -44,5 +44,6 @@ mod so101_service;
 mod start_stages;
 mod stop_input;
 mod stops;
+mod teach;
 mod ur_runs;
 mod xarm_runs;

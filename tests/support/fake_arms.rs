@@ -2,7 +2,7 @@
 
 use dimos::hardware::adapter::AdapterError;
 use dimos::hardware::check::Checked;
-use dimos::hardware::registry::{AdapterSpec, AddressForm, Level, OptionsSpec, Registry};
+use dimos::hardware::registry::{AdapterSpec, AddressForm, Level, OptionsSpec, Registry, Teach};
 use dimos::joint::{ControlMode, JointLimits};
 use schemars::JsonSchema;
 use serde::Deserialize;
@@ -58,6 +58,7 @@ pub const YOURARM: AdapterSpec = AdapterSpec {
     stale_after: std::time::Duration::from_millis(50),
     address: AddressForm { form: "HOST[:PORT]", required: true, check: host },
     holds_when_disabled: true,
+    teach: Teach::HandGuiding,
     gripper: true,
     options: OptionsSpec::of::<NetOptions>(),
     check: |config| Ok(Checked { limits: JointLimits::uniform(config.dof, 3.0, 2.0) }),

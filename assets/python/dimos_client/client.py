@@ -183,6 +183,10 @@ class Client(Planning):
         """Enables the motors and makes the arm ready, where it is. The arm's phase."""
         return str(self.call("arm_enable", arm=arm)["phase"])
 
+    def teach(self, arm: str, support_the_arm: bool = False) -> str:
+        """Hands the arm over to the hand that leads it, until `enable`. How it is led."""
+        return str(self.call("arm_teach", arm=arm, support_the_arm=support_the_arm)["note"])
+
 
 def _same(span: Optional[List[float]]) -> float:
     """Difference of positions of a gripper that counts as none [m or rad]."""

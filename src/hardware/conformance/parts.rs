@@ -3,9 +3,10 @@
 
 use super::Check;
 use super::Needs::{Faults, Motion, Nothing};
-use super::context::{Context, require};
+use super::context::{Context, farthest, require};
 use crate::arm::{IoInfo, IoState, JointStatus, Load, MAX_ANALOG, MAX_DIGITAL};
 use crate::hardware::adapter::{AdapterError, AdapterResult, Io};
+use crate::hardware::registry::Teach;
 use crate::hardware::sim::faults::{Fault, FaultKind};
 
 /// The checks of this file.
@@ -15,11 +16,51 @@ pub const CHECKS: &[Check] = &[
     Check::new(Nothing, "joint_status_is_read", "temperatures, currents, voltages, loads are plausible", joint_status),
     Check::new(Nothing, "payload_is_read", "the load at the flange is that of a body", payload_is_read),
     Check::new(Motion, "payload_is_read_back", "a load that is set is read back, also when enabled", payload),
+    Check::new(Faults, "hand_guiding_gives_way", "guided it gives way to a hand; stopped or enabled it holds", guiding),
     Check::new(Faults, "inputs_are_seen", "a digital input that changes is read at once", inputs),
 ];
 
+/// How far a hand moves a joint [rad].
+const BY_HAND: f64 = 0.04;
 /// How long a digital input stays low [s].
 const LOW: f64 = 0.3;
+
+fn guiding(context: &mut Context) -> Result<(), String> {
+    let push = Fault { amount: BY_HAND, ..Fault::new(FaultKind::Pushed) };
+    let pushes = context.emulator.is_some() && (0..4).all(|_| context.prepare(push));
+    context.connect()?;
+    let (claimed, there) = (context.row.teach == Teach::HandGuiding, context.adapter.hand_guiding().is_some());
+    require(claimed == there, || format!("hand guiding: {there}, its row says {claimed}"))?;
+    if !(there && pushes) {
+        return context.skip(if there { "its emulator cannot be moved by hand" } else { "it has no hand guiding" });
+    }
+    context.ready(context.position_mode().unwrap_or(context.first_mode()))?;
+    let start = context.positions()?;
+    context.trigger_faults()?;
+    context.stays(&start, 0.005)?;
+    for by_stop in [true, false] {
+        context.until("the guiding to begin", |context| match context.adapter.hand_guiding() {
+            Some(arm) => match arm.begin_hand_guiding() {
+                Err(AdapterError::Rejected(_)) => Ok(false),
+                begun => begun.map(|()| true).map_err(|e| format!("begin_hand_guiding: {e}")),
+            },
+            None => Err("the hand guiding is gone".into()),
+        })?;
+        let before = context.positions()?;
+        context.trigger_faults()?;
+        context.until("the arm to give way", |context| Ok(farthest(&context.positions()?, &before) > 0.5 * BY_HAND))?;
+        let here = context.standstill()?;
+        if !by_stop {
+            context.activate()?;
+            return context.stays(&here, 0.005);
+        }
+        context.stop()?;
+        context.trigger_faults()?;
+        context.stays(&here, 0.005)?;
+        context.activate()?;
+    }
+    Ok(())
+}
 
 /// Returns the channels; `None` without any.
 fn info(context: &mut Context) -> Option<IoInfo> {

@@ -10,7 +10,9 @@ use super::SPEC;
 use super::adapter::XArmAdapter;
 use super::emulator::XArmEmulator;
 use crate::arm::Pose;
-use crate::hardware::adapter::{AdapterError, Cartesian, ForceTorque, Gripper, JointReading, ManipulatorAdapter, Stop};
+use crate::hardware::adapter::{
+    AdapterError, Cartesian, ForceTorque, Gripper, HandGuiding, JointReading, ManipulatorAdapter, Stop,
+};
 use crate::hardware::conformance::{Check, Outcome, Subject, checks, run_on};
 use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use crate::hardware::sim::faults::{Fault, FaultKind};
@@ -66,6 +68,35 @@ fn floats(payload: &[u8]) -> Vec<f32> {
 pub(super) fn sent(emulator: &XArmEmulator, register: u8) -> Vec<Vec<u8>> {
     let trace = emulator.trace().into_iter();
     trace.filter(|request| request.register == register).map(|request| request.payload).collect()
+}
+
+#[test]
+fn a_hand_guides_the_arm_in_mode_2_until_it_is_stopped_or_activated() {
+    let push = |emulator: &XArmEmulator| emulator.inject(Fault { amount: 0.04, ..Fault::new(FaultKind::Pushed) }).unwrap();
+    for by_stop in [true, false] {
+        let (emulator, mut arm) = ready(json!({}), ControlMode::ServoPosition);
+        let start = six(&mut arm)[0];
+        push(&emulator);
+        std::thread::sleep(Duration::from_millis(50));
+        assert!((six(&mut arm)[0] - start).abs() < 1e-5, "a servo does not give way");
+        emulator.record();
+        until("the mode", || arm.begin_hand_guiding().is_ok());
+        assert_eq!(sent(&emulator, 19).first().map(|mode| mode[0]), Some(2));
+        assert_eq!((arm.get_control_mode(), arm.foreign_change()), (ControlMode::Impedance, None), "by order");
+        push(&emulator);
+        until("the push", || (six(&mut arm)[0] - start - 0.04).abs() < 1e-4);
+        let here = six(&mut arm);
+        assert!(matches!(arm.write_joint_positions(&here, 1.0), Err(AdapterError::Rejected(_))));
+        if by_stop {
+            assert_eq!(arm.write_stop(), Ok(Stop::Confirmed));
+        } else {
+            arm.activate().unwrap();
+            assert_eq!(arm.get_control_mode(), ControlMode::ServoPosition);
+        }
+        push(&emulator);
+        std::thread::sleep(Duration::from_millis(50));
+        assert!((six(&mut arm)[0] - start - 0.04).abs() < 1e-4, "it holds where it is");
+    }
 }
 
 #[test]

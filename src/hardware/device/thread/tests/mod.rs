@@ -2,6 +2,7 @@
 
 mod commands;
 mod connection;
+mod lead;
 mod parts;
 mod readings;
 
@@ -107,7 +108,11 @@ impl Bench {
 
     /// A connected arm of three joints.
     fn connected() -> Self {
-        let mut bench = Self::new(MockAdapter::new(DOF));
+        Self::connected_to(MockAdapter::new(DOF))
+    }
+
+    fn connected_to(arm: MockAdapter) -> Self {
+        let mut bench = Self::new(arm);
         bench.worker.connect(&mut bench.adapter).unwrap();
         bench.arm.clear_calls();
         bench
@@ -115,7 +120,12 @@ impl Bench {
 
     /// A connected arm whose motors this run has enabled.
     pub fn enabled() -> Self {
-        let mut bench = Self::connected();
+        Self::enabled_with(MockAdapter::new(DOF))
+    }
+
+    /// This arm, connected, its motors enabled by this run.
+    fn enabled_with(arm: MockAdapter) -> Self {
+        let mut bench = Self::connected_to(arm);
         bench.settle();
         bench.activate().unwrap();
         bench.arm.clear_calls();
