@@ -1,5 +1,6 @@
-//! `dimos arm enable|disable|reset|teach|gripper|io|payload|tool ARM`: motors, latch, gripper and optional parts of an arm in
-//! a run; `find-port`, `setup-motors`, `calibrate` and `configure`: work on an arm without a run, directly on its bus.
+//! `dimos arm enable|disable|reset|teach|gripper|io|payload|tool ARM`: motors, latch, leading, gripper and optional
+//! parts of an arm in a run; `find-port`, `setup-motors`, `calibrate` and `configure`: work on an arm without a run,
+//! directly on its bus.
 
 mod bus;
 mod calibrate;

@@ -39,8 +39,8 @@ pub struct Args {
     /// Move straight in joint space even if the run has a planner: not collision-checked
     #[arg(long, conflicts_with = "several")]
     pub direct: bool,
-    /// Let the arm's own controller move to --pose: not collision-checked; with a planner in the run only with --direct.
-    /// --frame controller gives the pose in the controller's own frame
+    /// Let the arm's own controller move to --pose: not collision-checked; with a planner in the run only with
+    /// --direct. --frame controller gives the pose in the controller's own frame
     #[arg(long, requires = "pose", conflicts_with_all = ["joints", "named", "by", "several", "through", "linear", "replan"])]
     pub native: bool,
     /// If an obstacle blocks the motion, stop, plan again and continue

@@ -1,5 +1,5 @@
-//! Requests that hand an arm over: to the hand that leads it, or to its own controller. Both end by `enable`: the arm is
-//! stopped where it is, and the run takes over at rest.
+//! Requests that hand an arm over: to the hand that leads it, or to its own controller. Both end by `enable`: the arm
+//! is stopped where it is, and the run takes over at rest.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -58,13 +58,17 @@ impl Service {
                 self.ask(Request::Lead { arm, by: LedBy::Hand }).await?;
                 if let Err(error) = order(self.device(arm)?.guide()).await {
                     let _ = self.take_over(name, arm).await;
-                    return Err(refused(name, "was not handed over", &error));
+                    return Err(refused(name, "does not begin hand guiding", &error));
                 }
                 "led by hand, motors on: the controller compensates gravity"
             }
         };
         self.parts.dispatcher.log(Severity::Info, format!("{name}: {note}"));
-        Ok(Reply::ArmTeach(api::ArmReply { arm: call.arm, phase: Phase::Led.name().to_owned(), note: Some(note.into()) }))
+        Ok(Reply::ArmTeach(api::ArmReply {
+            arm: call.arm,
+            phase: Phase::Led.name().to_owned(),
+            note: Some(note.into()),
+        }))
     }
 
     /// Ends the leading of an arm that is at rest, and makes it ready.
@@ -131,7 +135,8 @@ impl Service {
         let own = self.arm_view(arm as usize).and_then(|view| view.state.pose);
         let own = own.ok_or_else(|| {
             let what = format!("{name} reports no pose of its own, so it does not move to one");
-            RpcError::new(Code::Unsupported, what).hint("a run with a planner moves to poses: `dimos move` without --native")
+            RpcError::new(Code::Unsupported, what)
+                .hint("a run with a planner moves to poses: `dimos move` without --native")
         })?;
         let now = from_xyz_rpy(own.xyz, own.rpy);
         let model = self.tcp_models().into_iter().nth(arm as usize).flatten();

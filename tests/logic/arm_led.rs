@@ -1,5 +1,5 @@
-//! An arm that is led, by hand or by its own controller: what it gets meanwhile, what holds it, and how the run takes it
-//! over, on a virtual clock.
+//! An arm that is led, by hand or by its own controller: what it gets meanwhile, what holds it, and how the run takes
+//! it over, on a virtual clock.
 
 use dimos::control::request::Request;
 use dimos::telemetry::{Cause, Event, LedBy, Outcome, Phase};

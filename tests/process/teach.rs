@@ -32,14 +32,13 @@ fn a_led_motion_is_recorded_and_the_arm_is_taken_over_where_it_is() {
     let after = home.positions("arm");
     assert!((after[1] - before[1] - 0.3).abs() < 0.02, "{before:?} {after:?}");
     let text = std::fs::read_to_string(home.path().join("led.csv")).unwrap();
-    let rows: Vec<Vec<f64>> = { text.lines().skip(1) }
-        .map(|line| line.split(',').map(|cell| cell.parse().unwrap()).collect())
-        .collect();
+    let rows: Vec<Vec<f64>> =
+        { text.lines().skip(1) }.map(|line| line.split(',').map(|cell| cell.parse().unwrap()).collect()).collect();
     assert!(text.starts_with("time,arm_joint1,arm_joint2,") && rows.len() > 100, "{} rows", rows.len());
     assert!(rows.windows(2).all(|pair| pair[0][0] < pair[1][0] && (pair[1][2] - pair[0][2]).abs() < 0.1));
     assert!((rows.last().unwrap()[2] - after[1]).abs() < 1e-3);
     assert_eq!(phase(&home), "ready");
-    // No overwriting, and nothing is handed over for a file that cannot be written.
+    // No overwriting, and the arm is not led if the file cannot be written.
     home.dimos("arm teach arm --record led.csv --duration 1").with(2).says(&["led.csv"]);
     assert_eq!(phase(&home), "ready");
     // Without a file it stays led; a stop ends that.

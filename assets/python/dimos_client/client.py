@@ -184,7 +184,7 @@ class Client(Planning):
         return str(self.call("arm_enable", arm=arm)["phase"])
 
     def teach(self, arm: str, support_the_arm: bool = False) -> str:
-        """Hands the arm over to the hand that leads it, until `enable`. How it is led."""
+        """Lets the arm be led by hand until `enable`. How it is led."""
         return str(self.call("arm_teach", arm=arm, support_the_arm=support_the_arm)["note"])
 
 

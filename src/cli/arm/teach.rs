@@ -59,7 +59,7 @@ pub struct Args {
 pub fn run(args: &Args) -> Result {
     let (arm, json) = (&args.which.arm, args.which.target_run.json);
     let mut client = args.which.target_run.connect()?;
-    // Before the arm is handed over: a file that cannot be written ends nothing.
+    // Before the arm is led: with a file that cannot be written nothing changes.
     let file = args.record.as_deref().map(create).transpose()?;
     let signals = Signals::watch();
     let reply = client.call(ArmTeach { arm: arm.clone(), support_the_arm: args.support_the_arm })?;

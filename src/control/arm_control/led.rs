@@ -1,5 +1,5 @@
-//! An arm that is led: by hand, or by its own controller. It gets no setpoints; the limiters follow what is measured, so
-//! that the next start is where the arm is.
+//! An arm that is led: by hand, or by its own controller. It gets no setpoints; the limiters follow what is measured,
+//! so that the next start is where the arm is.
 
 use super::ArmControl;
 use crate::clock::Mono;

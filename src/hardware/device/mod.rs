@@ -22,9 +22,7 @@ use std::time::Duration;
 pub use details::Details;
 pub use health::{Episode, Health, Note};
 
-use crate::arm::{
-    ArmCommand, ArmState, GripperInfo, IoInfo, IoState, Load, OutputValue, Pose, StopInput, Supervision,
-};
+use crate::arm::{ArmCommand, ArmState, GripperInfo, IoInfo, IoState, Load, OutputValue, Pose, StopInput, Supervision};
 use crate::clock::Clock;
 use crate::hardware::adapter::{AdapterError, AdapterResult, ManipulatorAdapter, ManipulatorInfo};
 use crate::joint::{JointLimits, Joints};
@@ -231,8 +229,8 @@ impl Device {
         self.order(|reply| Order::SetPayload(load, reply))
     }
 
-    /// Lets the arm be guided by hand. `Unsupported` for an arm that cannot be. The tick must command nothing; `activate`
-    /// ends it.
+    /// Lets the arm be guided by hand. `Unsupported` for an arm that cannot be. The tick must command nothing;
+    /// `activate` ends it.
     pub fn guide(&self) -> Answer<()> {
         self.order(Order::Guide)
     }

@@ -333,7 +333,8 @@ impl Plant {
             Drive::Position | Drive::Servo => joint.position == joint.target,
             Drive::Velocity => joint.target == 0.0,
         };
-        self.sag <= 0.0 && self.active().iter().all(|joint| joint.velocity == 0.0 && joint.hand == 0.0 && arrived(joint))
+        self.sag <= 0.0
+            && self.active().iter().all(|joint| joint.velocity == 0.0 && joint.hand == 0.0 && arrived(joint))
     }
 
     fn step(&mut self, h: f64) {

@@ -17,8 +17,8 @@ use super::session::Session;
 use super::{HOLDS_WHEN_DISABLED, MODES, MODES_WITHOUT_VELOCITY, Options, check, model_of};
 use crate::arm::{ForceUnit, JointStatus, Load, Pose};
 use crate::hardware::adapter::{
-    AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, HandGuiding, JointMonitor, JointReading, ManipulatorAdapter,
-    ManipulatorInfo, Payload, RobotState, Stop,
+    AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, HandGuiding, JointMonitor, JointReading,
+    ManipulatorAdapter, ManipulatorInfo, Payload, RobotState, Stop,
 };
 use crate::hardware::registry::AdapterConfig;
 use crate::joint::{ControlMode, JointLimits, joints_of};

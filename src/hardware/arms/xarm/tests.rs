@@ -72,7 +72,8 @@ pub(super) fn sent(emulator: &XArmEmulator, register: u8) -> Vec<Vec<u8>> {
 
 #[test]
 fn a_hand_guides_the_arm_in_mode_2_until_it_is_stopped_or_activated() {
-    let push = |emulator: &XArmEmulator| emulator.inject(Fault { amount: 0.04, ..Fault::new(FaultKind::Pushed) }).unwrap();
+    let push =
+        |emulator: &XArmEmulator| emulator.inject(Fault { amount: 0.04, ..Fault::new(FaultKind::Pushed) }).unwrap();
     for by_stop in [true, false] {
         let (emulator, mut arm) = ready(json!({}), ControlMode::ServoPosition);
         let start = six(&mut arm)[0];
