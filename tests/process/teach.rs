@@ -13,7 +13,9 @@ const HAND: &str = "hardware.arm.options.sim.faults=[{kind: pushed, at: 2, durat
 
 fn start(home: &Home, blueprint: &str, set: &[&str]) -> Started {
     let mut command = home.command(&format!("run {blueprint}"));
-    set.iter().for_each(|set| drop(command.args(["--set", set])));
+    for set in set {
+        command.args(["--set", set]);
+    }
     let run = Started::of(command.stdin(Stdio::null()));
     run.until(UP);
     run

@@ -1,4 +1,4 @@
-//! `dimos arm teach ARM`: hands an arm over to the hand that leads it; with `--record`, writes the led motion to a file
+//! `dimos arm teach ARM`: lets an arm be led by hand; with `--record`, writes the led motion to a file
 //! and takes the arm over again.
 
 use std::fs::File;
