@@ -234,6 +234,10 @@ fn attention(r: &StatusReport) -> Vec<String> {
                 lines.push(format!("  hint: dimos arm reset {name}, then dimos arm enable {name}"));
             }
         }
+        if arm.phase == "led" {
+            lines.push(format!("{name} is led: it gets no setpoints"));
+            lines.push(format!("  hint: hold it still, then dimos arm enable {name}"));
+        }
         if let Some(error) = &arm.error {
             lines.push(format!("{name} reports error {}: {}", error.code, error.text));
         }

@@ -77,6 +77,10 @@ impl Service {
     async fn write_payload(&self, arm: u16, load: &Load) -> Result<Written, RpcError> {
         self.rests(arm)?;
         let name = self.parts.names.arm(arm);
+        if self.phase(arm as usize) == Phase::Led {
+            let hint = format!("hold it still, then: dimos arm enable {name}");
+            return Err(RpcError::new(Code::ArmNotReady, format!("{name} is led")).hint(hint));
+        }
         let resets = self.parts.connected.get(arm as usize).is_some_and(|connected| connected.payload_resets);
         let again = resets && matches!(self.phase(arm as usize), Phase::Activating | Phase::Ready);
         if again {
