@@ -4,6 +4,7 @@ use super::config::TaskConfig;
 use super::request::Motion;
 use super::speed_override::SpeedOverride;
 use super::task_body::{Claim, Context, Demand, JointView, OnCancel, OnLoss, Step, Target, TargetKind, TaskBody};
+use super::task_leader::LeaderJoint;
 use super::task_robot::FramePose;
 use super::task_spec::TaskSpec;
 use crate::clock::Mono;
@@ -39,6 +40,7 @@ pub struct Task {
     pub claims: Vec<Claim>,
     /// Whether all claims of the last tick were commanded.
     pub granted: bool,
+    leader: Vec<LeaderJoint>,
     index: u16,
     auto_start: bool,
     takes: &'static [TargetKind],
@@ -59,6 +61,7 @@ impl Task {
             demand: Demand::Nothing,
             claims: Vec::with_capacity(config.joints.len()),
             granted: false,
+            leader: config.kind.leader.clone(),
             index,
             auto_start: config.auto_start,
             takes: spec.takes,
@@ -71,6 +74,11 @@ impl Task {
     /// Returns the joints that it moves now: those of its motion, else all of its joints.
     pub fn moving_joints(&self) -> &[u16] {
         self.motion.as_ref().map_or(&self.joints, |motion| &motion.joints)
+    }
+
+    /// Returns whether it follows this joint.
+    pub fn is_led_by(&self, joint: u16) -> bool {
+        self.leader.iter().any(|leader| leader.joint == joint)
     }
 
     /// Returns whether it applies the speed override itself.
@@ -104,7 +112,7 @@ impl Task {
                 odd.map_or(Ok(()), |(&joint, _)| Err(Outcome::NonFinite(joint)))
             }
             Target::Chunk(motion, _) if motion.joints != self.joints => Err(Outcome::WrongTask(self.index)),
-            Target::Chunk(..) | Target::EndEffector(_) => Ok(()),
+            Target::Chunk(..) | Target::EndEffector(_) | Target::Start => Ok(()),
         }
     }
 

@@ -54,6 +54,7 @@ pub(super) fn need(request: &Request) -> Need<'_> {
         Request::Chunk(c) => Need::Lease(Subject::Task(&c.task)),
         Request::Twist(t) => Need::Lease(Subject::Task(&t.task)),
         Request::Pose(p) => Need::Lease(Subject::Task(&p.task)),
+        Request::Start(s) => Need::Lease(Subject::Task(&s.task)),
         Request::ArmReset(a) => Need::NoOtherHolder(Subject::Arm(&a.arm)),
         Request::ArmEnable(a) => Need::NoOtherHolder(Subject::Arm(&a.arm)),
         Request::ArmDisable(a) => Need::NoOtherHolder(Subject::Arm(&a.arm)),

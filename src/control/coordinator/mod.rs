@@ -130,6 +130,7 @@ impl Coordinator {
                 let (phase, cause) = (arm.failsafe.phase(), arm.failsafe.cause());
                 self.output.report(Event::Arm(i as u16, phase, cause));
             }
+            let fault = arm.unknown_position();
             let views = self.joints.iter_mut().skip(arm.first()).zip(arm.limiters());
             for (j, (view, limiter)) in views.enumerate() {
                 *view = JointView {
@@ -143,6 +144,9 @@ impl Coordinator {
                     velocity_limit: limiter.bounds().velocity,
                     jerk: arm.config().limits.jerk_max.get(j).copied().unwrap_or(crate::joint::DEFAULT_JERK),
                     tracking_error: arm.tracking_error(j),
+                    arm: i as u16,
+                    stamp: arm.state().stamp,
+                    fault,
                 };
             }
         }
@@ -201,9 +205,11 @@ impl Coordinator {
         }
     }
 
-    /// Starts tasks with `auto_start` and a first target as soon as all arms are ready.
+    /// Starts tasks with `auto_start` and a first target as soon as all arms are ready. An arm that only leads may be
+    /// disabled.
     fn auto_start(&mut self, now: Mono) {
-        if self.started || self.shutting_down || !self.arms.iter().all(|a| a.failsafe.phase() == Phase::Ready) {
+        let ready = |arm: &ArmControl| arm.failsafe.phase() == Phase::Ready || self.only_leads(arm);
+        if self.started || self.shutting_down || !self.arms.iter().all(ready) {
             return;
         }
         self.started = true;
@@ -212,6 +218,15 @@ impl Coordinator {
             let outcome = self.offer(now, t as u16, &target);
             self.output.report(Event::Request(0, outcome));
         }
+    }
+
+    /// Returns whether tasks that start automatically follow an arm with a known position, and none of them moves it.
+    fn only_leads(&self, arm: &ArmControl) -> bool {
+        let joints = arm.first() as u16..(arm.first() + arm.config().dof) as u16;
+        let starting = || self.tasks.iter().filter(|task| task.first_target().is_some());
+        arm.unknown_position() == Cause::None
+            && starting().any(|task| joints.clone().any(|joint| task.is_led_by(joint)))
+            && !starting().any(|task| task.joints.iter().any(|joint| joints.contains(joint)))
     }
 
     fn compute(&mut self, now: Mono) {
