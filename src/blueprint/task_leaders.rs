@@ -155,7 +155,8 @@ fn leaders_joint(
     }
     let Some(its) = params.joint_map.get(name) else {
         let diag = Diag::error(format!("{} follows no joint of {}", quote(name), quote(&arm.id)));
-        let at = pos.of(checker, "joint_map");
+        let at = pos.params.and_then(|params| checker.tree.entry(params, "joint_map"));
+        let at = at.map_or(pos.entry.kind.at, |(key, _)| key);
         checker.error(at, diag.hint("add it to `joint_map`, or name the joints that follow in `joint_names`"));
         return None;
     };

@@ -98,7 +98,7 @@ impl FollowTask {
 
     /// Returns the joint that is too far from its leader to approach it, and the distance [rad].
     fn too_far(&self, cx: &Context<'_>) -> Option<(u16, f64)> {
-        let most = self.params.max_approach.unwrap_or(f64::INFINITY);
+        let most = if self.params.max_approach > 0.0 { self.params.max_approach } else { f64::INFINITY };
         let mut away = self.pairs(cx).map(|(joint, view, _, target)| (joint, (target - view.position).abs()));
         away.find(|(_, distance)| distance.is_nan() || *distance > most)
     }

@@ -6,7 +6,7 @@ use schemars::JsonSchema;
 use serde::de::{Deserializer, Error};
 use serde::{Deserialize, Serialize};
 
-use crate::yaml::range::{maybe_positive, non_negative};
+use crate::yaml::range::non_negative;
 
 /// Highest speed of a joint on its way to the leader [rad/s].
 pub const MAX_APPROACH_SPEED: f64 = 0.3;
@@ -29,10 +29,10 @@ pub struct FollowParams {
     #[schemars(extend("exclusiveMinimum" = 0.0, "maximum" = MAX_APPROACH_SPEED))]
     pub approach_speed: f64,
     /// A joint that is further than this from the leader's is not moved to it: the task refuses to start, or ends
-    /// [rad]; `null`: any distance.
-    #[serde(deserialize_with = "maybe_positive")]
-    #[schemars(extend("exclusiveMinimum" = 0.0))]
-    pub max_approach: Option<f64>,
+    /// [rad]; 0 = any distance.
+    #[serde(deserialize_with = "non_negative")]
+    #[schemars(range(min = 0.0))]
+    pub max_approach: f64,
     /// Without a recent state of the leader the arm decelerates to rest. After this long the task ends [s]; before, the
     /// arm approaches the leader again.
     #[serde(deserialize_with = "non_negative")]
@@ -57,7 +57,7 @@ impl Default for FollowParams {
             scale: BTreeMap::new(),
             offset: BTreeMap::new(),
             approach_speed: MAX_APPROACH_SPEED,
-            max_approach: None,
+            max_approach: 0.0,
             leader_timeout: 2.0,
         }
     }

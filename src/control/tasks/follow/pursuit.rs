@@ -25,7 +25,7 @@ pub struct Room {
     pub lower: f64,
     /// Highest position [rad].
     pub upper: f64,
-    /// With which it decelerates where it is too fast for its caps or its range [rad/s²].
+    /// Its acceleration where it is too fast for its caps or its range [rad/s²]; at least that of the caps.
     pub acceleration: f64,
 }
 
@@ -55,13 +55,9 @@ impl Pursuit {
             velocity + within(caps.gain * behind, fastest)
         });
         let wanted = within(wanted, if target.is_some() { caps.velocity } else { 0.0 });
-        let up = braking_speed((room.upper - self.position).max(0.0), room.acceleration, dt);
-        let down = braking_speed((self.position - room.lower).max(0.0), room.acceleration, dt);
-        let inside = wanted.min(up).max(-down);
-        let change = inside - self.velocity;
-        // Too fast for its caps or for the room that is left: decelerates as a stream that has ended.
-        let too_fast = self.velocity.abs() > caps.velocity || inside != wanted || target.is_none();
-        if too_fast {
+        let change = wanted - self.velocity;
+        if self.velocity.abs() > caps.velocity || target.is_none() {
+            // Too fast: decelerates like the joints of a stream that has ended.
             self.acceleration = within(change / dt, room.acceleration);
         } else {
             // The highest acceleration from which the velocity arrives without overshoot, critically damped with the
@@ -71,6 +67,11 @@ impl Pursuit {
             let asked = caps.acceleration.min(arriving).min(damped).copysign(change);
             self.acceleration += within(asked - self.acceleration, caps.jerk * dt);
         }
+        // Never faster than it can stop inside its range.
+        let up = braking_speed((room.upper - self.position).max(0.0), room.acceleration, dt);
+        let down = braking_speed((self.position - room.lower).max(0.0), room.acceleration, dt);
+        let inside = (self.velocity + self.acceleration * dt).min(up).max(-down);
+        self.acceleration = within((inside - self.velocity) / dt, room.acceleration);
         self.velocity += self.acceleration * dt;
         self.position = (self.position + self.velocity * dt).max(room.lower).min(room.upper);
     }
