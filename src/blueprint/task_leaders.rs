@@ -28,12 +28,15 @@ pub(super) fn resolve(
         }
         let node = entry.params.as_ref().map(|params| params.at);
         let lost = |checker: &Checker<'_>, key| node.is_some_and(|node| !checker.has(node, key));
-        if ["leader", "joint_map", "scale", "offset"].into_iter().any(|key| lost(checker, key)) {
+        if ["leader", "joint_map", "scale", "offset", "gripper"].into_iter().any(|key| lost(checker, key)) {
             continue;
         }
         let pos = TaskPos { entry, params: node };
         let Some(leader) = leader(checker, &pos, &params, task, hardware) else { continue };
         joints(checker, &pos, &params, task, leader, hardware);
+        if params.gripper {
+            check_grippers(checker, &pos, &task.arms, leader, hardware);
+        }
         let at = pos.of(checker, "leader");
         followers.push(Follower { task: task.name.clone(), at, arms: task.arms.clone(), leader });
     }
@@ -139,6 +142,20 @@ fn joints(
         let before: usize = hardware.entries.iter().take(leader).map(|entry| entry.joints.len()).sum();
         let (scale, offset) = (of(&params.scale, 1.0), of(&params.offset, 0.0));
         task.leader.push(LeaderJoint { joint: (before + joint) as u16, scale, offset });
+    }
+}
+
+/// Checks that the leader and the one arm of the task have grippers.
+fn check_grippers(checker: &mut Checker<'_>, pos: &TaskPos<'_>, arms: &[usize], leader: usize, hardware: &Hardware) {
+    let at = pos.of(checker, "gripper");
+    if arms.len() > 1 {
+        let diag = Diag::error("the grippers of several arms cannot follow one");
+        return checker.error(at, diag.hint("make one task per arm"));
+    }
+    let entries = arms.iter().chain([&leader]).filter_map(|arm| hardware.entries.get(*arm));
+    if let Some(entry) = { entries }.find(|entry| entry.adapter.is_some_and(|row| !row.gripper)) {
+        let diag = Diag::error(format!("{} has no gripper", quote(&entry.id)));
+        checker.error(at, diag.hint("leave `gripper` out"));
     }
 }
 

@@ -233,6 +233,11 @@ pub trait TaskBody: std::fmt::Debug + Send {
         None
     }
 
+    /// Returns whether the gripper of the task's arm now follows that of the leader.
+    fn follows_gripper(&self) -> bool {
+        false
+    }
+
     /// Replaces the tool of the end effector; `false`: the type moves none. Called only while the task is not active.
     fn set_tool(&mut self, tool: &FramePose) -> bool {
         let _ = tool;

@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use dimos::arm::{Link, Supervision};
+use dimos::arm::{GripperInfo, GripperUnit, Link, Supervision};
 use dimos::control::config::{ArmConfig, FollowParams, LeaderJoint, TaskConfig, TaskKind};
 use dimos::control::request::Request;
 use dimos::robot::random::Random;
@@ -133,7 +133,7 @@ fn lag(samples: &[(f64, f64)], motion: impl Fn(f64) -> f64) -> (f64, f64) {
 
 #[test]
 fn in_step_it_lags_by_no_more_than_a_tick_and_the_age_of_the_state() {
-    // Resolution and noise of a hobby servo, states that are 2 ms old, and one state per tick or every second or fourth.
+    // Resolution and noise of a hobby servo, states that are 2 ms old, and one state per tick or each two or four.
     for every in [1, 2, 4] {
         let slow = Supervision { stale_after: Duration::from_millis(100), ..Supervision::default() };
         let leader = ArmConfig { supervision: slow, ..arm("leader", 6) };
@@ -361,6 +361,35 @@ fn with_auto_start_it_begins_when_its_arm_is_ready_whatever_the_leaders_motors_d
     rig.ask(Request::Enabled { arm: 1 });
     rig.run_for(0.5);
     assert_eq!(rig.tasks[0].state, TaskState::Executing, "{:?}", rig.events);
+}
+
+#[test]
+fn in_step_the_gripper_follows_by_its_own_range() {
+    let jaw = GripperInfo { unit: GripperUnit::Radians, range: Some((0.0, 2.0)), ..GripperInfo::default() };
+    let fingers = GripperInfo { range: Some((0.0, 0.1)), ..GripperInfo::default() };
+    let arms = vec![
+        ArmConfig { gripper_info: jaw, ..arm("leader", 6) },
+        ArmConfig { gripper_info: fingers, ..arm("follower", 6) },
+    ];
+    let mut rig = Rig::new(100.0, arms, vec![task_of(follow(|params| params.gripper = true))]);
+    rig.make_ready();
+    rig.arms[LEADER].state.gripper = Some(1.0);
+    assert_eq!(rig.ask(Request::Start { task: 0 }), Outcome::Accepted);
+    assert_eq!(rig.commands[FOLLOWER].gripper_seq, 0, "not on the way to the leader");
+    until_in_step(&mut rig);
+    rig.run_for(0.1);
+    assert_eq!((rig.commands[FOLLOWER].gripper_seq, rig.commands[FOLLOWER].gripper), (1, 0.05));
+    for k in 1..=100 {
+        rig.arms[LEADER].state.gripper = Some(1.0 + 0.01 * f64::from(k));
+        rig.tick();
+    }
+    let commands = rig.commands[FOLLOWER].gripper_seq;
+    assert!((15..=21).contains(&commands) && (rig.arms[FOLLOWER].gripper - 0.1).abs() < 3e-3, "{commands}");
+    rig.ask(Request::Cancel { task: Some(0) });
+    rig.arms[LEADER].state.gripper = Some(0.0);
+    rig.run_for(0.5);
+    assert_eq!(rig.commands[FOLLOWER].gripper_seq, commands);
+    assert_eq!(rig.commands[LEADER].gripper_seq, 0);
 }
 
 #[test]

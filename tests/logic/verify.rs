@@ -208,7 +208,8 @@ fn an_arm_that_follows_another_does_the_same_again() {
     let led_by = |joint| LeaderJoint { joint, scale: -0.7, offset: 0.1 + 0.2 };
     config.tasks.push(TaskConfig {
         name: "follow".into(),
-        kind: TaskKind::new("follow", &FollowParams::default()).led_by((6..12).map(led_by).collect()),
+        kind: TaskKind::new("follow", &FollowParams { gripper: true, ..FollowParams::default() })
+            .led_by((6..12).map(led_by).collect()),
         joints: (0..6).collect(),
         priority: 20,
         auto_start: false,
@@ -222,6 +223,7 @@ fn an_arm_that_follows_another_does_the_same_again() {
     for k in 0..2000u32 {
         let t = f64::from(k) * 0.01;
         run.states[1].position = joints_of(&[0.4 * t.sin() + if k > 1200 { 0.5 } else { 0.0 }; 6]);
+        run.states[1].gripper = Some(0.05 + 0.04 * t.cos());
         run.states[1].link = if (900..960).contains(&k) { Link::Down } else { Link::Up };
         match k {
             10 | 1500 => run.ask(Request::Start { task: 1 }),

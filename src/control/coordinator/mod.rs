@@ -16,6 +16,7 @@ use super::speed_override::SpeedOverride;
 use super::stalls::Stalls;
 use super::task::{Task, Tick};
 use super::task_body::JointView;
+use super::task_leader::gripper_target;
 use crate::arm::ArmState;
 use crate::clock::Mono;
 use crate::telemetry::{ArmSample, Cause, Event, Phase, Reason, TaskState};
@@ -114,6 +115,7 @@ impl Coordinator {
         }
         self.auto_start(time.now);
         self.compute(time.now);
+        self.lead_grippers(time.now);
         let output = &mut self.output;
         let mut retired = std::mem::take(&mut output.retired);
         self.arbiter.decide(&mut self.tasks, |event| output.report(event), |motion| retired.push(motion));
@@ -238,6 +240,25 @@ impl Coordinator {
             self.output.retired.extend(motion);
             if before != (task.state, task.reason) {
                 self.output.report(Event::Task(t as u16, task.state, task.reason));
+            }
+        }
+    }
+
+    /// Commands the grippers of arms that follow another arm.
+    fn lead_grippers(&mut self, now: Mono) {
+        for task in &mut self.tasks {
+            let Some((joint, leader)) = task.led_gripper(now) else { continue };
+            let of = |joint: u16| self.arm_of.get(joint as usize).map(|arm| usize::from(*arm));
+            let Some((own, leader)) = of(joint).zip(of(leader)) else { continue };
+            let Some((position, info)) =
+                self.arms.get(leader).and_then(|a| Some((a.state().gripper?, a.config().gripper_info)))
+            else {
+                continue;
+            };
+            let Some(arm) = self.arms.get_mut(own).filter(|arm| arm.config().gripper) else { continue };
+            let last = (arm.command().gripper_seq != 0).then_some(arm.command().gripper);
+            if let Some(target) = gripper_target(position, &info, &arm.config().gripper_info, last) {
+                arm.set_gripper(target, None);
             }
         }
     }

@@ -278,6 +278,10 @@ impl TaskBody for FollowTask {
         true
     }
 
+    fn follows_gripper(&self) -> bool {
+        self.params.gripper && self.stage == Stage::InStep
+    }
+
     fn first_target(&self) -> Option<Target<'static>> {
         Some(Target::Start)
     }

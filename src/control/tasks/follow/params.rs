@@ -24,6 +24,9 @@ pub struct FollowParams {
     pub scale: BTreeMap<String, f64>,
     /// What is added to the leader's position, for joints of the task [rad]; otherwise 0.
     pub offset: BTreeMap<String, f64>,
+    /// Whether the gripper follows the leader's while the arm is in step: to the same share of its own range, at most
+    /// 20 times per second.
+    pub gripper: bool,
     /// Highest speed of a joint on its way to the leader, above 0 to 0.3 [rad/s].
     #[serde(deserialize_with = "approach_speed")]
     #[schemars(extend("exclusiveMinimum" = 0.0, "maximum" = MAX_APPROACH_SPEED))]
@@ -56,6 +59,7 @@ impl Default for FollowParams {
             joint_map: BTreeMap::new(),
             scale: BTreeMap::new(),
             offset: BTreeMap::new(),
+            gripper: false,
             approach_speed: MAX_APPROACH_SPEED,
             max_approach: 0.0,
             leader_timeout: 2.0,
