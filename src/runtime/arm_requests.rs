@@ -109,7 +109,11 @@ impl Service {
                 return self.refusal(&outcome).map_or_else(|| Err(internal()), Err);
             }
             Phase::Ready | Phase::Activating => {}
-            _ => {
+            phase => {
+                // Its joints would move while it is being enabled.
+                if phase == Phase::Standby && view.command.mode.is_some() {
+                    self.wait_for_rest(&id, arm, Instant::now() + self.braking_limit(arm)).await?;
+                }
                 order(self.device(arm)?.activate()).await.map_err(|e| refused(&id, "was not enabled", &e))?;
                 self.ask(Request::Enabled { arm }).await?;
             }
