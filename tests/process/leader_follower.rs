@@ -37,6 +37,7 @@ fn a_follower_goes_where_a_hand_moves_a_leader_without_power() {
     eventually("the hand has moved the leader", moved);
     eventually("the follower is in step with it", || {
         let task = report(&home);
+        assert_eq!(task["state"], "EXECUTING", "{task}");
         let near = task["distance"].as_f64().is_some_and(|distance| distance < 0.03);
         near && task["reason"] == "in step with its leader" && apart(&home) < 0.03
     });

@@ -200,6 +200,10 @@ impl FollowTask {
             self.stage = Stage::Approaching;
         }
         let furthest = self.aim(cx);
+        if self.stage == Stage::InStep && !cx.granted && furthest > IN_STEP {
+            // What the leader did while nothing went out is not made up for at full speed.
+            (self.stage, self.engaged) = (Stage::Approaching, 0.0);
+        }
         if self.stage == Stage::Approaching {
             let near = furthest <= IN_STEP && cx.granted;
             let change = if near { cx.dt } else { -cx.dt };
@@ -249,9 +253,6 @@ impl TaskBody for FollowTask {
             for (joint, &index) in self.joints.iter_mut().zip(cx.joints) {
                 let view = cx.joint(index);
                 joint.motion.rebase(view.commanded, view.commanded_velocity);
-            }
-            if self.stage == Stage::InStep {
-                (self.stage, self.engaged) = (Stage::Approaching, 0.0);
             }
         }
         let fault = self.pairs(cx).map(|(.., leader, _)| leader).find(|leader| leader.fault != Cause::None);
