@@ -51,7 +51,7 @@ pub fn gripper_target(position: f64, of: &GripperInfo, own: &GripperInfo, last: 
     let ranges = of.range.zip(own.range).filter(|(of, own)| span(*of) != 0.0 && span(*own) != 0.0);
     let (target, step) = match ranges {
         Some((of, own)) => {
-            let share = ((position - of.0) / span(of)).max(0.0).min(1.0);
+            let share = ((position - of.0) / span(of)).clamp(0.0, 1.0);
             (own.0 + share * span(own), GRIPPER_STEP * span(own).abs())
         }
         None if of.unit == own.unit => (position, 1e-3),

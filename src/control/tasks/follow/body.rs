@@ -207,7 +207,7 @@ impl FollowTask {
         if self.stage == Stage::Approaching {
             let near = furthest <= IN_STEP && cx.granted;
             let change = if near { cx.dt } else { -cx.dt };
-            self.engaged = (self.engaged + change / ENGAGING).max(0.0).min(1.0);
+            self.engaged = (self.engaged + change / ENGAGING).clamp(0.0, 1.0);
             if self.engaged >= 1.0 {
                 self.stage = Stage::InStep;
             }
