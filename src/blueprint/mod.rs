@@ -23,6 +23,7 @@ mod resolve;
 pub mod schema;
 pub mod size;
 mod summary;
+mod task_leaders;
 mod task_robots;
 mod tasks;
 mod tick_clock;

@@ -10,7 +10,10 @@ use crate::blueprint::limits::JointOverride;
 use crate::blueprint::planner::{ViewBackend, ViewConfig};
 use crate::blueprint::schema::{BlueprintFile, CoordinatorConfig, HardwareType, OnExit, RecordingConfig, RpcConfig};
 use crate::blueprint::task_robots::{self, Base};
-use crate::blueprint::{arms, assets, park, planner_check, planner_files, planner_models, tasks, tick_clock};
+use crate::blueprint::{
+    arms, assets, park, planner_check, planner_files, planner_models, task_leaders, tasks, tick_clock,
+};
+use crate::control::task_leader::LeaderJoint;
 use crate::control::task_spec::TaskSpec;
 use crate::hardware::device::Setup;
 use crate::hardware::registry::AdapterSpec;
@@ -133,6 +136,8 @@ pub struct Task {
     pub auto_start: bool,
     /// The robot whose end effector it moves, if its type needs one.
     pub robot: Option<TaskRobot>,
+    /// The joint that each of its joints follows, if its type has a leader.
+    pub leader: Vec<LeaderJoint>,
 }
 
 /// The robot of a task that moves an end effector. Its description has been checked, and is read again for a run.
@@ -225,6 +230,7 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
         config
     });
     task_robots::resolve(&mut checker, &file.tasks, &mut tasks, planner.as_ref(), &hardware);
+    task_leaders::resolve(&mut checker, &file.tasks, &mut tasks, &hardware);
     let assets = assets::resolved(&checker, &file.tasks, file.planner.as_ref());
     let view = file.view.or_else(|| file.planner.and_then(|p| p.value.visualization));
     // Only without errors: a mistake in the section may have changed its backend.

@@ -49,6 +49,7 @@ pub(super) fn resolve(checker: &mut Checker<'_>, entries: &[Located<TaskEntry>],
                 priority: entry.priority,
                 auto_start: entry.auto_start,
                 robot: None,
+                leader: Vec::new(),
             });
         }
         checked.push(Checked { entry, joints });
@@ -154,7 +155,7 @@ fn params(
 /// are checked in `task_robots`.
 fn try_build(checker: &mut Checker<'_>, node: NodeId, spec: &TaskSpec, joints: &[usize], params: &Value) {
     let joints: Vec<u16> = joints.iter().map(|&j| j as u16).collect();
-    let Err(error) = (spec.build)(&TaskSetup { joints: &joints, params, robot: None }) else { return };
+    let Err(error) = (spec.build)(&TaskSetup { joints: &joints, params, robot: None, leader: &[] }) else { return };
     let at = checker.tree.get(node, error.key).unwrap_or(node);
     if !checker.lost.contains(at) {
         checker.error(at, Diag::error(error.what).maybe_hint(error.hint));

@@ -393,6 +393,10 @@ pub(super) fn print_tasks(tasks: &[TaskReport]) {
         if let Some(reason) = &task.reason {
             output::line(format_args!("  {} is {}: {reason}", task.name, task.state));
         }
+        if let Some(distance) = task.distance {
+            let text = format!("{distance:.3} rad ({:.1}°) from its leader", distance.to_degrees());
+            output::line(format_args!("  {} is {text}", task.name));
+        }
         if let Some(bound) = &task.bound {
             output::line(format_args!("  {} is limited by {bound}", task.name));
         }

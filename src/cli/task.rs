@@ -10,7 +10,7 @@ use super::exit::{Exit, Failure, Result};
 use super::follow::Signals;
 use super::targets::{Source, Width};
 use super::{output, status};
-use crate::rpc::api::{Cancel, Pose, Servo, Status, Twist, TwistFrame, Velocity};
+use crate::rpc::api::{Cancel, Pose, Servo, Start, Status, Twist, TwistFrame, Velocity};
 use crate::rpc::client::Client;
 use crate::rpc::report::TaskReport;
 use crate::rpc::{Code, RpcError};
@@ -34,7 +34,7 @@ enum Action {
         #[command(flatten)]
         target_run: Target,
     },
-    /// Query or cancel one task
+    /// Query, start or cancel one task
     Invoke {
         /// Name of the task
         task: String,
@@ -68,7 +68,10 @@ decelerate to rest.")]
 enum Method {
     /// State of the task and its reason
     State,
+    /// Start a follow task: the arm approaches its leader at 0.3 rad/s at most, then follows it
+    Start,
     /// Cancel its motion by decelerating
+    #[value(alias = "stop")]
     Cancel,
 }
 
@@ -121,9 +124,10 @@ fn refusal(error: RpcError) -> Failure {
 fn invoke(task: &str, method: Method, target_run: &Target) -> Result {
     let mut client = target_run.connect()?;
     match method {
-        Method::State => {
-            let report = find(&mut client, task)?;
-            if target_run.json { output::json(&report) } else { status::print_tasks(&[report]) }
+        Method::State => show(&mut client, task, target_run.json)?,
+        Method::Start => {
+            client.call(Start { task: task.to_owned() })?;
+            show(&mut client, task, target_run.json)?;
         }
         Method::Cancel => {
             let reply = client.call(Cancel { task: Some(task.to_owned()), ..Cancel::default() })?;
@@ -135,6 +139,17 @@ fn invoke(task: &str, method: Method, target_run: &Target) -> Result {
         }
     }
     Ok(Exit::Ok)
+}
+
+/// Prints a task.
+fn show(client: &mut Client, task: &str, json: bool) -> Result<()> {
+    let report = find(client, task)?;
+    if json {
+        output::json(&report)
+    } else {
+        status::print_tasks(&[report])
+    }
+    Ok(())
 }
 
 /// Kind of the targets that a task follows as a stream.

@@ -8,9 +8,11 @@ use crate::arm::{GripperInfo, Supervision};
 use crate::joint::{ControlMode, JointLimits};
 
 pub use super::task_config::{TaskConfig, TaskKind};
+pub use super::task_leader::LeaderJoint;
 pub use super::task_robot::{FramePose, NO_ROTATION, TaskKinematics};
 pub use super::tasks::cartesian::CartesianParams;
 pub use super::tasks::chunk::ChunkParams;
+pub use super::tasks::follow::FollowParams;
 pub use super::tasks::servo::ServoParams;
 pub use super::tasks::trajectory::TrajectoryParams;
 pub use super::tasks::velocity::VelocityParams;

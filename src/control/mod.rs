@@ -26,6 +26,7 @@ pub mod stalls;
 pub mod task;
 pub mod task_body;
 pub mod task_config;
+pub mod task_leader;
 pub mod task_robot;
 pub mod task_spec;
 pub mod tasks;

@@ -61,6 +61,11 @@ pub enum Request {
         /// The goal.
         goal: Goal,
     },
+    /// Start a task that takes no targets.
+    Start {
+        /// The task.
+        task: u16,
+    },
     /// Another tool for the end effector of a Cartesian task that is not active.
     Tool {
         /// The task.

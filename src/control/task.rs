@@ -1,13 +1,19 @@
 //! A task of the coordinator: claims joints and commands them. The behaviour of its type is in its body.
 
+use std::time::Duration;
+
 use super::config::TaskConfig;
 use super::request::Motion;
 use super::speed_override::SpeedOverride;
 use super::task_body::{Claim, Context, Demand, JointView, OnCancel, OnLoss, Step, Target, TargetKind, TaskBody};
+use super::task_leader::LeaderJoint;
 use super::task_robot::FramePose;
 use super::task_spec::TaskSpec;
 use crate::clock::Mono;
 use crate::telemetry::{Outcome, Reason, TaskState, TaskView};
+
+/// Shortest time between two commands to a gripper that follows another one.
+const GRIPPER_PERIOD: Duration = Duration::from_millis(50);
 
 /// What all tasks are given in a tick.
 #[derive(Debug, Clone, Copy)]
@@ -39,6 +45,9 @@ pub struct Task {
     pub claims: Vec<Claim>,
     /// Whether all claims of the last tick were commanded.
     pub granted: bool,
+    leader: Vec<LeaderJoint>,
+    /// When the gripper of its leader was read last.
+    gripper_at: Mono,
     index: u16,
     auto_start: bool,
     takes: &'static [TargetKind],
@@ -59,6 +68,8 @@ impl Task {
             demand: Demand::Nothing,
             claims: Vec::with_capacity(config.joints.len()),
             granted: false,
+            leader: config.kind.leader.clone(),
+            gripper_at: Mono::ZERO,
             index,
             auto_start: config.auto_start,
             takes: spec.takes,
@@ -71,6 +82,19 @@ impl Task {
     /// Returns the joints that it moves now: those of its motion, else all of its joints.
     pub fn moving_joints(&self) -> &[u16] {
         self.motion.as_ref().map_or(&self.joints, |motion| &motion.joints)
+    }
+
+    /// Returns whether it follows this joint.
+    pub fn is_led_by(&self, joint: u16) -> bool {
+        self.leader.iter().any(|leader| leader.joint == joint)
+    }
+
+    /// Returns a joint of its own and one of its leader's, whose arms' grippers are to move alike, at most every 50 ms.
+    pub fn led_gripper(&mut self, now: Mono) -> Option<(u16, u16)> {
+        let due = now.since(self.gripper_at) >= GRIPPER_PERIOD && self.is_active() && self.body.follows_gripper();
+        let pair = self.joints.first().zip(self.leader.first()).filter(|_| due)?;
+        self.gripper_at = now;
+        Some((*pair.0, pair.1.joint))
     }
 
     /// Returns whether it applies the speed override itself.
@@ -104,7 +128,7 @@ impl Task {
                 odd.map_or(Ok(()), |(&joint, _)| Err(Outcome::NonFinite(joint)))
             }
             Target::Chunk(motion, _) if motion.joints != self.joints => Err(Outcome::WrongTask(self.index)),
-            Target::Chunk(..) | Target::EndEffector(_) => Ok(()),
+            Target::Chunk(..) | Target::EndEffector(_) | Target::Start => Ok(()),
         }
     }
 

@@ -7,7 +7,7 @@ use super::request::{Goal, Motion};
 use super::task_robot::FramePose;
 use crate::clock::Mono;
 use crate::joint::Joints;
-use crate::telemetry::{Outcome, Reason, TaskState, TaskView};
+use crate::telemetry::{Cause, Outcome, Reason, TaskState, TaskView};
 
 /// State and limits of a joint, as a task sees them.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -32,6 +32,12 @@ pub struct JointView {
     pub jerk: f64,
     /// Distance of the joint from the range of its setpoints of the last `lag` seconds [rad].
     pub tracking_error: f64,
+    /// Index of its arm.
+    pub arm: u16,
+    /// When position and velocity were measured.
+    pub stamp: Mono,
+    /// Why they are not those of the joint at present: no recent state, a lost connection, an error of the arm.
+    pub fault: Cause,
 }
 
 /// Context of a call of a body.
@@ -101,6 +107,8 @@ pub enum Target<'a> {
     Chunk(&'a Motion, Mono),
     /// A pose or a twist of the end effector; any values.
     EndEffector(Goal),
+    /// None: the task finds its targets itself.
+    Start,
 }
 
 impl Target<'_> {
@@ -113,6 +121,7 @@ impl Target<'_> {
             Self::Chunk(..) => TargetKind::Chunk,
             Self::EndEffector(Goal::Pose { .. }) => TargetKind::Pose,
             Self::EndEffector(Goal::Twist { .. }) => TargetKind::Twist,
+            Self::Start => TargetKind::Start,
         }
     }
 }
@@ -132,12 +141,14 @@ pub enum TargetKind {
     Pose,
     /// A twist of the end effector.
     Twist,
+    /// A start without a target.
+    Start,
 }
 
 impl TargetKind {
     /// All kinds.
-    pub const ALL: [Self; 6] =
-        [Self::Trajectory, Self::Positions, Self::Velocities, Self::Chunk, Self::Pose, Self::Twist];
+    pub const ALL: [Self; 7] =
+        [Self::Trajectory, Self::Positions, Self::Velocities, Self::Chunk, Self::Pose, Self::Twist, Self::Start];
 
     /// Returns the rpc method that sends one.
     pub fn method(self) -> &'static str {
@@ -148,6 +159,7 @@ impl TargetKind {
             Self::Chunk => "chunk",
             Self::Pose => "pose",
             Self::Twist => "twist",
+            Self::Start => "start",
         }
     }
 }
@@ -219,6 +231,11 @@ pub trait TaskBody: std::fmt::Debug + Send {
     /// Returns the target with which a task with `auto_start` begins; `None`: it waits for a client.
     fn first_target(&self) -> Option<Target<'static>> {
         None
+    }
+
+    /// Returns whether the gripper of the task's arm now follows that of the leader.
+    fn follows_gripper(&self) -> bool {
+        false
     }
 
     /// Replaces the tool of the end effector; `false`: the type moves none. Called only while the task is not active.

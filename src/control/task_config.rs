@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
+use super::task_leader::LeaderJoint;
 use super::task_robot::TaskKinematics;
 use super::task_spec::to_value;
 
@@ -31,12 +32,21 @@ pub struct TaskKind {
     pub params: Value,
     /// The robot whose end effector it moves, if the type moves one.
     pub robot: Option<Box<TaskKinematics>>,
+    /// The joint of another arm that each of its joints follows, if the type has a leader.
+    pub leader: Vec<LeaderJoint>,
 }
 
 impl TaskKind {
     /// Creates the kind of a type that moves joints.
     pub fn new(name: &str, params: &impl Serialize) -> Self {
-        Self { name: name.to_owned(), params: to_value(params), robot: None }
+        Self { name: name.to_owned(), params: to_value(params), robot: None, leader: Vec::new() }
+    }
+
+    /// Adds the joints that its joints follow, in their order.
+    #[must_use]
+    pub fn led_by(mut self, leader: Vec<LeaderJoint>) -> Self {
+        self.leader = leader;
+        self
     }
 
     /// Adds the robot whose end effector it moves.
@@ -55,6 +65,8 @@ struct Stored {
     kind: Map<String, Value>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     robot: Option<Box<TaskKinematics>>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    leader: Vec<LeaderJoint>,
     joints: Vec<u16>,
     priority: i32,
     auto_start: bool,
@@ -63,8 +75,8 @@ struct Stored {
 impl From<TaskConfig> for Stored {
     fn from(task: TaskConfig) -> Self {
         let TaskConfig { name, kind, joints, priority, auto_start } = task;
-        let robot = kind.robot;
-        Self { name, kind: Map::from_iter([(kind.name, kind.params)]), robot, joints, priority, auto_start }
+        let (robot, leader) = (kind.robot, kind.leader);
+        Self { name, kind: Map::from_iter([(kind.name, kind.params)]), robot, leader, joints, priority, auto_start }
     }
 }
 
@@ -72,7 +84,7 @@ impl TryFrom<Stored> for TaskConfig {
     type Error = String;
 
     fn try_from(stored: Stored) -> Result<Self, String> {
-        let Stored { name, kind, mut robot, joints, priority, auto_start } = stored;
+        let Stored { name, kind, mut robot, leader, joints, priority, auto_start } = stored;
         let mut kinds = kind.into_iter();
         let (Some((kind, mut params)), None) = (kinds.next(), kinds.next()) else {
             return Err(format!("task {name} has not one type"));
@@ -80,7 +92,7 @@ impl TryFrom<Stored> for TaskConfig {
         if robot.is_none() {
             robot = among(&mut params).map_err(|e| format!("task {name}: {e}"))?;
         }
-        Ok(Self { name, kind: TaskKind { name: kind, params, robot }, joints, priority, auto_start })
+        Ok(Self { name, kind: TaskKind { name: kind, params, robot, leader }, joints, priority, auto_start })
     }
 }
 
@@ -115,7 +127,9 @@ mod tests {
     #[test]
     fn every_built_in_task_is_read_from_its_log_as_it_was() {
         for spec in TaskTable::builtin().rows() {
-            let kind = TaskKind { name: spec.name.into(), params: (spec.params.default)(), robot: None };
+            let joint = |joint| LeaderJoint { joint, scale: -0.1, offset: 0.3 };
+            let leader = if spec.has_leader() { (6..12).map(joint).collect() } else { Vec::new() };
+            let kind = TaskKind::new(spec.name, &(spec.params.default)()).led_by(leader);
             let written = task(if spec.robot { kind.of_robot(robot()) } else { kind });
             let text = serde_json::to_string(&written).unwrap();
             let read: TaskConfig = serde_json::from_str(&text).unwrap();
@@ -137,7 +151,7 @@ mod tests {
         let old = json!({"name": "t", "kind": {"eef_twist": params}, "joints": [0, 1, 2, 3, 4, 5], "priority": 10,
                          "auto_start": false});
         let read: TaskConfig = serde_json::from_value(old).unwrap();
-        let kind = TaskKind { name: "eef_twist".into(), params: own, robot: None };
+        let kind = TaskKind::new("eef_twist", &own);
         assert_eq!(read, task(kind.of_robot(robot())));
         TaskTable::builtin().build(&[read]).unwrap();
     }

@@ -10,6 +10,7 @@ use thiserror::Error;
 use super::config::{TaskConfig, TaskKinematics};
 use super::task::Task;
 use super::task_body::{Demand, TargetKind, TaskBody};
+use super::task_leader::LeaderJoint;
 use super::tasks::TABLE;
 use crate::joint::ControlMode;
 use crate::yaml::{self, Lost, Missing, NodeId, Tree};
@@ -38,6 +39,12 @@ impl TaskSpec {
     /// Returns whether it takes this kind of target.
     pub fn takes(&self, kind: TargetKind) -> bool {
         self.takes.contains(&kind)
+    }
+
+    /// Returns whether it follows another arm: [`LeaderParams`](super::task_leader::LeaderParams) are then among its
+    /// parameters, and `build` gets the leader's joints.
+    pub fn has_leader(&self) -> bool {
+        (self.params.keys)().contains(&"leader")
     }
 
     /// Returns the control modes of which an arm needs at least one.
@@ -93,6 +100,8 @@ pub struct TaskSetup<'a> {
     pub params: &'a Value,
     /// The robot whose end effector the task moves, if its type moves one.
     pub robot: Option<&'a TaskKinematics>,
+    /// The joint that each joint of the task follows, if its type has a leader.
+    pub leader: &'a [LeaderJoint],
 }
 
 impl TaskSetup<'_> {
@@ -181,7 +190,11 @@ impl TaskTable {
             None if spec.robot => return Err("the kinematics of its robot are missing".to_owned()),
             None => {}
         }
-        let setup = TaskSetup { joints: &task.joints, params: &kind.params, robot: kind.robot.as_deref() };
+        if spec.has_leader() && kind.leader.len() != task.joints.len() {
+            return Err("the joints of its leader are missing".to_owned());
+        }
+        let robot = kind.robot.as_deref();
+        let setup = TaskSetup { joints: &task.joints, params: &kind.params, robot, leader: &kind.leader };
         let body = (spec.build)(&setup).map_err(|e| match e.key {
             "" => e.what,
             key => format!("{key}: {}", e.what),

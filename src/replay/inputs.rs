@@ -253,7 +253,7 @@ pub(super) fn values(list: &[f64], first: usize, dof: usize) -> Option<Joints> {
     list.get(first..first + dof).map(crate::joint::joints_of)
 }
 
-/// Reads a state besides joint values. Skips efforts, gripper, pose and wrench, which no tick uses.
+/// Reads a state besides joint values. Skips efforts, pose and wrench, which no tick uses.
 fn read_input(input: &ArmInput, state: &mut ArmState) -> Result<(), String> {
     *state = ArmState {
         seq: input.seq,
@@ -272,6 +272,7 @@ fn read_input(input: &ArmInput, state: &mut ArmState) -> Result<(), String> {
         interference: interference(&input.interference)?,
         own_delay_ns: input.own_delay_ns,
         stop_input_open: input.stop_input_open,
+        gripper: input.gripper.first().copied(),
         ..ArmState::default()
     };
     Ok(())

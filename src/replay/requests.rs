@@ -56,6 +56,9 @@ enum LoggedRequest {
         position: [Option<f64>; 3],
         orientation: [Option<f64>; 4],
     },
+    Start {
+        task: u16,
+    },
     Stop {
         arm: Option<u16>,
     },
@@ -133,6 +136,7 @@ fn request(logged: LoggedRequest, joints: &[String]) -> Result<Request, String> 
             let tool = FramePose { position: numbers(position), orientation: numbers(orientation) };
             Request::Tool { task, tool }
         }
+        LoggedRequest::Start { task } => Request::Start { task },
         LoggedRequest::Stop { arm } => Request::Stop { arm },
         LoggedRequest::Reset { arm } => Request::Reset { arm },
         LoggedRequest::Ready { arm } => Request::Enabled { arm },
@@ -182,6 +186,7 @@ mod tests {
             Request::Cancel { task: Some(3) },
             Request::Servo { task: 1, target },
             Request::Velocity { task: 2, target },
+            Request::Start { task: 3 },
             Request::CartesianTarget {
                 task: 3,
                 goal: Goal::Pose { position: [0.1 + 0.2, -0.0, 1e-300], orientation: [f64::NAN, 0.0, 0.6, 0.8] },

@@ -216,6 +216,8 @@ methods! {
     "twist" Twist -> Done, check Twist::valid;
     /// Next target of a `cartesian_ik` task; repeat it within the task's timeout.
     "pose" Pose -> Done, check Pose::valid;
+    /// Starts a task that takes no targets: a `follow` task. `cancel` ends it.
+    "start" Start -> Done;
     /// Plans a collision-free motion. Replies when planning begins; `planning` reports its progress. Moves nothing.
     "plan" Plan -> PlanReply, check Plan::valid;
     /// Progress or result of planning.

@@ -56,6 +56,7 @@ pub(super) fn need(request: &Request) -> Need<'_> {
         Request::Pose(p) => Need::Lease(Subject::Task(&p.task)),
         Request::MoveNative(m) => Need::Lease(Subject::Arm(&m.arm)),
         Request::ArmTeach(a) => Need::NoOtherHolder(Subject::Arm(&a.arm)),
+        Request::Start(s) => Need::Lease(Subject::Task(&s.task)),
         Request::ArmReset(a) => Need::NoOtherHolder(Subject::Arm(&a.arm)),
         Request::ArmEnable(a) => Need::NoOtherHolder(Subject::Arm(&a.arm)),
         Request::ArmDisable(a) => Need::NoOtherHolder(Subject::Arm(&a.arm)),

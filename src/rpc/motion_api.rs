@@ -32,6 +32,14 @@ pub struct Move {
     pub direct: bool,
 }
 
+/// Parameters of `start`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Start {
+    /// The task's name.
+    pub task: String,
+}
+
 /// Default fraction of the limits for a motion.
 pub const DEFAULT_SPEED: f64 = 0.5;
 

@@ -295,7 +295,7 @@ pub struct TaskReport {
     /// Its type, as in the blueprint.
     #[serde(rename = "type")]
     pub kind: String,
-    /// The methods that send it targets: `execute`, `servo`, `velocity`, `pose`, `twist`.
+    /// The methods that send it targets: `execute`, `servo`, `velocity`, `pose`, `twist`; `start`: it takes none.
     #[serde(default)]
     pub takes: Vec<String>,
     /// Joints that it may claim.
@@ -310,9 +310,12 @@ pub struct TaskReport {
     pub reason: Option<String>,
     /// Number of its current or latest motion.
     pub motion: Option<u64>,
-    /// What currently limits its end effector.
+    /// What currently limits its motion, where the task knows.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bound: Option<String>,
+    /// Largest distance of a joint from its leader's, while a `follow` task is active [rad].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub distance: Option<f64>,
 }
 
 impl TaskReport {

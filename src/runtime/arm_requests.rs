@@ -114,6 +114,10 @@ impl Service {
                     self.led_arm_rests(&id, arm)?;
                     self.end_lead(&id, arm).await?;
                 }
+                // Its joints would move while it is being enabled.
+                if phase == Phase::Standby {
+                    self.wait_for_rest(&id, arm, Instant::now() + self.braking_limit(arm)).await?;
+                }
                 order(self.device(arm)?.activate()).await.map_err(|e| refused(&id, "was not enabled", &e))?;
                 self.ask(Request::Enabled { arm }).await?;
             }

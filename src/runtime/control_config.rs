@@ -27,7 +27,12 @@ pub(super) fn tasks(blueprint: &Blueprint) -> Result<(Vec<TaskConfig>, Vec<Task>
         let robot = robot.map_err(|what| format!("task {}: {what}", task.name))?;
         Ok(TaskConfig {
             name: task.name.clone(),
-            kind: TaskKind { name: task.spec.name.to_owned(), params: task.params.clone(), robot },
+            kind: TaskKind {
+                name: task.spec.name.to_owned(),
+                params: task.params.clone(),
+                robot,
+                leader: task.leader.clone(),
+            },
             joints: task.joints.iter().map(|&j| j as u16).collect(),
             priority: task.priority,
             auto_start: task.auto_start,

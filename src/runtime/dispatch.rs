@@ -152,6 +152,7 @@ pub fn log_of(request: &Request) -> Value {
         Request::Tool { task, tool: FramePose { position, orientation } } => {
             json!({"tool": {"task": task, "position": position, "orientation": orientation}})
         }
+        Request::Start { task } => json!({"start": {"task": task}}),
         Request::Stop { arm } => json!({"stop": {"arm": arm}}),
         Request::Reset { arm } => json!({"reset": {"arm": arm}}),
         Request::Enabled { arm } => json!({"ready": {"arm": arm}}),

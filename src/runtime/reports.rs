@@ -149,6 +149,7 @@ impl Service {
             progress: (view.motion > 0).then_some(view.progress),
             reason: self.reason(&view.reason),
             motion: (view.motion > 0).then_some(view.motion),
+            distance: view.distance,
             bound: Some(bound_text(view.bound, &self.parts.names)).filter(|text| !text.is_empty()),
         })
     }

@@ -358,6 +358,7 @@ impl Service {
             Call::Velocity(v) => self.stream(v.task, v.velocities, false).await.map(|()| Reply::Velocity(Done {})),
             Call::Chunk(chunk) => self.chunk(chunk).await.map(Reply::Chunk),
             Call::Twist(twist) => self.twist(&twist).await.map(Reply::Twist),
+            Call::Start(start) => self.start_task(&start.task).await.map(Reply::Start),
             Call::Pose(pose) => self.pose(&pose).await.map(Reply::Pose),
             Call::Shutdown(_) => {
                 let _ = self.parts.endings.send(Ending::Asked);

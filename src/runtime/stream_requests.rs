@@ -101,6 +101,13 @@ impl Service {
         self.steer(&call.task, Goal::Pose { position: call.xyz, orientation: turn.coords.into() }).await
     }
 
+    /// Starts a task that takes no targets.
+    pub(super) async fn start_task(&self, task: &str) -> Result<Done, RpcError> {
+        let task = self.task_index(task)?;
+        self.target(task, Request::Start { task }).await?;
+        Ok(Done {})
+    }
+
     async fn steer(&self, task: &str, goal: Goal) -> Result<Done, RpcError> {
         let task = self.task_index(task)?;
         self.target(task, Request::CartesianTarget { task, goal }).await?;

@@ -210,6 +210,7 @@ pub fn outcome_text(outcome: &Outcome, names: &Names) -> String {
 fn task_changed(task: u16, state: TaskState, reason: Reason, names: &Names) -> Described {
     let severity = match (state, reason) {
         (_, Reason::None | Reason::Cancelled | Reason::StreamEnded) => Severity::Info,
+        (_, Reason::Approaching | Reason::InStep) => Severity::Info,
         (_, Reason::ArmHeld(_, Cause::Operator | Cause::StopInput | Cause::Shutdown)) => Severity::Warn,
         (TaskState::Aborted | TaskState::Fault, _) => Severity::Error,
         _ => Severity::Warn,
@@ -221,15 +222,17 @@ fn task_changed(task: u16, state: TaskState, reason: Reason, names: &Names) -> D
     let mut d = Described { task: Some(name), ..plain("task", severity, state.name(), text) };
     match reason {
         Reason::None | Reason::Cancelled | Reason::Timeout | Reason::StreamEnded => {}
+        Reason::Approaching | Reason::InStep => {}
         Reason::PathTolerance(joint, value)
         | Reason::GoalTolerance(joint, value)
         | Reason::TrackingError(joint, value)
+        | Reason::LeaderAway(joint, value)
         | Reason::Jump(joint, value) => {
             d.joint = Some(names.joint(joint));
             d.values = vec![value];
         }
         Reason::Preempted(_, joint) | Reason::NonFinite(joint) => d.joint = Some(names.joint(joint)),
-        Reason::ArmHeld(arm, cause) => {
+        Reason::ArmHeld(arm, cause) | Reason::LeaderLost(arm, cause) => {
             d.arm = Some(names.arm(arm));
             d.values = code(cause);
         }
@@ -253,6 +256,12 @@ pub fn reason_text(reason: &Reason, names: &Names) -> String {
         Reason::TrackingError(joint, by) => {
             format!("tracking error of {} was {}", names.joint(joint), angle(by))
         }
+        Reason::Approaching => "approaching its leader".into(),
+        Reason::InStep => "in step with its leader".into(),
+        Reason::LeaderLost(arm, cause) => {
+            format!("the position of its leader {} is unknown{}", names.arm(arm), because(cause))
+        }
+        Reason::LeaderAway(joint, by) => format!("{} was {} from its leader", names.joint(joint), angle(by)),
     }
 }
 

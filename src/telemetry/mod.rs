@@ -232,9 +232,17 @@ pub enum Reason {
     Jump(u16, f64),
     /// The tracking error of a joint exceeded the task's tolerance: joint, error [rad].
     TrackingError(u16, f64),
+    /// On its way to its leader.
+    Approaching,
+    /// It follows its leader.
+    InStep,
+    /// The position of its leader is unknown: the leader, why.
+    LeaderLost(u16, Cause),
+    /// A joint was too far from its leader's to approach it: joint, distance [rad].
+    LeaderAway(u16, f64),
 }
 
-/// What limits an end effector's motion.
+/// What limits the motion of an end effector, or of an arm that follows another.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Bound {
     /// Nothing.
@@ -370,6 +378,8 @@ pub struct TaskView {
     pub elapsed: f64,
     /// Remaining time of the motion [s].
     pub remaining: f64,
-    /// What limits its end effector, while it moves one.
+    /// What limits its motion, where the task knows.
     pub bound: Bound,
+    /// Largest distance of a joint from its leader's, while it follows one [rad].
+    pub distance: Option<f64>,
 }

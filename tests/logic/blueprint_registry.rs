@@ -117,7 +117,7 @@ fn the_schema_joins_options_and_params() {
     let rule = rule.unwrap();
     assert_eq!(rule["if"]["required"], serde_json::json!(["adapter_type"]));
     assert!(rule["then"]["properties"]["options"].to_string().contains("tool"));
-    assert_eq!(schema["$defs"]["TaskEntry"]["allOf"].as_array().unwrap().len(), 6);
+    assert_eq!(schema["$defs"]["TaskEntry"]["allOf"].as_array().unwrap().len(), 7);
     assert_references(&schema, &schema);
 }
 

@@ -40,6 +40,7 @@ const LAYERS: &[(&str, &[&str])] = &[
 const PARTS: &[(&str, &str, &str)] = &[
     ("blueprint", "control", "config"),
     ("blueprint", "control", "task_body"),
+    ("blueprint", "control", "task_leader"),
     ("blueprint", "control", "task_robot"),
     ("blueprint", "control", "task_spec"),
     ("blueprint", "planning", "config"),

@@ -26,6 +26,7 @@ mod coordinator;
 mod device_stops;
 mod english;
 mod faults;
+mod follow;
 mod gaps;
 mod guards_virtual;
 mod help;

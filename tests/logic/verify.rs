@@ -3,9 +3,11 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use dimos::arm::Link;
 use dimos::blueprint::{Blueprint, Overrides};
 use dimos::control::config::{
-    CartesianParams, ServoParams, TaskConfig, TaskKind, TaskKinematics, TrajectoryParams, VelocityParams,
+    ArmConfig, CartesianParams, FollowParams, LeaderJoint, ServoParams, TaskConfig, TaskKind, TaskKinematics,
+    TrajectoryParams, VelocityParams,
 };
 use dimos::control::point_to_point::point_to_point;
 use dimos::control::request::{Goal, Request};
@@ -23,6 +25,7 @@ use dimos::rpc::api;
 use dimos::rpc::client::Client;
 use dimos::rpc::run_dir::RunDir;
 use dimos::runtime::{Options, Record, Run};
+use dimos::telemetry::TaskState;
 
 use crate::support::tampered::{rewrite, tamper, without_attachments};
 use crate::support::virtual_run::{VirtualRun, one_arm};
@@ -194,6 +197,47 @@ fn motions_of_an_end_effector_come_out_the_same_again() {
     run.finish();
     let found = reproducible(&log);
     assert!(found.ticks > 400 && found.requests > 200, "{found:?}");
+}
+
+/// An arm that follows another one, with everything that can happen to its leader.
+#[test]
+fn an_arm_that_follows_another_does_the_same_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut config = one_arm(6);
+    config.arms.push(ArmConfig { name: "leader".into(), ..config.arms[0].clone() });
+    let led_by = |joint| LeaderJoint { joint, scale: -0.7, offset: 0.1 + 0.2 };
+    config.tasks.push(TaskConfig {
+        name: "follow".into(),
+        kind: TaskKind::new("follow", &FollowParams { gripper: true, ..FollowParams::default() })
+            .led_by((6..12).map(led_by).collect()),
+        joints: (0..6).collect(),
+        priority: 20,
+        auto_start: false,
+    });
+    let log = folder.path().join("follow.mcap");
+    let mut run = VirtualRun::start(&config, &log);
+    (run.states[0].position, run.states[1].enabled) = (joints_of(&[0.1; 6]), false);
+    run.step();
+    run.ask(Request::Enabled { arm: 0 });
+    (0..40).for_each(|_| run.step());
+    for k in 0..2000u32 {
+        let t = f64::from(k) * 0.01;
+        run.states[1].position = joints_of(&[0.4 * t.sin() + if k > 1200 { 0.5 } else { 0.0 }; 6]);
+        run.states[1].gripper = Some(0.05 + 0.04 * t.cos());
+        run.states[1].link = if (900..960).contains(&k) { Link::Down } else { Link::Up };
+        match k {
+            10 | 1500 => run.ask(Request::Start { task: 1 }),
+            700 => run.ask(Request::Pause { on: true }),
+            800 => run.ask(Request::Pause { on: false }),
+            1400 => run.ask(Request::Cancel { task: Some(1) }),
+            _ => {}
+        }
+        run.step();
+    }
+    assert_eq!(run.tasks[1].state, TaskState::Executing);
+    run.finish();
+    let found = reproducible(&log);
+    assert!(found.ticks > 2000 && found.events > 12, "{found:?}");
 }
 
 /// The next number in the direction of infinity.

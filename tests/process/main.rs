@@ -22,6 +22,7 @@ mod gripper_force;
 mod gripper_joint;
 mod jog;
 mod joint_status;
+mod leader_follower;
 mod leases;
 mod library;
 mod onto;

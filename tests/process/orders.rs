@@ -7,6 +7,8 @@ use std::time::{Duration, Instant};
 use dimos::hardware::adapter::AdapterError;
 use dimos::hardware::registry::AdapterSpec;
 use dimos::rpc::Code;
+use dimos::rpc::api::Stop;
+use dimos::rpc::client::Client;
 use dimos::rpc::run_dir::RunDir;
 use dimos::runtime::{Record, Run};
 
@@ -72,4 +74,31 @@ fn the_answer_has_the_phase_that_the_order_led_to() {
         assert_eq!(run.reset("arm").unwrap().phase, "standby");
         assert_eq!(run.enable("arm").unwrap().phase, "ready");
     }
+}
+
+/// It was held again: its joints were said to move while it was being enabled.
+#[test]
+fn an_arm_that_is_enabled_while_it_still_brakes_is_ready_once_it_is_at_rest() {
+    let blueprint = "
+hardware: [{hardware_id: arm, adapter_type: mock, joints: {prefix: arm, count: 1}, limits: {acceleration: 0.2}}]
+tasks: [{name: traj_arm, type: trajectory, joint_names: {hardware: arm}}]
+";
+    let folder = tempfile::tempdir().unwrap();
+    let run =
+        Run::from_yaml("braking", blueprint).record(Record::Off).folder(RunDir::at(folder.path())).start().unwrap();
+    let speed = || run.state().arms[0].joints[0].velocity.unwrap().abs();
+    run.move_arm("arm", &[2.0], 1.0).unwrap();
+    eventually("the arm moves", || speed() > 0.4);
+    let mut client = Client::connect("braking", run.socket().unwrap()).unwrap();
+    // It is answered when the arm has stopped, 2 s later.
+    let stop = std::thread::spawn(move || client.call(Stop::default()).unwrap());
+    eventually("the arm is held", || run.status().arms[0].phase == "held");
+    run.reset("arm").unwrap();
+    assert!(speed() > 0.05, "too late: it brakes for 2 s");
+    assert_eq!(run.enable("arm").unwrap().phase, "ready");
+    assert!(speed() < 0.01);
+    stop.join().unwrap();
+    let arm = &run.status().arms[0];
+    assert_eq!((arm.phase.as_str(), &arm.cause), ("ready", &None));
+    run.move_arm("arm", &[0.0], 0.5).unwrap();
 }

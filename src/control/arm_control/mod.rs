@@ -149,6 +149,17 @@ impl ArmControl {
         self.feedback.freshness()
     }
 
+    /// Returns why the measured positions are not those of the arm at present; `None`: they are.
+    pub fn unknown_position(&self) -> Cause {
+        let (state, freshness) = (self.feedback.state(), self.feedback.freshness());
+        match state.link {
+            Link::Down | Link::Faulted => Cause::LinkLost,
+            _ if state.error != 0 => Cause::Fault(state.error),
+            _ if !freshness.fresh => Cause::Stale(freshness.age),
+            _ => Cause::None,
+        }
+    }
+
     /// Returns the distance of a joint from the range of its setpoints of the last `lag` seconds [rad].
     pub fn tracking_error(&self, joint: usize) -> f64 {
         self.tracking.error(joint)

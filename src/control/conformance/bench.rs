@@ -1,12 +1,12 @@
 //! Test bench of the checks: a coordinator on a virtual clock, one ideal arm, the task under test, and a task of higher
-//! priority on one of its joints.
+//! priority on one of its joints. For a task that follows another arm, also a leader with its motors off.
 
 use std::collections::VecDeque;
 use std::time::Duration;
 
 use crate::arm::{ArmState, Link, Supervision, VelocitySource};
 use crate::clock::Mono;
-use crate::control::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, TaskConfig, TaskKind};
+use crate::control::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, LeaderJoint, TaskConfig, TaskKind};
 use crate::control::coordinator::{Coordinator, TickTime};
 use crate::control::request::{Envelope, Goal, Motion, Request};
 use crate::control::task::Task;
@@ -38,6 +38,8 @@ pub struct Bench {
     coordinator: Coordinator,
     robot: TaskKinematics,
     arm: ArmState,
+    /// The arm that leads.
+    leader: ArmState,
     now: Mono,
     inbox: VecDeque<Envelope>,
     next_id: u64,
@@ -58,20 +60,22 @@ impl Bench {
         let robot = TaskKinematics::new(Kinematics::whole(&model).map_err(|e| e.to_string())?, flange);
         let config = config(spec, &robot);
         let tasks = TaskTable::with(&[*spec]).build(&config.tasks)?;
+        let arm = ArmState {
+            dof: DOF,
+            position: joints_of(&HOME),
+            velocity: joints_of(&[0.0; DOF]),
+            velocity_source: VelocitySource::Measured,
+            mode: ControlMode::ServoPosition,
+            enabled: true,
+            link: Link::Up,
+            ..ArmState::default()
+        };
         let mut bench = Self {
             spec: *spec,
             coordinator: Coordinator::new(&config, tasks),
             robot,
-            arm: ArmState {
-                dof: DOF,
-                position: joints_of(&HOME),
-                velocity: joints_of(&[0.0; DOF]),
-                velocity_source: VelocitySource::Measured,
-                mode: ControlMode::ServoPosition,
-                enabled: true,
-                link: Link::Up,
-                ..ArmState::default()
-            },
+            arm,
+            leader: ArmState { enabled: false, ..arm },
             now: Mono(1_000_000_000),
             inbox: VecDeque::new(),
             next_id: 1,
@@ -126,11 +130,13 @@ impl Bench {
         self.now = self.now.after(period * (skipped + 1));
         self.arm.seq += 1;
         self.arm.stamp = self.now.before(Duration::from_micros(1500));
+        (self.leader.seq, self.leader.stamp) = (self.arm.seq, self.arm.stamp);
         let late_ns = u64::from(skipped) * period.as_nanos() as u64;
         let time = TickTime { now: self.now, next: self.now.after(period), skipped, late_ns, woke_late_ns: late_ns };
         let counted = || self.allocations.map_or(0, |count| count());
         let before = counted();
-        let output = self.coordinator.tick(time, &[self.arm], || self.inbox.pop_front());
+        let states = [self.arm, self.leader];
+        let output = self.coordinator.tick(time, &states, || self.inbox.pop_front());
         self.allocated += counted() - before;
         self.events.extend(&output.events);
         output.retired.clear();
@@ -187,15 +193,27 @@ impl Bench {
                 let target = self.target(kind)?;
                 self.send(target);
             }
+            self.lead(0.0);
             self.tick(0);
             self.streamed += 1.0 / RATE;
         }
         Ok(())
     }
 
+    /// Moves the leader to the present point of the slow motion, and this much further [rad].
+    pub fn lead(&mut self, further: f64) {
+        let swing = self.swing() + further;
+        self.leader.position = joints_of(&HOME.map(|home| home + swing));
+    }
+
+    /// How far the slow motion has moved each joint [rad].
+    fn swing(&self) -> f64 {
+        0.1 * (1.0 - (std::f64::consts::PI * self.streamed).cos())
+    }
+
     /// The request with the next target of a slow motion.
     pub fn target(&self, kind: TargetKind) -> Result<Request, String> {
-        let swing = 0.1 * (1.0 - (std::f64::consts::PI * self.streamed).cos());
+        let swing = self.swing();
         let each = |f: &dyn Fn(f64) -> f64| -> Joints { joints_of(&HOME.map(f)) };
         Ok(match kind {
             TargetKind::Trajectory => Request::Execute { task: TESTED, motion: self.motion()? },
@@ -215,6 +233,7 @@ impl Bench {
                 let goal = Goal::Twist { linear: [0.0, 0.0, 0.05], angular: [0.0; 3], tool: false };
                 Request::CartesianTarget { task: TESTED, goal }
             }
+            TargetKind::Start => Request::Start { task: TESTED },
         })
     }
 
@@ -222,7 +241,7 @@ impl Bench {
     pub fn not_finite(kind: TargetKind) -> Option<Request> {
         let (task, odd) = (TESTED, f64::NAN);
         Some(match kind {
-            TargetKind::Trajectory | TargetKind::Chunk => return None,
+            TargetKind::Trajectory | TargetKind::Chunk | TargetKind::Start => return None,
             TargetKind::Positions => Request::Servo { task, target: [odd; MAX_DOF] },
             TargetKind::Velocities => Request::Velocity { task, target: [odd; MAX_DOF] },
             TargetKind::Pose => Request::CartesianTarget {
@@ -327,7 +346,9 @@ fn config(spec: &TaskSpec, robot: &TaskKinematics) -> CoordinatorConfig {
         write_period: Duration::from_millis(10),
         supervision: Supervision::default(),
     };
-    let kind = |name: &str, params, robot| TaskKind { name: name.to_owned(), params, robot };
+    let kind = |name: &str, params, robot| TaskKind { name: name.to_owned(), params, robot, leader: Vec::new() };
+    let led = |joint| LeaderJoint { joint, scale: 1.0, offset: 0.0 };
+    let leader = if spec.has_leader() { (DOF as u16..2 * DOF as u16).map(led).collect() } else { Vec::new() };
     let task = |name: &str, kind: TaskKind, joints: std::ops::Range<u16>, priority: i32| TaskConfig {
         name: name.to_owned(),
         kind,
@@ -336,6 +357,7 @@ fn config(spec: &TaskSpec, robot: &TaskKinematics) -> CoordinatorConfig {
         auto_start: false,
     };
     let tested = kind(spec.name, (spec.params.default)(), spec.robot.then(|| Box::new(robot.clone())));
+    let tested = tested.led_by(leader);
     let stronger = match spec.demand {
         Demand::Velocities => crate::control::tasks::velocity::SPEC,
         _ => crate::control::tasks::servo::SPEC,
@@ -344,7 +366,7 @@ fn config(spec: &TaskSpec, robot: &TaskKinematics) -> CoordinatorConfig {
     CoordinatorConfig {
         version: CONFIG_VERSION,
         rate: RATE,
-        arms: vec![arm],
+        arms: vec![arm.clone(), ArmConfig { name: "leader".to_owned(), ..arm }],
         tasks: vec![
             task("tested", tested, 0..DOF as u16, 10),
             task("stronger", stronger, CONTESTED..CONTESTED + 1, 20),

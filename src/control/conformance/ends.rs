@@ -90,6 +90,7 @@ fn again(bench: &mut Bench) -> Result<(), String> {
         TargetKind::Positions => Request::Servo { task: 0, target: crate::joint::joints_of(&before.map(|q| q + 0.05)) },
         kind => bench.target(kind)?,
     };
+    bench.lead(0.05);
     let outcome = bench.ask(target);
     if outcome != Some(Outcome::Accepted) || !bench.is_active() {
         return Err(format!("its next target: {outcome:?}"));

@@ -40,7 +40,8 @@ fn unknown_parameter(bench: &mut Bench) -> Result<(), String> {
         group.insert("no_such_parameter".to_owned(), Value::Bool(true));
     }
     let joints: Vec<u16> = (0..6).collect();
-    match (spec.build)(&TaskSetup { joints: &joints, params: &params, robot: Some(bench.robot()) }) {
+    let setup = TaskSetup { joints: &joints, params: &params, robot: Some(bench.robot()), leader: &[] };
+    match (spec.build)(&setup) {
         Err(_) => Ok(()),
         Ok(_) => Err("it was built with a parameter that it does not have: deny_unknown_fields".to_owned()),
     }

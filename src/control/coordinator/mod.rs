@@ -16,6 +16,7 @@ use super::speed_override::SpeedOverride;
 use super::stalls::Stalls;
 use super::task::{Task, Tick};
 use super::task_body::JointView;
+use super::task_leader::gripper_target;
 use crate::arm::ArmState;
 use crate::clock::Mono;
 use crate::telemetry::{ArmSample, Cause, Event, Phase, Reason, TaskState};
@@ -114,6 +115,7 @@ impl Coordinator {
         }
         self.auto_start(time.now);
         self.compute(time.now);
+        self.lead_grippers(time.now);
         let output = &mut self.output;
         let mut retired = std::mem::take(&mut output.retired);
         self.arbiter.decide(&mut self.tasks, |event| output.report(event), |motion| retired.push(motion));
@@ -130,6 +132,7 @@ impl Coordinator {
                 let (phase, cause) = (arm.failsafe.phase(), arm.failsafe.cause());
                 self.output.report(Event::Arm(i as u16, phase, cause));
             }
+            let fault = arm.unknown_position();
             let views = self.joints.iter_mut().skip(arm.first()).zip(arm.limiters());
             for (j, (view, limiter)) in views.enumerate() {
                 *view = JointView {
@@ -143,6 +146,9 @@ impl Coordinator {
                     velocity_limit: limiter.bounds().velocity,
                     jerk: arm.config().limits.jerk_max.get(j).copied().unwrap_or(crate::joint::DEFAULT_JERK),
                     tracking_error: arm.tracking_error(j),
+                    arm: i as u16,
+                    stamp: arm.state().stamp,
+                    fault,
                 };
             }
         }
@@ -201,9 +207,11 @@ impl Coordinator {
         }
     }
 
-    /// Starts tasks with `auto_start` and a first target as soon as all arms are ready.
+    /// Starts tasks with `auto_start` and a first target as soon as all arms are ready. An arm that only leads may be
+    /// disabled.
     fn auto_start(&mut self, now: Mono) {
-        if self.started || self.shutting_down || !self.arms.iter().all(|a| a.failsafe.phase() == Phase::Ready) {
+        let ready = |arm: &ArmControl| arm.failsafe.phase() == Phase::Ready || self.only_leads(arm);
+        if self.started || self.shutting_down || !self.arms.iter().all(ready) {
             return;
         }
         self.started = true;
@@ -212,6 +220,15 @@ impl Coordinator {
             let outcome = self.offer(now, t as u16, &target);
             self.output.report(Event::Request(0, outcome));
         }
+    }
+
+    /// Returns whether tasks that start automatically follow an arm with a known position, and none of them moves it.
+    fn only_leads(&self, arm: &ArmControl) -> bool {
+        let joints = arm.first() as u16..(arm.first() + arm.config().dof) as u16;
+        let starting = || self.tasks.iter().filter(|task| task.first_target().is_some());
+        arm.unknown_position() == Cause::None
+            && starting().any(|task| joints.clone().any(|joint| task.is_led_by(joint)))
+            && !starting().any(|task| task.joints.iter().any(|joint| joints.contains(joint)))
     }
 
     fn compute(&mut self, now: Mono) {
@@ -223,6 +240,25 @@ impl Coordinator {
             self.output.retired.extend(motion);
             if before != (task.state, task.reason) {
                 self.output.report(Event::Task(t as u16, task.state, task.reason));
+            }
+        }
+    }
+
+    /// Commands the grippers of arms that follow another arm.
+    fn lead_grippers(&mut self, now: Mono) {
+        for task in &mut self.tasks {
+            let Some((joint, leader)) = task.led_gripper(now) else { continue };
+            let of = |joint: u16| self.arm_of.get(joint as usize).map(|arm| usize::from(*arm));
+            let Some((own, leader)) = of(joint).zip(of(leader)) else { continue };
+            let Some((position, info)) =
+                self.arms.get(leader).and_then(|a| Some((a.state().gripper?, a.config().gripper_info)))
+            else {
+                continue;
+            };
+            let Some(arm) = self.arms.get_mut(own).filter(|arm| arm.config().gripper) else { continue };
+            let last = (arm.command().gripper_seq != 0).then_some(arm.command().gripper);
+            if let Some(target) = gripper_target(position, &info, &arm.config().gripper_info, last) {
+                arm.set_gripper(target, None);
             }
         }
     }

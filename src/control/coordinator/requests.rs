@@ -36,6 +36,7 @@ impl Coordinator {
                 outcome
             }
             Request::CartesianTarget { task, goal } => self.offer(now, task, &Target::EndEffector(goal)),
+            Request::Start { task } => self.offer(now, task, &Target::Start),
             Request::Tool { task, tool } => match self.tasks.get_mut(task as usize) {
                 Some(t) => t.set_tool(&tool).err().unwrap_or(Outcome::Accepted),
                 None => Outcome::WrongTask(task),

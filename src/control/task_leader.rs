@@ -1,0 +1,80 @@
+//! The leader of a task that follows another arm: its parameters in the blueprint, and its joints for the tick.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use crate::arm::GripperInfo;
+
+/// The parameters that name a task's leader, read from among all its parameters. A type that has a key `leader` has the
+/// others, too.
+#[derive(Debug, Clone, PartialEq, Default, Deserialize)]
+#[serde(default)]
+pub struct LeaderParams {
+    /// The `hardware_id` of the arm that leads.
+    pub leader: Option<String>,
+    /// The leader's joint for each joint of the task; empty: in order.
+    pub joint_map: BTreeMap<String, String>,
+    /// Factor on the leader's position, per joint of the task.
+    pub scale: BTreeMap<String, f64>,
+    /// What is added to it, per joint of the task [rad].
+    pub offset: BTreeMap<String, f64>,
+    /// Whether the gripper follows the leader's.
+    pub gripper: bool,
+}
+
+/// The joint that a joint of a task follows, at `scale` · position + `offset`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct LeaderJoint {
+    /// Index over all arms' joints.
+    pub joint: u16,
+    /// Factor on its position.
+    pub scale: f64,
+    /// What is added [rad].
+    pub offset: f64,
+}
+
+impl LeaderJoint {
+    /// Returns the target of the joint that follows, for a position of the leader's [rad].
+    pub fn target(&self, position: f64) -> f64 {
+        self.scale * position + self.offset
+    }
+}
+
+/// A gripper is commanded again when its target has changed by this share of its range.
+const GRIPPER_STEP: f64 = 0.01;
+
+/// Returns the position to which a gripper follows that of its leader: the same share of its range, or the same
+/// position where a range is not known. `None`: it is there already (`last` was commanded), or the units differ.
+pub fn gripper_target(position: f64, of: &GripperInfo, own: &GripperInfo, last: Option<f64>) -> Option<f64> {
+    let span = |range: (f64, f64)| range.1 - range.0;
+    let ranges = of.range.zip(own.range).filter(|(of, own)| span(*of) != 0.0 && span(*own) != 0.0);
+    let (target, step) = match ranges {
+        Some((of, own)) => {
+            let share = ((position - of.0) / span(of)).clamp(0.0, 1.0);
+            (own.0 + share * span(own), GRIPPER_STEP * span(own).abs())
+        }
+        None if of.unit == own.unit => (position, 1e-3),
+        None => return None,
+    };
+    let moves = last.is_none_or(|last| (target - last).abs() >= step);
+    (target.is_finite() && moves).then_some(target)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::arm::GripperUnit;
+
+    #[test]
+    fn a_gripper_goes_to_the_same_share_of_its_own_range() {
+        let jaw = GripperInfo { unit: GripperUnit::Radians, range: Some((0.0, 1.9)), ..Default::default() };
+        let fingers = GripperInfo { range: Some((0.0, 0.08)), ..Default::default() };
+        assert!((gripper_target(0.95, &jaw, &fingers, None).unwrap() - 0.04).abs() < 1e-12);
+        assert_eq!(gripper_target(2.5, &jaw, &fingers, None), Some(0.08));
+        assert_eq!(gripper_target(0.95, &jaw, &fingers, Some(0.0405)), None, "less than a step");
+        let unknown = GripperInfo::default();
+        assert_eq!(gripper_target(0.03, &fingers, &unknown, None), Some(0.03));
+        assert_eq!(gripper_target(0.95, &jaw, &unknown, None), None, "an angle is no opening");
+    }
+}
