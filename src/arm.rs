@@ -211,6 +211,10 @@ pub struct ArmCommand {
     /// Counts the starts of commanded motion: after enabling and after a change of mode. The first setpoint of each is
     /// compared with the measured pose before it is written.
     pub start_seq: u32,
+    /// The arm is led: a hand or its own controller may move it, and it gets no setpoints.
+    pub led: bool,
+    /// Counts the times that the arm began to be led: an order to begin belongs to one of them.
+    pub lead_seq: u32,
 }
 
 impl Default for ArmCommand {
@@ -226,6 +230,8 @@ impl Default for ArmCommand {
             next_tick: Mono::ZERO,
             at: Mono::ZERO,
             start_seq: 0,
+            led: false,
+            lead_seq: 0,
         }
     }
 }

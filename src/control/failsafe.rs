@@ -132,13 +132,13 @@ impl Failsafe {
         }
     }
 
-    /// The arm will be led: from `Ready`, or with the motors off from `Disabled`.
+    /// The arm will be led: from `Ready`, or for a hand that leads it with the motors off also from `Disabled`.
     pub fn lead(&mut self, by: LedBy, arm: u16, state: &ArmState, fresh: Freshness, now: Mono) -> Outcome {
-        let from = if by == LedBy::HandMotorsOff { Phase::Disabled } else { Phase::Ready };
+        let fits = self.phase == Phase::Ready || (by == LedBy::HandMotorsOff && self.phase == Phase::Disabled);
         if self.phase == Phase::Held {
             return Outcome::ArmLatched(arm, self.cause);
         }
-        if self.phase != from {
+        if !fits {
             return Outcome::ArmNotReady(arm, self.phase, self.cause);
         }
         match trouble(state, fresh) {

@@ -100,6 +100,11 @@ pub enum Request {
         /// What moves it.
         by: LedBy,
     },
+    /// End the motion that an arm's own controller makes.
+    EndNative {
+        /// The arm.
+        arm: u16,
+    },
     /// Open or close a gripper.
     Gripper {
         /// The arm.

@@ -71,6 +71,9 @@ enum LoggedRequest {
     Park {
         arm: u16,
     },
+    EndNative {
+        arm: u16,
+    },
     Lead {
         arm: u16,
         by: LedBy,
@@ -141,6 +144,7 @@ fn request(logged: LoggedRequest, joints: &[String]) -> Result<Request, String> 
         LoggedRequest::Reset { arm } => Request::Reset { arm },
         LoggedRequest::Ready { arm } => Request::Enabled { arm },
         LoggedRequest::Park { arm } => Request::PrepareDisable { arm },
+        LoggedRequest::EndNative { arm } => Request::EndNative { arm },
         LoggedRequest::Lead { arm, by } => Request::Lead { arm, by },
         LoggedRequest::Gripper { arm, opening, force } => {
             Request::Gripper { arm, opening: opening.unwrap_or(f64::NAN), force }
@@ -204,6 +208,7 @@ mod tests {
             Request::Reset { arm: 1 },
             Request::Enabled { arm: 0 },
             Request::PrepareDisable { arm: 2 },
+            Request::EndNative { arm: 1 },
             Request::Lead { arm: 1, by: LedBy::HandMotorsOff },
             Request::Gripper { arm: 1, opening: 0.1 + 0.2, force: None },
             Request::Gripper { arm: 1, opening: -0.1 - 0.2, force: Some(0.1 + 0.2) },

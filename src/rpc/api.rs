@@ -179,8 +179,10 @@ methods! {
     "arm_reset" ArmReset -> ArmReply;
     /// Enables the motors at the current position and makes the arm ready for motion.
     "arm_enable" ArmEnable -> ArmReply;
-    /// Lets the arm be led by hand, at rest: `arm_enable` ends that.
+    /// Lets the arm be led by hand, at rest: `arm_take_over` or `arm_enable` ends that.
     "arm_teach" ArmTeach -> ArmReply;
+    /// Makes a led arm ready where it is held still. Refused if it is not led, or no longer.
+    "arm_take_over" ArmTakeOver -> ArmReply;
     /// Lets the arm's own controller move it to a pose: not collision-checked; in a run with a planner only with
     /// `direct`. Replies when the motion begins; `motion` reports its end.
     "move_native" MoveNative -> NativeReply, check MoveNative::valid;

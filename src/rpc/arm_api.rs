@@ -75,6 +75,14 @@ pub struct ArmTeach {
     pub support_the_arm: bool,
 }
 
+/// Parameters of `arm_take_over`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ArmTakeOver {
+    /// The arm's `hardware_id`.
+    pub arm: String,
+}
+
 /// Parameters of `move_native`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
@@ -122,7 +130,7 @@ pub struct ArmDisable {
     pub now: bool,
 }
 
-/// Reply to `arm_reset`, `arm_enable`, `arm_teach` and `arm_disable`.
+/// Reply to `arm_reset`, `arm_enable`, `arm_teach`, `arm_take_over` and `arm_disable`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct ArmReply {
     /// The arm's `hardware_id`.

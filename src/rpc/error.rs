@@ -107,7 +107,7 @@ impl Code {
             Outcome::AlreadyExecuting(_) => Some(Self::AlreadyExecuting),
             Outcome::StartStateMismatch(..) => Some(Self::StartStateMismatch),
             Outcome::StartStateUnavailable(_) => Some(Self::StartStateUnavailable),
-            Outcome::ArmNotReady(..) | Outcome::ArmMoving(_) => Some(Self::ArmNotReady),
+            Outcome::ArmNotReady(..) | Outcome::ArmMoving(_) | Outcome::Paused => Some(Self::ArmNotReady),
             Outcome::ArmLatched(..) => Some(Self::ArmLatched),
             Outcome::StillFaulted(..) => Some(Self::StillFaulted),
             Outcome::WrongTask(_) => Some(Self::WrongTask),

@@ -55,6 +55,7 @@ pub(super) fn need(request: &Request) -> Need<'_> {
         Request::Twist(t) => Need::Lease(Subject::Task(&t.task)),
         Request::Pose(p) => Need::Lease(Subject::Task(&p.task)),
         Request::MoveNative(m) => Need::Lease(Subject::Arm(&m.arm)),
+        Request::ArmTakeOver(a) => Need::NoOtherHolder(Subject::Arm(&a.arm)),
         Request::ArmTeach(a) => Need::NoOtherHolder(Subject::Arm(&a.arm)),
         Request::Start(s) => Need::Lease(Subject::Task(&s.task)),
         Request::ArmReset(a) => Need::NoOtherHolder(Subject::Arm(&a.arm)),

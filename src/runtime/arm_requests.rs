@@ -122,6 +122,11 @@ impl Service {
                 self.ask(Request::Enabled { arm }).await?;
             }
         }
+        self.until_ready(id, arm).await
+    }
+
+    /// Waits for an enabled arm to be ready.
+    pub(super) async fn until_ready(&self, id: String, arm: u16) -> Result<Reply, RpcError> {
         let settled = |phase| matches!(phase, Phase::Ready | Phase::Held);
         self.until(Instant::now() + READY_LIMIT, || self.seen(arm, |view| settled(view.phase))).await;
         let view = self.arm_view(arm as usize).ok_or_else(internal)?;

@@ -84,7 +84,11 @@ impl Dispatcher {
     ) -> Result<oneshot::Receiver<Outcome>, SendError> {
         let ends_motion = matches!(
             request,
-            Request::Stop { .. } | Request::Cancel { .. } | Request::Pause { on: true } | Request::Shutdown
+            Request::Stop { .. }
+                | Request::Cancel { .. }
+                | Request::EndNative { .. }
+                | Request::Pause { on: true }
+                | Request::Shutdown
         );
         let id = self.next_id();
         let (sender, receiver) = oneshot::channel();
@@ -157,6 +161,7 @@ pub fn log_of(request: &Request) -> Value {
         Request::Reset { arm } => json!({"reset": {"arm": arm}}),
         Request::Enabled { arm } => json!({"ready": {"arm": arm}}),
         Request::PrepareDisable { arm } => json!({"park": {"arm": arm}}),
+        Request::EndNative { arm } => json!({"end_native": {"arm": arm}}),
         Request::Lead { arm, by } => json!({"lead": {"arm": arm, "by": by}}),
         Request::Gripper { arm, opening, force: None } => json!({"gripper": {"arm": arm, "opening": opening}}),
         Request::Gripper { arm, opening, force } => {

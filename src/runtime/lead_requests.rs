@@ -6,6 +6,7 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use nalgebra::{Isometry3, Vector3};
+use tokio::sync::oneshot;
 
 use super::arm_requests::{order, refused};
 use super::motions::{NATIVE, Planned};
@@ -13,6 +14,8 @@ use super::planner_port::isometry;
 use super::service::{Service, internal};
 use crate::arm::Pose;
 use crate::control::request::Request;
+use crate::hardware::adapter::AdapterError;
+use crate::hardware::device::Way;
 use crate::hardware::registry::Teach;
 use crate::joint::STANDSTILL;
 use crate::pose::{from_xyz_rpy, to_xyz_rpy};
@@ -21,24 +24,34 @@ use crate::rpc::api::{self, Reply};
 use crate::rpc::{Code, RpcError};
 use crate::sync::lock;
 use crate::telemetry::describe::Severity;
-use crate::telemetry::{Cause, LedBy, Outcome, Phase, Reason, TaskState};
+use crate::telemetry::{LedBy, Outcome, Phase, Reason, TaskState};
 
 /// Largest distance between the controller's own pose and the tool centre point [m]: more means different base frames.
-const LARGEST_TOOL: f64 = 0.6;
+const LARGEST_TOOL: f64 = 0.35;
 /// A pose is reached within these [m, rad].
 const REACHED: (f64, f64) = (1e-3, 0.01);
-/// A controller that is at rest for this long has ended its motion, or does not begin it.
+/// A controller whose joints make no progress for this long has ended its motion, or does not begin it.
 const ENDED_AFTER: Duration = Duration::from_secs(1);
-/// Number of a native motion that a client has cancelled.
-const CANCELLED: u64 = u64::MAX;
+/// Progress of a joint [rad].
+const PROGRESS: f64 = 2e-4;
+
+/// A motion of an arm's own controller.
+struct Native {
+    name: String,
+    arm: u16,
+    motion: u64,
+    /// In the controller's base frame, of the point that it reports.
+    target: Pose,
+    /// Fraction of the controller's top speed.
+    speed: f64,
+}
 
 impl Service {
     /// Lets an arm be led by hand, as its adapter's row says.
     pub(super) async fn teach(&self, call: api::ArmTeach) -> Result<Reply, RpcError> {
         let arm = self.arm_index(&call.arm)?;
         let name = &call.arm;
-        let way = self.parts.blueprint.arms.get(arm as usize).ok_or_else(internal)?.adapter.teach;
-        let note = match way {
+        let (by, note) = match self.parts.blueprint.arms.get(arm as usize).ok_or_else(internal)?.adapter.teach {
             Teach::No(why) => {
                 let what = format!("{name} cannot be led by hand: {why}");
                 return Err(RpcError::new(Code::Unsupported, what).hint(format!("dimos jog {name} moves it with keys")));
@@ -48,21 +61,17 @@ impl Service {
                 return Err(RpcError::new(Code::InvalidParams, what)
                     .hint(format!("hold the arm, then: dimos arm teach {name} --support-the-arm")));
             }
-            Teach::MotorsOff => {
-                self.disable(name.clone(), false).await?;
-                self.ask(Request::Lead { arm, by: LedBy::HandMotorsOff }).await?;
-                "led by hand, motors off: support the arm"
-            }
-            Teach::HandGuiding => {
-                self.end_streams(&self.joints_of_arm(arm).collect::<Vec<_>>()).await?;
-                self.ask(Request::Lead { arm, by: LedBy::Hand }).await?;
-                if let Err(error) = order(self.device(arm)?.guide()).await {
-                    let _ = self.take_over(name, arm).await;
-                    return Err(refused(name, "does not begin hand guiding", &error));
-                }
-                "led by hand, motors on: the controller compensates gravity"
-            }
+            Teach::MotorsOff => (LedBy::HandMotorsOff, "led by hand, motors off: support the arm"),
+            Teach::HandGuiding => (LedBy::Hand, "led by hand, motors on: the controller compensates gravity"),
         };
+        self.end_streams(&self.joints_of_arm(arm).collect::<Vec<_>>()).await?;
+        let lead = self.lead(arm, by).await?;
+        let device = self.device(arm)?;
+        let begun = order(if by == LedBy::Hand { device.lead(Way::Hand, lead) } else { device.disable() }).await;
+        if let Err(error) = begun {
+            let _ = self.take_over(name, arm).await;
+            return Err(refused(name, "cannot be led now", &error));
+        }
         self.parts.dispatcher.log(Severity::Info, format!("{name}: {note}"));
         Ok(Reply::ArmTeach(api::ArmReply {
             arm: call.arm,
@@ -71,10 +80,31 @@ impl Service {
         }))
     }
 
-    /// Ends the leading of an arm that is at rest, and makes it ready.
+    /// Makes a led arm ready.
+    pub(super) async fn take_over_led(&self, id: String) -> Result<Reply, RpcError> {
+        let phase = self.phase(self.arm_index(&id)?.into());
+        if phase != Phase::Led {
+            let what = format!("{id} is not led, or no longer: it is {}", phase.name());
+            return Err(RpcError::new(Code::Unsupported, what).hint("`dimos status` shows the cause"));
+        }
+        match self.enable(id).await? {
+            Reply::ArmEnable(reply) => Ok(Reply::ArmTakeOver(reply)),
+            _ => Err(internal()),
+        }
+    }
+
+    /// Lets the tick pass an arm on. Returns the number of this lead.
+    async fn lead(&self, arm: u16, by: LedBy) -> Result<u32, RpcError> {
+        self.ask(Request::Lead { arm, by }).await?;
+        Ok(self.arm_view(arm as usize).ok_or_else(internal)?.command.lead_seq)
+    }
+
+    /// Ends the leading of an arm whose motors are on, and makes it ready where it is.
     async fn take_over(&self, name: &str, arm: u16) -> Result<(), RpcError> {
         self.end_lead(name, arm).await?;
-        self.enable(name.to_owned()).await.map(|_| ())
+        order(self.device(arm)?.take_over()).await.map_err(|e| refused(name, "was not taken over", &e))?;
+        self.ask(Request::Enabled { arm }).await?;
+        self.until_ready(name.to_owned(), arm).await.map(|_| ())
     }
 
     /// Ends the leading of an arm: it gets its own stop, unless its motors are off, and is in standby.
@@ -86,7 +116,7 @@ impl Service {
 
     /// Refuses to take over an arm that still moves.
     pub(super) fn led_arm_rests(&self, name: &str, arm: u16) -> Result<(), RpcError> {
-        if self.native(arm).is_some_and(|number| number != 0) {
+        if self.is_native(arm) {
             return Err(RpcError::new(Code::ArmNotReady, format!("{name} is moved by its own controller"))
                 .hint("wait for it, or end it with `dimos cancel`"));
         }
@@ -98,7 +128,8 @@ impl Service {
         Err(RpcError::new(Code::ArmNotReady, what).hint("hold it still, then again"))
     }
 
-    /// Lets an arm's own controller move it to a pose. Replies when the motion begins.
+    /// Lets an arm's own controller move it to a pose. Replies when the motion begins; a thread of its own watches the
+    /// motion to its end, also without its client.
     pub(super) async fn move_native(&self, call: api::MoveNative) -> Result<Reply, RpcError> {
         let arm = self.arm_index(&call.arm)?;
         if !call.direct {
@@ -107,26 +138,94 @@ impl Service {
         let joints: Vec<u16> = self.joints_of_arm(arm).collect();
         self.end_streams(&joints).await?;
         let target = self.native_target(arm, &call)?;
-        let speed = call.speed * self.speed_override().fraction;
-        if self.speed_override().paused {
-            let what = "motions are paused, and a native motion does not wait";
-            return Err(RpcError::new(Code::ArmNotReady, what).hint("dimos resume"));
-        }
-        self.ask(Request::Lead { arm, by: LedBy::Controller }).await?;
-        if let Err(error) = order(self.device(arm)?.move_native(target, speed)).await {
-            let _ = self.take_over(&call.arm, arm).await;
-            return Err(refused(&call.arm, "does not move there", &error));
-        }
         let motion = self.parts.dispatcher.next_id();
         let planned =
             Planned { task: NATIVE, joints, goal: Vec::new(), duration: 0.0, plan: None, blocked: None, next: None };
         lock(&self.motions).plan(motion, planned);
-        self.natives.get(arm as usize).ok_or_else(internal)?.store(motion, Ordering::Release);
-        let text = format!("{}: native motion {motion}, not collision-checked", call.arm);
-        self.parts.dispatcher.log(Severity::Info, text);
+        let native = Native { name: call.arm, arm, motion, target, speed: call.speed * self.speed_override().fraction };
+        let reply = api::NativeReply { motion, speed: native.speed };
+        let (begun, answer) = oneshot::channel();
         let me = self.me.upgrade().ok_or_else(internal)?;
-        tokio::spawn(me.watch_native(call.arm, arm, motion, target));
-        Ok(Reply::MoveNative(api::NativeReply { motion, speed }))
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build();
+        let runtime = runtime.map_err(|e| RpcError::new(Code::Internal, e.to_string()))?;
+        let thread = std::thread::Builder::new().name("native".into());
+        let started = thread.spawn(move || runtime.block_on(me.run_native(&native, begun)));
+        started.map_err(|e| RpcError::new(Code::Internal, e.to_string()))?;
+        match answer.await {
+            Ok(Ok(())) => Ok(Reply::MoveNative(reply)),
+            refused => {
+                lock(&self.motions).forget(motion);
+                refused.map_or_else(|_| Err(internal()), |result| result.map(|()| Reply::MoveNative(reply)))
+            }
+        }
+    }
+
+    /// Begins a native motion, tells `begun` the result, and takes the arm over at its end.
+    async fn run_native(self: Arc<Self>, native: &Native, begun: oneshot::Sender<Result<(), RpcError>>) {
+        let arm = native.arm;
+        let lead = match self.lead(arm, LedBy::Controller).await {
+            Ok(lead) => lead,
+            Err(error) => return drop(begun.send(Err(error))),
+        };
+        self.set_native(arm, true);
+        let ordered = match self.device(arm) {
+            Ok(device) => order(device.lead(Way::To(native.target, native.speed), lead)).await,
+            Err(_) => Err(AdapterError::NotConnected),
+        };
+        if let Err(error) = ordered {
+            let _ = self.take_over(&native.name, arm).await;
+            self.set_native(arm, false);
+            return drop(begun.send(Err(refused(&native.name, "does not move there", &error))));
+        }
+        let text = format!("{}: native motion {}, not collision-checked", native.name, native.motion);
+        self.parts.dispatcher.log(Severity::Info, text);
+        let since = Instant::now();
+        // The client may be gone: the motion has begun all the same.
+        let _ = begun.send(Ok(()));
+        let end = self.native_end(native).await;
+        self.set_native(arm, false);
+        let text = format!("{}: native motion {} is {}", native.name, native.motion, end.0.name());
+        self.parts.dispatcher.log(Severity::Info, text);
+        let elapsed = since.elapsed().as_secs_f64();
+        lock(&self.motions).end(native.motion, end, elapsed, &self.positions());
+    }
+
+    /// Waits for the end of a native motion, takes the arm over, and returns how it ended.
+    async fn native_end(&self, native: &Native) -> (TaskState, Reason, Option<String>) {
+        let (arm, target) = (native.arm, from_xyz_rpy(native.target.xyz, native.target.rpy));
+        let (mut anchor, mut since) = (self.positions(), Instant::now());
+        while self.phase(arm as usize) == Phase::Led && !self.is_closed() {
+            let now = self.positions();
+            if anchor.iter().zip(&now).any(|(a, b)| (a - b).abs() > PROGRESS) {
+                (anchor, since) = (now, Instant::now());
+            }
+            let arrived = self.off_by(arm, &target).is_some_and(is_reached);
+            if since.elapsed() > if arrived { ENDED_AFTER / 10 } else { ENDED_AFTER } {
+                break;
+            }
+            self.next_tick().await;
+        }
+        let off = self.off_by(arm, &target);
+        let cancelled = self.phase(arm as usize) != Phase::Led;
+        let taken = match self.phase(arm as usize) {
+            Phase::Led | Phase::Standby if !self.is_closed() => self.take_over(&native.name, arm).await,
+            _ => Ok(()),
+        };
+        let view = self.arm_view(arm as usize);
+        match (view.map(|view| (view.phase, view.cause)), taken, off) {
+            (Some((Phase::Held, cause)), ..) => (TaskState::Aborted, Reason::ArmHeld(arm, cause), None),
+            (_, Err(error), _) => (TaskState::Aborted, Reason::Cancelled, Some(error.message)),
+            _ if cancelled => (TaskState::Aborted, Reason::Cancelled, None),
+            (_, _, Some(off)) if is_reached(off) => (TaskState::Completed, Reason::None, None),
+            (_, _, Some((m, rad))) => {
+                let text = format!("it ended {m:.4} m and {rad:.4} rad from the pose");
+                (TaskState::Aborted, Reason::Cancelled, Some(text))
+            }
+            (_, _, None) => {
+                let text = "the arm no longer reports its pose".to_owned();
+                (TaskState::Aborted, Reason::Cancelled, Some(text))
+            }
+        }
     }
 
     /// Returns the pose that the controller is given: in its own base frame, of the point that it reports.
@@ -162,66 +261,24 @@ impl Service {
         Ok(Pose { xyz, rpy })
     }
 
-    fn native(&self, arm: u16) -> Option<u64> {
-        Some(self.natives.get(arm as usize)?.load(Ordering::Acquire))
+    fn set_native(&self, arm: u16, runs: bool) {
+        if let Some(native) = self.natives.get(arm as usize) {
+            native.store(runs, Ordering::Release);
+        }
+    }
+
+    fn is_native(&self, arm: u16) -> bool {
+        self.natives.get(arm as usize).is_some_and(|native| native.load(Ordering::Acquire))
     }
 
     /// Cancels the native motions of these arms: each gets its own stop. Returns whether there was any.
     pub(super) async fn cancel_natives(&self, is_meant: impl Fn(u16) -> bool) -> Result<bool, RpcError> {
+        let led = |arm: &u16| is_meant(*arm) && self.phase(*arm as usize) == Phase::Led;
         let mut any = false;
-        for (arm, motion) in (0..).zip(&self.natives) {
-            let running = |number| (number != 0 && number != CANCELLED).then_some(CANCELLED);
-            if is_meant(arm) && motion.fetch_update(Ordering::AcqRel, Ordering::Acquire, running).is_ok() {
-                self.ask(Request::PrepareDisable { arm }).await?;
-                any = true;
-            }
+        for arm in (0..self.natives.len() as u16).filter(led) {
+            any |= self.ask(Request::EndNative { arm }).await? == Outcome::Cancelled;
         }
         Ok(any)
-    }
-
-    /// Watches a native motion until the arm is at rest, and takes the arm over.
-    async fn watch_native(self: Arc<Self>, name: String, arm: u16, motion: u64, target: Pose) {
-        let (target, begun) = (from_xyz_rpy(target.xyz, target.rpy), Instant::now());
-        let mut still: Option<Instant> = None;
-        while self.phase(arm as usize) == Phase::Led && !self.is_closed() {
-            if self.speed(arm) > STANDSTILL {
-                still = None;
-            }
-            let since = still.get_or_insert_with(Instant::now).elapsed();
-            if since > ENDED_AFTER || (since > ENDED_AFTER / 10 && self.off_by(arm, &target).is_some_and(is_reached)) {
-                break;
-            }
-            self.next_tick().await;
-        }
-        let off = self.off_by(arm, &target);
-        let view = self.arm_view(arm as usize);
-        let (phase, cause) = view.map_or((Phase::Unknown, Cause::None), |view| (view.phase, view.cause));
-        let cancelled = self.native(arm) == Some(CANCELLED);
-        let elapsed = begun.elapsed().as_secs_f64();
-        let end = match phase {
-            Phase::Held => (TaskState::Aborted, Reason::ArmHeld(arm, cause), None),
-            Phase::Led | Phase::Standby if cancelled || phase == Phase::Led => {
-                let taken = self.take_over(&name, arm).await;
-                match (taken, off) {
-                    (Err(error), _) => (TaskState::Aborted, Reason::Cancelled, Some(error.message)),
-                    _ if cancelled => (TaskState::Aborted, Reason::Cancelled, None),
-                    (_, Some(off)) if !is_reached(off) => {
-                        let text = format!("it ended {:.4} m and {:.4} rad from the pose", off.0, off.1);
-                        (TaskState::Aborted, Reason::Cancelled, Some(text))
-                    }
-                    _ => (TaskState::Completed, Reason::None, None),
-                }
-            }
-            phase => {
-                let outcome = Outcome::ArmNotReady(arm, phase, cause);
-                let text = self.refusal(&outcome).map(|error| error.message);
-                (TaskState::Aborted, Reason::Cancelled, text)
-            }
-        };
-        lock(&self.motions).end(motion, end, elapsed, &self.positions());
-        if let Some(native) = self.natives.get(arm as usize) {
-            native.store(0, Ordering::Release);
-        }
     }
 
     /// Returns how far the pose that an arm reports is from another one [m, rad].

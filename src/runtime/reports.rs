@@ -282,6 +282,7 @@ impl Service {
                 .data(serde_json::json!({"joint": names.joint(*joint), "distance": distance})),
             Outcome::StartStateUnavailable(_) => error.hint("`dimos status` shows its link and the age of its state"),
             Outcome::ArmNotReady(a, ..) => error.hint(format!("make it ready: `dimos arm enable {}`", arm(a))),
+            Outcome::Paused => error.hint("dimos resume"),
             Outcome::ArmMoving(_) => error.hint("again when it is at rest"),
             Outcome::ArmLatched(a, _) => {
                 let a = arm(a);

@@ -70,8 +70,8 @@ pub struct Service {
     pub(super) progress: Progress,
     /// One gripper order per arm at a time, so that each gets its own answer.
     pub(super) grippers: Vec<tokio::sync::Mutex<()>>,
-    /// Per arm, the number of the motion that its own controller makes; 0 = none.
-    pub(super) natives: Vec<AtomicU64>,
+    /// Per arm, whether its own controller moves it.
+    pub(super) natives: Vec<AtomicBool>,
     /// Per arm, the numbers of the slowly changing values that were logged last.
     pub(super) details_logged: Mutex<Vec<Details>>,
     /// Per arm, the objects that it holds and whose mass is known. Locked while a load is set.
@@ -102,7 +102,7 @@ impl Service {
         Self {
             progress: Progress::default(),
             grippers: parts.devices.iter().map(|_| tokio::sync::Mutex::default()).collect(),
-            natives: parts.devices.iter().map(|_| AtomicU64::default()).collect(),
+            natives: parts.devices.iter().map(|_| AtomicBool::default()).collect(),
             details_logged: Mutex::new(vec![Details::default(); parts.devices.len()]),
             task_tools: Mutex::new(parts.blueprint.tasks.iter().map(|task| task.robot.as_ref()?.tool).collect()),
             held_loads: parts.devices.iter().map(|_| tokio::sync::Mutex::default()).collect(),
@@ -296,10 +296,6 @@ impl Service {
         }
         if let Some(on) = call.paused {
             self.ask(Request::Pause { on }).await?;
-            // A controller of an arm knows no pause: its motion ends.
-            if on {
-                self.cancel_natives(|_| true).await?;
-            }
         }
         Ok(self.speed_override())
     }
@@ -341,6 +337,7 @@ impl Service {
             Call::Stop(s) => self.stop(s).await,
             Call::ArmReset(a) => self.reset(a.arm).await,
             Call::ArmEnable(a) => self.enable(a.arm).await,
+            Call::ArmTakeOver(a) => self.take_over_led(a.arm).await,
             Call::ArmTeach(a) => self.teach(a).await,
             Call::MoveNative(m) => self.move_native(m).await,
             Call::ArmDisable(a) => self.disable(a.arm, a.now).await,

@@ -143,7 +143,7 @@ fn request(id: u64, outcome: Outcome, names: &Names) -> Described {
     let text = format!("request {id}: {}", outcome_text(&outcome, names));
     let mut d = Described { request: Some(id), ..plain("request", severity, outcome.name(), text) };
     match outcome {
-        Outcome::Accepted | Outcome::Cancelled | Outcome::AlreadyStopped | Outcome::ShuttingDown => {}
+        Outcome::Accepted | Outcome::Cancelled | Outcome::AlreadyStopped | Outcome::ShuttingDown | Outcome::Paused => {}
         Outcome::AlreadyExecuting(task) | Outcome::WrongTask(task) | Outcome::InvalidTarget(task) => {
             d.task = Some(names.task(task));
         }
@@ -184,6 +184,7 @@ pub fn outcome_text(outcome: &Outcome, names: &Names) -> String {
         Outcome::ArmNotReady(arm, phase, cause) => {
             format!("{} is not ready: {}{}", names.arm(arm), phase.name(), because(cause))
         }
+        Outcome::Paused => "motions are paused, and a native motion does not wait".into(),
         Outcome::ArmMoving(arm) => format!("{} still moves", names.arm(arm)),
         Outcome::ArmLatched(arm, cause) => format!("{} is held{}: reset it first", names.arm(arm), because(cause)),
         Outcome::StillFaulted(arm, cause) => format!("{} cannot be reset yet{}", names.arm(arm), because(cause)),

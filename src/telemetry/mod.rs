@@ -314,6 +314,8 @@ pub enum Outcome {
     ArmNotReady(u16, Phase, Cause),
     /// The arm still moves: the arm.
     ArmMoving(u16),
+    /// Motions are paused, and the request is for one that cannot wait.
+    Paused,
     /// The arm's latch must be reset first: arm, cause.
     ArmLatched(u16, Cause),
     /// The cause of the arm's latch persists: arm, cause.
@@ -350,6 +352,7 @@ impl Outcome {
             Self::StartStateUnavailable(_) => "START_STATE_UNAVAILABLE",
             Self::ArmNotReady(..) => "ARM_NOT_READY",
             Self::ArmMoving(..) => "ARM_MOVING",
+            Self::Paused => "PAUSED",
             Self::ArmLatched(..) => "ARM_LATCHED",
             Self::StillFaulted(..) => "STILL_FAULTED",
             Self::WrongTask(_) => "WRONG_TASK",

@@ -64,9 +64,13 @@ fn an_arm_is_led_only_from_rest_without_a_task_and_its_motors_as_the_way_needs_t
     rig.arms[0].setpoint = None;
     assert_eq!(rig.ask(lead(LedBy::Hand)), Outcome::ArmMoving(0), "something else moves it");
     rig.arms[0].v[2] = 0.0;
-    assert_eq!(rig.ask(lead(LedBy::HandMotorsOff)), Outcome::ArmNotReady(0, Phase::Ready, Cause::None));
+    rig.ask(Request::Pause { on: true });
+    assert_eq!(rig.ask(lead(LedBy::Controller)), Outcome::Paused);
+    rig.ask(Request::Pause { on: false });
     rig.ask(Request::Stop { arm: None });
-    assert_eq!(rig.ask(lead(LedBy::Hand)), Outcome::ArmLatched(0, Cause::Operator));
+    for by in [LedBy::Hand, LedBy::HandMotorsOff, LedBy::Controller] {
+        assert_eq!(rig.ask(lead(by)), Outcome::ArmLatched(0, Cause::Operator));
+    }
 
     let mut off = Rig::new(100.0, vec![arm("arm", 6)], one(trajectory()));
     off.arms[0].enabled = false;
@@ -132,6 +136,29 @@ fn stops_faults_and_the_end_of_the_run_reach_a_led_arm() {
     lead(&mut stopped, 0.5, 0.3);
     assert_eq!(stopped.ask(Request::Stop { arm: None }), Outcome::Accepted);
     assert_eq!((stopped.phase(0), stopped.arms[0].stops), (Phase::Held, 1), "in the same tick");
+
+    // It moves on: another stop is another stop.
+    lead(&mut stopped, 0.5, 0.3);
+    assert_eq!(stopped.ask(Request::Stop { arm: Some(0) }), Outcome::Accepted);
+    assert_eq!((stopped.phase(0), stopped.arms[0].stops), (Phase::Held, 2));
+
+    for end in [Request::EndNative { arm: 0 }, Request::Pause { on: true }] {
+        let mut native = led(LedBy::Controller);
+        lead(&mut native, 0.5, 0.3);
+        native.ask(end);
+        native.run(2);
+        assert_eq!((native.phase(0), native.arms[0].stops), (Phase::Standby, 1));
+        assert!(!native.commands[0].led);
+    }
+    let mut hand = led(LedBy::Hand);
+    assert_eq!(hand.ask(Request::EndNative { arm: 0 }), Outcome::AlreadyStopped);
+    assert_eq!((hand.phase(0), hand.commands[0].led), (Phase::Led, true));
+
+    let mut elsewhere = led(LedBy::Controller);
+    elsewhere.arms[0].state.interference = dimos::arm::Interference::Stop;
+    elsewhere.run(2);
+    assert_eq!((elsewhere.phase(0), elsewhere.samples[0].cause), (Phase::Held, Cause::StoppedElsewhere));
+    assert_eq!(elsewhere.arms[0].stops, 1, "or its controller continues when it is released");
 
     let mut silent = led(LedBy::Controller);
     silent.arms[0].silent = true;

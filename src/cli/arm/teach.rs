@@ -16,7 +16,7 @@ use super::super::exit::{Exit, Failure, Result};
 use super::super::follow::Signals;
 use super::super::output;
 use super::ArmArgs;
-use crate::rpc::api::{ArmEnable, ArmTeach, State, Status};
+use crate::rpc::api::{ArmTakeOver, ArmTeach, State, Status};
 use crate::rpc::client::{Client, ClientError};
 use crate::rpc::report::ArmStateReport;
 use crate::rpc::{Code, RpcError};
@@ -75,6 +75,7 @@ pub fn run(args: &Args) -> Result {
         return Ok(Exit::Ok);
     };
     let recorded = record(&mut client, args, BufWriter::new(file), &signals);
+    // Refused if the arm is no longer led: another client has stopped or disabled it.
     let taken = take_over(&mut client, arm);
     let (samples, seconds) = recorded.map_err(|e| e.hint(format!("{} ends there", path.display())))?;
     taken?;
@@ -163,7 +164,7 @@ fn take_over(client: &mut Client, arm: &str) -> Result<()> {
     let begun = Instant::now();
     let mut asked = false;
     loop {
-        match client.call(ArmEnable { arm: arm.to_owned() }) {
+        match client.call(ArmTakeOver { arm: arm.to_owned() }) {
             Ok(_) => return Ok(()),
             Err(ClientError::Refused(RpcError { code: Code::ArmNotReady, .. })) if begun.elapsed() < STILL_LIMIT => {
                 if !std::mem::replace(&mut asked, true) {

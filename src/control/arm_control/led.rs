@@ -7,14 +7,13 @@ use crate::telemetry::{Cause, LedBy, Outcome, Phase};
 
 /// A joint that the arm's controller moves may have this much more than its velocity limit.
 const OVERSPEED: f64 = 1.1;
-/// Consecutive ticks above that: one velocity may be an estimate from noisy positions.
-const TOO_FAST_TICKS: u8 = 2;
+/// Consecutive readings above that: one velocity may be an estimate from noisy positions.
+const TOO_FAST_READINGS: u8 = 2;
 
 impl ArmControl {
     /// The arm will be led. It must be at rest; its own controller may only start from within its range.
     pub fn lead(&mut self, by: LedBy, arm: u16, now: Mono) -> Outcome {
-        let commanded = by != LedBy::HandMotorsOff && self.failsafe.phase() == Phase::Ready;
-        if commanded && !self.at_standstill() {
+        if self.failsafe.phase() == Phase::Ready && !self.at_standstill() {
             return Outcome::ArmMoving(arm);
         }
         if by == LedBy::Controller
@@ -25,8 +24,9 @@ impl ArmControl {
         let outcome = self.failsafe.lead(by, arm, self.feedback.state(), self.feedback.freshness(), now);
         if outcome == Outcome::Accepted {
             self.command.mode = None;
+            self.command.lead_seq = self.command.lead_seq.wrapping_add(1);
             self.holds_written = false;
-            self.led_too_fast = 0;
+            self.led_too_fast = (0, 0);
         }
         outcome
     }
@@ -36,6 +36,21 @@ impl ArmControl {
         let led = self.failsafe.led_by().is_some_and(|by| by != LedBy::HandMotorsOff);
         self.failsafe.prepare_disable(now);
         self.rest.stop_pending |= led;
+    }
+
+    /// Ends the motion of an arm's own controller by its own stop. Returns whether there was one.
+    pub fn end_native(&mut self, now: Mono) -> bool {
+        let native = self.failsafe.led_by() == Some(LedBy::Controller);
+        if native {
+            self.prepare_disable(now);
+        }
+        native
+    }
+
+    /// Orders another stop for an arm that is held and gets no setpoints: something may move it.
+    pub fn stop_again(&mut self) {
+        let held = self.failsafe.phase() == Phase::Held && !self.failsafe.cause().is_foreign();
+        self.rest.stop_pending |= held && self.command.mode.is_none();
     }
 
     /// Takes the limiters to where the joints are.
@@ -58,11 +73,15 @@ impl ArmControl {
         let velocities = self.feedback.state().velocity.iter().zip(&self.limiters).enumerate();
         let too_fast = { velocities }.find(|(_, (v, limiter))| v.abs() > OVERSPEED * limiter.bounds().velocity);
         let Some((joint, (velocity, _))) = too_fast else {
-            self.led_too_fast = 0;
+            self.led_too_fast = (0, 0);
             return None;
         };
-        self.led_too_fast += 1;
-        (self.led_too_fast >= TOO_FAST_TICKS).then_some(Cause::LedTooFast(joint as u16, *velocity))
+        let (readings, counted) = self.led_too_fast;
+        let seq = self.feedback.state().seq;
+        if seq != counted {
+            self.led_too_fast = (readings.saturating_add(1), seq);
+        }
+        (self.led_too_fast.0 >= TOO_FAST_READINGS).then_some(Cause::LedTooFast(joint as u16, *velocity))
     }
 
     /// Returns the first joint outside its range, its position, and how far outside it is [rad].

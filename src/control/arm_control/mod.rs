@@ -26,7 +26,7 @@ use super::written::Written;
 use crate::arm::{ArmCommand, ArmState, Link};
 use crate::clock::Mono;
 use crate::joint::{ControlMode, Joints, MAX_DOF};
-use crate::telemetry::{Cause, LimitKind, Outcome, Phase};
+use crate::telemetry::{Cause, LedBy, LimitKind, Outcome, Phase};
 use rest::Rest;
 
 /// A joint that moves this far while its arm is being enabled is moved by something else [rad].
@@ -58,8 +58,8 @@ pub struct ArmControl {
     /// The arm is on its way back to the last setpoint before a gap.
     returning: bool,
     rest: Rest,
-    /// Consecutive ticks in which the arm's own controller moved a joint too fast.
-    led_too_fast: u8,
+    /// Consecutive readings in which the arm's own controller moved a joint too fast, and the number of the last one.
+    led_too_fast: (u8, u64),
 }
 
 /// Request to one joint in this tick.
@@ -115,7 +115,7 @@ impl ArmControl {
             gap_since: None,
             returning: false,
             rest: Rest::default(),
-            led_too_fast: 0,
+            led_too_fast: (0, 0),
         }
     }
 
@@ -178,6 +178,7 @@ impl ArmControl {
     /// Takes the latest state. `stalls`: when the tick could not run. Returns whether the phase or its cause changed.
     pub fn read(&mut self, state: &ArmState, now: Mono, stalls: &Stalls, dt: f64) -> bool {
         let before = (self.failsafe.phase(), self.failsafe.cause());
+        let native = self.failsafe.led_by() == Some(LedBy::Controller);
         let verdict = self.feedback.read(state, now, stalls);
         self.take_written(now);
         self.failsafe.update(self.feedback.state(), self.feedback.freshness(), now);
@@ -187,6 +188,8 @@ impl ArmControl {
         if let Some(cause) = self.unexpected_motion(dt) {
             self.failsafe.hold(cause, now);
         }
+        // Its controller could continue when the other client releases it.
+        self.rest.stop_pending |= native && self.failsafe.cause() == Cause::StoppedElsewhere;
         before != (self.failsafe.phase(), self.failsafe.cause())
     }
 
@@ -256,6 +259,7 @@ impl ArmControl {
         (self.command.at, self.command.next_tick) = (now, next_tick);
         let phase = self.failsafe.phase();
         let held = phase == Phase::Held;
+        self.command.led = phase == Phase::Led;
         // An arm that another program controls gets neither a setpoint nor a stop.
         let foreign = held && self.failsafe.cause().is_foreign();
         self.rest.enter(held, foreign);
@@ -267,6 +271,9 @@ impl ArmControl {
             }
             _ if !self.feedback.state().enabled || foreign => {
                 self.command.mode = None;
+                if foreign && self.rest.stop_pending {
+                    self.stop();
+                }
                 Routed::NotReady
             }
             _ if matches!(self.feedback.state().link, Link::Down | Link::Faulted) => {

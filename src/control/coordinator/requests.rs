@@ -8,7 +8,7 @@ use crate::control::request::{Envelope, Motion, Request};
 use crate::control::speed_override::SpeedOverride;
 use crate::control::task::Tick;
 use crate::control::task_body::Target;
-use crate::telemetry::{Cause, Event, Outcome, Reason, TaskState};
+use crate::telemetry::{Cause, Event, LedBy, Outcome, Reason, TaskState};
 
 impl Coordinator {
     /// Handles a request and reports its outcome.
@@ -16,8 +16,14 @@ impl Coordinator {
         let outcome = match envelope.request {
             Request::Shutdown => {
                 self.shutting_down = true;
-                let led = self.arms.iter_mut().filter(|arm| arm.failsafe.led_by().is_some());
-                led.for_each(|arm| arm.prepare_disable(now));
+                for arm in 0..self.arms.len() as u16 {
+                    self.with_arm(arm, |a| {
+                        if a.failsafe.led_by().is_some() {
+                            a.prepare_disable(now);
+                        }
+                        Outcome::Accepted
+                    });
+                }
                 self.cancel(None)
             }
             Request::Stop { arm } => self.stop(arm, now),
@@ -51,12 +57,20 @@ impl Coordinator {
                 self.end_tasks_of_held_arms();
                 outcome
             }
+            Request::Lead { by: LedBy::Controller, .. } if self.speed.paused => Outcome::Paused,
             Request::Lead { arm, by } => match self.task_of_arm(arm) {
                 Some(task) => Outcome::AlreadyExecuting(task),
                 None => self.with_arm(arm, |a| a.lead(by, arm, now)),
             },
             Request::Speed { fraction } => self.change_speed(|speed| speed.set(fraction)),
-            Request::Pause { on } => self.change_speed(|speed| speed.paused = on),
+            Request::EndNative { arm } => self.end_native(arm, now),
+            Request::Pause { on } => {
+                // The controller of an arm knows no pause: its motion ends.
+                for arm in 0..if on { self.arms.len() as u16 } else { 0 } {
+                    self.end_native(arm, now);
+                }
+                self.change_speed(|speed| speed.paused = on)
+            }
             Request::Gripper { arm, opening, force } => self.gripper(arm, opening, force),
         };
         self.output.report(Event::Request(envelope.id, outcome));
@@ -80,11 +94,20 @@ impl Coordinator {
         active.map(|task| task as u16)
     }
 
+    /// Ends the motion of an arm's own controller.
+    fn end_native(&mut self, arm: u16, now: Mono) -> Outcome {
+        self.with_arm(arm, |a| if a.end_native(now) { Outcome::Cancelled } else { Outcome::AlreadyStopped })
+    }
+
     fn stop(&mut self, arm: Option<u16>, now: Mono) -> Outcome {
-        match arm {
-            Some(arm) if arm as usize >= self.arms.len() => return Outcome::StartStateUnavailable(arm),
-            Some(arm) => self.hold(arm as usize, Cause::Operator, now),
-            None => (0..self.arms.len()).for_each(|i| self.hold(i, Cause::Operator, now)),
+        if let Some(arm) = arm.filter(|&arm| arm as usize >= self.arms.len()) {
+            return Outcome::StartStateUnavailable(arm);
+        }
+        for i in (0..self.arms.len()).filter(|&i| arm.is_none_or(|arm| arm as usize == i)) {
+            if let Some(a) = self.arms.get_mut(i) {
+                a.stop_again();
+            }
+            self.hold(i, Cause::Operator, now);
         }
         Outcome::Accepted
     }

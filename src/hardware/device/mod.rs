@@ -21,8 +21,9 @@ use std::time::Duration;
 
 pub use details::Details;
 pub use health::{Episode, Health, Note};
+pub use thread::Way;
 
-use crate::arm::{ArmCommand, ArmState, GripperInfo, IoInfo, IoState, Load, OutputValue, Pose, StopInput, Supervision};
+use crate::arm::{ArmCommand, ArmState, GripperInfo, IoInfo, IoState, Load, OutputValue, StopInput, Supervision};
 use crate::clock::Clock;
 use crate::hardware::adapter::{AdapterError, AdapterResult, ManipulatorAdapter, ManipulatorInfo};
 use crate::joint::{JointLimits, Joints};
@@ -131,8 +132,8 @@ enum Order {
     SetOutput(OutputValue, SyncSender<AdapterResult<()>>),
     ReadPayload(SyncSender<AdapterResult<Option<Load>>>),
     SetPayload(Load, SyncSender<AdapterResult<Option<Load>>>),
-    Guide(SyncSender<AdapterResult<()>>),
-    MoveNative(Pose, f64, SyncSender<AdapterResult<()>>),
+    TakeOver(SyncSender<AdapterResult<()>>),
+    Lead(Way, u32, SyncSender<AdapterResult<()>>),
     Finish { disable: bool, reply: SyncSender<AdapterResult<()>> },
 }
 
@@ -229,17 +230,16 @@ impl Device {
         self.order(|reply| Order::SetPayload(load, reply))
     }
 
-    /// Lets the arm be guided by hand. `Unsupported` for an arm that cannot be. The tick must command nothing;
-    /// `activate` ends it.
-    pub fn guide(&self) -> Answer<()> {
-        self.order(Order::Guide)
+    /// Lets the arm be led, by a hand or by its own controller; the answer comes when that begins. `lead_seq` is that
+    /// of the tick's command: a stop in between refuses the order. `Unsupported` for an arm without it. `activate` and
+    /// `take_over` end it.
+    pub fn lead(&self, way: Way, lead_seq: u32) -> Answer<()> {
+        self.order(|reply| Order::Lead(way, lead_seq, reply))
     }
 
-    /// Lets the arm's own controller move its end effector to a pose in the controller's base frame, at a fraction of
-    /// its top speed; the answer comes when the motion begins. `Unsupported` for an arm without such a motion. The tick
-    /// must command nothing; `activate` ends it.
-    pub fn move_native(&self, pose: Pose, speed: f64) -> Answer<()> {
-        self.order(|reply| Order::MoveNative(pose, speed, reply))
+    /// Makes a led arm ready where it is, if its motors are on: `Rejected` otherwise.
+    pub fn take_over(&self) -> Answer<()> {
+        self.order(Order::TakeOver)
     }
 
     /// Returns the thread's wake deadline.

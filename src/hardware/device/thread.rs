@@ -10,6 +10,8 @@ mod slow_readings;
 mod tests;
 mod tick_monitor;
 
+pub use lead::Way;
+
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, TryRecvError};
@@ -231,7 +233,14 @@ impl Worker {
             Order::Activate(reply) => {
                 let _ = reply.send(self.activate(adapter));
             }
+            Order::TakeOver(reply) => {
+                // Motors that somebody has switched off meanwhile stay off.
+                let off = self.ordered_power == Some(false) || !self.state.enabled;
+                let refused = || Err(AdapterError::Rejected("its motors were switched off".to_owned()));
+                let _ = reply.send(if off { refused() } else { self.activate(adapter) });
+            }
             Order::Disable(reply) => {
+                self.lead.end("the motors were switched off");
                 let result = self.while_connected(adapter, |a| a.write_enable(false));
                 // After a refusal the motors are still on, which is no interference.
                 self.expect_nothing(result.is_ok().then_some(false));
@@ -265,9 +274,9 @@ impl Worker {
             Order::SetPayload(load, reply) => {
                 let _ = reply.send(self.set_payload(adapter, &load));
             }
-            Order::Guide(reply) => self.lead.order(lead::Way::Hand, reply, self.config.clock.now()),
-            Order::MoveNative(pose, speed, reply) => {
-                self.lead.order(lead::Way::To(pose, speed), reply, self.config.clock.now());
+            Order::Lead(way, lead_seq, reply) => {
+                self.expect_nothing(self.ordered_power);
+                self.lead.order(way, lead_seq, reply, self.config.clock.now());
             }
             Order::Finish { disable, reply } => {
                 let _ = reply.send(self.finish(adapter, disable));

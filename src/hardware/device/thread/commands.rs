@@ -20,6 +20,9 @@ impl Worker {
     pub(super) fn take_command(&mut self) -> ArmCommand {
         let command = self.commands.read();
         self.stop_pending |= command.stop_seq != self.last.stop_seq;
+        if self.last.led && !command.led {
+            self.lead.end("the arm was stopped");
+        }
         std::mem::replace(&mut self.last, command)
     }
 

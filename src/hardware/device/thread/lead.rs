@@ -14,57 +14,79 @@ use crate::joint::ControlMode;
 const TIMEOUT: Duration = Duration::from_secs(6);
 
 /// How an arm is led.
-#[derive(Debug, Clone, Copy)]
-pub(super) enum Way {
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Way {
     /// By hand.
     Hand,
     /// By its controller, to this pose at this fraction of the top speed.
     To(Pose, f64),
 }
 
+/// An order that is not carried out yet.
+struct Pending {
+    way: Way,
+    /// [`ArmCommand::lead_seq`](crate::arm::ArmCommand) of the lead that it belongs to.
+    lead_seq: u32,
+    reply: SyncSender<AdapterResult<()>>,
+    /// When it is too late.
+    until: Mono,
+}
+
 /// Whether the arm is led, or about to be.
 #[derive(Default)]
 pub(super) struct Lead {
-    /// The order that is not carried out yet, where its answer goes, and when it is too late.
-    pending: Option<(Way, SyncSender<AdapterResult<()>>, Mono)>,
+    pending: Option<Pending>,
     /// The controller has begun, and was neither stopped nor activated since.
     pub active: bool,
 }
 
 impl Lead {
     /// Takes an order.
-    pub fn order(&mut self, way: Way, reply: SyncSender<AdapterResult<()>>, now: Mono) {
+    pub fn order(&mut self, way: Way, lead_seq: u32, reply: SyncSender<AdapterResult<()>>, now: Mono) {
         self.end("another order came");
-        self.pending = Some((way, reply, now.after(TIMEOUT)));
+        self.pending = Some(Pending { way, lead_seq, reply, until: now.after(TIMEOUT) });
     }
 
     /// The arm is no longer led; an order that is not carried out yet is refused with the reason `why`.
     pub fn end(&mut self, why: &str) {
         self.active = false;
-        if let Some((_, reply, _)) = self.pending.take() {
-            let _ = reply.send(Err(AdapterError::Rejected(why.to_owned())));
+        if let Some(pending) = self.pending.take() {
+            let _ = pending.reply.send(Err(AdapterError::Rejected(why.to_owned())));
         }
     }
 }
 
 impl Worker {
-    /// Carries out a pending order, as far as the controller is ready for it.
+    /// Carries out a pending order, as far as the controller is ready for it. Only while the tick says that the arm is
+    /// led, by the lead that the order belongs to: a stop in between has ended that.
     pub(super) fn begin_to_lead(&mut self, adapter: &mut dyn ManipulatorAdapter) {
-        let Some((way, reply, until)) = self.lead.pending.take() else { return };
-        // The mode changes by order now.
-        self.expect_nothing(self.ordered_power);
+        let Some(pending) = self.lead.pending.take() else { return };
+        let (now, ahead) = (self.config.clock.now(), pending.lead_seq.wrapping_sub(self.last.lead_seq));
+        let ended = (ahead == 0 && !self.last.led) || ahead > u32::MAX / 2;
+        if ended || self.stop_pending || self.state.self_held {
+            let _ = pending.reply.send(Err(AdapterError::Rejected("the arm was stopped".to_owned())));
+            return;
+        }
+        if ahead > 0 && now < pending.until {
+            self.lead.pending = Some(pending);
+            return;
+        }
+        let Pending { way, reply, .. } = &pending;
         let mode = match way {
+            _ if ahead > 0 => Err(AdapterError::Timeout("the tick did not pass the arm on".to_owned())),
             _ if !self.connected => Err(AdapterError::NotConnected),
             Way::Hand => adapter.hand_guiding().map_or(Err(AdapterError::Unsupported), |arm| arm.begin_hand_guiding()),
             Way::To(..) if adapter.cartesian().is_none() => Err(AdapterError::Unsupported),
             Way::To(..) => adapter.set_control_mode(ControlMode::Position),
         };
-        if matches!(mode, Err(AdapterError::Rejected(_))) && self.config.clock.now() < until {
-            self.lead.pending = Some((way, reply, until));
+        if matches!(mode, Err(AdapterError::Rejected(_))) && now < pending.until {
+            // The mode changes by order now.
+            self.ordered_mode = None;
+            self.lead.pending = Some(pending);
             return;
         }
         let result = match (way, adapter.cartesian()) {
-            (Way::To(pose, speed), Some(arm)) => mode.and_then(|()| arm.write_cartesian_position(&pose, speed)),
+            (Way::To(pose, speed), Some(arm)) => mode.and_then(|()| arm.write_cartesian_position(pose, *speed)),
             _ => mode,
         };
         match result {
@@ -72,6 +94,8 @@ impl Worker {
             _ => {}
         }
         self.lead.active = result.is_ok();
+        // Another one than that is another client's.
+        self.ordered_mode = result.is_ok().then(|| adapter.get_control_mode());
         let _ = reply.send(result);
     }
 }

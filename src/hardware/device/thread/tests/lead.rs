@@ -5,12 +5,13 @@ use std::sync::mpsc::{Receiver, sync_channel};
 use super::*;
 use crate::arm::{Interference, Pose};
 use crate::hardware::adapter::AdapterError;
+use crate::hardware::device::Way;
 
 const POSE: Pose = Pose { xyz: [0.3, 0.1, 0.2], rpy: [0.0; 3] };
 
 fn native(bench: &Bench) -> Receiver<AdapterResult<()>> {
     let (reply, answer) = sync_channel(1);
-    bench._orders.send(Order::MoveNative(POSE, 0.25, reply)).unwrap();
+    bench._orders.send(Order::Lead(Way::To(POSE, 0.25), 1, reply)).unwrap();
     answer
 }
 
@@ -22,8 +23,14 @@ fn holding() -> Bench {
     bench
 }
 
+/// A tick of the first lead.
 fn idle(bench: &mut Bench) -> ArmState {
-    bench.tick(|c| c.mode = None)
+    bench.tick(|c| (c.mode, c.led, c.lead_seq) = (None, true, 1))
+}
+
+/// A tick that ends it by a stop.
+fn stop(bench: &mut Bench) -> ArmState {
+    bench.tick(|c| (c.mode, c.led, c.stop_seq) = (None, false, c.stop_seq + 1))
 }
 
 #[test]
@@ -64,7 +71,7 @@ fn a_pose_that_is_refused_is_refused_at_once_and_a_mode_that_never_comes_in_the_
     assert_eq!(answer.try_recv(), Ok(Err(AdapterError::Rejected("it moves".into()))));
 
     let (reply, answer) = sync_channel(1);
-    bench._orders.send(Order::Guide(reply)).unwrap();
+    bench._orders.send(Order::Lead(Way::Hand, 1, reply)).unwrap();
     idle(&mut bench);
     assert_eq!(answer.try_recv(), Ok(Err(AdapterError::Unsupported)), "this arm has no hand guiding");
 }
@@ -75,10 +82,63 @@ fn a_stop_ends_a_motion_that_has_not_begun() {
     bench.arm.fail("set_control_mode", AdapterError::Rejected("under way".into()));
     let answer = native(&bench);
     idle(&mut bench);
-    bench.tick(|c| (c.mode, c.stop_seq) = (None, c.stop_seq + 1));
-    idle(&mut bench);
+    stop(&mut bench);
+    stop(&mut bench);
     assert!(matches!(answer.try_recv(), Ok(Err(AdapterError::Rejected(_)))));
-    assert_eq!((bench.count("write_stop"), bench.count("write_cartesian_position")), (1, 0));
+    assert_eq!((bench.count("write_stop"), bench.count("write_cartesian_position")), (2, 0));
+}
+
+/// The order may come late: the client's thread had no processor.
+#[test]
+fn an_order_that_comes_after_the_stop_of_its_lead_is_refused() {
+    let mut bench = holding();
+    idle(&mut bench);
+    stop(&mut bench);
+    let late = native(&bench);
+    bench.tick(|_| ());
+    assert!(matches!(late.try_recv(), Ok(Err(AdapterError::Rejected(_)))));
+    // Nor does it belong to the next lead.
+    let late = native(&bench);
+    bench.tick(|c| (c.led, c.lead_seq) = (true, 2));
+    assert!(matches!(late.try_recv(), Ok(Err(AdapterError::Rejected(_)))));
+    assert_eq!((bench.count("set_control_mode"), bench.count("write_cartesian_position")), (0, 0));
+}
+
+#[test]
+fn an_order_that_comes_before_its_lead_waits_for_it() {
+    let mut bench = holding();
+    let early = native(&bench);
+    bench.tick(|c| c.mode = None);
+    assert!(early.try_recv().is_err() && bench.count("write_cartesian_position") == 0);
+    idle(&mut bench);
+    assert_eq!(early.try_recv(), Ok(Ok(())));
+}
+
+#[test]
+fn a_stop_that_the_arm_does_not_take_at_once_begins_no_motion() {
+    let mut bench = holding();
+    let answer = native(&bench);
+    bench.arm.fail("write_stop", AdapterError::Timeout("late".into()));
+    bench.tick(|c| (c.mode, c.led, c.lead_seq, c.stop_seq) = (None, true, 1, c.stop_seq + 1));
+    assert!(matches!(answer.try_recv(), Ok(Err(AdapterError::Rejected(_)))));
+    assert_eq!(bench.count("write_cartesian_position"), 0);
+}
+
+#[test]
+fn an_arm_whose_motors_were_switched_off_is_not_taken_over() {
+    let mut bench = holding();
+    let answer = native(&bench);
+    idle(&mut bench);
+    assert_eq!(answer.try_recv(), Ok(Ok(())));
+    let ask = |order: fn(std::sync::mpsc::SyncSender<AdapterResult<()>>) -> Order, bench: &mut Bench| {
+        let (reply, answer) = sync_channel(1);
+        bench._orders.send(order(reply)).unwrap();
+        stop(bench);
+        answer.recv().unwrap()
+    };
+    ask(Order::Disable, &mut bench).unwrap();
+    assert!(matches!(ask(Order::TakeOver, &mut bench), Err(AdapterError::Rejected(_))));
+    assert!(!bench.states.read().enabled);
 }
 
 #[test]
