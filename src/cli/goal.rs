@@ -187,6 +187,7 @@ impl Goal {
             timeout: search.timeout.map(|t| t.as_secs_f64()),
             through: before.iter().map(own).collect(),
             blend: self.blend,
+            by_number: false,
         }
     }
 }

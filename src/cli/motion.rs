@@ -6,7 +6,7 @@ use super::exit::{Exit, Failure, Result};
 use super::follow::{Signals, follow};
 use super::goal::{Goal, Search, has_planner, plan, show};
 use super::output;
-use crate::rpc::api::{ExecutePlan, Move, Poses, State};
+use crate::rpc::api::{ExecutePlan, Move, Plan, Poses, State};
 use crate::rpc::client::Client;
 
 /// Arguments of `move`.
@@ -69,7 +69,8 @@ pub fn run(args: &Args) -> Result {
 type Begun = (u64, String, serde_json::Value);
 
 fn plan_and_begin(args: &Args, client: &mut Client, signals: &Signals) -> Result<Begun> {
-    let request = args.goal.plan(args.arm.as_deref(), &args.search);
+    // The plan of a move is this move's own: `dimos execute` passes it over.
+    let request = Plan { by_number: true, ..args.goal.plan(args.arm.as_deref(), &args.search) };
     let planned = plan(client, request, signals)?;
     if !args.target_run.json {
         show(&planned);

@@ -17,7 +17,7 @@ const COLUMNS: usize = 8;
 /// Arguments of `preview`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// Number of the plan; default: the newest
+    /// Number of the plan; default: the newest of `dimos plan`
     pub plan: Option<u64>,
     /// Write the trajectory to a JSON file for `dimos execute FILE`
     #[arg(long, value_name = "FILE")]

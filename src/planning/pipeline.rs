@@ -60,6 +60,8 @@ pub struct PlanRequest {
     pub through: Vec<Vec<(usize, Goal)>>,
     /// How far away an end effector may pass them [m]; 0: the motion rests at each.
     pub blend: f64,
+    /// Whether only its number selects the plan.
+    pub by_number: bool,
 }
 
 /// A planned motion.

@@ -22,7 +22,7 @@ fn ask(scene: &PlanningScene, goal: Goal, start: &[f64]) -> Result<PlannedMotion
         speed: 1.0,
         seed: 0,
         through: Vec::new(),
-        blend: 0.0,
+        blend: 0.0, by_number: false,
     };
     solve(scene, &scene.world, &request, &Stop::never()).map_err(|failure| failure.what)
 }

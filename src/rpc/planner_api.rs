@@ -91,6 +91,17 @@ pub struct Plan {
     /// How far away its tool centre point may pass them, 0–1 [m]; 0: it stops at each.
     #[serde(default)]
     pub blend: f64,
+    /// Whether only its number selects this plan: `execute_plan` and `preview` without a number pass it over. For a
+    /// motion that is planned and executed in one step.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub by_number: bool,
+}
+
+impl Default for Plan {
+    fn default() -> Self {
+        let (goals, through, speed) = (Vec::new(), Vec::new(), default_speed());
+        Self { goals, speed, seed: 0, timeout: None, through, blend: 0.0, by_number: false }
+    }
 }
 
 /// Farthest that a waypoint may be passed [m].
@@ -252,7 +263,7 @@ pub struct GoalClamped {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Preview {
-    /// The plan's number; default: the newest plan.
+    /// The plan's number; default: the newest plan that is not `by_number`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<u64>,
 }
@@ -277,7 +288,7 @@ pub struct PreviewReply {
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ExecutePlan {
-    /// The plan's number; default: the newest plan.
+    /// The plan's number; default: the newest plan that is not `by_number`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<u64>,
     /// Whether a motion that an obstacle blocks is planned again from where it stopped, and continues.
@@ -327,7 +338,7 @@ pub struct PlannerReport {
     pub error: Option<String>,
     /// The planning robots.
     pub robots: Vec<RobotReport>,
-    /// Number of the newest plan.
+    /// Number of the plan that `execute_plan` and `preview` take without one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<u64>,
     /// Link pairs that touch in every configuration and are therefore not checked, by robot.

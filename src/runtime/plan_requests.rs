@@ -30,7 +30,8 @@ impl PlannerPort {
         let positions = all_positions(&scene, moment)?;
         let waypoint = |goal| Ok(vec![self.goal_of(&scene, goal, moment)?]);
         let through = plan.through.iter().map(waypoint).collect::<Result<Vec<_>, RpcError>>()?;
-        let request = PlanRequest { goals, positions, speed: plan.speed, seed: plan.seed, through, blend: plan.blend };
+        let api::Plan { speed, seed, blend, by_number, .. } = *plan;
+        let request = PlanRequest { goals, positions, speed, seed, through, blend, by_number };
         let id = moment.plan;
         self.thread.begin(id, request, plan.timeout.map(Duration::from_secs_f64)).map_err(|why| {
             let error = RpcError::new(Code::Planning, why.to_string());
@@ -124,7 +125,7 @@ impl PlannerPort {
 
     /// Returns the planner's report. The run adds the progress of a motion.
     pub(super) fn report(&self) -> api::PlannerReport {
-        let (state, error) = match &self.thread.newest(false) {
+        let (state, error) = match &self.thread.newest() {
             Some(Job { progress: Progress::Planning(_), .. }) => ("PLANNING", None),
             Some(Job { progress: Progress::Failed(failure, _), .. }) if !failure.cancelled => {
                 ("FAULT", Some(failure.what.clone()))
@@ -152,7 +153,7 @@ impl PlannerPort {
             state: state.to_owned(),
             error,
             robots: self.thread.now().robots.iter().map(robot).collect(),
-            plan: self.thread.newest(true).map(|job| job.id),
+            plan: self.thread.newest_without_number().map(|job| job.id),
             always_touching,
         }
     }
@@ -167,12 +168,17 @@ pub(super) fn all_positions(setup: &PlanningScene, moment: &Moment) -> Result<Ve
 pub(super) fn job(port: &PlannerPort, plan: Option<u64>) -> Result<Job, RpcError> {
     let job = match plan {
         Some(id) => port.thread.job(id),
-        None => port.thread.newest(true),
+        None => port.thread.newest_without_number(),
     };
-    job.ok_or_else(|| match plan {
-        Some(id) => RpcError::new(Code::UnknownPlan, format!("there is no plan {id}, or it is too long ago"))
-            .hint("`dimos plan` makes one"),
-        None => RpcError::new(Code::NoPlan, "there is no plan yet").hint("`dimos plan` makes one"),
+    job.ok_or_else(|| {
+        let (code, what) = match plan {
+            Some(id) => (Code::UnknownPlan, format!("there is no plan {id}, or it is too long ago")),
+            None if port.thread.newest().is_some() => {
+                (Code::NoPlan, "there is no plan: the plan of a `move` is executed by that move only".to_owned())
+            }
+            None => (Code::NoPlan, "there is no plan yet".to_owned()),
+        };
+        RpcError::new(code, what).hint("`dimos plan` makes one")
     })
 }
 
@@ -182,7 +188,8 @@ pub(super) fn found(port: &PlannerPort, plan: Option<u64>) -> Result<(Job, Arc<P
         Progress::Found(found, _) => Ok((job.clone(), found.clone())),
         Progress::Planning(_) => Err(RpcError::new(Code::Planning, format!("plan {} is not ready yet", job.id))),
         Progress::Failed(failure, _) => {
-            Err(RpcError::new(Code::NoPlan, format!("plan {} was not found: {}", job.id, failure.what)))
+            let what = format!("plan {} was not found: {}", job.id, failure.what);
+            Err(RpcError::new(Code::NoPlan, what).hint("plan again; `--plan N` executes an earlier plan"))
         }
     }
 }

@@ -61,6 +61,7 @@ impl Service {
         if request.goals.iter().any(is_relative) {
             self.resolve(&mut request, motion.plan).await?;
         }
+        request.by_number = true;
         let Reply::Plan(begun) = self.planner_call(Call::Plan(request)).await? else { return Err(internal()) };
         loop {
             if let Err(ended) = self.may_go_on(motion) {

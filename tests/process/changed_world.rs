@@ -48,7 +48,7 @@ impl Cell {
         let goal = PlanGoal { robot: "arm".into(), joints: Some(at(angle)), ..PlanGoal::default() };
         let plan = self
             .run
-            .call(Plan { goals: vec![goal], speed, seed: 0, timeout: None, through: Vec::new(), blend: 0.0 })
+            .call(Plan { goals: vec![goal], speed, seed: 0, timeout: None, ..Plan::default() })
             .unwrap()
             .plan;
         eventually("planning ends", || self.run.call(Planning { plan }).unwrap().state != "PLANNING");

@@ -202,6 +202,27 @@ fn what_cannot_be_planned_is_refused_in_words() {
 }
 
 #[test]
+fn execute_takes_what_plan_made_and_no_plan_of_a_move() {
+    let (home, _run) = up();
+    home.dimos("execute").with(1).says(&["NO_PLAN", "the plan of a `move`", "hint: `dimos plan` makes one"]);
+    home.dimos("preview").with(1).says(&["NO_PLAN"]);
+    // A move that begins and is not executed: another program has the arm.
+    home.dimos("plan arm 0.4 -0.3 0.6 0 0.8 0").with(0);
+    let mut holder = home.client();
+    holder.call(Lease { arm: Some("arm".into()) }).unwrap();
+    home.dimos("move arm -0.4 -0.3 0.6 0 0.8 0").with(1).says(&["LEASE_HELD"]);
+    drop(holder);
+    eventually("the lease is free", || home.dimos("execute --plan 4711").err.contains("UNKNOWN_PLAN"));
+    home.dimos("execute").with(0);
+    is_at(&home, "arm", &[0.4, -0.3, 0.6, 0.0, 0.8, 0.0]);
+    // A plan that was not found is no reason to execute the one before it.
+    home.dimos("plan arm --named home").with(0);
+    home.dimos("plan arm 0 1.5 1.5 0 0 0").with(1);
+    home.dimos("execute").with(1).says(&["NO_PLAN", "was not found: the goal collides", "hint: "]);
+    is_at(&home, "arm", &[0.4, -0.3, 0.6, 0.0, 0.8, 0.0]);
+}
+
+#[test]
 fn a_plan_is_refused_when_the_arm_or_the_world_is_not_as_it_was() {
     let (home, _run) = up();
     home.dimos("plan arm 0.8 -0.3 0.6 0 0.8 0").with(0);
@@ -398,9 +419,7 @@ fn two_arms_move_in_one_plan_and_keep_clear_of_each_other() {
             goals: vec![goal("left", left), goal("right", right)],
             speed: 1.0,
             seed: 3,
-            timeout: None,
-            through: Vec::new(),
-            blend: 0.0,
+            ..Plan::default()
         }
     };
     let turned = |angle| [angle, -0.3, 0.6, 0.0, 0.8, 0.0];
