@@ -1,5 +1,6 @@
 //! Goals of motions as typed on the command line, and planning.
 
+use std::path::PathBuf;
 use std::thread::sleep;
 use std::time::Duration;
 
@@ -9,7 +10,10 @@ use super::arguments::{finite, speed};
 use super::exit::{Exit, Failure, Result};
 use super::follow::Signals;
 use super::output::{self, fixed};
-use crate::rpc::api::{Cancel, DEFAULT_SPEED, Plan, PlanGoal, PlanSummary, Planner, Planning, PoseSpec};
+use super::recorded_path;
+use crate::rpc::api::{
+    Cancel, DEFAULT_SPEED, JointPath, PATH_TOLERANCE, Plan, PlanGoal, PlanSummary, Planner, Planning, PoseSpec,
+};
 use crate::rpc::client::{Client, ClientError};
 use crate::rpc::{Code, RpcError};
 
@@ -49,6 +53,13 @@ pub struct Goal {
     /// or pose:x,y,z,r,p,y (also with x,y,z or a quaternion); line:… is reached on a straight line
     #[arg(long, value_name = "WAYPOINT", num_args = 2.., value_parser = waypoint, allow_negative_numbers = true, conflicts_with_all = ["joints", "tcp", "named", "several"])]
     pub through: Vec<PlanGoal>,
+    /// Follow the path of a motion that was led or recorded: .csv or .json as for `execute`, or a log (.mcap). Its times
+    /// do not count; the way to its first point is planned
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["joints", "tcp", "named", "several", "through"])]
+    pub path: Option<PathBuf>,
+    /// How far the motion may pass from the recorded path, per joint [rad]
+    #[arg(long, value_name = "ANGLE", default_value_t = PATH_TOLERANCE, value_parser = tolerance, requires = "path")]
+    pub tolerance: f64,
     /// How far away the tool centre point may pass the waypoints [m]; 0: it stops at each
     #[arg(long, value_name = "DISTANCE", default_value_t = 0.0, value_parser = finite, requires = "through")]
     pub blend: f64,
@@ -64,6 +75,12 @@ fn position(text: &str) -> std::result::Result<f64, String> {
         }
         _ => wrong,
     })
+}
+
+/// Parses the tolerance of a path.
+fn tolerance(text: &str) -> std::result::Result<f64, String> {
+    let tolerance = finite(text)?;
+    if (1e-4..=0.1).contains(&tolerance) { Ok(tolerance) } else { Err("must be within 0.0001–0.1 rad".into()) }
 }
 
 /// Parses a coordinate; a list with commas gets a hint.
@@ -151,7 +168,7 @@ impl Goal {
     }
 
     /// Returns the goals for the planner; `robot` is the robot of positions, pose and name.
-    fn of(&self, robot: Option<&str>, search: &Search) -> Vec<PlanGoal> {
+    fn of(&self, robot: Option<&str>, path: Option<JointPath>, search: &Search) -> Vec<PlanGoal> {
         let Some(robot) = robot else { return self.several.clone() };
         if let Some(last) = self.through.last() {
             return vec![PlanGoal { robot: robot.to_owned(), ..last.clone() }];
@@ -170,6 +187,7 @@ impl Goal {
             by: spec(&self.by),
             frame: self.frame.clone(),
             named: self.named.clone(),
+            path,
             linear: search.linear,
         }]
     }
@@ -177,18 +195,26 @@ impl Goal {
 
 impl Goal {
     /// Returns a planning request.
-    pub fn plan(&self, robot: Option<&str>, search: &Search) -> Plan {
+    pub fn plan(&self, client: &mut Client, robot: Option<&str>, search: &Search) -> Result<Plan> {
+        let path = match (&self.path, robot) {
+            (Some(file), Some(name)) => {
+                let robots = client.call(Planner {})?.robots.into_iter().map(|robot| (robot.name, robot.joints));
+                let joints = recorded_path::joints_of(name, Code::UnknownRobot, robots.collect())?;
+                Some(recorded_path::read(file, &joints, self.tolerance)?)
+            }
+            _ => None,
+        };
         let before = self.through.split_last().map(|(_, before)| before).unwrap_or_default();
         let own = |goal: &PlanGoal| PlanGoal { robot: robot.unwrap_or_default().to_owned(), ..goal.clone() };
-        Plan {
-            goals: self.of(robot, search),
+        Ok(Plan {
+            goals: self.of(robot, path, search),
             speed: search.speed,
             seed: search.seed,
             timeout: search.timeout.map(|t| t.as_secs_f64()),
             through: before.iter().map(own).collect(),
             blend: self.blend,
             by_number: false,
-        }
+        })
     }
 }
 

@@ -8,7 +8,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::api::finite;
-use super::motion_api::{Trajectory, default_speed, valid_speed};
+use super::motion_api::{JointPath, Trajectory, default_speed, valid_speed};
 use super::report::{TcpReport, ToolReport};
 
 /// A pose; in the frame `map` unless another is given with it.
@@ -42,7 +42,7 @@ impl PoseSpec {
     }
 }
 
-/// Goal of one robot: exactly one of `joints`, `pose`, `by`, `named`.
+/// Goal of one robot: exactly one of `joints`, `pose`, `by`, `named`, `path`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PlanGoal {
@@ -65,6 +65,10 @@ pub struct PlanGoal {
     /// One of its named poses.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub named: Option<String>,
+    /// A path that it follows as it is, after a planned approach to its first point; for the only robot that moves.
+    /// Refused where it is not free.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub path: Option<JointPath>,
     /// Whether the tool centre point moves there on a straight line.
     #[serde(default)]
     pub linear: bool,
@@ -109,10 +113,12 @@ const MAX_BLEND: f64 = 1.0;
 
 impl PlanGoal {
     fn valid(&self, field: &str) -> Result<(), String> {
-        let given = [self.joints.is_some(), self.pose.is_some(), self.by.is_some(), self.named.is_some()];
-        if given.iter().filter(|given| **given).count() != 1 {
-            return Err(format!("{field} must have one of joints, pose, by, named"));
+        let of = |what: bool| usize::from(what);
+        let given = of(self.joints.is_some()) + of(self.pose.is_some()) + of(self.by.is_some());
+        if given + of(self.named.is_some()) + of(self.path.is_some()) != 1 {
+            return Err(format!("{field} must have one of joints, pose, by, named, path"));
         }
+        self.path.as_ref().map_or(Ok(()), |path| path.valid().map_err(|what| format!("{field}.{what}")))?;
         let is_pose = self.pose.is_some() || self.by.is_some();
         if self.linear && !is_pose {
             return Err(format!("{field}: linear needs a pose"));
@@ -137,12 +143,18 @@ impl Plan {
                 return Err(format!("{field}: {} has a goal already", goal.robot));
             }
             goal.valid(&field)?;
+            if goal.path.is_some() && (self.goals.len() > 1 || !self.through.is_empty()) {
+                return Err(format!("{field}: a path is followed by one robot alone, and without other waypoints"));
+            }
         }
         for (index, waypoint) in self.through.iter().enumerate() {
             let field = format!("through[{index}]");
             waypoint.valid(&field)?;
             if self.goals.len() != 1 || self.goals.iter().any(|goal| goal.robot != waypoint.robot) {
                 return Err(format!("{field}: waypoints are for the robot of the only goal"));
+            }
+            if waypoint.path.is_some() {
+                return Err(format!("{field}: a path is no waypoint"));
             }
             if waypoint.by.is_some() || self.goals.iter().any(|goal| goal.by.is_some()) {
                 return Err(format!("{field}: a motion `by` begins at the present pose, not at a waypoint"));

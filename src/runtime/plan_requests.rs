@@ -10,6 +10,7 @@ use super::planner_port::{PlannerPort, positions_of, robot_index, run_blocking};
 use super::service::internal;
 use super::tcp::TcpModel;
 use crate::collision::Stop;
+use crate::planning::joint_path::JointPath;
 use crate::planning::padded::GivenUp;
 use crate::planning::path::length;
 use crate::planning::pipeline::{Goal, PlanRequest, PlannedMotion};
@@ -47,14 +48,19 @@ impl PlannerPort {
         let index = robot_index(scene, &goal.robot)?;
         let robot = scene.robots.get(index).ok_or_else(internal)?;
         let config = &robot.config;
-        let joints = |values: &[f64]| {
+        let positions = |values: &[f64]| {
             if values.len() == config.joints.len() {
-                return Ok(Goal::Joints(values.to_vec()));
+                return Ok(values.to_vec());
             }
             let what = format!("{} has {} joints, the goal {} values", config.name, config.joints.len(), values.len());
             Err(RpcError::new(Code::InvalidParams, what).hint("give one position [rad] per joint, in order"))
         };
+        let joints = |values: &[f64]| positions(values).map(Goal::Joints);
         let any_turn = goal.pose.is_some_and(|pose| pose.rpy.is_none() && pose.quat.is_none());
+        if let Some(path) = &goal.path {
+            let points = path.points.iter().map(|q| positions(q)).collect::<Result<_, RpcError>>()?;
+            return Ok((index, Goal::Path(JointPath { points, tolerance: path.tolerance })));
+        }
         let goal = match (&goal.joints, &goal.named, self.goal_pose(robot, goal, moment)?) {
             (Some(values), _, _) => joints(values)?,
             (_, Some(name), _) => {

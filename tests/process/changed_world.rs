@@ -46,11 +46,8 @@ impl Cell {
     /// Plans to an angle of the first joint.
     fn plan(&self, angle: f64, speed: f64) -> u64 {
         let goal = PlanGoal { robot: "arm".into(), joints: Some(at(angle)), ..PlanGoal::default() };
-        let plan = self
-            .run
-            .call(Plan { goals: vec![goal], speed, seed: 0, timeout: None, ..Plan::default() })
-            .unwrap()
-            .plan;
+        let plan =
+            self.run.call(Plan { goals: vec![goal], speed, seed: 0, timeout: None, ..Plan::default() }).unwrap().plan;
         eventually("planning ends", || self.run.call(Planning { plan }).unwrap().state != "PLANNING");
         assert_eq!(self.run.call(Planning { plan }).unwrap().state, "PLANNED");
         plan

@@ -45,4 +45,5 @@ mod start_stages;
 mod stop_input;
 mod stops;
 mod ur_runs;
+mod waypoints;
 mod xarm_runs;

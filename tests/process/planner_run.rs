@@ -12,7 +12,7 @@ use crate::support::program::{Home, Started, eventually};
 use crate::support::wire::watch::Watch;
 
 /// An ideal arm in memory, with YourArm's description.
-const BLUEPRINT: &str = include_str!("../support/lab.yaml");
+pub(super) const BLUEPRINT: &str = include_str!("../support/lab.yaml");
 const HOME: [f64; 6] = [0.0, -0.3, 0.6, 0.0, 0.8, 0.0];
 /// Two walls that leave no way from one side of the arm to the other, as far as a search can tell in a minute.
 const WALLS: [&str; 2] = ["world add front --box 2 0.02 4 --at 1.1 0 0", "world add back --box 2 0.02 4 --at -1.1 0 0"];
@@ -36,7 +36,7 @@ fn up_between_walls() -> (Home, Started) {
 }
 
 #[track_caller]
-fn is_at(home: &Home, arm: &str, goal: &[f64]) {
+pub(super) fn is_at(home: &Home, arm: &str, goal: &[f64]) {
     let is = home.positions(arm);
     assert!(is.iter().zip(goal).all(|(is, goal)| (is - goal).abs() < 0.01), "{is:?} for {goal:?}");
 }
@@ -114,55 +114,6 @@ fn poses_lines_and_seeds() {
     is_at(&home, "arm", &[1.0, -0.3, 0.6, 0.0, 0.8, 0.0]);
     home.dimos("move arm --named near-table --speed 1").with(0);
     is_at(&home, "arm", &saved);
-    home.dimos("world remove post").with(0);
-    passes_waypoints(&home);
-}
-
-/// One motion through waypoints: it stops at each, or passes within `--blend` of it.
-fn passes_waypoints(home: &Home) {
-    home.dimos("move arm --named home --speed 1").with(0);
-    let through = "--through 0.5,-0.3,0.6,0,0.8,0 0.5,-0.1,0.4,0.3,0.8,0 line:0.35,0.05,0.35,3.14,0.2,0 near-table";
-    let planned = |options: &str| {
-        let plan = home.dimos(&format!("plan arm {through} {options} --speed 1 --json")).with(0).json();
-        (plan["summary"]["duration"].as_f64().unwrap(), home.dimos("preview --json").with(0).json())
-    };
-    // Largest joint distance of the closest point to the waypoint [rad], and the speed there [rad/s].
-    let closest = |preview: &Value, waypoint: [f64; 6]| {
-        let points = preview["trajectory"]["points"].as_array().unwrap();
-        let list = |point: &Value, what| -> Vec<f64> {
-            point[what].as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect()
-        };
-        let most = |values: &[f64]| values.iter().fold(0.0_f64, |most, v| most.max(v.abs()));
-        let away = |point: &Value| {
-            let off: Vec<f64> = list(point, "positions").iter().zip(waypoint).map(|(q, w)| q - w).collect();
-            (most(&off), most(&list(point, "velocities")))
-        };
-        points.iter().map(away).min_by(|a, b| a.0.total_cmp(&b.0)).unwrap()
-    };
-    let waypoint = [0.5, -0.1, 0.4, 0.3, 0.8, 0.0];
-    let (slow, exact) = planned("");
-    let (off, speed) = closest(&exact, waypoint);
-    assert!(off < 1e-6 && speed < 1e-6, "{off} rad, {speed} rad/s");
-    let (fast, blended) = planned("--blend 0.03");
-    let (off, speed) = closest(&blended, waypoint);
-    assert!(off > 1e-3 && off < 0.2 && speed > 0.05, "{off} rad, {speed} rad/s");
-    assert!(fast < 0.95 * slow, "{fast} s instead of {slow} s");
-    let tip =
-        |preview: &Value| -> Vec<[f64; 3]> { serde_json::from_value(preview["end_effectors"]["arm"].clone()).unwrap() };
-    let at = exact["trajectory"]["points"].as_array().unwrap().iter().position(|point| {
-        let q: Vec<f64> = serde_json::from_value(point["positions"].clone()).unwrap();
-        q.iter().zip(waypoint).all(|(q, w)| (q - w).abs() < 1e-6)
-    });
-    let place = tip(&exact)[at.unwrap()];
-    let distance = |p: &[f64; 3]| p.iter().zip(place).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
-    let nearest = tip(&blended).iter().map(distance).fold(f64::MAX, f64::min);
-    assert!(nearest < 0.03 + 1e-3, "{nearest} m from the waypoint");
-    let short = "--through 0.2,-0.3,0.6,0,0.8,0 0.2,-0.300000004,0.600000007,0,0.800000009,0 --blend 0.02 --json";
-    let plan = home.dimos(&format!("plan arm {short}")).with(0).json();
-    assert!(plan["summary"]["duration"].as_f64().unwrap() < 2.0, "a short piece takes no time: {plan}");
-    home.dimos(&format!("plan arm {through} 1,2")).with(2).says(&["6 joints, the goal 2 values"]);
-    home.dimos("plan arm --through home 0.1,0.2,0,0,0,9 home").with(1).says(&["waypoint 2: "]);
-    home.dimos("plan arm --through home").with(2);
 }
 
 #[test]
@@ -415,12 +366,7 @@ fn two_arms_move_in_one_plan_and_keep_clear_of_each_other() {
             joints: Some(joints.into()),
             ..PlanGoal::default()
         };
-        Plan {
-            goals: vec![goal("left", left), goal("right", right)],
-            speed: 1.0,
-            seed: 3,
-            ..Plan::default()
-        }
+        Plan { goals: vec![goal("left", left), goal("right", right)], speed: 1.0, seed: 3, ..Plan::default() }
     };
     let turned = |angle| [angle, -0.3, 0.6, 0.0, 0.8, 0.0];
     let mut planned = |plan: Plan| {
