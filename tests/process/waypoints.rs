@@ -120,4 +120,15 @@ fn the_motion_of_a_log_is_repeated_from_the_log_of_the_live_run() {
     std::thread::sleep(std::time::Duration::from_millis(300));
     home.dimos("move arm --path led.mcap --speed 1").with(0).says(&["followed through", "planned, collision-checked"]);
     is_at(&home, "arm", &end);
+    // The log has the pose of the tool centre point that the run reports, at rest.
+    let pose = home.dimos("state --json").with(0).json()["arms"][0]["pose"].take();
+    home.dimos("down").with(0);
+    let log = home.dimos("replay led.mcap --rate 1000 --json --topics /tcp/arm").with(0);
+    let last: Value = serde_json::from_str(log.out.lines().last().unwrap()).unwrap();
+    assert_eq!(last["data"]["header"]["frame_id"], "map");
+    for (axis, index) in [("x", 0), ("y", 1), ("z", 2)] {
+        let (logged, reported) = (&last["data"]["pose"]["position"][axis], &pose["xyz"][index]);
+        let off = logged.as_f64().unwrap() - reported.as_f64().unwrap();
+        assert!(off.abs() < 1e-4, "{axis}: {logged} for {reported}");
+    }
 }

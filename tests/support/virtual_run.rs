@@ -96,6 +96,7 @@ impl VirtualRun {
             frame_id: "coordinator".into(),
             attachments: vec![attachment],
             metadata: BTreeMap::from([("config_version".to_owned(), config.version.to_string())]),
+            tcps: Default::default(),
             wall: WallOffset::of(START.0, START.1),
             min_free: 0,
         };
