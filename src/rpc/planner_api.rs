@@ -272,12 +272,24 @@ pub struct GoalClamped {
 }
 
 /// Parameters of `preview`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Preview {
     /// The plan's number; default: the newest plan that is not `by_number`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<u64>,
+    /// Rate of the points, 0.1–1000 [Hz]: the motion as the arm gets it; default: the points that define it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub hz: Option<f64>,
+}
+
+impl Preview {
+    pub(super) fn valid(&self) -> Result<(), String> {
+        match self.hz.filter(|hz| !(0.1..=1000.0).contains(hz)) {
+            Some(hz) => Err(format!("hz is {hz}, must be within 0.1–1000")),
+            None => Ok(()),
+        }
+    }
 }
 
 /// A plan in full.
@@ -291,6 +303,9 @@ pub struct PreviewReply {
     pub trajectory: Trajectory,
     /// For each robot, the position of its tool centre point at each point of the trajectory: x, y, z [m] in `map`.
     pub end_effectors: BTreeMap<String, Vec<[f64; 3]>>,
+    /// For each robot, its orientation there as a quaternion x, y, z, w in `map`; with `hz` only.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub orientations: BTreeMap<String, Vec<[f64; 4]>>,
     /// For each robot, its tool centre point.
     #[serde(default)]
     pub tcps: BTreeMap<String, TcpReport>,

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use glamx::DAffine3;
 use nalgebra::Isometry3;
 
 use super::planner_port::{PlannerPort, positions_of, robot_index, run_blocking};
@@ -16,12 +17,16 @@ use crate::planning::path::length;
 use crate::planning::pipeline::{Goal, PlanRequest, PlannedMotion};
 use crate::planning::planner_thread::{BeginError, Job, Progress};
 use crate::planning::planning_scene::{PlannedRobot, PlanningScene};
+use crate::robot::kinematics::pose;
 use crate::rpc::api::{self, Moment, PlanSummary, ReleasedPlan};
 use crate::rpc::report::ToolReport;
 use crate::rpc::{Code, RpcError};
+use crate::trajectory::{Cursor, JointTrajectory, Sample, Spline, TrajectoryPoint};
 
 /// Timeout for checking whether a plan is still collision-free; after that it is not executed.
 const REVIEW_LIMIT: Duration = Duration::from_secs(2);
+/// Maximum number of samples of a preview: a reply of a few megabytes.
+const MAX_SAMPLES: f64 = 20_000.0;
 
 impl PlannerPort {
     pub(super) fn begin_plan(&self, plan: &api::Plan, moment: &Moment) -> Result<api::PlanReply, RpcError> {
@@ -81,27 +86,33 @@ impl PlannerPort {
         Ok((index, goal))
     }
 
-    pub(super) fn preview(&self, plan: Option<u64>) -> Result<api::PreviewReply, RpcError> {
-        let (job, found) = found(self, plan)?;
+    pub(super) fn preview(&self, call: &api::Preview) -> Result<api::PreviewReply, RpcError> {
+        let (job, found) = found(self, call.plan)?;
+        let mut trajectory = found.trajectory.clone();
+        if let Some(hz) = call.hz {
+            trajectory.points = samples(&trajectory, hz)?;
+        }
         let setup = self.thread.now();
-        let (mut end_effectors, mut tcps) = (BTreeMap::new(), BTreeMap::new());
+        let (mut end_effectors, mut orientations, mut tcps) = (BTreeMap::new(), BTreeMap::new(), BTreeMap::new());
         let mut first = 0;
         for &index in &found.robots {
             let Some(robot) = setup.robots.get(index) else { continue };
-            let kinematics = &robot.body.kinematics;
-            let mut frames = kinematics.frames();
-            let place = |point: &crate::trajectory::TrajectoryPoint, frames: &mut Vec<_>| {
+            let own = |point: &TrajectoryPoint| {
                 let own = point.positions.get(first..first + robot.joints.len()).unwrap_or_default();
-                kinematics.forward_from(&robot.body.base, own, frames);
-                kinematics.link_frame(robot.tcp(), frames).translation.to_array()
+                robot.tcp_pose(own)
             };
-            let way = found.trajectory.points.iter().map(|point| place(point, &mut frames)).collect();
-            end_effectors.insert(robot.config.name.clone(), way);
-            tcps.insert(robot.config.name.clone(), TcpModel::of(robot).report());
+            let poses: Vec<_> = trajectory.points.iter().map(own).collect();
+            let name = &robot.config.name;
+            end_effectors.insert(name.clone(), poses.iter().map(|pose| pose.translation.to_array()).collect());
+            if call.hz.is_some() {
+                let turn = |at: &DAffine3| <[f64; 4]>::from(pose(at).rotation.coords);
+                orientations.insert(name.clone(), poses.iter().map(turn).collect());
+            }
+            tcps.insert(name.clone(), TcpModel::of(robot).report());
             first += robot.joints.len();
         }
-        let summary = summary(&job, &found);
-        Ok(api::PreviewReply { plan: job.id, summary, trajectory: api_trajectory(&found), end_effectors, tcps })
+        let (plan, summary, trajectory) = (job.id, summary(&job, &found), api_trajectory(trajectory));
+        Ok(api::PreviewReply { plan, summary, trajectory, end_effectors, orientations, tcps })
     }
 
     /// Returns a plan for the coordinator to execute, if it is still collision-free.
@@ -116,7 +127,7 @@ impl PlannerPort {
         let version = self.thread.version();
         self.still_free(&job, &found, moment).await?;
         self.remember(job.id, found.clone(), version);
-        Ok(ReleasedPlan { plan: job.id, trajectory: api_trajectory(&found), task })
+        Ok(ReleasedPlan { plan: job.id, trajectory: api_trajectory(found.trajectory.clone()), task })
     }
 
     /// Checks a plan again: the world may have changed, or a robot that it does not move may have moved.
@@ -256,16 +267,35 @@ fn clamped((joint, requested, used): &(String, f64, f64)) -> api::GoalClamped {
     api::GoalClamped { joint: joint.clone(), requested: *requested, used: *used }
 }
 
-/// Converts a trajectory to its rpc type.
-fn api_trajectory(found: &PlannedMotion) -> api::Trajectory {
-    let point = |point: &crate::trajectory::TrajectoryPoint| api::Point {
-        time_from_start: point.time_from_start,
-        positions: point.positions.clone(),
-        velocities: Some(point.velocities.clone()).filter(|v| !v.is_empty()),
-        accelerations: Some(point.accelerations.clone()).filter(|a| !a.is_empty()),
-    };
-    api::Trajectory {
-        joint_names: found.trajectory.joint_names.clone(),
-        points: found.trajectory.points.iter().map(point).collect(),
+/// Samples a trajectory at a rate [Hz], its end included.
+fn samples(trajectory: &JointTrajectory, hz: f64) -> Result<Vec<TrajectoryPoint>, RpcError> {
+    let spline = Spline::new(trajectory).map_err(|e| RpcError::new(Code::InvalidTrajectory, e.to_string()))?;
+    let count = (spline.duration() * hz).ceil();
+    if count > MAX_SAMPLES {
+        let what = format!("{:.1} s at {hz} Hz are {count} samples (limit {MAX_SAMPLES})", spline.duration());
+        return Err(RpcError::new(Code::InvalidParams, what).hint("ask for a lower rate"));
     }
+    let (mut cursor, mut at) = (Cursor::default(), vec![Sample::default(); spline.joints()]);
+    let mut point = |time_from_start: f64| {
+        spline.sample(time_from_start, &mut cursor, &mut at);
+        let list = |value: fn(&Sample) -> f64| at.iter().map(value).collect();
+        TrajectoryPoint {
+            time_from_start,
+            positions: list(|s| s.position),
+            velocities: list(|s| s.velocity),
+            accelerations: list(|s| s.acceleration),
+        }
+    };
+    Ok((0..=count as u32).map(|k| point((f64::from(k) / hz).min(spline.duration()))).collect())
+}
+
+/// Converts a trajectory to its rpc type.
+fn api_trajectory(trajectory: JointTrajectory) -> api::Trajectory {
+    let point = |point: TrajectoryPoint| api::Point {
+        time_from_start: point.time_from_start,
+        positions: point.positions,
+        velocities: Some(point.velocities).filter(|v| !v.is_empty()),
+        accelerations: Some(point.accelerations).filter(|a| !a.is_empty()),
+    };
+    api::Trajectory { joint_names: trajectory.joint_names, points: trajectory.points.into_iter().map(point).collect() }
 }

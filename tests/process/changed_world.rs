@@ -108,7 +108,7 @@ impl Cell {
 
     /// The least distance from the objects on a plan's trajectory, for each of its points [rad, m].
     fn distances(&self, plan: u64, objects: &[WorldObject]) -> Vec<(Vec<f64>, f64)> {
-        let preview = self.run.call(Preview { plan: Some(plan) }).unwrap();
+        let preview = self.run.call(Preview { plan: Some(plan), hz: None }).unwrap();
         let ends = preview.trajectory.points.windows(2);
         let between = ends.flat_map(|pair| {
             let mix =

@@ -55,6 +55,7 @@ fn a_plan_is_shown_then_carried_out() {
     is_at(&home, "arm", &HOME);
     let shown = home.dimos("preview --out plan.json").with(0);
     assert!(shown.out.contains("arm_joint6") && shown.out.contains("arm: flange in map x"), "{}", shown.out);
+    sampled(&home, &home.dimos("preview --json").with(0).json());
     home.dimos("execute").with(0).says(&["planned, collision-checked"]);
     is_at(&home, "arm", &[0.3, -0.2, 0.5, 0.0, 0.4, 0.0]);
     // The file is a trajectory like any other, from where the plan began.
@@ -73,6 +74,31 @@ fn a_plan_is_shown_then_carried_out() {
     home.dimos("move arm --named home").with(0);
     home.dimos("move arm --named home").with(0);
     is_at(&home, "arm", &HOME);
+}
+
+/// `preview --hz`: the plan as the arm gets it, as CSV and as JSON.
+fn sampled(home: &Home, plan: &Value) {
+    let text = home.dimos("preview --hz 50").with(0).out;
+    let mut lines = text.lines();
+    let names: Vec<&str> = lines.next().unwrap().split(',').collect();
+    assert_eq!((names[0], names[1], names[7], names[13]), ("time", "arm_joint1", "arm_joint1_vel", "arm.x"));
+    let rows: Vec<Vec<f64>> = lines.map(|line| line.split(',').map(|cell| cell.parse().unwrap()).collect()).collect();
+    assert!(rows.iter().all(|row| row.len() == 1 + 6 + 6 + 7), "{names:?}");
+    let duration = plan["summary"]["duration"].as_f64().unwrap();
+    assert_eq!(rows.len(), (duration * 50.0).ceil() as usize + 1);
+    // Steps are what the velocities say, and the ends are those of the plan.
+    for pair in rows.windows(2).take(rows.len() - 2) {
+        let (step, mean) = (pair[1][1] - pair[0][1], 0.5 * (pair[0][7] + pair[1][7]) * 0.02);
+        assert!((pair[1][0] - pair[0][0] - 0.02).abs() < 2e-6 && (step - mean).abs() < 1e-4, "{pair:?}");
+    }
+    let last = rows.last().unwrap();
+    assert!((last[1] - 0.3).abs() < 1e-5 && last[7].abs() < 1e-5 && (last[0] - duration).abs() < 1e-5, "{last:?}");
+    assert!(end(plan).iter().zip(&last[13..16]).all(|(a, b)| (a - b).abs() < 1e-5), "{last:?}");
+    let json = home.dimos("preview --hz 50 --json").with(0).json();
+    assert_eq!(json["trajectory"]["points"].as_array().unwrap().len(), rows.len());
+    let turn: Vec<f64> = serde_json::from_value(json["orientations"]["arm"][0].clone()).unwrap();
+    assert!((turn.iter().map(|q| q * q).sum::<f64>() - 1.0).abs() < 1e-9, "{turn:?}");
+    home.dimos("preview --hz 0").with(2).says(&["within 0.1–1000 Hz"]);
 }
 
 #[test]
