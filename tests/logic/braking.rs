@@ -148,7 +148,8 @@ fn motion(setup: &PlanningScene, checker: &mut ExactChecker, random: &mut Random
         speed,
         seed,
         through: Vec::new(),
-        blend: 0.0, by_number: false,
+        blend: 0.0,
+        by_number: false,
     };
     let stop = Stop::new(Some(std::time::Instant::now() + Duration::from_secs(2)), None);
     solve(setup, &setup.world, &request, &stop).ok().filter(|found| found.trajectory.duration() > 0.5)
