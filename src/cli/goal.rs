@@ -46,11 +46,13 @@ pub struct Goal {
     #[arg(long, value_name = "NAME", conflicts_with = "tcp")]
     pub named: Option<String>,
     /// Goal of one of several arms in a common motion (repeatable): left=0.1,-0.3,0.6,0,0.8,0 or left=named:home or
-    /// left=pose:x,y,z or, with roll, pitch, yaw or a quaternion, left=pose:x,y,z,r,p,y or left=pose:x,y,z,qx,qy,qz,qw
+    /// left=pose:x,y,z or, with roll, pitch, yaw or a quaternion, left=pose:x,y,z,r,p,y or left=pose:x,y,z,qx,qy,qz,qw;
+    /// left=by:x,y,z moves by a distance; @FRAME after a pose gives its frame: left=by:0,0,0.05@tool
     #[arg(long = "goal", value_name = "ARM=GOAL", value_parser = arm_goal, conflicts_with_all = ["joints", "tcp", "named"])]
     pub several: Vec<PlanGoal>,
     /// One motion through these waypoints; the last is the goal. Each is a named pose, joints as 0.1,-0.3,0.6,0,0.8,0,
-    /// or pose:x,y,z,r,p,y (also with x,y,z or a quaternion); line:… is reached on a straight line
+    /// or pose:x,y,z,r,p,y (also with x,y,z or a quaternion, and @FRAME); line:… is reached on a straight
+    /// line
     #[arg(long, value_name = "WAYPOINT", num_args = 2.., value_parser = waypoint, allow_negative_numbers = true, conflicts_with_all = ["joints", "tcp", "named", "several"])]
     pub through: Vec<PlanGoal>,
     /// Follow the path of a motion that was led or recorded: .csv or .json as for `execute`, or a log (.mcap). Its times
@@ -103,7 +105,8 @@ fn arm_goal(text: &str) -> std::result::Result<PlanGoal, String> {
         }
         None => planned.joints = Some(numbers(goal)?),
         Some(("named", name)) => planned.named = Some(name.to_owned()),
-        Some(("pose", list)) => planned.pose = Some(pose(list)?),
+        Some(("pose", list)) => (planned.pose, planned.frame) = pose_in_frame(list)?,
+        Some(("by", list)) => (planned.by, planned.frame) = pose_in_frame(list)?,
         Some(_) => return Err(form.into()),
     }
     Ok(planned)
@@ -113,8 +116,10 @@ fn arm_goal(text: &str) -> std::result::Result<PlanGoal, String> {
 fn waypoint(text: &str) -> std::result::Result<PlanGoal, String> {
     let mut planned = PlanGoal::default();
     match text.split_once(':') {
-        Some(("pose", list)) => planned.pose = Some(pose(list)?),
-        Some(("line", list)) => (planned.pose, planned.linear) = (Some(pose(list)?), true),
+        Some((kind @ ("pose" | "line"), list)) => {
+            (planned.pose, planned.frame) = pose_in_frame(list)?;
+            planned.linear = kind == "line";
+        }
         Some(("named", name)) => planned.named = Some(name.to_owned()),
         Some(_) => return Err("must be a name, joints as 0.1,-0.3,…, pose:x,y,z,… or line:x,y,z,…".into()),
         None if text.contains(',') => planned.joints = Some(numbers(text)?),
@@ -125,6 +130,15 @@ fn waypoint(text: &str) -> std::result::Result<PlanGoal, String> {
 
 fn numbers(list: &str) -> std::result::Result<Vec<f64>, String> {
     list.split(',').map(|n| finite(n.trim()).map_err(|e| format!("{n:?}: {e}"))).collect()
+}
+
+/// Parses a pose and its frame, as in `x,y,z@cup`.
+fn pose_in_frame(list: &str) -> std::result::Result<(Option<PoseSpec>, Option<String>), String> {
+    match list.split_once('@') {
+        Some((_, "")) => Err("@ needs a frame: map, base, tool, or an object of the world".into()),
+        Some((list, frame)) => Ok((Some(pose(list)?), Some(frame.to_owned()))),
+        None => Ok((Some(pose(list)?), None)),
+    }
 }
 
 fn pose(list: &str) -> std::result::Result<PoseSpec, String> {

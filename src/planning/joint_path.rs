@@ -84,8 +84,8 @@ pub(super) fn legs_along(
             checker.contacts(&q).into_iter().next()
         });
         let what = contact.map_or_else(|| "too close to something".to_owned(), |contact| contact.to_string());
-        let (to, of, padding) = (i + 2, path.points.len(), checker.padding() * 1e3);
-        let what = format!("the path is not free at its waypoint {to} of {of}: {what} (padding {padding:.1} mm)");
+        let (to, of, padding) = (i + 2, path.points.len(), checker.padding());
+        let what = format!("the path is not free at its waypoint {to} of {of}: {what} (padding {padding:.4} m)");
         return Err(PlanFailure::new(what).hint("a path is followed as it is: correct the world, or lead it elsewhere"));
     }
     let way = Leg { path: path.points, fraction: None, clamped: Vec::new(), deviation: path.tolerance };

@@ -460,11 +460,24 @@ fn several_arms_are_sent_together_from_the_command_line() {
     // Poses, each in its own way, and the ways to type it wrong.
     home.dimos("plan --goal left=pose:0.35,0.4,0.3,3.14,0,0 --goal right=pose:0.35,-0.4,0.3").with(0);
     home.dimos("plan --goal left=pose:0.35,0.4,0.3,1,0,0,0").with(0);
+    // Each in a frame of its own: back by 4 cm along the tool, and 5 cm up in map.
+    let before = home.dimos("state --json").with(0).json();
+    home.dimos("plan --goal left=by:0,0,-0.04@tool --goal right=by:0,0,0.05").with(0);
+    let preview = home.dimos("preview --json").with(0).json();
+    for (index, arm, distance) in [(0, "left", 0.04), (1, "right", 0.05)] {
+        let start = &before["arms"][index]["pose"]["xyz"];
+        let goal = preview["end_effectors"][arm].as_array().unwrap().last().unwrap();
+        let moved =
+            (0..3).map(|k| (goal[k].as_f64().unwrap() - start[k].as_f64().unwrap()).powi(2)).sum::<f64>().sqrt();
+        assert!((moved - distance).abs() < 1e-3, "{arm} moves by {moved} m");
+    }
     for (arguments, words) in [
         ("plan --goal left", "must be ARM=GOAL"),
         ("plan --goal left=home", "not a number"),
         ("plan --goal left=pose:1,2", "a pose has 3, 6 or 7 numbers"),
         ("plan --goal left=pos:1,2,3", "must be ARM=GOAL"),
+        ("plan --goal left=by:0,0,0.1@", "@ needs a frame"),
+        ("plan --goal left=by:0,0,0.1@cup", "cup"),
         ("plan left --goal right=named:home", "cannot be used with"),
         ("move --goal left=named:home --direct", "cannot be used with"),
         ("plan --goal left=named:home --named home", "cannot be used with"),
