@@ -55,8 +55,8 @@ pub struct Goal {
     /// line
     #[arg(long, value_name = "WAYPOINT", num_args = 2.., value_parser = waypoint, allow_negative_numbers = true, conflicts_with_all = ["joints", "tcp", "named", "several"])]
     pub through: Vec<PlanGoal>,
-    /// Follow the path of a motion that was led or recorded: .csv or .json as for `execute`, or a log (.mcap). Its times
-    /// do not count; the way to its first point is planned
+    /// Follow the path of a motion that was led or recorded: .csv or .json as for `execute`, or a log (.mcap). Its
+    /// times do not count; the way to its first point is planned
     #[arg(long, value_name = "FILE", conflicts_with_all = ["joints", "tcp", "named", "several", "through"])]
     pub path: Option<PathBuf>,
     /// How far the motion may pass from the recorded path, per joint [rad]

@@ -52,8 +52,8 @@ pub fn run(args: &Args) -> Result {
     Ok(Exit::Ok)
 }
 
-/// Returns the motion as CSV: time [s], positions [rad] and velocities [rad/s] of the joints, and the tool centre points
-/// in `map` [m, quaternion]. `move --path` reads its joints.
+/// Returns the motion as CSV: time [s], positions [rad] and velocities [rad/s] of the joints, and the tool centre
+/// points in `map` [m, quaternion]. `move --path` reads its joints.
 fn csv(reply: &PreviewReply) -> String {
     let joints = &reply.trajectory.joint_names;
     let robots: Vec<&String> = reply.end_effectors.keys().collect();

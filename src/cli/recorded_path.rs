@@ -50,7 +50,7 @@ pub fn read(file: &Path, joints: &[String], tolerance: f64) -> Result<JointPath>
     // Half of the tolerance is for the straight lines, half for the blends between them.
     let points = thin(&rows, tolerance / 2.0);
     let (path, count) = (file.display(), points.len());
-    if count > MAX_PATH || count < 2 {
+    if !(2..=MAX_PATH).contains(&count) {
         let what = format!("{path}: {} positions make {count} waypoints (2 to {MAX_PATH})", rows.len());
         return Err(Failure::usage(what).hint("a larger --tolerance makes fewer"));
     }

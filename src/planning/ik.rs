@@ -215,8 +215,8 @@ impl<'a> Ik<'a> {
         }
     }
 
-    /// Descends from `q`; a solution is shifted by whole turns to the positions nearest to `near`. Returns the remaining
-    /// error.
+    /// Descends from `q`; a solution is shifted by whole turns to the positions nearest to `near`. Returns the
+    /// remaining error.
     fn reach(&mut self, target: &DAffine3, near: &[f64], settings: &IkSettings) -> PoseError {
         let error = self.descend(target, settings);
         if settings_met(&error, settings) {

@@ -95,8 +95,8 @@ impl LogReader {
         self.records.rewind()
     }
 
-    /// Returns the next message; `None` at the end of a closed log, and at the newest chunk of a live one. Returns `ReplayError::Cut` once, where a truncated
-    /// or damaged log ends.
+    /// Returns the next message; `None` at the end of a closed log, and at the newest chunk of a live one. Returns
+    /// `ReplayError::Cut` once, where a truncated or damaged log ends.
     pub fn next_entry(&mut self) -> Result<Option<Entry>, ReplayError> {
         loop {
             if let Some(entry) = self.ready.pop_front() {

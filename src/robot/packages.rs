@@ -135,8 +135,8 @@ fn name_in_manifest(folder: &Path) -> Option<String> {
 }
 
 /// Returns the packages below some folders by the names in their `package.xml`, as ROS 1 searches them: a package
-/// contains no others, a folder with `CATKIN_IGNORE` none at all, and of two with the same name the first one counts. Also returns whether all were searched: at most `limit`
-/// folders are.
+/// contains no others, a folder with `CATKIN_IGNORE` none at all, and of two with the same name the first one counts.
+/// Also returns whether all were searched: at most `limit` folders are.
 fn crawl(folders: &[PathBuf], limit: usize) -> (BTreeMap<String, PathBuf>, bool) {
     let (mut found, mut visited) = (BTreeMap::new(), 0);
     for folder in folders {

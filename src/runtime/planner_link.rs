@@ -163,7 +163,8 @@ impl Service {
         matches!(cancelled, Ok(Reply::Cancel(reply)) if reply.planning)
     }
 
-    /// Returns a plan's number, by default that of the one to execute without a number, and the coordinator's joints that it moves.
+    /// Returns a plan's number, by default that of the one to execute without a number, and the coordinator's joints
+    /// that it moves.
     pub(super) async fn plan_and_its_joints(&self, plan: Option<u64>) -> Result<(u64, Vec<String>), RpcError> {
         let planner = self.planner()?;
         let answer = |call| planner.answer(call, Moment::default(), QUERY_TIMEOUT);
