@@ -41,27 +41,6 @@ def motions_go_around(robot):
     assert "post" not in [thing["name"] for thing in robot.world_list()]
 
 
-def waypoints_and_distances(robot):
-    robot.move("arm", named="home", speed=1.0)
-    aside = Pose([0.35, 0.05, 0.35], rpy=[3.14, 0.2, 0])
-    way = [[0.5, -0.1, 0.4, 0.3, 0.8, 0], Goal(pose=aside, linear=True), "home"]
-    slow, fast = robot.plan("arm", through=way, speed=1.0), robot.plan("arm", through=way, blend=0.03, speed=1.0)
-    assert fast.duration < slow.duration, (fast, slow)
-    samples = robot.preview(hz=50)
-    assert samples["plan"] == fast.number and len(samples["trajectory"]["points"]) > 50 * fast.duration
-    # The plan of a move is its own: `execute` takes that of `plan`.
-    robot.move("arm", through=way, speed=1.0)
-    assert is_at(robot, HOME) and robot.preview()["plan"] == fast.number
-    before = robot.state("arm")
-    robot.move("arm", by=Pose([0, 0, 0.05]), frame="map", linear=True)
-    after = robot.state("arm")
-    assert near([b - a for a, b in zip(before.xyz, after.xyz)], [0, 0, 0.05], 1e-3), (before, after)
-    robot.move("arm", pose=Pose([0, 0, -0.05]), frame="tool")
-    refused(dimos.Refused, "INVALID_PARAMS", lambda: robot.move("arm", HOME, through=way))
-    refused(dimos.Refused, "INVALID_PARAMS", lambda: robot.move({"arm": Goal(joints=HOME)}, through=way))
-    refused(dimos.Refused, "INVALID_PARAMS", lambda: robot.move("arm", by=Pose([0, 0, 0.1]), named="home"))
-
-
 def poses_and_several_goals(robot):
     pose = Pose([0.35, 0.1, 0.3], rpy=[3.14, 0, 0])
     robot.move("arm", pose=pose, speed=1.0)
@@ -98,7 +77,6 @@ def a_planned_move_ends_the_streams_of_its_client(robot):
 with Client.connect() as robot:
     a_motion_that_is_not_planned_is_refused(robot)
     motions_go_around(robot)
-    waypoints_and_distances(robot)
     poses_and_several_goals(robot)
     carries_an_object(robot)
     a_planned_move_ends_the_streams_of_its_client(robot)
