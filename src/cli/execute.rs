@@ -1,4 +1,4 @@
-//! `dimos execute`: executes the newest plan, or a trajectory from a file.
+//! `dimos execute`: executes the newest plan of `dimos plan`, or a trajectory from a file.
 
 use std::path::PathBuf;
 
@@ -15,7 +15,7 @@ JSON: {\"joint_names\":[\"arm_joint1\"],\"points\":[{\"time_from_start\":0,\"pos
 CSV:  a header `time,arm_joint1,…` and optionally `arm_joint1_vel,…`; then one point per line. s, rad, rad/s.
 The first point must be the arm's position.")]
 pub struct Args {
-    /// Trajectory file, .json or .csv; default: the newest plan
+    /// Trajectory file, .json or .csv; default: the newest plan of `dimos plan`
     pub file: Option<PathBuf>,
     /// Execute the plan with this number
     #[arg(long, value_name = "N", conflicts_with = "file")]

@@ -1,5 +1,6 @@
 //! Goals of motions as typed on the command line, and planning.
 
+use std::path::PathBuf;
 use std::thread::sleep;
 use std::time::Duration;
 
@@ -9,7 +10,10 @@ use super::arguments::{finite, speed};
 use super::exit::{Exit, Failure, Result};
 use super::follow::Signals;
 use super::output::{self, fixed};
-use crate::rpc::api::{Cancel, DEFAULT_SPEED, Plan, PlanGoal, PlanSummary, Planner, Planning, PoseSpec};
+use super::recorded_path;
+use crate::rpc::api::{
+    Cancel, DEFAULT_SPEED, JointPath, PATH_TOLERANCE, Plan, PlanGoal, PlanSummary, Planner, Planning, PoseSpec,
+};
 use crate::rpc::client::{Client, ClientError};
 use crate::rpc::{Code, RpcError};
 
@@ -42,13 +46,22 @@ pub struct Goal {
     #[arg(long, value_name = "NAME", conflicts_with = "tcp")]
     pub named: Option<String>,
     /// Goal of one of several arms in a common motion (repeatable): left=0.1,-0.3,0.6,0,0.8,0 or left=named:home or
-    /// left=pose:x,y,z or, with roll, pitch, yaw or a quaternion, left=pose:x,y,z,r,p,y or left=pose:x,y,z,qx,qy,qz,qw
+    /// left=pose:x,y,z or, with roll, pitch, yaw or a quaternion, left=pose:x,y,z,r,p,y or left=pose:x,y,z,qx,qy,qz,qw;
+    /// left=by:x,y,z moves by a distance; @FRAME after a pose gives its frame: left=by:0,0,0.05@tool
     #[arg(long = "goal", value_name = "ARM=GOAL", value_parser = arm_goal, conflicts_with_all = ["joints", "tcp", "named"])]
     pub several: Vec<PlanGoal>,
     /// One motion through these waypoints; the last is the goal. Each is a named pose, joints as 0.1,-0.3,0.6,0,0.8,0,
-    /// or pose:x,y,z,r,p,y (also with x,y,z or a quaternion); line:… is reached on a straight line
+    /// or pose:x,y,z,r,p,y (also with x,y,z or a quaternion, and @FRAME); line:… is reached on a straight
+    /// line
     #[arg(long, value_name = "WAYPOINT", num_args = 2.., value_parser = waypoint, allow_negative_numbers = true, conflicts_with_all = ["joints", "tcp", "named", "several"])]
     pub through: Vec<PlanGoal>,
+    /// Follow the path of a motion that was led or recorded: .csv or .json as for `execute`, or a log (.mcap). Its
+    /// times do not count; the way to its first point is planned
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["joints", "tcp", "named", "several", "through"])]
+    pub path: Option<PathBuf>,
+    /// How far the motion may pass from the recorded path, per joint [rad]
+    #[arg(long, value_name = "ANGLE", default_value_t = PATH_TOLERANCE, value_parser = tolerance, requires = "path")]
+    pub tolerance: f64,
     /// How far away the tool centre point may pass the waypoints [m]; 0: it stops at each
     #[arg(long, value_name = "DISTANCE", default_value_t = 0.0, value_parser = finite, requires = "through")]
     pub blend: f64,
@@ -64,6 +77,12 @@ fn position(text: &str) -> std::result::Result<f64, String> {
         }
         _ => wrong,
     })
+}
+
+/// Parses the tolerance of a path.
+fn tolerance(text: &str) -> std::result::Result<f64, String> {
+    let tolerance = finite(text)?;
+    if (1e-4..=0.1).contains(&tolerance) { Ok(tolerance) } else { Err("must be within 0.0001–0.1 rad".into()) }
 }
 
 /// Parses a coordinate; a list with commas gets a hint.
@@ -86,7 +105,8 @@ fn arm_goal(text: &str) -> std::result::Result<PlanGoal, String> {
         }
         None => planned.joints = Some(numbers(goal)?),
         Some(("named", name)) => planned.named = Some(name.to_owned()),
-        Some(("pose", list)) => planned.pose = Some(pose(list)?),
+        Some(("pose", list)) => (planned.pose, planned.frame) = pose_in_frame(list)?,
+        Some(("by", list)) => (planned.by, planned.frame) = pose_in_frame(list)?,
         Some(_) => return Err(form.into()),
     }
     Ok(planned)
@@ -96,8 +116,10 @@ fn arm_goal(text: &str) -> std::result::Result<PlanGoal, String> {
 fn waypoint(text: &str) -> std::result::Result<PlanGoal, String> {
     let mut planned = PlanGoal::default();
     match text.split_once(':') {
-        Some(("pose", list)) => planned.pose = Some(pose(list)?),
-        Some(("line", list)) => (planned.pose, planned.linear) = (Some(pose(list)?), true),
+        Some((kind @ ("pose" | "line"), list)) => {
+            (planned.pose, planned.frame) = pose_in_frame(list)?;
+            planned.linear = kind == "line";
+        }
         Some(("named", name)) => planned.named = Some(name.to_owned()),
         Some(_) => return Err("must be a name, joints as 0.1,-0.3,…, pose:x,y,z,… or line:x,y,z,…".into()),
         None if text.contains(',') => planned.joints = Some(numbers(text)?),
@@ -108,6 +130,15 @@ fn waypoint(text: &str) -> std::result::Result<PlanGoal, String> {
 
 fn numbers(list: &str) -> std::result::Result<Vec<f64>, String> {
     list.split(',').map(|n| finite(n.trim()).map_err(|e| format!("{n:?}: {e}"))).collect()
+}
+
+/// Parses a pose and its frame, as in `x,y,z@cup`.
+fn pose_in_frame(list: &str) -> std::result::Result<(Option<PoseSpec>, Option<String>), String> {
+    match list.split_once('@') {
+        Some((_, "")) => Err("@ needs a frame: map, base, tool, or an object of the world".into()),
+        Some((list, frame)) => Ok((Some(pose(list)?), Some(frame.to_owned()))),
+        None => Ok((Some(pose(list)?), None)),
+    }
 }
 
 fn pose(list: &str) -> std::result::Result<PoseSpec, String> {
@@ -164,7 +195,7 @@ impl Goal {
     }
 
     /// Returns the goals for the planner; `robot` is the robot of positions, pose and name.
-    fn of(&self, robot: Option<&str>, search: &Search) -> Vec<PlanGoal> {
+    fn of(&self, robot: Option<&str>, path: Option<JointPath>, search: &Search) -> Vec<PlanGoal> {
         let Some(robot) = robot else { return self.several.clone() };
         if let Some(last) = self.through.last() {
             return vec![PlanGoal { robot: robot.to_owned(), ..last.clone() }];
@@ -176,6 +207,7 @@ impl Goal {
             by: self.spec(&self.by),
             frame: self.frame.clone(),
             named: self.named.clone(),
+            path,
             linear: search.linear,
         }]
     }
@@ -183,17 +215,26 @@ impl Goal {
 
 impl Goal {
     /// Returns a planning request.
-    pub fn plan(&self, robot: Option<&str>, search: &Search) -> Plan {
+    pub fn plan(&self, client: &mut Client, robot: Option<&str>, search: &Search) -> Result<Plan> {
+        let path = match (&self.path, robot) {
+            (Some(file), Some(name)) => {
+                let robots = client.call(Planner {})?.robots.into_iter().map(|robot| (robot.name, robot.joints));
+                let joints = recorded_path::joints_of(name, Code::UnknownRobot, robots.collect())?;
+                Some(recorded_path::read(file, &joints, self.tolerance)?)
+            }
+            _ => None,
+        };
         let before = self.through.split_last().map(|(_, before)| before).unwrap_or_default();
         let own = |goal: &PlanGoal| PlanGoal { robot: robot.unwrap_or_default().to_owned(), ..goal.clone() };
-        Plan {
-            goals: self.of(robot, search),
+        Ok(Plan {
+            goals: self.of(robot, path, search),
             speed: search.speed,
             seed: search.seed,
             timeout: search.timeout.map(|t| t.as_secs_f64()),
             through: before.iter().map(own).collect(),
             blend: self.blend,
-        }
+            by_number: false,
+        })
     }
 }
 

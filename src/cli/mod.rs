@@ -31,6 +31,7 @@ pub mod plan;
 pub mod pose;
 pub mod preview;
 pub mod proxy;
+mod recorded_path;
 pub mod replay;
 pub mod run;
 pub mod run_record;

@@ -5,8 +5,9 @@ use super::arguments::Target;
 use super::exit::{Exit, Failure, Result};
 use super::follow::{Signals, follow, follow_until};
 use super::goal::{Goal, Search, has_planner, plan, show};
-use super::output;
-use crate::rpc::api::{Cancel, ExecutePlan, Move, MoveNative, Poses, State};
+use super::{output, recorded_path};
+use crate::rpc::Code;
+use crate::rpc::api::{Cancel, ExecutePlan, Move, MoveNative, MoveReply, Plan, Poses, State};
 use crate::rpc::client::Client;
 
 /// Arguments of `move`.
@@ -16,6 +17,7 @@ use crate::rpc::client::Client;
 dimos move ARM Q… [OPTIONS]
        dimos move ARM --named NAME [OPTIONS]
        dimos move ARM --pose X Y Z [--rpy R P Y | --quat X Y Z W] [OPTIONS]
+       dimos move ARM --path FILE [--tolerance ANGLE] [OPTIONS]
        dimos move --goal ARM=GOAL… [OPTIONS]",
     after_help = "\
 With a planner in the run the motion is planned and collision-free; without one it is direct, not collision-checked, and \
@@ -41,10 +43,10 @@ pub struct Args {
     pub direct: bool,
     /// Let the arm's own controller move to --pose: not collision-checked; with a planner in the run only with
     /// --direct. --frame controller gives the pose in the controller's own frame
-    #[arg(long, requires = "pose", conflicts_with_all = ["joints", "named", "by", "several", "through", "linear", "replan"])]
+    #[arg(long, requires = "pose", conflicts_with_all = ["joints", "named", "by", "several", "through", "path", "linear", "replan"])]
     pub native: bool,
     /// If an obstacle blocks the motion, stop, plan again and continue
-    #[arg(long, conflicts_with_all = ["direct", "no_wait"])]
+    #[arg(long, conflicts_with_all = ["direct", "no_wait", "path"])]
     pub replan: bool,
     /// Return when the motion has begun
     #[arg(long)]
@@ -102,7 +104,8 @@ fn move_native(args: &Args, client: &mut Client, signals: &Signals) -> Result {
 type Begun = (u64, String, serde_json::Value);
 
 fn plan_and_begin(args: &Args, client: &mut Client, signals: &Signals) -> Result<Begun> {
-    let request = args.goal.plan(args.arm.as_deref(), &args.search);
+    // The plan of a move is this move's own: `dimos execute` passes it over.
+    let request = Plan { by_number: true, ..args.goal.plan(client, args.arm.as_deref(), &args.search)? };
     let planned = plan(client, request, signals)?;
     if !args.target_run.json {
         show(&planned);
@@ -115,6 +118,15 @@ fn plan_and_begin(args: &Args, client: &mut Client, signals: &Signals) -> Result
 }
 
 fn begin_direct(args: &Args, client: &mut Client, signals: &Signals) -> Result<Begun> {
+    if let (Some(arm), Some(file)) = (&args.arm, &args.goal.path) {
+        let arms = client.call(State {})?.arms.into_iter();
+        let arms = arms.map(|a| (a.hardware_id, a.joints.into_iter().map(|joint| joint.name).collect()));
+        let joints = recorded_path::joints_of(arm, Code::UnknownArm, arms.collect())?;
+        let path = Some(recorded_path::read(file, &joints, args.goal.tolerance)?);
+        signals.check()?;
+        let begun = client.call(Move { direct: args.direct, path, ..Move::new(arm, [], args.search.speed) })?;
+        return Ok(direct(begun, "direct to its first point and along the path"));
+    }
     let target = match (&args.arm, args.goal.joints(), &args.goal.named) {
         (Some(arm), Some(target), _) => Some((arm, target.to_vec())),
         (Some(arm), None, Some(name)) => Some((arm, saved(client, arm, name)?)),
@@ -130,13 +142,15 @@ fn begin_direct(args: &Args, client: &mut Client, signals: &Signals) -> Result<B
     };
     signals.check()?;
     let request = Move { direct: args.direct, ..Move::new(arm.clone(), target, args.search.speed) };
-    let begun = client.call(request)?;
-    output::note(format_args!(
-        "motion {} on {}: {:.2} s, direct, not collision-checked",
-        begun.motion, begun.task, begun.duration
-    ));
+    Ok(direct(client.call(request)?, "direct"))
+}
+
+/// Prints what a direct motion does.
+fn direct(begun: MoveReply, how: &str) -> Begun {
+    let MoveReply { motion, task, duration, .. } = &begun;
+    output::note(format_args!("motion {motion} on {task}: {duration:.2} s, {how}, not collision-checked"));
     let reply = serde_json::to_value(&begun).unwrap_or_default();
-    Ok((begun.motion, begun.task, reply))
+    (begun.motion, begun.task, reply)
 }
 
 /// Returns the positions of an arm's joints in a saved pose [rad].

@@ -52,6 +52,11 @@ pub fn finish() -> Result<(), Failure> {
     }
 }
 
+/// Prints what was done: a sentence, or JSON.
+pub fn done(what: impl Display, data: serde_json::Value, as_json: bool) {
+    if as_json { json(&data) } else { line(what) }
+}
+
 /// Prints a value to stdout as one line of JSON.
 pub fn json(value: &impl Serialize) {
     // The types printed have string keys only, so encoding cannot fail.

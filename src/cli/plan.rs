@@ -42,7 +42,7 @@ pub struct Args {
 pub fn run(args: &Args) -> Result {
     let mut client = args.target_run.connect()?;
     let signals = Signals::watch();
-    let request = args.goal.plan(args.robot.as_deref(), &args.search);
+    let request = args.goal.plan(&mut client, args.robot.as_deref(), &args.search)?;
     let planned = plan(&mut client, request, &signals)?;
     if args.target_run.json {
         output::json(&serde_json::json!({

@@ -61,11 +61,8 @@ pub fn run(args: &Args) -> Result {
         Command::List(args) => list(args),
         Command::Remove(args) => {
             args.target_run.connect()?.call(PoseRemove { name: args.name.clone() })?;
-            if args.target_run.json {
-                output::json(&serde_json::json!({"removed": args.name}));
-            } else {
-                output::line(format_args!("{} removed", args.name));
-            }
+            let removed = serde_json::json!({"removed": args.name});
+            output::done(format_args!("{} removed", args.name), removed, args.target_run.json);
             Ok(Exit::Ok)
         }
     }

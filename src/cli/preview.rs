@@ -1,10 +1,10 @@
-//! `dimos preview`: a plan as a table of samples, or as a trajectory file.
+//! `dimos preview`: a plan as a table of samples, as a trajectory file, or sampled for a plot.
 
 use std::path::PathBuf;
 
 use anyhow::Context;
 
-use super::arguments::Target;
+use super::arguments::{Target, finite};
 use super::exit::{Exit, Result};
 use super::goal::{Planned, show};
 use super::output::{self, Table, fixed, number};
@@ -17,8 +17,11 @@ const COLUMNS: usize = 8;
 /// Arguments of `preview`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// Number of the plan; default: the newest
+    /// Number of the plan; default: the newest of `dimos plan`
     pub plan: Option<u64>,
+    /// Print the motion of joints and tool centre points at this rate, for a plot: CSV, or JSON with --json
+    #[arg(long, value_name = "N", value_parser = rate)]
+    pub hz: Option<f64>,
     /// Write the trajectory to a JSON file for `dimos execute FILE`
     #[arg(long, value_name = "FILE")]
     pub out: Option<PathBuf>,
@@ -29,7 +32,7 @@ pub struct Args {
 
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
-    let reply = args.target_run.connect()?.call(Preview { plan: args.plan })?;
+    let reply = args.target_run.connect()?.call(Preview { plan: args.plan, hz: args.hz })?;
     if let Some(file) = &args.out {
         let text = serde_json::to_string(&reply.trajectory).unwrap_or_default();
         std::fs::write(file, text + "\n").with_context(|| file.display().to_string())?;
@@ -39,10 +42,43 @@ pub fn run(args: &Args) -> Result {
         output::json(&reply);
         return Ok(Exit::Ok);
     }
+    if args.hz.is_some() {
+        output::data(csv(&reply).as_bytes());
+        return Ok(Exit::Ok);
+    }
     let elapsed = reply.summary.times.values().sum();
     show(&Planned { plan: reply.plan, elapsed, summary: reply.summary.clone() });
     table(&reply).print();
     Ok(Exit::Ok)
+}
+
+/// Returns the motion as CSV: time [s], positions [rad] and velocities [rad/s] of the joints, and the tool centre
+/// points in `map` [m, quaternion]. `move --path` reads its joints.
+fn csv(reply: &PreviewReply) -> String {
+    let joints = &reply.trajectory.joint_names;
+    let robots: Vec<&String> = reply.end_effectors.keys().collect();
+    let columns = joints.iter().cloned().chain(joints.iter().map(|joint| format!("{joint}_vel")));
+    let tcp = |robot: &&String| ["x", "y", "z", "qx", "qy", "qz", "qw"].map(|axis| format!("{robot}.{axis}"));
+    let names: Vec<String> =
+        std::iter::once("time".to_owned()).chain(columns).chain(robots.iter().flat_map(tcp)).collect();
+    let mut text = names.join(",") + "\n";
+    for (k, point) in reply.trajectory.points.iter().enumerate() {
+        let mut row = vec![point.time_from_start];
+        row.extend(point.positions.iter().chain(point.velocities.iter().flatten()));
+        for robot in &robots {
+            row.extend(reply.end_effectors.get(*robot).and_then(|path| path.get(k)).into_iter().flatten());
+            row.extend(reply.orientations.get(*robot).and_then(|path| path.get(k)).into_iter().flatten());
+        }
+        let cells: Vec<String> = row.iter().map(|value| format!("{value:.6}")).collect();
+        text += &(cells.join(",") + "\n");
+    }
+    text
+}
+
+/// Parses a rate of samples.
+fn rate(text: &str) -> std::result::Result<f64, String> {
+    let hz = finite(text)?;
+    if (0.1..=1000.0).contains(&hz) { Ok(hz) } else { Err("must be within 0.1–1000 Hz".into()) }
 }
 
 /// Returns samples of the motion, its ends included: a row per joint and coordinate, a column per time, so that any

@@ -25,7 +25,8 @@ use view::{JsonLines, Live, Plain, View};
 /// Play a log in the terminal, verify it, or repeat its motion with an arm
 ///
 /// Plays in real time: a joint table and a progress bar on a terminal, one line per second elsewhere, one JSON object
-/// per message with --json. Exits with 3 if the log is truncated, or if the recorder lost samples.
+/// per message with --json. The log of a live run plays up to its newest chunk. Exits with 3 if the log is truncated,
+/// or if the recorder lost samples.
 ///
 /// With --verify the inputs and requests of every tick pass through the same control code again, and every command must
 /// be identical, bit for bit. Otherwise exits with 1 and prints the first difference; exits with 3 if a part is missing
@@ -104,8 +105,8 @@ enum SelectionError {
     NoLogs(Option<PathBuf>),
     #[error("the log {path} has no topic {topic}\nhint: it has {topics}")]
     NoTopic { path: PathBuf, topic: String, topics: String },
-    #[error("the log {path} has no messages\nhint: its run ended before the first tick")]
-    Empty { path: PathBuf },
+    #[error("the log {path} has no messages\nhint: its run {}", if *live { "has just started: try again" } else { "ended before the first tick" })]
+    Empty { path: PathBuf, live: bool },
     #[error("the log {path} is only {length:.3} s long\nhint: use a shorter --start-offset")]
     TooShort { path: PathBuf, length: f64 },
 }
@@ -178,7 +179,7 @@ fn choose(args: &ReplayArgs, info: &LogInfo, path: &Path) -> std::result::Result
         let topics = info.topics.keys().cloned().collect::<Vec<_>>().join(", ");
         return Err(SelectionError::NoTopic { path, topic: topic.clone(), topics });
     }
-    let Some((start, end)) = info.span else { return Err(SelectionError::Empty { path }) };
+    let Some((start, end)) = info.span else { return Err(SelectionError::Empty { path, live: info.live }) };
     let nanoseconds = |d: Duration| u64::try_from(d.as_nanos()).unwrap_or(u64::MAX);
     let from = start.saturating_add(nanoseconds(args.start_offset));
     if from > end {
@@ -192,8 +193,9 @@ fn choose(args: &ReplayArgs, info: &LogInfo, path: &Path) -> std::result::Result
 fn headline(path: &Path, info: &LogInfo) -> String {
     let run = info.metadata.get("run").map_or_else(String::new, |run| format!(", run {run}"));
     let length = info.span.map_or(0.0, |(start, end)| (end - start) as f64 * 1e-9);
-    let cut = if info.complete { "" } else { ", cut" };
-    format!("{}: {length:.3} s{run}{cut}", path.display())
+    let (path, live) = (path.display(), if info.live { "live: plays up to " } else { "" });
+    let cut = if info.complete || info.live { "" } else { ", cut" };
+    format!("{path}: {live}{length:.3} s{run}{cut}")
 }
 
 #[cfg(test)]

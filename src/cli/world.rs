@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use super::arguments::{Target, finite};
 use super::arm::parts::payload_text;
 use super::exit::{Exit, Failure, Result};
-use super::output::{self, Table, fixed};
+use super::output::{self, Table, done, fixed};
 use crate::rpc::api::{
     Attach, Detach, PoseSpec, ShapeSpec, World, WorldAdd, WorldEntry, WorldMove, WorldObject, WorldRemove,
 };
@@ -210,7 +210,7 @@ pub fn run(args: &Args) -> Result {
             }
             let added: Vec<&str> = names.iter().filter(|name| !replaced.iter().any(|r| r == *name)).copied().collect();
             let text = format!("{} objects added, {} replaced", added.len(), replaced.len());
-            done(format_args!("{text}"), json!({"added": added, "replaced": replaced}), a.target_run.json);
+            done(text, json!({"added": added, "replaced": replaced}), a.target_run.json);
         }
         Command::Attach(a) => {
             let (name, robot) = (a.name.clone(), a.robot.clone());
@@ -233,13 +233,6 @@ pub fn run(args: &Args) -> Result {
         }
     }
     Ok(Exit::Ok)
-}
-
-fn done(what: std::fmt::Arguments<'_>, data: Value, json: bool) {
-    match json {
-        true => output::json(&data),
-        false => output::line(what),
-    }
 }
 
 /// Returns those of these names that objects in the world have.

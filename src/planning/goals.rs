@@ -64,7 +64,7 @@ pub(super) fn configurations(
                 let settings = IkSettings { seed, position_only: true, ..reach() };
                 reached(robot, &target, &own, &settings, &mut free, stop)?
             }
-            Some(Goal::Line(_)) | None => vec![own],
+            Some(Goal::Line(_) | Goal::Path(_)) | None => vec![own],
         };
         all = all.iter().flat_map(|before| several.iter().map(move |own| [&before[..], own].concat())).collect();
         all.truncate(SOLUTIONS * SOLUTIONS);

@@ -136,9 +136,8 @@ impl<'a> Ik<'a> {
             }
             self.start(near, failure.attempts > 0, &mut random);
             failure.attempts += 1;
-            let error = self.descend(target, settings);
+            let error = self.reach(target, near, settings);
             if settings_met(&error, settings) {
-                self.kinematics.unwind(&mut self.q, near, |_| true);
                 let new = !found.iter().any(|q| distance(q, &self.q) < 1e-3);
                 if new && valid(&self.q) {
                     found.push(self.q.clone());
@@ -214,6 +213,16 @@ impl<'a> Ik<'a> {
         for (motion, column) in self.motion.iter_mut().zip(&self.columns) {
             *motion = x.map_or(0.0, |x| column.iter().zip(&x).map(|(a, b)| a * b).sum());
         }
+    }
+
+    /// Descends from `q`; a solution is shifted by whole turns to the positions nearest to `near`. Returns the
+    /// remaining error.
+    fn reach(&mut self, target: &DAffine3, near: &[f64], settings: &IkSettings) -> PoseError {
+        let error = self.descend(target, settings);
+        if settings_met(&error, settings) {
+            self.kinematics.unwind(&mut self.q, near, |_| true);
+        }
+        error
     }
 
     /// Descends from `q` until the pose is reached or progress ends; returns the remaining error.

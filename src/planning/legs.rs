@@ -1,13 +1,13 @@
 //! The legs of a motion: one to each waypoint, and one to the goals.
 
-use std::collections::BTreeMap;
 use std::time::Instant;
 
 use super::goals;
+use super::joint_path::legs_along;
 use super::padded::Near;
 use super::path::{Path, distance, unwind};
 use super::path_planner::{PlanSettings, plan};
-use super::pipeline::{Goal, PlanFailure, PlanRequest, Stage, failure_for};
+use super::pipeline::{Goal, PlanFailure, PlanRequest, Stage, StageTimes, failure_for};
 use super::timing::TimingSettings;
 use crate::collision::{CollisionChecker, Stop};
 use crate::robot::kinematics::frame;
@@ -20,11 +20,13 @@ const SHORTEST_BLENDED: f64 = 0.01;
 
 /// The way to one goal.
 pub(super) struct Leg {
-    path: Path,
+    pub path: Path,
     /// The part of a straight line that was followed.
     pub fraction: Option<f64>,
     /// Joints of its goal that were moved to their limits: name, requested and used position [rad or m].
     pub clamped: Vec<(String, f64, f64)>,
+    /// Maximum deviation at its corners [rad].
+    pub deviation: f64,
 }
 
 /// Plans the way through all waypoints to the goals.
@@ -32,13 +34,17 @@ pub(super) fn legs(
     stage: &mut Stage<'_>,
     request: &PlanRequest,
     stop: &Stop,
-    times: &mut BTreeMap<String, f64>,
+    times: &mut StageTimes,
 ) -> Result<Vec<Leg>, PlanFailure> {
     let begin = stage.start.clone();
     let mut legs: Vec<Leg> = Vec::new();
     for (i, goals) in request.through.iter().chain([&request.goals]).enumerate() {
         if let Some(at) = legs.last().and_then(|leg| leg.path.last()) {
             stage.start.clone_from(at);
+        }
+        if let [(robot, Goal::Path(path))] = goals.as_slice() {
+            legs.extend(legs_along(stage, (*robot, path), request.seed, stop, times)?);
+            continue;
         }
         let found = leg(stage, goals, request.seed, stop, times).map_err(|failure| match request.through.is_empty() {
             true => failure,
@@ -51,12 +57,12 @@ pub(super) fn legs(
 }
 
 /// Plans the way from the stage's start to goals.
-fn leg(
+pub(super) fn leg(
     stage: &mut Stage<'_>,
     goals: &[(usize, Goal)],
     seed: u64,
     stop: &Stop,
-    times: &mut BTreeMap<String, f64>,
+    times: &mut StageTimes,
 ) -> Result<Leg, PlanFailure> {
     let began = Instant::now();
     let mut took = |name: &str, time: f64| *times.entry(name.to_owned()).or_default() += time;
@@ -64,10 +70,11 @@ fn leg(
         [(_, Goal::Line(target))] => {
             let (path, fraction) = goals::line(stage, &frame(target), stop)?;
             took("search", began.elapsed().as_secs_f64());
-            Ok(Leg { path, fraction: Some(fraction), clamped: Vec::new() })
+            // The corners of a line are so flat that blending keeps to the line.
+            Ok(Leg { path, fraction: Some(fraction), clamped: Vec::new(), deviation: LINE_DEVIATION })
         }
-        several if several.iter().any(|(_, goal)| matches!(goal, Goal::Line(_))) => {
-            Err(PlanFailure::new("a straight line is planned for one robot at a time"))
+        several if several.iter().any(|(_, goal)| matches!(goal, Goal::Line(_) | Goal::Path(_))) => {
+            Err(PlanFailure::new("a straight line or a path is planned for one robot at a time"))
         }
         wanted => {
             let goals = goals::configurations(stage, wanted, seed, stop)?;
@@ -86,7 +93,7 @@ fn leg(
             let clamped = moved.map(|(asked, (joint, used))| (joint, asked, used)).collect();
             took("search", found.search_time.as_secs_f64());
             took("shorten", found.shorten_time.as_secs_f64());
-            Ok(Leg { path: found.path, fraction: None, clamped })
+            Ok(Leg { path: found.path, fraction: None, clamped, deviation: TimingSettings::default().deviation })
         }
     }
 }
@@ -101,11 +108,9 @@ pub(super) fn joined(stage: &Stage<'_>, legs: &[Leg], blend: f64) -> (Path, Vec<
             deviation.pop();
             deviation.push(passes);
         }
-        // The corners of a line are so flat that blending keeps to the line.
-        let own = if leg.fraction.is_some() { LINE_DEVIATION } else { TimingSettings::default().deviation };
         let skip = usize::from(!path.is_empty());
         path.extend(leg.path.iter().skip(skip).cloned());
-        deviation.resize(path.len(), own);
+        deviation.resize(path.len(), leg.deviation);
     }
     (path, deviation)
 }

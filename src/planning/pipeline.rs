@@ -6,6 +6,7 @@ use std::time::Instant;
 use glamx::DVec3;
 use nalgebra::{Isometry3, Vector3};
 
+use super::joint_path::JointPath;
 use super::legs::{joined, legs};
 use super::padded::{GivenUp, Near, Padded};
 use super::path::{Path, between, distance, length};
@@ -43,6 +44,8 @@ pub enum Goal {
     Position(Vector3<f64>),
     /// Pose of the end effector in the frame `map`, reached on a straight line.
     Line(Isometry3<f64>),
+    /// A path to follow, after an approach to its first configuration.
+    Path(JointPath),
 }
 
 /// A planning request.
@@ -60,6 +63,8 @@ pub struct PlanRequest {
     pub through: Vec<Vec<(usize, Goal)>>,
     /// How far away an end effector may pass them [m]; 0: the motion rests at each.
     pub blend: f64,
+    /// Whether only its number selects the plan.
+    pub by_number: bool,
 }
 
 /// A planned motion.
@@ -132,6 +137,9 @@ pub(super) struct Stage<'a> {
     /// One checker per moving robot, without the other moving ones; empty if only one robot moves.
     pub apart: Vec<Padded>,
 }
+
+/// Duration of each stage [s], by its name.
+pub(super) type StageTimes = BTreeMap<String, f64>;
 
 /// Plans a motion. The same scene, world and request give the same motion unless the timeout is reached.
 pub fn solve(

@@ -4,12 +4,15 @@ use nalgebra::{Isometry3, Translation3};
 
 use super::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
 use super::goals::configurations;
+use super::joint_path::JointPath;
 use super::path_planner::PlanError;
 use super::pipeline::{Goal, PlanRequest, PlannedMotion, solve, stage};
 use super::planning_scene::PlanningScene;
+use super::thin::thin;
 use crate::collision::{CollisionChecker, Stop};
 use crate::robot::kinematics::pose;
 use crate::robot::random::Random;
+use crate::trajectory::{Cursor, Sample, Spline};
 
 fn scene(robots: Vec<RobotConfig>, objects: Vec<ObjectConfig>) -> PlanningScene {
     PlanningScene::load(&PlannerConfig { robots, objects, ..PlannerConfig::default() }).unwrap()
@@ -23,6 +26,7 @@ fn ask(scene: &PlanningScene, goal: Goal, start: &[f64]) -> Result<PlannedMotion
         seed: 0,
         through: Vec::new(),
         blend: 0.0,
+        by_number: false,
     };
     solve(scene, &scene.world, &request, &Stop::never()).map_err(|failure| failure.what)
 }
@@ -120,4 +124,65 @@ fn goals_of_several_arms_touch_nothing_that_is_fixed() {
         }
     }
     assert!(looked > 5 && several > 0, "{looked} {several}");
+}
+
+/// What a hand led at 100 Hz, with the noise of encoders.
+fn led(seconds: f64) -> Vec<Vec<f64>> {
+    let mut random = Random::new(11);
+    let mut at = |t: f64| {
+        let way = [0.5 * t.sin(), -0.3 + 0.2 * (1.3 * t).cos(), 0.6, 0.1 * t, 0.8 + 0.1 * (2.0 * t).sin(), 0.0];
+        way.iter().map(|q| q + random.between(-5e-4, 5e-4)).collect()
+    };
+    (0..=(seconds * 100.0) as i32).map(|k| at(f64::from(k) * 0.01)).collect()
+}
+
+#[test]
+fn a_led_path_is_followed_within_its_tolerance_after_a_planned_approach() {
+    let scene = scene(vec![RobotConfig::yourarm()], Vec::new());
+    let (record, tolerance, start) = (led(12.0), 0.005, [0.0, -0.3, 0.6, 0.0, 0.8, 0.4]);
+    let points = thin(&record, tolerance / 2.0);
+    let waypoints = points.len();
+    assert!(waypoints < 120, "{waypoints} waypoints");
+    let path = Goal::Path(JointPath { points, tolerance: tolerance / 2.0 });
+    let motion = ask(&scene, path.clone(), &start).unwrap();
+    let spline = Spline::new(&motion.trajectory).unwrap();
+    // Every position of the record is passed, in its order, and nothing else after the approach.
+    let (mut cursor, mut at) = (Cursor::default(), [Sample::default(); 6]);
+    let mut row = 0;
+    for k in 0..(spline.duration() * 1000.0) as u32 {
+        spline.sample(f64::from(k) * 1e-3, &mut cursor, &mut at);
+        let off = |q: &Vec<f64>| at.iter().zip(q).map(|(a, q)| (a.position - q).abs()).fold(0.0, f64::max);
+        let ahead = record[row..].iter().take(120);
+        let nearest = ahead.enumerate().map(|(i, q)| (i, off(q))).min_by(|a, b| a.1.total_cmp(&b.1)).unwrap();
+        if row > 0 || nearest.1 < tolerance {
+            // A record at 100 Hz: half of a step beside the tolerance.
+            assert!(nearest.1 <= tolerance + 4e-3, "{} rad off at {k} ms, row {row}", nearest.1);
+            row += nearest.0;
+        }
+    }
+    assert!(row > record.len() - 10, "it ended at row {row}");
+    let rest = |q: &Vec<f64>| q.iter().zip(&record[0]).all(|(a, b)| (a - b).abs() < 1e-3);
+    let first = motion.trajectory.points.iter().find(|p| rest(&p.positions)).unwrap();
+    assert!(first.velocities.iter().all(|v| v.abs() < 1e-6), "it rests where the path begins: {first:?}");
+    // The hand took 12 s.
+    assert!(motion.trajectory.duration() < 15.0, "{} s with {waypoints} waypoints", motion.trajectory.duration());
+}
+
+#[test]
+fn a_path_is_refused_where_it_is_not_free_or_leaves_the_limits() {
+    let at = flange(&scene(vec![RobotConfig::yourarm()], Vec::new()), 0, &led(12.0)[471]);
+    let pose = Isometry3::from_parts(at.translation, Default::default());
+    let block = ObjectConfig { name: "post".into(), shape: ObjectShape::Box([0.03; 3]), pose, padding: 0.0 };
+    let blocked = scene(vec![RobotConfig::yourarm()], vec![block]);
+    let path = |points: &[Vec<f64>]| Goal::Path(JointPath { points: thin(points, 0.0025), tolerance: 0.0025 });
+    let start = led(0.0).remove(0);
+    let refused = ask(&blocked, path(&led(12.0)), &start).unwrap_err();
+    assert!(refused.contains("the path is not free at its waypoint") && refused.contains("\"post\""), "{refused}");
+    // Slightly outside is moved inside, within the tolerance.
+    let free = scene(vec![RobotConfig::yourarm()], Vec::new());
+    let upper = free.robots[0].limits[0].upper;
+    let to = |first: f64| ask(&free, path(&[start.clone(), [&[first], &start[1..]].concat()]), &start);
+    assert_eq!(to(upper + 1e-3).unwrap().path.last().unwrap()[0], upper);
+    let refused = to(upper + 5e-3).unwrap_err();
+    assert!(refused.contains("path: arm_joint1 at 2.") && refused.contains("outside its limits"), "{refused}");
 }

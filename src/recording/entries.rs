@@ -7,8 +7,8 @@ use mcap::records::{Channel, MessageHeader, Record, op};
 use serde::Serialize;
 
 use super::messages::{
-    ArmInput, ArmIo, ArmOutput, ArmStatus, Event, InertiaStamped, JointState, JointStatus, Log, Text, Tick,
-    WrenchStamped,
+    ArmInput, ArmIo, ArmOutput, ArmStatus, Event, InertiaStamped, JointState, JointStatus, Log, PoseStamped, Text,
+    Tick, WrenchStamped,
 };
 use super::replay::Selection;
 use super::wire::Message;
@@ -70,7 +70,9 @@ macro_rules! payloads {
         }
     };
 }
-payloads! { JointState Text WrenchStamped Log Tick Event ArmStatus ArmInput ArmOutput ArmIo InertiaStamped JointStatus }
+payloads! {
+    JointState Text WrenchStamped Log Tick Event ArmStatus ArmInput ArmOutput ArmIo InertiaStamped JointStatus PoseStamped
+}
 
 /// Returns the header and bytes of a message record; `None` for other records.
 pub(super) fn message(opcode: u8, body: &[u8]) -> Option<(MessageHeader, &[u8])> {

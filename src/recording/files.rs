@@ -70,7 +70,8 @@ pub fn retain_text_logs(folder: &Path, keep: usize) -> io::Result<Vec<PathBuf>> 
 fn retain_newest(folder: &Path, ending: &str, keep: usize) -> io::Result<Vec<PathBuf>> {
     let mut old = logs(folder, ending)?;
     old.truncate(old.len().saturating_sub(keep));
-    old.retain(|path| !is_being_written(path) && std::fs::remove_file(path).is_ok());
+    let live = |path: &PathBuf| File::open(path).is_ok_and(|file| is_being_written(&file));
+    old.retain(|path| !live(path) && std::fs::remove_file(path).is_ok());
     Ok(old)
 }
 
@@ -80,8 +81,12 @@ pub fn mark_as_being_written(file: &File) {
     let _ = file.try_lock();
 }
 
-fn is_being_written(path: &Path) -> bool {
-    File::open(path).is_ok_and(|file| matches!(file.try_lock(), Err(TryLockError::WouldBlock)))
+/// Returns whether a live run writes this log: its lock is held, which the kernel releases with the writer's process.
+pub(super) fn is_being_written(file: &File) -> bool {
+    // Shared, so that readers do not take each other for the writer.
+    let locked = file.try_lock_shared();
+    let _ = file.unlock();
+    matches!(locked, Err(TryLockError::WouldBlock))
 }
 
 /// Returns all logs in `folder` with that extension, oldest first.

@@ -69,6 +69,52 @@ message! {
 }
 
 message! {
+    /// A point in space.
+    "geometry_msgs/msg/Point" "geometry_msgs/Point" Point {
+        /// Along x [m].
+        x: f64,
+        /// Along y [m].
+        y: f64,
+        /// Along z [m].
+        z: f64,
+    }
+}
+
+message! {
+    /// An orientation, of length 1.
+    "geometry_msgs/msg/Quaternion" "geometry_msgs/Quaternion" Quaternion {
+        /// First component of the axis part.
+        x: f64,
+        /// Second component.
+        y: f64,
+        /// Third component.
+        z: f64,
+        /// Cosine of half the angle.
+        w: f64,
+    }
+}
+
+message! {
+    /// A position and an orientation.
+    "geometry_msgs/msg/Pose" "geometry_msgs/Pose" Pose {
+        /// Position.
+        position: Point,
+        /// Orientation.
+        orientation: Quaternion,
+    }
+}
+
+message! {
+    /// A pose at a time.
+    "geometry_msgs/msg/PoseStamped" "geometry_msgs/PoseStamped" PoseStamped {
+        /// Time, and the frame of the pose.
+        header: Header,
+        /// Pose of a tool centre point.
+        pose: Pose,
+    }
+}
+
+message! {
     /// A force and a torque.
     "geometry_msgs/msg/Wrench" "geometry_msgs/Wrench" Wrench {
         /// [N].

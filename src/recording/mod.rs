@@ -20,6 +20,7 @@ mod pending_executes;
 pub mod recorder;
 pub mod records;
 pub mod replay;
+pub mod tcp_log;
 mod tick_log;
 pub mod wire;
 mod worker;

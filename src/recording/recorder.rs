@@ -17,6 +17,7 @@ use super::files;
 use super::log_writer::LogAttachment;
 pub use super::notes::Note;
 use super::notes::NoteReceiver;
+use super::tcp_log::TcpChains;
 use super::worker::Worker;
 use crate::clock::{Clock, MonotonicClock, WallOffset};
 use crate::telemetry::describe::{Described, Names};
@@ -44,6 +45,8 @@ pub struct RecorderConfig {
     pub attachments: Vec<LogAttachment>,
     /// Further metadata, besides name, arms, joints and tasks.
     pub metadata: BTreeMap<String, String>,
+    /// Models of the arms' tool centre points.
+    pub tcps: TcpChains,
     /// Offset between monotonic and Unix time.
     pub wall: WallOffset,
     /// Minimum free space on the disk; below it the log ends [bytes].

@@ -1,5 +1,5 @@
 //! Reads the records of an MCAP file in order and in bounded memory: at most [`LIMIT`] bytes at a time, whatever the
-//! file contains; a truncated file is read up to the cut.
+//! file contains; a truncated file is read up to the cut, that of a live run up to its newest chunk.
 
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
@@ -9,6 +9,8 @@ use mcap::records::{ChunkHeader, Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use mcap::{MAGIC, McapError, parse_record};
 use thiserror::Error;
+
+use super::files;
 
 /// Maximum length of a record, and of a chunk's contents [bytes]. Attachments may be longer.
 pub const LIMIT: usize = 16 * 1024 * 1024;
@@ -36,7 +38,7 @@ pub enum ReplayError {
     },
     /// The file is truncated or damaged. Everything before was read.
     #[error(
-        "the log {path} ends at byte {at}: {reason}\nhint: everything before was read; this happens if the run was killed or is still live"
+        "the log {path} ends at byte {at}: {reason}\nhint: everything before was read; this happens if the run was killed"
     )]
     Cut {
         /// The log file.
@@ -66,6 +68,7 @@ pub struct RecordReader {
     at: u64,
     ended: bool,
     attachments: bool,
+    live: bool,
 }
 
 impl RecordReader {
@@ -73,6 +76,8 @@ impl RecordReader {
     pub fn open(path: &Path) -> Result<Self, ReplayError> {
         let io = |source| ReplayError::Io { path: path.to_owned(), source };
         let file = File::open(path).map_err(io)?;
+        // Before the length: a run that ends in between has written at least this much.
+        let live = files::is_being_written(&file);
         let length = file.metadata().map_err(io)?.len();
         let mut file = BufReader::with_capacity(64 * 1024, file);
         let mut magic = Vec::new();
@@ -80,7 +85,12 @@ impl RecordReader {
         if magic != MAGIC {
             return Err(ReplayError::NotMcap { path: path.to_owned() });
         }
-        Ok(Self { path: path.to_owned(), file, length, at: magic.len() as u64, ended: false, attachments: false })
+        Ok(Self { path: path.to_owned(), file, length, at: magic.len() as u64, ended: false, attachments: false, live })
+    }
+
+    /// Returns whether a live run was writing the file when it was opened.
+    pub fn is_live(&self) -> bool {
+        self.live
     }
 
     /// Also reads attachments, up to [`LIMIT`]; by default they are skipped.
@@ -114,20 +124,26 @@ impl RecordReader {
         self.go_to(MAGIC.len() as u64)
     }
 
-    /// Returns the next record; `None` after the footer of a complete file, and after an error.
+    /// Returns the next record; `None` after the footer of a complete file, after the last complete record of a live
+    /// one, and after an error.
     pub fn next_record(&mut self) -> Result<Option<RawRecord>, ReplayError> {
         if self.ended {
             return Ok(None);
         }
         let record = self.read_record();
-        self.ended = record.as_ref().map_or(true, |r| r.opcode == op::FOOTER);
-        record.map(Some)
+        self.ended = record.as_ref().map_or(true, |r| r.as_ref().is_none_or(|r| r.opcode == op::FOOTER));
+        record
     }
 
-    fn read_record(&mut self) -> Result<RawRecord, ReplayError> {
+    /// Returns the end of a file that is too short: a live one continues there.
+    fn too_short(&mut self, at: u64, reason: &str) -> Result<Option<RawRecord>, ReplayError> {
+        if self.live { Ok(None) } else { Err(self.cut(at, reason)) }
+    }
+
+    fn read_record(&mut self) -> Result<Option<RawRecord>, ReplayError> {
         let at = self.at;
         if self.length - at < PREFIX as u64 {
-            return Err(self.cut(at, "no valid footer"));
+            return self.too_short(at, "no valid footer");
         }
         let prefix: [u8; PREFIX] = self.read()?;
         let [opcode, length @ ..] = prefix;
@@ -136,7 +152,7 @@ impl RecordReader {
             return Err(self.cut(at, "no record at this position"));
         }
         if length > self.length - at - PREFIX as u64 {
-            return Err(self.cut(at, "the file ends inside a record"));
+            return self.too_short(at, "the file ends inside a record");
         }
         self.at = at + PREFIX as u64 + length;
         let body = match opcode {
@@ -148,11 +164,15 @@ impl RecordReader {
             _ if length > LIMIT as u64 => return Err(self.cut(at, "a record exceeds 16 MiB")),
             _ => self.body(length)?,
         };
-        let closed = || self.length - self.at >= MAGIC.len() as u64;
-        if opcode == op::FOOTER && !(closed() && self.read::<{ MAGIC.len() }>()? == *MAGIC) {
-            return Err(self.cut(at, "no valid footer"));
+        if opcode == op::FOOTER {
+            if self.length - self.at < MAGIC.len() as u64 {
+                return self.too_short(at, "no valid footer");
+            }
+            if self.read::<{ MAGIC.len() }>()? != *MAGIC {
+                return Err(self.cut(at, "no valid footer"));
+            }
         }
-        Ok(RawRecord { opcode, at, body })
+        Ok(Some(RawRecord { opcode, at, body }))
     }
 
     fn body(&mut self, length: u64) -> Result<Vec<u8>, ReplayError> {

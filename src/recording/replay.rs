@@ -36,6 +36,8 @@ pub struct LogInfo {
     pub span: Option<(u64, u64)>,
     /// Whether the log was closed properly.
     pub complete: bool,
+    /// Whether a live run was still writing it when it was opened: what it had written by then is read.
+    pub live: bool,
     /// Metadata of the run: `run`, `version`, `arms`, `tasks`, `wall_offset_ns` and more.
     pub metadata: BTreeMap<String, String>,
     /// Topics and their schemas.
@@ -63,6 +65,8 @@ impl LogReader {
             None => None,
         }
         .map_or_else(|| scan(&mut records, &mut channels), Ok)?;
+        // A run that is just ending has closed its log already.
+        info.live = records.is_live() && !info.complete;
         info.topics = channels.topics();
         info.metadata = metadata(&mut records)?;
         records.rewind()?;
@@ -91,8 +95,8 @@ impl LogReader {
         self.records.rewind()
     }
 
-    /// Returns the next message; `None` at the end of a closed log. Returns `ReplayError::Cut` once, where a truncated
-    /// or damaged log ends.
+    /// Returns the next message; `None` at the end of a closed log, and at the newest chunk of a live one. Returns
+    /// `ReplayError::Cut` once, where a truncated or damaged log ends.
     pub fn next_entry(&mut self) -> Result<Option<Entry>, ReplayError> {
         loop {
             if let Some(entry) = self.ready.pop_front() {
@@ -202,7 +206,7 @@ fn scan(records: &mut RecordReader, channels: &mut Channels) -> Result<LogInfo, 
                 }
             }
             Ok(None) => {
-                info.complete = true;
+                info.complete = !records.is_live();
                 return Ok(info);
             }
             Err(ReplayError::Cut { .. }) => return Ok(info),

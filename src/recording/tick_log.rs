@@ -9,12 +9,15 @@ use mcap::McapResult;
 use super::arm_messages::{input, input_differs, output, output_differs, status};
 use super::log_writer::LogWriter;
 use super::messages::{
-    ArmInput, ArmOutput, ArmStatus, Event, Header, JointState, Log, Text, Tick, Time, Vector3, Wrench, WrenchStamped,
+    ArmInput, ArmOutput, ArmStatus, Event, Header, JointState, Log, PoseStamped, Text, Tick, Time, Vector3, Wrench,
+    WrenchStamped,
 };
+use super::tcp_log::{TCP_EVERY, TcpChains};
 use super::wire::Message;
 use crate::arm::{ArmCommand, ArmState, VelocitySource};
 use crate::clock::{Mono, WallOffset};
 use crate::joint::{ControlMode, Joints};
+use crate::sync::lock;
 use crate::telemetry::describe::{Described, Names, Severity};
 use crate::telemetry::{ArmSample, Cause, Phase, TickSample};
 
@@ -32,6 +35,8 @@ pub struct TickLog {
     commands: JointState,
     arms: Vec<ArmLog>,
     events: Vec<(u64, Described)>,
+    /// Models of the arms' tool centre points.
+    pub tcps: TcpChains,
     /// Samples dropped since the last closed tick because the end of their own tick was lost.
     given_up: u32,
 }
@@ -44,6 +49,7 @@ struct ArmLog {
     command: Option<ArmCommand>,
     status: Option<StatusKey>,
     status_at: Mono,
+    tcp_at: Option<Mono>,
     error_text: String,
 }
 
@@ -63,7 +69,8 @@ impl TickLog {
         let name = names.arms.iter().flat_map(|a| a.joints.clone()).collect();
         let states = JointState { name, ..JointState::default() };
         let arms = names.arms.iter().map(|_| ArmLog::default()).collect();
-        Self { run, names, frame_id, wall, commands: states.clone(), states, arms, events: Vec::new(), given_up: 0 }
+        let (commands, events, tcps) = (states.clone(), Vec::new(), TcpChains::default());
+        Self { run, names, frame_id, wall, commands, states, arms, events, tcps, given_up: 0 }
     }
 
     /// Returns metadata that readers need: the joints of each arm, and the offset between its monotonic times and Unix
@@ -278,6 +285,17 @@ impl TickLog {
         if let (true, Some([x, y, z, tx, ty, tz])) = (is_new, state.wrench) {
             let wrench = Wrench { force: Vector3 { x, y, z }, torque: Vector3 { x: tx, y: ty, z: tz } };
             log.publish(&format!("/wrench/{id}"), time, &WrenchStamped { header: header.clone(), wrench })?;
+        }
+        if is_new && state.seq > 0 && arm.tcp_at.is_none_or(|last| tick.deadline.since(last) >= TCP_EVERY) {
+            // `states` has the values of this tick.
+            let chains = lock(&self.tcps);
+            let pose = chains.get(index).and_then(|chain| chain.as_ref()?.pose(&self.states.position));
+            drop(chains);
+            if let Some(pose) = pose {
+                let header = Header { frame_id: "map".to_owned(), ..header.clone() };
+                log.publish(&format!("/tcp/{id}"), time, &PoseStamped { header, pose })?;
+                arm.tcp_at = Some(tick.deadline);
+            }
         }
         let key = status_key(&sample, arm);
         if arm.status.as_ref() != Some(&key) || tick.deadline.since(arm.status_at) >= STATUS_EVERY {

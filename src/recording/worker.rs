@@ -61,7 +61,8 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
         stats: Arc<RecorderStats>,
     ) -> Result<Self, RecordError> {
         let names = config.names.clone();
-        let ticks = TickLog::new(config.run.clone(), names.clone(), config.frame_id.clone(), config.wall);
+        let mut ticks = TickLog::new(config.run.clone(), names.clone(), config.frame_id.clone(), config.wall);
+        ticks.tcps = config.tcps.clone();
         let begin = |sink| {
             let mut metadata = config.metadata.clone();
             metadata.extend(ticks.metadata());
@@ -302,6 +303,7 @@ mod tests {
             frame_id: String::new(),
             attachments: Vec::new(),
             metadata: BTreeMap::new(),
+            tcps: Default::default(),
             wall: WallOffset::of(Mono::ZERO, 0),
             min_free: 0,
         };

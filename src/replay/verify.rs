@@ -49,6 +49,9 @@ pub struct Verification {
     pub events: u64,
     /// Time from the first to the last of these ticks [s].
     pub length: f64,
+    /// Whether the run was live: what its log contained was verified, except the last tick.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub live: bool,
 }
 
 /// Replays a log and compares. Rejects a log with another config version, or with a task type that `table` lacks.
@@ -59,6 +62,7 @@ pub fn verify(path: &Path, table: &TaskTable) -> Result<Verification, RecordedEr
     let tasks = tasks.map_err(|what| RecordedError::Unfit { path: path.to_owned(), what })?;
     let mut records = RecordReader::open(path)?;
     let mut run = Rerun::new(&recorded, tasks);
+    run.counts.live = records.is_live();
     let end = loop {
         match records.next_record() {
             Ok(Some(record)) => {
@@ -103,7 +107,14 @@ impl<'a> Rerun<'a> {
             states: vec![ArmState::default(); recorded.config.arms.len()],
             requests: Vec::new(),
             span: None,
-            counts: Verification { finding: Finding::Reproducible, ticks: 0, requests: 0, events: 0, length: 0.0 },
+            counts: Verification {
+                finding: Finding::Reproducible,
+                ticks: 0,
+                requests: 0,
+                events: 0,
+                length: 0.0,
+                live: false,
+            },
             found: None,
         }
     }
@@ -191,7 +202,8 @@ impl<'a> Rerun<'a> {
         match cut {
             // The last tick's requests and events may be lost in the cut.
             Some(cut) if self.found.is_none() => self.stop_at(self.counts.ticks, first_line(&cut.to_string())),
-            None if self.found.is_none() && self.ticks.is_closed() => self.run_tick(),
+            // Those of a live run's last tick may not be written yet.
+            None if self.found.is_none() && self.ticks.is_closed() && !self.counts.live => self.run_tick(),
             _ => {}
         }
         let (first, last) = self.span.unwrap_or_default();

@@ -23,8 +23,8 @@ pub struct Packages {
     named: BTreeMap<String, PathBuf>,
     /// Folders that contain packages at any depth, from `ROS_PACKAGE_PATH`.
     ros: Vec<PathBuf>,
-    /// The packages in them; searched once, when the first is needed.
-    crawled: OnceLock<BTreeMap<String, PathBuf>>,
+    /// The packages in them, and whether all folders were searched; searched once, when the first is needed.
+    crawled: OnceLock<(BTreeMap<String, PathBuf>, bool)>,
     /// Prefixes, from `AMENT_PREFIX_PATH`.
     ament: Vec<PathBuf>,
 }
@@ -55,7 +55,8 @@ impl Packages {
                 false => Err(format!("the folder given for package `{package}` does not exist: {}", folder.display())),
             };
         }
-        let crawled = self.crawled.get_or_init(|| crawl(&self.ros)).get(package).cloned();
+        let (crawled, all) = self.crawled.get_or_init(|| crawl(&self.ros, MAX_FOLDERS));
+        let crawled = crawled.get(package).cloned();
         // A folder without package.xml, too.
         let direct = self.ros.iter().flat_map(|folder| {
             let itself = is_package(folder, package).then(|| folder.clone());
@@ -70,8 +71,12 @@ impl Packages {
         if let Some(own) = beside.ancestors().take(MAX_PARENTS).find(|folder| is_package(folder, package)) {
             return Ok(own.to_owned());
         }
+        let ended = match all {
+            true => String::new(),
+            false => format!("; the search of ROS_PACKAGE_PATH ended after {MAX_FOLDERS} folders"),
+        };
         Err(format!(
-            "unknown package `{package}`\nhint: give its folder: --package {package}=FOLDER, or \
+            "unknown package `{package}`{ended}\nhint: give its folder: --package {package}=FOLDER, or \
              `package_paths` in a blueprint; ROS_PACKAGE_PATH and AMENT_PREFIX_PATH are searched too"
         ))
     }
@@ -131,13 +136,17 @@ fn name_in_manifest(folder: &Path) -> Option<String> {
 
 /// Returns the packages below some folders by the names in their `package.xml`, as ROS 1 searches them: a package
 /// contains no others, a folder with `CATKIN_IGNORE` none at all, and of two with the same name the first one counts.
-fn crawl(folders: &[PathBuf]) -> BTreeMap<String, PathBuf> {
+/// Also returns whether all were searched: at most `limit` folders are.
+fn crawl(folders: &[PathBuf], limit: usize) -> (BTreeMap<String, PathBuf>, bool) {
     let (mut found, mut visited) = (BTreeMap::new(), 0);
     for folder in folders {
         let mut open = vec![(absolute(folder), 0)];
         while let Some((folder, depth)) = open.pop() {
             visited += 1;
-            if visited > MAX_FOLDERS || folder.join("CATKIN_IGNORE").exists() {
+            if visited > limit {
+                return (found, false);
+            }
+            if folder.join("CATKIN_IGNORE").exists() {
                 continue;
             }
             if folder.join("package.xml").is_file() {
@@ -158,7 +167,7 @@ fn crawl(folders: &[PathBuf]) -> BTreeMap<String, PathBuf> {
             open.extend(inside.into_iter().map(|path| (path, depth + 1)));
         }
     }
-    found
+    (found, true)
 }
 
 /// Returns an absolute path without `.` and `..`, normalized as text.
@@ -235,6 +244,27 @@ mod tests {
         assert_eq!(find("z_description"), Some(root.join("src/some_repo/robots/z_description")));
         assert_eq!(find("my_foo_description"), Some(root.join("src/foo_description")));
         assert_eq!([find("inner"), find("hidden"), find("too_deep")], [None, None, None]);
+    }
+
+    #[test]
+    fn a_search_that_ended_early_is_reported_with_a_package_that_was_not_found() {
+        let folder = tempfile::tempdir().unwrap();
+        let root = absolute(folder.path());
+        for package in ["a", "b", "c"] {
+            fs::create_dir_all(root.join("ros").join(package)).unwrap();
+            fs::write(root.join("ros").join(package).join("package.xml"), format!("<name>my_{package}</name>"))
+                .unwrap();
+        }
+        let packages = |limit| {
+            let ros = vec![root.join("ros")];
+            Packages { crawled: crawl(&ros, limit).into(), ros, ..Packages::default() }
+        };
+        let (whole, early) = (packages(4), packages(3));
+        assert!(whole.find("my_c", Path::new("/")).is_ok() && early.find("my_b", Path::new("/")).is_ok());
+        let missing = |packages: &Packages, name| packages.find(name, Path::new("/")).unwrap_err();
+        let words = "the search of ROS_PACKAGE_PATH ended after 50000 folders\nhint: ";
+        assert!(missing(&early, "my_c").contains(words), "{}", missing(&early, "my_c"));
+        assert!(!missing(&whole, "my_d").contains("ended after"));
     }
 
     #[test]

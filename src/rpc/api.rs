@@ -225,7 +225,7 @@ methods! {
     /// Progress or result of planning.
     "planning" Planning -> PlanningReport;
     /// A plan in full: the trajectory, and the paths of the end effectors.
-    "preview" Preview -> PreviewReply;
+    "preview" Preview -> PreviewReply, check Preview::valid;
     /// Executes a plan. Replies when the motion begins.
     "execute_plan" ExecutePlan -> ExecuteReply;
     /// The planner's state and robots.

@@ -9,14 +9,61 @@ use super::api::{MIN_SPEED, finite};
 use crate::joint::MAX_DOF;
 use crate::trajectory::{MAX_ACTIONS, MAX_DURATION};
 
-/// Parameters of `move`.
+/// A path in joint space, such as that of a motion that was led by hand or recorded, without its times.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct JointPath {
+    /// Joint positions [rad], one value per joint; joined by straight lines. At most 5000.
+    pub points: Vec<Vec<f64>>,
+    /// How far the motion may pass from them, so that it need not stop at each, above 0 and at most 0.1 [rad].
+    #[serde(default = "default_tolerance")]
+    pub tolerance: f64,
+}
+
+/// Default tolerance of a path [rad].
+pub const PATH_TOLERANCE: f64 = 0.005;
+/// Maximum tolerance of a path [rad].
+const MAX_TOLERANCE: f64 = 0.1;
+/// Maximum number of points of a path.
+pub const MAX_PATH: usize = 5000;
+
+fn default_tolerance() -> f64 {
+    PATH_TOLERANCE
+}
+
+impl JointPath {
+    pub(super) fn valid(&self) -> Result<(), String> {
+        let (count, width) = (self.points.len(), self.points.first().map_or(0, Vec::len));
+        if !(1..=MAX_PATH).contains(&count) {
+            return Err(format!("path.points has {count} points, must have 1 to {MAX_PATH}"));
+        }
+        for (index, point) in self.points.iter().enumerate() {
+            finite(&format!("path.points[{index}]"), point)?;
+            if point.is_empty() || point.len() != width {
+                return Err(format!("path.points[{index}] has {} values, the first point {width}", point.len()));
+            }
+        }
+        match self.tolerance > 0.0 && self.tolerance <= MAX_TOLERANCE {
+            true => Ok(()),
+            false => {
+                Err(format!("path.tolerance is {}, must be above 0 and at most {MAX_TOLERANCE} rad", self.tolerance))
+            }
+        }
+    }
+}
+
+/// Parameters of `move`: exactly one of `target` and `path`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Move {
     /// The arm's `hardware_id`.
     pub arm: String,
     /// Target of its joints [rad], one value per joint of the arm.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub target: Vec<f64>,
+    /// Path that the joints follow, after a straight motion to its first point.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub path: Option<JointPath>,
     /// Fraction of the velocity and acceleration limits to use, 0.01–1.
     #[serde(default = "default_speed")]
     pub speed: f64,
@@ -57,7 +104,7 @@ impl Move {
     /// Creates a request without further caps, for a run without a planner.
     pub fn new(arm: impl Into<String>, target: impl Into<Vec<f64>>, speed: f64) -> Self {
         let (arm, target) = (arm.into(), target.into());
-        Self { arm, target, speed, max_velocity: None, max_acceleration: None, direct: false }
+        Self { arm, target, path: None, speed, max_velocity: None, max_acceleration: None, direct: false }
     }
 
     /// Creates a request for a motion that is not collision-checked, also in a run with a planner.
@@ -67,7 +114,12 @@ impl Move {
 
     pub(super) fn valid(&self) -> Result<(), String> {
         let count = self.target.len();
-        if !(1..=MAX_DOF).contains(&count) {
+        if let Some(path) = &self.path {
+            path.valid()?;
+            if count > 0 {
+                return Err("target excludes path".into());
+            }
+        } else if !(1..=MAX_DOF).contains(&count) {
             return Err(format!("target has {count} values, must have 1 to {MAX_DOF}"));
         }
         finite("target", &self.target)?;

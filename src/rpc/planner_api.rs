@@ -8,7 +8,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::api::finite;
-use super::motion_api::{Trajectory, default_speed, valid_speed};
+use super::motion_api::{JointPath, Trajectory, default_speed, valid_speed};
 use super::report::{TcpReport, ToolReport};
 
 /// A pose; in the frame `map` unless another is given with it.
@@ -42,7 +42,7 @@ impl PoseSpec {
     }
 }
 
-/// Goal of one robot: exactly one of `joints`, `pose`, `by`, `named`.
+/// Goal of one robot: exactly one of `joints`, `pose`, `by`, `named`, `path`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PlanGoal {
@@ -65,6 +65,10 @@ pub struct PlanGoal {
     /// One of its named poses.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub named: Option<String>,
+    /// A path that it follows as it is, after a planned approach to its first point; for the only robot that moves.
+    /// Refused where it is not free.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub path: Option<JointPath>,
     /// Whether the tool centre point moves there on a straight line.
     #[serde(default)]
     pub linear: bool,
@@ -91,6 +95,17 @@ pub struct Plan {
     /// How far away its tool centre point may pass them, 0–1 [m]; 0: it stops at each.
     #[serde(default)]
     pub blend: f64,
+    /// Whether only its number selects this plan: `execute_plan` and `preview` without a number pass it over. For a
+    /// motion that is planned and executed in one step.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub by_number: bool,
+}
+
+impl Default for Plan {
+    fn default() -> Self {
+        let (goals, through, speed) = (Vec::new(), Vec::new(), default_speed());
+        Self { goals, speed, seed: 0, timeout: None, through, blend: 0.0, by_number: false }
+    }
 }
 
 /// Farthest that a waypoint may be passed [m].
@@ -98,10 +113,12 @@ const MAX_BLEND: f64 = 1.0;
 
 impl PlanGoal {
     fn valid(&self, field: &str) -> Result<(), String> {
-        let given = [self.joints.is_some(), self.pose.is_some(), self.by.is_some(), self.named.is_some()];
-        if given.iter().filter(|given| **given).count() != 1 {
-            return Err(format!("{field} must have one of joints, pose, by, named"));
+        let of = |what: bool| usize::from(what);
+        let given = of(self.joints.is_some()) + of(self.pose.is_some()) + of(self.by.is_some());
+        if given + of(self.named.is_some()) + of(self.path.is_some()) != 1 {
+            return Err(format!("{field} must have one of joints, pose, by, named, path"));
         }
+        self.path.as_ref().map_or(Ok(()), |path| path.valid().map_err(|what| format!("{field}.{what}")))?;
         let is_pose = self.pose.is_some() || self.by.is_some();
         if self.linear && !is_pose {
             return Err(format!("{field}: linear needs a pose"));
@@ -126,12 +143,18 @@ impl Plan {
                 return Err(format!("{field}: {} has a goal already", goal.robot));
             }
             goal.valid(&field)?;
+            if goal.path.is_some() && (self.goals.len() > 1 || !self.through.is_empty()) {
+                return Err(format!("{field}: a path is followed by one robot alone, and without other waypoints"));
+            }
         }
         for (index, waypoint) in self.through.iter().enumerate() {
             let field = format!("through[{index}]");
             waypoint.valid(&field)?;
             if self.goals.len() != 1 || self.goals.iter().any(|goal| goal.robot != waypoint.robot) {
                 return Err(format!("{field}: waypoints are for the robot of the only goal"));
+            }
+            if waypoint.path.is_some() {
+                return Err(format!("{field}: a path is no waypoint"));
             }
             if waypoint.by.is_some() || self.goals.iter().any(|goal| goal.by.is_some()) {
                 return Err(format!("{field}: a motion `by` begins at the present pose, not at a waypoint"));
@@ -249,12 +272,24 @@ pub struct GoalClamped {
 }
 
 /// Parameters of `preview`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Preview {
-    /// The plan's number; default: the newest plan.
+    /// The plan's number; default: the newest plan that is not `by_number`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<u64>,
+    /// Rate of the points, 0.1–1000 [Hz]: the motion as the arm gets it; default: the points that define it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub hz: Option<f64>,
+}
+
+impl Preview {
+    pub(super) fn valid(&self) -> Result<(), String> {
+        match self.hz.filter(|hz| !(0.1..=1000.0).contains(hz)) {
+            Some(hz) => Err(format!("hz is {hz}, must be within 0.1–1000")),
+            None => Ok(()),
+        }
+    }
 }
 
 /// A plan in full.
@@ -268,6 +303,9 @@ pub struct PreviewReply {
     pub trajectory: Trajectory,
     /// For each robot, the position of its tool centre point at each point of the trajectory: x, y, z [m] in `map`.
     pub end_effectors: BTreeMap<String, Vec<[f64; 3]>>,
+    /// For each robot, its orientation there as a quaternion x, y, z, w in `map`; with `hz` only.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub orientations: BTreeMap<String, Vec<[f64; 4]>>,
     /// For each robot, its tool centre point.
     #[serde(default)]
     pub tcps: BTreeMap<String, TcpReport>,
@@ -277,7 +315,7 @@ pub struct PreviewReply {
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ExecutePlan {
-    /// The plan's number; default: the newest plan.
+    /// The plan's number; default: the newest plan that is not `by_number`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<u64>,
     /// Whether a motion that an obstacle blocks is planned again from where it stopped, and continues.
@@ -327,7 +365,7 @@ pub struct PlannerReport {
     pub error: Option<String>,
     /// The planning robots.
     pub robots: Vec<RobotReport>,
-    /// Number of the newest plan.
+    /// Number of the plan that `execute_plan` and `preview` take without one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<u64>,
     /// Link pairs that touch in every configuration and are therefore not checked, by robot.

@@ -6,12 +6,16 @@ use std::time::Duration;
 use serde_json::json;
 
 use super::motions::{Carried, Planned};
+use super::planner_port::run_blocking;
 use super::service::{Service, internal};
 use crate::control::limit::Bounds;
 use crate::control::point_to_point::{MotionError, point_to_point};
 use crate::control::request::Motion;
 use crate::control::task_body::TargetKind;
 use crate::joint::JointLimits;
+use crate::planning::joint_path::{JointPath, Outside};
+use crate::planning::timing::time_within;
+use crate::planning::topp::JointBound;
 use crate::rpc::api::{self, Reply};
 use crate::rpc::{Code, RpcError};
 use crate::sync::lock;
@@ -64,8 +68,9 @@ impl Service {
         let arm = self.arm_index(&call.arm)?;
         let joints: Vec<u16> = self.joints_of_arm(arm).collect();
         let config = &self.parts.config.arms[arm as usize];
-        if call.target.len() != joints.len() {
-            let what = format!("{} has {} joints, the target {} values", call.arm, joints.len(), call.target.len());
+        let target = call.path.as_ref().and_then(|path| path.points.last()).unwrap_or(&call.target).clone();
+        if target.len() != joints.len() {
+            let what = format!("{} has {} joints, the target {} values", call.arm, joints.len(), target.len());
             return Err(RpcError::new(Code::InvalidParams, what).hint("give one position [rad] per joint, in order"));
         }
         let task = self.trajectory_task(&joints)?;
@@ -78,7 +83,14 @@ impl Service {
         let start = start.get(..config.dof).unwrap_or_default().to_vec();
         let names = self.parts.names.arms[arm as usize].joints.clone();
         let limits = capped(&config.limits, call.max_velocity, call.max_acceleration);
-        let motion = point_to_point(&names, &start, &call.target, &limits, call.speed).map_err(|e| match e {
+        let motion = match call.path {
+            Some(path) => {
+                let (names, start) = (names.clone(), start.clone());
+                run_blocking(move || along(&names, start, path, &limits, call.speed)).await?
+            }
+            None => point_to_point(&names, &start, &target, &limits, call.speed),
+        };
+        let motion = motion.map_err(|e| match e {
             MotionError::OutOfLimits { ref joint, excess, .. } => {
                 let data = json!({"joint": joint, "by": excess});
                 RpcError::new(Code::OutOfLimits, e.to_string())
@@ -101,7 +113,7 @@ impl Service {
             duration,
             joints: names,
             start,
-            target: call.target,
+            target,
             collision_checked: false,
         }))
     }
@@ -222,6 +234,43 @@ impl Service {
         }
         Ok(())
     }
+}
+
+/// Returns the motion straight to the first point of a path, and along it from rest to rest.
+fn along(
+    names: &[String],
+    start: Vec<f64>,
+    path: api::JointPath,
+    limits: &JointLimits,
+    speed: f64,
+) -> Result<JointTrajectory, MotionError> {
+    let list = |values: &[f64], j: usize| values.get(j).copied().unwrap_or_default();
+    let ranges: Vec<[f64; 2]> = (0..names.len())
+        .map(|j| Bounds::inside(list(&limits.position_lower, j), list(&limits.position_upper, j), 1.0, 1.0))
+        .map(|range| [range.lower, range.upper])
+        .collect();
+    let mut path = JointPath { points: path.points, tolerance: path.tolerance };
+    path.clamp(&ranges).map_err(|Outside { joint, position, limits: [lower, upper], .. }| {
+        MotionError::OutOfLimits {
+            joint: names.get(joint).cloned().unwrap_or_default(),
+            target: position,
+            lower,
+            upper,
+            excess: (lower - position).max(position - upper),
+        }
+    })?;
+    let mut deviation = vec![path.tolerance; path.points.len() + 1];
+    // It rests where the path begins.
+    deviation.iter_mut().take(2).for_each(|deviation| *deviation = 0.0);
+    let bound = |j| JointBound {
+        velocity: list(&limits.velocity_max, j),
+        acceleration: list(&limits.acceleration_max, j),
+        jerk: list(&limits.jerk_max, j),
+    };
+    let bounds: Vec<JointBound> = (0..names.len()).map(bound).collect();
+    let way = [vec![start], path.points].concat();
+    let timed = time_within(names, &way, &bounds, &deviation, speed, |_, _| true);
+    timed.map(|timed| timed.trajectory).map_err(|e| MotionError::NotFound(e.to_string()))
 }
 
 /// Returns the limits, with velocities [rad/s] and accelerations [rad/s²] of at most these.

@@ -4,23 +4,29 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use glamx::DAffine3;
 use nalgebra::Isometry3;
 
 use super::planner_port::{PlannerPort, positions_of, robot_index, run_blocking};
 use super::service::internal;
 use super::tcp::TcpModel;
 use crate::collision::Stop;
+use crate::planning::joint_path::JointPath;
 use crate::planning::padded::GivenUp;
 use crate::planning::path::length;
 use crate::planning::pipeline::{Goal, PlanRequest, PlannedMotion};
 use crate::planning::planner_thread::{BeginError, Job, Progress};
 use crate::planning::planning_scene::{PlannedRobot, PlanningScene};
+use crate::robot::kinematics::pose;
 use crate::rpc::api::{self, Moment, PlanSummary, ReleasedPlan};
 use crate::rpc::report::ToolReport;
 use crate::rpc::{Code, RpcError};
+use crate::trajectory::{Cursor, JointTrajectory, Sample, Spline, TrajectoryPoint};
 
 /// Timeout for checking whether a plan is still collision-free; after that it is not executed.
 const REVIEW_LIMIT: Duration = Duration::from_secs(2);
+/// Maximum number of samples of a preview: a reply of a few megabytes.
+const MAX_SAMPLES: f64 = 20_000.0;
 
 impl PlannerPort {
     pub(super) fn begin_plan(&self, plan: &api::Plan, moment: &Moment) -> Result<api::PlanReply, RpcError> {
@@ -30,7 +36,8 @@ impl PlannerPort {
         let positions = all_positions(&scene, moment)?;
         let waypoint = |goal| Ok(vec![self.goal_of(&scene, goal, moment)?]);
         let through = plan.through.iter().map(waypoint).collect::<Result<Vec<_>, RpcError>>()?;
-        let request = PlanRequest { goals, positions, speed: plan.speed, seed: plan.seed, through, blend: plan.blend };
+        let api::Plan { speed, seed, blend, by_number, .. } = *plan;
+        let request = PlanRequest { goals, positions, speed, seed, through, blend, by_number };
         let id = moment.plan;
         self.thread.begin(id, request, plan.timeout.map(Duration::from_secs_f64)).map_err(|why| {
             let error = RpcError::new(Code::Planning, why.to_string());
@@ -46,14 +53,19 @@ impl PlannerPort {
         let index = robot_index(scene, &goal.robot)?;
         let robot = scene.robots.get(index).ok_or_else(internal)?;
         let config = &robot.config;
-        let joints = |values: &[f64]| {
+        let positions = |values: &[f64]| {
             if values.len() == config.joints.len() {
-                return Ok(Goal::Joints(values.to_vec()));
+                return Ok(values.to_vec());
             }
             let what = format!("{} has {} joints, the goal {} values", config.name, config.joints.len(), values.len());
             Err(RpcError::new(Code::InvalidParams, what).hint("give one position [rad] per joint, in order"))
         };
+        let joints = |values: &[f64]| positions(values).map(Goal::Joints);
         let any_turn = goal.pose.is_some_and(|pose| pose.rpy.is_none() && pose.quat.is_none());
+        if let Some(path) = &goal.path {
+            let points = path.points.iter().map(|q| positions(q)).collect::<Result<_, RpcError>>()?;
+            return Ok((index, Goal::Path(JointPath { points, tolerance: path.tolerance })));
+        }
         let goal = match (&goal.joints, &goal.named, self.goal_pose(robot, goal, moment)?) {
             (Some(values), _, _) => joints(values)?,
             (_, Some(name), _) => {
@@ -74,27 +86,33 @@ impl PlannerPort {
         Ok((index, goal))
     }
 
-    pub(super) fn preview(&self, plan: Option<u64>) -> Result<api::PreviewReply, RpcError> {
-        let (job, found) = found(self, plan)?;
+    pub(super) fn preview(&self, call: &api::Preview) -> Result<api::PreviewReply, RpcError> {
+        let (job, found) = found(self, call.plan)?;
+        let mut trajectory = found.trajectory.clone();
+        if let Some(hz) = call.hz {
+            trajectory.points = samples(&trajectory, hz)?;
+        }
         let setup = self.thread.now();
-        let (mut end_effectors, mut tcps) = (BTreeMap::new(), BTreeMap::new());
+        let (mut end_effectors, mut orientations, mut tcps) = (BTreeMap::new(), BTreeMap::new(), BTreeMap::new());
         let mut first = 0;
         for &index in &found.robots {
             let Some(robot) = setup.robots.get(index) else { continue };
-            let kinematics = &robot.body.kinematics;
-            let mut frames = kinematics.frames();
-            let place = |point: &crate::trajectory::TrajectoryPoint, frames: &mut Vec<_>| {
+            let own = |point: &TrajectoryPoint| {
                 let own = point.positions.get(first..first + robot.joints.len()).unwrap_or_default();
-                kinematics.forward_from(&robot.body.base, own, frames);
-                kinematics.link_frame(robot.tcp(), frames).translation.to_array()
+                robot.tcp_pose(own)
             };
-            let way = found.trajectory.points.iter().map(|point| place(point, &mut frames)).collect();
-            end_effectors.insert(robot.config.name.clone(), way);
-            tcps.insert(robot.config.name.clone(), TcpModel::of(robot).report());
+            let poses: Vec<_> = trajectory.points.iter().map(own).collect();
+            let name = &robot.config.name;
+            end_effectors.insert(name.clone(), poses.iter().map(|pose| pose.translation.to_array()).collect());
+            if call.hz.is_some() {
+                let turn = |at: &DAffine3| <[f64; 4]>::from(pose(at).rotation.coords);
+                orientations.insert(name.clone(), poses.iter().map(turn).collect());
+            }
+            tcps.insert(name.clone(), TcpModel::of(robot).report());
             first += robot.joints.len();
         }
-        let summary = summary(&job, &found);
-        Ok(api::PreviewReply { plan: job.id, summary, trajectory: api_trajectory(&found), end_effectors, tcps })
+        let (plan, summary, trajectory) = (job.id, summary(&job, &found), api_trajectory(trajectory));
+        Ok(api::PreviewReply { plan, summary, trajectory, end_effectors, orientations, tcps })
     }
 
     /// Returns a plan for the coordinator to execute, if it is still collision-free.
@@ -109,7 +127,7 @@ impl PlannerPort {
         let version = self.thread.version();
         self.still_free(&job, &found, moment).await?;
         self.remember(job.id, found.clone(), version);
-        Ok(ReleasedPlan { plan: job.id, trajectory: api_trajectory(&found), task })
+        Ok(ReleasedPlan { plan: job.id, trajectory: api_trajectory(found.trajectory.clone()), task })
     }
 
     /// Checks a plan again: the world may have changed, or a robot that it does not move may have moved.
@@ -124,7 +142,7 @@ impl PlannerPort {
 
     /// Returns the planner's report. The run adds the progress of a motion.
     pub(super) fn report(&self) -> api::PlannerReport {
-        let (state, error) = match &self.thread.newest(false) {
+        let (state, error) = match &self.thread.newest() {
             Some(Job { progress: Progress::Planning(_), .. }) => ("PLANNING", None),
             Some(Job { progress: Progress::Failed(failure, _), .. }) if !failure.cancelled => {
                 ("FAULT", Some(failure.what.clone()))
@@ -152,7 +170,7 @@ impl PlannerPort {
             state: state.to_owned(),
             error,
             robots: self.thread.now().robots.iter().map(robot).collect(),
-            plan: self.thread.newest(true).map(|job| job.id),
+            plan: self.thread.newest_without_number().map(|job| job.id),
             always_touching,
         }
     }
@@ -167,12 +185,17 @@ pub(super) fn all_positions(setup: &PlanningScene, moment: &Moment) -> Result<Ve
 pub(super) fn job(port: &PlannerPort, plan: Option<u64>) -> Result<Job, RpcError> {
     let job = match plan {
         Some(id) => port.thread.job(id),
-        None => port.thread.newest(true),
+        None => port.thread.newest_without_number(),
     };
-    job.ok_or_else(|| match plan {
-        Some(id) => RpcError::new(Code::UnknownPlan, format!("there is no plan {id}, or it is too long ago"))
-            .hint("`dimos plan` makes one"),
-        None => RpcError::new(Code::NoPlan, "there is no plan yet").hint("`dimos plan` makes one"),
+    job.ok_or_else(|| {
+        let (code, what) = match plan {
+            Some(id) => (Code::UnknownPlan, format!("there is no plan {id}, or it is too long ago")),
+            None if port.thread.newest().is_some() => {
+                (Code::NoPlan, "there is no plan: the plan of a `move` is executed by that move only".to_owned())
+            }
+            None => (Code::NoPlan, "there is no plan yet".to_owned()),
+        };
+        RpcError::new(code, what).hint("`dimos plan` makes one")
     })
 }
 
@@ -182,7 +205,8 @@ pub(super) fn found(port: &PlannerPort, plan: Option<u64>) -> Result<(Job, Arc<P
         Progress::Found(found, _) => Ok((job.clone(), found.clone())),
         Progress::Planning(_) => Err(RpcError::new(Code::Planning, format!("plan {} is not ready yet", job.id))),
         Progress::Failed(failure, _) => {
-            Err(RpcError::new(Code::NoPlan, format!("plan {} was not found: {}", job.id, failure.what)))
+            let what = format!("plan {} was not found: {}", job.id, failure.what);
+            Err(RpcError::new(Code::NoPlan, what).hint("plan again; `--plan N` executes an earlier plan"))
         }
     }
 }
@@ -243,16 +267,35 @@ fn clamped((joint, requested, used): &(String, f64, f64)) -> api::GoalClamped {
     api::GoalClamped { joint: joint.clone(), requested: *requested, used: *used }
 }
 
-/// Converts a trajectory to its rpc type.
-fn api_trajectory(found: &PlannedMotion) -> api::Trajectory {
-    let point = |point: &crate::trajectory::TrajectoryPoint| api::Point {
-        time_from_start: point.time_from_start,
-        positions: point.positions.clone(),
-        velocities: Some(point.velocities.clone()).filter(|v| !v.is_empty()),
-        accelerations: Some(point.accelerations.clone()).filter(|a| !a.is_empty()),
-    };
-    api::Trajectory {
-        joint_names: found.trajectory.joint_names.clone(),
-        points: found.trajectory.points.iter().map(point).collect(),
+/// Samples a trajectory at a rate [Hz], its end included.
+fn samples(trajectory: &JointTrajectory, hz: f64) -> Result<Vec<TrajectoryPoint>, RpcError> {
+    let spline = Spline::new(trajectory).map_err(|e| RpcError::new(Code::InvalidTrajectory, e.to_string()))?;
+    let count = (spline.duration() * hz).ceil();
+    if count > MAX_SAMPLES {
+        let what = format!("{:.1} s at {hz} Hz are {count} samples (limit {MAX_SAMPLES})", spline.duration());
+        return Err(RpcError::new(Code::InvalidParams, what).hint("ask for a lower rate"));
     }
+    let (mut cursor, mut at) = (Cursor::default(), vec![Sample::default(); spline.joints()]);
+    let mut point = |time_from_start: f64| {
+        spline.sample(time_from_start, &mut cursor, &mut at);
+        let list = |value: fn(&Sample) -> f64| at.iter().map(value).collect();
+        TrajectoryPoint {
+            time_from_start,
+            positions: list(|s| s.position),
+            velocities: list(|s| s.velocity),
+            accelerations: list(|s| s.acceleration),
+        }
+    };
+    Ok((0..=count as u32).map(|k| point((f64::from(k) / hz).min(spline.duration()))).collect())
+}
+
+/// Converts a trajectory to its rpc type.
+fn api_trajectory(trajectory: JointTrajectory) -> api::Trajectory {
+    let point = |point: TrajectoryPoint| api::Point {
+        time_from_start: point.time_from_start,
+        positions: point.positions,
+        velocities: Some(point.velocities).filter(|v| !v.is_empty()),
+        accelerations: Some(point.accelerations).filter(|a| !a.is_empty()),
+    };
+    api::Trajectory { joint_names: trajectory.joint_names, points: trajectory.points.into_iter().map(point).collect() }
 }

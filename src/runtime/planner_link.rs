@@ -163,7 +163,8 @@ impl Service {
         matches!(cancelled, Ok(Reply::Cancel(reply)) if reply.planning)
     }
 
-    /// Returns a plan's number, by default the newest, and the coordinator's joints that it moves.
+    /// Returns a plan's number, by default that of the one to execute without a number, and the coordinator's joints
+    /// that it moves.
     pub(super) async fn plan_and_its_joints(&self, plan: Option<u64>) -> Result<(u64, Vec<String>), RpcError> {
         let planner = self.planner()?;
         let answer = |call| planner.answer(call, Moment::default(), QUERY_TIMEOUT);
@@ -171,10 +172,8 @@ impl Service {
             Some(number) => number,
             None => match answer(Call::Planner(api::Planner {})).await? {
                 Reply::Planner(PlannerReport { plan: Some(newest), .. }) => newest,
-                _ => {
-                    let none = RpcError::new(Code::NoPlan, "there is no plan yet");
-                    return Err(none.hint("`dimos plan` makes one"));
-                }
+                // The planner's own words.
+                _ => return answer(Call::Preview(api::Preview::default())).await.and_then(|_| Err(internal())),
             },
         };
         match answer(Call::Planning(api::Planning { plan: number })).await? {

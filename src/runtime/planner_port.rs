@@ -68,7 +68,7 @@ impl PlannerPort {
             Call::Planning(planning) => {
                 Ok(Reply::Planning(super::plan_requests::report(&job(self, Some(planning.plan))?)))
             }
-            Call::Preview(preview) => self.preview(preview.plan).map(Reply::Preview),
+            Call::Preview(preview) => self.preview(&preview).map(Reply::Preview),
             Call::Planner(_) => Ok(Reply::Planner(self.report())),
             Call::Cancel(cancel) => {
                 Ok(Reply::Cancel(CancelReply { planning: self.thread.cancel(cancel.plan), ..CancelReply::default() }))

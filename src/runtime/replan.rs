@@ -58,9 +58,14 @@ impl Service {
         self.rested(motion).await?;
         let unknown = || RpcError::new(Code::UnknownPlan, "the request of this plan is no longer known");
         let mut request = lock(&self.plan_requests).get(&motion.plan).cloned().ok_or_else(unknown)?;
+        if request.goals.iter().any(|goal| goal.path.is_some()) {
+            let what = "a path is followed as it is, not planned around what is in its way";
+            return Err(RpcError::new(Code::NoPlan, what));
+        }
         if request.goals.iter().any(is_relative) {
             self.resolve(&mut request, motion.plan).await?;
         }
+        request.by_number = true;
         let Reply::Plan(begun) = self.planner_call(Call::Plan(request)).await? else { return Err(internal()) };
         loop {
             if let Err(ended) = self.may_go_on(motion) {

@@ -27,6 +27,7 @@ use crate::control::tick_loop::Pulse;
 use crate::hardware::device::{Connected, Details, Device};
 use crate::joint::STANDSTILL;
 use crate::recording::recorder::{Notice, RecorderStats};
+use crate::recording::tcp_log::TcpChains;
 use crate::rpc::api::{self, Backend, BoxFuture, Done, RegisterPlanner, Registered, Reply, Request as Call};
 use crate::rpc::planner_proxy::PlannerProxy;
 use crate::rpc::report::StatusReport;
@@ -65,6 +66,8 @@ pub struct Service {
     pub(super) started: Instant,
     pub(super) motions: Mutex<Motions>,
     pub(super) recorder: OnceLock<Arc<RecorderStats>>,
+    /// The arms' tool centre points, for the log.
+    pub(super) logged_tcps: TcpChains,
     pub(super) log_throttle: LogThrottle,
     pub(super) late_stops: LateStops,
     pub(super) progress: Progress,
@@ -111,6 +114,7 @@ impl Service {
             started: Instant::now(),
             motions: Mutex::default(),
             recorder: OnceLock::new(),
+            logged_tcps: TcpChains::default(),
             log_throttle: LogThrottle::default(),
             late_stops: LateStops::default(),
             published: AtomicU64::new(0),

@@ -202,6 +202,7 @@ fn start_recorder(
     service: &Arc<Service>,
 ) -> Result<Recorder, StartError> {
     let (blueprint, wall) = (prepared.blueprint, prepared.wall);
+    service.log_tcps();
     let record = RecorderConfig {
         path: prepared.log.clone(),
         run: prepared.name.clone(),
@@ -209,6 +210,7 @@ fn start_recorder(
         frame_id: blueprint.coordinator.joint_state_frame_id.clone(),
         attachments: attachments(blueprint, config),
         metadata: metadata(blueprint, config),
+        tcps: service.logged_tcps.clone(),
         wall,
         min_free: blueprint.recording.min_free.0,
     };
@@ -228,6 +230,7 @@ fn publisher(service: Arc<Service>, wall: WallOffset) -> impl FnMut(bool) + Send
         service.publish(woken);
         if Instant::now() >= details_due {
             service.log_details();
+            service.log_tcps();
             details_due = Instant::now() + DETAILS_PERIOD;
         }
         service.report_late_stops(wall);

@@ -11,6 +11,7 @@ use nalgebra::Isometry3;
 use super::planner_port::{isometry, spec};
 use super::service::Service;
 use crate::planning::planning_scene::PlannedRobot;
+use crate::recording::tcp_log::TcpChain;
 use crate::robot::kinematics::{Kinematics, frame, pose};
 use crate::rpc::api::{RegisteredModel, RegisteredRobot};
 use crate::rpc::report::{PoseReport, TcpReport, ToolReport};
@@ -110,6 +111,19 @@ impl Service {
             planned.iter().find(|model| model.moves(joints)).cloned().or_else(|| self.tcp_of_task(joints))
         };
         self.parts.names.arms.iter().map(|arm| model(&arm.joints)).collect()
+    }
+
+    /// Passes the models to the recorder.
+    pub(super) fn log_tcps(&self) {
+        let all: Vec<&String> = self.parts.names.arms.iter().flat_map(|arm| &arm.joints).collect();
+        let index = |joint: &String| all.iter().position(|name| *name == joint);
+        let chain = |model: TcpModel| {
+            let joints = model.joints.iter().map(index).collect::<Option<_>>()?;
+            let TcpModel { kinematics, index: link, root, tool, .. } = model;
+            Some(TcpChain { joints, kinematics, link, root, tool })
+        };
+        let chains = self.tcp_models().into_iter().map(|model| chain(model?)).collect();
+        *lock(&self.logged_tcps) = chains;
     }
 
     /// Returns the model of the first task that moves the end effector of an arm with these joints.

@@ -33,6 +33,7 @@ impl Service {
             let _ = self.set_planner_tool(&model, model.tool).await;
             return Err(error);
         }
+        self.log_tcps();
         let tcp = TcpReport { tool: tool.as_ref().map(ToolReport::from), ..model.report() };
         let text = match tcp.tool {
             Some(tool) => format!("tool on {} at xyz {:.4?} m, rpy {:.4?} rad", tcp.link, tool.xyz, tool.rpy),

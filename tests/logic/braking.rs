@@ -149,6 +149,7 @@ fn motion(setup: &PlanningScene, checker: &mut ExactChecker, random: &mut Random
         seed,
         through: Vec::new(),
         blend: 0.0,
+        by_number: false,
     };
     let stop = Stop::new(Some(std::time::Instant::now() + Duration::from_secs(2)), None);
     solve(setup, &setup.world, &request, &stop).ok().filter(|found| found.trajectory.duration() > 0.5)

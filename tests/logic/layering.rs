@@ -44,6 +44,8 @@ const PARTS: &[(&str, &str, &str)] = &[
     ("blueprint", "control", "task_robot"),
     ("blueprint", "control", "task_spec"),
     ("blueprint", "planning", "config"),
+    // A log has the pose of each tool centre point.
+    ("recording", "robot", "kinematics"),
     // Unit tests of the device thread have the mock adapter of out-of-tree tests.
     ("hardware", "testing", "Call"),
     ("hardware", "testing", "MockAdapter"),

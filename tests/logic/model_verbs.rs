@@ -231,7 +231,7 @@ fn ik_has_a_base_a_group_a_tolerance_and_all_solutions() {
 fn collide_shows_the_pairs_that_touch_or_are_close() {
     let folded = ["0", "0", "1.7", "0", "0", "0"];
     let free = dimos(&["collide", "builtin:yourarm", "0", "0", "0", "0", "0", "0", "--within", "0"]);
-    assert_eq!((free.code, free.out.as_str()), (0, "free: no two links are within 0.0 mm\n"), "{}", free.err);
+    assert_eq!((free.code, free.out.as_str()), (0, "free: no two links are within 0.0000 m\n"), "{}", free.err);
     let near = dimos(&["collide", "builtin:yourarm", "0", "0", "0", "0", "0", "0", "--within", "1", "--json"]);
     let near: serde_json::Value = serde_json::from_str(&near.out).unwrap();
     let distances: Vec<f64> =

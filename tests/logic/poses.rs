@@ -51,8 +51,15 @@ fn plan(
     goal: Isometry3<f64>,
 ) -> Result<PlannedMotion, PlanFailure> {
     let goals = vec![(robot, Goal::Pose(goal))];
-    let request =
-        PlanRequest { goals, positions: positions.to_vec(), speed: 1.0, seed: 0, through: Vec::new(), blend: 0.0 };
+    let request = PlanRequest {
+        goals,
+        positions: positions.to_vec(),
+        speed: 1.0,
+        seed: 0,
+        through: Vec::new(),
+        blend: 0.0,
+        by_number: false,
+    };
     solve(scene, &scene.world, &request, &Stop::new(Some(Instant::now() + Duration::from_secs(20)), None))
 }
 

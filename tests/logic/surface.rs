@@ -10,9 +10,12 @@ use std::path::Path;
 use std::{env, fs};
 
 use clap::{ArgAction, Command};
+use dimos::blueprint::{Overrides, find, load};
 use dimos::cli::exit::Exit;
 use dimos::hardware::registry::Registry;
 use dimos::joint::make_joints;
+use dimos::planning::planning_scene::PlanningScene;
+use dimos::recording::tcp_log::TcpChain;
 use dimos::trajectory::{JointTrajectory, TrajectoryPoint};
 
 use crate::support::virtual_run::{VirtualRun, one_arm};
@@ -34,6 +37,14 @@ fn unchanged(name: &str, lines: &[String]) {
          An issue must ask for that, and the commit message must name it. Then write the file again:\n\
          DIMOS_REGENERATE=1 cargo test --test logic surface"
     );
+}
+
+/// The tool centre point of a YourArm.
+fn tcp() -> TcpChain {
+    let loaded = load(&find("yourarm-planner").unwrap(), &Overrides::default(), &Registry::builtin());
+    let robot = PlanningScene::load(&loaded.blueprint.unwrap().planner.unwrap()).unwrap().robots.remove(0);
+    let (kinematics, root) = (robot.body.kinematics.clone(), robot.body.base);
+    TcpChain { joints: (0..6).collect(), kinematics, link: robot.end_effector, root, tool: None }
 }
 
 /// The lines that only one of the texts has.
@@ -132,6 +143,7 @@ fn log_topics() {
         ..TrajectoryPoint::default()
     };
     let motion = JointTrajectory { joint_names: make_joints("arm", 6), points: vec![point(0.0, 0.0), point(0.5, 0.1)] };
+    *run.tcps.lock().unwrap() = vec![Some(tcp())];
     (0..20).for_each(|_| run.step());
     run.execute(0, &motion);
     (0..20).for_each(|_| run.step());

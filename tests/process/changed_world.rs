@@ -46,11 +46,8 @@ impl Cell {
     /// Plans to an angle of the first joint.
     fn plan(&self, angle: f64, speed: f64) -> u64 {
         let goal = PlanGoal { robot: "arm".into(), joints: Some(at(angle)), ..PlanGoal::default() };
-        let plan = self
-            .run
-            .call(Plan { goals: vec![goal], speed, seed: 0, timeout: None, through: Vec::new(), blend: 0.0 })
-            .unwrap()
-            .plan;
+        let plan =
+            self.run.call(Plan { goals: vec![goal], speed, seed: 0, timeout: None, ..Plan::default() }).unwrap().plan;
         eventually("planning ends", || self.run.call(Planning { plan }).unwrap().state != "PLANNING");
         assert_eq!(self.run.call(Planning { plan }).unwrap().state, "PLANNED");
         plan
@@ -111,7 +108,7 @@ impl Cell {
 
     /// The least distance from the objects on a plan's trajectory, for each of its points [rad, m].
     fn distances(&self, plan: u64, objects: &[WorldObject]) -> Vec<(Vec<f64>, f64)> {
-        let preview = self.run.call(Preview { plan: Some(plan) }).unwrap();
+        let preview = self.run.call(Preview { plan: Some(plan), hz: None }).unwrap();
         let ends = preview.trajectory.points.windows(2);
         let between = ends.flat_map(|pair| {
             let mix =

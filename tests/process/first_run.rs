@@ -66,6 +66,10 @@ fn a_move_ends_at_its_goal_and_replay_shows_it() {
         let off = joint["actual"].as_f64().unwrap() - joint["target"].as_f64().unwrap();
         assert!(off.abs() < 0.01, "{joint}");
     }
+    // The log of a live run is whole up to its newest chunk.
+    let live = home.dimos("replay --last --rate 1000").with(0).says(&["live: plays up to "]);
+    assert!(!live.err.contains("cut") && !live.err.contains("warning"), "{}", live.err);
+    home.dimos("replay --last --verify").with(0).shows(&["reproducible: ", "live: verified up to its newest chunk"]);
     home.dimos("down").with(0);
     // The log is closed when `down` returns.
     let played = home.dimos("replay --last --json --rate 1000 --topics /joint_states").with(0);

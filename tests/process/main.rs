@@ -47,4 +47,5 @@ mod stop_input;
 mod stops;
 mod teach;
 mod ur_runs;
+mod waypoints;
 mod xarm_runs;

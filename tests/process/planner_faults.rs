@@ -30,7 +30,7 @@ const PERIOD: Duration = Duration::from_millis(10);
 fn to(angle: f64, seed: u64) -> Plan {
     let joints = Some(vec![angle, -0.3, 0.6, 0.0, 0.8, 0.0]);
     let goal = PlanGoal { robot: "arm".into(), joints, ..PlanGoal::default() };
-    Plan { goals: vec![goal], speed: 1.0, seed, timeout: Some(0.2), through: Vec::new(), blend: 0.0 }
+    Plan { goals: vec![goal], speed: 1.0, seed, timeout: Some(0.2), ..Plan::default() }
 }
 
 /// What became of a request, and how long it took.

@@ -12,7 +12,7 @@ use crate::support::program::{Home, Started, eventually};
 use crate::support::wire::watch::Watch;
 
 /// An ideal arm in memory, with YourArm's description.
-const BLUEPRINT: &str = include_str!("../support/lab.yaml");
+pub(super) const BLUEPRINT: &str = include_str!("../support/lab.yaml");
 const HOME: [f64; 6] = [0.0, -0.3, 0.6, 0.0, 0.8, 0.0];
 /// Two walls that leave no way from one side of the arm to the other, as far as a search can tell in a minute.
 const WALLS: [&str; 2] = ["world add front --box 2 0.02 4 --at 1.1 0 0", "world add back --box 2 0.02 4 --at -1.1 0 0"];
@@ -36,7 +36,7 @@ fn up_between_walls() -> (Home, Started) {
 }
 
 #[track_caller]
-fn is_at(home: &Home, arm: &str, goal: &[f64]) {
+pub(super) fn is_at(home: &Home, arm: &str, goal: &[f64]) {
     let is = home.positions(arm);
     assert!(is.iter().zip(goal).all(|(is, goal)| (is - goal).abs() < 0.01), "{is:?} for {goal:?}");
 }
@@ -55,6 +55,7 @@ fn a_plan_is_shown_then_carried_out() {
     is_at(&home, "arm", &HOME);
     let shown = home.dimos("preview --out plan.json").with(0);
     assert!(shown.out.contains("arm_joint6") && shown.out.contains("arm: flange in map x"), "{}", shown.out);
+    sampled(&home, &home.dimos("preview --json").with(0).json());
     home.dimos("execute").with(0).says(&["planned, collision-checked"]);
     is_at(&home, "arm", &[0.3, -0.2, 0.5, 0.0, 0.4, 0.0]);
     // The file is a trajectory like any other, from where the plan began.
@@ -73,6 +74,31 @@ fn a_plan_is_shown_then_carried_out() {
     home.dimos("move arm --named home").with(0);
     home.dimos("move arm --named home").with(0);
     is_at(&home, "arm", &HOME);
+}
+
+/// `preview --hz`: the plan as the arm gets it, as CSV and as JSON.
+fn sampled(home: &Home, plan: &Value) {
+    let text = home.dimos("preview --hz 50").with(0).out;
+    let mut lines = text.lines();
+    let names: Vec<&str> = lines.next().unwrap().split(',').collect();
+    assert_eq!((names[0], names[1], names[7], names[13]), ("time", "arm_joint1", "arm_joint1_vel", "arm.x"));
+    let rows: Vec<Vec<f64>> = lines.map(|line| line.split(',').map(|cell| cell.parse().unwrap()).collect()).collect();
+    assert!(rows.iter().all(|row| row.len() == 1 + 6 + 6 + 7), "{names:?}");
+    let duration = plan["summary"]["duration"].as_f64().unwrap();
+    assert_eq!(rows.len(), (duration * 50.0).ceil() as usize + 1);
+    // Steps are what the velocities say, and the ends are those of the plan.
+    for pair in rows.windows(2).take(rows.len() - 2) {
+        let (step, mean) = (pair[1][1] - pair[0][1], 0.5 * (pair[0][7] + pair[1][7]) * 0.02);
+        assert!((pair[1][0] - pair[0][0] - 0.02).abs() < 2e-6 && (step - mean).abs() < 1e-4, "{pair:?}");
+    }
+    let last = rows.last().unwrap();
+    assert!((last[1] - 0.3).abs() < 1e-5 && last[7].abs() < 1e-5 && (last[0] - duration).abs() < 1e-5, "{last:?}");
+    assert!(end(plan).iter().zip(&last[13..16]).all(|(a, b)| (a - b).abs() < 1e-5), "{last:?}");
+    let json = home.dimos("preview --hz 50 --json").with(0).json();
+    assert_eq!(json["trajectory"]["points"].as_array().unwrap().len(), rows.len());
+    let turn: Vec<f64> = serde_json::from_value(json["orientations"]["arm"][0].clone()).unwrap();
+    assert!((turn.iter().map(|q| q * q).sum::<f64>() - 1.0).abs() < 1e-9, "{turn:?}");
+    home.dimos("preview --hz 0").with(2).says(&["within 0.1–1000 Hz"]);
 }
 
 #[test]
@@ -114,55 +140,6 @@ fn poses_lines_and_seeds() {
     is_at(&home, "arm", &[1.0, -0.3, 0.6, 0.0, 0.8, 0.0]);
     home.dimos("move arm --named near-table --speed 1").with(0);
     is_at(&home, "arm", &saved);
-    home.dimos("world remove post").with(0);
-    passes_waypoints(&home);
-}
-
-/// One motion through waypoints: it stops at each, or passes within `--blend` of it.
-fn passes_waypoints(home: &Home) {
-    home.dimos("move arm --named home --speed 1").with(0);
-    let through = "--through 0.5,-0.3,0.6,0,0.8,0 0.5,-0.1,0.4,0.3,0.8,0 line:0.35,0.05,0.35,3.14,0.2,0 near-table";
-    let planned = |options: &str| {
-        let plan = home.dimos(&format!("plan arm {through} {options} --speed 1 --json")).with(0).json();
-        (plan["summary"]["duration"].as_f64().unwrap(), home.dimos("preview --json").with(0).json())
-    };
-    // Largest joint distance of the closest point to the waypoint [rad], and the speed there [rad/s].
-    let closest = |preview: &Value, waypoint: [f64; 6]| {
-        let points = preview["trajectory"]["points"].as_array().unwrap();
-        let list = |point: &Value, what| -> Vec<f64> {
-            point[what].as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect()
-        };
-        let most = |values: &[f64]| values.iter().fold(0.0_f64, |most, v| most.max(v.abs()));
-        let away = |point: &Value| {
-            let off: Vec<f64> = list(point, "positions").iter().zip(waypoint).map(|(q, w)| q - w).collect();
-            (most(&off), most(&list(point, "velocities")))
-        };
-        points.iter().map(away).min_by(|a, b| a.0.total_cmp(&b.0)).unwrap()
-    };
-    let waypoint = [0.5, -0.1, 0.4, 0.3, 0.8, 0.0];
-    let (slow, exact) = planned("");
-    let (off, speed) = closest(&exact, waypoint);
-    assert!(off < 1e-6 && speed < 1e-6, "{off} rad, {speed} rad/s");
-    let (fast, blended) = planned("--blend 0.03");
-    let (off, speed) = closest(&blended, waypoint);
-    assert!(off > 1e-3 && off < 0.2 && speed > 0.05, "{off} rad, {speed} rad/s");
-    assert!(fast < 0.95 * slow, "{fast} s instead of {slow} s");
-    let tip =
-        |preview: &Value| -> Vec<[f64; 3]> { serde_json::from_value(preview["end_effectors"]["arm"].clone()).unwrap() };
-    let at = exact["trajectory"]["points"].as_array().unwrap().iter().position(|point| {
-        let q: Vec<f64> = serde_json::from_value(point["positions"].clone()).unwrap();
-        q.iter().zip(waypoint).all(|(q, w)| (q - w).abs() < 1e-6)
-    });
-    let place = tip(&exact)[at.unwrap()];
-    let distance = |p: &[f64; 3]| p.iter().zip(place).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
-    let nearest = tip(&blended).iter().map(distance).fold(f64::MAX, f64::min);
-    assert!(nearest < 0.03 + 1e-3, "{nearest} m from the waypoint");
-    let short = "--through 0.2,-0.3,0.6,0,0.8,0 0.2,-0.300000004,0.600000007,0,0.800000009,0 --blend 0.02 --json";
-    let plan = home.dimos(&format!("plan arm {short}")).with(0).json();
-    assert!(plan["summary"]["duration"].as_f64().unwrap() < 2.0, "a short piece takes no time: {plan}");
-    home.dimos(&format!("plan arm {through} 1,2")).with(2).says(&["6 joints, the goal 2 values"]);
-    home.dimos("plan arm --through home 0.1,0.2,0,0,0,9 home").with(1).says(&["waypoint 2: "]);
-    home.dimos("plan arm --through home").with(2);
 }
 
 #[test]
@@ -199,6 +176,27 @@ fn what_cannot_be_planned_is_refused_in_words() {
     let _run = fresh.run("lab.yaml --no-record");
     fresh.dimos("preview").with(1).says(table[10].2);
     fresh.dimos("execute").with(1).says(&["NO_PLAN"]);
+}
+
+#[test]
+fn execute_takes_what_plan_made_and_no_plan_of_a_move() {
+    let (home, _run) = up();
+    home.dimos("execute").with(1).says(&["NO_PLAN", "the plan of a `move`", "hint: `dimos plan` makes one"]);
+    home.dimos("preview").with(1).says(&["NO_PLAN"]);
+    // A move that begins and is not executed: another program has the arm.
+    home.dimos("plan arm 0.4 -0.3 0.6 0 0.8 0").with(0);
+    let mut holder = home.client();
+    holder.call(Lease { arm: Some("arm".into()) }).unwrap();
+    home.dimos("move arm -0.4 -0.3 0.6 0 0.8 0").with(1).says(&["LEASE_HELD"]);
+    drop(holder);
+    eventually("the lease is free", || home.dimos("execute --plan 4711").err.contains("UNKNOWN_PLAN"));
+    home.dimos("execute").with(0);
+    is_at(&home, "arm", &[0.4, -0.3, 0.6, 0.0, 0.8, 0.0]);
+    // A plan that was not found is no reason to execute the one before it.
+    home.dimos("plan arm --named home").with(0);
+    home.dimos("plan arm 0 1.5 1.5 0 0 0").with(1);
+    home.dimos("execute").with(1).says(&["NO_PLAN", "was not found: the goal collides", "hint: "]);
+    is_at(&home, "arm", &[0.4, -0.3, 0.6, 0.0, 0.8, 0.0]);
 }
 
 #[test]
@@ -394,14 +392,7 @@ fn two_arms_move_in_one_plan_and_keep_clear_of_each_other() {
             joints: Some(joints.into()),
             ..PlanGoal::default()
         };
-        Plan {
-            goals: vec![goal("left", left), goal("right", right)],
-            speed: 1.0,
-            seed: 3,
-            timeout: None,
-            through: Vec::new(),
-            blend: 0.0,
-        }
+        Plan { goals: vec![goal("left", left), goal("right", right)], speed: 1.0, seed: 3, ..Plan::default() }
     };
     let turned = |angle| [angle, -0.3, 0.6, 0.0, 0.8, 0.0];
     let mut planned = |plan: Plan| {
@@ -469,11 +460,24 @@ fn several_arms_are_sent_together_from_the_command_line() {
     // Poses, each in its own way, and the ways to type it wrong.
     home.dimos("plan --goal left=pose:0.35,0.4,0.3,3.14,0,0 --goal right=pose:0.35,-0.4,0.3").with(0);
     home.dimos("plan --goal left=pose:0.35,0.4,0.3,1,0,0,0").with(0);
+    // Each in a frame of its own: back by 4 cm along the tool, and 5 cm up in map.
+    let before = home.dimos("state --json").with(0).json();
+    home.dimos("plan --goal left=by:0,0,-0.04@tool --goal right=by:0,0,0.05").with(0);
+    let preview = home.dimos("preview --json").with(0).json();
+    for (index, arm, distance) in [(0, "left", 0.04), (1, "right", 0.05)] {
+        let start = &before["arms"][index]["pose"]["xyz"];
+        let goal = preview["end_effectors"][arm].as_array().unwrap().last().unwrap();
+        let moved =
+            (0..3).map(|k| (goal[k].as_f64().unwrap() - start[k].as_f64().unwrap()).powi(2)).sum::<f64>().sqrt();
+        assert!((moved - distance).abs() < 1e-3, "{arm} moves by {moved} m");
+    }
     for (arguments, words) in [
         ("plan --goal left", "must be ARM=GOAL"),
         ("plan --goal left=home", "not a number"),
         ("plan --goal left=pose:1,2", "a pose has 3, 6 or 7 numbers"),
         ("plan --goal left=pos:1,2,3", "must be ARM=GOAL"),
+        ("plan --goal left=by:0,0,0.1@", "@ needs a frame"),
+        ("plan --goal left=by:0,0,0.1@cup", "cup"),
         ("plan left --goal right=named:home", "cannot be used with"),
         ("move --goal left=named:home --direct", "cannot be used with"),
         ("plan --goal left=named:home --named home", "cannot be used with"),

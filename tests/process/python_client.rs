@@ -68,14 +68,24 @@ fn the_example_follows_its_policy() {
     assert!(ended.with(0).out.contains(" targets in 1."), "it says how it kept its time");
 }
 
-#[test]
-fn with_a_planner_the_client_plans() {
+/// Runs a script beside a run of the page's blueprint.
+fn tries(script: &str) {
     let home = Home::new();
     let [blueprint] = blocks("yaml")[..] else { panic!("one blueprint") };
     home.write("streams.yaml", blueprint);
     let _run = home.run("streams.yaml --no-record");
-    let Some(ended) = python(&home, &[&file("tests/python/try_planner.py")]) else { return };
+    let Some(ended) = python(&home, &[&file(script)]) else { return };
     assert!(ended.with(0).out.ends_with("all is as it says\n"));
+}
+
+#[test]
+fn with_a_planner_the_client_plans() {
+    tries("tests/python/try_planner.py");
+}
+
+#[test]
+fn with_a_planner_the_client_passes_waypoints() {
+    tries("tests/python/try_waypoints.py");
 }
 
 const PAGE: &str = include_str!("../../docs/python.md");

@@ -3,16 +3,24 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::{Arc, Mutex};
 
 use dimos::arm::{ArmCommand, ArmState, Link, Pose, VelocitySource};
+use dimos::blueprint::{Overrides, find, load};
 use dimos::clock::{Mono, WallOffset};
+use dimos::hardware::registry::Registry;
 use dimos::joint::{ControlMode, joints_of, make_joints};
+use dimos::planning::planning_scene::{PlannedRobot, PlanningScene};
 use dimos::recording::log_writer::LogAttachment;
 use dimos::recording::notes::channel;
 use dimos::recording::recorder::{Note, Recorder, RecorderConfig};
-use dimos::recording::replay::LogReader;
+use dimos::recording::replay::{LogReader, Payload};
+use dimos::recording::tcp_log::{TcpChain, TcpChains};
+use dimos::robot::kinematics::pose;
 use dimos::telemetry::describe::{ArmNames, Names, Severity};
 use dimos::telemetry::{ArmSample, Cause, Event, Outcome, Phase, Reason, Sample, TaskState, TickSample};
+
+use nalgebra::Isometry3;
 
 use crate::support::skip::skip_tool;
 
@@ -32,6 +40,7 @@ fn record(path: &Path) {
             data: b"name: readers\n".to_vec(),
         }],
         metadata: BTreeMap::new(),
+        tcps: tcps(),
         wall: WallOffset::of(Mono(5_000_000_000), WALL),
         min_free: 0,
     };
@@ -45,6 +54,54 @@ fn record(path: &Path) {
         sample(tick).into_iter().for_each(|s| ring.push(s).unwrap());
     }
     Recorder::start(config, consumer, receiver, |_| {}).unwrap().finish().unwrap();
+}
+
+/// The right arm is a YourArm, with a tool; of the left one there is no model.
+fn right_arm() -> PlannedRobot {
+    let registry = Registry::builtin();
+    let loaded = load(&find("yourarm-planner").unwrap(), &Overrides { sim: true, ..Overrides::default() }, &registry);
+    let mut config = loaded.blueprint.unwrap().planner.unwrap();
+    config.robots[0].tool = Some(Isometry3::translation(0.0, 0.0, 0.1));
+    PlanningScene::load(&config).unwrap().robots.remove(0)
+}
+
+fn tcps() -> TcpChains {
+    let robot = right_arm();
+    let chain = TcpChain {
+        joints: (7..13).collect(),
+        kinematics: robot.body.kinematics.clone(),
+        link: robot.end_effector,
+        root: robot.body.base,
+        tool: robot.config.tool,
+    };
+    Arc::new(Mutex::new(vec![None, Some(chain)]))
+}
+
+#[test]
+fn the_poses_of_a_log_are_those_of_its_joint_states() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("log.mcap");
+    record(&path);
+    let (robot, mut log, mut joints, mut poses) = (right_arm(), LogReader::open(&path).unwrap(), Vec::new(), 0);
+    while let Some(entry) = log.next_entry().unwrap() {
+        match entry.data {
+            Payload::JointState(state) if entry.topic == "/joint_states" => joints = state.position,
+            Payload::PoseStamped(message) => {
+                assert_eq!((entry.topic.as_str(), message.header.frame_id.as_str()), ("/tcp/right", "map"));
+                let (is, should) = (&message.pose, pose(&robot.tcp_pose(&joints[7..])));
+                let [x, y, z] = should.translation.vector.into();
+                let off = [is.position.x - x, is.position.y - y, is.position.z - z];
+                assert!(off.iter().all(|off| off.abs() < 1e-12), "{is:?} for {should}");
+                let turn = should.rotation.coords;
+                let dot = is.orientation.x * turn.x + is.orientation.y * turn.y + is.orientation.z * turn.z;
+                assert!(((dot + is.orientation.w * turn.w).abs() - 1.0).abs() < 1e-12, "{is:?} for {should}");
+                poses += 1;
+            }
+            _ => {}
+        }
+    }
+    // One for every state: at 100 Hz, from the 20th tick on.
+    assert_eq!(poses, 180);
 }
 
 fn sample(tick: u64) -> Vec<Sample> {

@@ -7,21 +7,9 @@ import time
 
 import dimos_client as dimos
 from dimos_client import Client
+from try_support import near, refused
 
 READY = [0.1, -0.2, 0.3, 0.0, 0.2, 0.0]
-
-
-def refused(kind, code, act):
-    try:
-        act()
-    except kind as error:
-        assert error.code == code, error
-        return error
-    raise AssertionError(f"{code} was expected")
-
-
-def near(a, b, by):
-    return all(abs(x - y) <= by for x, y in zip(a, b))
 
 
 def reads(robot):

@@ -4,23 +4,14 @@ import time
 
 import dimos_client as dimos
 from dimos_client import Client, Goal, Pose
+from try_support import near, refused
 
 HOME = [0.0, -0.3, 0.6, 0.0, 0.8, 0.0]
 ASIDE = [1.0, -0.3, 0.6, 0.0, 0.8, 0.0]
 
 
-def refused(kind, code, act):
-    try:
-        act()
-    except kind as error:
-        assert error.code == code, error
-        return error
-    raise AssertionError(f"{code} was expected")
-
-
 def is_at(robot, goal):
-    position = robot.state("arm").position
-    return all(abs(is_ - to) < 0.01 for is_, to in zip(position, goal))
+    return near(robot.state("arm").position, goal)
 
 
 def a_motion_that_is_not_planned_is_refused(robot):

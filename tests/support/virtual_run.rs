@@ -15,6 +15,7 @@ use dimos::joint::{ControlMode, JointLimits, make_joints};
 use dimos::recording::log_writer::LogAttachment;
 use dimos::recording::notes::{Notes, channel};
 use dimos::recording::recorder::{Note, Recorder, RecorderConfig};
+use dimos::recording::tcp_log::TcpChains;
 use dimos::runtime::log_of;
 use dimos::telemetry::describe::{ArmNames, Names};
 use dimos::telemetry::{Sample, TaskView, TickSample};
@@ -69,6 +70,8 @@ pub struct VirtualRun {
     inbox: VecDeque<Envelope>,
     next_id: u64,
     recorder: Recorder,
+    /// Models of the tool centre points, for the log.
+    pub tcps: TcpChains,
 }
 
 impl VirtualRun {
@@ -89,6 +92,7 @@ impl VirtualRun {
             media_type: "application/json".into(),
             data: serde_json::to_vec(config).unwrap(),
         };
+        let tcps = TcpChains::default();
         let record = RecorderConfig {
             path: Some(log.to_owned()),
             run: "virtual".into(),
@@ -96,6 +100,7 @@ impl VirtualRun {
             frame_id: "coordinator".into(),
             attachments: vec![attachment],
             metadata: BTreeMap::from([("config_version".to_owned(), config.version.to_string())]),
+            tcps: tcps.clone(),
             wall: WallOffset::of(START.0, START.1),
             min_free: 0,
         };
@@ -124,6 +129,7 @@ impl VirtualRun {
             inbox: VecDeque::new(),
             next_id: 1,
             recorder,
+            tcps,
         }
     }
 

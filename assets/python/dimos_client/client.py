@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from typing import Any, Dict, List, Mapping, Optional, Sequence, Set, Union
+from typing import Any, Collection, Dict, List, Mapping, Optional, Sequence, Set, Union
 
 from .errors import ArmNotReady, MotionFailed, Refused
-from .planning import Goals, Planning, goals_of, plan_number
-from .records import ArmState, Goal, Grip, Plan, Pose, numbers
+from .planning import Goals, Planning, plan_number, where_to
+from .records import ArmState, Goal, Grip, Plan, Pose, Waypoint, numbers
 
 STALLED = 15.0  # s without progress, after which `wait` cancels a motion
 GRIP_STARTS = 1.0  # s within which a gripper begins to move
@@ -32,22 +32,23 @@ class Client(Planning):
                         pose.get("frame"))
 
     def move(self, arm: Goals, target: Optional[Sequence[float]] = None, speed: float = 0.5, wait: bool = True, *,
-             named: Optional[str] = None, pose: Optional[Pose] = None, linear: bool = False, direct: bool = False,
-             replan: bool = False, seed: int = 0, timeout: Optional[float] = None) -> Dict[str, Any]:
-        """Moves an arm to `target` [rad], a `named` pose or a `pose`, or several together, as `plan`; `speed`: 0.01–1
-        of the limits. With a planner in the run the motion is planned around obstacles, and after `replan` planned
+             named: Optional[str] = None, pose: Optional[Pose] = None, by: Optional[Pose] = None,
+             frame: Optional[str] = None, linear: bool = False, through: Sequence[Waypoint] = (), blend: float = 0.0,
+             direct: bool = False, replan: bool = False, seed: int = 0,
+             timeout: Optional[float] = None) -> Dict[str, Any]:
+        """Moves an arm to `target` [rad], a `named` pose, a `pose`, `by` a pose or `through` waypoints, or several arms
+        together, with all keywords of `plan`; `speed`: 0.01–1 of the limits. With a planner in the run the motion is planned around obstacles, and after `replan` planned
         again when the world changes; `direct` moves straight in joint space, not collision-checked. Without a planner
         it is direct: `collision_checked` in the result says which. Ends this client's own streams to the arm."""
-        goals = goals_of(arm, Goal(target, named, pose, linear))
-        plain = isinstance(arm, str) and target is not None and not (named or pose or linear)
+        where = where_to(arm, Goal(target, named, pose, linear, frame, by), through, blend)
+        plain = isinstance(arm, str) and target is not None and not (named or pose or by or frame or linear)
         joints = numbers(target) if plain and target is not None else []
         if direct and not joints:
             raise Refused("INVALID_PARAMS", "a direct motion goes to joint positions", "give `target`")
         if not direct:
             try:
-                self._end_streams(self._streams_to(goals))
-                planned = self.plan(arm, target, named=named, pose=pose, linear=linear, speed=speed, seed=seed,
-                                    timeout=timeout)
+                self._end_streams(self._streams_to([arm] if isinstance(arm, str) else arm))
+                planned = self._planned(where, speed=speed, seed=seed, timeout=timeout, by_number=True)
                 return self.execute(planned, wait=wait, replan=replan)
             except Refused as error:
                 if not (error.code == "NO_PLANNER" and error.data is None and joints):
@@ -55,17 +56,17 @@ class Client(Planning):
         begun = self.call("move", arm=arm, target=joints, speed=speed, direct=direct or None)
         return self.wait(begun["motion"]) if wait else begun
 
-    def _streams_to(self, goals: Dict[str, Goal]) -> Set[str]:
+    def _streams_to(self, arms: Collection[str]) -> Set[str]:
         """The tasks to which this client streams, and whose joints a planned motion needs."""
         if not (self._streams or self._targets):
             return set()
         robots = self.call("planner")["robots"]
-        joints = {joint for robot in robots if robot["name"] in goals for joint in robot["joints"]}
+        joints = {joint for robot in robots if robot["name"] in arms for joint in robot["joints"]}
         return {task["name"] for task in self.status()["tasks"] if joints & set(task["joints"])}
 
     def execute(self, motion: Union[Plan, int, Mapping[str, Any], None] = None, task: Optional[str] = None,
                 wait: bool = True, *, replan: bool = False) -> Dict[str, Any]:
-        """Executes a plan (by default the newest), or follows a trajectory: joint_names, and points of
+        """Executes a plan (by default the newest of `plan`), or follows a trajectory: joint_names, and points of
         time_from_start [s], positions [rad], velocities [rad/s]. A trajectory is not collision-checked."""
         if motion is None or isinstance(motion, (Plan, int)):
             begun = self.call("execute_plan", plan=plan_number(motion), replan=replan or None)

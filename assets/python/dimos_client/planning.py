@@ -7,7 +7,7 @@ import time
 from typing import Any, Dict, List, Mapping, Optional, Sequence, Union
 
 from .errors import PlanningFailed, Refused
-from .records import Goal, Plan, Pose, numbers
+from .records import Goal, Plan, Pose, Waypoint, numbers
 from .streams import Streams
 
 Goals = Union[str, Mapping[str, Goal]]  # an arm, whose goal follows, or the goals of several
@@ -16,14 +16,20 @@ Goals = Union[str, Mapping[str, Goal]]  # an arm, whose goal follows, or the goa
 class Planning(Streams):
     """A connection that plans. All of this needs a planner in the run, else Refused with the code NO_PLANNER."""
     def plan(self, arm: Goals, target: Optional[Sequence[float]] = None, *, named: Optional[str] = None,
-             pose: Optional[Pose] = None, linear: bool = False, speed: float = 0.5, seed: int = 0,
+             pose: Optional[Pose] = None, by: Optional[Pose] = None, frame: Optional[str] = None, linear: bool = False,
+             through: Sequence[Waypoint] = (), blend: float = 0.0, speed: float = 0.5, seed: int = 0,
              timeout: Optional[float] = None) -> Plan:
         """Plans a collision-free motion from where the arm is, and waits for the plan; moves nothing. The goal is one
-        of `target` (joints [rad]), a `named` pose, or a `pose` of the end effector, on a straight line if `linear`.
+        of `target` (joints [rad]), a `named` pose, a `pose` of the tool centre point, or a motion `by` a pose from
+        where that is; both in `frame`, on a straight line if `linear`. Or one motion `through` waypoints, of which the
+        last is the goal; it passes them within `blend` [m], or stops at each.
         Several arms move together: `plan({"left": Goal(named="home"), "right": Goal(named="home")})`."""
-        goals = goals_of(arm, Goal(target, named, pose, linear))
-        params = [goal.params(name) for name, goal in goals.items()]
-        number: int = self.call("plan", goals=params, speed=speed, seed=seed, timeout=timeout)["plan"]
+        where = where_to(arm, Goal(target, named, pose, linear, frame, by), through, blend)
+        return self._planned(where, speed=speed, seed=seed, timeout=timeout)
+
+    def _planned(self, where: Dict[str, Any], **settings: Any) -> Plan:
+        """Plans, and waits for the plan."""
+        number: int = self.call("plan", **where, **settings)["plan"]
         try:
             while (report := self.call("planning", plan=number))["state"] == "PLANNING":
                 time.sleep(0.01)
@@ -38,10 +44,10 @@ class Planning(Streams):
         """Ends the planning of a plan, and no motion. Whether it was being planned."""
         return bool(self.call("cancel", plan=plan_number(plan)).get("planning", False))
 
-    def preview(self, plan: Union[Plan, int, None] = None) -> Dict[str, Any]:
-        """A plan, by default the newest, in full: `trajectory`, and per arm the path of its end effector [m] in
-        `end_effectors`."""
-        return self.call("preview", plan=plan_number(plan))
+    def preview(self, plan: Union[Plan, int, None] = None, hz: Optional[float] = None) -> Dict[str, Any]:
+        """A plan, by default the newest of `plan`, in full: `trajectory`, and per arm the path of its end effector [m]
+        in `end_effectors`. With `hz` sampled at that rate, with `orientations`."""
+        return self.call("preview", plan=plan_number(plan), hz=hz)
 
     def named_poses(self, arm: str) -> Dict[str, List[float]]:
         """The named poses of an arm [rad]."""
@@ -96,10 +102,35 @@ def plan_number(plan: Union[Plan, int, None]) -> Optional[int]:
     return plan.number if isinstance(plan, Plan) else plan
 
 
+def is_given(goal: Goal) -> bool:
+    """Whether anything of a goal is given."""
+    given = (goal.joints, goal.named, goal.pose, goal.by, goal.frame)
+    return goal.linear or any(one is not None for one in given)
+
+
+def where_to(arm: Goals, goal: Goal, through: Sequence[Waypoint], blend: float) -> Dict[str, Any]:
+    """The parameters of `plan` that say where."""
+    if not through:
+        return {"goals": [goal.params(name) for name, goal in goals_of(arm, goal).items()]}
+    if not isinstance(arm, str) or is_given(goal):
+        raise Refused("INVALID_PARAMS", "waypoints are for one arm, and the last is its goal", "give no other goal")
+    way = [waypoint(at).params(arm) for at in through]
+    return {"goals": way[-1:], "through": way[:-1], "blend": blend}
+
+
+def waypoint(at: Waypoint) -> Goal:
+    """A waypoint as a goal."""
+    if isinstance(at, Goal):
+        return at
+    if isinstance(at, str):
+        return Goal(named=at)
+    return Goal(pose=at) if isinstance(at, Pose) else Goal(joints=at)
+
+
 def goals_of(arm: Goals, goal: Goal) -> Dict[str, Goal]:
     """The goals of one arm or of several, by arm."""
     if isinstance(arm, str):
         return {arm: goal}
-    if goal.linear or any(given is not None for given in (goal.joints, goal.named, goal.pose)):
+    if is_given(goal):
         raise Refused("INVALID_PARAMS", "several arms have a goal each", "give none besides them")
     return dict(arm)

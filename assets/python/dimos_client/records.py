@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Dict, List, Optional, Sequence
+from typing import Any, Dict, List, Optional, Sequence, Union
 
 
 def numbers(values: Sequence[float]) -> List[float]:
@@ -59,12 +59,13 @@ class Pose:
 
 @dataclass(frozen=True)
 class Goal:
-    """Goal of an arm: one of `joints` [rad], `named`, `pose`."""
+    """Goal or waypoint of an arm: one of `joints` [rad], `named`, `pose`, `by`."""
     joints: Optional[Sequence[float]] = None
     named: Optional[str] = None
     pose: Optional[Pose] = None
     linear: bool = False  # the tool centre point moves to `pose` on a straight line
-    frame: Optional[str] = None  # of `pose`: "map" (default), "base", "tool", or an object of the world
+    frame: Optional[str] = None  # of `pose` or `by`: "map" (default), "base", "tool", or an object of the world
+    by: Optional[Pose] = None  # a motion of the tool centre point from where it is, along the axes of `frame`
 
     def params(self, arm: str) -> Dict[str, Any]:
         """The goal as a parameter of `plan`."""
@@ -75,11 +76,16 @@ class Goal:
             goal["named"] = self.named
         if self.pose is not None:
             goal["pose"] = self.pose.params()
+        if self.by is not None:
+            goal["by"] = self.by.params()
         if self.linear:
             goal["linear"] = True
         if self.frame is not None:
             goal["frame"] = self.frame
         return goal
+
+
+Waypoint = Union[str, Sequence[float], Pose, Goal]  # a named pose, joints [rad], a pose, or a goal with its settings
 
 
 @dataclass(frozen=True)

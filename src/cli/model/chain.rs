@@ -5,6 +5,15 @@ use crate::robot::srdf::Semantics;
 use crate::robot::{Joint, RobotModel};
 use crate::yaml::did_you_mean;
 
+/// Checks that there is a position for every joint of a link or robot.
+pub(super) fn check_count(of: &str, joints: &[&str], positions: &[f64]) -> Result<()> {
+    if joints.len() == positions.len() {
+        return Ok(());
+    }
+    let what = format!("`{of}` takes {} positions, found {}", joints.len(), positions.len());
+    Err(Failure::usage(what).hint(format!("the joints are: {}", joints.join(" "))))
+}
+
 /// Two links and the independent joints between them.
 pub(super) struct Chain<'r> {
     robot: &'r RobotModel,

@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use serde_json::json;
 
 use super::File;
-use super::chain::group_joints;
+use super::chain::{check_count, group_joints};
 use crate::cli::arguments::finite;
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output::{self, Table};
@@ -49,10 +49,7 @@ pub fn run(args: &Args) -> Result {
         None => robot.independent_joints(),
     };
     let names: Vec<&str> = joints.iter().filter_map(|j| robot.joints.get(*j)).map(|j| j.name.as_str()).collect();
-    if names.len() != args.positions.len() {
-        let what = format!("{} takes {} positions, found {}", robot.name, names.len(), args.positions.len());
-        return Err(Failure::usage(what).hint(format!("the joints are: {}", names.join(" "))));
-    }
+    check_count(&robot.name, &names, &args.positions)?;
     let q = configuration(&robot, &names, &args.positions);
     let mut body = whole(robot.clone(), loaded.semantics.disabled_pairs().collect()).map_err(Failure::usage)?;
     let unchecked = always_touch(&body);
@@ -79,17 +76,17 @@ pub fn run(args: &Args) -> Result {
         output::note(format_args!("not checked: {a} and {b} touch in every configuration"));
     }
     if !close.is_empty() {
-        let mut table = Table::new(&["LINK", "LINK", ">DISTANCE mm", ""]);
+        let mut table = Table::new(&["LINK", "LINK", ">DISTANCE m", ""]);
         for contact in &close {
             let touches = if contact.distance <= 0.0 { "touches" } else { "" };
-            let distance = output::fixed(contact.distance * 1e3, 1);
+            let distance = output::fixed(contact.distance, 4);
             table.row([contact.link.clone(), contact.other.clone(), distance, touches.to_owned()]);
         }
         table.print();
     }
-    let within = output::fixed(args.within * 1e3, 1);
+    let within = output::fixed(args.within, 4);
     output::line(match (touching, close.len()) {
-        (0, 0) => format!("free: no two links are within {within} mm"),
+        (0, 0) => format!("free: no two links are within {within} m"),
         (0, _) => "free".to_owned(),
         (1, _) => "1 pair of links touches; a negative distance is the penetration depth".to_owned(),
         (more, _) => format!("{more} pairs of links touch; a negative distance is the penetration depth"),

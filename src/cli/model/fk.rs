@@ -6,9 +6,9 @@ use nalgebra::Isometry3;
 use serde_json::json;
 
 use super::File;
-use super::chain::Chain;
+use super::chain::{Chain, check_count};
 use crate::cli::arguments::finite;
-use crate::cli::exit::{Exit, Failure, Result};
+use crate::cli::exit::{Exit, Result};
 use crate::cli::output;
 use crate::cli::targets::{Source, Width};
 use crate::pose::to_xyz_rpy;
@@ -45,11 +45,7 @@ pub fn run(args: &Args) -> Result {
     if args.stdin {
         return batch(args, &robot, &chain);
     }
-    if chain.joints.len() != args.positions.len() {
-        let (link, takes, found) = (chain.name(chain.link), chain.joints.len(), args.positions.len());
-        let failure = Failure::usage(format!("`{link}` takes {takes} positions, found {found}"));
-        return Err(failure.hint(format!("the joints are: {}", chain.names().join(" "))));
-    }
+    check_count(chain.name(chain.link), &chain.names(), &args.positions)?;
     chain.outside(&args.positions).iter().for_each(output::note);
     let pose = pose(&robot, &chain, &args.positions);
     if args.file.json {

@@ -28,7 +28,10 @@ fn print(found: &Verification) {
     let Verification { ticks, requests, events, length, .. } = found;
     let ran = format!("{ticks} ticks ({length:.3} s, {requests} requests, {events} events)");
     match &found.finding {
-        Finding::Reproducible => output::line(format_args!("reproducible: {ran}, every command bit for bit")),
+        Finding::Reproducible => {
+            let live = if found.live { "; live: verified up to its newest chunk" } else { "" };
+            output::line(format_args!("reproducible: {ran}, every command bit for bit{live}"));
+        }
         Finding::Different(d) => {
             output::line(format_args!("different at tick {}, after {:.3} s: {}", d.tick, d.time, what(d)));
             output::line(format_args!("  in the log: {}", d.logged));

@@ -46,9 +46,7 @@ impl Ik<'_> {
                 break;
             }
             self.start_around(near, spread, &mut random);
-            let error = self.descend(target, settings);
-            if settings_met(&error, settings) {
-                self.kinematics.unwind(&mut self.q, near, |_| true);
+            if settings_met(&self.reach(target, near, settings), settings) {
                 found.push(self.q.clone());
             }
         }

@@ -202,11 +202,16 @@ impl PlannerThread {
         lock(&self.shared.jobs).iter().rev().find(|job| job.id == id).cloned()
     }
 
-    /// Returns the newest request, or the newest with a motion.
-    pub fn newest(&self, found: bool) -> Option<Job> {
+    /// Returns the newest request.
+    pub fn newest(&self) -> Option<Job> {
         self.abandon_hung_request();
-        let jobs = lock(&self.shared.jobs);
-        jobs.iter().rev().find(|job| !found || matches!(job.progress, Progress::Found(..))).cloned()
+        lock(&self.shared.jobs).back().cloned()
+    }
+
+    /// Returns the newest request that does not need its number to be selected, also one without a motion.
+    pub fn newest_without_number(&self) -> Option<Job> {
+        self.abandon_hung_request();
+        lock(&self.shared.jobs).iter().rev().find(|job| !job.request.by_number).cloned()
     }
 }
 

@@ -40,6 +40,7 @@ fn turn(from: f64, to: f64, seed: u64) -> PlanRequest {
         seed,
         through: Vec::new(),
         blend: 0.0,
+        by_number: false,
     }
 }
 
@@ -75,7 +76,9 @@ fn a_panic_costs_one_request() {
     let failed = outcome(&planner, 2);
     assert!(matches!(&failed, Progress::Failed(f, _) if f.what.contains("a bug in the planner")), "{failed:?}");
     found(&planner, 3, turn(0.0, 0.5, 0));
-    assert_eq!(planner.newest(true).unwrap().id, 3);
+    assert_eq!(planner.newest().unwrap().id, 3);
+    found(&planner, 4, PlanRequest { by_number: true, ..turn(0.0, 0.5, 0) });
+    assert_eq!(planner.newest_without_number().unwrap().id, 3);
     assert!(matches!(planner.job(1).unwrap().progress, Progress::Found(..)));
 }
 
@@ -139,7 +142,7 @@ fn a_cancel_ends_the_request_and_frees_the_planner() {
     planner.begin(1, turn(1.5, -1.5, 0), None).unwrap();
     assert_eq!(planner.begin(2, turn(1.5, 1.4, 0), None), Err(BeginError::Busy));
     assert!(!planner.cancel(Some(2)), "the plan of another client");
-    assert!(planner.newest(false).unwrap().is_planning());
+    assert!(planner.newest().unwrap().is_planning());
     assert!(planner.cancel(Some(1)));
     let cancelled = outcome(&planner, 1);
     assert!(matches!(&cancelled, Progress::Failed(f, took) if f.cancelled && *took < TIMEOUT / 4), "{cancelled:?}");

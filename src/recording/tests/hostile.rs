@@ -35,6 +35,34 @@ fn every_prefix_of_a_log_is_read_up_to_the_cut() {
     assert_eq!(longest, whole.len());
 }
 
+/// A live log ends at its newest chunk, wherever its writer is; only without a writer it is cut.
+#[test]
+fn a_live_log_is_not_cut() {
+    let (folder, path) = folder();
+    record(&path, (0..60).flat_map(tick));
+    let bytes = std::fs::read(&path).unwrap();
+    let part = folder.path().join("part.mcap");
+    for length in [bytes.len() / 3, bytes.len() - 100, bytes.len() - 3] {
+        std::fs::write(&part, &bytes[..length]).unwrap();
+        let writer = std::fs::File::options().append(true).open(&part).unwrap();
+        files::mark_as_being_written(&writer);
+        let (live, end) = read(&part).unwrap();
+        assert!(end.is_none(), "{length} of {} bytes: {end:?}", bytes.len());
+        assert!(LogReader::open(&part).unwrap().info().live);
+        drop(writer);
+        let (ended, end) = read(&part).unwrap();
+        assert!(matches!(end, Some(ReplayError::Cut { .. })), "{end:?}");
+        assert_eq!(ended.len(), live.len());
+        assert!(!LogReader::open(&part).unwrap().info().live);
+    }
+    // A damaged log is cut, also while it is being written.
+    std::fs::write(&part, [&bytes[..bytes.len() - 100], &[0; 100]].concat()).unwrap();
+    let writer = std::fs::File::options().append(true).open(&part).unwrap();
+    files::mark_as_being_written(&writer);
+    let (_, end) = read(&part).unwrap();
+    assert!(matches!(end, Some(ReplayError::Cut { .. })), "{end:?}");
+}
+
 #[test]
 fn hostile_bytes_are_an_error_and_no_panic() {
     let (folder, path) = folder();

@@ -40,6 +40,7 @@ fn config(path: PathBuf) -> RecorderConfig {
             data: b"name: test\n".to_vec(),
         }],
         metadata: BTreeMap::from([("tick_rate".to_owned(), "100".to_owned())]),
+        tcps: Default::default(),
         wall: WallOffset::of(Mono(1_000_000_000), WALL),
         min_free: 0,
     }
