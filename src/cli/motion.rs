@@ -4,9 +4,9 @@
 use super::arguments::Target;
 use super::exit::{Exit, Failure, Result};
 use super::follow::{Signals, follow};
-use super::goal::{Goal, Search, has_planner, plan, show};
+use super::goal::{Goal, Leg, Search, has_planner, plan, show};
 use super::output;
-use crate::rpc::api::{ExecutePlan, Move, Poses, State};
+use crate::rpc::api::{ExecutePlan, Move, Plan, Planner, Poses, State};
 use crate::rpc::client::Client;
 
 /// Arguments of `move`.
@@ -24,7 +24,8 @@ its goal is given as joint positions.
   dimos move arm 0.3 -0.2 0.5 0 0.4 0
   dimos move arm --pose 0.3 0.1 0.4 --rpy 0 1.57 0
   dimos move arm --named home
-  dimos move --goal left=named:home --goal right=0.5,-0.3,0.6,0,0.8,0"
+  dimos move --goal left=named:home --goal right=0.5,-0.3,0.6,0,0.8,0
+  dimos move arm --through above grasp gripper:close above place gripper:open"
 )]
 pub struct Args {
     /// Name of the arm (hardware_id); with several arms use --goal for each
@@ -52,11 +53,19 @@ pub struct Args {
 
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
+    if args.goal.has_grips() && (args.no_wait || args.direct) {
+        return Err(Failure::usage("a motion with gripper actions is planned, and waits for each part")
+            .hint("without --no-wait and --direct"));
+    }
     let mut client = args.target_run.connect()?;
     let signals = Signals::watch();
+    if let (Some(arm), true) = (&args.arm, args.goal.has_grips()) {
+        return run_legs(args, arm, &mut client, &signals);
+    }
     let planned = !args.direct && has_planner(&mut client)?;
+    let request = args.goal.plan(args.arm.as_deref(), &args.search);
     let (motion, task, reply) =
-        if planned { plan_and_begin(args, &mut client, &signals)? } else { begin_direct(args, &mut client, &signals)? };
+        if planned { plan_and_begin(args, request, &mut client, &signals)? } else { begin_direct(args, &mut client, &signals)? };
     if !args.no_wait {
         return follow(&mut client, motion, &task, &signals, args.target_run.json);
     }
@@ -66,10 +75,39 @@ pub fn run(args: &Args) -> Result {
     Ok(Exit::Ok)
 }
 
+/// Executes a motion with gripper actions part by part: each motion is planned once the action before it has ended as it
+/// should, so for the fingers and the attached objects as they are then.
+fn run_legs(args: &Args, arm: &str, client: &mut Client, signals: &Signals) -> Result {
+    let robots = client.call(Planner {})?.robots;
+    let saved = client.call(Poses {})?.poses;
+    let robot = robots.iter().find(|robot| robot.name == arm);
+    // A wrong name ends it before anything moves.
+    let is_known = |name: &&str| saved.contains_key(*name) || robot.is_none_or(|r| r.named_poses.contains_key(*name));
+    if let Some(name) = args.goal.names().find(|name| !is_known(name)) {
+        return Err(Failure::usage(format!("{arm} has no named pose {name}: nothing has moved"))
+            .hint("`dimos pose list` lists the poses"));
+    }
+    for leg in args.goal.legs(arm, &args.search) {
+        match leg {
+            Leg::Motion(request) => {
+                let (motion, task, _) = plan_and_begin(args, request, client, signals)?;
+                match follow(client, motion, &task, signals, args.target_run.json)? {
+                    Exit::Ok => {}
+                    exit => return Ok(exit),
+                }
+            }
+            Leg::Grip(action) => action.run(client, arm, signals, args.target_run.json).map_err(|failure| {
+                let what = format!("{}: the motion ends here", failure.what);
+                Failure { what, ..failure }
+            })?,
+        }
+    }
+    Ok(Exit::Ok)
+}
+
 type Begun = (u64, String, serde_json::Value);
 
-fn plan_and_begin(args: &Args, client: &mut Client, signals: &Signals) -> Result<Begun> {
-    let request = args.goal.plan(args.arm.as_deref(), &args.search);
+fn plan_and_begin(args: &Args, request: Plan, client: &mut Client, signals: &Signals) -> Result<Begun> {
     let planned = plan(client, request, signals)?;
     if !args.target_run.json {
         show(&planned);

@@ -313,6 +313,22 @@ pub struct TaskReport {
     /// What currently limits its end effector.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bound: Option<String>,
+    /// What was sent to a `chunk` task, and the gripper targets sent to any task; absent before the first.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stream: Option<StreamCounts>,
+}
+
+/// Counts of a task's chunks and gripper targets since the start of the run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+pub struct StreamCounts {
+    /// Actions of chunks.
+    pub actions: u64,
+    /// Those that were dropped because their time was over.
+    pub late_actions: u64,
+    /// Gripper targets.
+    pub gripper_targets: u64,
+    /// Those that were dropped because their time was over.
+    pub late_gripper_targets: u64,
 }
 
 impl TaskReport {

@@ -156,9 +156,14 @@ pub fn log_of(request: &Request) -> Value {
         Request::Reset { arm } => json!({"reset": {"arm": arm}}),
         Request::Enabled { arm } => json!({"ready": {"arm": arm}}),
         Request::PrepareDisable { arm } => json!({"park": {"arm": arm}}),
-        Request::Gripper { arm, opening, force: None } => json!({"gripper": {"arm": arm, "opening": opening}}),
-        Request::Gripper { arm, opening, force } => {
-            json!({"gripper": {"arm": arm, "opening": opening, "force": force}})
+        Request::Gripper { arm, opening, force, speed } => {
+            let mut order = json!({"arm": arm, "opening": opening});
+            for (key, value) in [("force", force), ("speed", speed)] {
+                if value.is_some() {
+                    order[key] = json!(value);
+                }
+            }
+            json!({"gripper": order})
         }
         Request::Speed { fraction } => json!({"speed": {"fraction": fraction}}),
         Request::Pause { on } => json!({"pause": {"on": on}}),

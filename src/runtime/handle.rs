@@ -126,18 +126,18 @@ impl Handle {
 
     /// Commands the position of a gripper: its opening [m], or the angle [rad] of a rotary one.
     pub fn gripper(&self, arm: &str, position: f64) -> Result<(), RpcError> {
-        self.call(Gripper { arm: arm.to_owned(), position, force: None }).map(drop)
+        self.call(Gripper { arm: arm.to_owned(), position, ..Gripper::default() }).map(drop)
     }
 
     /// Commands the position of a gripper [m or rad] with a largest force, in its force unit [N or Nm].
     pub fn gripper_with_force(&self, arm: &str, position: f64, force: f64) -> Result<(), RpcError> {
-        self.call(Gripper { arm: arm.to_owned(), position, force: Some(force) }).map(drop)
+        self.call(Gripper { arm: arm.to_owned(), position, force: Some(force), ..Gripper::default() }).map(drop)
     }
 
     /// Sends the next target of a servo task [rad], one value per joint of the task; repeat it within the task's
     /// timeout.
     pub fn servo(&self, task: &str, positions: &[f64]) -> Result<(), RpcError> {
-        self.call(Servo { task: task.to_owned(), positions: positions.to_vec() }).map(drop)
+        self.call(Servo::new(task, positions.to_vec())).map(drop)
     }
 
     /// Sends the next target of a velocity task [rad/s], one value per joint of the task; repeat it within the task's

@@ -150,6 +150,7 @@ impl Service {
             reason: self.reason(&view.reason),
             motion: (view.motion > 0).then_some(view.motion),
             bound: Some(bound_text(view.bound, &self.parts.names)).filter(|text| !text.is_empty()),
+            stream: self.counters.get(index).and_then(|counters| counters.report()),
         })
     }
 
@@ -301,6 +302,7 @@ impl Service {
                     .data(serde_json::json!({"arm": arm(a), "force": force, "range": [least, most]}))
             }
             Outcome::NoGripperForce(_) => error.hint("command its position without a force"),
+            Outcome::NoGripperSpeed(_) => error.hint("command its position without a speed"),
             Outcome::WrongTask(_) => error.hint("`dimos status` lists the tasks and their types"),
             _ => error,
         })

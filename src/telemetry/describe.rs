@@ -156,7 +156,10 @@ fn request(id: u64, outcome: Outcome, names: &Names) -> Described {
             d.arm = Some(names.arm(arm));
             d.values = vec![value];
         }
-        Outcome::StartStateUnavailable(arm) | Outcome::NoGripper(arm) | Outcome::NoGripperForce(arm) => {
+        Outcome::StartStateUnavailable(arm)
+        | Outcome::NoGripper(arm)
+        | Outcome::NoGripperForce(arm)
+        | Outcome::NoGripperSpeed(arm) => {
             d.arm = Some(names.arm(arm));
         }
         Outcome::ArmNotReady(arm, _, cause) | Outcome::ArmLatched(arm, cause) | Outcome::StillFaulted(arm, cause) => {
@@ -195,6 +198,7 @@ pub fn outcome_text(outcome: &Outcome, names: &Names) -> String {
             format!("a force of {force} is outside the range of the gripper of {}", names.arm(arm))
         }
         Outcome::NoGripperForce(arm) => format!("the gripper of {} has no force control", names.arm(arm)),
+        Outcome::NoGripperSpeed(arm) => format!("the gripper of {} has no speed control", names.arm(arm)),
         Outcome::InvalidTarget(task) => {
             format!("the target of task {} is not finite, or its orientation is invalid", names.task(task))
         }

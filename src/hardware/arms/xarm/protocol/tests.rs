@@ -26,7 +26,7 @@ fn requests_are_the_golden_bytes() {
         (Command::MoveJoints { joints, speed: 0.5, acceleration: 8.0 }, 6, WATCHED, golden::MOVE_JOINTS),
         (Command::MoveLine { pose: POSE, speed: 100.0, acceleration: 2000.0 }, 7, WATCHED, golden::MOVE_LINE),
         (Command::Velocity { joints: velocities, duration: Some(0.2) }, 8, WATCHED, golden::VELOCITY),
-        (Command::Tool(Rtu::go(GripperKind::Xarm, 850, 50)), 9, WATCHED, golden::GRIPPER_GO),
+        (Command::Tool(Rtu::go(GripperKind::Xarm, 850, 50, None)), 9, WATCHED, golden::GRIPPER_GO),
         (Command::Tool(Rtu::read_position()), 10, WATCHED, golden::GRIPPER_READ),
         (Command::ReadToolBoard(0x0A0B), 11, WATCHED, golden::TOOL_BAUD),
         (Command::SetLoad([1.5, 0.0, -10.0, 80.0]), 12, WATCHED, golden::SET_LOAD),
@@ -34,7 +34,7 @@ fn requests_are_the_golden_bytes() {
     ] {
         assert_eq!(command.encode(transaction, protocol, &mut [0; 64]), bytes(golden), "{command:?}");
     }
-    assert_eq!(Rtu::go(GripperKind::XarmG2, 0, 50).bytes(), bytes(golden::GRIPPER_G2));
+    assert_eq!(Rtu::go(GripperKind::XarmG2, 0, 50, None).bytes(), bytes(golden::GRIPPER_G2));
 }
 
 fn response(golden: &str, transaction: u16, register: u8) -> Response {
