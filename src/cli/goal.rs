@@ -221,9 +221,7 @@ impl Goal {
     /// Returns a planning request, without gripper actions.
     pub fn plan(&self, robot: Option<&str>, search: &Search) -> Plan {
         let own = |waypoint: &Waypoint| match waypoint {
-            Waypoint::Goal(goal) => {
-                Some(PlanGoal { robot: robot.unwrap_or_default().to_owned(), ..goal.clone() })
-            }
+            Waypoint::Goal(goal) => Some(PlanGoal { robot: robot.unwrap_or_default().to_owned(), ..goal.clone() }),
             Waypoint::Grip(_) => None,
         };
         let mut through: Vec<PlanGoal> = self.through.iter().filter_map(own).collect();

@@ -64,8 +64,11 @@ pub fn run(args: &Args) -> Result {
     }
     let planned = !args.direct && has_planner(&mut client)?;
     let request = args.goal.plan(args.arm.as_deref(), &args.search);
-    let (motion, task, reply) =
-        if planned { plan_and_begin(args, request, &mut client, &signals)? } else { begin_direct(args, &mut client, &signals)? };
+    let (motion, task, reply) = if planned {
+        plan_and_begin(args, request, &mut client, &signals)?
+    } else {
+        begin_direct(args, &mut client, &signals)?
+    };
     if !args.no_wait {
         return follow(&mut client, motion, &task, &signals, args.target_run.json);
     }
@@ -75,8 +78,8 @@ pub fn run(args: &Args) -> Result {
     Ok(Exit::Ok)
 }
 
-/// Executes a motion with gripper actions part by part: each motion is planned once the action before it has ended as it
-/// should, so for the fingers and the attached objects as they are then.
+/// Executes a motion with gripper actions part by part. Each motion is planned once the action before it has succeeded,
+/// so for the fingers and the attached objects as they are then.
 fn run_legs(args: &Args, arm: &str, client: &mut Client, signals: &Signals) -> Result {
     let robots = client.call(Planner {})?.robots;
     let saved = client.call(Poses {})?.poses;

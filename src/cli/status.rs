@@ -393,9 +393,13 @@ pub(super) fn print_tasks(tasks: &[TaskReport]) {
             output::line(format_args!("  {} is limited by {bound}", task.name));
         }
         if let Some(sent) = &task.stream {
-            let counts = [("actions", sent.actions, sent.late_actions), ("gripper targets", sent.gripper_targets, sent.late_gripper_targets)];
+            let counts = [
+                ("actions", sent.actions, sent.late_actions),
+                ("gripper targets", sent.gripper_targets, sent.late_gripper_targets),
+            ];
             let sent = counts.iter().filter(|(_, count, _)| *count > 0);
-            let sent: Vec<_> = sent.map(|(what, count, late)| format!("{count} {what}, {late} of them late and dropped")).collect();
+            let sent: Vec<_> =
+                sent.map(|(what, count, late)| format!("{count} {what}, {late} of them late and dropped")).collect();
             output::line(format_args!("  {} was sent {}", task.name, sent.join("; ")));
         }
     }

@@ -50,8 +50,8 @@ impl PlannedRobot {
         named.filter(|(name, _)| !known(name)).map(|(name, joint)| (name, widest(&self.model, joint))).collect()
     }
 
-    /// Returns the links that no planned joint moves relative to `link`, such as the fingers on a flange: no plan brings
-    /// them closer to an object that it holds.
+    /// Returns the links that no planned joint moves relative to `link`, such as the fingers on a flange: no plan
+    /// brings them closer to an object that it holds.
     pub fn moved_together_with(&self, link: &str) -> Vec<String> {
         let carrier = |link: usize| {
             let carriers = std::iter::successors(link.checked_sub(1), |joint| {

@@ -36,7 +36,8 @@ impl Service {
         let age = if now > start { now.seconds_since(start) } else { 0.0 };
         let late = ((age / call.period).ceil() as usize).min(actions);
         let arm = call.gripper.as_deref().map(|targets| self.check_gripper_targets(task, targets)).transpose()?;
-        let count = |late| self.counters.get(task as usize).into_iter().for_each(|counters| counters.actions(actions, late));
+        let count =
+            |late| self.counters.get(task as usize).into_iter().for_each(|counters| counters.actions(actions, late));
         if late == actions {
             count(late);
             return Ok(api::ChunkReply { actions, late });

@@ -1,5 +1,5 @@
-//! Outcome of a gripper command, judged from what was measured after it: where the fingers came to rest, whether the
-//! device itself reports an object, the force. Never from the command alone.
+//! Outcome of a gripper command, judged from what was measured after it: where the fingers stopped, whether the device
+//! itself reports an object, the force. Never from the command alone.
 
 use std::time::Duration;
 
@@ -61,8 +61,7 @@ impl GripJudge {
         }
         // A device reports an object somewhat later than its fingers stop.
         let doubtful = self.closing && reading.holds == Some(false);
-        let settles =
-            if self.is_at(reading, self.target) || (self.has_moved && !doubtful) { SETTLES } else { STARTS };
+        let settles = if self.is_at(reading, self.target) || (self.has_moved && !doubtful) { SETTLES } else { STARTS };
         (now.since(self.since) >= settles).then(|| self.outcome(reading))
     }
 
@@ -120,8 +119,15 @@ mod tests {
         GripperInfo { range: Some((0.0, 0.08)), ..GripperInfo::default() }
     }
 
-    /// Plays fingers that take 0.8 s for their range and stop at `stop`; returns the outcome and the time of the last motion [s].
-    fn play(info: GripperInfo, from: f64, target: f64, stop: f64, end: (Option<f64>, Option<bool>)) -> (GripOutcome, f64) {
+    /// Plays fingers that take 0.8 s for their range and stop at `stop`. Returns the outcome and the time of the last
+    /// motion [s].
+    fn play(
+        info: GripperInfo,
+        from: f64,
+        target: f64,
+        stop: f64,
+        end: (Option<f64>, Option<bool>),
+    ) -> (GripOutcome, f64) {
         let mut judge = GripJudge::new(info, target, Some(10.0), from, Mono(0));
         let (mut position, step) = (from, info.range.map_or(0.0, |(a, b)| (a - b).abs() / 80.0));
         for tick in 1..500 {

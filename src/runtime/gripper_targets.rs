@@ -101,14 +101,15 @@ impl Counters {
 }
 
 impl Service {
-    /// Checks the gripper targets of a stream to a task: the arm of its joints has a gripper, and they are in its range.
-    /// Returns the arm.
+    /// Checks the gripper targets of a stream to a task: the arm of its joints has a gripper, and they are within its
+    /// range. Returns the arm.
     pub(super) fn check_gripper_targets(&self, task: u16, targets: &[f64]) -> Result<u16, RpcError> {
         let joints = self.parts.config.tasks.get(task as usize).map(|task| task.joints.as_slice()).unwrap_or_default();
         let mut arms = joints.iter().filter_map(|joint| self.locate(*joint)).map(|(arm, _)| arm as u16);
         let arm = arms.next().ok_or_else(internal)?;
         if arms.any(|other| other != arm) {
-            let what = format!("task {} has joints of several arms: whose gripper is meant?", self.parts.names.task(task));
+            let what =
+                format!("task {} has joints of several arms: whose gripper is meant?", self.parts.names.task(task));
             return Err(RpcError::new(Code::InvalidParams, what).hint("send gripper targets to a task of one arm"));
         }
         let Some(info) = self.gripper_info(arm.into()) else {
@@ -164,7 +165,9 @@ impl Service {
             }
             let range = info.gripper.and_then(|gripper| gripper.range);
             let same = range.map_or(0.0, |(closed, open)| SAME * (open - closed).abs());
-            if let Some(opening) = pending.next(now, same) {
+            // Paused, the gripper waits as the joints do.
+            let next = if self.speed_override().paused { None } else { pending.next(now, same) };
+            if let Some(opening) = next {
                 let request = Request::Gripper { arm, opening, force: None, speed: None };
                 let log = log_of(&request);
                 // A refusal is in the log; the next target tries again.

@@ -355,7 +355,9 @@ impl Service {
             Call::PoseSave(save) => self.save_pose(save).await.map(Reply::PoseSave),
             Call::PoseRemove(remove) => self.remove_pose(remove).await.map(|()| Reply::PoseRemove(Done {})),
             Call::Servo(s) => self.stream(s.task, s.positions, true, s.gripper).await.map(|()| Reply::Servo(Done {})),
-            Call::Velocity(v) => self.stream(v.task, v.velocities, false, None).await.map(|()| Reply::Velocity(Done {})),
+            Call::Velocity(v) => {
+                self.stream(v.task, v.velocities, false, None).await.map(|()| Reply::Velocity(Done {}))
+            }
             Call::Chunk(chunk) => self.chunk(chunk).await.map(Reply::Chunk),
             Call::Twist(twist) => self.twist(&twist).await.map(Reply::Twist),
             Call::Pose(pose) => self.pose(&pose).await.map(Reply::Pose),

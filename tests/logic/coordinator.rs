@@ -287,11 +287,18 @@ fn grippers_open_on_request_and_only_where_there_is_one() {
     rig.make_ready();
     assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: 0.04, force: None, speed: None }), Outcome::Accepted);
     assert_eq!((rig.arms[0].gripper, rig.commands[0].gripper_seq), (0.04, 1));
-    assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: 0.0, force: None, speed: None }), Outcome::Accepted, "closed");
+    assert_eq!(
+        rig.ask(Request::Gripper { arm: 0, opening: 0.0, force: None, speed: None }),
+        Outcome::Accepted,
+        "closed"
+    );
     assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: 0.04, force: None, speed: None }), Outcome::Accepted);
     assert_eq!(rig.ask(Request::Gripper { arm: 1, opening: 0.04, force: None, speed: None }), Outcome::NoGripper(1));
     for unfit in [f64::NAN, f64::INFINITY, -0.1] {
-        assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: unfit, force: None, speed: None }).name(), "OUT_OF_LIMITS");
+        assert_eq!(
+            rig.ask(Request::Gripper { arm: 0, opening: unfit, force: None, speed: None }).name(),
+            "OUT_OF_LIMITS"
+        );
     }
     // The gripper is refused, not a joint of the arm.
     let negative = rig.ask(Request::Gripper { arm: 0, opening: -0.1, force: None, speed: None });

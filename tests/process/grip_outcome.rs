@@ -139,3 +139,19 @@ fn chunks_and_streams_have_gripper_targets_and_late_ones_are_counted() {
     let [log] = &home.logs()[..] else { panic!("one log") };
     home.dimos(&format!("replay {} --verify", log.display())).with(0).shows(&["reproducible"]);
 }
+
+/// Of an xArm only the position is measured, of a Piper the torque, too. A jaw of an SO-101 that is stuck holds.
+#[test]
+fn other_arms_hold_what_is_between_their_fingers() {
+    let object = r#"[{"kind":"object","amount":0.03,"duration":600}]"#;
+    let stuck = r#"[{"kind":"blocked","joint":6,"duration":600}]"#;
+    for (run, faults, expected) in [
+        ("coordinator-xarm6", object, "holding an object at 0.030"),
+        ("coordinator-piper", object, "holding an object at 0.0300 m, force 1.00 Nm"),
+        ("coordinator-so101", stuck, "holding an object at "),
+    ] {
+        let home = Home::new();
+        let _run = home.run(&format!("{run} --sim --no-record --set hardware.arm.options.sim.faults={faults}"));
+        home.dimos("arm gripper arm close").with(0).shows(&[expected]);
+    }
+}

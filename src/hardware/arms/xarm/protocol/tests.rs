@@ -35,6 +35,10 @@ fn requests_are_the_golden_bytes() {
         assert_eq!(command.encode(transaction, protocol, &mut [0; 64]), bytes(golden), "{command:?}");
     }
     assert_eq!(Rtu::go(GripperKind::XarmG2, 0, 50, None).bytes(), bytes(golden::GRIPPER_G2));
+    // Speeds: of the motor [rpm]; of the fingers [mm/s] as the vendor's SDK converts 225, and 15 where less is asked.
+    assert_eq!(Rtu::speed(Some(0.5)).bytes(), bytes("0810030300010209c4"));
+    let speed = |fraction| Rtu::go(GripperKind::XarmG2, 0, 50, Some(fraction)).bytes()[9..11].to_vec();
+    assert_eq!((speed(1.0), speed(0.01)), (3765_u16.to_be_bytes().to_vec(), 578_u16.to_be_bytes().to_vec()));
 }
 
 fn response(golden: &str, transaction: u16, register: u8) -> Response {
