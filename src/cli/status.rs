@@ -362,7 +362,8 @@ fn gripper_line(arm: &ArmReport) -> Option<String> {
     let range = arm.gripper_range.map(|[closed, open]| format!("{closed:.4} {unit} closed, {open:.4} {unit} open"));
     let commands = arm.gripper_force_range.map(|[least, most]| format!("force {least} to {most} {force_unit}"));
     let measured = arm.gripper_force.map(|force| format!("measured force {force:.2} {force_unit}"));
-    let parts: Vec<String> = [range, commands, measured].into_iter().flatten().collect();
+    let speed = arm.gripper_has_speed.then(|| "speed control".to_owned());
+    let parts: Vec<String> = [range, commands, speed, measured].into_iter().flatten().collect();
     (!parts.is_empty()).then(|| format!("gripper {}", parts.join("; ")))
 }
 

@@ -200,30 +200,20 @@ pub enum GripOutcome {
     Blocked,
 }
 
-impl GripOutcome {
-    /// Returns the name as in JSON.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Open => "open",
-            Self::Closed => "closed",
-            Self::Reached => "reached",
-            Self::Holding => "holding",
-            Self::Blocked => "blocked",
-        }
-    }
-}
-
 impl GripReport {
     /// Returns the outcome with its figures as text.
     pub fn text(&self) -> String {
         let unit = &self.unit;
         let outcome = match self.outcome {
-            Some(GripOutcome::Holding) => "holding an object",
-            Some(outcome) => outcome.name(),
-            None => "no outcome",
+            Some(GripOutcome::Open) => "open at",
+            Some(GripOutcome::Closed) => "closed at",
+            Some(GripOutcome::Reached) => "reached",
+            Some(GripOutcome::Holding) => "holding an object at",
+            Some(GripOutcome::Blocked) => "blocked at",
+            None => "without an outcome at",
         };
         let force = self.force.map_or_else(String::new, |force| format!(", force {force:.2} {}", self.force_unit));
-        format!("gripper {outcome} at {:.4} {unit}{force}, after {:.2} s", self.position, self.elapsed)
+        format!("gripper {outcome} {:.4} {unit}{force}, after {:.2} s", self.position, self.elapsed)
     }
 }
 

@@ -188,6 +188,9 @@ pub struct ArmReport {
     /// Smallest and largest force of a gripper command [`gripper_force_unit`]; absent without force control.
     #[serde(default)]
     pub gripper_force_range: Option<[f64; 2]>,
+    /// Whether commands of its gripper may have a speed.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub gripper_has_speed: bool,
     /// Unit of its gripper's force: `N`, `Nm` or `%`; absent without a gripper.
     #[serde(default)]
     pub gripper_force_unit: Option<String>,

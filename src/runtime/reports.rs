@@ -116,6 +116,7 @@ impl Service {
             gripper_range: gripper.and_then(|gripper| gripper.range).map(<[f64; 2]>::from),
             gripper_unit: gripper.map(|gripper| gripper.unit.name().to_owned()),
             gripper_force_range: gripper.and_then(|gripper| gripper.force_range).map(<[f64; 2]>::from),
+            gripper_has_speed: gripper.is_some_and(|gripper| gripper.has_speed),
             gripper_force_unit: gripper.map(|gripper| gripper.force_unit.name().to_owned()),
             gripper_force: view.state.gripper_force,
             io: io.zip(health.details().io).map(|(info, state)| self.io_report(index, &info, &state)),

@@ -35,7 +35,7 @@ fn the_outcome_is_awaited_and_objects_are_attached_only_when_they_are_held() {
     let _run = home.run(&format!("grips.yaml --no-record --set hardware.arm.address={}", arm.address()));
     let said = home.dimos("arm gripper arm open").with(0).out;
     assert!(said.starts_with("arm: gripper open at 0.0800 m, force 0.00 N, after 0."), "{said}");
-    home.dimos("arm gripper arm 0.04").with(0).shows(&["gripper reached at 0.0400 m"]);
+    home.dimos("arm gripper arm 0.04").with(0).shows(&["gripper reached 0.0400 m"]);
     home.dimos("arm gripper arm close").with(0).shows(&["gripper closed at 0.0000 m"]);
     home.dimos("arm gripper arm open --no-wait").with(0).shows(&["arm: gripper to 0.0800 m"]);
     home.dimos("arm gripper arm open --timeout 0.01").with(1).says(&["still move after 0.01 s", "hint: "]);

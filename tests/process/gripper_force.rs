@@ -103,7 +103,7 @@ fn a_force_that_the_gripper_cannot_have_is_refused_and_moves_nothing() {
 fn a_rotary_gripper_is_in_radians_and_has_no_force() {
     let home = Home::new();
     let _run = home.run("coordinator-so101 --sim --no-record");
-    home.dimos("arm gripper arm 1.2").with(0).shows(&["arm: gripper reached at 1.", " rad, after "]);
+    home.dimos("arm gripper arm 1.2").with(0).shows(&["arm: gripper reached 1.", " rad, after "]);
     let state = || home.dimos("state --json").with(0).json()["arms"][0].clone();
     eventually("the angle", || state()["gripper"].as_f64().is_some_and(|angle| (angle - 1.2).abs() < 3e-3));
     assert_eq!((state()["gripper_unit"].as_str(), state()["gripper_force"].as_f64()), (Some("rad"), None));

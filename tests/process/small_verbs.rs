@@ -56,8 +56,8 @@ fn a_gripper_opens_and_closes_as_far_as_it_goes() {
     let (home, _run) = up();
     let mut client = home.client();
     let mut opening = || client.call(State {}).unwrap().arms[0].gripper.unwrap();
-    for (word, outcome, metres) in [("open", "open", 0.08), ("close", "closed", 0.0), ("0.03", "reached", 0.03)] {
-        home.dimos(&format!("arm gripper arm {word}")).with(0).shows(&[&format!("gripper {outcome} at {metres:.4} m")]);
+    for (word, outcome, metres) in [("open", "open at", 0.08), ("close", "closed at", 0.0), ("0.03", "reached", 0.03)] {
+        home.dimos(&format!("arm gripper arm {word}")).with(0).shows(&[&format!("gripper {outcome} {metres:.4} m")]);
         assert!((opening() - metres).abs() < 1e-3, "{word} waits");
     }
     // 40 mm at a quarter of 0.1 m/s.

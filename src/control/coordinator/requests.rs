@@ -163,7 +163,7 @@ impl Coordinator {
             (Some(force), Some((least, most))) if (least..=most).contains(&force) => {}
             (Some(force), Some(_)) => return Outcome::GripperForceOutOfLimits(arm, force),
         }
-        if speed.is_some_and(|speed| !info.has_speed || !(speed > 0.0 && speed <= 1.0)) {
+        if speed.is_some_and(|speed| !(info.has_speed && speed > 0.0 && speed <= 1.0)) {
             return Outcome::NoGripperSpeed(arm);
         }
         match a.failsafe.admits(arm) {
