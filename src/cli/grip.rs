@@ -1,5 +1,5 @@
-//! Gripper actions: `arm gripper`, and those between the waypoints of `move --through`. The run judges the outcome; this
-//! awaits and prints it, and attaches an object of the planner's world once it is held.
+//! Gripper actions: `arm gripper`, and those between the waypoints of `move --through`. The run judges the outcome.
+//! This awaits and prints it, and attaches an object of the planner's world once it is held.
 
 use std::thread::sleep;
 use std::time::Duration;
