@@ -200,6 +200,8 @@ pub struct ArmCommand {
     pub gripper: f64,
     /// Largest force of the gripper, in its force unit; `None`: the one set in the device.
     pub gripper_force: Option<f64>,
+    /// Fraction of the gripper's top speed (0–1]; `None`: the speed set in the device.
+    pub gripper_speed: Option<f64>,
     /// Counts the gripper commands; 0 = none yet.
     pub gripper_seq: u32,
     /// Counts the stops ordered from the arm's controller, e.g. when a latched hold is entered.
@@ -225,6 +227,7 @@ impl Default for ArmCommand {
             values: [0.0; MAX_DOF],
             gripper: 0.0,
             gripper_force: None,
+            gripper_speed: None,
             gripper_seq: 0,
             stop_seq: 0,
             next_tick: Mono::ZERO,

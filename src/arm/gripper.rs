@@ -46,4 +46,7 @@ pub struct GripperInfo {
     pub force_unit: ForceUnit,
     /// Smallest and largest force that can be commanded; `None` without force control.
     pub force_range: Option<(f64, f64)>,
+    /// Whether a command may have a speed.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub has_speed: bool,
 }

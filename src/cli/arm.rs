@@ -12,15 +12,17 @@ mod setup_motors;
 mod teach;
 pub(super) mod tool;
 
+use std::time::Duration;
+
 use clap::Subcommand;
 
-use super::arguments::{Target, finite};
-use super::exit::{Exit, Failure, Result};
+use super::arguments::{Target, duration, finite, speed};
+use super::exit::{Exit, Result};
+use super::follow::Signals;
+use super::grip::{GripAction, Objects, Opening, opening};
 use super::output;
 use crate::hardware::registry::Registry;
-use crate::rpc::api::{ArmDisable, ArmEnable, ArmReply, ArmReset, Gripper, Method, Status};
-use crate::rpc::client::Client;
-use crate::rpc::report::ArmReport;
+use crate::rpc::api::{ArmDisable, ArmEnable, ArmReply, ArmReset, Method};
 
 /// Arguments of `arm`.
 #[derive(Debug, clap::Args)]
@@ -46,17 +48,14 @@ enum Action {
     Reset(ArmArgs),
     /// Lead the arm by hand, and record the motion
     Teach(teach::Args),
-    /// Open or close the gripper, with a largest force if it has force control
-    Gripper {
-        #[command(flatten)]
-        which: ArmArgs,
-        /// Opening [m], angle [rad] of a rotary gripper, `open`, or `close`; `dimos status` shows the range
-        #[arg(value_name = "POSITION", value_parser = opening, allow_negative_numbers = true)]
-        opening: Opening,
-        /// Largest force [N, Nm or %; `dimos status` shows unit and range]; default: the one set in the arm
-        #[arg(long, value_name = "FORCE", value_parser = finite, allow_negative_numbers = true)]
-        force: Option<f64>,
-    },
+    /// Open or close the gripper, and wait for the outcome: open, closed, holding an object, blocked
+    #[command(after_help = "\
+Exit code 0: the fingers are where they were sent, or hold an object. 1: blocked, or no outcome within --timeout.
+
+  dimos arm gripper arm close --force 20
+  dimos arm gripper arm close --attach cup        # with a planner: cup is part of the arm once it is held
+  dimos arm gripper arm open --detach")]
+    Gripper(GripperArgs),
     /// List serial ports, and find the arm's by unplugging it or by asking each; no run needed
     FindPort(find_port::Args),
     /// Number the motors of a new arm, one after the other; no run needed
@@ -83,44 +82,32 @@ pub struct ArmArgs {
     pub target_run: Target,
 }
 
-/// Requested position of a gripper.
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum Opening {
-    /// This position [m or rad].
-    Position(f64),
-    /// Fully open.
-    Open,
-    /// Closed.
-    Close,
-}
-
-fn opening(text: &str) -> std::result::Result<Opening, String> {
-    match text {
-        "open" => Ok(Opening::Open),
-        "close" => Ok(Opening::Close),
-        _ => finite(text).map(Opening::Position).map_err(|e| format!("{e}; give m or rad, `open` or `close`")),
-    }
-}
-
-impl Opening {
-    /// Returns the position [m or rad]: the run knows the gripper's range.
-    fn of(self, client: &mut Client, arm: &str) -> Result<f64> {
-        if let Self::Position(position) = self {
-            return Ok(position);
-        }
-        let reported = client.call(Status {})?.arms.into_iter().find(|a| a.hardware_id == arm);
-        match reported {
-            Some(ArmReport { gripper_range: Some([closed, open]), .. }) => {
-                Ok(if self == Self::Open { open } else { closed })
-            }
-            // The run reports a wrong name.
-            None => Ok(0.0),
-            Some(_) => {
-                let what = format!("{arm} has no gripper, or does not report its range");
-                Err(Failure::new(Exit::Failed, what).hint(format!("give it as a number: dimos arm gripper {arm} 0.04")))
-            }
-        }
-    }
+/// Arguments of `arm gripper`.
+#[derive(Debug, clap::Args)]
+struct GripperArgs {
+    #[command(flatten)]
+    which: ArmArgs,
+    /// Opening [m], angle [rad] of a rotary gripper, `open`, or `close`; `dimos status` shows the range
+    #[arg(value_name = "POSITION", value_parser = opening, allow_negative_numbers = true)]
+    opening: Opening,
+    /// Largest force [N, Nm or %; `dimos status` shows unit and range]; default: the one set in the arm
+    #[arg(long, value_name = "FORCE", value_parser = finite, allow_negative_numbers = true)]
+    force: Option<f64>,
+    /// Fraction of the gripper's top speed, 0.01–1; default: the speed set in the arm
+    #[arg(long, value_name = "FRACTION", value_parser = speed)]
+    speed: Option<f64>,
+    /// Attach this object of the planner's world to the arm once the gripper holds it
+    #[arg(long, value_name = "OBJECT", conflicts_with_all = ["detach", "no_wait"])]
+    attach: Option<String>,
+    /// Detach the objects that the arm holds once the fingers have opened
+    #[arg(long, conflicts_with = "no_wait")]
+    detach: bool,
+    /// Maximum time for the outcome: 5s, or a number of seconds; default: 20s
+    #[arg(long, value_name = "TIME", value_parser = duration, conflicts_with = "no_wait")]
+    timeout: Option<Duration>,
+    /// Return when the command was sent
+    #[arg(long)]
+    no_wait: bool,
 }
 
 /// Runs the verb.
@@ -137,7 +124,7 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
             }
             Ok(Exit::Ok)
         }
-        Action::Gripper { which, opening, force } => gripper(which, *opening, *force),
+        Action::Gripper(args) => gripper(args),
         Action::Teach(args) => teach::run(args),
         Action::Io(args) => parts::io(args),
         Action::Payload(args) => parts::payload(args),
@@ -163,16 +150,26 @@ fn phase(which: &ArmArgs, request: impl Method<Reply = ArmReply>) -> Result<Stri
     Ok(reply.phase)
 }
 
-fn gripper(which: &ArmArgs, opening: Opening, force: Option<f64>) -> Result {
-    let (mut client, arm) = (which.target_run.connect()?, which.arm.clone());
-    let position = opening.of(&mut client, &arm)?;
-    let done = client.call(Gripper { arm, position, force })?;
+fn gripper(args: &GripperArgs) -> Result {
+    let (signals, which) = (Signals::watch(), &args.which);
+    let mut client = which.target_run.connect()?;
+    let objects = match &args.attach {
+        Some(name) => Objects::Attach(name.clone()),
+        None if args.detach => Objects::Detach,
+        None => Objects::Keep,
+    };
+    let (opening, force, speed, timeout) = (args.opening, args.force, args.speed, args.timeout);
+    let action = GripAction { opening, force, speed, timeout, objects };
+    if !args.no_wait {
+        return action.run(&mut client, &which.arm, &signals, which.target_run.json).map(|()| Exit::Ok);
+    }
+    let sent = action.send(&mut client, &which.arm)?;
     if which.target_run.json {
-        output::json(&done);
+        output::json(&sent);
     } else {
-        let unit = done.force_unit.as_deref().unwrap_or_default();
-        let force = done.force.map_or_else(String::new, |force| format!(", force at most {force} {unit}"));
-        output::line(format_args!("{}: gripper to {position:.4} {}{force}", which.arm, done.unit));
+        let unit = sent.force_unit.as_deref().unwrap_or_default();
+        let force = sent.force.map_or_else(String::new, |force| format!(", force at most {force} {unit}"));
+        output::line(format_args!("{}: gripper to {:.4} {}{force}", which.arm, sent.position, sent.unit));
     }
     Ok(Exit::Ok)
 }

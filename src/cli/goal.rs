@@ -9,6 +9,7 @@ use indicatif::{ProgressBar, ProgressFinish, ProgressStyle};
 use super::arguments::{finite, speed};
 use super::exit::{Exit, Failure, Result};
 use super::follow::Signals;
+use super::grip::{self, GripAction};
 use super::output::{self, fixed};
 use super::recorded_path;
 use crate::rpc::api::{
@@ -52,9 +53,9 @@ pub struct Goal {
     pub several: Vec<PlanGoal>,
     /// One motion through these waypoints; the last is the goal. Each is a named pose, joints as 0.1,-0.3,0.6,0,0.8,0,
     /// or pose:x,y,z,r,p,y (also with x,y,z or a quaternion, and @FRAME); line:… is reached on a straight
-    /// line
+    /// line. With `move` also gripper:open, gripper:close or gripper:0.03, where the arm waits for the outcome
     #[arg(long, value_name = "WAYPOINT", num_args = 2.., value_parser = waypoint, allow_negative_numbers = true, conflicts_with_all = ["joints", "tcp", "named", "several"])]
-    pub through: Vec<PlanGoal>,
+    pub through: Vec<Waypoint>,
     /// Follow the path of a motion that was led or recorded: .csv or .json as for `execute`, or a log (.mcap). Its
     /// times do not count; the way to its first point is planned
     #[arg(long, value_name = "FILE", conflicts_with_all = ["joints", "tcp", "named", "several", "through"])]
@@ -65,6 +66,23 @@ pub struct Goal {
     /// How far away the tool centre point may pass the waypoints [m]; 0: it stops at each
     #[arg(long, value_name = "DISTANCE", default_value_t = 0.0, value_parser = finite, requires = "through")]
     pub blend: f64,
+}
+
+/// An entry of `--through`.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Waypoint {
+    /// Where the arm goes.
+    Goal(PlanGoal),
+    /// What the gripper does there.
+    Grip(GripAction),
+}
+
+/// A part of a motion with gripper actions.
+pub enum Leg {
+    /// To plan and execute.
+    Motion(Plan),
+    /// To do at its end.
+    Grip(GripAction),
 }
 
 /// Parses a joint position; a name and a list get a hint at what was probably meant.
@@ -113,7 +131,7 @@ fn arm_goal(text: &str) -> std::result::Result<PlanGoal, String> {
 }
 
 /// Parses a waypoint, as in `--through`. It gets its robot later.
-fn waypoint(text: &str) -> std::result::Result<PlanGoal, String> {
+fn waypoint(text: &str) -> std::result::Result<Waypoint, String> {
     let mut planned = PlanGoal::default();
     match text.split_once(':') {
         Some((kind @ ("pose" | "line"), list)) => {
@@ -121,11 +139,14 @@ fn waypoint(text: &str) -> std::result::Result<PlanGoal, String> {
             planned.linear = kind == "line";
         }
         Some(("named", name)) => planned.named = Some(name.to_owned()),
-        Some(_) => return Err("must be a name, joints as 0.1,-0.3,…, pose:x,y,z,… or line:x,y,z,…".into()),
+        Some(("gripper", action)) => return grip::action(action).map(Waypoint::Grip),
+        Some(_) => {
+            return Err("must be a name, joints as 0.1,-0.3,…, pose:x,y,z,…, line:x,y,z,… or gripper:close".into());
+        }
         None if text.contains(',') => planned.joints = Some(numbers(text)?),
         None => planned.named = Some(text.to_owned()),
     }
-    Ok(planned)
+    Ok(Waypoint::Goal(planned))
 }
 
 fn numbers(list: &str) -> std::result::Result<Vec<f64>, String> {
@@ -197,9 +218,6 @@ impl Goal {
     /// Returns the goals for the planner; `robot` is the robot of positions, pose and name.
     fn of(&self, robot: Option<&str>, path: Option<JointPath>, search: &Search) -> Vec<PlanGoal> {
         let Some(robot) = robot else { return self.several.clone() };
-        if let Some(last) = self.through.last() {
-            return vec![PlanGoal { robot: robot.to_owned(), ..last.clone() }];
-        }
         vec![PlanGoal {
             robot: robot.to_owned(),
             joints: self.joints().map(<[f64]>::to_vec),
@@ -214,7 +232,30 @@ impl Goal {
 }
 
 impl Goal {
-    /// Returns a planning request.
+    /// Returns whether there are gripper actions between the waypoints.
+    pub fn has_grips(&self) -> bool {
+        self.through.iter().any(|waypoint| matches!(waypoint, Waypoint::Grip(_)))
+    }
+
+    /// Returns the names of poses among the waypoints.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.through.iter().filter_map(|waypoint| match waypoint {
+            Waypoint::Goal(goal) => goal.named.as_deref(),
+            Waypoint::Grip(_) => None,
+        })
+    }
+
+    /// Returns the motions and the gripper actions of a motion with both, in order.
+    pub fn legs(&self, robot: &str, search: &Search) -> Vec<Leg> {
+        let goes = |waypoint: &Waypoint| matches!(waypoint, Waypoint::Goal(_));
+        let leg = |part: &[Waypoint]| match part {
+            [Waypoint::Grip(action)] => Leg::Grip(action.clone()),
+            part => Leg::Motion(Self { through: part.to_vec(), ..self.clone() }.planned(Some(robot), None, search)),
+        };
+        self.through.chunk_by(|a, b| goes(a) && goes(b)).map(leg).collect()
+    }
+
+    /// Returns a planning request, without gripper actions.
     pub fn plan(&self, client: &mut Client, robot: Option<&str>, search: &Search) -> Result<Plan> {
         let path = match (&self.path, robot) {
             (Some(file), Some(name)) => {
@@ -224,17 +265,24 @@ impl Goal {
             }
             _ => None,
         };
-        let before = self.through.split_last().map(|(_, before)| before).unwrap_or_default();
-        let own = |goal: &PlanGoal| PlanGoal { robot: robot.unwrap_or_default().to_owned(), ..goal.clone() };
-        Ok(Plan {
-            goals: self.of(robot, path, search),
+        Ok(self.planned(robot, path, search))
+    }
+
+    fn planned(&self, robot: Option<&str>, path: Option<JointPath>, search: &Search) -> Plan {
+        let own = |waypoint: &Waypoint| match waypoint {
+            Waypoint::Goal(goal) => Some(PlanGoal { robot: robot.unwrap_or_default().to_owned(), ..goal.clone() }),
+            Waypoint::Grip(_) => None,
+        };
+        let mut through: Vec<PlanGoal> = self.through.iter().filter_map(own).collect();
+        Plan {
+            goals: through.pop().map_or_else(|| self.of(robot, path, search), |last| vec![last]),
             speed: search.speed,
             seed: search.seed,
             timeout: search.timeout.map(|t| t.as_secs_f64()),
-            through: before.iter().map(own).collect(),
+            through,
             blend: self.blend,
             by_number: false,
-        })
+        }
     }
 }
 

@@ -10,6 +10,7 @@
 
 mod active_motions;
 mod drive;
+mod fingers;
 mod keys;
 mod screen;
 mod session;
@@ -34,7 +35,8 @@ use watch::Watch;
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
 W/S A/D Q/E move the end effector along x, y, z, R/F T/G Y/H rotate it about them (roll, pitch, yaw); B: axes of the base \
-or of the tool. Tab: single joints: 1-9 select one, +/- or the arrows move it. [ ] speed, Space rest, X latched stop, Esc \
+or of the tool. Tab: single joints: 1-9 select one, +/- or the arrows move it. O and C open and close the gripper, a tap by a \
+small step. [ ] speed, Space rest, X latched stop, Esc \
 leave. Hold a key to move: the arm decelerates to rest within 0.25 s of the last key press, or at key-up if the terminal \
 reports it (kitty keyboard protocol).
 

@@ -18,6 +18,7 @@ pub mod exit;
 mod fetch;
 mod follow;
 mod goal;
+mod grip;
 pub mod jog;
 pub mod list_adapters;
 pub mod list_blueprints;

@@ -4,10 +4,10 @@
 use super::arguments::Target;
 use super::exit::{Exit, Failure, Result};
 use super::follow::{Signals, follow, follow_until};
-use super::goal::{Goal, Search, has_planner, plan, show};
+use super::goal::{Goal, Leg, Search, has_planner, plan, show};
 use super::{output, recorded_path};
 use crate::rpc::Code;
-use crate::rpc::api::{Cancel, ExecutePlan, Move, MoveNative, MoveReply, Plan, Poses, State};
+use crate::rpc::api::{Cancel, ExecutePlan, Move, MoveNative, MoveReply, Plan, Planner, Poses, State};
 use crate::rpc::client::Client;
 
 /// Arguments of `move`.
@@ -26,7 +26,8 @@ its goal is given as joint positions.
   dimos move arm 0.3 -0.2 0.5 0 0.4 0
   dimos move arm --pose 0.3 0.1 0.4 --rpy 0 1.57 0
   dimos move arm --named home
-  dimos move --goal left=named:home --goal right=0.5,-0.3,0.6,0,0.8,0"
+  dimos move --goal left=named:home --goal right=0.5,-0.3,0.6,0,0.8,0
+  dimos move arm --through above grasp gripper:close above place gripper:open"
 )]
 pub struct Args {
     /// Name of the arm (hardware_id); with several arms use --goal for each
@@ -58,14 +59,25 @@ pub struct Args {
 
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
+    if args.goal.has_grips() && (args.no_wait || args.direct) {
+        return Err(Failure::usage("a motion with gripper actions is planned, and waits for each part")
+            .hint("without --no-wait and --direct"));
+    }
     let mut client = args.target_run.connect()?;
     let signals = Signals::watch();
     if args.native {
         return move_native(args, &mut client, &signals);
     }
+    if let (Some(arm), true) = (&args.arm, args.goal.has_grips()) {
+        return run_legs(args, arm, &mut client, &signals);
+    }
     let planned = !args.direct && has_planner(&mut client)?;
-    let (motion, task, reply) =
-        if planned { plan_and_begin(args, &mut client, &signals)? } else { begin_direct(args, &mut client, &signals)? };
+    let (motion, task, reply) = if planned {
+        let request = args.goal.plan(&mut client, args.arm.as_deref(), &args.search)?;
+        plan_and_begin(args, request, &mut client, &signals)?
+    } else {
+        begin_direct(args, &mut client, &signals)?
+    };
     if !args.no_wait {
         return follow(&mut client, motion, &task, &signals, args.target_run.json);
     }
@@ -101,11 +113,41 @@ fn move_native(args: &Args, client: &mut Client, signals: &Signals) -> Result {
     follow_until(client, motion, arm, &cancel, signals, args.target_run.json)
 }
 
+/// Executes a motion with gripper actions part by part. Each motion is planned once the action before it has succeeded,
+/// so for the fingers and the attached objects as they are then.
+fn run_legs(args: &Args, arm: &str, client: &mut Client, signals: &Signals) -> Result {
+    let robots = client.call(Planner {})?.robots;
+    let saved = client.call(Poses {})?.poses;
+    let robot = robots.iter().find(|robot| robot.name == arm);
+    // A wrong name ends it before anything moves.
+    let is_known = |name: &&str| saved.contains_key(*name) || robot.is_none_or(|r| r.named_poses.contains_key(*name));
+    if let Some(name) = args.goal.names().find(|name| !is_known(name)) {
+        return Err(Failure::usage(format!("{arm} has no named pose {name}: nothing has moved"))
+            .hint("`dimos pose list` lists the poses"));
+    }
+    for leg in args.goal.legs(arm, &args.search) {
+        match leg {
+            Leg::Motion(request) => {
+                let (motion, task, _) = plan_and_begin(args, request, client, signals)?;
+                match follow(client, motion, &task, signals, args.target_run.json)? {
+                    Exit::Ok => {}
+                    exit => return Ok(exit),
+                }
+            }
+            Leg::Grip(action) => action.run(client, arm, signals, args.target_run.json).map_err(|failure| {
+                let what = format!("{}: the motion ends here", failure.what);
+                Failure { what, ..failure }
+            })?,
+        }
+    }
+    Ok(Exit::Ok)
+}
+
 type Begun = (u64, String, serde_json::Value);
 
-fn plan_and_begin(args: &Args, client: &mut Client, signals: &Signals) -> Result<Begun> {
+fn plan_and_begin(args: &Args, request: Plan, client: &mut Client, signals: &Signals) -> Result<Begun> {
     // The plan of a move is this move's own: `dimos execute` passes it over.
-    let request = Plan { by_number: true, ..args.goal.plan(client, args.arm.as_deref(), &args.search)? };
+    let request = Plan { by_number: true, ..request };
     let planned = plan(client, request, signals)?;
     if !args.target_run.json {
         show(&planned);

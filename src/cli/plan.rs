@@ -1,7 +1,7 @@
 //! `dimos plan ARM …`: plans and shows a collision-free motion of one arm or several, without executing it.
 
 use super::arguments::Target;
-use super::exit::{Exit, Result};
+use super::exit::{Exit, Failure, Result};
 use super::follow::Signals;
 use super::goal::{Goal, Search, plan, show};
 use super::output;
@@ -40,6 +40,10 @@ pub struct Args {
 
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
+    if args.goal.has_grips() {
+        let failure = Failure::usage("a plan has no gripper actions: how they end is known only when they are done");
+        return Err(failure.hint("`dimos move` plans each part when the one before it is done"));
+    }
     let mut client = args.target_run.connect()?;
     let signals = Signals::watch();
     let request = args.goal.plan(&mut client, args.robot.as_deref(), &args.search)?;

@@ -366,7 +366,8 @@ fn gripper_line(arm: &ArmReport) -> Option<String> {
     let range = arm.gripper_range.map(|[closed, open]| format!("{closed:.4} {unit} closed, {open:.4} {unit} open"));
     let commands = arm.gripper_force_range.map(|[least, most]| format!("force {least} to {most} {force_unit}"));
     let measured = arm.gripper_force.map(|force| format!("measured force {force:.2} {force_unit}"));
-    let parts: Vec<String> = [range, commands, measured].into_iter().flatten().collect();
+    let speed = arm.gripper_has_speed.then(|| "speed control".to_owned());
+    let parts: Vec<String> = [range, commands, speed, measured].into_iter().flatten().collect();
     (!parts.is_empty()).then(|| format!("gripper {}", parts.join("; ")))
 }
 
@@ -399,6 +400,16 @@ pub(super) fn print_tasks(tasks: &[TaskReport]) {
         }
         if let Some(bound) = &task.bound {
             output::line(format_args!("  {} is limited by {bound}", task.name));
+        }
+        if let Some(sent) = &task.stream {
+            let counts = [
+                ("actions", sent.actions, sent.late_actions),
+                ("gripper targets", sent.gripper_targets, sent.late_gripper_targets),
+            ];
+            let sent = counts.iter().filter(|(_, count, _)| *count > 0);
+            let sent: Vec<_> =
+                sent.map(|(what, count, late)| format!("{count} {what}, {late} of them late and dropped")).collect();
+            output::line(format_args!("  {} was sent {}", task.name, sent.join("; ")));
         }
     }
 }

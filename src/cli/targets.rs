@@ -18,6 +18,8 @@ const QUEUE: usize = 1;
 pub enum Width {
     /// One per joint.
     Joints(usize),
+    /// One per joint, and one for the gripper.
+    JointsAndGripper(usize),
     /// Six: linear and angular velocity.
     Twist,
     /// Six or seven: position, and roll, pitch, yaw or a quaternion.
@@ -28,6 +30,9 @@ impl Width {
     fn check(self, given: usize) -> std::result::Result<(), String> {
         match (self, given) {
             (Self::Joints(joints), _) if given != joints => Err(format!("{given} numbers for {joints} joints")),
+            (Self::JointsAndGripper(joints), _) if given != joints + 1 => {
+                Err(format!("{given} numbers for {joints} joints and the gripper"))
+            }
             (Self::Twist, _) if given != 6 => Err(format!("{given} numbers for a twist, which has 6")),
             (Self::Pose, _) if given != 6 && given != 7 => Err(format!("{given} numbers for a pose, which has 6 or 7")),
             _ => Ok(()),
@@ -183,6 +188,8 @@ mod tests {
             [(Width::Twist, 6, "a twist, which has 6"), (Width::Pose, 7, "a pose, which has 6 or 7")]
         {
             assert!(width.check(fits).is_ok() && width.check(6).is_ok());
+            let with_gripper = Width::JointsAndGripper(6);
+            assert!(with_gripper.check(6).is_err() && with_gripper.check(7).is_ok() && with_gripper.check(8).is_err());
             assert_eq!(width.check(5), Err(format!("5 numbers for {text}")));
             assert_eq!(width.check(8), Err(format!("8 numbers for {text}")));
         }

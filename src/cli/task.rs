@@ -58,6 +58,9 @@ decelerate to rest.")]
         /// Targets per second [Hz]; default: 50 from a file, as they arrive from stdin
         #[arg(long, value_name = "HZ", value_parser = hertz, alias = "rate")]
         hz: Option<f64>,
+        /// For a servo task: the last number of each line is a target of the arm's gripper [m, or rad of a rotary one]
+        #[arg(long)]
+        gripper: bool,
         #[command(flatten)]
         target_run: Target,
     },
@@ -88,14 +91,17 @@ pub fn run(args: &Args) -> Result {
             Ok(Exit::Ok)
         }
         Action::Invoke { task, method, target_run } => invoke(task, *method, target_run),
-        Action::Stream { task, file, hz, target_run } => {
+        Action::Stream { task, file, hz, gripper, target_run } => {
             let mut client = target_run.connect()?;
             let report = find(&mut client, task)?;
             let targets = Targets::of(&report)?;
+            let joints = report.joints.len();
             let width = match targets {
+                Targets::Positions if *gripper => Width::JointsAndGripper(joints),
+                _ if *gripper => return Err(Failure::usage(format!("--gripper is for a servo task, not for {task}"))),
                 Targets::Twist => Width::Twist,
                 Targets::Pose => Width::Pose,
-                Targets::Positions | Targets::Velocities => Width::Joints(report.joints.len()),
+                Targets::Positions | Targets::Velocities => Width::Joints(joints),
             };
             let (source, rate) = match file.as_deref().filter(|path| path.as_os_str() != "-") {
                 Some(path) => (Source::file(path, width)?, hz.or(Some(FILE_RATE))),
@@ -236,7 +242,11 @@ fn send(client: &mut Client, task: &TaskReport, targets: Targets, target: Vec<f6
     let name = task.name.clone();
     let three = |from: usize| std::array::from_fn(|i| target.get(from + i).copied().unwrap_or_default());
     match targets {
-        Targets::Positions => client.call(Servo { task: name, positions: target })?,
+        Targets::Positions => {
+            let mut positions = target;
+            let gripper = positions.split_off(positions.len().min(task.joints.len())).first().copied();
+            client.call(Servo { task: name, positions, gripper })?
+        }
         Targets::Velocities => client.call(Velocity { task: name, velocities: target })?,
         Targets::Twist => {
             client.call(Twist { task: name, linear: three(0), angular: three(3), frame: TwistFrame::Base })?

@@ -113,6 +113,8 @@ pub enum Request {
         opening: f64,
         /// Largest force, in the gripper's force unit; `None`: the device's own.
         force: Option<f64>,
+        /// Fraction of the gripper's top speed (0–1]; `None`: the device's own.
+        speed: Option<f64>,
     },
     /// Set the speed override.
     Speed {

@@ -339,6 +339,18 @@ pub trait Gripper {
     fn read_gripper_force(&mut self) -> AdapterResult<Option<f64>> {
         Ok(None)
     }
+    /// Returns whether the device itself reports an object in its grip; `None` if it cannot tell: the outcome of a
+    /// command is then judged from position and force. Must not allocate.
+    fn read_gripper_holds(&mut self) -> AdapterResult<Option<bool>> {
+        Ok(None)
+    }
+    /// Returns whether commands may have a speed. Never changes.
+    fn has_gripper_speed(&self) -> bool {
+        false
+    }
+    /// Sets the speed of the commands that follow, as a fraction of the gripper's top speed (0–1]; `None`: the device's
+    /// own. Called before every command of a gripper that `has_gripper_speed`.
+    fn set_gripper_speed(&mut self, _fraction: Option<f64>) {}
 }
 
 impl dyn Gripper + '_ {
@@ -349,11 +361,17 @@ impl dyn Gripper + '_ {
             range: self.get_gripper_range(),
             force_unit: self.get_gripper_force_unit(),
             force_range: self.get_gripper_force_range(),
+            has_speed: self.has_gripper_speed(),
         }
     }
 
-    /// Commands the position, with a largest force if there is one.
-    pub fn command(&mut self, position: f64, force: Option<f64>) -> AdapterResult<()> {
+    /// Commands the position, with a largest force and a speed (fraction of the top speed) if there are any.
+    pub fn command(&mut self, position: f64, force: Option<f64>, speed: Option<f64>) -> AdapterResult<()> {
+        match self.has_gripper_speed() {
+            true => self.set_gripper_speed(speed),
+            false if speed.is_some() => return Err(AdapterError::Unsupported),
+            false => {}
+        }
         match force {
             Some(force) => self.write_gripper_position_with_force(position, force),
             None => self.write_gripper_position(position),

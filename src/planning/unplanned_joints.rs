@@ -49,6 +49,20 @@ impl PlannedRobot {
         let named = grippers.filter_map(|joint| Some((self.model.joints.get(joint)?.name.clone(), joint)));
         named.filter(|(name, _)| !known(name)).map(|(name, joint)| (name, widest(&self.model, joint))).collect()
     }
+
+    /// Returns the links that no planned joint moves relative to `link`, such as the fingers on a flange: no plan
+    /// brings them closer to an object that it holds.
+    pub fn moved_together_with(&self, link: &str) -> Vec<String> {
+        let carrier = |link: usize| {
+            let carriers = std::iter::successors(link.checked_sub(1), |joint| {
+                self.model.joints.get(*joint).and_then(|joint| joint.parent.checked_sub(1))
+            });
+            carriers.into_iter().find(|joint| self.joints.contains(joint))
+        };
+        let Some(own) = self.model.link_index(link).map(carrier) else { return Vec::new() };
+        let links = self.model.links.iter().enumerate().filter(|(index, _)| carrier(*index) == own);
+        links.map(|(_, link)| link.name.clone()).collect()
+    }
 }
 
 /// Returns the positions of the independent joints that are not planned, by the model's names.

@@ -17,7 +17,8 @@ pub(super) fn input_differs(a: &ArmState, b: &ArmState) -> bool {
 
 /// Returns whether two commands differ in the fields of `ArmOutput`, except for counters that change on their own.
 pub(super) fn output_differs(a: &ArmCommand, b: &ArmCommand) -> bool {
-    let gripper = |c: &ArmCommand| (c.gripper.to_bits(), c.gripper_force.map(f64::to_bits), c.gripper_seq);
+    let limits = |c: &ArmCommand| [c.gripper_force, c.gripper_speed].map(|value| value.map(f64::to_bits));
+    let gripper = |c: &ArmCommand| (c.gripper.to_bits(), limits(c), c.gripper_seq);
     let parts = |c: &ArmCommand| (c.mode, gripper(c), c.stop_seq, c.start_seq);
     parts(a) != parts(b)
 }
@@ -61,6 +62,7 @@ pub(super) fn output(header: &Header, tick: u64, c: &ArmCommand) -> ArmOutput {
         next_tick_ns: c.next_tick.0,
         start_seq: c.start_seq,
         gripper_force: c.gripper_force.into_iter().collect(),
+        gripper_speed: c.gripper_speed.into_iter().collect(),
     }
 }
 

@@ -381,5 +381,7 @@ message! {
         start_seq: u32,
         /// Largest force of the gripper command, in the unit in coordinator.json; empty: the device's own.
         gripper_force: Vec<f64>,
+        /// Speed of the gripper command, as a fraction of the gripper's top speed; empty: the device's own.
+        gripper_speed: Vec<f64>,
     }
 }

@@ -141,12 +141,18 @@ impl<'a> Comparison<'a> {
                 let (then, now) = (Value::number(wanted.gripper), Value::number(command.gripper));
                 return arm("gripper command", then, now);
             }
-            let forces = [wanted.gripper_force.first().copied(), command.gripper_force];
-            if let [before, after] = forces.map(|force| force.map(f64::to_bits))
-                && before != after
-            {
-                let [then, now] = forces.map(|force| force.map_or_else(|| Value::text("none"), Value::number));
-                return arm("force of the gripper command", then, now);
+            let limits = [
+                ("force of the gripper command", &wanted.gripper_force, command.gripper_force),
+                ("speed of the gripper command", &wanted.gripper_speed, command.gripper_speed),
+            ];
+            for (what, then, now) in limits {
+                let values = [then.first().copied(), now];
+                if let [before, after] = values.map(|value| value.map(f64::to_bits))
+                    && before != after
+                {
+                    let [then, now] = values.map(|value| value.map_or_else(|| Value::text("none"), Value::number));
+                    return arm(what, then, now);
+                }
             }
             if wanted.stop_seq != command.stop_seq {
                 return arm("number of stops", Value::text(wanted.stop_seq), Value::text(command.stop_seq));

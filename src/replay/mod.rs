@@ -7,6 +7,7 @@
 
 pub mod compare;
 pub mod fit;
+pub mod grips;
 mod inputs;
 pub mod motion;
 pub mod onto;

@@ -6,6 +6,7 @@
 
 use std::path::Path;
 
+use super::grips::{self, RecordedGrip};
 use super::recorded::{Recorded, RecordedError};
 use crate::recording::messages::JointState;
 use crate::recording::replay::{LogReader, Payload, ReplayError, Selection};
@@ -30,6 +31,8 @@ pub struct RecordedMotion {
     pub rows: Vec<Vec<f64>>,
     /// Ticks missing in the log; bridged by straight lines.
     pub lost: u64,
+    /// Gripper commands during the motion, in order of time.
+    pub grips: Vec<RecordedGrip>,
 }
 
 /// Joint values of a tick.
@@ -64,7 +67,10 @@ impl RecordedMotion {
         let columns: Vec<Vec<f64>> = columns.into_iter().flatten().collect();
         let at = |k: usize| columns.iter().map(|c| c[k]).collect();
         let length = columns.first().map_or(0, Vec::len);
-        Ok(Self { joints, period, rows: (0..length).map(at).collect(), lost: ticks })
+        let ends = rows.first().zip(rows.last()).map(|(first, last)| first.tick..=last.tick);
+        let arms: Vec<String> = recorded.names.arms.iter().map(|arm| arm.hardware_id.clone()).collect();
+        let grips = ends.map(|ticks| grips::read(path, &arms, ticks, period)).transpose()?.unwrap_or_default();
+        Ok(Self { joints, period, rows: (0..length).map(at).collect(), lost: ticks, grips })
     }
 }
 

@@ -83,6 +83,8 @@ enum LoggedRequest {
         opening: Option<f64>,
         #[serde(default, deserialize_with = "present")]
         force: Option<f64>,
+        #[serde(default, deserialize_with = "present")]
+        speed: Option<f64>,
     },
     Speed {
         fraction: Option<f64>,
@@ -146,8 +148,8 @@ fn request(logged: LoggedRequest, joints: &[String]) -> Result<Request, String> 
         LoggedRequest::Park { arm } => Request::PrepareDisable { arm },
         LoggedRequest::EndNative { arm } => Request::EndNative { arm },
         LoggedRequest::Lead { arm, by } => Request::Lead { arm, by },
-        LoggedRequest::Gripper { arm, opening, force } => {
-            Request::Gripper { arm, opening: opening.unwrap_or(f64::NAN), force }
+        LoggedRequest::Gripper { arm, opening, force, speed } => {
+            Request::Gripper { arm, opening: opening.unwrap_or(f64::NAN), force, speed }
         }
         LoggedRequest::Speed { fraction } => Request::Speed { fraction: fraction.unwrap_or(f64::NAN) },
         LoggedRequest::Pause { on } => Request::Pause { on },
@@ -210,9 +212,9 @@ mod tests {
             Request::PrepareDisable { arm: 2 },
             Request::EndNative { arm: 1 },
             Request::Lead { arm: 1, by: LedBy::HandMotorsOff },
-            Request::Gripper { arm: 1, opening: 0.1 + 0.2, force: None },
-            Request::Gripper { arm: 1, opening: -0.1 - 0.2, force: Some(0.1 + 0.2) },
-            Request::Gripper { arm: 0, opening: 0.04, force: Some(f64::NAN) },
+            Request::Gripper { arm: 1, opening: 0.1 + 0.2, force: None, speed: None },
+            Request::Gripper { arm: 1, opening: -0.1 - 0.2, force: Some(0.1 + 0.2), speed: None },
+            Request::Gripper { arm: 0, opening: 0.04, force: Some(f64::NAN), speed: Some(0.1 + 0.2) },
             Request::Speed { fraction: 0.1 + 0.2 },
             Request::Pause { on: true },
             Request::Shutdown,

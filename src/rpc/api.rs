@@ -188,8 +188,10 @@ methods! {
     "move_native" MoveNative -> NativeReply, check MoveNative::valid;
     /// Decelerates the arm to rest and disables the motors. An arm without brakes falls.
     "arm_disable" ArmDisable -> ArmReply;
-    /// Commands a gripper.
+    /// Commands a gripper. Replies when the command was sent; `grip` reports its outcome.
     "gripper" Gripper -> GripperReply, check Gripper::valid;
+    /// Progress or outcome of a gripper command.
+    "grip" Grip -> GripReport;
     /// Levels of an arm's digital and analogue inputs and outputs.
     "arm_io" ArmIo -> IoReport;
     /// Sets digital and analogue outputs of an arm, and reads them back.

@@ -178,7 +178,7 @@ impl Method for Release {
 }
 
 /// Parameters of `gripper`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Gripper {
     /// The arm's `hardware_id`.
@@ -188,6 +188,12 @@ pub struct Gripper {
     /// Largest force [`gripper_force_unit` in `status`]; default: the one set in the device.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub force: Option<f64>,
+    /// Fraction of the gripper's top speed, 0.01–1; default: the speed set in the device.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub speed: Option<f64>,
+    /// Time for the outcome that `grip` reports [s], at most 600; default: 20.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub timeout: Option<f64>,
 }
 
 /// Reply to `gripper`: what was commanded.
@@ -203,11 +209,95 @@ pub struct GripperReply {
     /// Unit of the force: `N`, `Nm` or `%`; absent without a force.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub force_unit: Option<String>,
+    /// Fraction of the gripper's top speed; absent: the speed set in the device.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub speed: Option<f64>,
+    /// The command's number, for `grip`.
+    #[serde(default)]
+    pub order: u32,
 }
 
 impl Gripper {
     pub(super) fn valid(&self) -> Result<(), String> {
         finite("position", &[self.position])?;
-        finite("force", self.force.as_slice())
+        finite("force", self.force.as_slice())?;
+        self.speed.map_or(Ok(()), valid_speed)?;
+        match self.timeout.filter(|timeout| !(*timeout > 0.0 && *timeout <= 600.0)) {
+            Some(timeout) => Err(format!("timeout is {timeout} s, must be above 0, at most 600")),
+            None => Ok(()),
+        }
     }
+}
+
+/// Parameters of `grip`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Grip {
+    /// The arm's `hardware_id`.
+    pub arm: String,
+    /// Number of the command, from the reply to `gripper`; default: the latest.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub order: Option<u32>,
+}
+
+/// How a gripper command ended, judged from what was measured.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum GripOutcome {
+    /// At the commanded position, which is fully open.
+    Open,
+    /// At the commanded position, which is closed: nothing is between the fingers.
+    Closed,
+    /// At the commanded position.
+    Reached,
+    /// Stopped while closing, and holds an object.
+    Holding,
+    /// Stopped before the commanded position, without an object in its grip.
+    Blocked,
+}
+
+impl GripReport {
+    /// Returns the outcome with its figures as text.
+    pub fn text(&self) -> String {
+        let unit = &self.unit;
+        let outcome = match self.outcome {
+            Some(GripOutcome::Open) => "open at",
+            Some(GripOutcome::Closed) => "closed at",
+            Some(GripOutcome::Reached) => "reached",
+            Some(GripOutcome::Holding) => "holding an object at",
+            Some(GripOutcome::Blocked) => "blocked at",
+            None => "without an outcome at",
+        };
+        let force = self.force.map_or_else(String::new, |force| format!(", force {force:.2} {}", self.force_unit));
+        format!("gripper {outcome} {:.4} {unit}{force}, after {:.2} s", self.position, self.elapsed)
+    }
+}
+
+/// Reply to `grip`: progress or outcome of a gripper command.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+pub struct GripReport {
+    /// The arm's `hardware_id`.
+    pub arm: String,
+    /// Number of the command.
+    pub order: u32,
+    /// Whether it is over.
+    pub done: bool,
+    /// How it ended; absent before, and after an error.
+    pub outcome: Option<GripOutcome>,
+    /// Commanded position [`unit`].
+    pub target: f64,
+    /// Measured position [`unit`].
+    pub position: f64,
+    /// Unit of positions: `m` of opening, or `rad` of a rotary jaw.
+    pub unit: String,
+    /// Measured force [`force_unit`]; absent if the gripper measures none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub force: Option<f64>,
+    /// Unit of the force: `N`, `Nm` or `%`.
+    pub force_unit: String,
+    /// Time from the command to the last motion of the fingers [s]; before the end, to now.
+    pub elapsed: f64,
+    /// Why it has no outcome.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub error: Option<String>,
 }

@@ -116,7 +116,7 @@ impl Code {
             Outcome::OutOfLimits(..) | Outcome::GripperOutOfLimits(..) | Outcome::GripperForceOutOfLimits(..) => {
                 Some(Self::OutOfLimits)
             }
-            Outcome::NoGripperForce(_) => Some(Self::Unsupported),
+            Outcome::NoGripperForce(_) | Outcome::NoGripperSpeed(_) => Some(Self::Unsupported),
             Outcome::NoGripper(_) => Some(Self::NoGripper),
             Outcome::ShuttingDown => Some(Self::ShuttingDown),
         }

@@ -67,7 +67,7 @@ pub(super) fn need(request: &Request) -> Need<'_> {
         Request::ArmIoSet(io) => Need::NoOtherHolder(Subject::Arm(&io.arm)),
         Request::Poses(_) | Request::PoseSave(_) | Request::PoseRemove(_) => Need::Nothing,
         Request::Status(_) | Request::State(_) | Request::Motion(_) | Request::ArmIo(_) => Need::Nothing,
-        Request::ArmPayload(_) | Request::ArmTool(_) => Need::Nothing,
+        Request::ArmPayload(_) | Request::ArmTool(_) | Request::Grip(_) => Need::Nothing,
         Request::ExecutePlan(e) => Need::Plan(e.plan),
         Request::Plan(_) | Request::Planning(_) | Request::Preview(_) | Request::Planner(_) => Need::Nothing,
         Request::World(_) | Request::WorldAdd(_) | Request::WorldMove(_) | Request::WorldRemove(_) => Need::Nothing,

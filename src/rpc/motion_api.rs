@@ -315,11 +315,20 @@ pub struct Servo {
     pub task: String,
     /// Joint positions [rad], in the order of the task's joints.
     pub positions: Vec<f64>,
+    /// Target of the gripper of the task's arm [`gripper_unit` in `status`]; commanded at most 20 times a second.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub gripper: Option<f64>,
 }
 
 impl Servo {
+    /// Creates a target without one for the gripper.
+    pub fn new(task: impl Into<String>, positions: Vec<f64>) -> Self {
+        Self { task: task.into(), positions, gripper: None }
+    }
+
     pub(super) fn valid(&self) -> Result<(), String> {
-        finite("positions", &self.positions)
+        finite("positions", &self.positions)?;
+        finite("gripper", self.gripper.as_slice())
     }
 }
 
@@ -352,6 +361,10 @@ pub struct Chunk {
     /// Time of the first action, on the clock of `stamp` in `state` and in joint states [s since 1970]; default: now.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub start: Option<f64>,
+    /// Targets of the gripper of the task's arm [`gripper_unit` in `status`], one per action; commanded at their times,
+    /// at most 20 times a second.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub gripper: Option<Vec<f64>>,
 }
 
 /// Reply to `chunk`.
@@ -373,6 +386,12 @@ impl Chunk {
             finite(&format!("actions[{index}]"), action)?;
             if action.len() != width {
                 return Err(format!("actions[{index}] has {} values, the first {width}", action.len()));
+            }
+        }
+        if let Some(gripper) = &self.gripper {
+            finite("gripper", gripper)?;
+            if gripper.len() != count {
+                return Err(format!("gripper has {} values for {count} actions", gripper.len()));
             }
         }
         if !(0.001..=1.0).contains(&self.period) {

@@ -188,6 +188,9 @@ pub struct ArmReport {
     /// Smallest and largest force of a gripper command [`gripper_force_unit`]; absent without force control.
     #[serde(default)]
     pub gripper_force_range: Option<[f64; 2]>,
+    /// Whether commands of its gripper may have a speed.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub gripper_has_speed: bool,
     /// Unit of its gripper's force: `N`, `Nm` or `%`; absent without a gripper.
     #[serde(default)]
     pub gripper_force_unit: Option<String>,
@@ -316,6 +319,22 @@ pub struct TaskReport {
     /// Largest distance of a joint from its leader's, while a `follow` task is active [rad].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub distance: Option<f64>,
+    /// What was sent to a `chunk` task, and the gripper targets sent to any task; absent before the first.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stream: Option<StreamCounts>,
+}
+
+/// Counts of a task's chunks and gripper targets since the start of the run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+pub struct StreamCounts {
+    /// Actions of chunks.
+    pub actions: u64,
+    /// Those that were dropped because their time was over.
+    pub late_actions: u64,
+    /// Gripper targets.
+    pub gripper_targets: u64,
+    /// Those that were dropped because their time was over.
+    pub late_gripper_targets: u64,
 }
 
 impl TaskReport {

@@ -145,7 +145,7 @@ pub struct Attach {
     /// The link that holds it; default: the end-effector link.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub link: Option<String>,
-    /// Further links that may touch it.
+    /// Links that may touch it, besides those that no planned joint moves relative to `link`.
     #[serde(default)]
     pub touch_links: Vec<String>,
     /// Its mass [kg]: the arm's controller is set to carry it, if it takes a payload. The centre of mass and the

@@ -1,4 +1,4 @@
-//! Requests to an arm as a whole: stop, reset, enable, disable, gripper.
+//! Requests to an arm as a whole: stop, reset, enable, disable.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -27,7 +27,7 @@ const SETTLING_LIMIT: Duration = Duration::from_secs(1);
 /// Maximum wait of a request to disable: clients wait 10 s for a reply, of which the device needs a part.
 const BRAKING_LIMIT: Duration = Duration::from_secs(7);
 /// Timeout for an order to a device.
-const ORDER_LIMIT: Duration = Duration::from_secs(8);
+pub(super) const ORDER_LIMIT: Duration = Duration::from_secs(8);
 /// Maximum number of reports until an arm reports the effect of an order.
 const REPORTS: u32 = 3;
 /// Period of the requests to an enabled arm that is not ready yet.
@@ -205,48 +205,13 @@ impl Service {
         rested.unwrap_or_else(|| Err(self.speed(arm))).map_err(|speed| still_moves(id, speed))
     }
 
-    /// Commands a gripper, and waits for the arm's answer to this order.
-    pub(super) async fn gripper(&self, call: api::Gripper) -> Result<Reply, RpcError> {
-        let arm = self.arm_index(&call.arm)?;
-        if self.arm_view(arm as usize).is_some_and(|v| v.state.gripper.is_none()) {
-            return self.refusal(&Outcome::NoGripper(arm)).map_or_else(|| Err(internal()), Err);
-        }
-        let device = self.device(arm)?;
-        let info = self.gripper_info(arm.into()).unwrap_or_default();
-        let unit = info.unit.name();
-        let _turn = self.grippers.get(arm as usize).ok_or_else(internal)?.lock().await;
-        self.ask(Request::Gripper { arm, opening: call.position, force: call.force }).await?;
-        let order = self.arm_view(arm as usize).ok_or_else(internal)?.command.gripper_seq;
-        let gone = |view: &ArmSample| matches!(view.state.link, Link::Down | Link::Faulted);
-        let gone = || self.seen(arm, gone).map(|()| Err(AdapterError::NotConnected));
-        let look = || device.health().gripper_answer(order).or_else(gone);
-        match self.until(Instant::now() + ORDER_LIMIT, look).await {
-            Some(Ok(())) => Ok(Reply::Gripper(api::GripperReply {
-                position: call.position,
-                unit: unit.to_owned(),
-                force: call.force,
-                force_unit: call.force.map(|_| info.force_unit.name().to_owned()),
-            })),
-            Some(Err(error)) => {
-                let message = Message::of(format!("{} refused the gripper order: {error}", call.arm));
-                let hint = format!("`dimos state` shows the gripper's position now [{unit}], `dimos status` its range");
-                let (what, hint) = message.or_hint(hint);
-                Err(RpcError::new(Code::DeviceRefused, what).hint(hint))
-            }
-            None => {
-                let what = format!("{} did not answer the gripper order within {} s", call.arm, ORDER_LIMIT.as_secs());
-                Err(RpcError::new(Code::NoAnswer, what).hint("`dimos status` shows the arm's connection"))
-            }
-        }
-    }
-
     /// Returns units and ranges of an arm's gripper; `None` without one.
     pub(super) fn gripper_info(&self, arm: usize) -> Option<GripperInfo> {
         self.parts.connected.get(arm).and_then(|connected| connected.gripper)
     }
 
     /// Returns `Some` once an arm is in a condition.
-    fn seen(&self, arm: u16, is: impl Fn(&ArmSample) -> bool) -> Option<()> {
+    pub(super) fn seen(&self, arm: u16, is: impl Fn(&ArmSample) -> bool) -> Option<()> {
         self.arm_view(arm as usize).is_some_and(|view| is(&view)).then_some(())
     }
 

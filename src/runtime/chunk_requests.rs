@@ -35,7 +35,11 @@ impl Service {
         let start = self.start_of(&call, now)?;
         let age = if now > start { now.seconds_since(start) } else { 0.0 };
         let late = ((age / call.period).ceil() as usize).min(actions);
+        let arm = call.gripper.as_deref().map(|targets| self.check_gripper_targets(task, targets)).transpose()?;
+        let count =
+            |late| self.counters.get(task as usize).into_iter().for_each(|counters| counters.actions(actions, late));
         if late == actions {
+            count(late);
             return Ok(api::ChunkReply { actions, late });
         }
         let limits = self.limits_of(&config.joints);
@@ -53,6 +57,10 @@ impl Service {
         let motion = Box::new(Motion { id: 0, joints: config.joints.clone(), spline });
         self.outcome(self.parts.dispatcher.ask(Request::Chunk { task, start, motion }, log).await)?;
         self.streams_to(task);
+        count(late);
+        if let (Some(arm), Some(targets)) = (arm, &call.gripper) {
+            self.take_gripper_targets(task, arm, start, call.period, targets);
+        }
         Ok(api::ChunkReply { actions, late })
     }
 

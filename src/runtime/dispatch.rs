@@ -163,9 +163,14 @@ pub fn log_of(request: &Request) -> Value {
         Request::PrepareDisable { arm } => json!({"park": {"arm": arm}}),
         Request::EndNative { arm } => json!({"end_native": {"arm": arm}}),
         Request::Lead { arm, by } => json!({"lead": {"arm": arm, "by": by}}),
-        Request::Gripper { arm, opening, force: None } => json!({"gripper": {"arm": arm, "opening": opening}}),
-        Request::Gripper { arm, opening, force } => {
-            json!({"gripper": {"arm": arm, "opening": opening, "force": force}})
+        Request::Gripper { arm, opening, force, speed } => {
+            let mut order = json!({"arm": arm, "opening": opening});
+            for (key, value) in [("force", force), ("speed", speed)] {
+                if value.is_some() {
+                    order[key] = json!(value);
+                }
+            }
+            json!({"gripper": order})
         }
         Request::Speed { fraction } => json!({"speed": {"fraction": fraction}}),
         Request::Pause { on } => json!({"pause": {"on": on}}),

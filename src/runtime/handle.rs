@@ -6,8 +6,8 @@ use std::time::Duration;
 use super::service::Service;
 use super::{in_process, watchdog};
 use crate::rpc::api::{
-    ArmDisable, ArmEnable, ArmReply, ArmReset, Cancel, CancelReply, Execute, ExecuteReply, Gripper, Method, Move,
-    MoveReply, Servo, Stop, StopReply, Trajectory, Velocity,
+    ArmDisable, ArmEnable, ArmReply, ArmReset, Cancel, CancelReply, Execute, ExecuteReply, Grip, GripReport, Gripper,
+    Method, Move, MoveReply, Servo, Stop, StopReply, Trajectory, Velocity,
 };
 use crate::rpc::report::{MotionReport, StateReport, StatusReport};
 use crate::rpc::{Code, RpcError};
@@ -126,18 +126,31 @@ impl Handle {
 
     /// Commands the position of a gripper: its opening [m], or the angle [rad] of a rotary one.
     pub fn gripper(&self, arm: &str, position: f64) -> Result<(), RpcError> {
-        self.call(Gripper { arm: arm.to_owned(), position, force: None }).map(drop)
+        self.call(Gripper { arm: arm.to_owned(), position, ..Gripper::default() }).map(drop)
     }
 
     /// Commands the position of a gripper [m or rad] with a largest force, in its force unit [N or Nm].
     pub fn gripper_with_force(&self, arm: &str, position: f64, force: f64) -> Result<(), RpcError> {
-        self.call(Gripper { arm: arm.to_owned(), position, force: Some(force) }).map(drop)
+        self.call(Gripper { arm: arm.to_owned(), position, force: Some(force), ..Gripper::default() }).map(drop)
+    }
+
+    /// Moves a gripper and waits for the outcome, which `outcome` has, or else `error` the reason.
+    pub fn grip(&self, command: Gripper) -> Result<GripReport, RpcError> {
+        let arm = command.arm.clone();
+        let order = self.call(command)?.order;
+        loop {
+            let report = self.call(Grip { arm: arm.clone(), order: Some(order) })?;
+            if report.done {
+                return Ok(report);
+            }
+            std::thread::sleep(POLL_PERIOD);
+        }
     }
 
     /// Sends the next target of a servo task [rad], one value per joint of the task; repeat it within the task's
     /// timeout.
     pub fn servo(&self, task: &str, positions: &[f64]) -> Result<(), RpcError> {
-        self.call(Servo { task: task.to_owned(), positions: positions.to_vec() }).map(drop)
+        self.call(Servo::new(task, positions.to_vec())).map(drop)
     }
 
     /// Sends the next target of a velocity task [rad/s], one value per joint of the task; repeat it within the task's

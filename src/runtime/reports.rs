@@ -116,6 +116,7 @@ impl Service {
             gripper_range: gripper.and_then(|gripper| gripper.range).map(<[f64; 2]>::from),
             gripper_unit: gripper.map(|gripper| gripper.unit.name().to_owned()),
             gripper_force_range: gripper.and_then(|gripper| gripper.force_range).map(<[f64; 2]>::from),
+            gripper_has_speed: gripper.is_some_and(|gripper| gripper.has_speed),
             gripper_force_unit: gripper.map(|gripper| gripper.force_unit.name().to_owned()),
             gripper_force: view.state.gripper_force,
             io: io.zip(health.details().io).map(|(info, state)| self.io_report(index, &info, &state)),
@@ -151,6 +152,7 @@ impl Service {
             motion: (view.motion > 0).then_some(view.motion),
             distance: view.distance,
             bound: Some(bound_text(view.bound, &self.parts.names)).filter(|text| !text.is_empty()),
+            stream: self.counters.get(index).and_then(|counters| counters.report()),
         })
     }
 
@@ -308,6 +310,7 @@ impl Service {
                     .data(serde_json::json!({"arm": arm(a), "force": force, "range": [least, most]}))
             }
             Outcome::NoGripperForce(_) => error.hint("command its position without a force"),
+            Outcome::NoGripperSpeed(_) => error.hint("command its position without a speed"),
             Outcome::WrongTask(_) => error.hint("`dimos status` lists the tasks and their types"),
             _ => error,
         })

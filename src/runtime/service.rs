@@ -11,6 +11,8 @@ use nalgebra::Isometry3;
 
 use super::Ending;
 use super::dispatch::{Dispatcher, SendError, log_of};
+use super::gripper_requests::LatestGrip;
+use super::gripper_targets::{Counters, GripperTargets};
 use super::late_stops::LateStops;
 use super::log_throttle::LogThrottle;
 use super::motions::Motions;
@@ -75,6 +77,12 @@ pub struct Service {
     pub(super) grippers: Vec<tokio::sync::Mutex<()>>,
     /// Per arm, whether its own controller moves it.
     pub(super) natives: Vec<AtomicBool>,
+    /// Per arm, the latest gripper command.
+    pub(super) grips: Vec<Mutex<LatestGrip>>,
+    /// Per arm, the gripper targets of streams.
+    pub(super) gripper_targets: Vec<Mutex<GripperTargets>>,
+    /// Per task, what its streams sent.
+    pub(super) counters: Vec<Counters>,
     /// Per arm, the numbers of the slowly changing values that were logged last.
     pub(super) details_logged: Mutex<Vec<Details>>,
     /// Per arm, the objects that it holds and whose mass is known. Locked while a load is set.
@@ -106,6 +114,9 @@ impl Service {
             progress: Progress::default(),
             grippers: parts.devices.iter().map(|_| tokio::sync::Mutex::default()).collect(),
             natives: parts.devices.iter().map(|_| AtomicBool::default()).collect(),
+            grips: parts.devices.iter().map(|_| Mutex::default()).collect(),
+            gripper_targets: parts.devices.iter().map(|_| Mutex::default()).collect(),
+            counters: parts.config.tasks.iter().map(|_| Counters::default()).collect(),
             details_logged: Mutex::new(vec![Details::default(); parts.devices.len()]),
             task_tools: Mutex::new(parts.blueprint.tasks.iter().map(|task| task.robot.as_ref()?.tool).collect()),
             held_loads: parts.devices.iter().map(|_| tokio::sync::Mutex::default()).collect(),
@@ -305,7 +316,7 @@ impl Service {
     }
 
     async fn answer(&self, call: Call) -> Result<Reply, RpcError> {
-        let changes = !matches!(call, Call::Status(_) | Call::State(_) | Call::Motion(_));
+        let changes = !matches!(call, Call::Status(_) | Call::State(_) | Call::Motion(_) | Call::Grip(_));
         if changes && self.is_closed() {
             let stops = self.stoppable.load(Ordering::Acquire);
             match call {
@@ -346,6 +357,7 @@ impl Service {
             Call::MoveNative(m) => self.move_native(m).await,
             Call::ArmDisable(a) => self.disable(a.arm, a.now).await,
             Call::Gripper(g) => self.gripper(g).await,
+            Call::Grip(g) => self.grip(&g).map(Reply::Grip),
             Call::ArmPayload(p) => self.payload(&p.arm).await.map(Reply::ArmPayload),
             Call::ArmPayloadSet(p) => self.set_payload(p).await,
             Call::ArmTool(t) => self.tool(&t.arm).map(Reply::ArmTool),
@@ -355,8 +367,10 @@ impl Service {
             Call::Poses(_) => self.poses().await.map(Reply::Poses),
             Call::PoseSave(save) => self.save_pose(save).await.map(Reply::PoseSave),
             Call::PoseRemove(remove) => self.remove_pose(remove).await.map(|()| Reply::PoseRemove(Done {})),
-            Call::Servo(s) => self.stream(s.task, s.positions, true).await.map(|()| Reply::Servo(Done {})),
-            Call::Velocity(v) => self.stream(v.task, v.velocities, false).await.map(|()| Reply::Velocity(Done {})),
+            Call::Servo(s) => self.stream(s.task, s.positions, true, s.gripper).await.map(|()| Reply::Servo(Done {})),
+            Call::Velocity(v) => {
+                self.stream(v.task, v.velocities, false, None).await.map(|()| Reply::Velocity(Done {}))
+            }
             Call::Chunk(chunk) => self.chunk(chunk).await.map(Reply::Chunk),
             Call::Twist(twist) => self.twist(&twist).await.map(Reply::Twist),
             Call::Start(start) => self.start_task(&start.task).await.map(Reply::Start),

@@ -228,6 +228,8 @@ fn publisher(service: Arc<Service>, wall: WallOffset) -> impl FnMut(bool) + Send
     move |woken| {
         service.progress.made();
         service.publish(woken);
+        service.command_gripper_targets();
+        service.judge_grips();
         if Instant::now() >= details_due {
             service.log_details();
             service.log_tcps();

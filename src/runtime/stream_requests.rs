@@ -73,8 +73,14 @@ impl Service {
         self.until(limit, look).await;
     }
 
-    /// Sends the next target of a servo (`positions`) or velocity task.
-    pub(super) async fn stream(&self, task: String, values: Vec<f64>, positions: bool) -> Result<(), RpcError> {
+    /// Sends the next target of a servo (`positions`) or velocity task, and one of the gripper.
+    pub(super) async fn stream(
+        &self,
+        task: String,
+        values: Vec<f64>,
+        positions: bool,
+        gripper: Option<f64>,
+    ) -> Result<(), RpcError> {
         let index = self.task_index(&task)?;
         let width = self.parts.config.tasks[index as usize].joints.len();
         if values.len() != width {
@@ -86,7 +92,12 @@ impl Service {
             true => Request::Servo { task: index, target },
             false => Request::Velocity { task: index, target },
         };
-        self.target(index, request).await
+        let arm = gripper.map(|gripper| self.check_gripper_targets(index, &[gripper])).transpose()?;
+        self.target(index, request).await?;
+        if let (Some(arm), Some(gripper)) = (arm, gripper) {
+            self.take_gripper_targets(index, arm, self.now(), 0.0, &[gripper]);
+        }
+        Ok(())
     }
 
     /// Sends the next target of an `eef_twist` task.

@@ -37,6 +37,8 @@ impl PlannerPort {
             Some(mass) => Some(load_of(&object.shape, mass, &(in_flange(robot, &link, moment)? * at))),
             None => None,
         };
+        let mut touch_links = call.touch_links.clone();
+        touch_links.extend(robot.moved_together_with(&link));
         let held = |world: &mut World| {
             let stood = world.remove(&call.name)?;
             let solid = Solid { frame: frame(&at), ..stood.solid.clone() };
@@ -45,7 +47,7 @@ impl PlannerPort {
                 robot: index,
                 link: link.clone(),
                 solids: vec![solid],
-                touch_links: call.touch_links.clone(),
+                touch_links: touch_links.clone(),
                 padding: object.padding,
             });
             // An object that cannot be attached stays: no error removes an object from the world.
@@ -272,6 +274,11 @@ mod tests {
         };
         let load = port.attach(&attach("ball"), &moment).unwrap().load.unwrap();
         assert!((load.center[2] - 0.172).abs() < 1e-9, "{:?}: its fingers are 172 mm in front of it", load.center);
+        // The fingers may touch what they hold, the forearm may not.
+        let touching = port.thread.world(|world| world.held()[0].touch_links.clone());
+        let may_touch = |link: &str| touching.iter().any(|touching| touching == link);
+        assert!(may_touch("left_finger") && may_touch("right_finger") && may_touch("link6"), "{touching:?}");
+        assert!(!may_touch("link5") && !may_touch("link_base"), "{touching:?}");
 
         let (port, moment) = with_robot(RobotConfig { flange_link: None, ..robot }, [0.9, 0.0, 0.0]);
         let refused = port.attach(&attach("ball"), &moment).unwrap_err();

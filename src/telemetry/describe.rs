@@ -159,7 +159,8 @@ fn request(id: u64, outcome: Outcome, names: &Names) -> Described {
         Outcome::StartStateUnavailable(arm)
         | Outcome::ArmMoving(arm)
         | Outcome::NoGripper(arm)
-        | Outcome::NoGripperForce(arm) => {
+        | Outcome::NoGripperForce(arm)
+        | Outcome::NoGripperSpeed(arm) => {
             d.arm = Some(names.arm(arm));
         }
         Outcome::ArmNotReady(arm, _, cause) | Outcome::ArmLatched(arm, cause) | Outcome::StillFaulted(arm, cause) => {
@@ -200,6 +201,7 @@ pub fn outcome_text(outcome: &Outcome, names: &Names) -> String {
             format!("a force of {force} is outside the range of the gripper of {}", names.arm(arm))
         }
         Outcome::NoGripperForce(arm) => format!("the gripper of {} has no force control", names.arm(arm)),
+        Outcome::NoGripperSpeed(arm) => format!("the gripper of {} has no speed control", names.arm(arm)),
         Outcome::InvalidTarget(task) => {
             format!("the target of task {} is not finite, or its orientation is invalid", names.task(task))
         }

@@ -332,6 +332,8 @@ pub enum Outcome {
     GripperForceOutOfLimits(u16, f64),
     /// The gripper has no force control: the arm.
     NoGripperForce(u16),
+    /// The gripper takes no speed, or not this one: the arm.
+    NoGripperSpeed(u16),
     /// The target is not finite, or its orientation is invalid: the task.
     InvalidTarget(u16),
     /// The arm has no gripper: the arm.
@@ -358,7 +360,7 @@ impl Outcome {
             Self::WrongTask(_) => "WRONG_TASK",
             Self::NonFinite(_) => "NON_FINITE",
             Self::OutOfLimits(..) | Self::GripperOutOfLimits(..) | Self::GripperForceOutOfLimits(..) => "OUT_OF_LIMITS",
-            Self::NoGripperForce(_) => "UNSUPPORTED",
+            Self::NoGripperForce(_) | Self::NoGripperSpeed(_) => "UNSUPPORTED",
             Self::InvalidTarget(_) => "INVALID_TARGET",
             Self::NoGripper(_) => "NO_GRIPPER",
             Self::ShuttingDown => "SHUTTING_DOWN",

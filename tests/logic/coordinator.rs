@@ -283,18 +283,25 @@ fn grippers_open_on_request_and_only_where_there_is_one() {
     let mut without = arm("bare", 6);
     (with.gripper, without.gripper) = (true, false);
     let mut rig = Rig::new(100.0, vec![with, without], one(trajectory()));
-    assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: 0.04, force: None }).name(), "ARM_NOT_READY");
+    assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: 0.04, force: None, speed: None }).name(), "ARM_NOT_READY");
     rig.make_ready();
-    assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: 0.04, force: None }), Outcome::Accepted);
+    assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: 0.04, force: None, speed: None }), Outcome::Accepted);
     assert_eq!((rig.arms[0].gripper, rig.commands[0].gripper_seq), (0.04, 1));
-    assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: 0.0, force: None }), Outcome::Accepted, "closed");
-    assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: 0.04, force: None }), Outcome::Accepted);
-    assert_eq!(rig.ask(Request::Gripper { arm: 1, opening: 0.04, force: None }), Outcome::NoGripper(1));
+    assert_eq!(
+        rig.ask(Request::Gripper { arm: 0, opening: 0.0, force: None, speed: None }),
+        Outcome::Accepted,
+        "closed"
+    );
+    assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: 0.04, force: None, speed: None }), Outcome::Accepted);
+    assert_eq!(rig.ask(Request::Gripper { arm: 1, opening: 0.04, force: None, speed: None }), Outcome::NoGripper(1));
     for unfit in [f64::NAN, f64::INFINITY, -0.1] {
-        assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: unfit, force: None }).name(), "OUT_OF_LIMITS");
+        assert_eq!(
+            rig.ask(Request::Gripper { arm: 0, opening: unfit, force: None, speed: None }).name(),
+            "OUT_OF_LIMITS"
+        );
     }
     // The gripper is refused, not a joint of the arm.
-    let negative = rig.ask(Request::Gripper { arm: 0, opening: -0.1, force: None });
+    let negative = rig.ask(Request::Gripper { arm: 0, opening: -0.1, force: None, speed: None });
     assert_eq!(negative, Outcome::GripperOutOfLimits(0, -0.1));
     assert_eq!(rig.arms[0].gripper, 0.04);
 }
@@ -307,7 +314,7 @@ fn a_gripper_takes_forces_within_its_range_and_a_rotary_one_any_angle() {
     rotary.gripper_info.unit = GripperUnit::Radians;
     let mut rig = Rig::new(100.0, vec![strong, rotary], one(trajectory()));
     rig.make_ready();
-    let grip = |arm, opening, force| Request::Gripper { arm, opening, force };
+    let grip = |arm, opening, force| Request::Gripper { arm, opening, force, speed: None };
     assert_eq!(rig.ask(grip(0, 0.04, Some(40.0))), Outcome::Accepted);
     let command = rig.commands[0];
     assert_eq!((command.gripper, command.gripper_force, command.gripper_seq), (0.04, Some(40.0), 1));

@@ -85,7 +85,7 @@ fn ticks_with_every_task_type_do_not_allocate() {
             595 => _ = rig.send(Request::CartesianTarget { task: 6, goal: nowhere }),
             900 => _ = rig.servo(3, &[left + 0.01; 7]),
             901 => _ = rig.servo(3, &[left + 0.7; 7]),
-            910 => _ = rig.send(Request::Gripper { arm: 0, opening: 0.03, force: None }),
+            910 => _ = rig.send(Request::Gripper { arm: 0, opening: 0.03, force: None, speed: None }),
             920 => _ = rig.send(Request::Stop { arm: None }),
             940 => rig.arms[1].error = 3,
             945 => rig.arms[0].silent = true,

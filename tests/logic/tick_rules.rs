@@ -144,7 +144,7 @@ impl Scenario {
             (37, _) => {
                 let arm = self.random.below(3) as u16;
                 let force = (self.random.below(2) == 0).then(|| self.random.between(0.0, 50.0));
-                self.rig.send(Request::Gripper { arm, opening: self.random.between(-0.01, 0.1), force });
+                self.rig.send(Request::Gripper { arm, opening: self.random.between(-0.01, 0.1), force, speed: None });
             }
             _ => self.enable(),
         }

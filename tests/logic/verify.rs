@@ -77,7 +77,7 @@ fn eventful(folder: &Path) -> (PathBuf, u64) {
     run.ask(Request::Speed { fraction: 1.0 });
     steps(&mut run, 7);
     run.ask(Request::Cancel { task: Some(0) });
-    run.ask(Request::Gripper { arm: 0, opening: 0.1 + 0.2, force: Some(0.1 + 0.7) });
+    run.ask(Request::Gripper { arm: 0, opening: 0.1 + 0.2, force: Some(0.1 + 0.7), speed: None });
     steps(&mut run, 60);
     for k in 0..80 {
         // A stream at 50 Hz, then a jump in it.
@@ -451,7 +451,7 @@ fn exercise(name: &str, dof: usize) {
     let motion = begin(&mut client, vec![0.0; dof]);
     client.call(api::Cancel::default()).unwrap();
     motion.map(|motion| wait_for_end(&mut client, motion));
-    let _ = client.call(api::Gripper { arm: "arm".into(), position: 0.03, force: Some(7.5) });
+    let _ = client.call(api::Gripper { arm: "arm".into(), position: 0.03, force: Some(7.5), ..Default::default() });
     begin(&mut client, vec![0.25; dof]);
     client.call(api::Stop { arm: None }).unwrap();
     let _ = client.call(api::ArmReset { arm: "arm".into() });
@@ -497,7 +497,7 @@ fn streams_and_an_arm_fault_are_reproducible() {
     let mut refused = 0;
     for k in 0..400 {
         let x = 0.1 * (f64::from(k) * 0.02).sin();
-        let sent = client.call(api::Servo { task: "servo".into(), positions: vec![x, -x, x / 3.0] });
+        let sent = client.call(api::Servo::new("servo", vec![x, -x, x / 3.0]));
         refused += u32::from(sent.is_err());
         if refused > 20 {
             break;

@@ -73,7 +73,8 @@ fn exercise(blueprint: &str, arms: &[Arm]) {
 /// Opens and closes a gripper.
 fn grip(home: &Home, arm: &str, opening: f64) {
     for (word, position) in [("open", opening), ("close", 0.0)] {
-        home.dimos(&format!("arm gripper {arm} {word}")).with(0);
+        let outcome = if word == "open" { "gripper open at" } else { "gripper closed at" };
+        home.dimos(&format!("arm gripper {arm} {word}")).with(0).shows(&[outcome]);
         eventually(&format!("{arm} {word}"), || {
             let state = home.dimos("state --json").with(0).json();
             let arm = state["arms"].as_array().unwrap().iter().find(|a| a["hardware_id"] == arm).unwrap();

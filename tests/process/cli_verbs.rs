@@ -262,7 +262,11 @@ fn arm_verbs_and_cancel_print_their_result() {
     assert_eq!(home.run("cancel").with(0).out, "traj_arm: CANCELLED\n");
     let gripper = home.run("arm gripper arm 0.04").with(1);
     assert!(gripper.err.contains("arm has no gripper [NO_GRIPPER]"), "{}", gripper.err);
-    assert!(run.asked().contains(&Request::Gripper(Gripper { arm: "arm".into(), position: 0.04, force: None })));
+    assert!(run.asked().contains(&Request::Gripper(Gripper {
+        arm: "arm".into(),
+        position: 0.04,
+        ..Gripper::default()
+    })));
 }
 
 #[test]

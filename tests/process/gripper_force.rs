@@ -24,8 +24,7 @@ fn position_and_force_reach_the_arm_and_the_log() {
     // An object 30 mm wide: the fingers stop there and press.
     arm.put_object(0.03);
     let said = home.dimos("arm gripper arm 0.02 --force 12.5").with(0).out;
-    assert_eq!(said, "arm: gripper to 0.0200 m, force at most 12.5 N\n");
-    eventually("the grip", || state()["gripper_force"].as_f64() == Some(12.5));
+    assert!(said.starts_with("arm: gripper holding an object at 0.0300 m, force 12.50 N, after "), "{said}");
     let gripping = state();
     assert!((gripping["gripper"].as_f64().unwrap() - 0.03).abs() < 1e-6, "{gripping}");
     assert_eq!((gripping["gripper_unit"].as_str(), gripping["gripper_force_unit"].as_str()), (Some("m"), Some("N")));
@@ -42,10 +41,10 @@ fn position_and_force_reach_the_arm_and_the_log() {
 
     // Without a force it is the arm's own; the reply says what was commanded.
     arm.put_object(0.0);
-    let reply = home.dimos("arm gripper arm 0.05 --json").with(0).json();
-    assert_eq!(reply, serde_json::json!({"position": 0.05, "unit": "m"}));
+    let reply = home.dimos("arm gripper arm 0.05 --no-wait --json").with(0).json();
+    assert_eq!(reply, serde_json::json!({"position": 0.05, "unit": "m", "order": 2}));
     let reply = home.dimos("arm gripper arm open --force 60 --json").with(0).json();
-    assert_eq!(reply, serde_json::json!({"position": 0.08, "unit": "m", "force": 60.0, "force_unit": "N"}));
+    assert_eq!((&reply["target"], &reply["outcome"]), (&0.08.into(), &"open".into()), "{reply}");
     assert_eq!(orders(&arm)[1..], [Request::Gripper(50.0), Request::Grip(80.0, 60.0)]);
     home.dimos("down").with(0);
     drop(run);
@@ -104,8 +103,7 @@ fn a_force_that_the_gripper_cannot_have_is_refused_and_moves_nothing() {
 fn a_rotary_gripper_is_in_radians_and_has_no_force() {
     let home = Home::new();
     let _run = home.run("coordinator-so101 --sim --no-record");
-    let said = home.dimos("arm gripper arm 1.2").with(0).out;
-    assert_eq!(said, "arm: gripper to 1.2000 rad\n");
+    home.dimos("arm gripper arm 1.2").with(0).shows(&["arm: gripper reached 1.", " rad, after "]);
     let state = || home.dimos("state --json").with(0).json()["arms"][0].clone();
     eventually("the angle", || state()["gripper"].as_f64().is_some_and(|angle| (angle - 1.2).abs() < 3e-3));
     assert_eq!((state()["gripper_unit"].as_str(), state()["gripper_force"].as_f64()), (Some("rad"), None));

@@ -108,6 +108,19 @@ fn a_held_key_moves_the_arm_and_letting_go_stops_it() {
     terminal.keys(" ");
     terminal.until("at rest");
     rig.rest();
+
+    // The gripper opens and closes while its key is held.
+    let mut hold_until = |key: &str, there: fn(f64) -> bool| {
+        let began = Instant::now();
+        while !there(rig.watcher.call(State {}).unwrap().arms[0].gripper.unwrap()) {
+            assert!(began.elapsed() < TIMEOUT, "{key:?} does not move the gripper:\n{}", terminal.text());
+            terminal.keys(key);
+            std::thread::sleep(HOLD);
+        }
+    };
+    hold_until("o", |opening| opening > 0.07);
+    hold_until("C", |opening| opening < 0.01);
+    terminal.until("O/C open/close the gripper");
     terminal.keys("\x1b");
     jog.wait().with(0);
     eventually("the terminal is given back", || terminal.is_as_before());

@@ -18,6 +18,7 @@ mod disk;
 mod fault_table;
 mod first_run;
 mod franka_run;
+mod grip_outcome;
 mod gripper_force;
 mod gripper_joint;
 mod jog;

@@ -90,7 +90,11 @@ impl Home {
             let folder = RunDir::at(self.path("runs"));
             let run = Run::start(&blueprint, Options { record, folder, hold_latency: false, ..Options::default() });
             let run = run.unwrap();
-            let done = [GOAL, [0.1; 6], GOAL].iter().try_for_each(|target| moved(&run, target));
+            let poses = [(GOAL, 0.02), ([0.1; 6], 0.07), (GOAL, 0.05)];
+            let done = poses.iter().try_for_each(|(target, opening)| {
+                run.gripper("arm", *opening).map_err(|e| e.to_string())?;
+                moved(&run, target)
+            });
             run.stop();
             done
         });
@@ -169,6 +173,11 @@ fn a_motion_recorded_within_limits_is_followed_by_another_run_and_by_another_arm
     let (out, err) = home.run_in_time(&format!("replay {} --onto coordinator-yourarm", log.display()));
     assert!(out.contains("motion: COMPLETED") && err.contains("approach: arm"), "{out}{err}");
     assert_followed(&log, &home.path("again.mcap"));
+    // The gripper, too: the same commands, in the same parts of the motion.
+    let openings = |log: &Path| motion(log).grips.iter().map(|grip| grip.position).collect::<Vec<_>>();
+    assert_eq!((openings(&log), openings(&home.path("again.mcap"))), (vec![0.02, 0.07, 0.05], vec![0.02, 0.07, 0.05]));
+    let [_, second, third] = motion(&home.path("again.mcap")).grips.try_into().unwrap();
+    assert!(third.time > second.time + 0.3, "{second:?} {third:?}");
     assert_eq!(verify(&home.path("again.mcap"), &TaskTable::builtin()).unwrap().finding, Finding::Reproducible);
 
     let (out, _) = home.run_in_time(&format!("replay {} --onto mock6.yaml --rate 0.9 --json", log.display()));

@@ -468,8 +468,7 @@ fn a_rotary_gripper_is_in_radians() {
     let mut shim = shim_of("python3", "sim_arm:RotaryGripperAdapter", &home, &at, &["--address", "sim"]);
     let _shim = serving(&home, Started::of(shim.args(["--dof", "6"])));
     let _run = home.run("remote.yaml");
-    let said = home.dimos("arm gripper arm 0.05").with(0).out;
-    assert_eq!(said, "arm: gripper to 0.0500 rad\n");
+    home.dimos("arm gripper arm 0.05").with(0).shows(&["arm: gripper reached 0.05", " rad, after "]);
     assert_eq!(home.dimos("state --json").with(0).json()["arms"][0]["gripper_unit"], "rad");
     home.dimos("arm gripper arm 0.05 --force 1").with(1).says(&["no force control", "[UNSUPPORTED]"]);
 }

@@ -56,11 +56,13 @@ fn a_gripper_opens_and_closes_as_far_as_it_goes() {
     let (home, _run) = up();
     let mut client = home.client();
     let mut opening = || client.call(State {}).unwrap().arms[0].gripper.unwrap();
-    for (word, metres) in [("open", 0.08), ("close", 0.0), ("0.03", 0.03)] {
-        let said = home.dimos(&format!("arm gripper arm {word}")).with(0).out;
-        assert_eq!(said, format!("arm: gripper to {metres:.4} m\n"));
-        eventually(word, || (opening() - metres).abs() < 1e-3);
+    for (word, outcome, metres) in [("open", "open at", 0.08), ("close", "closed at", 0.0), ("0.03", "reached", 0.03)] {
+        home.dimos(&format!("arm gripper arm {word}")).with(0).shows(&[&format!("gripper {outcome} {metres:.4} m")]);
+        assert!((opening() - metres).abs() < 1e-3, "{word} waits");
     }
+    // 40 mm at a quarter of 0.1 m/s.
+    let slow = home.dimos("arm gripper arm 0.07 --speed 0.25 --json").with(0).json();
+    assert!(slow["elapsed"].as_f64().unwrap() > 1.4, "{slow}");
     home.dimos("arm gripper bare open").with(1).says(&["bare has no gripper, or does not report its range"]);
     home.dimos("arm gripper rarm close").with(2).says(&["[UNKNOWN_ARM]", "did you mean `arm`?"]);
     for wrong in ["ajar", "nan", ""] {

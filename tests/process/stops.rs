@@ -309,7 +309,7 @@ fn a_refused_request_takes_no_lease() {
     assert!(two.call(Status {}).unwrap().arms[0].commander.is_none(), "the refused request kept the lease");
     let far = dimos::rpc::api::Move::new("arm", [99.0; 6], 1.0);
     assert_eq!(refusal(one.call(far)).code, Code::OutOfLimits);
-    let wrong = Servo { task: "velocity_arm".into(), positions: vec![0.0; 6] };
+    let wrong = Servo::new("velocity_arm", vec![0.0; 6]);
     assert_eq!(refusal(one.call(wrong)).code, Code::WrongTask);
     assert!(two.call(Status {}).unwrap().arms[0].commander.is_none(), "the refused request kept the lease");
     // A lease that was held before stays.
@@ -321,7 +321,7 @@ fn a_refused_request_takes_no_lease() {
 #[test]
 fn a_servo_target_for_a_velocity_task_is_for_the_wrong_task() {
     let (home, _run) = up("--no-record");
-    let wrong = Servo { task: "velocity_arm".into(), positions: vec![1.0; 6] };
+    let wrong = Servo::new("velocity_arm", vec![1.0; 6]);
     assert_eq!(refusal(home.client().call(wrong)).code, Code::WrongTask);
 }
 

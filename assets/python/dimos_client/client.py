@@ -10,10 +10,6 @@ from .planning import Goals, Planning, plan_number, where_to
 from .records import ArmState, Goal, Grip, Plan, Pose, Waypoint, numbers
 
 STALLED = 15.0  # s without progress, after which `wait` cancels a motion
-GRIP_STARTS = 1.0  # s within which a gripper begins to move
-GRIP_SETTLES = 0.3  # s without motion after which a gripper is at rest
-GRIP_TOLERANCE = 0.01  # of its range: nearer positions are the same
-GRIP_LIMIT = 20.0  # s after which a gripper that still moves is given up
 
 
 class Client(Planning):
@@ -96,10 +92,12 @@ class Client(Planning):
             raise MotionFailed(report["state"], report["error"] or "it ended before its goal", data=report)
         return report
 
-    def gripper(self, arm: str, opening: Union[float, str], force: Optional[float] = None, wait: bool = True) -> Grip:
+    def gripper(self, arm: str, opening: Union[float, str], force: Optional[float] = None, wait: bool = True, *,
+                speed: Optional[float] = None, timeout: Optional[float] = None, attach: Optional[str] = None) -> Grip:
         """Moves a gripper to a position (an opening [m], or the angle [rad] of a rotary one), to "open" or "close",
-        with a largest `force` (unit and range are in `status`) if it has force control. Waits until the fingers rest,
-        and returns where and why: `outcome`. They hold something if they stopped while closing."""
+        with a largest `force` (unit and range are in `status`) and a `speed` (0.01-1 of its top speed) if it has them.
+        Waits until the fingers rest, at most `timeout` [s] (20), and returns where and why: `outcome`, as the run
+        judges it. If it holds something, `attach` is attached to the arm in the planner."""
         span: Optional[List[float]] = self._report(arm).get("gripper_range")
         if isinstance(opening, str):
             if opening not in ("open", "close"):
@@ -107,36 +105,24 @@ class Client(Planning):
             if span is None:
                 raise Refused("UNSUPPORTED", f"{arm} does not say how far it opens", "give a number")
             opening = span[opening == "open"]
-        begin = self.state(arm).gripper
-        self.call("gripper", arm=arm, position=opening, force=force)
-        state = self._fingers_at_rest(arm, opening, _same(span)) if wait else self.state(arm)
-        outcome = _outcome(begin, state.gripper, opening, span) if wait else "moving"
-        if outcome in ("holding", "blocked"):
+        order = self.call("gripper", arm=arm, position=opening, force=force, speed=speed, timeout=timeout)["order"]
+        report = self.call("grip", arm=arm, order=order)
+        while wait and not report["done"]:
+            time.sleep(0.02)
+            report = self.call("grip", arm=arm, order=order)
+        if error := report.get("error"):
             if self._report(arm).get("phase") == "held":  # a stop holds the fingers, too
-                raise ArmNotReady("ARM_LATCHED", f"{arm} was held while its gripper moved", "`reset`, then `enable`")
-        position = opening if state.gripper is None else state.gripper
-        return Grip(position, state.gripper_unit or "m", outcome, state.gripper_force, state.gripper_force_unit)
+                raise ArmNotReady("ARM_LATCHED", f"{arm}: {error}", "`reset`, then `enable`")
+            raise MotionFailed("NO_ANSWER", f"the gripper of {arm}: {error}", data=report)
+        grip = Grip(report["position"], report["unit"], report["outcome"] or "moving", report.get("force"),
+                    report["force_unit"], report["elapsed"])
+        if attach is not None and grip.holding:
+            self.attach(attach, arm)
+        return grip
 
     def _report(self, arm: str) -> Dict[str, Any]:
         arms: List[Dict[str, Any]] = self.status()["arms"]
         return next((report for report in arms if report["hardware_id"] == arm), {})
-
-    def _fingers_at_rest(self, arm: str, target: float, same: float) -> ArmState:
-        last, since, deadline = None, time.monotonic(), time.monotonic() + GRIP_LIMIT
-        settles = GRIP_STARTS
-        while True:
-            state = self.state(arm)
-            at, now = state.gripper, time.monotonic()
-            if at is None:
-                raise Refused("NO_GRIPPER", f"{arm} no longer reports its gripper", "`dimos status` may say why")
-            if last is None or abs(at - last) > same / 10:
-                settles = GRIP_STARTS if last is None else GRIP_SETTLES
-                last, since = at, now
-            if now - since >= (GRIP_SETTLES if abs(at - target) <= same else settles):
-                return state
-            if now > deadline:
-                raise MotionFailed("NO_ANSWER", f"the gripper of {arm} still moves after {GRIP_LIMIT:g} s")
-            time.sleep(0.02)
 
     def io(self, arm: str) -> Dict[str, Any]:
         """Digital and analogue inputs and outputs of an arm, as docs/rpc.md says."""
@@ -187,17 +173,3 @@ class Client(Planning):
     def teach(self, arm: str, support_the_arm: bool = False) -> str:
         """Lets the arm be led by hand until `enable`. How it is led."""
         return str(self.call("arm_teach", arm=arm, support_the_arm=support_the_arm)["note"])
-
-
-def _same(span: Optional[List[float]]) -> float:
-    """Difference of positions of a gripper that counts as none [m or rad]."""
-    return GRIP_TOLERANCE * abs(span[1] - span[0]) if span else 1e-3
-
-
-def _outcome(begin: Optional[float], at: Optional[float], target: float, span: Optional[List[float]]) -> str:
-    closed, opened = span or (0.0, float("inf"))
-    same = _same(span)
-    if at is None or abs(at - target) <= same:
-        return "closed" if abs(target - closed) <= same else "open" if abs(target - opened) <= same else "reached"
-    closing = (target - (at if begin is None else begin)) * (opened - closed) < 0
-    return "holding" if closing else "blocked"

@@ -114,10 +114,11 @@ class Grip:
     outcome: str  # "open", "closed" or "reached"; "holding" (stopped while closing), "blocked" (opening); "moving"
     force: Optional[float] = None  # measured, in `force_unit`
     force_unit: Optional[str] = None  # "N", "Nm" or "%"
+    elapsed: float = 0.0  # s from the command to the last motion of the fingers
 
     @property
     def holding(self) -> bool:
-        """Whether something is between the fingers: they stopped before the commanded position while closing."""
+        """Whether the gripper holds an object, as the run judges it."""
         return self.outcome == "holding"
 
 

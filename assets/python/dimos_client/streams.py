@@ -32,9 +32,10 @@ class Streams(Connection):
         """What happens from now on: `text` for people, `kind`, `level`, `arm`, `task`, `joint` for programs."""
         return (message["data"] for message in self._messages("events", None))
 
-    def servo(self, task: str, positions: Sequence[float]) -> None:
-        """Sends a servo task its next target [rad]. Does not wait: a later call, or `settle`, raises a refusal."""
-        self._target("servo", {"task": task, "positions": numbers(positions)})
+    def servo(self, task: str, positions: Sequence[float], gripper: Optional[float] = None) -> None:
+        """Sends a servo task its next target [rad], and the arm's gripper one [m, or rad of a rotary one]. Does not
+        wait: a later call, or `settle`, raises a refusal."""
+        self._target("servo", {"task": task, "positions": numbers(positions), "gripper": gripper})
 
     def velocity(self, task: str, velocities: Sequence[float]) -> None:
         """Sends a velocity task its next target [rad/s]; as `servo`."""
@@ -50,11 +51,13 @@ class Streams(Connection):
         self._target("pose", {"task": task, **Pose(xyz, rpy, quat).params()})
 
     def chunk(self, task: str, actions: Sequence[Sequence[float]], period: float,
-              start: Optional[float] = None) -> ChunkReport:
+              start: Optional[float] = None, gripper: Optional[Sequence[float]] = None) -> ChunkReport:
         """Sends a chunk task its next horizon: joint positions [rad], `period` [s] apart, the first at `start`, a
-        `stamp` of a joint state (default: now). It replaces the rest of the chunk before it from its start on."""
+        `stamp` of a joint state (default: now), and with each a position of the gripper [m, or rad of a rotary one]. It
+        replaces the rest of the chunk before it from its start on."""
         rows = [numbers(action) for action in actions]
-        reply = self.call("chunk", task=task, actions=rows, period=period, start=start)
+        targets = None if gripper is None else numbers(gripper)
+        reply = self.call("chunk", task=task, actions=rows, period=period, start=start, gripper=targets)
         self._streams.add(task)
         return ChunkReport(reply["actions"], reply["late"])
 

@@ -136,7 +136,7 @@ impl Stream {
             (Kind::Servo, Demand::Joint(index, speed)) => {
                 let passed = self.sent.map_or(Duration::ZERO, |at| now.saturating_duration_since(at));
                 if let Some(positions) = self.advance(index, speed, passed, view) {
-                    client.call(Servo { task, positions })?;
+                    client.call(Servo::new(task, positions))?;
                 }
             }
             _ => {}

@@ -48,6 +48,8 @@ pub enum KeyAction {
     Rest,
     /// Latched operational stop.
     Stop,
+    /// Open the gripper a step or, with `false`, close it.
+    Gripper(bool),
     /// Leave jog.
     Leave {
         /// Whether by Ctrl-C.
@@ -80,6 +82,8 @@ fn letter(c: char, joint_mode: bool) -> Option<KeyAction> {
     match c {
         ' ' => Some(KeyAction::Rest),
         'x' => Some(KeyAction::Stop),
+        'o' => Some(KeyAction::Gripper(true)),
+        'c' => Some(KeyAction::Gripper(false)),
         ']' => Some(KeyAction::Speed(true)),
         '[' => Some(KeyAction::Speed(false)),
         '+' | '=' if joint_mode => Some(KeyAction::Move(Motion::Joint { up: true })),
@@ -136,6 +140,8 @@ mod tests {
         for joint_mode in [false, true] {
             assert_eq!(of(KeyCode::Char(' '), joint_mode), Some(KeyAction::Rest));
             assert_eq!(of(KeyCode::Char('X'), joint_mode), Some(KeyAction::Stop));
+            assert_eq!(of(KeyCode::Char('o'), joint_mode), Some(KeyAction::Gripper(true)));
+            assert_eq!(of(KeyCode::Char('C'), joint_mode), Some(KeyAction::Gripper(false)));
             assert_eq!(of(KeyCode::Char(']'), joint_mode), Some(KeyAction::Speed(true)));
             assert_eq!(of(KeyCode::Tab, joint_mode), Some(KeyAction::Mode));
             assert_eq!(of(KeyCode::Esc, joint_mode), Some(KeyAction::Leave { interrupted: false }));

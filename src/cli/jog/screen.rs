@@ -170,7 +170,9 @@ fn pose(state: Option<&ArmStateReport>) -> Vec<Line> {
     }
     if let Some(gripper) = state.gripper {
         let unit = state.gripper_unit.as_deref().unwrap_or("m");
-        lines.push(Line::default().and(format!("gripper {gripper:.4} {unit}")));
+        let force = state.gripper_force.zip(state.gripper_force_unit.as_deref());
+        let force = force.map_or_else(String::new, |(force, unit)| format!("  force {force:.2} {unit}"));
+        lines.push(Line::default().and(format!("gripper {gripper:.4} {unit}{force}")));
     }
     lines
 }
@@ -225,6 +227,9 @@ fn help(view: &View<'_>, columns: usize) -> Vec<Line> {
             AXES.map(pair).into_iter().chain(["B base/tool axes".to_owned(), "Tab joints".to_owned()]).collect()
         }
     };
+    if view.seen.state.as_ref().is_some_and(|state| state.gripper.is_some()) {
+        keys.push("O/C open/close the gripper".to_owned());
+    }
     let always = ["[ ] speed", "Space rest", "X stop, latched", "Esc leave"];
     keys.extend(always.map(str::to_owned));
     keys.push(if view.releases { "moves while a key is down".to_owned() } else { "hold a key to move".to_owned() });

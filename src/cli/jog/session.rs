@@ -6,13 +6,14 @@ use crossterm::event::{Event, KeyEvent, KeyEventKind};
 
 use super::active_motions::ActiveMotions;
 use super::drive::{self, ArmView, Demand, Drives, Kind, Stream, refusal};
+use super::fingers::Fingers;
 use super::keys::{KeyAction, Motion, meaning};
 use super::screen::{self, View};
 use super::terminal::Terminal;
 use super::watch::{ArmSnapshot, Watch};
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::follow::Signals;
-use crate::rpc::api::{Release, State, Stop, TwistFrame};
+use crate::rpc::api::{Gripper, Release, State, Stop, TwistFrame};
 use crate::rpc::client::Client;
 
 /// Time between two targets.
@@ -64,6 +65,7 @@ pub struct Session {
     stream: Option<Stream>,
     /// When the last motion ended.
     resting: Option<Instant>,
+    fingers: Fingers,
     message: Option<(String, bool)>,
 }
 
@@ -75,8 +77,8 @@ impl Session {
             setting.joint_mode = !setting.joint_mode;
             message = Some((missing_task(&setting.arm, !setting.joint_mode), false));
         }
-        let (held, speed) = (ActiveMotions::default(), FIRST_SPEED);
-        Self { client, watch, drives, setting, held, speed, joint: 0, stream: None, resting: None, message }
+        let (held, speed, fingers) = (ActiveMotions::default(), FIRST_SPEED, Fingers::default());
+        Self { client, watch, drives, setting, held, speed, joint: 0, stream: None, resting: None, fingers, message }
     }
 
     /// Jogs until the user leaves, a signal arrives, or the terminal or the run is lost. In every case the arm
@@ -155,11 +157,26 @@ impl Session {
             (KeyAction::Step(forward), _) => {
                 self.choose(if forward { self.joint + 1 } else { self.joint.saturating_sub(1) });
             }
+            (KeyAction::Gripper(open), _) => self.grip(open, now)?,
             (KeyAction::Mode, _) => self.change_mode()?,
             (KeyAction::Rest, _) => self.rest()?,
             (KeyAction::Stop, _) => self.stop()?,
         }
         Ok(None)
+    }
+
+    /// Opens or closes the gripper by a step.
+    fn grip(&mut self, open: bool, now: Instant) -> Result<()> {
+        let refused = match self.fingers.step(open, &self.watch.seen(), now) {
+            Ok(None) => return Ok(()),
+            Ok(Some(position)) => {
+                let arm = self.setting.arm.clone();
+                refusal(self.client.call(Gripper { arm, position, ..Gripper::default() }).map(drop))?
+            }
+            Err(why) => Some(why),
+        };
+        self.message = refused.map(|text| (text, true));
+        Ok(())
     }
 
     fn choose(&mut self, joint: usize) {

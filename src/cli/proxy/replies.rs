@@ -190,7 +190,7 @@ mod tests {
     }
 
     fn target(position: f64) -> Target {
-        Target::Positions(Servo { task: "servo_arm".into(), positions: vec![position] })
+        Target::Positions(Servo::new("servo_arm", vec![position]))
     }
 
     fn next(lines: &mut Lines<BufReader<UnixStream>>) -> Value {

@@ -150,7 +150,7 @@ impl RunArm {
         let name = task.name.clone();
         let target = match velocities {
             true => Target::Velocities(Velocity { task: name, velocities: mapped }),
-            false => Target::Positions(Servo { task: name, positions: mapped }),
+            false => Target::Positions(Servo::new(name, mapped)),
         };
         self.commands().stream(target, &self.link.shared);
         if self.stream.is_none_or(|stream| stream.velocities != velocities) {
@@ -401,7 +401,7 @@ impl ControlledArm for RunArm {
         let Some([closed, open]) = self.info.gripper_range else { return };
         let position = opening.max(closed.min(open)).min(closed.max(open));
         self.gripper_ordered = Some(Instant::now());
-        self.send(&Gripper { arm: self.info.arm.clone(), position, force: None });
+        self.send(&Gripper { arm: self.info.arm.clone(), position, ..Gripper::default() });
     }
 
     fn set_load(&mut self, [mass, x, y, z]: [f32; 4]) -> Result<(), Refusal> {

@@ -17,10 +17,11 @@ use crate::cli::follow::{Signals, show_deviation};
 use crate::cli::text_log::Terminal;
 use crate::cli::{banner, check, output};
 use crate::replay::fit::fit;
+use crate::replay::grips::RecordedGrip;
 use crate::replay::motion::RecordedMotion;
 use crate::replay::onto::{Approach, Plan, check as check_limits, is_real, plan};
 use crate::rpc::RpcError;
-use crate::rpc::api::{self, ArmEnable, Cancel, Execute, Move, Point, State, Trajectory};
+use crate::rpc::api::{self, ArmEnable, Cancel, Execute, Gripper, Move, Point, State, Trajectory};
 use crate::rpc::report::{Deviation, MotionReport, StateReport};
 use crate::runtime::{Ended, Ending, Options, Record, Run};
 use crate::trajectory::JointTrajectory;
@@ -52,7 +53,9 @@ pub fn run(args: &ReplayArgs, onto: &str, log: &Path, span: &Span, catalog: Cata
     blueprint.arms.iter_mut().for_each(|arm| arm.auto_enable = false);
     let run = Run::start(&blueprint, options(args))?;
     let show = Show { bars: !args.json && io::stderr().is_terminal(), quiet: args.json };
-    let driver = Driver { run: &run, blueprint: &blueprint, plan: &plan, signals: &signals, show, rate: args.rate };
+    let grips = motion.grips.as_slice();
+    let driver =
+        Driver { run: &run, blueprint: &blueprint, plan: &plan, grips, signals: &signals, show, rate: args.rate };
     let result = driver.drive(&wanted);
     let ended = run.stop();
     terminal.flush();
@@ -125,6 +128,7 @@ struct Driver<'a> {
     run: &'a Run,
     blueprint: &'a Blueprint,
     plan: &'a Plan,
+    grips: &'a [RecordedGrip],
     signals: &'a Signals,
     show: Show,
     rate: f64,
@@ -134,6 +138,7 @@ impl Driver<'_> {
     fn drive(&self, wanted: &[bool]) -> std::result::Result<Vec<Deviation>, End> {
         let state = self.first_states()?;
         self.check_limits()?;
+        let grips = self.possible_grips(&state);
         for (arm, wanted) in self.blueprint.arms.iter().zip(wanted) {
             if *wanted || self.plan.approaches.iter().any(|a| a.arm == arm.hardware_id) {
                 self.run.call(ArmEnable { arm: arm.hardware_id.clone() })?;
@@ -145,7 +150,7 @@ impl Driver<'_> {
             let begun = self.run.call(go)?;
             let (arm, duration) = (&approach.arm, begun.duration);
             self.show.note(format_args!("approach: {arm} moves to the start of the motion, {duration:.1} s, directly"));
-            self.follow(&[begun.motion], "approach")?;
+            self.follow(&[begun.motion], "approach", &[])?;
         }
         let parts = self.plan.parts.iter();
         let requests: Vec<Execute> =
@@ -165,7 +170,7 @@ impl Driver<'_> {
         let duration = self.plan.parts.first().map_or(0.0, |p| p.trajectory.duration());
         let (joints, rate) = (self.plan.parts.iter().map(|p| p.trajectory.joint_names.len()).sum::<usize>(), self.rate);
         self.show.note(format_args!("motion: {joints} joints, {duration:.1} s at rate {rate}, not collision-checked"));
-        let reports = self.follow(&motions, "motion")?;
+        let reports = self.follow(&motions, "motion", &grips)?;
         Ok(reports.into_iter().flat_map(|report| report.deviation.unwrap_or_default()).collect())
     }
 
@@ -205,8 +210,37 @@ impl Driver<'_> {
         Err(Failure::new(Exit::Failed, what).hint(hint).into())
     }
 
-    /// Waits for the end of all motions. A failure of one, or a signal, cancels the others.
-    fn follow(&self, motions: &[u64], what: &'static str) -> std::result::Result<Vec<MotionReport>, End> {
+    /// Returns the recorded gripper commands for arms with a gripper, and prints how many others are left out.
+    fn possible_grips(&self, state: &StateReport) -> Vec<&RecordedGrip> {
+        let grips = |arm: &str| state.arms.iter().any(|a| a.hardware_id == arm && a.gripper.is_some());
+        let possible: Vec<_> = self.grips.iter().filter(|grip| grips(&grip.arm)).collect();
+        let others = self.grips.len() - possible.len();
+        if others > 0 {
+            self.show.note(format_args!("warning: {others} gripper commands of the log are left out: no such gripper"));
+        }
+        possible
+    }
+
+    /// Sends the gripper commands whose time has come; of several, the last of each arm.
+    fn grip(&self, due: &[&RecordedGrip]) -> std::result::Result<(), End> {
+        for (k, grip) in due.iter().enumerate() {
+            if due.iter().skip(k + 1).all(|later| later.arm != grip.arm) {
+                let (arm, position) = (grip.arm.clone(), grip.position);
+                let (force, speed) = (grip.force, grip.speed);
+                self.run.call(Gripper { arm, position, force, speed, timeout: None })?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Waits for the end of all motions, and sends gripper commands at their times. A failure of one, or a signal,
+    /// cancels the others.
+    fn follow(
+        &self,
+        motions: &[u64],
+        what: &'static str,
+        mut grips: &[&RecordedGrip],
+    ) -> std::result::Result<Vec<MotionReport>, End> {
         let bar = if self.show.bars { ProgressBar::new(1000) } else { ProgressBar::hidden() };
         if let Ok(style) = ProgressStyle::with_template("{prefix} [{bar:40}] {percent:>3} % {msg}") {
             bar.set_style(style.progress_chars("=> "));
@@ -214,6 +248,12 @@ impl Driver<'_> {
         bar.set_prefix(what);
         let result = loop {
             let reports = self.reports(motions)?;
+            let elapsed = reports.iter().map(|r| r.elapsed).fold(0.0, f64::max) * self.rate;
+            let (due, later) = grips.split_at(grips.partition_point(|grip| grip.time <= elapsed));
+            grips = later;
+            if let Err(refused) = self.grip(due) {
+                break Err(refused);
+            }
             let slowest = reports.iter().map(|r| r.progress).fold(1.0, f64::min);
             bar.set_position((slowest.clamp(0.0, 1.0) * 1000.0) as u64);
             bar.set_message(format!("{:.1} s left", reports.iter().map(|r| r.remaining).fold(0.0, f64::max)));

@@ -238,9 +238,11 @@ impl ArmControl {
         outcome
     }
 
-    /// Sets a new gripper position [m or rad] and its largest force [N or Nm]; `None`: the device's own.
-    pub fn set_gripper(&mut self, opening: f64, force: Option<f64>) {
+    /// Sets a new gripper position [m or rad], its largest force [N or Nm] and its speed, a fraction of the top speed;
+    /// `None`: the device's own.
+    pub fn set_gripper(&mut self, opening: f64, force: Option<f64>, speed: Option<f64>) {
         (self.command.gripper, self.command.gripper_force) = (opening, force);
+        self.command.gripper_speed = speed;
         self.command.gripper_seq = self.command.gripper_seq.wrapping_add(1);
     }
 

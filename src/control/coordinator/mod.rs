@@ -258,7 +258,7 @@ impl Coordinator {
             let Some(arm) = self.arms.get_mut(own).filter(|arm| arm.config().gripper) else { continue };
             let last = (arm.command().gripper_seq != 0).then_some(arm.command().gripper);
             if let Some(target) = gripper_target(position, &info, &arm.config().gripper_info, last) {
-                arm.set_gripper(target, None);
+                arm.set_gripper(target, None, None);
             }
         }
     }

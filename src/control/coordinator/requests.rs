@@ -71,7 +71,7 @@ impl Coordinator {
                 }
                 self.change_speed(|speed| speed.paused = on)
             }
-            Request::Gripper { arm, opening, force } => self.gripper(arm, opening, force),
+            Request::Gripper { arm, opening, force, speed } => self.gripper(arm, opening, force, speed),
         };
         self.output.report(Event::Request(envelope.id, outcome));
     }
@@ -184,7 +184,7 @@ impl Coordinator {
         Ok(())
     }
 
-    fn gripper(&mut self, arm: u16, opening: f64, force: Option<f64>) -> Outcome {
+    fn gripper(&mut self, arm: u16, opening: f64, force: Option<f64>, speed: Option<f64>) -> Outcome {
         let Some(a) = self.arms.get_mut(arm as usize) else { return Outcome::StartStateUnavailable(arm) };
         if !a.config().gripper {
             return Outcome::NoGripper(arm);
@@ -200,9 +200,12 @@ impl Coordinator {
             (Some(force), Some((least, most))) if (least..=most).contains(&force) => {}
             (Some(force), Some(_)) => return Outcome::GripperForceOutOfLimits(arm, force),
         }
+        if speed.is_some_and(|speed| !(info.has_speed && speed > 0.0 && speed <= 1.0)) {
+            return Outcome::NoGripperSpeed(arm);
+        }
         match a.failsafe.admits(arm) {
             Ok(()) => {
-                a.set_gripper(opening, force);
+                a.set_gripper(opening, force, speed);
                 Outcome::Accepted
             }
             Err(outcome) => outcome,

@@ -1,7 +1,7 @@
 //! Counters and texts of a device thread, for status and log. The tick does not read them.
 
 use std::collections::VecDeque;
-use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU8, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Mutex, OnceLock};
 
 use super::Details;
@@ -67,6 +67,8 @@ pub struct Health {
     details: Mutex<Details>,
     /// `ArmCommand::gripper_seq` of the last gripper command that was answered, and the answer.
     gripper: Mutex<Option<(u32, AdapterResult<()>)>>,
+    /// Whether the gripper itself reports an object: 0 if it cannot tell, 1 for none, 2 for one.
+    gripper_holds: AtomicU8,
     /// Raised when a stop or a gripper command is answered.
     listener: OnceLock<Wake>,
 }
@@ -114,6 +116,15 @@ impl Health {
             }
             _ => None,
         }
+    }
+
+    /// Returns whether the gripper itself reports an object in its grip; `None` if it cannot tell.
+    pub fn gripper_holds(&self) -> Option<bool> {
+        [None, Some(false), Some(true)].get(usize::from(self.gripper_holds.load(Ordering::Relaxed))).copied().flatten()
+    }
+
+    pub(super) fn set_gripper_holds(&self, holds: Option<bool>) {
+        self.gripper_holds.store(holds.map_or(0, |holds| 1 + u8::from(holds)), Ordering::Relaxed);
     }
 
     pub(super) fn answer_gripper(&self, order: u32, result: AdapterResult<()>) {

@@ -41,6 +41,17 @@ pub const PLAYABLE: &[FaultKind] = &[
     FaultKind::MotorOff,
 ];
 
+/// Returns [`PLAYABLE`] and more kinds; `N` is how many all are.
+pub const fn playable_and<const N: usize>(more: &[FaultKind]) -> [FaultKind; N] {
+    let mut all = [FaultKind::Stall; N];
+    let mut i = 0;
+    while i < N {
+        all[i] = if i < PLAYABLE.len() { PLAYABLE[i] } else { more[i - PLAYABLE.len()] };
+        i += 1;
+    }
+    all
+}
+
 /// Why the arm refuses a command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Refusal {

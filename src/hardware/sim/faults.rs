@@ -65,6 +65,11 @@ pub enum FaultKind {
     NoBuffers,
     /// The arm is a leader: it sends commands instead of its state.
     Leader,
+    /// An object of the width `amount` [m, or rad of a rotary gripper] is between the fingers for `duration`; without a
+    /// duration it stays.
+    Object,
+    /// The gripper's fingers do not move for `duration`.
+    GripperBlocked,
 }
 
 impl FaultKind {
@@ -109,7 +114,7 @@ pub struct Fault {
     #[serde(default = "default_code")]
     #[schemars(range(min = 1))]
     pub code: u16,
-    /// How far the arm sinks, for `sag`, or a joint is moved, for `pushed` [rad].
+    /// How far the arm sinks, for `sag`, or a joint is moved, for `pushed` [rad]; width of an `object` [m or rad].
     #[serde(default = "default_amount", deserialize_with = "non_negative")]
     pub amount: f64,
     /// Number of the joint, from 1, for `blocked`, `pushed` and `motor_off`.
@@ -321,7 +326,7 @@ mod tests {
     #[test]
     fn every_kind_says_what_it_is() {
         let all = FaultKind::all();
-        assert_eq!((all.len(), all[2].0), (FaultKind::Leader as usize + 1, FaultKind::Stall));
+        assert_eq!((all.len(), all[2].0), (FaultKind::GripperBlocked as usize + 1, FaultKind::Stall));
         assert!(all.iter().all(|(_, about)| about.ends_with('.')), "{all:?}");
     }
 

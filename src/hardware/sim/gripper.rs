@@ -1,5 +1,10 @@
 //! Gripper of a simulated arm.
 
+use super::faults::{Fault, FaultKind};
+
+/// The faults of a gripper.
+pub const FAULTS: [FaultKind; 2] = [FaultKind::Object, FaultKind::GripperBlocked];
+
 /// A gripper with finite speed. It presses on an object between its fingers with the largest force that it was given.
 #[derive(Debug, Clone, Copy)]
 pub struct Gripper {
@@ -12,12 +17,47 @@ pub struct Gripper {
     speed: f64,
     /// Position at which the fingers touch an object; 0 without one.
     object: f64,
+    /// Fraction of its speed with which it moves.
+    fraction: f64,
+    /// A fault keeps the fingers where they are.
+    blocked: bool,
+    /// The object is that of a fault with a duration.
+    lent: bool,
 }
 
 impl Gripper {
     /// Creates a gripper that opens to `max` [m or rad] at `speed` [m/s or rad/s]; initially half open.
     pub fn new(max: f64, speed: f64) -> Self {
-        Self { position: max / 2.0, max_force: 0.0, target: max / 2.0, max, speed, object: 0.0 }
+        Self {
+            position: max / 2.0,
+            max_force: 0.0,
+            target: max / 2.0,
+            max,
+            speed,
+            object: 0.0,
+            fraction: 1.0,
+            blocked: false,
+            lent: false,
+        }
+    }
+
+    /// Sets the fraction of its speed with which it moves.
+    pub fn set_speed(&mut self, fraction: f64) {
+        self.fraction = fraction.clamp(0.0, 1.0);
+    }
+
+    /// Plays the faults `object` and `gripper_blocked` that are due: `take` returns them. Call it whenever the arm is
+    /// advanced.
+    pub fn play(&mut self, mut take: impl FnMut(FaultKind) -> Option<Fault>) {
+        self.blocked = take(FaultKind::GripperBlocked).is_some();
+        match take(FaultKind::Object) {
+            Some(fault) => {
+                self.put_object(fault.amount);
+                self.lent = fault.duration > 0.0;
+            }
+            None if std::mem::take(&mut self.lent) => self.put_object(0.0),
+            None => {}
+        }
     }
 
     /// Returns the same gripper with a largest force.
@@ -39,6 +79,11 @@ impl Gripper {
         }
     }
 
+    /// Rests where it is, without pressing on an object.
+    pub fn rest(&mut self) {
+        self.target = self.position;
+    }
+
     /// Puts an object of this width [m or rad] between the fingers, if they are wide enough open; 0 takes it away.
     pub fn put_object(&mut self, width: f64) {
         self.object = width.clamp(0.0, self.position);
@@ -56,12 +101,16 @@ impl Gripper {
 
     /// Advances by `dt` [s].
     pub fn advance(&mut self, dt: f64) {
-        let (reach, goal) = (self.speed * dt.max(0.0), self.target.max(self.object));
+        if self.blocked {
+            return;
+        }
+        let (reach, goal) = (self.fraction * self.speed * dt.max(0.0), self.target.max(self.object));
         let error = goal - self.position;
         self.position = if error.abs() <= reach { goal } else { self.position + reach.copysign(error) };
     }
 
-    fn gripping(&self) -> bool {
+    /// Returns whether it presses on an object.
+    pub fn gripping(&self) -> bool {
         self.position == self.object && self.target < self.object
     }
 }

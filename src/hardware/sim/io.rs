@@ -11,16 +11,13 @@ const ANALOG: &[AnalogUnit] = &[AnalogUnit::Volt; 2];
 /// Highest voltage [V].
 pub const MAX_VOLTAGE: f64 = 10.0;
 
-/// The faults that a [`SimArm`] with inputs can play: those of [`arm::PLAYABLE`], and `input_low`.
-pub const PLAYABLE: &[FaultKind] = &{
-    let mut all = [FaultKind::InputLow; arm::PLAYABLE.len() + 1];
-    let mut i = 0;
-    while i < arm::PLAYABLE.len() {
-        all[i] = arm::PLAYABLE[i];
-        i += 1;
-    }
-    all
-};
+/// The faults that a [`SimArm`] with inputs and a gripper can play: those of [`arm::PLAYABLE`], of its inputs, and of
+/// its [gripper](super::gripper::FAULTS).
+pub const PLAYABLE: &[FaultKind] = &arm::playable_and::<{ arm::PLAYABLE.len() + 3 }>(&[
+    FaultKind::InputLow,
+    super::gripper::FAULTS[0],
+    super::gripper::FAULTS[1],
+]);
 
 /// Inputs and outputs. All digital inputs are wired to the supply, so they are high; outputs are low, voltages 0 V.
 #[derive(Debug, Clone, Copy)]

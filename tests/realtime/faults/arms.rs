@@ -120,12 +120,12 @@ fn f08_the_wire_never_asks_for_more_than_the_limits() {
     let mut target = vec![0.0, -0.3, 0.6, 0.0, 0.8, 0.0];
     for _ in 0..150 {
         target.iter_mut().for_each(|t| *t = (*t + 0.12 * (random.unit() - 0.5)).clamp(-1.0, 1.0));
-        client.call(Servo { task: "servo".into(), positions: target.clone() }).unwrap();
+        client.call(Servo::new("servo", target.clone())).unwrap();
         std::thread::sleep(Duration::from_secs_f64(0.004 + 0.016 * random.unit()));
     }
     // A larger jump is refused and holds the arm.
     target[0] += 0.5;
-    let _ = client.call(Servo { task: "servo".into(), positions: target });
+    let _ = client.call(Servo::new("servo", target));
     eventually("it is held", || home.status()["arms"][0]["phase"] == "held");
     eventually("it is at rest", || arm.joints().1.iter().all(|v| v.abs() < 1e-3));
     let trace = arm.trace();
@@ -162,7 +162,7 @@ fn f10_a_stream_that_ends_ends_the_motion() {
                 position[0] += way * 0.005;
                 let task = task.to_owned();
                 match task.as_str() {
-                    "servo" => client.call(Servo { task, positions: position.clone() }).map(drop),
+                    "servo" => client.call(Servo::new(task, position.clone())).map(drop),
                     _ => client.call(Velocity { task, velocities: vec![way * 0.5, 0.0, 0.0, 0.0, 0.0, 0.0] }).map(drop),
                 }
                 .unwrap();

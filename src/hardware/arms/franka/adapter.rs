@@ -275,6 +275,21 @@ impl Gripper for FrankaAdapter {
         Some(RANGE)
     }
 
+    fn read_gripper_holds(&mut self) -> AdapterResult<Option<bool>> {
+        self.with_hand(|hand| Ok(hand.grasps()))
+    }
+
+    fn has_gripper_speed(&self) -> bool {
+        true
+    }
+
+    fn set_gripper_speed(&mut self, fraction: Option<f64>) {
+        let _ = self.with_hand(|hand| {
+            hand.set_speed(fraction);
+            Ok(())
+        });
+    }
+
     fn get_gripper_force_range(&mut self) -> Option<(f64, f64)> {
         Some(FORCES)
     }

@@ -97,5 +97,7 @@ fn the_hand() {
     assert_eq!((grasp.len(), grasp[..10].to_vec()), (50, hex("0200 02000000 32000000")));
     assert_eq!(gripper::scan(&hex("0300 05000000 0c000000 0200")), Scan::Take(12, (5, 2)));
     let state = [&1_u32.to_le_bytes()[..], &0.04_f64.to_le_bytes(), &0.08_f64.to_le_bytes(), &[0, 35, 0]].concat();
-    assert_eq!(gripper::state(&state), Some((0.04, 0.08)));
+    assert_eq!(gripper::state(&state), Some((0.04, 0.08, false)));
+    let grasps = [&state[..20], &[1, 35, 0]].concat();
+    assert_eq!(gripper::state(&grasps), Some((0.04, 0.08, true)));
 }

@@ -17,6 +17,8 @@ const STALE: Duration = Duration::from_millis(500);
 const CLOSED: f64 = 0.001;
 /// Forces that can be commanded: the largest is the continuous one of the data sheet [N].
 pub const FORCES: (f64, f64) = (1.0, 70.0);
+/// Speed at which each finger moves 0.05 m/s, the largest of the data sheet [m/s].
+const TOP_SPEED: f64 = 0.1;
 /// Widest opening according to the data sheet [m].
 pub const RANGE: (f64, f64) = (0.0, 0.08);
 
@@ -27,8 +29,11 @@ pub struct Hand {
     last_id: u32,
     /// Width, largest width [m], and when they came.
     newest: Option<(f64, f64, Mono)>,
+    /// Speed for a command without one, and for the next command [m/s].
+    default_speed: f64,
     speed: f64,
     force: f64,
+    grasped: bool,
 }
 
 impl Hand {
@@ -49,15 +54,16 @@ impl Hand {
             }
         }
         let (speed, force) = (options.gripper_speed, options.gripper_force);
-        Ok(Self { tcp, udp, last_id: 1, newest: None, speed, force })
+        Ok(Self { tcp, udp, last_id: 1, newest: None, default_speed: speed, speed, force, grasped: false })
     }
 
     fn update(&mut self) -> AdapterResult<()> {
         let mut buffer = [0; 2 * STATE];
         for _ in 0..64 {
             let Ok(length) = self.udp.recv(&mut buffer) else { break };
-            if let Some((width, most)) = state(buffer.get(..length).unwrap_or_default()) {
+            if let Some((width, most, grasped)) = state(buffer.get(..length).unwrap_or_default()) {
                 self.newest = Some((width, most, MonotonicClock.now()));
+                self.grasped = grasped;
             }
         }
         // Answers come when a motion ends; the width shows how.
@@ -74,6 +80,16 @@ impl Hand {
     pub fn width(&mut self) -> AdapterResult<Option<f64>> {
         self.update()?;
         Ok(self.known().map(|(width, _)| width))
+    }
+
+    /// Returns whether it reports an object in its grip, if that is known.
+    pub fn grasps(&self) -> Option<bool> {
+        self.known().map(|_| self.grasped)
+    }
+
+    /// Sets the speed of the next commands, as a fraction of the largest; `None`: that of the blueprint.
+    pub fn set_speed(&mut self, fraction: Option<f64>) {
+        self.speed = fraction.map_or(self.default_speed, |fraction| fraction * TOP_SPEED);
     }
 
     /// Moves the fingers to a width [m]; with a force [N] it grasps what is between them. Closing always grasps, by

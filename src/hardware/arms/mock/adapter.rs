@@ -255,6 +255,14 @@ impl Gripper for MockArm {
         Ok(())
     }
 
+    fn has_gripper_speed(&self) -> bool {
+        true
+    }
+
+    fn set_gripper_speed(&mut self, fraction: Option<f64>) {
+        self.device.gripper.set_speed(fraction.unwrap_or(1.0));
+    }
+
     fn read_gripper_force(&mut self) -> AdapterResult<Option<f64>> {
         self.device.answer()?;
         Ok(Some(self.device.gripper.force()))

@@ -130,6 +130,7 @@ impl Device {
     fn advance(&mut self) {
         let before = self.arm.now();
         self.arm.integrate(self.clock.now());
+        self.gripper.play(|kind| self.arm.take_fault(kind));
         self.gripper.advance(self.arm.now().seconds_since(before));
     }
 

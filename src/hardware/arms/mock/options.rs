@@ -25,6 +25,8 @@ pub(super) const PLAYABLE: &[FaultKind] = &[
     FaultKind::Sag,
     FaultKind::Blocked,
     FaultKind::InputLow,
+    FaultKind::Object,
+    FaultKind::GripperBlocked,
 ];
 
 /// Options of a mock arm.

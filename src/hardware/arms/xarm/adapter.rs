@@ -422,6 +422,17 @@ impl Gripper for XArmAdapter {
         ForceUnit::Percent
     }
 
+    fn has_gripper_speed(&self) -> bool {
+        true
+    }
+
+    fn set_gripper_speed(&mut self, fraction: Option<f64>) {
+        let _ = self.with(|session| {
+            session.gripper().set_speed(fraction);
+            Ok(())
+        });
+    }
+
     fn get_gripper_force_range(&mut self) -> Option<(f64, f64)> {
         (self.options.gripper == GripperKind::XarmG2).then_some(FORCE_RANGE_G2)
     }

@@ -59,6 +59,8 @@ pub struct Gripper {
     next_poll: Mono,
     watched_until: Mono,
     polls: u32,
+    /// Fraction of its top speed for the next targets; `None`: the default.
+    speed: Option<f64>,
 }
 
 impl Gripper {
@@ -77,6 +79,7 @@ impl Gripper {
             next_poll: Mono::ZERO,
             watched_until: Mono::ZERO,
             polls: 0,
+            speed: None,
         }
     }
 
@@ -95,6 +98,14 @@ impl Gripper {
         let range = self.force_range().ok_or(AdapterError::Unsupported)?;
         let force = within("gripper force", force, range, "%")?;
         self.go(opening, force.round() as u16)
+    }
+
+    /// Sets the speed of the moves that follow, as a fraction of its top speed; `None`: the default.
+    pub fn set_speed(&mut self, speed: Option<f64>) {
+        if self.kind == GripperKind::Xarm && self.speed != speed {
+            self.wake.get_or_insert(Step::Speed);
+        }
+        self.speed = speed;
     }
 
     /// Queues a move to an opening [m].
@@ -159,8 +170,8 @@ impl Gripper {
             Step::Clear => Rtu::clear_error(),
             Step::Enable => Rtu::enable(),
             Step::Mode => Rtu::position_mode(),
-            Step::Speed => Rtu::speed(),
-            Step::Go(pulses, force) => Rtu::go(self.kind, pulses, force),
+            Step::Speed => Rtu::speed(self.speed),
+            Step::Go(pulses, force) => Rtu::go(self.kind, pulses, force, self.speed),
             Step::Error => Rtu::read_error(),
             Step::Position => Rtu::read_position(),
         };
@@ -193,6 +204,8 @@ impl Gripper {
             Step::Clear => (self.clear, self.error, self.wake) = (false, 0, Some(Step::Enable)),
             Step::Enable => self.wake = Some(Step::Mode),
             Step::Mode if self.kind == GripperKind::Xarm => self.wake = Some(Step::Speed),
+            // Another speed may have been set since.
+            Step::Speed if telegram != Rtu::speed(self.speed) => {}
             Step::Mode | Step::Speed => self.wake = None,
             Step::Go(pulses, force) => {
                 self.same = 0;

@@ -153,7 +153,7 @@ impl Worker {
             self.gripper_stop.end();
             let (position, force) = (command.gripper, command.gripper_force);
             let gripper = adapter.gripper().ok_or(AdapterError::Unsupported);
-            gripper.and_then(|gripper| gripper.command(position, force))
+            gripper.and_then(|gripper| gripper.command(position, force, command.gripper_speed))
         };
         if result.is_ok() {
             self.gripper_stop.commanded(command.gripper_force);
@@ -181,7 +181,7 @@ impl Worker {
         let Some(here) = self.gripper_stop.observe(position, gripper.get_gripper_unit(), now) else { return };
         // Closed may be the larger position of a rotary jaw.
         let (a, b) = gripper.get_gripper_range().unwrap_or((f64::MIN, f64::MAX));
-        if let Err(error) = gripper.command(here.max(a.min(b)).min(a.max(b)), self.gripper_stop.force()) {
+        if let Err(error) = gripper.command(here.max(a.min(b)).min(a.max(b)), self.gripper_stop.force(), None) {
             self.trouble(&format!("the gripper cannot be held: {error}"));
         }
     }

@@ -78,7 +78,10 @@ impl Worker {
         if all || turn == 2 {
             let gripper = adapter.gripper();
             (self.state.gripper, self.state.gripper_force) = match gripper {
-                Some(gripper) => (gripper.read_gripper_position()?, gripper.read_gripper_force()?),
+                Some(gripper) => {
+                    self.health.set_gripper_holds(gripper.read_gripper_holds()?);
+                    (gripper.read_gripper_position()?, gripper.read_gripper_force()?)
+                }
                 None => (None, None),
             };
             self.hold_gripper(adapter);

@@ -198,6 +198,7 @@ impl Control {
             self.follow_hand();
         }
         self.recover();
+        self.hand.play(|kind| self.arm.take_fault(kind));
         let finished = self.hand.advance(CYCLE);
         self.answers.extend(finished);
         self.id += 1;

@@ -4,6 +4,7 @@ use std::net::{IpAddr, SocketAddr};
 
 use super::control::Who;
 use crate::hardware::sim::arm::Delivery;
+use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::sim::gripper::Gripper;
 use crate::hardware::transport::Scan;
 
@@ -31,8 +32,6 @@ struct Motion {
 pub(super) struct Hand {
     fingers: Gripper,
     pub homed: bool,
-    /// Width of what is between the fingers [m].
-    pub object: Option<f64>,
     grasped: bool,
     motion: Option<Motion>,
     client: Option<(Who, SocketAddr)>,
@@ -42,7 +41,7 @@ pub(super) struct Hand {
 impl Hand {
     pub fn new() -> Self {
         let fingers = Gripper::new(WIDEST, SPEED);
-        Self { fingers, homed: true, object: None, grasped: false, motion: None, client: None, messages: 0 }
+        Self { fingers, homed: true, grasped: false, motion: None, client: None, messages: 0 }
     }
 
     /// Processes the command at the front of a connection's bytes. Returns the answers that are due.
@@ -81,11 +80,13 @@ impl Hand {
             }
             2 => {
                 let (width, inner, outer) = (number(0), number(1), number(2));
+                self.fingers.set_speed(number(3) / SPEED);
                 let success = (width - inner, width + outer);
                 self.begin(Motion { who, code, id, success, grasps: true }, width, answers);
             }
             3 => {
                 let width = number(0);
+                self.fingers.set_speed(number(1) / SPEED);
                 let success = (width - 1e-6, width + 1e-6);
                 self.begin(Motion { who, code, id, success, grasps: false }, width, answers);
             }
@@ -114,23 +115,31 @@ impl Hand {
         self.motion = Some(motion);
     }
 
+    /// Puts an object of this width [m] between the fingers; `None` takes it away.
+    pub fn put_object(&mut self, width: Option<f64>) {
+        self.fingers.put_object(width.unwrap_or_default());
+    }
+
+    /// Plays the faults of the fingers that are due.
+    pub fn play(&mut self, take: impl FnMut(FaultKind) -> Option<Fault>) {
+        self.fingers.play(take);
+    }
+
     /// Moves the fingers. Returns the answer to a motion that ends.
     pub fn advance(&mut self, dt: f64) -> Option<(Who, Vec<u8>)> {
-        let before = self.fingers.position;
         self.fingers.advance(dt);
-        let touches = self.object.filter(|width| before >= *width && self.fingers.position < *width);
-        if let Some(width) = touches {
-            self.fingers.position = width;
-            self.fingers.stop();
-            self.grasped = self.motion.as_ref().is_some_and(|motion| motion.grasps);
-        }
         if self.fingers.moving() {
             return None;
         }
         let motion = self.motion.take()?;
+        let touches = self.fingers.gripping();
+        self.grasped = touches && motion.grasps;
+        if touches && !motion.grasps {
+            self.fingers.rest(); // it does not press
+        }
         let (least, most) = motion.success;
         let inside = (least..=most).contains(&self.fingers.position);
-        let status = if inside && (motion.grasps || touches.is_none()) { SUCCESS } else { UNSUCCESSFUL };
+        let status = if inside && (motion.grasps || !touches) { SUCCESS } else { UNSUCCESSFUL };
         Some((motion.who, answer(motion.code, motion.id, status, 0)))
     }
 

@@ -57,6 +57,8 @@ const PLAYABLE: &[FaultKind] = &[
     FaultKind::Frozen,
     FaultKind::Blocked,
     FaultKind::Pushed,
+    FaultKind::Object,
+    FaultKind::GripperBlocked,
 ];
 /// Most connections at once, to arm and hand.
 const CLIENTS: usize = 8;
@@ -213,7 +215,7 @@ impl FrankaEmulator {
 
     /// Puts an object between the fingers [m], or takes it away.
     pub fn place_object(&self, width: Option<f64>) {
-        self.with(|control| control.hand.object = width);
+        self.with(|control| control.hand.put_object(width));
     }
 
     /// Sets whether the hand has been homed.

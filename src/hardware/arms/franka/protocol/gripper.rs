@@ -51,9 +51,10 @@ pub fn scan(bytes: &[u8]) -> Scan<(u32, u16)> {
     }
 }
 
-/// Returns the width and the largest width of a state [m]; the latter is 0 before the hand was homed.
-pub fn state(bytes: &[u8]) -> Option<(f64, f64)> {
+/// Returns the width and the largest width of a state [m], and whether it holds an object. The largest width is 0
+/// before the hand was homed.
+pub fn state(bytes: &[u8]) -> Option<(f64, f64, bool)> {
     let number = |at: usize| bytes.get(at..).and_then(<[u8]>::first_chunk).map(|bytes| f64::from_le_bytes(*bytes));
-    let values = (number(4)?, number(12)?);
+    let values = (number(4)?, number(12)?, bytes.get(20).is_some_and(|grasped| *grasped != 0));
     (bytes.len() == STATE && values.0.is_finite() && values.1.is_finite()).then_some(values)
 }

@@ -44,6 +44,8 @@ pub(super) const PLAYABLE: &[FaultKind] = &[
     FaultKind::Pushed,
     FaultKind::MotorOff,
     FaultKind::Leader,
+    FaultKind::Object,
+    FaultKind::GripperBlocked,
     // Only on a bus in memory; the last of the list, in that order.
     FaultKind::Disconnect,
     FaultKind::BusOff,

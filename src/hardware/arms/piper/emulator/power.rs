@@ -87,6 +87,7 @@ impl HasArm for Controller {
     fn advance(&mut self, now: Mono) {
         let (before, open) = (self.arm.now(), self.arm.estop_open());
         self.arm.integrate(now);
+        self.gripper.play(|kind| self.arm.take_fault(kind));
         self.gripper.advance(self.arm.now().seconds_since(before));
         if open {
             let _still_open = self.arm.clear_error();

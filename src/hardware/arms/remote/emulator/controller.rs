@@ -57,6 +57,7 @@ impl Controller {
     fn integrate(&mut self, now: Mono) {
         let before = self.arm.now();
         self.arm.integrate(now);
+        self.gripper.play(|kind| self.arm.take_fault(kind));
         self.gripper.advance(self.arm.now().seconds_since(before));
     }
 

@@ -33,6 +33,8 @@ pub(super) const PLAYABLE: &[FaultKind] = &[
     FaultKind::Blocked,
     FaultKind::Pushed,
     FaultKind::MotorOff,
+    FaultKind::Object,
+    FaultKind::GripperBlocked,
 ];
 
 /// Starts an emulator at `place`, with the `sim` part of the arm's options. It ends when it is dropped.

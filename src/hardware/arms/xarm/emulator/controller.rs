@@ -11,10 +11,10 @@ use super::super::protocol::gripper::GripperKind;
 use super::controlled_arm::{ControlledArm, Refusal};
 use super::kinematics::Links;
 use super::tool::Tool;
-use super::{SimOptions, SlowReply, Withhold};
+use super::{PLAYABLE, SimOptions, SlowReply, Withhold};
 use crate::clock::Mono;
 use crate::hardware::adapter::AdapterResult;
-use crate::hardware::sim::arm::{PLAYABLE, SimArm};
+use crate::hardware::sim::arm::SimArm;
 use crate::hardware::sim::reach::Chain;
 use crate::hardware::sim::trace::Trace;
 use crate::joint::Joints;
@@ -168,7 +168,10 @@ impl<A: ControlledArm> Controller<A> {
             self.arm.integrate(now.min(before.after(SLICE)));
             match self.arm.gripper() {
                 Some((opening, moving)) => self.tool.show(opening, moving),
-                None => self.tool.advance(self.arm.now().seconds_since(before)),
+                None => {
+                    self.tool.play(|kind| self.arm.due_fault(kind));
+                    self.tool.advance(self.arm.now().seconds_since(before));
+                }
             }
             self.next_move();
         }

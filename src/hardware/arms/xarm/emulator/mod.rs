@@ -32,8 +32,8 @@ use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::check::ConfigError;
 use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
-use crate::hardware::sim::arm::{self, HasArm, PLAYABLE, SimArm};
-use crate::hardware::sim::faults::Fault;
+use crate::hardware::sim::arm::{self, HasArm, SimArm};
+use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::sim::tcp_server::{Port, TcpServer, cannot_listen, ports_in_a_row};
 use crate::joint::{JointLimits, Joints};
 pub use controlled_arm::{ControlledArm, JOINT_LIMIT, Refusal};
@@ -41,6 +41,9 @@ pub use controller::Received;
 use controller::{Controller, introduce};
 use report::Kind;
 
+/// The faults that it can play.
+const PLAYABLE: &[FaultKind] =
+    &arm::playable_and::<{ arm::PLAYABLE.len() + 2 }>(&crate::hardware::sim::gripper::FAULTS);
 /// Prefix of messages.
 const WHO: &str = "xarm emulator";
 /// The report ports follow one another; they come first among the emulator's ports.

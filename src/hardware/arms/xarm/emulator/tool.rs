@@ -1,10 +1,16 @@
 //! What is at the tool flange: the tool board, and a gripper behind its RS485 that speaks Modbus-RTU.
 
 use super::super::protocol::gripper::GripperKind;
+use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::sim::gripper::Gripper;
 
 /// Index of 2 Mbit/s among the baud rates.
 const TWO_MBIT: i32 = 11;
+/// Nominal speed of the fingers at the largest speed of their motor [m/s], and that speed in the units of each
+/// gripper's telegrams.
+const TOP_SPEED: f64 = 0.25;
+const FASTEST_G1: f64 = 5000.0;
+const FASTEST_G2: f64 = 3765.0;
 /// The gripper's version.
 const VERSION: [u16; 3] = [3, 4, 3];
 
@@ -24,8 +30,13 @@ pub struct Tool {
 impl Tool {
     /// A flange with this gripper, half open.
     pub fn new(kind: GripperKind) -> Self {
-        let gripper = Gripper::new(kind.widest().unwrap_or(0.0), 0.1);
+        let gripper = Gripper::new(kind.widest().unwrap_or(0.0), TOP_SPEED);
         Self { kind, gripper, baud: TWO_MBIT, enabled: false, speed: 1500, order: None, error: 0 }
+    }
+
+    /// Plays the faults of the gripper that are due.
+    pub fn play(&mut self, take: impl FnMut(FaultKind) -> Option<Fault>) {
+        self.gripper.play(take);
     }
 
     /// Lets `dt` [s] pass.
@@ -98,6 +109,7 @@ impl Tool {
     fn holding(&self, register: u16) -> u16 {
         let [high, low] = [self.pulses() >> 16, self.pulses()].map(|value| value as u16);
         match register {
+            0x0000 if self.gripper.gripping() => 2,
             0x0000 => u16::from(self.gripper.moving()),
             0x000F => self.error,
             0x0100 => u16::from(self.enabled),
@@ -114,17 +126,20 @@ impl Tool {
             (0x0100, [_, on]) => self.enabled = *on == 1,
             (0x0303, [high, low]) => self.speed = u16::from_be_bytes([*high, *low]),
             (0x0109, _) => self.error = 0,
-            (0x0700, [a, b, c, d]) => self.go(i32::from_be_bytes([*a, *b, *c, *d])),
-            (0x0C00, [_, on, _, _, f0, f1, a, b, c, d]) => {
+            (0x0700, [a, b, c, d]) => {
+                self.go(i32::from_be_bytes([*a, *b, *c, *d]), f64::from(self.speed) / FASTEST_G1);
+            }
+            (0x0C00, [_, on, s0, s1, f0, f1, a, b, c, d]) => {
                 self.enabled |= *on == 1;
+                let speed = f64::from(u16::from_be_bytes([*s0, *s1])) / FASTEST_G2;
                 self.gripper.max_force = u16::from_be_bytes([*f0, *f1]).into();
-                self.go(i32::from_be_bytes([*a, *b, *c, *d]));
+                self.go(i32::from_be_bytes([*a, *b, *c, *d]), speed);
             }
             _ => {}
         }
     }
 
-    fn go(&mut self, pulses: i32) {
+    fn go(&mut self, pulses: i32, speed: f64) {
         if !self.enabled || self.error != 0 {
             return;
         }
@@ -132,6 +147,7 @@ impl Tool {
             GripperKind::XarmG2 => (f64::from(pulses) / 18.28 - 8.33).to_radians().sin() * 110.0 + 16.0,
             _ => f64::from(pulses) / 10.0,
         };
+        self.gripper.set_speed(speed);
         self.order = Some(millimetres / 1000.0);
         self.gripper.move_to(millimetres / 1000.0);
     }

@@ -25,9 +25,12 @@ const ERROR: u16 = 0x000F;
 const CLEAR: u16 = 0x0109;
 const MOVE_G2: u16 = 0x0C00;
 
-/// Speeds that the adapter uses [the gripper's own units].
-const SPEED_G1: u16 = 2000;
-const SPEED_G2: u16 = 1868; // 100 mm/s
+/// Speed of an xArm Gripper for a command without a speed, and the largest [rpm of its motor].
+const SPEED_G1: f64 = 2000.0;
+const TOP_SPEED_G1: f64 = 5000.0;
+/// Speed of a G2 for a command without a speed, the smallest and the largest of the vendor's SDK [mm/s].
+const SPEED_G2: f64 = 100.0;
+const SPEED_RANGE_G2: (f64, f64) = (15.0, 225.0);
 /// Force of a G2 for a command without a force, as the vendor's SDK has it; the smallest and the largest force [%].
 pub const FORCE_G2: u16 = 50;
 /// See [`FORCE_G2`].
@@ -126,17 +129,22 @@ impl Rtu {
         Self::write(MODE, &0_u16.to_be_bytes())
     }
 
-    /// Sets the speed of an xArm Gripper.
-    pub fn speed() -> Self {
-        Self::write(SPEED, &SPEED_G1.to_be_bytes())
+    /// Sets the speed of an xArm Gripper, a fraction of its largest.
+    pub fn speed(fraction: Option<f64>) -> Self {
+        let rpm = fraction.map_or(SPEED_G1, |fraction| (fraction * TOP_SPEED_G1).clamp(1.0, TOP_SPEED_G1));
+        Self::write(SPEED, &(rpm.round() as u16).to_be_bytes())
     }
 
-    /// Moves to a position [pulses], a G2 with this largest force [%].
-    pub fn go(kind: GripperKind, pulses: i32, force: u16) -> Self {
+    /// Moves to a position [pulses], a G2 with this largest force [%] and a fraction of its largest speed.
+    pub fn go(kind: GripperKind, pulses: i32, force: u16, speed: Option<f64>) -> Self {
         let [a, b, c, d] = pulses.to_be_bytes();
         match kind {
             GripperKind::XarmG2 => {
-                let ([s0, s1], [f0, f1]) = (SPEED_G2.to_be_bytes(), force.to_be_bytes());
+                let (least, most) = SPEED_RANGE_G2;
+                let speed = speed.map_or(SPEED_G2, |fraction| (fraction * most).clamp(least, most));
+                // From mm/s, as the vendor's SDK converts it.
+                let speed = ((speed * 60.0 / 9.88235 + 140.0) / 0.4).round() as u16;
+                let ([s0, s1], [f0, f1]) = (speed.to_be_bytes(), force.to_be_bytes());
                 Self::write(MOVE_G2, &[0, 1, s0, s1, f0, f1, a, b, c, d])
             }
             _ => Self::write(TARGET, &[a, b, c, d]),

@@ -26,7 +26,7 @@ fn requests_are_the_golden_bytes() {
         (Command::MoveJoints { joints, speed: 0.5, acceleration: 8.0 }, 6, WATCHED, golden::MOVE_JOINTS),
         (Command::MoveLine { pose: POSE, speed: 100.0, acceleration: 2000.0 }, 7, WATCHED, golden::MOVE_LINE),
         (Command::Velocity { joints: velocities, duration: Some(0.2) }, 8, WATCHED, golden::VELOCITY),
-        (Command::Tool(Rtu::go(GripperKind::Xarm, 850, 50)), 9, WATCHED, golden::GRIPPER_GO),
+        (Command::Tool(Rtu::go(GripperKind::Xarm, 850, 50, None)), 9, WATCHED, golden::GRIPPER_GO),
         (Command::Tool(Rtu::read_position()), 10, WATCHED, golden::GRIPPER_READ),
         (Command::ReadToolBoard(0x0A0B), 11, WATCHED, golden::TOOL_BAUD),
         (Command::SetLoad([1.5, 0.0, -10.0, 80.0]), 12, WATCHED, golden::SET_LOAD),
@@ -34,7 +34,11 @@ fn requests_are_the_golden_bytes() {
     ] {
         assert_eq!(command.encode(transaction, protocol, &mut [0; 64]), bytes(golden), "{command:?}");
     }
-    assert_eq!(Rtu::go(GripperKind::XarmG2, 0, 50).bytes(), bytes(golden::GRIPPER_G2));
+    assert_eq!(Rtu::go(GripperKind::XarmG2, 0, 50, None).bytes(), bytes(golden::GRIPPER_G2));
+    // Speeds: of the motor [rpm]; of the fingers [mm/s] as the vendor's SDK converts 225, and 15 where less is asked.
+    assert_eq!(Rtu::speed(Some(0.5)).bytes(), bytes("0810030300010209c4"));
+    let speed = |fraction| Rtu::go(GripperKind::XarmG2, 0, 50, Some(fraction)).bytes()[9..11].to_vec();
+    assert_eq!((speed(1.0), speed(0.01)), (3765_u16.to_be_bytes().to_vec(), 578_u16.to_be_bytes().to_vec()));
 }
 
 fn response(golden: &str, transaction: u16, register: u8) -> Response {

@@ -258,6 +258,7 @@ impl HasArm for Controller {
         let before = self.arm.now();
         self.arm.advance(now);
         self.io.play(&mut self.arm);
+        self.gripper.play(|kind| self.arm.take_fault(kind));
         self.gripper.advance(self.arm.now().seconds_since(before));
         if self.arm.estop_open() {
             self.gripper.stop();
