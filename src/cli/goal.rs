@@ -171,6 +171,7 @@ impl Goal {
             frame: self.frame.clone(),
             named: self.named.clone(),
             linear: search.linear,
+            path: None,
         }]
     }
 }

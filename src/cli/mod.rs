@@ -5,6 +5,7 @@ pub mod arguments;
 pub mod arm;
 mod ask;
 mod attach;
+pub mod back_out;
 pub mod banner;
 pub mod cancel;
 pub mod check;
@@ -94,6 +95,8 @@ enum Command {
     Execute(execute::Args),
     /// Edit the planner's obstacles: list, add, move, remove, load, attach, detach
     World(world::Args),
+    /// Retrace the logged path of an arm, back to where it was at rest before
+    BackOut(back_out::Args),
     /// Decelerate running motions to rest, and end planning
     Cancel(cancel::Args),
     /// Show or set the speed of all motions: a fraction, as 0.3 or 30%
@@ -311,6 +314,7 @@ fn built_in(cli: &Cli, catalog: Catalog<'_>) -> exit::Result {
         Command::Preview(args) => preview::run(args),
         Command::Execute(args) => execute::run(args),
         Command::World(args) => world::run(args),
+        Command::BackOut(args) => back_out::run(args),
         Command::Cancel(args) => cancel::run(args),
         Command::Pose(args) => pose::run(args),
         Command::Speed(args) => speed::run(args),

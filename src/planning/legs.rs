@@ -12,7 +12,8 @@ use super::timing::TimingSettings;
 use crate::collision::{CollisionChecker, Stop};
 use crate::robot::kinematics::frame;
 
-/// Maximum deviation at the corners of a straight line, and at a waypoint [rad].
+/// Maximum deviation at the corners of a straight line or a given path, which are so flat that blending keeps to it,
+/// and at a waypoint [rad].
 const LINE_DEVIATION: f64 = 1e-3;
 const MOST_DEVIATION: f64 = 0.5;
 /// Shortest piece at a waypoint that is blended [rad].
@@ -23,6 +24,8 @@ pub(super) struct Leg {
     path: Path,
     /// The part of a straight line that was followed.
     pub fraction: Option<f64>,
+    /// Maximum deviation at its corners [rad].
+    deviation: f64,
     /// Joints of its goal that were moved to their limits: name, requested and used position [rad or m].
     pub clamped: Vec<(String, f64, f64)>,
 }
@@ -64,7 +67,15 @@ fn leg(
         [(_, Goal::Line(target))] => {
             let (path, fraction) = goals::line(stage, &frame(target), stop)?;
             took("search", began.elapsed().as_secs_f64());
-            Ok(Leg { path, fraction: Some(fraction), clamped: Vec::new() })
+            Ok(Leg { path, fraction: Some(fraction), deviation: LINE_DEVIATION, clamped: Vec::new() })
+        }
+        [(_, Goal::Path(given))] => {
+            let path = goals::follow(stage, given, stop)?;
+            took("search", began.elapsed().as_secs_f64());
+            Ok(Leg { path, fraction: None, deviation: LINE_DEVIATION, clamped: Vec::new() })
+        }
+        several if several.iter().any(|(_, goal)| matches!(goal, Goal::Path(_))) => {
+            Err(PlanFailure::new("a given path is for one robot at a time"))
         }
         several if several.iter().any(|(_, goal)| matches!(goal, Goal::Line(_))) => {
             Err(PlanFailure::new("a straight line is planned for one robot at a time"))
@@ -86,7 +97,7 @@ fn leg(
             let clamped = moved.map(|(asked, (joint, used))| (joint, asked, used)).collect();
             took("search", found.search_time.as_secs_f64());
             took("shorten", found.shorten_time.as_secs_f64());
-            Ok(Leg { path: found.path, fraction: None, clamped })
+            Ok(Leg { path: found.path, fraction: None, deviation: TimingSettings::default().deviation, clamped })
         }
     }
 }
@@ -101,11 +112,9 @@ pub(super) fn joined(stage: &Stage<'_>, legs: &[Leg], blend: f64) -> (Path, Vec<
             deviation.pop();
             deviation.push(passes);
         }
-        // The corners of a line are so flat that blending keeps to the line.
-        let own = if leg.fraction.is_some() { LINE_DEVIATION } else { TimingSettings::default().deviation };
         let skip = usize::from(!path.is_empty());
         path.extend(leg.path.iter().skip(skip).cloned());
-        deviation.resize(path.len(), own);
+        deviation.resize(path.len(), leg.deviation);
     }
     (path, deviation)
 }

@@ -28,6 +28,8 @@ pub struct RecordedMotion {
     pub period: f64,
     /// Positions [rad], one row per tick, one value per joint.
     pub rows: Vec<Vec<f64>>,
+    /// Time of the last row [ns since 1970].
+    pub last: u64,
     /// Ticks missing in the log; bridged by straight lines.
     pub lost: u64,
 }
@@ -35,6 +37,7 @@ pub struct RecordedMotion {
 /// Joint values of a tick.
 struct Row {
     tick: u64,
+    time: u64,
     measured: Vec<f64>,
     commanded: Vec<f64>,
 }
@@ -64,7 +67,8 @@ impl RecordedMotion {
         let columns: Vec<Vec<f64>> = columns.into_iter().flatten().collect();
         let at = |k: usize| columns.iter().map(|c| c[k]).collect();
         let length = columns.first().map_or(0, Vec::len);
-        Ok(Self { joints, period, rows: (0..length).map(at).collect(), lost: ticks })
+        let last = rows.last().map_or(0, |row| row.time);
+        Ok(Self { joints, period, rows: (0..length).map(at).collect(), last, lost: ticks })
     }
 }
 
@@ -84,7 +88,7 @@ fn rows(path: &Path, joints: usize, from: u64, to: u64) -> Result<Vec<Row>, Reco
                 Payload::Tick(t) if rows.last().is_none_or(|row| t.tick > row.tick) => {
                     let now =
                         (std::mem::replace(&mut measured, nothing()), std::mem::replace(&mut commanded, nothing()));
-                    rows.push(Row { tick: t.tick, measured: now.0, commanded: now.1 });
+                    rows.push(Row { tick: t.tick, time: entry.log_time, measured: now.0, commanded: now.1 });
                 }
                 _ => {}
             },
@@ -155,7 +159,7 @@ mod tests {
     use super::*;
 
     fn row(tick: u64, measured: f64, commanded: f64) -> Row {
-        Row { tick, measured: vec![measured], commanded: vec![commanded] }
+        Row { tick, time: 0, measured: vec![measured], commanded: vec![commanded] }
     }
 
     #[test]

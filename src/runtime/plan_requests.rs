@@ -54,6 +54,10 @@ impl PlannerPort {
             Err(RpcError::new(Code::InvalidParams, what).hint("give one position [rad] per joint, in order"))
         };
         let any_turn = goal.pose.is_some_and(|pose| pose.rpy.is_none() && pose.quat.is_none());
+        if let Some(path) = &goal.path {
+            path.iter().try_for_each(|q| joints(q).map(drop))?;
+            return Ok((index, Goal::Path(path.clone())));
+        }
         let goal = match (&goal.joints, &goal.named, self.goal_pose(robot, goal, moment)?) {
             (Some(values), _, _) => joints(values)?,
             (_, Some(name), _) => {

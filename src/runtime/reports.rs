@@ -214,7 +214,8 @@ impl Service {
             return Err(RpcError::new(Code::UnknownMotion, format!("no motion {number}, or too long ago")));
         };
         let (task, collision_checked) = (self.parts.names.task(planned.task), planned.plan.is_some());
-        let mut report = MotionReport { motion: number, task, collision_checked, ..Default::default() };
+        let retraces_to = planned.retraces_to;
+        let mut report = MotionReport { motion: number, task, collision_checked, retraces_to, ..Default::default() };
         let view = self.task_view(planned.task as usize);
         if view.motion == number {
             (report.progress, report.elapsed, report.remaining) = (view.progress, view.elapsed, view.remaining);

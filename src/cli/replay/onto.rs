@@ -149,7 +149,7 @@ impl Driver<'_> {
         }
         let parts = self.plan.parts.iter();
         let requests: Vec<Execute> =
-            parts.map(|p| Execute { trajectory: sent(&p.trajectory), task: Some(p.task.clone()) }).collect();
+            parts.map(|p| Execute { trajectory: sent(&p.trajectory), task: Some(p.task.clone()), retraces_to: None }).collect();
         let mut motions = Vec::new();
         let mut refused = None;
         for begun in self.run.call_together(&requests) {
