@@ -88,7 +88,7 @@ pub fn run(args: &Args) -> Result {
         if !json {
             show(&found);
         }
-        if let Some(end) = end_here(args, held, Some(found.summary.duration)) {
+        if let Some(end) = end_here(args, &way, held, Some(found.summary.duration)) {
             return end;
         }
         signals.check()?;
@@ -98,7 +98,7 @@ pub fn run(args: &Args) -> Result {
     } else {
         let trajectory = timed(&mut client, log, name, &way, args.speed)?;
         let duration = trajectory.points.last().map(|point| point.time_from_start);
-        if let Some(end) = end_here(args, held, duration) {
+        if let Some(end) = end_here(args, &way, held, duration) {
             return end;
         }
         signals.check()?;
@@ -111,14 +111,17 @@ pub fn run(args: &Args) -> Result {
 }
 
 /// Returns the result if nothing is to move: the arm is held, or `--check`.
-fn end_here(args: &Args, held: Option<Failure>, duration: Option<f64>) -> Option<Result> {
+fn end_here(args: &Args, way: &Retrace, held: Option<Failure>, duration: Option<f64>) -> Option<Result> {
     match held {
         Some(failure) if !args.check => return Some(Err(failure)),
         None if !args.check => return None,
         _ => {}
     }
     if args.target_run.json {
-        output::json(&serde_json::json!({"duration": duration, "ready": held.is_none()}));
+        let goal = way.path.last();
+        let (length, time) = (length(&way.path), way.time as f64 * 1e-9);
+        output::json(&serde_json::json!({"duration": duration, "length": length, "goal": goal, "time": time,
+            "ready": held.is_none()}));
     } else {
         output::note("nothing has moved");
     }

@@ -8,6 +8,8 @@ const STILL: f64 = 5e-4;
 const WINDOW: f64 = 0.1;
 /// Distance between the arm and the path within which it is on it [rad, largest of all joints].
 pub const ON_PATH: f64 = 0.02;
+/// Distance from the goal of a way back within which an arm has arrived there [rad].
+const ARRIVED: f64 = 5e-3;
 /// Deviation of the shortened path from the recorded one [rad].
 const TOLERANCE: f64 = 1e-4;
 
@@ -56,7 +58,10 @@ pub fn retrace(motion: &RecordedMotion, now: &[f64], from: Option<u64>, back: Ba
     let end = rows.len().checked_sub(1).ok_or(RetraceError::TooShort)?;
     let time = |k: usize| motion.last.saturating_sub(((end - k) as f64 * period * 1e9) as u64);
     let resumed = from.and_then(|from| {
-        let first = (0..rows.len()).find(|k| time(*k) >= from)?;
+        let first = (0..rows.len()).find(|k| time(*k) + 1_000 >= from)?;
+        if apart(&rows[first], now) <= ARRIVED {
+            return Some(first);
+        }
         let nearest = (first..=end).map(|k| (k, apart(&rows[k], now)));
         let nearest = nearest.min_by(|a, b| a.1.total_cmp(&b.1)).filter(|(_, by)| *by <= ON_PATH)?;
         // The way back itself passed there as well, later.
@@ -77,7 +82,8 @@ pub fn retrace(motion: &RecordedMotion, now: &[f64], from: Option<u64>, back: Ba
             let mut goal = end;
             for _ in 0..count.max(1) {
                 let moving = moved_before(goal)?;
-                goal = (0..moving).rev().find(|k| !moves(k)).ok_or(RetraceError::TooShort)?;
+                let still = (0..moving).rev().find(|k| !moves(k)).ok_or(RetraceError::TooShort)?;
+                goal = still.saturating_sub(window);
             }
             goal
         }
