@@ -81,7 +81,7 @@ pub struct ArmArgs {
 
 /// Requested position of a gripper.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Opening {
+pub(super) enum Opening {
     /// This position [m or rad].
     Position(f64),
     /// Fully open.
@@ -90,7 +90,7 @@ enum Opening {
     Close,
 }
 
-fn opening(text: &str) -> std::result::Result<Opening, String> {
+pub(super) fn opening(text: &str) -> std::result::Result<Opening, String> {
     match text {
         "open" => Ok(Opening::Open),
         "close" => Ok(Opening::Close),
@@ -100,7 +100,7 @@ fn opening(text: &str) -> std::result::Result<Opening, String> {
 
 impl Opening {
     /// Returns the position [m or rad]: the run knows the gripper's range.
-    fn of(self, client: &mut Client, arm: &str) -> Result<f64> {
+    pub(super) fn of(self, client: &mut Client, arm: &str) -> Result<f64> {
         if let Self::Position(position) = self {
             return Ok(position);
         }

@@ -68,11 +68,13 @@ pub fn run(args: &Args) -> Result {
     let arm = arm_of(&status, args.arm.as_deref())?;
     let planned = !args.direct && has_planner(&mut client)?;
     if !planned && !args.direct {
-        let failure = Failure::new(Exit::Failed, "this run has no planner: the way back cannot be checked for collisions");
+        let failure =
+            Failure::new(Exit::Failed, "this run has no planner: the way back cannot be checked for collisions");
         return Err(failure.hint("run a planner beside this run; or look at the way yourself, and add --direct"));
     }
     let log = status.log.as_ref().map(Path::new).ok_or_else(|| {
-        Failure::new(Exit::Failed, "this run writes no log: there is no path to retrace").hint("run it without --no-record")
+        Failure::new(Exit::Failed, "this run writes no log: there is no path to retrace")
+            .hint("run it without --no-record")
     })?;
     let name = &arm.hardware_id;
     let (joints, way, ago) = way_back(&mut client, &status, name, log, args)?;
@@ -134,7 +136,8 @@ fn arm_of<'s>(status: &'s StatusReport, name: Option<&str>) -> Result<&'s ArmRep
         (None, [only]) => Ok(only),
         (None, _) => {
             let names: Vec<&str> = names.collect();
-            Err(Failure::usage(format!("the run has several arms: {}", names.join(", "))).hint("name one: dimos back-out ARM"))
+            Err(Failure::usage(format!("the run has several arms: {}", names.join(", ")))
+                .hint("name one: dimos back-out ARM"))
         }
         (Some(name), arms) => arms.iter().find(|arm| arm.hardware_id == name).ok_or_else(|| {
             Failure::usage(format!("no arm is named {name}")).maybe_hint(crate::yaml::did_you_mean(name, names, "arms"))
@@ -176,7 +179,8 @@ fn way_back(
         for window in WINDOWS {
             let since = ((from.unwrap_or(stamp).min(stamp) - window).max(0.0) * 1e9) as u64;
             let motion = RecordedMotion::read(log, since, u64::MAX).map_err(|e| Failure::of(Exit::Failed, e))?;
-            let lacks = || Failure::new(Exit::Failed, format!("the log does not have the positions of all joints of {arm}"));
+            let lacks =
+                || Failure::new(Exit::Failed, format!("the log does not have the positions of all joints of {arm}"));
             let own = columns(motion, &joints).ok_or_else(lacks)?;
             result = retrace(&own, &now, from.map(|from| (from * 1e9) as u64), back);
             if result != Err(RetraceError::TooShort) {
@@ -241,11 +245,8 @@ fn request(client: &mut Client, arm: &str, joints: &[String], way: &Retrace, spe
             .hint("look at the way yourself, and add --direct")
     })?;
     let row = |q: &Vec<f64>| order.iter().map(|j| q[*j]).collect();
-    let goal = PlanGoal {
-        robot: robot.name.clone(),
-        path: Some(way.path.iter().map(row).collect()),
-        ..PlanGoal::default()
-    };
+    let goal =
+        PlanGoal { robot: robot.name.clone(), path: Some(way.path.iter().map(row).collect()), ..PlanGoal::default() };
     Ok(Plan { goals: vec![goal], speed, seed: 0, timeout: None, through: Vec::new(), blend: 0.0 })
 }
 

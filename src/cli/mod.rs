@@ -19,6 +19,7 @@ pub mod exit;
 mod fetch;
 mod follow;
 mod goal;
+pub mod job;
 pub mod jog;
 pub mod list_adapters;
 pub mod list_blueprints;
@@ -95,6 +96,8 @@ enum Command {
     Execute(execute::Args),
     /// Edit the planner's obstacles: list, add, move, remove, load, attach, detach
     World(world::Args),
+    /// Run a job from a file: motions, gripper, inputs and outputs, loops; reports cycle times
+    Do(job::Args),
     /// Retrace the logged path of an arm, back to where it was at rest before
     BackOut(back_out::Args),
     /// Decelerate running motions to rest, and end planning
@@ -314,6 +317,7 @@ fn built_in(cli: &Cli, catalog: Catalog<'_>) -> exit::Result {
         Command::Preview(args) => preview::run(args),
         Command::Execute(args) => execute::run(args),
         Command::World(args) => world::run(args),
+        Command::Do(args) => job::run(args),
         Command::BackOut(args) => back_out::run(args),
         Command::Cancel(args) => cancel::run(args),
         Command::Pose(args) => pose::run(args),
