@@ -178,11 +178,9 @@ fn way_back(
         let mut result = Err(RetraceError::TooShort);
         for window in WINDOWS {
             let since = ((from.unwrap_or(stamp).min(stamp) - window).max(0.0) * 1e9) as u64;
-            let motion = RecordedMotion::read(log, since, u64::MAX).map_err(|e| Failure::of(Exit::Failed, e))?;
-            let lacks =
-                || Failure::new(Exit::Failed, format!("the log does not have the positions of all joints of {arm}"));
-            let own = columns(motion, &joints).ok_or_else(lacks)?;
-            result = retrace(&own, &now, from.map(|from| (from * 1e9) as u64), back);
+            let motion = RecordedMotion::measured(log, &joints, since, u64::MAX);
+            let motion = motion.map_err(|e| Failure::of(Exit::Failed, e))?;
+            result = retrace(&motion, &now, from.map(|from| (from * 1e9) as u64), back);
             if result != Err(RetraceError::TooShort) {
                 break;
             }
@@ -211,14 +209,6 @@ fn retraced_to(client: &mut Client, status: &StatusReport, joints: &[String]) ->
     let moves = status.tasks.iter().filter(|task| task.joints.iter().any(|joint| joints.contains(joint)));
     let newest = moves.filter_map(|task| task.motion).max()?;
     client.call(Motion { motion: newest }).ok()?.retraces_to
-}
-
-/// Returns the motion of these joints only, in this order.
-fn columns(motion: RecordedMotion, joints: &[String]) -> Option<RecordedMotion> {
-    let index = |joint: &String| motion.joints.iter().position(|j| j == joint);
-    let columns = joints.iter().map(index).collect::<Option<Vec<usize>>>()?;
-    let row = |row: &Vec<f64>| columns.iter().map(|c| row[*c]).collect();
-    Some(RecordedMotion { rows: motion.rows.iter().map(row).collect(), joints: joints.to_vec(), ..motion })
 }
 
 fn describe(arm: &str, joints: &[String], way: &Retrace, ago: f64) {

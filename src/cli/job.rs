@@ -17,7 +17,6 @@ use super::exit::{Exit, Failure, Result};
 use super::follow::{Signals, held};
 use super::output;
 use crate::rpc::api::{Lease, World};
-use crate::rpc::client::Client;
 use execute::{End, Runner};
 use names::Names;
 use step::{Job, Step};
@@ -74,6 +73,7 @@ pub fn run(args: &Args) -> Result {
         times,
         cycles: Times::default(),
         quiet,
+        arms: arms(&job),
         ready,
     };
     let ended = runner.run();
@@ -86,32 +86,43 @@ pub fn run(args: &Args) -> Result {
     }
     let (times, cycles) = (runner.times, runner.cycles);
     let mut report = times::to_json(&job, &times, &cycles);
-    report["job"] = json!(job.file);
-    report["completed"] = json!(ended.is_ok());
-    report["on_fault"] = json!(after);
     let (ended, result) = match ended {
         Ok(()) => ("done", Ok(Exit::Ok)),
         Err((step, End::Signal(signal))) => {
             output::note(format_args!("interrupted at {}", place(&job, step, &cycles)));
             ("interrupted", Ok(Exit::by_signal(signal)))
         }
-        Err((step, end)) => {
-            let (word, failure) = match end {
-                End::Fault(failure) => ("fault", failure),
-                End::Stopped(failure) => ("stopped", failure),
-                End::Signal(_) => ("interrupted", Failure::new(Exit::Failed, "interrupted")),
-            };
-            report["step"] = json!({"line": step.line, "step": step.text, "error": failure.what});
-            (word, Err(named(&mut client, &job, (step, &cycles), failure, after.as_deref())))
-        }
+        Err((step, End::Stopped(failure))) => ("stopped", Err((step, failure))),
+        Err((step, End::Fault(failure))) => ("fault", Err((step, failure))),
     };
-    report["ended"] = json!(ended);
+    let objects = client.call(World {}).map(|world| world.objects).unwrap_or_default();
+    let held_objects =
+        objects.into_iter().filter_map(|object| Some((object.held_by?.into_iter().next()?, object.name)));
+    let held_objects: Vec<_> = held_objects.filter(|_| result.is_err()).collect();
     if quiet {
+        report["job"] = json!(job.file);
+        report["ended"] = json!(ended);
+        report["on_fault"] = json!(after);
+        if let Err((step, failure)) = &result {
+            report["step"] = json!({"line": step.line, "step": step.text, "error": failure.what});
+        }
+        report["held"] = json!(held_objects);
         output::json(&report);
     } else {
         times::print(&job, &times, &cycles);
+        if let Some(after) = after.filter(|_| !job.on_fault.is_empty()) {
+            output::note(format_args!("on_fault: {after}"));
+        }
+        held_objects.iter().for_each(|(arm, object)| output::note(format_args!("{arm} holds {object}")));
     }
-    late_signal.map_or(result, |signal| Ok(Exit::by_signal(signal)))
+    if let Some(signal) = late_signal {
+        return Ok(Exit::by_signal(signal));
+    }
+    result.map_err(|(step, failure)| {
+        let what = format!("{}: {}", place(&job, step, &cycles), failure.what);
+        let hint = held(&mut client).or_else(|| failure.hint.clone());
+        Failure { what, hint, exit: Exit::Failed, ..failure }
+    })
 }
 
 /// Checks a job without running it.
@@ -138,26 +149,4 @@ fn arms(job: &Job) -> BTreeSet<String> {
 /// Names a step and the cycle in which it ended: `pick.yaml:9: move: home, in cycle 3`.
 fn place(job: &Job, step: &Step, cycles: &Times) -> String {
     format!("{}:{}: {}, in cycle {}", job.file, step.line, step.text, cycles.count() + 1)
-}
-
-/// Returns the failure of a step with its place, what became of `on_fault`, and what an arm still holds.
-fn named(
-    client: &mut Client,
-    job: &Job,
-    (step, cycles): (&Step, &Times),
-    failure: Failure,
-    on_fault: Option<&str>,
-) -> Failure {
-    let mut what = format!("{}: {}", place(job, step, cycles), failure.what);
-    if let Some(after) = on_fault.filter(|_| !job.on_fault.is_empty()) {
-        what += &format!("\non_fault: {after}");
-    }
-    let objects = client.call(World {}).map(|world| world.objects).unwrap_or_default();
-    for object in objects {
-        if let Some([arm, _]) = object.held_by {
-            what += &format!("\n{arm} holds {}", object.name);
-        }
-    }
-    let hint = held(client).or_else(|| failure.hint.clone());
-    Failure { what, hint, exit: Exit::Failed, ..failure }
 }

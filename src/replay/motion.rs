@@ -72,6 +72,30 @@ impl RecordedMotion {
     }
 }
 
+impl RecordedMotion {
+    /// Reads the measured motion of these joints, averaged over ±0.1 s, between two Unix times [ns]: since the last gap in
+    /// the log. Without those joints it has no rows.
+    pub fn measured(path: &Path, joints: &[String], from: u64, to: u64) -> Result<Self, RecordedError> {
+        let recorded = Recorded::open(path)?;
+        let names = recorded.joints();
+        let index = |joint: &String| names.iter().position(|name| name == joint);
+        let columns: Vec<usize> = joints.iter().map(index).collect::<Option<_>>().unwrap_or_default();
+        let rows = rows(path, names.len(), from, to)?;
+        let period = 1.0 / recorded.config.rate;
+        let is_known = |row: &Row| columns.iter().all(|j| row.measured[*j].is_finite());
+        let is_gap = |w: &[Row]| w[1].tick.saturating_sub(w[0].tick) as f64 * period > MAX_GAP + period;
+        let begin = rows.windows(2).rposition(|w| is_gap(w) || !is_known(&w[0])).map_or(0, |k| k + 1);
+        let rows = rows.get(begin..).filter(|rows| rows.iter().all(is_known)).unwrap_or_default();
+        let width = (AVERAGING_TIME / period).round() as usize;
+        let smooth: Vec<Vec<f64>> =
+            columns.iter().map(|j| averaged(&bridged(rows, |row| row.measured[*j]), width)).collect();
+        let at = |k: usize| smooth.iter().map(|column| column[k]).collect();
+        let length = smooth.first().map_or(0, Vec::len);
+        let last = rows.last().map_or(0, |row| row.time);
+        Ok(Self { joints: joints.to_vec(), period, rows: (0..length).map(at).collect(), last, lost: 0 })
+    }
+}
+
 fn rows(path: &Path, joints: usize, from: u64, to: u64) -> Result<Vec<Row>, RecordedError> {
     let topics = ["/joint_states", "/joint_commands", "/dimos/tick"].map(str::to_owned).to_vec();
     let mut log = LogReader::open(path)?;

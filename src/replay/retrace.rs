@@ -3,7 +3,7 @@
 use super::motion::RecordedMotion;
 
 /// An arm that moves less than this within [`WINDOW`] is at rest [rad].
-const STILL: f64 = 5e-4;
+const STILL: f64 = 2e-3;
 /// Time for that [s].
 const WINDOW: f64 = 0.1;
 /// Distance between the arm and the path within which it is on it [rad, largest of all joints].
@@ -11,7 +11,7 @@ pub const ON_PATH: f64 = 0.02;
 /// Distance from the goal of a way back within which an arm has arrived there [rad].
 const ARRIVED: f64 = 5e-3;
 /// Deviation of the shortened path from the recorded one [rad].
-const TOLERANCE: f64 = 1e-4;
+const TOLERANCE: f64 = 2e-4;
 
 /// How far back.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -83,7 +83,8 @@ pub fn retrace(motion: &RecordedMotion, now: &[f64], from: Option<u64>, back: Ba
             for _ in 0..count.max(1) {
                 let moving = moved_before(goal)?;
                 let still = (0..moving).rev().find(|k| !moves(k)).ok_or(RetraceError::TooShort)?;
-                goal = still.saturating_sub(window);
+                // Motions begin slowly: a little earlier it was fully at rest.
+                goal = (0..=still).rev().take(2 * window).take_while(|k| !moves(k)).last().unwrap_or(still);
             }
             goal
         }

@@ -20,6 +20,7 @@ mod first_run;
 mod franka_run;
 mod gripper_force;
 mod gripper_joint;
+mod jobs;
 mod jog;
 mod joint_status;
 mod leases;

@@ -14,7 +14,7 @@ use crate::cli::follow::{Signals, completed, watch};
 use crate::cli::goal::plan;
 use crate::cli::output;
 use crate::rpc::Code;
-use crate::rpc::api::{ArmEnable, ArmIo, ArmIoSet, ArmReset, Detach, ExecutePlan, Gripper, Move, Plan, Status};
+use crate::rpc::api::{ArmEnable, ArmIo, ArmIoSet, ArmReset, Detach, ExecutePlan, Gripper, Move, Plan, Status, World};
 use crate::rpc::client::{Client, ClientError};
 use crate::rpc::report::ArmReport;
 
@@ -69,6 +69,8 @@ pub struct Runner<'r, 'c> {
     pub cycles: Times,
     /// Whether nothing but errors is printed.
     pub quiet: bool,
+    /// The arms that it commands.
+    pub arms: BTreeSet<String>,
     /// Arms that were ready since the job began; `true`: since its last fault.
     pub ready: BTreeSet<(String, bool)>,
 }
@@ -97,7 +99,7 @@ impl<'r> Runner<'r, '_> {
         let steps = &self.job.on_fault;
         let Some(first) = steps.first() else { return Ok("none".into()) };
         let status = self.client.call(Status {}).map_err(|e| (format!("not run: {e}"), None))?;
-        let held = status.arms.iter().find(|arm| arm.phase != "ready" && self.seen(&arm.hardware_id));
+        let held = status.arms.iter().find(|arm| arm.phase != "ready" && self.arms.contains(&arm.hardware_id));
         if let Some(arm) = held.filter(|_| !matches!(first.act, Act::Reset | Act::Enable)) {
             return Err((format!("not run: {}", not_ready(arm)), None));
         }
@@ -127,7 +129,7 @@ impl<'r> Runner<'r, '_> {
     fn judged(&mut self, end: End) -> End {
         let End::Fault(failure) = end else { return end };
         match self.client.call(Status {}) {
-            Ok(status) if !status.arms.iter().any(|arm| self.seen(&arm.hardware_id) && is_by_others(arm)) => {
+            Ok(status) if !status.arms.iter().any(|arm| self.arms.contains(&arm.hardware_id) && is_by_others(arm)) => {
                 End::Fault(failure)
             }
             _ => End::Stopped(failure),
@@ -166,7 +168,12 @@ impl<'r> Runner<'r, '_> {
             }
             Act::Output(outputs) => drop(self.client.call(ArmIoSet { arm: arm(), outputs: outputs.clone() })?),
             Act::Attach(attach) => drop(self.client.call(attach.clone())?),
-            Act::Detach(name) => drop(self.client.call(Detach { name: name.clone() })?),
+            Act::Detach(name) => {
+                let objects = self.client.call(World {})?.objects;
+                if objects.iter().any(|object| object.name == *name && object.held_by.is_some()) {
+                    self.client.call(Detach { name: name.clone() })?;
+                }
+            }
             Act::Reset => {
                 let status = self.client.call(Status {})?;
                 let by_others = |a: &&ArmReport| a.hardware_id == step.arm && is_by_others(a);

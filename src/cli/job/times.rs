@@ -55,6 +55,9 @@ pub fn all<'j>(steps: &'j [Step], found: &mut Vec<&'j Step>) {
 /// Prints the report.
 pub fn print(job: &Job, steps: &[Times], cycles: &Times) {
     let mut table = Table::new(&["STEP", ">LINE", ">COUNT", ">MEAN s", ">MIN s", ">MAX s", ">P95 s"]);
+    if cycles.count() == 0 && steps.iter().all(|times| times.count() == 0) {
+        return;
+    }
     let mut row = |name: &str, line: String, times: &Times| {
         if let Some(figures) = times.figures() {
             let mut cells = vec![name.to_owned(), line, times.count().to_string()];
