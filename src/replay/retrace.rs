@@ -90,7 +90,7 @@ pub fn retrace(motion: &RecordedMotion, now: &[f64], from: Option<u64>, back: Ba
         }
         Back::Time(seconds) => {
             let steps = ((seconds / period).round() as usize).max(1);
-            (0..=begin).rev().filter(moves).nth(steps).ok_or(RetraceError::TooShort)?
+            (0..=begin).rev().filter(moves).nth(steps + window).ok_or(RetraceError::TooShort)?
         }
     };
     let whole: Vec<&Vec<f64>> = rows[goal..=begin].iter().rev().collect();
@@ -102,7 +102,8 @@ pub fn retrace(motion: &RecordedMotion, now: &[f64], from: Option<u64>, back: Ba
         }
         tolerance *= 2.0;
     };
-    let moving = (goal..=begin).filter(moves).count();
+    // A row counts as moving for the window after the motion too.
+    let moving = (goal..=begin).filter(moves).count().saturating_sub(window);
     Ok(Retrace { path, time: time(goal), duration: moving as f64 * period, at_rest: !moves(&goal) })
 }
 

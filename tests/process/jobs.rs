@@ -191,9 +191,8 @@ impl Cell {
     fn job(&self, trouble: Trouble, random: &mut Random) -> (usize, &'static str) {
         let job = self.home.start("do pick.yaml --json");
         let began = Instant::now();
-        let strikes = Duration::from_millis(700 + random.below(5000) as u64);
-        let (mut struck, mut gripped) = (false, 0);
-        let is_under_way = trouble == Trouble::NothingToGrip;
+        let strikes = Duration::from_millis(500 + random.below(4500) as u64);
+        let mut struck: Option<Instant> = None;
         match trouble {
             Trouble::InputLow => self.arm.set_input(0, false),
             Trouble::GoalBlocked => self.wall(self.place),
@@ -202,15 +201,12 @@ impl Cell {
         while !job.over() {
             assert!(began.elapsed() < Duration::from_secs(60), "{trouble:?}: the job does not end: {}", job.err());
             // The part is between the fingers while they are open above it.
-            if !is_under_way {
-                let open = self.home.client().call(State {}).unwrap().arms[0].gripper.is_some_and(|at| at > 0.045);
-                if open {
-                    self.arm.put_object(0.03);
-                    gripped += 1;
-                }
+            let open = || self.home.client().call(State {}).unwrap().arms[0].gripper.is_some_and(|at| at > 0.045);
+            if trouble != Trouble::NothingToGrip && open() {
+                self.arm.put_object(0.03);
             }
-            if !struck && began.elapsed() >= strikes {
-                struck = true;
+            if struck.is_none() && began.elapsed() >= strikes {
+                struck = Some(Instant::now());
                 let mut client = self.home.client();
                 match trouble {
                     Trouble::OperatorStop => drop(client.call(Stop::default()).unwrap()),
@@ -227,12 +223,11 @@ impl Cell {
                 }
             }
             // It ends the job only while something moves.
-            if struck && trouble == Trouble::Cancelled {
+            if struck.is_some() && trouble == Trouble::Cancelled {
                 let _ = self.home.client().call(Cancel::default());
             }
             std::thread::sleep(Duration::from_millis(20));
         }
-        assert!(gripped > 0 || is_under_way);
         let ended = job.wait();
         if ended.signal == Some(9) {
             assert_eq!(trouble, Trouble::Killed);
@@ -243,11 +238,18 @@ impl Cell {
         let steps = report["steps"].as_array().unwrap();
         let picks = steps.iter().filter(|s| s["line"].as_u64().is_some_and(|line| PICK_LINES.contains(&line)));
         let picks = picks.map(|s| s["count"].as_u64().unwrap() as usize).sum();
-        (picks, self.judge(trouble, &report, &ended))
+        // Just before the end of a job a trouble may come too late.
+        let in_time = struck.is_some_and(|at| at.elapsed() > Duration::from_millis(500));
+        (picks, self.judge((trouble, in_time), &report, &ended))
     }
 
     /// Checks that what a job left is what its report says.
-    fn judge(&self, trouble: Trouble, report: &Value, ended: &crate::support::program::Ended) -> &'static str {
+    fn judge(
+        &self,
+        (trouble, in_time): (Trouble, bool),
+        report: &Value,
+        ended: &crate::support::program::Ended,
+    ) -> &'static str {
         let (phase, cause) = self.phase();
         let said = report["ended"].as_str().unwrap();
         let told = format!("{trouble:?}: {report:#} {} phase {phase} {cause:?}", ended.err);
@@ -257,8 +259,12 @@ impl Cell {
             "done" => {
                 assert_eq!((code, phase.as_str()), (0, "ready"), "{told}");
                 assert!(self.held_objects().is_empty(), "{told}");
-                let late = [Trouble::None, Trouble::Paused, Trouble::Disconnect];
-                assert!(late.contains(&trouble) || ended.took > Duration::ZERO, "{told}");
+                match trouble {
+                    Trouble::NothingToGrip | Trouble::InputLow | Trouble::GoalBlocked => panic!("{told}"),
+                    Trouble::OperatorStop | Trouble::Estop | Trouble::Interrupted => assert!(!in_time, "{told}"),
+                    // The connection was there, the way behind the arm, or nothing moved.
+                    _ => {}
+                }
                 "done"
             }
             "interrupted" => {

@@ -11,7 +11,7 @@ use crate::cli::arm::opening;
 use crate::cli::exit::{Failure, Result};
 use crate::cli::output;
 use crate::rpc::api::{Attach, DEFAULT_SPEED, PlanGoal, PoseSpec};
-use crate::yaml::{self, Diag, Kind, NodeId, Tree, did_you_mean, quote};
+use crate::yaml::{self, Diag, Kind, Label, NodeId, Tree, did_you_mean, quote};
 
 /// Steps that `repeat` may be nested in.
 const MAX_NESTING: usize = 8;
@@ -36,6 +36,11 @@ impl Job {
         let mut reader = Reader { tree: Tree::new(), direct: false, replan: false, speed: DEFAULT_SPEED, count: 0 };
         let source = reader.tree.add_bytes(file.clone(), bytes);
         let root = source.and_then(|source| reader.tree.parse(source));
+        if let (Some(source), None, false) = (source, root, reader.tree.has_errors()) {
+            reader
+                .tree
+                .report(Diag::error("the file is empty").at(Label::start_of(source)).hint("steps: [{move: home}, …]"));
+        }
         let read = root.and_then(|root| reader.job(root, file.clone()));
         Self { tree: reader.tree, ..read.unwrap_or_else(|| Self::empty(file)) }
     }
@@ -450,7 +455,8 @@ mod tests {
                 format!("{}:{}: {} | {}", r.line.unwrap(), r.column.unwrap(), r.message, r.hint.unwrap_or_default())
             })
             .collect();
-        lines.sort_by_key(|line| line.split(':').next().unwrap().parse::<u32>().unwrap());
+        let at = |line: &String| line.splitn(3, ':').take(2).map(|n| n.parse::<u32>().unwrap()).collect::<Vec<_>>();
+        lines.sort_by_key(at);
         lines
     }
 
@@ -476,8 +482,8 @@ steps:
         let found = mistakes(text);
         let expected = [
             "1:1: unknown key `repeet` | did you mean `repeat`?",
-            "3:22: `x`: not a number",
-            "3:26: unknown key `speeed` | did you mean `speed`?",
+            "3:24: `x`: not a number",
+            "3:28: unknown key `speeed` | did you mean `speed`?",
             "4:14: `closed`: not a number; give m or rad, `open` or `close`",
             "5:19: `do0`: must be a digital input",
             "6:11: `soon`: not a duration",
@@ -485,7 +491,7 @@ steps:
             "8:14: needs two or more waypoints",
             "9:19: `2`: must be high or low",
             "10:21: `0`: must be a number of times",
-            "10:32: `~`: must be a name",
+            "10:",
             "11:11: needs one of named, joints, pose, by",
             "12:11: a direct motion needs `joints`",
             "13:25: `linear` needs a pose",
