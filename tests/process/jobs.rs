@@ -174,13 +174,13 @@ impl Cell {
             client.call(Detach { name }).unwrap();
         }
         let arm = || "arm".to_owned();
-        eventually("the arm is ready again", || {
-            let _ = client.call(ArmReset { arm: arm() });
-            self.phase().0 == "ready" || client.call(ArmEnable { arm: arm() }).is_ok() && self.phase().0 == "ready"
-        });
         let pose = PoseSpec { xyz: [0.0, 0.5, 0.5], ..PoseSpec::default() };
         client.call(WorldMove { name: "part".into(), pose }).unwrap();
-        eventually("the arm is at home", || {
+        eventually("the arm is ready again, and at home", || {
+            if self.phase().0 != "ready" {
+                let _ = client.call(ArmReset { arm: arm() });
+                let _ = client.call(ArmEnable { arm: arm() });
+            }
             self.home.start("move arm --named home --speed 1").wait().code == Some(0) && self.at(HOME)
         });
         let pose = PoseSpec { xyz: self.part, ..PoseSpec::default() };
@@ -252,8 +252,15 @@ impl Cell {
     ) -> &'static str {
         let (phase, cause) = self.phase();
         let said = report["ended"].as_str().unwrap();
-        let told = format!("{trouble:?}: {report:#} {} phase {phase} {cause:?}", ended.err);
-        assert!(self.rests(), "the arm moves after the job: {told}");
+        let of = |key| report.get(key).map(Value::to_string).unwrap_or_default();
+        let (step, after, held) = (of("step"), of("on_fault"), of("held"));
+        let told = format!("{trouble:?}: {said} {step} {after} {held}; {} phase {phase} {cause:?}", ended.err);
+        // The script of the emulator may break the connection during any job.
+        let lost = cause.as_deref() == Some("link_lost");
+        match lost {
+            true => eventually("the arm rests after the connection was lost", || self.rests()),
+            false => assert!(self.rests(), "the arm moves after the job: {told}"),
+        }
         let code = ended.code.unwrap();
         match said {
             "done" => {
@@ -278,6 +285,7 @@ impl Cell {
                 let on_fault = report["on_fault"].as_str();
                 let is_held = phase != "ready";
                 match trouble {
+                    _ if lost => assert!(is_held && on_fault != Some("done"), "{told}"),
                     Trouble::OperatorStop => {
                         let cause = cause.as_deref();
                         assert_eq!((said, on_fault, cause), ("stopped", None, Some("operator_stop")), "{told}");
@@ -288,7 +296,7 @@ impl Cell {
                         assert!(self.at(HOME) && self.held_objects().is_empty(), "{told}");
                     }
                     // The arm may be free, or held before the obstacle.
-                    Trouble::WayBlocked => assert!(said == "fault" && on_fault.is_some(), "{told}"),
+                    Trouble::WayBlocked => assert!(is_held == (said == "stopped"), "{told}"),
                     // A hold is not cleared, and nothing else was done.
                     _ => {
                         let kept = on_fault.is_none_or(|after| after.starts_with("not run: arm is "));

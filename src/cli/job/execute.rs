@@ -117,7 +117,7 @@ impl<'r> Runner<'r, '_> {
     fn steps(&mut self, steps: &'r [Step]) -> Outcome<(), (&'r Step, End)> {
         for step in steps {
             let began = Instant::now();
-            self.step(step).or_else(|(at, end)| Err((at, self.judged(end))))?;
+            self.step(step).map_err(|(at, end)| (at, self.judged(end)))?;
             if let Some(times) = self.times.get_mut(step.id) {
                 times.add(began.elapsed().as_secs_f64());
             }
@@ -230,7 +230,11 @@ impl<'r> Runner<'r, '_> {
         } else {
             let (goals, through) = (vec![goal.clone()], motion.through.clone());
             let request = Plan { goals, speed: *speed, seed: 0, timeout: None, through, blend: motion.blend };
-            let found = plan(self.client, request, self.signals)?;
+            let found = plan(self.client, request, self.signals).map_err(|failure| match failure.what.as_str() {
+                // Another client's `cancel`.
+                "no plan: cancelled" => End::Stopped(failure),
+                _ => failure.into(),
+            })?;
             self.signals.check()?;
             let (plan, replan) = (Some(found.plan), motion.replan);
             let begun = self.client.call(ExecutePlan { plan, replan, ..ExecutePlan::default() })?;

@@ -194,8 +194,8 @@ impl Reader {
                 arm = self.parsed(value, word)?;
                 if name == "reset" { Act::Reset } else { Act::Enable }
             }
-            ("move", Some(value)) => Act::Move(self.motion(value, &mut arm)?),
-            ("through", Some(value)) => Act::Move(self.through(value, &mut arm)?),
+            ("move", Some(value)) => Act::Move(Box::new(self.motion(value, &mut arm)?)),
+            ("through", Some(value)) => Act::Move(Box::new(self.through(value, &mut arm)?)),
             ("gripper", Some(value)) => self.gripper(value, &mut arm)?,
             ("wait", Some(value)) => self.wait(value, &mut arm)?,
             ("output", Some(value)) => self.output(value, &mut arm)?,

@@ -44,7 +44,7 @@ pub struct Step {
 /// What a step does.
 pub enum Act {
     /// Moves the arm.
-    Move(Motion),
+    Move(Box<Motion>),
     /// Opens or closes the gripper, and waits until it settles. `object`: whether it must hold something then.
     Gripper { to: Opening, force: Option<f64>, object: Option<bool>, timeout: Duration },
     /// Waits.
