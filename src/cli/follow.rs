@@ -45,8 +45,8 @@ pub fn completed(client: &mut Client, report: &MotionReport) -> Result<()> {
     Err(failure.hint(hint))
 }
 
-/// Waits for the end of a motion of `task`, with a progress bar named `title` on a terminal. A signal cancels the motion
-/// first. Returns its report, and the signal.
+/// Waits for the end of a motion of `task`, with a progress bar named `title` on a terminal. A signal cancels the
+/// motion first. Returns its report, and the signal.
 pub fn watch(
     client: &mut Client,
     motion: u64,

@@ -73,8 +73,8 @@ impl RecordedMotion {
 }
 
 impl RecordedMotion {
-    /// Reads the measured motion of these joints, averaged over ±0.1 s, between two Unix times [ns]: since the last gap in
-    /// the log. Without those joints it has no rows.
+    /// Reads the measured motion of these joints, averaged over ±0.1 s, between two Unix times [ns]: since the last gap
+    /// in the log. Without those joints it has no rows.
     pub fn measured(path: &Path, joints: &[String], from: u64, to: u64) -> Result<Self, RecordedError> {
         let recorded = Recorded::open(path)?;
         let names = recorded.joints();

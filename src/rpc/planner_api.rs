@@ -65,8 +65,8 @@ pub struct PlanGoal {
     /// One of its named poses.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub named: Option<String>,
-    /// Joint positions [rad] to pass in this order, straight in joint space; the last are the goal. Nothing is searched:
-    /// there is no plan if they are blocked. They keep half the padding, as the arm has been there.
+    /// Joint positions [rad] to pass in this order, straight in joint space; the last are the goal. Nothing is
+    /// searched: there is no plan if they are blocked. They keep half the padding, as the arm has been there.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub path: Option<Vec<Vec<f64>>>,
     /// Whether the tool centre point moves there on a straight line.
