@@ -255,8 +255,8 @@ impl Cell {
         let of = |key| report.get(key).map(Value::to_string).unwrap_or_default();
         let (step, after, held) = (of("step"), of("on_fault"), of("held"));
         let told = format!("{trouble:?}: {said} {step} {after} {held}; {} phase {phase} {cause:?}", ended.err);
-        // The script of the emulator may break the connection during any job.
-        let lost = cause.as_deref() == Some("link_lost");
+        // The script of the emulator may break the connection in any job; a loaded computer may read too late.
+        let lost = matches!(cause.as_deref(), Some("link_lost" | "stale"));
         // A job ends when the arm is held, which then decelerates.
         match phase == "ready" {
             false => eventually("the arm rests", || self.rests()),
@@ -265,7 +265,7 @@ impl Cell {
         let code = ended.code.unwrap();
         match said {
             "done" => {
-                assert_eq!((code, phase.as_str()), (0, "ready"), "{told}");
+                assert!(code == 0 && (phase == "ready" || lost), "{told}");
                 assert!(self.held_objects().is_empty(), "{told}");
                 match trouble {
                     Trouble::NothingToGrip | Trouble::InputLow | Trouble::GoalBlocked => panic!("{told}"),
@@ -276,7 +276,7 @@ impl Cell {
                 "done"
             }
             "interrupted" => {
-                assert_eq!((code, phase.as_str(), trouble), (130, "ready", Trouble::Interrupted), "{told}");
+                assert!(code == 130 && trouble == Trouble::Interrupted && (phase == "ready" || lost), "{told}");
                 "interrupted"
             }
             "stopped" | "fault" => {

@@ -230,10 +230,10 @@ impl<'r> Runner<'r, '_> {
         } else {
             let (goals, through) = (vec![goal.clone()], motion.through.clone());
             let request = Plan { goals, speed: *speed, seed: 0, timeout: None, through, blend: motion.blend };
-            let found = plan(self.client, request, self.signals).map_err(|failure| match failure.what.as_str() {
-                // Another client's `cancel`.
-                "no plan: cancelled" => End::Stopped(failure),
-                _ => failure.into(),
+            let found = plan(self.client, request, self.signals).map_err(|failure| {
+                // Another client's `cancel`, maybe at a waypoint.
+                let cancelled = failure.what.starts_with("no plan: ") && failure.what.ends_with("cancelled");
+                if cancelled { End::Stopped(failure) } else { failure.into() }
             })?;
             self.signals.check()?;
             let (plan, replan) = (Some(found.plan), motion.replan);
