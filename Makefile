@@ -139,4 +139,5 @@ soak:
 	DIMOS_STALLS=200 cargo test --release --locked --test realtime stalls:: -- --skip wire_stalls --nocapture --test-threads 1
 	DIMOS_WIRE=full cargo test --release --locked --test realtime wire_stalls -- --nocapture --test-threads 1
 	DIMOS_REPEATS=20 cargo test --release --locked --test realtime faults:: -- --nocapture --test-threads 1
+	DIMOS_JOBS=1000 cargo test --locked --test process jobs::picks -- --nocapture
 	DIMOS_BRAKING=1000 cargo test --locked --test logic braking

@@ -115,7 +115,8 @@ impl Flood {
             ..Point::default()
         };
         let trajectory = Trajectory { joint_names: joints.to_vec(), points: (0..POINTS).map(point).collect() };
-        let execute = json!({"id": 1, "method": "execute", "params": Execute { trajectory, task: None }});
+        let execute =
+            json!({"id": 1, "method": "execute", "params": Execute { trajectory, task: None, retraces_to: None }});
         let execute = execute.to_string() + "\n";
         let clients = (0..CLIENTS).map(|kind| {
             let (on, over, execute, socket) = (on.clone(), over.clone(), execute.clone(), socket.to_owned());

@@ -98,7 +98,7 @@ pub fn keep_moving(client: &mut Client, seconds: f64) -> Result<(), String> {
         let start: Vec<f64> = arm.joints.iter().map(|j| j.command.or(j.position).unwrap_or_default()).collect();
         let points = (0..=swings * STEPS).map(|i| swing(&start, i)).collect();
         let trajectory = Trajectory { joint_names, points };
-        client.call(Execute { trajectory, task: None }).map_err(|e| e.to_string())?;
+        client.call(Execute { trajectory, task: None, retraces_to: None }).map_err(|e| e.to_string())?;
     }
     Ok(())
 }

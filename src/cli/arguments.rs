@@ -48,6 +48,14 @@ impl Target {
         Ok(Client::find(&RunDir::standard(), self.run.as_deref())?)
     }
 
+    /// Connects to the run, if one is live or named.
+    pub fn connect_if_live(&self) -> Result<Option<Client>> {
+        match Client::find(&RunDir::standard(), self.run.as_deref()) {
+            Err(client::ClientError::NoRun) => Ok(None),
+            found => Ok(Some(found?)),
+        }
+    }
+
     /// Returns the named run, or all live runs.
     pub fn named_or_all(&self) -> Result<Vec<LiveRun>> {
         let folder = RunDir::standard();

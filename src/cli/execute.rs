@@ -42,7 +42,7 @@ pub fn run(args: &Args) -> Result {
     let begun = match trajectory {
         Some(trajectory) => {
             let points = trajectory.points.len();
-            let begun = client.call(Execute { trajectory, task: args.task.clone() })?;
+            let begun = client.call(Execute { trajectory, task: args.task.clone(), retraces_to: None })?;
             output::note(format_args!(
                 "motion {} on {}: {points} points, {:.2} s, not collision-checked",
                 begun.motion, begun.task, begun.duration
@@ -50,7 +50,7 @@ pub fn run(args: &Args) -> Result {
             begun
         }
         None => {
-            let begun = client.call(ExecutePlan { plan: args.plan, replan: args.replan, presence: None })?;
+            let begun = client.call(ExecutePlan { plan: args.plan, replan: args.replan, ..ExecutePlan::default() })?;
             let (motion, task) = (begun.motion, &begun.task);
             output::note(format_args!(
                 "motion {motion} on {task}: {:.2} s, planned, collision-checked",

@@ -15,7 +15,7 @@ use crate::rpc::client::Client;
 use crate::rpc::report::{Deviation, MotionReport};
 
 /// Poll period.
-const POLL_PERIOD: Duration = Duration::from_millis(50);
+const POLL_PERIOD: Duration = Duration::from_millis(20);
 /// Maximum wait for a cancelled motion to end.
 const REST_TIMEOUT: Duration = Duration::from_secs(10);
 /// Final error below which a joint counts as on target [rad].
@@ -30,20 +30,48 @@ pub fn follow(client: &mut Client, motion: u64, task: &str, signals: &Signals, j
     follow_until(client, motion, task, &cancel, signals, json)
 }
 
-/// As [`follow`]; a signal sends this request. `name` labels the progress bar.
+/// As [`follow`]; a signal sends this request. `title` labels the progress bar.
 pub fn follow_until(
     client: &mut Client,
     motion: u64,
-    name: &str,
+    title: &str,
     cancel: &Cancel,
     signals: &Signals,
     json: bool,
 ) -> Result {
+    let (report, cancelled) = watch(client, motion, cancel, title, signals)?;
+    print(&report, json);
+    match cancelled {
+        Some(signal) => Ok(Exit::by_signal(signal)),
+        None => completed(client, &report).map(|()| Exit::Ok),
+    }
+}
+
+/// Returns an error if a motion that has ended did not reach its goal.
+pub fn completed(client: &mut Client, report: &MotionReport) -> Result<()> {
+    if report.state == "COMPLETED" {
+        return Ok(());
+    }
+    let why = report.error.as_deref().unwrap_or("it ended before its goal");
+    let failure = Failure::new(Exit::Failed, format!("motion {}: {}: {why}", report.motion, report.state));
+    let hint = held(client).unwrap_or_else(|| "`dimos status` shows what the arm and the task wait for".into());
+    Err(failure.hint(hint))
+}
+
+/// Waits for the end of a motion, with a progress bar named `title` on a terminal. A signal sends `cancel` first.
+/// Returns its report, and the signal.
+pub fn watch(
+    client: &mut Client,
+    motion: u64,
+    cancel: &Cancel,
+    title: &str,
+    signals: &Signals,
+) -> Result<(MotionReport, Option<i32>)> {
     let bar = ProgressBar::new(1000).with_finish(ProgressFinish::AndClear);
     if let Ok(style) = ProgressStyle::with_template("{prefix} [{bar:40}] {percent:>3} % {msg}") {
         bar.set_style(style.progress_chars("=> "));
     }
-    bar.set_prefix(name.to_owned());
+    bar.set_prefix(title.to_owned());
     let mut cancelled: Option<Instant> = None;
     let mut motion = motion;
     let report = loop {
@@ -77,21 +105,11 @@ pub fn follow_until(
         sleep(POLL_PERIOD);
     };
     bar.finish_and_clear();
-    print(&report, json);
-    match signals.last() {
-        Some(signal) if cancelled.is_some() => Ok(Exit::by_signal(signal)),
-        _ if report.state == "COMPLETED" => Ok(Exit::Ok),
-        _ => {
-            let why = report.error.unwrap_or_else(|| "it ended before its goal".into());
-            let failure = Failure::new(Exit::Failed, format!("motion {motion}: {}: {why}", report.state));
-            Err(failure
-                .hint(held(client).unwrap_or_else(|| "`dimos status` shows what the arm and the task wait for".into())))
-        }
-    }
+    Ok((report, signals.last().filter(|_| cancelled.is_some())))
 }
 
 /// Returns which arms of the run are held and why, with the way out; `None` without one.
-fn held(client: &mut Client) -> Option<String> {
+pub fn held(client: &mut Client) -> Option<String> {
     let arms = client.call(Status {}).ok()?.arms;
     let held = arms.iter().filter(|arm| arm.phase == "held");
     let lines = held.filter_map(|arm| {

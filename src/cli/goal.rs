@@ -227,6 +227,7 @@ impl Goal {
             named: self.named.clone(),
             path,
             linear: search.linear,
+            retrace: None,
         }]
     }
 }

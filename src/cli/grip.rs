@@ -41,7 +41,7 @@ pub fn opening(text: &str) -> std::result::Result<Opening, String> {
 
 impl Opening {
     /// Returns the position [m or rad]: the run knows the gripper's range.
-    fn of(self, client: &mut Client, arm: &str) -> Result<f64> {
+    pub fn of(self, client: &mut Client, arm: &str) -> Result<f64> {
         if let Self::Position(position) = self {
             return Ok(position);
         }
@@ -206,7 +206,7 @@ impl GripAction {
 }
 
 /// Waits for the outcome of a command. A signal ends the wait; the fingers continue.
-fn wait(client: &mut Client, arm: &str, order: u32, signals: &Signals) -> Result<GripReport> {
+pub(super) fn wait(client: &mut Client, arm: &str, order: u32, signals: &Signals) -> Result<GripReport> {
     loop {
         let report = client.call(Grip { arm: arm.to_owned(), order: Some(order) })?;
         if report.done {

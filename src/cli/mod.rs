@@ -5,6 +5,7 @@ pub mod arguments;
 pub mod arm;
 mod ask;
 mod attach;
+pub mod back_out;
 pub mod banner;
 pub mod cancel;
 pub mod check;
@@ -19,6 +20,7 @@ mod fetch;
 mod follow;
 mod goal;
 mod grip;
+pub mod job;
 pub mod jog;
 pub mod list_adapters;
 pub mod list_blueprints;
@@ -96,6 +98,10 @@ enum Command {
     Execute(execute::Args),
     /// Edit the planner's obstacles: list, add, move, remove, load, attach, detach
     World(world::Args),
+    /// Run a job from a file: motions, gripper, inputs and outputs, loops; reports cycle times
+    Do(job::Args),
+    /// Retrace the logged path of an arm, back to where it was at rest before
+    BackOut(back_out::Args),
     /// Decelerate running motions to rest, and end planning
     Cancel(cancel::Args),
     /// Show or set the speed of all motions: a fraction, as 0.3 or 30%
@@ -313,6 +319,8 @@ fn built_in(cli: &Cli, catalog: Catalog<'_>) -> exit::Result {
         Command::Preview(args) => preview::run(args),
         Command::Execute(args) => execute::run(args),
         Command::World(args) => world::run(args),
+        Command::Do(args) => job::run(args),
+        Command::BackOut(args) => back_out::run(args),
         Command::Cancel(args) => cancel::run(args),
         Command::Pose(args) => pose::run(args),
         Command::Speed(args) => speed::run(args),

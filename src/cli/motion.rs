@@ -153,7 +153,7 @@ fn plan_and_begin(args: &Args, request: Plan, client: &mut Client, signals: &Sig
         show(&planned);
     }
     signals.check()?;
-    let begun = client.call(ExecutePlan { plan: Some(planned.plan), replan: args.replan, presence: None })?;
+    let begun = client.call(ExecutePlan { plan: Some(planned.plan), replan: args.replan, ..ExecutePlan::default() })?;
     output::note(format_args!("motion {} on {}: planned, collision-checked", begun.motion, begun.task));
     let reply = serde_json::to_value(&begun).unwrap_or_default();
     Ok((begun.motion, begun.task, reply))

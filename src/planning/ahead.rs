@@ -43,7 +43,7 @@ pub fn look_ahead(
     stop: &Stop,
 ) -> Result<Option<Blocked>, PlanFailure> {
     let spline = Spline::new(&found.trajectory).map_err(|e| PlanFailure::new(e.to_string()))?;
-    let mut stage = stage(setup, world, &found.robots, positions, setup.padding)?;
+    let mut stage = stage(setup, world, &found.robots, positions, found.padding)?;
     let checker = &mut stage.checker;
     checker.give_up_again(&found.given_up);
     let way = samples(&spline, elapsed);
@@ -69,7 +69,7 @@ pub fn look_ahead(
             checker.contacts(&q).into_iter().next()
         });
         let what = contact
-            .map_or_else(|| "the rest of the motion is blocked".to_owned(), |c| describe_contact(&c, setup.padding));
+            .map_or_else(|| "the rest of the motion is blocked".to_owned(), |c| describe_contact(&c, found.padding));
         return Ok(Some(Blocked { free_until: *time, what }));
     }
     Ok(None)

@@ -1,11 +1,13 @@
 //! From a request's goals to goal configurations.
 
+use super::ahead::describe_contact;
 use super::cartesian::{LineSettings, straight_line};
 use super::ik::{Ik, IkSettings};
 use super::padded::{Near, Padded};
-use super::path::{Path, between, distance};
+use super::path::{Path, between, distance, length, unwind};
 use super::pipeline::{Goal, PlanFailure, Stage, late};
 use super::planning_scene::PlannedRobot;
+use super::start_contact::{EscapePath, passes};
 use crate::collision::report::{Contact, Pair};
 use crate::collision::{CollisionChecker, Stop};
 use crate::robot::kinematics::frame;
@@ -64,7 +66,7 @@ pub(super) fn configurations(
                 let settings = IkSettings { seed, position_only: true, ..reach() };
                 reached(robot, &target, &own, &settings, &mut free, stop)?
             }
-            Some(Goal::Line(_) | Goal::Path(_)) | None => vec![own],
+            Some(Goal::Line(_) | Goal::Path(_) | Goal::Retrace(_)) | None => vec![own],
         };
         all = all.iter().flat_map(|before| several.iter().map(move |own| [&before[..], own].concat())).collect();
         all.truncate(SOLUTIONS * SOLUTIONS);
@@ -166,6 +168,43 @@ pub(super) fn line(stage: &mut Stage<'_>, target: &DAffine3, stop: &Stop) -> Res
     let part = 100.0 * line.fraction;
     Err(PlanFailure::new(format!("only {part:.1} % of the straight line is possible{reason}"))
         .hint("omit --linear for any collision-free path, or choose a closer pose"))
+}
+
+/// Follows given configurations straight in joint space, from the stage's start; fails where they are blocked.
+pub(super) fn follow(stage: &mut Stage<'_>, given: &Path, stop: &Stop) -> Result<Path, PlanFailure> {
+    let mut path = vec![stage.start.clone()];
+    path.extend(given.iter().cloned());
+    let checker = &mut stage.checker;
+    let turns = checker.turns().to_vec();
+    for k in 1..path.len() {
+        let (before, rest) = path.split_at_mut(k);
+        if let (Some(before), Some(q)) = (before.last(), rest.first_mut()) {
+            unwind(q, before, &turns);
+        }
+    }
+    if let Some(goal) = path.last() {
+        checker.give_up(Near::Goal, goal);
+    }
+    let escape_path = EscapePath::of(checker, &path);
+    let mut q = stage.start.clone();
+    for (k, pair) in path.windows(2).enumerate() {
+        let [a, b] = pair else { continue };
+        if passes(checker, escape_path.as_ref(), a, b, stop) {
+            continue;
+        }
+        if let Some(failure) = late(stop) {
+            return Err(failure);
+        }
+        let contact = (0..=BLOCK_SAMPLES).find_map(|k| {
+            between(a, b, f64::from(k) / f64::from(BLOCK_SAMPLES), &mut q);
+            checker.contacts(&q).into_iter().next()
+        });
+        let what = contact.map_or_else(String::new, |c| format!(": {}", describe_contact(&c, checker.padding())));
+        let (free, whole) = (length(path.get(..=k).unwrap_or_default()), length(&path));
+        return Err(PlanFailure::new(format!("the path is blocked after {free:.3} of {whole:.3} rad{what}"))
+            .hint("correct the world, or plan a motion around it: `dimos move`"));
+    }
+    Ok(path)
 }
 
 /// Returns where on a line which pair blocks it, and how close or deep that pair would get on the whole line: `blocked`

@@ -12,7 +12,8 @@ use super::timing::TimingSettings;
 use crate::collision::{CollisionChecker, Stop};
 use crate::robot::kinematics::frame;
 
-/// Maximum deviation at the corners of a straight line, and at a waypoint [rad].
+/// Maximum deviation at the corners of a straight line or a given path, which are so flat that blending keeps to it,
+/// and at a waypoint [rad].
 const LINE_DEVIATION: f64 = 1e-3;
 const MOST_DEVIATION: f64 = 0.5;
 /// Shortest piece at a waypoint that is blended [rad].
@@ -70,8 +71,15 @@ pub(super) fn leg(
         [(_, Goal::Line(target))] => {
             let (path, fraction) = goals::line(stage, &frame(target), stop)?;
             took("search", began.elapsed().as_secs_f64());
-            // The corners of a line are so flat that blending keeps to the line.
-            Ok(Leg { path, fraction: Some(fraction), clamped: Vec::new(), deviation: LINE_DEVIATION })
+            Ok(Leg { path, fraction: Some(fraction), deviation: LINE_DEVIATION, clamped: Vec::new() })
+        }
+        [(_, Goal::Retrace(given))] => {
+            let path = goals::follow(stage, given, stop)?;
+            took("search", began.elapsed().as_secs_f64());
+            Ok(Leg { path, fraction: None, deviation: LINE_DEVIATION, clamped: Vec::new() })
+        }
+        several if several.iter().any(|(_, goal)| matches!(goal, Goal::Retrace(_))) => {
+            Err(PlanFailure::new("a given path is for one robot at a time"))
         }
         several if several.iter().any(|(_, goal)| matches!(goal, Goal::Line(_) | Goal::Path(_))) => {
             Err(PlanFailure::new("a straight line or a path is planned for one robot at a time"))

@@ -28,6 +28,8 @@ const SAME_CONFIGURATION: f64 = 1e-3;
 /// Additional padding during the search [m]: between the points of its trajectory, a motion deviates slightly from the
 /// checked path and must still pass a later check.
 const EXTRA_PADDING: f64 = 2e-4;
+/// Part of the padding that a given path keeps: the arm has been there.
+const PATH_PADDING: f64 = 0.5;
 /// Distance at which nothing can touch [m].
 const OUT_OF_REACH: f64 = 1e5;
 /// Duration of the motion of robots that are already at the goal [s].
@@ -46,6 +48,8 @@ pub enum Goal {
     Line(Isometry3<f64>),
     /// A path to follow, after an approach to its first configuration.
     Path(JointPath),
+    /// Joint positions [rad] to pass, straight in joint space; the last are the goal. Nothing is searched.
+    Retrace(Path),
 }
 
 /// A planning request.
@@ -150,7 +154,9 @@ pub fn solve(
 ) -> Result<PlannedMotion, PlanFailure> {
     let mut times = BTreeMap::new();
     let moving: Vec<usize> = request.goals.iter().map(|(robot, _)| *robot).collect();
-    let mut stage = stage(setup, world, &moving, &request.positions, setup.padding + EXTRA_PADDING)?;
+    let given = request.goals.iter().any(|(_, goal)| matches!(goal, Goal::Retrace(_)));
+    let padding = if given { PATH_PADDING * setup.padding } else { setup.padding };
+    let mut stage = stage(setup, world, &moving, &request.positions, padding + EXTRA_PADDING)?;
     stage.checker.give_up(Near::Start, &stage.start);
     let lap = |times: &mut BTreeMap<String, f64>, name: &str, since: Instant| {
         times.insert(name.to_owned(), since.elapsed().as_secs_f64());
@@ -173,7 +179,7 @@ pub fn solve(
     let reached = |center: &[f64]| path.iter().any(|at| distance(at, center) < SAME_CONFIGURATION);
     let at_end = |given_up: &&GivenUp| given_up.near != Near::Goal || reached(&given_up.center);
     let given_up = stage.checker.given_up().iter().filter(at_end).cloned().collect();
-    let (robots, padding) = (stage.indices, setup.padding);
+    let robots = stage.indices;
     Ok(PlannedMotion { robots, path, trajectory, clearance, escape_path, padding, given_up, clamped, fraction, times })
 }
 

@@ -20,7 +20,7 @@ pub fn revalidate(
     positions: &[Vec<f64>],
     stop: &Stop,
 ) -> Result<(), PlanFailure> {
-    let mut stage = stage(setup, world, &found.robots, positions, setup.padding)?;
+    let mut stage = stage(setup, world, &found.robots, positions, found.padding)?;
     let checker = &mut stage.checker;
     checker.give_up_again(&found.given_up);
     for pair in found.trajectory.points.windows(2) {
@@ -39,7 +39,7 @@ pub fn revalidate(
         });
         let what = contact.map_or_else(
             || "the plan is no longer collision-free".to_owned(),
-            |contact| describe_contact(&contact, setup.padding),
+            |contact| describe_contact(&contact, found.padding),
         );
         return Err(PlanFailure::new(format!("after {:.2} s, {what}", a.time_from_start)));
     }

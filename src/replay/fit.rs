@@ -107,7 +107,14 @@ mod tests {
     const DT: f64 = 0.01;
 
     fn motion(rows: Vec<Vec<f64>>) -> RecordedMotion {
-        RecordedMotion { joints: make_joints("arm", rows[0].len()), period: DT, rows, lost: 0, grips: Vec::new() }
+        RecordedMotion {
+            joints: make_joints("arm", rows[0].len()),
+            period: DT,
+            rows,
+            last: 0,
+            lost: 0,
+            grips: Vec::new(),
+        }
     }
 
     /// Returns the largest distance between the curve and the commands.

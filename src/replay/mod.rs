@@ -3,6 +3,7 @@
 //! ```text
 //! log ─▶ recorded (who ran) ─▶ inputs (tick by tick) ─▶ verify: Coordinator::tick ─▶ the same commands?
 //!                           └▶ motion (what was commanded) ─▶ onto: a run of a blueprint that follows it
+//!                                              └▶ retrace: the way back of an arm
 //! ```
 
 pub mod compare;
@@ -13,4 +14,5 @@ pub mod motion;
 pub mod onto;
 pub mod recorded;
 mod requests;
+pub mod retrace;
 pub mod verify;

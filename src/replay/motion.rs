@@ -29,6 +29,8 @@ pub struct RecordedMotion {
     pub period: f64,
     /// Positions [rad], one row per tick, one value per joint.
     pub rows: Vec<Vec<f64>>,
+    /// Time of the last row [ns since 1970].
+    pub last: u64,
     /// Ticks missing in the log; bridged by straight lines.
     pub lost: u64,
     /// Gripper commands during the motion, in order of time.
@@ -38,6 +40,7 @@ pub struct RecordedMotion {
 /// Joint values of a tick.
 struct Row {
     tick: u64,
+    time: u64,
     measured: Vec<f64>,
     commanded: Vec<f64>,
 }
@@ -70,7 +73,39 @@ impl RecordedMotion {
         let ends = rows.first().zip(rows.last()).map(|(first, last)| first.tick..=last.tick);
         let arms: Vec<String> = recorded.names.arms.iter().map(|arm| arm.hardware_id.clone()).collect();
         let grips = ends.map(|ticks| grips::read(path, &arms, ticks, period)).transpose()?.unwrap_or_default();
-        Ok(Self { joints, period, rows: (0..length).map(at).collect(), lost: ticks, grips })
+        let last = rows.last().map_or(0, |row| row.time);
+        Ok(Self { joints, period, rows: (0..length).map(at).collect(), last, lost: ticks, grips })
+    }
+}
+
+impl RecordedMotion {
+    /// Reads the measured motion of these joints, averaged over ±0.1 s, between two Unix times [ns]: since the last gap
+    /// in the log. Without those joints it has no rows.
+    pub fn measured(path: &Path, joints: &[String], from: u64, to: u64) -> Result<Self, RecordedError> {
+        let recorded = Recorded::open(path)?;
+        let names = recorded.joints();
+        let index = |joint: &String| names.iter().position(|name| name == joint);
+        let columns: Vec<usize> = joints.iter().map(index).collect::<Option<_>>().unwrap_or_default();
+        let rows = rows(path, names.len(), from, to)?;
+        let period = 1.0 / recorded.config.rate;
+        let is_known = |row: &Row| columns.iter().all(|j| row.measured[*j].is_finite());
+        let is_gap = |w: &[Row]| w[1].tick.saturating_sub(w[0].tick) as f64 * period > MAX_GAP + period;
+        let begin = rows.windows(2).rposition(|w| is_gap(w) || !is_known(&w[0])).map_or(0, |k| k + 1);
+        let rows = rows.get(begin..).filter(|rows| rows.iter().all(is_known)).unwrap_or_default();
+        let width = (AVERAGING_TIME / period).round() as usize;
+        let smooth: Vec<Vec<f64>> =
+            columns.iter().map(|j| averaged(&bridged(rows, |row| row.measured[*j]), width)).collect();
+        let at = |k: usize| smooth.iter().map(|column| column[k]).collect();
+        let length = smooth.first().map_or(0, Vec::len);
+        let last = rows.last().map_or(0, |row| row.time);
+        Ok(Self {
+            joints: joints.to_vec(),
+            period,
+            rows: (0..length).map(at).collect(),
+            last,
+            lost: 0,
+            grips: Vec::new(),
+        })
     }
 }
 
@@ -90,7 +125,7 @@ fn rows(path: &Path, joints: usize, from: u64, to: u64) -> Result<Vec<Row>, Reco
                 Payload::Tick(t) if rows.last().is_none_or(|row| t.tick > row.tick) => {
                     let now =
                         (std::mem::replace(&mut measured, nothing()), std::mem::replace(&mut commanded, nothing()));
-                    rows.push(Row { tick: t.tick, measured: now.0, commanded: now.1 });
+                    rows.push(Row { tick: t.tick, time: entry.log_time, measured: now.0, commanded: now.1 });
                 }
                 _ => {}
             },
@@ -161,7 +196,7 @@ mod tests {
     use super::*;
 
     fn row(tick: u64, measured: f64, commanded: f64) -> Row {
-        Row { tick, measured: vec![measured], commanded: vec![commanded] }
+        Row { tick, time: 0, measured: vec![measured], commanded: vec![commanded] }
     }
 
     #[test]

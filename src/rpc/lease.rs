@@ -169,9 +169,9 @@ impl Lessee {
                 let (plan, joints) = backend.plan_of(plan).await?;
                 let arms = backend.arms_of(Subject::Joints(&joints));
                 self.claim(&arms, false)?;
-                let replan = matches!(&request, Request::ExecutePlan(execute) if execute.replan);
+                let Request::ExecutePlan(execute) = request else { return Ok((request, arms)) };
                 let presence = Some(Presence::of(&self.alive));
-                return Ok((Request::ExecutePlan(ExecutePlan { plan: Some(plan), replan, presence }), arms));
+                return Ok((Request::ExecutePlan(ExecutePlan { plan: Some(plan), presence, ..execute }), arms));
             }
         }
         Ok((request, Vec::new()))

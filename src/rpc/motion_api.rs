@@ -161,6 +161,9 @@ pub struct Execute {
     /// The trajectory task to use; default: the one whose joints cover the trajectory's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub task: Option<String>,
+    /// If the motion retraces the log: time in it of the goal [s since 1970]. `motion` reports it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub retraces_to: Option<f64>,
 }
 
 /// A trajectory with the field names and meaning of ROS (`trajectory_msgs/JointTrajectory`).

@@ -42,7 +42,7 @@ impl PoseSpec {
     }
 }
 
-/// Goal of one robot: exactly one of `joints`, `pose`, `by`, `named`, `path`.
+/// Goal of one robot: exactly one of `joints`, `pose`, `by`, `named`, `path`, `retrace`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PlanGoal {
@@ -69,6 +69,10 @@ pub struct PlanGoal {
     /// Refused where it is not free.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub path: Option<JointPath>,
+    /// Joint positions [rad] to pass in this order, straight in joint space; the last are the goal. Nothing is
+    /// searched: there is no plan if they are blocked. They keep half the padding, as the arm has been there.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub retrace: Option<Vec<Vec<f64>>>,
     /// Whether the tool centre point moves there on a straight line.
     #[serde(default)]
     pub linear: bool,
@@ -108,17 +112,30 @@ impl Default for Plan {
     }
 }
 
+/// Most configurations of a path.
+pub const MAX_RETRACE: usize = 2000;
 /// Farthest that a waypoint may be passed [m].
 const MAX_BLEND: f64 = 1.0;
 
 impl PlanGoal {
     fn valid(&self, field: &str) -> Result<(), String> {
-        let of = |what: bool| usize::from(what);
-        let given = of(self.joints.is_some()) + of(self.pose.is_some()) + of(self.by.is_some());
-        if given + of(self.named.is_some()) + of(self.path.is_some()) != 1 {
-            return Err(format!("{field} must have one of joints, pose, by, named, path"));
+        let retrace = self.retrace.as_deref().unwrap_or_default();
+        let given = [
+            self.joints.is_some(),
+            self.pose.is_some(),
+            self.by.is_some(),
+            self.named.is_some(),
+            self.path.is_some(),
+            self.retrace.is_some(),
+        ];
+        if given.iter().filter(|given| **given).count() != 1 {
+            return Err(format!("{field} must have one of joints, pose, by, named, path, retrace"));
         }
         self.path.as_ref().map_or(Ok(()), |path| path.valid().map_err(|what| format!("{field}.{what}")))?;
+        if self.retrace.is_some() && !(1..=MAX_RETRACE).contains(&retrace.len()) {
+            return Err(format!("{field}.retrace has {} configurations, must have 1 to {MAX_RETRACE}", retrace.len()));
+        }
+        retrace.iter().try_for_each(|q| finite(&format!("{field}.retrace"), q))?;
         let is_pose = self.pose.is_some() || self.by.is_some();
         if self.linear && !is_pose {
             return Err(format!("{field}: linear needs a pose"));
@@ -156,8 +173,9 @@ impl Plan {
             if waypoint.path.is_some() {
                 return Err(format!("{field}: a path is no waypoint"));
             }
-            if waypoint.by.is_some() || self.goals.iter().any(|goal| goal.by.is_some()) {
-                return Err(format!("{field}: a motion `by` begins at the present pose, not at a waypoint"));
+            let starts_here = |goal: &PlanGoal| goal.by.is_some() || goal.retrace.is_some();
+            if starts_here(waypoint) || self.goals.iter().any(starts_here) {
+                return Err(format!("{field}: `by` and `retrace` begin at the present pose, not at a waypoint"));
             }
         }
         if !(0.0..=MAX_BLEND).contains(&self.blend) {
@@ -312,7 +330,7 @@ pub struct PreviewReply {
 }
 
 /// Parameters of `execute_plan`.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ExecutePlan {
     /// The plan's number; default: the newest plan that is not `by_number`.
@@ -321,6 +339,9 @@ pub struct ExecutePlan {
     /// Whether a motion that an obstacle blocks is planned again from where it stopped, and continues.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub replan: bool,
+    /// If the motion retraces the log: time in it of the goal [s since 1970]. `motion` reports it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub retraces_to: Option<f64>,
     /// The requesting connection, if any; after its end nothing is planned again.
     #[serde(skip)]
     pub presence: Option<Presence>,

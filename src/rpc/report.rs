@@ -492,6 +492,9 @@ pub struct MotionReport {
     /// Whether it executes a plan: a direct motion and a trajectory of a client are not collision-checked.
     #[serde(default)]
     pub collision_checked: bool,
+    /// If it retraces the log: time in it of the goal [s since 1970].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub retraces_to: Option<f64>,
     /// When done: final error of each joint.
     pub deviation: Option<Vec<Deviation>>,
 }

@@ -52,7 +52,7 @@ impl Handle {
     /// Executes a trajectory with the task that covers its joints. Returns when the motion begins. An error if it does
     /// not start at the arm's position, or exceeds a limit.
     pub fn execute(&self, trajectory: Trajectory) -> Result<ExecuteReply, RpcError> {
-        self.call(Execute { trajectory, task: None })
+        self.call(Execute { trajectory, task: None, retraces_to: None })
     }
 
     /// Returns the progress of a motion, or how it ended.

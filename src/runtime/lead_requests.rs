@@ -139,8 +139,16 @@ impl Service {
         self.end_streams(&joints).await?;
         let target = self.native_target(arm, &call)?;
         let motion = self.parts.dispatcher.next_id();
-        let planned =
-            Planned { task: NATIVE, joints, goal: Vec::new(), duration: 0.0, plan: None, blocked: None, next: None };
+        let planned = Planned {
+            task: NATIVE,
+            joints,
+            goal: Vec::new(),
+            duration: 0.0,
+            plan: None,
+            blocked: None,
+            next: None,
+            retraces_to: None,
+        };
         lock(&self.motions).plan(motion, planned);
         let native = Native { name: call.arm, arm, motion, target, speed: call.speed * self.speed_override().fraction };
         let reply = api::NativeReply { motion, speed: native.speed };

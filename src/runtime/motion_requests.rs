@@ -120,7 +120,10 @@ impl Service {
 
     pub(super) async fn execute(&self, call: api::Execute) -> Result<Reply, RpcError> {
         self.end_streams(&self.joints_named(&call.trajectory.joint_names)?).await?;
-        self.execute_as(call, None).await.map(Reply::Execute)
+        let to = call.retraces_to;
+        let begun = self.execute_as(call, None).await?;
+        lock(&self.motions).retraces(begun.motion, to);
+        Ok(Reply::Execute(begun))
     }
 
     /// Returns the indices of joints over all arms' joints.
@@ -172,6 +175,7 @@ impl Service {
             plan,
             blocked: None,
             next: None,
+            retraces_to: None,
         };
         lock(&self.motions).plan(number, planned);
         let motion = Box::new(Motion { id: number, joints, spline });

@@ -29,6 +29,8 @@ pub struct Planned {
     pub blocked: Option<String>,
     /// What follows if it is planned again.
     pub next: Option<Next>,
+    /// If it retraces the log: time in it of the goal [s since 1970].
+    pub retraces_to: Option<f64>,
 }
 
 /// What a planned motion executes.
@@ -148,6 +150,13 @@ impl Motions {
         again
     }
 
+    /// Marks a motion as one that retraces the log to this time [s since 1970].
+    pub fn retraces(&mut self, number: u64, to: Option<f64>) {
+        if let Some((planned, _)) = self.0.get_mut(&number) {
+            planned.retraces_to = to;
+        }
+    }
+
     /// Sets the result of planning a motion again.
     pub fn went_on(&mut self, number: u64, next: Result<u64, String>) {
         if let Some((planned, _)) = self.0.get_mut(&number) {
@@ -192,6 +201,7 @@ mod tests {
             plan: None,
             blocked: None,
             next: None,
+            retraces_to: None,
         };
         let mut m = Motions::default();
         (1..=3).for_each(|n| m.plan(n, planned((n % 2) as u16)));

@@ -66,6 +66,10 @@ impl PlannerPort {
             let points = path.points.iter().map(|q| positions(q)).collect::<Result<_, RpcError>>()?;
             return Ok((index, Goal::Path(JointPath { points, tolerance: path.tolerance })));
         }
+        if let Some(retrace) = &goal.retrace {
+            let points = retrace.iter().map(|q| positions(q)).collect::<Result<_, RpcError>>()?;
+            return Ok((index, Goal::Retrace(points)));
+        }
         let goal = match (&goal.joints, &goal.named, self.goal_pose(robot, goal, moment)?) {
             (Some(values), _, _) => joints(values)?,
             (_, Some(name), _) => {

@@ -113,7 +113,9 @@ impl Service {
                 let released = planner.release(execute.plan, self.moment(0)).await?;
                 self.end_streams(&self.joints_named(&released.trajectory.joint_names)?).await?;
                 let replan = execute.replan.then_some(execute.presence);
-                self.execute_released(&planner, released, replan).await
+                let begun = self.execute_released(&planner, released, replan).await?;
+                lock(&self.motions).retraces(begun.motion, execute.retraces_to);
+                Ok(Reply::ExecutePlan(begun))
             }
             Call::Planner(_) => self.planner_report(&planner, limit).await.map(Reply::Planner),
             Call::Plan(plan) => {
@@ -140,10 +142,10 @@ impl Service {
         planner: &Planner<'_>,
         released: ReleasedPlan,
         replan: Option<Option<api::Presence>>,
-    ) -> Result<Reply, RpcError> {
+    ) -> Result<api::ExecuteReply, RpcError> {
         let ReleasedPlan { plan, trajectory, task } = released;
         // Data from another process is checked like that of any client.
-        let execute = api::Execute { trajectory, task };
+        let execute = api::Execute { trajectory, task, retraces_to: None };
         api::Method::check(&execute).map_err(|what| RpcError::new(Code::InvalidTrajectory, what))?;
         let begun = self.execute_as(execute, Some((plan, replan))).await?;
         *lock(&self.executed) = Some((plan, begun.motion));
@@ -152,7 +154,7 @@ impl Service {
         if let Some(motion) = under_way {
             self.recheck_motion(planner, &motion).await;
         }
-        Ok(Reply::ExecutePlan(begun))
+        Ok(begun)
     }
 
     /// Cancels the planning of this plan; `None`: of any. Returns whether it was being planned.

@@ -21,7 +21,7 @@ const REMEMBERED: usize = 64;
 /// Returns whether a goal depends on where its robot was, or on an object that may move.
 fn is_relative(goal: &PlanGoal) -> bool {
     let fixed = matches!(goal.frame.as_deref(), None | Some("map" | "base"));
-    goal.by.is_some() || !fixed
+    goal.by.is_some() || goal.path.is_some() || !fixed
 }
 
 impl Service {
@@ -82,7 +82,7 @@ impl Service {
         }
         self.may_go_on(motion)?;
         let presence = motion.replan.clone().flatten();
-        let execute = ExecutePlan { plan: Some(begun.plan), replan: true, presence };
+        let execute = ExecutePlan { plan: Some(begun.plan), replan: true, presence, ..ExecutePlan::default() };
         match self.planner_call(Call::ExecutePlan(execute)).await? {
             Reply::ExecutePlan(begun) => Ok(begun.motion),
             _ => Err(internal()),

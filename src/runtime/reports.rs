@@ -218,7 +218,8 @@ impl Service {
         };
         let task = if planned.task == NATIVE { "native".to_owned() } else { self.parts.names.task(planned.task) };
         let collision_checked = planned.plan.is_some();
-        let mut report = MotionReport { motion: number, task, collision_checked, ..Default::default() };
+        let retraces_to = planned.retraces_to;
+        let mut report = MotionReport { motion: number, task, collision_checked, retraces_to, ..Default::default() };
         let view = self.task_view(planned.task as usize);
         if view.motion == number {
             (report.progress, report.elapsed, report.remaining) = (view.progress, view.elapsed, view.remaining);

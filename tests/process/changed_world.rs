@@ -169,7 +169,7 @@ fn an_obstacle_in_the_way_of_a_motion_under_way_is_not_driven_through() {
 fn with_replan_it_goes_around_and_arrives() {
     let cell = up();
     let plan = cell.plan(1.4, 0.5);
-    let begun = cell.run.call(ExecutePlan { plan: Some(plan), replan: true, presence: None }).unwrap();
+    let begun = cell.run.call(ExecutePlan { plan: Some(plan), replan: true, ..Default::default() }).unwrap();
     eventually("it moves", || cell.joints()[0] > 0.15);
     let ball = cell.ball("late", 0.9);
     cell.run.call(WorldAdd(ball.clone())).unwrap();
@@ -185,7 +185,7 @@ fn with_replan_it_goes_around_and_arrives() {
     assert!(there && cell.clearance(&[ball]) >= PADDING, "{:?}", cell.joints());
     // With no way around it stays where it rests, and says why.
     let back = cell.plan(0.0, 0.5);
-    let begun = cell.run.call(ExecutePlan { plan: Some(back), replan: true, presence: None }).unwrap();
+    let begun = cell.run.call(ExecutePlan { plan: Some(back), replan: true, ..Default::default() }).unwrap();
     eventually("it moves", || cell.joints()[0] < 1.3);
     let goal = cell.ball("goal", 0.0);
     cell.run.call(WorldAdd(goal)).unwrap();

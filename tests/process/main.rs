@@ -21,6 +21,7 @@ mod franka_run;
 mod grip_outcome;
 mod gripper_force;
 mod gripper_joint;
+mod jobs;
 mod jog;
 mod joint_status;
 mod leader_follower;

@@ -286,7 +286,7 @@ fn nothing_is_planned_again_for_a_client_that_has_gone() {
     let (home, _run) = up();
     home.dimos("plan arm 1.4 -0.3 0.6 0 0.8 0 --speed 0.2").with(0);
     let mut client = home.client();
-    let execute = ExecutePlan { plan: None, replan: true, presence: None };
+    let execute = ExecutePlan { plan: None, replan: true, ..Default::default() };
     let begun = client.call(execute).unwrap();
     eventually("it moves", || home.positions("arm")[0] > 0.1);
     drop(client);

@@ -304,7 +304,7 @@ fn a_stop_that_arrives_after_the_reconnect_is_reported() {
 fn a_refused_request_takes_no_lease() {
     let (home, _run) = up("--no-record");
     let (mut one, mut two) = (home.client(), home.client());
-    let mismatch = refusal(one.call(Execute { trajectory: elsewhere(2), task: None }));
+    let mismatch = refusal(one.call(Execute { trajectory: elsewhere(2), task: None, retraces_to: None }));
     assert_eq!(mismatch.code, Code::StartStateMismatch);
     assert!(two.call(Status {}).unwrap().arms[0].commander.is_none(), "the refused request kept the lease");
     let far = dimos::rpc::api::Move::new("arm", [99.0; 6], 1.0);
@@ -314,7 +314,7 @@ fn a_refused_request_takes_no_lease() {
     assert!(two.call(Status {}).unwrap().arms[0].commander.is_none(), "the refused request kept the lease");
     // A lease that was held before stays.
     one.call(dimos::rpc::api::Lease::default()).unwrap();
-    refusal(one.call(Execute { trajectory: elsewhere(2), task: None }));
+    refusal(one.call(Execute { trajectory: elsewhere(2), task: None, retraces_to: None }));
     assert!(two.call(Status {}).unwrap().arms[0].commander.is_some());
 }
 
@@ -331,7 +331,7 @@ fn absurd_durations_are_refused() {
     let mut trajectory = elsewhere(2);
     trajectory.points.iter_mut().for_each(|p| p.positions = vec![0.0; 6]);
     trajectory.points[1].time_from_start = 1e308;
-    let refused = refusal(home.client().call(Execute { trajectory, task: None }));
+    let refused = refusal(home.client().call(Execute { trajectory, task: None, retraces_to: None }));
     assert_eq!(refused.code, Code::InvalidParams);
     assert!(refused.message.contains("24 h"), "{refused:?}");
     home.write("long.csv", "time,arm_joint1\n0,0\n1e308,0\n");
@@ -372,7 +372,7 @@ fn refused_executes_are_not_logged_whole() {
     let (home, run) = up("");
     let mut client = home.client();
     for _ in 0..40 {
-        refusal(client.call(Execute { trajectory: elsewhere(1500), task: None }));
+        refusal(client.call(Execute { trajectory: elsewhere(1500), task: None, retraces_to: None }));
     }
     run.end(rustix::process::Signal::TERM);
     let log = home.logs().pop().unwrap();

@@ -119,7 +119,7 @@ impl Soaked {
             });
             let trajectory = Trajectory { joint_names: task.joints.clone(), points: points.collect() };
             let task = Some(task.name.clone());
-            client.call(Execute { trajectory, task }).map_err(|e| format!("{}: {e}", self.name))?;
+            client.call(Execute { trajectory, task, retraces_to: None }).map_err(|e| format!("{}: {e}", self.name))?;
         }
         assert_eq!(moved.len(), ranged.len(), "{}: every joint moves: {moved:?}", self.name);
         Ok(())

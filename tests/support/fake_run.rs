@@ -62,6 +62,7 @@ impl FakeBackend {
             error: (state == "ABORTED").then(|| "arm_joint1 was 0.2000 rad off the path".into()),
             replanning: false,
             next: None,
+            retraces_to: None,
             collision_checked: false,
             deviation: done.then(|| vec![joint("arm_joint1", 0.3, 0.3004), joint("arm_joint2", -0.2, -0.1)]),
         }

@@ -153,8 +153,9 @@ impl Driver<'_> {
             self.follow(&[begun.motion], "approach", &[])?;
         }
         let parts = self.plan.parts.iter();
-        let requests: Vec<Execute> =
-            parts.map(|p| Execute { trajectory: sent(&p.trajectory), task: Some(p.task.clone()) }).collect();
+        let requests: Vec<Execute> = parts
+            .map(|p| Execute { trajectory: sent(&p.trajectory), task: Some(p.task.clone()), retraces_to: None })
+            .collect();
         let mut motions = Vec::new();
         let mut refused = None;
         for begun in self.run.call_together(&requests) {

@@ -1,0 +1,269 @@
+//! `dimos back-out [ARM]`: an arm retraces the path that the run logged, back to where it was at rest before its last
+//! motion. With a planner the whole way is checked for collisions before anything moves.
+
+use std::path::Path;
+use std::time::Duration;
+
+use super::arguments::{self, Target};
+use super::banner;
+use super::exit::{Exit, Failure, Result};
+use super::follow::{Signals, follow};
+use super::goal::{has_planner, plan, show};
+use super::output::{self, Table, fixed, span};
+use crate::planning::path::length;
+use crate::planning::timing::time_within;
+use crate::planning::topp::JointBound;
+use crate::replay::motion::RecordedMotion;
+use crate::replay::recorded::Recorded;
+use crate::replay::retrace::{Back, Retrace, RetraceError, retrace};
+use crate::rpc::api::{Execute, ExecutePlan, Motion, Plan, PlanGoal, Planner, Point, State, Status, Trajectory};
+use crate::rpc::client::Client;
+use crate::rpc::report::{ArmReport, StatusReport};
+
+/// Deviation from the logged path at its corners [rad]: between two corners it is straight.
+const DEVIATION: f64 = 1e-3;
+/// Parts of the log that are searched, from its end [s]; at last, all of it.
+const WINDOWS: [f64; 3] = [60.0, 1200.0, 1e9];
+/// Longest delay of the log behind the run.
+const LOG_DELAY: Duration = Duration::from_millis(300);
+
+/// Arguments of `back-out`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "\
+Retraces the path that the run's log has, slowly, to where the arm was at rest before its last motion; again, to where \
+it was at rest before that one. With a planner, the whole way is checked for collisions first. A held arm stays held: \
+reset and enable it yourself.
+
+  dimos back-out arm --check                    show the way; nothing moves
+  dimos arm reset arm && dimos arm enable arm   after a stop
+  dimos back-out arm")]
+pub struct Args {
+    /// Name of the arm (hardware_id); may be omitted if the run has one
+    pub arm: Option<String>,
+    /// Go back by this much time of logged motion; rests do not count
+    #[arg(long, value_name = "TIME", value_parser = arguments::duration)]
+    pub time: Option<Duration>,
+    /// Go back by this many motions
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..), conflicts_with = "time")]
+    pub motions: u32,
+    /// Fraction of the velocity and acceleration limits to use
+    #[arg(long, default_value_t = 0.2, value_parser = arguments::speed)]
+    pub speed: f64,
+    /// Show the way and check it; move nothing
+    #[arg(long)]
+    pub check: bool,
+    /// Not collision-checked; required if the run has no planner
+    #[arg(long)]
+    pub direct: bool,
+    /// Which run
+    #[command(flatten)]
+    pub target_run: Target,
+}
+
+/// Runs the verb.
+pub fn run(args: &Args) -> Result {
+    let mut client = args.target_run.connect()?;
+    let signals = Signals::watch();
+    let status = client.call(Status {})?;
+    let arm = arm_of(&status, args.arm.as_deref())?;
+    let planned = !args.direct && has_planner(&mut client)?;
+    if !planned && !args.direct {
+        let failure =
+            Failure::new(Exit::Failed, "this run has no planner: the way back cannot be checked for collisions");
+        return Err(failure.hint("run a planner beside this run; or look at the way yourself, and add --direct"));
+    }
+    let log = status.log.as_ref().map(Path::new).ok_or_else(|| {
+        Failure::new(Exit::Failed, "this run writes no log: there is no path to retrace")
+            .hint("run it without --no-record")
+    })?;
+    let name = &arm.hardware_id;
+    let (joints, way, ago) = way_back(&mut client, &status, name, log, args)?;
+    let json = args.target_run.json;
+    if !json {
+        describe(name, &joints, &way, ago);
+    }
+    let held = (arm.phase != "ready").then(|| not_ready(arm));
+    let to = Some(way.time as f64 * 1e-9);
+    let (motion, task) = if planned {
+        let request = request(&mut client, name, &joints, &way, args.speed)?;
+        let found = plan(&mut client, request, &signals)?;
+        if !json {
+            show(&found);
+        }
+        if let Some(end) = end_here(args, &way, held, Some(found.summary.duration)) {
+            return end;
+        }
+        signals.check()?;
+        let begun = client.call(ExecutePlan { plan: Some(found.plan), retraces_to: to, ..ExecutePlan::default() })?;
+        output::note(format_args!("motion {} on {}: planned, collision-checked", begun.motion, begun.task));
+        (begun.motion, begun.task)
+    } else {
+        let trajectory = timed(&mut client, log, name, &way, args.speed)?;
+        let duration = trajectory.points.last().map(|point| point.time_from_start);
+        if let Some(end) = end_here(args, &way, held, duration) {
+            return end;
+        }
+        signals.check()?;
+        let begun = client.call(Execute { trajectory, task: None, retraces_to: to })?;
+        let (motion, task, duration) = (begun.motion, &begun.task, begun.duration);
+        output::note(format_args!("motion {motion} on {task}: {duration:.2} s, direct, not collision-checked"));
+        (begun.motion, begun.task)
+    };
+    follow(&mut client, motion, &task, &signals, json)
+}
+
+/// Returns the result if nothing is to move: the arm is held, or `--check`.
+fn end_here(args: &Args, way: &Retrace, held: Option<Failure>, duration: Option<f64>) -> Option<Result> {
+    match held {
+        Some(failure) if !args.check => return Some(Err(failure)),
+        None if !args.check => return None,
+        _ => {}
+    }
+    if args.target_run.json {
+        let goal = way.path.last();
+        let (length, time) = (length(&way.path), way.time as f64 * 1e-9);
+        output::json(&serde_json::json!({"duration": duration, "length": length, "goal": goal, "time": time,
+            "ready": held.is_none()}));
+    } else {
+        output::note("nothing has moved");
+    }
+    Some(Ok(Exit::Ok))
+}
+
+fn arm_of<'s>(status: &'s StatusReport, name: Option<&str>) -> Result<&'s ArmReport> {
+    let names = status.arms.iter().map(|arm| arm.hardware_id.as_str());
+    match (name, status.arms.as_slice()) {
+        (None, [only]) => Ok(only),
+        (None, _) => {
+            let names: Vec<&str> = names.collect();
+            Err(Failure::usage(format!("the run has several arms: {}", names.join(", ")))
+                .hint("name one: dimos back-out ARM"))
+        }
+        (Some(name), arms) => arms.iter().find(|arm| arm.hardware_id == name).ok_or_else(|| {
+            Failure::usage(format!("no arm is named {name}")).maybe_hint(crate::yaml::did_you_mean(name, names, "arms"))
+        }),
+    }
+}
+
+fn not_ready(arm: &ArmReport) -> Failure {
+    let (name, cause) = (&arm.hardware_id, banner::cause(arm));
+    let cause = cause.map_or_else(String::new, |cause| format!(": {cause}"));
+    let reset = if arm.phase == "held" { format!("dimos arm reset {name}, then ") } else { String::new() };
+    Failure::new(Exit::Failed, format!("{name} is {}{cause}; nothing has moved", arm.phase))
+        .hint(format!("when it may move again: {reset}dimos arm enable {name}, then dimos back-out {name}"))
+}
+
+/// Returns the state of an arm: time [s since 1970], names and measured positions of its joints [rad].
+fn present(client: &mut Client, arm: &str) -> Result<(f64, Vec<String>, Vec<f64>)> {
+    let state = client.call(State {})?;
+    let joints = state.arms.iter().find(|a| a.hardware_id == arm).map_or(&[][..], |arm| &arm.joints);
+    let now = joints.iter().map(|j| j.position).collect::<Option<Vec<f64>>>().filter(|now| !now.is_empty());
+    let now = now.ok_or_else(|| Failure::new(Exit::Failed, format!("{arm} reports no position")))?;
+    Ok((state.stamp, joints.iter().map(|j| j.name.clone()).collect(), now))
+}
+
+/// Returns the joints of the arm, its way back, and the age of the goal [s].
+fn way_back(
+    client: &mut Client,
+    status: &StatusReport,
+    arm: &str,
+    log: &Path,
+    args: &Args,
+) -> Result<(Vec<String>, Retrace, f64)> {
+    let back = args.time.map_or(Back::Motions(args.motions), |time| Back::Time(time.as_secs_f64()));
+    let mut delays = [LOG_DELAY].into_iter();
+    loop {
+        let (stamp, joints, now) = present(client, arm)?;
+        let from = retraced_to(client, status, &joints);
+        let mut result = Err(RetraceError::TooShort);
+        for window in WINDOWS {
+            let since = ((from.unwrap_or(stamp).min(stamp) - window).max(0.0) * 1e9) as u64;
+            let motion = RecordedMotion::measured(log, &joints, since, u64::MAX);
+            let motion = motion.map_err(|e| Failure::of(Exit::Failed, e))?;
+            result = retrace(&motion, &now, from.map(|from| (from * 1e9) as u64), back);
+            if result != Err(RetraceError::TooShort) {
+                break;
+            }
+        }
+        match result {
+            Ok(way) => {
+                let ago = (stamp - way.time as f64 * 1e-9).max(0.0);
+                return Ok((joints, way, ago));
+            }
+            // What the arm did last is not in the log yet.
+            Err(RetraceError::Elsewhere { .. }) if delays.next().map(std::thread::sleep).is_some() => {}
+            Err(error @ RetraceError::Elsewhere { .. }) => {
+                return Err(Failure::new(Exit::Failed, error.to_string()).hint("move it with `dimos move`, or by hand"));
+            }
+            Err(RetraceError::TooShort) => {
+                let what = format!("the log has no earlier motion of {arm} that could be retraced so far");
+                let hint = "ask for less with --motions or --time; `dimos replay --last` plays the log";
+                return Err(Failure::new(Exit::Failed, what).hint(hint));
+            }
+        }
+    }
+}
+
+/// Returns the time in the log to which the newest motion of these joints retraced it [s since 1970], if it did.
+fn retraced_to(client: &mut Client, status: &StatusReport, joints: &[String]) -> Option<f64> {
+    let moves = status.tasks.iter().filter(|task| task.joints.iter().any(|joint| joints.contains(joint)));
+    let newest = moves.filter_map(|task| task.motion).max()?;
+    client.call(Motion { motion: newest }).ok()?.retraces_to
+}
+
+fn describe(arm: &str, joints: &[String], way: &Retrace, ago: f64) {
+    let rest = if way.at_rest { "where it was at rest" } else { "where it was" };
+    let (far, ago, took) = (fixed(length(&way.path), 3), span(ago), span(way.duration));
+    output::line(format_args!("{arm}: back by {far} rad along its logged path, {rest} {ago} ago ({took} of motion)"));
+    let (Some(first), Some(last)) = (way.path.first(), way.path.last()) else { return };
+    let mut table = Table::new(&["JOINT", ">NOW rad", ">GOAL rad", ">BY rad"]);
+    for (j, joint) in joints.iter().enumerate() {
+        table.row([joint.clone(), fixed(first[j], 4), fixed(last[j], 4), format!("{:+.4}", last[j] - first[j])]);
+    }
+    table.print();
+}
+
+/// Returns the planning request: the way, in the order of the planning robot's joints.
+fn request(client: &mut Client, arm: &str, joints: &[String], way: &Retrace, speed: f64) -> Result<Plan> {
+    let robots = client.call(Planner {})?.robots;
+    let order = |robot: &crate::rpc::api::RobotReport| -> Option<Vec<usize>> {
+        robot.joints.iter().map(|joint| joints.iter().position(|j| j == joint)).collect()
+    };
+    let fitting = robots.iter().filter_map(|robot| Some((robot, order(robot)?)));
+    let (robot, order) = { fitting }.max_by_key(|(robot, _)| robot.name == arm).ok_or_else(|| {
+        Failure::new(Exit::Failed, format!("the planner has no robot with the joints of {arm}"))
+            .hint("look at the way yourself, and add --direct")
+    })?;
+    let row = |q: &Vec<f64>| order.iter().map(|j| q[*j]).collect();
+    let goal = PlanGoal {
+        robot: robot.name.clone(),
+        retrace: Some(way.path.iter().map(row).collect()),
+        ..PlanGoal::default()
+    };
+    Ok(Plan { goals: vec![goal], speed, seed: 0, timeout: None, through: Vec::new(), blend: 0.0, by_number: true })
+}
+
+/// Returns the way as a trajectory within `speed` of the arm's limits, from where the arm is.
+fn timed(client: &mut Client, log: &Path, arm: &str, way: &Retrace, speed: f64) -> Result<Trajectory> {
+    let fail = |e: String| Failure::new(Exit::Failed, format!("no trajectory: {e}"));
+    let recorded = Recorded::open(log).map_err(|e| Failure::of(Exit::Failed, e))?;
+    let config = recorded.config.arms.iter().find(|config| config.name == arm);
+    let l = &config.ok_or_else(|| fail(format!("the log has no limits of {arm}")))?.limits;
+    let bound = |j: usize| JointBound {
+        velocity: l.velocity_max[j] * speed,
+        acceleration: l.acceleration_max[j] * speed,
+        jerk: l.jerk_max[j] * speed,
+    };
+    let (_, joints, now) = present(client, arm)?;
+    let mut path = vec![now];
+    path.extend(way.path.iter().cloned());
+    let bounds: Vec<JointBound> = (0..joints.len()).map(bound).collect();
+    let timed = time_within(&joints, &path, &bounds, &vec![DEVIATION; path.len()], 1.0, |_, _| true);
+    let points = timed.map_err(|e| fail(e.to_string()))?.trajectory.points.into_iter().map(|p| Point {
+        time_from_start: p.time_from_start,
+        positions: p.positions,
+        velocities: Some(p.velocities),
+        accelerations: Some(p.accelerations).filter(|a| !a.is_empty()),
+    });
+    Ok(Trajectory { joint_names: joints, points: points.collect() })
+}

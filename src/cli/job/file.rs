@@ -1,0 +1,535 @@
+//! A job as written: read from its file with every mistake at its place.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::time::Duration;
+
+use super::step::{Act, Job, Motion, Step};
+use crate::arm::channel;
+use crate::cli::arguments::{duration, finite, override_of_speed, time};
+use crate::cli::exit::{Failure, Result};
+use crate::cli::grip::opening;
+use crate::cli::output;
+use crate::rpc::api::{Attach, DEFAULT_SPEED, PlanGoal, PoseSpec};
+use crate::yaml::{self, Diag, Kind, Label, NodeId, Tree, did_you_mean, quote};
+
+/// Steps that `repeat` may be nested in.
+const MAX_NESTING: usize = 8;
+/// Largest number of repetitions.
+const MAX_TIMES: f64 = 1e9;
+/// Default time for a gripper to settle.
+const GRIPPER_TIME: Duration = Duration::from_secs(5);
+const STEPS: [&str; 10] =
+    ["move", "through", "gripper", "wait", "output", "repeat", "attach", "detach", "reset", "enable"];
+
+impl Job {
+    /// Reads a job. Prints all mistakes.
+    pub fn read(path: &Path) -> Result<Self> {
+        let file = path.display().to_string();
+        let bytes = std::fs::read(path).map_err(|e| Failure::usage(format!("{file}: {e}")))?;
+        let job = Self::parse(file, &bytes);
+        job.verdict().map(|()| job)
+    }
+
+    /// Reads a job; its mistakes are in its tree.
+    fn parse(file: String, bytes: &[u8]) -> Self {
+        let mut reader = Reader { tree: Tree::new(), direct: false, replan: false, speed: DEFAULT_SPEED, count: 0 };
+        let source = reader.tree.add_bytes(file.clone(), bytes);
+        let root = source.and_then(|source| reader.tree.parse(source));
+        if let (Some(source), None, false) = (source, root, reader.tree.has_errors()) {
+            reader
+                .tree
+                .report(Diag::error("the file is empty").at(Label::start_of(source)).hint("steps: [{move: home}, …]"));
+        }
+        let read = root.and_then(|root| reader.job(root, file.clone()));
+        Self { tree: reader.tree, ..read.unwrap_or_else(|| Self::empty(file)) }
+    }
+
+    fn empty(file: String) -> Self {
+        let (steps, on_fault) = (Vec::new(), Vec::new());
+        Self { tree: Tree::new(), file, arm: String::new(), steps, repeat: Some(1), on_fault, count: 0 }
+    }
+
+    /// Adds a mistake.
+    pub fn report(&mut self, at: NodeId, what: String, hint: Option<String>) {
+        let label = self.tree.label(at);
+        self.tree.report(Diag::error(what).at(label).maybe_hint(hint));
+    }
+
+    /// Returns an error if there are mistakes, after printing them.
+    pub fn verdict(&self) -> Result<()> {
+        let mut diags = self.tree.diags().to_vec();
+        if !self.tree.has_errors() {
+            return Ok(());
+        }
+        diags.sort_by_key(|d| d.at.as_ref().map(|at| at.range.start));
+        let colour = output::colour(&std::io::stderr());
+        for diag in &diags {
+            output::note(format_args!("{}\n", yaml::render(&self.tree, diag, colour)));
+        }
+        let reports: Vec<_> = diags.iter().map(|diag| diag.located(&self.tree)).collect();
+        let data = serde_json::json!({"errors": reports.len(), "diagnostics": reports});
+        Err(Failure::usage(format!("{}: the job has mistakes; nothing has moved", self.file)).data(data))
+    }
+}
+
+/// Reads the nodes of a job.
+struct Reader {
+    tree: Tree,
+    direct: bool,
+    replan: bool,
+    speed: f64,
+    count: usize,
+}
+
+impl Reader {
+    fn wrong<T>(&mut self, at: NodeId, what: impl Into<String>, hint: Option<&str>) -> Option<T> {
+        let label = self.tree.label(at);
+        self.tree.report(Diag::error(what).at(label).maybe_hint(hint.map(str::to_owned)));
+        None
+    }
+
+    fn text(&self, node: NodeId) -> Option<String> {
+        self.tree.text(node).map(str::to_owned)
+    }
+
+    /// Reports unknown keys of a group; `None` if it is no group.
+    fn group(&mut self, node: NodeId, known: &[&str]) -> Option<()> {
+        if !matches!(self.tree.node(node).map(|n| &n.kind), Some(Kind::Map(_))) {
+            let hint = format!("its keys: {}", known.join(", "));
+            return self.wrong(node, "expected a group of keys", Some(&hint));
+        }
+        for (key, _) in self.tree.entries(node).to_vec() {
+            let word = self.text(key).unwrap_or_default();
+            if !known.contains(&word.as_str()) {
+                let hint = did_you_mean(&word, known.iter().copied(), "keys here");
+                self.wrong::<()>(key, format!("unknown key {}", quote(&word)), hint.as_deref());
+            }
+        }
+        Some(())
+    }
+
+    /// Reads a scalar with a parser of the command line.
+    fn parsed<T>(&mut self, node: NodeId, parse: fn(&str) -> std::result::Result<T, String>) -> Option<T> {
+        let text = self.text(node).unwrap_or_default();
+        match parse(&text) {
+            Ok(value) => Some(value),
+            Err(what) => self.wrong(node, format!("{}: {what}", quote(&text)), None),
+        }
+    }
+
+    /// The same for the value of a key, if the key is there.
+    fn at<T>(&mut self, map: NodeId, key: &str, parse: fn(&str) -> std::result::Result<T, String>) -> Option<T> {
+        self.tree.get(map, key).and_then(|node| self.parsed(node, parse))
+    }
+
+    fn numbers(&mut self, node: NodeId) -> Option<Vec<f64>> {
+        let items = self.tree.items(node).to_vec();
+        if items.is_empty() {
+            return self.wrong(node, "expected a list of numbers", Some("write [0.1, -0.2, …]"));
+        }
+        items.into_iter().map(|item| self.parsed(item, finite)).collect()
+    }
+
+    fn array<const N: usize>(&mut self, map: NodeId, key: &str) -> Option<[f64; N]> {
+        let node = self.tree.get(map, key)?;
+        let values = self.numbers(node)?;
+        let count = values.len();
+        let array = values.try_into().ok();
+        array.or_else(|| self.wrong(node, format!("expected {N} numbers, found {count}"), None))
+    }
+
+    fn job(&mut self, root: NodeId, file: String) -> Option<Job> {
+        self.group(root, &["arm", "speed", "direct", "replan", "repeat", "on_fault", "steps"])?;
+        let mut job = Job::empty(file);
+        job.arm = self.at(root, "arm", word).unwrap_or_default();
+        self.speed = self.at(root, "speed", override_of_speed).unwrap_or(self.speed);
+        self.direct = self.at(root, "direct", flag).unwrap_or(false);
+        self.replan = self.at(root, "replan", flag).unwrap_or(false);
+        if let Some(node) = self.tree.get(root, "repeat") {
+            let forever = self.tree.text(node) == Some("forever");
+            job.repeat = if forever { None } else { Some(self.parsed(node, times).unwrap_or(1)) };
+        }
+        match self.tree.get(root, "steps") {
+            Some(steps) => job.steps = self.steps(steps, 0),
+            None => drop(self.wrong::<()>(root, "the key `steps` is missing", Some("steps: [{move: home}, …]"))),
+        }
+        if let Some(node) = self.tree.get(root, "on_fault")
+            && self.tree.text(node) != Some("stop")
+        {
+            job.on_fault = self.steps(node, 0);
+        }
+        job.count = self.count;
+        Some(job)
+    }
+
+    fn steps(&mut self, node: NodeId, nesting: usize) -> Vec<Step> {
+        let items = self.tree.items(node).to_vec();
+        if items.is_empty() {
+            self.wrong::<()>(node, "expected a list of steps", Some("start each step with `- `"));
+        }
+        if nesting > MAX_NESTING {
+            self.wrong::<()>(node, format!("steps are nested deeper than {MAX_NESTING} times"), None);
+            return Vec::new();
+        }
+        items.into_iter().filter_map(|item| self.step(item, nesting)).collect()
+    }
+
+    fn step(&mut self, at: NodeId, nesting: usize) -> Option<Step> {
+        let known = did_you_mean("", STEPS, "steps");
+        let (key, value) = match (self.tree.entries(at), self.text(at)) {
+            ([(key, value)], _) => (*key, Some(*value)),
+            (_, Some(_)) => (at, None),
+            _ => return self.wrong(at, "a step has one key, such as `- move: home`", known.as_deref()),
+        };
+        let name = self.text(key).unwrap_or_default();
+        let label = Diag::error("").at(self.tree.label(at)).located(&self.tree);
+        let id = self.count;
+        self.count += 1;
+        let mut arm = String::new();
+        let act = match (name.as_str(), value) {
+            ("reset", None) => Act::Reset,
+            ("enable", None) => Act::Enable,
+            ("reset" | "enable", Some(value)) => {
+                arm = self.parsed(value, word)?;
+                if name == "reset" { Act::Reset } else { Act::Enable }
+            }
+            ("move", Some(value)) => Act::Move(Box::new(self.motion(value, &mut arm)?)),
+            ("through", Some(value)) => Act::Move(Box::new(self.through(value, &mut arm)?)),
+            ("gripper", Some(value)) => self.gripper(value, &mut arm)?,
+            ("wait", Some(value)) => self.wait(value, &mut arm)?,
+            ("output", Some(value)) => self.output(value, &mut arm)?,
+            ("repeat", Some(value)) => {
+                self.group(value, &["times", "steps"])?;
+                match (self.tree.get(value, "times"), self.tree.get(value, "steps")) {
+                    (Some(count), Some(steps)) => {
+                        let times = self.parsed(count, times).unwrap_or(1);
+                        Act::Repeat { times, steps: self.steps(steps, nesting + 1) }
+                    }
+                    _ => return self.wrong(value, "needs `times` and `steps`", None),
+                }
+            }
+            ("attach", Some(value)) => self.attach(value, &mut arm)?,
+            ("detach", Some(value)) => Act::Detach(self.parsed(value, word)?),
+            (known, None) if STEPS.contains(&known) => {
+                return self.wrong(at, format!("`{known}` needs a value"), None);
+            }
+            _ => {
+                let hint = did_you_mean(&name, STEPS, "steps");
+                return self.wrong(key, format!("unknown step {}", quote(&name)), hint.as_deref());
+            }
+        };
+        Some(Step { at, id, line: label.line.unwrap_or(0), text: self.beginning(at), arm, act })
+    }
+
+    /// Returns the first lines of a step as one.
+    fn beginning(&self, at: NodeId) -> String {
+        let Some(node) = self.tree.node(at) else { return String::new() };
+        let text = self.tree.source(node.source).and_then(|source| source.text.get(node.range.clone()));
+        let words: Vec<&str> = text.unwrap_or_default().split_whitespace().collect();
+        let line = words.join(" ");
+        let line = line.strip_prefix('{').and_then(|line| line.strip_suffix('}')).unwrap_or(&line);
+        match line.char_indices().nth(40) {
+            Some((end, _)) => format!("{}…", line.get(..end).unwrap_or_default()),
+            None => line.to_owned(),
+        }
+    }
+
+    fn arm(&mut self, map: NodeId, arm: &mut String) {
+        *arm = self.at(map, "arm", word).unwrap_or_default();
+    }
+
+    fn motion(&mut self, node: NodeId, arm: &mut String) -> Option<Motion> {
+        let mut motion = Motion {
+            through: Vec::new(),
+            goal: PlanGoal::default(),
+            blend: 0.0,
+            speed: self.speed,
+            direct: self.direct,
+            replan: self.replan,
+        };
+        if self.tree.text(node).is_some() {
+            motion.goal.named = Some(self.parsed(node, word)?);
+            return Some(motion);
+        }
+        let known = ["named", "joints", "pose", "by", "frame", "linear", "speed", "direct", "replan", "arm"];
+        self.group(node, &known)?;
+        self.arm(node, arm);
+        motion.speed = self.at(node, "speed", override_of_speed).unwrap_or(motion.speed);
+        motion.direct = self.at(node, "direct", flag).unwrap_or(motion.direct);
+        motion.replan = self.at(node, "replan", flag).unwrap_or(motion.replan);
+        motion.goal = self.goal(node)?;
+        if motion.direct && motion.goal.joints.is_none() && motion.goal.named.is_none() {
+            return self.wrong(node, "a direct motion needs `joints` or a named pose", Some("leave out `direct`"));
+        }
+        Some(motion)
+    }
+
+    /// Reads a goal: the keys of a group whose other keys have been checked.
+    fn goal(&mut self, node: NodeId) -> Option<PlanGoal> {
+        let kinds = ["named", "joints", "pose", "by"].iter().filter(|key| self.tree.get(node, key).is_some()).count();
+        if kinds != 1 {
+            return self.wrong(node, "needs one of named, joints, pose, by", None);
+        }
+        let is_pose = self.tree.get(node, "pose").or(self.tree.get(node, "by")).is_some();
+        for key in ["frame", "linear"] {
+            if let Some((at, _)) = self.tree.entry(node, key).filter(|_| !is_pose) {
+                return self.wrong(at, format!("`{key}` needs a pose"), None);
+            }
+        }
+        Some(PlanGoal {
+            named: self.at(node, "named", word),
+            joints: self.tree.get(node, "joints").and_then(|joints| self.numbers(joints)),
+            pose: self.tree.get(node, "pose").and_then(|pose| self.pose(pose)),
+            by: self.tree.get(node, "by").and_then(|by| self.pose(by)),
+            frame: self.at(node, "frame", word),
+            linear: self.at(node, "linear", flag).unwrap_or(false),
+            ..PlanGoal::default()
+        })
+    }
+
+    fn pose(&mut self, node: NodeId) -> Option<PoseSpec> {
+        self.group(node, &["xyz", "rpy", "quat"])?;
+        if self.tree.get(node, "xyz").is_none() {
+            return self.wrong(node, "the key `xyz` is missing", Some("{xyz: [x, y, z], rpy: [r, p, y]}; m, rad"));
+        }
+        if self.tree.get(node, "rpy").is_some() && self.tree.get(node, "quat").is_some() {
+            return self.wrong(node, "has both rpy and quat", None);
+        }
+        let (rpy, quat) = (self.array(node, "rpy"), self.array(node, "quat"));
+        Some(PoseSpec { xyz: self.array(node, "xyz")?, rpy, quat })
+    }
+
+    fn through(&mut self, node: NodeId, arm: &mut String) -> Option<Motion> {
+        let mut motion = Motion {
+            through: Vec::new(),
+            goal: PlanGoal::default(),
+            blend: 0.0,
+            speed: self.speed,
+            direct: false,
+            replan: self.replan,
+        };
+        let mut list = node;
+        if self.tree.items(node).is_empty() {
+            self.group(node, &["waypoints", "blend", "speed", "replan", "arm"])?;
+            self.arm(node, arm);
+            motion.speed = self.at(node, "speed", override_of_speed).unwrap_or(motion.speed);
+            motion.replan = self.at(node, "replan", flag).unwrap_or(motion.replan);
+            motion.blend = self.at(node, "blend", finite).unwrap_or(0.0);
+            if !(0.0..=1.0).contains(&motion.blend) {
+                let blend = self.tree.get(node, "blend").unwrap_or(node);
+                return self.wrong(blend, "must be within 0–1 m", None);
+            }
+            list = self.tree.get(node, "waypoints").unwrap_or(node);
+        }
+        let mut goals = Vec::new();
+        for item in self.tree.items(list).to_vec() {
+            goals.push(if self.tree.text(item).is_some() {
+                PlanGoal { named: self.parsed(item, word), ..PlanGoal::default() }
+            } else {
+                self.group(item, &["named", "joints", "pose", "frame", "linear"])?;
+                self.goal(item)?
+            });
+        }
+        if goals.len() < 2 {
+            return self.wrong(list, "needs two or more waypoints", Some("through: [above, place]"));
+        }
+        motion.goal = goals.pop()?;
+        motion.through = goals;
+        Some(motion)
+    }
+
+    fn gripper(&mut self, node: NodeId, arm: &mut String) -> Option<Act> {
+        let (mut force, mut object, mut timeout, mut to) = (None, None, GRIPPER_TIME, Some(node));
+        if self.tree.text(node).is_none() {
+            self.group(node, &["to", "force", "object", "timeout", "arm"])?;
+            self.arm(node, arm);
+            force = self.at(node, "force", finite);
+            object = self.at(node, "object", flag);
+            timeout = self.at(node, "timeout", duration).unwrap_or(timeout);
+            to = self.tree.get(node, "to");
+        }
+        let Some(to) = to else {
+            return self.wrong(node, "the key `to` is missing", Some("to: open, close, or m or rad"));
+        };
+        Some(Act::Gripper { to: self.parsed(to, opening)?, force, object, timeout })
+    }
+
+    fn wait(&mut self, node: NodeId, arm: &mut String) -> Option<Act> {
+        if self.tree.text(node).is_some() {
+            return self.parsed(node, time).map(Act::Wait);
+        }
+        self.group(node, &["input", "is", "timeout", "arm"])?;
+        self.arm(node, arm);
+        let input = self.tree.get(node, "input");
+        let Some(input) = input else { return self.wrong(node, "the key `input` is missing", Some("input: di0")) };
+        let (input, high) = (self.parsed(input, digital_input)?, self.at(node, "is", level).unwrap_or(true));
+        Some(Act::Input { input, high, timeout: self.at(node, "timeout", duration) })
+    }
+
+    fn output(&mut self, node: NodeId, arm: &mut String) -> Option<Act> {
+        let mut outputs = BTreeMap::new();
+        for (key, value) in self.tree.entries(node).to_vec() {
+            let name = self.text(key).unwrap_or_default();
+            match (channel(&name, "do"), channel(&name, "ao")) {
+                _ if name == "arm" => self.arm(node, arm),
+                (Some(_), _) => drop(outputs.insert(name, f64::from(u8::from(self.parsed(value, level)?)))),
+                (_, Some(_)) => drop(outputs.insert(name, self.parsed(value, finite)?)),
+                _ => {
+                    return self.wrong(
+                        key,
+                        format!("{} is not an output", quote(&name)),
+                        Some("do0, do1, … and ao0, ao1, …"),
+                    );
+                }
+            }
+        }
+        if outputs.is_empty() {
+            return self.wrong(node, "needs an output", Some("output: {do0: 1}"));
+        }
+        Some(Act::Output(outputs))
+    }
+
+    fn attach(&mut self, node: NodeId, arm: &mut String) -> Option<Act> {
+        let mut attach =
+            Attach { name: String::new(), robot: String::new(), link: None, touch_links: Vec::new(), mass: None };
+        if self.tree.text(node).is_some() {
+            attach.name = self.parsed(node, word)?;
+            return Some(Act::Attach(attach));
+        }
+        self.group(node, &["object", "link", "touch", "mass", "arm"])?;
+        self.arm(node, arm);
+        let Some(object) = self.tree.get(node, "object") else {
+            return self.wrong(node, "the key `object` is missing", Some("its name: `dimos world list`"));
+        };
+        attach.name = self.parsed(object, word)?;
+        attach.link = self.at(node, "link", word);
+        attach.mass = self.at(node, "mass", finite);
+        if let Some(touch) = self.tree.get(node, "touch") {
+            let links = self.tree.items(touch).to_vec();
+            attach.touch_links = links.into_iter().filter_map(|link| self.parsed(link, word)).collect();
+        }
+        Some(Act::Attach(attach))
+    }
+}
+
+fn word(text: &str) -> std::result::Result<String, String> {
+    if matches!(text, "" | "~" | "null") { Err("must be a name".into()) } else { Ok(text.to_owned()) }
+}
+
+fn flag(text: &str) -> std::result::Result<bool, String> {
+    text.parse().map_err(|_| "must be true or false".into())
+}
+
+fn level(text: &str) -> std::result::Result<bool, String> {
+    match text {
+        "high" | "1" | "true" => Ok(true),
+        "low" | "0" | "false" => Ok(false),
+        _ => Err("must be high or low, 1 or 0".into()),
+    }
+}
+
+fn times(text: &str) -> std::result::Result<u64, String> {
+    match text.parse::<u64>() {
+        Ok(times) if times >= 1 && times as f64 <= MAX_TIMES => Ok(times),
+        _ => Err("must be a number of times, 1 or more".into()),
+    }
+}
+
+fn digital_input(text: &str) -> std::result::Result<String, String> {
+    match channel(text, "di") {
+        Some(_) => Ok(text.to_owned()),
+        None => Err("must be a digital input: di0, di1, …".into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn mistakes(text: &str) -> Vec<String> {
+        let job = Job::parse("job.yaml".into(), text.as_bytes());
+        let reports = job.tree.diags().iter().map(|diag| diag.located(&job.tree));
+        let mut lines: Vec<_> = reports
+            .map(|r| {
+                format!("{}:{}: {} | {}", r.line.unwrap(), r.column.unwrap(), r.message, r.hint.unwrap_or_default())
+            })
+            .collect();
+        let at = |line: &String| line.splitn(3, ':').take(2).map(|n| n.parse::<u32>().unwrap()).collect::<Vec<_>>();
+        lines.sort_by_key(at);
+        lines
+    }
+
+    #[test]
+    fn every_mistake_is_reported_at_its_place() {
+        let text = "\
+repeet: 10
+steps:
+  - move: {joints: [1, x], speeed: 30%}
+  - gripper: closed
+  - wait: {input: do0}
+  - wait: soon
+  - mov: home
+  - through: [home]
+  - output: {do0: 2}
+  - repeat: {times: 0, steps: [{move: }]}
+  - move: {pose: {xyz: [1, 2]}, named: home}
+  - move: {by: {xyz: [0, 0, 0]}, direct: true}
+  - move: {joints: [0], linear: true}
+  - [1]
+  - move
+";
+        let found = mistakes(text);
+        let expected = [
+            "1:1: unknown key `repeet` | did you mean `repeat`?",
+            "3:24: `x`: not a number",
+            "3:28: unknown key `speeed` | did you mean `speed`?",
+            "4:14: `closed`: not a number; give m or rad, `open` or `close`",
+            "5:19: `do0`: must be a digital input",
+            "6:11: `soon`: not a duration",
+            "7:5: unknown step `mov` | did you mean `move`?",
+            "8:14: needs two or more waypoints",
+            "9:19: `2`: must be high or low",
+            "10:21: `0`: must be a number of times",
+            "10:",
+            "11:11: needs one of named, joints, pose, by",
+            "12:11: a direct motion needs `joints`",
+            "13:25: `linear` needs a pose",
+            "14:5: a step has one key",
+            "15:5: `move` needs a value",
+        ];
+        for (found, expected) in found.iter().zip(expected) {
+            assert!(found.starts_with(expected), "{found}\nexpected {expected}");
+        }
+        assert_eq!(found.len(), expected.len(), "{found:#?}");
+    }
+
+    #[test]
+    fn a_job_has_its_steps_with_their_lines() {
+        let job = Job::parse(
+            "pick.yaml".into(),
+            b"speed: 30%\nrepeat: forever\non_fault: stop\nsteps:\n  - move: home\n  - repeat:\n      times: 2\n      steps:\n        - output: {do0: high, ao1: 2.5}\n  - reset\n",
+        );
+        assert!(!job.tree.has_errors());
+        assert_eq!((job.repeat, job.on_fault.len(), job.count), (None, 0, 4));
+        let Act::Move(motion) = &job.steps[0].act else { panic!("a motion") };
+        assert_eq!((motion.speed, motion.goal.named.as_deref()), (0.3, Some("home")));
+        let Act::Repeat { times: 2, steps } = &job.steps[1].act else { panic!("a loop") };
+        let Act::Output(outputs) = &steps[0].act else { panic!("outputs") };
+        assert_eq!(outputs, &BTreeMap::from([("do0".to_owned(), 1.0), ("ao1".to_owned(), 2.5)]));
+        assert_eq!((steps[0].line, steps[0].text.as_str()), (9, "output: {do0: high, ao1: 2.5}"));
+        assert_eq!((job.steps[2].line, job.steps[2].id), (10, 3));
+    }
+
+    #[test]
+    fn a_file_of_any_bytes_is_refused_and_never_a_panic() {
+        for text in
+            ["", "[]", "steps", "steps: 3", "steps: []", "a: b: c", "steps: [[[[]]]]", "steps: [{move: {}}]", "\u{0}"]
+        {
+            assert!(!mistakes(text).is_empty(), "{text:?}");
+        }
+        let deep =
+            "steps: [".to_owned() + &"{repeat: {times: 1, steps: [".repeat(20) + "reset" + &"]}}".repeat(20) + "]";
+        assert!(!mistakes(&deep).is_empty());
+    }
+}

@@ -1,0 +1,175 @@
+//! Checks the names in a job against a run before anything moves: arms, poses, inputs, outputs, objects.
+
+use std::collections::BTreeMap;
+
+use super::step::{Act, Job, Motion, Step};
+use super::times::all;
+use crate::cli::exit::Result;
+use crate::cli::goal::has_planner;
+use crate::cli::grip::Opening;
+use crate::rpc::api::{Attach, PlanGoal, Planner, Poses, RobotReport, State, Status, World};
+use crate::rpc::client::Client;
+use crate::rpc::report::{ArmReport, ArmStateReport};
+use crate::yaml::{NodeId, did_you_mean, quote};
+
+/// What a run has.
+pub struct Names {
+    /// Its arms.
+    pub arms: Vec<ArmReport>,
+    /// Whether it has a planner.
+    pub planner: bool,
+    /// Joints of each arm, in order.
+    joints: BTreeMap<String, Vec<String>>,
+    robots: Vec<RobotReport>,
+    poses: BTreeMap<String, crate::rpc::api::SavedPose>,
+    objects: Vec<String>,
+}
+
+/// A mistake: where, what, hint.
+type Mistake = (NodeId, String, Option<String>);
+
+impl Names {
+    /// Asks a run.
+    pub fn of(client: &mut Client) -> Result<Self> {
+        let planner = has_planner(client)?;
+        let arms = client.call(Status {})?.arms;
+        let poses = client.call(Poses {})?.poses;
+        let robots = if planner { client.call(Planner {})?.robots } else { Vec::new() };
+        let objects = if planner { client.call(World {})?.objects } else { Vec::new() };
+        let objects = objects.into_iter().map(|object| object.name).collect();
+        let own = |arm: ArmStateReport| (arm.hardware_id, arm.joints.into_iter().map(|joint| joint.name).collect());
+        let joints = client.call(State {})?.arms.into_iter().map(own).collect();
+        Ok(Self { joints, arms, planner, robots, poses, objects })
+    }
+
+    /// Returns an arm.
+    pub fn arm(&self, name: &str) -> Option<&ArmReport> {
+        self.arms.iter().find(|arm| arm.hardware_id == name)
+    }
+
+    /// Gives every step of a job its arm, and reports the names that the run does not know.
+    pub fn check(&self, job: &mut Job) -> Result<()> {
+        if let ("", [only]) = (job.arm.as_str(), self.arms.as_slice()) {
+            job.arm.clone_from(&only.hardware_id);
+        }
+        let arm = job.arm.clone();
+        job.steps.iter_mut().chain(&mut job.on_fault).for_each(|step| name_arm(step, &arm));
+        let mut steps = Vec::new();
+        all(&job.steps, &mut steps);
+        all(&job.on_fault, &mut steps);
+        let mistakes: Vec<Mistake> = steps.into_iter().filter_map(|step| self.mistake(step)).collect();
+        mistakes.into_iter().for_each(|(at, what, hint)| job.report(at, what, hint));
+        job.verdict()
+    }
+
+    fn mistake(&self, step: &Step) -> Option<Mistake> {
+        let say = |what: String, hint: Option<String>| Some((step.at, what, hint));
+        let unknown = |kind: &str, name: &str, known: &mut dyn Iterator<Item = &str>| {
+            say(format!("the run has no {kind} {}", quote(name)), did_you_mean(name, known, "it has"))
+        };
+        match &step.act {
+            Act::Repeat { .. } | Act::Wait(_) => return None,
+            Act::Attach(_) | Act::Detach(_) if !self.planner => {
+                return say("this run has no planner, which knows objects".to_owned(), None);
+            }
+            Act::Attach(Attach { name, .. }) | Act::Detach(name) if !self.objects.contains(name) => {
+                return unknown("object", name, &mut self.objects.iter().map(String::as_str));
+            }
+            Act::Detach(_) => return None,
+            _ => {}
+        }
+        let names = &mut self.arms.iter().map(|arm| arm.hardware_id.as_str());
+        if step.arm.is_empty() {
+            let all: Vec<&str> = names.collect();
+            return say(format!("which arm? the run has {}", all.join(", ")), Some("name it: `arm: …`".into()));
+        }
+        let Some(arm) = self.arm(&step.arm) else { return unknown("arm", &step.arm, names) };
+        let levels = |kind: &str| {
+            let io = arm.io.as_ref();
+            match kind {
+                "di" => io.map_or(0, |io| io.digital_inputs.len()),
+                "do" => io.map_or(0, |io| io.digital_outputs.len()),
+                _ => io.map_or(0, |io| io.analog_outputs.len()),
+            }
+        };
+        let missing = |name: &str| {
+            let (kind, number) = name.split_at_checked(2)?;
+            let count = levels(kind);
+            let known = number.parse::<usize>().is_ok_and(|number| number < count);
+            let has = if count == 0 { "none".to_owned() } else { format!("{kind}0 to {kind}{}", count - 1) };
+            (!known).then(|| (step.at, format!("{} has no {name}", step.arm), Some(format!("it has {has}"))))
+        };
+        match &step.act {
+            Act::Move(motion) => self.motion(step, motion, arm),
+            Act::Gripper { to, object, .. } => {
+                let ranged = arm.gripper_range.is_some();
+                match (&arm.gripper_unit, to) {
+                    (None, _) => say(format!("{} has no gripper", step.arm), None),
+                    (_, Opening::Open | Opening::Close) if !ranged => {
+                        say(format!("the gripper of {} reports no range", step.arm), Some("give m or rad".into()))
+                    }
+                    _ if object.is_some() && !ranged => {
+                        say(format!("the gripper of {} cannot tell whether it holds something", step.arm), None)
+                    }
+                    _ => None,
+                }
+            }
+            Act::Input { input, .. } => missing(input),
+            Act::Output(outputs) => outputs.keys().find_map(|name| missing(name)),
+            _ => None,
+        }
+    }
+
+    fn motion(&self, step: &Step, motion: &Motion, arm: &ArmReport) -> Option<Mistake> {
+        let say = |what: String, hint: &str| Some((step.at, what, Some(hint.to_owned())));
+        if !motion.direct && !self.planner {
+            let hint = "run a planner blueprint; or write `direct: true`: not collision-checked";
+            return say("this run has no planner".to_owned(), hint);
+        }
+        let count = arm.position_limits.len();
+        for goal in motion.through.iter().chain([&motion.goal]) {
+            match goal {
+                PlanGoal { joints: Some(joints), .. } if joints.len() != count => {
+                    let what = format!("{} has {count} joints, the goal {} values", step.arm, joints.len());
+                    return say(what, "give one position [rad] per joint, base first");
+                }
+                PlanGoal { named: Some(name), .. } if self.named(&step.arm, name).is_none() => {
+                    let robots = self.robots.iter().filter(|robot| robot.name == step.arm);
+                    let names = robots.flat_map(|robot| robot.named_poses.keys()).chain(self.poses.keys());
+                    let hint = did_you_mean(name, names.map(String::as_str), "it has");
+                    let hint = hint.unwrap_or_else(|| "save where the arm is: dimos pose save NAME".into());
+                    return say(format!("the run has no pose {} of {}", quote(name), step.arm), &hint);
+                }
+                _ => {}
+            }
+        }
+        None
+    }
+
+    /// Returns the positions of an arm's joints in a saved pose, or one of the blueprint [rad].
+    pub fn named(&self, arm: &str, name: &str) -> Option<Vec<f64>> {
+        let joints = self.joints.get(arm)?;
+        if let Some(saved) = self.poses.get(name).and_then(|pose| pose.get(arm)) {
+            return joints.iter().map(|joint| saved.get(joint).copied()).collect();
+        }
+        let robot = self.robots.iter().find(|robot| robot.name == arm)?;
+        let values = robot.named_poses.get(name)?;
+        let value = |joint| values.get(robot.joints.iter().position(|j| j == joint)?).copied();
+        joints.iter().map(value).collect()
+    }
+}
+
+/// Gives a step and its nested steps their arm.
+fn name_arm(step: &mut Step, arm: &str) {
+    if step.arm.is_empty() {
+        arm.clone_into(&mut step.arm);
+    }
+    match &mut step.act {
+        Act::Move(motion) => {
+            motion.through.iter_mut().chain([&mut motion.goal]).for_each(|goal| goal.robot.clone_from(&step.arm));
+        }
+        Act::Attach(attach) => attach.robot.clone_from(&step.arm),
+        Act::Repeat { steps, .. } => steps.iter_mut().for_each(|step| name_arm(step, arm)),
+        _ => {}
+    }
+}
