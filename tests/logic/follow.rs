@@ -180,7 +180,8 @@ fn a_leader_that_stands_still_leaves_the_arm_at_rest_in_spite_of_its_noise() {
 
 #[test]
 fn a_leader_that_is_lost_is_waited_for_at_rest_and_approached_again() {
-    let faults: [(&str, fn(&mut SimArm, bool)); 3] = [
+    type Set = fn(&mut SimArm, bool);
+    let faults: [(&str, Set); 3] = [
         ("stale", |arm, on| arm.silent = on),
         ("link", |arm, on| arm.link = if on { Link::Down } else { Link::Up }),
         ("error", |arm, on| arm.error = if on { 31 } else { 0 }),
