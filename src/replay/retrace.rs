@@ -157,7 +157,7 @@ mod tests {
         ramp(1.0, 2.0);
         ramp(2.0, 2.4);
         let joints = vec!["a".to_owned(), "b".to_owned()];
-        RecordedMotion { joints, period: DT, rows, last: 10_000_000_000, lost: 0 }
+        RecordedMotion { joints, period: DT, rows, last: 10_000_000_000, lost: 0, grips: Vec::new() }
     }
 
     fn at(x: f64) -> Vec<f64> {
