@@ -43,6 +43,13 @@ fn a_led_motion_is_recorded_and_the_arm_is_taken_over_where_it_is() {
     // No overwriting, and the arm is not led if the file cannot be written.
     home.dimos("arm teach arm --record led.csv --duration 1").with(2).says(&["led.csv"]);
     assert_eq!(phase(&home), "ready");
+    // What another client has switched off stays off.
+    let teaching = Started::of(home.command("arm teach arm --record other.csv").stdin(Stdio::null()));
+    eventually("it is led", || phase(&home) == "led");
+    home.dimos("arm disable arm").with(0);
+    teaching.wait().with(1).says(&["no longer led"]);
+    assert_eq!((phase(&home).as_str(), &home.status()["arms"][0]["enabled"]), ("disabled", &json!(false)));
+    home.dimos("arm enable arm").with(0);
     // Without a file it stays led; a stop ends that.
     home.dimos("arm teach arm").with(0).says(&["dimos arm enable arm"]);
     assert_eq!(phase(&home), "led");
@@ -60,6 +67,12 @@ fn an_arm_without_motors_is_led_only_by_who_supports_it_and_others_say_why_not()
     let refused = home.dimos("arm teach arm").with(2);
     refused.says(&["motors off", "--support-the-arm"]);
     assert_eq!(phase(&home), "ready");
+    // A refused request changes nothing: the motors of a held arm stay on.
+    home.dimos("stop").with(0);
+    home.dimos("arm teach arm --support-the-arm").with(1).says(&["reset it first"]);
+    assert_eq!((phase(&home).as_str(), &home.status()["arms"][0]["enabled"]), ("held", &json!(true)));
+    home.dimos("arm reset arm").with(0);
+    home.dimos("arm enable arm").with(0);
     home.dimos("arm teach arm --support-the-arm").with(0).shows(&["motors off: support the arm"]);
     assert_eq!((phase(&home).as_str(), &home.status()["arms"][0]["enabled"]), ("led", &json!(false)));
     eventually("it is held still", || home.dimos("arm enable arm").code == Some(0));
@@ -86,8 +99,12 @@ fn the_controllers_own_motion_ends_at_the_pose_in_map_and_is_cancelled_and_stopp
     home.dimos("move arm --native --direct --pose 3 0 0.3").with(1).says(&["no solution"]);
     assert_eq!(phase(&home), "ready");
 
+    // Its client leaves at once: the run takes the arm over all the same.
+    home.dimos("move arm --native --direct --pose 0.3 0.1 0.3 --no-wait").with(0);
+    eventually("the arm is taken over", || phase(&home) == "ready" && near(0.1));
+
     let going = Started::of(&mut home.command("move arm --native --direct --pose 0.3 -0.25 0.3 --speed 0.05"));
-    eventually("it moves", || phase(&home) == "led" && !near(0.05));
+    eventually("it moves", || phase(&home) == "led" && !near(0.1));
     going.signal(Signal::INT);
     going.wait().with(130).says(&["cancelling"]);
     assert!(!near(-0.25) && phase(&home) == "ready", "{}", tcp());
