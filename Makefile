@@ -16,11 +16,15 @@ SHIPPED := $(TARGET)/shipped
 LARGEST := 12000000
 # For all users where root installs, else for this user.
 PREFIX ?= $(if $(filter 0,$(shell id -u)),/usr/local,$(HOME)/.local)
-# The shipped program contains equal functions once (Rust's own linker, which is the default on x86-64, does that), no
-# paths of the computer that built it, and of zstd's compressors that of level 1, which logs are written with.
-EQUAL_ONCE = $(if $(filter x86_64-unknown-linux-gnu,$(shell rustc --print host-tuple)),-Clink-arg=-Wl$(,)--icf=all)
+# The shipped program contains equal functions once (Rust's own linker, which is the default on x86-64, does that),
+# relative relocations in their short form where the C library knows it (glibc 2.36), no paths of the computer that built
+# it, and a zstd with the compressor of level 1, which logs are written with, and the smaller decoders.
+LLD = $(filter x86_64-unknown-linux-gnu,$(shell rustc --print host-tuple))
+NEW_GLIBC = $(shell printf '%s\n' 2.36 "$$(getconf GNU_LIBC_VERSION | cut -d' ' -f2)" | sort -V | sed -n '1s/^2\.36$$/yes/p')
+SMALL_LINK = $(if $(LLD),-Clink-arg=-Wl$(,)--icf=all $(if $(NEW_GLIBC),-Clink-arg=-Wl$(,)-z$(,)pack-relative-relocs))
 SHORT_PATHS := --remap-path-prefix=$(or $(CARGO_HOME),$(HOME)/.cargo)/registry/src/=
-LEVEL_1 := $(foreach kind,DFAST GREEDY LAZY LAZY2 BTLAZY2 BTOPT BTULTRA,-DZSTD_EXCLUDE_$(kind)_BLOCK_COMPRESSOR)
+SMALL_ZSTD := $(foreach kind,DFAST GREEDY LAZY LAZY2 BTLAZY2 BTOPT BTULTRA,-DZSTD_EXCLUDE_$(kind)_BLOCK_COMPRESSOR) \
+-DHUF_FORCE_DECOMPRESS_X1=1 -DZSTD_FORCE_DECOMPRESS_SEQUENCES_SHORT=1 -DDYNAMIC_BMI2=0
 # Without objcopy the linker drops the debug information.
 STRIP := $(if $(shell command -v objcopy),,CARGO_PROFILE_DIST_STRIP=symbols)
 
@@ -43,7 +47,7 @@ dist: shipped
 # The optimized program without debug information, and its debug file.
 shipped:
 	@echo "building dimos as it is shipped: several minutes" >&2
-	$(STRIP) CFLAGS="$(LEVEL_1)" RUSTFLAGS="$(EQUAL_ONCE) $(SHORT_PATHS)" cargo build --profile dist --locked --bin dimos
+	$(STRIP) CFLAGS="$(SMALL_ZSTD)" RUSTFLAGS="$(SMALL_LINK) $(SHORT_PATHS)" cargo build --profile dist --locked --bin dimos
 	packaging/strip.sh $(TARGET)/dist/dimos $(SHIPPED)
 	@size=$$(stat -c %s $(SHIPPED)/dimos); [ $$size -le $(LARGEST) ] || \
 	{ echo "error: the program has $$size bytes (limit $(LARGEST))" >&2; exit 1; }

@@ -216,7 +216,7 @@ impl Service {
     }
 
     /// Returns the time by which an arm must have reported again.
-    fn next_report(&self, arm: u16) -> Instant {
+    pub(super) fn next_report(&self, arm: u16) -> Instant {
         let own = self.parts.config.arms.get(arm as usize).map(|arm| arm.read_period);
         Instant::now() + REPORTS * own.unwrap_or_default().max(self.period())
     }

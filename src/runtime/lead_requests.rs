@@ -72,6 +72,10 @@ impl Service {
             let _ = self.take_over(name, arm).await;
             return Err(refused(name, "cannot be led now", &error));
         }
+        if by == LedBy::HandMotorsOff {
+            self.next_tick().await;
+            self.until(self.next_report(arm), || self.seen(arm, |view| !view.state.enabled)).await;
+        }
         self.parts.dispatcher.log(Severity::Info, format!("{name}: {note}"));
         Ok(Reply::ArmTeach(api::ArmReply {
             arm: call.arm,
@@ -128,7 +132,7 @@ impl Service {
         Err(RpcError::new(Code::ArmNotReady, what).hint("hold it still, then again"))
     }
 
-    /// Lets an arm's own controller move it to a pose. Replies when the motion begins; a thread of its own watches the
+    /// Lets an arm's own controller move it to a pose. Replies when the motion begins; a separate thread watches the
     /// motion to its end, also without its client.
     pub(super) async fn move_native(&self, call: api::MoveNative) -> Result<Reply, RpcError> {
         let arm = self.arm_index(&call.arm)?;
@@ -168,7 +172,7 @@ impl Service {
         }
     }
 
-    /// Begins a native motion, tells `begun` the result, and takes the arm over at its end.
+    /// Begins a native motion, sends the result to `begun`, and takes the arm over at its end.
     async fn run_native(self: Arc<Self>, native: &Native, begun: oneshot::Sender<Result<(), RpcError>>) {
         let arm = native.arm;
         let lead = match self.lead(arm, LedBy::Controller).await {

@@ -45,6 +45,7 @@ fn what_state_prints_can_be_pasted() {
     let pasted = printed(&home, "link_tcp in map");
     home.dimos(&format!("move arm {pasted}")).with(0);
     stays(&home, "arm", &before);
+    home.dimos(&format!("plan arm {pasted}")).with(0);
     let preview = home.dimos("preview").with(0).out;
     assert!(preview.contains("arm: link_tcp in map x"), "{preview}");
     let shown = home.dimos("state").with(0).out;
