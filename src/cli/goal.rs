@@ -69,6 +69,7 @@ pub struct Goal {
 }
 
 /// An entry of `--through`.
+#[expect(clippy::large_enum_variant, reason = "a few of them, from the command line")]
 #[derive(Debug, Clone, PartialEq)]
 pub enum Waypoint {
     /// Where the arm goes.
