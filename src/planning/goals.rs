@@ -18,7 +18,7 @@ use glamx::DAffine3;
 /// Number of IK solutions to look for when one robot moves to a pose.
 const SOLUTIONS: usize = 8;
 /// Attempts to find them.
-const ATTEMPTS: usize = 200;
+const ATTEMPTS: usize = 3200;
 /// Tolerance of a pose goal [m, rad].
 const POSE_TOLERANCE: f64 = 1e-5;
 /// Distance [m] and rotation [rad] from the present pose within which a robot that is slightly outside its limits

@@ -1,9 +1,12 @@
-//! Inverse kinematics: joint positions for a pose of a link. Damped least squares from a seed, then from random
-//! configurations, until enough solutions are found. Every returned configuration reaches the pose within the
-//! tolerances, is inside the limits, and passes the caller's test; otherwise the failure says what is missing.
+//! Inverse kinematics: joint positions for a pose of a link. Damped least squares from a seed and from random
+//! configurations, sixteen at a time in single precision; those that arrive take the last steps in double precision.
+//! Every returned configuration reaches the pose within the tolerances, is inside the limits, and passes the caller's
+//! test; otherwise the failure says what is missing.
 
 mod closest;
+mod lanes;
 
+use dimos_kernels::block::LANES;
 use glamx::{DAffine3, DVec3};
 
 use crate::collision::checker::Stop;
@@ -23,11 +26,13 @@ pub struct IkSettings {
     pub rotation: f64,
     /// Whether the orientation is free.
     pub position_only: bool,
-    /// Maximum attempts: the first from the seed, the others from random configurations.
+    /// Maximum attempts to reach the pose at all, rounded up to whole blocks of 16: the first from the seed, the others
+    /// from random configurations. A sixteenth of them, at least one block, to find further or valid solutions.
     pub attempts: usize,
     /// Maximum steps per attempt.
     pub steps: usize,
-    /// Number of distinct solutions to look for, nearest first; more take longer.
+    /// Number of distinct solutions to look for, nearest first. One is whichever is found first, and takes the least
+    /// time.
     pub solutions: usize,
     /// Seed of all random numbers.
     pub seed: u64,
@@ -35,7 +40,7 @@ pub struct IkSettings {
 
 impl Default for IkSettings {
     fn default() -> Self {
-        Self { position: 1e-6, rotation: 1e-6, position_only: false, attempts: 100, steps: 60, solutions: 1, seed: 0 }
+        Self { position: 1e-6, rotation: 1e-6, position_only: false, attempts: 3200, steps: 60, solutions: 1, seed: 0 }
     }
 }
 
@@ -84,6 +89,8 @@ pub struct Ik<'a> {
     columns: Vec<Column>,
     q: Vec<f64>,
     motion: Vec<f64>,
+    /// `None` if no joint moves the link.
+    lanes: Option<lanes::Attempts>,
 }
 
 /// Distance of a configuration from a pose.
@@ -104,7 +111,8 @@ impl<'a> Ik<'a> {
     pub fn new(kinematics: &'a Kinematics, link: usize) -> Self {
         let n = kinematics.dof();
         let (frames, columns) = (kinematics.frames(), vec![[0.0; 6]; n]);
-        Self { kinematics, link, frames, columns, q: vec![0.0; n], motion: vec![0.0; n] }
+        let lanes = lanes::Attempts::new(kinematics, link);
+        Self { kinematics, link, frames, columns, q: vec![0.0; n], motion: vec![0.0; n], lanes }
     }
 
     /// Returns configurations in which the link is at `target` (in the root's frame), the nearest to `near` first;
@@ -128,26 +136,33 @@ impl<'a> Ik<'a> {
             attempts: 0,
             stopped: false,
         };
-        let mut best = f64::INFINITY;
-        while failure.attempts < settings.attempts.max(1) && found.len() < settings.solutions.max(1) {
+        let wanted = settings.solutions.max(1);
+        let (mut best, mut reached) = (f64::INFINITY, Vec::new());
+        loop {
+            let out_of_reach = found.is_empty() && failure.rejected == 0;
+            let most = if out_of_reach { settings.attempts.max(1) } else { settings.attempts / 16 };
+            if found.len() >= wanted || failure.attempts >= most {
+                break;
+            }
             if failure.attempts > 0 && stop.is_over() {
                 failure.stopped = true;
                 break;
             }
-            self.start(near, failure.attempts > 0, &mut random);
-            failure.attempts += 1;
-            let error = self.reach(target, near, settings);
-            if settings_met(&error, settings) {
-                let new = !found.iter().any(|q| distance(q, &self.q) < 1e-3);
-                if new && valid(&self.q) {
-                    found.push(self.q.clone());
-                } else if new {
-                    failure.rejected += 1;
-                }
-            } else if error.squared() < best {
+            let from_seed = failure.attempts == 0;
+            let error = self.attempt(target, near, settings, from_seed, &mut random, &mut reached);
+            failure.attempts += LANES;
+            if reached.is_empty() && error.squared() < best {
                 best = error.squared();
                 (failure.position, failure.rotation) = (error.linear.length(), error.angular.length());
                 failure.best.clone_from(&self.q);
+            }
+            for q in reached.drain(..) {
+                let new = found.len() < wanted && !found.iter().any(|other| distance(other, &q) < 1e-3);
+                if new && valid(&q) {
+                    found.push(q);
+                } else if new {
+                    failure.rejected += 1;
+                }
             }
         }
         if found.is_empty() {
@@ -183,16 +198,6 @@ impl<'a> Ik<'a> {
         let at_limit = |j: &usize| q[*j] >= limits[*j].upper - 1e-6 || q[*j] <= limits[*j].lower + 1e-6;
         let joints = (0..q.len()).filter(at_limit).filter(|j| beyond(*j) > 0.0);
         joints.max_by(|a, b| beyond(*a).total_cmp(&beyond(*b))).map(|j| (j, self.kinematics.names()[j].clone()))
-    }
-
-    fn start(&mut self, near: &[f64], random_start: bool, random: &mut Random) {
-        self.q.resize(near.len(), 0.0);
-        for ((q, l), near) in self.q.iter_mut().zip(self.kinematics.limits()).zip(near) {
-            *q = match random_start {
-                true => crate::collision::allowed_pairs::sample(l.lower, l.upper, random),
-                false => near.max(l.lower).min(l.upper),
-            };
-        }
     }
 
     fn error(&mut self, target: &DAffine3, settings: &IkSettings) -> PoseError {

@@ -1,6 +1,8 @@
 //! The solution closest to a seed. The plain search returns whatever branch its random starts find; here it also starts
 //! around the seed, and each solution of a redundant arm moves towards the seed while its link stays at the pose.
 
+use dimos_kernels::block::LANES;
+use dimos_kernels::ik::Until;
 use glamx::DAffine3;
 
 use super::{Ik, IkFailure, IkSettings, settings_met};
@@ -41,14 +43,11 @@ impl Ik<'_> {
         let plain = self.solve(target, near, settings, &mut valid, stop);
         let mut found = plain.as_ref().cloned().unwrap_or_default();
         let mut random = Random::new(settings.seed ^ 0x5EED);
-        for spread in SPREADS.into_iter().flat_map(|spread| [spread; STARTS]) {
+        for spreads in SPREADS.chunks(LANES / STARTS) {
             if stop.is_over() {
                 break;
             }
-            self.start_around(near, spread, &mut random);
-            if settings_met(&self.reach(target, near, settings), settings) {
-                found.push(self.q.clone());
-            }
+            self.attempt_around(target, near, settings, spreads, &mut random, &mut found);
         }
         for q in &mut found {
             let moved = self.approach(target, near, q, settings);
@@ -69,14 +68,23 @@ impl Ik<'_> {
         if apart.is_empty() { plain } else { Ok(apart) }
     }
 
-    fn start_around(&mut self, near: &[f64], spread: f64, random: &mut Random) {
-        self.q.resize(near.len(), 0.0);
-        for ((q, l), near) in self.q.iter_mut().zip(self.kinematics.limits()).zip(near) {
+    /// Makes one attempt per lane from configurations around a seed, as many per standard deviation [rad or m].
+    fn attempt_around(
+        &mut self,
+        target: &DAffine3,
+        near: &[f64],
+        settings: &IkSettings,
+        spreads: &[f64],
+        random: &mut Random,
+        reached: &mut Vec<Vec<f64>>,
+    ) {
+        let limits = self.kinematics.limits();
+        self.attempt_from(target, near, settings, Until::All, reached, |lane, v| {
             // The sum of three has a standard deviation of one, and no tails.
             let away: f64 = (0..3).map(|_| random.between(-1.0, 1.0)).sum();
-            let spread = spread.min(0.5 * (l.upper - l.lower));
-            *q = (near + spread * away).max(l.lower).min(l.upper);
-        }
+            let spread = spreads.get(lane / STARTS).map_or(0.0, |s| s.min(0.5 * (limits[v].upper - limits[v].lower)));
+            near[v] + spread * away
+        });
     }
 
     /// Returns the configuration reached from a solution by moving towards `near` with the link at its pose.

@@ -12,6 +12,7 @@ mod stored;
 
 use std::f64::consts::TAU;
 
+use dimos_kernels::chain;
 use glamx::{DAffine3, DMat3, DQuat, DVec3};
 use nalgebra::Isometry3;
 use serde::{Deserialize, Serialize};
@@ -253,6 +254,23 @@ impl Kinematics {
     /// Returns how a body depends on the configuration: the joint's index in `q` and the mimic factor.
     pub fn drive(&self, body: usize) -> Option<(usize, f64)> {
         self.bodies.get(body).filter(|_| body != 0).map(|b| (b.variable, b.multiplier))
+    }
+
+    /// Returns the joints that move a link, from the root, and the link's frame in that of the last one.
+    pub fn chain(&self, link: usize) -> (Vec<chain::Joint>, DAffine3) {
+        let mut bodies: Vec<usize> = self.ancestors(self.body_of(link)).collect();
+        bodies.reverse();
+        let joint = |body: &Body| chain::Joint {
+            origin: chain::Frame {
+                rotation: body.origin.matrix3.to_cols_array_2d(),
+                translation: body.origin.translation.to_array(),
+            },
+            slides: body.motion == Motion::Slide,
+            variable: body.variable,
+            multiplier: body.multiplier,
+            offset: body.offset,
+        };
+        (bodies.iter().filter_map(|b| self.bodies.get(*b)).map(joint).collect(), self.offset_of(link))
     }
 
     /// Returns upper bounds of a point's motion per unit of joint motion; `reach` is the distance of the point from the

@@ -1,0 +1,14 @@
+//! Computation in lanes: sixteen configurations of an arm at a time, in single precision, on the widest vectors that the
+//! processor has. A package of its own, because cargo optimizes whole packages: this one is compiled for speed in every
+//! profile, tests and the small program that is shipped included.
+//!
+//! Every kernel is written once, over [`block::Block`], and compiled for each width. The result does not depend on the
+//! width, bit for bit: a block always has sixteen lanes, and every width computes the same operations in the same order.
+
+pub mod block;
+pub mod chain;
+pub mod ik;
+pub mod trig;
+mod width;
+
+pub use width::Width;
