@@ -211,9 +211,12 @@ fn ik_has_a_base_a_group_a_tolerance_and_all_solutions() {
     assert!((elbows[0].abs() - std::f64::consts::FRAC_PI_2).abs() < 1e-3 && elbows[0] * elbows[1] < 0.0, "{all}");
     let table = with(&["--group", "arm", "--all"]);
     assert!(table.out.starts_with("DISTANCE") && table.out.lines().count() == 3, "{}", table.out);
-    let loose = with(&["--group", "arm", "--tolerance", "0.01", "--json"]);
+    // 5 mm out of reach.
+    let far = ["ik", file, "--srdf", srdf, "--position-only", "--pose", "1.005", "0", "0.5", "--group", "arm"];
+    assert_eq!(dimos(&far).code, 1);
+    let loose = dimos(&[&far[..], &["--tolerance", "0.01", "--json"]].concat());
     let loose: serde_json::Value = serde_json::from_str(&loose.out).unwrap();
-    assert!((1e-7..0.01).contains(&loose["position_error"].as_f64().unwrap()), "{loose}");
+    assert!((4.9e-3..0.01).contains(&loose["position_error"].as_f64().unwrap()), "{loose}");
     let seeded = with(&["--group", "arm", "--seed", "0", "2.5"]);
     assert!(seeded.err.contains("warning: elbow at 2.5 rad is outside its limits -2.0000 to 2.0000"), "{}", seeded.err);
     for (more, what) in [

@@ -30,8 +30,8 @@ impl Attempts {
 }
 
 impl Ik<'_> {
-    /// Makes sixteen attempts from random configurations, the first from `near` if `from_seed`; adds those that reach the
-    /// pose to `reached`, nearest first. Returns the same as [`Self::attempt_from`].
+    /// Makes sixteen attempts from random configurations, the first from `near` if `from_seed`; adds those that reach
+    /// the pose to `reached`, nearest first. Returns the same as [`Self::attempt_from`].
     pub(super) fn attempt(
         &mut self,
         target: &DAffine3,
@@ -51,8 +51,8 @@ impl Ik<'_> {
         error
     }
 
-    /// Makes attempts from `start` (of a lane and a variable), within the limits; adds those that reach the pose. Returns
-    /// the error of the last one that was looked at, and leaves its configuration in `q`: the closest, if none did.
+    /// Makes attempts from `start` (of a lane and a variable), within the limits; adds those that reach the pose. If
+    /// none does, returns the error of the closest, and leaves its configuration in `q`.
     pub(super) fn attempt_from(
         &mut self,
         target: &DAffine3,
