@@ -73,3 +73,10 @@ export function choice<T extends string>(
   choose(chosen);
   return {element: el('div', {class: 'choice'}, ...buttons.values()), choose};
 }
+
+const COLORS = ['#4c9aff', '#f5a524', '#30a46c', '#e5484d', '#ab6bff', '#12a5b5', '#d6409f', '#8b8d98'];
+
+/** Colour of an arm's joint in tables and plots. */
+export function jointColor(index: number): string {
+  return COLORS[index % COLORS.length]!;
+}

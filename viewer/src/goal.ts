@@ -18,6 +18,8 @@ export class GoalEditor {
   /** Joint goal [rad], in the order of the arm's joints; null until people change it. */
   joints: number[] | null = null;
   named: string | null = null;
+  /** Whether people have changed the goal since it was where the arm is. */
+  edited = false;
   readonly changed = new Signal();
 
   constructor(private readonly context: Context) {
@@ -43,6 +45,7 @@ export class GoalEditor {
     this.joints = this.joints ?? this.present();
     this.joints[index] = value;
     this.named = null;
+    this.edited = true;
     this.showGhost();
   }
 
@@ -64,15 +67,13 @@ export class GoalEditor {
     if (!values) return;
     this.joints = [...values];
     this.named = name;
+    this.edited = true;
     this.showGhost();
   }
 
   setMode(mode: Mode): void {
     this.mode = mode;
-    this.joints = this.named = null;
-    if (mode === 'pose') this.placeMarker();
-    this.showHandles();
-    this.showGhost();
+    this.reset();
   }
 
   setHandles(handles: Handles): void {
@@ -83,7 +84,13 @@ export class GoalEditor {
   /** Back to where the arm is. */
   reset(): void {
     this.joints = this.named = null;
+    this.edited = false;
     if (this.mode === 'pose') this.placeMarker();
+    this.show();
+  }
+
+  /** Shows the goal in the view. */
+  show(): void {
     this.showHandles();
     this.showGhost();
   }
@@ -103,11 +110,14 @@ export class GoalEditor {
     const {marker} = this.context.gizmo;
     marker.position.set(...xyz);
     marker.quaternion.copy(quaternionOf(rpy));
+    this.edited = true;
     this.context.view.stage.invalidate();
+    this.changed.emit();
   }
 
   /** The goal as the planner takes it; null if there is none yet. */
   goal(): Goal | null {
+    if (!this.edited) return null;
     const robot = this.robot?.name ?? this.context.selected;
     if (this.mode === 'joints') {
       if (this.named) return {robot, named: this.named};
@@ -127,7 +137,10 @@ export class GoalEditor {
 
   private showHandles(): void {
     const {gizmo} = this.context;
-    if (this.mode === 'pose') gizmo.attach(gizmo.marker, this.handles, () => this.changed.emit());
+    if (this.mode === 'pose') gizmo.attach(gizmo.marker, this.handles, () => {
+      this.edited = true;
+      this.changed.emit();
+    });
     else if (gizmo.object === gizmo.marker) gizmo.detach();
   }
 

@@ -21,7 +21,7 @@ export function armsPanel(context: Context): HTMLElement {
 
 function card(context: Context, name: string) {
   const phase = el('span', {class: 'phase'});
-  const figures = el('div', {class: 'figures'});
+  const figures = el('div', {class: 'figures', title: 'adapter and address, rate of new states, age of the newest one'});
   const notes = el('div', {class: 'notes'});
   const reset = button('Reset', () => void context.act('arm_reset', {arm: name}), {
     class: 'reset', title: 'Clears a hold or a fault. Moves nothing, enables nothing',
@@ -40,7 +40,7 @@ function card(context: Context, name: string) {
     setText(phase, arm.link === 'up' ? arm.phase : `${arm.link} · ${arm.phase}`);
     phase.dataset.level = arm.link === 'up' ? LEVELS[arm.phase] ?? 'muted' : 'bad';
     const rate = figure(arm.measured_rate_hz, 0);
-    const old = arm.state_age_ms === null ? 'no state yet' : `state ${duration(arm.state_age_ms)} old`;
+    const old = arm.state_age_ms === null ? 'no state yet' : `age ${duration(arm.state_age_ms)}`;
     setText(figures, `${arm.adapter} at ${arm.address} · ${rate} Hz · ${old} · ` +
       (arm.enabled ? 'motors on' : 'motors off'));
     notes.replaceChildren(...notesOf(arm, tasksOf(status, context.run.scene.arms.find((a) => a.name === name)!.joints)));

@@ -1,6 +1,6 @@
 // Joints of the selected arm: where each is between its limits, velocity, effort; pose of the tool, gripper.
 import {type Context} from '../context';
-import {choice, el, setClass, setText} from '../dom';
+import {choice, el, jointColor, setClass, setText} from '../dom';
 import {angle, angleText, figure, shortJoint} from '../units';
 
 const NEAR = 0.05; // of the range: a joint so close to a limit is marked
@@ -21,11 +21,12 @@ export function jointsPanel(context: Context): HTMLElement {
   const build = () => {
     const arm = context.arm;
     setText(title, arm && run.scene.arms.length > 1 ? `Joints of ${arm.name}` : 'Joints');
-    rows = (arm?.joints ?? []).map((joint) => {
+    rows = (arm?.joints ?? []).map((joint, i) => {
+      const name = el('td', {class: 'swatch', text: shortJoint(joint, arm!.name), title: joint});
+      name.style.setProperty('--color', jointColor(i));
       const bar = el('i');
       const cells = [el('td', {class: 'number'}), el('td', {class: 'number'}), el('td', {class: 'number'})];
-      const row = el('tr', {}, el('td', {text: shortJoint(joint, arm!.name), title: joint}),
-        el('td', {class: 'wide'}, el('div', {class: 'bar'}, bar)), ...cells);
+      const row = el('tr', {}, name, el('td', {class: 'wide'}, el('div', {class: 'bar'}, bar)), ...cells);
       return {bar, row, cells, joint};
     });
     body.replaceChildren(...rows.map(({row}) => row));

@@ -34,7 +34,7 @@ export function movePanel(context: Context): HTMLElement {
   const preview = button('Preview', () => context.view.stage.element.dispatchEvent(new Event('preview')), {id: 'preview'});
   const execute = button('Execute', () => void flow.execute(), {id: 'execute', class: 'go', title: 'Moves the arm along the plan'});
   const cancel = button('Cancel', () => {
-    flow.cancel(context.selected).catch((error: unknown) => context.report(error));
+    flow.cancel(flow.busy ? flow.arm : context.selected).catch((error: unknown) => context.report(error));
   }, {id: 'cancel', title: 'Ends planning, or decelerates the motion to rest'});
   const clear = button('New goal', () => {
     flow.clear();
@@ -72,11 +72,19 @@ export function movePanel(context: Context): HTMLElement {
   };
   editor.changed.on(() => {
     // A new goal replaces the plan of the old one.
-    if (!flow.busy && flow.stage !== 'idle' && (editor.joints || editor.mode === 'pose')) flow.clear();
+    if (!flow.busy && flow.stage !== 'idle' && editor.edited) flow.clear();
     showNamed();
     show();
   });
-  flow.changed.on(show);
+  let stage = flow.stage;
+  flow.changed.on(() => {
+    if (flow.stage !== stage) {
+      stage = flow.stage;
+      if (stage === 'ended') editor.reset();
+      else if (stage === 'failed') editor.show();
+    }
+    show();
+  });
   run.onStatus.on(show);
   run.onPoses.on(showNamed);
   context.onSelect.on(() => {

@@ -1,13 +1,12 @@
 // Plots of the last minutes: joints of the selected arm, or the lateness of ticks.
 import uPlot from 'uplot';
 import {type Context} from '../context';
-import {choice, el} from '../dom';
+import {choice, el, jointColor} from '../dom';
 import {type Quantity} from '../history';
 import {angle, shortJoint} from '../units';
 
 const REDRAW = 200; // ms
 const MOST_POINTS = 600;
-const COLORS = ['#4c9aff', '#f5a524', '#30a46c', '#e5484d', '#ab6bff', '#12a5b5', '#d6409f', '#8b8d98'];
 const QUANTITIES: readonly (readonly [Quantity, string])[] = [
   ['position', 'Position'], ['velocity', 'Velocity'], ['effort', 'Effort'], ['error', 'Tracking error'],
   ['lateness', 'Tick lateness'],
@@ -66,11 +65,11 @@ class Plot {
       scales: {x: {time: false}, y: {range: (_plot, low, high) => padded(low, high, this.quantity)}},
       axes: [{...axis, size: 24, values: (_plot, values) => values.map((value) => `${value.toFixed(0)} s`)},
         {...axis, size: 52}],
-      series: [{}, ...names.map((name, i) => ({label: name, stroke: COLORS[i % COLORS.length]!, width: 1.25, points: {show: false}}))],
+      series: [{}, ...names.map((name, i) => ({label: name, stroke: jointColor(i), width: 1.25, points: {show: false}}))],
     }, [[]], this.area);
     this.legend.replaceChildren(el('span', {class: 'unit', text: this.unit()}), ...names.map((name, i) => {
       const item = el('span', {text: name});
-      item.style.setProperty('--color', COLORS[i % COLORS.length]!);
+      item.style.setProperty('--color', jointColor(i));
       return item;
     }));
     this.draw();
@@ -90,10 +89,7 @@ class Plot {
     const shown = [time!.map((t) => t! - now),
       ...values.map((row) => (turned === 1 ? row : row.map((v) => (v === null ? null : v * turned))))];
     this.chart.setData(shown as uPlot.AlignedData, false);
-    this.chart.batch(() => {
-      this.chart!.setScale('x', {min: -this.span(), max: 0});
-      this.chart!.redraw(true, true);
-    });
+    this.chart.setScale('x', {min: -this.span(), max: 0});
   }
 
   private unit(): string {

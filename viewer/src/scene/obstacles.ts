@@ -40,7 +40,7 @@ export class Obstacles {
     const held = object.held_by;
     const geometry = geometryOf(object.shape);
     const mesh = new Mesh(geometry, new MeshLambertMaterial({
-      color: held ? HELD : FREE, transparent: true, opacity: held ? 0.9 : 0.55,
+      color: held ? HELD : FREE, transparent: true, opacity: held ? 0.9 : 0.35,
     }));
     const edges = new LineSegments(new EdgesGeometry(geometry, 30), new LineBasicMaterial({color: held ? HELD : FREE}));
     mesh.add(edges);

@@ -154,6 +154,8 @@ export class Robot {
       if ((part as {isURDFCollider?: boolean}).isURDFCollider || part instanceof AxesHelper || part.userData.attached) {
         drop.push(part);
       }
+      // What no joint moves would only tint the arm itself.
+      if ((part as {isURDFVisual?: boolean}).isURDFVisual && !moves(part)) drop.push(part);
       if (part instanceof Mesh) part.material = material;
     });
     for (const part of drop) part.removeFromParent();
@@ -166,6 +168,15 @@ export class Robot {
 const colliderMaterial: Material = new MeshLambertMaterial({
   color: 0xff5d8f, transparent: true, opacity: 0.35, depthWrite: false, side: DoubleSide,
 });
+
+/** Whether a joint can move this part of a model. */
+function moves(part: Object3D): boolean {
+  for (let at: Object3D | null = part; at; at = at.parent) {
+    const type = (at as {jointType?: string}).jointType;
+    if (type && type !== 'fixed') return true;
+  }
+  return false;
+}
 
 /** Geometry of a ghost is the arm's own. */
 function disposeMaterial(part: Object3D): void {

@@ -24,7 +24,7 @@ export class Stage {
   /** What the camera is fitted to. */
   readonly content = new Group();
   /** Before a frame is drawn: moving parts take their newest places. */
-  readonly onFrame = new Signal<number>();
+  readonly onFrame = new Signal();
   /** Frames drawn, and time of the page's own code in them [ms]; for tests. */
   readonly measured = {frames: 0, script: 0, longest: 0};
 
@@ -56,16 +56,18 @@ export class Stage {
   invalidate(): void {
     if (this.requested) return;
     this.requested = true;
-    requestAnimationFrame((now) => {
-      this.requested = false;
-      const began = performance.now();
-      this.onFrame.emit(now);
-      const spent = performance.now() - began;
-      this.renderer.render(this.scene, this.camera);
-      this.measured.frames += 1;
-      this.measured.script += spent;
-      this.measured.longest = Math.max(this.measured.longest, spent);
-    });
+    requestAnimationFrame(() => this.draw());
+  }
+
+  private draw(): void {
+    this.requested = false;
+    const began = performance.now();
+    this.onFrame.emit();
+    const spent = performance.now() - began;
+    this.renderer.render(this.scene, this.camera);
+    this.measured.frames += 1;
+    this.measured.script += spent;
+    this.measured.longest = Math.max(this.measured.longest, spent);
   }
 
   /** Turns the camera to a side, at a distance that shows everything. */
@@ -77,7 +79,7 @@ export class Stage {
     const centre = box.getCenter(new Vector3());
     // Twice the radius of the home pose leaves room for the arm's reach.
     const radius = Math.max(0.35, box.getSize(new Vector3()).length() / 2) * 1.2;
-    const narrow = Math.min(1, this.camera.aspect);
+    const narrow = Math.min(1, this.camera.aspect / 1.4);
     const distance = radius / Math.sin((FIELD_OF_VIEW / 2) * Math.PI / 180) / Math.max(0.55, narrow);
     this.controls.target.copy(centre);
     this.camera.position.copy(VIEWS[view]).normalize().multiplyScalar(distance).add(centre);
@@ -103,7 +105,8 @@ export class Stage {
     this.camera.aspect = clientWidth / clientHeight;
     this.camera.updateProjectionMatrix();
     this.renderer.setSize(clientWidth, clientHeight);
-    this.invalidate();
+    // A resized canvas is empty: not even one frame is left out.
+    this.draw();
   }
 
   private recolour(): void {
