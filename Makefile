@@ -1,11 +1,12 @@
-# run install dist check test test-fast · test-tools test-rerun deny mutants · bench bench-quick jitter soak
+# run install dist viewer check test test-fast · test-tools test-rerun deny mutants · bench bench-quick jitter soak
 
 PYTHON ?= python3
 # Most tests wait rather than compute. More at a time than this and whole runs no longer keep their time.
 export NEXTEST_TEST_THREADS ?= $(shell echo $$((2 * $$(nproc))))
 READERS := tests/readers
-SYSTEM_TOOLS := cyclictest linux.uml insmod ip tc cansend
-SYSTEM_PACKAGES := rt-tests user-mode-linux kmod iproute2 can-utils
+VIEWER := viewer/dist/index.html
+SYSTEM_TOOLS := cyclictest linux.uml insmod ip tc cansend chromium
+SYSTEM_PACKAGES := rt-tests user-mode-linux kmod iproute2 can-utils chromium
 
 # A comma in the argument of a function.
 , := ,
@@ -28,10 +29,10 @@ SMALL_ZSTD := $(foreach kind,DFAST GREEDY LAZY LAZY2 BTLAZY2 BTOPT BTULTRA,-DZST
 # Without objcopy the linker drops the debug information.
 STRIP := $(if $(shell command -v objcopy),,CARGO_PROFILE_DIST_STRIP=symbols)
 
-.PHONY: run install dist shipped check lint spelling licences test test-fast test-tools test-rerun deny mutants bench bench-quick jitter soak
+.PHONY: run install dist shipped viewer viewer-if-npm check lint spelling licences test test-fast test-tools test-rerun deny mutants bench bench-quick jitter soak
 
 # Builds the program to try it, not optimized, and starts the shipped blueprint; its arm is simulated. Ends with Ctrl-C.
-run:
+run: viewer-if-npm
 	@[ -e $(TARGET)/quick/dimos ] || echo "building dimos: 3 to 5 minutes the first time" >&2
 	@cargo run --profile quick --locked -- run coordinator-yourarm || [ $$? -eq 130 ]
 
@@ -45,12 +46,27 @@ dist: shipped
 	packaging/dist.sh $(SHIPPED)/dimos $(SHIPPED)
 
 # The optimized program without debug information, and its debug file.
-shipped:
+shipped: viewer-if-npm
 	@echo "building dimos as it is shipped: several minutes" >&2
 	$(STRIP) CFLAGS="$(SMALL_ZSTD)" RUSTFLAGS="$(SMALL_LINK) $(SHORT_PATHS)" cargo build --profile dist --locked --bin dimos
 	packaging/strip.sh $(TARGET)/dist/dimos $(SHIPPED)
 	@size=$$(stat -c %s $(SHIPPED)/dimos); [ $$size -le $(LARGEST) ] || \
 	{ echo "error: the program has $$size bytes (limit $(LARGEST))" >&2; exit 1; }
+
+# The page of the live view, which the next build of the program contains.
+viewer: $(VIEWER)
+
+# cargo never runs Node: without the page, a program shows how to get it.
+viewer-if-npm:
+	@if command -v npm >/dev/null; then $(MAKE) --no-print-directory $(VIEWER); \
+	else echo "note: without npm the program has no page for its live view" >&2; fi
+
+$(VIEWER): $(wildcard viewer/*.* viewer/src/* viewer/src/*/*) viewer/node_modules/.package-lock.json
+	cd viewer && npm run --silent build
+
+viewer/node_modules/.package-lock.json: viewer/package-lock.json
+	cd viewer && npm ci --no-audit --no-fund
+	touch $@
 
 check: lint spelling licences
 
@@ -71,8 +87,8 @@ licences:
 deny:
 	cargo deny --all-features check bans licenses sources
 
-# Installs nothing: tests whose tools are missing are skipped.
-test:
+# Installs no tools: tests whose tools are missing are skipped.
+test: viewer-if-npm
 	@[ -e .venv/readers-installed ] || echo "note: some tests will be skipped; make test-tools installs what they need"
 	cargo test --locked --doc
 	@if cargo nextest --version >/dev/null 2>&1; \
@@ -87,9 +103,9 @@ test-fast:
 	else cargo test --locked --lib; \
 	fi
 
-# What tests compare with and run in: other people's readers of logs; as root, also cyclictest, and a guest kernel that
-# has CAN, with the tools for its interfaces.
-test-tools: .venv/readers-installed $(READERS)/node_modules/.package-lock.json
+# What tests compare with and run in: other people's readers of logs; as root, also cyclictest, a browser, and a guest
+# kernel that has CAN, with the tools for its interfaces.
+test-tools: .venv/readers-installed $(READERS)/node_modules/.package-lock.json viewer/node_modules/.package-lock.json
 	@if [ "$$(id -u)" = 0 ]; then missing=; for tool in $(SYSTEM_TOOLS); do command -v $$tool >/dev/null || missing=yes; done; \
 	[ -z "$$missing" ] || { apt-get update -q && apt-get install -qy --no-install-recommends $(SYSTEM_PACKAGES); }; \
 	fi

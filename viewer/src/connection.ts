@@ -5,6 +5,7 @@ const FIRST_DELAY = 250; // ms before the first retry; doubled for each further 
 const LONGEST_DELAY = 4000;
 const CONNECT_TIMEOUT = 4000;
 const WRONG_TOKEN = 4401;
+const TOO_MANY_PAGES = 4429;
 
 interface Pending {
   resolve(result: unknown): void;
@@ -19,6 +20,8 @@ export class Connection {
   /** When the next attempt begins [ms, `performance.now`]; 0 while there is none. */
   retryAt = 0;
   attempts = 0;
+  /** The server has as many pages as it serves. */
+  full = false;
   onState: () => void = () => {};
   onStream: (stream: string, data: unknown, lost: number) => void = () => {};
 
@@ -50,7 +53,8 @@ export class Connection {
       this.socket = null;
       this.failAll();
       if (event.code === WRONG_TOKEN) return this.change('refused');
-      const delay = Math.min(FIRST_DELAY * 2 ** this.attempts, LONGEST_DELAY);
+      this.full = event.code === TOO_MANY_PAGES;
+      const delay = this.full ? LONGEST_DELAY : Math.min(FIRST_DELAY * 2 ** this.attempts, LONGEST_DELAY);
       this.attempts += 1;
       this.retryAt = performance.now() + delay;
       this.change('lost');

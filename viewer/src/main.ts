@@ -78,7 +78,7 @@ function layout(context: Context, canvas: HTMLElement): void {
     tabs.querySelectorAll('button').forEach((each) => each.setAttribute('aria-selected', String(each.dataset.tab === tab)));
     window.dispatchEvent(new Event('resize'));
   };
-  const licences = button('licences', () => (document.getElementById('licences') as HTMLDialogElement).showModal(), {class: 'quiet'});
+  const licences = button('licences', () => (document.getElementById('licences') as HTMLDialogElement).show(), {class: 'quiet'});
   top.element.append(top.stop);
   left.append(el('footer', {}, el('span', {id: 'version'}), licences));
   context.run.onStatus.on(({version}) => {

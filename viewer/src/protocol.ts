@@ -33,7 +33,8 @@ export interface SceneArm {
   type: string;
   dof: number;
   joints: string[];
-  gripper: {joint: string | null; min: number; max: number} | null;
+  /** `closed` and `open` are positions of the URDF's joint; `min` and `max` those that `state` reports. */
+  gripper: {joint: string | null; closed: number | null; open: number | null; min: number | null; max: number | null} | null;
 }
 
 /** One message of the stream `coordinator_joint_state`. */

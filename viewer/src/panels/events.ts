@@ -7,8 +7,10 @@ import {clock} from '../units';
 const SHOWN = 200;
 
 export function eventsPanel(context: Context): HTMLElement {
-  const list = el('ol', {class: 'events', id: 'events'});
+  const none = el('li', {class: 'minor', text: 'none since this page was opened'});
+  const list = el('ol', {class: 'events', id: 'events'}, none);
   const add = (event: RunEvent) => {
+    none.remove();
     list.prepend(el('li', {class: event.level},
       el('time', {text: clock(new Date(event.stamp * 1000))}), el('span', {text: event.text})));
     while (list.children.length > SHOWN) list.lastElementChild!.remove();

@@ -42,7 +42,7 @@ function dataAge({run}: Context): {text: string; level: string} {
   if (broken?.state === 'lost') {
     const wait = broken.retryAt - performance.now();
     const next = broken.retryAt && wait > 0 ? `next attempt in ${(wait / 1000).toFixed(1)} s` : 'reconnecting…';
-    return {text: `connection lost · ${next}`, level: 'bad'};
+    return {text: `${broken.full ? 'too many pages are open' : 'connection lost'} · ${next}`, level: 'bad'};
   }
   if (broken) return {text: 'connecting…', level: 'warn'};
   if (run.age === Infinity) return {text: 'waiting for data…', level: 'warn'};

@@ -105,10 +105,10 @@ class Plot {
 
 /** Room above and below the lines; noise of an arm at rest does not fill the plot. */
 function padded(low: number | null, high: number | null, quantity: Quantity): [number, number] {
-  if (low === null || high === null || !Number.isFinite(low) || !Number.isFinite(high)) return [-1, 1];
-  if (quantity === 'lateness') return [0, Math.max(high * 1.1, 100)];
+  if (quantity === 'lateness') return [0, Math.max((high ?? 0) * 1.1, 100)];
   const smallest = (quantity === 'effort' ? 0.5 : quantity === 'error' ? 0.002 : 0.05) *
     (quantity === 'effort' ? 1 : angle.factor);
+  if (low === null || high === null || !Number.isFinite(low) || !Number.isFinite(high)) return [-smallest, smallest];
   const room = Math.max((high - low) * 0.08, smallest - (high - low) / 2, 0);
   return [low - room, high + room];
 }

@@ -17,7 +17,7 @@ export class Robot {
   private readonly ghosts = new Map<Kind, URDFRobot>();
   private readonly frames: AxesHelper[] = [];
   private readonly tool = new Matrix4();
-  private readonly tcpFrame = new AxesHelper(0.09);
+  private readonly tcpFrame = frame(0.09);
   private colliders = false;
 
   constructor(readonly model: SceneRobot, meshes: Meshes, private readonly changed: () => void) {
@@ -105,15 +105,15 @@ export class Robot {
 
   /** Shows the frame of every link. */
   showFrames(visible: boolean): void {
-    for (const frame of this.frames.splice(0)) {
-      frame.removeFromParent();
-      dispose(frame);
+    for (const axes of this.frames.splice(0)) {
+      axes.removeFromParent();
+      dispose(axes);
     }
     if (visible) {
       for (const link of Object.values(this.urdf.links)) {
-        const frame = new AxesHelper(0.07);
-        link.add(frame);
-        this.frames.push(frame);
+        const axes = frame(0.06);
+        link.add(axes);
+        this.frames.push(axes);
       }
     }
     this.changed();
@@ -168,6 +168,14 @@ export class Robot {
 const colliderMaterial: Material = new MeshLambertMaterial({
   color: 0xff5d8f, transparent: true, opacity: 0.35, depthWrite: false, side: DoubleSide,
 });
+
+/** The axes of a frame, also seen through links. */
+function frame(size: number): AxesHelper {
+  const axes = new AxesHelper(size);
+  (axes.material as Material).depthTest = false;
+  axes.renderOrder = 2;
+  return axes;
+}
 
 /** Whether a joint can move this part of a model. */
 function moves(part: Object3D): boolean {

@@ -100,11 +100,13 @@ export class View {
   private moveFingers(): void {
     const {run} = this.context;
     for (const {name, gripper} of run.scene.arms) {
-      const [opening, range] = [run.armState(name)?.gripper, run.arm(name)?.gripper_range];
+      const position = run.armState(name)?.gripper;
       const robot = this.robots.get(this.context.robotOf(name)?.name ?? '');
-      if (!gripper?.joint || typeof opening !== 'number' || !range || !robot) continue;
-      const fraction = (opening - range[0]) / (range[1] - range[0] || 1);
-      if (robot.setFinger(gripper.joint, gripper.min + fraction * (gripper.max - gripper.min))) this.stage.invalidate();
+      if (!robot || !gripper?.joint || typeof position !== 'number') continue;
+      const {min, max, closed, open} = gripper;
+      if (min === null || max === null || closed === null || open === null || min === max) continue;
+      const joint = closed + ((position - min) / (max - min)) * (open - closed);
+      if (robot.setFinger(gripper.joint, joint)) this.stage.invalidate();
     }
   }
 }
