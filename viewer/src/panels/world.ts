@@ -117,7 +117,7 @@ function addPart(context: Context): HTMLElement {
       show();
     }).element,
     el('span', {class: 'minor', text: 'size'}), size,
-    el('span', {class: 'minor', text: 'centre in map'}), el('div', {class: 'grid3'}, ...at.map((each) => each.element)),
+    el('span', {class: 'minor', text: 'centre in map'}), el('div', {class: 'grid3', id: 'object-at'}, ...at.map((each) => each.element)),
     el('div', {class: 'row'}, name, add));
 }
 

@@ -2,6 +2,7 @@
 import {Line, Quaternion, Vector3} from 'three';
 import {type Context} from '../context';
 import {type Preview} from '../protocol';
+import {Labels} from './labels';
 import {Meshes} from './meshes';
 import {Obstacles} from './obstacles';
 import {Robot} from './robot';
@@ -23,6 +24,7 @@ export class View {
     const {run} = context;
     const meshes = new Meshes(token);
     const changed = () => stage.invalidate();
+    const labels = new Labels(stage, (name) => context.select(name));
     run.scene.robots.forEach((model, index) => {
       const robot = new Robot(model, meshes, changed);
       const trace = new Trace(TRACE_COLORS[index % TRACE_COLORS.length]!);
@@ -31,6 +33,12 @@ export class View {
       stage.content.add(robot.group);
       stage.scene.add(trace.line);
     });
+    for (const {name} of run.scene.arms.length > 1 ? run.scene.arms : []) {
+      const robot = this.robots.get(context.robotOf(name)?.name ?? '');
+      if (robot) labels.add(name, robot.group);
+    }
+    labels.choose(context.selected);
+    context.onSelect.on(() => labels.choose(context.selected));
     this.obstacles = new Obstacles(stage.content, (robot, link) => this.robots.get(robot)?.linkNamed(link) ?? null,
       changed);
     run.onJoints.on(() => {
