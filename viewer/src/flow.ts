@@ -91,7 +91,7 @@ export class Flow {
 
   /** Drops the plan; it stays known to the run. */
   clear(): void {
-    if (this.busy) return;
+    if (this.busy || this.stage === 'idle') return;
     this.forget();
     this.set('idle', '');
   }

@@ -21,6 +21,8 @@ export class GoalEditor {
   /** Whether people have changed the goal since it was where the arm is. */
   edited = false;
   readonly changed = new Signal();
+  /** People changed the goal. */
+  readonly onEdit = new Signal();
 
   constructor(private readonly context: Context) {
     context.onSelect.on(() => this.reset());
@@ -45,7 +47,7 @@ export class GoalEditor {
     this.joints = this.joints ?? this.present();
     this.joints[index] = value;
     this.named = null;
-    this.edited = true;
+    this.edit();
     this.showGhost();
   }
 
@@ -67,7 +69,7 @@ export class GoalEditor {
     if (!values) return;
     this.joints = [...values];
     this.named = name;
-    this.edited = true;
+    this.edit();
     this.showGhost();
   }
 
@@ -110,7 +112,7 @@ export class GoalEditor {
     const {marker} = this.context.gizmo;
     marker.position.set(...xyz);
     marker.quaternion.copy(quaternionOf(rpy));
-    this.edited = true;
+    this.edit();
     this.context.view.stage.invalidate();
     this.changed.emit();
   }
@@ -129,6 +131,11 @@ export class GoalEditor {
     return {robot, pose: this.freeOrientation ? pose : {...pose, quat}, ...(this.linear ? {linear: true} : {})};
   }
 
+  private edit(): void {
+    this.edited = true;
+    this.onEdit.emit();
+  }
+
   private placeMarker(): void {
     const {position, quaternion} = this.context.view.tcp(this.robot?.name ?? '');
     this.context.gizmo.marker.position.copy(position);
@@ -138,7 +145,7 @@ export class GoalEditor {
   private showHandles(): void {
     const {gizmo} = this.context;
     if (this.mode === 'pose') gizmo.attach(gizmo.marker, this.handles, () => {
-      this.edited = true;
+      this.edit();
       this.changed.emit();
     });
     else if (gizmo.object === gizmo.marker) gizmo.detach();

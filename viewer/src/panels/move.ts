@@ -70,9 +70,9 @@ export function movePanel(context: Context): HTMLElement {
       return chip;
     }));
   };
+  // A new goal replaces the plan of the old one.
+  editor.onEdit.on(() => flow.clear());
   editor.changed.on(() => {
-    // A new goal replaces the plan of the old one.
-    if (!flow.busy && flow.stage !== 'idle' && editor.edited) flow.clear();
     showNamed();
     show();
   });
