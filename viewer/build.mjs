@@ -17,26 +17,42 @@ const noCollada = {
 
 const bundled = await esbuild.build({
   entryPoints: [here + 'src/main.ts'],
-  bundle: true, minify: true, write: false, outdir: here + 'dist',
-  format: 'iife', target: 'es2022', legalComments: 'none', loader: {'.css': 'css'}, plugins: [noCollada],
+  bundle: true,
+  minify: true,
+  write: false,
+  outdir: here + 'dist',
+  format: 'iife',
+  target: 'es2022',
+  legalComments: 'none',
+  loader: {'.css': 'css'},
+  plugins: [noCollada],
 });
 const part = (end) => bundled.outputFiles.find((file) => file.path.endsWith(end)).text;
 
 const parts = Object.keys(JSON.parse(readFileSync(here + 'package.json', 'utf8')).dependencies);
-const licences = parts.map((name) => {
-  const folder = `${here}node_modules/${name}/`;
-  const {version, license} = JSON.parse(readFileSync(folder + 'package.json', 'utf8'));
-  // urdf-loader has its notice in its README, and the text of Apache-2.0 is this project's own.
-  const text = existsSync(folder + 'LICENSE') ? readFileSync(folder + 'LICENSE', 'utf8')
-    : readFileSync(folder + 'README.md', 'utf8').split('# LICENSE')[1] + '\n\n' + readFileSync(here + '../LICENSE', 'utf8');
-  return `${name} ${version} (${license})\n\n${text.trim()}`;
-}).join('\n\n\n');
+const licences = parts
+  .map((name) => {
+    const folder = `${here}node_modules/${name}/`;
+    const {version, license} = JSON.parse(readFileSync(folder + 'package.json', 'utf8'));
+    // urdf-loader has its notice in its README, and the text of Apache-2.0 is this project's own.
+    const text = existsSync(folder + 'LICENSE')
+      ? readFileSync(folder + 'LICENSE', 'utf8')
+      : readFileSync(folder + 'README.md', 'utf8').split('# LICENSE')[1] +
+        '\n\n' +
+        readFileSync(here + '../LICENSE', 'utf8');
+    return `${name} ${version} (${license})\n\n${text.trim()}`;
+  })
+  .join('\n\n\n');
 
 const escape = (text) => text.replace(/&/g, '&amp;').replace(/</g, '&lt;');
 const page = readFileSync(here + 'src/index.html', 'utf8')
   .replace('/*style*/', () => part('.css').trim())
   .replace('<!--licences-->', () => escape(licences))
-  .replace('/*script*/', () => part('.js').trim().replace(/<\/script/g, '<\\/script'));
+  .replace('/*script*/', () =>
+    part('.js')
+      .trim()
+      .replace(/<\/script/g, '<\\/script'),
+  );
 mkdirSync(here + 'dist', {recursive: true});
 writeFileSync(here + 'dist/index.html', page);
 

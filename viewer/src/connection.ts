@@ -29,7 +29,10 @@ export class Connection {
   private pending = new Map<number, Pending>();
   private next = 1;
 
-  constructor(private readonly url: string, private readonly token: string) {}
+  constructor(
+    private readonly url: string,
+    private readonly token: string,
+  ) {}
 
   open(): void {
     this.retryAt = 0;

@@ -44,8 +44,10 @@ export class Context {
   /** The model of an arm: the robot with its joints. */
   robotOf(arm: string): SceneRobot | undefined {
     const joints = this.run.scene.arms.find((each) => each.name === arm)?.joints ?? [];
-    return this.run.scene.robots.find((robot) => robot.name === arm) ??
-      this.run.scene.robots.find((robot) => joints.some((joint) => joint in robot.joints));
+    return (
+      this.run.scene.robots.find((robot) => robot.name === arm) ??
+      this.run.scene.robots.find((robot) => joints.some((joint) => joint in robot.joints))
+    );
   }
 
   /** The newest measured position of a joint. */

@@ -11,7 +11,9 @@ interface Options {
 }
 
 export function el<K extends keyof HTMLElementTagNameMap>(
-  tag: K, options: Options = {}, ...children: Child[]
+  tag: K,
+  options: Options = {},
+  ...children: Child[]
 ): HTMLElementTagNameMap[K] {
   const element = document.createElement(tag);
   if (options.class) element.className = options.class;
@@ -45,8 +47,13 @@ export class NumberField {
     this.input = el('input', {attributes: {type: 'number', step: String(step), inputmode: 'decimal'}});
     this.value = value;
     this.input.addEventListener('input', () => onChange(this.value));
-    this.element = el('label', {class: 'field'}, el('span', {text: label}), this.input,
-      unit ? el('span', {class: 'unit', text: unit}) : null);
+    this.element = el(
+      'label',
+      {class: 'field'},
+      el('span', {text: label}),
+      this.input,
+      unit ? el('span', {class: 'unit', text: unit}) : null,
+    );
   }
 
   get value(): number {
@@ -60,15 +67,24 @@ export class NumberField {
 
 /** Buttons of which one is chosen. */
 export function choice<T extends string>(
-  values: readonly (readonly [T, string])[], chosen: T, onChange: (value: T) => void,
+  values: readonly (readonly [T, string])[],
+  chosen: T,
+  onChange: (value: T) => void,
 ): {element: HTMLElement; choose(value: T): void} {
   const buttons = new Map<T, HTMLButtonElement>();
   const choose = (value: T) => buttons.forEach((each, key) => each.setAttribute('aria-pressed', String(key === value)));
   for (const [value, text] of values) {
-    buttons.set(value, button(text, () => {
-      choose(value);
-      onChange(value);
-    }, {attributes: {'data-value': value}}));
+    buttons.set(
+      value,
+      button(
+        text,
+        () => {
+          choose(value);
+          onChange(value);
+        },
+        {attributes: {'data-value': value}},
+      ),
+    );
   }
   choose(chosen);
   return {element: el('div', {class: 'choice'}, ...buttons.values()), choose};

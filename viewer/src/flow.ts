@@ -44,7 +44,7 @@ export class Flow {
       const report = await this.untilPlanned(plan);
       this.planning = report;
       if (report.state !== 'PLANNED') {
-        const why = report.state === 'CANCELLED' ? 'planning cancelled' : report.error ?? 'no plan found';
+        const why = report.state === 'CANCELLED' ? 'planning cancelled' : (report.error ?? 'no plan found');
         throw new RpcError('NO_PLAN', why, report.hint ?? undefined);
       }
       const hz = Math.max(0.1, Math.min(PREVIEW_RATE, PREVIEW_POINTS / Math.max(report.summary?.duration ?? 1, 0.1)));
@@ -85,7 +85,8 @@ export class Flow {
   async cancel(arm: string): Promise<void> {
     const params = this.stage === 'planning' && this.plan !== null ? {plan: this.plan} : {arm};
     const {tasks} = await this.run.watch.request<{tasks: Record<string, string>}>('cancel', params);
-    if (!this.busy) this.text = Object.values(tasks ?? {}).includes('CANCELLED') ? 'motion cancelled' : 'nothing to cancel';
+    if (!this.busy)
+      this.text = Object.values(tasks ?? {}).includes('CANCELLED') ? 'motion cancelled' : 'nothing to cancel';
     this.changed.emit();
   }
 

@@ -53,9 +53,13 @@ export class GoalEditor {
 
   /** Named poses of the blueprint, and those that people saved: name → positions. */
   namedPoses(): Map<string, number[]> {
-    const poses = new Map(Object.entries(
-      this.context.run.planner?.robots.find((robot) => robot.name === this.robot?.name)?.named_poses ??
-      this.robot?.groups ?? {}));
+    const poses = new Map(
+      Object.entries(
+        this.context.run.planner?.robots.find((robot) => robot.name === this.robot?.name)?.named_poses ??
+          this.robot?.groups ??
+          {},
+      ),
+    );
     for (const [name, arms] of Object.entries(this.context.run.poses)) {
       const joints = arms[this.context.selected];
       const values = this.names.map((joint) => joints?.[joint]);
@@ -144,10 +148,11 @@ export class GoalEditor {
 
   private showHandles(): void {
     const {gizmo} = this.context;
-    if (this.mode === 'pose') gizmo.attach(gizmo.marker, this.handles, () => {
-      this.edit();
-      this.changed.emit();
-    });
+    if (this.mode === 'pose')
+      gizmo.attach(gizmo.marker, this.handles, () => {
+        this.edit();
+        this.changed.emit();
+      });
     else if (gizmo.object === gizmo.marker) gizmo.detach();
   }
 

@@ -78,7 +78,10 @@ export class History {
   /** Lateness is the distance of a tick's time from the earliest of the last seconds, per period. */
   private offsets: number[] = [];
 
-  constructor(arms: {name: string; joints: string[]}[], private readonly period: () => number | null) {
+  constructor(
+    arms: {name: string; joints: string[]}[],
+    private readonly period: () => number | null,
+  ) {
     for (const {name, joints} of arms) {
       const ring = (rate: number) => new Ring(LONGEST * rate, joints.length);
       this.arms.set(name, {joints, position: ring(30), velocity: ring(30), effort: ring(30), error: ring(10)});
@@ -94,17 +97,30 @@ export class History {
     let a = 0;
     for (const arm of this.arms.values()) {
       const indices = this.indices[a++]!;
-      arm.position.push(state.stamp, indices.map((i) => state.position[i]));
-      arm.velocity.push(state.stamp, indices.map((i) => state.velocity[i]));
-      arm.effort.push(state.stamp, indices.map((i) => state.effort[i]));
+      arm.position.push(
+        state.stamp,
+        indices.map((i) => state.position[i]),
+      );
+      arm.velocity.push(
+        state.stamp,
+        indices.map((i) => state.velocity[i]),
+      );
+      arm.effort.push(
+        state.stamp,
+        indices.map((i) => state.effort[i]),
+      );
     }
     this.takeTick(state);
   }
 
   takeState(state: State): void {
     for (const {hardware_id, joints} of state.arms) {
-      this.arms.get(hardware_id)?.error.push(state.stamp, joints.map(({command, position}) =>
-        command === null || position === null || command === undefined ? null : command - position));
+      this.arms.get(hardware_id)?.error.push(
+        state.stamp,
+        joints.map(({command, position}) =>
+          command === null || position === null || command === undefined ? null : command - position,
+        ),
+      );
     }
   }
 

@@ -26,7 +26,8 @@ const app = document.getElementById('app')!;
 async function main(): Promise<void> {
   window.addEventListener('hashchange', () => location.reload());
   const token = location.hash.slice(1);
-  if (!token) return message('This address has no token', 'Open the address that the run prints when it starts: it ends with #…');
+  if (!token)
+    return message('This address has no token', 'Open the address that the run prints when it starts: it ends with #…');
   const scene = await readScene(token);
   if (!scene) return;
   document.title = `${scene.name} · dimos`;
@@ -42,7 +43,9 @@ async function main(): Promise<void> {
   run.onLink.on(() => enableActs(run.connected));
   enableActs(false);
   // For tests: what was drawn, and how long the page's own code took.
-  Object.assign(window, {dimos: {measured: stage.measured, run, history: context.history, memory: stage.renderer.info.memory}});
+  Object.assign(window, {
+    dimos: {measured: stage.measured, run, history: context.history, memory: stage.renderer.info.memory},
+  });
   run.start();
 }
 
@@ -66,19 +69,48 @@ async function readScene(token: string): Promise<Scene | null> {
 
 function layout(context: Context, canvas: HTMLElement): void {
   const top = header(context);
-  const offline = el('div', {class: 'offline-note', text: 'No connection: what you see is old, and nothing can be commanded'});
-  const centre = el('section', {class: 'centre'}, canvas, toolbar(context), offline, notice(context), timeline(context));
-  const left = el('aside', {class: 'left', attributes: {'data-panel': 'arms'}}, armsPanel(context), jointsPanel(context));
+  const offline = el('div', {
+    class: 'offline-note',
+    text: 'No connection: what you see is old, and nothing can be commanded',
+  });
+  const centre = el(
+    'section',
+    {class: 'centre'},
+    canvas,
+    toolbar(context),
+    offline,
+    notice(context),
+    timeline(context),
+  );
+  const left = el(
+    'aside',
+    {class: 'left', attributes: {'data-panel': 'arms'}},
+    armsPanel(context),
+    jointsPanel(context),
+  );
   const panels = el('div', {class: 'panels'}, movePanel(context), worldPanel(context), eventsPanel(context));
-  const tabs = el('nav', {class: 'tabs'}, ...[['arms', 'Arms'], ['move', 'Move'], ['world', 'Obstacles'],
-    ['events', 'Events'], ['plots', 'Plots']].map(([name, text]) =>
-    button(text!, () => choose(name!), {attributes: {'data-tab': name!}})));
+  const tabs = el(
+    'nav',
+    {class: 'tabs'},
+    ...[
+      ['arms', 'Arms'],
+      ['move', 'Move'],
+      ['world', 'Obstacles'],
+      ['events', 'Events'],
+      ['plots', 'Plots'],
+    ].map(([name, text]) => button(text!, () => choose(name!), {attributes: {'data-tab': name!}})),
+  );
   const choose = (tab: string) => {
     document.body.dataset.tab = tab;
-    tabs.querySelectorAll('button').forEach((each) => each.setAttribute('aria-selected', String(each.dataset.tab === tab)));
+    panels.scrollTop = 0;
+    tabs
+      .querySelectorAll('button')
+      .forEach((each) => each.setAttribute('aria-selected', String(each.dataset.tab === tab)));
     window.dispatchEvent(new Event('resize'));
   };
-  const licences = button('licences', () => (document.getElementById('licences') as HTMLDialogElement).show(), {class: 'quiet'});
+  const licences = button('licences', () => (document.getElementById('licences') as HTMLDialogElement).show(), {
+    class: 'quiet',
+  });
   top.element.append(top.stop);
   left.append(el('footer', {}, el('span', {id: 'version'}), licences));
   context.run.onStatus.on(({version}) => {

@@ -34,7 +34,13 @@ export interface SceneArm {
   dof: number;
   joints: string[];
   /** `closed` and `open` are positions of the URDF's joint; `min` and `max` those that `state` reports. */
-  gripper: {joint: string | null; closed: number | null; open: number | null; min: number | null; max: number | null} | null;
+  gripper: {
+    joint: string | null;
+    closed: number | null;
+    open: number | null;
+    min: number | null;
+    max: number | null;
+  } | null;
 }
 
 /** One message of the stream `coordinator_joint_state`. */
@@ -135,8 +141,13 @@ export interface Status {
 }
 
 export interface PlannerReport {
-  robots: {name: string; joints: string[]; limits: [number | null, number | null][];
-    named_poses: Record<string, number[]>; end_effector_link: string}[];
+  robots: {
+    name: string;
+    joints: string[];
+    limits: [number | null, number | null][];
+    named_poses: Record<string, number[]>;
+    end_effector_link: string;
+  }[];
 }
 
 export interface PosesReport {
@@ -197,7 +208,11 @@ export interface StopReply {
 
 /** Why a request did not succeed: what the run answered, or `LOST` without an answer. */
 export class RpcError extends Error {
-  constructor(readonly code: string, message: string, readonly hint?: string) {
+  constructor(
+    readonly code: string,
+    message: string,
+    readonly hint?: string,
+  ) {
     super(message);
   }
 }

@@ -1,7 +1,15 @@
 // The run as the page knows it: newest joint states, state, status, world and events, and the age of the data.
 import {Connection} from './connection';
-import {type JointState, type PlannerReport, type PosesReport, type RunEvent, type Scene, type State, type Status,
-  type WorldObject} from './protocol';
+import {
+  type JointState,
+  type PlannerReport,
+  type PosesReport,
+  type RunEvent,
+  type Scene,
+  type State,
+  type Status,
+  type WorldObject,
+} from './protocol';
 import {Signal} from './signal';
 
 const JOINT_RATE = 30; // Hz
@@ -38,8 +46,13 @@ export class Run {
   readonly watch: Connection;
 
   private received = 0;
+  private stateReceived = 0;
 
-  constructor(readonly scene: Scene, url: string, token: string) {
+  constructor(
+    readonly scene: Scene,
+    url: string,
+    token: string,
+  ) {
     this.work = new Connection(url, token);
     this.watch = new Connection(url, token);
   }
@@ -69,6 +82,17 @@ export class Run {
 
   get stale(): boolean {
     return this.age > STALE_AFTER;
+  }
+
+  /** Age of an arm's newest state [ms]; infinite before the first. */
+  armAge(name: string): number {
+    const age = this.armState(name)?.age_ms ?? Infinity;
+    // A reply that is late because `work` waits for another one does not make the arm's state old.
+    return age + Math.min(this.age, performance.now() - this.stateReceived);
+  }
+
+  armStale(name: string): boolean {
+    return this.armAge(name) > STALE_AFTER;
   }
 
   arm(name: string) {
@@ -119,6 +143,7 @@ export class Run {
 
   private async readState(): Promise<void> {
     this.state = await this.work.request<State>('state');
+    this.stateReceived = performance.now();
     this.onState.emit(this.state);
   }
 

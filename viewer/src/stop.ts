@@ -36,9 +36,12 @@ export class Stop {
       const after = Math.round(performance.now() - began);
       this.lines = Object.entries(arms).map(([arm, confirmation]) => ({
         good: confirmation === 'confirmed',
-        text: confirmation === 'confirmed' ? `${arm} held at ${clock(new Date())} (${after} ms)`
-          : confirmation === 'not_sent' ? `${arm} NOT STOPPED: unreachable; the stop is delivered when it is back`
-          : `${arm}: stop sent, NOT CONFIRMED by the arm`,
+        text:
+          confirmation === 'confirmed'
+            ? `${arm} held at ${clock(new Date())} (${after} ms)`
+            : confirmation === 'not_sent'
+              ? `${arm} NOT STOPPED: unreachable; the stop is delivered when it is back`
+              : `${arm}: stop sent, NOT CONFIRMED by the arm`,
       }));
     } catch (error) {
       const why = error instanceof RpcError ? error.message : String(error);

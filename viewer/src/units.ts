@@ -18,7 +18,9 @@ export const angle = {
     this.unit = unit;
     try {
       localStorage.setItem(KEY, unit);
-    } catch { /* the browser keeps nothing: the choice is that of this visit */ }
+    } catch {
+      /* the browser keeps nothing: the choice is that of this visit */
+    }
     this.changed.emit();
   },
   get factor(): number {
@@ -52,8 +54,10 @@ export function duration(milliseconds: number): string {
 /** Time of day with milliseconds. */
 export function clock(date: Date): string {
   const two = (n: number) => String(n).padStart(2, '0');
-  return `${two(date.getHours())}:${two(date.getMinutes())}:${two(date.getSeconds())}.` +
-    String(date.getMilliseconds()).padStart(3, '0');
+  return (
+    `${two(date.getHours())}:${two(date.getMinutes())}:${two(date.getSeconds())}.` +
+    String(date.getMilliseconds()).padStart(3, '0')
+  );
 }
 
 /** The joint's name without the arm's: `joint1` of `left_joint1`. */

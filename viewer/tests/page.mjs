@@ -37,15 +37,20 @@ test('the arm on screen moves when another program moves it', async () => {
     return (rest = await changed(browser, before, await picture(page))) < 0.001;
   });
   run.dimos('move', 'arm', '--named', 'zero');
-  await until('joint2 at zero in the table', async () => /^joint20\.000/.test(await page.textContent('.joints tbody tr:nth-child(2)')));
+  await until('joint2 at zero in the table', async () =>
+    /^joint20\.000/.test(await page.textContent('.joints tbody tr:nth-child(2)')),
+  );
   let moved = 0;
-  await until('the arm looks different', async () => (moved = await changed(browser, before, await picture(page))) > 0.01);
+  await until(
+    'the arm looks different',
+    async () => (moved = await changed(browser, before, await picture(page))) > 0.01,
+  );
   console.log(`pixels changed: ${(rest * 100).toFixed(3)} % at rest, ${(moved * 100).toFixed(1)} % after the motion`);
 });
 
 test('a goal is planned, previewed and executed by clicks, and nothing moves before Execute', async () => {
   const start = run.positions();
-  assert.ok(await page.isDisabled('#plan') && await page.isDisabled('#execute'), 'no goal yet');
+  assert.ok((await page.isDisabled('#plan')) && (await page.isDisabled('#execute')), 'no goal yet');
   const empty = await picture(page);
   await click('[data-pose=home]');
   await until('the goal is shown', async () => (await changed(browser, empty, await picture(page))) > 0.005);
@@ -108,11 +113,14 @@ test('a wrong token shows nothing of the run', async () => {
   const stranger = await open(browser, run.url.replace(/#.*/, '#00000000000000000000000000000000'));
   await text(stranger, '#message', /refuses this token/);
   assert.equal(await stranger.locator('#view').count(), 0);
-  const code = await stranger.evaluate(() => new Promise((resolve) => {
-    const socket = new WebSocket(`ws://${location.host}/rpc`);
-    socket.onopen = () => socket.send('{"token":"wrong"}');
-    socket.onclose = ({code}) => resolve(code);
-  }));
+  const code = await stranger.evaluate(
+    () =>
+      new Promise((resolve) => {
+        const socket = new WebSocket(`ws://${location.host}/rpc`);
+        socket.onopen = () => socket.send('{"token":"wrong"}');
+        socket.onclose = ({code}) => resolve(code);
+      }),
+  );
   assert.equal(code, 4401);
   await stranger.context().close();
 });
@@ -125,7 +133,10 @@ test('on a phone, Stop is on screen and nothing is wider than it', async () => {
     const {width, stop} = await phone.evaluate(() => {
       const at = document.querySelector('#stop').getBoundingClientRect();
       const top = document.elementFromPoint(at.x + at.width / 2, at.y + at.height / 2);
-      return {width: document.documentElement.scrollWidth, stop: at.bottom <= innerHeight && top?.closest('#stop') !== null};
+      return {
+        width: document.documentElement.scrollWidth,
+        stop: at.bottom <= innerHeight && top?.closest('#stop') !== null,
+      };
     });
     assert.ok(width <= 390 && stop, `${tab}: ${width} px wide, Stop reachable: ${stop}`);
   }
@@ -137,7 +148,7 @@ test('a lost connection is shown, disables acts, and recovers', async () => {
   run.child.kill('SIGSTOP');
   await text(page, '#age', /^no data for \d/);
   await text(page, '#age', /^connection lost/);
-  assert.ok(await page.isDisabled('#plan') && await page.isDisabled('#pause'));
+  assert.ok((await page.isDisabled('#plan')) && (await page.isDisabled('#pause')));
   assert.ok(await page.isEnabled('#stop'));
   await click('#stop');
   await text(page, '#stop-report', /NOT CONFIRMED/);

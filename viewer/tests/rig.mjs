@@ -8,7 +8,13 @@ import {chromium} from 'playwright-core';
 const PROGRAM = process.env.DIMOS;
 const BROWSER = '/usr/bin/chromium';
 /** Software rendering: test machines have no graphics processor. */
-const FLAGS = ['--headless=new', '--no-sandbox', '--use-gl=angle', '--use-angle=swiftshader', '--enable-unsafe-swiftshader'];
+const FLAGS = [
+  '--headless=new',
+  '--no-sandbox',
+  '--use-gl=angle',
+  '--use-angle=swiftshader',
+  '--enable-unsafe-swiftshader',
+];
 export const TIMEOUT = 20_000; // ms, of every wait
 
 /** A run, in a home folder of its own. */
@@ -21,7 +27,11 @@ export class Run {
   static async start(...args) {
     const home = mkdtempSync(join(tmpdir(), 'dimos-page-'));
     for (const folder of ['run', 'state', 'config', 'cache']) mkdirSync(join(home, folder), {mode: 0o700});
-    const child = spawn(PROGRAM, ['run', ...args, '--no-record'], {env: environment(home), cwd: home, stdio: ['ignore', 'pipe', 'pipe']});
+    const child = spawn(PROGRAM, ['run', ...args, '--no-record'], {
+      env: environment(home),
+      cwd: home,
+      stdio: ['ignore', 'pipe', 'pipe'],
+    });
     let output = '';
     const up = new Promise((resolve, reject) => {
       const take = (data) => {
@@ -43,7 +53,11 @@ export class Run {
 
   /** A verb of the program, to its end; what it printed. */
   dimos(...args) {
-    const {status, stdout, stderr} = spawnSync(PROGRAM, args, {env: environment(this.home), cwd: this.home, encoding: 'utf8'});
+    const {status, stdout, stderr} = spawnSync(PROGRAM, args, {
+      env: environment(this.home),
+      cwd: this.home,
+      encoding: 'utf8',
+    });
     if (status !== 0) throw new Error(`dimos ${args.join(' ')}: ${status}\n${stdout}${stderr}`);
     return stdout;
   }
@@ -75,8 +89,12 @@ export class Run {
 
 function environment(home) {
   return {
-    PATH: process.env.PATH, HOME: home, XDG_RUNTIME_DIR: join(home, 'run'), XDG_STATE_HOME: join(home, 'state'),
-    XDG_CONFIG_HOME: join(home, 'config'), XDG_CACHE_HOME: join(home, 'cache'),
+    PATH: process.env.PATH,
+    HOME: home,
+    XDG_RUNTIME_DIR: join(home, 'run'),
+    XDG_STATE_HOME: join(home, 'state'),
+    XDG_CONFIG_HOME: join(home, 'config'),
+    XDG_CACHE_HOME: join(home, 'cache'),
   };
 }
 
@@ -102,7 +120,8 @@ export async function open(browser, url, viewport = {width: 1200, height: 760}) 
 export async function text(page, selector, pattern) {
   await page.waitForFunction(
     ([selector, source]) => new RegExp(source).test(document.querySelector(selector)?.textContent ?? ''),
-    [selector, pattern.source]);
+    [selector, pattern.source],
+  );
   return page.textContent(selector);
 }
 
@@ -123,21 +142,29 @@ export function picture(page) {
 /** Fraction of the pixels that differ between two pictures. */
 export async function changed(browser, a, b) {
   const page = await browser.newPage();
-  const fraction = await page.evaluate(async (urls) => {
-    const [a, b] = await Promise.all(urls.map(async (url) => {
-      const image = new Image();
-      image.src = url;
-      await image.decode();
-      const context = Object.assign(document.createElement('canvas'), {width: image.width, height: image.height}).getContext('2d');
-      context.drawImage(image, 0, 0);
-      return context.getImageData(0, 0, image.width, image.height).data;
-    }));
-    let different = 0;
-    for (let i = 0; i < a.length; i += 4) {
-      different += Math.abs(a[i] - b[i]) + Math.abs(a[i + 1] - b[i + 1]) + Math.abs(a[i + 2] - b[i + 2]) > 48 ? 1 : 0;
-    }
-    return different / (a.length / 4);
-  }, [a, b].map((png) => `data:image/png;base64,${png.toString('base64')}`));
+  const fraction = await page.evaluate(
+    async (urls) => {
+      const [a, b] = await Promise.all(
+        urls.map(async (url) => {
+          const image = new Image();
+          image.src = url;
+          await image.decode();
+          const context = Object.assign(document.createElement('canvas'), {
+            width: image.width,
+            height: image.height,
+          }).getContext('2d');
+          context.drawImage(image, 0, 0);
+          return context.getImageData(0, 0, image.width, image.height).data;
+        }),
+      );
+      let different = 0;
+      for (let i = 0; i < a.length; i += 4) {
+        different += Math.abs(a[i] - b[i]) + Math.abs(a[i + 1] - b[i + 1]) + Math.abs(a[i + 2] - b[i + 2]) > 48 ? 1 : 0;
+      }
+      return different / (a.length / 4);
+    },
+    [a, b].map((png) => `data:image/png;base64,${png.toString('base64')}`),
+  );
   await page.close();
   return fraction;
 }

@@ -11,8 +11,14 @@ export function eventsPanel(context: Context): HTMLElement {
   const list = el('ol', {class: 'events', id: 'events'}, none);
   const add = (event: RunEvent) => {
     none.remove();
-    list.prepend(el('li', {class: event.level},
-      el('time', {text: clock(new Date(event.stamp * 1000))}), el('span', {text: event.text})));
+    list.prepend(
+      el(
+        'li',
+        {class: event.level},
+        el('time', {text: clock(new Date(event.stamp * 1000))}),
+        el('span', {text: event.text}),
+      ),
+    );
     while (list.children.length > SHOWN) list.lastElementChild!.remove();
   };
   context.run.onEvent.on(add);

@@ -22,7 +22,9 @@ export function gripperPanel(context: Context): HTMLElement {
 
   const limits = () => run.arm(context.selected)?.gripper_range ?? null;
   const text = (position: number) =>
-    run.arm(context.selected)?.gripper_unit === 'rad' ? `${figure(position, 3)} rad` : `${figure(position * 1000, 1)} mm`;
+    run.arm(context.selected)?.gripper_unit === 'rad'
+      ? `${figure(position, 3)} rad`
+      : `${figure(position * 1000, 1)} mm`;
   const target = () => {
     const [low, high] = limits() ?? [0, 0];
     return low + (Number(range.value) / 1000) * (high - low);
@@ -48,15 +50,23 @@ export function gripperPanel(context: Context): HTMLElement {
   };
   const open = button('Open', () => void command(limits()![1]), {id: 'grip-open'});
   const close = button('Close', () => void command(limits()![0]), {id: 'grip-close'});
-  const go = button('Set', () => void command(target()), {id: 'grip-set', title: 'Moves the gripper to the position of the slider'});
+  const go = button('Set', () => void command(target()), {
+    id: 'grip-set',
+    title: 'Moves the gripper to the position of the slider',
+  });
   range.addEventListener('input', () => {
     touched = true;
     setText(value, text(target()));
     show();
   });
-  const element = el('fieldset', {class: 'acts gripper'}, el('h2', {text: 'Gripper'}),
+  const element = el(
+    'fieldset',
+    {class: 'acts gripper'},
+    el('h2', {text: 'Gripper'}),
     el('label', {class: 'slider plain'}, el('span', {text: 'position'}), range, value),
-    el('div', {class: 'buttons'}, open, close, go), outcome);
+    el('div', {class: 'buttons'}, open, close, go),
+    outcome,
+  );
   const show = () => {
     const has = limits();
     setClass(element, 'hidden', !has);

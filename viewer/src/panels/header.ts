@@ -8,17 +8,23 @@ export function header(context: Context): {element: HTMLElement; stop: HTMLEleme
   const real = !run.scene.simulated;
   const age = el('span', {class: 'age', id: 'age', attributes: {role: 'status'}});
   const badge = el('span', {
-    class: real ? 'badge real' : 'badge simulated', id: 'banner', text: real ? 'REAL ARM' : 'SIMULATED',
+    class: real ? 'badge real' : 'badge simulated',
+    id: 'banner',
+    text: real ? 'REAL ARM' : 'SIMULATED',
     title: real ? 'Acts move real hardware' : 'No hardware moves: emulators or ideal arms',
   });
-  const element = el('header', {},
-    el('div', {class: 'title'}, el('strong', {text: run.scene.name}), badge, age), override(context));
+  const element = el(
+    'header',
+    {},
+    el('div', {class: 'title'}, el('strong', {text: run.scene.name}), badge, age),
+    override(context),
+  );
 
   const show = () => {
     const {text, level} = dataAge(context);
     setText(age, text);
     age.dataset.level = level;
-    document.body.classList.toggle('stale', level !== 'good');
+    document.body.classList.toggle('stale', level === 'warn' || level === 'bad');
     document.body.classList.toggle('offline', !run.connected);
   };
   run.onLink.on(show);
@@ -47,6 +53,15 @@ function dataAge({run}: Context): {text: string; level: string} {
   if (broken) return {text: 'connecting…', level: 'warn'};
   if (run.age === Infinity) return {text: 'waiting for data…', level: 'warn'};
   if (run.stale) return {text: `no data for ${duration(run.age)}`, level: 'bad'};
+  for (const {name} of run.scene.arms) {
+    const old = run.armAge(name);
+    if (run.state && run.armStale(name)) {
+      return {
+        text: Number.isFinite(old) ? `${name}: no state for ${duration(old)}` : `${name}: no state yet`,
+        level: 'old',
+      };
+    }
+  }
   return {text: 'live', level: 'good'};
 }
 
@@ -54,9 +69,16 @@ function dataAge({run}: Context): {text: string; level: string} {
 function override(context: Context): HTMLElement {
   const {run} = context;
   const value = el('output', {text: '100 %'});
-  const range = el('input', {id: 'speed', attributes: {
-    type: 'range', min: '1', max: '100', value: '100', 'aria-label': 'speed override',
-  }});
+  const range = el('input', {
+    id: 'speed',
+    attributes: {
+      type: 'range',
+      min: '1',
+      max: '100',
+      value: '100',
+      'aria-label': 'speed override',
+    },
+  });
   let held = 0; // the slider is the person's until shortly after the last touch
   range.addEventListener('input', () => {
     held = performance.now();
@@ -67,7 +89,8 @@ function override(context: Context): HTMLElement {
     void context.act('speed', {fraction: Number(range.value) / 100});
   });
   const pause = button('Pause', () => void context.act('speed', {paused: !run.status?.speed.paused}), {
-    id: 'pause', title: 'Pauses all motions on their paths',
+    id: 'pause',
+    title: 'Pauses all motions on their paths',
   });
   run.onStatus.on(({speed}) => {
     setText(pause, speed.paused ? 'Resume' : 'Pause');
@@ -76,8 +99,14 @@ function override(context: Context): HTMLElement {
     range.value = String(Math.round(speed.fraction * 100));
     setText(value, `${range.value} %`);
   });
-  return el('fieldset', {class: 'override acts', title: 'Speed of all motions of the run'},
-    el('span', {class: 'label', text: 'Speed'}), range, value, pause);
+  return el(
+    'fieldset',
+    {class: 'override acts', title: 'Speed of all motions of the run'},
+    el('span', {class: 'label', text: 'Speed'}),
+    range,
+    value,
+    pause,
+  );
 }
 
 function stopButton(context: Context): HTMLElement {
@@ -85,14 +114,19 @@ function stopButton(context: Context): HTMLElement {
   const press = () => void stop.press();
   const lines = el('div', {class: 'stop-lines', id: 'stop-report', attributes: {role: 'alert'}});
   const control = button('STOP', press, {
-    id: 'stop', title: 'Holds all arms at once, until they are reset (Escape). An operational stop, not a safety function',
+    id: 'stop',
+    title: 'Holds all arms at once, until they are reset (Escape). An operational stop, not a safety function',
   });
   control.append(el('kbd', {text: 'Esc'}));
-  window.addEventListener('keydown', (event) => {
-    if (event.key !== 'Escape' || event.repeat) return;
-    event.preventDefault();
-    press();
-  }, {capture: true});
+  window.addEventListener(
+    'keydown',
+    (event) => {
+      if (event.key !== 'Escape' || event.repeat) return;
+      event.preventDefault();
+      press();
+    },
+    {capture: true},
+  );
   stop.changed.on(() => {
     lines.replaceChildren(...stop.lines.map(({text, good}) => el('div', {class: good ? 'good' : 'bad', text})));
     setClass(control, 'active', stop.active);

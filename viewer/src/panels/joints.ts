@@ -9,12 +9,23 @@ const PERIOD = 100; // ms between two updates of the table
 export function jointsPanel(context: Context): HTMLElement {
   const {run} = context;
   const title = el('h2');
-  const unit = choice([['rad', 'rad'], ['deg', 'deg']] as const, angle.unit, (value) => angle.set(value));
+  const unit = choice(
+    [
+      ['rad', 'rad'],
+      ['deg', 'deg'],
+    ] as const,
+    angle.unit,
+    (value) => angle.set(value),
+  );
   const body = el('tbody');
   const units = [el('th'), el('th'), el('th')] as const;
   const pose = el('dl', {class: 'pose', id: 'pose'});
-  const table = el('table', {class: 'joints'},
-    el('thead', {}, el('tr', {}, el('th', {text: 'joint'}), el('th', {class: 'wide'}), ...units)), body);
+  const table = el(
+    'table',
+    {class: 'joints'},
+    el('thead', {}, el('tr', {}, el('th', {text: 'joint'}), el('th', {class: 'wide'}), ...units)),
+    body,
+  );
   let rows: {bar: HTMLElement; row: HTMLElement; cells: HTMLElement[]; joint: string}[] = [];
   let limits: (readonly [number, number] | null)[] = [];
 
@@ -74,12 +85,30 @@ export function jointsPanel(context: Context): HTMLElement {
     }
     if (typeof state?.gripper === 'number') {
       const mm = state.gripper_unit === 'm';
-      const force = typeof state.gripper_force === 'number' ? `  ${figure(state.gripper_force, 1)} ${state.gripper_force_unit}` : '';
-      lines.push(['gripper', `${mm ? figure(state.gripper * 1000, 1) + ' mm' : angleText(state.gripper) + ' ' + angle.label}${force}`]);
+      const force =
+        typeof state.gripper_force === 'number'
+          ? `  ${figure(state.gripper_force, 1)} ${state.gripper_force_unit}`
+          : '';
+      lines.push([
+        'gripper',
+        `${mm ? figure(state.gripper * 1000, 1) + ' mm' : angleText(state.gripper) + ' ' + angle.label}${force}`,
+      ]);
     }
     if (state?.wrench) {
-      lines.push(['force', `${state.wrench.slice(0, 3).map((v) => figure(v, 1)).join('  ')} N`]);
-      lines.push(['torque', `${state.wrench.slice(3).map((v) => figure(v, 2)).join('  ')} Nm`]);
+      lines.push([
+        'force',
+        `${state.wrench
+          .slice(0, 3)
+          .map((v) => figure(v, 1))
+          .join('  ')} N`,
+      ]);
+      lines.push([
+        'torque',
+        `${state.wrench
+          .slice(3)
+          .map((v) => figure(v, 2))
+          .join('  ')} Nm`,
+      ]);
     }
     if (pose.children.length !== lines.length * 2) {
       pose.replaceChildren(...lines.flatMap(() => [el('dt'), el('dd')]));
@@ -106,8 +135,16 @@ export function jointsPanel(context: Context): HTMLElement {
     showPose();
   });
   build();
-  return el('section', {class: 'joints live'}, el('div', {class: 'section-head'}, title, unit.element), table,
-    el('h3', {text: 'Tool centre point', class: 'minor'}), pose);
+  const element = el(
+    'section',
+    {class: 'joints live'},
+    el('div', {class: 'section-head'}, title, unit.element),
+    table,
+    el('h3', {text: 'Tool centre point', class: 'minor'}),
+    pose,
+  );
+  run.onState.on(() => setClass(element, 'old', run.armStale(context.selected)));
+  return element;
 }
 
 function scaled(velocity: number | null | undefined): string {

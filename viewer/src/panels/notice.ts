@@ -9,7 +9,8 @@ export function notice(context: Context): HTMLElement {
     if (!notice) return;
     element.replaceChildren(
       el('div', {}, el('div', {text: notice.text}), notice.hint ? el('div', {class: 'hint', text: notice.hint}) : null),
-      button('✕', () => context.onNotice.emit(null), {class: 'small', title: 'Close'}));
+      button('✕', () => context.onNotice.emit(null), {class: 'small', title: 'Close'}),
+    );
   });
   return element;
 }

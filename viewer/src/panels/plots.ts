@@ -8,18 +8,33 @@ import {angle, shortJoint} from '../units';
 const REDRAW = 200; // ms
 const MOST_POINTS = 600;
 const QUANTITIES: readonly (readonly [Quantity, string])[] = [
-  ['position', 'Position'], ['velocity', 'Velocity'], ['effort', 'Effort'], ['error', 'Tracking error'],
+  ['position', 'Position'],
+  ['velocity', 'Velocity'],
+  ['effort', 'Effort'],
+  ['error', 'Tracking error'],
   ['lateness', 'Tick lateness'],
 ];
 
 export function plotsPanel(context: Context): HTMLElement {
   let span = 60;
-  const spans = choice([['30', '30 s'], ['60', '1 min'], ['180', '3 min']] as const, '60', (value) => {
-    span = Number(value);
-  });
+  const spans = choice(
+    [
+      ['30', '30 s'],
+      ['60', '1 min'],
+      ['180', '3 min'],
+    ] as const,
+    '60',
+    (value) => {
+      span = Number(value);
+    },
+  );
   const plots = [new Plot(context, 'position', () => span), new Plot(context, 'error', () => span)];
-  const element = el('section', {class: 'plots', attributes: {'data-panel': 'plots'}},
-    ...plots.map((plot) => plot.element), spans.element);
+  const element = el(
+    'section',
+    {class: 'plots', attributes: {'data-panel': 'plots'}},
+    ...plots.map((plot) => plot.element),
+    spans.element,
+  );
   window.setInterval(() => {
     if (!document.hidden) plots.forEach((plot) => plot.draw());
   }, REDRAW);
@@ -37,7 +52,11 @@ class Plot {
   private readonly legend = el('div', {class: 'legend'});
   private chart: uPlot | null = null;
 
-  constructor(private readonly context: Context, private quantity: Quantity, private readonly span: () => number) {
+  constructor(
+    private readonly context: Context,
+    private quantity: Quantity,
+    private readonly span: () => number,
+  ) {
     for (const [value, text] of QUANTITIES) this.select.append(el('option', {text, attributes: {value}}));
     this.select.value = quantity;
     this.select.addEventListener('change', () => {
@@ -53,25 +72,39 @@ class Plot {
     this.chart?.destroy();
     const style = getComputedStyle(document.documentElement);
     const [text, line] = [style.getPropertyValue('--muted').trim(), style.getPropertyValue('--line').trim()];
-    const names = this.quantity === 'lateness' ? ['sampled ticks']
-      : (this.context.arm?.joints ?? []).map((joint) => shortJoint(joint, this.context.selected));
+    const names =
+      this.quantity === 'lateness'
+        ? ['sampled ticks']
+        : (this.context.arm?.joints ?? []).map((joint) => shortJoint(joint, this.context.selected));
     const font = '11px system-ui, sans-serif';
     const axis = {stroke: text, grid: {stroke: line, width: 1}, ticks: {stroke: line, width: 1, size: 4}, font};
-    this.chart = new uPlot({
-      width: Math.max(50, this.area.clientWidth),
-      height: Math.max(50, this.area.clientHeight),
-      legend: {show: false},
-      cursor: {y: false, points: {show: false}},
-      scales: {x: {time: false}, y: {range: (_plot, low, high) => padded(low, high, this.quantity)}},
-      axes: [{...axis, size: 24, values: (_plot, values) => values.map((value) => `${value.toFixed(0)} s`)},
-        {...axis, size: 52}],
-      series: [{}, ...names.map((name, i) => ({label: name, stroke: jointColor(i), width: 1.25, points: {show: false}}))],
-    }, [[]], this.area);
-    this.legend.replaceChildren(el('span', {class: 'unit', text: this.unit()}), ...names.map((name, i) => {
-      const item = el('span', {text: name});
-      item.style.setProperty('--color', jointColor(i));
-      return item;
-    }));
+    this.chart = new uPlot(
+      {
+        width: Math.max(50, this.area.clientWidth),
+        height: Math.max(50, this.area.clientHeight),
+        legend: {show: false},
+        cursor: {y: false, points: {show: false}},
+        scales: {x: {time: false}, y: {range: (_plot, low, high) => padded(low, high, this.quantity)}},
+        axes: [
+          {...axis, size: 24, values: (_plot, values) => values.map((value) => `${value.toFixed(0)} s`)},
+          {...axis, size: 52},
+        ],
+        series: [
+          {},
+          ...names.map((name, i) => ({label: name, stroke: jointColor(i), width: 1.25, points: {show: false}})),
+        ],
+      },
+      [[]],
+      this.area,
+    );
+    this.legend.replaceChildren(
+      el('span', {class: 'unit', text: this.unit()}),
+      ...names.map((name, i) => {
+        const item = el('span', {text: name});
+        item.style.setProperty('--color', jointColor(i));
+        return item;
+      }),
+    );
     this.draw();
   }
 
@@ -86,8 +119,10 @@ class Plot {
     const data = ring.since(now - this.span(), MOST_POINTS, peaks);
     const turned = ['position', 'velocity', 'error'].includes(this.quantity) ? angle.factor : 1;
     const [time, ...values] = data;
-    const shown = [time!.map((t) => t! - now),
-      ...values.map((row) => (turned === 1 ? row : row.map((v) => (v === null ? null : v * turned))))];
+    const shown = [
+      time!.map((t) => t! - now),
+      ...values.map((row) => (turned === 1 ? row : row.map((v) => (v === null ? null : v * turned)))),
+    ];
     this.chart.setData(shown as uPlot.AlignedData, false);
     this.chart.setScale('x', {min: -this.span(), max: 0});
   }
@@ -106,8 +141,8 @@ class Plot {
 /** Room above and below the lines; noise of an arm at rest does not fill the plot. */
 function padded(low: number | null, high: number | null, quantity: Quantity): [number, number] {
   if (quantity === 'lateness') return [0, Math.max((high ?? 0) * 1.1, 100)];
-  const smallest = (quantity === 'effort' ? 0.5 : quantity === 'error' ? 0.002 : 0.05) *
-    (quantity === 'effort' ? 1 : angle.factor);
+  const smallest =
+    (quantity === 'effort' ? 0.5 : quantity === 'error' ? 0.002 : 0.05) * (quantity === 'effort' ? 1 : angle.factor);
   if (low === null || high === null || !Number.isFinite(low) || !Number.isFinite(high)) return [-smallest, smallest];
   const room = Math.max((high - low) * 0.08, smallest - (high - low) / 2, 0);
   return [low - room, high + room];

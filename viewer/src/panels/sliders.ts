@@ -30,8 +30,13 @@ export function jointSliders(context: Context, editor: GoalEditor): HTMLElement 
     sliders = editor.names.map((joint, index) => {
       const [lower, upper] = limitsOf(joint, index);
       const name = shortJoint(joint, context.selected);
-      const input = el('input', {attributes: {type: 'range', min: '0', max: String(STEPS), 'aria-label': name, 'data-joint': joint}});
-      const output = el('input', {class: 'value', attributes: {type: 'number', step: 'any', 'aria-label': `${name} position`}});
+      const input = el('input', {
+        attributes: {type: 'range', min: '0', max: String(STEPS), 'aria-label': name, 'data-joint': joint},
+      });
+      const output = el('input', {
+        class: 'value',
+        attributes: {type: 'number', step: 'any', 'aria-label': `${name} position`},
+      });
       const slider = {joint, input, output, lower, upper};
       input.addEventListener('input', () => {
         editor.setJoint(index, lower + (Number(input.value) / STEPS) * (upper - lower));
@@ -57,8 +62,10 @@ export function jointSliders(context: Context, editor: GoalEditor): HTMLElement 
     });
     setClass(element, 'set', editor.joints !== null);
     const unit = angle.unit === 'deg' ? 'degrees' : 'rad';
-    setText(element.querySelector('.unit-note')!,
-      editor.joints ? `goal in ${unit}` : `present positions in ${unit}: move a slider to set a goal`);
+    setText(
+      element.querySelector('.unit-note')!,
+      editor.joints ? `goal in ${unit}` : `present positions in ${unit}: move a slider to set a goal`,
+    );
   };
   let key = '';
   context.run.onStatus.on(() => {

@@ -5,9 +5,15 @@ import {figure} from '../units';
 
 export function timeline(context: Context): HTMLElement {
   const {flow, view} = context;
-  const range = el('input', {id: 'scrub', attributes: {type: 'range', min: '0', max: '1000', value: '0', 'aria-label': 'time in the plan'}});
+  const range = el('input', {
+    id: 'scrub',
+    attributes: {type: 'range', min: '0', max: '1000', value: '0', 'aria-label': 'time in the plan'},
+  });
   const text = el('output');
-  const play = button('▶', () => (playing ? halt() : start()), {class: 'play', title: 'Plays the planned motion; moves nothing'});
+  const play = button('▶', () => (playing ? halt() : start()), {
+    class: 'play',
+    title: 'Plays the planned motion; moves nothing',
+  });
   const label = el('span', {class: 'label', text: 'Plan'});
   const element = el('div', {class: 'timeline hidden', id: 'timeline'}, label, play, range, text);
   let playing = false;

@@ -17,18 +17,35 @@ export function worldPanel(context: Context): HTMLElement {
     const now = JSON.stringify([run.world, moving.name()]);
     if (now === key) return;
     key = now;
-    list.replaceChildren(...run.world.map((object) => {
-      const held = object.held_by;
-      const row = el('li', {attributes: {'data-object': object.name}},
-        el('div', {}, el('strong', {text: object.name}), el('span', {class: 'minor', text: held ? `held by ${held.join('/')}` : shapeText(object.shape)})),
-        button('Move', () => moving.start(object), {class: 'small'}),
-        button('Remove', async () => {
-          if (await context.act('world_remove', {name: object.name})) await run.readWorld().catch(() => {});
-        }, {class: 'small danger'}));
-      if (held) row.querySelectorAll('button').forEach((each) => { each.disabled = true; });
-      setClass(row, 'selected', moving.name() === object.name);
-      return row;
-    }));
+    list.replaceChildren(
+      ...run.world.map((object) => {
+        const held = object.held_by;
+        const row = el(
+          'li',
+          {attributes: {'data-object': object.name}},
+          el(
+            'div',
+            {},
+            el('strong', {text: object.name}),
+            el('span', {class: 'minor', text: held ? `held by ${held.join('/')}` : shapeText(object.shape)}),
+          ),
+          button('Move', () => moving.start(object), {class: 'small'}),
+          button(
+            'Remove',
+            async () => {
+              if (await context.act('world_remove', {name: object.name})) await run.readWorld().catch(() => {});
+            },
+            {class: 'small danger'},
+          ),
+        );
+        if (held)
+          row.querySelectorAll('button').forEach((each) => {
+            each.disabled = true;
+          });
+        setClass(row, 'selected', moving.name() === object.name);
+        return row;
+      }),
+    );
     if (!run.world.length) list.replaceChildren(el('li', {class: 'minor', text: 'no obstacles'}));
   };
   run.onWorld.on(show);
@@ -56,20 +73,31 @@ function movePart(context: Context) {
     const object = current && context.view.obstacles.get(current.name);
     if (object) context.gizmo.attach(object, handles, () => {});
   };
-  const apply = button('Apply', async () => {
-    const object = current && context.view.obstacles.get(current.name);
-    if (!object || !current) return end();
-    const pose = {xyz: object.position.toArray(), quat: object.quaternion.toArray()};
-    const name = current.name;
-    const done = await context.act('world_move', {name, pose});
-    if (done) current.pose = {xyz: pose.xyz, quat: pose.quat as [number, number, number, number]};
-    end();
-    await context.run.readWorld().catch(() => {});
-  }, {class: 'primary'});
-  const mode = choice<Handles>([['translate', 'Shift'], ['rotate', 'Turn']], 'translate', (value) => {
-    handles = value;
-    attach();
-  });
+  const apply = button(
+    'Apply',
+    async () => {
+      const object = current && context.view.obstacles.get(current.name);
+      if (!object || !current) return end();
+      const pose = {xyz: object.position.toArray(), quat: object.quaternion.toArray()};
+      const name = current.name;
+      const done = await context.act('world_move', {name, pose});
+      if (done) current.pose = {xyz: pose.xyz, quat: pose.quat as [number, number, number, number]};
+      end();
+      await context.run.readWorld().catch(() => {});
+    },
+    {class: 'primary'},
+  );
+  const mode = choice<Handles>(
+    [
+      ['translate', 'Shift'],
+      ['rotate', 'Turn'],
+    ],
+    'translate',
+    (value) => {
+      handles = value;
+      attach();
+    },
+  );
   const element = el('div', {class: 'row hidden'}, mode.element, apply, button('Revert', end));
   return {
     element,
@@ -88,7 +116,10 @@ function movePart(context: Context) {
 
 function addPart(context: Context): HTMLElement {
   let kind: Kind = 'box';
-  const name = el('input', {id: 'object-name', attributes: {placeholder: 'name', 'aria-label': 'name of the obstacle', maxlength: '40'}});
+  const name = el('input', {
+    id: 'object-name',
+    attributes: {placeholder: 'name', 'aria-label': 'name of the obstacle', maxlength: '40'},
+  });
   const field = (label: string, value: number) => new NumberField(label, 'm', value, 0.01);
   const sizes: Record<Kind, NumberField[]> = {
     box: [field('x', 0.1), field('y', 0.1), field('z', 0.2)],
@@ -102,23 +133,41 @@ function addPart(context: Context): HTMLElement {
     const [a, b, c] = sizes[kind].map((each) => each.value);
     return kind === 'box' ? {box: [a!, b!, c!]} : kind === 'sphere' ? {sphere: a!} : {cylinder: [a!, b!]};
   };
-  const add = button('Add', async () => {
-    const given = name.value.trim() || nextName(kind, context.run.world);
-    const pose = {xyz: at.map((each) => each.value) as Vec3};
-    if (await context.act('world_add', {name: given, shape: shape(), pose})) {
-      name.value = '';
-      await context.run.readWorld().catch(() => {});
-    }
-  }, {id: 'object-add', class: 'primary'});
+  const add = button(
+    'Add',
+    async () => {
+      const given = name.value.trim() || nextName(kind, context.run.world);
+      const pose = {xyz: at.map((each) => each.value) as Vec3};
+      if (await context.act('world_add', {name: given, shape: shape(), pose})) {
+        name.value = '';
+        await context.run.readWorld().catch(() => {});
+      }
+    },
+    {id: 'object-add', class: 'primary'},
+  );
   show();
-  return el('fieldset', {class: 'acts add'}, el('h3', {text: 'New obstacle'}),
-    choice<Kind>([['box', 'Box'], ['sphere', 'Sphere'], ['cylinder', 'Cylinder']], 'box', (value) => {
-      kind = value;
-      show();
-    }).element,
-    el('span', {class: 'minor', text: 'size'}), size,
-    el('span', {class: 'minor', text: 'centre in map'}), el('div', {class: 'grid3', id: 'object-at'}, ...at.map((each) => each.element)),
-    el('div', {class: 'row'}, name, add));
+  return el(
+    'fieldset',
+    {class: 'acts add'},
+    el('h3', {text: 'New obstacle'}),
+    choice<Kind>(
+      [
+        ['box', 'Box'],
+        ['sphere', 'Sphere'],
+        ['cylinder', 'Cylinder'],
+      ],
+      'box',
+      (value) => {
+        kind = value;
+        show();
+      },
+    ).element,
+    el('span', {class: 'minor', text: 'size'}),
+    size,
+    el('span', {class: 'minor', text: 'centre in map'}),
+    el('div', {class: 'grid3', id: 'object-at'}, ...at.map((each) => each.element)),
+    el('div', {class: 'row'}, name, add),
+  );
 }
 
 function nextName(kind: string, world: WorldObject[]): string {

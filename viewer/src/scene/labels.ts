@@ -7,12 +7,20 @@ export class Labels {
   private readonly labels: {element: HTMLElement; object: Object3D; name: string}[] = [];
   private readonly point = new Vector3();
 
-  constructor(private readonly stage: Stage, private readonly select: (name: string) => void) {
+  constructor(
+    private readonly stage: Stage,
+    private readonly select: (name: string) => void,
+  ) {
     stage.onFrame.on(() => this.place());
   }
 
   add(name: string, object: Object3D): void {
-    const element = el('button', {class: 'arm-label', text: name, onclick: () => this.select(name), attributes: {type: 'button'}});
+    const element = el('button', {
+      class: 'arm-label',
+      text: name,
+      onclick: () => this.select(name),
+      attributes: {type: 'button'},
+    });
     this.stage.element.append(element);
     this.labels.push({element, object, name});
   }

@@ -1,7 +1,17 @@
 // Obstacles of the world, and objects that arms hold.
 import {
-  BoxGeometry, BufferGeometry, CylinderGeometry, EdgesGeometry, LineBasicMaterial, LineSegments, Mesh,
-  MeshLambertMaterial, Object3D, OctahedronGeometry, Quaternion, SphereGeometry,
+  BoxGeometry,
+  BufferGeometry,
+  CylinderGeometry,
+  EdgesGeometry,
+  LineBasicMaterial,
+  LineSegments,
+  Mesh,
+  MeshLambertMaterial,
+  Object3D,
+  OctahedronGeometry,
+  Quaternion,
+  SphereGeometry,
 } from 'three';
 import {type Pose, type Shape, type WorldObject} from '../protocol';
 import {quaternionOf} from './robot';
@@ -15,8 +25,11 @@ export class Obstacles {
   /** The object that is being moved by hand keeps its place on screen. */
   held: string | null = null;
 
-  constructor(private readonly root: Object3D, private readonly link: (robot: string, link: string) => Object3D | null,
-    private readonly changed: () => void) {}
+  constructor(
+    private readonly root: Object3D,
+    private readonly link: (robot: string, link: string) => Object3D | null,
+    private readonly changed: () => void,
+  ) {}
 
   /** Shows this world: only what differs is made again. */
   show(world: WorldObject[]): void {
@@ -39,9 +52,14 @@ export class Obstacles {
   private add(object: WorldObject, key: string): void {
     const held = object.held_by;
     const geometry = geometryOf(object.shape);
-    const mesh = new Mesh(geometry, new MeshLambertMaterial({
-      color: held ? HELD : FREE, transparent: true, opacity: held ? 0.9 : 0.35,
-    }));
+    const mesh = new Mesh(
+      geometry,
+      new MeshLambertMaterial({
+        color: held ? HELD : FREE,
+        transparent: true,
+        opacity: held ? 0.9 : 0.35,
+      }),
+    );
     const edges = new LineSegments(new EdgesGeometry(geometry, 30), new LineBasicMaterial({color: held ? HELD : FREE}));
     mesh.add(edges);
     mesh.userData.attached = true;

@@ -1,7 +1,17 @@
 // One arm of the view: its links from the URDF, its joints, collision geometry, ghosts and tool centre point.
 import {
-  AxesHelper, Color, DoubleSide, Group, Material, Matrix4, Mesh, MeshLambertMaterial, MeshPhongMaterial, Object3D,
-  Quaternion, Vector3,
+  AxesHelper,
+  Color,
+  DoubleSide,
+  Group,
+  Material,
+  Matrix4,
+  Mesh,
+  MeshLambertMaterial,
+  MeshPhongMaterial,
+  Object3D,
+  Quaternion,
+  Vector3,
 } from 'three';
 import URDFLoader, {type URDFRobot} from 'urdf-loader';
 import {type ArmStatus, type SceneRobot} from '../protocol';
@@ -19,18 +29,26 @@ export class Robot {
   private readonly tool = new Matrix4();
   private readonly tcpFrame = frame(0.09);
   private colliders = false;
+  private stale = false;
 
-  constructor(readonly model: SceneRobot, meshes: Meshes, private readonly changed: () => void) {
+  constructor(
+    readonly model: SceneRobot,
+    meshes: Meshes,
+    private readonly changed: () => void,
+  ) {
     const loader = new URDFLoader();
     loader.parseCollision = true;
     loader.loadMeshCb = (url, _manager, material, done) => {
-      void meshes.get(url).then((geometry) => {
-        done(new Mesh(geometry, material));
-        this.dress();
-      }, (error: Error) => {
-        console.warn(error);
-        done(new Object3D());
-      });
+      void meshes.get(url).then(
+        (geometry) => {
+          done(new Mesh(geometry, material));
+          this.dress();
+        },
+        (error: Error) => {
+          console.warn(error);
+          done(new Object3D());
+        },
+      );
     };
     this.urdf = loader.parse(model.urdf);
     for (const joint of Object.values(this.urdf.joints)) joint.ignoreLimits = true;
@@ -63,6 +81,24 @@ export class Robot {
     const turn = tool ? quaternionOf(tool.rpy) : new Quaternion();
     this.tool.compose(new Vector3(...(tool?.xyz ?? [0, 0, 0])), turn, new Vector3(1, 1, 1));
     this.tcpFrame.matrix.copy(this.tool);
+  }
+
+  /** Draws the arm faintly while its state is old. */
+  setStale(stale: boolean): void {
+    if (stale === this.stale) return;
+    this.stale = stale;
+    this.urdf.traverse((part) => {
+      if (!(part as {isURDFVisual?: boolean}).isURDFVisual) return;
+      part.traverse((mesh) => {
+        if (!(mesh instanceof Mesh)) return;
+        const material = mesh.material as Material;
+        material.userData.opacity ??= material.opacity;
+        material.transparent = stale || (material.userData.opacity as number) < 1;
+        material.opacity = (material.userData.opacity as number) * (stale ? 0.3 : 1);
+        material.needsUpdate = true;
+      });
+    });
+    this.changed();
   }
 
   /** Pose of the tool centre point in `map`. */
@@ -148,7 +184,10 @@ export class Robot {
     const ghost = this.urdf.clone() as URDFRobot;
     const drop: Object3D[] = [];
     const material = new MeshLambertMaterial({
-      color: new Color(GHOSTS[kind]), transparent: true, opacity: kind === 'goal' ? 0.4 : 0.45, depthWrite: false,
+      color: new Color(GHOSTS[kind]),
+      transparent: true,
+      opacity: kind === 'goal' ? 0.4 : 0.45,
+      depthWrite: false,
     });
     ghost.traverse((part) => {
       if ((part as {isURDFCollider?: boolean}).isURDFCollider || part instanceof AxesHelper || part.userData.attached) {
@@ -166,7 +205,11 @@ export class Robot {
 }
 
 const colliderMaterial: Material = new MeshLambertMaterial({
-  color: 0xff5d8f, transparent: true, opacity: 0.35, depthWrite: false, side: DoubleSide,
+  color: 0xff5d8f,
+  transparent: true,
+  opacity: 0.35,
+  depthWrite: false,
+  side: DoubleSide,
 });
 
 /** The axes of a frame, also seen through links. */
@@ -194,7 +237,8 @@ function disposeMaterial(part: Object3D): void {
 /** Roll, pitch, yaw about fixed axes. */
 export function quaternionOf(rpy: readonly [number, number, number]): Quaternion {
   const [x, y, z] = [new Vector3(1, 0, 0), new Vector3(0, 1, 0), new Vector3(0, 0, 1)];
-  return new Quaternion().setFromAxisAngle(z, rpy[2])
+  return new Quaternion()
+    .setFromAxisAngle(z, rpy[2])
     .multiply(new Quaternion().setFromAxisAngle(y, rpy[1]))
     .multiply(new Quaternion().setFromAxisAngle(x, rpy[0]));
 }

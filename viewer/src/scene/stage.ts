@@ -1,7 +1,18 @@
 // The 3D view: camera, lights, grid, and frames that are drawn only when something changed.
 import {
-  AmbientLight, AxesHelper, Box3, Color, DirectionalLight, GridHelper, Group, HemisphereLight, Object3D,
-  PerspectiveCamera, Scene as ThreeScene, Vector3, WebGLRenderer,
+  AmbientLight,
+  AxesHelper,
+  Box3,
+  Color,
+  DirectionalLight,
+  GridHelper,
+  Group,
+  HemisphereLight,
+  Object3D,
+  PerspectiveCamera,
+  Scene as ThreeScene,
+  Vector3,
+  WebGLRenderer,
 } from 'three';
 import {OrbitControls} from 'three/addons/controls/OrbitControls.js';
 import {Signal} from '../signal';
@@ -44,8 +55,14 @@ export class Stage {
     sun.position.set(1.5, -2, 4);
     const fill = new DirectionalLight(0xffffff, 0.5);
     fill.position.set(-2, 2, 1);
-    this.scene.add(this.content, this.grid, sun, fill, new HemisphereLight(0xffffff, 0x8d8d99, 1.1),
-      new AmbientLight(0xffffff, 0.25));
+    this.scene.add(
+      this.content,
+      this.grid,
+      sun,
+      fill,
+      new HemisphereLight(0xffffff, 0x8d8d99, 1.1),
+      new AmbientLight(0xffffff, 0.25),
+    );
     this.recolour();
     this.scheme.addEventListener('change', () => this.recolour());
     new ResizeObserver(() => this.resize()).observe(element);
@@ -77,10 +94,10 @@ export class Stage {
     for (const child of this.content.children) if (child.userData.fit) box.expandByObject(child);
     if (box.isEmpty()) box.set(new Vector3(-0.4, -0.4, 0), new Vector3(0.4, 0.4, 0.7));
     const centre = box.getCenter(new Vector3());
-    // Twice the radius of the home pose leaves room for the arm's reach.
-    const radius = Math.max(0.35, box.getSize(new Vector3()).length() / 2) * 1.2;
+    // Room for the reach of one arm, around it or around all.
+    const radius = Math.max(0.35, box.getSize(new Vector3()).length() / 2) * 0.8 + 0.16;
     const narrow = Math.min(1, this.camera.aspect / 1.4);
-    const distance = radius / Math.sin((FIELD_OF_VIEW / 2) * Math.PI / 180) / Math.max(0.55, narrow);
+    const distance = radius / Math.sin(((FIELD_OF_VIEW / 2) * Math.PI) / 180) / Math.max(0.55, narrow);
     this.controls.target.copy(centre);
     this.camera.position.copy(VIEWS[view]).normalize().multiplyScalar(distance).add(centre);
     this.controls.update();

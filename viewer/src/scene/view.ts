@@ -20,7 +20,11 @@ export class View {
   private readonly point = new Vector3();
   private readonly turn = new Quaternion();
 
-  constructor(readonly stage: Stage, private readonly context: Context, token: string) {
+  constructor(
+    readonly stage: Stage,
+    private readonly context: Context,
+    token: string,
+  ) {
     const {run} = context;
     const meshes = new Meshes(token);
     const changed = () => stage.invalidate();
@@ -39,13 +43,20 @@ export class View {
     }
     labels.choose(context.selected);
     context.onSelect.on(() => labels.choose(context.selected));
-    this.obstacles = new Obstacles(stage.content, (robot, link) => this.robots.get(robot)?.linkNamed(link) ?? null,
-      changed);
+    this.obstacles = new Obstacles(
+      stage.content,
+      (robot, link) => this.robots.get(robot)?.linkNamed(link) ?? null,
+      changed,
+    );
     run.onJoints.on(() => {
       this.fresh = true;
       stage.invalidate();
     });
-    run.onState.on(() => this.moveFingers());
+    run.onState.on(() => {
+      this.moveFingers();
+      for (const {name} of run.scene.arms)
+        this.robots.get(context.robotOf(name)?.name ?? '')?.setStale(run.armStale(name));
+    });
     run.onWorld.on(() => this.obstacles.show(run.world));
     run.onStatus.on((status) => {
       for (const [name, robot] of this.robots) {
@@ -127,6 +138,7 @@ export function at({trajectory}: Preview, time: number): Map<string, number> {
   const [a, b] = [points[Math.max(0, next - 1)]!, points[next]!];
   const span = b.time_from_start - a.time_from_start;
   const fraction = span > 0 ? Math.min(1, Math.max(0, (time - a.time_from_start) / span)) : 1;
-  return new Map(joint_names.map((joint, i) =>
-    [joint, a.positions[i]! + fraction * (b.positions[i]! - a.positions[i]!)] as const));
+  return new Map(
+    joint_names.map((joint, i) => [joint, a.positions[i]! + fraction * (b.positions[i]! - a.positions[i]!)] as const),
+  );
 }
