@@ -188,6 +188,10 @@ export class Robot {
       transparent: true,
       opacity: kind === 'goal' ? 0.4 : 0.45,
       depthWrite: false,
+      // Where both are at the same place, the arm is seen.
+      polygonOffset: true,
+      polygonOffsetFactor: 1,
+      polygonOffsetUnits: 8,
     });
     ghost.traverse((part) => {
       if ((part as {isURDFCollider?: boolean}).isURDFCollider || part instanceof AxesHelper || part.userData.attached) {
