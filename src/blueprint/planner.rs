@@ -262,8 +262,8 @@ pub struct PoseEntry {
     pub quat: Option<[f64; 4]>,
 }
 
-/// The live view: a page in the browser that shows the arms and commands them. `dimos view` prints its URL. Without this
-/// section a run with a robot model serves it; `--no-view` does without. See `docs/view.md`.
+/// The live view: a page in the browser that shows the arms and commands them. `dimos view` prints its URL. Without
+/// this section a run with a robot model serves it; `--no-view` does without. See `docs/view.md`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct ViewConfig {

@@ -11,8 +11,8 @@ use crate::runtime::Ended;
 /// Last line of the banner of a run with a terminal.
 pub const IN_A_TERMINAL: &str = "Press Ctrl-C for a controlled stop. In a second terminal: dimos status";
 
-/// Prints the banner of a run that is up: to stderr, or as one line of JSON to stdout. `url` is that of the live view with
-/// its token, `end` the last line.
+/// Prints the banner of a run that is up: to stderr, or as one line of JSON to stdout. `url` is that of the live view
+/// with its token, `end` the last line.
 pub(super) fn print(
     terminal: &Terminal,
     report: &StatusReport,

@@ -169,8 +169,10 @@ fn print(up: &Up, json: bool) {
     };
     output::line(format_args!("{what}  {}{standing}", up.run));
     output::line(format_args!("pid       {}", up.pid));
+    let view = |url: &String| output::line(format_args!("view      {url}"));
     if let Some(run) = &up.attached {
         output::line(format_args!("text log  {}", up.text_log.display()));
+        up.view.iter().for_each(view);
         return output::note(format_args!("attached to run {run}; end it with: dimos down {}", up.run));
     }
     for (arm, phase) in &up.arms {
@@ -179,9 +181,7 @@ fn print(up: &Up, json: bool) {
     }
     output::line(format_args!("log       {}", up.log.as_deref().unwrap_or("none")));
     output::line(format_args!("text log  {}", up.text_log.display()));
-    if let Some(url) = &up.view {
-        output::line(format_args!("view      {url}"));
-    }
+    up.view.iter().for_each(view);
     output::note(format_args!("next: dimos status, dimos logs -f, dimos down {}", up.run));
 }
 

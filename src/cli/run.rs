@@ -119,7 +119,9 @@ fn in_background(args: &Args, catalog: Catalog<'_>, text_log: &Path) -> Result {
     };
     let (endings, notified) = match &up {
         Up::Run(run) => (run.endings(), starter.up(&run.status(), run.socket(), run.view_url(), None)),
-        Up::Planner(planner) => (planner.endings(), starter.up(&planner.report(), None, None, Some(planner.run()))),
+        Up::Planner(planner) => {
+            (planner.endings(), starter.up(&planner.report(), None, planner.view_url(), Some(planner.run())))
+        }
     };
     if !notified {
         terminal.note("the starting process exited before the run was ready");

@@ -1,12 +1,15 @@
 //! `dimos view`: prints the URL of a run's live view, with its token.
 
+use std::path::PathBuf;
+
 use serde::Serialize;
 
 use super::arguments::Target;
 use super::exit::{Exit, Failure, Result};
 use super::output;
-use crate::rpc::client;
-use crate::rpc::run_dir::{RunDir, view_file};
+use crate::rpc::api::Status;
+use crate::rpc::client::{self, Client};
+use crate::rpc::run_dir::{LiveRun, RunDir, view_file};
 
 /// Arguments of `view`.
 #[derive(Debug, clap::Args)]
@@ -28,8 +31,9 @@ struct View<'a> {
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
     let run = client::find(&RunDir::standard(), args.target_run.run.as_deref())?;
-    let Ok(text) = std::fs::read_to_string(view_file(&run.socket)) else {
-        let hint = "its blueprint needs a robot model or a section `view`, and the run no --no-view";
+    let read = |file: PathBuf| std::fs::read_to_string(file).ok();
+    let Some(text) = read(view_file(&run.socket)).or_else(|| read(of_planner(&run)?)) else {
+        let hint = "the blueprint of the run, or of a planner attached to it, needs a robot model or a section `view`";
         return Err(Failure::new(Exit::Failed, format!("run {} has no live view", run.name)).hint(hint));
     };
     let url = text.trim();
@@ -38,4 +42,11 @@ pub fn run(args: &Args) -> Result {
         false => output::line(url),
     }
     Ok(Exit::Ok)
+}
+
+/// Returns the file of the planner that is attached to a run: with a model of the arms, it serves the view.
+fn of_planner(run: &LiveRun) -> Option<PathBuf> {
+    let status = Client::connect(&run.name, &run.socket).ok()?.call(Status {}).ok()?;
+    let name = status.planner?.attached?.name;
+    Some(RunDir::standard().planners().path().join(format!("{name}.view")))
 }

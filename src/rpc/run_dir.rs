@@ -1,8 +1,8 @@
 //! The run directory: sockets and locks of the live runs.
 //!
-//! A run holds a lock on `<run>.lock`, which contains its pid, beside its socket `<run>.sock`; `<run>.view` has the URL of
-//! its live view, with the token. The kernel releases the lock when the process ends, so files without a lock are stale;
-//! any process that finds them removes them.
+//! A run holds a lock on `<run>.lock`, which contains its pid, beside its socket `<run>.sock`; `<run>.view` has the URL
+//! of its live view, with the token. The kernel releases the lock when the process ends, so files without a lock are
+//! stale; any process that finds them removes them.
 
 use std::fs::{self, DirBuilder, File, OpenOptions, Permissions, TryLockError};
 use std::io::{self, Read, Write};

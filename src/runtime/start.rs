@@ -78,7 +78,7 @@ impl Run {
     fn serve_view(&mut self, blueprint: &Blueprint) {
         let Some((config, socket)) = view::config_of(blueprint).zip(self.socket()) else { return };
         let shown = Shown::of_run(self.name(), blueprint, self.config());
-        match View::start(&config, shown, socket) {
+        match View::start(&config, shown, socket, socket) {
             Ok(view) => {
                 let _ = self.handle.service.view.set(view.address().to_owned());
                 self.view = Some(view);

@@ -73,7 +73,7 @@ impl Access {
 pub struct UrlFile(PathBuf);
 
 impl UrlFile {
-    /// Writes the file beside the run's socket.
+    /// Writes the file beside a socket.
     pub fn write(socket: &Path, url: &str) -> io::Result<Self> {
         let path = run_dir::view_file(socket);
         let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&path)?;

@@ -1,8 +1,9 @@
 //! The bridge of one page: a WebSocket on one side, a connection to the run's socket on the other. Each message of the
 //! page is one line of the rpc protocol, passed on as it is; each line of the run becomes one message.
 //!
-//! Both directions are independent: a `stop` gets through while the page is slow to take what the run sends. A page that
-//! takes nothing for [`SEND_TIMEOUT`] is dropped; meanwhile the run drops its oldest messages, as for every client.
+//! Both directions are independent: a `stop` gets through while the page is slow to take the messages of a stream. A
+//! page that takes nothing for [`SEND_TIMEOUT`] is dropped; meanwhile the run drops its oldest messages, as for every
+//! client.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -101,7 +102,7 @@ fn has_token(access: &Access, text: &str) -> bool {
     token.as_ref().and_then(|token| token["token"].as_str()).is_some_and(|token| access.is_token(token))
 }
 
-/// Why a bridge ends, for its page; `None`: the page takes nothing any more.
+/// Why a bridge ends, for its page; `None`: the page no longer takes anything.
 type End = Option<(u16, &'static str)>;
 
 /// Passes messages of the page on to the run.

@@ -1,5 +1,5 @@
-//! The HTTP of the live view: one `GET` per connection. `httparse`, which hyper also uses, reads the head; a request has
-//! no body, and the end of the connection is the end of the reply.
+//! The HTTP of the live view: one `GET` per connection. `httparse`, which hyper also uses, reads the head; a request
+//! has no body, and the end of the connection is the end of the reply.
 
 use std::borrow::Cow;
 use std::io;

@@ -1,5 +1,5 @@
 //! The live view: a page in the browser that shows the arms of a run and commands them. It is one more client of the
-//! run's socket: what it sends obeys the leases, limits and refusals of every client.
+//! run's socket, with the leases, limits and refusals of every client.
 //!
 //! ```text
 //!  browser ── GET / ─────────▶ the page, compressed in the program
@@ -7,7 +7,7 @@
 //!          ◀─ WebSocket /rpc ─▶ bridge ◀── one connection per page ──▶ the run's socket
 //! ```
 //!
-//! One thread of ordinary priority serves all pages. The run does not wait for it, and goes on without it.
+//! One thread of ordinary priority serves all pages. The run does not wait for it, and continues without it.
 
 #[cfg(feature = "view")]
 mod access;
@@ -27,7 +27,7 @@ mod without_view;
 
 #[cfg(feature = "view")]
 pub use server::View;
-pub use shown::{Shown, ShownArm, ShownRobot};
+pub use shown::{Shown, ShownArm, ShownGripper, ShownRobot};
 #[cfg(not(feature = "view"))]
 pub use without_view::View;
 

@@ -1,4 +1,4 @@
-//! `/scene.json`: what does not change while the run lives. Robot descriptions are read and expanded for it, and their
+//! `/scene.json`: what does not change during the run. Robot descriptions are read and expanded for it, and their
 //! meshes numbered: a page can ask for these files only.
 
 use std::collections::{BTreeMap, HashMap};
@@ -86,7 +86,7 @@ struct Gripper<'a> {
     /// Its position when closed and open, as `state` reports it.
     min: Option<f64>,
     max: Option<f64>,
-    unit: &'static str,
+    unit: &'a str,
 }
 
 fn in_order<T: Serialize, S: Serializer>(pairs: impl AsRef<[(String, T)]>, serializer: S) -> Result<S::Ok, S::Error> {
@@ -171,31 +171,29 @@ fn number_meshes(element: &mut Element, numbers: &HashMap<&str, usize>) {
 
 fn limits_of(joint: &str, arms: &[ShownArm]) -> Option<Limits> {
     let (arm, index) = arms.iter().find_map(|arm| Some((arm, arm.joints.iter().position(|name| name == joint)?)))?;
-    let limits = &arm.config.limits;
-    let of = |list: &[f64]| list.get(index).copied();
+    // Infinite ones become null.
+    let of = |list: &[f64]| list.get(index).copied().unwrap_or(f64::INFINITY);
+    let limits = &arm.limits;
     Some(Limits {
-        lower: of(&limits.position_lower)?,
-        upper: of(&limits.position_upper)?,
-        velocity: of(&limits.velocity_max)?,
+        lower: of(&limits.position_lower),
+        upper: of(&limits.position_upper),
+        velocity: of(&limits.velocity_max),
     })
 }
 
 fn arm_of<'a>(arm: &'a ShownArm, robots: &'a [ShownRobot]) -> Arm<'a> {
     let has = |robot: &&ShownRobot| robot.joints.iter().any(|(joint, _)| arm.joints.contains(joint));
     let driven = robots.iter().filter(has).find_map(|robot| robot.gripper.as_ref());
-    let gripper = arm.config.gripper.then(|| {
-        let info = &arm.config.gripper_info;
-        Gripper {
-            joint: driven.map(|driven| driven.joint.as_str()),
-            closed: driven.map(|driven| driven.closed),
-            open: driven.map(|driven| driven.open),
-            min: info.range.map(|(closed, _)| closed),
-            max: info.range.map(|(_, open)| open),
-            unit: info.unit.name(),
-        }
+    let ShownArm { name, adapter, address, simulated, joints, gripper, .. } = arm;
+    let gripper = gripper.as_ref().map(|gripper| Gripper {
+        joint: driven.map(|driven| driven.joint.as_str()),
+        closed: driven.map(|driven| driven.closed),
+        open: driven.map(|driven| driven.open),
+        min: gripper.range.map(|(closed, _)| closed),
+        max: gripper.range.map(|(_, open)| open),
+        unit: &gripper.unit,
     });
-    let ShownArm { name, adapter, address, simulated, joints, config } = arm;
-    Arm { name, r#type: adapter, address, simulated: *simulated, dof: config.dof, joints, gripper }
+    Arm { name, r#type: adapter, address, simulated: *simulated, dof: joints.len(), joints, gripper }
 }
 
 fn pose(pose: &Isometry3<f64>) -> Pose {

@@ -36,7 +36,7 @@ const MAX_CONNECTIONS: usize = 64;
 const SEND_BUFFER: usize = 128 << 10;
 /// Pause after a failed accept (no file descriptors left).
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
-/// Time for pages to be told that the run ends.
+/// Time limit for closing the pages at the end of the run.
 const FLUSH_TIME: Duration = Duration::from_millis(100);
 
 /// A running server. Ends, and removes the file with its URL, when dropped.
@@ -60,14 +60,15 @@ struct Site {
 }
 
 impl View {
-    /// Starts serving the page of the run with this socket.
-    pub fn start(config: &ViewConfig, shown: Shown, socket: &Path) -> Result<Self, String> {
+    /// Starts serving the page of the run with this socket. The URL is also in the file that belongs to `claim`: the
+    /// socket's path of the run itself, or of the planner that serves the page.
+    pub fn start(config: &ViewConfig, shown: Shown, socket: &Path, claim: &Path) -> Result<Self, String> {
         let listener = bind(config)?;
         let failed = |what: &'static str| move |error: io::Error| format!("{what}: {error}");
         let at = listener.local_addr().map_err(failed("its port"))?;
         let access = Access::new(at).map_err(failed("no random numbers for its token"))?;
         let (address, url) = (access.address(), access.url());
-        let file = UrlFile::write(socket, &url).map_err(failed("the file with its URL"))?;
+        let file = UrlFile::write(claim, &url).map_err(failed("the file with its URL"))?;
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_io()
             .enable_time()

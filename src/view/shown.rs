@@ -3,9 +3,11 @@
 use nalgebra::Isometry3;
 
 use crate::blueprint::{Blueprint, TaskRobot};
-use crate::control::config::{ArmConfig, CoordinatorConfig};
+use crate::control::config::CoordinatorConfig;
+use crate::joint::JointLimits;
 use crate::planning::config::{GripperJoint, RobotConfig};
 use crate::robot::Source;
+use crate::rpc::report::{ArmReport, StateReport, StatusReport};
 
 /// The arms and robots that a page shows.
 #[derive(Debug, Clone, Default)]
@@ -14,7 +16,7 @@ pub struct Shown {
     pub name: String,
     /// Whether any arm is an emulator, or an ideal arm in memory.
     pub simulated: bool,
-    /// Whether the run has a planner of its own.
+    /// Whether the run has a planner.
     pub planner: bool,
     /// The robots with a model.
     pub robots: Vec<ShownRobot>,
@@ -25,7 +27,7 @@ pub struct Shown {
 /// A robot with a model.
 #[derive(Debug, Clone)]
 pub struct ShownRobot {
-    /// Name: the planner's robot, or the task that moves its end effector.
+    /// Name of the planner's robot, or of the arm whose end effector a task moves.
     pub name: String,
     /// Its description, which is read when a page asks for it.
     pub source: Source,
@@ -56,8 +58,19 @@ pub struct ShownArm {
     pub simulated: bool,
     /// Names of its joints.
     pub joints: Vec<String>,
-    /// Effective limits, and what is known of its gripper.
-    pub config: ArmConfig,
+    /// Limits, one entry per joint.
+    pub limits: JointLimits,
+    /// Its gripper.
+    pub gripper: Option<ShownGripper>,
+}
+
+/// The gripper of an arm.
+#[derive(Debug, Clone)]
+pub struct ShownGripper {
+    /// Position when closed and when open, if known [`unit`](Self::unit).
+    pub range: Option<(f64, f64)>,
+    /// Unit of its positions: `m` or `rad`.
+    pub unit: String,
 }
 
 impl Shown {
@@ -69,7 +82,11 @@ impl Shown {
             address: arm.address.clone(),
             simulated: !arm.is_real(),
             joints: arm.joints.clone(),
-            config: config.clone(),
+            limits: config.limits.clone(),
+            gripper: config.gripper.then(|| {
+                let info = &config.gripper_info;
+                ShownGripper { range: info.range, unit: info.unit.name().to_owned() }
+            }),
         });
         Self {
             name: name.to_owned(),
@@ -77,6 +94,39 @@ impl Shown {
             planner: blueprint.planner.is_some(),
             robots: robots(blueprint),
             arms: arms.collect(),
+        }
+    }
+
+    /// Returns what a page shows of a run that a planner with this blueprint is attached to.
+    pub fn of_attached(blueprint: &Blueprint, status: &StatusReport, state: &StateReport) -> Self {
+        let arm = |arm: &ArmReport| {
+            let joints = state.arms.iter().find(|state| state.hardware_id == arm.hardware_id);
+            let own = blueprint.arms.iter().find(|own| own.hardware_id == arm.hardware_id);
+            let limit = |end: usize| arm.position_limits.iter().filter_map(move |limits| limits.get(end)).copied();
+            ShownArm {
+                name: arm.hardware_id.clone(),
+                adapter: arm.adapter.clone(),
+                address: arm.address.clone(),
+                simulated: arm.simulated,
+                joints: joints.iter().flat_map(|arm| &arm.joints).map(|joint| joint.name.clone()).collect(),
+                limits: JointLimits {
+                    position_lower: limit(0).collect(),
+                    position_upper: limit(1).collect(),
+                    velocity_max: own.map(|own| own.own_limits.velocity_max.clone()).unwrap_or_default(),
+                    ..JointLimits::default()
+                },
+                gripper: arm
+                    .gripper_unit
+                    .clone()
+                    .map(|unit| ShownGripper { range: arm.gripper_range.map(|[closed, open]| (closed, open)), unit }),
+            }
+        };
+        Self {
+            name: status.run.clone(),
+            simulated: status.simulated,
+            planner: true,
+            robots: robots(blueprint),
+            arms: status.arms.iter().map(arm).collect(),
         }
     }
 }
@@ -88,7 +138,8 @@ fn robots(blueprint: &Blueprint) -> Vec<ShownRobot> {
     let names = blueprint.joint_names();
     for task in &blueprint.tasks {
         let joints = task.joints.iter().filter_map(|joint| names.get(*joint)).map(|name| (*name).to_owned());
-        let Some(robot) = task.robot.as_ref().map(|robot| of_task(&task.name, robot, joints.collect())) else {
+        let arm = task.arms.first().and_then(|arm| blueprint.arms.get(*arm)).map_or("", |arm| &arm.hardware_id);
+        let Some(robot) = task.robot.as_ref().map(|robot| of_task(arm, robot, joints.collect())) else {
             continue;
         };
         let shown = |(joint, _): &(String, String)| robots.iter().any(|r| r.joints.iter().any(|(j, _)| j == joint));

@@ -11,7 +11,7 @@ pub enum View {}
 
 impl View {
     /// Fails: this build has none.
-    pub fn start(_: &ViewConfig, _: Shown, _: &Path) -> Result<Self, String> {
+    pub fn start(_: &ViewConfig, _: Shown, _: &Path, _: &Path) -> Result<Self, String> {
         Err("this build has none (cargo feature `view`)".to_owned())
     }
 

@@ -1,5 +1,5 @@
-//! The live view over real sockets, as a browser and as others see it: who gets what, and that its WebSocket is one more
-//! connection to the run.
+//! The live view over real sockets, as a browser and as others see it: who gets what, and that its WebSocket is one
+//! more connection to the run.
 
 use std::fs;
 use std::io::{Read, Write};
@@ -50,7 +50,7 @@ view: {port: 0}
 ";
 
 /// The page of a run.
-struct Page {
+pub struct Page {
     /// `127.0.0.1:7000`.
     host: String,
     token: String,
@@ -59,7 +59,7 @@ struct Page {
 type Socket = WebSocket<TcpStream>;
 
 impl Page {
-    fn of(url: &str) -> Self {
+    pub fn of(url: &str) -> Self {
         let (host, token) = url.strip_prefix("http://").unwrap().split_once("/#").unwrap();
         Self { host: host.to_owned(), token: token.to_owned() }
     }
@@ -90,6 +90,10 @@ impl Page {
 
     fn get(&self, path: &str) -> (u16, Vec<u8>) {
         self.get_with(path, &self.token)
+    }
+
+    pub fn scene(&self) -> Value {
+        serde_json::from_slice(&self.get("/scene.json").1).unwrap()
     }
 
     /// A WebSocket that has sent a token, and what the server answered.
@@ -164,7 +168,7 @@ fn a_page_with_the_token_sees_and_commands_the_run_and_no_other_does() {
     }
     assert!(unpacked(&content).to_lowercase().starts_with("<!doctype html>"));
 
-    let scene: Value = serde_json::from_slice(&page.get("/scene.json").1).unwrap();
+    let scene = page.scene();
     let robot = &scene["robots"][0];
     assert_eq!((&scene["kind"], &scene["name"], &scene["simulated"]), (&json!("run"), &json!("cell"), &json!(true)));
     assert_eq!(
