@@ -28,8 +28,8 @@ base-uri 'none'; form-action 'none'; frame-ancestors 'none'\r\n";
 
 /// Ports that are tried, from the configured one on.
 const PORTS: u16 = 100;
-/// Maximum number of pages with a WebSocket.
-const MAX_PAGES: usize = 8;
+/// Maximum number of WebSockets: two per page, one of them for stops only.
+const MAX_SOCKETS: usize = 16;
 /// Maximum number of connections; further ones wait.
 const MAX_CONNECTIONS: usize = 64;
 /// Size of the kernel's buffer to a page [bytes]: a page that takes nothing is noticed when it is full.
@@ -82,7 +82,7 @@ impl View {
             shown: Arc::new(shown),
             scene: OnceCell::new(),
             run: socket.to_owned(),
-            pages: Arc::new(Semaphore::new(MAX_PAGES)),
+            pages: Arc::new(Semaphore::new(MAX_SOCKETS)),
         };
         let thread = std::thread::Builder::new().name("view".into()).spawn(move || {
             let serving = || runtime.block_on(serve(listener, Arc::new(site), ended));

@@ -272,8 +272,8 @@ fn pages_are_bounded_and_one_that_takes_nothing_is_dropped() {
         }
         asked
     });
-    let mut pages: Vec<Socket> = (0..7).map(|_| page.accepted()).collect();
-    let (_ninth, answer) = page.open(&page.token);
+    let mut pages: Vec<Socket> = (0..15).map(|_| page.accepted()).collect();
+    let (_one_more, answer) = page.open(&page.token);
     assert_eq!(closed_with(answer), Some(4429));
     let silent = page.connect();
     let began = std::time::Instant::now();

@@ -49,7 +49,7 @@ async function main(): Promise<void> {
   run.start();
 }
 
-/** Reads the scene, again and again until the run answers; null if it refuses the token. */
+/** Reads the scene, with retries until the run answers; null if it refuses the token. */
 async function readScene(token: string): Promise<Scene | null> {
   for (let delay = 250; ; delay = Math.min(delay * 2, LONGEST_DELAY)) {
     try {

@@ -3,7 +3,7 @@
 export type Vec3 = [number, number, number];
 export type Quat = [number, number, number, number];
 
-/** What does not change while the run lives: `/scene.json`. */
+/** What does not change during a run: `/scene.json`. */
 export interface Scene {
   version: number;
   kind: string;

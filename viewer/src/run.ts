@@ -158,7 +158,7 @@ export class Run {
     }
   }
 
-  /** Runs a request again and again, the next one this long after the end of the one before. */
+  /** Repeats a request, each this long after the end of the one before. */
   private repeat(period: number, request: () => Promise<void>): void {
     const next = async () => {
       if (this.work.state === 'open' && !document.hidden) await request().catch(() => {});

@@ -143,7 +143,7 @@ test('on a phone, Stop is on screen and nothing is wider than it', async () => {
   await phone.context().close();
 });
 
-// The last one: the run's clock has stood still, so its arms are held afterwards.
+// The last one: the run was suspended, so its arms are held afterwards.
 test('a lost connection is shown, disables acts, and recovers', async () => {
   run.child.kill('SIGSTOP');
   await text(page, '#age', /^no data for \d/);

@@ -17,7 +17,7 @@ const FLAGS = [
 ];
 export const TIMEOUT = 20_000; // ms, of every wait
 
-/** A run, in a home folder of its own. */
+/** A run, in its own home folder. */
 export class Run {
   constructor(home, child) {
     this.home = home;

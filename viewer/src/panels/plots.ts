@@ -113,7 +113,7 @@ class Plot {
     if (!this.chart || !this.area.clientWidth) return;
     const ring = this.quantity === 'lateness' ? history.lateness : history.arms.get(selected)?.[this.quantity];
     if (!ring?.length) return;
-    // While no data comes, time goes on: the gap is seen.
+    // Without data the time axis continues, so that the gap is seen.
     const now = history.lateness.length ? history.lateness.last + (run.stale ? run.age / 1000 : 0) : ring.last;
     const peaks = this.quantity === 'lateness' || this.quantity === 'error';
     const data = ring.since(now - this.span(), MOST_POINTS, peaks);
