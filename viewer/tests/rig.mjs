@@ -112,6 +112,7 @@ export async function open(browser, url, viewport = {width: 1200, height: 760}) 
   page.on('request', (request) => page.requests.push(request.url()));
   page.on('websocket', (socket) => page.requests.push(socket.url()));
   page.on('pageerror', (error) => page.errors.push(error.stack));
+  page.on('console', (message) => message.type() === 'error' && page.errors.push(message.text()));
   await page.goto(url);
   return page;
 }

@@ -9,6 +9,8 @@ import {Robot} from './robot';
 import {Stage, dispose} from './stage';
 import {Trace, planLine} from './trace';
 
+/** Smallest motion of a joint for which a frame is drawn [rad]: noise at rest is less. */
+const SMALLEST = 1e-5;
 const TRACE_COLORS = [0xe5484d, 0x30a46c, 0xab6bff, 0xf5a524];
 
 export class View {
@@ -17,6 +19,7 @@ export class View {
   private readonly traces = new Map<string, Trace>();
   private readonly planLines: Line[] = [];
   private fresh = false;
+  private drawn: number[] = [];
   private readonly point = new Vector3();
   private readonly turn = new Quaternion();
 
@@ -48,7 +51,10 @@ export class View {
       (robot, link) => this.robots.get(robot)?.linkNamed(link) ?? null,
       changed,
     );
-    run.onJoints.on(() => {
+    run.onJoints.on(({position}) => {
+      const moved = position.some((value, i) => Math.abs((value ?? 0) - (this.drawn[i] ?? Infinity)) > SMALLEST);
+      if (!moved) return;
+      this.drawn = position.map((value) => value ?? 0);
       this.fresh = true;
       stage.invalidate();
     });
