@@ -8,7 +8,8 @@ use crate::support::skip::{skip, skip_tool};
 #[test]
 fn the_page_works_in_a_browser() {
     let viewer = Path::new(env!("CARGO_MANIFEST_DIR")).join("viewer");
-    let has = |tool: &str| Command::new(tool).arg("--version").stdout(Stdio::null()).status().is_ok_and(|s| s.success());
+    let has =
+        |tool: &str| Command::new(tool).arg("--version").stdout(Stdio::null()).status().is_ok_and(|s| s.success());
     if !viewer.join("dist/index.html").exists() {
         return skip("the page of the live view (make viewer)");
     }

@@ -2,6 +2,7 @@
 import {type JointState, type State} from './protocol';
 
 export const LONGEST = 180; // s that are kept
+const GAP = 0.7; // s without a sample
 
 /** Columns of one sample each, in a ring: the time first. */
 export class Ring {
@@ -16,7 +17,13 @@ export class Ring {
 
   push(time: number, values: (number | null | undefined)[]): void {
     // A clock that was set back would draw lines to the left.
-    if (this.count && time <= this.at(0, this.length - 1)) return;
+    if (time <= this.last) return;
+    // Lines end where data was missing.
+    if (time - this.last > GAP) this.store(this.last + GAP, []);
+    this.store(time, values);
+  }
+
+  private store(time: number, values: (number | null | undefined)[]): void {
     const index = this.count % this.size;
     this.columns[0]![index] = time;
     for (let i = 1; i < this.columns.length; i++) this.columns[i]![index] = values[i - 1] ?? NaN;
@@ -44,9 +51,9 @@ export class Ring {
       out[0]!.push(this.at(0, i));
       for (let c = 1; c < this.columns.length; c++) {
         let value = this.at(c, i);
-        for (let j = 1; peaks && j < stride && i + j < this.length; j++) {
+        for (let j = 1; j < stride && i + j < this.length; j++) {
           const other = this.at(c, i + j);
-          if (Math.abs(other) > Math.abs(value)) value = other;
+          if (Number.isNaN(other) || (peaks && Math.abs(other) > Math.abs(value))) value = other;
         }
         out[c]!.push(Number.isNaN(value) ? null : value);
       }

@@ -21,6 +21,7 @@ import {worldPanel} from './panels/world';
 import {pause} from './flow';
 
 const LONGEST_DELAY = 4000; // ms between two attempts to read the scene
+const NO_ACTS_AFTER = 1500; // ms without a joint state
 const app = document.getElementById('app')!;
 
 async function main(): Promise<void> {
@@ -40,8 +41,12 @@ async function main(): Promise<void> {
   run.onJoints.on((state) => context.history.takeJoints(state));
   run.onState.on((state) => context.history.takeState(state));
   layout(context, canvas);
-  run.onLink.on(() => enableActs(run.connected));
-  enableActs(false);
+  const usable = () => run.connected && run.age < NO_ACTS_AFTER;
+  let enabled = false;
+  enableActs(enabled);
+  window.setInterval(() => {
+    if (usable() !== enabled) enableActs((enabled = usable()));
+  }, 100);
   // For tests: what was drawn, and how long the page's own code took.
   Object.assign(window, {
     dimos: {measured: stage.measured, run, history: context.history, memory: stage.renderer.info.memory},
@@ -120,7 +125,7 @@ function layout(context: Context, canvas: HTMLElement): void {
   choose('move');
 }
 
-/** Without a connection nothing can be commanded. Stop is not among these. */
+/** Without a connection, or without data, nothing can be commanded. Stop is not among these. */
 function enableActs(connected: boolean): void {
   document.querySelectorAll<HTMLFieldSetElement>('fieldset.acts').forEach((each) => {
     each.disabled = !connected;

@@ -45,7 +45,7 @@ export class Stop {
       }));
     } catch (error) {
       const why = error instanceof RpcError ? error.message : String(error);
-      this.lines = [{good: false, text: `NOT CONFIRMED: ${why}. use the stop button at the arm`}];
+      this.lines = [{good: false, text: `NOT CONFIRMED: ${why}. Use the stop button at the arm`}];
     }
     this.sending = false;
     this.changed.emit();
