@@ -32,7 +32,7 @@ struct View<'a> {
 pub fn run(args: &Args) -> Result {
     let run = client::find(&RunDir::standard(), args.target_run.run.as_deref())?;
     let read = |file: PathBuf| std::fs::read_to_string(file).ok();
-    let Some(text) = read(view_file(&run.socket)).or_else(|| read(of_planner(&run)?)) else {
+    let Some(text) = of_planner(&run).and_then(read).or_else(|| read(view_file(&run.socket))) else {
         let hint = "the blueprint of the run, or of a planner attached to it, needs a robot model or a section `view`";
         return Err(Failure::new(Exit::Failed, format!("run {} has no live view", run.name)).hint(hint));
     };
@@ -44,7 +44,7 @@ pub fn run(args: &Args) -> Result {
     Ok(Exit::Ok)
 }
 
-/// Returns the file of the planner that is attached to a run: with a model of the arms, it serves the view.
+/// Returns the file of the planner that is attached to a run, whose page also has the planner's robots.
 fn of_planner(run: &LiveRun) -> Option<PathBuf> {
     let status = Client::connect(&run.name, &run.socket).ok()?.call(Status {}).ok()?;
     let name = status.planner?.attached?.name;

@@ -18,6 +18,11 @@ const HEAD_TIMEOUT: Duration = Duration::from_secs(5);
 /// Time limit for a reply: the largest mesh through a slow tunnel.
 const REPLY_TIMEOUT: Duration = Duration::from_secs(60);
 
+/// Maximum number of bytes behind a request that are discarded.
+const MAX_UNREAD: u64 = 1 << 20;
+/// Time limit for the client to close the connection.
+const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
+
 /// Headers of every reply. Nothing is kept, and no other site may embed the page or read from it.
 const COMMON: &str = "Cache-Control: no-store\r\nX-Content-Type-Options: nosniff\r\nReferrer-Policy: no-referrer\r\n\
 Cross-Origin-Resource-Policy: same-origin\r\nConnection: close\r\n";
@@ -120,7 +125,11 @@ pub async fn send(stream: &mut TcpStream, reply: Reply) -> io::Result<()> {
         stream.write_all(&body).await?;
         stream.shutdown().await
     };
-    timeout(REPLY_TIMEOUT, sending).await.unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()))
+    timeout(REPLY_TIMEOUT, sending).await.unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()))?;
+    // Closing with unread bytes would discard the reply.
+    let mut unread = stream.take(MAX_UNREAD);
+    let _ = timeout(CLOSE_TIMEOUT, tokio::io::copy(&mut unread, &mut tokio::io::sink())).await;
+    Ok(())
 }
 
 fn reason(status: u16) -> &'static str {
