@@ -25,6 +25,8 @@ export class Flow {
   text = '';
   error: RpcError | null = null;
   readonly changed = new Signal();
+  /** People want to see the plan. */
+  readonly onPlay = new Signal();
 
   constructor(private readonly run: Run) {}
 

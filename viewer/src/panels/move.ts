@@ -49,7 +49,7 @@ export function movePanel(context: Context): HTMLElement {
     },
     {id: 'direct', class: 'go', title: 'Moves the arm: in joint space, not collision-checked'},
   );
-  const preview = button('Preview', () => context.view.stage.element.dispatchEvent(new Event('preview')), {
+  const preview = button('Preview', () => flow.onPlay.emit(), {
     id: 'preview',
   });
   const execute = button('Execute', () => void flow.execute(), {

@@ -51,7 +51,7 @@ export function timeline(context: Context): HTMLElement {
     time = (Number(range.value) / 1000) * end();
     show();
   });
-  context.view.stage.element.addEventListener('preview', () => {
+  flow.onPlay.on(() => {
     time = 0;
     halt();
     start();
