@@ -1,6 +1,7 @@
 // Buttons over the view: where the camera looks from, and what is shown.
 import {type Context} from '../context';
 import {button, el} from '../dom';
+import {type Robot} from '../scene/robot';
 import {VIEWS} from '../scene/stage';
 
 const NAMES: Record<keyof typeof VIEWS, string> = {iso: 'Fit', front: 'Front', side: 'Side', top: 'Top'};
@@ -18,8 +19,7 @@ export function toolbar({view}: Context): HTMLElement {
     );
     return control;
   };
-  const each = (set: (robot: typeof view.robots extends Map<string, infer R> ? R : never) => void) =>
-    view.robots.forEach(set);
+  const each = (set: (robot: Robot) => void) => view.robots.forEach(set);
   return el(
     'div',
     {class: 'toolbar'},
