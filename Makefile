@@ -1,11 +1,11 @@
-# run install dist check test test-fast · test-tools test-rerun deny mutants · bench bench-quick jitter soak
+# run install dist viewer check test test-fast · test-tools test-rerun deny mutants · bench bench-quick jitter soak
 
 PYTHON ?= python3
 # Most tests wait rather than compute. More at a time than this and whole runs no longer keep their time.
 export NEXTEST_TEST_THREADS ?= $(shell echo $$((2 * $$(nproc))))
 READERS := tests/readers
-SYSTEM_TOOLS := cyclictest linux.uml insmod ip tc cansend
-SYSTEM_PACKAGES := rt-tests user-mode-linux kmod iproute2 can-utils
+SYSTEM_TOOLS := cyclictest linux.uml insmod ip tc cansend chromium
+SYSTEM_PACKAGES := rt-tests user-mode-linux kmod iproute2 can-utils chromium
 
 # A comma in the argument of a function.
 , := ,
@@ -28,10 +28,15 @@ SMALL_ZSTD := $(foreach kind,DFAST GREEDY LAZY LAZY2 BTLAZY2 BTOPT BTULTRA,-DZST
 # Without objcopy the linker drops the debug information.
 STRIP := $(if $(shell command -v objcopy),,CARGO_PROFILE_DIST_STRIP=symbols)
 
-.PHONY: run install dist shipped check lint spelling licences test test-fast test-tools test-rerun deny mutants bench bench-quick jitter soak
+# What the page of the live view is built from; nothing where it is not in this tree.
+PAGE := viewer/dist/index.html
+PAGE_SOURCES := $(wildcard viewer/*.json viewer/*.mjs) $(shell find viewer/src -type f 2>/dev/null)
+NODE := $(if $(wildcard viewer/package.json),$(shell command -v npm))
+
+.PHONY: run install dist shipped viewer viewer-if-possible check lint spelling licences test test-fast test-tools test-rerun deny mutants bench bench-quick jitter soak
 
 # Builds the program to try it, not optimized, and starts the shipped blueprint; its arm is simulated. Ends with Ctrl-C.
-run:
+run: viewer-if-possible
 	@[ -e $(TARGET)/quick/dimos ] || echo "building dimos: 3 to 5 minutes the first time" >&2
 	@cargo run --profile quick --locked -- run coordinator-yourarm || [ $$? -eq 130 ]
 
@@ -45,12 +50,28 @@ dist: shipped
 	packaging/dist.sh $(SHIPPED)/dimos $(SHIPPED)
 
 # The optimized program without debug information, and its debug file.
-shipped:
+shipped: viewer
 	@echo "building dimos as it is shipped: several minutes" >&2
 	$(STRIP) CFLAGS="$(SMALL_ZSTD)" RUSTFLAGS="$(SMALL_LINK) $(SHORT_PATHS)" cargo build --profile dist --locked --bin dimos
 	packaging/strip.sh $(TARGET)/dist/dimos $(SHIPPED)
 	@size=$$(stat -c %s $(SHIPPED)/dimos); [ $$size -le $(LARGEST) ] || \
 	{ echo "error: the program has $$size bytes (limit $(LARGEST))" >&2; exit 1; }
+
+# The page of the live view, which the next build embeds. Without Node that build embeds a page that says so.
+viewer: $(if $(NODE),$(PAGE))
+	@[ -e $(PAGE) ] || echo "note: the page of the live view is not built: Node and npm are missing" >&2
+
+# For those who only try: without a network it does without.
+viewer-if-possible:
+	@$(MAKE) --no-print-directory viewer || echo "note: the page of the live view is not built; all else works" >&2
+
+$(PAGE): viewer/node_modules/.package-lock.json $(PAGE_SOURCES)
+	cd viewer && npm run --silent build
+	@touch $@
+
+viewer/node_modules/.package-lock.json: viewer/package.json viewer/package-lock.json
+	cd viewer && npm ci --no-audit --no-fund
+	@touch $@
 
 check: lint spelling licences
 
@@ -72,7 +93,7 @@ deny:
 	cargo deny --all-features check bans licenses sources
 
 # Installs nothing: tests whose tools are missing are skipped.
-test:
+test: viewer-if-possible
 	@[ -e .venv/readers-installed ] || echo "note: some tests will be skipped; make test-tools installs what they need"
 	cargo test --locked --doc
 	@if cargo nextest --version >/dev/null 2>&1; \
@@ -87,9 +108,9 @@ test-fast:
 	else cargo test --locked --lib; \
 	fi
 
-# What tests compare with and run in: other people's readers of logs; as root, also cyclictest, and a guest kernel that
-# has CAN, with the tools for its interfaces.
-test-tools: .venv/readers-installed $(READERS)/node_modules/.package-lock.json
+# What tests compare with and run in: other people's readers of logs; as root, also cyclictest, a browser, and a guest
+# kernel that has CAN, with the tools for its interfaces.
+test-tools: .venv/readers-installed $(READERS)/node_modules/.package-lock.json viewer/node_modules/.package-lock.json
 	@if [ "$$(id -u)" = 0 ]; then missing=; for tool in $(SYSTEM_TOOLS); do command -v $$tool >/dev/null || missing=yes; done; \
 	[ -z "$$missing" ] || { apt-get update -q && apt-get install -qy --no-install-recommends $(SYSTEM_PACKAGES); }; \
 	fi

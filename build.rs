@@ -8,7 +8,8 @@ fn main() -> io::Result<()> {
     println!("cargo::rerun-if-changed=build.rs");
     version();
     blueprints()?;
-    packed()
+    packed()?;
+    page()
 }
 
 /// Sets `DIMOS_VERSION`: the package's version, with the commit where there is one: `0.1.0 (1d8ac97f)`.
@@ -77,4 +78,29 @@ fn collect(folder: &Path, files: &mut Vec<PathBuf>) -> io::Result<()> {
         if path.is_dir() { collect(&path, files)? } else { files.push(path) }
     }
     Ok(())
+}
+
+/// The page of the live view, which `make viewer` makes, and the one that says so while there is none.
+const PAGE: &str = "viewer/dist/index.html";
+const NO_PAGE: &str = "assets/no-viewer.html";
+
+/// Compresses the page of the live view, as browsers take it.
+fn page() -> io::Result<()> {
+    // The folder, not the file: a file that is missing would build the program again each time.
+    let folder = Path::new(PAGE).parent().filter(|folder| folder.is_dir());
+    for watched in folder.and_then(Path::to_str).into_iter().chain([NO_PAGE]) {
+        println!("cargo::rerun-if-changed={watched}");
+    }
+    let text = fs::read(PAGE).or_else(|_| fs::read(NO_PAGE))?;
+    let mut file = vec![0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 2, 255];
+    file.extend(miniz_oxide::deflate::compress_to_vec(&text, 9));
+    file.extend(crc32(&text).to_le_bytes());
+    file.extend((text.len() as u32).to_le_bytes());
+    fs::write(PathBuf::from(env::var("OUT_DIR").unwrap_or_default()).join("page.html.gz"), file)
+}
+
+/// The check sum at the end of a gzip file.
+fn crc32(bytes: &[u8]) -> u32 {
+    let bit = |crc: u32, _| if crc & 1 == 1 { (crc >> 1) ^ 0xedb8_8320 } else { crc >> 1 };
+    !bytes.iter().fold(!0, |crc, byte| (0..8).fold(crc ^ u32::from(*byte), bit))
 }

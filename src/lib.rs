@@ -66,6 +66,8 @@ pub mod recording;
 
 pub mod blueprint;
 
+pub mod view;
+
 pub mod runtime;
 
 pub mod replay;

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fmt;
+use std::net::{IpAddr, Ipv4Addr};
 
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::de::value::MapAccessDeserializer;
@@ -261,19 +262,23 @@ pub struct PoseEntry {
     pub quat: Option<[f64; 4]>,
 }
 
-/// The live view in the browser. Not in this version: `check` and `run` warn about it.
+/// The live view: a page in the browser that shows the arms and commands them. `dimos view` prints its URL. Without
+/// this section a run with a robot model serves it; `--no-view` does without. See `docs/view.md`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct ViewConfig {
     /// Backend of the view.
     pub backend: ViewBackend,
-    /// Port of its page on this machine; 0 = any free port.
+    /// IP address that it is served at. `127.0.0.1` is this computer only; with any other one, all who reach the
+    /// computer can try, and the connection is not encrypted.
+    pub host: IpAddr,
+    /// First port that is tried; if others have it, the next free one of 100. 0 = any free port.
     pub port: u16,
 }
 
 impl Default for ViewConfig {
     fn default() -> Self {
-        Self { backend: ViewBackend::Meshcat, port: 7000 }
+        Self { backend: ViewBackend::Meshcat, host: Ipv4Addr::LOCALHOST.into(), port: 7000 }
     }
 }
 
@@ -281,7 +286,7 @@ impl Default for ViewConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum ViewBackend {
-    /// A page in the browser.
+    /// The page of dimos, in the browser. The name is that of Drake's viewer, whose place it takes.
     #[default]
     Meshcat,
     /// None.

@@ -235,9 +235,11 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
     let view = file.view.or_else(|| file.planner.and_then(|p| p.value.visualization));
     // Only without errors: a mistake in the section may have changed its backend.
     let sound = checker.tree.diags().iter().all(|diag| diag.severity != Severity::Error);
-    if let Some(view) = view.as_ref().filter(|view| sound && view.backend != ViewBackend::None) {
-        let diag = Diag::warning("the live view is not in this version: no page will be served");
-        checker.error(view.at, diag.hint("remove the section, or set `backend: none`"));
+    let served = view.as_ref().filter(|view| sound && view.backend != ViewBackend::None);
+    if let Some(view) = served.filter(|view| !view.host.is_loopback()) {
+        let what = format!("the live view is open to the network at {}, not encrypted", view.host);
+        let diag = Diag::warning(what).note("anyone who reads the traffic has the token, and can command the arms");
+        checker.error(view.at, diag.hint("remove `host` and connect through ssh: docs/view.md"));
     }
     Blueprint {
         name: name.value,

@@ -35,7 +35,7 @@ pub struct BlueprintFile {
     pub tasks: Vec<Located<TaskEntry>>,
     /// Motion planning.
     pub planner: Option<Located<PlannerEntry>>,
-    /// The live view in the browser; not in this version.
+    /// The live view in the browser.
     pub view: Option<Located<ViewConfig>>,
     /// The log of the run.
     pub recording: RecordingConfig,

@@ -1,6 +1,7 @@
 //! `dimos run` of a planner blueprint while a live run has its arms: the planner attaches to that run and starts no
 //! hardware. Ends by a signal, its duration, or `dimos down` with its name; the run continues.
 
+use std::io::IsTerminal;
 use std::path::Path;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::Duration;
@@ -14,11 +15,12 @@ use super::run_record::RunRecord;
 use super::text_log::Terminal;
 use crate::blueprint::Blueprint;
 use crate::planning::config::RobotConfig;
-use crate::rpc::api::Status;
+use crate::rpc::api::{State, Status};
 use crate::rpc::client::{self, Client, ClientError};
 use crate::rpc::report::{ArmReport, StatusReport};
 use crate::rpc::run_dir::{Claim, LiveRun, RunDir};
 use crate::runtime::{AttachedPlanner, Ending, LinkEvent};
+use crate::view::{self, Shown, View};
 
 /// A planner attached to a run, in its own process.
 pub struct Attached {
@@ -28,6 +30,7 @@ pub struct Attached {
     /// The arms of the run.
     arms: Vec<ArmReport>,
     planner: AttachedPlanner,
+    view: Option<View>,
     /// Its name among the planners; released when it ends.
     _claim: Claim,
     ending: (Sender<Ending>, Receiver<Ending>),
@@ -164,9 +167,20 @@ impl Attached {
         };
         let planner = AttachedPlanner::start(&name, &config, &run.socket, on_event)
             .map_err(|e| Failure::new(Exit::Failed, e.to_string()).hint(e.hint()))?;
-        let status = Client::connect(&run.name, &run.socket).and_then(|mut client| client.call(Status {}));
-        let arms = status.map(|status| status.arms).unwrap_or_default();
-        Ok(Self { name, blueprint: blueprint.name.clone(), run, arms, planner, _claim: claim, ending: channel() })
+        let reports = Client::connect(&run.name, &run.socket)
+            .and_then(|mut client| Ok((client.call(Status {})?, client.call(State {})?)));
+        let view = reports.as_ref().ok().filter(|_| !args.no_view).and_then(|(status, state)| {
+            let (config, shown) = (view::config_of(blueprint)?, Shown::of_attached(blueprint, status, state));
+            let served = View::start(&config, shown, &run.socket, claim.socket());
+            served.inspect_err(|why| tracing::warn!("no live view: {why}")).ok()
+        });
+        let arms = reports.map(|(status, _)| status.arms).unwrap_or_default();
+        Ok(Self { name, blueprint: blueprint.name.clone(), run, arms, planner, view, _claim: claim, ending: channel() })
+    }
+
+    /// Returns the URL of its live view, with the token, if it serves one.
+    pub fn view_url(&self) -> Option<&str> {
+        self.view.as_ref().map(View::url)
     }
 
     /// Returns the planner's status for run records.
@@ -193,7 +207,8 @@ impl Attached {
     /// Serves until a signal or the duration ends it.
     pub fn keep_up(self, terminal: &Terminal, args: &Args, text_log: Option<&Path>) -> Result {
         let record = RunRecord::begin(&self.report(), text_log);
-        self.print_banner(terminal, args.json && text_log.is_none());
+        let url = self.view_url().filter(|_| text_log.is_none() && std::io::stderr().is_terminal());
+        self.print_banner(terminal, url, args.json && text_log.is_none());
         let ending = match args.duration {
             Some(limit) => self.ending.1.recv_timeout(limit),
             None => self.ending.1.recv().map_err(|_| RecvTimeoutError::Disconnected),
@@ -215,7 +230,7 @@ impl Attached {
         Ok(exit)
     }
 
-    fn print_banner(&self, terminal: &Terminal, json: bool) {
+    fn print_banner(&self, terminal: &Terminal, url: Option<&str>, json: bool) {
         let pid = std::process::id();
         if json {
             let robots: Vec<&str> = self.planner.robots().iter().map(|robot| robot.name.as_str()).collect();
@@ -232,6 +247,10 @@ impl Attached {
         for robot in self.planner.robots() {
             let task = robot.task.as_deref().unwrap_or("the task that has its joints");
             terminal.note(format_args!("  robot      {}: {} joints, moved by {task}", robot.name, robot.joints.len()));
+        }
+        if let Some(view) = &self.view {
+            let line = url.map_or_else(|| banner::view_without_token(view.address()), str::to_owned);
+            terminal.note(format_args!("  view       {line}"));
         }
         terminal.note("Press Ctrl-C to detach; the run continues. In another terminal: dimos plan");
     }

@@ -11,8 +11,16 @@ use crate::runtime::Ended;
 /// Last line of the banner of a run with a terminal.
 pub const IN_A_TERMINAL: &str = "Press Ctrl-C for a controlled stop. In a second terminal: dimos status";
 
-/// Prints the banner of a run that is up: to stderr, or as one line of JSON to stdout. `end` is its last line.
-pub(super) fn print(terminal: &Terminal, report: &StatusReport, socket: &Path, end: &str, json: bool) {
+/// Prints the banner of a run that is up: to stderr, or as one line of JSON to stdout. `url` is that of the live view
+/// with its token, `end` the last line.
+pub(super) fn print(
+    terminal: &Terminal,
+    report: &StatusReport,
+    socket: &Path,
+    url: Option<&str>,
+    end: &str,
+    json: bool,
+) {
     #[derive(Serialize)]
     struct Started<'a> {
         event: &'static str,
@@ -23,11 +31,11 @@ pub(super) fn print(terminal: &Terminal, report: &StatusReport, socket: &Path, e
     if json {
         return terminal.json(&Started { event: "started", socket, report });
     }
-    text(report, socket, end).iter().for_each(|line| terminal.note(line));
+    text(report, socket, url, end).iter().for_each(|line| terminal.note(line));
 }
 
 /// Returns the banner's lines.
-pub fn text(report: &StatusReport, socket: &Path, end: &str) -> Vec<String> {
+pub fn text(report: &StatusReport, socket: &Path, url: Option<&str>, end: &str) -> Vec<String> {
     let heading = heading(report);
     let mut lines = vec![format!("{heading}  (pid {}, dimos {})", report.pid, report.version)];
     let mut row = |what: &str, text: String| lines.push(format!("  {what:<10} {text}"));
@@ -48,8 +56,16 @@ pub fn text(report: &StatusReport, socket: &Path, end: &str) -> Vec<String> {
     }
     row("log", report.log.clone().unwrap_or_else(|| "none".into()));
     row("socket", socket.display().to_string());
+    if let Some(address) = &report.view {
+        row("view", url.map_or_else(|| view_without_token(address), str::to_owned));
+    }
     lines.push(end.into());
     lines
+}
+
+/// Returns the address of a live view with the way to its token.
+pub fn view_without_token(address: &str) -> String {
+    format!("{address}  (`dimos view` prints the URL with its token)")
 }
 
 /// Returns the first words about a run: its name, and in capitals whether it is simulated.
@@ -171,7 +187,12 @@ run coordinator-yourarm  PARTLY SIMULATED  (pid 42, dimos 0.1.0)
   log        none
   socket     /run/dimos.sock
 Press Ctrl-C for a controlled stop. In a second terminal: dimos status";
-        assert_eq!(text(&report, Path::new("/run/dimos.sock"), IN_A_TERMINAL).join("\n"), expected);
+        let socket = Path::new("/run/dimos.sock");
+        assert_eq!(text(&report, socket, None, IN_A_TERMINAL).join("\n"), expected);
+        let viewed = StatusReport { view: Some("http://127.0.0.1:7000/".into()), ..report };
+        let line = |url| text(&viewed, socket, url, "end").into_iter().rev().nth(1).unwrap();
+        assert_eq!(line(Some("http://127.0.0.1:7000/#1f")), "  view       http://127.0.0.1:7000/#1f");
+        assert!(line(None).starts_with("  view       http://127.0.0.1:7000/  (`dimos view`"), "{}", line(None));
 
         assert_eq!(at_exit(&arm("park", false)), "it moves to its park pose, then motors off");
         let (normal, parked) = (Ended::default(), Ended { parked: vec!["arm".into()], ..Ended::default() });

@@ -53,6 +53,9 @@ pub struct Up {
     pub text_log: PathBuf,
     /// Its socket, if it has one.
     pub socket: Option<PathBuf>,
+    /// URL of its live view, with the token, if it is served.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub view: Option<String>,
     /// The run it attached to, if it is a planner.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub attached: Option<String>,
@@ -166,8 +169,10 @@ fn print(up: &Up, json: bool) {
     };
     output::line(format_args!("{what}  {}{standing}", up.run));
     output::line(format_args!("pid       {}", up.pid));
+    let view = |url: &String| output::line(format_args!("view      {url}"));
     if let Some(run) = &up.attached {
         output::line(format_args!("text log  {}", up.text_log.display()));
+        up.view.iter().for_each(view);
         return output::note(format_args!("attached to run {run}; end it with: dimos down {}", up.run));
     }
     for (arm, phase) in &up.arms {
@@ -176,6 +181,7 @@ fn print(up: &Up, json: bool) {
     }
     output::line(format_args!("log       {}", up.log.as_deref().unwrap_or("none")));
     output::line(format_args!("text log  {}", up.text_log.display()));
+    up.view.iter().for_each(view);
     output::note(format_args!("next: dimos status, dimos logs -f, dimos down {}", up.run));
 }
 
@@ -200,7 +206,8 @@ impl StartingProcess {
     }
 
     /// Reports that the run is up, or the planner attached to that run; returns whether the command was still waiting.
-    pub fn up(self, report: &StatusReport, socket: Option<&Path>, attached: Option<&str>) -> bool {
+    /// `view` is the URL of the live view with its token: only that command gets it, not the text log.
+    pub fn up(self, report: &StatusReport, socket: Option<&Path>, view: Option<&str>, attached: Option<&str>) -> bool {
         let text_log = self.text_log.clone();
         let up = Up {
             run: report.run.clone(),
@@ -212,6 +219,7 @@ impl StartingProcess {
             log: report.log.clone(),
             text_log,
             socket: socket.map(PathBuf::from),
+            view: view.map(str::to_owned),
             attached: attached.map(str::to_owned),
         };
         self.send(&StartMessage::Up(up)).is_ok()
@@ -257,7 +265,7 @@ mod tests {
         let up = |arms: Vec<ArmReport>| {
             let (ours, theirs) = UnixStream::pair().unwrap();
             let starter = StartingProcess { stream: theirs, text_log: "text.log".into() };
-            starter.up(&StatusReport { run: "cell".into(), arms, ..StatusReport::default() }, None, None);
+            starter.up(&StatusReport { run: "cell".into(), arms, ..StatusReport::default() }, None, None, None);
             let mut line = String::new();
             BufReader::new(ours).read_line(&mut line).unwrap();
             let StartMessage::Up(up) = serde_json::from_str(&line).unwrap() else { panic!("{line}") };

@@ -47,6 +47,7 @@ mod targets;
 pub mod task;
 mod text_log;
 mod trajectory_file;
+pub mod view;
 pub mod world;
 
 use std::ffi::OsString;
@@ -122,6 +123,8 @@ enum Command {
     Task(task::Args),
     /// Serve an arm of a run to programs that were written for a vendor's SDK
     Proxy(proxy::Args),
+    /// Print the URL of a run's live view, a page in the browser that shows its arms
+    View(view::Args),
     /// Shut down a run: decelerate, release the arms, close the log
     Down(down::Args),
     /// Show the text log of a run that was started with --daemon, live or dead
@@ -331,6 +334,7 @@ fn built_in(cli: &Cli, catalog: Catalog<'_>) -> exit::Result {
         Command::Jog(args) => jog::run(args),
         Command::Task(args) => task::run(args),
         Command::Proxy(args) => proxy::run(args),
+        Command::View(args) => view::run(args),
         Command::Down(args) => down::run(args),
         Command::Logs(args) => logs::run(args),
         Command::Adapter(args) => adapter::run(args, registry),

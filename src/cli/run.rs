@@ -2,6 +2,7 @@
 //! planner whose arms belong to a live run attaches to that run ([`attach`]). With `--daemon` a separate process does
 //! that ([`daemon`]).
 
+use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::Sender;
 use std::time::Duration;
@@ -41,6 +42,9 @@ pub struct Args {
     /// Write no log
     #[arg(long)]
     pub no_record: bool,
+    /// Serve no live view
+    #[arg(long)]
+    pub no_view: bool,
     /// Name of the run; default: the blueprint's name
     #[arg(long, value_name = "RUN")]
     pub name: Option<String>,
@@ -71,7 +75,13 @@ impl Args {
             None if self.no_record => Record::Off,
             None => Record::AsBlueprint,
         };
-        Options { name: self.name.clone(), record, service_manager: ServiceManager::from_env(), ..Options::default() }
+        Options {
+            name: self.name.clone(),
+            record,
+            service_manager: ServiceManager::from_env(),
+            view: !self.no_view,
+            ..Options::default()
+        }
     }
 }
 
@@ -108,8 +118,10 @@ fn in_background(args: &Args, catalog: Catalog<'_>, text_log: &Path) -> Result {
         }
     };
     let (endings, notified) = match &up {
-        Up::Run(run) => (run.endings(), starter.up(&run.status(), run.socket(), None)),
-        Up::Planner(planner) => (planner.endings(), starter.up(&planner.report(), None, Some(planner.run()))),
+        Up::Run(run) => (run.endings(), starter.up(&run.status(), run.socket(), run.view_url(), None)),
+        Up::Planner(planner) => {
+            (planner.endings(), starter.up(&planner.report(), None, planner.view_url(), Some(planner.run())))
+        }
     };
     if !notified {
         terminal.note("the starting process exited before the run was ready");
@@ -199,7 +211,10 @@ fn keep_up(
     let report = run.status();
     let in_terminal = record.as_ref().is_none_or(|record| record.text_log.is_none());
     let how_to_end = if in_terminal { banner::IN_A_TERMINAL } else { daemon::HOW_TO_END };
-    banner::print(terminal, &report, run.socket().unwrap_or_else(|| Path::new("none")), how_to_end, json);
+    // The token is shown to a person only: what is not a terminal may be kept.
+    let url = run.view_url().filter(|_| in_terminal && std::io::stderr().is_terminal());
+    let socket = run.socket().unwrap_or_else(|| Path::new("none"));
+    banner::print(terminal, &report, socket, url, how_to_end, json);
     let ending = run.wait_for_end(duration);
     // A terminal that is lost has no one before it who expects a motion.
     let unwatched = matches!(ending, Ending::Fault(_) | Ending::Log(_) | Ending::Signal(SIGHUP));

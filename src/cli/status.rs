@@ -204,6 +204,9 @@ fn print(r: &StatusReport, verbose: bool) {
     let blueprint = &r.blueprint;
     output::line(format_args!("  pid {}, up {}, blueprint {blueprint}, dimos {}", r.pid, span(r.uptime), r.version));
     output::line(format_args!("  log {}", r.log.as_deref().unwrap_or("none")));
+    if let Some(address) = &r.view {
+        output::line(format_args!("  view {}", banner::view_without_token(address)));
+    }
     if let Some(recorder) = r.recorder.as_ref().filter(|recorder| verbose || recorder.dropped > 0) {
         output::line(format_args!("  {} messages logged, {} dropped", recorder.messages, recorder.dropped));
     }

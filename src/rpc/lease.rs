@@ -244,6 +244,9 @@ impl Drop for Lessee {
     }
 }
 
+/// Name of the program where a page of the live view commands the arm.
+const LIVE_VIEW: &str = "a page of the live view";
+
 /// Returns the name of a process from its command line: `dimos move`, `python3 policy.py`.
 fn program(pid: Option<i32>) -> String {
     let read = |pid: i32| std::fs::read(format!("/proc/{pid}/cmdline")).ok();
@@ -253,6 +256,10 @@ fn program(pid: Option<i32>) -> String {
     for word in words.take(2).take_while(|word| !word.starts_with('-')) {
         let word: String = word.rsplit('/').next().unwrap_or_default().chars().take(40).collect();
         name = if name.is_empty() { word } else { format!("{name} {word}") };
+    }
+    // Of `dimos run`, whether it is this run or a planner that is attached to it, only the live view commands arms.
+    if name == "dimos run" {
+        return LIVE_VIEW.to_owned();
     }
     // Other users' terminals show the name.
     name.retain(|c| !c.is_control());

@@ -47,6 +47,9 @@ pub struct StatusReport {
     /// The planner; absent without one.
     #[serde(default)]
     pub planner: Option<PlannerStatus>,
+    /// Address of the live view, without its token; absent without one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub view: Option<String>,
 }
 
 impl StatusReport {

@@ -1,7 +1,8 @@
 //! The run directory: sockets and locks of the live runs.
 //!
-//! A run holds a lock on `<run>.lock`, which contains its pid, beside its socket `<run>.sock`. The kernel releases the
-//! lock when the process ends, so files without a lock are stale; any process that finds them removes them.
+//! A run holds a lock on `<run>.lock`, which contains its pid, beside its socket `<run>.sock`; `<run>.view` has the URL
+//! of its live view, with the token. The kernel releases the lock when the process ends, so files without a lock are
+//! stale; any process that finds them removes them.
 
 use std::fs::{self, DirBuilder, File, OpenOptions, Permissions, TryLockError};
 use std::io::{self, Read, Write};
@@ -139,7 +140,7 @@ impl RunDir {
                 Ok(()) if is_same_file(&file, &lock_path) => {
                     file.set_len(0).map_err(in_lock)?;
                     write!(file, "{}", std::process::id()).map_err(in_lock)?;
-                    remove(&socket)?;
+                    remove_files(&socket)?;
                     return Ok(Claim { run: run.to_owned(), socket, lock_path, _lock: file });
                 }
                 Ok(()) => {} // Its previous holder removed the file after we opened it.
@@ -167,7 +168,7 @@ impl RunDir {
             let name = path.file_stem().and_then(|n| n.to_str()).unwrap_or_default().to_owned();
             match path.extension().and_then(|e| e.to_str()) {
                 Some("lock") => {}
-                Some("sock") if !path.with_extension("lock").exists() => {
+                Some("sock" | "view") if !path.with_extension("lock").exists() => {
                     remove(&path)?;
                     continue;
                 }
@@ -177,7 +178,7 @@ impl RunDir {
             let Ok(mut file) = File::open(&path) else { continue };
             match file.try_lock() {
                 Ok(()) if is_same_file(&file, &path) => {
-                    remove(&socket)?;
+                    remove_files(&socket)?;
                     remove(&path)?;
                 }
                 Err(TryLockError::WouldBlock) => runs.push(LiveRun { name, pid: read_pid(&mut file), socket }),
@@ -219,7 +220,7 @@ impl Claim {
 impl Drop for Claim {
     fn drop(&mut self) {
         // Still locked, so these are not another run's files. After a failure the next run removes them.
-        let _ = remove(&self.socket);
+        let _ = remove_files(&self.socket);
         let _ = remove(&self.lock_path);
     }
 }
@@ -231,6 +232,17 @@ pub fn check_name(run: &str) -> Result<(), RunDirError> {
         return Err(RunDirError::BadName(run.to_owned()));
     }
     Ok(())
+}
+
+/// Returns the file with the URL of a run's live view, beside its socket.
+pub fn view_file(socket: &Path) -> PathBuf {
+    socket.with_extension("view")
+}
+
+/// Removes what a run has beside its lock.
+fn remove_files(socket: &Path) -> Result<(), RunDirError> {
+    remove(socket)?;
+    remove(&view_file(socket))
 }
 
 fn remove(path: &Path) -> Result<(), RunDirError> {

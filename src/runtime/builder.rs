@@ -110,6 +110,12 @@ impl Builder {
         self
     }
 
+    /// Serves the live view, where the blueprint has a robot model or a section `view`. [`Run::view_url`] has its URL.
+    pub fn view(mut self) -> Self {
+        self.options.view = true;
+        self
+    }
+
     /// Where its socket and lock are; the command line looks in [`RunDir::standard`] only.
     pub fn folder(mut self, folder: RunDir) -> Self {
         self.options.folder = folder;

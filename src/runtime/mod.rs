@@ -2,7 +2,7 @@
 //! all others.
 //!
 //! ```text
-//! start: claim the name ─▶ lock the devices ─▶ emulators ─▶ connect all ─▶ tick, recorder ─▶ enable ─▶ rpc
+//! start: claim the name ─▶ lock the devices ─▶ emulators ─▶ connect all ─▶ tick, recorder ─▶ enable ─▶ rpc ─▶ view
 //! stop:  park, where asked ─▶ decelerate ─▶ end the tick ─▶ release the arms ─▶ close rpc ─▶ close the log
 //! ```
 
@@ -71,6 +71,7 @@ use crate::rpc::report::ArmReport;
 use crate::rpc::run_dir::RunDir;
 use crate::rpc::server::Server;
 use crate::rt::host::LatencyHold;
+use crate::view::View;
 use arms::Arms;
 use dispatch::{Dispatcher, OutcomeThread};
 use tick::Tick;
@@ -109,6 +110,8 @@ pub struct Options {
     pub hold_latency: bool,
     /// Receives start, heartbeat and end of the run, e.g. systemd.
     pub service_manager: Option<ServiceManager>,
+    /// Whether the live view is served, as the blueprint says.
+    pub view: bool,
 }
 
 impl Default for Options {
@@ -121,6 +124,7 @@ impl Default for Options {
             solver: None,
             hold_latency: true,
             service_manager: None,
+            view: false,
         }
     }
 }
@@ -221,6 +225,7 @@ pub struct Run {
     dispatcher: Arc<Dispatcher>,
     outcomes: Option<OutcomeThread>,
     recorder: Option<Recorder>,
+    view: Option<View>,
     server: Option<Server>,
     handle: Handle,
     endings: (Sender<Ending>, Receiver<Ending>),
@@ -250,6 +255,11 @@ impl Run {
     /// Returns its socket, if it has one.
     pub fn socket(&self) -> Option<&std::path::Path> {
         self.server.as_ref().map(Server::socket)
+    }
+
+    /// Returns the URL of its live view, with the token, if it is served.
+    pub fn view_url(&self) -> Option<&str> {
+        self.view.as_ref().map(View::url)
     }
 
     /// Returns a handle for other threads.

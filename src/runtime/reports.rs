@@ -65,6 +65,7 @@ impl Service {
             speed: self.speed_override(),
             tasks: (0..parts.config.tasks.len()).filter_map(|i| self.task_report(i)).collect(),
             planner: None, // filled in by the `status` method
+            view: self.view.get().cloned(),
         }
     }
 

@@ -68,6 +68,8 @@ pub struct Service {
     pub(super) started: Instant,
     pub(super) motions: Mutex<Motions>,
     pub(super) recorder: OnceLock<Arc<RecorderStats>>,
+    /// Address of the live view.
+    pub(super) view: OnceLock<String>,
     /// The arms' tool centre points, for the log.
     pub(super) logged_tcps: TcpChains,
     pub(super) log_throttle: LogThrottle,
@@ -125,6 +127,7 @@ impl Service {
             started: Instant::now(),
             motions: Mutex::default(),
             recorder: OnceLock::new(),
+            view: OnceLock::new(),
             logged_tcps: TcpChains::default(),
             log_throttle: LogThrottle::default(),
             late_stops: LateStops::default(),

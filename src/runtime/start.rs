@@ -3,8 +3,10 @@
 //!
 //! ```text
 //! Prepared ─────────▶ Connected ───────────▶ Run ───────────────────────────────▶ enabled ─▶ listening
-//! name, log, models   devices, arms' limits  recorder, outcomes, tick, watchdog   motors     socket
+//! name, log, models   devices, arms' limits  recorder, outcomes, tick, watchdog   motors     socket, live view
 //! ```
+//!
+//! Only the live view may fail: the run starts without it, with a warning.
 
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
@@ -42,6 +44,7 @@ use crate::rpc::streams::Streams;
 use crate::rt::host::{self, Grant, LatencyHold};
 use crate::telemetry::Sample;
 use crate::telemetry::describe::Names;
+use crate::view::{self, Shown, View};
 
 /// Minimum time between two looks for values of an arm that change slowly.
 const DETAILS_PERIOD: Duration = Duration::from_millis(50);
@@ -49,6 +52,7 @@ const DETAILS_PERIOD: Duration = Duration::from_millis(50);
 impl Run {
     /// Starts a run. On failure everything is stopped again, and nothing has moved.
     pub fn start(blueprint: &Blueprint, options: Options) -> Result<Self, StartError> {
+        let view = options.view;
         // If a later stage fails, the run ends before its name is released.
         let (claim, mut run) = Prepared::new(blueprint, options)?.connect()?.start()?;
         run.enable(blueprint)?;
@@ -58,6 +62,9 @@ impl Run {
                 StartError::other(format!("the socket cannot be opened: {e}"), hint)
             })?;
             run.server = Some(server);
+            if view {
+                run.serve_view(blueprint);
+            }
         } else {
             run.handle.service.keep(claim);
         }
@@ -65,6 +72,19 @@ impl Run {
             manager.ready(&status_line(&run.status()));
         }
         Ok(run)
+    }
+
+    /// Serves the live view, if the blueprint has one.
+    fn serve_view(&mut self, blueprint: &Blueprint) {
+        let Some((config, socket)) = view::config_of(blueprint).zip(self.socket()) else { return };
+        let shown = Shown::of_run(self.name(), blueprint, self.config());
+        match View::start(&config, shown, socket, socket) {
+            Ok(view) => {
+                let _ = self.handle.service.view.set(view.address().to_owned());
+                self.view = Some(view);
+            }
+            Err(why) => tracing::warn!("no live view: {why}"),
+        }
     }
 
     fn enable(&self, blueprint: &Blueprint) -> Result<(), StartError> {
@@ -183,6 +203,7 @@ impl Connected<'_> {
             dispatcher,
             outcomes: Some(outcomes),
             recorder: Some(recorder),
+            view: None,
             server: None,
             handle: Handle { service },
             endings: (endings, ended),

@@ -272,15 +272,21 @@ fn the_written_blueprint_reads_back_the_same() {
 }
 
 #[test]
-fn a_live_view_is_warned_of_and_runs_all_the_same() {
-    let in_planner =
-        Overrides { set: vec!["planner.visualization.port=7000".to_owned()], sim: true, ..Overrides::default() };
-    let in_planner = load(&find("yourarm-planner").unwrap(), &in_planner, &fake_arms::registry());
-    for loaded in [set(&["view.port=7000"]), in_planner] {
-        assert_eq!((loaded.errors(), loaded.warnings()), (0, 1), "{}", loaded.render(false));
-        assert!(loaded.render(false).contains("the live view is not in this version"), "{}", loaded.render(false));
+fn a_live_view_that_is_open_to_the_network_is_warned_of() {
+    for quiet in ["view.port=7000", "view.host=127.0.0.2", "view={backend: none, host: 0.0.0.0}", "view.host='::1'"] {
+        assert_eq!((set(&[quiet]).errors(), set(&[quiet]).warnings()), (0, 0), "{quiet}");
     }
-    assert_eq!(set(&["view.backend=none"]).warnings(), 0);
+    let in_planner =
+        Overrides { set: vec!["planner.visualization.host=0.0.0.0".to_owned()], sim: true, ..Overrides::default() };
+    let in_planner = load(&find("yourarm-planner").unwrap(), &in_planner, &fake_arms::registry());
+    for loaded in [set(&["view.host=192.168.1.5"]), in_planner] {
+        assert_eq!((loaded.errors(), loaded.warnings()), (0, 1), "{}", loaded.render(false));
+        let text = loaded.render(false);
+        assert!(text.contains("open to the network at ") && text.contains("ssh"), "{text}");
+    }
+    for wrong in ["view.host=robot.local", "view.host=''", "view.port=70000"] {
+        assert_eq!(set(&[wrong]).errors(), 1, "{wrong}: {}", set(&[wrong]).render(false));
+    }
 }
 
 #[test]

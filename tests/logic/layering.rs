@@ -32,6 +32,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("rpc", &[]),
     ("recording", &[]),
     ("blueprint", &["robot", "assets", "collision", "hardware"]),
+    ("view", &["robot", "rpc", "blueprint"]),
     ("runtime", ALL),
     ("replay", ALL),
     ("cli", ALL),
@@ -44,6 +45,8 @@ const PARTS: &[(&str, &str, &str)] = &[
     ("blueprint", "control", "task_robot"),
     ("blueprint", "control", "task_spec"),
     ("blueprint", "planning", "config"),
+    ("view", "control", "config"),
+    ("view", "planning", "config"),
     // A log has the pose of each tool centre point.
     ("recording", "robot", "kinematics"),
     // Unit tests of the device thread have the mock adapter of out-of-tree tests.

@@ -11,5 +11,6 @@ mod piper_kernel;
 mod piper_sdk;
 mod ur_control;
 mod ur_rtde;
+mod viewer;
 mod xarm_proxy;
 mod xarm_sdk;

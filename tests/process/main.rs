@@ -49,5 +49,7 @@ mod stop_input;
 mod stops;
 mod teach;
 mod ur_runs;
+#[cfg(feature = "view")]
+mod view;
 mod waypoints;
 mod xarm_runs;

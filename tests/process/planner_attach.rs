@@ -329,9 +329,22 @@ fn in_the_background_it_is_one_line_and_a_name() {
     home.dimos("run lab.yaml -d").with(1).says(&["run cell has a planner already: lab"]);
     assert!(home.dimos("logs lab").with(0).out.contains(ATTACHED));
     home.dimos("down lab").with(0).says(&["planner lab ended"]);
-    let shown = home.dimos("run lab.yaml -d").with(0).says(&["attached to run cell; end it with: dimos down lab"]);
-    assert!(shown.out.contains("planner   lab"), "{}", shown.out);
+    let shown = Started::of(&mut home.as_typed("run lab.yaml -d --set view.port=0")).wait().with(0);
+    let shown = shown.says(&["attached to run cell; end it with: dimos down lab"]).shows(&["planner   lab"]);
+    #[cfg(feature = "view")]
+    {
+        // It has the model, so it serves the live view of the run.
+        let url = home.dimos("view").with(0).out;
+        assert!(shown.out.contains(&url), "{}", shown.out);
+        let scene = crate::view::Page::of(url.trim()).scene();
+        assert_eq!((&scene["name"], &scene["robots"][0]["joints"]["arm_joint1"]), (&json!("cell"), &json!("joint1")));
+        assert_eq!(
+            (&scene["arms"][0]["dof"], &scene["robots"][0]["limits"]["arm_joint1"]["upper"]),
+            (&json!(6), &json!(2.0))
+        );
+    }
     home.dimos("down lab").with(0);
+    home.dimos("view").with(1).says(&["run cell has no live view", "hint: "]);
     eventually("it is noticed", || home.status()["planner"] == Value::Null);
 }
 

@@ -32,7 +32,7 @@ const SPEC: AdapterSpec = AdapterSpec {
 };
 
 /// Threads of a run begin with one of these.
-const THREADS: &[&str] = &["tick", "outcomes", "recorder", "watchdog", "device/", "planner", "rpc", "replan"];
+const THREADS: &[&str] = &["tick", "outcomes", "recorder", "watchdog", "device/", "planner", "rpc", "replan", "view"];
 
 /// The arms are the same in all of these tests.
 static ALONE: Mutex<()> = Mutex::new(());
@@ -78,7 +78,7 @@ planner:
 "
         );
         let run = Run::from_yaml("stages", &blueprint).adapters(&[SPEC]).record(Record::To(self.path(log)));
-        run.folder(self.place())
+        run.folder(self.place()).view().set("view.port", 0)
     }
 
     fn place(&self) -> RunDir {
@@ -192,6 +192,25 @@ fn a_socket_that_cannot_be_opened() {
     let bench = Bench::new();
     *APPEARS.lock().unwrap() = Some(bench.path("runs").join("stages.sock"));
     bench.fails(|| bench.run("log.mcap").start(), "the socket cannot be opened");
+}
+
+#[test]
+#[cfg(feature = "view")]
+fn a_live_view_that_cannot_be_served_ends_no_start() {
+    let bench = Bench::new();
+    let elsewhere = bench.run("log.mcap").set("view.host", "192.0.2.1").start().unwrap();
+    assert!(elsewhere.view_url().is_none() && elsewhere.status().view.is_none());
+    assert!(elsewhere.socket().is_some() && elsewhere.stop().troubles.is_empty());
+    // Its file is in the way of another one.
+    let (run, file) = (bench.run("other.mcap"), bench.path("runs/stages.view"));
+    *APPEARS.lock().unwrap() = Some(file);
+    let run = run.start().unwrap();
+    assert!(run.view_url().is_none() && run.stop().troubles.is_empty());
+    eventually("all threads are gone", || threads().is_empty());
+    let served = bench.run("again.mcap").start().unwrap();
+    assert!(served.view_url().is_some() && bench.path("runs/stages.view").exists());
+    assert!(served.stop().troubles.is_empty() && !bench.path("runs/stages.view").exists());
+    eventually("all threads are gone", || threads().is_empty());
 }
 
 #[test]

@@ -220,6 +220,7 @@ pub fn status() -> StatusReport {
             ..Default::default()
         }],
         planner: None,
+        view: None,
     }
 }
 

@@ -46,7 +46,16 @@ impl Home {
             .current_dir(self.path())
     }
 
+    /// A verb. Runs serve no live view: many run at a time, and few tests look at it.
     pub fn command(&self, arguments: &str) -> Command {
+        match arguments.strip_prefix("run ") {
+            Some(rest) => self.as_typed(&format!("run --no-view {rest}")),
+            None => self.as_typed(arguments),
+        }
+    }
+
+    /// A verb as a user types it.
+    pub fn as_typed(&self, arguments: &str) -> Command {
         let mut command = Command::new(env!("CARGO_BIN_EXE_dimos"));
         self.settle(command.args(arguments.split_whitespace()));
         command

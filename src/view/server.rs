@@ -1,0 +1,227 @@
+//! The server of the live view: its thread, its connections.
+
+use std::borrow::Cow;
+use std::io;
+use std::net::{SocketAddr, TcpListener as StdListener};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::{OnceCell, Semaphore, watch};
+use tokio::task::{JoinSet, spawn_blocking};
+
+use super::access::{Access, UrlFile};
+use super::http::{self, Reply, Request};
+use super::scene::Scene;
+use super::{Shown, bridge, stl};
+use crate::blueprint::planner::ViewConfig;
+
+/// The page, compressed by the build.
+static PAGE: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/page.html.gz"));
+/// What the page may do: run its own script, and talk to this server.
+const PAGE_HEADERS: &str = "Content-Encoding: gzip\r\nContent-Security-Policy: default-src 'none'; \
+script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'; img-src data: blob: 'self'; \
+base-uri 'none'; form-action 'none'; frame-ancestors 'none'\r\n";
+
+/// Ports that are tried, from the configured one on.
+const PORTS: u16 = 100;
+/// Maximum number of WebSockets: two per page, one of them for stops only.
+const MAX_SOCKETS: usize = 16;
+/// Maximum number of connections; further ones wait.
+const MAX_CONNECTIONS: usize = 64;
+/// Size of the kernel's buffer to a page [bytes]: a page that takes nothing is noticed when it is full.
+const SEND_BUFFER: usize = 128 << 10;
+/// Pause after a failed accept (no file descriptors left).
+const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+/// Time limit for closing the pages at the end of the run.
+const FLUSH_TIME: Duration = Duration::from_millis(100);
+
+/// A running server. Ends, and removes the file with its URL, when dropped.
+#[derive(Debug)]
+pub struct View {
+    address: String,
+    url: String,
+    end: watch::Sender<bool>,
+    thread: Option<JoinHandle<()>>,
+    _file: UrlFile,
+}
+
+/// What connections share.
+struct Site {
+    access: Access,
+    shown: Arc<Shown>,
+    scene: OnceCell<Arc<Scene>>,
+    /// The run's socket.
+    run: PathBuf,
+    pages: Arc<Semaphore>,
+}
+
+impl View {
+    /// Starts serving the page of the run with this socket. The URL is also in the file that belongs to `claim`: the
+    /// socket's path of the run itself, or of the planner that serves the page.
+    pub fn start(config: &ViewConfig, shown: Shown, socket: &Path, claim: &Path) -> Result<Self, String> {
+        let listener = bind(config)?;
+        let failed = |what: &'static str| move |error: io::Error| format!("{what}: {error}");
+        let at = listener.local_addr().map_err(failed("its port"))?;
+        let access = Access::new(at).map_err(failed("no random numbers for its token"))?;
+        let (address, url) = (access.address(), access.url());
+        let file = UrlFile::write(claim, &url).map_err(failed("the file with its URL"))?;
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_io()
+            .enable_time()
+            .max_blocking_threads(1)
+            .thread_name("view-files")
+            .build()
+            .map_err(failed("no runtime"))?;
+        let (end, ended) = watch::channel(false);
+        let site = Site {
+            access,
+            shown: Arc::new(shown),
+            scene: OnceCell::new(),
+            run: socket.to_owned(),
+            pages: Arc::new(Semaphore::new(MAX_SOCKETS)),
+        };
+        let thread = std::thread::Builder::new().name("view".into()).spawn(move || {
+            let serving = || runtime.block_on(serve(listener, Arc::new(site), ended));
+            match catch_unwind(AssertUnwindSafe(serving)) {
+                Ok(Ok(())) => {}
+                Ok(Err(error)) => tracing::warn!("the live view has ended: {error}"),
+                Err(_) => tracing::warn!("the live view has ended by a defect of the program; the run continues"),
+            }
+            // Does not wait for a large mesh that is still being read.
+            runtime.shutdown_background();
+        });
+        Ok(Self { address, url, end, thread: Some(thread.map_err(failed("no thread"))?), _file: file })
+    }
+
+    /// Returns its address, without the token.
+    pub fn address(&self) -> &str {
+        &self.address
+    }
+
+    /// Returns its address with the token: for the user's eyes and the file only, never for a log.
+    pub fn url(&self) -> &str {
+        &self.url
+    }
+}
+
+impl Drop for View {
+    fn drop(&mut self) {
+        let _ = self.end.send(true);
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+/// Listens at the first free port.
+fn bind(config: &ViewConfig) -> Result<StdListener, String> {
+    let last = if config.port == 0 { 0 } else { config.port.saturating_add(PORTS - 1) };
+    let mut why = None;
+    for port in config.port..=last {
+        let at = SocketAddr::new(config.host, port);
+        match StdListener::bind(at).and_then(|listener| prepare(&listener).map(|()| listener)) {
+            Ok(listener) => return Ok(listener),
+            Err(error) if error.kind() == io::ErrorKind::AddrInUse => why = Some(error),
+            Err(error) => return Err(format!("{at}: {error}")),
+        }
+    }
+    let why = why.map_or_else(String::new, |why| format!(": {why}"));
+    Err(format!("no free port from {} to {last}{why}", config.port))
+}
+
+fn prepare(listener: &StdListener) -> io::Result<()> {
+    // Connections inherit it.
+    rustix::net::sockopt::set_socket_send_buffer_size(listener, SEND_BUFFER)?;
+    listener.set_nonblocking(true)
+}
+
+/// Accepts connections until the end.
+async fn serve(listener: StdListener, site: Arc<Site>, mut ended: watch::Receiver<bool>) -> io::Result<()> {
+    let listener = TcpListener::from_std(listener)?;
+    let (mut connections, for_pages) = (JoinSet::new(), ended.clone());
+    loop {
+        tokio::select! {
+            _ = ended.wait_for(|ended| *ended) => break,
+            Some(_) = connections.join_next() => {}
+            accepted = listener.accept(), if connections.len() < MAX_CONNECTIONS => match accepted {
+                Ok((stream, _)) => drop(connections.spawn(connection(stream, site.clone(), for_pages.clone()))),
+                Err(_) => tokio::time::sleep(ACCEPT_PAUSE).await,
+            },
+        }
+    }
+    let _ = tokio::time::timeout(FLUSH_TIME, async { while connections.join_next().await.is_some() {} }).await;
+    Ok(())
+}
+
+async fn connection(mut stream: TcpStream, site: Arc<Site>, ended: watch::Receiver<bool>) {
+    let _ = stream.set_nodelay(true);
+    let reply = match http::read(&mut stream).await {
+        Ok(None) => return,
+        Ok(Some(request)) if request.path == "/rpc" && bridge::key(&request).is_some() && is_own(&site, &request) => {
+            return bridge::serve(stream, request, &site.access, &site.run, &site.pages, ended).await;
+        }
+        Ok(Some(request)) => answer(&site, &request).await,
+        Err(reply) => reply,
+    };
+    // The browser shows an error; there is no one else who could act on it.
+    let _ = http::send(&mut stream, reply).await;
+}
+
+fn is_own(site: &Site, request: &Request) -> bool {
+    site.access.is_own(request.header("host"), request.header("origin"))
+}
+
+async fn answer(site: &Site, request: &Request) -> Reply {
+    if !is_own(site, request) {
+        return Reply::text(403, "this page is served to itself only: open the address that `dimos view` prints");
+    }
+    if request.method != "GET" {
+        return Reply::text(405, "only GET");
+    }
+    let allowed = || site.access.is_bearer(request.header("authorization"));
+    match request.path.as_str() {
+        "/" => {
+            Reply { status: 200, kind: "text/html; charset=utf-8", headers: PAGE_HEADERS, body: Cow::Borrowed(PAGE) }
+        }
+        "/rpc" => Reply::text(426, "this is a WebSocket"),
+        "/scene.json" if allowed() => match scene(site).await {
+            Some(scene) => content("application/json", scene.json.clone().into_bytes()),
+            None => Reply::text(500, "the scene cannot be made"),
+        },
+        path => match path.strip_prefix("/mesh/") {
+            Some(number) if allowed() => mesh(site, number).await,
+            None if path != "/scene.json" => Reply::text(404, "there is no such page"),
+            _ => Reply::text(401, "the token is missing or wrong: `dimos view` prints the URL"),
+        },
+    }
+}
+
+fn content(kind: &'static str, body: Vec<u8>) -> Reply {
+    Reply { status: 200, kind, headers: "", body: Cow::Owned(body) }
+}
+
+/// Returns the scene, read by the first page that asks for it. `None`: reading panicked.
+async fn scene(site: &Site) -> Option<Arc<Scene>> {
+    let shown = site.shown.clone();
+    let read = || async { spawn_blocking(move || Arc::new(Scene::read(&shown))).await };
+    site.scene.get_or_try_init(read).await.ok().cloned()
+}
+
+async fn mesh(site: &Site, number: &str) -> Reply {
+    let scene = scene(site).await;
+    let mesh = number.parse::<usize>().ok().and_then(|number| scene.as_ref()?.meshes.get(number));
+    let path = match mesh {
+        Some(Ok(path)) => path.clone(),
+        Some(Err(why)) => return Reply::text(404, why),
+        None => return Reply::text(404, "there is no such mesh"),
+    };
+    match spawn_blocking(move || stl::from_file(&path)).await {
+        Ok(Ok(stl)) => content("model/stl", stl),
+        Ok(Err(why)) => Reply::text(500, why),
+        Err(_) => Reply::text(500, "the mesh cannot be read"),
+    }
+}

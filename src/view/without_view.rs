@@ -1,0 +1,27 @@
+//! The live view of a build without it.
+
+use std::path::Path;
+
+use super::Shown;
+use crate::blueprint::planner::ViewConfig;
+
+/// No view.
+#[derive(Debug)]
+pub enum View {}
+
+impl View {
+    /// Fails: this build has none.
+    pub fn start(_: &ViewConfig, _: Shown, _: &Path, _: &Path) -> Result<Self, String> {
+        Err("this build has none (cargo feature `view`)".to_owned())
+    }
+
+    /// Returns its address.
+    pub fn address(&self) -> &str {
+        match *self {}
+    }
+
+    /// Returns its address with the token.
+    pub fn url(&self) -> &str {
+        match *self {}
+    }
+}

@@ -1,0 +1,139 @@
+// The page of a run: reads the token, the scene, and puts the panels together.
+import 'uplot/dist/uPlot.min.css';
+import './style.css';
+import {Context} from './context';
+import {button, el} from './dom';
+import {type Scene} from './protocol';
+import {Run} from './run';
+import {Gizmo} from './scene/gizmo';
+import {Stage} from './scene/stage';
+import {View} from './scene/view';
+import {armsPanel} from './panels/arms';
+import {eventsPanel} from './panels/events';
+import {header} from './panels/header';
+import {jointsPanel} from './panels/joints';
+import {movePanel} from './panels/move';
+import {notice} from './panels/notice';
+import {plotsPanel} from './panels/plots';
+import {timeline} from './panels/timeline';
+import {toolbar} from './panels/toolbar';
+import {worldPanel} from './panels/world';
+import {pause} from './flow';
+
+const LONGEST_DELAY = 4000; // ms between two attempts to read the scene
+const NO_ACTS_AFTER = 1500; // ms without a joint state
+const app = document.getElementById('app')!;
+
+async function main(): Promise<void> {
+  window.addEventListener('hashchange', () => location.reload());
+  const token = location.hash.slice(1);
+  if (!token)
+    return message('This address has no token', 'Open the address that the run prints when it starts: it ends with #…');
+  const scene = await readScene(token);
+  if (!scene) return;
+  document.title = `${scene.name} · dimos`;
+  const run = new Run(scene, `${location.protocol === 'https:' ? 'wss' : 'ws'}://${location.host}/rpc`, token);
+  const context = new Context(run);
+  const canvas = el('div', {class: 'canvas', id: 'view'});
+  const stage = new Stage(canvas);
+  context.gizmo = new Gizmo(stage);
+  context.view = new View(stage, context, token);
+  run.onJoints.on((state) => context.history.takeJoints(state));
+  run.onState.on((state) => context.history.takeState(state));
+  layout(context, canvas);
+  const usable = () => run.connected && run.age < NO_ACTS_AFTER;
+  let enabled = false;
+  enableActs(enabled);
+  window.setInterval(() => {
+    if (usable() !== enabled) enableActs((enabled = usable()));
+  }, 100);
+  // For tests: what was drawn, and how long the page's own code took.
+  Object.assign(window, {
+    dimos: {measured: stage.measured, run, history: context.history, memory: stage.renderer.info.memory},
+  });
+  run.start();
+}
+
+/** Reads the scene, with retries until the run answers; null if it refuses the token. */
+async function readScene(token: string): Promise<Scene | null> {
+  for (let delay = 250; ; delay = Math.min(delay * 2, LONGEST_DELAY)) {
+    try {
+      const reply = await fetch('/scene.json', {headers: {Authorization: `Bearer ${token}`}});
+      if (reply.ok) return (await reply.json()) as Scene;
+      if (reply.status === 401) {
+        message('The run refuses this token', 'Open the address that the run prints: each run has its own token');
+        return null;
+      }
+      message('The run does not show itself', `${reply.status} ${await reply.text()}`);
+    } catch {
+      message('No connection to the run', `next attempt in ${delay / 1000} s`);
+    }
+    await pause(delay);
+  }
+}
+
+function layout(context: Context, canvas: HTMLElement): void {
+  const top = header(context);
+  const offline = el('div', {
+    class: 'offline-note',
+    text: 'No connection: what you see is old, and nothing can be commanded',
+  });
+  const centre = el(
+    'section',
+    {class: 'centre'},
+    canvas,
+    toolbar(context),
+    offline,
+    notice(context),
+    timeline(context),
+  );
+  const left = el(
+    'aside',
+    {class: 'left', attributes: {'data-panel': 'arms'}},
+    armsPanel(context),
+    jointsPanel(context),
+  );
+  const panels = el('div', {class: 'panels'}, movePanel(context), worldPanel(context), eventsPanel(context));
+  const tabs = el(
+    'nav',
+    {class: 'tabs'},
+    ...[
+      ['arms', 'Arms'],
+      ['move', 'Move'],
+      ['world', 'Obstacles'],
+      ['events', 'Events'],
+      ['plots', 'Plots'],
+    ].map(([name, text]) => button(text!, () => choose(name!), {attributes: {'data-tab': name!}})),
+  );
+  const choose = (tab: string) => {
+    document.body.dataset.tab = tab;
+    panels.scrollTop = 0;
+    tabs
+      .querySelectorAll('button')
+      .forEach((each) => each.setAttribute('aria-selected', String(each.dataset.tab === tab)));
+    window.dispatchEvent(new Event('resize'));
+  };
+  const licences = button('licences', () => (document.getElementById('licences') as HTMLDialogElement).show(), {
+    class: 'quiet',
+  });
+  top.element.append(top.stop);
+  left.append(el('footer', {}, el('span', {id: 'version'}), licences));
+  context.run.onStatus.on(({version}) => {
+    document.getElementById('version')!.textContent = `dimos ${version}`;
+  });
+  app.replaceChildren(top.element, left, centre, plotsPanel(context), el('aside', {class: 'right'}, tabs, panels));
+  choose('move');
+}
+
+/** Without a connection, or without data, nothing can be commanded. Stop is not among these. */
+function enableActs(connected: boolean): void {
+  document.querySelectorAll<HTMLFieldSetElement>('fieldset.acts').forEach((each) => {
+    each.disabled = !connected;
+  });
+}
+
+function message(title: string, text: string): void {
+  app.replaceChildren(el('div', {class: 'message', id: 'message'}, el('h1', {text: title}), el('p', {text})));
+}
+
+void main();

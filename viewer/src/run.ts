@@ -1,0 +1,169 @@
+// The run as the page knows it: newest joint states, state, status, world and events, and the age of the data.
+import {Connection} from './connection';
+import {
+  type JointState,
+  type PlannerReport,
+  type PosesReport,
+  type RunEvent,
+  type Scene,
+  type State,
+  type Status,
+  type WorldObject,
+} from './protocol';
+import {Signal} from './signal';
+
+const JOINT_RATE = 30; // Hz
+const STATE_PERIOD = 100; // ms: commands, poses, grippers
+const STATUS_PERIOD = 500;
+const WORLD_PERIOD = 1000;
+/** Joint states older than this are shown as stale [ms]. */
+export const STALE_AFTER = 500;
+const SILENT_AFTER = 3000; // ms without a reply to `status` before the connection counts as lost
+const EVENTS_KEPT = 200;
+
+export class Run {
+  status: Status | null = null;
+  state: State | null = null;
+  joints: JointState | null = null;
+  planner: PlannerReport | null = null;
+  poses: PosesReport['poses'] = {};
+  world: WorldObject[] = [];
+  readonly events: RunEvent[] = [];
+  /** Messages that this page was too slow for. */
+  lost = 0;
+
+  readonly onJoints = new Signal<JointState>();
+  readonly onState = new Signal<State>();
+  readonly onStatus = new Signal<Status>();
+  readonly onWorld = new Signal();
+  readonly onPoses = new Signal();
+  readonly onEvent = new Signal<RunEvent>();
+  readonly onLink = new Signal();
+
+  /** Subscriptions and acts; its requests complete one after the other. */
+  readonly work: Connection;
+  /** `status`, `stop` and `cancel` only: the run answers these at once, whatever `work` waits for. */
+  readonly watch: Connection;
+
+  private received = 0;
+  private stateReceived = 0;
+
+  constructor(
+    readonly scene: Scene,
+    url: string,
+    token: string,
+  ) {
+    this.work = new Connection(url, token);
+    this.watch = new Connection(url, token);
+  }
+
+  start(): void {
+    this.work.onStream = (stream, data, lost) => this.takeStream(stream, data, lost);
+    this.work.onState = () => {
+      if (this.work.state === 'open') void this.begin();
+      this.onLink.emit();
+    };
+    this.watch.onState = () => this.onLink.emit();
+    this.work.open();
+    this.watch.open();
+    this.repeat(STATUS_PERIOD, () => this.readStatus());
+    this.repeat(STATE_PERIOD, () => this.readState());
+    this.repeat(WORLD_PERIOD, () => this.readWorld());
+  }
+
+  get connected(): boolean {
+    return this.work.state === 'open' && this.watch.state === 'open';
+  }
+
+  /** Age of the newest joint state [ms]; infinite before the first. */
+  get age(): number {
+    return this.received ? performance.now() - this.received : Infinity;
+  }
+
+  get stale(): boolean {
+    return this.age > STALE_AFTER;
+  }
+
+  /** Age of an arm's newest state [ms]; infinite before the first. */
+  armAge(name: string): number {
+    const age = this.armState(name)?.age_ms ?? Infinity;
+    // A reply that is late because `work` waits for another one does not make the arm's state old.
+    return age + Math.min(this.age, performance.now() - this.stateReceived);
+  }
+
+  armStale(name: string): boolean {
+    return this.armAge(name) > STALE_AFTER;
+  }
+
+  arm(name: string) {
+    return this.status?.arms.find((arm) => arm.hardware_id === name);
+  }
+
+  armState(name: string) {
+    return this.state?.arms.find((arm) => arm.hardware_id === name);
+  }
+
+  /** Reads what changes seldom: after connecting, and after acts that change it. */
+  async readPoses(): Promise<void> {
+    this.poses = (await this.work.request<PosesReport>('poses')).poses;
+    this.onPoses.emit();
+  }
+
+  async readWorld(): Promise<void> {
+    // The planner handles one request at a time: while it plans, this connection would wait for it.
+    if (!this.status?.planner || this.status.planner.state === 'PLANNING') return;
+    this.world = (await this.work.request<{objects: WorldObject[]}>('world')).objects;
+    this.onWorld.emit();
+  }
+
+  private async begin(): Promise<void> {
+    try {
+      await this.work.request('subscribe', {stream: 'coordinator_joint_state', rate: JOINT_RATE});
+      await this.work.request('subscribe', {stream: 'events'});
+      if (this.scene.planner) this.planner = await this.work.request<PlannerReport>('planner');
+      await this.readPoses();
+    } catch (error) {
+      console.warn(error);
+    }
+  }
+
+  private takeStream(stream: string, data: unknown, lost: number): void {
+    if (stream === 'coordinator_joint_state') {
+      this.received = performance.now();
+      this.lost += lost;
+      this.joints = data as JointState;
+      this.onJoints.emit(this.joints);
+    } else if (stream === 'events') {
+      const event = data as RunEvent;
+      this.events.push(event);
+      if (this.events.length > EVENTS_KEPT) this.events.shift();
+      this.onEvent.emit(event);
+    }
+  }
+
+  private async readState(): Promise<void> {
+    this.state = await this.work.request<State>('state');
+    this.stateReceived = performance.now();
+    this.onState.emit(this.state);
+  }
+
+  private async readStatus(): Promise<void> {
+    if (this.watch.state !== 'open') return;
+    try {
+      this.status = await this.watch.request<Status>('status', {}, SILENT_AFTER);
+      this.onStatus.emit(this.status);
+    } catch {
+      this.watch.drop();
+      this.work.drop();
+    }
+  }
+
+  /** Repeats a request, each this long after the end of the one before. */
+  private repeat(period: number, request: () => Promise<void>): void {
+    const next = async () => {
+      if (this.work.state === 'open' && !document.hidden) await request().catch(() => {});
+      window.setTimeout(next, period);
+    };
+    void next();
+  }
+}

@@ -1,0 +1,169 @@
+// The page of a live run in a real browser: what it shows, and what its clicks do to the run.
+import assert from 'node:assert/strict';
+import {after, before, test} from 'node:test';
+import {browser as launch, changed, open, picture, Run, text, until} from './rig.mjs';
+
+const HOME = [0, -0.3, 0.6, 0, 0.8, 0];
+let browser, run, page;
+
+before(async () => {
+  [browser, run] = await Promise.all([launch(), Run.start('yourarm-planner')]);
+  page = await open(browser, run.url);
+});
+after(async () => {
+  run?.end();
+  await browser?.close();
+});
+
+const near = (a, b, tolerance = 0.01) => a.every((value, i) => Math.abs(value - b[i]) < tolerance);
+const click = (selector) => page.click(selector);
+
+test('it loads from the run alone, and moves nothing', async () => {
+  await text(page, '#age', /^live$/);
+  await text(page, '.joints tbody', /joint6/);
+  assert.equal(await page.textContent('#banner'), 'SIMULATED');
+  const origin = new URL(run.url).host;
+  const outside = page.requests.filter((url) => !url.startsWith('data:') && new URL(url).host !== origin);
+  assert.deepEqual(outside, [], 'requests to other hosts');
+  assert.ok(page.requests.length >= 4, `the page, the scene and two sockets: ${page.requests}`);
+  assert.deepEqual(page.errors, [], 'such as a violation of the Content-Security-Policy');
+  assert.ok(near(run.positions(), HOME));
+  assert.equal(run.arm().commander ?? null, null, 'the page has no lease');
+});
+
+test('the arm on screen moves when another program moves it', async () => {
+  let before, rest;
+  await until('the view is at rest', async () => {
+    before = await picture(page);
+    return (rest = await changed(browser, before, await picture(page))) < 0.001;
+  });
+  const frames = () => page.evaluate(() => window.dimos.measured.frames);
+  await until('no frame is drawn at rest', async () => {
+    const drawn = await frames();
+    await page.waitForTimeout(400);
+    return (await frames()) === drawn;
+  });
+  run.dimos('move', 'arm', '--named', 'zero');
+  await until('joint2 at zero in the table', async () =>
+    /^joint20\.000/.test(await page.textContent('.joints tbody tr:nth-child(2)')),
+  );
+  let moved = 0;
+  await until(
+    'the arm looks different',
+    async () => (moved = await changed(browser, before, await picture(page))) > 0.01,
+  );
+  console.log(`pixels changed: ${(rest * 100).toFixed(3)} % at rest, ${(moved * 100).toFixed(1)} % after the motion`);
+});
+
+test('a goal is planned, previewed and executed by clicks, and nothing moves before Execute', async () => {
+  const start = run.positions();
+  assert.ok((await page.isDisabled('#plan')) && (await page.isDisabled('#execute')), 'no goal yet');
+  const empty = await picture(page);
+  await click('[data-pose=home]');
+  await until('the goal is shown', async () => (await changed(browser, empty, await picture(page))) > 0.005);
+  await click('#plan');
+  await page.waitForSelector('#execute:enabled');
+  assert.match(await page.textContent('#report'), /planned in \d+ ms.* s · .*clearance/);
+  const end = await page.inputValue('#scrub');
+  await click('#preview');
+  await page.waitForFunction((end) => document.querySelector('#scrub').value !== end, end);
+  assert.ok(near(run.positions(), start, 1e-3), 'preview moves the ghost only');
+  await click('#execute');
+  await text(page, '#report', /completed in .* final error/);
+  assert.ok(near(run.positions(), HOME), `${run.positions()}`);
+  await until('the lease is released', () => !run.arm().commander);
+});
+
+test('an obstacle is added by hand, in the way of a goal, and removed', async () => {
+  await click('[data-tab=world]');
+  await page.fill('#object-name', 'block');
+  for (const [index, value] of ['0.4', '0', '0.55'].entries()) {
+    await page.locator('#object-at input').nth(index).fill(value);
+  }
+  await click('#object-add');
+  await page.waitForSelector('[data-object=block]');
+  const block = run.json('world', 'list').objects.find((object) => object.name === 'block');
+  assert.deepEqual(block.pose.xyz, [0.4, 0, 0.55]);
+  await click('[data-tab=move]');
+  await click('[data-pose=zero]');
+  await click('#plan');
+  await text(page, '#report', /block/);
+  assert.ok(await page.isDisabled('#execute'));
+  await click('[data-tab=world]');
+  await click('[data-object=block] >> text=Remove');
+  await until('it is removed', () => !run.json('world', 'list').objects.some((object) => object.name === 'block'));
+  await click('[data-tab=move]');
+});
+
+test('Stop holds the moving arm and says so; Reset and Enable are separate acts', async () => {
+  await page.fill('#plan-speed', '5');
+  await click('[data-pose=zero]');
+  await click('#plan');
+  await page.waitForSelector('#execute:enabled');
+  await click('#execute');
+  await until('it moves', () => !near(run.positions(), HOME, 0.01));
+  await page.keyboard.press('Escape');
+  assert.match(await text(page, '#stop-report', /held at/), /^arm held at \d\d:\d\d:\d\d\.\d{3} \(\d+ ms\)$/);
+  assert.equal(run.arm().phase, 'held');
+  const held = run.positions();
+  assert.ok(!near(held, [0, 0, 0, 0, 0, 0], 0.02), 'stopped on the way');
+  await text(page, '.card', /held: stopped by an operator/);
+  await click('.reset');
+  await until('reset', () => run.arm().phase === 'standby');
+  await click('.enable');
+  await until('ready', () => run.arm().phase === 'ready');
+  await until('the report of the stop is gone', async () => (await page.textContent('#stop-report')) === '');
+  assert.ok(near(run.positions(), held, 1e-3), 'neither moves the arm');
+});
+
+test('a wrong token shows nothing of the run', async () => {
+  const stranger = await open(browser, run.url.replace(/#.*/, '#00000000000000000000000000000000'));
+  await text(stranger, '#message', /refuses this token/);
+  assert.equal(await stranger.locator('#view').count(), 0);
+  const code = await stranger.evaluate(
+    () =>
+      new Promise((resolve) => {
+        const socket = new WebSocket(`ws://${location.host}/rpc`);
+        socket.onopen = () => socket.send('{"token":"wrong"}');
+        socket.onclose = ({code}) => resolve(code);
+      }),
+  );
+  assert.equal(code, 4401);
+  await stranger.context().close();
+});
+
+test('on a phone, Stop is on screen and nothing is wider than it', async () => {
+  const phone = await open(browser, run.url, {width: 390, height: 844});
+  await text(phone, '#age', /^live$/);
+  for (const tab of ['arms', 'move', 'world', 'events', 'plots']) {
+    await phone.click(`[data-tab=${tab}]`);
+    const {width, stop} = await phone.evaluate(() => {
+      const at = document.querySelector('#stop').getBoundingClientRect();
+      const top = document.elementFromPoint(at.x + at.width / 2, at.y + at.height / 2);
+      return {
+        width: document.documentElement.scrollWidth,
+        stop: at.bottom <= innerHeight && top?.closest('#stop') !== null,
+      };
+    });
+    assert.ok(width <= 390 && stop, `${tab}: ${width} px wide, Stop reachable: ${stop}`);
+  }
+  await phone.context().close();
+});
+
+// The last one: the run was suspended, so its arms are held afterwards.
+test('a lost connection is shown, disables acts, and recovers', async () => {
+  run.child.kill('SIGSTOP');
+  await text(page, '#age', /^no data for \d/);
+  await text(page, '#age', /^connection lost/);
+  assert.ok((await page.isDisabled('#plan')) && (await page.isDisabled('#pause')));
+  assert.ok(await page.isEnabled('#stop'));
+  await click('#stop');
+  await text(page, '#stop-report', /NOT CONFIRMED/);
+  run.child.kill('SIGCONT');
+  await text(page, '#age', /^live$/);
+  assert.ok(await page.isEnabled('#pause'));
+  assert.deepEqual(
+    page.errors.filter((text) => !/WebSocket|net::/.test(text)),
+    [],
+  );
+});
