@@ -72,7 +72,7 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     let options = config.options::<Options>()?;
     let calibration = Calibration::of(&options.calibration).map_err(|e| ConfigError::new("calibration", e))?;
     options.sim.check("acme", &limits(&Calibration::default()), emulator::PLAYABLE)?;
-    Ok(Checked { limits: limits(&calibration) })
+    Ok(Checked::new(limits(&calibration)))
 }
 
 /// The joint limits of a calibrated arm, in SI units.
