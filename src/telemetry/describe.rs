@@ -281,6 +281,7 @@ pub fn bound_text(bound: Bound, names: &Names) -> String {
         Bound::None => String::new(),
         Bound::Velocity(joint) => format!("the velocity limit of {}", names.joint(joint)),
         Bound::Position(joint) => format!("the position limit of {}", names.joint(joint)),
+        Bound::Acceleration(joint) => format!("the acceleration limit of {}", names.joint(joint)),
         Bound::Singularity => "a singularity nearby".into(),
         Bound::Invalid => "a target that is not finite".into(),
     }

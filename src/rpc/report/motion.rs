@@ -28,7 +28,7 @@ pub struct TaskReport {
     pub reason: Option<String>,
     /// Number of its current or latest motion.
     pub motion: Option<u64>,
-    /// What currently limits its motion, where the task knows.
+    /// What currently limits its motion: the first joint whose commands are limited, a singularity, …
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bound: Option<String>,
     /// Largest distance of a joint from its leader's, while a `follow` task is active [rad].
