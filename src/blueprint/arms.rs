@@ -160,7 +160,8 @@ fn check_options(checker: &mut Checker<'_>, entry: &Located<HardwareEntry>, row:
     mistakes(checker.tree) == before
 }
 
-/// Runs the adapter's check of joints and options, and reports a mistake at its option. Returns what is known of the arm.
+/// Runs the adapter's check of joints and options, and reports a mistake at its option. Returns what is known of the
+/// arm.
 fn own_check(
     checker: &mut Checker<'_>,
     entry: &Located<HardwareEntry>,
