@@ -50,15 +50,17 @@ fn blueprints() -> io::Result<()> {
     fs::write(out.join("blueprints.rs"), format!("&[\n{rows}]\n"))
 }
 
+const SCHEMAS: [&str; 2] = ["assets/job.schema.json", "assets/rpc.schema.json"];
+
 /// Deflates the texts that are seldom needed, and writes the table of their names that `src/packed.rs` includes.
 fn packed() -> io::Result<()> {
     let out = PathBuf::from(env::var("OUT_DIR").unwrap_or_default());
-    let mut files = vec![PathBuf::from("assets/rpc.schema.json")];
+    let mut files: Vec<_> = SCHEMAS.iter().map(PathBuf::from).collect();
     for folder in ["assets/robots", "assets/templates"] {
         println!("cargo::rerun-if-changed={folder}");
         collect(Path::new(folder), &mut files)?;
     }
-    println!("cargo::rerun-if-changed=assets/rpc.schema.json");
+    SCHEMAS.iter().for_each(|file| println!("cargo::rerun-if-changed={file}"));
     files.sort();
     let mut rows = String::new();
     for (number, file) in files.iter().enumerate() {

@@ -6,8 +6,9 @@ use crate::arm::Supervision;
 use crate::blueprint::resolve::{Arm, Checker};
 use crate::blueprint::schema::{HardwareEntry, Joints, OnExit};
 use crate::blueprint::{limits, park, parts};
+use crate::hardware::check::Checked;
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, SIM};
-use crate::joint::{JointLimits, MAX_DOF, make_joints};
+use crate::joint::{MAX_DOF, make_joints};
 use crate::yaml::{Diag, Located, NodeId, Tree, did_you_mean, quote};
 
 /// The arms, and the names that tasks may refer to.
@@ -100,14 +101,15 @@ fn arm(
         dof: joints.len(),
         options: options.clone(),
     };
-    let own = if counted && read { own_limits(checker, entry, &row, &config) } else { None };
+    let checked = if counted && read { own_check(checker, entry, &row, &config) } else { None };
+    let own = checked.as_ref().map(|checked| checked.limits.clone());
     let limits = match joints_known {
         true => limits::resolve(checker, &entry.limits, joints, own.as_ref()),
         false => Vec::new(),
     };
     let park_pose = park::resolve(checker, entry, joints, joints_known, own.as_ref(), &limits);
     let simulated = address == SIM && row.emulate.is_some();
-    let setup = parts::resolve(checker, entry);
+    let setup = parts::resolve(checker, entry, &checked.unwrap_or_default());
     let default_on_exit = if row.holds_when_disabled { OnExit::Disable } else { OnExit::Hold };
     Arm {
         hardware_id: id.to_owned(),
@@ -158,15 +160,16 @@ fn check_options(checker: &mut Checker<'_>, entry: &Located<HardwareEntry>, row:
     mistakes(checker.tree) == before
 }
 
-/// Runs the adapter's check of joints and options, and reports a mistake at its option. Returns the arm's own limits.
-fn own_limits(
+/// Runs the adapter's check of joints and options, and reports a mistake at its option. Returns what is known of the
+/// arm.
+fn own_check(
     checker: &mut Checker<'_>,
     entry: &Located<HardwareEntry>,
     row: &AdapterSpec,
     config: &AdapterConfig,
-) -> Option<JointLimits> {
+) -> Option<Checked> {
     match (row.check)(config) {
-        Ok(checked) => Some(checked.limits),
+        Ok(checked) => Some(checked),
         Err(refused) => {
             let at = match &entry.options {
                 Some(options) if !refused.option.is_empty() => checker.tree.nearest(options.at, &refused.option),

@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 use crate::arm::{Load, MAX_DIGITAL, StopInput, UPRIGHT, channel};
 use crate::blueprint::resolve::Checker;
 use crate::blueprint::schema::HardwareEntry;
+use crate::hardware::check::Checked;
 use crate::hardware::device::Setup;
 use crate::pose;
 use crate::yaml::{Diag, Located, quote};
@@ -56,18 +57,31 @@ pub struct MountingEntry {
     pub rpy: [f64; 3],
 }
 
-/// Checks and returns what an entry sets.
-pub(super) fn resolve(checker: &mut Checker<'_>, entry: &HardwareEntry) -> Setup {
+/// Checks and returns what an entry sets, as far as the arm is known before it is connected.
+pub(super) fn resolve(checker: &mut Checker<'_>, entry: &HardwareEntry, arm: &Checked) -> Setup {
+    let payload = entry.payload.as_ref();
+    if arm.max_payload == Some(0.0)
+        && let Some(at) = payload.map(|payload| payload.at).or(entry.mounting.as_ref().map(|mounting| mounting.at))
+    {
+        let what = format!("the controller of {} takes neither a payload nor a mounting", quote(&entry.adapter_type));
+        checker.error(at, Diag::error(what).hint("remove `payload` and `mounting`"));
+    }
     Setup {
-        stop_input: entry.stop_input.as_ref().and_then(|stop| stop_input(checker, stop)),
-        payload: entry.payload.as_ref().and_then(|payload| load(checker, payload)),
+        stop_input: entry.stop_input.as_ref().and_then(|stop| stop_input(checker, stop, arm.digital_inputs)),
+        payload: payload.and_then(|payload| load(checker, payload, arm.max_payload.filter(|most| *most > 0.0))),
         gravity: entry.mounting.as_ref().and_then(|mounting| gravity(checker, mounting)),
     }
 }
 
-fn load(checker: &mut Checker<'_>, entry: &Located<PayloadEntry>) -> Option<Load> {
+fn load(checker: &mut Checker<'_>, entry: &Located<PayloadEntry>, most: Option<f64>) -> Option<Load> {
     let PayloadEntry { mass, center, inertia } = entry.value;
     let load = Load { mass, center, inertia };
+    if let Some(most) = most.filter(|most| mass > *most) {
+        let diag = Diag::error(format!("the arm takes at most {most:.1} kg, not {mass} kg"));
+        let at = checker.tree.entry(entry.at, "mass").map_or(entry.at, |(_, value)| value);
+        checker.error(at, diag.hint("a lighter tool or workpiece, or a larger arm"));
+        return None;
+    }
     match load.check() {
         Ok(()) => Some(load),
         Err(what) => {
@@ -89,11 +103,20 @@ fn gravity(checker: &mut Checker<'_>, entry: &Located<MountingEntry>) -> Option<
     Some(base.inverse_transform_vector(&UPRIGHT.into()).into())
 }
 
-fn stop_input(checker: &mut Checker<'_>, stop: &StopInputEntry) -> Option<StopInput> {
+fn stop_input(checker: &mut Checker<'_>, stop: &StopInputEntry, inputs: Option<u8>) -> Option<StopInput> {
     let input = channel(&stop.input, "di");
     if input.is_none() {
         let diag = Diag::error(format!("{} is not a digital input", quote(&stop.input)));
         checker.error(stop.input.at, diag.hint(format!("give `di0` to `di{}`", MAX_DIGITAL - 1)));
     }
-    Some(StopInput { input: input?, open: stop.open == InputLevel::High })
+    let input = input?;
+    if let Some(inputs) = inputs.filter(|inputs| input >= *inputs) {
+        let hint = match inputs {
+            0 => "the arm has no digital inputs: remove `stop_input`".to_owned(),
+            inputs => format!("it has di0 to di{}", inputs - 1),
+        };
+        checker.error(stop.input.at, Diag::error(format!("the arm has no digital input di{input}")).hint(hint));
+        return None;
+    }
+    Some(StopInput { input, open: stop.open == InputLevel::High })
 }

@@ -13,7 +13,7 @@ use super::output::{self, Table, fixed, span};
 use crate::planning::path::length;
 use crate::planning::timing::time_within;
 use crate::planning::topp::JointBound;
-use crate::replay::motion::RecordedMotion;
+use crate::replay::motion::{RecordedMotion, tcp_path};
 use crate::replay::recorded::Recorded;
 use crate::replay::retrace::{Back, Retrace, RetraceError, retrace};
 use crate::rpc::api::{Execute, ExecutePlan, Motion, Plan, PlanGoal, Planner, Point, State, Status, Trajectory};
@@ -43,6 +43,9 @@ pub struct Args {
     /// Go back by this much time of logged motion; rests do not count
     #[arg(long, value_name = "TIME", value_parser = arguments::duration)]
     pub time: Option<Duration>,
+    /// Go back by this length of the tool centre point's path [m]
+    #[arg(long, value_name = "METRES", value_parser = arguments::finite, conflicts_with_all = ["time", "motions"])]
+    pub distance: Option<f64>,
     /// Go back by this many motions
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..), conflicts_with = "time")]
     pub motions: u32,
@@ -170,7 +173,14 @@ fn way_back(
     log: &Path,
     args: &Args,
 ) -> Result<(Vec<String>, Retrace, f64)> {
-    let back = args.time.map_or(Back::Motions(args.motions), |time| Back::Time(time.as_secs_f64()));
+    if args.distance.is_some_and(|metres| metres <= 0.0) {
+        return Err(Failure::usage("--distance is a length above 0 m"));
+    }
+    if args.distance.is_some() && !status.arms.iter().any(|a| a.hardware_id == arm && a.tcp.is_some()) {
+        let failure =
+            Failure::new(Exit::Failed, format!("this run has no model of {arm}: its path has no length in m"));
+        return Err(failure.hint("go back by --time or --motions, or run a planner blueprint"));
+    }
     let mut delays = [LOG_DELAY].into_iter();
     loop {
         let (stamp, joints, now) = present(client, arm)?;
@@ -180,6 +190,13 @@ fn way_back(
             let since = ((from.unwrap_or(stamp).min(stamp) - window).max(0.0) * 1e9) as u64;
             let motion = RecordedMotion::measured(log, &joints, since, u64::MAX);
             let motion = motion.map_err(|e| Failure::of(Exit::Failed, e))?;
+            let tcp = args.distance.map(|_| tcp_path(log, arm, since, u64::MAX)).transpose();
+            let tcp = tcp.map_err(|e| Failure::of(Exit::Failed, e))?.unwrap_or_default();
+            let back = match (args.distance, args.time) {
+                (Some(metres), _) => Back::Distance(metres, &tcp),
+                (_, Some(time)) => Back::Time(time.as_secs_f64()),
+                _ => Back::Motions(args.motions),
+            };
             result = retrace(&motion, &now, from.map(|from| (from * 1e9) as u64), back);
             if result != Err(RetraceError::TooShort) {
                 break;
@@ -197,7 +214,7 @@ fn way_back(
             }
             Err(RetraceError::TooShort) => {
                 let what = format!("the log has no earlier motion of {arm} that could be retraced so far");
-                let hint = "ask for less with --motions or --time; `dimos replay --last` plays the log";
+                let hint = "ask for less with --motions, --time or --distance; `dimos replay --last` plays the log";
                 return Err(Failure::new(Exit::Failed, what).hint(hint));
             }
         }

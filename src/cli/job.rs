@@ -2,7 +2,10 @@
 
 mod execute;
 mod file;
+mod keys;
 mod names;
+#[cfg(test)]
+mod schema_tests;
 mod step;
 mod times;
 

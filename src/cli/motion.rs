@@ -9,6 +9,7 @@ use super::{output, recorded_path};
 use crate::rpc::Code;
 use crate::rpc::api::{Cancel, ExecutePlan, Move, MoveNative, MoveReply, Plan, Planner, Poses, State};
 use crate::rpc::client::Client;
+use crate::telemetry::describe::percent;
 
 /// Arguments of `move`.
 #[derive(Debug, clap::Args)]
@@ -99,10 +100,16 @@ fn move_native(args: &Args, client: &mut Client, signals: &Signals) -> Result {
     let request =
         MoveNative { arm: arm.clone(), pose, controller_frame, speed: args.search.speed, direct: args.direct };
     let begun = client.call(request)?;
-    let (motion, percent) = (begun.motion, begun.speed * 100.0);
+    let (motion, speed) = (begun.motion, percent(begun.speed));
     output::note(format_args!(
-        "motion {motion} by {arm}'s own controller at {percent:.0} % of its top speed: not collision-checked"
+        "motion {motion} by {arm}'s own controller at {speed} of its top speed: not collision-checked"
     ));
+    if let Some(tool) = begun.tool.filter(|tool| *tool > 1e-3) {
+        output::note(format_args!(
+            "  the controller's pose is {tool:.3} m from the tool centre point: right if that is a tool, wrong if the \
+             base frames differ; `dimos state` prints both"
+        ));
+    }
     if args.no_wait {
         if args.target_run.json {
             output::json(&begun);

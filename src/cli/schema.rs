@@ -1,4 +1,4 @@
-//! `dimos schema`: the JSON Schema of blueprints, and of the rpc protocol.
+//! `dimos schema`: the JSON Schema of blueprints, of jobs, and of the rpc protocol.
 
 use serde_json::Value;
 
@@ -13,15 +13,24 @@ pub struct Args {
     /// Print the schema of the rpc protocol instead: methods, parameters, replies, streams
     #[arg(long)]
     rpc: bool,
+    /// Print the schema of jobs instead
+    #[arg(long, conflicts_with = "rpc")]
+    job: bool,
 }
 
-/// What [`crate::rpc::schema::json_schema`] returns, made by a test: the program is smaller without what makes it.
+/// What [`crate::rpc::schema::json_schema`] returns, and the schema of jobs: made by tests, because the program is
+/// smaller without what makes them.
 const RPC: &str = "rpc.schema.json";
+const JOB: &str = "job.schema.json";
 
 /// Runs the verb.
 pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
-    let rpc = || packed::text(RPC).and_then(|text| serde_json::from_str(text).ok()).unwrap_or_default();
-    let schema: Value = if args.rpc { rpc() } else { blueprint::json_schema(catalog) };
+    let made = |name| packed::text(name).and_then(|text| serde_json::from_str(text).ok()).unwrap_or_default();
+    let schema: Value = match (args.rpc, args.job) {
+        (true, _) => made(RPC),
+        (_, true) => made(JOB),
+        _ => blueprint::json_schema(catalog),
+    };
     // A value made of maps and lists always encodes.
     output::line(serde_json::to_string_pretty(&schema).unwrap_or_default());
     Ok(Exit::Ok)

@@ -4,6 +4,7 @@ use super::arguments::{self, Target};
 use super::exit::{Exit, Result};
 use super::output;
 use crate::rpc::api::{Speed, SpeedReport};
+use crate::telemetry::describe::percent;
 
 /// Arguments of `speed`.
 #[derive(Debug, clap::Args)]
@@ -45,9 +46,9 @@ fn change(target: &Target, call: Speed) -> Result {
 
 /// Describes an override in one line.
 pub fn describe(report: &SpeedReport) -> String {
-    let percent = report.fraction * 100.0;
+    let percent = percent(report.fraction);
     match report.paused {
-        true => format!("paused; at {percent:.0} % of the speed after `dimos resume`"),
-        false => format!("speed {percent:.0} %"),
+        true => format!("paused; at {percent} of the speed after `dimos resume`"),
+        false => format!("speed {percent}"),
     }
 }

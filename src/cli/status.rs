@@ -14,6 +14,7 @@ use super::speed::describe;
 use crate::rpc::api::{SpeedReport, Status};
 use crate::rpc::client::{Client, ClientError};
 use crate::rpc::report::{ArmReport, Percentiles, PlannerStatus, StatusReport, TaskReport};
+use crate::rpc::report::{LED_BY_CONTROLLER, end_of_lead};
 use crate::rpc::run_dir::LiveRun;
 
 /// Arguments of `status`.
@@ -238,8 +239,10 @@ fn attention(r: &StatusReport) -> Vec<String> {
             }
         }
         if arm.phase == "led" {
-            lines.push(format!("{name} is led: it gets no setpoints"));
-            lines.push(format!("  hint: hold it still, then dimos arm enable {name}"));
+            let by = arm.led_by.as_deref().unwrap_or_default();
+            let leader = if by == LED_BY_CONTROLLER { "by its own controller" } else { "by hand" };
+            lines.push(format!("{name} is led {leader}: it gets no setpoints"));
+            lines.push(format!("  hint: {}", end_of_lead(name, by)));
         }
         if let Some(error) = &arm.error {
             lines.push(format!("{name} reports error {}: {}", error.code, error.text));

@@ -49,8 +49,9 @@ pub enum AdapterError {
     /// The device refused a command.
     #[error("{0}")]
     Rejected(String),
-    /// Two setpoints are still unacknowledged, so this one was not sent. Not a failure of the device.
-    #[error("two setpoints are still unacknowledged")]
+    /// Not a failure of the device: two setpoints are still unacknowledged, so this one was not sent; or the errors are
+    /// being cleared.
+    #[error("the arm is busy")]
     Busy,
     /// The device has no such feature.
     #[error("not supported by this arm")]
@@ -225,7 +226,8 @@ pub trait ManipulatorAdapter: Send {
     fn write_stop(&mut self) -> AdapterResult<Stop>;
     /// Enables or disables the motors.
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()>;
-    /// Clears the device's error state. Moves and enables nothing.
+    /// Clears the device's error state. Moves and enables nothing. `Busy` while that takes time: the device thread then
+    /// calls it again in the next cycle, for at most 7.5 s, and reads and stops the arm meanwhile.
     fn write_clear_errors(&mut self) -> AdapterResult<()>;
     /// Returns the longest regular time between two setpoints, known once connected. `None`: one per tick or, if
     /// longer, per period of the states.

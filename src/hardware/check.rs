@@ -16,6 +16,28 @@ use crate::message::Message;
 pub struct Checked {
     /// Nominal joint limits. A connected arm may narrow them.
     pub limits: JointLimits,
+    /// Number of digital inputs; `None`: known once connected.
+    pub digital_inputs: Option<u8>,
+    /// Largest mass at the flange that the controller takes [kg], 0 if it takes neither a load nor a mounting; `None`:
+    /// known once connected.
+    pub max_payload: Option<f64>,
+}
+
+impl Checked {
+    /// Creates the result for an arm of which only the limits are known before it is connected.
+    pub fn new(limits: JointLimits) -> Self {
+        Self { limits, ..Self::default() }
+    }
+
+    /// Says that the arm has these digital inputs.
+    pub fn digital_inputs(self, number: u8) -> Self {
+        Self { digital_inputs: Some(number), ..self }
+    }
+
+    /// Says that the controller takes loads up to this mass [kg]; 0: none.
+    pub fn max_payload(self, mass: f64) -> Self {
+        Self { max_payload: Some(mass), ..self }
+    }
 }
 
 /// An invalid configuration and its location. `Display` prints `what`, without the hint.

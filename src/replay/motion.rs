@@ -109,6 +109,26 @@ impl RecordedMotion {
     }
 }
 
+/// Reads the positions of an arm's tool centre point [m] between two Unix times [ns], with their times. Empty if the
+/// run has no model of the arm.
+pub fn tcp_path(path: &Path, arm: &str, from: u64, to: u64) -> Result<Vec<(u64, [f64; 3])>, RecordedError> {
+    let mut log = LogReader::open(path)?;
+    log.select(Selection { topics: vec![format!("/tcp/{arm}")], from, to })?;
+    let mut found = Vec::new();
+    loop {
+        match log.next_entry() {
+            Ok(Some(entry)) => {
+                if let Payload::PoseStamped(at) = &entry.data {
+                    let p = &at.pose.position;
+                    found.push((entry.log_time, [p.x, p.y, p.z]));
+                }
+            }
+            Ok(None) | Err(ReplayError::Cut { .. }) => return Ok(found),
+            Err(e) => return Err(e.into()),
+        }
+    }
+}
+
 fn rows(path: &Path, joints: usize, from: u64, to: u64) -> Result<Vec<Row>, RecordedError> {
     let topics = ["/joint_states", "/joint_commands", "/dimos/tick"].map(str::to_owned).to_vec();
     let mut log = LogReader::open(path)?;

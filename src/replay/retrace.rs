@@ -13,13 +13,19 @@ const ARRIVED: f64 = 5e-3;
 /// Deviation of the shortened path from the recorded one [rad].
 const TOLERANCE: f64 = 2e-4;
 
+/// Part of the path of a tool centre point that is shorter counts as noise [m].
+const NOISE: f64 = 2e-3;
+
 /// How far back.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Back {
+pub enum Back<'a> {
     /// To where the arm was at rest before its last motions: this many, at least 1.
     Motions(u32),
     /// By this much time of motion [s]; rests do not count.
     Time(f64),
+    /// By this length of the path of the tool centre point [m], whose positions [m] have been these, with their times
+    /// [ns since 1970].
+    Distance(f64, &'a [(u64, [f64; 3])]),
 }
 
 /// A way back.
@@ -53,7 +59,12 @@ pub enum RetraceError {
 
 /// Returns the way back of an arm that is at `now` [rad]. `motion` has only its joints, in the same order. `from`: the
 /// arm retraced the log to this time [ns since 1970] before, or was stopped on that way; the way continues from there.
-pub fn retrace(motion: &RecordedMotion, now: &[f64], from: Option<u64>, back: Back) -> Result<Retrace, RetraceError> {
+pub fn retrace(
+    motion: &RecordedMotion,
+    now: &[f64],
+    from: Option<u64>,
+    back: Back<'_>,
+) -> Result<Retrace, RetraceError> {
     let (rows, period) = (motion.rows.as_slice(), motion.period);
     let end = rows.len().checked_sub(1).ok_or(RetraceError::TooShort)?;
     let time = |k: usize| motion.last.saturating_sub(((end - k) as f64 * period * 1e9) as u64);
@@ -92,6 +103,10 @@ pub fn retrace(motion: &RecordedMotion, now: &[f64], from: Option<u64>, back: Ba
             let steps = ((seconds / period).round() as usize).max(1);
             (0..=begin).rev().filter(moves).nth(steps + window).ok_or(RetraceError::TooShort)?
         }
+        Back::Distance(metres, tcp) => {
+            let at = passed(tcp, time(end), metres).ok_or(RetraceError::TooShort)?;
+            (0..=begin).rev().find(|k| time(*k) <= at).ok_or(RetraceError::TooShort)?
+        }
     };
     let whole: Vec<&Vec<f64>> = rows[goal..=begin].iter().rev().collect();
     let mut tolerance = TOLERANCE;
@@ -105,6 +120,23 @@ pub fn retrace(motion: &RecordedMotion, now: &[f64], from: Option<u64>, back: Ba
     // A row counts as moving for the window after the motion too.
     let moving = (goal..=begin).filter(moves).count().saturating_sub(window);
     Ok(Retrace { path, time: time(goal), duration: moving as f64 * period, at_rest: !moves(&goal) })
+}
+
+/// Returns when a tool centre point was this far back along its path from where it was at `end` [m, ns].
+fn passed(tcp: &[(u64, [f64; 3])], end: u64, metres: f64) -> Option<u64> {
+    let mut way = tcp.iter().rev().skip_while(|(time, _)| *time > end);
+    let (&(mut at, mut from), mut left) = (way.next()?, metres);
+    for (time, xyz) in way {
+        let step = xyz.iter().zip(&from).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
+        if step < NOISE {
+            continue;
+        }
+        if step >= left {
+            return Some(at - ((at - time) as f64 * left / step) as u64);
+        }
+        (at, from, left) = (*time, *xyz, left - step);
+    }
+    None
 }
 
 /// Returns the largest difference of a joint [rad].
@@ -180,6 +212,26 @@ mod tests {
         assert_eq!(retrace(&motion, &at(2.4), None, Back::Motions(4)), Err(RetraceError::TooShort));
         let back = retrace(&motion, &at(2.4), None, Back::Time(0.5)).unwrap();
         assert!(!back.at_rest && (back.path.last().unwrap()[0] - 2.2).abs() < 0.01, "{back:?}");
+    }
+
+    #[test]
+    fn a_distance_counts_along_the_path_of_the_tool_and_rests_and_noise_do_not() {
+        let motion = record();
+        // The tool moves by 0.1 m per radian of the first joint, there and back again in x, and trembles at rest.
+        let begin = motion.last - ((motion.rows.len() - 1) as f64 * DT * 1e9) as u64;
+        let tremble = |k: usize| if k % 2 == 0 { 1e-4 } else { -1e-4 };
+        let tcp: Vec<(u64, [f64; 3])> = (0..)
+            .zip(&motion.rows)
+            .map(|(k, q)| (begin + k as u64 * 10_000_000, [0.1 * q[0], 0.2, tremble(k)]))
+            .collect();
+        for (metres, goal) in [(0.02, 2.2), (0.1, 1.4), (0.15, 0.9)] {
+            let found = retrace(&motion, &at(2.4), None, Back::Distance(metres, &tcp)).unwrap();
+            let x = found.path.last().unwrap()[0];
+            assert!((x - goal).abs() < 0.02, "{metres}: {x}");
+        }
+        let far = retrace(&motion, &at(2.4), None, Back::Distance(0.3, &tcp));
+        assert_eq!(far, Err(RetraceError::TooShort));
+        assert_eq!(retrace(&motion, &at(2.4), None, Back::Distance(0.1, &[])), Err(RetraceError::TooShort));
     }
 
     #[test]

@@ -117,6 +117,10 @@ pub struct NativeReply {
     pub motion: u64,
     /// Fraction of the top speed that the controller was given.
     pub speed: f64,
+    /// Distance of the pose that the controller reports from the tool centre point [m], by which the goal was
+    /// converted: right if that is its tool, wrong by a difference of the base frames. Absent if nothing was converted.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tool: Option<f64>,
 }
 
 /// Parameters of `arm_disable`.

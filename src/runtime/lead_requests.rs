@@ -21,6 +21,7 @@ use crate::joint::STANDSTILL;
 use crate::pose::{from_xyz_rpy, to_xyz_rpy};
 use crate::robot::kinematics::pose as to_isometry;
 use crate::rpc::api::{self, Reply};
+use crate::rpc::report::{LED_BY_CONTROLLER, end_of_lead};
 use crate::rpc::{Code, RpcError};
 use crate::sync::lock;
 use crate::telemetry::describe::Severity;
@@ -122,7 +123,7 @@ impl Service {
     pub(super) fn led_arm_rests(&self, name: &str, arm: u16) -> Result<(), RpcError> {
         if self.is_native(arm) {
             return Err(RpcError::new(Code::ArmNotReady, format!("{name} is moved by its own controller"))
-                .hint("wait for it, or end it with `dimos cancel`"));
+                .hint(end_of_lead(name, LED_BY_CONTROLLER)));
         }
         let speed = self.speed(arm);
         if speed <= STANDSTILL {
@@ -141,7 +142,7 @@ impl Service {
         }
         let joints: Vec<u16> = self.joints_of_arm(arm).collect();
         self.end_streams(&joints).await?;
-        let target = self.native_target(arm, &call)?;
+        let (target, tool) = self.native_target(arm, &call)?;
         let motion = self.parts.dispatcher.next_id();
         let planned = Planned {
             task: NATIVE,
@@ -155,7 +156,7 @@ impl Service {
         };
         lock(&self.motions).plan(motion, planned);
         let native = Native { name: call.arm, arm, motion, target, speed: call.speed * self.speed_override().fraction };
-        let reply = api::NativeReply { motion, speed: native.speed };
+        let reply = api::NativeReply { motion, speed: native.speed, tool };
         let (begun, answer) = oneshot::channel();
         let me = self.me.upgrade().ok_or_else(internal)?;
         let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build();
@@ -240,8 +241,9 @@ impl Service {
         }
     }
 
-    /// Returns the pose that the controller is given: in its own base frame, of the point that it reports.
-    fn native_target(&self, arm: u16, call: &api::MoveNative) -> Result<Pose, RpcError> {
+    /// Returns the pose that the controller is given: in its own base frame, of the point that it reports; and how far
+    /// that point is from the tool centre point [m], if the goal is one of the latter.
+    fn native_target(&self, arm: u16, call: &api::MoveNative) -> Result<(Pose, Option<f64>), RpcError> {
         let name = self.parts.names.arm(arm);
         let own = self.arm_view(arm as usize).and_then(|view| view.state.pose);
         let own = own.ok_or_else(|| {
@@ -252,25 +254,25 @@ impl Service {
         let now = from_xyz_rpy(own.xyz, own.rpy);
         let model = self.tcp_models().into_iter().nth(arm as usize).flatten();
         let measured = self.tcp_poses().into_iter().nth(arm as usize).flatten();
-        let target = match (model, measured) {
+        let (target, tool) = match (model, measured) {
             (Some(model), Some(tcp)) if !call.controller_frame => {
                 let (root, tcp) = (to_isometry(&model.root), from_xyz_rpy(tcp.xyz, tcp.rpy));
                 let tool = (root * now).inverse() * tcp;
-                if tool.translation.vector.norm() > LARGEST_TOOL {
+                let distance = tool.translation.vector.norm();
+                if distance > LARGEST_TOOL {
                     let what = format!(
-                        "the pose that {name} reports is {:.3} m from the tool centre point of its model: their base \
-                         frames differ",
-                        tool.translation.vector.norm()
+                        "the pose that {name} reports is {distance:.3} m from the tool centre point of its model: their \
+                         base frames differ"
                     );
                     return Err(RpcError::new(Code::Unsupported, what)
                         .hint("give the pose in the controller's own frame: --frame controller"));
                 }
-                root.inverse() * goal(call, &tcp) * tool.inverse()
+                (root.inverse() * goal(call, &tcp) * tool.inverse(), Some(distance))
             }
-            _ => goal(call, &now),
+            _ => (goal(call, &now), None),
         };
         let (xyz, rpy) = to_xyz_rpy(&target);
-        Ok(Pose { xyz, rpy })
+        Ok((Pose { xyz, rpy }, tool))
     }
 
     fn set_native(&self, arm: u16, runs: bool) {
@@ -281,6 +283,11 @@ impl Service {
 
     fn is_native(&self, arm: u16) -> bool {
         self.natives.get(arm as usize).is_some_and(|native| native.load(Ordering::Acquire))
+    }
+
+    /// Returns what leads an arm that is led: `controller` or `hand`.
+    pub(super) fn led_by(&self, arm: u16) -> &'static str {
+        if self.is_native(arm) { LED_BY_CONTROLLER } else { "hand" }
     }
 
     /// Cancels the native motions of these arms: each gets its own stop. Returns whether there was any.

@@ -10,6 +10,7 @@ use crate::control::request::Request;
 use crate::hardware::adapter::AdapterError;
 use crate::joint::STANDSTILL;
 use crate::rpc::api::{self, AttachReply, LoadReport, PayloadReply, Reply, Request as Call};
+use crate::rpc::report::end_of_lead;
 use crate::rpc::{Code, RpcError};
 use crate::telemetry::describe::Severity;
 use crate::telemetry::{Phase, TaskState};
@@ -78,7 +79,7 @@ impl Service {
         self.rests(arm)?;
         let name = self.parts.names.arm(arm);
         if self.phase(arm as usize) == Phase::Led {
-            let hint = format!("hold it still, then: dimos arm enable {name}");
+            let hint = end_of_lead(&name, self.led_by(arm));
             return Err(RpcError::new(Code::ArmNotReady, format!("{name} is led")).hint(hint));
         }
         let resets = self.parts.connected.get(arm as usize).is_some_and(|connected| connected.payload_resets);

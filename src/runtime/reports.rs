@@ -16,7 +16,7 @@ use crate::rpc::{Code, RpcError};
 use crate::rt::histogram::Figures;
 use crate::sync::lock;
 use crate::telemetry::describe::{Described, Severity, bound_text, cause_text, outcome_text, reason_text};
-use crate::telemetry::{Cause, Outcome, Reason, TaskState};
+use crate::telemetry::{Cause, Outcome, Phase, Reason, TaskState};
 
 impl Service {
     /// Returns the reply to `status`.
@@ -102,6 +102,7 @@ impl Service {
             simulated: !arm.is_real(),
             link: view.state.link.name().to_owned(),
             phase: view.phase.name().to_owned(),
+            led_by: (view.phase == Phase::Led).then(|| self.led_by(index as u16).to_owned()),
             cause: (view.cause != Cause::None)
                 .then(|| CauseReport { name: view.cause.name().to_owned(), text: cause_text(view.cause) }),
             stop_pending: self.late_stops.is_waiting(index),
@@ -285,6 +286,7 @@ impl Service {
                 .hint("move to its first point first: `dimos move`")
                 .data(serde_json::json!({"joint": names.joint(*joint), "distance": distance})),
             Outcome::StartStateUnavailable(_) => error.hint("`dimos status` shows its link and the age of its state"),
+            Outcome::ArmNotReady(a, Phase::Led, _) => error.hint(end_of_lead(&arm(a), self.led_by(*a))),
             Outcome::ArmNotReady(a, ..) => error.hint(format!("make it ready: `dimos arm enable {}`", arm(a))),
             Outcome::Paused => error.hint("dimos resume"),
             Outcome::ArmMoving(_) => error.hint("again when it is at rest"),

@@ -117,10 +117,10 @@ pub fn describe(event: &Event, names: &Names) -> Described {
             Described { values: vec![f64::from(skipped), late_ns as f64], ..d }
         }
         Event::Speed(fraction, paused) => {
-            let percent = fraction * 100.0;
+            let percent = percent(fraction);
             let (status, text) = match paused {
-                true => ("paused", format!("all motions are paused; speed {percent:.0} % afterwards")),
-                false => ("set", format!("speed {percent:.0} %")),
+                true => ("paused", format!("all motions are paused; speed {percent} afterwards")),
+                false => ("set", format!("speed {percent}")),
             };
             Described { values: vec![fraction], ..plain("speed", Severity::Info, status, text) }
         }
@@ -169,6 +169,13 @@ fn request(id: u64, outcome: Outcome, names: &Names) -> Described {
         }
     }
     d
+}
+
+/// Writes a fraction as `30 %`: to 0.1 %, and below 1 % to 0.001 %.
+pub fn percent(fraction: f64) -> String {
+    let percent = fraction * 100.0;
+    let decimals = if percent.abs() < 1.0 { 1000.0 } else { 10.0 };
+    format!("{} %", (percent * decimals).round() / decimals)
 }
 
 /// Returns the outcome of a request as text.
@@ -274,6 +281,7 @@ pub fn bound_text(bound: Bound, names: &Names) -> String {
         Bound::None => String::new(),
         Bound::Velocity(joint) => format!("the velocity limit of {}", names.joint(joint)),
         Bound::Position(joint) => format!("the position limit of {}", names.joint(joint)),
+        Bound::Acceleration(joint) => format!("the acceleration limit of {}", names.joint(joint)),
         Bound::Singularity => "a singularity nearby".into(),
         Bound::Invalid => "a target that is not finite".into(),
     }

@@ -242,7 +242,7 @@ pub enum Reason {
     LeaderAway(u16, f64),
 }
 
-/// What limits the motion of an end effector, or of an arm that follows another.
+/// What limits the motion of a task.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Bound {
     /// Nothing.
@@ -252,6 +252,8 @@ pub enum Bound {
     Velocity(u16),
     /// A position limit of this joint.
     Position(u16),
+    /// The acceleration limit of this joint.
+    Acceleration(u16),
     /// A singularity nearby.
     Singularity,
     /// Its target or its state is not finite.
@@ -383,7 +385,7 @@ pub struct TaskView {
     pub elapsed: f64,
     /// Remaining time of the motion [s].
     pub remaining: f64,
-    /// What limits its motion, where the task knows.
+    /// What limits its motion: where the task knows, else the first of its joints whose commands are limited.
     pub bound: Bound,
     /// Largest distance of a joint from its leader's, while it follows one [rad].
     pub distance: Option<f64>,

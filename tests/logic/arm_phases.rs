@@ -106,9 +106,12 @@ fn an_open_stop_input_latches_a_hold_in_every_phase_and_is_reset_only_when_close
             rig.execute(0, sweep(1, 0..6, q, 1.0, 2.0));
             rig.run_for(0.8);
         }
+        let speed = rig.speed(0);
         rig.arms[0].state.stop_input_open = true;
-        rig.run(2);
+        // In the tick after the reading.
+        rig.run(1);
         assert_eq!((rig.phase(0), rig.samples[0].cause), (Phase::Held, Cause::StopInput), "{enabled} {moving}");
+        assert!(!moving || rig.speed(0) < speed, "{} {speed}", rig.speed(0));
         assert!(rig.reported(Event::Arm(0, Phase::Held, Cause::StopInput)));
         rig.run_for(2.0);
         assert_eq!((rig.commands[0].mode, rig.arms[0].stops), (None, u32::from(enabled)));

@@ -4,7 +4,7 @@ use dimos::arm::{GripperUnit, VelocitySource};
 use dimos::control::config::*;
 use dimos::control::request::Request;
 use dimos::joint::ControlMode;
-use dimos::telemetry::{Cause, Event, Outcome, Phase, Reason, TaskState};
+use dimos::telemetry::{Bound, Cause, Event, Outcome, Phase, Reason, TaskState};
 
 use crate::support::rig::*;
 
@@ -394,4 +394,29 @@ fn a_burst_of_requests_is_answered_within_a_few_ticks_and_a_stop_in_it_is_not_ke
     assert_eq!(rig.outcome(stop), Outcome::Accepted);
     assert_eq!(rig.phase(0), Phase::Held);
     ids.iter().for_each(|id| assert_eq!(rig.outcome(*id), Outcome::Accepted));
+}
+
+#[test]
+fn a_stream_that_is_limited_says_by_what_as_long_as_it_is() {
+    let mut rig = Rig::one_arm(one(servo()));
+    rig.run_for(0.5);
+    assert_eq!(rig.tasks[0].bound, Bound::None);
+    // Twice the velocity limit, then on the spot.
+    let mut target = rig.commanded(0);
+    let mut seen = Vec::new();
+    for _ in 0..40 {
+        target[1] += 2.0 * V_MAX * rig.dt();
+        target[1] = target[1].min(rig.commanded(0)[1] + 0.15);
+        rig.servo(0, &target);
+        rig.tick();
+        seen.push(rig.tasks[0].bound);
+    }
+    assert_eq!(rig.tasks[0].state, TaskState::Executing);
+    assert!(seen.ends_with(&[Bound::Velocity(1); 10]), "{seen:?}");
+    let rest = rig.commanded(0);
+    for _ in 0..100 {
+        rig.servo(0, &rest);
+        rig.tick();
+    }
+    assert_eq!(rig.tasks[0].bound, Bound::None);
 }

@@ -11,7 +11,7 @@ use dimos::arm::{GripperInfo, GripperUnit, Interference, Link};
 use dimos::control::config::*;
 use dimos::control::request::Request;
 use dimos::robot::random::Random;
-use dimos::telemetry::Phase;
+use dimos::telemetry::{Bound, Phase, TaskView};
 
 use crate::support::rig::*;
 
@@ -260,7 +260,9 @@ impl Scenario {
                 let _ = write!(reports, "{event:?}");
             }
             // No task here follows another arm: the digests have nothing of the distance from it.
-            let tasks = format!("{:?}", self.rig.tasks).replace(", distance: None", "");
+            // What limits a motion is in `status` only: no log has it.
+            let tasks: Vec<_> = self.rig.tasks.iter().map(|t| TaskView { bound: Bound::None, ..t.clone() }).collect();
+            let tasks = format!("{tasks:?}").replace(", distance: None", "");
             let _ = write!(reports, "{tasks} {:?}", self.rig.retired);
             self.rig.retired.clear();
         }

@@ -93,7 +93,7 @@ fn an_arm_is_not_enabled_while_its_stop_input_is_open_or_missing() {
     };
     let err = start("{input: di0, open: high}", 3);
     assert!(err.contains("the stop input di0 is open") && err.contains("hint: close it"), "{err}");
-    let err = start("{input: di9}", 3);
+    let err = start("{input: di9}", 2);
     assert!(err.contains("no digital input di9") && err.contains("it has di0 to di7"), "{err}");
     let err = start("{input: do1}", 2);
     assert!(err.contains("`do1` is not a digital input") && err.contains("cell.yaml:2:"), "{err}");

@@ -61,7 +61,7 @@ pub const YOURARM: AdapterSpec = AdapterSpec {
     teach: Teach::HandGuiding,
     gripper: true,
     options: OptionsSpec::of::<NetOptions>(),
-    check: |config| Ok(Checked { limits: JointLimits::uniform(config.dof, 3.0, 2.0) }),
+    check: |config| Ok(Checked::new(JointLimits::uniform(config.dof, 3.0, 2.0)).digital_inputs(8)),
     create: |_| Err(AdapterError::Rejected(NOT_HERE.to_owned())),
     emulate: Some(|_, _| Err(AdapterError::Rejected(NOT_HERE.to_owned()))),
     service: None,

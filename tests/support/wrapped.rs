@@ -35,7 +35,7 @@ pub const ROW: AdapterSpec = AdapterSpec {
     about: "an arm of a test",
     stale_after: Duration::from_secs(5),
     address: AddressForm { form: "TEXT", required: false, check: |address| Ok(address.to_owned()) },
-    check: |config| Ok(Checked { limits: JointLimits::uniform(config.dof, 3.0, 2.0) }),
+    check: |config| Ok(Checked::new(JointLimits::uniform(config.dof, 3.0, 2.0))),
     ..mock::SPEC
 };
 

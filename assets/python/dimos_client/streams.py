@@ -61,6 +61,11 @@ class Streams(Connection):
         self._streams.add(task)
         return ChunkReport(reply["actions"], reply["late"])
 
+    def start(self, task: str) -> None:
+        """Starts a task that takes no targets, such as a follow task: its arm approaches the leader's and follows it.
+        `cancel(task=…)` ends it; the end of this client does not."""
+        self.call("start", task=task)
+
     def settle(self) -> None:
         """Waits until all targets that were sent are answered; raises the first refusal."""
         while self._targets:

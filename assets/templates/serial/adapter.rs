@@ -163,9 +163,9 @@ impl AcmeAdapter {
     }
 }
 
-/// Velocity of a servo [rad/s].
-fn velocity(servo: &Servo) -> f64 {
-    f64::from(servo.velocity) * TAU / TURN
+/// Velocity of a joint [rad/s].
+fn velocity(servo: &Servo, range: &super::Range) -> f64 {
+    range.sign() * f64::from(servo.velocity) * TAU / TURN
 }
 
 /// Whether a stop makes the position of servo `i` its goal: if it moves, or is a joint far from its goal. A joint that
@@ -253,7 +253,7 @@ impl ManipulatorAdapter for AcmeAdapter {
 
     fn read_joint_velocities(&mut self, velocities: &mut [f64]) -> AdapterResult<bool> {
         let servos = self.not_older(STATE_AGE)?;
-        fill(velocities, &self.of_joints(&servos, |servo, _| velocity(servo)));
+        fill(velocities, &self.of_joints(&servos, velocity));
         Ok(true) // YOUR ARM: leave the method out if they do not measure them; never fill in zeros
     }
 
@@ -263,7 +263,7 @@ impl ManipulatorAdapter for AcmeAdapter {
             stamp: None,
             device_ns: None,
             position: self.of_joints(&servos, |servo, range| range.angle(servo.position)),
-            velocity: Some(self.of_joints(&servos, |servo, _| velocity(servo))),
+            velocity: Some(self.of_joints(&servos, velocity)),
             effort: None,
             valid: Some(true),
         };
@@ -416,8 +416,8 @@ mod tests {
         let before = adapter.fetch().unwrap();
         // Its calibration says that the first joint ends 100 counts below the position that it has.
         let high = before[0].position - 100;
-        let mut ranges = [Range { zero: 2048, low: 0, high: 4095 }; SERVOS];
-        ranges[0] = Range { zero: 0, low: 0, high };
+        let mut ranges = [Range { zero: 2048, low: 0, high: 4095, reversed: false }; SERVOS];
+        ranges[0] = Range { zero: 0, low: 0, high, reversed: false };
         adapter.calibration = Calibration::of(&ranges).unwrap();
         let refused = adapter.activate().unwrap_err().to_string();
         assert!(refused.starts_with("joint 1 is 8.8° outside its range\nhint: "), "{refused}");

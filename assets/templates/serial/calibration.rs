@@ -11,9 +11,9 @@ use super::{DOF, OPEN, SERVOS};
 /// Counts of a turn.
 pub const TURN: f64 = 4096.0; // YOUR ARM
 /// Range of a joint according to the data sheet: 170° on both sides of the middle. YOUR ARM: one for each joint.
-const JOINT: Range = Range { zero: 2048, low: 114, high: 3982 };
+const JOINT: Range = Range { zero: 2048, low: 114, high: 3982, reversed: false };
 /// The gripper, closed and open. YOUR ARM.
-const GRIPPER: Range = Range { zero: 1000, low: 1000, high: 3000 };
+const GRIPPER: Range = Range { zero: 1000, low: 1000, high: 3000, reversed: false };
 
 /// Zero and range of a servo [counts]. The gripper is closed at `low` and open at `high`; it needs no zero.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -25,17 +25,25 @@ pub struct Range {
     pub low: i32,
     /// Highest position.
     pub high: i32,
+    /// Whether the joint turns to its data sheet's + when the counts decrease.
+    #[serde(default)]
+    pub reversed: bool,
 }
 
 impl Range {
     /// The angle of a position [rad].
     pub fn angle(&self, counts: i32) -> f64 {
-        f64::from(counts - self.zero) * TAU / TURN
+        self.sign() * f64::from(counts - self.zero) * TAU / TURN
+    }
+
+    /// −1 for a reversed joint: also for its velocity.
+    pub fn sign(&self) -> f64 {
+        if self.reversed { -1.0 } else { 1.0 }
     }
 
     /// The position in the range that is closest to an angle.
     pub fn counts(&self, angle: f64) -> i32 {
-        self.inside((angle * TURN / TAU).round() as i32 + self.zero)
+        self.inside((self.sign() * angle * TURN / TAU).round() as i32 + self.zero)
     }
 
     /// The position in the range that is closest to another one.
@@ -43,9 +51,10 @@ impl Range {
         counts.max(self.low).min(self.high)
     }
 
-    /// The angles of both ends [rad].
+    /// The angles of both ends [rad], the lower one first.
     pub fn angles(&self) -> (f64, f64) {
-        (self.angle(self.low), self.angle(self.high))
+        let (a, b) = (self.angle(self.low), self.angle(self.high));
+        (a.min(b), a.max(b))
     }
 }
 
@@ -113,8 +122,11 @@ mod tests {
 
     #[test]
     fn counts_are_angles_by_the_zero_and_openings_by_the_range() {
-        let range = Range { zero: 1000, low: 500, high: 3000 };
+        let range = Range { zero: 1000, low: 500, high: 3000, reversed: false };
         assert_eq!((range.angle(1000 + 1024), range.counts(TAU / 4.0)), (TAU / 4.0, 2024));
+        let reversed = Range { zero: 2000, reversed: true, ..range };
+        assert_eq!((reversed.angle(2000 + 1024), reversed.counts(-TAU / 4.0)), (-TAU / 4.0, 3000));
+        assert_eq!(reversed.angles(), (reversed.angle(3000), reversed.angle(500)));
         assert_eq!((range.counts(-9.0), range.counts(9.0)), (500, 3000), "never beyond the range");
         let calibration = Calibration::of(&[range; SERVOS]).unwrap();
         assert_eq!((calibration.opening(500), calibration.opening(3000)), (0.0, OPEN));

@@ -24,7 +24,8 @@ use calibration::{Calibration, Range};
 
 /// Number of joints.
 pub const DOF: usize = 6;
-/// Number of servos: the gripper is the last one. They are numbered from 1.
+/// Number of servos: the gripper is the last one. They are numbered from 1. YOUR ARM: for one without a gripper `DOF`,
+/// and `gripper: false` below; the compiler then leads to all that is the gripper's.
 pub const SERVOS: usize = DOF + 1;
 
 // YOUR ARM: the modes that it has, and whether it keeps its pose when the motors are off. Most geared servos do not.
@@ -32,7 +33,10 @@ const MODES: &[ControlMode] = &[ControlMode::Position, ControlMode::ServoPositio
 const HOLDS_WHEN_DISABLED: bool = false;
 
 /// Rate at which all servos are read [Hz].
-const NATIVE_RATE: f64 = 100.0; // YOUR ARM: their answers must fit into the period, at the line's rate
+///
+/// YOUR ARM: request and replies must fit into the period. A byte takes 10 bits: 7 replies of 80 bytes take 5.6 ms at
+/// 1 Mbit/s, and 56 ms at 100 kbit/s. A pseudo-terminal has no rate, so the emulator does not show it.
+const NATIVE_RATE: f64 = 100.0;
 /// Opening of the gripper when it is open [m].
 const OPEN: f64 = 0.08; // YOUR ARM
 /// Top speed of every joint [rad/s].
@@ -57,7 +61,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
         check: |address| wire::address(address).map(|address| address.to_string()),
     },
     holds_when_disabled: HOLDS_WHEN_DISABLED,
-    teach: Teach::No("not implemented"),
+    teach: Teach::No("not implemented"), // YOUR ARM: `Teach::MotorsOff` if one hand can hold it with its motors off
     gripper: true,
     options: OptionsSpec::of::<Options>(),
     check,
@@ -72,7 +76,7 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     let options = config.options::<Options>()?;
     let calibration = Calibration::of(&options.calibration).map_err(|e| ConfigError::new("calibration", e))?;
     options.sim.check("acme", &limits(&Calibration::default()), emulator::PLAYABLE)?;
-    Ok(Checked { limits: limits(&calibration) })
+    Ok(Checked::new(limits(&calibration)))
 }
 
 /// The joint limits of a calibrated arm, in SI units.
@@ -91,8 +95,8 @@ fn limits(calibration: &Calibration) -> JointLimits {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
-    /// Zero and range of each servo, from the base, the gripper last: `[{zero: 2048, low: 114, high: 3982}, …]`. Empty:
-    /// those of the data sheet.
+    /// Zero and range of each servo, from the base, the gripper last: `[{zero: 2048, low: 114, high: 3982}, …]`;
+    /// `reversed: true` for a joint that turns the other way. Empty: those of the data sheet.
     pub calibration: Vec<Range>,
     /// Whether the line returns what is sent on it.
     pub echo: bool,

@@ -94,6 +94,9 @@ pub struct Reply<'a> {
 }
 
 /// Finds a reply with this much data at the front of `bytes`. Noise, damage and other replies are skipped.
+///
+/// YOUR ARM: where data is escaped (byte stuffing), let [`Reply::data`] be an array and copy the data there without the
+/// escapes; the frame is then longer than its data.
 pub fn scan(bytes: &[u8], length: usize) -> Scan<Reply<'_>> {
     let noise = bytes.iter().take_while(|byte| **byte != 0x5A).count();
     if noise > 0 {

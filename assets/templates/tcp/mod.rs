@@ -61,7 +61,7 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("acme", SPEC.dof)?;
     let (options, limits) = (config.options::<Options>()?, limits());
     options.sim.check("acme", &limits, PLAYABLE)?;
-    Ok(Checked { limits }) // YOUR ARM: where an option changes the limits, like a model, this is the place
+    Ok(Checked::new(limits)) // YOUR ARM: where an option changes the limits, like a model, this is the place
 }
 
 /// The joint limits of the data sheet, in SI units.

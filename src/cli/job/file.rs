@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Duration;
 
+use super::keys::{self, Group};
 use super::step::{Act, Job, Motion, Step};
 use crate::arm::channel;
 use crate::cli::arguments::{duration, finite, override_of_speed, time};
@@ -19,8 +20,6 @@ const MAX_NESTING: usize = 8;
 const MAX_TIMES: f64 = 1e9;
 /// Default time for a gripper to settle.
 const GRIPPER_TIME: Duration = Duration::from_secs(5);
-const STEPS: [&str; 10] =
-    ["move", "through", "gripper", "wait", "output", "repeat", "attach", "detach", "reset", "enable"];
 
 impl Job {
     /// Reads a job. Prints all mistakes.
@@ -94,7 +93,8 @@ impl Reader {
     }
 
     /// Reports unknown keys of a group; `None` if it is no group.
-    fn group(&mut self, node: NodeId, known: &[&str]) -> Option<()> {
+    fn group(&mut self, node: NodeId, group: &Group) -> Option<()> {
+        let known = group.names();
         if !matches!(self.tree.node(node).map(|n| &n.kind), Some(Kind::Map(_))) {
             let hint = format!("its keys: {}", known.join(", "));
             return self.wrong(node, "expected a group of keys", Some(&hint));
@@ -140,7 +140,7 @@ impl Reader {
     }
 
     fn job(&mut self, root: NodeId, file: String) -> Option<Job> {
-        self.group(root, &["arm", "speed", "direct", "replan", "repeat", "on_fault", "steps"])?;
+        self.group(root, &keys::JOB)?;
         let mut job = Job::empty(file);
         job.arm = self.at(root, "arm", word).unwrap_or_default();
         self.speed = self.at(root, "speed", override_of_speed).unwrap_or(self.speed);
@@ -176,7 +176,8 @@ impl Reader {
     }
 
     fn step(&mut self, at: NodeId, nesting: usize) -> Option<Step> {
-        let known = did_you_mean("", STEPS, "steps");
+        let steps = keys::STEPS.names();
+        let known = did_you_mean("", steps.iter().copied(), "steps");
         let (key, value) = match (self.tree.entries(at), self.text(at)) {
             ([(key, value)], _) => (*key, Some(*value)),
             (_, Some(_)) => (at, None),
@@ -200,7 +201,7 @@ impl Reader {
             ("wait", Some(value)) => self.wait(value, &mut arm)?,
             ("output", Some(value)) => self.output(value, &mut arm)?,
             ("repeat", Some(value)) => {
-                self.group(value, &["times", "steps"])?;
+                self.group(value, &keys::REPEAT)?;
                 match (self.tree.get(value, "times"), self.tree.get(value, "steps")) {
                     (Some(count), Some(steps)) => {
                         let times = self.parsed(count, times).unwrap_or(1);
@@ -211,11 +212,11 @@ impl Reader {
             }
             ("attach", Some(value)) => self.attach(value, &mut arm)?,
             ("detach", Some(value)) => Act::Detach(self.parsed(value, word)?),
-            (known, None) if STEPS.contains(&known) => {
+            (known, None) if steps.contains(&known) => {
                 return self.wrong(at, format!("`{known}` needs a value"), None);
             }
             _ => {
-                let hint = did_you_mean(&name, STEPS, "steps");
+                let hint = did_you_mean(&name, steps.iter().copied(), "steps");
                 return self.wrong(key, format!("unknown step {}", quote(&name)), hint.as_deref());
             }
         };
@@ -252,8 +253,7 @@ impl Reader {
             motion.goal.named = Some(self.parsed(node, word)?);
             return Some(motion);
         }
-        let known = ["named", "joints", "pose", "by", "frame", "linear", "speed", "direct", "replan", "arm"];
-        self.group(node, &known)?;
+        self.group(node, &keys::MOTION)?;
         self.arm(node, arm);
         motion.speed = self.at(node, "speed", override_of_speed).unwrap_or(motion.speed);
         motion.direct = self.at(node, "direct", flag).unwrap_or(motion.direct);
@@ -289,7 +289,7 @@ impl Reader {
     }
 
     fn pose(&mut self, node: NodeId) -> Option<PoseSpec> {
-        self.group(node, &["xyz", "rpy", "quat"])?;
+        self.group(node, &keys::POSE)?;
         if self.tree.get(node, "xyz").is_none() {
             return self.wrong(node, "the key `xyz` is missing", Some("{xyz: [x, y, z], rpy: [r, p, y]}; m, rad"));
         }
@@ -311,7 +311,7 @@ impl Reader {
         };
         let mut list = node;
         if self.tree.items(node).is_empty() {
-            self.group(node, &["waypoints", "blend", "speed", "replan", "arm"])?;
+            self.group(node, &keys::THROUGH)?;
             self.arm(node, arm);
             motion.speed = self.at(node, "speed", override_of_speed).unwrap_or(motion.speed);
             motion.replan = self.at(node, "replan", flag).unwrap_or(motion.replan);
@@ -327,7 +327,7 @@ impl Reader {
             goals.push(if self.tree.text(item).is_some() {
                 PlanGoal { named: self.parsed(item, word), ..PlanGoal::default() }
             } else {
-                self.group(item, &["named", "joints", "pose", "frame", "linear"])?;
+                self.group(item, &keys::WAYPOINT)?;
                 self.goal(item)?
             });
         }
@@ -342,7 +342,7 @@ impl Reader {
     fn gripper(&mut self, node: NodeId, arm: &mut String) -> Option<Act> {
         let (mut force, mut object, mut timeout, mut to) = (None, None, GRIPPER_TIME, Some(node));
         if self.tree.text(node).is_none() {
-            self.group(node, &["to", "force", "object", "timeout", "arm"])?;
+            self.group(node, &keys::GRIPPER)?;
             self.arm(node, arm);
             force = self.at(node, "force", finite);
             object = self.at(node, "object", flag);
@@ -359,7 +359,7 @@ impl Reader {
         if self.tree.text(node).is_some() {
             return self.parsed(node, time).map(Act::Wait);
         }
-        self.group(node, &["input", "is", "timeout", "arm"])?;
+        self.group(node, &keys::INPUT)?;
         self.arm(node, arm);
         let input = self.tree.get(node, "input");
         let Some(input) = input else { return self.wrong(node, "the key `input` is missing", Some("input: di0")) };
@@ -397,7 +397,7 @@ impl Reader {
             attach.name = self.parsed(node, word)?;
             return Some(Act::Attach(attach));
         }
-        self.group(node, &["object", "link", "touch", "mass", "arm"])?;
+        self.group(node, &keys::ATTACH)?;
         self.arm(node, arm);
         let Some(object) = self.tree.get(node, "object") else {
             return self.wrong(node, "the key `object` is missing", Some("its name: `dimos world list`"));
@@ -444,92 +444,5 @@ fn digital_input(text: &str) -> std::result::Result<String, String> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn mistakes(text: &str) -> Vec<String> {
-        let job = Job::parse("job.yaml".into(), text.as_bytes());
-        let reports = job.tree.diags().iter().map(|diag| diag.located(&job.tree));
-        let mut lines: Vec<_> = reports
-            .map(|r| {
-                format!("{}:{}: {} | {}", r.line.unwrap(), r.column.unwrap(), r.message, r.hint.unwrap_or_default())
-            })
-            .collect();
-        let at = |line: &String| line.splitn(3, ':').take(2).map(|n| n.parse::<u32>().unwrap()).collect::<Vec<_>>();
-        lines.sort_by_key(at);
-        lines
-    }
-
-    #[test]
-    fn every_mistake_is_reported_at_its_place() {
-        let text = "\
-repeet: 10
-steps:
-  - move: {joints: [1, x], speeed: 30%}
-  - gripper: closed
-  - wait: {input: do0}
-  - wait: soon
-  - mov: home
-  - through: [home]
-  - output: {do0: 2}
-  - repeat: {times: 0, steps: [{move: }]}
-  - move: {pose: {xyz: [1, 2]}, named: home}
-  - move: {by: {xyz: [0, 0, 0]}, direct: true}
-  - move: {joints: [0], linear: true}
-  - [1]
-  - move
-";
-        let found = mistakes(text);
-        let expected = [
-            "1:1: unknown key `repeet` | did you mean `repeat`?",
-            "3:24: `x`: not a number",
-            "3:28: unknown key `speeed` | did you mean `speed`?",
-            "4:14: `closed`: not a number; give m or rad, `open` or `close`",
-            "5:19: `do0`: must be a digital input",
-            "6:11: `soon`: not a duration",
-            "7:5: unknown step `mov` | did you mean `move`?",
-            "8:14: needs two or more waypoints",
-            "9:19: `2`: must be high or low",
-            "10:21: `0`: must be a number of times",
-            "10:",
-            "11:11: needs one of named, joints, pose, by",
-            "12:11: a direct motion needs `joints`",
-            "13:25: `linear` needs a pose",
-            "14:5: a step has one key",
-            "15:5: `move` needs a value",
-        ];
-        for (found, expected) in found.iter().zip(expected) {
-            assert!(found.starts_with(expected), "{found}\nexpected {expected}");
-        }
-        assert_eq!(found.len(), expected.len(), "{found:#?}");
-    }
-
-    #[test]
-    fn a_job_has_its_steps_with_their_lines() {
-        let job = Job::parse(
-            "pick.yaml".into(),
-            b"speed: 30%\nrepeat: forever\non_fault: stop\nsteps:\n  - move: home\n  - repeat:\n      times: 2\n      steps:\n        - output: {do0: high, ao1: 2.5}\n  - reset\n",
-        );
-        assert!(!job.tree.has_errors());
-        assert_eq!((job.repeat, job.on_fault.len(), job.count), (None, 0, 4));
-        let Act::Move(motion) = &job.steps[0].act else { panic!("a motion") };
-        assert_eq!((motion.speed, motion.goal.named.as_deref()), (0.3, Some("home")));
-        let Act::Repeat { times: 2, steps } = &job.steps[1].act else { panic!("a loop") };
-        let Act::Output(outputs) = &steps[0].act else { panic!("outputs") };
-        assert_eq!(outputs, &BTreeMap::from([("do0".to_owned(), 1.0), ("ao1".to_owned(), 2.5)]));
-        assert_eq!((steps[0].line, steps[0].text.as_str()), (9, "output: {do0: high, ao1: 2.5}"));
-        assert_eq!((job.steps[2].line, job.steps[2].id), (10, 3));
-    }
-
-    #[test]
-    fn a_file_of_any_bytes_is_refused_and_never_a_panic() {
-        for text in
-            ["", "[]", "steps", "steps: 3", "steps: []", "a: b: c", "steps: [[[[]]]]", "steps: [{move: {}}]", "\u{0}"]
-        {
-            assert!(!mistakes(text).is_empty(), "{text:?}");
-        }
-        let deep =
-            "steps: [".to_owned() + &"{repeat: {times: 1, steps: [".repeat(20) + "reset" + &"]}}".repeat(20) + "]";
-        assert!(!mistakes(&deep).is_empty());
-    }
-}
+#[path = "file_tests.rs"]
+mod tests;

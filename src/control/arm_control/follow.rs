@@ -63,10 +63,10 @@ impl ArmControl {
                     match limited {
                         Ok(limited) => {
                             if let Some(was) = self.limited.get_mut(j) {
-                                if let (Some((kind, asked)), false) = (limited.by, *was) {
+                                if let (Some((kind, asked)), None) = (limited.by, *was) {
                                     report(j, kind, asked);
                                 }
-                                *was = limited.by.is_some();
+                                *was = limited.by.map(|(kind, _)| kind);
                             }
                             limited.value
                         }

@@ -26,7 +26,7 @@ use super::written::Written;
 use crate::arm::{ArmCommand, ArmState, Link};
 use crate::clock::Mono;
 use crate::joint::{ControlMode, Joints, MAX_DOF};
-use crate::telemetry::{Cause, LedBy, LimitKind, Outcome, Phase};
+use crate::telemetry::{Bound, Cause, LedBy, LimitKind, Outcome, Phase};
 use rest::Rest;
 
 /// A joint that moves this far while its arm is being enabled is moved by something else [rad].
@@ -43,8 +43,8 @@ pub struct ArmControl {
     /// Its phase.
     pub failsafe: Failsafe,
     limiters: Vec<Limiter>,
-    /// Whether a limit changed the joint's command in the last tick.
-    limited: Vec<bool>,
+    /// The limit that changed the joint's command in the last tick.
+    limited: Vec<Option<LimitKind>>,
     command: ArmCommand,
     written: Written,
     /// Whether the arm still holds the positions that were written last: it has been under power since.
@@ -101,7 +101,7 @@ impl ArmControl {
         };
         Self {
             limiters: (0..config.dof).map(|j| Limiter::new(bound(j))).collect(),
-            limited: vec![false; config.dof],
+            limited: vec![None; config.dof],
             feedback: Feedback::new(&config),
             tracking: Tracking::new(&config, period),
             written: Written::new(period, config.write_period),
@@ -127,6 +127,16 @@ impl ArmControl {
     /// Returns the index of its first joint over all arms.
     pub fn first(&self) -> usize {
         self.first
+    }
+
+    /// Returns the limit that changed the command of a joint (index over all arms) in the last tick.
+    pub fn limited(&self, joint: usize) -> Option<Bound> {
+        let kind = (*self.limited.get(joint.checked_sub(self.first)?)?)?;
+        Some(match kind {
+            LimitKind::Position => Bound::Position(joint as u16),
+            LimitKind::Velocity => Bound::Velocity(joint as u16),
+            LimitKind::Acceleration => Bound::Acceleration(joint as u16),
+        })
     }
 
     /// Returns the limiters of its joints.

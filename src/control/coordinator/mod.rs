@@ -19,7 +19,7 @@ use super::task_body::JointView;
 use super::task_leader::gripper_target;
 use crate::arm::ArmState;
 use crate::clock::Mono;
-use crate::telemetry::{ArmSample, Cause, Event, Phase, Reason, TaskState};
+use crate::telemetry::{ArmSample, Bound, Cause, Event, Phase, Reason, TaskState};
 
 pub use tick_output::{TickOutput, TickTime};
 
@@ -335,6 +335,10 @@ impl Coordinator {
         }
         for (view, task) in self.output.tasks.iter_mut().zip(&self.tasks) {
             *view = task.view();
+            if view.bound == Bound::None && task.granted && task.is_active() {
+                let limited = |joint: &u16| self.arms.iter().find_map(|arm| arm.limited(usize::from(*joint)));
+                view.bound = task.moving_joints().iter().find_map(limited).unwrap_or_default();
+            }
         }
     }
 }

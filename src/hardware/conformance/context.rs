@@ -334,6 +334,19 @@ impl Context {
             .collect())
     }
 
+    /// Clears the arm's errors; waits for an arm that needs time for it.
+    pub fn clear_errors(&mut self) -> AdapterResult<()> {
+        let end = Instant::now() + WAIT_TIMEOUT;
+        loop {
+            match self.adapter.write_clear_errors() {
+                Err(AdapterError::Busy) if Instant::now() < end => {
+                    pause(&mut *self.adapter, Duration::from_millis(5));
+                }
+                result => return result,
+            }
+        }
+    }
+
     /// Waits until `done` returns true.
     pub fn until(&mut self, what: &str, mut done: impl FnMut(&mut Self) -> Result<bool, String>) -> Result<(), String> {
         let end = Instant::now() + WAIT_TIMEOUT;

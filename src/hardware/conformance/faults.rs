@@ -37,7 +37,7 @@ fn errors(context: &mut Context) -> Result<(), String> {
     let start = context.positions()?;
     let refused = context.adapter.write_joint_positions(&start, 0.1);
     require(matches!(refused, Err(AdapterError::Fault { .. })), || format!("motion in error: {refused:?}"))?;
-    context.adapter.write_clear_errors().map_err(|e| format!("write_clear_errors: {e}"))?;
+    context.clear_errors().map_err(|e| format!("write_clear_errors: {e}"))?;
     context.until("the error to be cleared", |context| Ok(context.error()?.0 == 0))?;
     context.stays(&start, 0.005)?;
     context.activate()
@@ -52,7 +52,7 @@ fn estop(context: &mut Context) -> Result<(), String> {
     context.trigger_faults()?;
     context.until("the E-stop", |context| Ok(context.error()?.0 != 0))?;
     require(context.adapter.write_enable(true).is_err(), || "enabling in E-stop is accepted".into())?;
-    context.until("the release", |context| Ok(context.adapter.write_clear_errors().is_ok()))?;
+    context.until("the release", |context| Ok(context.clear_errors().is_ok()))?;
     require(!context.enabled()?, || "clearing switched the motors on".into())?;
     context.activate()?;
     if !context.row.holds_when_disabled {

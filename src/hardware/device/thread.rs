@@ -14,7 +14,7 @@ pub use lead::Way;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
-use std::sync::mpsc::{Receiver, TryRecvError};
+use std::sync::mpsc::{Receiver, SyncSender, TryRecvError};
 use std::time::Duration;
 
 use super::gripper::GripperStop;
@@ -39,6 +39,8 @@ const TURNS: u8 = 6;
 /// Cycles that read the error code and the motors' state.
 const ERROR_TURN: u8 = 0;
 const ENABLED_TURN: u8 = 1;
+/// How long clearing the arm's errors may take; clients wait a little longer for it.
+const CLEAR_LIMIT: Duration = Duration::from_millis(7500);
 /// Shortest and longest wait between two attempts to reconnect.
 const BACK_OFF: (Duration, Duration) = (Duration::from_millis(500), Duration::from_secs(5));
 
@@ -95,6 +97,8 @@ pub(super) struct Worker {
     slow: slow_readings::Slow,
     /// The arm is led, or about to be.
     lead: lead::Lead,
+    /// The errors are being cleared, since then.
+    clearing: Option<(SyncSender<AdapterResult<()>>, Mono)>,
     /// The load to set whenever the motors are enabled.
     payload: Option<Load>,
     last_read: Mono,
@@ -147,6 +151,7 @@ impl Worker {
             plausible: Plausible::default(),
             slow: slow_readings::Slow::default(),
             lead: lead::Lead::default(),
+            clearing: None,
             payload,
             last_read: Mono::ZERO,
             next_read: Mono::ZERO,
@@ -203,6 +208,7 @@ impl Worker {
                 return true;
             }
         }
+        self.clear_errors(adapter);
         if self.connected {
             self.send_command(adapter);
             self.check_tick();
@@ -250,11 +256,10 @@ impl Worker {
             }
             Order::ClearErrors(reply) => {
                 self.write_errors = 0;
-                self.expect_nothing(Some(self.state.enabled));
-                let result = self.while_connected(adapter, |a| a.write_clear_errors());
-                self.turn = ERROR_TURN;
-                self.read(adapter);
-                let _ = reply.send(result);
+                match self.clearing {
+                    None => self.clearing = Some((reply, self.config.clock.now())),
+                    Some(_) => drop(reply.send(Err(AdapterError::Rejected("a reset is under way".to_owned())))),
+                }
             }
             Order::SetLimits(limits, reply) => {
                 self.set_limits(&limits);
@@ -284,6 +289,20 @@ impl Worker {
             }
         }
         false
+    }
+
+    /// Clears the arm's errors, if that was ordered. An arm that needs time for it is asked again in the next cycle.
+    fn clear_errors(&mut self, adapter: &mut dyn ManipulatorAdapter) {
+        let Some((reply, since)) = self.clearing.take() else { return };
+        self.expect_nothing(Some(self.state.enabled));
+        let result = self.while_connected(adapter, |a| a.write_clear_errors());
+        if result == Err(AdapterError::Busy) && self.config.clock.now().since(since) < CLEAR_LIMIT {
+            self.clearing = Some((reply, since));
+            return;
+        }
+        self.turn = ERROR_TURN;
+        self.read(adapter);
+        let _ = reply.send(result);
     }
 
     fn while_connected<T>(

@@ -115,6 +115,11 @@ impl SimArm {
         }
     }
 
+    /// Sets the top speed of a joint [rad/s], as servos have one each.
+    pub fn limit_speed(&mut self, joint: usize, speed: f64) {
+        self.plant.limit_speed(joint, speed);
+    }
+
     /// Moves at top speed to the last goal since power-up, if there is one, as some servos do when their motors come
     /// on.
     pub fn resume_goal(&mut self) {

@@ -173,6 +173,11 @@ impl Plant {
         self.drive = if self.active().iter().any(|joint| joint.on) { Drive::Stop } else { Drive::Disabled };
     }
 
+    /// Sets the top speed of a joint [rad/s].
+    pub fn limit_speed(&mut self, joint: usize, speed: f64) {
+        self.active_mut().iter_mut().skip(joint).take(1).for_each(|joint| joint.velocity_max = speed);
+    }
+
     /// Decelerates to rest and holds; no effect while disabled.
     pub fn stop(&mut self) {
         self.delayed.clear();

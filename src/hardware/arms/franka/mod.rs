@@ -152,5 +152,5 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     }
     let limits = options.model.limits(options.full_range);
     options.sim.check(&limits)?;
-    Ok(Checked { limits })
+    Ok(Checked::new(limits).digital_inputs(0))
 }

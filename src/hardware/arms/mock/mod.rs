@@ -13,6 +13,7 @@ use std::time::Duration;
 
 use crate::hardware::check::{Checked, ConfigError};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
+use crate::hardware::sim::io::SimIo;
 use crate::joint::{ControlMode, JointLimits, MAX_DOF};
 use std::f64::consts::PI;
 
@@ -49,7 +50,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
 fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("a mock arm", SPEC.dof)?;
     config.options::<Options>()?.check(config.dof)?;
-    Ok(Checked { limits: limits(config.dof) })
+    Ok(Checked::new(limits(config.dof)).digital_inputs(SimIo::INFO.digital_inputs))
 }
 
 /// ±2π rad, π rad/s, 10 rad/s², 100 rad/s³ for every joint.

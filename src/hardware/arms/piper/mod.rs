@@ -79,7 +79,7 @@ const ACCELERATION: f64 = 5.0;
 fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("piper", SPEC.dof)?;
     config.options::<Options>()?.sim.check(emulator::PLAYABLE)?;
-    Ok(Checked { limits: limits() })
+    Ok(Checked::new(limits()).digital_inputs(0).max_payload(0.0))
 }
 
 /// The joint limits of the data sheet.

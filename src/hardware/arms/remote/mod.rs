@@ -63,7 +63,7 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("a remote arm", SPEC.dof)?;
     let (sim, limits) = (config.options::<Options>()?.sim, limits(config.dof));
     sim.check("remote", &limits, emulator::PLAYABLE)?;
-    Ok(Checked { limits })
+    Ok(Checked::new(limits).digital_inputs(0).max_payload(0.0))
 }
 
 /// Nominal limits: ±2π rad, π rad/s. The peer states the real ones.

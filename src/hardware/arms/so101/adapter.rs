@@ -42,6 +42,8 @@ pub struct So101Adapter {
     pub(super) state: Option<([Servo; SERVOS], Mono)>,
     /// The last goal of the gripper [counts]; `None`: the goal that its servo has.
     pub(super) gripper_goal: Option<i32>,
+    /// Top speed of the gripper [counts/s]; 0 = none.
+    pub(super) gripper_speed: u16,
     /// The servos' homing offsets, read when connecting [counts].
     pub(super) offsets: [i32; SERVOS],
     /// The settings with other values than wanted that the last warning listed.
@@ -61,6 +63,7 @@ impl So101Adapter {
             mode: MODES.first().copied().unwrap_or_default(),
             state: None,
             gripper_goal: None,
+            gripper_speed: 0,
             offsets: [0; SERVOS],
             warned: Vec::new(),
         })
@@ -82,9 +85,9 @@ impl So101Adapter {
         let mut values = [[0; 7]; SERVOS];
         for (j, value) in values.iter_mut().enumerate() {
             let held = servos.get(j).map_or(0, |servo| servo.goal);
-            let goal = match joints.get(j) {
-                Some(angle) => self.range(j).counts(*angle),
-                None => self.gripper_goal.unwrap_or(held),
+            let (goal, speed) = match joints.get(j) {
+                Some(angle) => (self.range(j).counts(*angle), speed),
+                None => (self.gripper_goal.unwrap_or(held), self.gripper_speed),
             };
             let ([g0, g1], [s0, s1]) = ((goal.max(0) as u16).to_le_bytes(), speed.to_le_bytes());
             *value = [ACCELERATION, g0, g1, 0, 0, s0, s1];
@@ -116,7 +119,7 @@ impl ManipulatorAdapter for So101Adapter {
 
     fn disconnect(&mut self) {
         self.bus.line.close();
-        (self.state, self.gripper_goal) = (None, None);
+        (self.state, self.gripper_goal, self.gripper_speed) = (None, None, 0);
     }
 
     fn is_connected(&self) -> bool {
@@ -202,7 +205,7 @@ impl ManipulatorAdapter for So101Adapter {
     fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()> {
         let joints = finite::<DOF>(positions)?;
         let speed = match self.mode {
-            ControlMode::Position => (velocity * TOP_SPEED * TURN / TAU).max(SLOWEST) as u16,
+            ControlMode::Position => counts_of_speed(velocity),
             _ => 0,
         };
         self.drive(joints, speed)
@@ -289,4 +292,9 @@ impl ManipulatorAdapter for So101Adapter {
 /// Returns a servo's velocity [rad/s].
 fn velocity(servo: Option<&Servo>) -> f64 {
     servo.map_or(0.0, |servo| f64::from(servo.velocity) * TAU / TURN)
+}
+
+/// Returns a fraction of the top speed as a servo takes it [counts/s].
+pub(super) fn counts_of_speed(fraction: f64) -> u16 {
+    (fraction * TOP_SPEED * TURN / TAU).max(SLOWEST) as u16
 }

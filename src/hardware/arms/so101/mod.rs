@@ -80,7 +80,7 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("so101", SPEC.dof)?;
     let options = config.options::<Options>()?;
     options.sim.check()?;
-    Ok(Checked { limits: limits(&options.calibration()?) })
+    Ok(Checked::new(limits(&options.calibration()?)).digital_inputs(0).max_payload(0.0))
 }
 
 /// Returns the joint limits of a calibrated arm in SI units.

@@ -3,8 +3,8 @@
 use std::f64::consts::TAU;
 
 use super::DOF;
-use super::adapter::So101Adapter;
-use super::protocol::TURN;
+use super::adapter::{So101Adapter, counts_of_speed};
+use super::protocol::{SERVOS, TURN, register};
 use crate::arm::{GripperUnit, JointStatus};
 use crate::hardware::adapter::{AdapterError, AdapterResult, Gripper, JointMonitor};
 use crate::hardware::adapter_util::{fill, within};
@@ -53,6 +53,9 @@ impl Gripper for So101Adapter {
         if !servos.get(DOF).is_some_and(|servo| servo.on) {
             return Err(AdapterError::Rejected("the motor of the gripper is off".into()));
         }
+        if servos.get(DOF).is_some_and(|servo| servo.top_speed != self.gripper_speed) {
+            self.bus.write(SERVOS as u8, register::TOP_SPEED, &self.gripper_speed.to_le_bytes())?;
+        }
         let goal = range.low + (position * TURN / TAU).round() as i32;
         self.gripper_goal = Some(goal);
         let mut goals = servos.map(|servo| servo.goal);
@@ -63,5 +66,13 @@ impl Gripper for So101Adapter {
     fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
         let range = self.range(DOF);
         Some((0.0, f64::from(range.high - range.low) * TAU / TURN))
+    }
+
+    fn has_gripper_speed(&self) -> bool {
+        true
+    }
+
+    fn set_gripper_speed(&mut self, fraction: Option<f64>) {
+        self.gripper_speed = fraction.map_or(0, counts_of_speed);
     }
 }

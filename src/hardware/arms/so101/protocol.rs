@@ -41,6 +41,8 @@ pub mod register {
     pub const ACCELERATION: u8 = 41;
     /// Goal position, two bytes.
     pub const GOAL: u8 = 42;
+    /// Velocity of the goal, two bytes: in position mode the top speed, 0 = none.
+    pub const TOP_SPEED: u8 = 46;
     /// Lock: while it is 1, writes to the EEPROM are lost at power-off.
     pub const LOCK: u8 = 55;
     /// Position, two bytes.
@@ -165,6 +167,8 @@ pub struct Servo {
     pub on: bool,
     /// Goal position [counts].
     pub goal: i32,
+    /// Top speed [counts/s]; 0 = none.
+    pub top_speed: u16,
     /// Position [counts].
     pub position: i32,
     /// Velocity [counts/s].
@@ -192,6 +196,7 @@ impl Servo {
         Some(Self {
             on: byte(40) == 1,
             goal: signed(word(42), 15),
+            top_speed: word(46),
             position: signed(word(56), 15),
             velocity: signed(word(58), 15),
             voltage: byte(62),

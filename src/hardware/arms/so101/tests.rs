@@ -86,6 +86,43 @@ fn joints_and_gripper_move_in_radians() {
 }
 
 #[test]
+fn the_gripper_has_a_speed_of_its_own_also_while_joints_stream() {
+    let (mut adapter, servos) = arm(json!({}));
+    adapter.connect().unwrap();
+    adapter.activate().unwrap();
+    adapter.set_control_mode(ControlMode::ServoPosition).unwrap();
+    let speeds = || {
+        let speed = |servos: &Servos, i| u16::from_le_bytes([servos.byte(i, 46), servos.byte(i, 47)]);
+        servos.with(|servos, _| [speed(servos, 0), speed(servos, DOF)])
+    };
+    let stream = |adapter: &mut So101Adapter| {
+        let here = positions(adapter);
+        adapter.write_joint_positions(&here, 1.0).unwrap();
+    };
+    stream(&mut adapter);
+    let command = |adapter: &mut So101Adapter, to, speed| {
+        let gripper: &mut dyn Gripper = adapter;
+        assert!(gripper.info().has_speed);
+        gripper.command(to, None, speed).unwrap();
+    };
+    // A tenth of 3 rad/s.
+    command(&mut adapter, 1.5, Some(0.1));
+    let counts = (0.3 * 4096.0 / std::f64::consts::TAU) as u16;
+    assert_eq!(speeds(), [0, counts]);
+    let mut fastest = 0;
+    for _ in 0..40 {
+        stream(&mut adapter);
+        std::thread::sleep(Duration::from_millis(10));
+        fastest = fastest.max(adapter.fetch().unwrap()[DOF].velocity);
+    }
+    assert_eq!(speeds(), [0, counts], "setpoints of the joints leave it alone");
+    assert!(fastest > 0 && fastest <= i32::from(counts) + 1, "{fastest} counts/s");
+    command(&mut adapter, 0.2, None);
+    assert_eq!(speeds(), [0, 0], "the fastest");
+    until(|| (adapter.read_gripper_position().unwrap().unwrap() - 0.2).abs() < 2e-3);
+}
+
+#[test]
 fn a_joint_outside_its_range_is_not_enabled() {
     // The calibration says that the first joint ends at 2100 counts; it is at 2048 + 326.
     let home = tempfile::tempdir().unwrap();

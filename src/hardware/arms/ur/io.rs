@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use super::adapter::UrAdapter;
+use super::model::Model;
 use super::program;
 use super::protocol::state::State;
 use crate::arm::{AnalogUnit, IoInfo, IoState, JointStatus, Load};
@@ -14,7 +15,7 @@ const SHOWN: Duration = Duration::from_millis(500);
 /// How long the refusal of a program may take that shows nothing in the state.
 const REFUSED: Duration = Duration::from_millis(150);
 /// Number of digital inputs, and of outputs: 8 standard, 8 configurable, 2 of the tool.
-const DIGITAL: u8 = 18;
+pub(super) const DIGITAL: u8 = 18;
 /// Range of analogue outputs: from 0 to this [V], or between these [A].
 const VOLTS: f64 = 10.0;
 const AMPERES: (f64, f64) = (0.004, 0.02);
@@ -25,6 +26,11 @@ const OUTPUT_UNITS: [[AnalogUnit; 2]; 4] = units();
 const FAILED: [i32; 3] = [245, 251, 252];
 /// Masses [kg] and lengths [m] closer than this are equal.
 const SAME: f64 = 1e-4;
+
+/// Returns the largest payload that a controller takes [kg]: a little more than the rated one.
+pub(super) fn max_payload(model: Model) -> f64 {
+    1.2 * model.payload()
+}
 
 impl UrAdapter {
     /// Returns the newest state, with temperatures, currents and voltages of the joints, inputs, outputs and payload;
@@ -37,7 +43,7 @@ impl UrAdapter {
     /// inertia (xx, yy, zz, xy, xz, yz [kg·m²]). Waits until the state shows it. A wrong payload causes protective
     /// stops, and motion when the brakes are released.
     pub fn set_payload(&mut self, mass: f64, cog: [f64; 3], inertia: Option<[f64; 6]>) -> AdapterResult<()> {
-        let most = 1.2 * self.options.model.payload();
+        let most = max_payload(self.options.model);
         let finite = cog.iter().chain(inertia.iter().flatten()).all(|value| value.is_finite());
         if !finite || !(0.0..=most).contains(&mass) {
             let what = format!("a payload of {mass} kg is not between 0 and {most:.1} kg");

@@ -124,7 +124,7 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     within("stop_deceleration", options.stop_deceleration, (1.0, 40.0))?;
     let limits = options.model.limits();
     options.sim.check(&limits)?;
-    Ok(Checked { limits })
+    Ok(Checked::new(limits).digital_inputs(io::DIGITAL).max_payload(io::max_payload(options.model)))
 }
 
 /// Returns an error for an option that is not between `least` and `most`.

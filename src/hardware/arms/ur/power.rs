@@ -6,7 +6,7 @@ use std::time::Duration;
 use super::Options;
 use super::program;
 use super::protocol::inputs::Order;
-use super::protocol::status::{self, moves, robot, robot_name, safety, safety_text};
+use super::protocol::status::{self, robot, robot_name, safety, safety_text};
 use super::rtde::in_use;
 use super::session::{FULL_SPEED, Session};
 use crate::clock::{Clock, Mono, MonotonicClock};
@@ -25,7 +25,8 @@ const OFF_LIMIT: Duration = Duration::from_secs(3);
 const START_LIMIT: Duration = Duration::from_millis(1500);
 /// A protective stop is released this long after it was seen at the earliest, as the controller demands, too.
 const PROTECTED: Duration = Duration::from_millis(5100);
-/// How long the end of a protective stop may take to show, and that of a fault of the safety system.
+/// How long the end of a protective stop or of a paused program may take to show, and that of a fault of the safety
+/// system.
 const RELEASE_LIMIT: Duration = Duration::from_secs(1);
 const RESTART_LIMIT: Duration = Duration::from_secs(5);
 
@@ -160,19 +161,28 @@ impl Session {
     }
 
     /// Ends a protective stop or a fault of the safety system. Only for an operator who has found its cause. A paused
-    /// program is ended first: it would continue.
+    /// program is ended first: it would continue. `Busy` until it is done: call it again with the next state.
     pub fn clear_errors(&mut self) -> AdapterResult<()> {
-        self.update(Duration::ZERO)?;
+        let cleared = self.update(Duration::ZERO).and_then(|()| self.next_step());
+        if !matches!(cleared, Err(AdapterError::Busy)) {
+            self.asked = None;
+        }
+        cleared
+    }
+
+    /// Does the next step of that, without waiting for its effect.
+    fn next_step(&mut self) -> AdapterResult<()> {
         (self.ready, self.ended) = (None, None);
         let Some(stopped) = self.stopped else { return Ok(()) };
         match stopped.mode {
-            safety::PROTECTIVE_STOP => self.release(stopped.since),
-            safety::VIOLATION | safety::FAULT => {
-                let mut dashboard = self.dashboard()?;
-                dashboard.ask("close safety popup")?;
-                dashboard.order("restart safety", "restarting safety")?;
-                self.wait_until_safe(RESTART_LIMIT)
+            // Also one that was paused after another was ended: by hand, at the pendant.
+            safety::PROTECTIVE_STOP if self.program_exists() => self.once("stop", "stopped", RELEASE_LIMIT),
+            safety::PROTECTIVE_STOP if MonotonicClock.now().since(stopped.since) < PROTECTED => {
+                self.asked = None;
+                Err(AdapterError::Busy)
             }
+            safety::PROTECTIVE_STOP => self.once("unlock protective stop", "protective stop releasing", RELEASE_LIMIT),
+            safety::VIOLATION | safety::FAULT => self.once("restart safety", "restarting safety", RESTART_LIMIT),
             mode => Err(AdapterError::Rejected(format!(
                 "{}\nhint: end its cause, then reset the arm again",
                 safety_text(mode)
@@ -180,44 +190,31 @@ impl Session {
         }
     }
 
-    fn release(&mut self, since: Mono) -> AdapterResult<()> {
-        self.end_program()?;
-        let early = PROTECTED.saturating_sub(MonotonicClock.now().since(since));
-        self.wait(early, |session| Ok(session.stopped.is_none().then_some(())))?;
-        if self.stopped.is_none() {
-            return Ok(());
+    /// Sends an order to the dashboard once; then `Busy` until `limit`, by which it must have had its effect.
+    fn once(&mut self, order: &'static str, expected: &str, limit: Duration) -> AdapterResult<()> {
+        if let Some((_, since, answer)) = self.asked.as_ref().filter(|(asked, ..)| *asked == order) {
+            if MonotonicClock.now().since(*since) < limit {
+                return Err(AdapterError::Busy);
+            }
+            answer.clone()?;
+            return Err(AdapterError::Rejected(match self.program_exists() {
+                true => {
+                    "the paused program does not end, and would continue after the stop\nhint: end it at the pendant"
+                        .into()
+                }
+                false => {
+                    format!("{}, still\nhint: the pendant shows what to do", safety_text(self.state.safety_mode))
+                }
+            }));
         }
-        // It may have been paused after it was ended: by hand, at the pendant.
-        self.end_program()?;
         let mut dashboard = self.dashboard()?;
-        dashboard.ask("close safety popup")?;
-        dashboard.order("unlock protective stop", "protective stop releasing")?;
-        self.wait_until_safe(RELEASE_LIMIT)
-    }
-
-    /// Ends a running or paused program, and verifies that.
-    fn end_program(&mut self) -> AdapterResult<()> {
-        if !self.program_exists() {
-            return Ok(());
-        }
-        let asked = self.dashboard()?.order("stop", "stopped");
-        let ended = self.wait(RELEASE_LIMIT, |session| Ok((!session.program_exists()).then_some(())))?;
-        if ended.is_none() {
-            asked?;
-        }
-        ended.ok_or_else(|| {
-            AdapterError::Rejected(
-                "the paused program does not end, and would continue after the stop\nhint: end it at the pendant"
-                    .into(),
-            )
-        })
-    }
-
-    fn wait_until_safe(&mut self, limit: Duration) -> AdapterResult<()> {
-        let safe = self.wait(limit, |session| Ok(moves(session.state.safety_mode).then_some(())))?;
-        safe.ok_or_else(|| {
-            let text = safety_text(self.state.safety_mode);
-            AdapterError::Rejected(format!("{text}, still\nhint: the pendant shows what to do"))
-        })
+        let answer = if order == "stop" {
+            dashboard.order(order, expected) // the program may end although the dashboard answers otherwise
+        } else {
+            dashboard.ask("close safety popup")?;
+            Ok(dashboard.order(order, expected)?)
+        };
+        self.asked = Some((order, MonotonicClock.now(), answer));
+        Err(AdapterError::Busy)
     }
 }

@@ -69,6 +69,8 @@ pub struct Session {
     primary_at: Mono,
     /// The present stop by the safety system.
     pub(super) stopped: Option<Stopped>,
+    /// The last order of the present reset to the dashboard, when it was sent, and its answer.
+    pub(super) asked: Option<(&'static str, Mono, AdapterResult<()>)>,
     /// Number of our program, while it runs and takes orders.
     pub(super) ready: Option<i32>,
     /// Why it no longer does, if this run did not order that.
@@ -104,6 +106,7 @@ impl Session {
             updated: Mono::ZERO,
             primary_at: Mono::ZERO,
             stopped: None,
+            asked: None,
             ready: None,
             ended: None,
             end_due: false,

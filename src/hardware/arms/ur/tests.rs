@@ -60,6 +60,16 @@ pub(super) fn stream(adapter: &mut UrAdapter, way: f64) -> [f64; DOF] {
     goal
 }
 
+/// Resets the arm, as the device thread does: with each state, until it is done.
+pub(super) fn reset(adapter: &mut UrAdapter) -> Result<(), AdapterError> {
+    let mut cleared = Err(AdapterError::Busy);
+    until(adapter, |adapter| {
+        cleared = adapter.write_clear_errors();
+        cleared != Err(AdapterError::Busy)
+    });
+    cleared
+}
+
 pub(super) fn text(error: AdapterError) -> String {
     error.to_string()
 }
@@ -185,7 +195,15 @@ fn a_protective_stop_is_released_by_order_only_and_not_before_5_s() {
     adapter.connect().unwrap();
     assert_eq!(adapter.read_error().unwrap(), (code, what));
     assert_eq!(emulator.program().as_deref(), Some("dimos_control"), "the program is only paused");
-    adapter.write_clear_errors().unwrap();
+    // It does not wait: states are read, and the arm is stopped again.
+    assert_eq!(adapter.write_clear_errors(), Err(AdapterError::Busy));
+    until(&mut adapter, |_| emulator.program().is_none());
+    let before = adapter.state().unwrap().time;
+    assert_eq!(adapter.write_clear_errors(), Err(AdapterError::Busy));
+    until(&mut adapter, |adapter| adapter.state().unwrap().time > before + 0.1);
+    assert_eq!(adapter.write_stop(), Ok(Stop::Confirmed));
+    assert_eq!(adapter.read_state().unwrap().mode, 3, "still a protective stop");
+    reset(&mut adapter).unwrap();
     assert!(began.elapsed() >= Duration::from_secs(5));
     assert_eq!(emulator.program(), None, "it would have continued");
     assert_eq!(adapter.read_error().unwrap(), (0, String::new()));
@@ -213,7 +231,7 @@ fn safety_modes_are_reported() {
     // A violation switches power off, and ends with a restart of the safety system.
     emulator.set_safety(Some(8));
     until(&mut adapter, |adapter| adapter.read_error().unwrap().0 == 8 && !adapter.read_enabled().unwrap());
-    adapter.write_clear_errors().unwrap();
+    reset(&mut adapter).unwrap();
     assert!(!adapter.read_enabled().unwrap(), "clearing enables nothing");
     adapter.activate().unwrap();
 }

@@ -124,7 +124,7 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     let options: Options = config.options()?;
     let limits = model_of(&options, config.dof)?.limits();
     options.sim.check(&limits)?;
-    Ok(Checked { limits })
+    Ok(Checked::new(limits).digital_inputs(0))
 }
 
 /// Returns the model of options and number of joints, or why they conflict.

@@ -87,7 +87,7 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("yourarm", SPEC.dof)?;
     let (options, limits) = (config.options::<Options>()?, limits());
     options.sim.check("yourarm", &limits, PLAYABLE)?;
-    Ok(Checked { limits })
+    Ok(Checked::new(limits).digital_inputs(protocol::DIGITAL))
 }
 
 /// Returns the joint limits in SI units.

@@ -262,9 +262,12 @@ impl Servos {
         if self.arm.error() != 0 && near(0) {
             let _ = self.arm.clear_error();
         }
-        let speed = f64::from(self.word(0, GOAL_SPEED)) * TAU / 4096.0 / SPEED;
+        for servo in 0..SERVOS {
+            let speed = f64::from(self.word(servo, GOAL_SPEED)) * TAU / f64::from(TURN);
+            self.arm.limit_speed(servo, if speed > 0.0 { speed.min(SPEED) } else { SPEED });
+        }
         if self.arm.error() == 0 {
-            self.arm.take_goal(&goals, if speed > 0.0 { speed.min(1.0) } else { 1.0 }, speed == 0.0);
+            self.arm.take_goal(&goals, 1.0, self.word(0, GOAL_SPEED) == 0);
         }
     }
 

@@ -1,6 +1,7 @@
 //! Commands: what is written, what is not, and what a refusal means.
 
 use std::sync::atomic::Ordering::Relaxed;
+use std::sync::mpsc::sync_channel;
 
 use super::*;
 use crate::arm::{Interference, Link};
@@ -276,4 +277,38 @@ fn a_gripper_that_moves_after_a_stop_is_held_within_its_range() {
     let held: Vec<Call> = bench.arm.calls().into_iter().filter(|c| c.name() == "write_gripper_position").collect();
     assert_eq!(held.len(), 1, "{held:?}");
     assert!(matches!(held[0], Call::WriteGripperPosition(at) if (0.021..0.025).contains(&at)));
+}
+
+#[test]
+fn a_reset_that_takes_time_is_asked_again_while_states_are_read_and_stops_are_sent() {
+    let mut bench = Bench::enabled();
+    let begin = |bench: &mut Bench| {
+        let (reply, answer) = sync_channel(1);
+        bench._orders.send(Order::ClearErrors(reply)).unwrap();
+        answer
+    };
+    (0..3).for_each(|_| bench.arm.fail("write_clear_errors", AdapterError::Busy));
+    let (first, mut seq) = (begin(&mut bench), bench.states.read().seq);
+    for cycle in 0..3 {
+        let state = bench.tick(|c| (c.mode, c.stop_seq) = (None, 1));
+        assert!(state.seq > seq && first.try_recv().is_err(), "cycle {cycle}");
+        seq = state.seq;
+    }
+    assert_eq!(bench.count("write_stop"), 1);
+    let second = begin(&mut bench);
+    bench.tick(|_| {});
+    assert_eq!(first.try_recv(), Ok(Ok(())));
+    assert!(matches!(second.try_recv(), Ok(Err(AdapterError::Rejected(why))) if why == "a reset is under way"));
+    assert_eq!(bench.count("write_clear_errors"), 4);
+    // It does not take for ever.
+    (0..1000).for_each(|_| bench.arm.fail("write_clear_errors", AdapterError::Busy));
+    let last = begin(&mut bench);
+    for _ in 0..749 {
+        bench.tick(|_| {});
+    }
+    assert!(last.try_recv().is_err());
+    for _ in 0..3 {
+        bench.tick(|_| {});
+    }
+    assert_eq!(last.try_recv(), Ok(Err(AdapterError::Busy)));
 }
