@@ -13,6 +13,7 @@ use super::output::{self, Table, Tone, fixed, toned};
 use crate::rpc::api::{Cancel, Motion, Status};
 use crate::rpc::client::Client;
 use crate::rpc::report::{Deviation, MotionReport};
+use crate::telemetry::describe::percent;
 
 /// Poll period.
 const POLL_PERIOD: Duration = Duration::from_millis(20);
@@ -86,7 +87,7 @@ pub fn watch(
         let left = format!("{:.1} s left", report.remaining.max(0.0));
         bar.set_message(match &report.speed {
             Some(speed) if speed.paused => format!("{left}, PAUSED (dimos resume)"),
-            Some(speed) => format!("{left} at {:.0} % of the speed", speed.fraction * 100.0),
+            Some(speed) => format!("{left} at {} % of the speed", percent(speed.fraction)),
             None => left,
         });
         if report.done {

@@ -9,10 +9,12 @@ use super::{output, recorded_path};
 use crate::rpc::Code;
 use crate::rpc::api::{Cancel, ExecutePlan, Move, MoveNative, MoveReply, Plan, Planner, Poses, State};
 use crate::rpc::client::Client;
+use crate::telemetry::describe::percent;
 
 /// Arguments of `move`.
 #[derive(Debug, clap::Args)]
 #[command(
+    group = clap::ArgGroup::new("goal").required(true).multiple(true),
     override_usage = "\
 dimos move ARM Q… [OPTIONS]
        dimos move ARM --named NAME [OPTIONS]
@@ -99,9 +101,9 @@ fn move_native(args: &Args, client: &mut Client, signals: &Signals) -> Result {
     let request =
         MoveNative { arm: arm.clone(), pose, controller_frame, speed: args.search.speed, direct: args.direct };
     let begun = client.call(request)?;
-    let (motion, percent) = (begun.motion, begun.speed * 100.0);
+    let (motion, percent) = (begun.motion, percent(begun.speed));
     output::note(format_args!(
-        "motion {motion} by {arm}'s own controller at {percent:.0} % of its top speed: not collision-checked"
+        "motion {motion} by {arm}'s own controller at {percent} % of its top speed: not collision-checked"
     ));
     if args.no_wait {
         if args.target_run.json {

@@ -4,12 +4,13 @@ use super::arguments::{self, Target};
 use super::exit::{Exit, Result};
 use super::output;
 use crate::rpc::api::{Speed, SpeedReport};
+use crate::telemetry::describe::percent;
 
 /// Arguments of `speed`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
     /// Fraction of the speed of all motions, as 0.3 or 30%; without it the present one is shown
-    #[arg(value_parser = arguments::override_of_speed)]
+    #[arg(value_parser = arguments::speed, allow_negative_numbers = true)]
     pub fraction: Option<f64>,
     /// Which run
     #[command(flatten)]
@@ -45,9 +46,9 @@ fn change(target: &Target, call: Speed) -> Result {
 
 /// Describes an override in one line.
 pub fn describe(report: &SpeedReport) -> String {
-    let percent = report.fraction * 100.0;
+    let percent = percent(report.fraction);
     match report.paused {
-        true => format!("paused; at {percent:.0} % of the speed after `dimos resume`"),
-        false => format!("speed {percent:.0} %"),
+        true => format!("paused; at {percent} % of the speed after `dimos resume`"),
+        false => format!("speed {percent} %"),
     }
 }

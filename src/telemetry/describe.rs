@@ -117,10 +117,10 @@ pub fn describe(event: &Event, names: &Names) -> Described {
             Described { values: vec![f64::from(skipped), late_ns as f64], ..d }
         }
         Event::Speed(fraction, paused) => {
-            let percent = fraction * 100.0;
+            let percent = percent(fraction);
             let (status, text) = match paused {
-                true => ("paused", format!("all motions are paused; speed {percent:.0} % afterwards")),
-                false => ("set", format!("speed {percent:.0} %")),
+                true => ("paused", format!("all motions are paused; speed {percent} % afterwards")),
+                false => ("set", format!("speed {percent} %")),
             };
             Described { values: vec![fraction], ..plain("speed", Severity::Info, status, text) }
         }
@@ -129,6 +129,11 @@ pub fn describe(event: &Event, names: &Names) -> Described {
             plain("degraded", Severity::Error, "late", text)
         }
     }
+}
+
+/// Returns a fraction in percent, in steps of 0.01 %: 30, 12.5, 0.3.
+pub fn percent(fraction: f64) -> f64 {
+    (fraction * 1e4).round() / 1e2
 }
 
 fn plain(kind: &'static str, severity: Severity, status: &'static str, text: String) -> Described {
@@ -192,10 +197,10 @@ pub fn outcome_text(outcome: &Outcome, names: &Names) -> String {
         Outcome::WrongTask(task) => format!("task {} does not support this request", names.task(task)),
         Outcome::NonFinite(joint) => format!("the target of {} is not a finite number", names.joint(joint)),
         Outcome::OutOfLimits(joint, by) => {
-            format!("the target of {} is outside its limits by {by:.4}", names.joint(joint))
+            format!("the target of {} is outside its limits by {}", names.joint(joint), angle(by))
         }
         Outcome::GripperOutOfLimits(arm, opening) => {
-            format!("the gripper of {} cannot go to {opening:.4}: an opening must be 0 m or more", names.arm(arm))
+            format!("the gripper of {} cannot go to {opening:.4} m: an opening must be 0 m or more", names.arm(arm))
         }
         Outcome::GripperForceOutOfLimits(arm, force) => {
             format!("a force of {force} is outside the range of the gripper of {}", names.arm(arm))

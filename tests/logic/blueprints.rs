@@ -41,6 +41,8 @@ fn shipped_blueprints_have_no_mistakes() {
         let blueprint = loaded.blueprint.unwrap();
         assert!(blueprint.arms.iter().all(|arm| !arm.is_real()), "{name} must run without hardware");
         assert_eq!(blueprint.name, name);
+        // Without a name of its own: a copy is named after its file, and its poses are not those of the original.
+        assert!(!blueprint.sources[0].1.lines().any(|line| line.starts_with("name:")), "{name}");
         assert!(!blueprint.description.is_empty());
         assert!(blueprint.sources[0].1.starts_with("# yaml-language-server: $schema="), "{name}");
     }

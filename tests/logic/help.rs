@@ -52,6 +52,9 @@ fn usage_lines_have_the_order_that_is_parsed() {
         let error = dimos::cli::command().try_get_matches_from(line.split(' ')).unwrap_err();
         let text = error.to_string();
         assert!(text.contains(usage) && text.contains("--pose X Y Z [--rpy R P Y"), "{text}");
+        let required = text.split("Usage:").next().unwrap();
+        let goal = ["--rpy", "--frame", "--tolerance", "--blend"].iter().find(|option| required.contains(**option));
+        assert!(goal.is_none() || line.contains(goal.unwrap()), "a goal is none of its settings: {text}");
     }
     let reads = |line: &str| dimos::cli::command().try_get_matches_from(line.split(' ')).is_ok();
     assert!(reads("dimos move arm 0.1 -0.2") && reads("dimos move arm --named home"));
