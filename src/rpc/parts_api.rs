@@ -122,7 +122,7 @@ const MAX_TOOL: f64 = 5.0;
 pub struct ArmToolSet {
     /// The arm's `hardware_id`.
     pub arm: String,
-    /// Pose of the tool centre point in the frame of the end-effector link; null: no tool.
+    /// Pose of the tool centre point in the frame of the end-effector link, at most 5 m along each axis; null: no tool.
     pub tool: Option<PoseSpec>,
 }
 

@@ -94,7 +94,7 @@ impl Service {
             MotionError::OutOfLimits { ref joint, excess, .. } => {
                 let data = json!({"joint": joint, "by": excess});
                 RpcError::new(Code::OutOfLimits, e.to_string())
-                    .hint("limits are the arm's own, narrowed by `limits` in the blueprint; commands stay 0.01 rad inside")
+                    .hint("positions are in rad; limits are the arm's own, narrowed by `limits` in the blueprint; commands stay 0.01 rad inside")
                     .data(data)
             }
             MotionError::NotFound(_) => {

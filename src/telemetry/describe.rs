@@ -306,7 +306,9 @@ pub fn cause_text(cause: Cause) -> String {
         Cause::LinkLost => "the connection was lost".into(),
         Cause::NonFinite => "a command was not a finite number".into(),
         Cause::Jump => "a command jumped".into(),
-        Cause::Overrun => "the tick lost too much time".into(),
+        Cause::Overrun => {
+            "100 ms or more passed between two ticks: this computer was too busy; see `dimos doctor`".into()
+        }
         Cause::HeartbeatLost => "the device thread saw no heartbeat of the tick".into(),
         Cause::PowerLost => "the motors were disabled unexpectedly".into(),
         Cause::Tracking(joint, by) => format!(
