@@ -91,7 +91,7 @@ pub fn speed(text: &str) -> std::result::Result<f64, String> {
     }
 }
 
-/// Parses an angle [rad]; more than a turn is taken for degrees.
+/// Parses an angle [rad]; more than a turn counts as degrees.
 pub fn angle(text: &str) -> std::result::Result<f64, String> {
     let value = coordinate(text)?;
     is_angle(value).map(|()| value)

@@ -61,8 +61,8 @@ impl LogReader {
         Self::open_with(path, None)
     }
 
-    /// Opens a log to read only these topics: of a long one without a summary, such as that of a live run, it unpacks no
-    /// more than it takes to know them. Damage then shows only where it is read.
+    /// Opens a log to read only these topics: of a long one without a summary, such as that of a live run, it unpacks
+    /// no more than it takes to know them. Damage then shows only where it is read.
     pub fn open_for(path: &Path, topics: &[&str]) -> Result<Self, ReplayError> {
         Self::open_with(path, Some(topics))
     }

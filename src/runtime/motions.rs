@@ -105,8 +105,8 @@ impl Motions {
         self.0.remove(&number);
     }
 
-    /// Takes a change of a task's state at a tick. `positions`: present positions of all joints [rad]. Motions of a task
-    /// begin and end in order.
+    /// Takes a change of a task's state at a tick. `positions`: present positions of all joints [rad]. Motions of a
+    /// task begin and end in order.
     pub fn task_changed(&mut self, task: u16, (tick, state, reason): (u64, TaskState, Reason), positions: &[f64]) {
         let running = self.0.values_mut().find(|(planned, end)| planned.task == task && end.is_none());
         let Some((planned, end)) = running else { return };

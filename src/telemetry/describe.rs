@@ -422,7 +422,7 @@ mod tests {
             "request 7: the first point or target is 0.5000 rad (28.65°) from the position of left_joint1"
         );
         let d = describe(&Event::Request(8, Outcome::GripperOutOfLimits(1, -0.01)), &names());
-        let text = "request 8: the gripper of right cannot go to -0.0100: an opening must be 0 m or more";
+        let text = "request 8: the gripper of right cannot go to -0.0100 m: an opening must be 0 m or more";
         assert_eq!((d.text.as_str(), d.status), (text, "OUT_OF_LIMITS"));
         assert_eq!((d.arm.as_deref(), d.joint, d.values), (Some("right"), None, vec![-0.01]));
     }
