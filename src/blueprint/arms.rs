@@ -133,7 +133,7 @@ fn arm(
 
 /// Shortest default of `stale_after` for a simulated arm: its emulator is a thread and waits for a processor like any
 /// other; the electronics of an arm do not.
-const SIMULATED_STALE_AFTER: Duration = Duration::from_millis(100);
+const SIMULATED_STALE_AFTER: Duration = Duration::from_millis(250);
 
 /// Returns the adapter's supervision figures, overridden by those of the blueprint.
 fn supervision(entry: &HardwareEntry, row: &AdapterSpec, simulated: bool) -> Supervision {

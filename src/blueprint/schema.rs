@@ -112,7 +112,7 @@ pub struct HardwareEntry {
     #[schemars(extend("minimum" = 0, "maximum" = 1))]
     pub lag: Option<f64>,
     /// Max age of a state [s]: an arm without a newer state is held. The limit is never shorter than three device
-    /// periods. Default: the adapter's; at least 0.1 for a simulated arm.
+    /// periods. Default: the adapter's; at least 0.25 for a simulated arm.
     #[serde(default, deserialize_with = "range::maybe_age")]
     #[schemars(extend("minimum" = 0.02, "maximum" = 2))]
     pub stale_after: Option<f64>,

@@ -75,15 +75,8 @@ pub fn finite(text: &str) -> std::result::Result<f64, String> {
     }
 }
 
-/// Parses a fraction of the arm's limits.
+/// Parses a fraction of the limits or of the speed: `0.3` or `30%`.
 pub fn speed(text: &str) -> std::result::Result<f64, String> {
-    let lowest = crate::rpc::api::MIN_SPEED;
-    let value = finite(text)?;
-    if (lowest..=1.0).contains(&value) { Ok(value) } else { Err(format!("must be within {lowest}–1")) }
-}
-
-/// Parses a speed override: `0.3` or `30%`.
-pub fn override_of_speed(text: &str) -> std::result::Result<f64, String> {
     let lowest = crate::rpc::api::MIN_SPEED;
     let value = match text.strip_suffix('%') {
         Some(percent) => finite(percent)? / 100.0,
@@ -91,9 +84,36 @@ pub fn override_of_speed(text: &str) -> std::result::Result<f64, String> {
     };
     match value {
         _ if (lowest..=1.0).contains(&value) => Ok(value),
-        _ if value > 1.0 && !text.ends_with('%') => Err(format!("must be within {lowest}–1, or with a % sign")),
+        _ if value > 1.0 && value <= 100.0 && !text.ends_with('%') => {
+            Err(format!("must be within {lowest}–1; for percent write {text}%"))
+        }
         _ => Err(format!("must be within {lowest}–1, or {:.0}–100%", lowest * 100.0)),
     }
+}
+
+/// Parses an angle [rad]; more than a turn counts as degrees.
+pub fn angle(text: &str) -> std::result::Result<f64, String> {
+    let value = coordinate(text)?;
+    is_angle(value).map(|()| value)
+}
+
+/// Refuses an angle of more than a turn [rad].
+pub fn is_angle(value: f64) -> std::result::Result<(), String> {
+    if value.abs() <= std::f64::consts::TAU {
+        return Ok(());
+    }
+    Err(format!("angles are in rad, at most a turn: {value}° is {:.4} rad", value.to_radians()))
+}
+
+/// Parses a coordinate; a list with commas, and a unit, get a hint.
+pub fn coordinate(text: &str) -> std::result::Result<f64, String> {
+    finite(text).map_err(|wrong| match text.trim_end_matches(['°', 'd', 'e', 'g', 'r', 'a', 'm']) {
+        _ if text.contains(',') => format!("{wrong}: separate the numbers by blanks: {}", text.replace(',', " ")),
+        number if number.len() < text.len() && finite(number).is_ok() => {
+            format!("{wrong}: give it without a unit; lengths are in m, angles in rad (1° is 0.01745)")
+        }
+        _ => wrong,
+    })
 }
 
 /// Parses a rate per second.
@@ -144,6 +164,33 @@ pub fn setting(text: &str) -> std::result::Result<(String, String), String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_value_in_another_unit_is_refused_with_the_right_one() {
+        for (text, expected) in [
+            ("180", Err("angles are in rad, at most a turn: 180° is 3.1416 rad")),
+            ("-90", Err("angles are in rad, at most a turn: -90° is -1.5708 rad")),
+            ("90deg", Err("not a number: give it without a unit; lengths are in m, angles in rad (1° is 0.01745)")),
+            ("3.1", Ok(3.1)),
+            ("-6.2", Ok(-6.2)),
+        ] {
+            assert_eq!(angle(text), expected.map_err(str::to_owned), "{text}");
+        }
+        assert_eq!(coordinate("0.3"), Ok(0.3));
+        assert!(coordinate("300mm").unwrap_err().contains("lengths are in m"));
+        assert!(coordinate("0.3,0.1,0.4").unwrap_err().ends_with("by blanks: 0.3 0.1 0.4"));
+    }
+
+    #[test]
+    fn a_speed_is_a_fraction_or_percent() {
+        for (text, fraction) in [("0.3", 0.3), ("30%", 0.3), ("1%", 0.01), ("1", 1.0), ("12.5%", 0.125)] {
+            assert_eq!(speed(text), Ok(fraction), "{text}");
+        }
+        assert!(speed("50").unwrap_err().ends_with("for percent write 50%"));
+        for wrong in ["0", "0.001", "200%", "-0.5", "500", "fast"] {
+            assert!(speed(wrong).is_err(), "{wrong}");
+        }
+    }
 
     #[test]
     fn durations_are_seconds_or_have_a_unit() {

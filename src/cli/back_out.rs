@@ -13,6 +13,7 @@ use super::output::{self, Table, fixed, span};
 use crate::planning::path::length;
 use crate::planning::timing::time_within;
 use crate::planning::topp::JointBound;
+use crate::recording::replay::LogReader;
 use crate::replay::motion::{RecordedMotion, tcp_path};
 use crate::replay::recorded::Recorded;
 use crate::replay::retrace::{Back, Retrace, RetraceError, retrace};
@@ -263,7 +264,8 @@ fn request(client: &mut Client, arm: &str, joints: &[String], way: &Retrace, spe
 /// Returns the way as a trajectory within `speed` of the arm's limits, from where the arm is.
 fn timed(client: &mut Client, log: &Path, arm: &str, way: &Retrace, speed: f64) -> Result<Trajectory> {
     let fail = |e: String| Failure::new(Exit::Failed, format!("no trajectory: {e}"));
-    let recorded = Recorded::open(log).map_err(|e| Failure::of(Exit::Failed, e))?;
+    let opened = LogReader::open_for(log, &[]).map_err(|e| Failure::of(Exit::Failed, e))?;
+    let recorded = Recorded::of(log, opened.info().clone()).map_err(|e| Failure::of(Exit::Failed, e))?;
     let config = recorded.config.arms.iter().find(|config| config.name == arm);
     let l = &config.ok_or_else(|| fail(format!("the log has no limits of {arm}")))?.limits;
     let bound = |j: usize| JointBound {

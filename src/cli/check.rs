@@ -93,7 +93,8 @@ pub fn report(name: &str, overrides: &Overrides, catalog: Catalog<'_>, as_json: 
 
 fn print(summary: &Summary) {
     let rate = summary.coordinator.tick_rate;
-    output::line(format_args!("{}: {}", summary.name, summary.description));
+    let about = Some(&summary.description).filter(|text| !text.is_empty());
+    output::line(about.map_or_else(|| summary.name.clone(), |about| format!("{}: {about}", summary.name)));
     output::line(format_args!("files: {}; tick: {rate} Hz", summary.files.join(", ")));
     for arm in &summary.arms {
         let standing = banner::standing(arm.simulated, &arm.address);

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use super::arguments::Target;
-use super::exit::{Exit, Result};
+use super::exit::{Exit, Failure, Result};
 use super::follow::{Signals, follow};
 use super::{output, trajectory_file};
 use crate::rpc::api::{Execute, ExecutePlan};
@@ -36,6 +36,12 @@ pub struct Args {
 
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
+    let is_number = |file: &PathBuf| file.to_string_lossy().parse::<u64>().is_ok() && !file.exists();
+    if let Some(number) = args.file.as_ref().filter(|file| is_number(file)) {
+        let number = number.display();
+        return Err(Failure::usage(format!("there is no trajectory file {number}"))
+            .hint(format!("a plan is given by its number with --plan {number}")));
+    }
     let trajectory = args.file.as_deref().map(trajectory_file::read).transpose()?;
     let mut client = args.target_run.connect()?;
     let signals = (!args.no_wait).then(Signals::watch);

@@ -19,11 +19,12 @@ pub enum Exit {
     Failed = 1,
     /// The command line, the blueprint or a file is wrong.
     Usage = 2,
-    /// Hardware unreachable; for log readers: the log is cut or has lost data.
+    /// Hardware unreachable.
     Hardware = 3,
     /// A run ended by a fault.
     Fault = 4,
-    /// A run ended because its log could not be written: the disk is full, or the log was removed.
+    /// A log is cut or has lost data, or a run ended because its log could not be written: the disk is full, or the log
+    /// was removed.
     Log = 5,
     /// Ended by SIGINT, after the controlled stop.
     Interrupted = 130,
@@ -33,16 +34,16 @@ pub enum Exit {
 
 impl Exit {
     /// Exit code of log readers when a log is cut or data is missing.
-    pub const DATA_LOST: Self = Self::Hardware;
+    pub const DATA_LOST: Self = Self::Log;
 
     /// All exit codes with their meaning.
     pub const ALL: &[(Self, &str)] = &[
         (Self::Ok, "done"),
         (Self::Failed, "failed, refused, or not confirmed"),
         (Self::Usage, "the command line, a blueprint, a model or a file is wrong"),
-        (Self::Hardware, "hardware unreachable; replay: the log is cut or has lost data"),
+        (Self::Hardware, "hardware unreachable"),
         (Self::Fault, "a run ended by a fault"),
-        (Self::Log, "a run ended because its log could not be written"),
+        (Self::Log, "a log is cut, has lost data, or could not be written"),
         (Self::Interrupted, "ended by SIGINT, after the controlled stop"),
         (Self::Terminated, "ended by SIGTERM, after the controlled stop"),
     ];

@@ -74,7 +74,7 @@ pub fn watch(
     }
     bar.set_prefix(title.to_owned());
     let mut cancelled: Option<Instant> = None;
-    let mut motion = motion;
+    let (mut motion, mut paused) = (motion, false);
     let report = loop {
         let report = client.call(Motion { motion })?;
         if let Some(next) = report.next.filter(|_| report.done) {
@@ -85,6 +85,12 @@ pub fn watch(
         }
         bar.set_position((report.progress.clamp(0.0, 1.0) * 1000.0) as u64);
         let left = format!("{:.1} s left", report.remaining.max(0.0));
+        // A script or a log has no progress bar that shows why nothing moves.
+        let pauses = report.speed.as_ref().is_some_and(|speed| speed.paused);
+        if pauses && !std::mem::replace(&mut paused, pauses) && bar.is_hidden() {
+            output::note(format_args!("motion {motion} is paused until `dimos resume`"));
+        }
+        paused = pauses;
         bar.set_message(match &report.speed {
             Some(speed) if speed.paused => format!("{left}, PAUSED (dimos resume)"),
             Some(speed) => format!("{left} at {} of the speed", percent(speed.fraction)),

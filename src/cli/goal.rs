@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use indicatif::{ProgressBar, ProgressFinish, ProgressStyle};
 
-use super::arguments::{finite, speed};
+use super::arguments::{angle, coordinate, finite, is_angle, speed};
 use super::exit::{Exit, Failure, Result};
 use super::follow::Signals;
 use super::grip::{self, GripAction};
@@ -23,19 +23,19 @@ const POLL_PERIOD: Duration = Duration::from_millis(20);
 
 /// Goal of a motion.
 #[derive(Debug, Clone, clap::Args)]
-#[group(id = "goal", required = true, multiple = true)]
+#[group(skip)]
 pub struct Goal {
     /// Target positions of its joints [rad], one per joint, base first
-    #[arg(value_name = "Q", value_parser = position, allow_negative_numbers = true, conflicts_with_all = ["tcp", "named"])]
+    #[arg(value_name = "Q", value_parser = position, allow_negative_numbers = true, conflicts_with_all = ["tcp", "named"], group = "goal")]
     pub joints: Vec<f64>,
     /// Target position of the tool centre point: x, y, z [m]; orientation is free unless --rpy or --quat is given
-    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = coordinate, allow_negative_numbers = true, group = "tcp")]
+    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = coordinate, allow_negative_numbers = true, groups = ["tcp", "goal"])]
     pub pose: Option<Vec<f64>>,
     /// Move the tool centre point by x, y, z [m] along the axes of --frame; --rpy or --quat turns it about them
-    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = coordinate, allow_negative_numbers = true, group = "tcp")]
+    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = coordinate, allow_negative_numbers = true, groups = ["tcp", "goal"])]
     pub by: Option<Vec<f64>>,
     /// Roll, pitch, yaw about fixed axes [rad]
-    #[arg(long, value_names = ["R", "P", "Y"], num_args = 3, value_parser = coordinate, allow_negative_numbers = true, requires = "tcp")]
+    #[arg(long, value_names = ["R", "P", "Y"], num_args = 3, value_parser = angle, allow_negative_numbers = true, requires = "tcp")]
     pub rpy: Option<Vec<f64>>,
     /// Orientation as a quaternion x, y, z, w
     #[arg(long, value_names = ["X", "Y", "Z", "W"], num_args = 4, value_parser = coordinate, allow_negative_numbers = true, requires = "tcp", conflicts_with = "rpy")]
@@ -44,21 +44,21 @@ pub struct Goal {
     #[arg(long, value_name = "FRAME", requires = "tcp")]
     pub frame: Option<String>,
     /// Named pose
-    #[arg(long, value_name = "NAME", conflicts_with = "tcp")]
+    #[arg(long, value_name = "NAME", conflicts_with = "tcp", group = "goal")]
     pub named: Option<String>,
     /// Goal of one of several arms in a common motion (repeatable): left=0.1,-0.3,0.6,0,0.8,0 or left=named:home or
     /// left=pose:x,y,z or, with roll, pitch, yaw or a quaternion, left=pose:x,y,z,r,p,y or left=pose:x,y,z,qx,qy,qz,qw;
     /// left=by:x,y,z moves by a distance; @FRAME after a pose gives its frame: left=by:0,0,0.05@tool
-    #[arg(long = "goal", value_name = "ARM=GOAL", value_parser = arm_goal, conflicts_with_all = ["joints", "tcp", "named"])]
+    #[arg(long = "goal", value_name = "ARM=GOAL", value_parser = arm_goal, conflicts_with_all = ["joints", "tcp", "named"], group = "goal")]
     pub several: Vec<PlanGoal>,
     /// One motion through these waypoints; the last is the goal. Each is a named pose, joints as 0.1,-0.3,0.6,0,0.8,0,
     /// or pose:x,y,z,r,p,y (also with x,y,z or a quaternion, and @FRAME); line:… is reached on a straight
     /// line. With `move` also gripper:open, gripper:close or gripper:0.03, where the arm waits for the outcome
-    #[arg(long, value_name = "WAYPOINT", num_args = 2.., value_parser = waypoint, allow_negative_numbers = true, conflicts_with_all = ["joints", "tcp", "named", "several"])]
+    #[arg(long, value_name = "WAYPOINT", num_args = 2.., value_parser = waypoint, allow_negative_numbers = true, conflicts_with_all = ["joints", "tcp", "named", "several"], group = "goal")]
     pub through: Vec<Waypoint>,
     /// Follow the path of a motion that was led or recorded: .csv or .json as for `execute`, or a log (.mcap). Its
     /// times do not count; the way to its first point is planned
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["joints", "tcp", "named", "several", "through"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["joints", "tcp", "named", "several", "through"], group = "goal")]
     pub path: Option<PathBuf>,
     /// How far the motion may pass from the recorded path, per joint [rad]
     #[arg(long, value_name = "ANGLE", default_value_t = PATH_TOLERANCE, value_parser = tolerance, requires = "path")]
@@ -88,9 +88,7 @@ pub enum Leg {
 
 /// Parses a joint position; a name and a list get a hint at what was probably meant.
 fn position(text: &str) -> std::result::Result<f64, String> {
-    let separate = text.split(',').all(|part| part.trim().parse::<f64>().is_ok());
-    finite(text).map_err(|wrong| match text.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '_' | '-')) {
-        _ if text.contains(',') && separate => format!("{wrong}: separate the positions by blanks"),
+    coordinate(text).map_err(|wrong| match text.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '_' | '-')) {
         true if text.starts_with(|c: char| c.is_ascii_alphabetic()) && text.parse::<f64>().is_err() => {
             format!("{wrong}: a named pose is given with --named {text}")
         }
@@ -102,14 +100,6 @@ fn position(text: &str) -> std::result::Result<f64, String> {
 fn tolerance(text: &str) -> std::result::Result<f64, String> {
     let tolerance = finite(text)?;
     if (1e-4..=0.1).contains(&tolerance) { Ok(tolerance) } else { Err("must be within 0.0001–0.1 rad".into()) }
-}
-
-/// Parses a coordinate; a list with commas gets a hint.
-fn coordinate(text: &str) -> std::result::Result<f64, String> {
-    finite(text).map_err(|wrong| match text.contains(',') {
-        true => format!("{wrong}: separate the numbers by blanks: {}", text.replace(',', " ")),
-        false => wrong,
-    })
 }
 
 /// Parses an arm and its goal, as in `--goal`.
@@ -168,6 +158,7 @@ fn pose(list: &str) -> std::result::Result<PoseSpec, String> {
     let xyz = match *numbers(list)? {
         [x, y, z] => [x, y, z],
         [x, y, z, roll, pitch, yaw] => {
+            [roll, pitch, yaw].into_iter().try_for_each(is_angle)?;
             rpy = Some([roll, pitch, yaw]);
             [x, y, z]
         }
@@ -183,7 +174,7 @@ fn pose(list: &str) -> std::result::Result<PoseSpec, String> {
 /// Settings of the search and the speed.
 #[derive(Debug, Clone, clap::Args)]
 pub struct Search {
-    /// Fraction of the velocity and acceleration limits to use, 0.01–1
+    /// Fraction of the velocity and acceleration limits to use: 0.01–1, or 1–100%
     #[arg(long, value_name = "FRACTION", default_value_t = DEFAULT_SPEED, value_parser = speed)]
     pub speed: f64,
     /// Move the tool centre point on a straight line to --pose or by --by

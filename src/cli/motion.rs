@@ -14,6 +14,7 @@ use crate::telemetry::describe::percent;
 /// Arguments of `move`.
 #[derive(Debug, clap::Args)]
 #[command(
+    group = clap::ArgGroup::new("goal").required(true).multiple(true),
     override_usage = "\
 dimos move ARM Q… [OPTIONS]
        dimos move ARM --named NAME [OPTIONS]

@@ -9,6 +9,7 @@ use super::output;
 /// Arguments of `plan`.
 #[derive(Debug, clap::Args)]
 #[command(
+    group = clap::ArgGroup::new("goal").required(true).multiple(true),
     override_usage = "\
 dimos plan ARM Q… [OPTIONS]
        dimos plan ARM --named NAME [OPTIONS]

@@ -25,11 +25,11 @@ use view::{JsonLines, Live, Plain, View};
 /// Play a log in the terminal, verify it, or repeat its motion with an arm
 ///
 /// Plays in real time: a joint table and a progress bar on a terminal, one line per second elsewhere, one JSON object
-/// per message with --json. The log of a live run plays up to its newest chunk. Exits with 3 if the log is truncated,
+/// per message with --json. The log of a live run plays up to its newest chunk. Exits with 5 if the log is truncated,
 /// or if the recorder lost samples.
 ///
 /// With --verify the inputs and requests of every tick pass through the same control code again, and every command must
-/// be identical, bit for bit. Otherwise exits with 1 and prints the first difference; exits with 3 if a part is missing
+/// be identical, bit for bit. Otherwise exits with 1 and prints the first difference; exits with 5 if a part is missing
 /// in the log, up to which all commands are identical.
 ///
 /// With --onto the arms of a blueprint follow the recorded motion, matched by joint names, in a separate run: first a
@@ -37,6 +37,7 @@ use view::{JsonLines, Live, Plain, View};
 /// that exceeds a limit is rejected before anything moves. It is not collision-checked. Ctrl-C decelerates the arms to
 /// rest.
 #[derive(Debug, Clone, Args)]
+#[command(override_usage = "dimos replay <LOG | --last> [OPTIONS]")]
 pub struct ReplayArgs {
     /// Log file (.mcap)
     #[arg(value_name = "LOG", required_unless_present = "last", conflicts_with = "last")]
@@ -122,6 +123,10 @@ pub fn run(args: &ReplayArgs, catalog: Catalog<'_>) -> Result {
         Err(e) if e.downcast_ref::<io::Error>().is_some_and(|e| e.kind() == io::ErrorKind::BrokenPipe) => Ok(Exit::Ok),
         Err(e) if e.is::<SelectionError>() || e.is::<ReplayError>() || e.is::<RecordedError>() => {
             Err(Failure::of(Exit::Usage, e))
+        }
+        Err(e) if e.is::<io::Error>() => {
+            Err(Failure::new(Exit::Failed, format!("cannot write to standard output: {e}"))
+                .hint("what was printed is not complete"))
         }
         other => Ok(other?),
     }

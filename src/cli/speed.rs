@@ -10,7 +10,7 @@ use crate::telemetry::describe::percent;
 #[derive(Debug, clap::Args)]
 pub struct Args {
     /// Fraction of the speed of all motions, as 0.3 or 30%; without it the present one is shown
-    #[arg(value_parser = arguments::override_of_speed)]
+    #[arg(value_parser = arguments::speed, allow_negative_numbers = true)]
     pub fraction: Option<f64>,
     /// Which run
     #[command(flatten)]

@@ -259,6 +259,9 @@ fn attention(r: &StatusReport) -> Vec<String> {
             lines.push(format!("{name}: its connection is {}", arm.link));
         }
     }
+    if r.speed.paused {
+        lines.push("all motions are paused: nothing moves until `dimos resume`".to_owned());
+    }
     for task in r.tasks.iter().filter(|task| matches!(task.state.as_str(), "ABORTED" | "FAULT")) {
         let why = task.reason.as_deref().unwrap_or("unknown reason");
         lines.push(format!("{} is {}: {why}", task.name, task.state));

@@ -37,10 +37,11 @@ pub fn run(args: &Args) -> Result {
     let replies = of_each(&runs, |run| stop(run, args));
     let done: BTreeMap<&str, &StopReply> =
         replies.iter().filter_map(|(run, r)| r.as_ref().ok().map(|r| (run.name.as_str(), r))).collect();
-    if args.target_run.json {
-        output::json(&done);
-    } else if !done.is_empty() {
-        print(&done);
+    match (done.is_empty(), args.target_run.json) {
+        // Only the error is printed: one object in all.
+        (true, _) => {}
+        (false, true) => output::json(&done),
+        (false, false) => print(&done),
     }
     if args.target_run.run.is_none() {
         for other in other_users::runs() {

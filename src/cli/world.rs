@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use serde_json::{Value, json};
 
-use super::arguments::{Target, finite};
+use super::arguments::{Target, angle, finite};
 use super::arm::parts::payload_text;
 use super::exit::{Exit, Failure, Result};
 use super::output::{self, Table, done, fixed};
@@ -56,7 +56,7 @@ pub struct PoseArgs {
     #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite, allow_negative_numbers = true, required = true)]
     pub at: Vec<f64>,
     /// Roll, pitch, yaw about fixed axes [rad]
-    #[arg(long, value_names = ["R", "P", "Y"], num_args = 3, value_parser = finite, allow_negative_numbers = true)]
+    #[arg(long, value_names = ["R", "P", "Y"], num_args = 3, value_parser = angle, allow_negative_numbers = true)]
     pub rpy: Option<Vec<f64>>,
 }
 

@@ -229,12 +229,11 @@ fn describe_block(
         least = checker.contacts(q).iter().filter(|contact| of_pair(contact)).fold(least, |d, c| d.min(c.distance));
     }
     let kind = if matches!(first.pair, Pair::Links(..)) { "link" } else { "obstacle" };
-    let place =
-        if length > 1e-3 { format!("after {:.0} of {:.0} mm ", along * 1e3, length * 1e3) } else { String::new() };
+    let place = if length > 1e-3 { format!("after {along:.3} of {length:.3} m ") } else { String::new() };
     let (link, other) = (&first.link, &first.other);
     let closest = match least {
-        least if least > 0.0 => format!("within {:.1} mm (padding {:.1} mm)", least * 1e3, checker.padding() * 1e3),
-        least => format!("{:.1} mm deep", -least * 1e3),
+        least if least > 0.0 => format!("within {least:.4} m (padding {:.4} m)", checker.padding()),
+        least => format!("{:.4} m deep", -least),
     };
     Some(format!("{place}link {link:?} would come too close to {kind} {other:?}, on the whole line {closest}"))
 }

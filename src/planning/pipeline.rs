@@ -249,7 +249,7 @@ pub(super) fn failure_for(stage: &Stage<'_>, error: &PlanError) -> PlanFailure {
             let digits = digits_outside(*position, *lower, *upper);
             let limits = format!("{lower:.digits$} … {upper:.digits$} {unit}");
             PlanFailure::new(format!("{which}: {name} at {position:.digits$} {unit} is outside its limits {limits}"))
-                .hint("the narrower limits of model and arm apply, and commands stay 0.01 rad inside those of the arm; `dimos state` shows the joint positions")
+                .hint("positions are in rad; the narrower limits of model and arm apply, and commands stay 0.01 rad inside those of the arm; `dimos state` shows the joint positions")
         }
         PlanError::Collides { which: "start", .. } => PlanFailure::new(error.to_string())
             .hint("move the arm out of contact with `dimos move … --direct` or by hand, or correct the world"),

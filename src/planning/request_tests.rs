@@ -78,10 +78,10 @@ fn a_blocked_straight_line_names_the_pair_and_where_it_is() {
     };
     let blocked = scene(vec![RobotConfig::yourarm()], vec![ball]);
     let failure = ask(&blocked, Goal::Line(target), &start).unwrap_err();
-    let (place, _) = failure.split_once(" of 250 mm link ").unwrap_or_else(|| panic!("{failure}"));
+    let (place, _) = failure.split_once(" of 0.250 m link ").unwrap_or_else(|| panic!("{failure}"));
     let along: f64 = place.rsplit_once("after ").unwrap().1.parse().unwrap();
-    assert!((50.0..200.0).contains(&along), "{failure}");
-    assert!(failure.contains("would come too close to obstacle \"ball\"") && failure.contains("mm deep"), "{failure}");
+    assert!((0.05..0.2).contains(&along), "{failure}");
+    assert!(failure.contains("would come too close to obstacle \"ball\"") && failure.contains(" m deep"), "{failure}");
 }
 
 #[test]

@@ -231,6 +231,34 @@ mod tests {
     }
 
     #[test]
+    fn a_part_of_a_log_without_a_summary_is_read_without_unpacking_the_rest() {
+        use crate::recording::records::RecordReader;
+        use crate::recording::replay::{LogReader, Selection};
+        let (folder, sink) = (tempfile::tempdir().unwrap(), Shared::default());
+        let mut log = LogWriter::create(sink.clone(), 0, &[], BTreeMap::new()).unwrap();
+        for time in 1..=5 {
+            log.publish("/a", time, &Text { data: "x".into() }).unwrap();
+            log.flush_soon();
+            log.flush_if_due(Mono(time)).unwrap();
+        }
+        let path = folder.path().join("log.mcap");
+        let mut bytes = sink.0.lock().unwrap().get_ref().clone();
+        std::fs::write(&path, &bytes).unwrap();
+        let mut records = RecordReader::open(&path).unwrap();
+        let all = std::iter::from_fn(|| records.next_record().ok().flatten());
+        let chunks: Vec<_> = all.filter(|record| record.opcode == mcap::records::op::CHUNK).collect();
+        // Damage in the third of five chunks shows whether it is unpacked.
+        bytes[chunks[2].at as usize + 9 + chunks[2].body.len() - 3] ^= 0xff;
+        std::fs::write(&path, &bytes).unwrap();
+        assert_eq!(LogReader::open(&path).unwrap().info().span, Some((1, 2)));
+        let mut end = LogReader::open_for(&path, &["/a"]).unwrap();
+        assert_eq!(end.info().span, Some((1, 5)));
+        end.select(Selection { from: 4, ..Selection::default() }).unwrap();
+        let times: Vec<u64> = std::iter::from_fn(|| end.next_entry().ok().flatten()).map(|e| e.log_time).collect();
+        assert_eq!(times, [4, 5]);
+    }
+
+    #[test]
     fn a_finished_log_has_profile_statistics_metadata_and_attachment() {
         let blueprint =
             LogAttachment { name: "b.yaml".into(), media_type: "application/yaml".into(), data: b"name: x".to_vec() };

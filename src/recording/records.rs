@@ -75,6 +75,10 @@ impl RecordReader {
     /// Opens a file and checks its MCAP magic.
     pub fn open(path: &Path) -> Result<Self, ReplayError> {
         let io = |source| ReplayError::Io { path: path.to_owned(), source };
+        // Opening a pipe would wait for its writer.
+        if !std::fs::metadata(path).map_err(io)?.is_file() {
+            return Err(ReplayError::NotMcap { path: path.to_owned() });
+        }
         let file = File::open(path).map_err(io)?;
         // Before the length: a run that ends in between has written at least this much.
         let live = files::is_being_written(&file);

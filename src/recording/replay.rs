@@ -58,13 +58,23 @@ pub struct LogReader {
 impl LogReader {
     /// Opens a log. Uses the summary of a closed log; scans a truncated one to find its end.
     pub fn open(path: &Path) -> Result<Self, ReplayError> {
+        Self::open_with(path, None)
+    }
+
+    /// Opens a log to read only these topics: of a long one without a summary, such as that of a live run, it unpacks
+    /// no more than it takes to know them. Damage then shows only where it is read.
+    pub fn open_for(path: &Path, topics: &[&str]) -> Result<Self, ReplayError> {
+        Self::open_with(path, Some(topics))
+    }
+
+    fn open_with(path: &Path, topics: Option<&[&str]>) -> Result<Self, ReplayError> {
         let mut records = RecordReader::open(path)?;
         let mut channels = Channels::default();
         let mut info = match records.summary_start()? {
             Some(start) => summary(&mut records, start, &mut channels)?,
             None => None,
         }
-        .map_or_else(|| scan(&mut records, &mut channels), Ok)?;
+        .map_or_else(|| scan(&mut records, &mut channels, topics), Ok)?;
         // A run that is just ending has closed its log already.
         info.live = records.is_live() && !info.complete;
         info.topics = channels.topics();
@@ -176,8 +186,13 @@ fn summary(records: &mut RecordReader, start: u64, channels: &mut Channels) -> R
     }
 }
 
-/// Reads time span and channels of a log without a summary, from the whole file.
-fn scan(records: &mut RecordReader, channels: &mut Channels) -> Result<LogInfo, ReplayError> {
+/// Reads time span and channels of a log without a summary, from the whole file; with `topics`, channels only until
+/// these are known.
+fn scan(records: &mut RecordReader, channels: &mut Channels, topics: Option<&[&str]>) -> Result<LogInfo, ReplayError> {
+    let knows = |channels: &Channels| {
+        topics.is_some_and(|topics| topics.iter().all(|topic| channels.topics().contains_key(*topic)))
+    };
+    let mut known = knows(channels);
     records.rewind()?;
     let mut info = LogInfo::default();
     let mut seen = |from: u64, to: u64| {
@@ -187,14 +202,16 @@ fn scan(records: &mut RecordReader, channels: &mut Channels) -> Result<LogInfo, 
     loop {
         match records.next_record() {
             Ok(Some(record)) if record.opcode == op::CHUNK => {
-                let mut any = false;
+                // One without messages has no times.
+                let mut any = known && chunk_header(&record.body).is_ok_and(|header| header.message_end_time > 0);
                 let each = |opcode, body: &[u8]| {
                     any |= opcode == op::MESSAGE;
                     channels.learn(opcode, body);
                 };
-                if unpack_chunk(&record.body, each).is_err() {
+                if !known && unpack_chunk(&record.body, each).is_err() {
                     return Ok(info);
                 }
+                known = known || knows(channels);
                 if let (true, Ok(header)) = (any, chunk_header(&record.body)) {
                     seen(header.message_start_time, header.message_end_time);
                 }

@@ -17,6 +17,8 @@ const AVERAGING_TIME: f64 = 0.1;
 /// The step between two sources is faded out over this time [s].
 const FADE_TIME: f64 = 1.0;
 
+/// Measured joints, commanded joints, ticks.
+const TOPICS: [&str; 3] = ["/joint_states", "/joint_commands", "/dimos/tick"];
 /// Maximum gap bridged by a straight line [s].
 const MAX_GAP: f64 = 1.0;
 
@@ -51,7 +53,7 @@ impl RecordedMotion {
     pub fn read(path: &Path, from: u64, to: u64) -> Result<Self, RecordedError> {
         let recorded = Recorded::open(path)?;
         let names = recorded.joints();
-        let rows = rows(path, names.len(), from, to)?;
+        let rows = rows(LogReader::open(path)?, &TOPICS, names.len(), (from, to))?;
         let is_commanded = |row: &Row| row.commanded.iter().any(|q| q.is_finite());
         let whole = (0, rows.len().saturating_sub(1));
         let first = rows.iter().position(is_commanded).unwrap_or(whole.0);
@@ -82,11 +84,14 @@ impl RecordedMotion {
     /// Reads the measured motion of these joints, averaged over ±0.1 s, between two Unix times [ns]: since the last gap
     /// in the log. Without those joints it has no rows.
     pub fn measured(path: &Path, joints: &[String], from: u64, to: u64) -> Result<Self, RecordedError> {
-        let recorded = Recorded::open(path)?;
+        // The log of a live run has no index: nothing before `from` is unpacked.
+        let [measured, _, tick] = TOPICS;
+        let log = LogReader::open_for(path, &[measured, tick])?;
+        let recorded = Recorded::of(path, log.info().clone())?;
         let names = recorded.joints();
         let index = |joint: &String| names.iter().position(|name| name == joint);
         let columns: Vec<usize> = joints.iter().map(index).collect::<Option<_>>().unwrap_or_default();
-        let rows = rows(path, names.len(), from, to)?;
+        let rows = rows(log, &[measured, tick], names.len(), (from, to))?;
         let period = 1.0 / recorded.config.rate;
         let is_known = |row: &Row| columns.iter().all(|j| row.measured[*j].is_finite());
         let is_gap = |w: &[Row]| w[1].tick.saturating_sub(w[0].tick) as f64 * period > MAX_GAP + period;
@@ -129,9 +134,8 @@ pub fn tcp_path(path: &Path, arm: &str, from: u64, to: u64) -> Result<Vec<(u64, 
     }
 }
 
-fn rows(path: &Path, joints: usize, from: u64, to: u64) -> Result<Vec<Row>, RecordedError> {
-    let topics = ["/joint_states", "/joint_commands", "/dimos/tick"].map(str::to_owned).to_vec();
-    let mut log = LogReader::open(path)?;
+fn rows(mut log: LogReader, topics: &[&str], joints: usize, (from, to): (u64, u64)) -> Result<Vec<Row>, RecordedError> {
+    let topics = topics.iter().map(|topic| (*topic).to_owned()).collect();
     log.select(Selection { topics, from, to })?;
     let nothing = || vec![f64::NAN; joints];
     let positions = |m: &JointState| if m.position.len() == joints { m.position.clone() } else { nothing() };
@@ -140,7 +144,7 @@ fn rows(path: &Path, joints: usize, from: u64, to: u64) -> Result<Vec<Row>, Reco
     loop {
         match log.next_entry() {
             Ok(Some(entry)) => match &entry.data {
-                Payload::JointState(m) if entry.topic == "/joint_states" => measured = positions(m),
+                Payload::JointState(m) if entry.topic == TOPICS[0] => measured = positions(m),
                 Payload::JointState(m) => commanded = positions(m),
                 Payload::Tick(t) if rows.last().is_none_or(|row| t.tick > row.tick) => {
                     let now =

@@ -72,7 +72,11 @@ pub struct Recorded {
 impl Recorded {
     /// Reads the run of a log.
     pub fn open(path: &Path) -> Result<Self, RecordedError> {
-        let info = LogReader::open(path)?.info().clone();
+        Self::of(path, LogReader::open(path)?.info().clone())
+    }
+
+    /// Reads the run of a log that was opened already.
+    pub fn of(path: &Path, info: LogInfo) -> Result<Self, RecordedError> {
         let path = path.to_owned();
         let Some(json) = attachment(&path, COORDINATOR)? else { return Err(RecordedError::NoCoordinator { path }) };
         let version = config_version(&info.metadata, &json);

@@ -43,7 +43,7 @@ pub enum ClientError {
     #[error(transparent)]
     RunDir(#[from] RunDirError),
     /// The connection failed or broke.
-    #[error("run {run:?}: {error}")]
+    #[error("run {run:?}: {}", io_text(.error))]
     Io {
         /// The run's name.
         run: String,
@@ -79,6 +79,16 @@ impl ClientError {
             Self::Protocol { .. } => Some("the run may be another version of dimos: `dimos status` shows it".into()),
             Self::Refused(error) => error.hint.clone(),
         }
+    }
+}
+
+/// Describes an error of the socket: what matters is that the run is gone, not at which call that shows.
+fn io_text(error: &io::Error) -> String {
+    match error.kind() {
+        io::ErrorKind::BrokenPipe | io::ErrorKind::ConnectionReset | io::ErrorKind::UnexpectedEof => {
+            "the run closed the connection".into()
+        }
+        _ => error.to_string(),
     }
 }
 
@@ -345,6 +355,14 @@ mod tests {
             }
         });
         Client::over(client, "test", TIMEOUT).unwrap()
+    }
+
+    #[test]
+    fn a_run_that_is_gone_closed_the_connection_wherever_that_shows() {
+        for kind in [io::ErrorKind::BrokenPipe, io::ErrorKind::ConnectionReset, io::ErrorKind::UnexpectedEof] {
+            let error = ClientError::Io { run: "cell".into(), error: kind.into() };
+            assert_eq!(error.to_string(), "run \"cell\": the run closed the connection");
+        }
     }
 
     #[test]

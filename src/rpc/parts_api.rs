@@ -113,19 +113,27 @@ pub struct ArmTool {
     pub arm: String,
 }
 
+/// Farthest tool centre point along an axis of its link [m]: more is a length in mm.
+const MAX_TOOL: f64 = 5.0;
+
 /// Parameters of `arm_tool_set`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ArmToolSet {
     /// The arm's `hardware_id`.
     pub arm: String,
-    /// Pose of the tool centre point in the frame of the end-effector link; null: no tool.
+    /// Pose of the tool centre point in the frame of the end-effector link, at most 5 m along each axis; null: no tool.
     pub tool: Option<PoseSpec>,
 }
 
 impl ArmToolSet {
     pub(super) fn valid(&self) -> Result<(), String> {
-        self.tool.map_or(Ok(()), |tool| tool.valid("tool"))
+        let Some(tool) = self.tool else { return Ok(()) };
+        tool.valid("tool")?;
+        match tool.xyz.iter().find(|v| v.abs() > MAX_TOOL) {
+            Some(far) => Err(format!("tool.xyz has {far} m, must be within ±{MAX_TOOL} m")),
+            None => Ok(()),
+        }
     }
 }
 

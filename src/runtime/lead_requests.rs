@@ -153,6 +153,7 @@ impl Service {
             blocked: None,
             next: None,
             retraces_to: None,
+            began: None,
         };
         lock(&self.motions).plan(motion, planned);
         let native = Native { name: call.arm, arm, motion, target, speed: call.speed * self.speed_override().fraction };

@@ -57,7 +57,7 @@ impl Service {
     pub(super) fn needs_no_plan(&self, arm: &str) -> Result<(), RpcError> {
         match self.planner() {
             Ok(_) => Err(RpcError::new(Code::NotPlanned, format!("a direct motion of {arm} is not collision-checked"))
-                .hint("this run has a planner: `plan`, then `execute_plan`; or ask for it with `direct`: true")),
+                .hint("this run has a planner, and a planned motion is checked: plan and execute it; or order it all the same: --direct, in rpc and Python `direct`")),
             Err(RpcError { code: Code::NoPlanner, data: None, .. }) => Ok(()),
             Err(gone) => Err(gone),
         }
@@ -94,7 +94,7 @@ impl Service {
             MotionError::OutOfLimits { ref joint, excess, .. } => {
                 let data = json!({"joint": joint, "by": excess});
                 RpcError::new(Code::OutOfLimits, e.to_string())
-                    .hint("limits are the arm's own, narrowed by `limits` in the blueprint; commands stay 0.01 rad inside")
+                    .hint("positions are in rad; limits are the arm's own, narrowed by `limits` in the blueprint; commands stay 0.01 rad inside")
                     .data(data)
             }
             MotionError::NotFound(_) => {
@@ -176,6 +176,7 @@ impl Service {
             blocked: None,
             next: None,
             retraces_to: None,
+            began: None,
         };
         lock(&self.motions).plan(number, planned);
         let motion = Box::new(Motion { id: number, joints, spline });

@@ -31,6 +31,8 @@ pub struct Planned {
     pub next: Option<Next>,
     /// If it retraces the log: time in it of the goal [s since 1970].
     pub retraces_to: Option<f64>,
+    /// The tick at which its task began it, once that is known.
+    pub began: Option<u64>,
 }
 
 /// What a planned motion executes.
@@ -81,6 +83,8 @@ pub struct End {
     pub reason: Reason,
     /// Positions of its joints [rad].
     pub actual: Vec<f64>,
+    /// The tick at which it ended.
+    pub tick: u64,
 }
 
 /// The motions of a run, by number.
@@ -101,16 +105,18 @@ impl Motions {
         self.0.remove(&number);
     }
 
-    /// Takes a change of a task's state. `positions`: present positions of all joints [rad]. Motions of a task end in
-    /// order.
-    pub fn task_changed(&mut self, task: u16, state: TaskState, reason: Reason, positions: &[f64]) {
-        if !matches!(state, TaskState::Completed | TaskState::Aborted | TaskState::Fault) {
-            return;
-        }
+    /// Takes a change of a task's state at a tick. `positions`: present positions of all joints [rad]. Motions of a
+    /// task begin and end in order.
+    pub fn task_changed(&mut self, task: u16, (tick, state, reason): (u64, TaskState, Reason), positions: &[f64]) {
         let running = self.0.values_mut().find(|(planned, end)| planned.task == task && end.is_none());
-        if let Some((planned, end)) = running {
-            let at = |j: &u16| positions.get(*j as usize).copied().unwrap_or(f64::NAN);
-            *end = Some(End { state, reason, actual: planned.joints.iter().map(at).collect() });
+        let Some((planned, end)) = running else { return };
+        match state {
+            TaskState::Executing => planned.began = planned.began.or(Some(tick)),
+            TaskState::Completed | TaskState::Aborted | TaskState::Fault => {
+                let at = |j: &u16| positions.get(*j as usize).copied().unwrap_or(f64::NAN);
+                *end = Some(End { state, reason, actual: planned.joints.iter().map(at).collect(), tick });
+            }
+            _ => {}
         }
     }
 
@@ -126,7 +132,7 @@ impl Motions {
         if let Some((planned, end)) = self.0.get_mut(&number) {
             (planned.duration, planned.blocked) = (elapsed, why);
             let at = |j: &u16| positions.get(*j as usize).copied().unwrap_or(f64::NAN);
-            *end = Some(End { state, reason, actual: planned.joints.iter().map(at).collect() });
+            *end = Some(End { state, reason, actual: planned.joints.iter().map(at).collect(), tick: 0 });
         }
     }
 
@@ -202,12 +208,15 @@ mod tests {
             blocked: None,
             next: None,
             retraces_to: None,
+            began: None,
         };
         let mut m = Motions::default();
         (1..=3).for_each(|n| m.plan(n, planned((n % 2) as u16)));
-        m.task_changed(1, TaskState::Executing, Reason::None, &[]);
-        m.task_changed(1, TaskState::Completed, Reason::None, &[0.0, 0.499]);
-        assert_eq!(m.get(1).unwrap().1.as_ref().unwrap().actual, vec![0.499]);
+        m.task_changed(1, (7, TaskState::Executing, Reason::None), &[]);
+        m.task_changed(1, (9, TaskState::Completed, Reason::None), &[0.0, 0.499]);
+        let (first, end) = m.get(1).unwrap();
+        assert_eq!((first.began, end.as_ref().unwrap().tick), (Some(7), 9));
+        assert_eq!(end.as_ref().unwrap().actual, vec![0.499]);
         assert!(m.get(2).unwrap().1.is_none() && m.get(3).unwrap().1.is_none());
         (4..500).for_each(|n| m.plan(n, planned(0)));
         assert!(m.get(1).is_none() && m.get(499).is_some());

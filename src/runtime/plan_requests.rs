@@ -74,7 +74,7 @@ impl PlannerPort {
             (Some(values), _, _) => joints(values)?,
             (_, Some(name), _) => {
                 let names: Vec<&String> = config.named_poses.keys().collect();
-                let unknown = || RpcError::unknown(Code::InvalidParams, "named pose", name, &names);
+                let unknown = || RpcError::unknown(Code::InvalidParams, "pose", name, &names);
                 joints(config.named_poses.get(name).ok_or_else(unknown)?)?
             }
             // On a line, any orientation is the present one.

@@ -237,10 +237,15 @@ impl Service {
             None if view.motion == number && over => {
                 let at = self.positions();
                 let actual = planned.joints.iter().map(|j| at.get(*j as usize).copied().unwrap_or(f64::NAN)).collect();
-                Some(End { state: view.state, reason: view.reason, actual })
+                Some(End { state: view.state, reason: view.reason, actual, tick: self.last_tick() })
             }
             None => None,
         };
+        // The task counts the time on the path: less than has passed, if the motion was slowed or paused.
+        if let Some(began) = planned.began {
+            let ticks = end.as_ref().map_or_else(|| self.last_tick(), |end| end.tick).saturating_sub(began);
+            report.elapsed = report.elapsed.max(ticks as f64 * self.period().as_secs_f64());
+        }
         let Some(end) = end else {
             let speed = self.speed_override();
             report.remaining /= speed.fraction;
@@ -274,6 +279,13 @@ impl Service {
         Ok(report)
     }
 
+    /// Returns the limits of a joint [rad].
+    fn range(&self, joint: u16) -> Option<[f64; 2]> {
+        let (arm, j) = self.locate(joint)?;
+        let limits = &self.parts.config.arms.get(arm)?.limits;
+        Some([*limits.position_lower.get(j)?, *limits.position_upper.get(j)?])
+    }
+
     /// Returns a refusal by the tick as an error; `None`: it was accepted.
     pub(super) fn refusal(&self, outcome: &Outcome) -> Option<RpcError> {
         let code = Code::of(outcome)?;
@@ -298,7 +310,13 @@ impl Service {
                 error.hint(format!("remove the cause, then repeat `dimos arm reset {}`", arm(a)))
             }
             Outcome::OutOfLimits(joint, by) => error
-                .hint("limits are the arm's own, narrowed by `limits` in the blueprint")
+                .hint(match self.range(*joint) {
+                    Some([lower, upper]) => format!(
+                        "{} may be at {lower:.4} … {upper:.4} rad: the arm's own limits, narrowed by `limits` in the blueprint",
+                        names.joint(*joint)
+                    ),
+                    None => "limits are the arm's own, narrowed by `limits` in the blueprint".to_owned(),
+                })
                 .data(serde_json::json!({"joint": names.joint(*joint), "by": by})),
             Outcome::GripperOutOfLimits(a, opening) => error
                 .hint("`dimos status` shows its range")

@@ -155,11 +155,14 @@ impl Service {
         }
         let robots = self.robots().await?;
         for goal in plan.goals.iter_mut().chain(&mut plan.through) {
-            let Some(pose) = goal.named.as_ref().and_then(|name| saved.get(name)) else { continue };
             let Some(robot) = robots.iter().find(|robot| robot.name == goal.robot) else { continue };
-            if goal.named.as_ref().is_some_and(|name| robot.named_poses.contains_key(name)) {
+            let Some(name) = goal.named.as_ref().filter(|name| !robot.named_poses.contains_key(*name)) else {
                 continue;
-            }
+            };
+            let Some(pose) = saved.get(name) else {
+                let names: Vec<&String> = robot.named_poses.keys().chain(saved.keys()).collect();
+                return Err(RpcError::unknown(Code::InvalidParams, "pose", name, &names));
+            };
             let position = |joint: &String| pose.values().find_map(|arm| arm.get(joint)).copied();
             let joints = robot.joints.iter().map(|joint| position(joint).ok_or(joint)).collect::<Result<Vec<_>, _>>();
             let joints = joints.map_err(|joint| {

@@ -205,7 +205,7 @@ impl Service {
             Notice::Event { tick, event, described } => {
                 if let Event::Task(task, state, reason) = event {
                     let actual = self.positions();
-                    lock(&self.motions).task_changed(*task, *state, *reason, &actual);
+                    lock(&self.motions).task_changed(*task, (tick, *state, *reason), &actual);
                 }
                 self.report_event(tick, described, wall);
             }

@@ -199,10 +199,10 @@ pub fn outcome_text(outcome: &Outcome, names: &Names) -> String {
         Outcome::WrongTask(task) => format!("task {} does not support this request", names.task(task)),
         Outcome::NonFinite(joint) => format!("the target of {} is not a finite number", names.joint(joint)),
         Outcome::OutOfLimits(joint, by) => {
-            format!("the target of {} is outside its limits by {by:.4}", names.joint(joint))
+            format!("the target of {} is outside its limits by {}", names.joint(joint), angle(by))
         }
         Outcome::GripperOutOfLimits(arm, opening) => {
-            format!("the gripper of {} cannot go to {opening:.4}: an opening must be 0 m or more", names.arm(arm))
+            format!("the gripper of {} cannot go to {opening:.4} m: an opening must be 0 m or more", names.arm(arm))
         }
         Outcome::GripperForceOutOfLimits(arm, force) => {
             format!("a force of {force} is outside the range of the gripper of {}", names.arm(arm))
@@ -309,7 +309,9 @@ pub fn cause_text(cause: Cause) -> String {
         Cause::LinkLost => "the connection was lost".into(),
         Cause::NonFinite => "a command was not a finite number".into(),
         Cause::Jump => "a command jumped".into(),
-        Cause::Overrun => "the tick lost too much time".into(),
+        Cause::Overrun => {
+            "100 ms or more passed between two ticks: this computer was too busy; see `dimos doctor`".into()
+        }
         Cause::HeartbeatLost => "the device thread saw no heartbeat of the tick".into(),
         Cause::PowerLost => "the motors were disabled unexpectedly".into(),
         Cause::Tracking(joint, by) => format!(
@@ -423,7 +425,7 @@ mod tests {
             "request 7: the first point or target is 0.5000 rad (28.65°) from the position of left_joint1"
         );
         let d = describe(&Event::Request(8, Outcome::GripperOutOfLimits(1, -0.01)), &names());
-        let text = "request 8: the gripper of right cannot go to -0.0100: an opening must be 0 m or more";
+        let text = "request 8: the gripper of right cannot go to -0.0100 m: an opening must be 0 m or more";
         assert_eq!((d.text.as_str(), d.status), (text, "OUT_OF_LIMITS"));
         assert_eq!((d.arm.as_deref(), d.joint, d.values), (Some("right"), None, vec![-0.01]));
     }

@@ -52,6 +52,9 @@ fn usage_lines_have_the_order_that_is_parsed() {
         let error = dimos::cli::command().try_get_matches_from(line.split(' ')).unwrap_err();
         let text = error.to_string();
         assert!(text.contains(usage) && text.contains("--pose X Y Z [--rpy R P Y"), "{text}");
+        let required = text.split("Usage:").next().unwrap();
+        let goal = ["--rpy", "--frame", "--tolerance", "--blend"].iter().find(|option| required.contains(**option));
+        assert!(goal.is_none() || line.contains(goal.unwrap()), "a goal is none of its settings: {text}");
     }
     let reads = |line: &str| dimos::cli::command().try_get_matches_from(line.split(' ')).is_ok();
     assert!(reads("dimos move arm 0.1 -0.2") && reads("dimos move arm --named home"));
@@ -62,7 +65,7 @@ fn usage_lines_have_the_order_that_is_parsed() {
 fn mistakes_in_goals_get_a_hint() {
     let refused = |line: &str| dimos::cli::command().try_get_matches_from(line.split(' ')).unwrap_err().to_string();
     assert!(refused("dimos move arm home").contains("--named home"));
-    assert!(refused("dimos move arm 0.1,0.2").contains("separate the positions by blanks"));
+    assert!(refused("dimos move arm 0.1,0.2").contains("separate the numbers by blanks: 0.1 0.2"));
     assert!(refused("dimos move arm --pose 0.3,x 0 0").contains("separate the numbers by blanks"));
     assert!(refused("dimos plan --goal arm=home").contains("arm=named:home"));
     assert!(refused("dimos move arm nan").contains("must be finite"));

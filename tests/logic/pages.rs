@@ -1,4 +1,5 @@
-//! The pages refer only to what exists: links and their anchors, and the tests of each fault in `docs/faults.md`.
+//! The pages refer only to what exists: links and their anchors, the tests of each fault in `docs/faults.md`, commands
+//! and blueprints.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -149,8 +150,94 @@ fn f30_only_the_clock_reads_the_wall_clock() {
     assert_eq!(readers, ["src/clock.rs"]);
 }
 
+/// The command lines of a page, and whether each is part of a sentence: those of its code blocks and in backticks.
+fn commands(page: &str) -> Vec<(String, bool)> {
+    let mut code = false;
+    let blocks = page.lines().filter(|line| {
+        let fence = line.starts_with("```");
+        code ^= fence;
+        code && !fence
+    });
+    let blocks = blocks.flat_map(|line| line.split(" #").next().unwrap_or_default().split("&&").map(str::to_owned));
+    let text = prose(page).collect::<Vec<_>>().join("\n").replace('\n', " ");
+    let inline = text.split('`').skip(1).step_by(2).map(str::to_owned);
+    let all = blocks.map(|line| (line, false)).chain(inline.map(|line| (line, true)));
+    // A diagram lists verbs: `dimos run, move`.
+    let is_command = |line: &str| line.starts_with("dimos ") && !line.split(' ').any(|word| word.ends_with(','));
+    all.map(|(line, said)| (line.trim().to_owned(), said)).filter(|(line, _)| is_command(line)).collect()
+}
+
+/// Words as a shell splits them.
+fn words(line: &str) -> Vec<String> {
+    let (mut words, mut quote) = (vec![String::new()], None);
+    for c in line.chars() {
+        match quote {
+            Some(open) if c == open => quote = None,
+            None if c == '\'' || c == '"' => quote = Some(c),
+            None if c == ' ' => words.push(String::new()),
+            _ => words.last_mut().unwrap().push(c),
+        }
+    }
+    words.into_iter().filter(|word| !word.is_empty()).collect()
+}
+
+/// Every command that a page shows is understood. One with a placeholder is left to the reader; one in a sentence may
+/// lack arguments, but for those of the README.
+#[test]
+fn every_command_of_a_page_is_understood() {
+    let (mut wrong, mut seen) = (Vec::new(), 0);
+    for (page, text) in pages().into_iter().filter(|(page, _)| !page.starts_with("docs/decisions")) {
+        for (line, said) in commands(&text) {
+            let words = words(&line);
+            let is_placeholder = |word: &String| {
+                word.contains(['…', '|', '[', '<', '>']) && !word.contains('=')
+                    || ["X", "Q", "TIME", "PORT", "WIDTH", "N"].contains(&word.as_str())
+            };
+            if words.iter().any(is_placeholder) || words.iter().any(|word| word == "2>&1") {
+                continue;
+            }
+            seen += 1;
+            use clap::error::ErrorKind::*;
+            match dimos::cli::command().try_get_matches_from(&words).map_err(|error| (error.kind(), error)) {
+                Ok(_) | Err((DisplayHelp | DisplayVersion | DisplayHelpOnMissingArgumentOrSubcommand, _)) => {}
+                Err((MissingRequiredArgument | MissingSubcommand, _)) if said && page != "README.md" => {}
+                Err((_, error)) => wrong.push(format!("{page}: {line}\n{error}")),
+            }
+        }
+    }
+    assert!(seen > 150, "{seen}");
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+/// The blueprints of the pages, also those that belong into another one, have neither mistakes nor warnings.
+#[test]
+fn blueprints_of_the_pages_are_right() {
+    use dimos::blueprint::{Overrides, SearchPath, load_from};
+    use dimos::hardware::registry::Registry;
+    let folder = tempfile::tempdir().unwrap();
+    for (page, include) in [
+        ("docs/cartesian.md", "include: [coordinator-yourarm]"),
+        ("docs/leader-follower.md", "include: [leader-follower]"),
+        ("docs/proxy.md", ""),
+        ("docs/python.md", ""),
+    ] {
+        let text = std::fs::read_to_string(root().join(page)).unwrap();
+        let block = text.split("```yaml\n").nth(1).and_then(|rest| rest.split("```").next()).unwrap();
+        let file = folder.path().join("cell.yaml");
+        std::fs::write(&file, format!("{include}\n{block}")).unwrap();
+        let search = SearchPath { folders: vec![root().join("blueprints")] };
+        let found = search.find(file.to_str().unwrap()).unwrap();
+        let said = load_from(&search, &found, &Overrides::default(), &Registry::builtin()).render(false);
+        assert!(said.is_empty(), "{page}:\n{said}");
+    }
+}
+
 #[test]
 fn the_checks_see_what_they_should() {
+    let block = "```sh\ndimos a b # c\ndimos d && dimos e\n```\nuse `dimos f\n'g h'` or `x`\n";
+    let found = [("dimos a b", false), ("dimos d", false), ("dimos e", false), ("dimos f 'g h'", true)];
+    assert_eq!(commands(block), found.map(|(line, said)| (line.to_owned(), said)));
+    assert_eq!(words("a 'b c' d=\"e\""), ["a", "b c", "d=e"]);
     let page = "# A `b`: c, d\n```\n# no heading\n[no](link)\n```\n[x](y.md#z) [w](#a-b-c-d)\n";
     assert_eq!(anchors(page), BTreeSet::from(["a-b-c-d".to_owned()]));
     assert_eq!(links(page), ["y.md#z", "#a-b-c-d"]);

@@ -137,7 +137,7 @@ fn groups_poses_limits_and_arguments_take_effect() {
     let (home, _run) = up();
     home.dimos("move rig --named ready --speed 1").with(0).says(&["planned, collision-checked"]);
     is_at(&home, [0.1, 3.0, 0.2, 0.01]);
-    home.dimos("plan rig --named beyond").with(2).says(&["no named pose named `beyond`", "home, ready"]);
+    home.dimos("plan rig --named beyond").with(2).says(&["no pose named `beyond`", "home, ready"]);
     // The short way round, from where the arm is: counted on, without a jump.
     home.dimos("move rig 0.1 -3.0 0.2 0.01 --speed 1").with(0);
     is_at(&home, [0.1, std::f64::consts::TAU - 3.0, 0.2, 0.01]);

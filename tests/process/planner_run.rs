@@ -152,7 +152,7 @@ fn what_cannot_be_planned_is_refused_in_words() {
         ("plan arm --pose 5 0 0.3 --rpy 0 0 0", 1, &["arm: no IK solution after ", " m and ", "hint: "]),
         ("plan arm 9 0 0 0 0 0", 1, &["goal: arm_joint1 at 9.0000 rad is outside its limits", "hint: "]),
         ("plan arm 0 0 0", 2, &["arm has 6 joints, the goal 3 values"]),
-        ("plan arm --named hme", 2, &["no named pose named `hme`", "did you mean `home`?"]),
+        ("plan arm --named hme", 2, &["no pose named `hme`", "did you mean `home`?"]),
         ("plan amr --named home", 2, &["UNKNOWN_ROBOT", "did you mean `arm`?"]),
         ("plan arm --pose 0.3 0 0.3 --quat 1 1 0 0", 2, &["pose.quat has length 1.414"]),
         ("plan arm 0 0 0 0 0 0 --linear", 2, &["--pose <X> <Y> <Z>|--by <X> <Y> <Z>"]),

@@ -3,7 +3,7 @@
 use std::io::{BufRead, BufReader, Write};
 use std::process::Stdio;
 
-use dimos::rpc::api::{State, Status};
+use dimos::rpc::api::{Motion, State, Status};
 use rustix::process::Signal;
 use serde_json::Value;
 
@@ -88,7 +88,7 @@ fn a_motion_is_slowed_down_paused_and_resumed_and_its_log_verifies() {
     let run = home.run("coordinator-yourarm");
     assert_eq!(home.dimos("speed").with(0).out, "speed 100 %\n");
     home.dimos("speed 150%").with(2).says(&["0.01–1", "1–100%"]);
-    home.dimos("speed 30").with(2).says(&["with a % sign"]);
+    home.dimos("speed 30").with(2).says(&["for percent write 30%"]);
     let moving = home.dimos("move arm 0.9 -0.3 0.6 0 0.8 0 --speed 0.3 --no-wait --json").with(0).json();
     let motion = moving["motion"].as_u64().unwrap();
     assert_eq!(home.dimos("pause").with(0).out, "paused; at 100 % of the speed after `dimos resume`\n");
@@ -99,10 +99,14 @@ fn a_motion_is_slowed_down_paused_and_resumed_and_its_log_verifies() {
         before == after && before[0] < 0.85
     });
     assert_eq!(task()["state"], "EXECUTING");
-    home.dimos("status").with(0).shows(&["paused; at 50 % of the speed"]);
+    home.dimos("status").with(0).shows(&["! all motions are paused", "paused; at 50 % of the speed"]);
     assert_eq!(home.dimos("resume").with(0).out, "speed 50 %\n");
     eventually("it arrives", || task()["state"] == "COMPLETED");
     assert_eq!(task()["motion"], motion);
+    // The time that has passed: more than the task has counted on the path, at half the speed.
+    let report = home.client().call(Motion { motion }).unwrap();
+    let on_path = moving["duration"].as_f64().unwrap();
+    assert!(report.done && report.elapsed > 1.4 * on_path, "{} s, {on_path} s on the path", report.elapsed);
     assert!((home.positions("arm")[0] - 0.9).abs() < 1e-3);
     home.dimos("down").with(0);
     drop(run);

@@ -41,7 +41,7 @@ fn a_led_motion_is_recorded_and_the_arm_is_taken_over_where_it_is() {
     assert!((rows.last().unwrap()[2] - after[1]).abs() < 1e-3);
     assert_eq!(phase(&home), "ready");
     // No overwriting, and the arm is not led if the file cannot be written.
-    home.dimos("arm teach arm --record led.csv --duration 1").with(2).says(&["led.csv"]);
+    home.dimos("arm teach arm --record led.csv --duration 1").with(2).says(&["led.csv exists already", "hint: "]);
     assert_eq!(phase(&home), "ready");
     // What another client has switched off stays off.
     let teaching = Started::of(home.command("arm teach arm --record other.csv").stdin(Stdio::null()));
@@ -79,7 +79,8 @@ fn an_arm_without_motors_is_led_only_by_who_supports_it_and_others_say_why_not()
     assert_eq!(phase(&home), "ready");
     run.end(Signal::TERM).with(143);
     let run = start(&home, "coordinator-yourarm", &[]);
-    home.dimos("arm teach arm").with(1).says(&["its protocol has no hand guiding", "dimos jog arm"]);
+    home.dimos("arm teach arm --record none.csv").with(1).says(&["its protocol has no hand guiding", "dimos jog arm"]);
+    assert!(!home.path().join("none.csv").exists(), "nothing was recorded");
     run.end(Signal::TERM).with(143);
 }
 

@@ -60,13 +60,13 @@ pub fn run(args: &Args) -> Result {
     let (arm, json) = (&args.which.arm, args.which.target_run.json);
     let mut client = args.which.target_run.connect()?;
     // Before the arm is led: with a file that cannot be written nothing changes.
-    let file = args.record.as_deref().map(create).transpose()?;
+    let mut file = args.record.as_deref().map(NewFile::create).transpose()?;
     let signals = Signals::watch();
     let reply = client.call(ArmTeach { arm: arm.clone(), support_the_arm: args.support_the_arm })?;
     if !json {
         output::line(format_args!("{arm}: {}", reply.note.as_deref().unwrap_or(&reply.phase)));
     }
-    let (Some(file), Some(path)) = (file, &args.record) else {
+    let (Some(new), Some(path)) = (&mut file, &args.record) else {
         if json {
             output::json(&reply);
         } else {
@@ -74,7 +74,8 @@ pub fn run(args: &Args) -> Result {
         }
         return Ok(Exit::Ok);
     };
-    let recorded = record(&mut client, args, BufWriter::new(file), &signals);
+    let recorded = record(&mut client, args, BufWriter::new(&new.file), &signals);
+    new.keep = true;
     // Refused if the arm is no longer led: another client has stopped or disabled it.
     let taken = take_over(&mut client, arm);
     let (samples, seconds) = recorded.map_err(|e| e.hint(format!("{} ends there", path.display())))?;
@@ -88,8 +89,31 @@ pub fn run(args: &Args) -> Result {
     Ok(signals.last().map_or(Exit::Ok, Exit::by_signal))
 }
 
-fn create(path: &Path) -> Result<File> {
-    File::create_new(path).map_err(|e| Failure::new(Exit::Usage, format!("{}: {e}", path.display())))
+/// A file that did not exist. It is removed again unless the arm was led.
+struct NewFile<'a> {
+    file: File,
+    path: &'a Path,
+    keep: bool,
+}
+
+impl<'a> NewFile<'a> {
+    fn create(path: &'a Path) -> Result<Self> {
+        let file = File::create_new(path).map_err(|e| match e.kind() {
+            io::ErrorKind::AlreadyExists => Failure::usage(format!("{} exists already", path.display()))
+                .hint("a recording is never overwritten: choose another name, or remove the file"),
+            _ => Failure::usage(format!("cannot create {}: {e}", path.display())),
+        })?;
+        Ok(Self { file, path, keep: false })
+    }
+}
+
+impl Drop for NewFile<'_> {
+    fn drop(&mut self) {
+        if !self.keep {
+            // A file that stays is in the way of the next attempt only.
+            let _ = std::fs::remove_file(self.path);
+        }
+    }
 }
 
 /// Writes samples until Enter, a signal or the end of the time. Returns their number, and the time [s].

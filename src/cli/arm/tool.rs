@@ -1,6 +1,6 @@
 //! `dimos arm tool ARM`: the tool centre point of an arm.
 
-use super::super::arguments::finite;
+use super::super::arguments::{angle, finite};
 use super::super::exit::{Exit, Result};
 use super::super::output::{self, fixed};
 use super::ArmArgs;
@@ -16,7 +16,7 @@ pub struct Args {
     #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite, allow_negative_numbers = true)]
     xyz: Option<Vec<f64>>,
     /// Roll, pitch, yaw of the tool in that frame, about fixed axes [rad]
-    #[arg(long, value_names = ["R", "P", "Y"], num_args = 3, value_parser = finite, allow_negative_numbers = true, requires = "xyz")]
+    #[arg(long, value_names = ["R", "P", "Y"], num_args = 3, value_parser = angle, allow_negative_numbers = true, requires = "xyz")]
     rpy: Option<Vec<f64>>,
     /// Orientation of the tool in that frame as a quaternion x, y, z, w
     #[arg(long, value_names = ["X", "Y", "Z", "W"], num_args = 4, value_parser = finite, allow_negative_numbers = true, requires = "xyz", conflicts_with = "rpy")]

@@ -267,7 +267,11 @@ impl<'r> Runner<'r, '_> {
         let report = report.map_err(|failure| self.signals.last().map_or_else(|| failure.into(), End::Signal))?;
         let holds = report.outcome == Some(GripOutcome::Holding);
         let wrong = match (report.outcome, object) {
-            (None, _) => report.error.as_deref().unwrap_or("no outcome"),
+            (None, _) => {
+                let why = report.error.as_deref().unwrap_or("no reason is known");
+                let what = format!("the gripper of {arm} did not settle: {why}; {}", report.text());
+                return Err(Failure::new(Exit::Failed, what).into());
+            }
             (Some(GripOutcome::Blocked), _) => "did not get there",
             (Some(_), Some(true)) if !holds => "holds nothing",
             (Some(_), Some(false)) if holds => "holds something",

@@ -7,7 +7,7 @@ use std::time::Duration;
 use super::keys::{self, Group};
 use super::step::{Act, Job, Motion, Step};
 use crate::arm::channel;
-use crate::cli::arguments::{duration, finite, override_of_speed, time};
+use crate::cli::arguments::{duration, finite, is_angle, speed, time};
 use crate::cli::exit::{Failure, Result};
 use crate::cli::grip::opening;
 use crate::cli::output;
@@ -143,7 +143,7 @@ impl Reader {
         self.group(root, &keys::JOB)?;
         let mut job = Job::empty(file);
         job.arm = self.at(root, "arm", word).unwrap_or_default();
-        self.speed = self.at(root, "speed", override_of_speed).unwrap_or(self.speed);
+        self.speed = self.at(root, "speed", speed).unwrap_or(self.speed);
         self.direct = self.at(root, "direct", flag).unwrap_or(false);
         self.replan = self.at(root, "replan", flag).unwrap_or(false);
         if let Some(node) = self.tree.get(root, "repeat") {
@@ -255,7 +255,7 @@ impl Reader {
         }
         self.group(node, &keys::MOTION)?;
         self.arm(node, arm);
-        motion.speed = self.at(node, "speed", override_of_speed).unwrap_or(motion.speed);
+        motion.speed = self.at(node, "speed", speed).unwrap_or(motion.speed);
         motion.direct = self.at(node, "direct", flag).unwrap_or(motion.direct);
         motion.replan = self.at(node, "replan", flag).unwrap_or(motion.replan);
         motion.goal = self.goal(node)?;
@@ -296,7 +296,10 @@ impl Reader {
         if self.tree.get(node, "rpy").is_some() && self.tree.get(node, "quat").is_some() {
             return self.wrong(node, "has both rpy and quat", None);
         }
-        let (rpy, quat) = (self.array(node, "rpy"), self.array(node, "quat"));
+        let (rpy, quat) = (self.array::<3>(node, "rpy"), self.array(node, "quat"));
+        if let Some(Err(wrong)) = rpy.map(|rpy| rpy.into_iter().try_for_each(is_angle)) {
+            return self.wrong(node, wrong, None);
+        }
         Some(PoseSpec { xyz: self.array(node, "xyz")?, rpy, quat })
     }
 
@@ -313,7 +316,7 @@ impl Reader {
         if self.tree.items(node).is_empty() {
             self.group(node, &keys::THROUGH)?;
             self.arm(node, arm);
-            motion.speed = self.at(node, "speed", override_of_speed).unwrap_or(motion.speed);
+            motion.speed = self.at(node, "speed", speed).unwrap_or(motion.speed);
             motion.replan = self.at(node, "replan", flag).unwrap_or(motion.replan);
             motion.blend = self.at(node, "blend", finite).unwrap_or(0.0);
             if !(0.0..=1.0).contains(&motion.blend) {

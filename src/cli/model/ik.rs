@@ -7,7 +7,7 @@ use serde_json::json;
 
 use super::File;
 use super::chain::Chain;
-use crate::cli::arguments::finite;
+use crate::cli::arguments::{angle, finite};
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output::{self, Table};
 use crate::collision::checker::Stop;
@@ -31,7 +31,7 @@ pub struct Args {
     #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite, allow_negative_numbers = true, required = true)]
     pose: Vec<f64>,
     /// Target roll, pitch, yaw about fixed axes [rad]
-    #[arg(long, value_names = ["R", "P", "Y"], num_args = 3, value_parser = finite, allow_negative_numbers = true)]
+    #[arg(long, value_names = ["R", "P", "Y"], num_args = 3, value_parser = angle, allow_negative_numbers = true)]
     rpy: Option<Vec<f64>>,
     /// Target orientation as a quaternion x, y, z, w
     #[arg(long, value_names = ["X", "Y", "Z", "W"], num_args = 4, value_parser = finite, allow_negative_numbers = true, conflicts_with = "rpy")]

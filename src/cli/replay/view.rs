@@ -12,6 +12,8 @@ use crate::clock::Mono;
 use crate::recording::messages::JointState;
 use crate::recording::replay::{Entry, Payload};
 
+/// Requests whose kind is remembered.
+const KEPT_REQUESTS: usize = 64;
 /// Time between two redraws of the table.
 const REDRAW_EVERY: Duration = Duration::from_millis(50);
 /// Log time between two plain lines of joint positions [ns].
@@ -56,13 +58,21 @@ pub struct Plain<W> {
     from: u64,
     next: u64,
     others: BTreeMap<String, u64>,
+    /// Number and kind of the latest requests, for the lines that answer them.
+    asked: VecDeque<(String, String)>,
 }
 
 impl<W: Write> Plain<W> {
     /// Creates a view that writes to `out`, with times relative to a Unix time [ns].
     pub fn new(out: W, from: u64) -> Self {
-        Self { out, from, next: 0, others: BTreeMap::new() }
+        Self { out, from, next: 0, others: BTreeMap::new(), asked: VecDeque::new() }
     }
+}
+
+/// Returns number and kind of a logged request: `{"id":3,"request":{"execute":{…}}}` is `3`, `execute`.
+fn request(json: &str) -> Option<(String, String)> {
+    let (id, request) = json.strip_prefix("{\"id\":")?.split_once(",\"request\":{\"")?;
+    Some((id.to_owned(), request.split('"').next()?.to_owned()))
 }
 
 impl<W: Write> View for Plain<W> {
@@ -79,7 +89,19 @@ impl<W: Write> View for Plain<W> {
                     writeln!(self.out, "{line}")?;
                 }
             }
-            Payload::Log(log) => writeln!(self.out, "{at:10.3} s  {}: {}", level(log.level), log.msg)?,
+            Payload::Log(log) => {
+                let answer = log.msg.strip_prefix("request ").and_then(|answer| answer.split_once(':'));
+                let asked = answer.and_then(|(id, text)| Some((self.asked.iter().find(|asked| asked.0 == id)?, text)));
+                let text = asked.map(|((id, kind), text)| format!("request {id} ({kind}):{text}"));
+                writeln!(self.out, "{at:10.3} s  {}: {}", level(log.level), text.as_ref().unwrap_or(&log.msg))?;
+            }
+            Payload::Text(text) if entry.topic == "/dimos/requests" => {
+                self.asked.extend(request(&text.data));
+                if self.asked.len() > KEPT_REQUESTS {
+                    self.asked.pop_front();
+                }
+                *self.others.entry(entry.topic.clone()).or_default() += 1;
+            }
             // Already shown as a line of the text log.
             Payload::Event(_) => {}
             _ => *self.others.entry(entry.topic.clone()).or_default() += 1,
@@ -266,6 +288,21 @@ mod tests {
         view.end().unwrap();
         let expected = "     0.000 s  joint1 0.0000 rad  joint2 - rad\n     1.000 s  joint1 10.0000 rad  joint2 - rad\n     1.600 s  warn: arm is held\n";
         assert_eq!(String::from_utf8(out).unwrap(), expected);
+    }
+
+    #[test]
+    fn plain_lines_name_the_request_that_is_answered() {
+        use crate::recording::messages::Text;
+        let (mut out, mut answer) = (Vec::new(), text(0));
+        let data = Text { data: "{\"id\":6,\"request\":{\"execute\":{\"task\":0}}}".into() };
+        let request = Entry { topic: "/dimos/requests".into(), log_time: 0, data: Payload::Text(data) };
+        if let Payload::Log(log) = &mut answer.data {
+            log.msg = "request 6: accepted".into();
+        }
+        let mut view = Plain::new(&mut out, 0);
+        view.show(&request, Mono::ZERO).unwrap();
+        view.show(&answer, Mono::ZERO).unwrap();
+        assert_eq!(String::from_utf8(out).unwrap(), "     0.000 s  warn: request 6 (execute): accepted\n");
     }
 
     #[test]

@@ -168,7 +168,7 @@ fn f24_what_was_logged_before_kill_9_can_be_read() {
         run.signal(Signal::KILL);
         assert_eq!(run.wait().signal, Some(9));
         let (log, replayed) = played(&home, "log.mcap", "/dimos/tick");
-        assert_eq!(replayed.code, Some(3), "kill {kill}: a truncated file is reported\n{}", replayed.err);
+        assert_eq!(replayed.code, Some(5), "kill {kill}: a truncated file is reported\n{}", replayed.err);
         let last = Mono(log.last().unwrap_or(&Value::Null)["data"]["deadline_ns"].as_u64().unwrap_or_default());
         // The emulator recorded the last setpoint, which the log should contain.
         losses.push(ms(last, setpoints(&arm.trace()).last().unwrap().0));
