@@ -114,7 +114,8 @@ fn rows(path: &Path, joints: usize, from: u64, to: u64) -> Result<Vec<Row>, Reco
     let mut log = LogReader::open(path)?;
     log.select(Selection { topics, from, to })?;
     let nothing = || vec![f64::NAN; joints];
-    let positions = |m: &JointState| if m.position.len() == joints { m.position.clone() } else { nothing() };
+    // Grippers follow the joints.
+    let positions = |m: &JointState| m.position.get(..joints).map_or_else(nothing, <[f64]>::to_vec);
     let (mut measured, mut commanded) = (nothing(), nothing());
     let mut rows: Vec<Row> = Vec::new();
     loop {
