@@ -19,11 +19,12 @@ pub enum Exit {
     Failed = 1,
     /// The command line, the blueprint or a file is wrong.
     Usage = 2,
-    /// Hardware unreachable; for log readers: the log is cut or has lost data.
+    /// Hardware unreachable; for `replay`: the log is cut or has lost data.
     Hardware = 3,
     /// A run ended by a fault.
     Fault = 4,
-    /// A run ended because its log could not be written: the disk is full, or the log was removed.
+    /// A run ended because its log could not be written: the disk is full, or the log was removed. For `log`: the log
+    /// is cut, damaged, or has lost data.
     Log = 5,
     /// Ended by SIGINT, after the controlled stop.
     Interrupted = 130,
@@ -32,7 +33,7 @@ pub enum Exit {
 }
 
 impl Exit {
-    /// Exit code of log readers when a log is cut or data is missing.
+    /// Exit code of `replay` when a log is cut or data is missing.
     pub const DATA_LOST: Self = Self::Hardware;
 
     /// All exit codes with their meaning.
@@ -42,7 +43,7 @@ impl Exit {
         (Self::Usage, "the command line, a blueprint, a model or a file is wrong"),
         (Self::Hardware, "hardware unreachable; replay: the log is cut or has lost data"),
         (Self::Fault, "a run ended by a fault"),
-        (Self::Log, "a run ended because its log could not be written"),
+        (Self::Log, "a run ended because its log could not be written; log: the log is cut, damaged or has lost data"),
         (Self::Interrupted, "ended by SIGINT, after the controlled stop"),
         (Self::Terminated, "ended by SIGTERM, after the controlled stop"),
     ];

@@ -17,6 +17,7 @@ use thiserror::Error;
 use super::arguments::{Changes, duration, time};
 use super::exit::{Exit, Failure, Result};
 use crate::blueprint::Catalog;
+use crate::control::task_spec::TaskTable;
 use crate::recording::files;
 use crate::recording::replay::{LogInfo, LogReader, ReplayError};
 use crate::replay::recorded::RecordedError;
@@ -126,6 +127,11 @@ pub fn run(args: &ReplayArgs, catalog: Catalog<'_>) -> Result {
         }
         other => Ok(other?),
     }
+}
+
+/// Verifies a log.
+pub fn verify_log(path: &Path, tasks: &TaskTable, json: bool) -> Result {
+    verify::run(path, tasks, json).map_err(|e| Failure::of(Exit::Usage, e))
 }
 
 fn try_run(args: &ReplayArgs, catalog: Catalog<'_>) -> anyhow::Result<Exit> {

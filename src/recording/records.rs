@@ -93,6 +93,11 @@ impl RecordReader {
         self.live
     }
 
+    /// Returns the position of the next record, and the length of the file [bytes].
+    pub fn position(&self) -> (u64, u64) {
+        (self.at, self.length)
+    }
+
     /// Also reads attachments, up to [`LIMIT`]; by default they are skipped.
     pub fn with_attachments(mut self) -> Self {
         self.attachments = true;
