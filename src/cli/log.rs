@@ -1,4 +1,4 @@
-//! `dimos log`: list, check, print, cut, repair and export logs.
+//! `dimos log`: list, check, print, cut, repair, export and plot logs.
 
 mod cat;
 mod copy;
@@ -6,6 +6,7 @@ mod doctor;
 mod export;
 mod info;
 mod list;
+mod plot;
 
 use std::io::{self, IsTerminal, Write};
 use std::path::{Path, PathBuf};
@@ -91,6 +92,19 @@ are empty. With --topic a row is a message, with the columns of the first one.")
         #[arg(short, long, value_name = "FILE")]
         output: Option<PathBuf>,
     },
+    /// Draw measured and commanded positions of joints, with their limits, as SVG
+    Plot {
+        #[command(flatten)]
+        log: Log,
+        #[command(flatten)]
+        part: Part,
+        /// Draw only these joints, separated by commas
+        #[arg(long, value_name = "NAME", value_delimiter = ',')]
+        joint: Vec<String>,
+        /// The new file (.svg); a file of that name is replaced
+        #[arg(short, long, value_name = "FILE")]
+        output: PathBuf,
+    },
 }
 
 /// Which log.
@@ -134,6 +148,7 @@ pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
         Command::Export { log, part, topic, output } => {
             export::run(&log.path()?, part, topic.as_deref(), output.as_deref(), log.json)
         }
+        Command::Plot { log, part, joint, output } => plot::run(&log.path()?, part, joint, output, log.json),
     }
 }
 

@@ -127,7 +127,7 @@ enum Command {
     Down(down::Args),
     /// Show the text log of a run that was started with --daemon, live or dead
     Logs(logs::Args),
-    /// List, check, print, cut, repair and export logs
+    /// List, check, print, cut, repair, export and plot logs
     Log(log::Args),
     /// Add an arm: generate its adapter, test it, run its emulator
     Adapter(adapter::Args),

@@ -83,7 +83,26 @@ fn a_log_is_listed_checked_printed_cut_and_exported() {
     assert!(moved, "joint 1 went to 0.3 rad");
     let ticks = home.dimos("log export --last --topic /dimos/tick").with(0);
     assert!(ticks.out.lines().next().unwrap().contains("late_ns"));
+    home.dimos("log plot --last --joint arm_joint1 -o plot.svg").with(0);
+    let plot = std::fs::read_to_string(home.path().join("plot.svg")).unwrap();
+    assert!(plot.contains("arm_joint1") && plot.contains("limits -") && !plot.contains("arm_joint2"), "{plot}");
+    home.dimos("log plot --last --joint elbow -o plot.svg").with(2).says(&["joints: arm_joint1"]);
+    home.dimos("log cat --last --topics /nothing").with(2).says(&["topics: "]);
     home.dimos("log export --last --topic /nothing").with(2).says(&["topics: "]);
+}
+
+/// Start and length of the contents of each chunk of an MCAP file.
+fn chunks(file: &[u8]) -> Vec<(usize, usize)> {
+    const CHUNK: u8 = 0x06;
+    let (mut at, mut found) = (8, Vec::new());
+    while let Some(length) = file.get(at + 1..at + 9) {
+        let length = u64::from_le_bytes(length.try_into().unwrap()) as usize;
+        if file[at] == CHUNK {
+            found.push((at + 9, length));
+        }
+        at += 9 + length;
+    }
+    found
 }
 
 #[test]
@@ -111,10 +130,10 @@ fn the_log_of_a_killed_run_is_recovered() {
     home.dimos(&format!("log doctor {file}")).with(0);
     home.dimos(&format!("log verify {file}")).with(0).shows(&["reproducible"]);
     // A chunk in the middle is damaged: the rest is still read.
-    let whole = std::fs::read(file).unwrap();
-    let mut damaged = whole.clone();
-    damaged[whole.len() / 2] ^= 0x55;
-    home.write("damaged.mcap", "");
+    let mut damaged = std::fs::read(file).unwrap();
+    let chunks = chunks(&damaged);
+    let (start, length) = chunks[chunks.len() / 2];
+    damaged[start + length / 2] ^= 0x55;
     std::fs::write(home.path().join("damaged.mcap"), damaged).unwrap();
     home.dimos("log doctor damaged.mcap").with(5).shows(&["damaged at byte"]);
     home.dimos("log recover damaged.mcap").with(5);

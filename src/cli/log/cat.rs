@@ -5,12 +5,18 @@ use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
 use super::{Part, ended, unreadable, written};
-use crate::cli::exit::{Exit, Result};
+use crate::cli::exit::{Exit, Failure, Result};
+use crate::recording::replay::LogReader;
 use crate::recording::scan::{Item, Scan};
 
 /// Prints messages, one a line.
 pub fn run(path: &Path, part: &Part, topics: &[String], json: bool) -> Result {
     let (from, to) = part.of(path)?;
+    let known = LogReader::open(path).map_err(unreadable)?.info().topics.clone();
+    if let Some(unknown) = topics.iter().find(|topic| !known.contains_key(*topic)) {
+        let all = known.into_keys().collect::<Vec<_>>().join(", ");
+        return Err(Failure::usage(format!("the log has no topic {unknown}")).hint(format!("topics: {all}")));
+    }
     let began = from.saturating_sub(part.from.as_nanos() as u64);
     let mut scan = Scan::open_part(path, topics, (from, to)).map_err(unreadable)?;
     let mut out = BufWriter::with_capacity(256 * 1024, io::stdout().lock());

@@ -50,6 +50,6 @@ fn print(done: &str, scan: &Scan, written: &Written, to: &Path, as_json: bool) {
     }
     output::line(format_args!("{done}: {messages} messages, {length:.3} s: {}", to.display()));
     if let Some(loss) = loss {
-        output::note(format_args!("warning: the log {loss}"));
+        output::note(format_args!("warning: the log was not whole: {loss}"));
     }
 }

@@ -152,7 +152,7 @@ impl Rows<'_> {
 }
 
 /// Reads the selected messages of a log until `take` returns `false`; returns the cut.
-fn each(
+pub fn each(
     log: &mut LogReader,
     selection: Selection,
     mut take: impl FnMut(Entry) -> Result<bool>,
