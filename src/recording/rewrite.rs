@@ -1,4 +1,4 @@
-//! Writes logs anew from what can be read of others: a part of a log, or what a crash left.
+//! Copies what can be read of a log to a new one: a part of a log, or what a crash left.
 
 use std::collections::BTreeMap;
 use std::fs::File;

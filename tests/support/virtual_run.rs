@@ -3,6 +3,7 @@
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
+use std::sync::Arc;
 use std::time::Duration;
 
 use dimos::arm::{ArmState, GripperInfo, Link, Supervision, VelocitySource};
@@ -20,7 +21,6 @@ use dimos::runtime::log_of;
 use dimos::telemetry::describe::{ArmNames, Names};
 use dimos::telemetry::{Sample, TaskView, TickSample};
 use dimos::trajectory::{JointTrajectory, Spline};
-use serde_json::json;
 
 /// Ticks are this long.
 pub const PERIOD: Duration = Duration::from_millis(10);
@@ -66,7 +66,8 @@ pub struct VirtualRun {
     names: Names,
     now: Mono,
     ring: rtrb::Producer<Sample>,
-    notes: Notes,
+    /// The way to the recorder besides the ticks.
+    pub notes: Notes,
     inbox: VecDeque<Envelope>,
     next_id: u64,
     recorder: Recorder,
@@ -144,9 +145,12 @@ impl VirtualRun {
         let all: Vec<&String> = self.names.arms.iter().flat_map(|a| &a.joints).collect();
         let index = |name| all.iter().position(|j| *j == name).unwrap() as u16;
         let joints = trajectory.joint_names.iter().map(index).collect();
-        let motion = Motion { id: self.next_id, joints, spline: Spline::new(trajectory).unwrap() };
-        let logged = json!({"execute": {"task": task, "motion": motion.id, "trajectory": trajectory}});
-        self.send_logged(Request::Execute { task, motion: Box::new(motion) }, logged);
+        let (id, stamp) = (self.next_id, self.now);
+        let motion = Motion { id, joints, spline: Spline::new(trajectory).unwrap() };
+        self.next_id += 1;
+        let trajectory = Arc::new(trajectory.clone());
+        self.notes.send(Note::Execute { id, stamp, task, motion: id, trajectory }).unwrap();
+        self.inbox.push_back(Envelope { id, request: Request::Execute { task, motion: Box::new(motion) } });
     }
 
     fn send_logged(&mut self, request: Request, logged: serde_json::Value) {

@@ -51,7 +51,7 @@ struct Rows<'a> {
 }
 
 impl Rows<'_> {
-    /// Writes a row; `false` if nobody reads it.
+    /// Writes a row; `false` if the reader has closed the pipe.
     fn row(&mut self, time: u64, cells: impl Iterator<Item = String>) -> Result<bool> {
         self.count += 1;
         let mut line = format!("{:.9}", time.saturating_sub(self.began) as f64 * 1e-9);
