@@ -202,3 +202,76 @@ fn stamped(stamp: &Header, parent: &str, child: String, at: Isometry3<f64>) -> T
         transform,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::robot::model::Mimic;
+
+    fn joint(name: &str, kind: JointKind, parent: usize, child: usize, mimic: Option<Mimic>) -> Joint {
+        let axis = if kind == JointKind::Prismatic { Vector3::y_axis() } else { Vector3::z_axis() };
+        Joint { name: name.into(), kind, parent, child, origin: Isometry3::identity(), axis, limits: UNLIMITED, mimic }
+    }
+
+    /// A beam that turns, and two fingers at its end, of which the right one follows the left one.
+    fn tongs(name: &str, arm: usize) -> LoggedRobot {
+        let link = |name: &str| Link { name: name.into(), ..Link::default() };
+        let follows = Mimic { leader: 1, multiplier: -1.0, offset: 0.0 };
+        let joints = vec![
+            joint("turn", JointKind::Revolute, 0, 1, None),
+            joint("finger", JointKind::Prismatic, 1, 2, None),
+            joint("other", JointKind::Prismatic, 1, 3, Some(follows)),
+        ];
+        let links = ["base", "beam", "left", "right"].map(link).into();
+        LoggedRobot {
+            name: name.into(),
+            model: RobotModel { name: "tongs".into(), links, joints },
+            root: Isometry3::translation(0.0, arm as f64, 0.0),
+            joints: vec![(0, arm, format!("{name}_joint1"))],
+            rest: vec![0.0, 0.04, -0.04],
+            gripper: Some(LoggedGripper { arm, joint: 1, range: [(0.0, 0.08), (0.0, 0.04)] }),
+            end_effector: 1,
+        }
+    }
+
+    /// The frames of a message: parent, child, and position.
+    fn frames(message: &TFMessage) -> Vec<(&str, &str, [f64; 3])> {
+        let transforms = message.transforms.iter();
+        let at = |t: &Transform| [t.translation.x, t.translation.y, t.translation.z];
+        transforms.map(|t| (&*t.header.frame_id, &*t.child_frame_id, at(&t.transform))).collect()
+    }
+
+    #[test]
+    fn fingers_are_where_the_gripper_is_measured() {
+        let robots = LoggedRobots::new(vec![tongs("arm", 0)]);
+        let state = ArmState { gripper: Some(0.02), ..ArmState::default() };
+        let message = robots.moved(&Header::default(), &[0.5], |_| Some(&state), |_| Isometry3::identity());
+        let expected = [
+            ("base", "beam", [0.0; 3]),
+            ("beam", "left", [0.0, 0.01, 0.0]),
+            ("beam", "right", [0.0, -0.01, 0.0]),
+            ("beam", "arm_tcp", [0.0; 3]),
+        ];
+        assert_eq!(frames(&message), expected);
+        assert_eq!(robots.driven(0, 0.08), Some(("finger", 0.04)));
+        let unknown = robots.moved(&Header::default(), &[f64::NAN], |_| None, |_| Isometry3::identity());
+        assert!(unknown.transforms.is_empty(), "its joint is not measured yet");
+    }
+
+    #[test]
+    fn several_robots_have_frames_and_joints_of_their_own_in_one_description() {
+        let shared = LoggedRobot { name: "same_joint".into(), ..tongs("left", 0) };
+        let robots = LoggedRobots::new(vec![tongs("left", 0), tongs("right", 1), shared]);
+        let all = robots.combined();
+        let links: Vec<&str> = all.links.iter().map(|link| link.name.as_str()).collect();
+        assert_eq!(links[..3], ["map", "left_base", "left_beam"]);
+        assert_eq!((links.len(), links[5]), (9, "right_base"));
+        let joints: Vec<&str> = all.joints.iter().map(|joint| joint.name.as_str()).collect();
+        assert_eq!(joints[..4], ["map_to_left", "left_joint1", "left_finger", "left_other"]);
+        assert_eq!(all.joints[7].mimic.map(|mimic| mimic.leader), Some(6), "right_other follows right_finger");
+        assert!(all.joints.iter().enumerate().all(|(index, joint)| joint.child == index + 1));
+        let fixed = robots.fixed(&Header::default());
+        assert_eq!(frames(&fixed), [("map", "left_base", [0.0; 3]), ("map", "right_base", [0.0, 1.0, 0.0])]);
+        assert_eq!(robots.frame("right", "beam").as_deref(), Some("right_beam"));
+    }
+}

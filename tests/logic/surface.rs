@@ -164,6 +164,9 @@ fn log_topics() {
     let (stamp, robots) = (Mono(0), Arc::new(LoggedRobots::new(vec![robot])));
     run.notes.send(Note::Robots { stamp, robots, description: "<robot/>".into() }).unwrap();
     (0..20).for_each(|_| run.step());
+    // What a run notes of its first request, if that is a trajectory.
+    let trajectory = Arc::new(motion.clone());
+    run.notes.send(Note::Execute { id: 1, stamp, task: 0, motion: 1, trajectory }).unwrap();
     run.execute(0, &motion);
     (0..20).for_each(|_| run.step());
     run.finish();

@@ -3,7 +3,6 @@
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
-use std::sync::Arc;
 use std::time::Duration;
 
 use dimos::arm::{ArmState, GripperInfo, Link, Supervision, VelocitySource};
@@ -21,6 +20,7 @@ use dimos::runtime::log_of;
 use dimos::telemetry::describe::{ArmNames, Names};
 use dimos::telemetry::{Sample, TaskView, TickSample};
 use dimos::trajectory::{JointTrajectory, Spline};
+use serde_json::json;
 
 /// Ticks are this long.
 pub const PERIOD: Duration = Duration::from_millis(10);
@@ -145,12 +145,9 @@ impl VirtualRun {
         let all: Vec<&String> = self.names.arms.iter().flat_map(|a| &a.joints).collect();
         let index = |name| all.iter().position(|j| *j == name).unwrap() as u16;
         let joints = trajectory.joint_names.iter().map(index).collect();
-        let (id, stamp) = (self.next_id, self.now);
-        let motion = Motion { id, joints, spline: Spline::new(trajectory).unwrap() };
-        self.next_id += 1;
-        let trajectory = Arc::new(trajectory.clone());
-        self.notes.send(Note::Execute { id, stamp, task, motion: id, trajectory }).unwrap();
-        self.inbox.push_back(Envelope { id, request: Request::Execute { task, motion: Box::new(motion) } });
+        let motion = Motion { id: self.next_id, joints, spline: Spline::new(trajectory).unwrap() };
+        let logged = json!({"execute": {"task": task, "motion": motion.id, "trajectory": trajectory}});
+        self.send_logged(Request::Execute { task, motion: Box::new(motion) }, logged);
     }
 
     fn send_logged(&mut self, request: Request, logged: serde_json::Value) {

@@ -49,7 +49,7 @@ pub fn run(path: &Path, part: &Part, topics: &[String], json: bool) -> Result {
         return Ok(Exit::Ok);
     }
     if unknown > 0 {
-        crate::cli::output::note(format_args!("warning: {unknown} messages do not match their schema"));
+        crate::cli::output::note(format_args!("warning: {unknown} messages cannot be decoded by their schema"));
         return Ok(Exit::Log);
     }
     Ok(ended(&scan))

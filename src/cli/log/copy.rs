@@ -16,7 +16,7 @@ pub fn cut(path: &Path, part: &Part, to: &Path, json: bool) -> Result {
     let mut scan = Scan::open(path).map_err(unreadable)?;
     scan.part = part;
     let name = path.file_name().unwrap_or_default().to_string_lossy();
-    let written = copy(&mut scan, to, Some(&name), progress()).map_err(failure)?;
+    let written = copy(&mut scan, to, Some(&name), progress()).map_err(|e| failure(e, to))?;
     print("cut", &scan, &written, to, json);
     // Only damage inside the part matters; a cut after it does not.
     Ok(if scan.damage.is_empty() { Exit::Ok } else { Exit::Log })
@@ -31,12 +31,16 @@ pub fn recover(path: &Path, to: Option<&Path>, json: bool) -> Result {
     }
     let beside = path.with_file_name(format!("{}-recovered.mcap", path.file_stem().unwrap_or_default().display()));
     let to = to.unwrap_or(&beside);
-    let written = copy(&mut scan, to, None, progress()).map_err(failure)?;
+    let written = copy(&mut scan, to, None, progress()).map_err(|e| failure(e, to))?;
     print("recovered", &scan, &written, to, json);
     Ok(if loss(&scan).is_some() { Exit::Log } else { Exit::Ok })
 }
 
-fn failure(error: RewriteError) -> Failure {
+fn failure(error: RewriteError, to: &Path) -> Failure {
+    // A part of a file is of no use.
+    if matches!(error, RewriteError::Write { exists: false, .. }) {
+        let _ = std::fs::remove_file(to);
+    }
     let exit = if matches!(error, RewriteError::Read(_)) { Exit::Usage } else { Exit::Failed };
     Failure::of(exit, error)
 }

@@ -20,7 +20,7 @@ const PANEL: f64 = 260.0;
 const HEIGHT: f64 = 190.0;
 /// Where the plot begins in its panel [px].
 const LEFT: f64 = 80.0;
-const TOP: f64 = 30.0;
+const TOP: f64 = 50.0;
 /// Colours of the measured and the commanded positions, and of limits.
 const COLOURS: [&str; 3] = ["#1f77b4", "#ff7f0e", "#d62728"];
 
@@ -58,7 +58,7 @@ pub fn run(path: &Path, part: &Part, joints: &[String], to: &Path, json: bool) -
     let span = (part.from.as_secs_f64(), until.saturating_sub(began) as f64 * 1e-9);
     let drawn: Vec<_> = names.iter().zip(&curves).filter(|(n, _)| joints.is_empty() || joints.contains(n)).collect();
     let mut svg = String::new();
-    let (height, name) = (PANEL * drawn.len() as f64 + 20.0, path.file_name().unwrap_or_default().display());
+    let (height, name) = (TOP - 10.0 + PANEL * drawn.len() as f64, path.file_name().unwrap_or_default().display());
     let _ = writeln!(
         svg,
         "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{WIDTH}\" height=\"{height}\" font-family=\"sans-serif\" \
@@ -130,12 +130,14 @@ fn panel(svg: &mut String, y: f64, name: &str, curves: &[Curve; 2], limits: Opti
         let (at, colour) = (at_y(limit), COLOURS[2]);
         let _ = writeln!(svg, "<path d=\"M{LEFT} {at:.1}H{right}\" stroke=\"{colour}\" stroke-dasharray=\"6 3\"/>");
     }
-    for (curve, colour) in curves.iter().zip(COLOURS) {
+    // The command is wider, and below: where both are the same it is still seen.
+    for ((curve, colour), width) in curves.iter().zip(COLOURS).zip([1.2, 3.0]).rev() {
         let mut points = String::new();
         for (time, value) in thinned(curve, span) {
             let _ = write!(points, "{:.1},{:.1} ", at_x(time), at_y(value));
         }
-        let _ = writeln!(svg, "<polyline points=\"{points}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"1.3\"/>");
+        let _ =
+            writeln!(svg, "<polyline points=\"{points}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"{width}\"/>");
     }
     let (name, unit) = (escaped(name), if limits.is_some() { "rad" } else { "m or rad" });
     let range = limits.map_or_else(String::new, |[lower, upper]| format!("limits {lower:.3} to {upper:.3} rad"));
