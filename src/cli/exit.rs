@@ -43,7 +43,7 @@ impl Exit {
         (Self::Usage, "the command line, a blueprint, a model or a file is wrong"),
         (Self::Hardware, "hardware unreachable"),
         (Self::Fault, "a run ended by a fault"),
-        (Self::Log, "a log is cut, has lost data, or could not be written"),
+        (Self::Log, "a log is cut, damaged, has lost data, or could not be written"),
         (Self::Interrupted, "ended by SIGINT, after the controlled stop"),
         (Self::Terminated, "ended by SIGTERM, after the controlled stop"),
     ];

@@ -24,6 +24,7 @@ pub mod job;
 pub mod jog;
 pub mod list_adapters;
 pub mod list_blueprints;
+pub mod log;
 pub mod logs;
 pub mod man;
 pub mod model;
@@ -129,6 +130,8 @@ enum Command {
     Down(down::Args),
     /// Show the text log of a run that was started with --daemon, live or dead
     Logs(logs::Args),
+    /// List, check, print, cut, repair, export and plot logs
+    Log(log::Args),
     /// Add an arm: generate its adapter, test it, run its emulator
     Adapter(adapter::Args),
     /// List the supported arms
@@ -336,6 +339,7 @@ fn built_in(cli: &Cli, catalog: Catalog<'_>) -> exit::Result {
         Command::Proxy(args) => proxy::run(args),
         Command::View(args) => view::run(args),
         Command::Down(args) => down::run(args),
+        Command::Log(args) => log::run(args, catalog),
         Command::Logs(args) => logs::run(args),
         Command::Adapter(args) => adapter::run(args, registry),
         Command::ListAdapters(args) => list_adapters::run(args, registry),

@@ -6,6 +6,7 @@ mod player;
 mod verify;
 mod view;
 
+use std::collections::BTreeMap;
 use std::io::{self, IsTerminal};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -16,6 +17,7 @@ use thiserror::Error;
 use super::arguments::{Changes, duration, time};
 use super::exit::{Exit, Failure, Result};
 use crate::blueprint::Catalog;
+use crate::control::task_spec::TaskTable;
 use crate::recording::files;
 use crate::recording::replay::{LogInfo, LogReader, ReplayError};
 use crate::replay::recorded::RecordedError;
@@ -132,6 +134,11 @@ pub fn run(args: &ReplayArgs, catalog: Catalog<'_>) -> Result {
     }
 }
 
+/// Verifies a log.
+pub fn verify_log(path: &Path, tasks: &TaskTable, json: bool) -> Result {
+    verify::run(path, tasks, json).map_err(|e| Failure::of(Exit::Usage, e))
+}
+
 fn try_run(args: &ReplayArgs, catalog: Catalog<'_>) -> anyhow::Result<Exit> {
     let path = log_path(args)?;
     if args.verify {
@@ -153,7 +160,12 @@ fn try_run(args: &ReplayArgs, catalog: Catalog<'_>) -> anyhow::Result<Exit> {
         Box::new(JsonLines::new(out.lock()))
     } else {
         eprintln!("{}", headline(&path, log.info()));
-        if tty { Box::new(Live::new(out.lock(), &part)) } else { Box::new(Plain::new(out.lock(), began)) }
+        let joints = joints(log.info());
+        if tty {
+            Box::new(Live::new(out.lock(), &part, joints))
+        } else {
+            Box::new(Plain::new(out.lock(), began, joints))
+        }
     };
     let end = play(&mut log, &part, view.as_mut(), &mut RealTime)?;
     drop(view);
@@ -192,6 +204,13 @@ fn choose(args: &ReplayArgs, info: &LogInfo, path: &Path) -> std::result::Result
     }
     let to = args.duration.map_or(end, |d| from.saturating_add(nanoseconds(d)).min(end));
     Ok(Part { topics: args.topics.clone(), from, to, rate: args.rate, looping: args.looping })
+}
+
+/// Returns the number of joints of all arms: grippers follow them in `/joint_states`.
+fn joints(info: &LogInfo) -> usize {
+    let arms =
+        info.metadata.get("arms").and_then(|text| serde_json::from_str::<BTreeMap<String, Vec<String>>>(text).ok());
+    arms.map_or(usize::MAX, |arms| arms.values().map(Vec::len).sum())
 }
 
 /// Returns a line about the log, before it plays.

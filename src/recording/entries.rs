@@ -6,11 +6,13 @@ use mcap::parse_record;
 use mcap::records::{Channel, MessageHeader, Record, op};
 use serde::Serialize;
 
+use super::cdr::CdrError;
 use super::messages::{
     ArmInput, ArmIo, ArmOutput, ArmStatus, Event, InertiaStamped, JointState, JointStatus, Log, PoseStamped, Text,
     Tick, WrenchStamped,
 };
 use super::replay::Selection;
+use super::ros2msg::Schema;
 use super::wire::Message;
 
 /// Maximum length of a topic or schema name [bytes].
@@ -37,7 +39,9 @@ macro_rules! payloads {
                 #[doc = concat!("A [`", stringify!($name), "`](super::messages::", stringify!($name), ").")]
                 $name($name),
             )*
-            /// A type unknown here.
+            /// Another type, decoded by the schema in the log.
+            Other(serde_json::Value),
+            /// A type whose schema is not understood.
             Unknown {
                 /// Name of its schema.
                 schema: String,
@@ -61,10 +65,14 @@ macro_rules! payloads {
             }
         }
 
-        fn decode(schema: &str, fields: Option<usize>, bytes: &[u8]) -> Payload {
-            let decoded = match (schema, fields) {
+        fn decode(channel: &KnownChannel, bytes: &[u8]) -> Payload {
+            let schema = channel.schema.as_str();
+            let decoded = match (schema, channel.fields) {
                 $(($name::SCHEMA, Some(fields)) => $name::decode_first(bytes, fields).map(Payload::$name),)*
-                _ => return Payload::Unknown { schema: schema.into(), bytes: bytes.len() },
+                _ => match &channel.other {
+                    Some(other) => by_schema(other, bytes),
+                    None => return Payload::Unknown { schema: schema.into(), bytes: bytes.len() },
+                },
             };
             decoded.unwrap_or_else(|e| Payload::Damaged { schema: schema.into(), error: e.to_string() })
         }
@@ -72,6 +80,13 @@ macro_rules! payloads {
 }
 payloads! {
     JointState Text WrenchStamped Log Tick Event ArmStatus ArmInput ArmOutput ArmIo InertiaStamped JointStatus PoseStamped
+}
+
+/// Decodes a message by the schema in the log.
+fn by_schema(schema: &Schema, bytes: &[u8]) -> Result<Payload, CdrError> {
+    let mut text = String::new();
+    schema.json(bytes, &mut text)?;
+    serde_json::from_str(&text).map(Payload::Other).map_err(|_| CdrError::Header)
 }
 
 /// Returns the header and bytes of a message record; `None` for other records.
@@ -86,8 +101,8 @@ pub(super) fn message(opcode: u8, body: &[u8]) -> Option<(MessageHeader, &[u8])>
 /// The channels of a log read so far.
 #[derive(Default)]
 pub(super) struct Channels {
-    /// Name of each schema, and the number of its fields that are known here.
-    schemas: HashMap<u16, (String, Option<usize>)>,
+    /// Name of each schema, the number of its fields that are known here, and otherwise the schema.
+    schemas: HashMap<u16, (String, Option<usize>, Option<Schema>)>,
     channels: HashMap<u16, KnownChannel>,
 }
 
@@ -96,6 +111,8 @@ struct KnownChannel {
     schema: String,
     /// Number of known fields of its messages; `None`: they are not CDR with a ROS 2 schema known here.
     fields: Option<usize>,
+    /// The schema of messages that are CDR with another one.
+    other: Option<Schema>,
 }
 
 impl Channels {
@@ -108,7 +125,9 @@ impl Channels {
                 {
                     let text = std::str::from_utf8(&data).ok().filter(|_| header.encoding == "ros2msg");
                     let fields = text.and_then(|text| known_fields(&header.name, text));
-                    self.schemas.insert(header.id, (header.name, fields));
+                    let other =
+                        text.filter(|_| fields.is_none()).and_then(|text| Schema::parse(&header.name, text).ok());
+                    self.schemas.insert(header.id, (header.name, fields, other));
                 }
             }
             op::CHANNEL => {
@@ -123,9 +142,10 @@ impl Channels {
     }
 
     fn add(&mut self, channel: Channel) {
-        let (schema, fields) = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
-        let fields = fields.filter(|_| channel.message_encoding == "cdr");
-        self.channels.insert(channel.id, KnownChannel { topic: channel.topic, schema, fields });
+        let (schema, fields, other) = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
+        let is_cdr = channel.message_encoding == "cdr";
+        let (fields, other) = (fields.filter(|_| is_cdr), other.filter(|_| is_cdr));
+        self.channels.insert(channel.id, KnownChannel { topic: channel.topic, schema, fields, other });
     }
 
     /// Takes a record; queues its message if it is selected.
@@ -147,7 +167,7 @@ impl Channels {
         if !chosen && channel.schema != Tick::SCHEMA {
             return;
         }
-        let data = decode(&channel.schema, channel.fields, bytes);
+        let data = decode(channel, bytes);
         if let Payload::Tick(tick) = &data {
             *lost += u64::from(tick.dropped);
         }

@@ -56,6 +56,11 @@ pub fn newest(folder: &Path) -> io::Result<Option<PathBuf>> {
     Ok(logs(folder, LOG)?.pop())
 }
 
+/// Returns all logs in `folder`, the oldest first.
+pub fn all(folder: &Path) -> io::Result<Vec<PathBuf>> {
+    logs(folder, LOG)
+}
+
 /// Removes all but the newest `keep` logs from `folder`, and no other files. Keeps logs that a live run writes, and
 /// those that cannot be removed. Returns the removed paths.
 pub fn retain(folder: &Path, keep: usize) -> io::Result<Vec<PathBuf>> {

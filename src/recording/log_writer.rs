@@ -36,6 +36,9 @@ const QOS: &str = "- history: 1
   avoid_ros_namespace_conventions: false
 ";
 
+/// Topics whose last message every late reader gets: `ros2 bag play` offers them as transient local.
+const LATCHED: [&str; 2] = ["/robot_description", "/tf_static"];
+
 /// A file attached to a log, such as the blueprint.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LogAttachment {
@@ -104,7 +107,9 @@ impl<W: Write + Seek> LogWriter<W> {
     pub fn announce<M: Message>(&mut self, topic: &str) -> McapResult<()> {
         if !self.channels.contains_key(topic) {
             let schema = self.mcap.add_schema(M::SCHEMA, "ros2msg", M::schema_text().as_bytes())?;
-            let metadata = BTreeMap::from([("offered_qos_profiles".to_owned(), QOS.to_owned())]);
+            let durability = if LATCHED.contains(&topic) { "durability: 1" } else { "durability: 2" };
+            let qos = QOS.replace("durability: 2", durability);
+            let metadata = BTreeMap::from([("offered_qos_profiles".to_owned(), qos)]);
             let id = self.mcap.add_channel(schema, topic, "cdr", &metadata)?;
             self.channels.insert(topic.to_owned(), Channel { id, sequence: 0 });
         }

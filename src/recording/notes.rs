@@ -5,6 +5,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, Sender};
 
+use super::display_messages::MarkerArray;
+use super::robots::LoggedRobots;
 use crate::arm::{IoInfo, IoState, JointStatus, Load};
 use crate::clock::Mono;
 use crate::joint::MAX_DOF;
@@ -80,6 +82,22 @@ pub enum Note {
         /// The load.
         load: Load,
     },
+    /// The robots of the run, before its first tick.
+    Robots {
+        /// Time.
+        stamp: Mono,
+        /// The robots.
+        robots: Arc<LoggedRobots>,
+        /// Their description: URDF.
+        description: String,
+    },
+    /// Objects of the world that were added, changed or removed.
+    Markers {
+        /// Time.
+        stamp: Mono,
+        /// The objects.
+        markers: MarkerArray,
+    },
     /// An arm's text for its current error.
     ArmText {
         /// Index of the arm.
@@ -95,6 +113,8 @@ impl Note {
         NOTE_OVERHEAD
             + match self {
                 Self::Request { json: text, .. } | Self::Log { text, .. } | Self::ArmText { text, .. } => text.len(),
+                Self::Robots { description, .. } => description.len(),
+                Self::Markers { markers, .. } => size_of_val(markers.markers.as_slice()),
                 Self::Io { .. } => size_of::<IoState>(),
                 Self::Payload { .. } => size_of::<Load>(),
                 Self::JointStatus { joints, .. } => size_of_val(&**joints),

@@ -97,6 +97,11 @@ impl RecordReader {
         self.live
     }
 
+    /// Returns the position of the next record, and the length of the file [bytes].
+    pub fn position(&self) -> (u64, u64) {
+        (self.at, self.length)
+    }
+
     /// Also reads attachments, up to [`LIMIT`]; by default they are skipped.
     pub fn with_attachments(mut self) -> Self {
         self.attachments = true;
@@ -115,8 +120,10 @@ impl RecordReader {
         Ok((complete && start >= MAGIC.len() as u64 && start < self.length).then_some(start))
     }
 
-    /// Moves to the start of a record.
+    /// Moves to the start of a record, at most to the end of the file.
     pub fn go_to(&mut self, at: u64) -> Result<(), ReplayError> {
+        // An index may claim anything.
+        let at = at.min(self.length);
         self.file.seek(SeekFrom::Start(at)).map_err(|e| self.io(e))?;
         self.at = at;
         self.ended = false;

@@ -50,6 +50,8 @@ pub struct LogReader {
     selection: Selection,
     info: LogInfo,
     channels: Channels,
+    /// Latest time and position of each chunk of a closed log.
+    index: Vec<(u64, u64)>,
     ready: VecDeque<Entry>,
     failed: Option<ReplayError>,
     lost: u64,
@@ -69,9 +71,9 @@ impl LogReader {
 
     fn open_with(path: &Path, topics: Option<&[&str]>) -> Result<Self, ReplayError> {
         let mut records = RecordReader::open(path)?;
-        let mut channels = Channels::default();
+        let (mut channels, mut index) = (Channels::default(), Vec::new());
         let mut info = match records.summary_start()? {
-            Some(start) => summary(&mut records, start, &mut channels)?,
+            Some(start) => summary(&mut records, start, &mut channels, &mut index)?,
             None => None,
         }
         .map_or_else(|| scan(&mut records, &mut channels, topics), Ok)?;
@@ -85,6 +87,7 @@ impl LogReader {
             selection: Selection::default(),
             info,
             channels,
+            index,
             ready: VecDeque::new(),
             failed: None,
             lost: 0,
@@ -102,7 +105,12 @@ impl LogReader {
         self.ready.clear();
         self.failed = None;
         self.lost = 0;
-        self.records.rewind()
+        // A late part of a long log begins at its first chunk. Everything else that is read comes before the chunks.
+        let (from, later) = (self.selection.from, self.info.span.is_some_and(|(start, _)| self.selection.from > start));
+        match self.index.iter().filter(|(end, _)| *end >= from).map(|(_, at)| *at).min().filter(|_| later) {
+            Some(at) => self.records.go_to(at),
+            None => self.records.rewind(),
+        }
     }
 
     /// Returns the next message; `None` at the end of a closed log, and at the newest chunk of a live one. Returns
@@ -164,13 +172,23 @@ pub fn attachment(path: &Path, name: &str) -> Result<Option<Vec<u8>>, ReplayErro
 }
 
 /// Reads time span and channels from the summary of a closed log; `None` if it lacks them.
-fn summary(records: &mut RecordReader, start: u64, channels: &mut Channels) -> Result<Option<LogInfo>, ReplayError> {
+fn summary(
+    records: &mut RecordReader,
+    start: u64,
+    channels: &mut Channels,
+    index: &mut Vec<(u64, u64)>,
+) -> Result<Option<LogInfo>, ReplayError> {
     records.go_to(start)?;
     let mut info = None;
     loop {
         match records.next_record() {
             Ok(Some(record)) => {
                 channels.learn(record.opcode, &record.body);
+                if record.opcode == op::CHUNK_INDEX
+                    && let Ok(Record::ChunkIndex(chunk)) = parse_record(record.opcode, &record.body)
+                {
+                    index.push((chunk.message_end_time, chunk.chunk_start_offset));
+                }
                 if record.opcode == op::STATISTICS
                     && let Ok(Record::Statistics(s)) = parse_record(record.opcode, &record.body)
                 {

@@ -7,11 +7,13 @@ use std::time::Duration;
 use mcap::McapResult;
 
 use super::arm_messages::{input, input_differs, output, output_differs, status};
+use super::display_messages::DiagnosticArray;
 use super::log_writer::LogWriter;
 use super::messages::{
     ArmInput, ArmOutput, ArmStatus, Event, Header, JointState, Log, PoseStamped, Text, Tick, Time, Vector3, Wrench,
     WrenchStamped,
 };
+use super::scene_log::SceneLog;
 use super::tcp_log::{TCP_EVERY, TcpChains};
 use super::wire::Message;
 use crate::arm::{ArmCommand, ArmState, VelocitySource};
@@ -27,13 +29,17 @@ const STATUS_EVERY: Duration = Duration::from_millis(100);
 /// The samples of the current tick, and the latest logged values of each arm.
 pub struct TickLog {
     run: String,
-    names: Names,
-    frame_id: String,
-    wall: WallOffset,
-    /// Messages of all arms, created once with their names and refilled for each tick.
-    states: JointState,
+    pub(super) names: Names,
+    pub(super) frame_id: String,
+    pub(super) wall: WallOffset,
+    /// Messages of all arms, created once with their names and refilled for each tick. Grippers that were measured
+    /// follow the joints in `states`.
+    pub(super) states: JointState,
     commands: JointState,
-    arms: Vec<ArmLog>,
+    pub(super) arms: Vec<ArmLog>,
+    /// The arms of these grippers.
+    grippers: Vec<usize>,
+    pub(super) scene: SceneLog,
     events: Vec<(u64, Described)>,
     /// Models of the arms' tool centre points.
     pub tcps: TcpChains,
@@ -42,9 +48,9 @@ pub struct TickLog {
 }
 
 #[derive(Default)]
-struct ArmLog {
+pub(super) struct ArmLog {
     /// Sample of this arm since the last closed tick.
-    pending: Option<ArmSample>,
+    pub(super) pending: Option<ArmSample>,
     state: Option<ArmState>,
     command: Option<ArmCommand>,
     status: Option<StatusKey>,
@@ -55,7 +61,7 @@ struct ArmLog {
 
 impl ArmLog {
     /// Returns the state that the tick read, if any.
-    fn read(&self) -> Option<&ArmState> {
+    pub(super) fn read(&self) -> Option<&ArmState> {
         self.pending.as_ref().map(|s| &s.state).filter(|s| s.seq > 0)
     }
 }
@@ -70,7 +76,8 @@ impl TickLog {
         let states = JointState { name, ..JointState::default() };
         let arms = names.arms.iter().map(|_| ArmLog::default()).collect();
         let (commands, events, tcps) = (states.clone(), Vec::new(), TcpChains::default());
-        Self { run, names, frame_id, wall, commands, states, arms, events, tcps, given_up: 0 }
+        let (grippers, scene) = (Vec::new(), SceneLog::default());
+        Self { run, names, frame_id, wall, commands, states, arms, grippers, scene, events, tcps, given_up: 0 }
     }
 
     /// Returns metadata that readers need: the joints of each arm, and the offset between its monotonic times and Unix
@@ -97,6 +104,7 @@ impl TickLog {
             log.announce::<ArmInput>(&format!("/dimos/inputs/{arm}"))?;
             log.announce::<ArmOutput>(&format!("/dimos/outputs/{arm}"))?;
         }
+        log.announce::<DiagnosticArray>("/diagnostics")?;
         log.announce::<Tick>("/dimos/tick")?;
         log.announce::<Event>("/dimos/events")?;
         log.announce::<Text>("/dimos/requests")?;
@@ -179,6 +187,7 @@ impl TickLog {
         tick.dropped = tick.dropped.saturating_add(std::mem::take(&mut self.given_up));
         self.joint_states(log, &tick)?;
         self.joint_commands(log, &tick)?;
+        self.scene(log, &tick)?;
         for index in 0..self.arms.len() {
             self.one_arm(log, &tick, index)?;
         }
@@ -220,8 +229,33 @@ impl TickLog {
         self.column(&mut message.position, |arm| arm.read().map(|s| s.position));
         self.column(&mut message.velocity, |arm| arm.read().and_then(velocity));
         self.column(&mut message.effort, |arm| arm.read().and_then(|s| s.effort));
+        self.append_grippers(&mut message);
         self.states = message;
         log.publish("/joint_states", self.wall.wall(tick.deadline), &self.states)
+    }
+
+    /// Appends the positions of the grippers that have been measured.
+    fn append_grippers(&mut self, states: &mut JointState) {
+        for (index, arm) in self.arms.iter().enumerate() {
+            if arm.read().is_some_and(|s| s.gripper.is_some()) && !self.grippers.contains(&index) {
+                let driven = self.scene.robots.driven(index, 0.0).map(|(joint, _)| joint.to_owned());
+                states.name.push(driven.unwrap_or_else(|| format!("{}_gripper", self.names.arm(index as u16))));
+                self.grippers.push(index);
+            }
+        }
+        for arm in &self.grippers {
+            let state = self.arms.get(*arm).and_then(ArmLog::read);
+            let position =
+                state.and_then(|s| s.gripper).map(|at| self.scene.robots.driven(*arm, at).map_or(at, |d| d.1));
+            let values = [position, None, state.and_then(|s| s.gripper_force)];
+            for (column, value) in
+                [&mut states.position, &mut states.velocity, &mut states.effort].into_iter().zip(values)
+            {
+                if !column.is_empty() {
+                    column.push(value.unwrap_or(f64::NAN));
+                }
+            }
+        }
     }
 
     fn joint_commands<W: Write + Seek>(&mut self, log: &mut LogWriter<W>, tick: &TickSample) -> McapResult<()> {

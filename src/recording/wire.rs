@@ -81,28 +81,36 @@ macro_rules! numbers {
     )*};
 }
 
+/// Lists of types of fields: the type in Rust, the list in a message definition.
 macro_rules! sequences {
     ($($rust:ty => $list:literal;)*) => {$(
-        impl Field for Vec<$rust> {
+        impl $crate::recording::wire::Field for Vec<$rust> {
             const ROS: &'static str = $list;
             const MIN_SIZE: usize = 4;
-            fn put(&self, out: &mut Encoder) {
+            fn put(&self, out: &mut $crate::recording::cdr::Encoder) {
                 out.length(self.len());
-                self.iter().for_each(|element| element.put(out));
+                self.iter().for_each(|element| $crate::recording::wire::Field::put(element, out));
             }
-            fn get(from: &mut Decoder<'_>) -> Result<Self, CdrError> {
-                let length = from.length(<$rust>::MIN_SIZE)?;
-                (0..length).map(|_| <$rust>::get(from)).collect()
+            fn get(
+                from: &mut $crate::recording::cdr::Decoder<'_>,
+            ) -> Result<Self, $crate::recording::cdr::CdrError> {
+                let length = from.length(<$rust as $crate::recording::wire::Field>::MIN_SIZE)?;
+                (0..length).map(|_| <$rust as $crate::recording::wire::Field>::get(from)).collect()
+            }
+            fn define(known: &mut $crate::recording::wire::Definitions) {
+                <$rust as $crate::recording::wire::Field>::define(known);
             }
         }
     )*};
 }
+pub(crate) use sequences;
 
 numbers! {
     u8 => "uint8", "uint8[]";
     i32 => "int32", "int32[]";
     u32 => "uint32", "uint32[]";
     u64 => "uint64", "uint64[]";
+    f32 => "float32", "float32[]";
     f64 => "float64", "float64[]";
 }
 sequences! { String => "string[]"; }
@@ -167,7 +175,7 @@ macro_rules! message {
                 $(
                     $(text.push_str(concat!("#", $doc, "\n"));)*
                     text.push_str(<$type as $crate::recording::wire::Field>::ROS);
-                    text.push_str(concat!(" ", stringify!($field), "\n"));
+                    text.push_str(concat!(" ", stringify!($field), "\n").replace(" r#", " ").as_str());
                 )*
                 text
             }

@@ -188,6 +188,8 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
             Note::Payload { arm, stamp, load } => {
                 self.ticks.part(log, arm, "payload", stamp, |header, _| payload(header, &load))
             }
+            Note::Robots { stamp, robots, description } => self.ticks.robots(log, stamp, robots, description),
+            Note::Markers { stamp, markers } => self.ticks.markers(log, stamp, markers),
             Note::ArmText { arm, text } => {
                 self.ticks.arm_text(arm, text);
                 Ok(())
@@ -200,7 +202,11 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
         let Some((log, execute)) = self.log.as_mut().zip(self.executes.answered(id)) else { return Ok(()) };
         let taken_on = matches!(outcome, Outcome::Accepted);
         let json = if taken_on { execute.whole() } else { execute.refused() };
-        self.ticks.request(log, id, execute.stamp, &json)
+        self.ticks.request(log, id, execute.stamp, &json)?;
+        if taken_on {
+            self.ticks.motion(log, execute.stamp, execute.task, &execute.trajectory)?;
+        }
+        Ok(())
     }
 
     fn close(&mut self, tick: &TickSample) -> McapResult<()> {

@@ -186,7 +186,7 @@ impl Assembler {
     fn joint_values(&mut self, bytes: &[u8]) -> Result<JointState, String> {
         let known = !self.names.is_empty() && bytes.get(STAMP_END..).is_some_and(|rest| rest.starts_with(&self.names));
         let values = if known { self.lists(bytes).map_err(|e| e.to_string())? } else { self.first_values(bytes)? };
-        let fits = |list: &[f64]| list.is_empty() || list.len() == self.joints.len();
+        let fits = |list: &[f64]| list.is_empty() || list.len() >= self.joints.len();
         if ![&values.position, &values.velocity, &values.effort].into_iter().all(|list| fits(list)) {
             return Err("the number of values differs from the number of joints".to_owned());
         }
@@ -196,7 +196,8 @@ impl Assembler {
     /// Decodes a message whose names are new.
     fn first_values(&mut self, bytes: &[u8]) -> Result<JointState, String> {
         let values: JointState = message(bytes)?;
-        if values.name != self.joints {
+        // Grippers follow the joints.
+        if !values.name.starts_with(&self.joints) {
             return Err("the joints differ from those of the run".to_owned());
         }
         let mut head = Encoder::default();

@@ -138,7 +138,8 @@ fn rows(mut log: LogReader, topics: &[&str], joints: usize, (from, to): (u64, u6
     let topics = topics.iter().map(|topic| (*topic).to_owned()).collect();
     log.select(Selection { topics, from, to })?;
     let nothing = || vec![f64::NAN; joints];
-    let positions = |m: &JointState| if m.position.len() == joints { m.position.clone() } else { nothing() };
+    // Grippers follow the joints.
+    let positions = |m: &JointState| m.position.get(..joints).map_or_else(nothing, <[f64]>::to_vec);
     let (mut measured, mut commanded) = (nothing(), nothing());
     let mut rows: Vec<Row> = Vec::new();
     loop {

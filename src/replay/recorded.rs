@@ -9,6 +9,7 @@ use thiserror::Error;
 use crate::control::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, FIRST_CONFIG_VERSION};
 use crate::joint::MAX_DOF;
 use crate::recording::replay::{LogInfo, LogReader, ReplayError, attachment};
+use crate::recording::rewrite::PART_OF;
 use crate::recording::{CONFIG_VERSION_KEY, COORDINATOR};
 use crate::telemetry::describe::{ArmNames, Names};
 
@@ -41,6 +42,14 @@ pub enum RecordedError {
         found: u32,
         /// The program that wrote it.
         writer: String,
+    },
+    /// It is a part of a log: what the coordinator did before is unknown.
+    #[error("the log {path} is a part of {whole}: it cannot be verified alone\nhint: verify the whole log")]
+    Part {
+        /// The log.
+        path: PathBuf,
+        /// The log that it was cut out of.
+        whole: String,
     },
     /// Its contents are inconsistent.
     #[error(
@@ -90,8 +99,12 @@ impl Recorded {
         }
     }
 
-    /// Rejects a log whose config version differs from this program's: its ticks cannot be recomputed bit for bit.
+    /// Rejects a part of a log, and a log whose config version differs from this program's: their ticks cannot be
+    /// recomputed bit for bit.
     pub fn check_version(&self) -> Result<(), RecordedError> {
+        if let Some(whole) = self.info.metadata.get(PART_OF) {
+            return Err(RecordedError::Part { path: self.path.clone(), whole: whole.clone() });
+        }
         if self.version == CONFIG_VERSION {
             return Ok(());
         }

@@ -24,6 +24,7 @@ mod late_stops;
 mod lead_requests;
 mod log_file;
 mod log_throttle;
+mod logged_scene;
 mod motion_requests;
 mod motions;
 mod park;

@@ -15,6 +15,7 @@ use super::gripper_requests::LatestGrip;
 use super::gripper_targets::{Counters, GripperTargets};
 use super::late_stops::LateStops;
 use super::log_throttle::LogThrottle;
+use super::logged_scene::LoggedWorld;
 use super::motions::Motions;
 use super::payloads::HeldLoads;
 use super::planner_link::Attached;
@@ -29,6 +30,7 @@ use crate::control::tick_loop::Pulse;
 use crate::hardware::device::{Connected, Details, Device};
 use crate::joint::STANDSTILL;
 use crate::recording::recorder::{Notice, RecorderStats};
+use crate::recording::robots::LoggedRobots;
 use crate::recording::tcp_log::TcpChains;
 use crate::rpc::api::{self, Backend, BoxFuture, Done, RegisterPlanner, Registered, Reply, Request as Call};
 use crate::rpc::planner_proxy::PlannerProxy;
@@ -72,6 +74,10 @@ pub struct Service {
     pub(super) view: OnceLock<String>,
     /// The arms' tool centre points, for the log.
     pub(super) logged_tcps: TcpChains,
+    /// The robots of the log, with the names of their frames.
+    pub(super) logged_robots: Mutex<Arc<LoggedRobots>>,
+    /// The objects of the world, as logged.
+    pub(super) logged_world: Mutex<LoggedWorld>,
     pub(super) log_throttle: LogThrottle,
     pub(super) late_stops: LateStops,
     pub(super) progress: Progress,
@@ -129,6 +135,8 @@ impl Service {
             recorder: OnceLock::new(),
             view: OnceLock::new(),
             logged_tcps: TcpChains::default(),
+            logged_robots: Mutex::default(),
+            logged_world: Mutex::default(),
             log_throttle: LogThrottle::default(),
             late_stops: LateStops::default(),
             published: AtomicU64::new(0),

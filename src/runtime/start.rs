@@ -224,12 +224,17 @@ fn start_recorder(
 ) -> Result<Recorder, StartError> {
     let (blueprint, wall) = (prepared.blueprint, prepared.wall);
     service.log_tcps();
+    let mut attachments = attachments(blueprint, config);
+    if prepared.log.is_some() {
+        attachments.extend(service.log_robots());
+        service.log_world();
+    }
     let record = RecorderConfig {
         path: prepared.log.clone(),
         run: prepared.name.clone(),
         names: prepared.names.clone(),
         frame_id: blueprint.coordinator.joint_state_frame_id.clone(),
-        attachments: attachments(blueprint, config),
+        attachments,
         metadata: metadata(blueprint, config),
         tcps: service.logged_tcps.clone(),
         wall,
@@ -254,6 +259,7 @@ fn publisher(service: Arc<Service>, wall: WallOffset) -> impl FnMut(bool) + Send
         if Instant::now() >= details_due {
             service.log_details();
             service.log_tcps();
+            service.log_world();
             details_due = Instant::now() + DETAILS_PERIOD;
         }
         service.report_late_stops(wall);

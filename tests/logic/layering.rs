@@ -49,6 +49,8 @@ const PARTS: &[(&str, &str, &str)] = &[
     ("view", "planning", "config"),
     // A log has the pose of each tool centre point.
     ("recording", "robot", "kinematics"),
+    // And the transform of each link.
+    ("recording", "robot", "model"),
     // Unit tests of the device thread have the mock adapter of out-of-tree tests.
     ("hardware", "testing", "Call"),
     ("hardware", "testing", "MockAdapter"),

@@ -7,16 +7,22 @@ mod source;
 
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::Arc;
 use std::{env, fs};
 
 use clap::{ArgAction, Command};
 use dimos::blueprint::{Overrides, find, load};
 use dimos::cli::exit::Exit;
+use dimos::clock::Mono;
 use dimos::hardware::registry::Registry;
 use dimos::joint::make_joints;
 use dimos::planning::planning_scene::PlanningScene;
+use dimos::recording::recorder::Note;
+use dimos::recording::robots::{LoggedRobot, LoggedRobots};
 use dimos::recording::tcp_log::TcpChain;
+use dimos::robot::Source;
 use dimos::trajectory::{JointTrajectory, TrajectoryPoint};
+use nalgebra::Isometry3;
 
 use crate::support::virtual_run::{VirtualRun, one_arm};
 
@@ -144,7 +150,23 @@ fn log_topics() {
     };
     let motion = JointTrajectory { joint_names: make_joints("arm", 6), points: vec![point(0.0, 0.0), point(0.5, 0.1)] };
     *run.tcps.lock().unwrap() = vec![Some(tcp())];
+    let model = dimos::robot::load(&Source::new("builtin:yourarm")).into_model().unwrap();
+    let joint = |i: usize| (model.joint_index(&format!("joint{}", i + 1)).unwrap(), i, format!("arm_joint{}", i + 1));
+    let robot = LoggedRobot {
+        name: "arm".into(),
+        root: Isometry3::identity(),
+        joints: (0..6).map(joint).collect(),
+        rest: Vec::new(),
+        gripper: None,
+        end_effector: model.links.len() - 1,
+        model,
+    };
+    let (stamp, robots) = (Mono(0), Arc::new(LoggedRobots::new(vec![robot])));
+    run.notes.send(Note::Robots { stamp, robots, description: "<robot/>".into() }).unwrap();
     (0..20).for_each(|_| run.step());
+    // What a run notes of its first request, if that is a trajectory.
+    let trajectory = Arc::new(motion.clone());
+    run.notes.send(Note::Execute { id: 1, stamp, task: 0, motion: 1, trajectory }).unwrap();
     run.execute(0, &motion);
     (0..20).for_each(|_| run.step());
     run.finish();

@@ -27,6 +27,7 @@ mod joint_status;
 mod leader_follower;
 mod leases;
 mod library;
+mod log_verbs;
 mod onto;
 mod orders;
 mod packages;

@@ -11,15 +11,18 @@ use dimos::clock::{Mono, WallOffset};
 use dimos::hardware::registry::Registry;
 use dimos::joint::{ControlMode, joints_of, make_joints};
 use dimos::planning::planning_scene::{PlannedRobot, PlanningScene};
+use dimos::recording::display_messages::{Marker, MarkerArray};
 use dimos::recording::log_writer::LogAttachment;
 use dimos::recording::notes::channel;
 use dimos::recording::recorder::{Note, Recorder, RecorderConfig};
 use dimos::recording::replay::{LogReader, Payload};
+use dimos::recording::robots::{LoggedRobot, LoggedRobots};
 use dimos::recording::tcp_log::{TcpChain, TcpChains};
 use dimos::robot::kinematics::pose;
 use dimos::telemetry::describe::{ArmNames, Names, Severity};
 use dimos::telemetry::{ArmSample, Cause, Event, Outcome, Phase, Reason, Sample, TaskState, TickSample};
 
+use dimos::trajectory::{JointTrajectory, TrajectoryPoint};
 use nalgebra::Isometry3;
 
 use crate::support::skip::skip_tool;
@@ -50,6 +53,14 @@ fn record(path: &Path) {
     notes.send(Note::Request { id: 1, stamp, json: r#"{"method":"move","arm":"left"}"#.into() }).unwrap();
     notes.send(Note::Log { severity: Severity::Warn, stamp, text: "Größe: 1 µm".into() }).unwrap();
     notes.send(Note::ArmText { arm: 1, text: "joint 2: überhitzt".into() }).unwrap();
+    let robots = Arc::new(LoggedRobots::new(vec![logged_right_arm()]));
+    notes.send(Note::Robots { stamp, robots, description: "<robot name=\"ä\"/>".into() }).unwrap();
+    let marker = Marker { ns: "world/wall".into(), r#type: 1, text: "ö".into(), ..Marker::default() };
+    notes.send(Note::Markers { stamp, markers: MarkerArray { markers: vec![marker] } }).unwrap();
+    let point =
+        |t: f64| TrajectoryPoint { time_from_start: t, positions: vec![t * 0.2; 6], ..TrajectoryPoint::default() };
+    let trajectory = JointTrajectory { joint_names: make_joints("right", 6), points: vec![point(0.0), point(1.25)] };
+    notes.send(Note::Execute { id: 2, stamp, task: 0, motion: 3, trajectory: Arc::new(trajectory) }).unwrap();
     for tick in 0..200 {
         sample(tick).into_iter().for_each(|s| ring.push(s).unwrap());
     }
@@ -75,6 +86,76 @@ fn tcps() -> TcpChains {
         tool: robot.config.tool,
     };
     Arc::new(Mutex::new(vec![None, Some(chain)]))
+}
+
+/// The same arm as a log shows it.
+fn logged_right_arm() -> LoggedRobot {
+    let robot = right_arm();
+    let names = make_joints("right", 6);
+    LoggedRobot {
+        name: "right".into(),
+        root: pose(&robot.body.base),
+        joints: robot.joints.iter().zip(7..13).zip(names).map(|((own, index), name)| (*own, index, name)).collect(),
+        rest: robot.rest.clone(),
+        gripper: None,
+        end_effector: robot.end_effector,
+        model: (*robot.model).clone(),
+    }
+}
+
+/// Pose of a frame in `map`, by the latest transforms: parent and pose of each frame.
+fn placed(frames: &BTreeMap<String, (String, Isometry3<f64>)>, name: &str) -> Isometry3<f64> {
+    match frames.get(name) {
+        Some((parent, at)) => placed(frames, parent) * at,
+        None => {
+            assert_eq!(name, "map");
+            Isometry3::identity()
+        }
+    }
+}
+
+#[test]
+fn the_transforms_of_a_log_place_the_tool_where_the_model_does() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("log.mcap");
+    record(&path);
+    let (robot, mut log) = (right_arm(), LogReader::open(&path).unwrap());
+    let (mut frames, mut joints, mut checked, mut motion, mut paths) = (BTreeMap::new(), Vec::new(), 0, false, 0);
+    while let Some(entry) = log.next_entry().unwrap() {
+        match &entry.data {
+            Payload::JointState(state) if entry.topic == "/joint_states" => joints.clone_from(&state.position),
+            Payload::Other(data) if entry.topic == "/tf" || entry.topic == "/tf_static" => {
+                for t in data["transforms"].as_array().unwrap() {
+                    let number = |part: &str, axis: &str| t["transform"][part][axis].as_f64().unwrap();
+                    let [x, y, z] = ["x", "y", "z"].map(|axis| number("translation", axis));
+                    let [i, j, k, w] = ["x", "y", "z", "w"].map(|axis| number("rotation", axis));
+                    let turn = nalgebra::UnitQuaternion::from_quaternion(nalgebra::Quaternion::new(w, i, j, k));
+                    let name = |value: &serde_json::Value| value.as_str().unwrap().to_owned();
+                    let at = Isometry3::from_parts([x, y, z].into(), turn);
+                    frames.insert(name(&t["child_frame_id"]), (name(&t["header"]["frame_id"]), at));
+                }
+                if entry.topic == "/tf" {
+                    let (is, should) = (placed(&frames, "right_tcp"), pose(&robot.tcp_pose(&joints[7..13])));
+                    let off = (is.translation.vector - should.translation.vector).norm();
+                    assert!(off < 1e-9 && is.rotation.angle_to(&should.rotation) < 1e-6, "{is} instead of {should}");
+                    checked += 1;
+                }
+            }
+            Payload::Other(data) if entry.topic == "/joint_trajectory" => {
+                assert_eq!(data["points"][1]["time_from_start"]["nanosec"], 250_000_000);
+                motion = true;
+            }
+            Payload::Other(data) if entry.topic == "/markers" => {
+                for marker in data["markers"].as_array().unwrap().iter().filter(|m| m["ns"] == "plan/traj_left") {
+                    paths += 1;
+                    assert_eq!(marker["points"].as_array().unwrap().len(), 26, "1.25 s at 20 Hz");
+                }
+            }
+            _ => {}
+        }
+    }
+    // From the 20th tick on, 25 a second.
+    assert_eq!((checked, motion, paths), (45, true, 1));
 }
 
 #[test]
@@ -135,6 +216,7 @@ fn sample(tick: u64) -> Vec<Sample> {
     }
     match tick {
         5 => samples.push(Sample::Event(tick, Event::Request(1, Outcome::Accepted))),
+        30 => samples.push(Sample::Event(tick, Event::Request(2, Outcome::Accepted))),
         90 => samples.push(Sample::Event(tick, Event::Task(0, TaskState::Aborted, Reason::GoalTolerance(2, 0.03)))),
         101 => samples.push(Sample::Event(tick, Event::Arm(1, Phase::Held, Cause::Fault(-31)))),
         _ => {}

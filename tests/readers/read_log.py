@@ -72,6 +72,8 @@ def read_rosbags(path):
         for connection in reader.connections:
             qos = connection.ext.offered_qos_profiles
             assert len(qos) == 1 and qos[0].depth == 10, (connection.topic, qos)
+            latched = connection.topic in ("/tf_static", "/robot_description")
+            assert (qos[0].durability.value == 1) == latched, (connection.topic, qos)
         for connection, time, raw in reader.messages():
             data = plain(reader.deserialize(raw, connection.msgtype))
             found[connection.topic].append((time, without_type_name(data)))

@@ -66,7 +66,8 @@ pub struct VirtualRun {
     names: Names,
     now: Mono,
     ring: rtrb::Producer<Sample>,
-    notes: Notes,
+    /// The way to the recorder besides the ticks.
+    pub notes: Notes,
     inbox: VecDeque<Envelope>,
     next_id: u64,
     recorder: Recorder,

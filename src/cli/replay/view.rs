@@ -57,15 +57,16 @@ pub struct Plain<W> {
     out: W,
     from: u64,
     next: u64,
+    joints: usize,
     others: BTreeMap<String, u64>,
     /// Number and kind of the latest requests, for the lines that answer them.
     asked: VecDeque<(String, String)>,
 }
 
 impl<W: Write> Plain<W> {
-    /// Creates a view that writes to `out`, with times relative to a Unix time [ns].
-    pub fn new(out: W, from: u64) -> Self {
-        Self { out, from, next: 0, others: BTreeMap::new(), asked: VecDeque::new() }
+    /// Creates a view of the first `joints` joints that writes to `out`, with times relative to a Unix time [ns].
+    pub fn new(out: W, from: u64, joints: usize) -> Self {
+        Self { out, from, next: 0, joints, others: BTreeMap::new(), asked: VecDeque::new() }
     }
 }
 
@@ -83,7 +84,7 @@ impl<W: Write> View for Plain<W> {
                 if entry.log_time >= self.next {
                     self.next = entry.log_time + LINE_EVERY;
                     let mut line = format!("{at:10.3} s");
-                    for (i, name) in joints.name.iter().enumerate() {
+                    for (i, name) in joints.name.iter().take(self.joints).enumerate() {
                         line.push_str(&format!("  {name} {} rad", number(&joints.position, i, 4)));
                     }
                     writeln!(self.out, "{line}")?;
@@ -127,6 +128,7 @@ pub struct Live<W> {
     at: u64,
     drawn_at: Option<Mono>,
     drawn_lines: usize,
+    joints: usize,
     states: Option<JointState>,
     commands: BTreeMap<String, f64>,
     arms: BTreeMap<String, String>,
@@ -134,8 +136,8 @@ pub struct Live<W> {
 }
 
 impl<W: Write> Live<W> {
-    /// Creates a view that draws on `out`, a terminal.
-    pub fn new(out: W, part: &Part) -> Self {
+    /// Creates a view of the first `joints` joints that draws on `out`, a terminal.
+    pub fn new(out: W, part: &Part, joints: usize) -> Self {
         Self {
             out,
             from: part.from,
@@ -144,6 +146,7 @@ impl<W: Write> Live<W> {
             at: part.from,
             drawn_at: None,
             drawn_lines: 0,
+            joints,
             states: None,
             commands: BTreeMap::new(),
             arms: BTreeMap::new(),
@@ -180,7 +183,7 @@ impl<W: Write> Live<W> {
             let mut table = Table::new();
             table.load_style(presets::NOTHING);
             table.set_header(["joint", "rad", "deg", "rad/s", "command rad"].map(right));
-            for (i, name) in states.name.iter().enumerate() {
+            for (i, name) in states.name.iter().take(self.joints).enumerate() {
                 let degrees: Vec<f64> = states.position.iter().map(|p| p.to_degrees()).collect();
                 let command: Vec<f64> = self.commands.get(name).copied().into_iter().collect();
                 let cells = [
@@ -280,7 +283,7 @@ mod tests {
     #[test]
     fn plain_lines_come_once_a_second_and_for_each_text() {
         let mut out = Vec::new();
-        let mut view = Plain::new(&mut out, 1_000_000_000);
+        let mut view = Plain::new(&mut out, 1_000_000_000, usize::MAX);
         for i in 0..=15 {
             view.show(&joints(1_000_000_000 + i * 100_000_000, &[i as f64, f64::NAN]), Mono::ZERO).unwrap();
         }
@@ -309,7 +312,7 @@ mod tests {
     fn the_live_table_redraws_in_place() {
         let part = Part { topics: vec![], from: 0, to: 2_000_000_000, rate: 1.0, looping: false };
         let mut out = Vec::new();
-        let mut view = Live::new(&mut out, &part);
+        let mut view = Live::new(&mut out, &part, usize::MAX);
         view.show(&joints(0, &[std::f64::consts::PI, f64::NAN]), Mono(0)).unwrap();
         view.show(&joints(10_000_000, &[1.0, 1.0]), Mono(10_000_000)).unwrap();
         view.show(&text(1_000_000_000), Mono(1_000_000_000)).unwrap();

@@ -239,11 +239,14 @@ fn unknown_values_are_absent_or_nan_but_never_zero() {
             _ => None,
         })
         .collect();
-    assert_eq!(states[0].name, ["left_joint1", "left_joint2", "left_joint3", "right_joint1", "right_joint2"]);
-    assert!(states[0].position[3..].iter().all(|p| p.is_nan()), "the right arm has no state yet");
+    let joints = ["left_joint1", "left_joint2", "left_joint3", "right_joint1", "right_joint2"];
+    assert_eq!(states[0].name[..5], joints);
+    assert_eq!((&states[0].name[5..], &states[0].position[5..]), (&["left_gripper".to_owned()][..], &[0.04][..]));
+    assert!(states[0].position[3..5].iter().all(|p| p.is_nan()), "the right arm has no state yet");
     assert!(states[0].effort.is_empty(), "no arm reports efforts on tick 0");
     assert_eq!(states[2].effort[..3], [1.5, 2.5, 0.2]);
-    assert!(states[2].effort[3..].iter().all(|e| e.is_nan()), "the right arm never reports efforts");
+    assert!(states[2].effort[3..5].iter().all(|e| e.is_nan()), "the right arm never reports efforts");
+    assert_eq!(states[2].effort[5], 7.2, "the force of the gripper");
     let commands: Vec<_> = entries.iter().filter(|e| e.topic == "/joint_commands").collect();
     assert_eq!(commands.len(), 2, "nothing was commanded on tick 0");
     let Payload::JointState(c) = &commands[0].data else { panic!() };

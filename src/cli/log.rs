@@ -1,0 +1,238 @@
+//! `dimos log`: list, check, print, cut, repair, export and plot logs.
+
+mod cat;
+mod copy;
+mod doctor;
+mod export;
+mod info;
+mod list;
+mod plot;
+
+use std::io::{self, IsTerminal, Write};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::arguments::time;
+use super::exit::{Exit, Failure, Result};
+use super::replay;
+use crate::blueprint::Catalog;
+use crate::recording::files;
+use crate::recording::replay::{LogReader, ReplayError};
+use crate::recording::scan::Scan;
+
+/// Arguments of `log`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "\
+LOG is a file, also of another program; a file name alone is looked for in the folder of logs too.
+Times count from the beginning of the log: 1.5, 10s, 2m.
+Exit code 5: the log is cut, damaged, or has lost data. Everything that can be read was used.")]
+pub struct Args {
+    /// What to do
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum Command {
+    /// List the logs of runs, the newest first
+    List {
+        /// Print JSON
+        #[arg(long)]
+        json: bool,
+    },
+    /// Show what is in a log: topics, counts, rates, faults
+    Info(Log),
+    /// Print the messages of a log, one a line
+    Cat {
+        #[command(flatten)]
+        log: Log,
+        #[command(flatten)]
+        part: Part,
+        /// Print only these topics, separated by commas
+        #[arg(long, value_name = "TOPIC", value_delimiter = ',')]
+        topics: Vec<String>,
+    },
+    /// Read all of a log and check it: checksums, order, gaps, messages
+    Doctor(Log),
+    /// Replay a log through the control code and compare its commands bit for bit
+    Verify(Log),
+    /// Write a part of a log to a new file, which begins with the state at that time
+    Cut {
+        #[command(flatten)]
+        log: Log,
+        #[command(flatten)]
+        part: Part,
+        /// The new file
+        #[arg(short, long, value_name = "FILE")]
+        output: PathBuf,
+    },
+    /// Write what can be read of a damaged log to a new file
+    Recover {
+        #[command(flatten)]
+        log: Log,
+        /// The new file; default: LOG-recovered.mcap
+        #[arg(short, long, value_name = "FILE")]
+        output: Option<PathBuf>,
+    },
+    /// Export joint states and commands, or one topic, as CSV
+    #[command(after_help = "\
+A row has the time [s], and of each joint its position, velocity, effort and commanded value. Values that are unknown \
+are empty. With --topic a row is a message, with the columns of the first one.")]
+    Export {
+        #[command(flatten)]
+        log: Log,
+        #[command(flatten)]
+        part: Part,
+        /// Export this topic instead, e.g. /wrench/arm
+        #[arg(long, value_name = "TOPIC")]
+        topic: Option<String>,
+        /// The new file; default: standard output
+        #[arg(short, long, value_name = "FILE")]
+        output: Option<PathBuf>,
+    },
+    /// Draw measured and commanded positions of joints, with their limits, as SVG
+    Plot {
+        #[command(flatten)]
+        log: Log,
+        #[command(flatten)]
+        part: Part,
+        /// Draw only these joints, separated by commas
+        #[arg(long, value_name = "NAME", value_delimiter = ',')]
+        joint: Vec<String>,
+        /// The new file (.svg); a file of that name is replaced
+        #[arg(short, long, value_name = "FILE")]
+        output: PathBuf,
+    },
+}
+
+/// Which log.
+#[derive(Debug, clap::Args)]
+struct Log {
+    /// Log file (.mcap)
+    #[arg(value_name = "LOG", required_unless_present = "last", conflicts_with = "last")]
+    log: Option<PathBuf>,
+    /// Use the newest log
+    #[arg(long)]
+    last: bool,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Which part of it.
+#[derive(Debug, clap::Args)]
+struct Part {
+    /// Begin this long after the first message
+    #[arg(long, value_name = "TIME", default_value = "0", value_parser = time)]
+    from: Duration,
+    /// End this long after the first message
+    #[arg(long, value_name = "TIME", value_parser = time)]
+    to: Option<Duration>,
+}
+
+/// Runs the verb.
+pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
+    match &args.command {
+        Command::List { json } => list::run(*json),
+        Command::Info(log) => info::run(&log.path()?, log.json),
+        Command::Cat { log, part, topics } => cat::run(&log.path()?, part, topics, log.json),
+        Command::Doctor(log) => doctor::run(&log.path()?, log.json),
+        Command::Verify(log) => match replay::verify_log(&log.path()?, catalog.tasks, log.json) {
+            Ok(Exit::DATA_LOST) => Ok(Exit::Log),
+            other => other,
+        },
+        Command::Cut { log, part, output } => copy::cut(&log.path()?, part, output, log.json),
+        Command::Recover { log, output } => copy::recover(&log.path()?, output.as_deref(), log.json),
+        Command::Export { log, part, topic, output } => {
+            export::run(&log.path()?, part, topic.as_deref(), output.as_deref(), log.json)
+        }
+        Command::Plot { log, part, joint, output } => plot::run(&log.path()?, part, joint, output, log.json),
+    }
+}
+
+impl Log {
+    /// Returns the path of the log.
+    fn path(&self) -> Result<PathBuf> {
+        let folder = files::log_folder();
+        if let Some(path) = &self.log {
+            let listed = folder.map(|folder| folder.join(path)).filter(|listed| !path.exists() && listed.exists());
+            return Ok(listed.unwrap_or_else(|| path.clone()));
+        }
+        let newest = folder.as_deref().map(files::newest).transpose().map_err(|e| Failure::of(Exit::Failed, e))?;
+        let none = || Failure::usage("there is no log yet").hint("`dimos run` writes one unless --no-record is given");
+        newest.flatten().ok_or_else(none)
+    }
+}
+
+impl Part {
+    /// Returns the first and last Unix time [ns], within a log that has messages.
+    fn of(&self, path: &Path) -> Result<(u64, u64)> {
+        let reader = LogReader::open(path).map_err(unreadable)?;
+        let empty = || Failure::usage(format!("the log {} has no messages", path.display()));
+        let (start, end) = reader.info().span.ok_or_else(empty)?;
+        let at = |offset: Duration| start.saturating_add(offset.as_nanos().try_into().unwrap_or(u64::MAX));
+        let (from, to) = (at(self.from), self.to.map_or(end, at));
+        if from > end || from > to {
+            let length = (end - start) as f64 * 1e-9;
+            let what = format!("nothing is between --from and --to: the log is {length:.3} s long");
+            return Err(Failure::usage(what).hint("both count from the beginning of the log"));
+        }
+        Ok((from, to))
+    }
+}
+
+/// Returns the failure of a file that is no log.
+fn unreadable(error: ReplayError) -> Failure {
+    Failure::of(Exit::Usage, error)
+}
+
+/// Returns a bar for reading a log, on a terminal.
+fn progress() -> impl FnMut(&Scan) {
+    let bar = if io::stderr().is_terminal() { ProgressBar::new(1) } else { ProgressBar::hidden() };
+    if let Ok(style) = ProgressStyle::with_template("[{bar:40}] {percent:>3} %") {
+        bar.set_style(style.progress_chars("=> "));
+    }
+    move |scan: &Scan| {
+        let (at, length) = scan.position();
+        bar.set_length(length);
+        bar.set_position(at);
+        if at >= length {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+/// Returns what a log lacks; `None` if it is whole, or the log of a live run.
+fn loss(scan: &Scan) -> Option<String> {
+    let damaged = scan.damage.first().map(|(at, why)| {
+        let more = scan.damage.len() - 1;
+        format!(
+            "damaged at byte {at}: {why}{}",
+            if more > 0 { format!(" ({more} more chunks)") } else { String::new() }
+        )
+    });
+    let cut = || scan.cut.clone().filter(|_| !scan.is_live());
+    damaged.or_else(cut).or_else(|| (!scan.complete && !scan.is_live()).then(|| "it was not closed".to_owned()))
+}
+
+/// Returns the exit code for a log, and prints what it lacks.
+fn ended(scan: &Scan) -> Exit {
+    match loss(scan) {
+        None => Exit::Ok,
+        Some(loss) => {
+            super::output::note(format_args!("warning: the log is not whole: {loss}"));
+            Exit::Log
+        }
+    }
+}
+
+/// Writes text; `false` if the reader has closed the pipe.
+fn written(out: &mut dyn Write, text: &str) -> Result<bool> {
+    match out.write_all(text.as_bytes()) {
+        Ok(()) => Ok(true),
+        Err(e) if e.kind() == io::ErrorKind::BrokenPipe => Ok(false),
+        Err(e) => Err(Failure::new(Exit::Failed, format!("cannot write: {e}"))),
+    }
+}

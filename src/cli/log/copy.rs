@@ -1,0 +1,59 @@
+//! `dimos log cut` and `dimos log recover`: new logs from others.
+
+use std::path::Path;
+
+use serde_json::json;
+
+use super::{Part, loss, progress, unreadable};
+use crate::cli::exit::{Exit, Failure, Result};
+use crate::cli::output;
+use crate::recording::rewrite::{RewriteError, Written, copy};
+use crate::recording::scan::Scan;
+
+/// Writes a part of a log.
+pub fn cut(path: &Path, part: &Part, to: &Path, json: bool) -> Result {
+    let part = part.of(path)?;
+    let mut scan = Scan::open(path).map_err(unreadable)?;
+    scan.part = part;
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    let written = copy(&mut scan, to, Some(&name), progress()).map_err(|e| failure(e, to))?;
+    print("cut", &scan, &written, to, json);
+    // Only damage inside the part matters; a cut after it does not.
+    Ok(if scan.damage.is_empty() { Exit::Ok } else { Exit::Log })
+}
+
+/// Writes what can be read of a log.
+pub fn recover(path: &Path, to: Option<&Path>, json: bool) -> Result {
+    let mut scan = Scan::open(path).map_err(unreadable)?;
+    if scan.is_live() {
+        let what = format!("{} is being written by a live run", path.display());
+        return Err(Failure::usage(what).hint("end the run first; `dimos log cut` works meanwhile"));
+    }
+    let beside = path.with_file_name(format!("{}-recovered.mcap", path.file_stem().unwrap_or_default().display()));
+    let to = to.unwrap_or(&beside);
+    let written = copy(&mut scan, to, None, progress()).map_err(|e| failure(e, to))?;
+    print("recovered", &scan, &written, to, json);
+    Ok(if loss(&scan).is_some() { Exit::Log } else { Exit::Ok })
+}
+
+fn failure(error: RewriteError, to: &Path) -> Failure {
+    // A part of a file is of no use.
+    if matches!(error, RewriteError::Write { exists: false, .. }) {
+        let _ = std::fs::remove_file(to);
+    }
+    let exit = if matches!(error, RewriteError::Read(_)) { Exit::Usage } else { Exit::Failed };
+    Failure::of(exit, error)
+}
+
+fn print(done: &str, scan: &Scan, written: &Written, to: &Path, as_json: bool) {
+    let length = written.span.map_or(0.0, |(start, end)| (end - start) as f64 * 1e-9);
+    let (messages, loss) = (written.messages, loss(scan));
+    if as_json {
+        output::json(&json!({"file": to, "messages": messages, "length": length, "loss": loss}));
+        return;
+    }
+    output::line(format_args!("{done}: {messages} messages, {length:.3} s: {}", to.display()));
+    if let Some(loss) = loss {
+        output::note(format_args!("warning: the log was not whole: {loss}"));
+    }
+}

@@ -1,0 +1,117 @@
+//! `dimos log doctor`: reads all of a log and checks it.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use serde_json::{Value, json};
+
+use super::{loss, progress, unreadable};
+use crate::cli::exit::{Exit, Result};
+use crate::cli::output;
+use crate::recording::messages::Tick;
+use crate::recording::scan::{Item, Scan};
+use crate::recording::wire::Message;
+
+/// Checks a log and prints the findings.
+pub fn run(path: &Path, json: bool) -> Result {
+    let mut scan = Scan::open(path).map_err(unreadable)?;
+    let (mut found, mut bar) = (Findings::default(), progress());
+    while let Some(item) = scan.next_item().map_err(unreadable)? {
+        match item {
+            Item::Messages => found.batch(&scan),
+            // Of an attachment that is too long for memory there are no contents.
+            Item::Other(record) if record.body.is_empty() => {}
+            Item::Other(record) => {
+                if let Err(e) = mcap::parse_record(record.opcode, &record.body) {
+                    found.problems.push(format!("an attachment at byte {}: {e}", record.at));
+                }
+            }
+        }
+        bar(&scan);
+    }
+    found.problems.extend(loss(&scan));
+    let counted = scan.statistics.as_ref().map(|s| s.message_count).filter(|count| *count != found.messages);
+    if let Some(counted) = counted.filter(|_| scan.damage.is_empty()) {
+        found.problems.push(format!("the summary counts {counted} messages, the log has {}", found.messages));
+    }
+    if found.undecoded > 0 {
+        found.problems.push(format!("{} messages do not match their schema", found.undecoded));
+    }
+    if found.unordered > 0 {
+        found.problems.push(format!("{} messages are older than the one before on their topic", found.unordered));
+    }
+    if found.lost > 0 {
+        found.problems.push(format!("{} samples of ticks were lost while recording", found.lost));
+    }
+    let healthy = found.problems.is_empty();
+    if json {
+        let data = json!({
+            "healthy": healthy, "live": scan.is_live(), "messages": found.messages, "ticks": found.ticks,
+            "topics": found.times.len(), "problems": found.problems,
+        });
+        output::json(&data);
+    } else {
+        found.problems.iter().for_each(|problem| output::line(format_args!("problem: {problem}")));
+        let (messages, topics) = (found.messages, found.times.len());
+        let verdict = if healthy { "healthy" } else { "not whole" };
+        let live = if scan.is_live() { ", live: read up to its newest chunk" } else { "" };
+        output::line(format_args!("{verdict}: {messages} messages on {topics} topics, {} ticks{live}", found.ticks));
+        if !healthy {
+            output::note("hint: `dimos log recover` writes what can be read to a new file");
+        }
+    }
+    Ok(if healthy { Exit::Ok } else { Exit::Log })
+}
+
+#[derive(Default)]
+struct Findings {
+    messages: u64,
+    ticks: u64,
+    /// Index of the next tick.
+    next: Option<u64>,
+    lost: u64,
+    undecoded: u64,
+    unordered: u64,
+    /// Latest time on each channel.
+    times: BTreeMap<u16, u64>,
+    problems: Vec<String>,
+    text: String,
+}
+
+impl Findings {
+    fn batch(&mut self, scan: &Scan) {
+        for (message, channel, bytes) in scan.messages() {
+            self.messages += 1;
+            self.text.clear();
+            // Only schemas that are understood can be checked.
+            let wrong = channel.decoder.is_some() && channel.json(bytes, &mut self.text).is_err();
+            self.undecoded += u64::from(wrong);
+            let last = self.times.insert(message.channel, message.time);
+            // Notes of other threads have their own times.
+            let of_ticks =
+                !matches!(channel.topic.as_str(), "/rosout" | "/dimos/requests" | "/markers" | "/joint_trajectory");
+            self.unordered += u64::from(of_ticks && last.is_some_and(|last| message.time < last));
+            if channel.topic == "/dimos/tick" {
+                self.tick(bytes);
+            }
+        }
+    }
+
+    fn tick(&mut self, bytes: &[u8]) {
+        let number = |data: &Value, key: &str| data.get(key).and_then(Value::as_u64).unwrap_or(0);
+        // The type is tried first: it is faster.
+        let (tick, dropped) = match Tick::decode(bytes) {
+            Ok(tick) => (tick.tick, u64::from(tick.dropped)),
+            Err(_) => {
+                let data = serde_json::from_str(&self.text).unwrap_or_default();
+                (number(&data, "tick"), number(&data, "dropped"))
+            }
+        };
+        self.ticks += 1;
+        self.lost += dropped;
+        let gap = self.next.replace(tick + 1).filter(|next| *next != tick);
+        if let Some(next) = gap.filter(|_| self.problems.len() < 20) {
+            self.problems.push(format!("ticks {next} to {} are missing", tick.saturating_sub(1)));
+        }
+    }
+}

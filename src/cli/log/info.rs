@@ -1,0 +1,129 @@
+//! `dimos log info`: what is in a log.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use serde_json::{Value, json};
+
+use super::{progress, unreadable};
+use crate::cli::exit::{Exit, Result};
+use crate::cli::output::{self, Table, fixed};
+use crate::recording::disk_space::Megabytes;
+use crate::recording::replay::{LogInfo, LogReader, ReplayError};
+use crate::recording::scan::{Item, Scan};
+
+/// Prints what is in a log.
+pub fn run(path: &Path, json: bool) -> Result {
+    let reader = LogReader::open(path).map_err(unreadable)?;
+    let info = reader.info();
+    let mut scan = Scan::open(path).map_err(unreadable)?;
+    let (mut counts, mut attachments, mut bar) = (BTreeMap::<u16, u64>::new(), Vec::new(), progress());
+    while let Some(item) = scan.next_item().map_err(unreadable)? {
+        match item {
+            Item::Messages => {
+                scan.messages().for_each(|(message, ..)| *counts.entry(message.channel).or_default() += 1);
+            }
+            Item::Other(record) => {
+                if let Ok(mcap::records::Record::Attachment { header, data, .. }) =
+                    mcap::parse_record(record.opcode, &record.body)
+                {
+                    attachments.push(json!({"name": header.name, "size": data.len()}));
+                }
+            }
+        }
+        bar(&scan);
+    }
+    let faults = faults(path, info).map_err(unreadable)?;
+    let length = length(info);
+    let mut topics: Vec<_> = scan.channels.iter().collect();
+    topics.sort_by_key(|(_, channel)| &channel.topic);
+    let count = |id: &u16| counts.get(id).copied().unwrap_or(0);
+    let rate = |id: &u16| if length > 0.0 { count(id) as f64 / length } else { 0.0 };
+    let size = std::fs::metadata(path).map_or(0, |about| about.len());
+    if json {
+        let topics = topics.iter().map(|(id, channel)| {
+            let (messages, rate) = (count(id), rate(id));
+            json!({"topic": channel.topic, "schema": channel.schema.0, "messages": messages, "rate": rate})
+        });
+        let mut data = json!({
+            "path": path, "size": size, "length": length, "start": info.span.map(|(start, _)| start),
+            "state": state(info), "metadata": info.metadata, "topics": topics.collect::<Vec<_>>(),
+            "attachments": attachments, "faults": faults,
+        });
+        if let Some(arms) = arms(info) {
+            data["arms"] = json!(arms);
+        }
+        output::json(&data);
+        return Ok(exit(info, &scan));
+    }
+    let text = |key: &str| info.metadata.get(key).map_or("-", String::as_str);
+    output::line(format_args!("{}: {}", path.display(), state(info)));
+    output::line(format_args!("run {}, started {}, {length:.3} s, {}", text("run"), started(info), Megabytes(size)));
+    let (version, config) = (text("dimos_version"), text("config_version"));
+    output::line(format_args!("dimos {version}, config version {config}, tick rate {} Hz", text("tick_rate")));
+    output::line(format_args!("arms: {}", arms(info).map_or_else(|| "-".to_owned(), |arms| arms.join(", "))));
+    let mut table = Table::new(&["TOPIC", "SCHEMA", ">MESSAGES", ">HZ"]);
+    for (id, channel) in topics {
+        table.row([channel.topic.clone(), channel.schema.0.clone(), count(id).to_string(), fixed(rate(id), 1)]);
+    }
+    table.print();
+    let sizes = attachments.iter().filter_map(|a| Some(format!("{} ({} B)", a["name"].as_str()?, a["size"])));
+    output::line(format_args!("attachments: {}", sizes.collect::<Vec<_>>().join(", ")));
+    output::line(format_args!("faults: {}", faults.len()));
+    for fault in &faults {
+        let time = fault["time"].as_f64().unwrap_or(0.0);
+        output::line(format_args!("{time:10.3} s  {}", fault["text"].as_str().unwrap_or_default()));
+    }
+    Ok(exit(info, &scan))
+}
+
+fn exit(info: &LogInfo, scan: &Scan) -> Exit {
+    if (info.complete || info.live) && scan.damage.is_empty() { Exit::Ok } else { Exit::Log }
+}
+
+/// Returns the length of a log [s].
+pub fn length(info: &LogInfo) -> f64 {
+    info.span.map_or(0.0, |(start, end)| (end - start) as f64 * 1e-9)
+}
+
+/// Returns the UTC time of the first message.
+pub fn started(info: &LogInfo) -> String {
+    let time = info.span.and_then(|(start, _)| jiff::Timestamp::from_second((start / 1_000_000_000) as i64).ok());
+    time.map_or_else(|| "-".to_owned(), |time| time.to_string())
+}
+
+/// Returns whether a log is whole.
+pub fn state(info: &LogInfo) -> &'static str {
+    match (info.live, info.complete) {
+        (true, _) => "live",
+        (_, true) => "complete",
+        _ => "cut",
+    }
+}
+
+/// Returns the names of the arms.
+pub fn arms(info: &LogInfo) -> Option<Vec<String>> {
+    let arms: BTreeMap<String, Value> = serde_json::from_str(info.metadata.get("arms")?).ok()?;
+    Some(arms.into_keys().collect())
+}
+
+/// Returns the errors among the events of a log, with their times [s from its start].
+pub fn faults(path: &Path, info: &LogInfo) -> std::result::Result<Vec<Value>, ReplayError> {
+    let topic = "/dimos/events".to_owned();
+    let mut scan = Scan::open_part(path, std::slice::from_ref(&topic), (0, u64::MAX))?;
+    let (start, mut faults, mut text) = (info.span.map_or(0, |(start, _)| start), Vec::new(), String::new());
+    while let Some(item) = scan.next_item()? {
+        let Item::Messages = item else { continue };
+        for (message, _, bytes) in scan.messages().filter(|(_, channel, _)| channel.topic == topic) {
+            text.clear();
+            let channel = scan.channels.get(&message.channel);
+            let known = channel.is_some_and(|channel| channel.json(bytes, &mut text).is_ok());
+            let event: Value = serde_json::from_str(&text).ok().filter(|_| known).unwrap_or_default();
+            if event["severity"] == "error" {
+                let time = message.time.saturating_sub(start) as f64 * 1e-9;
+                faults.push(json!({"time": time, "text": event["text"], "arm": event["arm"]}));
+            }
+        }
+    }
+    Ok(faults)
+}

@@ -1,0 +1,167 @@
+//! `dimos log` and what 3D tools need, on logs of real runs.
+
+use std::path::Path;
+use std::process::Command;
+
+use rustix::process::Signal;
+use serde_json::Value;
+
+use crate::support::program::{Home, eventually};
+use crate::support::skip::skip_tool;
+
+/// Runs the example arm with a planner: two motions, an obstacle that comes and goes.
+fn recorded() -> Home {
+    let home = Home::new();
+    let run = home.run("yourarm-planner");
+    home.dimos("world add wall --box 0.1 0.2 0.3 --at 0.6 0 0.2").with(0);
+    home.dimos("move arm 0.3 -0.2 0.5 0 0.4 0").with(0);
+    home.dimos("world remove wall").with(0);
+    home.dimos("move arm --named home").with(0);
+    run.end(Signal::INT).with(130);
+    home
+}
+
+fn topics(info: &Value) -> Vec<(String, u64)> {
+    let topics = info["topics"].as_array().unwrap().iter();
+    topics.map(|t| (t["topic"].as_str().unwrap().to_owned(), t["messages"].as_u64().unwrap())).collect()
+}
+
+#[test]
+fn a_log_is_listed_checked_printed_cut_and_exported() {
+    let home = recorded();
+    let log = home.logs()[0].display().to_string();
+    let listed = home.dimos("log list --json").with(0).json();
+    assert_eq!(
+        (&listed[0]["state"], &listed[0]["arms"][0], &listed[0]["faults"]),
+        (&"complete".into(), &"arm".into(), &0.into())
+    );
+    let info = home.dimos("log info --last --json").with(0).json();
+    let seen = topics(&info);
+    let count = |topic: &str| seen.iter().find(|(name, _)| name == topic).map_or(0, |(_, count)| *count);
+    assert_eq!((count("/robot_description"), count("/tf_static"), count("/joint_trajectory")), (1, 1, 2), "{seen:?}");
+    // Added, removed, and the paths of two motions.
+    assert!(count("/markers") >= 4 && count("/diagnostics") > 1, "{seen:?}");
+    let length = info["length"].as_f64().unwrap();
+    assert!(count("/tf") as f64 >= 20.0 * (length - 1.0), "{} in {length} s", count("/tf"));
+    home.dimos("log info --last").with(0).shows(&["/tf", "tf2_msgs/msg/TFMessage", "faults: 0"]);
+    home.dimos("log doctor --last").with(0).shows(&["healthy"]);
+    home.dimos("log verify --last").with(0).shows(&["reproducible"]);
+    home.dimos("replay --last --verify").with(0).shows(&["reproducible"]);
+
+    // `cat` reads every message, and each topic alone.
+    let all = home.dimos("log cat --last --json").with(0);
+    assert_eq!(all.out.lines().count() as u64, seen.iter().map(|(_, count)| count).sum::<u64>());
+    let first: Value = serde_json::from_str(all.out.lines().next().unwrap()).unwrap();
+    assert_eq!(first["topic"], "/robot_description", "latched topics come first");
+    let motions = home.dimos("log cat --last --json --topics /joint_trajectory").with(0);
+    let motion: Value = serde_json::from_str(motions.out.lines().next().unwrap()).unwrap();
+    assert_eq!(motion["data"]["joint_names"][0], "arm_joint1");
+
+    // A part begins with the state before it.
+    let part = home.path().join("part.mcap").display().to_string();
+    home.dimos(&format!("log cut {log} --from 0.5 --to 1.5 -o {part}")).with(0);
+    let cut = home.dimos(&format!("log info {part} --json")).with(0).json();
+    let kept = topics(&cut);
+    assert!((0.9..=1.01).contains(&cut["length"].as_f64().unwrap()), "{}", cut["length"]);
+    for topic in ["/robot_description", "/tf_static", "/dimos/outputs/arm"] {
+        assert!(kept.iter().any(|(name, count)| name == topic && *count > 0), "{topic} is not in {kept:?}");
+    }
+    assert_eq!(cut["attachments"], info["attachments"]);
+    home.dimos(&format!("log doctor {part}")).with(0);
+    home.dimos(&format!("log verify {part}")).with(2).says(&["is a part of", "verify the whole log"]);
+    home.dimos(&format!("log cut {log} -o {part}")).with(1).says(&["cannot write", "hint: choose another file"]);
+    home.dimos(&format!("log cut {log} --from 10h -o x.mcap")).with(2).says(&["nothing is between"]);
+
+    let table = home.path().join("table.csv");
+    home.dimos(&format!("log export {log} -o {}", table.display())).with(0);
+    let table = std::fs::read_to_string(table).unwrap();
+    let rows: Vec<Vec<&str>> = table.lines().map(|line| line.split(',').collect()).collect();
+    assert_eq!(rows[0][..3], ["time", "arm_joint1.position", "arm_joint1.velocity"]);
+    assert_eq!(rows.len() as u64, count("/joint_states") + 1);
+    assert!(rows.iter().all(|row| row.len() == rows[0].len()));
+    let moved = rows.iter().any(|row| row[1].parse::<f64>().is_ok_and(|q| (q - 0.3).abs() < 0.01));
+    assert!(moved, "joint 1 went to 0.3 rad");
+    let ticks = home.dimos("log export --last --topic /dimos/tick").with(0);
+    assert!(ticks.out.lines().next().unwrap().contains("late_ns"));
+    home.dimos("log plot --last --joint arm_joint1 -o plot.svg").with(0);
+    let plot = std::fs::read_to_string(home.path().join("plot.svg")).unwrap();
+    assert!(plot.contains("arm_joint1") && plot.contains("limits -") && !plot.contains("arm_joint2"), "{plot}");
+    home.dimos("log plot --last --joint elbow -o plot.svg").with(2).says(&["joints: arm_joint1"]);
+    home.dimos("log cat --last --topics /nothing").with(2).says(&["topics: "]);
+    home.dimos("log export --last --topic /nothing").with(2).says(&["topics: "]);
+}
+
+/// Start and length of the contents of each chunk of an MCAP file.
+fn chunks(file: &[u8]) -> Vec<(usize, usize)> {
+    const CHUNK: u8 = 0x06;
+    let (mut at, mut found) = (8, Vec::new());
+    while let Some(length) = file.get(at + 1..at + 9) {
+        let length = u64::from_le_bytes(length.try_into().unwrap()) as usize;
+        if file[at] == CHUNK {
+            found.push((at + 9, length));
+        }
+        at += 9 + length;
+    }
+    found
+}
+
+#[test]
+fn the_log_of_a_killed_run_is_recovered() {
+    let home = Home::new();
+    let run = home.run("coordinator-mock");
+    eventually("there is something to lose", || {
+        home.logs().first().is_some_and(|log| log.metadata().unwrap().len() > 60_000)
+    });
+    let log = home.logs()[0].clone();
+    home.dimos("log doctor --last").with(0).shows(&["live"]);
+    home.dimos("log recover --last").with(2).says(&["live run"]);
+    run.signal(Signal::KILL);
+    let _ = run.wait();
+    // The last record is torn, as by a loss of power.
+    let bytes = std::fs::read(&log).unwrap();
+    std::fs::write(&log, &bytes[..bytes.len() - 7]).unwrap();
+    home.dimos("log doctor --last").with(5).shows(&["problem: it ends at byte", "not whole"]);
+    home.dimos("log info --last").with(5).shows(&["cut"]);
+    home.dimos("log cat --last --topics /dimos/tick").with(5);
+    home.dimos("log verify --last").with(5);
+    let recovered = home.dimos("log recover --last --json").with(5).json();
+    let file = recovered["file"].as_str().unwrap();
+    assert!(recovered["messages"].as_u64().unwrap() > 100 && file.ends_with("-recovered.mcap"), "{recovered}");
+    home.dimos(&format!("log doctor {file}")).with(0);
+    home.dimos(&format!("log verify {file}")).with(0).shows(&["reproducible"]);
+    // A chunk in the middle is damaged: the rest is still read.
+    let mut damaged = std::fs::read(file).unwrap();
+    let chunks = chunks(&damaged);
+    let (start, length) = chunks[chunks.len() / 2];
+    damaged[start + length / 2] ^= 0x55;
+    std::fs::write(home.path().join("damaged.mcap"), damaged).unwrap();
+    home.dimos("log doctor damaged.mcap").with(5).shows(&["damaged at byte"]);
+    home.dimos("log recover damaged.mcap").with(5);
+    home.dimos("log doctor README.md").with(2);
+}
+
+#[test]
+fn other_tools_place_the_tool_where_the_model_does() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let python = root.join(".venv/bin/python");
+    if !python.exists() {
+        return skip_tool("the Python readers in .venv");
+    }
+    let home = recorded();
+    let urdf = home.path().join("description.urdf");
+    let mut read = Command::new(python);
+    read.arg(root.join("tests/readers/read_scene.py")).arg(&home.logs()[0]).arg("arm_tcp").arg(&urdf);
+    let output = read.output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let scene: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let joints: Vec<String> = (1..=6).map(|i| scene["joints"][format!("arm_joint{i}")].to_string()).collect();
+    let joints = joints.join(" ");
+    // By the arm's model, and by the description in the log.
+    for model in ["builtin:yourarm --link flange", &format!("{} --base map --link flange", urdf.display())] {
+        let fk = home.dimos(&format!("model fk {model} {joints} --json")).with(0).json();
+        for (axis, row) in scene["pose"].as_array().unwrap().iter().take(3).enumerate() {
+            let off = row[3].as_f64().unwrap() - fk["xyz"][axis].as_f64().unwrap();
+            assert!(off.abs() < 1e-6, "{off} m along axis {axis}: {} {fk}", scene["pose"]);
+        }
+    }
+}
