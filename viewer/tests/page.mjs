@@ -155,13 +155,14 @@ test('a lost connection is shown, disables acts, and recovers', async () => {
   run.child.kill('SIGSTOP');
   await text(page, '#age', /^no data for \d/);
   await text(page, '#age', /^connection lost/);
-  assert.ok((await page.isDisabled('#plan')) && (await page.isDisabled('#pause')));
+  await page.waitForSelector('#pause:disabled');
+  assert.ok(await page.isDisabled('#plan'));
   assert.ok(await page.isEnabled('#stop'));
   await click('#stop');
   await text(page, '#stop-report', /NOT CONFIRMED/);
   run.child.kill('SIGCONT');
   await text(page, '#age', /^live$/);
-  assert.ok(await page.isEnabled('#pause'));
+  await page.waitForSelector('#pause:enabled');
   assert.deepEqual(
     page.errors.filter((text) => !/WebSocket|net::/.test(text)),
     [],
