@@ -105,3 +105,11 @@ impl AdapterConfig {
             .map_err(|error| ConfigError { what: format!("{}: {}", self.hardware_id, error.what), ..error }.into())
     }
 }
+
+/// Returns an error for a value of an option that is not within its range.
+pub fn in_range(option: &str, value: f64, (least, most): (f64, f64)) -> Result<(), ConfigError> {
+    if (least..=most).contains(&value) {
+        return Ok(());
+    }
+    Err(ConfigError::new(option, format!("{option} is {least} to {most}, not {value}")))
+}

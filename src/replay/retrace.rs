@@ -219,7 +219,7 @@ mod tests {
         let motion = record();
         // The tool moves by 0.1 m per radian of the first joint, there and back again in x, and trembles at rest.
         let begin = motion.last - ((motion.rows.len() - 1) as f64 * DT * 1e9) as u64;
-        let tremble = |k: usize| if k % 2 == 0 { 1e-4 } else { -1e-4 };
+        let tremble = |k: usize| if k.is_multiple_of(2) { 1e-4 } else { -1e-4 };
         let tcp: Vec<(u64, [f64; 3])> = (0..)
             .zip(&motion.rows)
             .map(|(k, q)| (begin + k as u64 * 10_000_000, [0.1 * q[0], 0.2, tremble(k)]))

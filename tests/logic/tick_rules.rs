@@ -261,7 +261,7 @@ impl Scenario {
             }
             // No task here follows another arm: the digests have nothing of the distance from it.
             // What limits a motion is in `status` only: no log has it.
-            let tasks: Vec<_> = self.rig.tasks.iter().map(|t| TaskView { bound: Bound::None, ..t.clone() }).collect();
+            let tasks: Vec<_> = self.rig.tasks.iter().map(|t| TaskView { bound: Bound::None, ..*t }).collect();
             let tasks = format!("{tasks:?}").replace(", distance: None", "");
             let _ = write!(reports, "{tasks} {:?}", self.rig.retired);
             self.rig.retired.clear();

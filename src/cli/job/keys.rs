@@ -1,7 +1,6 @@
 //! The keys of jobs: what the reader takes, and what `assets/job.schema.json` is made of.
 
-// Only the test that makes the schema reads the values.
-#![cfg_attr(not(test), allow(dead_code))]
+#![cfg_attr(not(test), allow(dead_code, reason = "only the test that makes the schema reads the values"))]
 
 /// What may be the value of a key, or a step.
 #[derive(Debug, Clone, Copy)]

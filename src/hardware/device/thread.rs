@@ -258,7 +258,11 @@ impl Worker {
                 self.write_errors = 0;
                 match self.clearing {
                     None => self.clearing = Some((reply, self.config.clock.now())),
-                    Some(_) => drop(reply.send(Err(AdapterError::Rejected("a reset is under way".to_owned())))),
+                    Some(_) => {
+                        drop(reply.send(Err(AdapterError::Rejected(
+                            "a reset is under way\nhint: wait for its end".to_owned(),
+                        ))))
+                    }
                 }
             }
             Order::SetLimits(limits, reply) => {

@@ -22,7 +22,7 @@ use super::stream::{Controller, Ending, Line, Shared};
 use super::tcp_listener::ListenerThread;
 use crate::clock::Mono;
 use crate::hardware::adapter::{AdapterError, AdapterResult};
-use crate::hardware::registry::Emulator;
+use crate::hardware::registry::{Emulator, EmulatorAddress};
 use crate::joint::Joints;
 use crate::rt::host;
 use crate::rt::wake::Wake;
@@ -30,6 +30,9 @@ use crate::sync::lock;
 
 /// How long a new client waits for the end of one that is disconnecting.
 const GRACE: Duration = Duration::from_millis(200);
+
+/// Attempts to find consecutive free ports.
+pub const ATTEMPTS: u32 = 200;
 
 /// Purpose of a port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -231,6 +234,26 @@ pub fn ports_in_a_row(ip: IpAddr, first: u16, count: u16) -> io::Result<Vec<TcpL
         all.push(TcpListener::bind((ip, port))?);
     }
     Ok(all)
+}
+
+/// Listens at the consecutive ports of an emulator of `who`: `count` from `first` on, or from any free one in this
+/// process. Returns the address of the first one, too.
+pub fn emulator_ports(
+    who: &str,
+    place: &EmulatorAddress,
+    first: u16,
+    count: u16,
+) -> AdapterResult<(SocketAddr, Vec<TcpListener>)> {
+    let at = place.tcp(first)?;
+    let who = format!("{who} emulator");
+    let all = match at.port() {
+        0 => (0..ATTEMPTS)
+            .find_map(|_| ports_in_a_row(at.ip(), 0, count).ok())
+            .ok_or_else(|| AdapterError::Io(format!("{who}: no {count} consecutive free ports at {}", at.ip())))?,
+        _ => ports_in_a_row(at.ip(), first, count).map_err(|e| cannot_listen(&who, at, &e))?,
+    };
+    let listening = all.first().and_then(|listener| listener.local_addr().ok());
+    Ok((listening.unwrap_or(at), all))
 }
 
 /// Returns why `who` cannot listen at a port, with a hint.

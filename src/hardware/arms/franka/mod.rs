@@ -27,7 +27,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::hardware::check::{Checked, ConfigError};
+use crate::hardware::check::{Checked, ConfigError, in_range};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use crate::hardware::transport::tcp::Endpoint;
 use crate::joint::ControlMode;
@@ -128,13 +128,9 @@ impl Default for Options {
 fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("franka", SPEC.dof)?;
     let options: Options = config.options()?;
-    let within = |name: &str, value: f64, (least, most): (f64, f64)| match value {
-        value if (least..=most).contains(&value) => Ok(()),
-        value => Err(ConfigError::new(name, format!("{name} is {least} to {most}, not {value}"))),
-    };
-    within("cutoff_frequency", options.cutoff_frequency, (1.0, 1000.0))?;
-    within("gripper_speed", options.gripper_speed, (0.001, 0.1))?;
-    within("gripper_force", options.gripper_force, (0.0, 70.0))?;
+    in_range("cutoff_frequency", options.cutoff_frequency, (1.0, 1000.0))?;
+    in_range("gripper_speed", options.gripper_speed, (0.001, 0.1))?;
+    in_range("gripper_force", options.gripper_force, (0.0, 70.0))?;
     let lists = [
         ("joint_impedance", &options.joint_impedance, DOF, (0.0, 14250.0)),
         ("collision_torques", &options.collision_torques, DOF, (0.0, 1000.0)),
@@ -144,7 +140,7 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
         if !values.is_empty() && values.len() != count {
             return Err(ConfigError::new(name, format!("{name} has {count} values, not {}", values.len())));
         }
-        values.iter().try_for_each(|value| within(name, *value, range))?;
+        values.iter().try_for_each(|value| in_range(name, *value, range))?;
     }
     if options.collision_torques.is_empty() != options.collision_forces.is_empty() {
         let what = "collision_torques and collision_forces belong together: set both, or neither";

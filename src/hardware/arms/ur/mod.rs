@@ -36,7 +36,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::hardware::check::{Checked, ConfigError};
+use crate::hardware::check::{Checked, ConfigError, in_range};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use crate::joint::ControlMode;
 use address::Address;
@@ -119,18 +119,10 @@ impl Default for Options {
 fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("ur", SPEC.dof)?;
     let options: Options = config.options()?;
-    within("lookahead_time", options.lookahead_time, (0.03, 0.2))?;
-    within("gain", options.gain, (100.0, 2000.0))?;
-    within("stop_deceleration", options.stop_deceleration, (1.0, 40.0))?;
+    in_range("lookahead_time", options.lookahead_time, (0.03, 0.2))?;
+    in_range("gain", options.gain, (100.0, 2000.0))?;
+    in_range("stop_deceleration", options.stop_deceleration, (1.0, 40.0))?;
     let limits = options.model.limits();
     options.sim.check(&limits)?;
     Ok(Checked::new(limits).digital_inputs(io::DIGITAL).max_payload(io::max_payload(options.model)))
-}
-
-/// Returns an error for an option that is not between `least` and `most`.
-fn within(name: &str, value: f64, (least, most): (f64, f64)) -> Result<(), ConfigError> {
-    match value {
-        value if (least..=most).contains(&value) => Ok(()),
-        value => Err(ConfigError::new(name, format!("{name} is {least} to {most}, not {value}"))),
-    }
 }

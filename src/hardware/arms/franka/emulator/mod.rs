@@ -16,7 +16,7 @@ mod tests;
 mod urdf;
 mod wire;
 
-use std::net::{IpAddr, SocketAddr, TcpListener, UdpSocket};
+use std::net::{SocketAddr, UdpSocket};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
@@ -33,7 +33,7 @@ use crate::hardware::check::ConfigError;
 use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use crate::hardware::sim::arm;
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::sim::tcp_server::{Port, TcpServer, cannot_listen, ports_in_a_row};
+use crate::hardware::sim::tcp_server::{Port, TcpServer, emulator_ports};
 use crate::joint::{JointLimits, Joints};
 use crate::rt::histogram::{self, Histogram};
 use clock::{Network, Pace};
@@ -62,8 +62,6 @@ const PLAYABLE: &[FaultKind] = &[
 ];
 /// Most connections at once, to arm and hand.
 const CLIENTS: usize = 8;
-/// Attempts to find two consecutive free ports.
-const ATTEMPTS: u32 = 200;
 /// Time between two looks for answers that are due.
 const ANSWERS: Duration = Duration::from_millis(1);
 
@@ -118,15 +116,11 @@ impl Default for SimOptions {
 impl SimOptions {
     /// Returns an error for values that the emulator cannot have.
     pub(super) fn check(&self, limits: &JointLimits) -> Result<(), ConfigError> {
-        let range = |name: &str, value: f64, (least, most): (f64, f64)| {
-            let what = || format!("{name} must be {least} to {most}, not {value}");
-            if (least..=most).contains(&value) { Ok(()) } else { Err(ConfigError::new(format!("sim.{name}"), what())) }
-        };
-        range("lose", self.lose, (0.0, 1.0))?;
-        range("repeat", self.repeat, (0.0, 1.0))?;
-        range("reorder", self.reorder, (0.0, 1.0))?;
-        range("drift", self.drift, (-1000.0, 1000.0))?;
-        range("command_wait", self.command_wait, (0.0, 0.1))?;
+        for (name, value) in [("lose", self.lose), ("repeat", self.repeat), ("reorder", self.reorder)] {
+            arm::check_range(name, value, 0.0..=1.0, "")?;
+        }
+        arm::check_range("drift", self.drift, -1000.0..=1000.0, "ppm")?;
+        arm::check_range("command_wait", self.command_wait, 0.0..=0.1, "s")?;
         self.common().check("franka", limits, PLAYABLE)
     }
 
@@ -150,13 +144,8 @@ impl FrankaEmulator {
     pub fn start(config: &AdapterConfig, place: &EmulatorAddress) -> AdapterResult<Self> {
         config.check(super::check)?;
         let options: super::Options = config.options()?;
-        let ip = place.tcp(PORT)?.ip();
-        let (first, listeners) = match place {
-            EmulatorAddress::InProcess => (0..ATTEMPTS)
-                .find_map(|_| listen(ip, 0).ok())
-                .ok_or_else(|| AdapterError::Io(format!("franka emulator: no two consecutive free ports at {ip}")))?,
-            _ => listen(ip, PORT).map_err(|e| cannot_listen("franka emulator", SocketAddr::new(ip, PORT), &e))?,
-        };
+        let (address, listeners) = emulator_ports("franka", place, PORT, 2)?;
+        let ip = address.ip();
         let serve = |e: std::io::Error| AdapterError::Io(format!("franka emulator: cannot serve: {e}"));
         let mut control = Control::new(options.model, &options.sim, MonotonicClock.now())?;
         if ip.is_ipv6() {
@@ -176,7 +165,7 @@ impl FrankaEmulator {
             .name("franka-sim-clock".to_owned())
             .spawn(move || clock::run(&shared, &socket, &end, (network, pace), &times))
             .map_err(serve)?;
-        Ok(Self { server, address: SocketAddr::new(ip, first), ends, answers, clock: Some(clock) })
+        Ok(Self { server, address, ends, answers, clock: Some(clock) })
     }
 
     fn with<T>(&self, act: impl FnOnce(&mut Control) -> T) -> T {
@@ -241,13 +230,6 @@ impl Drop for FrankaEmulator {
             let _ = clock.join();
         }
     }
-}
-
-/// Listens at two ports from `first`; from any free port if that is 0.
-fn listen(ip: IpAddr, first: u16) -> std::io::Result<(u16, Vec<TcpListener>)> {
-    let all = ports_in_a_row(ip, first, 2)?;
-    let first = all.first().map_or(Ok(0), |listener| listener.local_addr().map(|at| at.port()))?;
-    Ok((first, all))
 }
 
 impl Emulator for FrankaEmulator {

@@ -22,7 +22,7 @@ pub mod program_times {
     pub use super::ours::{ENDS, FAR, FIRST, SPREAD, VELOCITY_ENDS};
 }
 
-use std::net::{IpAddr, SocketAddr, TcpListener};
+use std::net::SocketAddr;
 use std::time::Duration;
 
 use schemars::JsonSchema;
@@ -36,7 +36,7 @@ use crate::hardware::check::ConfigError;
 use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use crate::hardware::sim::arm;
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::sim::tcp_server::{Port, TcpServer, cannot_listen, ports_in_a_row};
+use crate::hardware::sim::tcp_server::{Port, TcpServer, emulator_ports};
 use crate::joint::{JointLimits, Joints};
 use controller::Controller;
 
@@ -70,8 +70,6 @@ fn takes_scripts(port: usize) -> bool {
 
 /// Most connections at once.
 const CLIENTS: usize = 32;
-/// Attempts to find consecutive free ports.
-const ATTEMPTS: u32 = 200;
 /// Time between two looks for messages at the script's ports.
 const MESSAGES: Duration = Duration::from_millis(10);
 /// The dashboard sends nothing that is not asked for.
@@ -140,18 +138,13 @@ impl UrEmulator {
     pub fn start(config: &AdapterConfig, place: &EmulatorAddress) -> AdapterResult<Self> {
         config.check(super::check)?;
         let options: super::Options = config.options()?;
-        let ip = place.tcp(FIRST_PORT)?.ip();
-        let (first, listeners) = match place {
-            EmulatorAddress::InProcess => (0..ATTEMPTS)
-                .find_map(|_| listen(ip, 0).ok())
-                .ok_or_else(|| AdapterError::Io(format!("ur emulator: no {PORTS} consecutive free ports at {ip}")))?,
-            _ => {
-                listen(ip, FIRST_PORT).map_err(|e| cannot_listen("ur emulator", SocketAddr::new(ip, FIRST_PORT), &e))?
-            }
-        };
+        let (address, listeners) = emulator_ports("ur", place, FIRST_PORT, PORTS)?;
+        let used = SERVICES.map(|service| service as usize);
+        let listeners =
+            listeners.into_iter().enumerate().filter(|(i, _)| used.contains(i)).map(|(_, listener)| listener);
         let controller = Controller::new(options.model, &options.sim, MonotonicClock.now())?;
         let period = Duration::from_secs_f64(1.0 / options.model.rate());
-        let ports = listeners.into_iter().zip(SERVICES).map(|(listener, service)| {
+        let ports = listeners.zip(SERVICES).map(|(listener, service)| {
             let period = match service {
                 Service::Dashboard => NEVER,
                 Service::Rtde => period,
@@ -161,7 +154,7 @@ impl UrEmulator {
         });
         let server = TcpServer::with_ports("ur", controller, ports.collect(), CLIENTS);
         let server = server.map_err(|e| AdapterError::Io(format!("ur emulator: cannot serve: {e}")))?;
-        Ok(Self { server, address: SocketAddr::new(ip, first) })
+        Ok(Self { server, address })
     }
 
     /// Calls `act` with the controller, advanced to the present.
@@ -261,15 +254,6 @@ impl UrEmulator {
     pub fn outputs(&self) -> (u64, [f64; 2]) {
         self.with(|controller| (controller.outputs.digital, controller.outputs.analog))
     }
-}
-
-/// Listens at the ports of all services from `first`; from any free port if that is 0.
-fn listen(ip: IpAddr, first: u16) -> std::io::Result<(u16, Vec<TcpListener>)> {
-    let all = ports_in_a_row(ip, first, PORTS)?;
-    let first = all.first().map_or(Ok(0), |listener| listener.local_addr().map(|at| at.port()))?;
-    let used = SERVICES.map(|service| service as usize);
-    let served = all.into_iter().enumerate().filter(|(i, _)| used.contains(i)).map(|(_, listener)| listener);
-    Ok((first, served.collect()))
 }
 
 impl Emulator for UrEmulator {

@@ -34,7 +34,7 @@ use crate::hardware::check::ConfigError;
 use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use crate::hardware::sim::arm::{self, HasArm, SimArm};
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::sim::tcp_server::{Port, TcpServer, cannot_listen, ports_in_a_row};
+use crate::hardware::sim::tcp_server::{ATTEMPTS, Port, TcpServer, cannot_listen, ports_in_a_row};
 use crate::joint::{JointLimits, Joints};
 pub use controlled_arm::{ControlledArm, JOINT_LIMIT, Refusal};
 pub use controller::Received;
@@ -52,8 +52,6 @@ const REPORT_PORTS: u16 = Kind::ALL.len() as u16;
 const SECOND: usize = Kind::ALL.len() + 1;
 /// Most control connections at once.
 const CLIENTS: usize = 16;
-/// Attempts to find consecutive free ports.
-const ATTEMPTS: u32 = 200;
 
 /// What the emulator does.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
