@@ -139,10 +139,7 @@ pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
         Command::Info(log) => info::run(&log.path()?, log.json),
         Command::Cat { log, part, topics } => cat::run(&log.path()?, part, topics, log.json),
         Command::Doctor(log) => doctor::run(&log.path()?, log.json),
-        Command::Verify(log) => match replay::verify_log(&log.path()?, catalog.tasks, log.json) {
-            Ok(Exit::DATA_LOST) => Ok(Exit::Log),
-            other => other,
-        },
+        Command::Verify(log) => replay::verify_log(&log.path()?, catalog.tasks, log.json),
         Command::Cut { log, part, output } => copy::cut(&log.path()?, part, output, log.json),
         Command::Recover { log, output } => copy::recover(&log.path()?, output.as_deref(), log.json),
         Command::Export { log, part, topic, output } => {
