@@ -51,7 +51,7 @@ pub enum AdapterError {
     Rejected(String),
     /// Not a failure of the device: two setpoints are still unacknowledged, so this one was not sent; or the errors are
     /// being cleared.
-    #[error("the arm is busy")]
+    #[error("busy: two setpoints are unacknowledged, or errors are still being cleared")]
     Busy,
     /// The device has no such feature.
     #[error("not supported by this arm")]

@@ -23,7 +23,7 @@ fn sdk(argument: &str) -> Option<String> {
 fn the_vendors_sdk_uses_the_emulated_servos() {
     let home = Home::new();
     let emulator = home.start("adapter emulate so101 --pty");
-    emulator.until("Ctrl-C ends it");
+    emulator.until("check it");
     let said = emulator.out() + &emulator.err();
     let path = said.split_whitespace().find(|word| word.starts_with("/dev/pts/")).expect("its line");
     let Some(said) = sdk(path) else { return };

@@ -382,8 +382,9 @@ fn lines(text: &str) -> impl Iterator<Item = Value> + '_ {
     text.lines().map(|line| serde_json::from_str(line).unwrap())
 }
 
+/// The numbers of the joints; not those of the gripper behind them, whose velocity is not measured.
 fn numbers(list: &Value) -> Vec<f64> {
-    list.as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect()
+    list.as_array().unwrap().iter().map_while(Value::as_f64).collect()
 }
 
 impl Started {

@@ -58,7 +58,9 @@ fn position_and_force_reach_the_arm_and_the_log() {
                 commands.push((output.gripper, output.gripper_force));
             }
             Payload::ArmInput(input) => measured.push((input.gripper, input.gripper_force)),
-            Payload::Text(text) => asked.push(serde_json::from_str::<Value>(&text.data).unwrap()["request"].clone()),
+            Payload::Text(text) if entry.topic == "/dimos/requests" => {
+                asked.push(serde_json::from_str::<Value>(&text.data).unwrap()["request"].clone())
+            }
             Payload::JointState(joints) if entry.topic == "/gripper/arm" => published.push(joints.effort),
             _ => {}
         }

@@ -12,7 +12,7 @@ use rustix::fs::{AtFlags, CWD, Timespec, Timestamps, utimensat};
 /// The checkout that is tested.
 pub const CHECKOUT: &str = env!("CARGO_MANIFEST_DIR");
 /// What cargo reads of it.
-const SOURCES: [&str; 8] = ["assets", "benches", "blueprints", "build.rs", "src", "tests", "viewer", ".git"];
+const SOURCES: [&str; 9] = ["assets", "benches", "blueprints", "build.rs", "kernels", "src", "tests", "viewer", ".git"];
 
 /// The folder of the programs that cargo builds for this test.
 pub fn programs() -> PathBuf {

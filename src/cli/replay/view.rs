@@ -302,7 +302,7 @@ mod tests {
         if let Payload::Log(log) = &mut answer.data {
             log.msg = "request 6: accepted".into();
         }
-        let mut view = Plain::new(&mut out, 0);
+        let mut view = Plain::new(&mut out, 0, usize::MAX);
         view.show(&request, Mono::ZERO).unwrap();
         view.show(&answer, Mono::ZERO).unwrap();
         assert_eq!(String::from_utf8(out).unwrap(), "     0.000 s  warn: request 6 (execute): accepted\n");

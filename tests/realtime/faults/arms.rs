@@ -98,7 +98,7 @@ tasks:
     assert_eq!(ended.err.matches("no state: ").count(), 3, "one line per episode:\n{}", ended.err);
     let (log, _) = played(&home, "log.mcap", "/joint_states,/arm_status/arm");
     let states: Vec<&Value> = log.iter().filter(|m| m["topic"] == "/joint_states").collect();
-    assert!(states.len() > 100 && states.iter().all(|m| m["data"]["position"].as_array().unwrap().len() == 7));
+    assert!(states.len() > 100 && states.iter().all(|m| m["data"]["position"].as_array().unwrap().len() == 7 + 1));
     let phases: Vec<&str> = log.iter().filter_map(|m| m["data"]["phase"].as_str()).collect();
     let holds = phases.windows(2).filter(|w| w[0] == "ready" && w[1] == "held").count();
     assert_eq!(holds, 1, "one or two errors hold nothing, a row of them does: {phases:?}");

@@ -87,7 +87,12 @@ fn a_paused_program_is_ended_before_a_protective_stop_is_released_whatever_bit_s
     emulator.inject(Fault::new(FaultKind::ErrorCode).code(153)).unwrap();
     until(&mut adapter, |adapter| adapter.read_error().unwrap().0 != 0);
     assert_eq!(emulator.program().as_deref(), Some("dimos_control"));
-    adapter.write_clear_errors().unwrap();
+    let mut cleared = Err(AdapterError::Busy);
+    until(&mut adapter, |adapter| {
+        cleared = adapter.write_clear_errors();
+        cleared != Err(AdapterError::Busy)
+    });
+    cleared.unwrap();
     assert_eq!(emulator.program(), None, "it would continue");
 }
 
