@@ -38,7 +38,9 @@ pub fn share_builds(folder: &Path) {
     symlink(&target, folder.join("target")).unwrap();
     fs::copy(checkout.join("Cargo.lock"), root.join("Cargo.lock")).unwrap();
     let used = fs::read_to_string(checkout.join("Cargo.toml")).unwrap();
-    let workspace = format!("{used}\n[workspace]\nmembers = [{:?}]\n", folder.file_name().unwrap());
+    let members = "members = [\"kernels\"";
+    assert!(used.contains(members), "{used}");
+    let workspace = used.replace(members, &format!("{members}, {:?}", folder.file_name().unwrap()));
     fs::write(root.join("Cargo.toml"), workspace).unwrap();
     let used = used.split("[dev-dependencies]\n").nth(1).unwrap().split("\n[").next().unwrap();
     let manifest = fs::read_to_string(folder.join("Cargo.toml")).unwrap();
