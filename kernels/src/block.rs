@@ -158,7 +158,7 @@ impl Block for Portable {
 /// Blocks in the vectors of x86 processors. Their methods may only run where the processor has the feature: kernels are
 /// called through [`crate::Width`], which asks the processor.
 #[cfg(target_arch = "x86_64")]
-pub mod x86 {
+pub(crate) mod x86 {
     use std::arch::x86_64::*;
 
     use super::{Block, Lanes};
@@ -168,7 +168,7 @@ pub mod x86 {
 
     /// Sixteen lanes of AVX-512.
     #[derive(Clone, Copy)]
-    pub struct Avx512(__m512);
+    pub(crate) struct Avx512(__m512);
 
     // SAFETY of all blocks below: these types are used only in functions that enable the feature, which `Width` calls
     // only where the processor has it.
@@ -253,7 +253,7 @@ pub mod x86 {
 
     /// Sixteen lanes in two vectors of AVX2.
     #[derive(Clone, Copy)]
-    pub struct Avx2(__m256, __m256);
+    pub(crate) struct Avx2(__m256, __m256);
 
     impl Block for Avx2 {
         type Mask = (__m256, __m256);

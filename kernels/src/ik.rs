@@ -7,7 +7,7 @@
 use crate::block::{Block, LANES, Lanes};
 use crate::chain::{Bend, Chain, Frame, Step};
 use crate::trig::sin_cos;
-use crate::width::Width;
+use crate::width::{Vectors, Width};
 
 /// A lane has arrived at this distance [m and rad, together].
 const ARRIVED: f32 = 1e-4;
@@ -70,14 +70,14 @@ impl Solver {
     pub fn descend(&mut self, pose: &Frame, rotation: bool, q: &mut [Lanes], steps: usize, until: Until) -> u16 {
         assert!(q.len() >= self.limits.len(), "a configuration has {} entries", self.limits.len());
         let search = Search { target: self.chain.target(pose), rotation, steps, until };
-        match self.width {
-            // SAFETY: a width is one of this processor.
+        match self.width.0 {
+            // SAFETY: only `Width` makes one, and only of vectors that this processor has.
             #[cfg(target_arch = "x86_64")]
-            Width::Avx512 => unsafe { avx512(self, &search, q) },
+            Vectors::Avx512 => unsafe { avx512(self, &search, q) },
             // SAFETY: see above.
             #[cfg(target_arch = "x86_64")]
-            Width::Avx2 => unsafe { avx2(self, &search, q) },
-            Width::Portable => descend::<crate::block::Portable>(self, &search, q),
+            Vectors::Avx2 => unsafe { avx2(self, &search, q) },
+            Vectors::Portable => descend::<crate::block::Portable>(self, &search, q),
         }
     }
 }

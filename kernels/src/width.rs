@@ -1,8 +1,11 @@
 //! The vectors that the processor has.
 
-/// Which vectors kernels use. All give the same bits.
+/// Which vectors kernels use; always some that this processor has. All give the same bits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Width {
+pub struct Width(pub(crate) Vectors);
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Vectors {
     /// Sixteen lanes at a time (x86 with AVX-512).
     #[cfg(target_arch = "x86_64")]
     Avx512,
@@ -19,25 +22,25 @@ impl Width {
         #[cfg(target_arch = "x86_64")]
         {
             if is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("fma") {
-                return Self::Avx512;
+                return Self(Vectors::Avx512);
             }
             if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
-                return Self::Avx2;
+                return Self(Vectors::Avx2);
             }
         }
-        Self::Portable
+        Self(Vectors::Portable)
     }
 
     /// Returns the widths that this processor can use, widest first.
     pub fn usable() -> Vec<Self> {
-        let mut widths = Vec::new();
+        let mut widths = vec![Self::widest()];
         #[cfg(target_arch = "x86_64")]
-        match Self::widest() {
-            Self::Avx512 => widths.extend([Self::Avx512, Self::Avx2]),
-            Self::Avx2 => widths.push(Self::Avx2),
-            Self::Portable => {}
+        if widths == [Self(Vectors::Avx512)] && is_x86_feature_detected!("avx2") {
+            widths.push(Self(Vectors::Avx2));
         }
-        widths.push(Self::Portable);
+        if !widths.contains(&Self(Vectors::Portable)) {
+            widths.push(Self(Vectors::Portable));
+        }
         widths
     }
 }

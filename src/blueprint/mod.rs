@@ -24,6 +24,7 @@ pub mod schema;
 pub mod size;
 mod summary;
 mod task_leaders;
+mod task_pos;
 mod task_robots;
 mod tasks;
 mod tick_clock;

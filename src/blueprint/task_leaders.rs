@@ -7,6 +7,7 @@ use serde::Deserialize;
 use crate::blueprint::arms::{Entry, Hardware};
 use crate::blueprint::resolve::{Checker, Task};
 use crate::blueprint::schema::TaskEntry;
+use crate::blueprint::task_pos::TaskPos;
 use crate::control::task_leader::{LeaderJoint, LeaderParams};
 use crate::yaml::{Diag, Located, NodeId, did_you_mean, quote};
 
@@ -51,25 +52,6 @@ struct Follower {
     /// The arms that it moves, and the one that leads.
     arms: Vec<usize>,
     leader: usize,
-}
-
-/// Position of a task in its file.
-struct TaskPos<'e> {
-    entry: &'e Located<TaskEntry>,
-    params: Option<NodeId>,
-}
-
-impl TaskPos<'_> {
-    /// Returns the node of a parameter, or of the task's type if the parameter is not written.
-    fn of(&self, checker: &Checker<'_>, key: &str) -> NodeId {
-        self.params.and_then(|params| checker.tree.get(params, key)).unwrap_or(self.entry.kind.at)
-    }
-
-    /// Returns the nodes of a key in a parameter that is a group.
-    fn inner(&self, checker: &Checker<'_>, param: &str, key: &str) -> (NodeId, NodeId) {
-        let at = self.of(checker, param);
-        checker.tree.entry(at, key).unwrap_or((at, at))
-    }
 }
 
 /// Returns the arm that leads.

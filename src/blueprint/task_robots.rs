@@ -11,12 +11,13 @@ use crate::blueprint::arms::Hardware;
 use crate::blueprint::planner_files::file;
 use crate::blueprint::resolve::{Checker, Task, TaskRobot};
 use crate::blueprint::schema::TaskEntry;
+use crate::blueprint::task_pos::TaskPos;
 use crate::control::task_robot::{FramePose, RobotParams, TaskKinematics};
 use crate::planning::config::{PlannerConfig, RobotConfig};
 use crate::robot::kinematics::Kinematics;
 use crate::robot::model::{JointKind, RobotModel};
 use crate::robot::{Source, load};
-use crate::yaml::{Diag, Located, NodeId, Severity, did_you_mean, quote};
+use crate::yaml::{Diag, Located, Severity, did_you_mean, quote};
 
 /// Sets the robot of every task whose type moves an end effector.
 pub(super) fn resolve(
@@ -37,19 +38,6 @@ pub(super) fn resolve(
             let pos = TaskPos { entry, params: entry.params.as_ref().map(|p| p.at) };
             task.robot = robot(checker, &pos, &params, &joints, planner, task.spec.name);
         }
-    }
-}
-
-/// Position of a task in its file.
-struct TaskPos<'e> {
-    entry: &'e Located<TaskEntry>,
-    params: Option<NodeId>,
-}
-
-impl TaskPos<'_> {
-    /// Returns the node of a parameter, or of the task's type if the parameter is not written.
-    fn of(&self, checker: &Checker<'_>, key: &str) -> NodeId {
-        self.params.and_then(|params| checker.tree.get(params, key)).unwrap_or(self.entry.kind.at)
     }
 }
 

@@ -49,5 +49,6 @@ mod templates;
 mod test_support;
 mod tick_rules;
 mod verify;
+mod verify_runs;
 mod xacro;
 mod yaml_reader;

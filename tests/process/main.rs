@@ -33,6 +33,7 @@ mod orders;
 mod packages;
 mod park;
 mod payload;
+mod planner_arms;
 mod planner_attach;
 mod planner_faults;
 mod planner_run;
