@@ -2,7 +2,7 @@
 
 PYTHON ?= python3
 # Most tests wait rather than compute. More at a time than this and whole runs no longer keep their time.
-export NEXTEST_TEST_THREADS ?= $(shell echo $$((3 * $$(nproc))))
+export NEXTEST_TEST_THREADS ?= $(shell echo $$((2 * $$(nproc))))
 READERS := tests/readers
 SYSTEM_TOOLS := cyclictest linux.uml insmod ip tc cansend chromium
 SYSTEM_PACKAGES := rt-tests user-mode-linux kmod iproute2 can-utils chromium
