@@ -96,9 +96,9 @@ deny:
 test: viewer-if-possible
 	@[ -e .venv/readers-installed ] || echo "note: some tests will be skipped; make test-tools installs what they need"
 	cargo test --locked --doc
-	@if cargo nextest --version >/dev/null 2>&1; \
-	then cargo nextest run --locked; \
-	else cargo test --locked --lib --bins --tests; \
+	@if ! cargo nextest --version >/dev/null 2>&1; then cargo test --locked --lib --bins --tests; \
+	elif command -v $(PYTHON) >/dev/null; then $(PYTHON) tests/suite.py; \
+	else cargo nextest run --locked; \
 	fi
 
 # The logic, in a minute: no run of the program, no vendor's tool.

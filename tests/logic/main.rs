@@ -43,6 +43,7 @@ mod poses;
 mod robot_models;
 mod rpc;
 mod speed_override;
+mod standstills;
 mod surface;
 mod task_conformance;
 mod templates;

@@ -1,0 +1,111 @@
+"""Runs the tests with cargo-nextest beside a thread that notices when this computer stands still.
+
+On a shared host a virtual machine's processors are sometimes taken away for 0.1 s: nothing in it runs, not even a
+thread of the highest real-time priority. An arm in motion is held then, as it must be, and the test that watched it
+fails, though nothing was wrong. Such a test was interrupted; it has no result yet. It is run again, alone, if the
+standstill was seen from outside of the test while it ran. A test that fails at any other time has failed.
+"""
+
+import os
+import subprocess
+import sys
+import threading
+import time
+import xml.etree.ElementTree as xml
+from datetime import datetime
+
+JUNIT = os.path.join(os.environ.get("CARGO_TARGET_DIR", "target"), "nextest", "default", "junit.xml")
+# Half of the time between two ticks at which arms are held: a standstill is seen in part only, between two wake-ups.
+STANDSTILL = 0.05
+# Without a real-time priority a thread may wait because others run. The processors count as taken away if the
+# hypervisor says so for half of the time.
+STOLEN = 0.5
+ATTEMPTS = 3
+
+
+class Standstills(threading.Thread):
+    """Wakes up every 10 ms and keeps the times when it could not."""
+
+    def __init__(self):
+        super().__init__(daemon=True)
+        self.seen = []  # (begin, end) [s since 1970]
+
+    def run(self):
+        realtime = self.asks_for_realtime()
+        tick = 1.0 / os.sysconf("SC_CLK_TCK")
+        before, stolen_before = time.monotonic(), self.stolen()
+        while True:
+            time.sleep(0.01)
+            now, stolen = time.monotonic(), 0 if realtime else self.stolen()
+            gap, before = now - before, now
+            taken, stolen_before = (stolen - stolen_before) * tick, stolen
+            if gap >= STANDSTILL and (realtime or taken >= STOLEN * gap):
+                end = time.time()
+                self.seen.append((end - gap, end))
+
+    @staticmethod
+    def asks_for_realtime():
+        """Whether this thread, and no process that is started by another, has a real-time priority."""
+        try:
+            policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+            os.sched_setscheduler(0, policy, os.sched_param(99))
+            return True
+        except (OSError, AttributeError):
+            return False
+
+    @staticmethod
+    def stolen():
+        """Time for which the hypervisor ran something else [clock ticks, all processors]."""
+        try:
+            with open("/proc/stat") as file:
+                return int(file.readline().split()[8])
+        except (OSError, IndexError):
+            return 0
+
+    def while_it_ran(self, begin, end):
+        """The longest standstill in a span of time [s], or 0."""
+        return max((b - a for a, b in list(self.seen) if a < end and b > begin), default=0.0)
+
+
+def failures():
+    """Binary, name, begin and end of each failed test of the last run."""
+    for suite in xml.parse(JUNIT).getroot().iter("testsuite"):
+        for case in suite.iter("testcase"):
+            if case.find("failure") is None and case.find("error") is None:
+                continue
+            begin = datetime.fromisoformat(case.get("timestamp").replace("Z", "+00:00")).timestamp()
+            yield suite.get("name"), case.get("name"), begin, begin + float(case.get("time"))
+
+
+def nextest(arguments):
+    return subprocess.run(["cargo", "nextest", "run", "--locked", *arguments]).returncode
+
+
+def main():
+    standstills = Standstills()
+    standstills.start()
+    if os.path.exists(JUNIT):
+        os.remove(JUNIT)
+    code = nextest(sys.argv[1:])
+    for _ in range(ATTEMPTS):
+        # 100: tests were run, and some have failed.
+        if code != 100 or not os.path.exists(JUNIT):
+            break
+        failed = list(failures())
+        interrupted = [standstills.while_it_ran(begin, end) for _, _, begin, end in failed]
+        for (binary, name, _, _), gap in zip(failed, interrupted):
+            if gap:
+                print(f"INTERRUPTED: {binary} {name}: this computer stood still for {1000 * gap:.0f} ms")
+        if not failed or not all(interrupted):
+            break
+        again = " | ".join(f"(binary_id(={binary}) & test(={name}))" for binary, name, _, _ in failed)
+        print("no result yet; run again, alone:", flush=True)
+        code = nextest(["--test-threads", "1", "-E", again])
+    longest = max((end - begin for begin, end in standstills.seen), default=0.0)
+    if longest:
+        print(f"note: this computer stood still {len(standstills.seen)} times, up to {1000 * longest:.0f} ms")
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
