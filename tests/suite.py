@@ -1,9 +1,9 @@
-"""Runs the tests with cargo-nextest beside a thread that notices when this computer stands still.
+"""Runs the tests with cargo-nextest beside a thread that notices when this computer is stalled.
 
 On a shared host a virtual machine's processors are sometimes taken away for 0.1 s: nothing in it runs, not even a
 thread of the highest real-time priority. An arm in motion is held then, as it must be, and the test that watched it
 fails, though nothing was wrong. Such a test was interrupted; it has no result yet. It is run again, alone, if the
-standstill was seen from outside of the test while it ran. A test that fails at any other time has failed.
+stall was seen from outside of the test while it ran. A test that fails at any other time has failed.
 """
 
 import os
@@ -15,15 +15,15 @@ import xml.etree.ElementTree as xml
 from datetime import datetime
 
 JUNIT = os.path.join(os.environ.get("CARGO_TARGET_DIR", "target"), "nextest", "default", "junit.xml")
-# Half of the time between two ticks at which arms are held: a standstill is seen in part only, between two wake-ups.
-STANDSTILL = 0.05
+# Half of the time between two ticks at which arms are held: a stall is seen in part only, between two wake-ups.
+STALL = 0.05
 # Without a real-time priority a thread may wait because others run. The processors count as taken away if the
 # hypervisor says so for half of the time.
 STOLEN = 0.5
 ATTEMPTS = 3
 
 
-class Standstills(threading.Thread):
+class Stalls(threading.Thread):
     """Wakes up every 10 ms and keeps the times when it could not."""
 
     def __init__(self):
@@ -39,7 +39,7 @@ class Standstills(threading.Thread):
             now, stolen = time.monotonic(), 0 if realtime else self.stolen()
             gap, before = now - before, now
             taken, stolen_before = (stolen - stolen_before) * tick, stolen
-            if gap >= STANDSTILL and (realtime or taken >= STOLEN * gap):
+            if gap >= STALL and (realtime or taken >= STOLEN * gap):
                 end = time.time()
                 self.seen.append((end - gap, end))
 
@@ -63,7 +63,7 @@ class Standstills(threading.Thread):
             return 0
 
     def while_it_ran(self, begin, end):
-        """The longest standstill in a span of time [s], or 0."""
+        """The longest stall in a span of time [s], or 0."""
         return max((b - a for a, b in list(self.seen) if a < end and b > begin), default=0.0)
 
 
@@ -82,8 +82,8 @@ def nextest(arguments):
 
 
 def main():
-    standstills = Standstills()
-    standstills.start()
+    stalls = Stalls()
+    stalls.start()
     if os.path.exists(JUNIT):
         os.remove(JUNIT)
     code = nextest(sys.argv[1:])
@@ -92,18 +92,18 @@ def main():
         if code != 100 or not os.path.exists(JUNIT):
             break
         failed = list(failures())
-        interrupted = [standstills.while_it_ran(begin, end) for _, _, begin, end in failed]
+        interrupted = [stalls.while_it_ran(begin, end) for _, _, begin, end in failed]
         for (binary, name, _, _), gap in zip(failed, interrupted):
             if gap:
-                print(f"INTERRUPTED: {binary} {name}: this computer stood still for {1000 * gap:.0f} ms")
+                print(f"INTERRUPTED: {binary} {name}: this computer was stalled for {1000 * gap:.0f} ms")
         if not failed or not all(interrupted):
             break
         again = " | ".join(f"(binary_id(={binary}) & test(={name}))" for binary, name, _, _ in failed)
         print("no result yet; run again, alone:", flush=True)
         code = nextest(["--test-threads", "1", "-E", again])
-    longest = max((end - begin for begin, end in standstills.seen), default=0.0)
+    longest = max((end - begin for begin, end in stalls.seen), default=0.0)
     if longest:
-        print(f"note: this computer stood still {len(standstills.seen)} times, up to {1000 * longest:.0f} ms")
+        print(f"note: this computer was stalled {len(stalls.seen)} times, up to {1000 * longest:.0f} ms")
     return code
 
 

@@ -1,5 +1,5 @@
-//! `make test` repeats a test only if this computer stood still while it ran (tests/suite.py). Cargo is replaced by a
-//! script that reports one failure; a standstill is a suite that is stopped by a signal.
+//! `make test` repeats a test only if this computer was stalled while it ran (tests/suite.py). Cargo is replaced by a
+//! script that reports one failure; a stall is a suite that is stopped by a signal.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -7,12 +7,12 @@ use std::process::Command;
 
 use crate::support::skip;
 
-/// Reports that `logic one` failed in the last second; before, the suite stands still if `$STAND_STILL` is set. What is
+/// Reports that `logic one` failed in the last second; before, the suite is stalled if `$STALL` is set. What is
 /// run again passes.
 const CARGO: &str = r#"#!/bin/sh
 echo "$*" >>runs
 [ "$(wc -l <runs)" = 1 ] || exit 0
-[ -z "$STAND_STILL" ] || { kill -STOP $PPID; sleep 0.3; kill -CONT $PPID; }
+[ -z "$STALL" ] || { kill -STOP $PPID; sleep 0.3; kill -CONT $PPID; }
 sleep 0.1
 mkdir -p target/nextest/default
 cat >target/nextest/default/junit.xml <<END
@@ -25,7 +25,7 @@ exit 100
 "#;
 
 /// Exit code and output of the suite, and what cargo was asked to run.
-fn suite(stand_still: bool) -> (Option<i32>, String, String) {
+fn suite(stall: bool) -> (Option<i32>, String, String) {
     let folder = tempfile::tempdir().unwrap();
     let cargo = folder.path().join("cargo");
     fs::write(&cargo, CARGO).unwrap();
@@ -33,14 +33,14 @@ fn suite(stand_still: bool) -> (Option<i32>, String, String) {
     let path = format!("{}:{}", folder.path().display(), std::env::var("PATH").unwrap());
     let mut command = Command::new("python3");
     command.arg(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/suite.py")).current_dir(folder.path());
-    command.env("PATH", path).env_remove("CARGO_TARGET_DIR").env("STAND_STILL", if stand_still { "yes" } else { "" });
+    command.env("PATH", path).env_remove("CARGO_TARGET_DIR").env("STALL", if stall { "yes" } else { "" });
     let output = command.output().unwrap();
     let runs = fs::read_to_string(folder.path().join("runs")).unwrap();
     (output.status.code(), String::from_utf8(output.stdout).unwrap(), runs)
 }
 
 #[test]
-fn what_a_standstill_interrupted_is_run_again_and_nothing_else() {
+fn what_a_stall_interrupted_is_run_again_and_nothing_else() {
     if Command::new("python3").arg("--version").output().is_err() {
         return skip::skip_tool("python3");
     }
@@ -52,7 +52,7 @@ fn what_a_standstill_interrupted_is_run_again_and_nothing_else() {
     let (code, output, runs) = suite(true);
     if realtime {
         assert_eq!((code, runs.lines().count()), (Some(0), 2), "{output}{runs}");
-        assert!(output.contains("INTERRUPTED: dimos::logic one: this computer stood still for"), "{output}");
+        assert!(output.contains("INTERRUPTED: dimos::logic one: this computer was stalled for"), "{output}");
         let again = "nextest run --locked --test-threads 1 -E (binary_id(=dimos::logic) & test(=one))";
         assert_eq!(runs.lines().nth(1), Some(again), "{runs}");
     } else {
