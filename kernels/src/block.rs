@@ -45,6 +45,8 @@ pub trait Block: Copy {
     fn max(self, b: Self) -> Self;
     /// The nearest integer, of two the even one.
     fn round(self) -> Self;
+    /// The square root.
+    fn sqrt(self) -> Self;
     /// Lanes in which `self < b`.
     fn less(self, b: Self) -> Self::Mask;
     /// `a` in the lanes of the mask, `b` in the others.
@@ -137,6 +139,11 @@ impl Block for Portable {
     #[inline(always)]
     fn round(self) -> Self {
         Self(self.0.map(f32::round_ties_even))
+    }
+
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        Self(std::array::from_fn(|i| self.0[i].sqrt()))
     }
 
     #[inline(always)]
@@ -236,6 +243,11 @@ pub(crate) mod x86 {
         }
 
         #[inline(always)]
+        fn sqrt(self) -> Self {
+            Self(unsafe { _mm512_sqrt_ps(self.0) })
+        }
+
+        #[inline(always)]
         fn less(self, b: Self) -> Self::Mask {
             unsafe { _mm512_cmp_ps_mask::<_CMP_LT_OQ>(self.0, b.0) }
         }
@@ -322,6 +334,11 @@ pub(crate) mod x86 {
         #[inline(always)]
         fn round(self) -> Self {
             unsafe { Self(_mm256_round_ps::<NEAREST>(self.0), _mm256_round_ps::<NEAREST>(self.1)) }
+        }
+
+        #[inline(always)]
+        fn sqrt(self) -> Self {
+            unsafe { Self(_mm256_sqrt_ps(self.0), _mm256_sqrt_ps(self.1)) }
         }
 
         #[inline(always)]

@@ -5,9 +5,13 @@
 //! Every kernel is written once, over [`block::Block`], and compiled for each width. The result does not depend on the
 //! width, bit for bit: a block always has sixteen lanes, and every width computes the same operations in the same order.
 
+pub mod apart;
 pub mod block;
+pub mod bodies;
 pub mod chain;
+pub mod cover;
 pub mod ik;
+pub mod obstacle;
 pub mod trig;
 mod width;
 

@@ -8,6 +8,7 @@ use glamx::{DAffine3, DVec3};
 use crate::robot::model::Limits;
 
 use super::checker::{CollisionChecker, Resolution, Stop};
+use super::lanes::InLanes;
 use super::motion::Pieces;
 use super::pairs::general::nearest;
 use super::pairs::{self, Placed, point};
@@ -41,6 +42,8 @@ pub struct ExactChecker {
     /// The pair that touched last: likely to touch again.
     pub(super) witness: Option<usize>,
     pub(super) pieces: Pieces,
+    /// Excludes most pairs, sixteen configurations at a time.
+    pub(super) lanes: InLanes,
     pub(super) checks: u64,
     /// Padding of each pair [m], parallel to `pairs`: closer counts as touching.
     pub(super) pads: Vec<f64>,
@@ -70,6 +73,7 @@ impl ExactChecker {
         let link_pairs = pairs.iter().map(link_pair).collect();
         let pieces = Pieces::new(scene.dof(), pairs.len());
         let pads = vec![0.0; pairs.len()];
+        let lanes = InLanes::new(&scene, &pairs);
         let mut made = Self {
             pads,
             still,
@@ -80,6 +84,7 @@ impl ExactChecker {
             always: None,
             witness: None,
             pieces,
+            lanes,
             checks: 0,
             scene: scene.clone(),
         };
@@ -91,6 +96,23 @@ impl ExactChecker {
     /// Returns the scene.
     pub fn scene(&self) -> &Arc<Scene> {
         &self.scene
+    }
+
+    /// Returns the index of a pair that touches at a configuration.
+    pub(super) fn first_touch(&mut self, q: &[f64]) -> Option<usize> {
+        self.lanes.set(q);
+        let (none, all) = (self.lanes.none.clone(), self.lanes.all.clone());
+        let found = self.lanes.find((1, 0.0), &none, &self.pads, &all, self.witness);
+        if found.is_some() || self.lanes.close.is_empty() {
+            self.checks += 1;
+            self.witness = found.or(self.witness);
+            return found;
+        }
+        self.place(q);
+        let touches = |i: &usize| self.gap(*i, 0.0) == Gap::Touch;
+        let found = self.lanes.close.iter().map(|(pair, _)| *pair as usize).find(touches);
+        self.witness = found.or(self.witness);
+        found
     }
 
     /// Moves all frames to a configuration.
@@ -218,6 +240,31 @@ impl ExactChecker {
         best
     }
 
+    /// Returns the smallest distance, below `below` [m], of two things that can collide and move relative to each other,
+    /// at any of up to sixteen configurations; `None` if there is none.
+    pub fn closest(&mut self, configurations: &[Vec<f64>], below: f64) -> Option<Contact> {
+        self.lanes.find_closer(configurations, below);
+        let mut best: Option<Contact> = None;
+        for (lane, q) in configurations.iter().enumerate() {
+            if !self.lanes.close.iter().any(|(_, lanes)| lanes >> lane & 1 == 1) {
+                continue;
+            }
+            self.place(q);
+            for i in 0..self.lanes.close.len() {
+                let (pair, lanes) = self.lanes.close[i];
+                let pair = self.pairs[pair as usize];
+                let limit = best.as_ref().map_or(below, |contact| contact.distance);
+                if lanes >> lane & 1 == 1
+                    && self.least_distance(pair) < limit
+                    && let Some(contact) = self.contact(pair).filter(|contact| contact.distance < limit)
+                {
+                    best = Some(contact);
+                }
+            }
+        }
+        best
+    }
+
     /// Returns a lower bound of a pair's distance, from the links' bounding balls.
     fn least_distance(&self, pair: Pair) -> f64 {
         let ball = |l: usize| (self.center(&self.scene.links[l]), self.scene.links[l].ball.1);
@@ -302,11 +349,7 @@ impl CollisionChecker for ExactChecker {
         if self.always.is_some() {
             return self.always;
         }
-        self.place(q);
-        let touches = |i: &usize| self.gap(*i, 0.0) == Gap::Touch;
-        let found = self.witness.filter(touches).or_else(|| (0..self.pairs.len()).find(touches));
-        self.witness = found.or(self.witness);
-        found.map(|i| self.pairs[i])
+        self.first_touch(q).map(|i| self.pairs[i])
     }
 
     fn clearance(&mut self, q: &[f64]) -> Option<Contact> {

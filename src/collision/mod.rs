@@ -12,6 +12,7 @@ pub mod body;
 pub mod checker;
 pub mod cloud;
 pub mod exact;
+mod lanes;
 mod motion;
 mod padding;
 pub mod pairs;

@@ -1,13 +1,23 @@
 //! Continuous collision checks. At the middle of a piece of the motion, each pair is checked with a margin: the most
 //! that its members can approach each other on the way to either end of the piece (a bound from the joints' lever
-//! arms). A pair farther apart than its margin is free on the whole piece; for the other pairs, the piece is split in
-//! two. So most pairs need few checks, and a motion that passes is also free between the samples.
+//! arms). A pair farther apart than its margin is free on the whole piece; for the other pairs, the piece is split. So
+//! most pairs need few checks, and a motion that passes is also free between the samples.
 //!
-//! All pieces of one size are checked before those of half the size, which finds contacts early.
+//! Sixteen pieces at a time are checked with covers, down to pieces on which nothing moves far; what is left is checked
+//! exactly, split in two each time. All pieces of one size are checked before smaller ones, which finds contacts early.
+
+use dimos_kernels::block::LANES;
 
 use super::checker::Stop;
 use super::exact::{ExactChecker, Gap};
 use super::report::Pair;
+
+/// A piece is split into this many for the next check in lanes.
+const PARTS: usize = 4;
+/// Pieces on which nothing moves farther than this [m] are not split for lanes any longer: covers are not tighter.
+const LANES_END: f64 = 0.004;
+/// Pieces that are checked for contacts exactly before all are split.
+const TRIES: usize = 3;
 
 /// A piece of a motion, and its unproven pairs.
 #[derive(Debug, Clone, Copy)]
@@ -28,6 +38,8 @@ pub(super) struct Pieces {
     /// Pairs of the pieces.
     pairs_now: Vec<u32>,
     pairs_next: Vec<u32>,
+    /// Pairs of the pieces that are checked together.
+    together: Vec<u32>,
     /// Maximum motion of each link [m].
     links: Vec<f64>,
 }
@@ -35,16 +47,31 @@ pub(super) struct Pieces {
 impl Pieces {
     pub(super) fn new(dof: usize, pairs: usize) -> Self {
         let none = Vec::new;
-        let (now, next) = (Vec::new(), Vec::new());
         Self {
             q: vec![0.0; dof],
             reach: vec![0.0; pairs],
-            now,
-            next,
+            now: Vec::new(),
+            next: Vec::new(),
             pairs_now: none(),
             pairs_next: none(),
+            together: none(),
             links: vec![],
         }
+    }
+
+    /// Sets `q` to a point of a motion.
+    fn place(&mut self, from: &[f64], to: &[f64], at: f64) {
+        for ((x, a), b) in self.q.iter_mut().zip(from).zip(to) {
+            *x = a + (b - a) * at;
+        }
+    }
+
+    /// Makes the pieces found the ones to check.
+    fn advance(&mut self) {
+        std::mem::swap(&mut self.now, &mut self.next);
+        std::mem::swap(&mut self.pairs_now, &mut self.pairs_next);
+        self.next.clear();
+        self.pairs_next.clear();
     }
 }
 
@@ -52,7 +79,7 @@ impl ExactChecker {
     /// Returns whether nothing touches on a motion, as defined by `CollisionChecker::motion_is_free`.
     pub(super) fn check_motion(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool {
         // After the deadline, every call returns at once.
-        if stop.is_over() || self.always.is_some() || !self.is_clear(to) || !self.is_clear(from) {
+        if stop.is_over() || self.always.is_some() {
             return false;
         }
         let mut pieces = std::mem::replace(&mut self.pieces, Pieces::new(0, 0));
@@ -61,39 +88,113 @@ impl ExactChecker {
         free
     }
 
-    /// Returns whether nothing touches at a configuration.
-    fn is_clear(&mut self, q: &[f64]) -> bool {
-        use super::checker::CollisionChecker;
-        self.is_free(q)
-    }
-
     fn check_motion_with(&mut self, p: &mut Pieces, from: &[f64], to: &[f64], stop: &Stop) -> bool {
         let most = self.measure(p, from, to);
+        let mut size = 1.0 / LANES as f64;
         p.now.clear();
         p.pairs_now.clear();
-        p.pairs_now.extend(0..self.pairs.len() as u32);
-        p.now.push(Piece { start: 0.0, first: 0, last: p.pairs_now.len() as u32 });
-        let mut size = 1.0;
+        p.now.extend((0..LANES).map(|i| Piece { start: i as f64 * size, first: 0, last: 0 }));
+        loop {
+            if let Some(pair) = self.check_in_lanes(p, from, to, size) {
+                self.witness = Some(pair);
+                return false;
+            }
+            p.advance();
+            if p.now.is_empty() {
+                return true;
+            }
+            if stop.is_over() || self.any_touches(p, from, to, size) {
+                return false;
+            }
+            if most * size <= LANES_END {
+                break;
+            }
+            size /= PARTS as f64;
+            for piece in &p.now {
+                p.next.extend((0..PARTS).map(|i| Piece { start: piece.start + i as f64 * size, ..*piece }));
+            }
+            std::mem::swap(&mut p.now, &mut p.next);
+            p.next.clear();
+        }
+        let (first, last) = (p.now.first().map_or(0.0, |piece| piece.start), p.now.last().map_or(1.0, |p| p.start + size));
+        (last < 1.0 || self.first_touch(to).is_none())
+            && (first > 0.0 || self.first_touch(from).is_none())
+            && self.check_exactly(p, from, to, size, most, stop)
+    }
+
+    /// Finds the pieces, and their pairs, that are not proven free with covers; ends and returns the pair if one surely
+    /// touches. Without pairs, a piece has all.
+    fn check_in_lanes(&mut self, p: &mut Pieces, from: &[f64], to: &[f64], size: f64) -> Option<usize> {
+        for at in (0..p.now.len()).step_by(LANES) {
+            let number = (p.now.len() - at).min(LANES);
+            p.together.clear();
+            for lane in 0..number {
+                let piece = p.now[at + lane];
+                p.place(from, to, piece.start + 0.5 * size);
+                for (values, q) in self.lanes.q.iter_mut().zip(&p.q) {
+                    values.0[lane] = *q as f32;
+                }
+                // Parts of one piece follow each other.
+                if lane == 0 || p.now[at + lane - 1].first != piece.first {
+                    p.together.extend_from_slice(&p.pairs_now[piece.first as usize..piece.last as usize]);
+                }
+            }
+            p.together.sort_unstable();
+            p.together.dedup();
+            let all = self.lanes.all.clone();
+            let pairs = if p.together.is_empty() { &*all } else { &p.together[..] };
+            self.checks += number as u64;
+            let touching = self.lanes.find((number, 0.5 * size), &p.reach, &self.pads, pairs, self.witness);
+            if touching.is_some() {
+                return touching;
+            }
+            for lane in 0..number {
+                let first = p.pairs_next.len() as u32;
+                let close = self.lanes.close.iter().filter(|(_, lanes)| lanes >> lane & 1 == 1);
+                p.pairs_next.extend(close.map(|(pair, _)| *pair));
+                let last = p.pairs_next.len() as u32;
+                if last > first {
+                    p.next.push(Piece { start: p.now[at + lane].start, first, last });
+                }
+            }
+        }
+        None
+    }
+
+    /// Returns whether anything touches in the middle of the pieces that have most pairs: shallow contacts, which covers
+    /// cannot find, are found before the pieces are many.
+    fn any_touches(&mut self, p: &mut Pieces, from: &[f64], to: &[f64], size: f64) -> bool {
+        let mut below = u32::MAX;
+        for _ in 0..TRIES {
+            let number = |piece: &&Piece| piece.last - piece.first;
+            let Some(worst) = p.now.iter().filter(|piece| number(piece) < below).max_by_key(number).copied() else { break };
+            below = worst.last - worst.first;
+            p.place(from, to, worst.start + 0.5 * size);
+            self.place(&p.q);
+            for k in worst.first..worst.last {
+                let pair = p.pairs_now[k as usize] as usize;
+                if self.gap(pair, 0.0) == Gap::Touch {
+                    self.witness = Some(pair);
+                    return true;
+                }
+            }
+        }
+        false
+    }
+
+    fn check_exactly(&mut self, p: &mut Pieces, from: &[f64], to: &[f64], whole: f64, most: f64, stop: &Stop) -> bool {
+        let mut size = whole;
         while !p.now.is_empty() {
             // The last pieces are below the resolution.
             let last = most * size <= self.resolution.motion;
-            p.next.clear();
-            p.pairs_next.clear();
             for i in 0..p.now.len() {
                 let piece = p.now[i];
                 let middle = piece.start + 0.5 * size;
-                for ((x, a), b) in p.q.iter_mut().zip(from).zip(to) {
-                    *x = a + (b - a) * middle;
-                }
                 if stop.is_over() {
                     return false;
                 }
+                p.place(from, to, middle);
                 self.place(&p.q);
-                if let Some(witness) = self.witness
-                    && self.gap(witness, 0.0) == Gap::Touch
-                {
-                    return false;
-                }
                 let first = p.pairs_next.len() as u32;
                 for k in piece.first..piece.last {
                     let pair = p.pairs_now[k as usize];
@@ -112,8 +213,7 @@ impl ExactChecker {
                     p.next.push(Piece { start: middle, first, last: end });
                 }
             }
-            std::mem::swap(&mut p.now, &mut p.next);
-            std::mem::swap(&mut p.pairs_now, &mut p.pairs_next);
+            p.advance();
             size *= 0.5;
         }
         true

@@ -160,8 +160,8 @@ impl Scene {
         let Some(own) = self.robots.get(r).filter(|_| !solids.is_empty()) else { return };
         let kinematics = &robot.kinematics;
         let (body, place) = (kinematics.body_of(link), kinematics.offset_of(link));
-        let carry = |s: &Solid| Solid { core: s.core.clone(), radius: s.radius + padding, frame: place * s.frame };
-        let solids: Vec<Solid> = solids.iter().map(carry).collect();
+        let mut solids: Vec<Solid> = solids.iter().map(|s| s.clone().at(place * s.frame)).collect();
+        solids.iter_mut().for_each(|s| s.radius += padding);
         let ball = ball_around(&solids);
         let reach = ball.0.length() + ball.1;
         let mut levers = vec![0.0; self.limits.len()];

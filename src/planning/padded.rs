@@ -95,6 +95,11 @@ impl Padded {
         self.bare.is_free(q)
     }
 
+    /// Returns the smallest distance below `below` [m] at any of up to sixteen configurations, regardless of the padding.
+    pub fn closest(&mut self, configurations: &[Vec<f64>], below: f64) -> Option<Contact> {
+        self.bare.closest(configurations, below)
+    }
+
     /// Adds exceptions around a start or goal for the pairs that are closer there.
     pub fn give_up(&mut self, near: Near, center: &[f64]) {
         let closer = self.full.closer_than_padding(center);

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Instant;
 
+use dimos_kernels::block::LANES;
 use glamx::DVec3;
 use nalgebra::{Isometry3, Vector3};
 
@@ -311,21 +312,23 @@ pub(super) fn late(stop: &Stop) -> Option<PlanFailure> {
 
 /// Returns the minimum clearance on a path and its pair; `None` if the timeout is reached first.
 fn clearance(checker: &mut Padded, path: &Path, stop: &Stop) -> Option<(f64, [String; 2])> {
-    let mut least: Option<(f64, [String; 2])> = None;
-    let mut q = path.first()?.clone();
+    let mut least = checker.clearance(path.first()?)?;
+    let mut samples: Path = Vec::with_capacity(LANES);
     for pair in path.windows(2) {
         let [a, b] = pair else { continue };
         let steps = (distance(a, b) / CLEARANCE_STEP).ceil().max(1.0) as usize;
-        for step in 0..=steps {
+        for first in (1..=steps).step_by(LANES) {
             if stop.is_over() {
                 return None;
             }
-            between(a, b, step as f64 / steps as f64, &mut q);
-            let contact = checker.clearance(&q)?;
-            if least.as_ref().is_none_or(|(distance, _)| contact.distance < *distance) {
-                least = Some((contact.distance, [contact.link, contact.other]));
-            }
+            samples.clear();
+            samples.extend((first..=steps).take(LANES).map(|step| {
+                let mut q = a.clone();
+                between(a, b, step as f64 / steps as f64, &mut q);
+                q
+            }));
+            least = checker.closest(&samples, least.distance).unwrap_or(least);
         }
     }
-    least
+    Some((least.distance, [least.link, least.other]))
 }

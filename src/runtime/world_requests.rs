@@ -8,7 +8,6 @@ use nalgebra::{Isometry3, Matrix3, Vector3};
 
 use super::planner_port::{PlannerPort, isometry, positions_of, robot_index, run_blocking, spec};
 use super::service::internal;
-use crate::collision::Solid;
 use crate::collision::world::{Attached, Obstacle, World};
 use crate::planning::config::{ObjectConfig, ObjectShape};
 use crate::planning::planning_scene::{PlannedRobot, obstacle};
@@ -41,7 +40,7 @@ impl PlannerPort {
         touch_links.extend(robot.moved_together_with(&link));
         let held = |world: &mut World| {
             let stood = world.remove(&call.name)?;
-            let solid = Solid { frame: frame(&at), ..stood.solid.clone() };
+            let solid = stood.solid.clone().at(frame(&at));
             let taken = world.attach(Attached {
                 name: call.name.clone(),
                 robot: index,
@@ -77,7 +76,7 @@ impl PlannerPort {
             let held = world.detach(name)?;
             let solids = held.solids.into_iter();
             solids
-                .map(|solid| Solid { frame: frame(&at), ..solid })
+                .map(|solid| solid.at(frame(&at)))
                 .try_for_each(|solid| world.add(Obstacle { name: name.to_owned(), solid, padding: held.padding }))
         };
         self.thread.world(let_go).map_err(|e| wrong(e.to_string()))?;

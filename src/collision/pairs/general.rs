@@ -2,9 +2,10 @@
 //! closest points and penetration depths, for reports rather than during planning.
 
 use glamx::{DAffine3, DPose3, DQuat, DVec3};
+use parry3d_f64::bounding_volume::BoundingVolume;
 use parry3d_f64::query::gjk::{self, CsoPoint, GJKResult, VoronoiSimplex};
 use parry3d_f64::query::{self, ClosestPoints};
-use parry3d_f64::shape::{Ball, ConvexPolyhedron, Cuboid, Cylinder, Segment, Shape, SupportMap};
+use parry3d_f64::shape::{Ball, ConvexPolyhedron, Cuboid, Cylinder, Segment, Shape, SupportMap, TriMesh};
 
 use super::super::shape::Placed;
 
@@ -28,7 +29,12 @@ pub fn distance(a: &Placed, b: &Placed) -> f64 {
     if holds(a, b) || holds(b, a) {
         return 0.0;
     }
-    with_shape(a, |pa, sa| with_shape(b, |pb, sb| query::distance(pa, sa, pb, sb).map_or(0.0, |d| d.distance)))
+    with_shape(a, |pa, sa| {
+        with_shape(b, |pb, sb| match (sa.as_support_map(), sb.as_support_map()) {
+            (Some(ma), Some(mb)) => convex_distance(&pa.inv_mul(pb), ma, mb),
+            _ => query::distance(pa, sa, pb, sb).map_or(0.0, |d| d.distance),
+        })
+    })
 }
 
 /// Returns whether two cores are within `reach` [m] of each other.
@@ -43,23 +49,77 @@ pub fn within(a: &Placed, b: &Placed, reach: f64) -> bool {
     with_shape(a, |pa, sa| {
         with_shape(b, |pb, sb| match (sa.as_support_map(), sb.as_support_map()) {
             (Some(ma), Some(mb)) => convex_within(&pa.inv_mul(pb), ma, mb, reach),
-            // A query that parry does not support counts as touching. Its closest points are not used: for a box and a
-            // triangle they are not always the closest.
-            _ => query::distance(pa, sa, pb, sb).map_or(0.0, |d| d.distance) <= reach,
+            _ => match (sa.as_trimesh(), sb.as_trimesh()) {
+                (Some(mesh), _) => mesh_within(mesh, &pa.inv_mul(pb), sb, reach),
+                (_, Some(mesh)) => mesh_within(mesh, &pb.inv_mul(pa), sa, reach),
+                // What parry does not support counts as touching.
+                _ => true,
+            },
         })
     })
 }
 
-/// GJK ends as soon as the distance is known to be below or above `reach`.
+/// Starts of GJK besides the direction between the shapes.
+const STARTS: [DVec3; 4] = [DVec3::X, DVec3::Y, DVec3::Z, DVec3::new(0.36, -0.48, 0.8)];
+/// A distance is believed if a direction separates the shapes by as much, less this [m]: GJK is less exact at curved surfaces.
+const BELIEVED: f64 = 1e-5;
+
+/// Returns how far two convex shapes are apart along a direction: a lower bound of their distance [m].
+fn separation(pose: &DPose3, a: &dyn SupportMap, b: &dyn SupportMap, direction: DVec3) -> f64 {
+    let n = direction.normalize_or_zero();
+    n.dot(b.support_point(pose, -n) - a.local_support_point(n))
+}
+
+/// Returns the distance of two convex shapes [m]. parry's GJK ends with points that are not the closest when it makes no
+/// progress, mostly at parallel faces; then it starts again from elsewhere. A lower bound if none of its answers is
+/// proven.
+fn convex_distance(pose: &DPose3, a: &dyn SupportMap, b: &dyn SupportMap) -> f64 {
+    let mut least: f64 = 0.0;
+    for start in std::iter::once(pose.translation.try_normalize().unwrap_or(DVec3::X)).chain(STARTS) {
+        let mut simplex = VoronoiSimplex::new();
+        simplex.reset(CsoPoint::from_shapes(pose, a, b, start));
+        match gjk::closest_points(pose, a, b, f64::MAX, true, &mut simplex) {
+            GJKResult::Intersection => return 0.0,
+            GJKResult::ClosestPoints(p, q, _) => {
+                let apart = separation(pose, a, b, q - p);
+                if apart >= p.distance(q) - BELIEVED {
+                    return p.distance(q);
+                }
+                least = least.max(apart);
+            }
+            GJKResult::Proximity(_) | GJKResult::NoIntersection(_) => {}
+        }
+    }
+    least
+}
+
+/// Returns whether two convex shapes are within `reach` [m]: GJK ends as soon as the distance is known to be below or
+/// above. That it is above has to be proven by a direction.
 fn convex_within(pose: &DPose3, a: &dyn SupportMap, b: &dyn SupportMap, reach: f64) -> bool {
     let direction = pose.translation.try_normalize().unwrap_or(DVec3::X);
     let mut simplex = VoronoiSimplex::new();
     simplex.reset(CsoPoint::from_shapes(pose, a, b, direction));
     match gjk::closest_points(pose, a, b, reach.max(0.0), false, &mut simplex) {
-        GJKResult::Intersection | GJKResult::Proximity(_) => true,
-        GJKResult::ClosestPoints(p, q, _) => p.distance(q) <= reach,
-        GJKResult::NoIntersection(_) => false,
+        GJKResult::NoIntersection(n) if separation(pose, a, b, n) > reach => false,
+        // It may have ended without a result, or with an upper bound that is not the distance.
+        _ => convex_distance(pose, a, b) <= reach,
     }
+}
+
+/// Returns whether a mesh is within `reach` [m] of another shape, whose pose is in the mesh's frame.
+fn mesh_within(mesh: &TriMesh, pose: &DPose3, other: &dyn Shape, reach: f64) -> bool {
+    let near = other.compute_aabb(pose).loosened(reach + BELIEVED);
+    let mut near = mesh.bvh().intersect_aabb(&near).map(|i| mesh.triangle(i));
+    if let Some(map) = other.as_support_map() {
+        return near.any(|triangle| convex_within(pose, &triangle, map, reach));
+    }
+    let Some(other) = other.as_trimesh() else { return true };
+    let back = pose.inverse();
+    near.any(|triangle| {
+        let box_around = triangle.compute_aabb(&back).loosened(reach + BELIEVED);
+        let mut others = other.bvh().intersect_aabb(&box_around);
+        others.any(|i| convex_within(pose, &triangle, &other.triangle(i), reach))
+    })
 }
 
 /// Returns the closest points of two cores, or their penetration depth.

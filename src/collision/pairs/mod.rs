@@ -31,7 +31,7 @@ pub fn within(a: &Placed, b: &Placed, reach: f64) -> bool {
     match (a, b) {
         (Box(f, h), Box(g, k)) => {
             let gap = box_box::gap(f, *h, g, *k);
-            gap <= reach && (gap <= 0.0 || general::distance(a, b) <= reach)
+            gap <= reach && (gap <= 0.0 || general::within(a, b, reach))
         }
         (Point(_) | Segment(..) | Box(..), Point(_) | Segment(..) | Box(..)) => distance(a, b) <= reach,
         (Point(_), Placed::Cylinder(..)) | (Placed::Cylinder(..), Point(_)) => distance(a, b) <= reach,

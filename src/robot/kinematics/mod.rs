@@ -260,17 +260,19 @@ impl Kinematics {
     pub fn chain(&self, link: usize) -> (Vec<chain::Joint>, DAffine3) {
         let mut bodies: Vec<usize> = self.ancestors(self.body_of(link)).collect();
         bodies.reverse();
-        let joint = |body: &Body| chain::Joint {
-            origin: chain::Frame {
-                rotation: body.origin.matrix3.to_cols_array_2d(),
-                translation: body.origin.translation.to_array(),
-            },
-            slides: body.motion == Motion::Slide,
-            variable: body.variable,
-            multiplier: body.multiplier,
-            offset: body.offset,
+        (bodies.iter().filter_map(|b| self.joint(*b)).map(|(_, joint)| joint).collect(), self.offset_of(link))
+    }
+
+    /// Returns the parent of a body and the joint that moves it; `None` for the root.
+    pub fn joint(&self, body: usize) -> Option<(usize, chain::Joint)> {
+        let body = self.bodies.get(body).filter(|_| body != 0)?;
+        let origin = chain::Frame {
+            rotation: body.origin.matrix3.to_cols_array_2d(),
+            translation: body.origin.translation.to_array(),
         };
-        (bodies.iter().filter_map(|b| self.bodies.get(*b)).map(joint).collect(), self.offset_of(link))
+        let slides = body.motion == Motion::Slide;
+        let (variable, multiplier, offset) = (body.variable, body.multiplier, body.offset);
+        Some((body.parent, chain::Joint { origin, slides, variable, multiplier, offset }))
     }
 
     /// Returns upper bounds of a point's motion per unit of joint motion; `reach` is the distance of the point from the
