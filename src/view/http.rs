@@ -111,7 +111,7 @@ fn parse(bytes: &[u8]) -> Result<Option<(Request, usize)>, httparse::Error> {
     let request = Request {
         method: head.method.unwrap_or_default().to_owned(),
         path: decoded(path),
-        query: query.to_owned(),
+        query: decoded(query),
         headers: head.headers.iter().map(|h| (h.name.to_ascii_lowercase(), text(h.value))).collect(),
         rest: Vec::new(),
     };
@@ -172,13 +172,13 @@ mod tests {
 
     #[test]
     fn a_head_is_read_when_it_is_complete() {
-        let text = b"GET /mesh/3?x=1 HTTP/1.1\r\nHOST: localhost:7000\r\nConnection: keep-alive, Upgrade\r\n\r\nrest";
+        let text = b"GET /mesh/3?x=%221 HTTP/1.1\r\nHOST: localhost:7000\r\nConnection: keep-alive, Upgrade\r\n\r\nrest";
         for length in 0..text.len() - 4 {
             assert!(parse(&text[..length]).unwrap().is_none(), "{length}");
         }
         let (request, length) = parse(text).unwrap().unwrap();
         assert_eq!((request.method.as_str(), request.path.as_str(), &text[length..]), ("GET", "/mesh/3", &b"rest"[..]));
-        assert_eq!((request.header("host"), request.query.as_str()), (Some("localhost:7000"), "x=1"));
+        assert_eq!((request.header("host"), request.query.as_str()), (Some("localhost:7000"), "x=\"1"));
         assert!(request.has_word("connection", "upgrade") && !request.has_word("connection", "close"));
         for (path, text) in [("/a%20b", "/a b"), ("/%C3%A4%2f", "/ä/"), ("/100%", "/100%"), ("/%g0%4", "/%g0%4")] {
             assert_eq!(decoded(path), text);

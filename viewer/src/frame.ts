@@ -46,7 +46,7 @@ export function frame(context: Context, parts: Parts): HTMLElement[] {
     ),
     about,
   );
-  const centre = el('section', {class: 'centre'}, canvas, toolbar(context), notice(context), foot);
+  const centre = el('section', {class: 'centre'}, canvas, toolbar(context, plots !== null), notice(context), foot);
   const column = el('aside', {class: 'left', attributes: {'data-panel': 'arms'}}, ...left);
   const licences = button('licences', () => (document.getElementById('licences') as HTMLDialogElement).show(), {
     class: 'quiet',

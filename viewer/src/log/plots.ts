@@ -193,6 +193,9 @@ class Plot {
     const commanded = this.quantity === 'position' ? rows.map(({command}) => command!) : [];
     const data = [joints.map(({t}) => t), ...rows.map(({own}) => own), ...commanded];
     this.chart.setData(data as uPlot.AlignedData, false);
+    const {min, max} = this.chart.scales.x!;
+    // Draws, with the range of the new values.
+    if (min != null && max != null) this.chart.setScale('x', {min, max});
   }
 
   show([from, to]: [number, number], time: number): void {

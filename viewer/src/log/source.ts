@@ -106,7 +106,8 @@ export class LogSource {
     const reply = await this.server.get<Reply>(`/messages?${query.join('&')}`, signal);
     this.length = reply.length;
     this.live = reply.live;
-    return reply.messages;
+    // Chunks are in the order of their first messages.
+    return reply.messages.sort((a, b) => a.t - b.t);
   }
 }
 

@@ -86,6 +86,8 @@ export class Story {
       if (message.topic === EVENTS) this.events.push(message as Message<LoggedEvent>);
       else for (const marker of (message.data as Markers).markers) this.change(message.t, marker);
     }
+    this.events.sort((a, b) => a.t - b.t);
+    this.changes.sort((a, b) => a.t - b.t);
     this.upTo = Math.max(this.upTo, ...[starts.at(-1), news.at(-1)].map((message) => message?.t ?? -1));
     if (starts.length + news.length || from === 0) this.changed.emit();
   }

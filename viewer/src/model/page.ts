@@ -13,6 +13,8 @@ export function modelPage(scene: Scene, token: string, app: HTMLElement): void {
   const run = new Posed(scene as ModelScene, new Server(token));
   const context = new Context(run);
   const canvas = makeView(context, token);
+  // From one position of a slider to the next is no way.
+  context.view.showTraces(false);
   const joints = scene.robots.reduce((sum, robot) => sum + Object.keys(robot.joints).length, 0);
   const count = (n: number, what: string) => `${n} ${what}${n === 1 ? '' : 's'}`;
   const objects = run.model.objects.length;

@@ -7,8 +7,11 @@ import {type Posed} from './posed';
 export function checks(context: Context, run: Posed): HTMLElement {
   const verdict = el('p', {class: 'verdict', id: 'verdict', attributes: {role: 'status'}});
   const pairs = el('tbody', {id: 'pairs'});
-  const table = el('table', {class: 'pairs'}, el('thead', {}, el('tr', {}, el('th', {text: 'pair'}), el('th', {text: 'distance mm'}))), pairs);
+  const table = el('table', {class: 'pairs'}, el('thead', {}, el('tr', {}, el('th', {text: 'pair'}), el('th', {text: 'mm'}))), pairs);
   const poses = el('div', {id: 'tcp'});
+  // With one robot its name says nothing.
+  const prefix = run.scene.robots.length === 1 ? `${run.scene.robots[0]!.name}/` : '';
+  const own = (link: string) => (prefix && link.startsWith(prefix) ? link.slice(prefix.length) : link);
   const show = () => {
     const touching = run.pairs?.filter(({distance}) => distance <= 0).length ?? 0;
     verdict.dataset.level = run.trouble ? 'warn' : touching ? 'bad' : 'good';
@@ -28,7 +31,7 @@ export function checks(context: Context, run: Posed): HTMLElement {
         el(
           'tr',
           {class: distance <= 0 ? 'touches' : ''},
-          el('td', {}, el('div', {text: a}), el('div', {text: b})),
+          el('td', {}, el('div', {text: own(a)}), el('div', {text: own(b)})),
           el('td', {class: 'number', text: figure(distance * 1000, 1)}),
         ),
       ),
@@ -62,7 +65,7 @@ export function checks(context: Context, run: Posed): HTMLElement {
     el('h2', {text: 'Collisions'}),
     verdict,
     table,
-    el('p', {class: 'minor', text: 'Pairs closer than 50 mm; negative: penetration depth'}),
+    el('p', {class: 'minor', text: 'Distances of pairs closer than 50 mm; negative: penetration depth'}),
     el('h2', {text: 'Tool centre point'}),
     poses,
   );
