@@ -30,6 +30,8 @@ export class Robot {
   private readonly tcpFrame = frame(0.09);
   private colliders = false;
   private stale = false;
+  /** Materials whose colours are right. */
+  private readonly toned = new WeakSet<Material>([touchingMaterial]);
   /** Materials of links that were drawn red. */
   private readonly own = new WeakMap<Mesh, Material | Material[]>();
 
@@ -201,7 +203,11 @@ export class Robot {
         });
       } else if (visual) {
         part.traverse((mesh) => {
-          if (mesh instanceof Mesh && mesh.material instanceof MeshPhongMaterial) mesh.material.shininess = 25;
+          if (!(mesh instanceof Mesh && mesh.material instanceof MeshPhongMaterial) || this.toned.has(mesh.material)) return;
+          this.toned.add(mesh.material);
+          mesh.material.shininess = 25;
+          // The loader takes the figures of a description for linear ones; people choose colours as on a screen.
+          mesh.material.color.convertSRGBToLinear();
         });
       }
     });
