@@ -155,11 +155,16 @@ impl Log {
         if let Some(path) = &self.log {
             return Ok(found(path));
         }
-        let folder = files::log_folder();
-        let newest = folder.as_deref().map(files::newest).transpose().map_err(|e| Failure::of(Exit::Failed, e))?;
-        let none = || Failure::usage("there is no log yet").hint("`dimos run` writes one unless --no-record is given");
-        newest.flatten().ok_or_else(none)
+        newest()
     }
+}
+
+/// Returns the path of the newest log.
+pub(super) fn newest() -> Result<PathBuf> {
+    let folder = files::log_folder();
+    let newest = folder.as_deref().map(files::newest).transpose().map_err(|e| Failure::of(Exit::Failed, e))?;
+    let none = || Failure::usage("there is no log yet").hint("`dimos run` writes one unless --no-record is given");
+    newest.flatten().ok_or_else(none)
 }
 
 /// Returns the path of a log, which may be the name alone of one in the folder of logs.

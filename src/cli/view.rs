@@ -30,6 +30,9 @@ pub struct Args {
     /// Show this log, robot model or blueprint; default: the URL of the live run
     #[arg(value_name = "WHAT", conflicts_with = "run")]
     pub what: Option<String>,
+    /// Show the newest log
+    #[arg(long, conflicts_with_all = ["what", "run"])]
+    pub last: bool,
     /// How a robot model is read
     #[command(flatten)]
     with: With,
@@ -43,6 +46,10 @@ pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
     if let Some(what) = &args.what {
         return open(args, what, catalog);
     }
+    not_of_a_model(args, "what is shown")?;
+    if args.last {
+        return open(args, &super::log::newest()?.to_string_lossy(), catalog);
+    }
     let run = client::find(&RunDir::standard(), args.target_run.run.as_deref())?;
     let read = |file: PathBuf| std::fs::read_to_string(file).ok();
     let Some(text) = of_planner(&run).and_then(read).or_else(|| read(view_file(&run.socket))) else {
@@ -51,6 +58,15 @@ pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
     };
     print(args, "run", &run.name, text.trim());
     Ok(Exit::Ok)
+}
+
+/// Refuses the options of robot models for something else.
+fn not_of_a_model(args: &Args, what: &str) -> Result<()> {
+    if args.with == With::default() {
+        return Ok(());
+    }
+    let options = "--package, --xacro-arg, --srdf and --joint-limits";
+    Err(Failure::usage(format!("{what} is no robot model: {options} are for one")))
 }
 
 fn print(args: &Args, kind: &str, name: &str, url: &str) {
@@ -91,8 +107,8 @@ fn open(args: &Args, what: &str, catalog: Catalog<'_>) -> Result {
         _ if what.starts_with("builtin:") => ("model", Arc::new(posed::Posed::model(path, &args.with)?)),
         _ => ("blueprint", Arc::new(posed::Posed::blueprint(what, catalog)?)),
     };
-    if kind != "model" && args.with != With::default() {
-        return Err(Failure::usage(format!("{what} is a {kind}: the options of a robot model cannot be used")));
+    if kind != "model" {
+        not_of_a_model(args, what)?;
     }
     let view = View::open(&ViewConfig::default(), subject)
         .map_err(|why| Failure::new(Exit::Failed, format!("the page cannot be served: {why}")))?;

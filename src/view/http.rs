@@ -172,7 +172,8 @@ mod tests {
 
     #[test]
     fn a_head_is_read_when_it_is_complete() {
-        let text = b"GET /mesh/3?x=%221 HTTP/1.1\r\nHOST: localhost:7000\r\nConnection: keep-alive, Upgrade\r\n\r\nrest";
+        let text =
+            b"GET /mesh/3?x=%221 HTTP/1.1\r\nHOST: localhost:7000\r\nConnection: keep-alive, Upgrade\r\n\r\nrest";
         for length in 0..text.len() - 4 {
             assert!(parse(&text[..length]).unwrap().is_none(), "{length}");
         }

@@ -198,7 +198,7 @@ async fn answer(site: &Site, request: &Request) -> Reply {
     let path = request.path.strip_prefix('/').unwrap_or_default();
     let (what, rest) = path.split_once('/').unwrap_or((path, ""));
     match what {
-        "" if rest.is_empty() => {
+        "" if path.is_empty() => {
             let body = Cow::Borrowed(PAGE);
             return Reply { status: 200, kind: "text/html; charset=utf-8", headers: PAGE_HEADERS, body, keep: false };
         }

@@ -7,7 +7,7 @@ use std::sync::Mutex;
 use serde_json::{Map, Value, json};
 
 use crate::cli::exit::{Exit, Failure, Result};
-use crate::recording::replay::{LogReader, ReplayError, attachment};
+use crate::recording::replay::{LogReader, attachment};
 use crate::recording::window::LogWindows;
 use crate::replay::recorded::Recorded;
 use crate::rpc::api::WorldObject;
@@ -25,6 +25,15 @@ pub struct Log {
     start: u64,
 }
 
+/// What a log says of its run.
+#[derive(Default)]
+struct Known {
+    run: String,
+    arms: Vec<Value>,
+    /// Limits of the arms' joints.
+    limits: Map<String, Value>,
+}
+
 impl Log {
     /// Opens a log.
     pub fn open(path: &Path) -> Result<Self> {
@@ -40,22 +49,22 @@ impl Log {
     }
 
     /// Returns the arms with their joints and limits, as far as the log has them.
-    fn arms(&self) -> std::result::Result<(Vec<Value>, Map<String, Value>, String), ReplayError> {
-        let info = LogReader::open_for(&self.path, &["/joint_states"])?.info().clone();
-        let name = info.metadata.get("run").cloned().unwrap_or_default();
+    fn known(&self) -> Option<Known> {
+        let info = LogReader::open_for(&self.path, &["/joint_states"]).ok()?.info().clone();
+        let run = info.metadata.get("run").cloned().unwrap_or_default();
         let (mut arms, mut limits) = (Vec::new(), Map::new());
         let mut arm = |name: &str, joints: &Value| {
             let dof = joints.as_array().map_or(0, Vec::len);
             arms.push(json!({"name": name, "type": "", "dof": dof, "joints": joints, "gripper": null}));
         };
         // Logs of other versions have names at least.
-        let Ok(run) = Recorded::of(&self.path, info.clone()) else {
+        let Ok(recorded) = Recorded::of(&self.path, info.clone()) else {
             let known =
                 info.metadata.get("arms").and_then(|arms| serde_json::from_str::<Map<String, Value>>(arms).ok());
             known.iter().flatten().for_each(|(name, joints)| arm(name, joints));
-            return Ok((arms, limits, name));
+            return Some(Known { run, arms, limits });
         };
-        for (names, config) in run.names.arms.iter().zip(&run.config.arms) {
+        for (names, config) in recorded.names.arms.iter().zip(&recorded.config.arms) {
             arm(&names.hardware_id, &json!(names.joints));
             for (i, joint) in names.joints.iter().enumerate() {
                 let of = |list: &[f64]| list.get(i).copied().filter(|limit| limit.is_finite());
@@ -65,7 +74,7 @@ impl Log {
                 limits.insert(joint.clone(), json!({"lower": lower, "upper": upper, "velocity": velocity}));
             }
         }
-        Ok((arms, limits, name))
+        Some(Known { run, arms, limits })
     }
 
     /// Returns the messages of a window as JSON.
@@ -103,7 +112,7 @@ fn seconds(time: u64, start: u64) -> f64 {
 
 impl Subject for Log {
     fn scene(&self) -> Scene {
-        let (arms, limits, name) = self.arms().unwrap_or_default();
+        let Known { run: name, arms, limits } = self.known().unwrap_or_default();
         let (mut meshes, mut robots) = (Vec::new(), Vec::new());
         if let Ok(Some(urdf)) = attachment(&self.path, "robot_description.urdf") {
             let mut urdf = String::from_utf8_lossy(&urdf).into_owned();
