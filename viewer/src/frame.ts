@@ -70,7 +70,9 @@ export function frame(context: Context, parts: Parts): HTMLElement[] {
     // On a desktop the other columns are always there.
     const shown = parts.tabs.some(([name]) => name === tab) || narrow.matches ? tab : parts.tabs[0]![0];
     for (const [name, , panel] of parts.tabs) panel.classList.toggle('hidden', name !== shown);
-    for (const each of tabs.children) each.setAttribute('aria-selected', String((each as HTMLElement).dataset.tab === tab));
+    tabs
+      .querySelectorAll('button')
+      .forEach((each) => each.setAttribute('aria-selected', String(each.dataset.tab === tab)));
     window.dispatchEvent(new Event('resize'));
   };
   choose(narrow.matches ? 'arms' : parts.tabs[0]![0]);

@@ -1,4 +1,4 @@
-// The page of a run: reads the token, the scene, and puts the panels together.
+// The page: reads the token and the scene; of a run it puts the panels together.
 import 'uplot/dist/uPlot.min.css';
 import './style.css';
 import {Context} from './context';

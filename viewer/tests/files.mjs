@@ -81,7 +81,9 @@ test('a log is scrubbed and played: arm, table, plan and marks', async () => {
   const at = await page.locator('#marks .motion').evaluate((mark) => parseFloat(mark.style.left) / 100);
   const length = await page.evaluate(() => window.player.source.length);
   await seek(page, at + 0.3 / length);
-  await until('the plan is shown', () => page.evaluate(() => window.player.story.motionsAt(window.player.time).length > 0));
+  await until('the plan is shown', () =>
+    page.evaluate(() => window.player.story.motionsAt(window.player.time).length > 0),
+  );
   const moving = Number((await joint(page, 2)).replace('−', '-'));
   assert.ok(moving > -0.31 && moving < -0.001, `on its way: ${moving}`);
   await until('the plan looks different', async () => (await changed(browser, start, await picture(page))) > 0.005);

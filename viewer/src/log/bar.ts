@@ -80,5 +80,6 @@ export function bar(player: Player): HTMLElement {
   story.changed.on(mark);
   mark();
   show();
-  return el('div', {class: 'timeline log-bar', id: 'timeline'}, play, el('div', {class: 'track'}, marks, range), text, rate);
+  const track = el('div', {class: 'track'}, marks, range);
+  return el('div', {class: 'timeline log-bar', id: 'timeline'}, play, track, text, rate);
 }

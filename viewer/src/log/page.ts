@@ -33,7 +33,9 @@ export function logPage(scene: Scene, token: string, app: HTMLElement): void {
   const about = el('div', {class: 'about', id: 'about'});
   const describe = () => {
     const state = source.live ? 'live' : log.log.loss ? `cut: ${log.log.loss}` : 'complete';
-    setText(about, player.trouble || `${log.log.file} · ${new Date(log.log.start * 1000).toLocaleString()} · ${duration(source.length * 1000)} · ${state}`);
+    const began = new Date(log.log.start * 1000).toLocaleString();
+    const known = [log.log.file, began, duration(source.length * 1000), state].join(' · ');
+    setText(about, player.trouble || known);
     setClass(about, 'bad', player.trouble !== '');
   };
   player.onTime.on(describe);
@@ -52,6 +54,7 @@ export function logPage(scene: Scene, token: string, app: HTMLElement): void {
       tabs: [['events', 'Events', events(player)]],
     }),
   );
+  // For tests: what is shown.
   Object.assign(window, {player});
   void story.begin().catch((error) => context.report(error));
   player.seek(0);

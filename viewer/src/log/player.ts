@@ -1,5 +1,6 @@
 // A log that is played: the run as it was at a time. It reads blocks of ten seconds, and keeps the last ones.
-import {type ArmStatus, type Preview, type Vec3} from '../protocol';
+import {Euler, Quaternion} from 'three';
+import {type ArmStatus, type Vec3} from '../protocol';
 import {Signal} from '../signal';
 import {Still} from '../still';
 import {
@@ -12,7 +13,6 @@ import {
   poseOf,
 } from './source';
 import {type Story} from './story';
-import {Euler, Quaternion} from 'three';
 
 const BLOCK = 10; // s
 const PER_BLOCK = 500; // messages of each topic
@@ -33,7 +33,6 @@ export class Player extends Still {
   rate = 1;
   playing = false;
   readonly onTime = new Signal();
-  readonly onPlan = new Signal<Preview | null>();
   private readonly blocks = new Map<number, Block | Promise<void>>();
   private worldKey = -2;
   private settled = 0;
@@ -66,7 +65,8 @@ export class Player extends Still {
     const step = (now: number) => {
       if (!this.playing) return;
       // What is not read yet is waited for.
-      if (this.block(this.time)) this.time = Math.min(this.source.length, this.time + (Math.max(0, now - last) / 1000) * this.rate);
+      const passed = (Math.max(0, now - last) / 1000) * this.rate;
+      if (this.block(this.time)) this.time = Math.min(this.source.length, this.time + passed);
       last = now;
       this.block(this.time + this.rate * 2);
       this.show();
@@ -106,7 +106,8 @@ export class Player extends Still {
           this.show();
         },
         (error: Error) => {
-          this.failed = error.message;
+          this.failed = error instanceof TypeError ? 'no connection: this page is no longer served' : error.message;
+          this.onTime.emit();
           window.setTimeout(() => this.blocks.delete(index), 1000);
         },
       );

@@ -62,8 +62,10 @@ export function logPlots(context: Context, player: Player): HTMLElement {
   const draw = () => plots.forEach((plot) => plot.show(window_(), player.time));
   const check = () => {
     const [from, to] = window_();
-    const missing = !samples || from < samples.from - 1e-6 || to > samples.to + 1e-6 || to - from < (samples.to - samples.from) / 5;
-    if (missing && !reading) void read();
+    const inside = samples && from > samples.from - 1e-6 && to < samples.to + 1e-6;
+    // After a wide window a narrow one has too few points.
+    const fine = samples && to - from > (samples.to - samples.from) / 5;
+    if (!(inside && fine) && !reading) void read();
     draw();
   };
   const spans = choice(
@@ -145,7 +147,10 @@ class Plot {
         legend: {show: false},
         cursor: {y: false, points: {show: false}, drag: {x: false, y: false}},
         scales: {x: {time: false, auto: false}, y: {range: (_plot, low, high) => padded(low, high, this.least)}},
-        axes: [{...axis, size: 24, values: (_plot, values) => values.map((value) => `${Number(value.toFixed(3))} s`)}, {...axis, size: 52}],
+        axes: [
+          {...axis, size: 24, values: (_plot, values) => values.map((value) => `${Number(value.toFixed(3))} s`)},
+          {...axis, size: 52},
+        ],
         series: [{}, ...series, ...(this.quantity === 'position' ? commands : [])],
       },
       [[]],

@@ -86,7 +86,8 @@ export class LogSource {
 
   /** The topics of a kind that this log has: `/tcp/` gives one for each arm. */
   topics(...kinds: string[]): string[] {
-    return this.scene.log.topics.filter((topic) => kinds.some((kind) => topic === kind || (kind.endsWith('/') && topic.startsWith(kind))));
+    const is = (topic: string, kind: string) => topic === kind || (kind.endsWith('/') && topic.startsWith(kind));
+    return this.scene.log.topics.filter((topic) => kinds.some((kind) => is(topic, kind)));
   }
 
   async read<T>(topics: string[], options: Options): Promise<Message<T>[]> {

@@ -32,7 +32,8 @@ export class Trails {
   }
 
   private add(): Line {
-    const geometry = new BufferGeometry().setAttribute('position', new BufferAttribute(new Float32Array(POINTS * 3), 3));
+    const points = new BufferAttribute(new Float32Array(POINTS * 3), 3);
+    const geometry = new BufferGeometry().setAttribute('position', points);
     const line = new Line(geometry, new LineBasicMaterial({color: 0xe5484d}));
     line.frustumCulled = false;
     line.visible = this.visible;

@@ -7,7 +7,8 @@ import {type Posed} from './posed';
 export function checks(context: Context, run: Posed): HTMLElement {
   const verdict = el('p', {class: 'verdict', id: 'verdict', attributes: {role: 'status'}});
   const pairs = el('tbody', {id: 'pairs'});
-  const table = el('table', {class: 'pairs'}, el('thead', {}, el('tr', {}, el('th', {text: 'pair'}), el('th', {text: 'mm'}))), pairs);
+  const head = el('tr', {}, el('th', {text: 'pair'}), el('th', {text: 'mm'}));
+  const table = el('table', {class: 'pairs'}, el('thead', {}, head), pairs);
   const poses = el('div', {id: 'tcp'});
   // With one robot its name says nothing.
   const prefix = run.scene.robots.length === 1 ? `${run.scene.robots[0]!.name}/` : '';
@@ -54,7 +55,9 @@ export function checks(context: Context, run: Posed): HTMLElement {
       ),
     );
     const touched = new Set((run.pairs ?? []).filter(({distance}) => distance <= 0).flatMap(({links}) => links));
-    for (const [name, robot] of context.view.robots) robot.highlight((link) => touched.has(link) || touched.has(`${name}/${link}`));
+    for (const [name, robot] of context.view.robots) {
+      robot.highlight((link) => touched.has(link) || touched.has(`${name}/${link}`));
+    }
   };
   run.onReply.on(show);
   angle.changed.on(show);

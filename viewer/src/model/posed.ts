@@ -41,7 +41,7 @@ export class Posed extends Still {
   ) {
     super(model);
     this.trouble = model.unchecked ?? '';
-    for (const robot of model.robots) for (const joint of Object.keys(robot.joints)) this.positions.set(joint, this.rest(robot, joint));
+    for (const robot of model.robots) this.reset(robot);
     // A pose that is called home is where people expect the arm.
     for (const robot of model.robots) {
       const home = robot.groups?.home ?? robot.groups?.ready;
@@ -76,8 +76,12 @@ export class Posed extends Still {
 
   /** Every joint where it is closest to zero. */
   zero(robot: SceneRobot): void {
-    for (const joint of Object.keys(robot.joints)) this.positions.set(joint, this.rest(robot, joint));
+    this.reset(robot);
     this.changed();
+  }
+
+  private reset(robot: SceneRobot): void {
+    for (const joint of Object.keys(robot.joints)) this.positions.set(joint, this.rest(robot, joint));
   }
 
   private rest(robot: SceneRobot, joint: string): number {
@@ -114,7 +118,7 @@ export class Posed extends Still {
         this.trouble = '';
       } catch (error) {
         this.pairs = null;
-        this.trouble = `no reply: ${(error as Error).message}`;
+        this.trouble = error instanceof TypeError ? 'this page is no longer served' : (error as Error).message;
       }
       this.onReply.emit();
     }

@@ -38,7 +38,8 @@ export function sliders(context: Context, run: Posed, robot: SceneRobot): HTMLEl
   const note = el('p', {class: 'minor'});
   const show = () => {
     rows.forEach((row) => row.show());
-    setText(note, `in ${angle.unit === 'deg' ? 'degrees' : 'rad'}${Object.keys(robot.joints).some(linear) ? ', or m' : ''}`);
+    const lengths = Object.keys(robot.joints).some(linear) ? ', or m' : '';
+    setText(note, `in ${angle.unit === 'deg' ? 'degrees' : 'rad'}${lengths}`);
   };
   const unit = choice(
     [
@@ -54,12 +55,13 @@ export function sliders(context: Context, run: Posed, robot: SceneRobot): HTMLEl
   const poses = Object.entries(robot.groups ?? {}).map(([name, positions]) =>
     button(name, () => run.pose(robot, positions), {attributes: {'data-pose': name}}),
   );
+  const zero = button('all 0', () => run.zero(robot), {title: 'As close to zero as the limits allow'});
   const several = run.scene.robots.length > 1;
   return el(
     'section',
     {class: 'posed'},
     el('div', {class: 'section-head'}, el('h2', {text: several ? `Joints of ${robot.name}` : 'Joints'}), unit.element),
-    el('div', {class: 'chips'}, ...poses, button('all 0', () => run.zero(robot), {title: 'Each joint where it is closest to zero'})),
+    el('div', {class: 'chips'}, ...poses, zero),
     el('div', {class: 'sliders'}, ...rows.map((row) => row.element)),
     note,
   );

@@ -203,11 +203,12 @@ export class Robot {
         });
       } else if (visual) {
         part.traverse((mesh) => {
-          if (!(mesh instanceof Mesh && mesh.material instanceof MeshPhongMaterial) || this.toned.has(mesh.material)) return;
-          this.toned.add(mesh.material);
-          mesh.material.shininess = 25;
+          const material: unknown = mesh instanceof Mesh && mesh.material;
+          if (!(material instanceof MeshPhongMaterial) || this.toned.has(material)) return;
+          this.toned.add(material);
+          material.shininess = 25;
           // The loader takes the figures of a description for linear ones; people choose colours as on a screen.
-          mesh.material.color.convertSRGBToLinear();
+          material.color.convertSRGBToLinear();
         });
       }
     });
