@@ -1,5 +1,5 @@
-//! `dimos view`: prints the URL of a run's live view, with its token; or serves the same page on a log, a robot model or
-//! a blueprint, until Ctrl-C.
+//! `dimos view`: prints the URL of a run's live view, with its token; or serves the same page on a log, a robot model
+//! or a blueprint, until Ctrl-C.
 
 #[cfg(feature = "view")]
 mod log;

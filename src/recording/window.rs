@@ -129,8 +129,8 @@ impl LogWindows {
         self.scan.channels.values().map(|channel| channel.topic.as_str())
     }
 
-    /// Reads the messages of topics between two Unix times [ns], until `take` returns `false`. With `points` the window
-    /// has so many sections of equal length, of which only the first message of each topic is read, 0: all messages.
+    /// Reads the messages of topics between two Unix times [ns], until `take` returns `false`. The window is divided
+    /// into `points` sections of equal length; only the first message of each topic is read in each. 0: all messages.
     pub fn read(
         &mut self,
         topics: &[&str],
@@ -159,7 +159,7 @@ impl LogWindows {
                         continue;
                     }
                     if let Some(passed) = (message.time - from).checked_div(step) {
-                        *due = from.saturating_add((passed + 1) * step);
+                        *due = from.saturating_add((passed + 1).saturating_mul(step));
                     }
                     if !take(message, channel, bytes) {
                         return Ok(());

@@ -32,6 +32,7 @@ mod without_view;
 pub use scene::{MeshFile, Scene};
 #[cfg(feature = "view")]
 pub use server::View;
+#[cfg(feature = "view")]
 pub(crate) use shown::robots;
 pub use shown::{Shown, ShownArm, ShownGripper, ShownRobot};
 #[cfg(feature = "view")]

@@ -1,5 +1,5 @@
 //! `/scene.json`: what does not change during the run. Robot descriptions are read and expanded for it, and their
-//! meshes numbered: a page can ask for these files only. The hash of a mesh is in its address, so that browsers keep it.
+//! meshes numbered: a page can ask for these files only. The hash of a mesh is in its address: browsers keep it.
 
 use std::collections::{BTreeMap, HashMap};
 use std::hash::{DefaultHasher, Hasher};
