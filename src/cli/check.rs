@@ -1,6 +1,6 @@
 //! `dimos check NAME|PATH`: validates a blueprint and prints the resolved configuration. Connects to nothing.
 
-mod robots;
+pub(super) mod robots;
 
 use serde_json::json;
 

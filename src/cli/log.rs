@@ -152,15 +152,25 @@ pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
 impl Log {
     /// Returns the path of the log.
     fn path(&self) -> Result<PathBuf> {
-        let folder = files::log_folder();
         if let Some(path) = &self.log {
-            let listed = folder.map(|folder| folder.join(path)).filter(|listed| !path.exists() && listed.exists());
-            return Ok(listed.unwrap_or_else(|| path.clone()));
+            return Ok(found(path));
         }
-        let newest = folder.as_deref().map(files::newest).transpose().map_err(|e| Failure::of(Exit::Failed, e))?;
-        let none = || Failure::usage("there is no log yet").hint("`dimos run` writes one unless --no-record is given");
-        newest.flatten().ok_or_else(none)
+        newest()
     }
+}
+
+/// Returns the path of the newest log.
+pub(super) fn newest() -> Result<PathBuf> {
+    let folder = files::log_folder();
+    let newest = folder.as_deref().map(files::newest).transpose().map_err(|e| Failure::of(Exit::Failed, e))?;
+    let none = || Failure::usage("there is no log yet").hint("`dimos run` writes one unless --no-record is given");
+    newest.flatten().ok_or_else(none)
+}
+
+/// Returns the path of a log, which may be the name alone of one in the folder of logs.
+pub(super) fn found(path: &Path) -> PathBuf {
+    let listed = files::log_folder().map(|folder| folder.join(path));
+    listed.filter(|listed| !path.exists() && listed.exists()).unwrap_or_else(|| path.to_owned())
 }
 
 impl Part {

@@ -124,7 +124,7 @@ enum Command {
     Task(task::Args),
     /// Serve an arm of a run to programs that were written for a vendor's SDK
     Proxy(proxy::Args),
-    /// Print the URL of a run's live view, a page in the browser that shows its arms
+    /// Print the URL of the live view, a page in the browser; or show a log, robot model or blueprint in it
     View(view::Args),
     /// Shut down a run: decelerate, release the arms, close the log
     Down(down::Args),
@@ -337,7 +337,7 @@ fn built_in(cli: &Cli, catalog: Catalog<'_>) -> exit::Result {
         Command::Jog(args) => jog::run(args),
         Command::Task(args) => task::run(args),
         Command::Proxy(args) => proxy::run(args),
-        Command::View(args) => view::run(args),
+        Command::View(args) => view::run(args, catalog),
         Command::Down(args) => down::run(args),
         Command::Log(args) => log::run(args, catalog),
         Command::Logs(args) => logs::run(args),

@@ -1,7 +1,7 @@
 //! `dimos model …`: inspect robot descriptions. Needs no run.
 
 mod assets;
-mod chain;
+pub(super) mod chain;
 mod check;
 mod collide;
 mod fk;
@@ -9,7 +9,7 @@ mod ik;
 mod info;
 mod meshes;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use super::exit::{Exit, Failure, Result};
 use super::output;
@@ -50,6 +50,16 @@ struct File {
     /// URDF or xacro file, or a built-in robot: builtin:xarm6
     #[arg(value_name = "FILE")]
     file: PathBuf,
+    #[command(flatten)]
+    with: With,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// What a description is read with.
+#[derive(Debug, Default, PartialEq, clap::Args)]
+pub(super) struct With {
     /// Folder of a package (repeatable); ROS_PACKAGE_PATH and AMENT_PREFIX_PATH are searched too
     #[arg(long, value_name = "NAME=DIR", value_parser = pair::<'='>)]
     package: Vec<(String, String)>,
@@ -62,9 +72,6 @@ struct File {
     /// joint_limits.yaml of the robot: accelerations and jerks
     #[arg(long, value_name = "FILE")]
     joint_limits: Option<PathBuf>,
-    /// Print JSON
-    #[arg(long)]
-    json: bool,
 }
 
 /// `NAME=VALUE`
@@ -81,38 +88,52 @@ fn xacro_arg(text: &str) -> std::result::Result<(String, String), String> {
     Ok((name.strip_suffix(':').unwrap_or(&name).to_owned(), value))
 }
 
-impl File {
-    fn load(&self, meshes: Meshes) -> Loaded {
-        load(&Source {
-            path: self.file.clone(),
+impl With {
+    /// Returns the description in this file.
+    pub fn source(&self, file: &Path, meshes: Meshes) -> Source {
+        Source {
+            path: file.to_owned(),
             packages: self.package.iter().map(|(name, folder)| (name.clone(), folder.into())).collect(),
             xacro_args: self.xacro_arg.iter().cloned().collect(),
             srdf: self.srdf.clone(),
             joint_limits: self.joint_limits.clone(),
             meshes,
-        })
+        }
+    }
+}
+
+impl File {
+    fn load(&self, meshes: Meshes) -> Loaded {
+        load(&self.with.source(&self.file, meshes))
     }
 
     /// Returns the robot; prints its mistakes and warnings to stderr.
     fn robot(&self, meshes: Meshes) -> Result<(RobotModel, Loaded)> {
-        let mut loaded = self.load(meshes);
-        let Some(model) = loaded.model.take() else { return Err(self.refuse(&loaded)) };
-        let text = loaded.render(output::colour(&std::io::stderr()));
-        if !text.is_empty() {
-            output::note(text.trim_end());
-        }
-        Ok((model, loaded))
+        robot(self.load(meshes), &self.file)
     }
 
-    /// Returns the failure of a description with mistakes, after printing them; of a file that cannot be read, the
-    /// reason.
     fn refuse(&self, loaded: &Loaded) -> Failure {
-        if let Some(diag) = loaded.unreadable() {
-            return Failure { hint: diag.hint.clone(), ..Failure::usage(diag.message.clone()) };
-        }
-        output::note(loaded.render(output::colour(&std::io::stderr())).trim_end());
-        Failure::usage(format!("{} has mistakes", self.file.display()))
+        refuse(loaded, &self.file)
     }
+}
+
+/// Returns the robot of a description; prints its mistakes and warnings to stderr.
+pub(super) fn robot(mut loaded: Loaded, file: &Path) -> Result<(RobotModel, Loaded)> {
+    let Some(model) = loaded.model.take() else { return Err(refuse(&loaded, file)) };
+    let text = loaded.render(output::colour(&std::io::stderr()));
+    if !text.is_empty() {
+        output::note(text.trim_end());
+    }
+    Ok((model, loaded))
+}
+
+/// Returns the failure of a description with mistakes, after printing them; of a file that cannot be read, the reason.
+fn refuse(loaded: &Loaded, file: &Path) -> Failure {
+    if let Some(diag) = loaded.unreadable() {
+        return Failure { hint: diag.hint.clone(), ..Failure::usage(diag.message.clone()) };
+    }
+    output::note(loaded.render(output::colour(&std::io::stderr())).trim_end());
+    Failure::usage(format!("{} has mistakes", file.display()))
 }
 
 /// Runs the verb.

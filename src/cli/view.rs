@@ -1,12 +1,20 @@
-//! `dimos view`: prints the URL of a run's live view, with its token.
+//! `dimos view`: prints the URL of a run's live view, with its token; or serves the same page on a log, a robot model
+//! or a blueprint, until Ctrl-C.
+
+#[cfg(feature = "view")]
+mod log;
+#[cfg(feature = "view")]
+mod posed;
 
 use std::path::PathBuf;
 
-use serde::Serialize;
+use serde_json::json;
 
 use super::arguments::Target;
 use super::exit::{Exit, Failure, Result};
+use super::model::With;
 use super::output;
+use crate::blueprint::Catalog;
 use crate::rpc::api::Status;
 use crate::rpc::client::{self, Client};
 use crate::rpc::run_dir::{LiveRun, RunDir, view_file};
@@ -14,34 +22,58 @@ use crate::rpc::run_dir::{LiveRun, RunDir, view_file};
 /// Arguments of `view`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
-The URL contains the run's token: with it, everything that `dimos` can do to the arms can be done from the page. A new \
-run has a new one. Through ssh: ssh -L 7000:127.0.0.1:7000 HOST, then open the URL in the local browser.")]
+The URL contains a token: with that of a run, everything that `dimos` can do to the arms can be done from the page. A \
+new run has a new one. Through ssh: ssh -L 7000:127.0.0.1:7000 HOST, then open the URL in the local browser.
+WHAT is a log (.mcap; a file name alone is looked for in the folder of logs too), a robot model (.urdf, .xacro, \
+builtin:xarm6), or a blueprint. It is shown until Ctrl-C; nothing is connected and nothing moves.")]
 pub struct Args {
+    /// Show this log, robot model or blueprint; default: the URL of the live run
+    #[arg(value_name = "WHAT", conflicts_with = "run")]
+    pub what: Option<String>,
+    /// Show the newest log
+    #[arg(long, conflicts_with_all = ["what", "run"])]
+    pub last: bool,
+    /// How a robot model is read
+    #[command(flatten)]
+    with: With,
     /// Which run
     #[command(flatten)]
     pub target_run: Target,
 }
 
-#[derive(Serialize)]
-struct View<'a> {
-    run: &'a str,
-    url: &'a str,
-}
-
 /// Runs the verb.
-pub fn run(args: &Args) -> Result {
+pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
+    if let Some(what) = &args.what {
+        return open(args, what, catalog);
+    }
+    not_of_a_model(args, "what is shown")?;
+    if args.last {
+        return open(args, &super::log::newest()?.to_string_lossy(), catalog);
+    }
     let run = client::find(&RunDir::standard(), args.target_run.run.as_deref())?;
     let read = |file: PathBuf| std::fs::read_to_string(file).ok();
     let Some(text) = of_planner(&run).and_then(read).or_else(|| read(view_file(&run.socket))) else {
         let hint = "the blueprint of the run, or of a planner attached to it, needs a robot model or a section `view`";
         return Err(Failure::new(Exit::Failed, format!("run {} has no live view", run.name)).hint(hint));
     };
-    let url = text.trim();
+    print(args, "run", &run.name, text.trim());
+    Ok(Exit::Ok)
+}
+
+/// Refuses the options of robot models for something else.
+fn not_of_a_model(args: &Args, what: &str) -> Result<()> {
+    if args.with == With::default() {
+        return Ok(());
+    }
+    let options = "--package, --xacro-arg, --srdf and --joint-limits";
+    Err(Failure::usage(format!("{what} is no robot model: {options} are for one")))
+}
+
+fn print(args: &Args, kind: &str, name: &str, url: &str) {
     match args.target_run.json {
-        true => output::json(&View { run: &run.name, url }),
+        true => output::json(&json!({kind: name, "url": url})),
         false => output::line(url),
     }
-    Ok(Exit::Ok)
 }
 
 /// Returns the file of the planner that is attached to a run, whose page also has the planner's robots.
@@ -49,4 +81,48 @@ fn of_planner(run: &LiveRun) -> Option<PathBuf> {
     let status = Client::connect(&run.name, &run.socket).ok()?.call(Status {}).ok()?;
     let name = status.planner?.attached?.name;
     Some(RunDir::standard().planners().path().join(format!("{name}.view")))
+}
+
+/// Serves the page on something that is not live.
+#[cfg(feature = "view")]
+fn open(args: &Args, what: &str, catalog: Catalog<'_>) -> Result {
+    use std::path::Path;
+    use std::sync::Arc;
+
+    use super::follow::Signals;
+    use crate::blueprint::planner::ViewConfig;
+    use crate::view::{Subject, View};
+
+    let signals = Signals::watch_with_hangup();
+    let path = Path::new(what);
+    let (kind, subject): (_, Arc<dyn Subject>) = match path.extension().and_then(|ending| ending.to_str()) {
+        Some("mcap") => {
+            let log = log::Log::open(&super::log::found(path))?;
+            if let Some(loss) = log.loss() {
+                output::note(format_args!("warning: the log is not whole: {loss}"));
+            }
+            ("log", Arc::new(log))
+        }
+        Some("urdf" | "xacro" | "xml") => ("model", Arc::new(posed::Posed::model(path, &args.with)?)),
+        _ if what.starts_with("builtin:") => ("model", Arc::new(posed::Posed::model(path, &args.with)?)),
+        _ => ("blueprint", Arc::new(posed::Posed::blueprint(what, catalog)?)),
+    };
+    if kind != "model" {
+        not_of_a_model(args, what)?;
+    }
+    let view = View::open(&ViewConfig::default(), subject)
+        .map_err(|why| Failure::new(Exit::Failed, format!("the page cannot be served: {why}")))?;
+    print(args, kind, what, view.url());
+    output::note(format_args!("open the URL in a browser; Ctrl-C ends the page"));
+    loop {
+        if let Some(signal) = signals.last() {
+            return Ok(Exit::by_signal(signal));
+        }
+        std::thread::sleep(std::time::Duration::from_millis(100));
+    }
+}
+
+#[cfg(not(feature = "view"))]
+fn open(_: &Args, _: &str, _: Catalog<'_>) -> Result {
+    Err(Failure::new(Exit::Failed, "this build has no live view (cargo feature `view`)"))
 }

@@ -274,10 +274,32 @@ fn may_touch(world: &World, a: &Origin, b: &Origin) -> bool {
     if a.held.is_some() || b.held.is_some() {
         return a.body == b.body || touches(a, name(b)) || touches(b, name(a));
     }
-    let parent = |x: &Origin| robot.model.parent_joint(x.link).map(|j| j.parent);
-    let neighbours = parent(a) == Some(b.link) || parent(b) == Some(a.link);
+    unchecked(robot, a.link, b.link).is_some()
+}
+
+/// Why two links of a robot are never checked against each other.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Unchecked {
+    /// No joint that moves is between them.
+    Fixed,
+    /// They are parent and child.
+    Neighbours,
+    /// The pair is allowed.
+    Allowed,
+}
+
+/// Returns why two links of a robot, by index, are never checked against each other; `None` if they are.
+pub fn unchecked(robot: &Robot, a: usize, b: usize) -> Option<Unchecked> {
+    let name = |link: usize| robot.model.links.get(link).map_or("", |link| link.name.as_str());
+    let parent = |link: usize| robot.model.parent_joint(link).map(|joint| joint.parent);
     let is = |(x, y): &(String, String)| (x == name(a) && y == name(b)) || (x == name(b) && y == name(a));
-    a.body == b.body || neighbours || robot.allowed.iter().any(is)
+    if robot.kinematics.body_of(a) == robot.kinematics.body_of(b) {
+        Some(Unchecked::Fixed)
+    } else if parent(a) == Some(b) || parent(b) == Some(a) {
+        Some(Unchecked::Neighbours)
+    } else {
+        robot.allowed.iter().any(is).then_some(Unchecked::Allowed)
+    }
 }
 
 fn place(obstacle: &super::world::Obstacle) -> PlacedObstacle {

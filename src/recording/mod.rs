@@ -28,6 +28,7 @@ pub mod scan;
 mod scene_log;
 pub mod tcp_log;
 mod tick_log;
+pub mod window;
 pub mod wire;
 mod worker;
 

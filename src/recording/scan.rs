@@ -49,7 +49,7 @@ pub enum Item {
 
 /// A log that is read from its beginning to its end.
 pub struct Scan {
-    records: RecordReader,
+    pub(super) records: RecordReader,
     /// Channels read so far.
     pub channels: BTreeMap<u16, LogChannel>,
     schemas: BTreeMap<u16, (String, String, Vec<u8>)>,
@@ -68,7 +68,7 @@ pub struct Scan {
     bytes: Vec<u8>,
     messages: Vec<RawMessage>,
     /// Chunks to read; `None`: everything.
-    chunks: Option<VecDeque<u64>>,
+    pub(super) chunks: Option<VecDeque<u64>>,
 }
 
 impl Scan {
@@ -187,7 +187,7 @@ impl Scan {
         })
     }
 
-    fn learn(&mut self, opcode: u8, body: &[u8]) {
+    pub(super) fn learn(&mut self, opcode: u8, body: &[u8]) {
         match parse_record(opcode, body) {
             Ok(Record::Message { header, data }) => {
                 let start = self.bytes.len();

@@ -62,6 +62,8 @@ pub use device_lock::DeviceLockError;
 pub use dispatch::log_of;
 pub use handle::Handle;
 pub use service_manager::ServiceManager;
+#[cfg(feature = "view")]
+pub(crate) use world_requests::typed as world_object;
 
 use crate::control::config::CoordinatorConfig;
 use crate::control::request::Request;

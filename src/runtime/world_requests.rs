@@ -204,7 +204,7 @@ fn configured(object: &WorldObject, pose: Isometry3<f64>) -> ObjectConfig {
 }
 
 /// Converts an object of the blueprint to its rpc type.
-pub(super) fn typed(object: &ObjectConfig) -> WorldObject {
+pub(crate) fn typed(object: &ObjectConfig) -> WorldObject {
     let shape = match &object.shape {
         ObjectShape::Box(size) => ShapeSpec::Box(*size),
         ObjectShape::Sphere(radius) => ShapeSpec::Sphere(*radius),

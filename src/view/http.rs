@@ -23,8 +23,8 @@ const MAX_UNREAD: u64 = 1 << 20;
 /// Time limit for the client to close the connection.
 const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// Headers of every reply. Nothing is kept, and no other site may embed the page or read from it.
-const COMMON: &str = "Cache-Control: no-store\r\nX-Content-Type-Options: nosniff\r\nReferrer-Policy: no-referrer\r\n\
+/// Headers of every reply. No other site may embed the page or read from it.
+const COMMON: &str = "X-Content-Type-Options: nosniff\r\nReferrer-Policy: no-referrer\r\n\
 Cross-Origin-Resource-Policy: same-origin\r\nConnection: close\r\n";
 
 /// The head of a request.
@@ -34,6 +34,8 @@ pub struct Request {
     pub method: String,
     /// Path, without a query.
     pub path: String,
+    /// Query, without `?`.
+    pub query: String,
     /// Names in lower case, and values.
     headers: Vec<(String, String)>,
     /// What was received behind the head.
@@ -63,13 +65,15 @@ pub struct Reply {
     pub headers: &'static str,
     /// Content.
     pub body: Cow<'static, [u8]>,
+    /// Whether browsers may keep it for good: its address has its hash.
+    pub keep: bool,
 }
 
 impl Reply {
     /// Creates a reply with a short text.
     pub fn text(status: u16, text: impl Into<String>) -> Self {
         let body = Cow::Owned((text.into() + "\n").into_bytes());
-        Self { status, kind: "text/plain; charset=utf-8", headers: "", body }
+        Self { status, kind: "text/plain; charset=utf-8", headers: "", body, keep: false }
     }
 }
 
@@ -103,20 +107,36 @@ fn parse(bytes: &[u8]) -> Result<Option<(Request, usize)>, httparse::Error> {
     let httparse::Status::Complete(length) = head.parse(bytes)? else { return Ok(None) };
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
     let target = head.path.unwrap_or_default();
+    let (path, query) = target.split_once('?').unwrap_or((target, ""));
     let request = Request {
         method: head.method.unwrap_or_default().to_owned(),
-        path: target.split('?').next().unwrap_or_default().to_owned(),
+        path: decoded(path),
+        query: decoded(query),
         headers: head.headers.iter().map(|h| (h.name.to_ascii_lowercase(), text(h.value))).collect(),
         rest: Vec::new(),
     };
     Ok(Some((request, length)))
 }
 
+/// Decodes `%41` to `A`.
+fn decoded(path: &str) -> String {
+    let (mut bytes, mut rest) = (Vec::new(), path.as_bytes());
+    while let [first, after @ ..] = rest {
+        let code = after.get(..2).filter(|_| *first == b'%').and_then(|code| std::str::from_utf8(code).ok());
+        let byte = code.and_then(|code| u8::from_str_radix(code, 16).ok());
+        bytes.push(byte.unwrap_or(*first));
+        rest = if byte.is_some() { &after[2..] } else { after };
+    }
+    String::from_utf8_lossy(&bytes).into_owned()
+}
+
 /// Sends a reply and closes the connection.
 pub async fn send(stream: &mut TcpStream, reply: Reply) -> io::Result<()> {
-    let Reply { status, kind, headers, body } = reply;
+    let Reply { status, kind, headers, body, keep } = reply;
+    let cache = if keep { "private, max-age=31536000, immutable" } else { "no-store" };
     let head = format!(
-        "HTTP/1.1 {status} {}\r\nContent-Type: {kind}\r\nContent-Length: {}\r\n{COMMON}{headers}\r\n",
+        "HTTP/1.1 {status} {}\r\nContent-Type: {kind}\r\nContent-Length: {}\r\nCache-Control: {cache}\r\n\
+        {COMMON}{headers}\r\n",
         reason(status),
         body.len()
     );
@@ -152,14 +172,18 @@ mod tests {
 
     #[test]
     fn a_head_is_read_when_it_is_complete() {
-        let text = b"GET /mesh/3?x=1 HTTP/1.1\r\nHOST: localhost:7000\r\nConnection: keep-alive, Upgrade\r\n\r\nrest";
+        let text =
+            b"GET /mesh/3?x=%221 HTTP/1.1\r\nHOST: localhost:7000\r\nConnection: keep-alive, Upgrade\r\n\r\nrest";
         for length in 0..text.len() - 4 {
             assert!(parse(&text[..length]).unwrap().is_none(), "{length}");
         }
         let (request, length) = parse(text).unwrap().unwrap();
         assert_eq!((request.method.as_str(), request.path.as_str(), &text[length..]), ("GET", "/mesh/3", &b"rest"[..]));
-        assert_eq!(request.header("host"), Some("localhost:7000"));
+        assert_eq!((request.header("host"), request.query.as_str()), (Some("localhost:7000"), "x=\"1"));
         assert!(request.has_word("connection", "upgrade") && !request.has_word("connection", "close"));
+        for (path, text) in [("/a%20b", "/a b"), ("/%C3%A4%2f", "/ä/"), ("/100%", "/100%"), ("/%g0%4", "/%g0%4")] {
+            assert_eq!(decoded(path), text);
+        }
         assert!(parse(b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03").is_err(), "TLS");
         assert!(parse(format!("GET / HTTP/1.1\r\n{}\r\n", "a: b\r\n".repeat(MAX_HEADERS + 1)).as_bytes()).is_err());
     }

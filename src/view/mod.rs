@@ -1,5 +1,6 @@
 //! The live view: a page in the browser that shows the arms of a run and commands them. It is one more client of the
-//! run's socket, with the leases, limits and refusals of every client.
+//! run's socket, with the leases, limits and refusals of every client. The same page shows what is not live: a log, a
+//! robot model ([`Subject`]).
 //!
 //! ```text
 //!  browser ── GET / ─────────▶ the page, compressed in the program
@@ -22,12 +23,20 @@ mod server;
 mod shown;
 #[cfg(feature = "view")]
 mod stl;
+#[cfg(feature = "view")]
+mod subject;
 #[cfg(not(feature = "view"))]
 mod without_view;
 
 #[cfg(feature = "view")]
+pub use scene::{MeshFile, Scene};
+#[cfg(feature = "view")]
 pub use server::View;
+#[cfg(feature = "view")]
+pub(crate) use shown::robots;
 pub use shown::{Shown, ShownArm, ShownGripper, ShownRobot};
+#[cfg(feature = "view")]
+pub use subject::{Subject, value};
 #[cfg(not(feature = "view"))]
 pub use without_view::View;
 

@@ -1,7 +1,8 @@
 //! `/scene.json`: what does not change during the run. Robot descriptions are read and expanded for it, and their
-//! meshes numbered: a page can ask for these files only.
+//! meshes numbered: a page can ask for these files only. The hash of a mesh is in its address: browsers keep it.
 
 use std::collections::{BTreeMap, HashMap};
+use std::hash::{DefaultHasher, Hasher};
 use std::path::PathBuf;
 
 use nalgebra::Isometry3;
@@ -20,8 +21,38 @@ const VERSION: u32 = 1;
 pub struct Scene {
     /// The scene as JSON.
     pub json: String,
-    /// The mesh files by number; the error says why there is none.
-    pub meshes: Vec<Result<PathBuf, String>>,
+    /// The mesh files by number.
+    pub meshes: Vec<MeshFile>,
+}
+
+/// A mesh file.
+#[derive(Debug)]
+pub enum MeshFile {
+    /// A file.
+    At(PathBuf),
+    /// The contents of a file with this name.
+    Inside(String, Vec<u8>),
+    /// Why there is none.
+    Missing(String),
+}
+
+impl MeshFile {
+    /// Returns the address of the mesh with this number.
+    pub fn address(&self, number: usize) -> String {
+        let hash = match self {
+            Self::At(path) => std::fs::read(path).ok().map(|bytes| hash(&bytes)),
+            Self::Inside(_, bytes) => Some(hash(bytes)),
+            Self::Missing(_) => None,
+        };
+        hash.map_or_else(|| format!("/mesh/{number}"), |hash| format!("/mesh/{number}-{hash}"))
+    }
+}
+
+/// Returns the hash of a mesh file in its address.
+pub fn hash(bytes: &[u8]) -> String {
+    let mut hasher = DefaultHasher::new();
+    hasher.write(bytes);
+    format!("{:016x}", hasher.finish())
 }
 
 #[derive(Serialize)]
@@ -64,6 +95,7 @@ struct Limits {
     lower: f64,
     upper: f64,
     velocity: f64,
+    acceleration: f64,
 }
 
 #[derive(Serialize)]
@@ -95,13 +127,13 @@ fn in_order<T: Serialize, S: Serializer>(pairs: impl AsRef<[(String, T)]>, seria
 
 impl Scene {
     /// Reads the descriptions of the robots. One that cannot be read is left out, with a warning.
-    pub fn read(shown: &Shown) -> Self {
+    pub fn read(shown: &Shown, kind: &'static str) -> Self {
         let mut meshes = Vec::new();
         let robots: Vec<Robot<'_>> = shown.robots.iter().filter_map(|robot| read(robot, shown, &mut meshes)).collect();
         let address: Vec<&str> = shown.arms.iter().map(|arm| arm.address.as_str()).collect();
         let document = Document {
             version: VERSION,
-            kind: "run",
+            kind,
             name: &shown.name,
             simulated: shown.simulated,
             address: address.join(", "),
@@ -112,9 +144,16 @@ impl Scene {
         // Plain structs with string keys always encode.
         Self { json: serde_json::to_string(&document).unwrap_or_default(), meshes }
     }
+
+    /// Adds what only this kind of scene has.
+    pub fn with(mut self, name: &str, value: &serde_json::Value) -> Self {
+        self.json.truncate(self.json.len().saturating_sub(1));
+        self.json += &format!(",\"{name}\":{value}}}");
+        self
+    }
 }
 
-fn read<'a>(robot: &'a ShownRobot, shown: &Shown, meshes: &mut Vec<Result<PathBuf, String>>) -> Option<Robot<'a>> {
+fn read<'a>(robot: &'a ShownRobot, shown: &Shown, meshes: &mut Vec<MeshFile>) -> Option<Robot<'a>> {
     let source = robot::Source { meshes: Meshes::Mark, ..robot.source.clone() };
     let mut loaded = robot::load(&source);
     let semantics = std::mem::take(&mut loaded.semantics);
@@ -124,8 +163,11 @@ fn read<'a>(robot: &'a ShownRobot, shown: &Shown, meshes: &mut Vec<Result<PathBu
     let mut numbers = HashMap::new();
     for mesh in model.meshes() {
         numbers.entry(mesh.uri.as_str()).or_insert_with(|| {
-            meshes.push(mesh.path.clone().ok_or_else(|| format!("{}: file not found", mesh.uri)));
-            meshes.len() - 1
+            let file = mesh.path.clone().map(MeshFile::At);
+            let file = file.unwrap_or_else(|| MeshFile::Missing(format!("{}: file not found", mesh.uri)));
+            let address = file.address(meshes.len());
+            meshes.push(file);
+            address
         });
     }
     number_meshes(&mut document.root, &numbers);
@@ -152,14 +194,14 @@ fn read<'a>(robot: &'a ShownRobot, shown: &Shown, meshes: &mut Vec<Result<PathBu
     })
 }
 
-/// Replaces the names of mesh files by `/mesh/NUMBER`.
-fn number_meshes(element: &mut Element, numbers: &HashMap<&str, usize>) {
+/// Replaces the names of mesh files by their addresses.
+fn number_meshes(element: &mut Element, numbers: &HashMap<&str, String>) {
     if element.name == "mesh" {
         let filename = element.attributes.iter_mut().find(|attribute| attribute.name == "filename");
         if let Some(filename) = filename
-            && let Some(number) = numbers.get(filename.value.as_str())
+            && let Some(address) = numbers.get(filename.value.as_str())
         {
-            filename.value = format!("/mesh/{number}");
+            filename.value.clone_from(address);
         }
     }
     for node in &mut element.children {
@@ -178,6 +220,7 @@ fn limits_of(joint: &str, arms: &[ShownArm]) -> Option<Limits> {
         lower: of(&limits.position_lower),
         upper: of(&limits.position_upper),
         velocity: of(&limits.velocity_max),
+        acceleration: of(&limits.acceleration_max),
     })
 }
 

@@ -15,7 +15,8 @@ use tokio::task::{JoinSet, spawn_blocking};
 
 use super::access::{Access, UrlFile};
 use super::http::{self, Reply, Request};
-use super::scene::Scene;
+use super::scene::{self, Scene};
+use super::subject::{Live, Subject};
 use super::{Shown, bridge, stl};
 use crate::blueprint::planner::ViewConfig;
 
@@ -46,16 +47,16 @@ pub struct View {
     url: String,
     end: watch::Sender<bool>,
     thread: Option<JoinHandle<()>>,
-    _file: UrlFile,
+    _file: Option<UrlFile>,
 }
 
 /// What connections share.
 struct Site {
     access: Access,
-    shown: Arc<Shown>,
+    subject: Arc<dyn Subject>,
     scene: OnceCell<Arc<Scene>>,
-    /// The run's socket.
-    run: PathBuf,
+    /// The run's socket; `None`: no run is shown.
+    run: Option<PathBuf>,
     pages: Arc<Semaphore>,
 }
 
@@ -63,12 +64,28 @@ impl View {
     /// Starts serving the page of the run with this socket. The URL is also in the file that belongs to `claim`: the
     /// socket's path of the run itself, or of the planner that serves the page.
     pub fn start(config: &ViewConfig, shown: Shown, socket: &Path, claim: &Path) -> Result<Self, String> {
+        let live = Live { shown, socket: socket.to_owned() };
+        Self::serve(config, Arc::new(live), Some(socket.to_owned()), Some(claim))
+    }
+
+    /// Starts serving pages of something that is not live.
+    pub fn open(config: &ViewConfig, subject: Arc<dyn Subject>) -> Result<Self, String> {
+        Self::serve(config, subject, None, None)
+    }
+
+    fn serve(
+        config: &ViewConfig,
+        subject: Arc<dyn Subject>,
+        run: Option<PathBuf>,
+        claim: Option<&Path>,
+    ) -> Result<Self, String> {
         let listener = bind(config)?;
         let failed = |what: &'static str| move |error: io::Error| format!("{what}: {error}");
         let at = listener.local_addr().map_err(failed("its port"))?;
         let access = Access::new(at).map_err(failed("no random numbers for its token"))?;
         let (address, url) = (access.address(), access.url());
-        let file = UrlFile::write(claim, &url).map_err(failed("the file with its URL"))?;
+        let file =
+            claim.map(|claim| UrlFile::write(claim, &url)).transpose().map_err(failed("the file with its URL"))?;
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_io()
             .enable_time()
@@ -77,13 +94,7 @@ impl View {
             .build()
             .map_err(failed("no runtime"))?;
         let (end, ended) = watch::channel(false);
-        let site = Site {
-            access,
-            shown: Arc::new(shown),
-            scene: OnceCell::new(),
-            run: socket.to_owned(),
-            pages: Arc::new(Semaphore::new(MAX_SOCKETS)),
-        };
+        let site = Site { access, subject, scene: OnceCell::new(), run, pages: Arc::new(Semaphore::new(MAX_SOCKETS)) };
         let thread = std::thread::Builder::new().name("view".into()).spawn(move || {
             let serving = || runtime.block_on(serve(listener, Arc::new(site), ended));
             match catch_unwind(AssertUnwindSafe(serving)) {
@@ -161,10 +172,12 @@ async fn connection(mut stream: TcpStream, site: Arc<Site>, ended: watch::Receiv
     let _ = stream.set_nodelay(true);
     let reply = match http::read(&mut stream).await {
         Ok(None) => return,
-        Ok(Some(request)) if request.path == "/rpc" && bridge::key(&request).is_some() && is_own(&site, &request) => {
-            return bridge::serve(stream, request, &site.access, &site.run, &site.pages, ended).await;
-        }
-        Ok(Some(request)) => answer(&site, &request).await,
+        Ok(Some(request)) => match &site.run {
+            Some(run) if request.path == "/rpc" && bridge::key(&request).is_some() && is_own(&site, &request) => {
+                return bridge::serve(stream, request, &site.access, run, &site.pages, ended).await;
+            }
+            _ => answer(&site, &request).await,
+        },
         Err(reply) => reply,
     };
     // The browser shows an error; there is no one else who could act on it.
@@ -182,46 +195,65 @@ async fn answer(site: &Site, request: &Request) -> Reply {
     if request.method != "GET" {
         return Reply::text(405, "only GET");
     }
-    let allowed = || site.access.is_bearer(request.header("authorization"));
-    match request.path.as_str() {
-        "/" => {
-            Reply { status: 200, kind: "text/html; charset=utf-8", headers: PAGE_HEADERS, body: Cow::Borrowed(PAGE) }
+    let path = request.path.strip_prefix('/').unwrap_or_default();
+    let (what, rest) = path.split_once('/').unwrap_or((path, ""));
+    match what {
+        "" if path.is_empty() => {
+            let body = Cow::Borrowed(PAGE);
+            return Reply { status: 200, kind: "text/html; charset=utf-8", headers: PAGE_HEADERS, body, keep: false };
         }
-        "/rpc" => Reply::text(426, "this is a WebSocket"),
-        "/scene.json" if allowed() => match scene(site).await {
-            Some(scene) => content("application/json", scene.json.clone().into_bytes()),
-            None => Reply::text(500, "the scene cannot be made"),
-        },
-        path => match path.strip_prefix("/mesh/") {
-            Some(number) if allowed() => mesh(site, number).await,
-            None if path != "/scene.json" => Reply::text(404, "there is no such page"),
-            _ => Reply::text(401, "the token is missing or wrong: `dimos view` prints the URL"),
-        },
+        "rpc" if site.run.is_some() => return Reply::text(426, "this is a WebSocket"),
+        "scene.json" | "mesh" | "object" | "messages" | "pose" => {}
+        _ => return Reply::text(404, "there is no such page"),
     }
+    if !site.access.is_bearer(request.header("authorization")) {
+        return Reply::text(401, "the token is missing or wrong: `dimos view` prints the URL");
+    }
+    let Some(scene) = scene(site).await else { return Reply::text(500, "the scene cannot be made") };
+    if what == "scene.json" {
+        return content("application/json", scene.json.clone().into_bytes());
+    }
+    let (subject, what, rest, query) = (site.subject.clone(), what.to_owned(), rest.to_owned(), request.query.clone());
+    let reply = spawn_blocking(move || match what.as_str() {
+        "mesh" => mesh(&scene, &rest),
+        "object" => match subject.object(&rest).map(|object| stl::of_object(&object.shape)) {
+            Some(Ok(bytes)) => content("application/octet-stream", bytes),
+            Some(Err(why)) => Reply::text(404, why),
+            None => Reply::text(404, "there is no such object"),
+        },
+        what => match subject.answer(what, &query) {
+            Some(Ok(json)) => content("application/json", json.into_bytes()),
+            Some(Err(why)) => Reply::text(400, why),
+            None => Reply::text(404, "there is no such page"),
+        },
+    });
+    reply.await.unwrap_or_else(|_| Reply::text(500, "this cannot be read"))
 }
 
 fn content(kind: &'static str, body: Vec<u8>) -> Reply {
-    Reply { status: 200, kind, headers: "", body: Cow::Owned(body) }
+    Reply { status: 200, kind, headers: "", body: Cow::Owned(body), keep: false }
 }
 
 /// Returns the scene, read by the first page that asks for it. `None`: reading panicked.
 async fn scene(site: &Site) -> Option<Arc<Scene>> {
-    let shown = site.shown.clone();
-    let read = || async { spawn_blocking(move || Arc::new(Scene::read(&shown))).await };
+    let subject = site.subject.clone();
+    let read = || async { spawn_blocking(move || Arc::new(subject.scene())).await };
     site.scene.get_or_try_init(read).await.ok().cloned()
 }
 
-async fn mesh(site: &Site, number: &str) -> Reply {
-    let scene = scene(site).await;
-    let mesh = number.parse::<usize>().ok().and_then(|number| scene.as_ref()?.meshes.get(number));
-    let path = match mesh {
-        Some(Ok(path)) => path.clone(),
-        Some(Err(why)) => return Reply::text(404, why),
-        None => return Reply::text(404, "there is no such mesh"),
+/// Returns a mesh by the end of its address: its number and hash.
+fn mesh(scene: &Scene, address: &str) -> Reply {
+    let number = address.split('-').next().and_then(|number| number.parse::<usize>().ok());
+    let Some((number, mesh)) = number.and_then(|number| Some((number, scene.meshes.get(number)?))) else {
+        return Reply::text(404, "there is no such mesh");
     };
-    match spawn_blocking(move || stl::from_file(&path)).await {
-        Ok(Ok(stl)) => content("model/stl", stl),
-        Ok(Err(why)) => Reply::text(500, why),
-        Err(_) => Reply::text(500, "the mesh cannot be read"),
+    match (stl::of(mesh), mesh) {
+        (Ok(stl), _) => {
+            // A file that was changed meanwhile has another address.
+            let keep = address.contains('-') && mesh.address(number).ends_with(address);
+            Reply { keep, ..content("model/stl", stl) }
+        }
+        (Err(why), scene::MeshFile::Missing(_)) => Reply::text(404, why),
+        (Err(why), _) => Reply::text(500, why),
     }
 }

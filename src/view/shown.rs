@@ -132,7 +132,7 @@ impl Shown {
 }
 
 /// Returns the planner's robots, and those of tasks whose joints no planned robot has.
-fn robots(blueprint: &Blueprint) -> Vec<ShownRobot> {
+pub(crate) fn robots(blueprint: &Blueprint) -> Vec<ShownRobot> {
     let mut robots: Vec<ShownRobot> =
         blueprint.planner.iter().flat_map(|planner| &planner.robots).map(of_planner).collect();
     let names = blueprint.joint_names();

@@ -47,6 +47,8 @@ const PARTS: &[(&str, &str, &str)] = &[
     ("blueprint", "planning", "config"),
     ("view", "control", "config"),
     ("view", "planning", "config"),
+    // Obstacles that are point clouds.
+    ("view", "collision", "ply"),
     // A log has the pose of each tool centre point.
     ("recording", "robot", "kinematics"),
     // And the transform of each link.

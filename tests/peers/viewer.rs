@@ -7,6 +7,15 @@ use crate::support::skip::{skip, skip_tool};
 
 #[test]
 fn the_page_works_in_a_browser() {
+    in_a_browser("tests/page.mjs");
+}
+
+#[test]
+fn logs_models_and_blueprints_are_shown_in_a_browser() {
+    in_a_browser("tests/files.mjs");
+}
+
+fn in_a_browser(tests: &str) {
     let viewer = Path::new(env!("CARGO_MANIFEST_DIR")).join("viewer");
     let has =
         |tool: &str| Command::new(tool).arg("--version").stdout(Stdio::null()).status().is_ok_and(|s| s.success());
@@ -17,7 +26,7 @@ fn the_page_works_in_a_browser() {
         return skip_tool("Node, Chromium and its driver");
     }
     let output = Command::new("node")
-        .args(["--test", "tests/page.mjs"])
+        .args(["--test", tests])
         .current_dir(viewer)
         .env("DIMOS", env!("CARGO_BIN_EXE_dimos"))
         .output()

@@ -180,12 +180,30 @@ fn a_page_with_the_token_sees_and_commands_the_run_and_no_other_does() {
     assert!(robot["limits"]["arm_joint1"]["upper"].as_f64().unwrap() > 0.5, "{robot}");
     assert_eq!((&scene["arms"][0]["name"], &scene["arms"][0]["joints"]), (&json!("arm"), &json!(["arm_joint1"])));
     let urdf = robot["urdf"].as_str().unwrap();
-    assert!(
-        urdf.contains(r#"filename="/mesh/0" scale="2 2 2""#) && urdf.contains("/mesh/1") && !urdf.contains("part.")
-    );
+    let address = urdf.split_once(r#"filename=""#).unwrap().1.split_once('"').unwrap().0;
+    assert!(address.starts_with("/mesh/0-") && urdf.contains(r#"" scale="2 2 2""#), "{urdf}");
+    assert!(urdf.contains(r#""/mesh/1""#) && !urdf.contains("part."), "{urdf}");
 
-    let (status, stl) = page.get("/mesh/0");
-    assert_eq!((status, stl.len(), stl[80]), (200, 84 + 4 * 50, 4), "not scaled, as STL");
+    // Its hash is in its address: a browser keeps it, until the file is another one.
+    let bearer = format!("Authorization: Bearer {}", page.token);
+    let keeps = |address: &str| {
+        let (status, head, stl) = page.request(&format!("GET {address}"), &[&host, &bearer]);
+        assert_eq!((status, stl.len(), stl[80]), (200, 84 + 4 * 50, 4), "not scaled, as STL");
+        assert!(head.contains("immutable") != head.contains("no-store"), "{head}");
+        head.contains("Cache-Control: private, max-age=31536000, immutable")
+    };
+    assert!(keeps(address) && !keeps("/mesh/0") && !keeps("/mesh/0-0123456789abcdef"));
+    home.write("part.obj", &PART.replace("0.125", "0.25"));
+    assert!(!keeps(address));
+
+    // The file of an object of the world, and no other one.
+    home.dimos(&format!("world add a/part --mesh {} --at 3 0 0", home.path().join("part.obj").display())).with(0);
+    let (status, stl) = page.get("/object/a%2Fpart");
+    assert_eq!((status, stl.len()), (200, 84 + 4 * 50));
+    home.dimos("world add ball --sphere 0.1 --at 3 1 0").with(0);
+    for path in ["/object/ball", "/object/none", "/object/", "/messages?topics=/tf", "/pose?q=0"] {
+        assert_eq!(page.get(path).0, 404, "{path}");
+    }
     let (status, why) = page.get("/mesh/1");
     assert_eq!((status, String::from_utf8_lossy(&why).contains("package://gone")), (404, true));
     for path in ["/mesh/2", "/mesh/", "/mesh/-1", "/mesh/../cell.yaml", "/mesh/%2e%2e/cell.yaml", "/cell.yaml", "//"] {
@@ -193,7 +211,7 @@ fn a_page_with_the_token_sees_and_commands_the_run_and_no_other_does() {
     }
 
     // Without the token, from another site, or by a name that someone else resolves.
-    for path in ["/scene.json", "/mesh/0"] {
+    for path in ["/scene.json", "/mesh/0", "/object/ball", "/messages", "/pose"] {
         assert_eq!(page.get_with(path, "").0, 401, "{path}");
         assert_eq!(page.get_with(path, &"0".repeat(32)).0, 401, "{path}");
     }
@@ -249,6 +267,29 @@ fn a_page_with_the_token_sees_and_commands_the_run_and_no_other_does() {
     for log in fs::read_dir(home.path().join("state/dimos")).unwrap() {
         let bytes = fs::read(log.unwrap().path()).unwrap();
         assert!(!bytes.windows(page.token.len()).any(|text| text == page.token.as_bytes()));
+    }
+}
+
+#[test]
+fn what_cannot_be_shown_is_refused_by_name() {
+    let home = Home::new();
+    home.write("broken.urdf", "<robot name='r'><link name='a'/><link name='a'/></robot>");
+    home.write("not.mcap", "no log");
+    home.write("ideal.yaml", "hardware: [{hardware_id: arm, joints: {prefix: arm, count: 1}, adapter_type: mock}]");
+    for (arguments, says) in [
+        ("gone.mcap", vec!["gone.mcap", "hint: "]),
+        ("not.mcap", vec!["not.mcap is not an MCAP file"]),
+        ("broken.urdf", vec!["broken.urdf", "has mistakes"]),
+        ("builtin:gone", vec!["gone", "hint: "]),
+        ("no-such-blueprint", vec!["no-such-blueprint"]),
+        ("ideal.yaml", vec!["has no robot model", "hint: "]),
+        ("ideal.yaml --run cell", vec!["cannot be used with"]),
+        ("ideal.yaml --last", vec!["cannot be used with"]),
+        ("yourarm-planner --srdf x", vec!["yourarm-planner is no robot model"]),
+        ("--srdf x", vec!["is no robot model"]),
+        ("--last", vec!["there is no log yet"]),
+    ] {
+        home.dimos(&format!("view {arguments}")).with(2).says(&says);
     }
 }
 

@@ -1,8 +1,10 @@
-// The page of a run: reads the token, the scene, and puts the panels together.
+// The page: reads the token and the scene; of a run it puts the panels together.
 import 'uplot/dist/uPlot.min.css';
 import './style.css';
 import {Context} from './context';
 import {button, el} from './dom';
+import {logPage} from './log/page';
+import {modelPage} from './model/page';
 import {type Scene} from './protocol';
 import {Run} from './run';
 import {Gizmo} from './scene/gizmo';
@@ -32,6 +34,8 @@ async function main(): Promise<void> {
   const scene = await readScene(token);
   if (!scene) return;
   document.title = `${scene.name} · dimos`;
+  if (scene.kind === 'log') return logPage(scene, token, app);
+  if (scene.kind !== 'run') return modelPage(scene, token, app);
   const run = new Run(scene, `${location.protocol === 'https:' ? 'wss' : 'ws'}://${location.host}/rpc`, token);
   const context = new Context(run);
   const canvas = el('div', {class: 'canvas', id: 'view'});

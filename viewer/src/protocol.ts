@@ -25,7 +25,14 @@ export interface SceneRobot {
   joints: Record<string, string>;
   /** Named poses, in the order of `joints`. */
   groups?: Record<string, number[]>;
-  limits: Record<string, {lower: number | null; upper: number | null; velocity: number | null}>;
+  limits: Record<string, JointLimit>;
+}
+
+export interface JointLimit {
+  lower: number | null;
+  upper: number | null;
+  velocity: number | null;
+  acceleration?: number | null;
 }
 
 export interface SceneArm {

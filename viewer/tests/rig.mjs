@@ -1,6 +1,6 @@
 // What the tests of the page share: a run of the given program in folders of its own, and a real browser.
 import {spawn, spawnSync} from 'node:child_process';
-import {mkdirSync, mkdtempSync, rmSync} from 'node:fs';
+import {mkdirSync, mkdtempSync, readFileSync, rmSync} from 'node:fs';
 import {tmpdir} from 'node:os';
 import {join} from 'node:path';
 import {chromium} from 'playwright-core';
@@ -27,7 +27,8 @@ export class Run {
   static async start(...args) {
     const home = mkdtempSync(join(tmpdir(), 'dimos-page-'));
     for (const folder of ['run', 'state', 'config', 'cache']) mkdirSync(join(home, folder), {mode: 0o700});
-    const child = spawn(PROGRAM, ['run', ...args, '--no-record'], {
+    const record = args.includes('--record') ? [] : ['--no-record'];
+    const child = spawn(PROGRAM, ['run', ...args, ...record], {
       env: environment(home),
       cwd: home,
       stdio: ['ignore', 'pipe', 'pipe'],
@@ -87,7 +88,7 @@ export class Run {
   }
 }
 
-function environment(home) {
+export function environment(home) {
   return {
     PATH: process.env.PATH,
     HOME: home,
@@ -99,7 +100,9 @@ function environment(home) {
 }
 
 export function browser() {
-  return chromium.launch({executablePath: BROWSER, args: FLAGS});
+  // A page that the test serves counts as one of another network.
+  const own = process.env.DIMOS_PAGE ? ['--disable-features=LocalNetworkAccessChecks'] : [];
+  return chromium.launch({executablePath: BROWSER, args: [...FLAGS, ...own]});
 }
 
 /** A page that notes its requests and errors, and waits at most `TIMEOUT`. */
@@ -113,6 +116,13 @@ export async function open(browser, url, viewport = {width: 1200, height: 760}) 
   page.on('websocket', (socket) => page.requests.push(socket.url()));
   page.on('pageerror', (error) => page.errors.push(error.stack));
   page.on('console', (message) => message.type() === 'error' && page.errors.push(message.text()));
+  // The page that was built just now, in a program that does not embed it yet.
+  if (process.env.DIMOS_PAGE) {
+    await page.route(`${new URL(url).origin}/`, async (route) => {
+      const response = await route.fetch();
+      await route.fulfill({response, body: readFileSync(process.env.DIMOS_PAGE, 'utf8')});
+    });
+  }
   await page.goto(url);
   return page;
 }

@@ -48,7 +48,7 @@ pub(super) fn of(blueprint: &Blueprint) -> Result<Vec<Robot>, String> {
 }
 
 /// Returns the commanded limits of a blueprint's joints, as far as they are known without the arms.
-fn commanded(summary: &Summary) -> BTreeMap<String, JointBounds> {
+pub(in crate::cli) fn commanded(summary: &Summary) -> BTreeMap<String, JointBounds> {
     let bounds = |joint: &JointSummary| {
         // Position ranges are shown as in the model, beside those of the arm.
         let position = [f64::NEG_INFINITY, f64::INFINITY];

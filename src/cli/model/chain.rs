@@ -106,7 +106,7 @@ pub(super) fn group_joints(robot: &RobotModel, semantics: &Semantics, group: &st
 }
 
 /// Returns the first link at the end of the longest chain of joints that passes no finger of a gripper.
-fn end_of_arm(robot: &RobotModel) -> usize {
+pub(in crate::cli) fn end_of_arm(robot: &RobotModel) -> usize {
     let mut depths: Vec<Option<usize>> = vec![None; robot.links.len()];
     if let Some(root) = depths.first_mut() {
         *root = Some(0);

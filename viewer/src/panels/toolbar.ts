@@ -6,7 +6,7 @@ import {VIEWS} from '../scene/stage';
 
 const NAMES: Record<keyof typeof VIEWS, string> = {iso: 'Fit', front: 'Front', side: 'Side', top: 'Top'};
 
-export function toolbar({view}: Context): HTMLElement {
+export function toolbar({view}: Context, traced = true): HTMLElement {
   const toggle = (text: string, title: string, on: boolean, set: (on: boolean) => void) => {
     const control = button(
       text,
@@ -33,7 +33,7 @@ export function toolbar({view}: Context): HTMLElement {
     el(
       'div',
       {class: 'choice'},
-      toggle('Trace', 'Way of the tool centre points', true, (on) => view.showTraces(on)),
+      traced ? toggle('Trace', 'Way of the tool centre points', true, (on) => view.showTraces(on)) : null,
       toggle('Frames', 'Frame of every link', false, (on) => each((robot) => robot.showFrames(on))),
       toggle('Collision', 'Collision geometry', false, (on) => each((robot) => robot.showColliders(on))),
       toggle('Grid', 'Grid and frame of map: 0.1 m', true, (on) => view.stage.setGrid(on)),

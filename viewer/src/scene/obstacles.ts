@@ -10,10 +10,13 @@ import {
   MeshLambertMaterial,
   Object3D,
   OctahedronGeometry,
+  Points,
+  PointsMaterial,
   Quaternion,
   SphereGeometry,
 } from 'three';
 import {type Pose, type Shape, type WorldObject} from '../protocol';
+import {type Meshes} from './meshes';
 import {quaternionOf} from './robot';
 import {dispose} from './stage';
 
@@ -29,6 +32,7 @@ export class Obstacles {
     private readonly root: Object3D,
     private readonly link: (robot: string, link: string) => Object3D | null,
     private readonly changed: () => void,
+    private readonly meshes: Meshes,
   ) {}
 
   /** Shows this world: only what differs is made again. */
@@ -62,12 +66,38 @@ export class Obstacles {
     );
     const edges = new LineSegments(new EdgesGeometry(geometry, 30), new LineBasicMaterial({color: held ? HELD : FREE}));
     mesh.add(edges);
+    void this.dress(mesh, edges, object);
     mesh.userData.attached = true;
     place(mesh, object.pose);
     const parent = held ? this.link(held[0], held[1]) : this.root;
     (parent ?? this.root).add(mesh);
     this.objects.set(object.name, {key, object: mesh});
     this.changed();
+  }
+
+  /** Gives an object its mesh or its points, when they are there. */
+  private async dress(mesh: Mesh, edges: LineSegments, {name, shape}: WorldObject): Promise<void> {
+    const file = 'mesh' in shape ? shape.mesh : 'cloud' in shape ? shape.cloud : '';
+    if (!file) return;
+    // The file is part of the address: an object of the same name may come to have another one.
+    const url = `/object/${encodeURIComponent(name)}?${encodeURIComponent(file)}`;
+    try {
+      if ('cloud' in shape) {
+        const points = new Points(await this.meshes.cloud(url), new PointsMaterial({color: FREE, size: 0.008}));
+        mesh.add(points);
+        (mesh.material as MeshLambertMaterial).visible = edges.visible = false;
+      } else {
+        const geometry = await this.meshes.get(url);
+        mesh.geometry.dispose();
+        edges.geometry.dispose();
+        // Disposed with the object, so it has its own.
+        mesh.geometry = geometry.clone();
+        edges.geometry = new EdgesGeometry(geometry, 30);
+      }
+      this.changed();
+    } catch (error) {
+      console.warn(error);
+    }
   }
 
   private remove(name: string): void {
@@ -85,7 +115,7 @@ export function place(object: Object3D, pose: Pose): void {
   object.quaternion.copy(pose.quat ? new Quaternion(...pose.quat).normalize() : quaternionOf(pose.rpy ?? [0, 0, 0]));
 }
 
-/** Meshes and clouds are files on the run's machine: a small marker shows where they are. */
+/** Until the file of a mesh or a cloud is here, a small marker shows where it is. */
 function geometryOf(shape: Shape): BufferGeometry {
   if ('box' in shape) return new BoxGeometry(...shape.box);
   if ('sphere' in shape) return new SphereGeometry(shape.sphere, 32, 20);

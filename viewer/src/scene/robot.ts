@@ -30,6 +30,10 @@ export class Robot {
   private readonly tcpFrame = frame(0.09);
   private colliders = false;
   private stale = false;
+  /** Materials whose colours are right. */
+  private readonly toned = new WeakSet<Material>([touchingMaterial]);
+  /** Materials of links that were drawn red. */
+  private readonly own = new WeakMap<Mesh, Material | Material[]>();
 
   constructor(
     readonly model: SceneRobot,
@@ -50,14 +54,14 @@ export class Robot {
         },
       );
     };
-    this.urdf = loader.parse(model.urdf);
+    this.urdf = loader.parse(withMaterials(model.urdf));
     for (const joint of Object.values(this.urdf.joints)) joint.ignoreLimits = true;
     this.group.position.set(...model.base.xyz);
     this.group.quaternion.set(...model.base.quat);
     this.group.userData.fit = true;
     this.group.add(this.urdf);
     this.tcpFrame.matrixAutoUpdate = false;
-    this.link.add(this.tcpFrame);
+    if (model.tip) this.link.add(this.tcpFrame);
     this.dress();
   }
 
@@ -105,6 +109,34 @@ export class Robot {
   tcp(position: Vector3, quaternion: Quaternion): void {
     this.link.updateWorldMatrix(true, false);
     new Matrix4().multiplyMatrices(this.link.matrixWorld, this.tool).decompose(position, quaternion, new Vector3());
+  }
+
+  /** Where the first joint of an arm is. */
+  baseOf(joint: string | undefined): Object3D {
+    return this.urdf.joints[this.model.joints[joint ?? ''] ?? ''] ?? this.group;
+  }
+
+  /** Whether a joint, by the coordinator's name, is prismatic. */
+  isLinear(joint: string): boolean {
+    return this.urdf.joints[this.model.joints[joint] ?? '']?.jointType === 'prismatic';
+  }
+
+  /** Draws links red. */
+  highlight(chosen: (link: string) => boolean): void {
+    for (const [name, link] of Object.entries(this.urdf.links)) {
+      const red = chosen(name);
+      for (const visual of link.children) {
+        if (!(visual as {isURDFVisual?: boolean}).isURDFVisual) continue;
+        visual.traverse((mesh) => {
+          if (!(mesh instanceof Mesh)) return;
+          // Links may share a material of the description.
+          const own = this.own.get(mesh) ?? mesh.material;
+          this.own.set(mesh, own);
+          mesh.material = red ? touchingMaterial : own;
+        });
+      }
+    }
+    this.changed();
   }
 
   linkNamed(name: string): Object3D {
@@ -171,7 +203,12 @@ export class Robot {
         });
       } else if (visual) {
         part.traverse((mesh) => {
-          if (mesh instanceof Mesh && mesh.material instanceof MeshPhongMaterial) mesh.material.shininess = 25;
+          const material: unknown = mesh instanceof Mesh && mesh.material;
+          if (!(material instanceof MeshPhongMaterial) || this.toned.has(material)) return;
+          this.toned.add(material);
+          material.shininess = 25;
+          // The loader takes the figures of a description for linear ones; people choose colours as on a screen.
+          material.color.convertSRGBToLinear();
         });
       }
     });
@@ -215,6 +252,21 @@ const colliderMaterial: Material = new MeshLambertMaterial({
   depthWrite: false,
   side: DoubleSide,
 });
+
+const touchingMaterial: Material = new MeshPhongMaterial({color: 0xe5484d});
+
+/** Links may use a material that another link defines: the loader knows those of the robot only. */
+function withMaterials(text: string): Document {
+  const urdf = new DOMParser().parseFromString(text, 'text/xml');
+  const known = new Set([...urdf.querySelectorAll('robot > material')].map((each) => each.getAttribute('name')));
+  for (const material of urdf.querySelectorAll('visual > material[name]:has(color)')) {
+    const name = material.getAttribute('name');
+    if (!name || known.has(name)) continue;
+    known.add(name);
+    urdf.documentElement.append(material.cloneNode(true));
+  }
+  return urdf;
+}
 
 /** The axes of a frame, also seen through links. */
 function frame(size: number): AxesHelper {

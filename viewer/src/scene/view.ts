@@ -40,16 +40,18 @@ export class View {
       stage.content.add(robot.group);
       stage.scene.add(trace.line);
     });
-    for (const {name} of run.scene.arms.length > 1 ? run.scene.arms : []) {
+    for (const {name, joints} of run.scene.arms.length > 1 ? run.scene.arms : []) {
       const robot = this.robots.get(context.robotOf(name)?.name ?? '');
-      if (robot) labels.add(name, robot.group);
+      if (robot) labels.add(name, run.scene.robots.length > 1 ? robot.group : robot.baseOf(joints[0]));
     }
     labels.choose(context.selected);
     context.onSelect.on(() => labels.choose(context.selected));
     this.obstacles = new Obstacles(
       stage.content,
-      (robot, link) => this.robots.get(robot)?.linkNamed(link) ?? null,
+      // In a log all robots are one.
+      (robot, link) => (this.robots.get(robot) ?? [...this.robots.values()][0])?.linkNamed(link) ?? null,
       changed,
+      meshes,
     );
     run.onJoints.on(({position}) => {
       const moved = position.some((value, i) => Math.abs((value ?? 0) - (this.drawn[i] ?? Infinity)) > SMALLEST);

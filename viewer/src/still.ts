@@ -1,0 +1,23 @@
+// What is not live, in the form of a run: the panels that show a run also show a log, or a model at joint positions.
+import {Run} from './run';
+import {type Scene} from './protocol';
+
+export class Still extends Run {
+  constructor(scene: Scene) {
+    super(scene, '', '');
+  }
+
+  override start(): void {}
+
+  override get connected(): boolean {
+    return true;
+  }
+
+  override get age(): number {
+    return 0;
+  }
+
+  override armAge(): number {
+    return 0;
+  }
+}
