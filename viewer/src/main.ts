@@ -1,6 +1,7 @@
 // The page of a run: reads the token, the scene, and puts the panels together.
 import 'uplot/dist/uPlot.min.css';
 import './style.css';
+import './acts.css';
 import {Context} from './context';
 import {button, el} from './dom';
 import {type Scene} from './protocol';
@@ -11,10 +12,12 @@ import {View} from './scene/view';
 import {armsPanel} from './panels/arms';
 import {eventsPanel} from './panels/events';
 import {header} from './panels/header';
+import {jogPanel} from './panels/jog';
 import {jointsPanel} from './panels/joints';
 import {movePanel} from './panels/move';
 import {notice} from './panels/notice';
 import {plotsPanel} from './panels/plots';
+import {ledNote} from './panels/teach';
 import {timeline} from './panels/timeline';
 import {toolbar} from './panels/toolbar';
 import {worldPanel} from './panels/world';
@@ -84,6 +87,7 @@ function layout(context: Context, canvas: HTMLElement): void {
     canvas,
     toolbar(context),
     offline,
+    ledNote(context),
     notice(context),
     timeline(context),
   );
@@ -93,13 +97,14 @@ function layout(context: Context, canvas: HTMLElement): void {
     armsPanel(context),
     jointsPanel(context),
   );
-  const panels = el('div', {class: 'panels'}, movePanel(context), worldPanel(context), eventsPanel(context));
+  const panels = el('div', {class: 'panels'}, movePanel(context), jogPanel(context), worldPanel(context), eventsPanel(context));
   const tabs = el(
     'nav',
     {class: 'tabs'},
     ...[
       ['arms', 'Arms'],
       ['move', 'Move'],
+      ['jog', 'Jog'],
       ['world', 'Obstacles'],
       ['events', 'Events'],
       ['plots', 'Plots'],
@@ -112,6 +117,7 @@ function layout(context: Context, canvas: HTMLElement): void {
       .querySelectorAll('button')
       .forEach((each) => each.setAttribute('aria-selected', String(each.dataset.tab === tab)));
     window.dispatchEvent(new Event('resize'));
+    context.onTab.emit();
   };
   const licences = button('licences', () => (document.getElementById('licences') as HTMLDialogElement).show(), {
     class: 'quiet',
