@@ -7,6 +7,16 @@ use crate::support::skip::{skip, skip_tool};
 
 #[test]
 fn the_page_works_in_a_browser() {
+    in_a_browser("page.mjs");
+}
+
+/// With `DIMOS_PAGE_SOAK` (minutes) the same acts again and again, while nothing may grow.
+#[test]
+fn the_page_jogs_teaches_and_moves_several_arms() {
+    in_a_browser(if std::env::var_os("DIMOS_PAGE_SOAK").is_some() { "soak.mjs" } else { "acts.mjs" });
+}
+
+fn in_a_browser(file: &str) {
     let viewer = Path::new(env!("CARGO_MANIFEST_DIR")).join("viewer");
     let has =
         |tool: &str| Command::new(tool).arg("--version").stdout(Stdio::null()).status().is_ok_and(|s| s.success());
@@ -17,7 +27,7 @@ fn the_page_works_in_a_browser() {
         return skip_tool("Node, Chromium and its driver");
     }
     let output = Command::new("node")
-        .args(["--test", "tests/page.mjs"])
+        .args(["--test", &format!("tests/{file}")])
         .current_dir(viewer)
         .env("DIMOS", env!("CARGO_BIN_EXE_dimos"))
         .output()
