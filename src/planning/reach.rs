@@ -1,4 +1,4 @@
-//! Inverse kinematics for a pose that people drag: the configuration that continues the one before, and what it touches.
+//! Inverse kinematics for a pose that people drag: the configuration that continues the one before, and what touches.
 
 use glamx::DAffine3;
 

@@ -123,7 +123,7 @@ export class Jog {
     const {run, selected: arm} = this.context;
     const drive = this.drive(this.mode)!;
     const mode = this.mode;
-    this.active = true;
+    this.active = run.streaming = true;
     this.targets = [];
     this.sent = performance.now();
     try {
@@ -144,14 +144,14 @@ export class Jog {
       await run.work.request('cancel', {task: drive.task}, LATE);
     } catch (error) {
       const known = error instanceof RpcError ? error : new RpcError('INTERNAL', String(error));
-      const lost = known.code === 'LOST';
-      const hint = lost ? 'the arm decelerates to rest by itself: hold the button again when the run replies' : known.hint;
+      const lost = known.code === 'LOST' && 'the arm decelerates to rest: hold again when the run replies';
+      const hint = lost || known.hint;
       this.problem = {text: known.message, hint};
       this.held.clear();
     }
     // What made the run refuse may need the lease to be mended.
     await run.work.request('release', {arm}, LATE).catch(() => {});
-    this.active = false;
+    this.active = run.streaming = false;
     if (this.held.size) void this.run();
     this.changed.emit();
   }

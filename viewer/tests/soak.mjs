@@ -1,5 +1,5 @@
-// The page for a long time (DIMOS_PAGE_SOAK minutes): motions, jogging, dragged poses and lost connections, while neither
-// its heap nor the memory of the run may grow.
+// The page for a long time (DIMOS_PAGE_SOAK minutes): motions, jogging, dragged poses and lost connections, while
+// neither its heap nor the memory of the run may grow.
 import assert from 'node:assert/strict';
 import {readdirSync, readFileSync} from 'node:fs';
 import {test} from 'node:test';
@@ -26,8 +26,9 @@ test(`nothing grows in ${MINUTES} min`, {timeout: (MINUTES + 5) * 60_000}, async
       const now = await measure(session, page, run.child.pid);
       console.log(`${(part() * MINUTES).toFixed(1)} min, cycle ${cycles}: ${JSON.stringify(now)}`);
       if (part() < WARM || !warm) warm = now;
-      else for (const [what, most] of Object.entries(LARGEST)) {
-        assert.ok(now[what] <= warm[what] + most, `${what} grew from ${warm[what]} to ${now[what]} in ${cycles} cycles`);
+      for (const [what, most] of Object.entries(LARGEST)) {
+        const [from, to] = [warm[what], now[what]];
+        assert.ok(to <= from + most, `${what} grew from ${from} to ${to} in ${cycles} cycles`);
       }
     }
     assert.deepEqual(page.errors.filter((error) => !/WebSocket|net::/.test(error)), []);

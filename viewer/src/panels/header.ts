@@ -109,9 +109,9 @@ function override(context: Context): HTMLElement {
   );
 }
 
-/** Whether Space has a meaning of its own where the focus is: text, a button, a check box, a list. */
+/** Whether Space has a meaning of its own where the focus is: text, a button (not of jog), a check box, a list. */
 function takesSpace(target: EventTarget | null): boolean {
-  return target instanceof Element && target.closest('input:not([type=range]), button, select, textarea') !== null;
+  return target instanceof Element && target.closest('input:not([type=range]), button:not(.hold), select, textarea') !== null;
 }
 
 function stopButton(context: Context): HTMLElement {

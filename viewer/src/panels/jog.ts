@@ -122,7 +122,8 @@ export function jogPanel(context: Context): HTMLElement {
     }
     list.forEach(({element}, i) => setClass(element, 'chosen', jog.mode === 'joints' && keysOn() && i === chosen));
     const on = keys.getAttribute('aria-pressed') === 'true';
-    setText(keysText, on ? (jog.mode === 'tool' ? 'hold a key; [ ] speed, B axes' : '1–9 joint, hold + or −; [ ] speed') : '');
+    const meaning = jog.mode === 'tool' ? 'hold a key; [ ] speed, B axes' : '1–9 joint, hold + or −; [ ] speed';
+    setText(keysText, on ? meaning : '');
     const lines: HTMLElement[] = [];
     const {problem, task} = jog;
     if (problem) lines.push(el('div', {class: 'bad', text: problem.text}));
@@ -130,7 +131,7 @@ export function jogPanel(context: Context): HTMLElement {
     if (!problem && jog.active) lines.push(el('div', {class: 'good', text: `${context.selected} is jogged`}));
     if (!problem && jog.active && task?.bound) lines.push(el('div', {class: 'warn', text: `limited by ${task.bound}`}));
     if (!problem && !jog.active && arm && arm.phase !== 'ready')
-      lines.push(el('div', {class: 'minor', text: `${context.selected} is ${arm.phase}: it must be ready to be jogged`}));
+      lines.push(el('div', {class: 'minor', text: `${context.selected} is ${arm.phase}, not ready to be jogged`}));
     report.replaceChildren(...lines);
     showValues();
   };
@@ -157,7 +158,9 @@ export function jogPanel(context: Context): HTMLElement {
 
   const keyDown = (event: KeyboardEvent) => {
     const typed = event.target instanceof Element && event.target.closest('input:not([type=range]), select, textarea');
-    if (!keysOn() || typed || event.ctrlKey || event.altKey || event.metaKey) return;
+    // While one of these is down, browsers may not report that another key is released.
+    if (event.ctrlKey || event.altKey || event.metaKey) return jog.releaseAll();
+    if (!keysOn() || typed) return;
     const pressed = event.key.toLowerCase();
     const motion = motionOf(pressed, jog.mode, chosen);
     if (motion) {
