@@ -10,7 +10,7 @@ fn the_page_works_in_a_browser() {
     in_a_browser("page.mjs");
 }
 
-/// With `DIMOS_PAGE_SOAK` (minutes) the same acts again and again, while nothing may grow.
+/// With `DIMOS_PAGE_SOAK` (minutes) the same acts repeatedly, while nothing may grow.
 #[test]
 fn the_page_jogs_teaches_and_moves_several_arms() {
     in_a_browser(if std::env::var_os("DIMOS_PAGE_SOAK").is_some() { "soak.mjs" } else { "acts.mjs" });
