@@ -148,6 +148,7 @@ export class Flow {
   }
 
   private forget(): void {
+    this.task = '';
     this.plan = this.preview = this.planning = this.motion = this.error = null;
   }
 

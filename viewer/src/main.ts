@@ -42,7 +42,9 @@ async function main(): Promise<void> {
   context.gizmo = new Gizmo(stage);
   context.view = new View(stage, context, token);
   run.onJoints.on((state) => context.history.takeJoints(state));
-  run.onState.on((state) => context.history.takeState(state));
+  // While it is jogged the mode may be another one than that of the newest status.
+  const follows = (arm: string) => !run.streaming && run.arm(arm)?.mode.endsWith('position') !== false;
+  run.onState.on((state) => context.history.takeState(state, follows));
   layout(context, canvas);
   const usable = () => run.connected && run.age < NO_ACTS_AFTER;
   let enabled = false;

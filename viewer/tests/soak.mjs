@@ -22,7 +22,7 @@ test(`nothing grows in ${MINUTES} min`, {timeout: (MINUTES + 5) * 60_000}, async
     const part = () => (Date.now() - began) / (MINUTES * 60_000);
     let [warm, cycles] = [null, 0];
     while (part() < 1) {
-      await cycle(page, cycles++);
+      await cycle(page, cycles++).catch((error) => release(run, error));
       const now = await measure(session, page, run.child.pid);
       console.log(`${(part() * MINUTES).toFixed(1)} min, cycle ${cycles}: ${JSON.stringify(now)}`);
       if (part() < WARM || !warm) warm = now;
@@ -38,6 +38,17 @@ test(`nothing grows in ${MINUTES} min`, {timeout: (MINUTES + 5) * 60_000}, async
   }
 });
 
+/** Goes on where a computer that was too busy held an arm; any other error ends the test. */
+function release(run, error) {
+  const held = run.json('status')[0].arms.filter(({phase, hardware_id}) => phase === 'held' && hardware_id !== 'soft');
+  if (!held.length) throw error;
+  for (const {hardware_id: arm, cause} of held) {
+    console.log(`${arm} was held: ${cause?.text}`);
+    run.dimos('arm', 'reset', arm);
+    run.dimos('arm', 'enable', arm);
+  }
+}
+
 /** What people do with a page. */
 async function cycle(page, number) {
   await page.click('[data-tab=move]');
@@ -52,9 +63,7 @@ async function cycle(page, number) {
   await page.waitForSelector('#execute:enabled');
   await page.click('#preview');
   await page.click('#execute');
-  await text(page, '#report', /completed in/).catch(async (error) => {
-    throw new Error(`${await page.textContent('#report')}: ${error}`);
-  });
+  assert.match(await text(page, '#report', /completed in|held|aborted/i), /completed in/);
   await page.click('[data-arm=left] .card-head');
   await page.click('[data-panel=move] [data-value=pose]');
   const y = page.locator('.pose-fields .grid3 input').nth(1);

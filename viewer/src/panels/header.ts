@@ -111,7 +111,8 @@ function override(context: Context): HTMLElement {
 
 /** Whether Space has a meaning of its own where the focus is: text, a button (not of jog), a check box, a list. */
 function takesSpace(target: EventTarget | null): boolean {
-  return target instanceof Element && target.closest('input:not([type=range]), button:not(.hold), select, textarea') !== null;
+  const takers = 'input:not([type=range]), button:not(.hold), select, textarea';
+  return target instanceof Element && target.closest(takers) !== null;
 }
 
 function stopButton(context: Context): HTMLElement {
