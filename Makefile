@@ -159,7 +159,7 @@ jitter:
 # Arms idle and moving beside eight busy processes for half an hour, with and without real-time permission, and runs that
 # are stopped and continued 200 times: no arm may be held by that. Then an hour of the page of the live view. Three and a
 # half hours on a machine without other work.
-soak:
+soak: viewer-if-possible
 	DIMOS_SOAK=1800 cargo test --release --locked --test realtime stalls_soak -- --nocapture --test-threads 1
 	DIMOS_SOAK=120 DIMOS_SOAK_ALL=1 cargo test --release --locked --test realtime stalls_soak -- --nocapture --test-threads 1
 	DIMOS_STALLS=200 cargo test --release --locked --test realtime stalls:: -- --skip wire_stalls --nocapture --test-threads 1
