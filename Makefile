@@ -157,8 +157,9 @@ jitter:
 	cargo bench --locked --bench jitter
 
 # Arms idle and moving beside eight busy processes for half an hour, with and without real-time permission, and runs that
-# are stopped and continued 200 times: no arm may be held by that. Two and a half hours on a machine without other work.
-soak:
+# are stopped and continued 200 times: no arm may be held by that. Then an hour of the page of the live view. Three and a
+# half hours on a machine without other work.
+soak: viewer-if-possible
 	DIMOS_SOAK=1800 cargo test --release --locked --test realtime stalls_soak -- --nocapture --test-threads 1
 	DIMOS_SOAK=120 DIMOS_SOAK_ALL=1 cargo test --release --locked --test realtime stalls_soak -- --nocapture --test-threads 1
 	DIMOS_STALLS=200 cargo test --release --locked --test realtime stalls:: -- --skip wire_stalls --nocapture --test-threads 1
@@ -166,3 +167,4 @@ soak:
 	DIMOS_REPEATS=20 cargo test --release --locked --test realtime faults:: -- --nocapture --test-threads 1
 	DIMOS_JOBS=1000 cargo test --locked --test process jobs::picks -- --nocapture
 	DIMOS_BRAKING=1000 cargo test --locked --test logic braking
+	DIMOS_PAGE_SOAK=60 cargo test --locked --test peers several_arms -- --nocapture

@@ -24,6 +24,7 @@ pub mod path_planner;
 pub mod pipeline;
 pub mod planner_thread;
 pub mod planning_scene;
+pub mod reach;
 pub mod revalidate;
 pub mod rrt_connect;
 pub mod sampler;

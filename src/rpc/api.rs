@@ -232,6 +232,8 @@ methods! {
     "execute_plan" ExecutePlan -> ExecuteReply;
     /// The planner's state and robots.
     "planner" Planner -> PlannerReport;
+    /// Inverse kinematics: joint positions for a pose of a robot, and what touches there. Moves nothing.
+    "ik" Ik -> IkReply, check Ik::valid;
     /// The objects of the planner's world.
     "world" World -> WorldReport;
     /// Adds an object to the world, or replaces the one of the same name.

@@ -70,6 +70,7 @@ pub(super) fn need(request: &Request) -> Need<'_> {
         Request::ArmPayload(_) | Request::ArmTool(_) | Request::Grip(_) => Need::Nothing,
         Request::ExecutePlan(e) => Need::Plan(e.plan),
         Request::Plan(_) | Request::Planning(_) | Request::Preview(_) | Request::Planner(_) => Need::Nothing,
+        Request::Ik(_) => Need::Nothing,
         Request::World(_) | Request::WorldAdd(_) | Request::WorldMove(_) | Request::WorldRemove(_) => Need::Nothing,
         Request::Attach(_) => Need::Nothing,
         // Who watches an arm may slow it down, also one that another client moves.

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use glamx::DAffine3;
 use nalgebra::Isometry3;
 
-use super::planner_port::{PlannerPort, positions_of, robot_index, run_blocking};
+use super::planner_port::{PlannerPort, isometry, positions_of, robot_index, run_blocking};
 use super::service::internal;
 use super::tcp::TcpModel;
 use crate::collision::Stop;
@@ -17,7 +17,8 @@ use crate::planning::path::length;
 use crate::planning::pipeline::{Goal, PlanRequest, PlannedMotion};
 use crate::planning::planner_thread::{BeginError, Job, Progress};
 use crate::planning::planning_scene::{PlannedRobot, PlanningScene};
-use crate::robot::kinematics::pose;
+use crate::planning::reach::Reached;
+use crate::robot::kinematics::{frame, pose};
 use crate::rpc::api::{self, Moment, PlanSummary, ReleasedPlan};
 use crate::rpc::report::ToolReport;
 use crate::rpc::{Code, RpcError};
@@ -117,6 +118,28 @@ impl PlannerPort {
         }
         let (plan, summary, trajectory) = (job.id, summary(&job, &found), api_trajectory(trajectory));
         Ok(api::PreviewReply { plan, summary, trajectory, end_effectors, orientations, tcps })
+    }
+
+    /// Solves the inverse kinematics of a pose, on another thread.
+    pub(super) async fn ik(&self, call: api::Ik, moment: &Moment) -> Result<api::IkReply, RpcError> {
+        self.measured(moment);
+        let scene = self.thread.now();
+        let robot = robot_index(&scene, &call.robot)?;
+        let positions = all_positions(&scene, moment)?;
+        let present = positions.get(robot).cloned().unwrap_or_default();
+        let dof = present.len();
+        let near = call.near.unwrap_or(present);
+        if near.len() != dof {
+            let what = format!("{} has {dof} joints, `near` {} values", call.robot, near.len());
+            return Err(RpcError::new(Code::InvalidParams, what));
+        }
+        let target = (frame(&isometry(&call.pose)), call.pose.rpy.is_none() && call.pose.quat.is_none());
+        let stop = Stop::new(Some(Instant::now() + REVIEW_LIMIT), None);
+        let reached = run_blocking(self.thread.reach(robot, positions, target, near, stop)).await?;
+        Ok(match reached {
+            Ok(Reached { joints, contact }) => api::IkReply { joints: Some(joints), error: contact },
+            Err(failure) => api::IkReply { joints: None, error: Some(failure.what) },
+        })
     }
 
     /// Returns a plan for the coordinator to execute, if it is still collision-free.

@@ -133,6 +133,7 @@ impl Service {
                 self.recheck(&planner).await;
                 changed
             }
+            Call::Ik(_) => planner.answer(call, self.moment(0), limit).await,
             _ => planner.answer(call, Moment::default(), limit).await,
         }
     }

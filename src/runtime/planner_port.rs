@@ -70,6 +70,7 @@ impl PlannerPort {
             }
             Call::Preview(preview) => self.preview(&preview).map(Reply::Preview),
             Call::Planner(_) => Ok(Reply::Planner(self.report())),
+            Call::Ik(call) => self.ik(call, moment).await.map(Reply::Ik),
             Call::Cancel(cancel) => {
                 Ok(Reply::Cancel(CancelReply { planning: self.thread.cancel(cancel.plan), ..CancelReply::default() }))
             }

@@ -9,6 +9,7 @@ use super::tcp::TcpModel;
 use crate::arm::{ArmState, VelocitySource};
 use crate::clock::WallOffset;
 use crate::hardware::device::Connected;
+use crate::hardware::registry::Teach;
 use crate::rpc::api::{LoadReport, SpeedReport};
 use crate::rpc::report::*;
 use crate::rpc::streams::{EventReport, JointState, Level};
@@ -103,6 +104,11 @@ impl Service {
             link: view.state.link.name().to_owned(),
             phase: view.phase.name().to_owned(),
             led_by: (view.phase == Phase::Led).then(|| self.led_by(index as u16).to_owned()),
+            teach: match arm.adapter.teach {
+                Teach::HandGuiding => Some("hand_guiding".into()),
+                Teach::MotorsOff => Some("motors_off".into()),
+                Teach::No(_) => None,
+            },
             cause: (view.cause != Cause::None)
                 .then(|| CauseReport { name: view.cause.name().to_owned(), text: cause_text(view.cause) }),
             stop_pending: self.late_stops.is_waiting(index),

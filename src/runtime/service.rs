@@ -352,6 +352,7 @@ impl Service {
             | Call::Preview(_)
             | Call::ExecutePlan(_)
             | Call::Planner(_)
+            | Call::Ik(_)
             | Call::World(_)
             | Call::WorldAdd(_)
             | Call::WorldMove(_)

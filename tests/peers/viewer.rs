@@ -7,15 +7,21 @@ use crate::support::skip::{skip, skip_tool};
 
 #[test]
 fn the_page_works_in_a_browser() {
-    in_a_browser("tests/page.mjs");
+    in_a_browser("page.mjs");
 }
 
 #[test]
 fn logs_models_and_blueprints_are_shown_in_a_browser() {
-    in_a_browser("tests/files.mjs");
+    in_a_browser("files.mjs");
 }
 
-fn in_a_browser(tests: &str) {
+/// With `DIMOS_PAGE_SOAK` (minutes) the same acts repeatedly, while nothing may grow.
+#[test]
+fn the_page_jogs_teaches_and_moves_several_arms() {
+    in_a_browser(if std::env::var_os("DIMOS_PAGE_SOAK").is_some() { "soak.mjs" } else { "acts.mjs" });
+}
+
+fn in_a_browser(file: &str) {
     let viewer = Path::new(env!("CARGO_MANIFEST_DIR")).join("viewer");
     let has =
         |tool: &str| Command::new(tool).arg("--version").stdout(Stdio::null()).status().is_ok_and(|s| s.success());
@@ -26,7 +32,7 @@ fn in_a_browser(tests: &str) {
         return skip_tool("Node, Chromium and its driver");
     }
     let output = Command::new("node")
-        .args(["--test", tests])
+        .args(["--test", &format!("tests/{file}")])
         .current_dir(viewer)
         .env("DIMOS", env!("CARGO_BIN_EXE_dimos"))
         .output()

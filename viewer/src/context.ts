@@ -20,6 +20,8 @@ export class Context {
   /** The arm that the joint table, the plots and the motion panel are for. */
   selected = '';
   readonly onSelect = new Signal();
+  /** Another tab of panels was opened. */
+  readonly onTab = new Signal();
   readonly onNotice = new Signal<Notice | null>();
   view!: View;
   gizmo!: Gizmo;

@@ -12,12 +12,28 @@ export type Goal =
   | {robot: string; named: string}
   | {robot: string; pose: {xyz: Vec3; quat?: Quat}; linear?: boolean};
 
+/** Parameters of `plan`. */
+export interface PlanRequest {
+  goals: Goal[];
+  speed: number;
+  through?: Goal[];
+  blend?: number;
+}
+
 export type Stage = 'idle' | 'planning' | 'planned' | 'failed' | 'executing' | 'ended';
+
+/** A motion that has begun. */
+interface Begun {
+  motion: number;
+  task?: string;
+}
 
 export class Flow {
   stage: Stage = 'idle';
-  arm = '';
+  /** The arms that move. */
+  arms: string[] = [];
   plan: number | null = null;
+  private task = '';
   preview: Preview | null = null;
   planning: PlanningReport | null = null;
   motion: MotionReport | null = null;
@@ -34,13 +50,13 @@ export class Flow {
     return this.stage === 'planning' || this.stage === 'executing';
   }
 
-  async makePlan(arm: string, goal: Goal, speed: number): Promise<void> {
+  async makePlan(arms: string[], request: PlanRequest): Promise<void> {
     if (this.busy) return;
     this.forget();
-    this.arm = arm;
+    this.arms = arms;
     this.set('planning', 'planning…');
     try {
-      const {plan} = await this.run.work.request<{plan: number}>('plan', {goals: [goal], speed});
+      const {plan} = await this.run.work.request<{plan: number}>('plan', request);
       this.plan = plan;
       this.changed.emit();
       const report = await this.untilPlanned(plan);
@@ -57,13 +73,12 @@ export class Flow {
     }
   }
 
-  /** Moves the arm along the plan. */
+  /** Moves the arms along the plan. */
   async execute(): Promise<void> {
     if (this.stage !== 'planned' || this.plan === null) return;
     this.set('executing', 'starting…');
     try {
-      const {motion} = await this.run.work.request<{motion: number}>('execute_plan', {plan: this.plan});
-      await this.follow(motion);
+      await this.follow(await this.run.work.request<Begun>('execute_plan', {plan: this.plan}));
     } catch (error) {
       this.fail(error);
     }
@@ -73,11 +88,10 @@ export class Flow {
   async moveDirect(arm: string, target: number[], speed: number): Promise<void> {
     if (this.busy) return;
     this.forget();
-    this.arm = arm;
+    this.arms = [arm];
     this.set('executing', 'starting…');
     try {
-      const {motion} = await this.run.work.request<{motion: number}>('move', {arm, target, speed, direct: true});
-      await this.follow(motion);
+      await this.follow(await this.run.work.request<Begun>('move', {arm, target, speed, direct: true}));
     } catch (error) {
       this.fail(error);
     }
@@ -85,7 +99,9 @@ export class Flow {
 
   /** Ends planning, or decelerates the motion to rest. */
   async cancel(arm: string): Promise<void> {
-    const params = this.stage === 'planning' && this.plan !== null ? {plan: this.plan} : {arm};
+    // One task moves all arms of a plan.
+    const own = this.stage === 'executing' && this.task ? {task: this.task} : {arm};
+    const params = this.stage === 'planning' && this.plan !== null ? {plan: this.plan} : own;
     const {tasks} = await this.run.watch.request<{tasks: Record<string, string>}>('cancel', params);
     if (!this.busy)
       this.text = Object.values(tasks ?? {}).includes('CANCELLED') ? 'motion cancelled' : 'nothing to cancel';
@@ -108,7 +124,8 @@ export class Flow {
   }
 
   /** Follows a motion to its end. It continues without the page: a lost connection ends only the watching. */
-  private async follow(motion: number): Promise<void> {
+  private async follow({motion, task}: Begun): Promise<void> {
+    this.task = task ?? '';
     for (;;) {
       try {
         this.motion = await this.run.work.request<MotionReport>('motion', {motion});
@@ -122,8 +139,8 @@ export class Flow {
       this.changed.emit();
       await pause(POLL);
     }
-    // The arm is free for other programs as soon as it is at rest.
-    await this.run.work.request('release', {arm: this.arm}).catch(() => {});
+    // The arms are free for other programs as soon as they are at rest.
+    for (const arm of this.arms) await this.run.work.request('release', {arm}).catch(() => {});
     const {state, error, deviation, elapsed} = this.motion;
     if (state !== 'COMPLETED') throw new RpcError(state, error ?? `motion ${state.toLowerCase()}`);
     const worst = Math.max(0, ...(deviation ?? []).map(({target, actual}) => Math.abs(target - actual)));
@@ -131,6 +148,7 @@ export class Flow {
   }
 
   private forget(): void {
+    this.task = '';
     this.plan = this.preview = this.planning = this.motion = this.error = null;
   }
 

@@ -120,12 +120,13 @@ export class History {
     this.takeTick(state);
   }
 
-  takeState(state: State): void {
+  /** `follows`: whether an arm is commanded by positions, so that there is a tracking error. */
+  takeState(state: State, follows: (arm: string) => boolean): void {
     for (const {hardware_id, joints} of state.arms) {
       this.arms.get(hardware_id)?.error.push(
         state.stamp,
         joints.map(({command, position}) =>
-          command === null || position === null || command === undefined ? null : command - position,
+          follows(hardware_id) && typeof command === 'number' && position !== null ? command - position : null,
         ),
       );
     }

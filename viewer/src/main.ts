@@ -1,6 +1,7 @@
 // The page: reads the token and the scene; of a run it puts the panels together.
 import 'uplot/dist/uPlot.min.css';
 import './style.css';
+import './acts.css';
 import {Context} from './context';
 import {button, el} from './dom';
 import {logPage} from './log/page';
@@ -13,10 +14,12 @@ import {View} from './scene/view';
 import {armsPanel} from './panels/arms';
 import {eventsPanel} from './panels/events';
 import {header} from './panels/header';
+import {jogPanel} from './panels/jog';
 import {jointsPanel} from './panels/joints';
 import {movePanel} from './panels/move';
 import {notice} from './panels/notice';
 import {plotsPanel} from './panels/plots';
+import {ledNote} from './panels/teach';
 import {timeline} from './panels/timeline';
 import {toolbar} from './panels/toolbar';
 import {worldPanel} from './panels/world';
@@ -43,7 +46,9 @@ async function main(): Promise<void> {
   context.gizmo = new Gizmo(stage);
   context.view = new View(stage, context, token);
   run.onJoints.on((state) => context.history.takeJoints(state));
-  run.onState.on((state) => context.history.takeState(state));
+  // While it is jogged the mode may be another one than that of the newest status.
+  const follows = (arm: string) => !run.streaming && run.arm(arm)?.mode.endsWith('position') !== false;
+  run.onState.on((state) => context.history.takeState(state, follows));
   layout(context, canvas);
   const usable = () => run.connected && run.age < NO_ACTS_AFTER;
   let enabled = false;
@@ -88,6 +93,7 @@ function layout(context: Context, canvas: HTMLElement): void {
     canvas,
     toolbar(context),
     offline,
+    ledNote(context),
     notice(context),
     timeline(context),
   );
@@ -97,13 +103,14 @@ function layout(context: Context, canvas: HTMLElement): void {
     armsPanel(context),
     jointsPanel(context),
   );
-  const panels = el('div', {class: 'panels'}, movePanel(context), worldPanel(context), eventsPanel(context));
+  const panels = el('div', {class: 'panels'}, movePanel(context), jogPanel(context), worldPanel(context), eventsPanel(context));
   const tabs = el(
     'nav',
     {class: 'tabs'},
     ...[
       ['arms', 'Arms'],
       ['move', 'Move'],
+      ['jog', 'Jog'],
       ['world', 'Obstacles'],
       ['events', 'Events'],
       ['plots', 'Plots'],
@@ -116,6 +123,7 @@ function layout(context: Context, canvas: HTMLElement): void {
       .querySelectorAll('button')
       .forEach((each) => each.setAttribute('aria-selected', String(each.dataset.tab === tab)));
     window.dispatchEvent(new Event('resize'));
+    context.onTab.emit();
   };
   const licences = button('licences', () => (document.getElementById('licences') as HTMLDialogElement).show(), {
     class: 'quiet',

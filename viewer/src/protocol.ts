@@ -105,6 +105,10 @@ export interface ArmStatus {
   simulated: boolean;
   link: string;
   phase: string;
+  /** What leads it, while it is led. */
+  led_by?: string | null;
+  /** How it may be led by hand: `hand_guiding` or `motors_off`. */
+  teach?: string | null;
   cause: {name: string; text: string} | null;
   enabled: boolean;
   mode: string;
@@ -130,6 +134,17 @@ export interface Task {
   progress: number | null;
   reason: string | null;
   motion: number | null;
+  /** The methods that send it targets. */
+  takes?: string[];
+  priority?: number;
+  /** What limits its motion now. */
+  bound?: string | null;
+}
+
+/** Reply to `ik`. */
+export interface IkReply {
+  joints?: number[] | null;
+  error?: string | null;
 }
 
 export interface Status {

@@ -29,6 +29,8 @@ export class Run {
   poses: PosesReport['poses'] = {};
   world: WorldObject[] = [];
   readonly events: RunEvent[] = [];
+  /** Targets are sent on `work`: nothing that may take long goes there. */
+  streaming = false;
   /** Messages that this page was too slow for. */
   lost = 0;
 
@@ -111,7 +113,7 @@ export class Run {
 
   async readWorld(): Promise<void> {
     // The planner handles one request at a time: while it plans, this connection would wait for it.
-    if (!this.status?.planner || this.status.planner.state === 'PLANNING') return;
+    if (this.streaming || !this.status?.planner || this.status.planner.state === 'PLANNING') return;
     this.world = (await this.work.request<{objects: WorldObject[]}>('world')).objects;
     this.onWorld.emit();
   }

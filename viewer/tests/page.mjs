@@ -135,7 +135,7 @@ test('a wrong token shows nothing of the run', async () => {
 test('on a phone, Stop is on screen and nothing is wider than it', async () => {
   const phone = await open(browser, run.url, {width: 390, height: 844});
   await text(phone, '#age', /^live$/);
-  for (const tab of ['arms', 'move', 'world', 'events', 'plots']) {
+  for (const tab of ['arms', 'move', 'jog', 'world', 'events', 'plots']) {
     await phone.click(`[data-tab=${tab}]`);
     const {width, stop} = await phone.evaluate(() => {
       const at = document.querySelector('#stop').getBoundingClientRect();

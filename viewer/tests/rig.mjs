@@ -1,6 +1,7 @@
 // What the tests of the page share: a run of the given program in folders of its own, and a real browser.
 import {spawn, spawnSync} from 'node:child_process';
 import {mkdirSync, mkdtempSync, readFileSync, rmSync} from 'node:fs';
+import {connect} from 'node:net';
 import {tmpdir} from 'node:os';
 import {join} from 'node:path';
 import {chromium} from 'playwright-core';
@@ -72,12 +73,20 @@ export class Run {
     return this.json('view').url;
   }
 
-  arm() {
-    return this.json('status')[0].arms[0];
+  arm(name) {
+    return this.json('status')[0].arms.find((arm) => !name || arm.hardware_id === name);
   }
 
-  positions() {
-    return this.json('state').arms[0].joints.map((joint) => joint.position);
+  positions(name) {
+    const arm = this.json('state').arms.find((arm) => !name || arm.hardware_id === name);
+    return arm.joints.map((joint) => joint.position);
+  }
+
+  /** A client beside the page, which gets the joint states of every tick: see `Watch`. */
+  async watch() {
+    const watch = new Watch(join(this.home, 'run/dimos', `${this.json('status')[0].run}.sock`));
+    await watch.ready;
+    return watch;
   }
 
   /** Ends the run, also one that is stopped by a signal, and removes its folders. */
@@ -85,6 +94,62 @@ export class Run {
     this.child.removeAllListeners('exit');
     this.child.kill('SIGKILL');
     rmSync(this.home, {recursive: true, force: true});
+  }
+}
+
+/** Joint states as the run publishes them, with the time of their ticks. */
+export class Watch {
+  positions = {};
+  velocities = {};
+  /** Of the newest tick [s since 1970]. */
+  stamp = 0;
+
+  constructor(path) {
+    this.socket = connect(path);
+    let rest = '';
+    this.ready = new Promise((resolve, reject) => {
+      this.socket.on('error', reject);
+      this.socket.on('data', (data) => {
+        const lines = (rest + data).split('\n');
+        rest = lines.pop();
+        for (const line of lines) if (this.take(JSON.parse(line))) resolve();
+      });
+    });
+    this.send('subscribe', {stream: 'coordinator_joint_state'});
+  }
+
+  send(method, params) {
+    this.socket.write(JSON.stringify({id: 1, method, params}) + '\n');
+  }
+
+  take({stream, data}) {
+    if (!stream) return false;
+    data.name.forEach((name, i) => {
+      this.positions[name] = data.position[i];
+      this.velocities[name] = data.velocity[i];
+    });
+    this.stamp = data.stamp;
+    return true;
+  }
+
+  /** Waits until a joint moves. */
+  moving(joint) {
+    return until(`${joint} moves`, () => Math.abs(this.velocities[joint]) > 0.01);
+  }
+
+  /** Waits until a joint has been at rest for 0.3 s; returns when that began [s since 1970]. */
+  async resting(joint) {
+    let since = 0;
+    await until(`${joint} is at rest`, () => {
+      if (Math.abs(this.velocities[joint]) > 1e-3) since = 0;
+      else since ||= this.stamp;
+      return since && this.stamp - since > 0.3;
+    }, 5);
+    return since;
+  }
+
+  close() {
+    this.socket.destroy();
   }
 }
 
@@ -137,11 +202,11 @@ export async function text(page, selector, pattern) {
 }
 
 /** Polls until a check holds. */
-export async function until(what, check) {
+export async function until(what, check, period = 100) {
   const end = Date.now() + TIMEOUT;
   while (!(await check())) {
     if (Date.now() > end) throw new Error(`not within ${TIMEOUT / 1000} s: ${what}`);
-    await new Promise((resolve) => setTimeout(resolve, 100));
+    await new Promise((resolve) => setTimeout(resolve, period));
   }
 }
 

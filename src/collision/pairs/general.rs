@@ -75,7 +75,7 @@ fn separation(pose: &DPose3, a: &dyn SupportMap, b: &dyn SupportMap, direction: 
 /// proven.
 fn convex_distance(pose: &DPose3, a: &dyn SupportMap, b: &dyn SupportMap) -> f64 {
     let mut least: f64 = 0.0;
-    for start in std::iter::once(pose.translation.try_normalize().unwrap_or(DVec3::X)).chain(STARTS) {
+    for start in std::iter::once((-pose.translation).try_normalize().unwrap_or(DVec3::X)).chain(STARTS) {
         let mut simplex = VoronoiSimplex::new();
         simplex.reset(CsoPoint::from_shapes(pose, a, b, start));
         match gjk::closest_points(pose, a, b, f64::MAX, true, &mut simplex) {

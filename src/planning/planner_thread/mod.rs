@@ -9,11 +9,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use glamx::DAffine3;
 use nalgebra::Isometry3;
 
 use super::ahead::{Blocked, look_ahead};
 use super::pipeline::{PlanFailure, PlanRequest, PlannedMotion, solve};
 use super::planning_scene::PlanningScene;
+use super::reach::{Reached, reach};
 use super::revalidate::revalidate;
 use super::unplanned_joints::Measured;
 use crate::collision::Stop;
@@ -194,6 +196,20 @@ impl PlannerThread {
     ) -> impl FnOnce() -> Result<Option<Blocked>, PlanFailure> + Send + use<> {
         let (setup, world) = (self.now(), lock(&self.world).0.clone());
         move || look_ahead(&setup, &world, &found, &positions, elapsed, &stop)
+    }
+
+    /// Returns the inverse kinematics of a pose of a robot (index) in `map`, its orientation free if `position_only`:
+    /// see [`reach`]. Run it on another thread.
+    pub fn reach(
+        &self,
+        robot: usize,
+        positions: Vec<Vec<f64>>,
+        (target, position_only): (DAffine3, bool),
+        near: Vec<f64>,
+        stop: Stop,
+    ) -> impl FnOnce() -> Result<Reached, PlanFailure> + Send + use<> {
+        let (setup, world) = (self.now(), lock(&self.world).0.clone());
+        move || reach(&setup, &world, robot, &positions, (&target, position_only), &near, &stop)
     }
 
     /// Returns a request by its id.

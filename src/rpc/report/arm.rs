@@ -26,6 +26,10 @@ pub struct ArmReport {
     /// What leads it, while its phase is `led`: `hand` or `controller`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub led_by: Option<String>,
+    /// How it may be led by hand (`arm_teach`): `hand_guiding`, or `motors_off`, for which it must be supported;
+    /// absent: it cannot.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub teach: Option<String>,
     /// Why it is held; absent if it is not.
     pub cause: Option<CauseReport>,
     /// A stop that could not be sent; it is delivered after the reconnect.

@@ -100,7 +100,7 @@ function notesOf(arm: ArmStatus, tasks: Task[]): HTMLElement[] {
     if (task.state === 'EXECUTING' || task.state === 'CANCELLING') {
       const progress = task.progress === null ? '' : ` ${Math.round(task.progress * 100)} %`;
       note('info', `${task.name}: ${task.state.toLowerCase()}${progress}`);
-    } else if (task.state === 'ABORTED' || task.state === 'FAULT') {
+    } else if ((task.state === 'ABORTED' && task.reason !== 'cancelled') || task.state === 'FAULT') {
       note('warn', `${task.name}: ${task.state.toLowerCase()}${task.reason ? ` (${task.reason})` : ''}`);
     }
   }

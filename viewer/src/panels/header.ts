@@ -109,24 +109,39 @@ function override(context: Context): HTMLElement {
   );
 }
 
+/** Whether Space has a meaning of its own where the focus is: text, a button (not of jog), a check box, a list. */
+function takesSpace(target: EventTarget | null): boolean {
+  const takers = 'input:not([type=range]), button:not(.hold), select, textarea';
+  return target instanceof Element && target.closest(takers) !== null;
+}
+
 function stopButton(context: Context): HTMLElement {
   const {stop} = context;
   const press = () => void stop.press();
   const lines = el('div', {class: 'stop-lines', id: 'stop-report', attributes: {role: 'alert'}});
   const control = button('STOP', press, {
     id: 'stop',
-    title: 'Holds all arms at once, until they are reset (Escape). An operational stop, not a safety function',
+    title:
+      'Holds all arms at once, until they are reset (Escape, or Space where nothing is typed). An operational stop, ' +
+      'not a safety function',
   });
   control.append(el('kbd', {text: 'Esc'}));
   window.addEventListener(
     'keydown',
     (event) => {
-      if (event.key !== 'Escape' || event.repeat) return;
+      const meant = event.key === 'Escape' || (event.key === ' ' && !takesSpace(event.target));
+      if (!meant) return;
       event.preventDefault();
-      press();
+      event.stopPropagation();
+      if (!event.repeat) press();
     },
     {capture: true},
   );
+  // A button that was clicked gives the focus back, so that Space is Stop and does not click it again.
+  document.addEventListener('click', ({target, detail}) => {
+    const control = target instanceof Element && target.closest('button');
+    if (control && detail > 0) control.blur();
+  });
   stop.changed.on(() => {
     lines.replaceChildren(...stop.lines.map(({text, good}) => el('div', {class: good ? 'good' : 'bad', text})));
     setClass(control, 'active', stop.active);

@@ -5,7 +5,9 @@ import {GoalEditor, type Mode} from '../goal';
 import {figure} from '../units';
 import {jointSliders} from './sliders';
 import {poseFields} from './pose';
+import {goalsPart} from './goals';
 import {gripperPanel} from './gripper';
+import {savePose} from './save';
 
 export function movePanel(context: Context): HTMLElement {
   const {run, flow} = context;
@@ -23,6 +25,7 @@ export function movePanel(context: Context): HTMLElement {
   const named = el('div', {class: 'chips', id: 'named'});
   const sliders = jointSliders(context, editor);
   const pose = poseFields(editor);
+  const goals = goalsPart(context, editor);
   const speed = el('input', {
     id: 'plan-speed',
     attributes: {type: 'range', min: '5', max: '100', value: '50', 'aria-label': 'speed of the next motion'},
@@ -34,10 +37,11 @@ export function movePanel(context: Context): HTMLElement {
   const plan = button(
     'Plan',
     () => {
-      const goal = editor.goal();
-      if (!goal) return;
+      const request = editor.request(fraction());
+      if (typeof request === 'string') return context.onNotice.emit({text: request});
+      context.onNotice.emit(null);
       editor.hide();
-      void flow.makePlan(context.selected, goal, fraction());
+      void flow.makePlan(editor.arms, request);
     },
     {id: 'plan', class: 'primary'},
   );
@@ -60,7 +64,7 @@ export function movePanel(context: Context): HTMLElement {
   const cancel = button(
     'Cancel',
     () => {
-      flow.cancel(flow.busy ? flow.arm : context.selected).catch((error: unknown) => context.report(error));
+      flow.cancel(flow.arms[0] && flow.busy ? flow.arms[0] : context.selected).catch((error: unknown) => context.report(error));
     },
     {id: 'cancel', title: 'Ends planning, or decelerates the motion to rest'},
   );
@@ -68,7 +72,7 @@ export function movePanel(context: Context): HTMLElement {
     'Clear goal',
     () => {
       flow.clear();
-      editor.reset();
+      editor.clear();
     },
     {id: 'clear'},
   );
@@ -89,9 +93,11 @@ export function movePanel(context: Context): HTMLElement {
     setClass(named, 'hidden', editor.mode !== 'joints');
     setClass(pose, 'hidden', editor.mode !== 'pose');
     setClass(warning, 'hidden', !!withPlanner);
+    setClass(goals, 'hidden', !withPlanner);
     for (const each of [plan, preview, execute]) setClass(each, 'hidden', !withPlanner);
     setClass(direct, 'hidden', !!withPlanner);
-    plan.disabled = flow.busy || !editor.goal();
+    plan.disabled = flow.busy || !editor.arms.length;
+    setText(plan, editor.arms.length > 2 ? 'Plan all' : editor.arms.length > 1 ? 'Plan both' : 'Plan');
     direct.disabled = flow.busy || !editor.joints;
     preview.disabled = flow.stage !== 'planned';
     execute.disabled = flow.stage !== 'planned';
@@ -118,7 +124,7 @@ export function movePanel(context: Context): HTMLElement {
   flow.changed.on(() => {
     if (flow.stage !== stage) {
       stage = flow.stage;
-      if (stage === 'ended') editor.reset();
+      if (stage === 'ended') editor.clear();
       else if (stage === 'failed') editor.show();
     }
     show();
@@ -126,7 +132,9 @@ export function movePanel(context: Context): HTMLElement {
   run.onStatus.on(show);
   run.onPoses.on(showNamed);
   context.onSelect.on(() => {
-    flow.clear();
+    // A plan that moves the selected arm stays.
+    if (!flow.arms.includes(context.selected)) flow.clear();
+    modes.choose(editor.mode);
     showNamed();
     show();
   });
@@ -144,11 +152,12 @@ export function movePanel(context: Context): HTMLElement {
       named,
       sliders,
       pose,
+      goals,
       el('label', {class: 'slider plain'}, el('span', {text: 'speed'}), speed, speedText),
       el('div', {class: 'buttons'}, plan, preview, execute, direct, cancel, clear),
       report,
     ),
-    savePose(context),
+    el('fieldset', {class: 'acts'}, savePose(context)),
     gripperPanel(context),
   );
 }
@@ -156,7 +165,8 @@ export function movePanel(context: Context): HTMLElement {
 function showReport(report: HTMLElement, {flow}: Context): void {
   const lines: HTMLElement[] = [];
   const line = (level: string, text: string) => lines.push(el('div', {class: level, text}));
-  if (flow.text) line(flow.stage === 'failed' ? 'bad' : flow.stage === 'ended' ? 'good' : '', flow.text);
+  const who = flow.arms.length > 1 && flow.stage !== 'idle' ? `${flow.arms.join(' and ')}: ` : '';
+  if (flow.text) line(flow.stage === 'failed' ? 'bad' : flow.stage === 'ended' ? 'good' : '', who + flow.text);
   if (flow.error?.hint) line('hint', flow.error.hint);
   const summary = flow.stage === 'planned' || flow.stage === 'executing' ? flow.preview?.summary : null;
   if (summary) {
@@ -171,23 +181,4 @@ function showReport(report: HTMLElement, {flow}: Context): void {
     }
   }
   report.replaceChildren(...lines);
-}
-
-/** Saves where the arm is under a name. */
-function savePose(context: Context): HTMLElement {
-  const name = el('input', {
-    attributes: {placeholder: 'name of the present pose', 'aria-label': 'name of the pose', maxlength: '40'},
-  });
-  const save = button(
-    'Save',
-    async () => {
-      if (!name.value.trim()) return name.focus();
-      if (await context.act('pose_save', {name: name.value.trim(), arms: [context.selected]})) {
-        name.value = '';
-        await context.run.readPoses().catch(() => {});
-      }
-    },
-    {title: 'Saves the measured joint positions: a named pose for later goals'},
-  );
-  return el('fieldset', {class: 'acts row save'}, name, save);
 }

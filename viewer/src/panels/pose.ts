@@ -1,5 +1,5 @@
 // Figures of a pose goal, beside the handles in the view.
-import {choice, el, NumberField, setText} from '../dom';
+import {choice, el, NumberField, setClass, setText} from '../dom';
 import {type GoalEditor} from '../goal';
 import {type Handles} from '../scene/gizmo';
 import {angle} from '../units';
@@ -28,6 +28,7 @@ export function poseFields(editor: GoalEditor): HTMLElement {
     return el('label', {class: 'check', title}, box, el('span', {text}));
   };
   const note = el('p', {class: 'minor'});
+  const reach = el('div', {class: 'note', id: 'reach', attributes: {role: 'status'}});
   const show = () => {
     const {xyz, rpy} = editor.pose();
     setText(
@@ -41,6 +42,14 @@ export function poseFields(editor: GoalEditor): HTMLElement {
       if (document.activeElement !== field.input) field.value = rpy[i]! * angle.factor;
     });
   };
+  const showReach = () => {
+    const {problem, joints, touches} = editor.reach;
+    setClass(reach, 'hidden', !editor.edited || (!problem && !joints));
+    setClass(reach, 'bad', problem !== null);
+    const way = touches ? `${problem}: Plan looks for other joint positions of this pose` : problem;
+    setText(reach, way ?? 'reachable: the ghost is the goal');
+  };
+  editor.changed.on(showReach);
   editor.changed.on(show);
   angle.changed.on(show);
   return el(
@@ -49,14 +58,15 @@ export function poseFields(editor: GoalEditor): HTMLElement {
     handles.element,
     el('div', {class: 'grid3'}, ...lengths.map((f) => f.element), ...angles.map((f) => f.element)),
     note,
+    reach,
     el(
       'div',
       {class: 'row'},
       check('free orientation', 'The planner chooses the orientation', (on) => {
-        editor.freeOrientation = on;
+        editor.setFreeOrientation(on);
       }),
       check('straight line', 'The tool centre point moves on a straight line', (on) => {
-        editor.linear = on;
+        editor.setLinear(on);
       }),
     ),
   );

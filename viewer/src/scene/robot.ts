@@ -20,6 +20,8 @@ import {dispose} from './stage';
 
 type Kind = 'goal' | 'plan';
 const GHOSTS: Record<Kind, number> = {goal: 0xf5a524, plan: 0x3b9eff};
+/** A goal that cannot be reached, or where something touches. */
+const BAD = 0xe5484d;
 
 export class Robot {
   readonly group = new Group();
@@ -144,7 +146,7 @@ export class Robot {
   }
 
   /** Shows the arm at other joint positions beside itself, or removes that. Unknown joints are as measured. */
-  setGhost(kind: Kind, position: ((joint: string) => number | null | undefined) | null): void {
+  setGhost(kind: Kind, position: ((joint: string) => number | null | undefined) | null, bad = false): void {
     let ghost = this.ghosts.get(kind);
     if (!position) {
       if (!ghost) return;
@@ -163,6 +165,7 @@ export class Robot {
       const value = position(joint) ?? (this.urdf.joints[name]?.angle as number | undefined) ?? 0;
       ghost.setJointValue(name, value);
     }
+    (ghost.userData.material as MeshLambertMaterial).color.set(bad ? BAD : GHOSTS[kind]);
     this.changed();
   }
 
@@ -241,6 +244,7 @@ export class Robot {
     for (const part of drop) part.removeFromParent();
     for (const joint of Object.values(ghost.joints)) joint.ignoreLimits = true;
     ghost.renderOrder = 1;
+    ghost.userData.material = material;
     return ghost;
   }
 }
