@@ -32,6 +32,7 @@ mod guards_virtual;
 mod help;
 mod kinematics;
 mod layering;
+mod log_storage;
 mod model;
 mod model_verbs;
 mod no_alloc;
