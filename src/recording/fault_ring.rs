@@ -114,9 +114,9 @@ mod tests {
     use crate::telemetry::describe::Severity;
 
     #[test]
-    fn thirty_seconds_of_four_arms_at_500_hz_fit_and_nothing_exceeds_64_mib() {
+    fn thirty_seconds_of_four_arms_at_400_hz_fit_and_nothing_exceeds_64_mib() {
         assert_eq!(capacity(100.0, 1), 3000 * 2 + EVENTS);
-        assert_eq!(capacity(500.0, 4), 15_000 * 5 + EVENTS);
+        assert_eq!(capacity(400.0, 4), 12_000 * 5 + EVENTS);
         assert!(capacity(2000.0, 16) * size_of::<Sample>() + MEMORY.1 <= 64 << 20);
     }
 

@@ -62,6 +62,12 @@ pub fn further_parts(first: &Path) -> impl Iterator<Item = PathBuf> {
     (1..).map(|number| part(first, number)).take_while(|path| path.exists())
 }
 
+/// Returns the size of all files of a log [bytes].
+pub fn size(first: &Path) -> u64 {
+    let size = |path: &Path| std::fs::metadata(path).map_or(0, |about| about.len());
+    size(first) + further_parts(first).map(|path| size(&path)).sum::<u64>()
+}
+
 /// Returns the log in a folder that holds one: its first file. Returns other paths unchanged.
 pub fn log_at(path: &Path) -> PathBuf {
     let Ok(entries) = std::fs::read_dir(path) else { return path.to_owned() };

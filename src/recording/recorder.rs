@@ -193,6 +193,11 @@ impl Recorder {
         self.stats.clone()
     }
 
+    /// Lets the thread take what waits now, instead of within 50 ms.
+    pub fn wake(&self) {
+        self.thread.iter().for_each(|thread| thread.thread().unpark());
+    }
+
     /// Takes the remaining samples and closes the log. Call it after the tick has ended. Returns the error that ended
     /// the log, if any.
     pub fn finish(mut self) -> Result<(), RecordError> {

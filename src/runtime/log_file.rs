@@ -25,7 +25,7 @@ pub(super) fn log_path(
     wall: WallOffset,
 ) -> Result<Option<PathBuf>, StartError> {
     let log = match &options.record {
-        Record::Off => None,
+        Record::Off | Record::Faults => None,
         Record::To(path) => Some(path.clone()),
         Record::AsBlueprint if !blueprint.recording.enabled => None,
         Record::AsBlueprint => {
@@ -46,10 +46,10 @@ fn log_folder(blueprint: &Blueprint) -> Option<PathBuf> {
 }
 
 /// Returns how the blueprint wants logs to be stored.
-pub(super) fn storage(blueprint: &Blueprint, config: &CoordinatorConfig) -> Storage {
+pub(super) fn storage(blueprint: &Blueprint, options: &Options, config: &CoordinatorConfig) -> Storage {
     let recording = &blueprint.recording;
     let time = |seconds: f64| (seconds > 0.0).then(|| Duration::from_secs_f64(seconds.min(1e9)));
-    let folder = log_folder(blueprint).filter(|_| recording.fault_log);
+    let folder = log_folder(blueprint).filter(|_| recording.fault_log && options.record != Record::Off);
     Storage {
         min_free: recording.min_free.0,
         compress: recording.compression == Compression::Zstd,

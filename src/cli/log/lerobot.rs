@@ -232,7 +232,7 @@ impl Frames {
             }
             Ok(true)
         })?;
-        self.frames_before(self.at.saturating_add((0.5e9 / self.rate) as u64)).map_err(failed)?;
+        self.frames_before(self.at.saturating_add((0.25e9 / self.rate) as u64)).map_err(failed)?;
         Ok(cut.filter(|_| !log.info().live).map(|cut| cut.to_string()))
     }
 
