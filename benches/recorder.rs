@@ -1,5 +1,5 @@
-//! The recorder without a tick: four arms at 1 kHz for a minute, samples as fast as it takes them, and how fast a log of
-//! a million messages is decoded (`--quick`: all shorter).
+//! The recorder without a tick: four arms at 1 kHz for a minute, samples as fast as it takes them, and how fast a log
+//! of a million messages is decoded (`--quick`: all shorter).
 
 #[path = "support/mod.rs"]
 #[allow(dead_code, reason = "shared with the other benchmarks")]

@@ -347,18 +347,20 @@ pub struct RecordingConfig {
     /// Minimum free space on the disk of the log, such as `200 MB`, or in bytes; 0 = no minimum. With less, a run does
     /// not start, and a live run ends with its log closed and complete.
     pub min_free: Size,
-    /// Compression of the log. Without it a log is about three times as large.
+    /// Compression of the log. Without it a log is about four times as large.
     pub compression: Compression,
-    /// Time between two syncs of the log to the disk [s], which is what a loss of power costs; 0 leaves it to the kernel,
-    /// half a minute.
+    /// Time between two syncs of the log to the disk [s], which is what a loss of power costs; 0 leaves it to the
+    /// kernel: half a minute.
     #[serde(deserialize_with = "range::non_negative")]
+    #[schemars(range(min = 0.0))]
     pub sync_every: f64,
-    /// Size at which the log continues in another file, such as `1 GB`; 0 = never. Less than 1 MB
+    /// Size at which the log continues in another file, without attachments, such as `1 GB`; 0 = never. Less than 1 MB
     /// counts as 1 MB.
     pub split_size: Size,
     /// Length at which the log continues in another file [s]; 0 = never. Less than 1 s counts as
     /// 1 s.
     #[serde(deserialize_with = "range::non_negative")]
+    #[schemars(range(min = 0.0))]
     pub split_after: f64,
     /// Whether a run that is not recorded logs its faults: the 30 s before, which it keeps in at most 64 MiB of memory,
     /// and the 5 s after.

@@ -125,9 +125,9 @@ are empty. With --topic a row is a message, with the columns of the first one.")
         /// Frames per second of the data set; default: the tick rate
         #[arg(long, value_name = "N", requires = "lerobot", value_parser = clap::value_parser!(u32).range(1..=2000))]
         fps: Option<u32>,
-        /// What the arms do in the data set
-        #[arg(long, value_name = "TEXT", requires = "lerobot", default_value = "")]
-        task: String,
+        /// What the arms do in the data set; default: the name of the run
+        #[arg(long, value_name = "TEXT", requires = "lerobot")]
+        task: Option<String>,
     },
     /// Draw measured and commanded positions of joints, with their limits, as SVG
     Plot {
@@ -187,7 +187,7 @@ pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
             match (parquet, rosbag2, lerobot) {
                 (Some(to), ..) => export::parquet(&path, part, to, log.json),
                 (_, Some(to), _) => rosbag::run(&path, part, to, log.json),
-                (.., Some(to)) => lerobot::run(&path, part, to, *fps, task, log.json),
+                (.., Some(to)) => lerobot::run(&path, part, to, *fps, task.as_deref(), log.json),
                 _ => export::csv(&path, part, topic.as_deref(), output.as_deref(), log.json),
             }
         }

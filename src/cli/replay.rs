@@ -28,10 +28,10 @@ use view::{JsonLines, Live, Plain, View};
 
 /// Play a log in the terminal, verify it, or repeat its motion with an arm
 ///
-/// Plays in real time: a joint table and a progress bar on a terminal (space pauses, right arrow plays the next tick, up
-/// and down play 10 % faster and slower, q ends), one line per second elsewhere, one JSON object
-/// per message with --json. The log of a live run plays up to its newest chunk. Exits with 5 if the log is truncated,
-/// or if the recorder lost samples.
+/// Plays in real time: a joint table and a progress bar on a terminal (space pauses, right arrow plays the next tick,
+/// up and down play 10 % faster and slower, q ends), one line per second elsewhere, one JSON object per message with
+/// --json. The log of a live run plays up to its newest chunk. Exits with 5 if the log is truncated, or if the recorder
+/// lost samples.
 ///
 /// With --verify the inputs and requests of every tick pass through the same control code again, and every command must
 /// be identical, bit for bit. Otherwise exits with 1 and prints the first difference; exits with 5 if a part is missing

@@ -51,8 +51,8 @@ fn new_path(folder: &Path, run: &str, wall_ns: u64, ending: &str) -> PathBuf {
     std::iter::once(first.clone()).chain(others).find(|path| !path.exists()).unwrap_or(first)
 }
 
-/// Returns the path of a further file of a log, from 1: `<run>-20261121T141630Z_1.mcap`. Such files are no logs of their
-/// own in [`all`] and [`newest`], and are removed with the first one.
+/// Returns the path of a further file of a log, from 1: `<run>-20261121T141630Z_1.mcap`. Such files are no logs of
+/// their own in [`all`] and [`newest`], and are removed with the first one.
 pub fn part(first: &Path, number: u32) -> PathBuf {
     first.with_file_name(format!("{}_{number}.{LOG}", first.file_stem().unwrap_or_default().display()))
 }

@@ -39,7 +39,7 @@ pub(super) struct Worker<W: Write + Seek, F, O> {
     path: PathBuf,
     /// Its number in the log, from 0.
     part: u32,
-    /// Bytes of the earlier ones, and deadline of its first tick.
+    /// Bytes before its first message, of all files, and deadline of its first tick.
     began: (u64, Option<Mono>),
     topics: Topics,
     log: Option<LogWriter<W>>,
@@ -121,7 +121,6 @@ where
         let own = disk.as_ref().filter(|_| storage.sync_every.is_some());
         let sync = own.map(|file| file.try_clone().and_then(DiskSync::start)).transpose();
         (self.disk, self.sync) = (disk, sync.map_err(RecordError::Thread)?);
-        self.began = (self.stats.bytes.load(Ordering::Relaxed), None);
         let mut metadata = self.config.metadata.clone();
         metadata.extend(self.ticks.metadata().into_iter().chain(more));
         let now = self.config.wall.wall(MonotonicClock.now());
@@ -133,6 +132,7 @@ where
             Ok(log)
         };
         self.log = Some(create().map_err(|e| write_error(&self.path, &e))?);
+        self.began = (self.stats.bytes.load(Ordering::Relaxed), None);
         let mut latest: Vec<Note> = self.latest.values().cloned().collect();
         for note in &mut latest {
             if let Note::Io { stamp: at, .. } | Note::Payload { stamp: at, .. } = note {
@@ -240,7 +240,12 @@ where
         if let Some(until) = self.until {
             let until = if std::mem::take(&mut self.faulted) { deadline.after(AFTER) } else { until };
             self.until = Some(until);
-            return if deadline >= until { self.end_fault() } else { Ok(()) };
+            if deadline >= until {
+                self.end_fault()?;
+                // Its thread syncs it once more.
+                self.sync = None;
+            }
+            return Ok(());
         }
         let (storage, first) = (&self.config.storage, *self.began.1.get_or_insert(deadline));
         let size = self.stats.bytes.load(Ordering::Relaxed) - self.began.0;
@@ -302,8 +307,7 @@ where
     /// Ends the log of a fault.
     fn end_fault(&mut self) -> Result<(), RecordError> {
         let (Some(log), Some((faults, _))) = (self.log.take(), &self.faults) else { return Ok(()) };
-        // Its thread syncs it once more.
-        (self.until, self.sync) = (None, None);
+        (self.until, self.disk) = (None, None);
         log.finish().map_err(|e| write_error(&self.path, &e))?;
         if faults.keep > 0 {
             // What cannot be removed remains.
@@ -380,7 +384,7 @@ where
         result
     }
 
-    /// Ends the log after an error. That of a fault ends alone: its run goes on without.
+    /// Ends the log after an error. That of a fault ends alone: its run continues.
     fn stop_log(&mut self, error: RecordError) {
         self.log = None;
         if self.faults.is_some() {
@@ -407,6 +411,9 @@ where
         if self.faults.is_some() {
             if let Err(e) = self.end_fault() {
                 self.stop_log(e);
+            }
+            if let Some(Ok(false)) = self.sync.take().map(|sync| sync.finish(LAST_SYNC)) {
+                (self.on_notice)(Notice::Unsynced(LAST_SYNC));
             }
             return Ok(());
         }

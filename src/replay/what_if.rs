@@ -1,5 +1,5 @@
-//! What would have been: the recorded states and requests of a run with a changed configuration. The states are those of
-//! the log: how the arms would have followed other commands is unknown.
+//! What would have been: the recorded states and requests of a run with a changed configuration. The states are those
+//! of the log: how the arms would have followed other commands is unknown.
 
 use std::path::Path;
 

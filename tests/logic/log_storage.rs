@@ -28,7 +28,7 @@ fn parts(after: u64) -> Storage {
     Storage { split_after: Some(Duration::from_secs(after)), ..Storage::default() }
 }
 
-/// Goes on for this many ticks, back and forth all the time.
+/// Runs for this many ticks, back and forth all the time.
 fn swing(run: &mut VirtualRun, ticks: u64) {
     let (names, limits) = (make_joints("arm", 6), JointLimits::uniform(6, 3.0, 2.0).with_defaults());
     let end = run.tick + ticks;
@@ -255,7 +255,7 @@ fn what_if_a_limit_were_lower() {
     assert!(strict.events.iter().any(|event| !event.logged && event.text.contains("ABORTED")), "{:?}", strict.events);
     for (path, value, says) in [
         ("arms.elbow.velocity_max", "1", "there is no elbow\nhint: arm"),
-        ("arms.arm.limits.speed", "1", "hint: position_lower, position_upper, velocity_max"),
+        ("arms.arm.limits.speed", "1", "position_lower, position_upper, velocity_max"),
         ("arms.arm.limits.velocity_max", "-1", "leave no room to move"),
         ("arms.arm.limits", "1", "it has several values"),
         ("rate", "fast", "needs another of its kind"),

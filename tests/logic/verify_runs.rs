@@ -118,7 +118,7 @@ fn a_fault_of_a_run_that_is_not_recorded_is_logged() {
         }
         std::thread::sleep(Duration::from_millis(20));
     }
-    // The run ends before the log does by itself.
+    // The run ends before the 5 s after the fault are over.
     assert_eq!(run.stop().log, None);
     let found = files::all(&logs).unwrap();
     assert_eq!(found.len(), 1, "the fault did not come");

@@ -20,7 +20,7 @@ const EPISODES: &str = "meta/episodes/chunk-000/file-000.parquet";
 const LATE: f64 = 0.125;
 
 /// Writes the data set. Frames are the state at their time, and the command of the same tick.
-pub fn run(path: &Path, part: &Part, folder: &Path, fps: Option<u32>, task: &str, json: bool) -> Result {
+pub fn run(path: &Path, part: &Part, folder: &Path, fps: Option<u32>, task: Option<&str>, json: bool) -> Result {
     let (from, to) = part.of(path)?;
     let mut log = LogReader::open(path).map_err(unreadable)?;
     let text = |key: &str| log.info().metadata.get(key).cloned().unwrap_or_default();
@@ -28,7 +28,7 @@ pub fn run(path: &Path, part: &Part, folder: &Path, fps: Option<u32>, task: &str
     let not_of_run = || Failure::usage(format!("{} is not the log of a run: its arms are unknown", path.display()));
     let fps = fps.map(f64::from).or_else(|| text("tick_rate").parse().ok()).ok_or_else(not_of_run)?;
     let (run, rate) = (text("run"), fps.round().max(1.0));
-    let task = if task.is_empty() { &run } else { task };
+    let task = task.unwrap_or(&run);
     let mut frames = Frames::new(&mut log, (from, to), rate)?;
     if frames.names.is_empty() {
         return Err(not_of_run());

@@ -77,7 +77,7 @@ pub enum Key {
 pub struct Pace {
     /// Factor.
     pub rate: f64,
-    /// Whether it stands still.
+    /// Whether it is paused.
     pub paused: bool,
     /// A time and the Unix time of the log then [ns].
     from: (Mono, u64),
@@ -101,7 +101,8 @@ impl Pace {
         self.from.1 + (passed * 1e9) as u64
     }
 
-    /// Waits until a time of the log. Returns whether to go on, or why not.
+    /// Waits until a time of the log. Returns `None` to continue, and otherwise whether it was
+    /// interrupted.
     fn wait(&mut self, log_time: u64, view: &mut dyn View, time: &mut dyn Waiting) -> io::Result<Option<bool>> {
         loop {
             let due = (!self.paused).then(|| self.due(log_time));
