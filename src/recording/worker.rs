@@ -1,5 +1,7 @@
 //! The steps of the recorder thread.
 
+mod faults;
+
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{Seek, Write};
@@ -265,56 +267,6 @@ where
         let name = first.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let more = BTreeMap::from([(PART.to_owned(), self.part.to_string()), (PART_OF.to_owned(), name)]);
         self.begin(files::part(&first, self.part), deadline, more)
-    }
-
-    /// Keeps what came while there is no log.
-    fn keep(&mut self, notes: Vec<Note>, samples: Vec<Sample>) {
-        for note in notes {
-            self.know(&note);
-            let known = matches!(note, Note::Robots { .. } | Note::Markers { .. } | Note::ArmText { .. });
-            if let (Some((_, ring)), false) = (&mut self.faults, known) {
-                ring.note(note);
-            }
-        }
-        if let Some((_, ring)) = &mut self.faults {
-            samples.into_iter().for_each(|sample| ring.sample(sample));
-        }
-    }
-
-    /// Makes a log of what was kept.
-    fn log_fault(&mut self) -> Result<(), RecordError> {
-        let Some((faults, mut ring)) = self.faults.take() else { return Ok(()) };
-        let done = self.write_kept(&faults, &mut ring);
-        ring.clear();
-        self.faults = Some((faults, ring));
-        done
-    }
-
-    fn write_kept(&mut self, faults: &FaultLog, ring: &mut FaultRing) -> Result<(), RecordError> {
-        (self.until, self.faulted) = (Some(Mono(u64::MAX)), false);
-        let stamp = ring.begin().unwrap_or_default();
-        let wall = self.config.wall.wall(MonotonicClock.now());
-        let path = files::new_log_path(&faults.folder, &format!("{}-fault", self.config.run), wall);
-        disk_space::check(&path, self.config.storage.min_free)?;
-        let part = (PART_OF.to_owned(), "a run whose beginning was not kept".to_owned());
-        self.begin(path, stamp, (!ring.whole).then_some(part).into_iter().collect())?;
-        while let Some((notes, sample)) = ring.next() {
-            self.put(notes, &[sample])?;
-        }
-        self.put(ring.rest(), &[])
-    }
-
-    /// Ends the log of a fault.
-    fn end_fault(&mut self) -> Result<(), RecordError> {
-        let (Some(log), Some((faults, _))) = (self.log.take(), &self.faults) else { return Ok(()) };
-        (self.until, self.disk) = (None, None);
-        log.finish().map_err(|e| write_error(&self.path, &e))?;
-        if faults.keep > 0 {
-            // What cannot be removed remains.
-            let _ = files::retain(&faults.folder, faults.keep);
-        }
-        (self.on_notice)(Notice::Fault(Ok(&self.path)));
-        Ok(())
     }
 
     /// Takes from a note what every file begins with.
