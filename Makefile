@@ -1,4 +1,4 @@
-# run install dist viewer check test test-fast · test-tools test-rerun deny mutants · bench bench-quick jitter soak
+# run install dist viewer check test test-fast · test-tools test-rerun test-lerobot deny mutants · bench bench-quick jitter soak
 
 PYTHON ?= python3
 # Most tests wait rather than compute. More at a time than this and whole runs no longer keep their time.
@@ -33,7 +33,7 @@ PAGE := viewer/dist/index.html
 PAGE_SOURCES := $(wildcard viewer/*.json viewer/*.mjs) $(shell find viewer/src -type f 2>/dev/null)
 NODE := $(if $(wildcard viewer/package.json),$(shell command -v npm))
 
-.PHONY: run install dist shipped viewer viewer-if-possible check lint spelling licences test test-fast test-tools test-rerun deny mutants bench bench-quick jitter soak
+.PHONY: run install dist shipped viewer viewer-if-possible check lint spelling licences test test-fast test-tools test-rerun test-lerobot deny mutants bench bench-quick jitter soak
 
 # Builds the program to try it, not optimized, and starts the shipped blueprint; its arm is simulated. Ends with Ctrl-C.
 run: viewer-if-possible
@@ -131,6 +131,12 @@ test-rerun: .venv/readers-installed
 	.venv/bin/rerun analytics disable
 	DIMOS_RERUN=1 cargo test --locked --test process readers::rerun
 
+# LeRobot with all that it asks for is large (torch), so it has a venv of its own.
+test-lerobot:
+	[ -e .venv-lerobot/bin/python ] || $(PYTHON) -m venv .venv-lerobot
+	.venv-lerobot/bin/pip install -q lerobot==0.4.4
+	DIMOS_LEROBOT=1 cargo test --locked --test process log_verbs::lerobot
+
 # Changes the code of the control path a little, hundreds of times, and runs the fast tests on each change: what no test
 # notices is listed, without those in tests/mutants-equivalent.txt. Hours; `make mutants MUTANTS="--file src/control/limit.rs"`
 # is one file. Wants cargo-mutants and cargo-nextest.
@@ -142,14 +148,14 @@ mutants:
 
 # Compute time of a tick, cost per arm, memory, start-up, processor time; the way to the wire and back; what talking to a
 # run costs; how fast logs
-# are verified.
+# are written, read and verified.
 bench:
-	cargo bench --locked --bench control --bench wire --bench rpc --bench verify
+	cargo bench --locked --bench control --bench wire --bench rpc --bench recorder --bench verify
 
 # Starts every benchmark in a form of a few seconds, without optimization: to see that each still runs. Fails where a part
 # of one does not; its figures mean nothing.
 bench-quick:
-	cargo bench --locked --profile dev --bench control --bench jitter --bench planning --bench rpc --bench verify \
+	cargo bench --locked --profile dev --bench control --bench jitter --bench planning --bench recorder --bench rpc --bench verify \
 	--bench wire -- --quick
 
 # Lateness of the tick beside cyclictest.

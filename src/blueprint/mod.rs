@@ -36,6 +36,6 @@ pub use load::{Loaded, Overrides, load, load_from};
 pub use parts::{InputLevel, MountingEntry, PayloadEntry, StopInputEntry};
 pub use registry::{FindError, Found, Listing, SearchPath, Source, embed, find, list, names};
 pub use resolve::{Arm, Blueprint, Task, TaskRobot, UsedAsset};
-pub use schema::{CoordinatorConfig, OnExit, RecordingConfig, RpcConfig};
+pub use schema::{Compression, CoordinatorConfig, OnExit, RecordingConfig, RpcConfig};
 pub use summary::{ArmSummary, JointSummary, Limit, Origin, Summary, TaskSummary};
 pub use tick_clock::TickClock;

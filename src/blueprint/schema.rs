@@ -347,11 +347,50 @@ pub struct RecordingConfig {
     /// Minimum free space on the disk of the log, such as `200 MB`, or in bytes; 0 = no minimum. With less, a run does
     /// not start, and a live run ends with its log closed and complete.
     pub min_free: Size,
+    /// Compression of the log. Without it a log is about four times as large.
+    pub compression: Compression,
+    /// Time between two syncs of the log to the disk [s], which is what a loss of power costs; 0 leaves it to the
+    /// kernel: half a minute.
+    #[serde(deserialize_with = "range::non_negative")]
+    #[schemars(range(min = 0.0))]
+    pub sync_every: f64,
+    /// Size at which the log continues in another file, without attachments, such as `1 GB`; 0 = never. Less than 1 MB
+    /// counts as 1 MB.
+    pub split_size: Size,
+    /// Length at which the log continues in another file [s]; 0 = never. Less than 1 s counts as
+    /// 1 s.
+    #[serde(deserialize_with = "range::non_negative")]
+    #[schemars(range(min = 0.0))]
+    pub split_after: f64,
+    /// Whether a run that is not recorded logs its faults: the 30 s before, which it keeps in at most 64 MiB of memory,
+    /// and the 5 s after.
+    pub fault_log: bool,
+}
+
+/// Compression of a log.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Compression {
+    /// zstd, its fastest level.
+    #[default]
+    Zstd,
+    /// None.
+    None,
 }
 
 impl Default for RecordingConfig {
     fn default() -> Self {
-        Self { enabled: true, directory: None, keep: 20, min_free: Size(200_000_000) }
+        Self {
+            enabled: true,
+            directory: None,
+            keep: 20,
+            min_free: Size(200_000_000),
+            compression: Compression::Zstd,
+            sync_every: 1.0,
+            split_size: Size(0),
+            split_after: 0.0,
+            fault_log: true,
+        }
     }
 }
 

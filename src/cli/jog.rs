@@ -14,7 +14,7 @@ mod fingers;
 mod keys;
 mod screen;
 mod session;
-mod terminal;
+pub(super) mod terminal;
 mod watch;
 
 use std::io::{self, IsTerminal};

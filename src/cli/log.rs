@@ -5,8 +5,11 @@ mod copy;
 mod doctor;
 mod export;
 mod info;
+mod lerobot;
 mod list;
 mod plot;
+mod rosbag;
+mod what_if;
 
 use std::io::{self, IsTerminal, Write};
 use std::path::{Path, PathBuf};
@@ -14,7 +17,7 @@ use std::time::Duration;
 
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::arguments::time;
+use super::arguments::{setting, time};
 use super::exit::{Exit, Failure, Result};
 use super::replay;
 use crate::blueprint::Catalog;
@@ -58,6 +61,25 @@ enum Command {
     Doctor(Log),
     /// Replay a log through the control code and compare its commands bit for bit
     Verify(Log),
+    /// Run a log again with a changed limit, task or tolerance, and show what differs
+    #[command(after_help = "\
+A PATH leads into coordinator.json, an attachment of the log. Names select arms, tasks and joints; groups in between may \
+be left out:
+  arms.arm.velocity_max=0.5              all joints [rad/s]
+  arms.arm.velocity_max.arm_joint2=0.5   one joint
+  tasks.traj_arm.path_tolerance=0.05     [rad]
+A wrong PATH shows what there is. The states are those of the log: how the arms would have followed other commands is \
+unknown.")]
+    WhatIf {
+        #[command(flatten)]
+        log: Log,
+        /// Change a value (repeatable)
+        #[arg(long, value_name = "PATH=VALUE", value_parser = setting, required = true)]
+        set: Vec<(String, String)>,
+        /// Write every command that differs to this new file (CSV)
+        #[arg(short, long, value_name = "FILE")]
+        output: Option<PathBuf>,
+    },
     /// Write a part of a log to a new file, which begins with the state at that time
     Cut {
         #[command(flatten)]
@@ -76,7 +98,7 @@ enum Command {
         #[arg(short, long, value_name = "FILE")]
         output: Option<PathBuf>,
     },
-    /// Export joint states and commands, or one topic, as CSV
+    /// Export joint states and commands, or one topic, as CSV; or as Parquet, rosbag2 or LeRobot data set
     #[command(after_help = "\
 A row has the time [s], and of each joint its position, velocity, effort and commanded value. Values that are unknown \
 are empty. With --topic a row is a message, with the columns of the first one.")]
@@ -88,9 +110,24 @@ are empty. With --topic a row is a message, with the columns of the first one.")
         /// Export this topic instead, e.g. /wrench/arm
         #[arg(long, value_name = "TOPIC")]
         topic: Option<String>,
-        /// The new file; default: standard output
+        /// The new CSV file; default: standard output
         #[arg(short, long, value_name = "FILE")]
         output: Option<PathBuf>,
+        /// Write a Parquet file with the same columns; unknown values are NaN
+        #[arg(long, value_name = "FILE", conflicts_with_all = ["topic", "output"])]
+        parquet: Option<PathBuf>,
+        /// Write a folder that `ros2 bag` opens, with all topics
+        #[arg(long, value_name = "DIR", conflicts_with_all = ["topic", "output", "parquet"])]
+        rosbag2: Option<PathBuf>,
+        /// Write a LeRobot data set (v3.0) with one episode: positions are states, commanded positions are actions
+        #[arg(long, value_name = "DIR", conflicts_with_all = ["topic", "output", "parquet", "rosbag2"])]
+        lerobot: Option<PathBuf>,
+        /// Frames per second of the data set; default: the tick rate
+        #[arg(long, value_name = "N", requires = "lerobot", value_parser = clap::value_parser!(u32).range(1..=2000))]
+        fps: Option<u32>,
+        /// What the arms do in the data set; default: the name of the run
+        #[arg(long, value_name = "TEXT", requires = "lerobot")]
+        task: Option<String>,
     },
     /// Draw measured and commanded positions of joints, with their limits, as SVG
     Plot {
@@ -110,7 +147,7 @@ are empty. With --topic a row is a message, with the columns of the first one.")
 /// Which log.
 #[derive(Debug, clap::Args)]
 struct Log {
-    /// Log file (.mcap)
+    /// Log file (.mcap): of several the first, or their folder
     #[arg(value_name = "LOG", required_unless_present = "last", conflicts_with = "last")]
     log: Option<PathBuf>,
     /// Use the newest log
@@ -140,10 +177,19 @@ pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
         Command::Cat { log, part, topics } => cat::run(&log.path()?, part, topics, log.json),
         Command::Doctor(log) => doctor::run(&log.path()?, log.json),
         Command::Verify(log) => replay::verify_log(&log.path()?, catalog.tasks, log.json),
+        Command::WhatIf { log, set, output } => {
+            what_if::run(&log.path()?, catalog.tasks, set, output.as_deref(), log.json)
+        }
         Command::Cut { log, part, output } => copy::cut(&log.path()?, part, output, log.json),
         Command::Recover { log, output } => copy::recover(&log.path()?, output.as_deref(), log.json),
-        Command::Export { log, part, topic, output } => {
-            export::run(&log.path()?, part, topic.as_deref(), output.as_deref(), log.json)
+        Command::Export { log, part, topic, output, parquet, rosbag2, lerobot, fps, task } => {
+            let path = log.path()?;
+            match (parquet, rosbag2, lerobot) {
+                (Some(to), ..) => export::parquet(&path, part, to, log.json),
+                (_, Some(to), _) => rosbag::run(&path, part, to, log.json),
+                (.., Some(to)) => lerobot::run(&path, part, to, *fps, task.as_deref(), log.json),
+                _ => export::csv(&path, part, topic.as_deref(), output.as_deref(), log.json),
+            }
         }
         Command::Plot { log, part, joint, output } => plot::run(&log.path()?, part, joint, output, log.json),
     }
@@ -170,7 +216,8 @@ pub(super) fn newest() -> Result<PathBuf> {
 /// Returns the path of a log, which may be the name alone of one in the folder of logs.
 pub(super) fn found(path: &Path) -> PathBuf {
     let listed = files::log_folder().map(|folder| folder.join(path));
-    listed.filter(|listed| !path.exists() && listed.exists()).unwrap_or_else(|| path.to_owned())
+    let listed = listed.filter(|listed| !path.exists() && listed.exists());
+    files::log_at(&listed.unwrap_or_else(|| path.to_owned()))
 }
 
 impl Part {

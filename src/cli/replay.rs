@@ -1,6 +1,7 @@
 //! `dimos replay`: plays a log on the terminal in real time, replays it through the control code, or drives arms with
 //! it.
 
+mod keys;
 mod onto;
 mod player;
 mod verify;
@@ -21,14 +22,16 @@ use crate::control::task_spec::TaskTable;
 use crate::recording::files;
 use crate::recording::replay::{LogInfo, LogReader, ReplayError};
 use crate::replay::recorded::RecordedError;
-use player::{Part, RealTime, play};
+use keys::Keys;
+use player::{Pace, Part, RealTime, Waiting, play};
 use view::{JsonLines, Live, Plain, View};
 
 /// Play a log in the terminal, verify it, or repeat its motion with an arm
 ///
-/// Plays in real time: a joint table and a progress bar on a terminal, one line per second elsewhere, one JSON object
-/// per message with --json. The log of a live run plays up to its newest chunk. Exits with 5 if the log is truncated,
-/// or if the recorder lost samples.
+/// Plays in real time: a joint table and a progress bar on a terminal (space pauses, right arrow plays the next tick,
+/// up and down play 10 % faster and slower, q ends), one line per second elsewhere, one JSON object per message with
+/// --json. The log of a live run plays up to its newest chunk. Exits with 5 if the log is truncated, or if the recorder
+/// lost samples.
 ///
 /// With --verify the inputs and requests of every tick pass through the same control code again, and every command must
 /// be identical, bit for bit. Otherwise exits with 1 and prints the first difference; exits with 5 if a part is missing
@@ -53,11 +56,14 @@ pub struct ReplayArgs {
     /// Repeat from the start
     #[arg(short, long = "loop")]
     pub looping: bool,
+    /// Wait for the space bar; needs a terminal
+    #[arg(short = 'p', long, conflicts_with_all = ["json", "verify", "blueprint"])]
+    pub start_paused: bool,
     /// Start this long after the first message, e.g. 1.5, 10s or 2m
     #[arg(long, value_name = "TIME", default_value = "0", value_parser = time)]
     pub start_offset: Duration,
     /// Play this much of the log, e.g. 1.5, 10s or 2m
-    #[arg(long, value_name = "TIME", value_parser = duration)]
+    #[arg(long, value_name = "TIME", value_parser = duration, alias = "playback-duration")]
     pub duration: Option<Duration>,
     /// Play only these topics, separated by commas
     #[arg(long, value_name = "TOPIC", value_delimiter = ',')]
@@ -156,6 +162,10 @@ fn try_run(args: &ReplayArgs, catalog: Catalog<'_>) -> anyhow::Result<Exit> {
     let began = log.info().span.map_or(part.from, |(start, _)| start);
     let out = io::stdout();
     let tty = out.is_terminal();
+    let keys = tty && !args.json && io::stdin().is_terminal();
+    if args.start_paused && !keys {
+        return Err(Failure::usage("--start-paused waits for a key, and there is no terminal").into());
+    }
     let mut view: Box<dyn View> = if args.json {
         Box::new(JsonLines::new(out.lock()))
     } else {
@@ -167,8 +177,9 @@ fn try_run(args: &ReplayArgs, catalog: Catalog<'_>) -> anyhow::Result<Exit> {
             Box::new(Plain::new(out.lock(), began, joints))
         }
     };
-    let end = play(&mut log, &part, view.as_mut(), &mut RealTime)?;
-    drop(view);
+    let mut time: Box<dyn Waiting> = if keys { Box::new(Keys::open()?) } else { Box::new(RealTime) };
+    let end = play(&mut log, &part, Pace::new(args.rate, args.start_paused), view.as_mut(), time.as_mut())?;
+    drop((view, time));
     if let Some(cut) = &end.cut {
         eprintln!("warning: {cut}");
     }
@@ -178,12 +189,15 @@ fn try_run(args: &ReplayArgs, catalog: Catalog<'_>) -> anyhow::Result<Exit> {
     if end.damaged > 0 {
         eprintln!("warning: {} messages do not match their schema", end.damaged);
     }
+    if end.interrupted {
+        return Ok(Exit::Interrupted);
+    }
     Ok(if end.cut.is_some() || end.lost > 0 || end.damaged > 0 { Exit::DATA_LOST } else { Exit::Ok })
 }
 
 fn log_path(args: &ReplayArgs) -> anyhow::Result<PathBuf> {
     if let Some(path) = &args.log {
-        return Ok(path.clone());
+        return Ok(files::log_at(path));
     }
     let folder = files::log_folder();
     let newest = folder.as_deref().map(files::newest).transpose()?.flatten();
@@ -203,7 +217,7 @@ fn choose(args: &ReplayArgs, info: &LogInfo, path: &Path) -> std::result::Result
         return Err(SelectionError::TooShort { path, length: (end - start) as f64 * 1e-9 });
     }
     let to = args.duration.map_or(end, |d| from.saturating_add(nanoseconds(d)).min(end));
-    Ok(Part { topics: args.topics.clone(), from, to, rate: args.rate, looping: args.looping })
+    Ok(Part { topics: args.topics.clone(), from, to, looping: args.looping })
 }
 
 /// Returns the number of joints of all arms: grippers follow them in `/joint_states`.

@@ -39,7 +39,7 @@ pub struct Args {
     /// Write the log to this file
     #[arg(long, value_name = "FILE", conflicts_with = "no_record")]
     pub record: Option<PathBuf>,
-    /// Write no log
+    /// Write no log, except of a fault (recording.fault_log)
     #[arg(long)]
     pub no_record: bool,
     /// Serve no live view
@@ -72,7 +72,7 @@ impl Args {
     fn options(&self) -> Options {
         let record = match &self.record {
             Some(path) => Record::To(path.clone()),
-            None if self.no_record => Record::Off,
+            None if self.no_record => Record::Faults,
             None => Record::AsBlueprint,
         };
         Options {

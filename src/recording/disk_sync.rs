@@ -25,7 +25,10 @@ impl DiskSync {
             for () in requested {
                 let _ = result.send(file.sync_data());
             }
-            let _ = result.send(file.sync_data());
+            let last = file.sync_data();
+            // Closed before it is reported: until then the file is locked, and its run seems live.
+            drop(file);
+            let _ = result.send(last);
         })?;
         Ok(Self { requests, results })
     }

@@ -51,6 +51,31 @@ fn new_path(folder: &Path, run: &str, wall_ns: u64, ending: &str) -> PathBuf {
     std::iter::once(first.clone()).chain(others).find(|path| !path.exists()).unwrap_or(first)
 }
 
+/// Returns the path of a further file of a log, from 1: `<run>-20261121T141630Z_1.mcap`. Such files are no logs of
+/// their own in [`all`] and [`newest`], and are removed with the first one.
+pub fn part(first: &Path, number: u32) -> PathBuf {
+    first.with_file_name(format!("{}_{number}.{LOG}", first.file_stem().unwrap_or_default().display()))
+}
+
+/// Returns the further files of a log that exist, in order.
+pub fn further_parts(first: &Path) -> impl Iterator<Item = PathBuf> {
+    (1..).map(|number| part(first, number)).take_while(|path| path.exists())
+}
+
+/// Returns the size of all files of a log [bytes].
+pub fn size(first: &Path) -> u64 {
+    let size = |path: &Path| std::fs::metadata(path).map_or(0, |about| about.len());
+    size(first) + further_parts(first).map(|path| size(&path)).sum::<u64>()
+}
+
+/// Returns the log in a folder that holds one: its first file. Returns other paths unchanged.
+pub fn log_at(path: &Path) -> PathBuf {
+    let Ok(entries) = std::fs::read_dir(path) else { return path.to_owned() };
+    let logs = entries.flatten().map(|entry| entry.path()).filter(|path| path.extension().is_some_and(|e| e == LOG));
+    // `_` sorts after `.`, but a log of one file may have any name.
+    logs.min_by_key(|path| path.file_stem().map(std::ffi::OsStr::to_owned)).unwrap_or_else(|| path.to_owned())
+}
+
 /// Returns the newest log in `folder`, by the time in its name.
 pub fn newest(folder: &Path) -> io::Result<Option<PathBuf>> {
     Ok(logs(folder, LOG)?.pop())
@@ -76,7 +101,12 @@ fn retain_newest(folder: &Path, ending: &str, keep: usize) -> io::Result<Vec<Pat
     let mut old = logs(folder, ending)?;
     old.truncate(old.len().saturating_sub(keep));
     let live = |path: &PathBuf| File::open(path).is_ok_and(|file| is_being_written(&file));
-    old.retain(|path| !live(path) && std::fs::remove_file(path).is_ok());
+    old.retain(|path| {
+        let parts: Vec<PathBuf> = further_parts(path).collect();
+        // What cannot be removed remains.
+        !std::iter::once(path).chain(&parts).any(live)
+            && parts.iter().rev().chain([path]).all(|path| std::fs::remove_file(path).is_ok())
+    });
     Ok(old)
 }
 
@@ -180,6 +210,23 @@ mod tests {
         assert_eq!(retain(folder.path(), 0).unwrap(), [ended]);
         drop(writing);
         assert_eq!(retain(folder.path(), 0).unwrap(), [live]);
+    }
+
+    #[test]
+    fn the_files_of_a_log_are_one_log() {
+        let folder = tempfile::tempdir().unwrap();
+        let first = touch(folder.path(), "run-20251121T141630Z.mcap");
+        let parts = [1, 2].map(|number| part(&first, number));
+        parts.iter().for_each(|path| std::fs::write(path, b"").unwrap());
+        assert_eq!(all(folder.path()).unwrap(), std::slice::from_ref(&first));
+        assert_eq!(further_parts(&first).collect::<Vec<_>>(), parts);
+        assert_eq!(log_at(folder.path()), first);
+        let writing = File::open(&parts[1]).unwrap();
+        mark_as_being_written(&writing);
+        assert_eq!(retain(folder.path(), 0).unwrap(), <[PathBuf; 0]>::default());
+        drop(writing);
+        assert_eq!(retain(folder.path(), 0).unwrap(), [first]);
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
     }
 
     #[test]

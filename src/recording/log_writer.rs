@@ -7,7 +7,7 @@ use std::io::{Seek, Write};
 use std::time::Duration;
 
 use mcap::records::{MessageHeader, Metadata};
-use mcap::{Attachment, McapResult, WriteOptions, Writer};
+use mcap::{Attachment, Compression, McapResult, WriteOptions, Writer};
 
 use super::cdr::Encoder;
 use super::wire::Message;
@@ -54,10 +54,14 @@ pub struct LogAttachment {
 pub struct LogWriter<W: Write + Seek> {
     mcap: Writer<W>,
     channels: HashMap<String, Channel>,
+    topics: Topics,
     encoder: Encoder,
     flush: FlushTimer,
     written: u64,
 }
+
+/// Topics in the order of their channels, each with name and text of its schema.
+pub(super) type Topics = Vec<(String, &'static str, fn() -> String)>;
 
 struct Channel {
     id: u16,
@@ -73,10 +77,22 @@ impl<W: Write + Seek> LogWriter<W> {
         attachments: &[LogAttachment],
         metadata: BTreeMap<String, String>,
     ) -> McapResult<Self> {
+        Self::create_with(sink, now, attachments, metadata, true)
+    }
+
+    /// The same with or without compression.
+    pub fn create_with(
+        sink: W,
+        now: u64,
+        attachments: &[LogAttachment],
+        metadata: BTreeMap<String, String>,
+        compress: bool,
+    ) -> McapResult<Self> {
         let mut mcap = WriteOptions::new()
             .profile("ros2")
             .library(concat!("dimos/", env!("CARGO_PKG_VERSION")))
             .chunk_size(Some(CHUNK_SIZE))
+            .compression(compress.then_some(Compression::Zstd))
             // Chunks of 100 ms are too short for higher compression levels to help.
             .compression_level(1)
             // Worker threads would compete with the tick; seeking back would leave half a chunk after a crash.
@@ -97,6 +113,7 @@ impl<W: Write + Seek> LogWriter<W> {
         Ok(Self {
             mcap,
             channels: HashMap::new(),
+            topics: Topics::new(),
             encoder: Encoder::default(),
             flush: FlushTimer::default(),
             written: 0,
@@ -105,13 +122,28 @@ impl<W: Write + Seek> LogWriter<W> {
 
     /// Declares a topic, so that it is listed even without messages.
     pub fn announce<M: Message>(&mut self, topic: &str) -> McapResult<()> {
+        self.add(topic, M::SCHEMA, M::schema_text)
+    }
+
+    /// Declares the topics of an earlier file of the same log: they have the same channels in all files.
+    pub(super) fn announce_all(&mut self, topics: &Topics) -> McapResult<()> {
+        topics.iter().try_for_each(|(topic, name, text)| self.add(topic, name, *text))
+    }
+
+    /// Returns the topics so far.
+    pub(super) fn topics(&self) -> &Topics {
+        &self.topics
+    }
+
+    fn add(&mut self, topic: &str, name: &'static str, text: fn() -> String) -> McapResult<()> {
         if !self.channels.contains_key(topic) {
-            let schema = self.mcap.add_schema(M::SCHEMA, "ros2msg", M::schema_text().as_bytes())?;
+            let schema = self.mcap.add_schema(name, "ros2msg", text().as_bytes())?;
             let durability = if LATCHED.contains(&topic) { "durability: 1" } else { "durability: 2" };
             let qos = QOS.replace("durability: 2", durability);
             let metadata = BTreeMap::from([("offered_qos_profiles".to_owned(), qos)]);
             let id = self.mcap.add_channel(schema, topic, "cdr", &metadata)?;
             self.channels.insert(topic.to_owned(), Channel { id, sequence: 0 });
+            self.topics.push((topic.to_owned(), name, text));
         }
         Ok(())
     }

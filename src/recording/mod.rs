@@ -13,10 +13,12 @@ pub mod disk_space;
 mod disk_sync;
 pub mod display_messages;
 mod entries;
+pub mod fault_ring;
 pub mod files;
 pub mod log_writer;
 pub mod messages;
 pub mod notes;
+pub mod parquet;
 mod pending_executes;
 pub mod recorder;
 pub mod records;
@@ -26,6 +28,7 @@ pub mod robots;
 pub mod ros2msg;
 pub mod scan;
 mod scene_log;
+pub mod storage;
 pub mod tcp_log;
 mod tick_log;
 pub mod window;
@@ -37,5 +40,7 @@ mod tests;
 
 /// Key of the config version in a log's metadata.
 pub const CONFIG_VERSION_KEY: &str = "config_version";
+/// Key in the metadata of a log in several files, from the second on: the number of the file, from 1.
+pub const PART: &str = "part";
 /// Name of the attachment with the coordinator's configuration.
 pub const COORDINATOR: &str = "coordinator.json";

@@ -108,8 +108,31 @@ pub enum Note {
 }
 
 impl Note {
+    /// Returns its time; that of a text for an arm's error is unknown.
+    pub(super) fn stamp(&self) -> Mono {
+        match self {
+            Self::Request { stamp, .. }
+            | Self::Execute { stamp, .. }
+            | Self::Log { stamp, .. }
+            | Self::Io { stamp, .. }
+            | Self::JointStatus { stamp, .. }
+            | Self::Payload { stamp, .. }
+            | Self::Robots { stamp, .. }
+            | Self::Markers { stamp, .. } => *stamp,
+            Self::ArmText { .. } => Mono::ZERO,
+        }
+    }
+
+    /// Returns the id of a request.
+    pub(super) fn request(&self) -> Option<u64> {
+        match self {
+            Self::Request { id, .. } | Self::Execute { id, .. } => Some(*id),
+            _ => None,
+        }
+    }
+
     /// Returns its approximate size [bytes].
-    fn size(&self) -> usize {
+    pub(super) fn size(&self) -> usize {
         NOTE_OVERHEAD
             + match self {
                 Self::Request { json: text, .. } | Self::Log { text, .. } | Self::ArmText { text, .. } => text.len(),

@@ -17,6 +17,7 @@ use super::files;
 use super::log_writer::LogAttachment;
 pub use super::notes::Note;
 use super::notes::NoteReceiver;
+use super::storage::Storage;
 use super::tcp_log::TcpChains;
 use super::worker::Worker;
 use crate::clock::{Clock, MonotonicClock, WallOffset};
@@ -49,8 +50,8 @@ pub struct RecorderConfig {
     pub tcps: TcpChains,
     /// Offset between monotonic and Unix time.
     pub wall: WallOffset,
-    /// Minimum free space on the disk; below it the log ends [bytes].
-    pub min_free: u64,
+    /// How it is stored.
+    pub storage: Storage,
 }
 
 /// Notices of the recorder, delivered on its thread: handlers must be fast.
@@ -71,6 +72,8 @@ pub enum Notice<'a> {
     Stopped(&'a RecordError),
     /// The log is closed, but the disk did not store all of it in this time.
     Unsynced(Duration),
+    /// The log of a fault, of a run that is not recorded, is complete, or why there is none.
+    Fault(Result<&'a Path, &'a RecordError>),
 }
 
 /// Why there is no log, or why it ended early.
@@ -156,10 +159,14 @@ impl Recorder {
         on_notice: impl FnMut(Notice<'_>) + Send + 'static,
     ) -> Result<Self, RecordError> {
         let stats = Arc::new(RecorderStats::default());
-        let file = config.path.as_deref().map(create_file).transpose()?;
-        let disk = file.as_ref().and_then(|f| f.try_clone().ok());
-        let sink = file.map(|f| Counted { inner: BufWriter::with_capacity(BUFFER, f), stats: stats.clone(), at: 0 });
-        let mut worker = Worker::new(&config, sink, disk, ring, notes, on_notice, stats.clone())?;
+        let (path, counted) = (config.path.clone(), stats.clone());
+        let open = move |path: &Path| {
+            let file = create_file(path)?;
+            let disk = file.try_clone().ok();
+            let inner = BufWriter::with_capacity(BUFFER, file);
+            Ok((Counted { inner, stats: counted.clone(), at: 0 }, disk))
+        };
+        let mut worker = Worker::new(config, open, ring, notes, on_notice, stats.clone())?;
         let stop = Arc::new(AtomicBool::new(false));
         let stopping = stop.clone();
         let thread = std::thread::Builder::new().name("recorder".into()).spawn(move || {
@@ -173,7 +180,7 @@ impl Recorder {
             worker.finish(MonotonicClock.now())
         });
         let thread = Some(thread.map_err(RecordError::Thread)?);
-        Ok(Self { path: config.path, stats, stop, thread })
+        Ok(Self { path, stats, stop, thread })
     }
 
     /// Returns the path of the log.
@@ -184,6 +191,11 @@ impl Recorder {
     /// Returns live statistics.
     pub fn stats(&self) -> Arc<RecorderStats> {
         self.stats.clone()
+    }
+
+    /// Lets the thread take what waits now, instead of within 50 ms.
+    pub fn wake(&self) {
+        self.thread.iter().for_each(|thread| thread.thread().unpark());
     }
 
     /// Takes the remaining samples and closes the log. Call it after the tick has ended. Returns the error that ended

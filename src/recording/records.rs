@@ -209,6 +209,34 @@ impl RecordReader {
     }
 }
 
+/// Checks the checksums of the two sections of a closed file: all its data, and its summary. Returns what is wrong.
+pub fn check_sections(path: &Path) -> Result<Option<McapError>, ReplayError> {
+    let io = |source| ReplayError::Io { path: path.to_owned(), source };
+    let mut file = File::open(path).map_err(io)?;
+    let length = file.metadata().map_err(io)?.len();
+    let mut reader = LinearReader::new_with_options(
+        LinearReaderOptions::default()
+            .with_emit_chunks(true)
+            .with_validate_data_section_crc(true)
+            .with_validate_summary_section_crc(true)
+            // No record is longer than the file.
+            .with_record_length_limit(usize::try_from(length).unwrap_or(usize::MAX)),
+    );
+    while let Some(event) = reader.next_event() {
+        match event {
+            Ok(LinearReadEvent::ReadRequest(wanted)) => {
+                let read = file.read(reader.insert(wanted.min(LIMIT))).map_err(io)?;
+                reader.notify_read(read);
+            }
+            Ok(LinearReadEvent::Record { .. }) => {}
+            Err(e @ (McapError::BadDataCrc { .. } | McapError::BadSummaryCrc { .. })) => return Ok(Some(e)),
+            // The records themselves are checked where they are used.
+            Err(_) => return Ok(None),
+        }
+    }
+    Ok(None)
+}
+
 /// Returns the header of a chunk record: time range, sizes, compression.
 pub fn chunk_header(body: &[u8]) -> Result<ChunkHeader, McapError> {
     match parse_record(op::CHUNK, body)? {

@@ -1,13 +1,14 @@
 //! Reads a log: its decoded messages in order of time, up to a cut.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use mcap::parse_record;
 use mcap::records::{Record, op};
 
 use super::entries::{Channels, message};
 use super::records::{RawRecord, RecordReader, chunk_header, unpack_chunk};
+use super::{PART, files};
 
 pub use super::entries::{Entry, Payload};
 pub use super::records::ReplayError;
@@ -44,8 +45,14 @@ pub struct LogInfo {
     pub topics: BTreeMap<String, String>,
 }
 
-/// A log opened for reading.
+/// A log opened for reading: of one in several files all of them, if it is opened by the first.
 pub struct LogReader {
+    /// Files after the first, with their first and last times.
+    parts: Vec<(PathBuf, (u64, u64))>,
+    first: PathBuf,
+    /// The file that is read; 0 is the first.
+    part: usize,
+    topics: Option<Vec<String>>,
     records: RecordReader,
     selection: Selection,
     info: LogInfo,
@@ -70,6 +77,25 @@ impl LogReader {
     }
 
     fn open_with(path: &Path, topics: Option<&[&str]>) -> Result<Self, ReplayError> {
+        let mut log = Self::open_one(path, topics)?;
+        for (part, number) in further_files(path, &log.info).into_iter().zip(1u32..) {
+            let next = Self::open_one(&part, topics)?.info;
+            if !continues(&log.info, &next, number) {
+                break;
+            }
+            (log.info.complete, log.info.live) = (next.complete, next.live);
+            log.info.topics.extend(next.topics);
+            // One without messages has nothing to read.
+            let times = next.span.or(log.info.span.map(|(_, end)| (end, end))).unwrap_or_default();
+            if let (Some(span), Some((_, end))) = (&mut log.info.span, next.span) {
+                span.1 = span.1.max(end);
+            }
+            log.parts.push((part, times));
+        }
+        Ok(log)
+    }
+
+    fn open_one(path: &Path, topics: Option<&[&str]>) -> Result<Self, ReplayError> {
         let mut records = RecordReader::open(path)?;
         let (mut channels, mut index) = (Channels::default(), Vec::new());
         let mut info = match records.summary_start()? {
@@ -83,6 +109,10 @@ impl LogReader {
         info.metadata = metadata(&mut records)?;
         records.rewind()?;
         Ok(Self {
+            parts: Vec::new(),
+            first: path.to_owned(),
+            part: 0,
+            topics: topics.map(|topics| topics.iter().map(|topic| (*topic).to_owned()).collect()),
             records,
             selection: Selection::default(),
             info,
@@ -105,6 +135,12 @@ impl LogReader {
         self.ready.clear();
         self.failed = None;
         self.lost = 0;
+        let from = self.selection.from;
+        // The first file that has anything of the part; those before it end earlier.
+        let part = self.parts.iter().rposition(|(_, (start, _))| *start <= from).map_or(0, |at| at + 1);
+        if part != self.part {
+            self.turn_to(part)?;
+        }
         // A late part of a long log begins at its first chunk. Everything else that is read comes before the chunks.
         let (from, later) = (self.selection.from, self.info.span.is_some_and(|(start, _)| self.selection.from > start));
         match self.index.iter().filter(|(end, _)| *end >= from).map(|(_, at)| *at).min().filter(|_| later) {
@@ -123,10 +159,26 @@ impl LogReader {
             if let Some(e) = self.failed.take() {
                 return Err(e);
             }
-            let Some(record) = self.records.next_record()? else { return Ok(None) };
+            let Some(record) = self.records.next_record()? else {
+                let next = self.parts.get(self.part).filter(|(_, (start, _))| *start <= self.selection.to);
+                if next.is_none() {
+                    return Ok(None);
+                }
+                self.turn_to(self.part + 1)?;
+                continue;
+            };
             // Messages before the damage come first.
             self.failed = self.take(&record).err();
         }
+    }
+
+    /// Opens another file of the log.
+    fn turn_to(&mut self, part: usize) -> Result<(), ReplayError> {
+        let path = part.checked_sub(1).and_then(|at| self.parts.get(at)).map_or(&self.first, |(path, _)| path);
+        let topics: Option<Vec<&str>> = self.topics.as_ref().map(|topics| topics.iter().map(String::as_str).collect());
+        let one = Self::open_one(path, topics.as_deref())?;
+        (self.records, self.channels, self.index, self.part) = (one.records, one.channels, one.index, part);
+        Ok(())
     }
 
     /// Returns the number of samples lost by the recorder so far, whether or not `/dimos/tick` is selected.
@@ -152,6 +204,26 @@ impl LogReader {
         }
         Ok(())
     }
+}
+
+/// Returns the files that may continue a log.
+fn further_files(path: &Path, info: &LogInfo) -> Vec<PathBuf> {
+    if info.metadata.contains_key(PART) { Vec::new() } else { files::further_parts(path).collect() }
+}
+
+/// Returns whether a file continues a log: it is of the same run, and has this number.
+fn continues(log: &LogInfo, next: &LogInfo, number: u32) -> bool {
+    let same = |key| log.metadata.get(key) == next.metadata.get(key);
+    next.metadata.get(PART) == Some(&number.to_string()) && same("wall_offset_ns") && same("run")
+}
+
+/// Returns the files of a log in order: of one in several files all of them, if this is the first.
+pub fn parts(path: &Path) -> Result<Vec<PathBuf>, ReplayError> {
+    if !files::part(path, 1).exists() {
+        return Ok(vec![path.to_owned()]);
+    }
+    let log = LogReader::open(path)?;
+    Ok(std::iter::once(log.first).chain(log.parts.into_iter().map(|(path, _)| path)).collect())
 }
 
 /// Returns an attachment by name; `None` if there is none before the first message.

@@ -2,13 +2,14 @@
 //! origin. Chunks that are damaged are skipped and reported.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use mcap::parse_record;
 use mcap::records::{Record, Statistics, op};
 
 use super::cdr::CdrError;
 use super::records::{RawRecord, RecordReader, ReplayError, chunk_header, unpack_chunk};
+use super::replay::parts;
 use super::ros2msg::Schema;
 
 /// A channel of a log.
@@ -69,14 +70,20 @@ pub struct Scan {
     messages: Vec<RawMessage>,
     /// Chunks to read; `None`: everything.
     pub(super) chunks: Option<VecDeque<u64>>,
+    /// Topics of which only these chunks are read.
+    topics: Option<Vec<String>>,
+    /// Further files of the log, and whether the current one is of these.
+    rest: VecDeque<PathBuf>,
+    further: bool,
+    /// Messages that the summaries of earlier files count.
+    counted: u64,
 }
 
 impl Scan {
-    /// Opens a log.
+    /// Opens a log: of one in several files all of them, if this is the first.
     pub fn open(path: &Path) -> Result<Self, ReplayError> {
-        let records = RecordReader::open(path)?.with_attachments();
         Ok(Self {
-            records,
+            records: RecordReader::open(path)?.with_attachments(),
             channels: BTreeMap::new(),
             schemas: BTreeMap::new(),
             profile: String::new(),
@@ -88,6 +95,10 @@ impl Scan {
             bytes: Vec::new(),
             messages: Vec::new(),
             chunks: None,
+            topics: None,
+            rest: parts(path)?.into_iter().skip(1).collect(),
+            further: false,
+            counted: 0,
         })
     }
 
@@ -95,11 +106,17 @@ impl Scan {
     /// chunks that have them. Other messages may be read too.
     pub fn open_part(path: &Path, topics: &[String], part: (u64, u64)) -> Result<Self, ReplayError> {
         let mut scan = Self::open(path)?;
-        scan.part = part;
-        let Some(start) = scan.records.summary_start()? else {
-            scan.records.rewind()?;
-            return Ok(scan);
-        };
+        (scan.part, scan.topics) = (part, Some(topics.to_vec()));
+        scan.choose_chunks()?;
+        Ok(scan)
+    }
+
+    fn choose_chunks(&mut self) -> Result<(), ReplayError> {
+        let part = self.part;
+        let scan = self;
+        scan.chunks = None;
+        let Some(topics) = scan.topics.clone() else { return Ok(()) };
+        let Some(start) = scan.records.summary_start()? else { return scan.records.rewind() };
         scan.records.go_to(start)?;
         let mut chunks = Vec::new();
         while let Ok(Some(record)) = scan.records.next_record() {
@@ -119,8 +136,22 @@ impl Scan {
             scan.chunks = Some(chunks.iter().map(|index| index.chunk_start_offset).collect());
         }
         scan.complete = false;
-        scan.records.rewind()?;
-        Ok(scan)
+        scan.records.rewind()
+    }
+
+    /// Continues with the next file of the log, if there is one.
+    fn turn_over(&mut self) -> Result<bool, ReplayError> {
+        let Some(next) = self.rest.pop_front().filter(|_| self.complete) else { return Ok(false) };
+        self.records = RecordReader::open(&next)?.with_attachments();
+        (self.complete, self.further) = (false, true);
+        self.counted += self.statistics.take().map_or(0, |s| s.message_count);
+        self.choose_chunks()?;
+        Ok(true)
+    }
+
+    /// Returns the number of messages that the summaries count.
+    pub fn counted(&self) -> Option<u64> {
+        self.statistics.as_ref().map(|s| s.message_count + self.counted)
     }
 
     /// Returns whether a live run was writing the log when it was opened.
@@ -141,12 +172,16 @@ impl Scan {
                     Some(at) => self.records.go_to(at)?,
                     None => {
                         self.complete = true;
+                        if self.turn_over()? {
+                            continue;
+                        }
                         return Ok(None);
                     }
                 }
             }
             let record = match self.records.next_record() {
                 Ok(Some(record)) => record,
+                Ok(None) if self.turn_over()? => continue,
                 Ok(None) => return Ok(None),
                 Err(ReplayError::Cut { at, reason, .. }) => {
                     self.cut = Some(format!("it ends at byte {at}: {reason}"));
@@ -163,6 +198,8 @@ impl Scan {
                     }
                     self.messages.sort_by_key(|message| message.time);
                 }
+                // Every file has the same.
+                op::ATTACHMENT | op::METADATA if self.further => {}
                 op::ATTACHMENT | op::METADATA => return Ok(Some(Item::Other(record))),
                 opcode => self.learn(opcode, &record.body),
             }

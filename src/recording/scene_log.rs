@@ -1,5 +1,6 @@
 //! What 3D viewers and panels show of a tick: transforms, accepted motions, diagnostics.
 
+use std::collections::BTreeMap;
 use std::io::{Seek, Write};
 use std::sync::Arc;
 use std::time::Duration;
@@ -37,6 +38,9 @@ const PATH_WIDTH: f64 = 0.004;
 #[derive(Default)]
 pub(super) struct SceneLog {
     pub robots: Arc<LoggedRobots>,
+    description: String,
+    /// The objects of the world, by namespace and number.
+    objects: BTreeMap<(String, i32), Marker>,
     tf_at: Option<Mono>,
     diagnosed_at: Option<Mono>,
     /// Phase of each arm in the latest diagnostics.
@@ -48,20 +52,41 @@ pub(super) struct SceneLog {
 }
 
 impl TickLog {
+    /// Takes the robots and their description.
+    pub fn robots(&mut self, robots: Arc<LoggedRobots>, description: String) {
+        (self.scene.robots, self.scene.description) = (robots, description);
+    }
+
     /// Logs the description of the robots, and the transforms that do not change.
-    pub fn robots<W: Write + Seek>(
-        &mut self,
-        log: &mut LogWriter<W>,
-        stamp: Mono,
-        robots: Arc<LoggedRobots>,
-        description: String,
-    ) -> McapResult<()> {
+    pub fn latched<W: Write + Seek>(&self, log: &mut LogWriter<W>, stamp: Mono) -> McapResult<()> {
+        if self.scene.description.is_empty() {
+            return Ok(());
+        }
         let time = self.wall.wall(stamp);
         let header = Header { stamp: Time::of(time), frame_id: String::new() };
-        log.publish("/robot_description", time, &Text { data: description })?;
-        log.publish("/tf_static", time, &robots.fixed(&header))?;
-        self.scene.robots = robots;
-        Ok(())
+        log.publish("/robot_description", time, &Text { data: self.scene.description.clone() })?;
+        log.publish("/tf_static", time, &self.scene.robots.fixed(&header))
+    }
+
+    /// Logs at the beginning of a file what it needs to be understood alone: now what seldom changes, and with the next
+    /// tick everything else.
+    pub fn renew<W: Write + Seek>(&mut self, log: &mut LogWriter<W>, stamp: Mono) -> McapResult<()> {
+        self.arms.iter_mut().for_each(|arm| arm.fresh = true);
+        (self.scene.tf_at, self.scene.diagnosed_at) = (None, None);
+        self.latched(log, stamp)?;
+        let markers: Vec<Marker> = self.scene.objects.values().cloned().collect();
+        if markers.is_empty() { Ok(()) } else { self.markers(log, stamp, MarkerArray { markers }) }
+    }
+
+    /// Takes changes of the world's objects.
+    pub fn objects(&mut self, changes: &MarkerArray) {
+        for marker in &changes.markers {
+            let key = (marker.ns.clone(), marker.id);
+            match marker.action {
+                0 => drop(self.scene.objects.insert(key, marker.clone())),
+                _ => drop(self.scene.objects.remove(&key)),
+            }
+        }
     }
 
     /// Logs changes of the world's objects.
@@ -181,6 +206,8 @@ impl TickLog {
         status.push(diagnostic("tick", level, text.to_owned(), figures));
         *scene = SceneLog {
             robots: scene.robots.clone(),
+            description: std::mem::take(&mut scene.description),
+            objects: std::mem::take(&mut scene.objects),
             tf_at: scene.tf_at,
             diagnosed_at: Some(tick.deadline),
             phases: phases().collect(),

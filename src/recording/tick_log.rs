@@ -57,6 +57,8 @@ pub(super) struct ArmLog {
     status_at: Mono,
     tcp_at: Option<Mono>,
     error_text: String,
+    /// A new file begins with everything that is known of it.
+    pub(super) fresh: bool,
 }
 
 impl ArmLog {
@@ -298,11 +300,12 @@ impl TickLog {
         let id = &names.hardware_id;
         let state = &sample.state;
         let is_new = arm.state.is_none_or(|last| last.seq != state.seq);
-        if arm.state.is_none_or(|last| input_differs(&last, state)) {
+        let fresh = std::mem::take(&mut arm.fresh);
+        if fresh || arm.state.is_none_or(|last| input_differs(&last, state)) {
             log.publish(&format!("/dimos/inputs/{id}"), time, &input(&header, tick.tick, state))?;
         }
         arm.state = Some(*state);
-        if arm.command.is_none_or(|last| output_differs(&last, &sample.command)) {
+        if fresh || arm.command.is_none_or(|last| output_differs(&last, &sample.command)) {
             log.publish(&format!("/dimos/outputs/{id}"), time, &output(&header, tick.tick, &sample.command))?;
         }
         arm.command = Some(sample.command);
@@ -332,7 +335,7 @@ impl TickLog {
             }
         }
         let key = status_key(&sample, arm);
-        if arm.status.as_ref() != Some(&key) || tick.deadline.since(arm.status_at) >= STATUS_EVERY {
+        if fresh || arm.status.as_ref() != Some(&key) || tick.deadline.since(arm.status_at) >= STATUS_EVERY {
             log.publish(&format!("/arm_status/{id}"), time, &status(header, tick, &sample, &arm.error_text))?;
             arm.status = Some(key);
             arm.status_at = tick.deadline;

@@ -1,6 +1,8 @@
 //! The steps of the recorder thread.
 
-use std::collections::VecDeque;
+mod faults;
+
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{Seek, Write};
 use std::path::{Path, PathBuf};
@@ -11,87 +13,135 @@ use std::time::Duration;
 use mcap::{McapError, McapResult};
 
 use super::arm_messages::{io, joint_status, payload};
-use super::disk_space;
 use super::disk_sync::DiskSync;
-use super::log_writer::LogWriter;
+use super::fault_ring::{AFTER, FaultRing};
+use super::log_writer::{LogWriter, Topics};
 use super::notes::NoteReceiver;
 use super::pending_executes::{Execute, PendingExecutes};
 use super::recorder::{Note, Notice, RecordError, RecorderConfig, RecorderStats};
+use super::rewrite::PART_OF;
+use super::storage::FaultLog;
 use super::tick_log::TickLog;
+use super::{PART, disk_space, files};
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::telemetry::describe::{Described, Names, describe};
+use crate::telemetry::describe::{Severity, describe};
 use crate::telemetry::{Event, Outcome, Sample, TickSample};
 
-/// Period of syncing the file to disk, against a loss of power.
-const SYNC_EVERY: Duration = Duration::from_secs(1);
 /// Longest wait for the disk at the end: a run ends soon after Ctrl-C, whatever its disk does.
 const LAST_SYNC: Duration = Duration::from_secs(2);
 /// Period of checking the disk's free space and the log file.
 const WATCH_EVERY: Duration = Duration::from_millis(500);
 
 /// Turns samples and notes into log and notices. Tests step it with their own clock.
-pub(super) struct Worker<W: Write + Seek, F> {
+pub(super) struct Worker<W: Write + Seek, F, O> {
+    config: RecorderConfig,
+    /// Creates a file, and returns a second handle of it, for its free space.
+    open: O,
+    /// The current file of the log.
     path: PathBuf,
+    /// Its number in the log, from 0.
+    part: u32,
+    /// Bytes before its first message, of all files, and deadline of its first tick.
+    began: (u64, Option<Mono>),
+    topics: Topics,
     log: Option<LogWriter<W>>,
-    /// A second handle of the file, for its free space.
     disk: Option<File>,
     sync: Option<DiskSync>,
     synced: Mono,
-    min_free: u64,
     watched: Mono,
     ticks: TickLog,
-    names: Names,
     ring: rtrb::Consumer<Sample>,
     notes: NoteReceiver,
     /// Trajectory requests that the tick has not answered yet.
     executes: PendingExecutes,
+    /// The latest inputs and outputs, and the latest load, of each arm.
+    latest: BTreeMap<(bool, u16), Note>,
+    /// What is kept of a run without a log.
+    faults: Option<(FaultLog, FaultRing)>,
+    /// End of the log of a fault; the end of time until the tick with the fault is closed.
+    until: Option<Mono>,
+    /// Whether the current tick has a fault.
+    faulted: bool,
     on_notice: F,
     stats: Arc<RecorderStats>,
     ended: Option<RecordError>,
 }
 
-impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
+impl<W, F, O> Worker<W, F, O>
+where
+    W: Write + Seek,
+    F: FnMut(Notice<'_>),
+    O: FnMut(&Path) -> Result<(W, Option<File>), RecordError>,
+{
     pub(super) fn new(
-        config: &RecorderConfig,
-        sink: Option<W>,
-        disk: Option<File>,
+        config: RecorderConfig,
+        open: O,
         ring: rtrb::Consumer<Sample>,
         notes: NoteReceiver,
         on_notice: F,
         stats: Arc<RecorderStats>,
     ) -> Result<Self, RecordError> {
-        let names = config.names.clone();
-        let mut ticks = TickLog::new(config.run.clone(), names.clone(), config.frame_id.clone(), config.wall);
+        let mut ticks = TickLog::new(config.run.clone(), config.names.clone(), config.frame_id.clone(), config.wall);
         ticks.tcps = config.tcps.clone();
-        let begin = |sink| {
-            let mut metadata = config.metadata.clone();
-            metadata.extend(ticks.metadata());
-            let now = config.wall.wall(MonotonicClock.now());
-            let mut log = LogWriter::create(sink, now, &config.attachments, metadata)?;
-            ticks.announce(&mut log)?;
-            Ok(log)
-        };
-        let path = config.path.clone().unwrap_or_default();
-        let sync = disk.as_ref().map(|file| file.try_clone().and_then(DiskSync::start));
-        let sync = sync.transpose().map_err(RecordError::Thread)?;
-        let log = sink.map(begin).transpose().map_err(|e| write_error(&path, &e))?;
-        Ok(Self {
-            path,
-            log,
-            disk,
-            sync,
+        let path = config.path.clone();
+        let faults = config.storage.fault_log.clone().filter(|_| path.is_none());
+        let mut worker = Self {
+            config,
+            open,
+            path: PathBuf::new(),
+            part: 0,
+            began: (0, None),
+            topics: Topics::new(),
+            log: None,
+            disk: None,
+            sync: None,
             synced: Mono::ZERO,
-            min_free: config.min_free,
             watched: Mono::ZERO,
             ticks,
-            names,
             ring,
             notes,
             executes: PendingExecutes::default(),
+            latest: BTreeMap::new(),
+            faults: faults.map(|faults| (faults.clone(), FaultRing::new(faults.samples))),
+            until: None,
+            faulted: false,
             on_notice,
             stats,
             ended: None,
-        })
+        };
+        if let Some(path) = path {
+            worker.begin(path, Mono::ZERO, BTreeMap::new())?;
+        }
+        Ok(worker)
+    }
+
+    /// Opens a file of the log. It begins with what it needs to be understood alone, at this time.
+    fn begin(&mut self, path: PathBuf, stamp: Mono, more: BTreeMap<String, String>) -> Result<(), RecordError> {
+        let (sink, disk) = (self.open)(&path)?;
+        self.path = path;
+        let storage = &self.config.storage;
+        let own = disk.as_ref().filter(|_| storage.sync_every.is_some());
+        let sync = own.map(|file| file.try_clone().and_then(DiskSync::start)).transpose();
+        (self.disk, self.sync) = (disk, sync.map_err(RecordError::Thread)?);
+        let mut metadata = self.config.metadata.clone();
+        metadata.extend(self.ticks.metadata().into_iter().chain(more));
+        let now = self.config.wall.wall(MonotonicClock.now());
+        let create = || {
+            let mut log = LogWriter::create_with(sink, now, &self.config.attachments, metadata, storage.compress)?;
+            log.announce_all(&self.topics)?;
+            self.ticks.announce(&mut log)?;
+            self.ticks.renew(&mut log, stamp)?;
+            Ok(log)
+        };
+        self.log = Some(create().map_err(|e| write_error(&self.path, &e))?);
+        self.began = (self.stats.bytes.load(Ordering::Relaxed), None);
+        let mut latest: Vec<Note> = self.latest.values().cloned().collect();
+        for note in &mut latest {
+            if let Note::Io { stamp: at, .. } | Note::Payload { stamp: at, .. } = note {
+                *at = stamp;
+            }
+        }
+        latest.into_iter().try_for_each(|note| self.note(note)).map_err(|e| write_error(&self.path, &e))
     }
 
     /// Takes all pending samples and notes and logs them.
@@ -107,9 +157,15 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
         }
         let samples: Vec<Sample> = self.ring.read_chunk(waiting).into_iter().flatten().collect();
         // Events are reported before any disk access.
-        let mut described = self.report_events(&samples);
-        if let Err(e) = self.write(notes, &samples, &mut described, now) {
-            self.stop_log(write_error(&self.path, &e));
+        let fault = self.report_events(&samples);
+        let done = if self.log.is_none() && self.faults.is_some() {
+            self.keep(notes, samples);
+            if fault { self.log_fault() } else { Ok(()) }
+        } else {
+            self.write(notes, &samples, now)
+        };
+        if let Err(e) = done {
+            self.stop_log(e);
         } else if now.since(self.watched) >= WATCH_EVERY {
             self.watched = now;
             self.watch();
@@ -119,56 +175,114 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
     /// Ends the log while there is space to close it, or when the file is gone.
     fn watch(&mut self) {
         let Some((file, _)) = self.disk.as_ref().zip(self.log.as_ref()) else { return };
-        let Err(reason) = disk_space::watch(&self.path, file, self.min_free) else { return };
+        let Err(reason) = disk_space::watch(&self.path, file, self.config.storage.min_free) else { return };
         let closed = self.log.take().map(|log| log.finish().map(drop)).transpose();
         // A full disk is the more important error.
         self.stop_log(closed.map_or_else(|e| write_error(&self.path, &e), |_| reason));
     }
 
-    fn report_events(&mut self, samples: &[Sample]) -> VecDeque<Described> {
-        let mut all = VecDeque::new();
+    /// Reports the events among samples. Returns whether there is a fault.
+    fn report_events(&mut self, samples: &[Sample]) -> bool {
+        let mut fault = false;
         for sample in samples {
             if let Sample::Event(tick, event) = sample {
-                let described = describe(event, &self.names);
+                let described = describe(event, &self.config.names);
+                fault |= described.severity == Severity::Error;
                 (self.on_notice)(Notice::Event { tick: *tick, event, described: &described });
-                all.push_back(described);
             }
         }
-        all
+        fault
     }
 
-    fn write(
-        &mut self,
-        notes: Vec<Note>,
-        samples: &[Sample],
-        described: &mut VecDeque<Described>,
-        now: Mono,
-    ) -> McapResult<()> {
+    fn write(&mut self, notes: Vec<Note>, samples: &[Sample], now: Mono) -> Result<(), RecordError> {
+        self.put(notes, samples)?;
+        let Some(log) = &mut self.log else { return Ok(()) };
+        let mut flush = || {
+            let due = self.config.storage.sync_every.is_some_and(|every| now.since(self.synced) >= every);
+            if log.flush_if_due(now)? && due {
+                self.sync.as_ref().map_or(Ok(()), DiskSync::request)?;
+                self.synced = now;
+            }
+            Ok(())
+        };
+        flush().map_err(|e| write_error(&self.path, &e))?;
+        self.stats.messages.store(log.written(), Ordering::Relaxed);
+        Ok(())
+    }
+
+    fn put(&mut self, notes: Vec<Note>, samples: &[Sample]) -> Result<(), RecordError> {
         for note in notes {
-            self.note(note)?;
+            self.note(note).map_err(|e| write_error(&self.path, &e))?;
         }
         for sample in samples {
             match sample {
                 Sample::Arm(arm) => self.ticks.arm(*arm),
                 Sample::Event(tick, event) => {
                     if let Event::Request(id, outcome) = event {
-                        self.answered(*id, outcome)?;
+                        self.answered(*id, outcome).map_err(|e| write_error(&self.path, &e))?;
                     }
-                    self.ticks.event(*tick, described.pop_front());
+                    let described = describe(event, &self.config.names);
+                    self.faulted |= described.severity == Severity::Error;
+                    self.ticks.event(*tick, Some(described));
                 }
-                Sample::Tick(tick) => self.close(tick)?,
+                Sample::Tick(tick) => {
+                    self.close(tick).map_err(|e| write_error(&self.path, &e))?;
+                    self.closed(tick.deadline)?;
+                }
             }
         }
-        let Some(log) = &mut self.log else { return Ok(()) };
-        if log.flush_if_due(now)? && now.since(self.synced) >= SYNC_EVERY {
-            self.sync.as_ref().map_or(Ok(()), DiskSync::request)?;
-            self.synced = now;
-        }
-        self.stats.messages.store(log.written(), Ordering::Relaxed);
         Ok(())
     }
 
+    /// After a tick: the log of a fault ends, or a long log continues in another file.
+    fn closed(&mut self, deadline: Mono) -> Result<(), RecordError> {
+        if self.log.is_none() {
+            return Ok(());
+        }
+        if let Some(until) = self.until {
+            let until = if std::mem::take(&mut self.faulted) { deadline.after(AFTER) } else { until };
+            self.until = Some(until);
+            if deadline >= until {
+                self.end_fault()?;
+                // Its thread syncs it once more.
+                self.sync = None;
+            }
+            return Ok(());
+        }
+        let (storage, first) = (&self.config.storage, *self.began.1.get_or_insert(deadline));
+        let size = self.stats.bytes.load(Ordering::Relaxed) - self.began.0;
+        let due = storage.split_size.is_some_and(|most| size >= most)
+            || storage.split_after.is_some_and(|most| deadline.since(first) >= most);
+        if due { self.split(deadline) } else { Ok(()) }
+    }
+
+    /// Continues in another file.
+    fn split(&mut self, deadline: Mono) -> Result<(), RecordError> {
+        let Some((log, first)) = self.log.take().zip(self.config.path.clone()) else { return Ok(()) };
+        self.topics.clone_from(log.topics());
+        log.finish().map_err(|e| write_error(&self.path, &e))?;
+        // Its thread syncs it once more.
+        self.sync = None;
+        self.part += 1;
+        let name = first.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let more = BTreeMap::from([(PART.to_owned(), self.part.to_string()), (PART_OF.to_owned(), name)]);
+        self.begin(files::part(&first, self.part), deadline, more)
+    }
+
+    /// Takes from a note what every file begins with.
+    fn know(&mut self, note: &Note) {
+        match note {
+            Note::Io { arm, .. } => drop(self.latest.insert((false, *arm), note.clone())),
+            Note::Payload { arm, .. } => drop(self.latest.insert((true, *arm), note.clone())),
+            Note::Markers { markers, .. } => self.ticks.objects(markers),
+            Note::Robots { robots, description, .. } => self.ticks.robots(robots.clone(), description.clone()),
+            Note::ArmText { arm, text } => self.ticks.arm_text(*arm, text.clone()),
+            _ => {}
+        }
+    }
+
     fn note(&mut self, note: Note) -> McapResult<()> {
+        self.know(&note);
         let Some(log) = &mut self.log else { return Ok(()) };
         match note {
             Note::Request { id, stamp, json } => self.ticks.request(log, id, stamp, &json),
@@ -188,12 +302,9 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
             Note::Payload { arm, stamp, load } => {
                 self.ticks.part(log, arm, "payload", stamp, |header, _| payload(header, &load))
             }
-            Note::Robots { stamp, robots, description } => self.ticks.robots(log, stamp, robots, description),
+            Note::Robots { stamp, .. } => self.ticks.latched(log, stamp),
             Note::Markers { stamp, markers } => self.ticks.markers(log, stamp, markers),
-            Note::ArmText { arm, text } => {
-                self.ticks.arm_text(arm, text);
-                Ok(())
-            }
+            Note::ArmText { .. } => Ok(()),
         }
     }
 
@@ -225,8 +336,14 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
         result
     }
 
+    /// Ends the log after an error. That of a fault ends alone: its run continues.
     fn stop_log(&mut self, error: RecordError) {
         self.log = None;
+        if self.faults.is_some() {
+            (self.until, self.sync) = (None, None);
+            (self.on_notice)(Notice::Fault(Err(&error)));
+            return;
+        }
         self.stats.failed.store(true, Ordering::Relaxed);
         (self.on_notice)(Notice::Stopped(&error));
         self.ended = Some(error);
@@ -243,6 +360,15 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
             }
         }
         self.watch();
+        if self.faults.is_some() {
+            if let Err(e) = self.end_fault() {
+                self.stop_log(e);
+            }
+            if let Some(Ok(false)) = self.sync.take().map(|sync| sync.finish(LAST_SYNC)) {
+                (self.on_notice)(Notice::Unsynced(LAST_SYNC));
+            }
+            return Ok(());
+        }
         let Some(log) = self.log.take() else { return self.ended.map_or(Ok(()), Err) };
         let sync = self.sync.take();
         let synced = log.finish().and_then(|_| Ok(sync.map_or(Ok(true), |sync| sync.finish(LAST_SYNC))?));
@@ -270,6 +396,7 @@ mod tests {
     use super::*;
     use crate::clock::WallOffset;
     use crate::recording::notes::channel;
+    use crate::telemetry::describe::Names;
     use std::collections::BTreeMap;
     use std::io::{Cursor, Error, ErrorKind, SeekFrom};
     use std::sync::Mutex;
@@ -311,18 +438,18 @@ mod tests {
             metadata: BTreeMap::new(),
             tcps: Default::default(),
             wall: WallOffset::of(Mono::ZERO, 0),
-            min_free: 0,
+            storage: Default::default(),
         };
         let notices = Arc::new(Mutex::new(Vec::new()));
         let sink = notices.clone();
         let on_notice = move |n: Notice<'_>| match n {
             Notice::Stopped(e) => sink.lock().unwrap().push(e.to_string()),
             Notice::Event { described, .. } => sink.lock().unwrap().push(described.kind.to_owned()),
-            Notice::Lost(_) | Notice::Unsynced(_) => {}
+            Notice::Lost(_) | Notice::Unsynced(_) | Notice::Fault(_) => {}
         };
         let stats = Arc::new(RecorderStats::default());
-        let disk = Full { inner: Cursor::new(Vec::new()), room: 4000 };
-        let mut worker = Worker::new(&config, Some(disk), None, ring, receiver, on_notice, stats.clone()).unwrap();
+        let open = |_: &Path| Ok((Full { inner: Cursor::new(Vec::new()), room: 4000 }, None));
+        let mut worker = Worker::new(config, open, ring, receiver, on_notice, stats.clone()).unwrap();
         for tick in 0..40 {
             let sample = TickSample { tick, ..TickSample::default() };
             producer.push(Sample::Tick(sample)).unwrap();

@@ -74,7 +74,7 @@ type Mismatch = (&'static str, Option<(usize, Option<usize>)>, Value, Value);
 /// Compares ticks with a log.
 #[derive(Debug)]
 pub(super) struct Comparison<'a> {
-    names: &'a Names,
+    pub names: &'a Names,
 }
 
 impl<'a> Comparison<'a> {
@@ -97,6 +97,36 @@ impl<'a> Comparison<'a> {
         })
     }
 
+    /// Returns the events that only the log has, and those that only the replay has, as text.
+    pub fn other_events(&self, logged: &[Event], output: &TickOutput) -> (Vec<String>, Vec<String>) {
+        let mut now: Vec<Described> = output.events.iter().map(|event| describe(event, self.names)).collect();
+        let mut only_then = Vec::new();
+        for then in logged {
+            match now.iter().position(|now| is_reported_by(now, then)) {
+                Some(at) => drop(now.remove(at)),
+                None => only_then.push(then.text.clone()),
+            }
+        }
+        (only_then, now.into_iter().map(|event| event.text).collect())
+    }
+
+    /// Passes on the command of each joint in the log and now; NaN where there is none, or one of another mode.
+    pub fn commands(&self, logged: &LoggedTick, output: &TickOutput, mut each: impl FnMut(usize, &str, f64, f64)) {
+        let mut first = 0;
+        for ((then, now), names) in logged.arms.iter().zip(&output.arms).zip(&self.names.arms) {
+            let dof = names.joints.len();
+            let mode = ControlMode::of_name(&then.output.mode);
+            let none = [f64::NAN; crate::joint::MAX_DOF];
+            let was = mode.and_then(|mode| values(column(mode, logged).1, first, dof)).unwrap_or(none);
+            let comparable = now.command.mode.is_some() && (mode.is_none() || mode == now.command.mode);
+            let is = if comparable { now.command.values } else { none };
+            for ((j, name), (then, now)) in names.joints.iter().enumerate().zip(was.iter().zip(&is)) {
+                each(first + j, name, *then, *now);
+            }
+            first += dof;
+        }
+    }
+
     fn arms(&self, logged: &LoggedTick, output: &TickOutput) -> Option<Mismatch> {
         let mut first = 0;
         let arms = logged.arms.iter().zip(&output.arms).zip(&self.names.arms).enumerate();
@@ -115,11 +145,7 @@ impl<'a> Comparison<'a> {
             }
             let (command, wanted) = (&now.command, &then.output);
             if let Some(mode) = command.mode {
-                let (what, column) = match mode {
-                    ControlMode::Velocity => ("velocity command", &logged.commands.velocity),
-                    ControlMode::Torque => ("torque command", &logged.commands.effort),
-                    _ => ("position command", &logged.commands.position),
-                };
+                let (what, column) = column(mode, logged);
                 let absent = [f64::NAN; crate::joint::MAX_DOF];
                 let then = values(column, first, dof).unwrap_or(absent);
                 let mut pairs = then.iter().zip(&command.values).take(dof).enumerate();
@@ -186,6 +212,15 @@ impl<'a> Comparison<'a> {
                 ("event", None, then, now.map_or(Value::text(""), |d| Value::Text(d.text)))
             })
         })
+    }
+}
+
+/// Returns the logged commands of a mode, and what they are.
+fn column(mode: ControlMode, logged: &LoggedTick) -> (&'static str, &[f64]) {
+    match mode {
+        ControlMode::Velocity => ("velocity command", &logged.commands.velocity),
+        ControlMode::Torque => ("torque command", &logged.commands.effort),
+        _ => ("position command", &logged.commands.position),
     }
 }
 

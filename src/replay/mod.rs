@@ -16,3 +16,4 @@ pub mod recorded;
 mod requests;
 pub mod retrace;
 pub mod verify;
+pub mod what_if;

@@ -44,12 +44,20 @@ pub enum RecordedError {
         writer: String,
     },
     /// It is a part of a log: what the coordinator did before is unknown.
-    #[error("the log {path} is a part of {whole}: it cannot be verified alone\nhint: verify the whole log")]
+    #[error(
+        "the log {path} is a part of {whole}: it cannot be verified alone\nhint: only a log from its beginning can be verified: verify the whole log"
+    )]
     Part {
         /// The log.
         path: PathBuf,
         /// The log that it was cut out of.
         whole: String,
+    },
+    /// A changed value does not fit.
+    #[error("the change does not fit: {what}")]
+    Change {
+        /// The problem.
+        what: String,
     },
     /// Its contents are inconsistent.
     #[error(
@@ -109,6 +117,14 @@ impl Recorded {
             return Ok(());
         }
         Err(version_error(self.path.clone(), self.version, &self.info))
+    }
+
+    /// Checks another configuration for the run.
+    ///
+    /// # Errors
+    /// A description of what does not fit.
+    pub fn check(&self, config: &CoordinatorConfig) -> Result<(), String> {
+        names(config, &self.info.metadata).map(drop)
     }
 
     /// Returns the names of all joints, arm by arm.

@@ -8,15 +8,16 @@ use mcap::records::{Record, op};
 use serde::Serialize;
 
 use super::compare::{Comparison, Difference};
-use super::inputs::{Assembler, Topic};
+use super::inputs::{Assembler, LoggedTick, Topic};
 use super::recorded::{Recorded, RecordedError};
 use crate::arm::ArmState;
-use crate::control::coordinator::Coordinator;
+use crate::control::config::CoordinatorConfig;
+use crate::control::coordinator::{Coordinator, TickOutput};
 use crate::control::request::Envelope;
 use crate::control::task::Task;
 use crate::control::task_spec::TaskTable;
 use crate::recording::records::{RawRecord, RecordReader, unpack_chunk};
-use crate::recording::replay::ReplayError;
+use crate::recording::replay::{ReplayError, parts};
 
 /// Result of a verification.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -60,34 +61,23 @@ pub fn verify(path: &Path, table: &TaskTable) -> Result<Verification, RecordedEr
     recorded.check_version()?;
     let tasks = table.build(&recorded.config.tasks);
     let tasks = tasks.map_err(|what| RecordedError::Unfit { path: path.to_owned(), what })?;
-    let mut records = RecordReader::open(path)?;
-    let mut run = Rerun::new(&recorded, tasks);
-    run.counts.live = records.is_live();
-    let end = loop {
-        match records.next_record() {
-            Ok(Some(record)) => {
-                if let Err(damage) = run.record(&record) {
-                    break Some(records.cut(record.at, damage));
-                }
-            }
-            Ok(None) => break None,
-            Err(cut @ ReplayError::Cut { .. }) => break Some(cut),
-            Err(e) => return Err(e.into()),
-        }
-        if run.found.is_some() {
-            break None;
-        }
-    };
+    let mut run = Rerun::new(&recorded, &recorded.config, tasks);
+    let end = run.read(path)?;
     Ok(run.finish(end))
 }
 
+/// Handler of a tick: what the log has, what it gave now, and its time after the first tick [ns].
+pub(super) type See<'a> = &'a mut dyn FnMut(&LoggedTick, &TickOutput, u64);
+
 /// A log on its way through a coordinator.
-struct Rerun<'a> {
+pub(super) struct Rerun<'a> {
     recorded: &'a Recorded,
     channels: Vec<Option<Topic>>,
     ticks: Assembler,
     coordinator: Coordinator,
     comparison: Comparison<'a>,
+    /// Sees the ticks instead of the comparison.
+    see: Option<See<'a>>,
     states: Vec<ArmState>,
     requests: Vec<Envelope>,
     /// Deadlines of the first and of the last tick [ns].
@@ -97,13 +87,15 @@ struct Rerun<'a> {
 }
 
 impl<'a> Rerun<'a> {
-    fn new(recorded: &'a Recorded, tasks: Vec<Task>) -> Self {
+    /// Prepares to run the inputs of a log with a configuration.
+    pub fn new(recorded: &'a Recorded, config: &CoordinatorConfig, tasks: Vec<Task>) -> Self {
         Self {
             recorded,
             channels: Vec::new(),
             ticks: Assembler::new(recorded),
-            coordinator: Coordinator::new(&recorded.config, tasks),
+            coordinator: Coordinator::new(config, tasks),
             comparison: Comparison::new(recorded),
+            see: None,
             states: vec![ArmState::default(); recorded.config.arms.len()],
             requests: Vec::new(),
             span: None,
@@ -117,6 +109,36 @@ impl<'a> Rerun<'a> {
             },
             found: None,
         }
+    }
+
+    /// Lets `see` have the ticks, which are then not compared.
+    pub fn seen_by(mut self, see: See<'a>) -> Self {
+        self.see = Some(see);
+        self
+    }
+
+    /// Reads all files of the log. Returns where it is cut.
+    pub fn read(&mut self, path: &Path) -> Result<Option<ReplayError>, RecordedError> {
+        for part in parts(path)? {
+            let mut records = RecordReader::open(&part)?;
+            self.counts.live = records.is_live();
+            loop {
+                match records.next_record() {
+                    Ok(Some(record)) => {
+                        if let Err(damage) = self.record(&record) {
+                            return Ok(Some(records.cut(record.at, damage)));
+                        }
+                    }
+                    Ok(None) => break,
+                    Err(cut @ ReplayError::Cut { .. }) => return Ok(Some(cut)),
+                    Err(e) => return Err(e.into()),
+                }
+                if self.found.is_some() {
+                    return Ok(None);
+                }
+            }
+        }
+        Ok(None)
     }
 
     fn record(&mut self, record: &RawRecord) -> Result<(), mcap::McapError> {
@@ -188,7 +210,10 @@ impl<'a> Rerun<'a> {
         drop(requests);
         let deadline = logged.tick.deadline_ns;
         let (first, _) = *self.span.get_or_insert((deadline, deadline));
-        if let Some(difference) = self.comparison.compare(logged, output, deadline.saturating_sub(first)) {
+        let time = deadline.saturating_sub(first);
+        if let Some(see) = &mut self.see {
+            see(logged, output, time);
+        } else if let Some(difference) = self.comparison.compare(logged, output, time) {
             self.found = Some(Finding::Different(difference));
             return;
         }
@@ -198,7 +223,8 @@ impl<'a> Rerun<'a> {
         self.ticks.next();
     }
 
-    fn finish(mut self, cut: Option<ReplayError>) -> Verification {
+    /// Runs the last tick, unless the log is cut.
+    pub fn finish(mut self, cut: Option<ReplayError>) -> Verification {
         match cut {
             // The last tick's requests and events may be lost in the cut.
             Some(cut) if self.found.is_none() => self.stop_at(self.counts.ticks, first_line(&cut.to_string())),

@@ -2,9 +2,10 @@
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
+use std::time::Duration;
 
 use super::{Options, Record, StartError};
-use crate::blueprint::Blueprint;
+use crate::blueprint::{Blueprint, Compression};
 use crate::clock::{Clock, MonotonicClock, WallOffset};
 use crate::control::config::CoordinatorConfig;
 use crate::hardware::device;
@@ -12,7 +13,8 @@ use crate::message::Message;
 use crate::recording::log_writer::LogAttachment;
 use crate::recording::notes::Notes;
 use crate::recording::recorder::Note;
-use crate::recording::{CONFIG_VERSION_KEY, COORDINATOR, disk_space, files};
+use crate::recording::storage::{FaultLog, Storage};
+use crate::recording::{CONFIG_VERSION_KEY, COORDINATOR, disk_space, fault_ring, files};
 use crate::telemetry::describe::{Names, Severity};
 
 /// Returns the path of the log, if there is one. An error if the disk lacks space for it.
@@ -23,7 +25,7 @@ pub(super) fn log_path(
     wall: WallOffset,
 ) -> Result<Option<PathBuf>, StartError> {
     let log = match &options.record {
-        Record::Off => None,
+        Record::Off | Record::Faults => None,
         Record::To(path) => Some(path.clone()),
         Record::AsBlueprint if !blueprint.recording.enabled => None,
         Record::AsBlueprint => {
@@ -41,6 +43,25 @@ pub(super) fn log_path(
 
 fn log_folder(blueprint: &Blueprint) -> Option<PathBuf> {
     blueprint.recording.directory.as_ref().map(PathBuf::from).or_else(files::log_folder)
+}
+
+/// Returns how the blueprint wants logs to be stored.
+pub(super) fn storage(blueprint: &Blueprint, options: &Options, config: &CoordinatorConfig) -> Storage {
+    let recording = &blueprint.recording;
+    let time = |seconds: f64| (seconds > 0.0).then(|| Duration::from_secs_f64(seconds.min(1e9)));
+    let folder = log_folder(blueprint).filter(|_| recording.fault_log && options.record != Record::Off);
+    Storage {
+        min_free: recording.min_free.0,
+        compress: recording.compression == Compression::Zstd,
+        sync_every: time(recording.sync_every),
+        split_size: Some(recording.split_size.0).filter(|size| *size > 0).map(|size| size.max(1_000_000)),
+        split_after: time(recording.split_after).map(|after| after.max(Duration::from_secs(1))),
+        fault_log: folder.map(|folder| FaultLog {
+            folder,
+            keep: recording.keep as usize,
+            samples: fault_ring::capacity(config.rate, config.arms.len()),
+        }),
+    }
 }
 
 /// Removes the oldest logs beyond what the blueprint keeps.

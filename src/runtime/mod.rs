@@ -93,7 +93,9 @@ pub enum Record {
     AsBlueprint,
     /// This file.
     To(PathBuf),
-    /// No log.
+    /// No log but those of faults, as set in the blueprint.
+    Faults,
+    /// No log at all.
     Off,
 }
 

@@ -222,6 +222,10 @@ impl Service {
                 "the log is closed, but its disk has not stored all of it after {} s; keep the power on",
                 after.as_secs()
             ),
+            Notice::Fault(Ok(path)) => {
+                tracing::warn!("the time before and after the fault is in the log {}", path.display());
+            }
+            Notice::Fault(Err(error)) => tracing::warn!("there is no log of the fault: {error}"),
             Notice::Stopped(error) => {
                 tracing::error!("{error}");
                 let first = error.to_string().lines().next().unwrap_or_default().to_owned();

@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 use super::arms::{self, Arms, BroughtUp, Slots};
 use super::control_config::{coordinator_config, names_of, tasks};
 use super::dispatch::{Dispatcher, OutcomeThread};
-use super::log_file::{attachments, log_device_note, log_path, metadata, no_log, retain};
+use super::log_file::{attachments, log_device_note, log_path, metadata, no_log, retain, storage};
 use super::planner_link::command_limits;
 use super::planner_port::PlannerPort;
 use super::service::{Service, ServiceParts};
@@ -225,7 +225,8 @@ fn start_recorder(
     let (blueprint, wall) = (prepared.blueprint, prepared.wall);
     service.log_tcps();
     let mut attachments = attachments(blueprint, config);
-    if prepared.log.is_some() {
+    let storage = storage(blueprint, &prepared.options, config);
+    if prepared.log.is_some() || storage.fault_log.is_some() {
         attachments.extend(service.log_robots());
         service.log_world();
     }
@@ -238,7 +239,7 @@ fn start_recorder(
         metadata: metadata(blueprint, config),
         tcps: service.logged_tcps.clone(),
         wall,
-        min_free: blueprint.recording.min_free.0,
+        storage,
     };
     let receiver = service.clone();
     let notice = move |notice: Notice<'_>| receiver.notice(notice, wall);

@@ -33,6 +33,7 @@ mod help;
 mod host_stalls;
 mod kinematics;
 mod layering;
+mod log_storage;
 mod model;
 mod model_verbs;
 mod no_alloc;

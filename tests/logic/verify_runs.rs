@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use dimos::blueprint::{Blueprint, Overrides};
 use dimos::hardware::registry::Registry;
+use dimos::recording::files;
 use dimos::rpc::api;
 use dimos::rpc::client::Client;
 use dimos::rpc::run_dir::RunDir;
@@ -100,6 +101,29 @@ tasks:
   - {name: servo, type: servo, joint_names: {hardware: arm}}
   - {name: velocity, type: velocity, joint_names: {hardware: arm}, priority: 5}
 ";
+
+#[test]
+fn a_fault_of_a_run_that_is_not_recorded_is_logged() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, logs) = (folder.path().join("streamed.yaml"), folder.path().join("logs"));
+    std::fs::write(&path, STREAMED).unwrap();
+    let directory = format!("recording.directory={}", logs.display());
+    let blueprint = blueprint(path.to_str().unwrap(), &[&directory]);
+    let options =
+        |record| Options { record, folder: RunDir::at(folder.path()), hold_latency: false, ..Options::default() };
+    let run = Run::start(&blueprint, options(Record::Faults)).unwrap();
+    for _ in 0..500 {
+        if !files::all(&logs).unwrap().is_empty() {
+            break;
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    // The run ends before the 5 s after the fault are over.
+    assert_eq!(run.stop().log, None);
+    let found = files::all(&logs).unwrap();
+    assert_eq!(found.len(), 1, "the fault did not come");
+    assert!(reproducible(&found[0]).ticks > 200);
+}
 
 #[test]
 fn streams_and_an_arm_fault_are_reproducible() {

@@ -164,4 +164,34 @@ fn other_tools_place_the_tool_where_the_model_does() {
             assert!(off.abs() < 1e-6, "{off} m along axis {axis}: {} {fk}", scene["pose"]);
         }
     }
+    // What is exported is what was recorded, to other people's readers.
+    home.dimos("log export --last -o table.csv").with(0);
+    home.dimos("log export --last --parquet table.parquet").with(0).shows(&["rows"]);
+    home.dimos("log export --last --rosbag2 bag").with(0);
+    let set = home.dimos("log export --last --lerobot set --task wave --json").with(0).json();
+    assert!(set["frames"].as_u64().unwrap() > 100 && set["fps"] == 100.0, "{set}");
+    let mut read = Command::new(root.join(".venv/bin/python"));
+    let output = read.arg(root.join("tests/readers/read_exports.py")).arg(&home.logs()[0]).arg(home.path()).output();
+    let output = output.unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert_eq!(String::from_utf8_lossy(&output.stdout).matches("are the same").count(), 3);
+    home.dimos("log verify bag").with(0).shows(&["reproducible"]);
+    home.dimos("log export --last --rosbag2 bag").with(1).says(&["cannot write", "hint: choose another file"]);
+}
+
+/// `make test-lerobot` installs LeRobot and asks for this one; it is too large for `make test-tools`.
+#[test]
+fn lerobot_loads_a_data_set() {
+    if std::env::var("DIMOS_LEROBOT").as_deref() != Ok("1") {
+        return;
+    }
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let home = recorded();
+    for (folder, options) in [("set", ""), ("slow", "--fps 30")] {
+        home.dimos(&format!("log export --last --lerobot {folder} --task wave {options}")).with(0);
+        let mut load = Command::new(root.join(".venv-lerobot/bin/python"));
+        let output = load.arg(root.join("tests/readers/load_lerobot.py")).arg(home.path().join(folder)).output();
+        let output = output.unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    }
 }

@@ -45,7 +45,7 @@ fn record(path: &Path) {
         metadata: BTreeMap::new(),
         tcps: tcps(),
         wall: WallOffset::of(Mono(5_000_000_000), WALL),
-        min_free: 0,
+        storage: Default::default(),
     };
     let (mut ring, consumer) = rtrb::RingBuffer::new(4096);
     let (notes, receiver) = channel();

@@ -15,6 +15,7 @@ use dimos::joint::{ControlMode, JointLimits, make_joints};
 use dimos::recording::log_writer::LogAttachment;
 use dimos::recording::notes::{Notes, channel};
 use dimos::recording::recorder::{Note, Recorder, RecorderConfig};
+use dimos::recording::storage::Storage;
 use dimos::recording::tcp_log::TcpChains;
 use dimos::runtime::log_of;
 use dimos::telemetry::describe::{ArmNames, Names};
@@ -83,6 +84,11 @@ impl VirtualRun {
 
     /// The same with the task types of a table.
     pub fn start_with(table: &TaskTable, config: &CoordinatorConfig, log: &Path) -> Self {
+        Self::start_stored(table, config, Some(log), Storage::default())
+    }
+
+    /// The same with a log that is stored in this way, or without one.
+    pub fn start_stored(table: &TaskTable, config: &CoordinatorConfig, log: Option<&Path>, storage: Storage) -> Self {
         let arm = |a: &ArmConfig| ArmNames { hardware_id: a.name.clone(), joints: make_joints(&a.name, a.dof) };
         let names = Names {
             arms: config.arms.iter().map(arm).collect(),
@@ -95,7 +101,7 @@ impl VirtualRun {
         };
         let tcps = TcpChains::default();
         let record = RecorderConfig {
-            path: Some(log.to_owned()),
+            path: log.map(Path::to_owned),
             run: "virtual".into(),
             names: names.clone(),
             frame_id: "coordinator".into(),
@@ -103,7 +109,7 @@ impl VirtualRun {
             metadata: BTreeMap::from([("config_version".to_owned(), config.version.to_string())]),
             tcps: tcps.clone(),
             wall: WallOffset::of(START.0, START.1),
-            min_free: 0,
+            storage,
         };
         let (ring, samples) = rtrb::RingBuffer::new(64 * 1024);
         let (notes, noted) = channel();
@@ -200,6 +206,11 @@ impl VirtualRun {
         self.tasks.clone_from(&output.tasks);
         self.now = next;
         self.tick += 1;
+    }
+
+    /// Returns the time of the next tick.
+    pub fn now(&self) -> Mono {
+        self.now
     }
 
     /// Closes the log.

@@ -81,7 +81,8 @@ impl Terminal {
         enable_raw_mode()?;
         TAKEN.store(true, Ordering::SeqCst);
         let size = (columns.into(), rows.into());
-        let terminal = Self { drawn: Vec::new(), size, colour: output::colour(&io::stdout()), events: listen()? };
+        let terminal =
+            Self { drawn: Vec::new(), size, colour: output::colour(&io::stdout()), events: listen("jog-keys")? };
         // A terminal without the kitty keyboard protocol ignores this sequence; one with it will report key-ups. The
         // first key-up shows which it is.
         let flags = KeyboardEnhancementFlags::DISAMBIGUATE_ESCAPE_CODES | KeyboardEnhancementFlags::REPORT_EVENT_TYPES;
@@ -166,7 +167,7 @@ impl Drop for Terminal {
 
 /// Reads keys on a separate thread: the library's read never returns from a closed terminal. Keys are time-stamped when
 /// typed.
-fn listen() -> io::Result<Receiver<io::Result<(Event, Instant)>>> {
+pub fn listen(thread: &str) -> io::Result<Receiver<io::Result<(Event, Instant)>>> {
     let (to, events) = sync_channel(KEY_CAPACITY);
     let listening = move || {
         loop {
@@ -177,7 +178,7 @@ fn listen() -> io::Result<Receiver<io::Result<(Event, Instant)>>> {
             }
         }
     };
-    std::thread::Builder::new().name("jog-keys".into()).spawn(listening)?;
+    std::thread::Builder::new().name(thread.into()).spawn(listening)?;
     Ok(events)
 }
 

@@ -36,7 +36,8 @@ pub fn recover(path: &Path, to: Option<&Path>, json: bool) -> Result {
     Ok(if loss(&scan).is_some() { Exit::Log } else { Exit::Ok })
 }
 
-fn failure(error: RewriteError, to: &Path) -> Failure {
+/// Returns the failure of a copy; removes what there is of the new file.
+pub fn failure(error: RewriteError, to: &Path) -> Failure {
     // A part of a file is of no use.
     if matches!(error, RewriteError::Write { exists: false, .. }) {
         let _ = std::fs::remove_file(to);

@@ -9,6 +9,8 @@ use super::{loss, progress, unreadable};
 use crate::cli::exit::{Exit, Result};
 use crate::cli::output;
 use crate::recording::messages::Tick;
+use crate::recording::records::check_sections;
+use crate::recording::replay::parts;
 use crate::recording::scan::{Item, Scan};
 use crate::recording::wire::Message;
 
@@ -30,9 +32,15 @@ pub fn run(path: &Path, json: bool) -> Result {
         bar(&scan);
     }
     found.problems.extend(loss(&scan));
-    let counted = scan.statistics.as_ref().map(|s| s.message_count).filter(|count| *count != found.messages);
+    let counted = scan.counted().filter(|count| *count != found.messages);
     if let Some(counted) = counted.filter(|_| scan.damage.is_empty()) {
         found.problems.push(format!("the summary counts {counted} messages, the log has {}", found.messages));
+    }
+    if scan.complete && scan.damage.is_empty() {
+        for part in parts(path).map_err(unreadable)? {
+            let wrong = check_sections(&part).map_err(unreadable)?;
+            found.problems.extend(wrong.map(|wrong| format!("{}: {wrong}", part.display())));
+        }
     }
     if found.undecoded > 0 {
         found.problems.push(format!("{} messages do not match their schema", found.undecoded));

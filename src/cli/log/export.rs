@@ -1,4 +1,4 @@
-//! `dimos log export`: joint values, or the messages of a topic, as CSV.
+//! `dimos log export`: joint values as CSV or Parquet, or the messages of a topic as CSV.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
@@ -10,21 +10,17 @@ use super::{Part, ended, unreadable, written};
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output;
 use crate::recording::messages::JointState;
+use crate::recording::parquet::{Column, ParquetWriter};
 use crate::recording::replay::{Entry, LogReader, Payload, ReplayError, Selection};
 use crate::recording::scan::{Item, Scan};
 
-/// Exports a log.
-pub fn run(path: &Path, part: &Part, topic: Option<&str>, to: Option<&Path>, json: bool) -> Result {
+/// Exports a log as text.
+pub fn csv(path: &Path, part: &Part, topic: Option<&str>, to: Option<&Path>, json: bool) -> Result {
     let (from, until) = part.of(path)?;
     let began = from.saturating_sub(part.from.as_nanos() as u64);
     let mut out: Box<dyn Write> = match to {
         None => Box::new(BufWriter::new(io::stdout().lock())),
-        Some(to) => {
-            let failed = |e: io::Error| {
-                Failure::new(Exit::Failed, format!("cannot write {}: {e}", to.display())).hint("choose another file")
-            };
-            Box::new(BufWriter::new(File::create_new(to).map_err(failed)?))
-        }
+        Some(to) => Box::new(new_file(to)?),
     };
     let mut rows = Rows { out: &mut *out, began, count: 0 };
     let exit = match topic {
@@ -41,6 +37,109 @@ pub fn run(path: &Path, part: &Part, topic: Option<&str>, to: Option<&Path>, jso
         output::done(format_args!("{count} rows: {}", to.display()), json!({"file": to, "rows": count}), json);
     }
     Ok(exit)
+}
+
+/// Exports joint states and commands as a Parquet file, with the columns of the text; unknown values are NaN.
+pub fn parquet(path: &Path, part: &Part, to: &Path, json: bool) -> Result {
+    let part_of_log = part.of(path)?;
+    let began = part_of_log.0.saturating_sub(part.from.as_nanos() as u64);
+    let out = new_file(to)?;
+    let names = joint_names(path, part_of_log)?;
+    let numbers = || Column::Numbers(Vec::new());
+    let mut columns = vec![("time".to_owned(), numbers()), ("log_time".to_owned(), Column::Integers(Vec::new()))];
+    columns.extend(columns_of(&names).map(|name| (name, numbers())));
+    let failed = |e| cannot_write(to, e);
+    let mut file = ParquetWriter::new(out, columns).map_err(failed)?;
+    let exit = joint_rows(path, part_of_log, names.len(), |time, values| {
+        for (column, value) in file.columns.iter_mut().skip(2).zip(values) {
+            if let Column::Numbers(list) = column {
+                list.push(value.unwrap_or(f64::NAN));
+            }
+        }
+        if let [Column::Numbers(seconds), Column::Integers(times), ..] = &mut file.columns[..] {
+            seconds.push(time.saturating_sub(began) as f64 * 1e-9);
+            times.push(time as i64);
+        }
+        file.row_added().map_err(failed).map(|()| true)
+    })?;
+    let rows = file.finish(&[]).map_err(failed)?;
+    output::done(format_args!("{rows} rows: {}", to.display()), json!({"file": to, "rows": rows}), json);
+    Ok(exit)
+}
+
+/// Creates a file that must not exist yet.
+pub fn new_file(to: &Path) -> Result<BufWriter<File>> {
+    File::create_new(to).map(BufWriter::new).map_err(|e| cannot_write(to, e))
+}
+
+/// Returns the failure of a file that cannot be written.
+pub fn cannot_write(to: &Path, e: io::Error) -> Failure {
+    Failure::new(Exit::Failed, format!("cannot write {}: {e}", to.display())).hint("choose another file")
+}
+
+const STATES: &str = "/joint_states";
+const COMMANDS: &str = "/joint_commands";
+
+/// Returns the names in joint states; a gripper gets its name when it is first measured.
+fn joint_names(path: &Path, (from, to): (u64, u64)) -> Result<Vec<String>> {
+    let mut names: Vec<String> = Vec::new();
+    let mut log = LogReader::open(path).map_err(unreadable)?;
+    each(&mut log, Selection { topics: vec![STATES.to_owned()], from, to }, |entry| {
+        if let Payload::JointState(state) = entry.data
+            && state.name.len() > names.len()
+        {
+            names = state.name;
+        }
+        Ok(true)
+    })?;
+    Ok(names)
+}
+
+/// Returns the names of the columns of these joints.
+fn columns_of(names: &[String]) -> impl Iterator<Item = String> {
+    let columns = ["position", "velocity", "effort", "command"];
+    names.iter().flat_map(move |name| columns.map(|column| format!("{name}.{column}")))
+}
+
+/// Passes on time [ns] and values of each joint state and the commands with it, until `row` returns `false`.
+fn joint_rows(
+    path: &Path,
+    (from, to): (u64, u64),
+    joints: usize,
+    mut row: impl FnMut(u64, &[Option<f64>]) -> Result<bool>,
+) -> Result {
+    let mut log = LogReader::open(path).map_err(unreadable)?;
+    let mut waiting: Option<(u64, JointState)> = None;
+    let mut commands = JointState::default();
+    let mut write = |time: u64, state: &JointState, commands: &JointState| {
+        let lists = [&commands.position, &commands.velocity, &commands.effort];
+        // One of them has a value: an arm has one mode at a time.
+        let command = |i: usize| lists.iter().filter_map(|list| list.get(i)).copied().find(|v| !v.is_nan());
+        let of = |list: &[f64], i: usize| list.get(i).copied();
+        let values = |i| [of(&state.position, i), of(&state.velocity, i), of(&state.effort, i), command(i)];
+        let values: Vec<Option<f64>> = (0..joints).flat_map(values).collect();
+        row(time, &values)
+    };
+    let cut = each(&mut log, Selection { topics: vec![STATES.to_owned(), COMMANDS.to_owned()], from, to }, |entry| {
+        let Payload::JointState(values) = entry.data else { return Ok(true) };
+        if entry.topic == COMMANDS {
+            commands = values;
+            return Ok(true);
+        }
+        let last = waiting.replace((entry.log_time, values));
+        let commands = std::mem::take(&mut commands);
+        last.map_or(Ok(true), |(time, state)| write(time, &state, &commands))
+    })?;
+    if let Some((time, state)) = waiting {
+        write(time, &state, &commands)?;
+    }
+    match cut.filter(|_| !log.info().live) {
+        Some(cut) => {
+            output::note(format_args!("warning: {cut}"));
+            Ok(Exit::Log)
+        }
+        None => Ok(Exit::Ok),
+    }
 }
 
 struct Rows<'a> {
@@ -69,52 +168,10 @@ impl Rows<'_> {
     }
 
     /// Writes joint states and commands, a row for each state.
-    fn joints(&mut self, path: &Path, (from, to): (u64, u64)) -> Result {
-        let topics = vec!["/joint_states".to_owned(), "/joint_commands".to_owned()];
-        let mut log = LogReader::open(path).map_err(unreadable)?;
-        // A gripper gets its name when it is first measured.
-        let mut names: Vec<String> = Vec::new();
-        let mut exit = Exit::Ok;
-        each(&mut log, Selection { topics: topics[..1].to_vec(), from, to }, |entry| {
-            if let Payload::JointState(state) = entry.data
-                && state.name.len() > names.len()
-            {
-                names = state.name;
-            }
-            Ok(true)
-        })?;
-        let columns = ["position", "velocity", "effort", "command"];
-        self.heading(names.iter().flat_map(|name| columns.map(|column| format!("{name}.{column}"))))?;
-        let mut waiting: Option<(u64, JointState)> = None;
-        let mut commands = JointState::default();
-        let row = |rows: &mut Self, time: u64, state: &JointState, commands: &JointState| {
-            let lists = [&commands.position, &commands.velocity, &commands.effort];
-            // One of them has a value: an arm has one mode at a time.
-            let command = |i: usize| lists.iter().filter_map(|list| list.get(i)).copied().find(|v| !v.is_nan());
-            let of = |list: &[f64], i: usize| list.get(i).copied();
-            let cells = (0..names.len()).flat_map(|i| {
-                [of(&state.position, i), of(&state.velocity, i), of(&state.effort, i), command(i)].map(cell)
-            });
-            rows.row(time, cells)
-        };
-        let cut = each(&mut log, Selection { topics: topics.clone(), from, to }, |entry| {
-            let Payload::JointState(values) = entry.data else { return Ok(true) };
-            if entry.topic == topics[1] {
-                commands = values;
-                return Ok(true);
-            }
-            let last = waiting.replace((entry.log_time, values));
-            let commands = std::mem::take(&mut commands);
-            last.map_or(Ok(true), |(time, state)| row(self, time, &state, &commands))
-        })?;
-        if let Some((time, state)) = waiting {
-            row(self, time, &state, &commands)?;
-        }
-        if let Some(cut) = cut.filter(|_| !log.info().live) {
-            output::note(format_args!("warning: {cut}"));
-            exit = Exit::Log;
-        }
-        Ok(exit)
+    fn joints(&mut self, path: &Path, part: (u64, u64)) -> Result {
+        let names = joint_names(path, part)?;
+        self.heading(columns_of(&names))?;
+        joint_rows(path, part, names.len(), |time, values| self.row(time, values.iter().copied().map(cell)))
     }
 
     /// Writes the messages of a topic, with the columns of the first one.

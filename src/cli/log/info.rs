@@ -9,6 +9,7 @@ use super::{progress, unreadable};
 use crate::cli::exit::{Exit, Result};
 use crate::cli::output::{self, Table, fixed};
 use crate::recording::disk_space::Megabytes;
+use crate::recording::files;
 use crate::recording::replay::{LogInfo, LogReader, ReplayError};
 use crate::recording::scan::{Item, Scan};
 
@@ -39,7 +40,7 @@ pub fn run(path: &Path, json: bool) -> Result {
     topics.sort_by_key(|(_, channel)| &channel.topic);
     let count = |id: &u16| counts.get(id).copied().unwrap_or(0);
     let rate = |id: &u16| if length > 0.0 { count(id) as f64 / length } else { 0.0 };
-    let size = std::fs::metadata(path).map_or(0, |about| about.len());
+    let size = files::size(path);
     if json {
         let topics = topics.iter().map(|(id, channel)| {
             let (messages, rate) = (count(id), rate(id));

@@ -19,7 +19,7 @@ pub fn run(json: bool) -> Result {
         (Table::new(&["LOG", "STARTED", ">LENGTH", ">SIZE", "~ARMS", "STATE", ">FAULTS"]), Vec::new());
     for path in logs.iter().rev() {
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let size = std::fs::metadata(path).map_or(0, |about| about.len());
+        let size = files::size(path);
         let read = LogReader::open(path).and_then(|log| Ok((faults(path, log.info())?.len(), log.info().clone())));
         let Ok((faults, info)) = read else {
             all.push(json!({"path": path, "size": size, "state": "unreadable"}));

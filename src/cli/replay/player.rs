@@ -1,5 +1,6 @@
 //! Passes the messages of a log to a view, each at its time.
 
+use std::io;
 use std::time::Duration;
 
 use super::view::View;
@@ -15,8 +16,6 @@ pub struct Part {
     pub from: u64,
     /// Last Unix time, inclusive [ns].
     pub to: u64,
-    /// Speed factor.
-    pub rate: f64,
     /// Repeat from the start.
     pub looping: bool,
 }
@@ -30,49 +29,129 @@ pub struct End {
     pub lost: u64,
     /// Messages that do not match their schema.
     pub damaged: u64,
+    /// Whether Ctrl-C ended it.
+    pub interrupted: bool,
 }
 
 /// A clock that can be waited on.
-pub trait Waiting: Clock {
-    /// Waits until that time; returns at once if it is past.
-    fn wait_until(&mut self, time: Mono);
+pub trait Waiting {
+    /// Returns the time.
+    fn time(&self) -> Mono;
+    /// Waits for a key, at most until that time; returns at once if it is past.
+    fn wait(&mut self, until: Option<Mono>) -> Option<Key>;
 }
 
 /// Real time.
 #[derive(Debug, Clone, Copy)]
 pub struct RealTime;
 
-impl Clock for RealTime {
-    fn now(&self) -> Mono {
+impl Waiting for RealTime {
+    fn time(&self) -> Mono {
         MonotonicClock.now()
+    }
+
+    fn wait(&mut self, until: Option<Mono>) -> Option<Key> {
+        std::thread::sleep(until.map_or(Duration::ZERO, |until| until.since(self.time())));
+        None
     }
 }
 
-impl Waiting for RealTime {
-    fn wait_until(&mut self, time: Mono) {
-        std::thread::sleep(time.since(self.now()));
+/// What a key asks for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Key {
+    /// Pause, or continue.
+    Pause,
+    /// Play the next tick.
+    Next,
+    /// Play faster or, with `false`, slower.
+    Faster(bool),
+    /// End.
+    End {
+        /// Whether by Ctrl-C.
+        interrupted: bool,
+    },
+}
+
+/// How fast time passes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Pace {
+    /// Factor.
+    pub rate: f64,
+    /// Whether it is paused.
+    pub paused: bool,
+    /// A time and the Unix time of the log then [ns].
+    from: (Mono, u64),
+}
+
+impl Pace {
+    /// Creates one that begins with the log.
+    pub fn new(rate: f64, paused: bool) -> Self {
+        Self { rate, paused, from: (Mono::ZERO, 0) }
+    }
+
+    /// Returns when a time of the log is due.
+    fn due(&self, log_time: u64) -> Mono {
+        let (from, began) = self.from;
+        from.after(Duration::from_secs_f64(log_time.saturating_sub(began) as f64 * 1e-9 / self.rate))
+    }
+
+    /// Returns the time of the log now.
+    fn at(&self, now: Mono) -> u64 {
+        let passed = if self.paused { 0.0 } else { now.since(self.from.0).as_secs_f64() * self.rate };
+        self.from.1 + (passed * 1e9) as u64
+    }
+
+    /// Waits until a time of the log. Returns `None` to continue, and otherwise whether it was
+    /// interrupted.
+    fn wait(&mut self, log_time: u64, view: &mut dyn View, time: &mut dyn Waiting) -> io::Result<Option<bool>> {
+        loop {
+            let due = (!self.paused).then(|| self.due(log_time));
+            let Some(key) = time.wait(due) else { return Ok(None) };
+            let now = time.time();
+            self.from = (now, self.at(now).min(log_time));
+            match key {
+                Key::Pause => self.paused = !self.paused,
+                Key::Next => {
+                    self.from.1 = log_time;
+                    return Ok(None);
+                }
+                Key::Faster(faster) => self.rate = (self.rate * if faster { 1.1 } else { 1.0 / 1.1 }).clamp(1e-3, 1e6),
+                Key::End { interrupted } => return Ok(Some(interrupted)),
+            }
+            view.pace(self)?;
+        }
     }
 }
 
 /// Plays a part of a log.
-pub fn play(log: &mut LogReader, part: &Part, view: &mut dyn View, time: &mut dyn Waiting) -> anyhow::Result<End> {
+pub fn play(
+    log: &mut LogReader,
+    part: &Part,
+    mut pace: Pace,
+    view: &mut dyn View,
+    time: &mut dyn Waiting,
+) -> anyhow::Result<End> {
     // A cut after the selected part does not matter.
     let reaches_end = log.info().span.is_none_or(|(_, end)| part.to >= end);
+    view.pace(&pace)?;
     loop {
         let mut end = End::default();
         log.select(Selection { topics: part.topics.clone(), from: part.from, to: part.to })?;
-        let begun = time.now();
-        let due = |log_time: u64| {
-            begun.after(Duration::from_secs_f64(log_time.saturating_sub(part.from) as f64 * 1e-9 / part.rate))
-        };
-        let mut any = false;
+        pace.from = (time.time(), part.from);
+        // Messages of one time are one step.
+        let mut shown = None;
         loop {
             match log.next_entry() {
                 Ok(Some(entry)) => {
-                    time.wait_until(due(entry.log_time));
+                    if shown != Some(entry.log_time)
+                        && let Some(interrupted) = pace.wait(entry.log_time, view, time)?
+                    {
+                        view.end()?;
+                        return Ok(End { interrupted, ..End::default() });
+                    }
                     end.damaged += u64::from(matches!(entry.data, Payload::Damaged { .. }));
-                    view.show(&entry, time.now())?;
-                    any = true;
+                    view.show(&entry, time.time())?;
+                    shown = Some(entry.log_time);
                 }
                 Ok(None) => break,
                 Err(cut @ ReplayError::Cut { .. }) => {
@@ -84,11 +163,13 @@ pub fn play(log: &mut LogReader, part: &Part, view: &mut dyn View, time: &mut dy
         }
         end.lost = log.lost();
         view.end()?;
-        if !(part.looping && any) {
+        if !(part.looping && shown.is_some()) {
             return Ok(end);
         }
         // A pass takes at least the duration of its part, otherwise a short one would loop at full speed.
-        time.wait_until(due(part.to));
+        if let Some(interrupted) = pace.wait(part.to, view, time)? {
+            return Ok(End { interrupted, ..end });
+        }
     }
 }
 
@@ -100,11 +181,41 @@ mod tests {
     use crate::recording::messages::Text;
     use crate::recording::replay::Entry;
     use std::collections::BTreeMap;
-    use std::io;
 
     impl Waiting for VirtualClock {
-        fn wait_until(&mut self, time: Mono) {
-            self.advance(time.since(self.now()));
+        fn time(&self) -> Mono {
+            self.now()
+        }
+
+        fn wait(&mut self, until: Option<Mono>) -> Option<Key> {
+            self.advance(until.map_or(Duration::ZERO, |until| until.since(self.now())));
+            None
+        }
+    }
+
+    /// Keys, each after a time [ms].
+    struct Typed {
+        clock: VirtualClock,
+        keys: Vec<(u64, Key)>,
+    }
+
+    impl Waiting for Typed {
+        fn time(&self) -> Mono {
+            self.clock.now()
+        }
+
+        fn wait(&mut self, until: Option<Mono>) -> Option<Key> {
+            let next = self.keys.first().map(|(at, key)| (Mono(at * 1_000_000), *key));
+            match (until, next) {
+                (Some(until), Some((at, _))) if until < at => self.clock.wait(Some(until)),
+                (Some(until), None) => self.clock.wait(Some(until)),
+                (None, None) => panic!("waits forever"),
+                (_, Some((at, key))) => {
+                    self.clock.wait(Some(at));
+                    self.keys.remove(0);
+                    Some(key)
+                }
+            }
         }
     }
 
@@ -135,7 +246,8 @@ mod tests {
         let mut log = LogReader::open(&path).unwrap();
         for (to, cut) in [(450, false), (900, true)] {
             let mut notes = Notes { seen: Vec::new(), room: 99 };
-            let end = play(&mut log, &part(0, to), &mut notes, &mut VirtualClock::default()).unwrap();
+            let end =
+                play(&mut log, &part(0, to), Pace::new(1.0, false), &mut notes, &mut VirtualClock::default()).unwrap();
             assert_eq!(end.cut.is_some(), cut, "up to {to} ms");
             assert_eq!(notes.seen.len() as u64, to / 100 + 1);
         }
@@ -153,17 +265,21 @@ mod tests {
     }
 
     fn played(part: Part, room: usize) -> Vec<(String, u64)> {
+        played_at(1.0, part, room)
+    }
+
+    fn played_at(rate: f64, part: Part, room: usize) -> Vec<(String, u64)> {
         let folder = tempfile::tempdir().unwrap();
         let mut notes = Notes { seen: Vec::new(), room };
         let mut clock = VirtualClock::default();
-        let end = play(&mut log(&folder), &part, &mut notes, &mut clock);
+        let end = play(&mut log(&folder), &part, Pace::new(rate, false), &mut notes, &mut clock);
         assert_eq!(end.is_ok(), notes.seen.len() < room);
         notes.seen
     }
 
     fn part(from_ms: u64, to_ms: u64) -> Part {
         let ns = |ms| 5_000_000_000 + ms * 1_000_000;
-        Part { topics: Vec::new(), from: ns(from_ms), to: ns(to_ms), rate: 1.0, looping: false }
+        Part { topics: Vec::new(), from: ns(from_ms), to: ns(to_ms), looping: false }
     }
 
     #[test]
@@ -180,7 +296,30 @@ mod tests {
 
     #[test]
     fn a_rate_scales_time() {
-        assert_eq!(played(Part { rate: 2.0, ..part(0, 200) }, 99).last(), Some(&("2".into(), 100)));
+        assert_eq!(played_at(2.0, part(0, 200), 99).last(), Some(&("2".into(), 100)));
+    }
+
+    fn typed(paused: bool, keys: &[(u64, Key)]) -> (Vec<(String, u64)>, End) {
+        let folder = tempfile::tempdir().unwrap();
+        let mut notes = Notes { seen: Vec::new(), room: 99 };
+        let mut time = Typed { clock: VirtualClock::default(), keys: keys.to_vec() };
+        let end = play(&mut log(&folder), &part(0, 300), Pace::new(1.0, paused), &mut notes, &mut time).unwrap();
+        (notes.seen, end)
+    }
+
+    #[test]
+    fn keys_pause_step_and_change_the_rate() {
+        let at = |all: &[(&str, u64)]| all.iter().map(|(t, at)| ((*t).to_owned(), *at)).collect::<Vec<_>>();
+        // A pause of a second in the middle of a wait.
+        let (seen, _) = typed(false, &[(150, Key::Pause), (1150, Key::Pause)]);
+        assert_eq!(seen, at(&[("0", 0), ("1", 100), ("2", 1200), ("3", 1300)]));
+        // Started paused: one step, another one, then on.
+        let (seen, _) = typed(true, &[(500, Key::Next), (700, Key::Next), (900, Key::Pause)]);
+        assert_eq!(seen, at(&[("0", 500), ("1", 700), ("2", 1000), ("3", 1100)]));
+        let (seen, _) = typed(false, &[(100, Key::Faster(true)), (100, Key::Faster(false)), (100, Key::Faster(true))]);
+        assert_eq!(seen.iter().map(|(_, at)| *at).collect::<Vec<_>>(), [0, 100, 190, 281]);
+        let (seen, end) = typed(true, &[(20, Key::End { interrupted: true })]);
+        assert!(seen.is_empty() && end.interrupted);
     }
 
     #[test]

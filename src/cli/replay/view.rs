@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use comfy_table::{Cell, CellAlignment, Table, presets};
 
-use super::player::Part;
+use super::player::{Pace, Part};
 use crate::cli::output;
 use crate::clock::Mono;
 use crate::recording::messages::JointState;
@@ -27,6 +27,10 @@ const BAR: usize = 40;
 pub trait View {
     /// Takes a message; `now` is the time for redraws.
     fn show(&mut self, entry: &Entry, now: Mono) -> io::Result<()>;
+    /// Takes how fast it plays from now on.
+    fn pace(&mut self, _pace: &Pace) -> io::Result<()> {
+        Ok(())
+    }
     /// Ends the log, or one pass of a loop.
     fn end(&mut self) -> io::Result<()>;
 }
@@ -124,7 +128,7 @@ pub struct Live<W> {
     out: W,
     from: u64,
     to: u64,
-    rate: f64,
+    pace: Pace,
     at: u64,
     drawn_at: Option<Mono>,
     drawn_lines: usize,
@@ -142,7 +146,7 @@ impl<W: Write> Live<W> {
             out,
             from: part.from,
             to: part.to,
-            rate: part.rate,
+            pace: Pace::new(1.0, false),
             at: part.from,
             drawn_at: None,
             drawn_lines: 0,
@@ -206,7 +210,10 @@ impl<W: Write> Live<W> {
         let full = (at as f64 / whole.max(1) as f64 * BAR as f64) as usize;
         let full = full.min(BAR);
         let (at, whole) = (at as f64 * 1e-9, whole as f64 * 1e-9);
-        format!("[{}{}] {at:.1} / {whole:.1} s  ×{}", "=".repeat(full), " ".repeat(BAR - full), self.rate)
+        // 1.1, not 1.1000000000000001.
+        let rate = (self.pace.rate * 1e3).round() / 1e3;
+        let paused = if self.pace.paused { "  paused: space, →" } else { "" };
+        format!("[{}{}] {at:.1} / {whole:.1} s  ×{}{}", "=".repeat(full), " ".repeat(BAR - full), rate, paused)
     }
 
     fn draw(&mut self) -> io::Result<()> {
@@ -228,6 +235,11 @@ impl<W: Write> View for Live<W> {
             self.draw()?;
         }
         Ok(())
+    }
+
+    fn pace(&mut self, pace: &Pace) -> io::Result<()> {
+        self.pace = *pace;
+        self.draw()
     }
 
     fn end(&mut self) -> io::Result<()> {
@@ -310,7 +322,7 @@ mod tests {
 
     #[test]
     fn the_live_table_redraws_in_place() {
-        let part = Part { topics: vec![], from: 0, to: 2_000_000_000, rate: 1.0, looping: false };
+        let part = Part { topics: vec![], from: 0, to: 2_000_000_000, looping: false };
         let mut out = Vec::new();
         let mut view = Live::new(&mut out, &part, usize::MAX);
         view.show(&joints(0, &[std::f64::consts::PI, f64::NAN]), Mono(0)).unwrap();

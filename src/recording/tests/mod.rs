@@ -42,7 +42,7 @@ fn config(path: PathBuf) -> RecorderConfig {
         metadata: BTreeMap::from([("tick_rate".to_owned(), "100".to_owned())]),
         tcps: Default::default(),
         wall: WallOffset::of(Mono(1_000_000_000), WALL),
-        min_free: 0,
+        storage: Default::default(),
     }
 }
 
@@ -112,6 +112,8 @@ fn start(path: &Path, notices: &Notices) -> (Recorder, rtrb::Producer<Sample>, N
             Notice::Lost(samples) => format!("lost {samples}"),
             Notice::Unsynced(after) => format!("not synced after {after:?}"),
             Notice::Stopped(e) => e.to_string(),
+            Notice::Fault(Ok(path)) => format!("fault: {}", path.display()),
+            Notice::Fault(Err(e)) => format!("no log of a fault: {e}"),
         };
         notices.lock().unwrap().push(text);
     };
