@@ -8,8 +8,8 @@
 
 use std::sync::Arc;
 
-use crate::bodies::{Body, Frames, forward, point};
 use crate::block::{Block, Lanes};
+use crate::bodies::{Body, Frames, forward, point};
 use crate::cover::{Node, Tree};
 use crate::obstacle::{BoxCore, Core, CylinderCore, Obstacle, Placed, Squared};
 use crate::width::{Vectors, Width};

@@ -55,19 +55,13 @@ fn moved<B: Block>(parent: &Frames, joint: &Joint, q: &Lanes) -> Columns<B> {
     let origin = [origin[0].add(parent[3][0]), origin[1].add(parent[3][1]), origin[2].add(parent[3][2])];
     let position = B::load(q).mul_add(B::splat(joint.multiplier as f32), B::splat(joint.offset as f32));
     if joint.slides {
-        let slid = [
-            z[0].mul_add(position, origin[0]),
-            z[1].mul_add(position, origin[1]),
-            z[2].mul_add(position, origin[2]),
-        ];
+        let slid =
+            [z[0].mul_add(position, origin[0]), z[1].mul_add(position, origin[1]), z[2].mul_add(position, origin[2])];
         return [x, y, z, slid];
     }
     let (sin, cos) = sin_cos(position);
-    let turned_x = [
-        x[0].mul_add(cos, y[0].mul(sin)),
-        x[1].mul_add(cos, y[1].mul(sin)),
-        x[2].mul_add(cos, y[2].mul(sin)),
-    ];
+    let turned_x =
+        [x[0].mul_add(cos, y[0].mul(sin)), x[1].mul_add(cos, y[1].mul(sin)), x[2].mul_add(cos, y[2].mul(sin))];
     let turned_y = [
         x[0].neg_mul_add(sin, y[0].mul(cos)),
         x[1].neg_mul_add(sin, y[1].mul(cos)),

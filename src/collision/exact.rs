@@ -240,8 +240,8 @@ impl ExactChecker {
         best
     }
 
-    /// Returns the smallest distance, below `below` [m], of two things that can collide and move relative to each other,
-    /// at any of up to sixteen configurations; `None` if there is none.
+    /// Returns the smallest distance, below `below` [m], of two things that can collide and move relative to each
+    /// other, at any of up to sixteen configurations; `None` if there is none.
     pub fn closest(&mut self, configurations: &[Vec<f64>], below: f64) -> Option<Contact> {
         self.lanes.find_closer(configurations, below);
         let mut best: Option<Contact> = None;

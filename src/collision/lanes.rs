@@ -69,9 +69,10 @@ impl InLanes {
         }
     }
 
-    /// Fills `close` with the pairs of `pairs` that are not proven apart in the first `lanes` lanes; ends and returns the
-    /// pair if one surely touches. `half`: half of the length of each stretch, as a part of the motion; `reach`: the most
-    /// that each pair can approach on the whole motion, `pads`: the padding of each [m]; `likely` is compared first.
+    /// Fills `close` with the pairs of `pairs` that are not proven apart in the first `lanes` lanes; ends and returns
+    /// the pair if one surely touches. `half`: half of the length of each stretch, as a part of the motion; `reach`:
+    /// the most that each pair can approach on the whole motion, `pads`: the padding of each [m]; `likely` is compared
+    /// first.
     pub fn find(
         &mut self,
         (lanes, half): (usize, f64),

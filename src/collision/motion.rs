@@ -116,7 +116,8 @@ impl ExactChecker {
             std::mem::swap(&mut p.now, &mut p.next);
             p.next.clear();
         }
-        let (first, last) = (p.now.first().map_or(0.0, |piece| piece.start), p.now.last().map_or(1.0, |p| p.start + size));
+        let (first, last) =
+            (p.now.first().map_or(0.0, |piece| piece.start), p.now.last().map_or(1.0, |p| p.start + size));
         (last < 1.0 || self.first_touch(to).is_none())
             && (first > 0.0 || self.first_touch(from).is_none())
             && self.check_exactly(p, from, to, size, most, stop)
@@ -161,13 +162,15 @@ impl ExactChecker {
         None
     }
 
-    /// Returns whether anything touches in the middle of the pieces that have most pairs: shallow contacts, which covers
-    /// cannot find, are found before the pieces are many.
+    /// Returns whether anything touches in the middle of the pieces that have most pairs: shallow contacts, which
+    /// covers cannot find, are found before the pieces are many.
     fn any_touches(&mut self, p: &mut Pieces, from: &[f64], to: &[f64], size: f64) -> bool {
         let mut below = u32::MAX;
         for _ in 0..TRIES {
             let number = |piece: &&Piece| piece.last - piece.first;
-            let Some(worst) = p.now.iter().filter(|piece| number(piece) < below).max_by_key(number).copied() else { break };
+            let Some(worst) = p.now.iter().filter(|piece| number(piece) < below).max_by_key(number).copied() else {
+                break;
+            };
             below = worst.last - worst.first;
             p.place(from, to, worst.start + 0.5 * size);
             self.place(&p.q);

@@ -95,7 +95,8 @@ impl Padded {
         self.bare.is_free(q)
     }
 
-    /// Returns the smallest distance below `below` [m] at any of up to sixteen configurations, regardless of the padding.
+    /// Returns the smallest distance below `below` [m] at any of up to sixteen configurations, regardless of the
+    /// padding.
     pub fn closest(&mut self, configurations: &[Vec<f64>], below: f64) -> Option<Contact> {
         self.bare.closest(configurations, below)
     }

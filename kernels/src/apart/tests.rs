@@ -32,7 +32,8 @@ fn close(scene: &Scene, q: &Lanes, half: f32, reach: f64, pad: f64) -> (Option<u
     let mut found = Vec::new();
     let (reach, pads) = ([reach; 3], [pad; 3]);
     let q = std::slice::from_ref(q);
-    let stretches = Stretches { q, half, lanes: u16::MAX, reach: &reach, pads: &pads, likely: None, ends_at_touch: true };
+    let stretches =
+        Stretches { q, half, lanes: u16::MAX, reach: &reach, pads: &pads, likely: None, ends_at_touch: true };
     let touching = scene.close(&stretches, &[0, 1, 2], &mut Buffers::default(), &mut found);
     (touching, found)
 }

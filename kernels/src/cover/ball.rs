@@ -77,7 +77,8 @@ fn shallowest(at: Vector, planes: &[Plane]) -> (f64, Vector) {
 
 /// Returns a ball around balls: close to the smallest.
 pub(super) fn enclosing(balls: &[Ball]) -> Ball {
-    let (low, high) = bounds(balls.iter().flat_map(|b| [b.center.map(|x| x - b.radius), b.center.map(|x| x + b.radius)]));
+    let (low, high) =
+        bounds(balls.iter().flat_map(|b| [b.center.map(|x| x - b.radius), b.center.map(|x| x + b.radius)]));
     let mut at: Vector = std::array::from_fn(|i| 0.5 * (low[i] + high[i]));
     let mut best = Ball { center: at, radius: f64::INFINITY };
     let mut size = 0.25 * distance(low, high);

@@ -32,7 +32,13 @@ impl Cell {
     ///
     /// Whatever part of the solid is in the box, its extreme points are on its surface or corners of the box: a ball
     /// that contains the polygons and the corners that are inside contains the part.
-    pub fn new(polygons: Vec<Vec<Vector>>, low: Vector, high: Vector, planes: &[Plane], inside: Inside<'_>) -> Option<Self> {
+    pub fn new(
+        polygons: Vec<Vec<Vector>>,
+        low: Vector,
+        high: Vector,
+        planes: &[Plane],
+        inside: Inside<'_>,
+    ) -> Option<Self> {
         let corners = (0..8).map(|k| std::array::from_fn(|i| if k >> i & 1 == 1 { high[i] } else { low[i] }));
         let is_inside = |p: &Vector| match inside {
             Inside::Convex => planes.iter().all(|plane| plane.depth(*p) >= 0.0),
@@ -60,7 +66,11 @@ impl Cell {
         let at = 0.5 * (self.low[axis] + self.high[axis]);
         let half = |sign: f64| {
             let (mut low, mut high) = (self.low, self.high);
-            if sign > 0.0 { low[axis] = at } else { high[axis] = at }
+            if sign > 0.0 {
+                low[axis] = at
+            } else {
+                high[axis] = at
+            }
             let cut = self.polygons.iter().map(|polygon| cut(polygon, axis, at, sign));
             Self::new(cut.filter(|polygon| !polygon.is_empty()).collect(), low, high, planes, inside)
         };

@@ -237,7 +237,8 @@ const NONE: f64 = -1.0;
 /// Rounds a ball so that it contains the exact one, and the inner one so that it is contained.
 fn node(ball: &Ball, inner: f64) -> Node {
     let far = ball.center.iter().map(|x| x.abs()).sum::<f64>() + ball.radius;
-    let (radius, inner) = ((ball.radius + far * ROUNDING) as f32, if inner < 0.0 { NONE } else { inner - far * ROUNDING });
+    let (radius, inner) =
+        ((ball.radius + far * ROUNDING) as f32, if inner < 0.0 { NONE } else { inner - far * ROUNDING });
     Node { center: ball.center.map(|x| x as f32), radius, inner: inner as f32, first: 0, count: 0 }
 }
 

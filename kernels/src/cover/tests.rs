@@ -86,8 +86,13 @@ fn points_segments_and_joined_solids_are_covered() {
     assert!((0..=100).all(|i| covered(&segment, 0, [0.0, 0.0, 0.006 * f64::from(i) - 0.3])));
 
     // About x by a quarter turn, then moved; radii grow.
-    let place = Place { rotation: [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], translation: [1.0, 2.0, 3.0], radius: 0.01 };
-    let here = Place { rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], translation: [0.0; 3], radius: 0.0 };
+    let place = Place {
+        rotation: [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]],
+        translation: [1.0, 2.0, 3.0],
+        radius: 0.01,
+    };
+    let here =
+        Place { rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], translation: [0.0; 3], radius: 0.0 };
     let joined = Tree::join(&[(&cloud, place), (&segment, here), (&Tree::of_point(), place)]);
     assert!(points.iter().all(|p| covered(&joined, 0, [1.0 + p[0], 2.0 - p[2], 3.0 + p[1]])));
     assert!(covered(&joined, 0, [0.0, 0.0, 0.29]) && covered(&joined, 0, [1.0, 2.0, 3.0099]));

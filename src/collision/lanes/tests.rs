@@ -31,8 +31,7 @@ fn obstacles(random: &mut Random) -> Vec<Obstacle> {
         DAffine3::from_rotation_translation(DQuat::from_axis_angle(axis, place.x), place)
     };
     let frames: Vec<DAffine3> = (0..7).map(|_| at()).collect();
-    let points: Vec<DVec3> =
-        (0..300).map(|_| DVec3::new(random.unit(), random.unit(), random.unit()) * 0.3).collect();
+    let points: Vec<DVec3> = (0..300).map(|_| DVec3::new(random.unit(), random.unit(), random.unit()) * 0.3).collect();
     let shapes = [
         Solid::cuboid(DVec3::new(0.1, 0.2, 0.3), frames[0]),
         Solid::sphere(0.12, frames[1]),

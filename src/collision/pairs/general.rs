@@ -61,7 +61,9 @@ pub fn within(a: &Placed, b: &Placed, reach: f64) -> bool {
 
 /// Starts of GJK besides the direction between the shapes.
 const STARTS: [DVec3; 4] = [DVec3::X, DVec3::Y, DVec3::Z, DVec3::new(0.36, -0.48, 0.8)];
-/// A distance is believed if a direction separates the shapes by as much, less this [m]: GJK is less exact at curved surfaces.
+/// A distance is proven if a direction separates the shapes by as much, less this [m].
+const PROVEN: f64 = 1e-8;
+/// The same for the best of several: GJK is less exact at curved surfaces.
 const BELIEVED: f64 = 1e-5;
 
 /// Returns how far two convex shapes are apart along a direction: a lower bound of their distance [m].
@@ -70,27 +72,27 @@ fn separation(pose: &DPose3, a: &dyn SupportMap, b: &dyn SupportMap, direction: 
     n.dot(b.support_point(pose, -n) - a.local_support_point(n))
 }
 
-/// Returns the distance of two convex shapes [m]. parry's GJK ends with points that are not the closest when it makes no
-/// progress, mostly at parallel faces; then it starts again from elsewhere. A lower bound if none of its answers is
+/// Returns the distance of two convex shapes [m]. parry's GJK ends with points that are not the closest when it makes
+/// no progress, mostly at parallel faces; then it starts again from elsewhere. A lower bound if none of its answers is
 /// proven.
 fn convex_distance(pose: &DPose3, a: &dyn SupportMap, b: &dyn SupportMap) -> f64 {
-    let mut least: f64 = 0.0;
+    let (mut lower, mut upper): (f64, f64) = (0.0, f64::INFINITY);
     for start in std::iter::once((-pose.translation).try_normalize().unwrap_or(DVec3::X)).chain(STARTS) {
         let mut simplex = VoronoiSimplex::new();
         simplex.reset(CsoPoint::from_shapes(pose, a, b, start));
         match gjk::closest_points(pose, a, b, f64::MAX, true, &mut simplex) {
             GJKResult::Intersection => return 0.0,
             GJKResult::ClosestPoints(p, q, _) => {
-                let apart = separation(pose, a, b, q - p);
-                if apart >= p.distance(q) - BELIEVED {
-                    return p.distance(q);
+                lower = lower.max(separation(pose, a, b, q - p));
+                upper = upper.min(p.distance(q));
+                if lower >= upper - PROVEN {
+                    return upper;
                 }
-                least = least.max(apart);
             }
             GJKResult::Proximity(_) | GJKResult::NoIntersection(_) => {}
         }
     }
-    least
+    if lower >= upper - BELIEVED { upper } else { lower }
 }
 
 /// Returns whether two convex shapes are within `reach` [m]: GJK ends as soon as the distance is known to be below or

@@ -94,7 +94,8 @@ fn parallel_boxes_are_as_far_apart_as_they_are() {
             translation: turn * vector(&mut random, 0.2),
         };
         let (f, g) = (frame(), frame());
-        let mut half = || DVec3::new(random.between(0.002, 0.05), random.between(0.002, 0.05), random.between(0.002, 0.05));
+        let mut half =
+            || DVec3::new(random.between(0.002, 0.05), random.between(0.002, 0.05), random.between(0.002, 0.05));
         let (h, k) = (half(), half());
         if box_box::gap(&f, h, &g, k) <= 0.0 {
             continue;
