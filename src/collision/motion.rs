@@ -16,6 +16,9 @@ use super::report::Pair;
 const PARTS: usize = 4;
 /// Pieces on which nothing moves farther than this [m] are not split for lanes any longer: covers are not tighter.
 const LANES_END: f64 = 0.004;
+/// Pieces on which nothing moves farther than this [m] are also checked exactly where covers prove less than half of
+/// them free. Longer ones are not worth it: their parts are mostly proven next.
+const EXACT_BELOW: f64 = 0.032;
 /// Pieces that are checked for contacts exactly before all are split.
 const TRIES: usize = 3;
 
@@ -66,6 +69,15 @@ impl Pieces {
         }
     }
 
+    /// Splits all pieces into parts of a size; they keep their pairs.
+    fn split(&mut self, parts: usize, size: f64) {
+        for piece in &self.now {
+            self.next.extend((0..parts).map(|i| Piece { start: piece.start + i as f64 * size, ..*piece }));
+        }
+        std::mem::swap(&mut self.now, &mut self.next);
+        self.next.clear();
+    }
+
     /// Makes the pieces found the ones to check.
     fn advance(&mut self) {
         std::mem::swap(&mut self.now, &mut self.next);
@@ -95,6 +107,7 @@ impl ExactChecker {
         p.pairs_now.clear();
         p.now.extend((0..LANES).map(|i| Piece { start: i as f64 * size, first: 0, last: 0 }));
         loop {
+            let checked = p.now.len();
             if let Some(pair) = self.check_in_lanes(p, from, to, size) {
                 self.witness = Some(pair);
                 return false;
@@ -103,18 +116,26 @@ impl ExactChecker {
             if p.now.is_empty() {
                 return true;
             }
-            if stop.is_over() || self.any_touches(p, from, to, size) {
+            if stop.is_over() {
+                return false;
+            }
+            if most * size <= EXACT_BELOW && 2 * p.now.len() > checked {
+                // Covers prove little: contacts too shallow for them are found before the pieces are many.
+                if !self.check_middles(p, from, to, size, stop) {
+                    return false;
+                }
+                p.advance();
+                if p.now.is_empty() {
+                    return true;
+                }
+            } else if self.any_touches(p, from, to, size) {
                 return false;
             }
             if most * size <= LANES_END {
                 break;
             }
             size /= PARTS as f64;
-            for piece in &p.now {
-                p.next.extend((0..PARTS).map(|i| Piece { start: piece.start + i as f64 * size, ..*piece }));
-            }
-            std::mem::swap(&mut p.now, &mut p.next);
-            p.next.clear();
+            p.split(PARTS, size);
         }
         let (first, last) =
             (p.now.first().map_or(0.0, |piece| piece.start), p.now.last().map_or(1.0, |p| p.start + size));
@@ -188,36 +209,46 @@ impl ExactChecker {
     fn check_exactly(&mut self, p: &mut Pieces, from: &[f64], to: &[f64], whole: f64, most: f64, stop: &Stop) -> bool {
         let mut size = whole;
         while !p.now.is_empty() {
+            if !self.check_middles(p, from, to, size, stop) {
+                return false;
+            }
             // The last pieces are below the resolution.
-            let last = most * size <= self.resolution.motion;
-            for i in 0..p.now.len() {
-                let piece = p.now[i];
-                let middle = piece.start + 0.5 * size;
-                if stop.is_over() {
-                    return false;
-                }
-                p.place(from, to, middle);
-                self.place(&p.q);
-                let first = p.pairs_next.len() as u32;
-                for k in piece.first..piece.last {
-                    let pair = p.pairs_now[k as usize];
-                    match self.gap(pair as usize, 0.5 * size * p.reach[pair as usize]) {
-                        Gap::Far => {}
-                        Gap::Close => p.pairs_next.push(pair),
-                        Gap::Touch => {
-                            self.witness = Some(pair as usize);
-                            return false;
-                        }
-                    }
-                }
-                let end = p.pairs_next.len() as u32;
-                if end > first && !last {
-                    p.next.push(Piece { start: piece.start, first, last: end });
-                    p.next.push(Piece { start: middle, first, last: end });
-                }
+            if most * size <= self.resolution.motion {
+                return true;
             }
             p.advance();
             size *= 0.5;
+            p.split(2, size);
+        }
+        true
+    }
+
+    /// Finds the pieces, and their pairs, that are not proven free by an exact check of the middle; returns false at a
+    /// contact, and at the deadline.
+    fn check_middles(&mut self, p: &mut Pieces, from: &[f64], to: &[f64], size: f64, stop: &Stop) -> bool {
+        for i in 0..p.now.len() {
+            let piece = p.now[i];
+            if stop.is_over() {
+                return false;
+            }
+            p.place(from, to, piece.start + 0.5 * size);
+            self.place(&p.q);
+            let first = p.pairs_next.len() as u32;
+            for k in piece.first..piece.last {
+                let pair = p.pairs_now[k as usize];
+                match self.gap(pair as usize, 0.5 * size * p.reach[pair as usize]) {
+                    Gap::Far => {}
+                    Gap::Close => p.pairs_next.push(pair),
+                    Gap::Touch => {
+                        self.witness = Some(pair as usize);
+                        return false;
+                    }
+                }
+            }
+            let last = p.pairs_next.len() as u32;
+            if last > first {
+                p.next.push(Piece { start: piece.start, first, last });
+            }
         }
         true
     }

@@ -31,7 +31,7 @@ pub fn distance(a: &Placed, b: &Placed) -> f64 {
     }
     with_shape(a, |pa, sa| {
         with_shape(b, |pb, sb| match (sa.as_support_map(), sb.as_support_map()) {
-            (Some(ma), Some(mb)) => convex_distance(&pa.inv_mul(pb), ma, mb),
+            (Some(ma), Some(mb)) => convex_closest(&pa.inv_mul(pb), ma, mb).map_or(0.0, |found| found.distance()),
             _ => query::distance(pa, sa, pb, sb).map_or(0.0, |d| d.distance),
         })
     })
@@ -61,9 +61,9 @@ pub fn within(a: &Placed, b: &Placed, reach: f64) -> bool {
 
 /// Starts of GJK besides the direction between the shapes.
 const STARTS: [DVec3; 4] = [DVec3::X, DVec3::Y, DVec3::Z, DVec3::new(0.36, -0.48, 0.8)];
-/// A distance is proven if a direction separates the shapes by as much, less this [m].
-const PROVEN: f64 = 1e-8;
-/// The same for the best of several: GJK is less exact at curved surfaces.
+/// An answer of GJK is the distance if a direction separates the shapes by as much, less this [m].
+const PROVEN: f64 = 1e-6;
+/// The same for the best of several answers: at curved surfaces none is better.
 const BELIEVED: f64 = 1e-5;
 
 /// Returns how far two convex shapes are apart along a direction: a lower bound of their distance [m].
@@ -72,27 +72,62 @@ fn separation(pose: &DPose3, a: &dyn SupportMap, b: &dyn SupportMap, direction: 
     n.dot(b.support_point(pose, -n) - a.local_support_point(n))
 }
 
-/// Returns the distance of two convex shapes [m]. parry's GJK ends with points that are not the closest when it makes
-/// no progress, mostly at parallel faces; then it starts again from elsewhere. A lower bound if none of its answers is
-/// proven.
-fn convex_distance(pose: &DPose3, a: &dyn SupportMap, b: &dyn SupportMap) -> f64 {
-    let (mut lower, mut upper): (f64, f64) = (0.0, f64::INFINITY);
-    for start in std::iter::once((-pose.translation).try_normalize().unwrap_or(DVec3::X)).chain(STARTS) {
+/// Distance of two convex shapes, and where.
+#[derive(Debug, Clone, Copy)]
+struct Closest {
+    /// A direction that separates the shapes by as much has been found [m].
+    lower: f64,
+    /// Distance of the two points [m].
+    upper: f64,
+    a: DVec3,
+    b: DVec3,
+}
+
+impl Closest {
+    /// Returns the distance [m]; the lower bound if the points are not proven to be the closest.
+    fn distance(&self) -> f64 {
+        if self.lower >= self.upper - BELIEVED { self.upper } else { self.lower }
+    }
+
+    /// Improves this with the answer of GJK from a start; returns false if the shapes overlap.
+    fn improve(&mut self, pose: &DPose3, a: &dyn SupportMap, b: &dyn SupportMap, start: DVec3) -> bool {
         let mut simplex = VoronoiSimplex::new();
         simplex.reset(CsoPoint::from_shapes(pose, a, b, start));
         match gjk::closest_points(pose, a, b, f64::MAX, true, &mut simplex) {
-            GJKResult::Intersection => return 0.0,
+            GJKResult::Intersection => return false,
             GJKResult::ClosestPoints(p, q, _) => {
-                lower = lower.max(separation(pose, a, b, q - p));
-                upper = upper.min(p.distance(q));
-                if lower >= upper - PROVEN {
-                    return upper;
+                self.lower = self.lower.max(separation(pose, a, b, q - p));
+                if p.distance(q) < self.upper {
+                    (self.upper, self.a, self.b) = (p.distance(q), p, q);
                 }
             }
             GJKResult::Proximity(_) | GJKResult::NoIntersection(_) => {}
         }
+        true
     }
-    if lower >= upper - BELIEVED { upper } else { lower }
+}
+
+/// Returns the closest points of two convex shapes, in the frame of `a`; `None` if the shapes overlap. parry's GJK ends
+/// with points that are not the closest when it makes no progress, mostly at parallel faces; then it starts again from
+/// elsewhere, also with the shapes exchanged.
+fn convex_closest(pose: &DPose3, a: &dyn SupportMap, b: &dyn SupportMap) -> Option<Closest> {
+    let mut best = Closest { lower: 0.0, upper: f64::INFINITY, a: DVec3::ZERO, b: pose.translation };
+    if !best.improve(pose, a, b, (-pose.translation).try_normalize().unwrap_or(DVec3::X)) {
+        return None;
+    }
+    if best.lower >= best.upper - PROVEN {
+        return Some(best);
+    }
+    let back = pose.inverse();
+    let mut other = Closest { upper: f64::INFINITY, ..best };
+    for start in std::iter::once((-back.translation).try_normalize().unwrap_or(DVec3::X)).chain(STARTS) {
+        if !best.improve(pose, a, b, start) || !other.improve(&back, b, a, start) {
+            return None;
+        }
+    }
+    let lower = best.lower.max(other.lower);
+    let exchanged = Closest { lower, a: pose * other.b, b: pose * other.a, upper: other.upper };
+    Some(if other.upper < best.upper { exchanged } else { Closest { lower, ..best } })
 }
 
 /// Returns whether two convex shapes are within `reach` [m]: GJK ends as soon as the distance is known to be below or
@@ -104,7 +139,7 @@ fn convex_within(pose: &DPose3, a: &dyn SupportMap, b: &dyn SupportMap, reach: f
     match gjk::closest_points(pose, a, b, reach.max(0.0), false, &mut simplex) {
         GJKResult::NoIntersection(n) if separation(pose, a, b, n) > reach => false,
         // It may have ended without a result, or with an upper bound that is not the distance.
-        _ => convex_distance(pose, a, b) <= reach,
+        _ => convex_closest(pose, a, b).is_none_or(|found| found.distance() <= reach),
     }
 }
 
@@ -133,6 +168,17 @@ pub fn nearest(a: &Placed, b: &Placed) -> Nearest {
         let swapped = !matches!(a, Placed::Cloud(..));
         return if swapped { Nearest { a: found.b, b: found.a, ..found } } else { found };
     }
+    let apart = with_shape(a, |pa, sa| {
+        with_shape(b, |pb, sb| {
+            let found = convex_closest(&pa.inv_mul(pb), sa.as_support_map()?, sb.as_support_map()?)?;
+            Some(Nearest { distance: found.distance(), a: pa * found.a, b: pa * found.b })
+        })
+    });
+    apart.unwrap_or_else(|| nearest_of_any(a, b))
+}
+
+/// The same for cores that overlap, and for meshes.
+fn nearest_of_any(a: &Placed, b: &Placed) -> Nearest {
     let inside = holds(a, b) || holds(b, a);
     with_hull(a, |pa, sa| {
         with_hull(b, |pb, sb| {
