@@ -12,6 +12,7 @@ pub mod chain;
 pub mod cover;
 pub mod ik;
 pub mod obstacle;
+pub mod support;
 pub mod trig;
 mod width;
 

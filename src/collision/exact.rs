@@ -295,11 +295,12 @@ fn gap_of_cores(a: &Placed, b: &Placed, radii: f64, margin: f64) -> Gap {
             _ => Gap::Far,
         };
     }
-    if pairs::gap(a, b) > radii + margin {
+    // Most pairs are far.
+    if pairs::gap(a, b) > radii + margin || (margin > 0.0 && !pairs::within(a, b, radii + margin)) {
         Gap::Far
     } else if pairs::within(a, b, radii) {
         Gap::Touch
-    } else if margin > 0.0 && pairs::within(a, b, radii + margin) {
+    } else if margin > 0.0 {
         Gap::Close
     } else {
         Gap::Far

@@ -3,9 +3,11 @@
 
 use std::sync::{Arc, OnceLock};
 
+use dimos_kernels::Width;
 use dimos_kernels::cover::{Inside, Tree};
+use dimos_kernels::support::Vertices;
 use glamx::{DAffine3, DVec3};
-use parry3d_f64::shape::{ConvexPolyhedron, TriMesh, TriMeshFlags};
+use parry3d_f64::shape::{ConvexPolyhedron, SupportMap, TriMesh, TriMeshFlags};
 
 use super::cloud::Cloud;
 
@@ -60,6 +62,7 @@ pub enum Core {
 #[derive(Debug, Clone)]
 pub struct Hull {
     polyhedron: ConvexPolyhedron,
+    vertices: Vertices,
     middle: DVec3,
     half: DVec3,
 }
@@ -72,13 +75,22 @@ impl Hull {
             return Err(ShapeError::Mesh("a vertex is not finite".into()));
         }
         let polyhedron = ConvexPolyhedron::from_convex_hull(points).ok_or(flat)?;
+        let corners: Vec<[f64; 3]> = polyhedron.points().iter().map(|p| p.to_array()).collect();
+        let vertices = Vertices::new(&corners, Width::widest()).ok_or(ShapeError::Flat(points.len()))?;
         let (middle, half) = bounds(polyhedron.points().iter().copied());
-        Ok(Self { polyhedron, middle, half })
+        Ok(Self { polyhedron, vertices, middle, half })
     }
 
     /// Returns parry's representation.
     pub fn polyhedron(&self) -> &ConvexPolyhedron {
         &self.polyhedron
+    }
+}
+
+/// The same vertex as the polyhedron's, found several times faster.
+impl SupportMap for Hull {
+    fn local_support_point(&self, direction: DVec3) -> DVec3 {
+        self.vertices.farthest(direction.to_array()).into()
     }
 }
 

@@ -30,7 +30,7 @@ pub fn distance(a: &Placed, b: &Placed) -> f64 {
         return 0.0;
     }
     with_shape(a, |pa, sa| {
-        with_shape(b, |pb, sb| match (sa.as_support_map(), sb.as_support_map()) {
+        with_shape(b, |pb, sb| match (support(a, sa), support(b, sb)) {
             (Some(ma), Some(mb)) => convex_closest(&pa.inv_mul(pb), ma, mb).map_or(0.0, |found| found.distance()),
             _ => query::distance(pa, sa, pb, sb).map_or(0.0, |d| d.distance),
         })
@@ -47,11 +47,11 @@ pub fn within(a: &Placed, b: &Placed, reach: f64) -> bool {
         return true;
     }
     with_shape(a, |pa, sa| {
-        with_shape(b, |pb, sb| match (sa.as_support_map(), sb.as_support_map()) {
+        with_shape(b, |pb, sb| match (support(a, sa), support(b, sb)) {
             (Some(ma), Some(mb)) => convex_within(&pa.inv_mul(pb), ma, mb, reach),
             _ => match (sa.as_trimesh(), sb.as_trimesh()) {
-                (Some(mesh), _) => mesh_within(mesh, &pa.inv_mul(pb), sb, reach),
-                (_, Some(mesh)) => mesh_within(mesh, &pb.inv_mul(pa), sa, reach),
+                (Some(mesh), _) => mesh_within(mesh, &pa.inv_mul(pb), sb, support(b, sb), reach),
+                (_, Some(mesh)) => mesh_within(mesh, &pb.inv_mul(pa), sa, support(a, sa), reach),
                 // What parry does not support counts as touching.
                 _ => true,
             },
@@ -131,23 +131,25 @@ fn convex_closest(pose: &DPose3, a: &dyn SupportMap, b: &dyn SupportMap) -> Opti
 }
 
 /// Returns whether two convex shapes are within `reach` [m]: GJK ends as soon as the distance is known to be below or
-/// above. That it is above has to be proven by a direction.
+/// above. Both have to be proven, by points or by a direction.
 fn convex_within(pose: &DPose3, a: &dyn SupportMap, b: &dyn SupportMap, reach: f64) -> bool {
     let direction = pose.translation.try_normalize().unwrap_or(DVec3::X);
     let mut simplex = VoronoiSimplex::new();
     simplex.reset(CsoPoint::from_shapes(pose, a, b, direction));
     match gjk::closest_points(pose, a, b, reach.max(0.0), false, &mut simplex) {
+        GJKResult::Intersection => true,
         GJKResult::NoIntersection(n) if separation(pose, a, b, n) > reach => false,
+        GJKResult::Proximity(_) if simplex.project_origin_and_reduce().length() <= reach => true,
         // It may have ended without a result, or with an upper bound that is not the distance.
         _ => convex_closest(pose, a, b).is_none_or(|found| found.distance() <= reach),
     }
 }
 
 /// Returns whether a mesh is within `reach` [m] of another shape, whose pose is in the mesh's frame.
-fn mesh_within(mesh: &TriMesh, pose: &DPose3, other: &dyn Shape, reach: f64) -> bool {
+fn mesh_within(mesh: &TriMesh, pose: &DPose3, other: &dyn Shape, map: Option<&dyn SupportMap>, reach: f64) -> bool {
     let near = other.compute_aabb(pose).loosened(reach + BELIEVED);
     let mut near = mesh.bvh().intersect_aabb(&near).map(|i| mesh.triangle(i));
-    if let Some(map) = other.as_support_map() {
+    if let Some(map) = map {
         return near.any(|triangle| convex_within(pose, &triangle, map, reach));
     }
     let Some(other) = other.as_trimesh() else { return true };
@@ -170,7 +172,7 @@ pub fn nearest(a: &Placed, b: &Placed) -> Nearest {
     }
     let apart = with_shape(a, |pa, sa| {
         with_shape(b, |pb, sb| {
-            let found = convex_closest(&pa.inv_mul(pb), sa.as_support_map()?, sb.as_support_map()?)?;
+            let found = convex_closest(&pa.inv_mul(pb), support(a, sa)?, support(b, sb)?)?;
             Some(Nearest { distance: found.distance(), a: pa * found.a, b: pa * found.b })
         })
     });
@@ -231,6 +233,14 @@ fn with_shape<R>(placed: &Placed, f: impl FnOnce(&DPose3, &dyn Shape) -> R) -> R
         Placed::Hull(frame, hull) => f(&pose(frame), hull.polyhedron()),
         Placed::Mesh(frame, mesh) => f(&pose(frame), mesh.surface()),
         Placed::Cloud(frame, _) => f(&pose(frame), &Ball::new(0.0)),
+    }
+}
+
+/// Returns what GJK needs of a convex core; `shape` is parry's.
+fn support<'a>(placed: &Placed<'a>, shape: &'a dyn Shape) -> Option<&'a dyn SupportMap> {
+    match placed {
+        Placed::Hull(_, hull) => Some(*hull),
+        _ => shape.as_support_map(),
     }
 }
 
