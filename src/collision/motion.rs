@@ -16,9 +16,9 @@ use super::report::Pair;
 const PARTS: usize = 4;
 /// Pieces on which nothing moves farther than this [m] are not split for lanes any longer: covers are not tighter.
 const LANES_END: f64 = 0.004;
-/// Pieces on which nothing moves farther than this [m] are also checked exactly where covers prove less than half of
-/// them free. Longer ones are not worth it: their parts are mostly proven next.
-const EXACT_BELOW: f64 = 0.032;
+/// More pieces than these are all checked exactly where covers prove less than half of them free. Fewer are not worth
+/// it: their parts are mostly proven next.
+const MANY: usize = 24;
 /// Pieces that are checked for contacts exactly before all are split.
 const TRIES: usize = 3;
 
@@ -119,7 +119,7 @@ impl ExactChecker {
             if stop.is_over() {
                 return false;
             }
-            if most * size <= EXACT_BELOW && 2 * p.now.len() > checked {
+            if p.now.len() > MANY && 2 * p.now.len() > checked {
                 // Covers prove little: contacts too shallow for them are found before the pieces are many.
                 if !self.check_middles(p, from, to, size, stop) {
                     return false;
