@@ -130,7 +130,8 @@ def main():
             steps = max(1, math.ceil(np.linalg.norm(b - a) / STEP))
             for k in range(steps + 1):
                 looks += 1
-                q = a + (b - a) * (k / steps)
+                # The end itself: rounding may put it beyond a limit.
+                q = b if k == steps else a + (b - a) * (k / steps)
                 found = found or judge.touches(q) or [f"joint {i} outside" for i in judge.outside(q)]
         if found:
             touching += 1
