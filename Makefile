@@ -1,8 +1,12 @@
-# run install dist viewer check test test-fast · test-tools test-rerun test-lerobot deny mutants · bench bench-quick jitter soak
+# run install dist viewer check test test-fast · test-tools test-rerun test-lerobot deny mutants ·
+# bench bench-quick bench-page bench-share jitter soak
 
 PYTHON ?= python3
 # Most tests wait rather than compute. More at a time than this and whole runs no longer keep their time.
 export NEXTEST_TEST_THREADS ?= $(shell echo $$((2 * $$(nproc))))
+# Cargo features beside the default ones: `make test FEATURES=share`.
+export FEATURES ?=
+WITH := $(if $(FEATURES),--features $(FEATURES))
 READERS := tests/readers
 SYSTEM_TOOLS := cyclictest linux.uml insmod ip tc cansend chromium
 SYSTEM_PACKAGES := rt-tests user-mode-linux kmod iproute2 can-utils chromium
@@ -12,8 +16,9 @@ SYSTEM_PACKAGES := rt-tests user-mode-linux kmod iproute2 can-utils chromium
 TARGET := $(or $(CARGO_TARGET_DIR),target)
 # Where the stripped program, its debug file and the packages go.
 SHIPPED := $(TARGET)/shipped
-# Largest program that is shipped [bytes]: 12 MB, and 1.5 MB for the live view and the verbs of `dimos log`.
-LARGEST := 13500000
+# Largest program that is shipped [bytes]: 12 MB, 1.5 MB for the live view and the verbs of `dimos log`, and 12 MB for
+# the network.
+LARGEST := 25500000
 # For all users where root installs, else for this user.
 PREFIX ?= $(if $(filter 0,$(shell id -u)),/usr/local,$(HOME)/.local)
 # The shipped program contains equal functions once (Rust's own linker, which is the default on x86-64, does that),
@@ -33,7 +38,7 @@ PAGE := viewer/dist/index.html
 PAGE_SOURCES := $(wildcard viewer/*.json viewer/*.mjs) $(shell find viewer/src -type f 2>/dev/null)
 NODE := $(if $(wildcard viewer/package.json),$(shell command -v npm))
 
-.PHONY: run install dist shipped viewer viewer-if-possible check lint spelling licences test test-fast test-tools test-rerun test-lerobot deny mutants bench bench-quick jitter soak
+.PHONY: run install dist shipped viewer viewer-if-possible check lint spelling licences test test-fast test-tools test-rerun test-lerobot deny mutants bench bench-quick bench-page bench-share jitter soak
 
 # Builds the program to try it, not optimized, and starts the shipped blueprint; its arm is simulated. Ends with Ctrl-C.
 run: viewer-if-possible
@@ -52,7 +57,7 @@ dist: shipped
 # The optimized program without debug information, and its debug file.
 shipped: viewer
 	@echo "building dimos as it is shipped: several minutes" >&2
-	$(STRIP) CFLAGS="$(SMALL_ZSTD)" RUSTFLAGS="$(SMALL_LINK) $(SHORT_PATHS)" cargo build --profile dist --locked --bin dimos
+	$(STRIP) CFLAGS="$(SMALL_ZSTD)" RUSTFLAGS="$(SMALL_LINK) $(SHORT_PATHS)" cargo build --profile dist --locked --features share --bin dimos
 	packaging/strip.sh $(TARGET)/dist/dimos $(SHIPPED)
 	@size=$$(stat -c %s $(SHIPPED)/dimos); [ $$size -le $(LARGEST) ] || \
 	{ echo "error: the program has $$size bytes (limit $(LARGEST))" >&2; exit 1; }
@@ -77,7 +82,7 @@ check: lint spelling licences
 
 lint:
 	cargo fmt --check
-	cargo clippy --all-targets --locked -- -D warnings
+	cargo clippy --all-targets --locked $(WITH) -- -D warnings
 	cargo clippy --no-default-features --locked -- -D warnings
 
 spelling:
@@ -95,10 +100,10 @@ deny:
 # Installs nothing: tests whose tools are missing are skipped.
 test: viewer-if-possible
 	@[ -e .venv/readers-installed ] || echo "note: some tests will be skipped; make test-tools installs what they need"
-	cargo test --locked --doc
-	@if ! cargo nextest --version >/dev/null 2>&1; then cargo test --locked --lib --bins --tests; \
+	cargo test --locked $(WITH) --doc
+	@if ! cargo nextest --version >/dev/null 2>&1; then cargo test --locked $(WITH) --lib --bins --tests; \
 	elif command -v $(PYTHON) >/dev/null; then $(PYTHON) tests/suite.py; \
-	else cargo nextest run --locked; \
+	else cargo nextest run --locked $(WITH); \
 	fi
 
 # The logic, in a minute: no run of the program, no vendor's tool.
@@ -155,16 +160,26 @@ bench:
 # Starts every benchmark in a form of a few seconds, without optimization: to see that each still runs. Fails where a part
 # of one does not; its figures mean nothing.
 bench-quick:
-	cargo bench --locked --profile dev --bench control --bench jitter --bench planning --bench recorder --bench rpc --bench verify \
-	--bench wire -- --quick
+	cargo bench --locked $(WITH) --profile dev --bench control --bench jitter --bench planning --bench recorder --bench rpc --bench verify \
+	--bench wire $(if $(findstring share,$(FEATURES)),--bench share) -- --quick
+
+# How soon the page shows an arm in Chromium, its script time per frame with four arms, the processor time of its
+# server, and the lateness of the tick with and without a page. ROUNDS=1: a quick one.
+bench-page: viewer
+	cargo build --release --locked --bin dimos
+	DIMOS=$(abspath $(TARGET))/release/dimos node viewer/tests/bench.mjs
+
+# What a run on the network costs and how fast it is, over the loopback interface. PART=stops: one part of it.
+bench-share:
+	cargo bench --locked --features share --bench share -- $(PART)
 
 # Lateness of the tick beside cyclictest.
 jitter:
 	cargo bench --locked --bench jitter
 
 # Arms idle and moving beside eight busy processes for half an hour, with and without real-time permission, and runs that
-# are stopped and continued 200 times: no arm may be held by that. Then an hour of the page of the live view. Three and a
-# half hours on a machine without other work.
+# are stopped and continued 200 times: no arm may be held by that. A million targets that lead arms into contact: nothing
+# may touch. Then an hour of the page of the live view. Three and a half hours on a machine without other work.
 soak: viewer-if-possible
 	DIMOS_SOAK=1800 cargo test --release --locked --test realtime stalls_soak -- --nocapture --test-threads 1
 	DIMOS_SOAK=120 DIMOS_SOAK_ALL=1 cargo test --release --locked --test realtime stalls_soak -- --nocapture --test-threads 1
@@ -173,4 +188,5 @@ soak: viewer-if-possible
 	DIMOS_REPEATS=20 cargo test --release --locked --test realtime faults:: -- --nocapture --test-threads 1
 	DIMOS_JOBS=1000 cargo test --locked --test process jobs::picks -- --nocapture
 	DIMOS_BRAKING=1000 cargo test --locked --test logic braking
+	DIMOS_GUARD_TARGETS=1000000 cargo test --release --locked --test logic guard::adversarial -- --nocapture
 	DIMOS_PAGE_SOAK=60 cargo test --locked --test peers several_arms -- --nocapture

@@ -68,6 +68,8 @@ pub mod blueprint;
 
 pub mod view;
 
+pub mod share;
+
 pub mod runtime;
 
 pub mod replay;

@@ -78,7 +78,9 @@ def failures():
 
 
 def nextest(arguments):
-    return subprocess.run(["cargo", "nextest", "run", "--locked", *arguments]).returncode
+    features = os.environ.get("FEATURES")
+    chosen = ["--features", features] if features else []
+    return subprocess.run(["cargo", "nextest", "run", "--locked", *chosen, *arguments]).returncode
 
 
 def main():

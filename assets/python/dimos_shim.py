@@ -12,10 +12,11 @@ MOTIONS = ["write_gripper_position", "write_cartesian_position"]
 INSTEAD = {"activate": ("write_enable", [True]), "deactivate": ("write_stop", [])}  # for adapters without these methods
 DISABLED, MISSING = "it stopped on its own or is not enabled: enable it first", (ModuleNotFoundError, AttributeError)
 
-def control_modes():  # of dimos; where that is not installed, an object replaces what adapters import from it
+def control_modes():  # of dimos; objects replace what adapters of the guide import from it and it lacks, or all of it
     name, bag = "dimos.hardware.manipulators", argparse.Namespace
     with contextlib.suppress(ImportError):
-        return importlib.import_module(name + ".spec").ControlMode
+        vars(spec := importlib.import_module(name + ".spec")).setdefault("JointLimits", bag)  # elsewhere since 0.0.15
+        return spec.ControlMode
     modes = "position servo_position velocity torque cartesian cartesian_velocity impedance".split()
     spec = bag(ControlMode=enum.Enum("ControlMode", {mode.upper(): mode for mode in modes}), ManipulatorInfo=bag,
                JointLimits=bag, ManipulatorAdapter=object, AdapterRegistry=object)

@@ -1,7 +1,8 @@
 //! `make bench`: cost of a tick and of a run. Prints and judges figures; no figure fails it.
-//! `cargo bench --bench control -- ticks arms tasks start runs` runs only the named parts.
+//! `cargo bench --bench control -- ticks arms tasks guard start runs` runs only the named parts.
 
 mod bed;
+mod guard;
 mod live;
 #[path = "../support/mod.rs"]
 #[allow(dead_code, reason = "shared with the other benchmark")]
@@ -29,8 +30,8 @@ fn main() -> ExitCode {
     // As in a run: memory locked, deep idle states disabled, if permitted.
     let (_grants, _hold) = dimos::rt::host::prepare_process(true);
     type Section = (&'static str, fn(Effort));
-    let sections: [Section; 5] =
-        [("ticks", ticks), ("arms", arms), ("tasks", task_types), ("start", start), ("runs", runs)];
+    let sections: [Section; 6] =
+        [("ticks", ticks), ("arms", arms), ("tasks", task_types), ("guard", guarded), ("start", start), ("runs", runs)];
     let named: Vec<String> = std::env::args().collect();
     let all = sections.iter().all(|(name, _)| !named.iter().any(|n| n == name));
     for (_, section) in sections.iter().filter(|(name, _)| all || named.iter().any(|n| n == name)) {
@@ -116,6 +117,26 @@ fn task_types(effort: Effort) {
         rows.push(Measure::new(format!("{name}, p99"), "µs", micros(&alone, 0.99)));
     }
     print("Coordinator::tick by type of task, free-running", &rows);
+}
+
+fn guarded(effort: Effort) {
+    let ticks = effort.of(1_000, 20_000);
+    let mut rows = Vec::new();
+    for (name, guarded, streams) in [
+        ("without a guard, random poses", false, guard::Streams::Random),
+        ("random poses", true, guard::Streams::Random),
+        ("pushing at each other", true, guard::Streams::Push),
+    ] {
+        let (alone, stops): (Vec<Ticks>, Vec<usize>) =
+            (0..effort.of(1, 5)).map(|_| guard::ticks(guarded, streams, ticks)).unzip();
+        for (quantile, text) in [(0.5, "p50"), (0.95, "p95"), (0.99, "p99")] {
+            let row = Measure::new(format!("{name}, {text}"), "µs", micros(&alone, quantile));
+            rows.push(if guarded && quantile == 0.99 { row.goal(Goal::AtMost(50.0)) } else { row });
+        }
+        let stops = stops.iter().map(|stops| *stops as f64).collect();
+        rows.push(Measure::new(format!("{name}, stops of arms"), "", stops));
+    }
+    print("Coordinator::tick with the collision guard, two 7-joint arms, 10 000 points, streams, free-running", &rows);
 }
 
 fn start(effort: Effort) {

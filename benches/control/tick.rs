@@ -220,6 +220,7 @@ impl World {
             samples: sample_in,
             arm_views,
             task_views: task_view_in,
+            guard: None,
             source: dimos::control::pace::Source::Host,
             pulse: pulse.clone(),
         };

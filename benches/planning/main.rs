@@ -1,10 +1,11 @@
 //! Planning times over a file of problems.
 //!
-//! `cargo bench --bench planning -- --problems FILE.jsonl --urdf FILE [--srdf FILE] [--package NAME=DIR]
-//! [--level exact] [--shapes true|vamp] [--seed N] [--limit N] [--out FILE.json]`; `--ik LINK --urdf FILE` and
-//! `--timing` measure only these parts.
+//! `cargo bench --bench planning -- --problems FILE.jsonl --urdf FILE [--srdf FILE] [--package NAME=DIR] [--level
+//! fast|certified|exact] [--shapes true|vamp] [--seed N] [--limit N] [--rounds N] [--refine MS] [--paths-only] [--peer
+//! PROGRAM [--peer-range RAD]] [--out FILE.json]`; `--ik LINK --urdf FILE` and `--timing` measure only these parts.
 
 mod parts;
+mod peer;
 mod problems;
 
 #[path = "../support/machine.rs"]
@@ -24,6 +25,7 @@ use std::time::{Duration, Instant};
 
 use clap::Parser;
 use dimos::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
+use dimos::planning::level::Level;
 use dimos::planning::path_planner::{Plan, PlanError, PlanSettings, plan};
 use dimos::planning::timing::{TimingSettings, bounds, time};
 use problems::{Arm, Problem, Shapes, load, packages};
@@ -44,9 +46,18 @@ struct Arguments {
     /// Folder of `package://NAME`
     #[arg(long, value_name = "NAME=DIR")]
     package: Vec<String>,
-    /// Collision checker
-    #[arg(long, default_value = "exact")]
-    level: Level,
+    /// How motions are checked
+    #[arg(long, default_value = "certified")]
+    level: LevelName,
+    /// Rounds over all problems; the shortest times of each problem count
+    #[arg(long, default_value_t = 1)]
+    rounds: usize,
+    /// Planner to compare with, built from VAMP: called as `PROGRAM problems.txt REPEATS RANGE out.json` in each round
+    #[arg(long, value_name = "PROGRAM")]
+    peer: Option<PathBuf>,
+    /// Range of the peer's search [rad]
+    #[arg(long, value_name = "RAD", default_value_t = 1.0)]
+    peer_range: f64,
     /// Geometry of cylinders
     #[arg(long, default_value = "true")]
     shapes: Shapes,
@@ -65,6 +76,12 @@ struct Arguments {
     /// Also solve random poses of this link
     #[arg(long, value_name = "LINK")]
     ik: Option<String>,
+    /// Refine each path for this long [ms]
+    #[arg(long, value_name = "MS", default_value_t = 0)]
+    refine: u64,
+    /// Leave out the timing of the paths
+    #[arg(long)]
+    paths_only: bool,
     /// Also time random paths
     #[arg(long)]
     timing: bool,
@@ -77,9 +94,23 @@ struct Arguments {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-enum Level {
-    /// Every solid against every other, in double precision, with continuous motion checks.
+enum LevelName {
+    /// At samples, with covers; nothing is proven.
+    Fast,
+    /// Searched at samples, then proven free.
+    Certified,
+    /// Every edge of the search is proven.
     Exact,
+}
+
+impl From<LevelName> for Level {
+    fn from(name: LevelName) -> Self {
+        match name {
+            LevelName::Fast => Self::Fast,
+            LevelName::Certified => Self::Certified,
+            LevelName::Exact => Self::Exact,
+        }
+    }
 }
 
 /// Result of one problem; empty fields if not solved.
@@ -96,6 +127,8 @@ struct Row {
     path: Option<Vec<Vec<f64>>>,
     /// Processor time of this thread: `total_us` on an idle machine.
     cpu_us: Option<f64>,
+    /// Processor time of the preparation of the scene: not in the other times.
+    setup_us: f64,
     checks: Option<u64>,
     timing_us: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -106,6 +139,22 @@ struct Row {
     /// Time from the timeout to the planner's return.
     #[serde(skip)]
     late_us: Option<f64>,
+}
+
+impl Row {
+    /// Keeps the shorter of the times of two rounds.
+    fn keep_shortest(&mut self, again: &Self) {
+        self.setup_us = self.setup_us.min(again.setup_us);
+        let times = [
+            (&mut self.plan_us, again.plan_us),
+            (&mut self.simplify_us, again.simplify_us),
+            (&mut self.total_us, again.total_us),
+            (&mut self.cpu_us, again.cpu_us),
+        ];
+        for (time, again) in times {
+            *time = time.zip(again).map(|(a, b)| a.min(b)).or(*time);
+        }
+    }
 }
 
 fn main() -> ExitCode {
@@ -139,8 +188,24 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
     let Some(problems) = &arguments.problems else { return Ok(()) };
     let problems = load(problems, arguments.limit)?;
     println!("loaded    {} problems and {} in {:.0?}", problems.len(), arm.model().name, began.elapsed());
-    let rows = problems.iter().map(|p| solve(&arm, p, arguments)).collect::<Result<Vec<_>, _>>()?;
-    report(&rows, &arguments.level);
+    let peer = peer::Peer::of(arguments.peer.as_deref(), &problems, arguments.peer_range)?;
+    let mut rows: Vec<Row> = Vec::new();
+    for round in 0..arguments.rounds.max(1) {
+        let again = problems.iter().map(|p| solve(&arm, p, arguments)).collect::<Result<Vec<_>, _>>()?;
+        if round == 0 {
+            rows = again;
+        } else {
+            rows.iter_mut().zip(again).for_each(|(row, again)| row.keep_shortest(&again));
+        }
+        if let Some(peer) = &peer {
+            peer.run()?;
+        }
+    }
+    report(&rows, arguments.level);
+    match &peer {
+        Some(peer) => peer.report(&rows),
+        None => println!("peer      SKIPPED: no program of VAMP is given with --peer"),
+    }
     if let Some(out) = &arguments.out {
         std::fs::write(out, serde_json::to_string(&serde_json::json!({ "rows": rows }))?)?;
         println!("wrote     {}", out.display());
@@ -152,16 +217,25 @@ fn solve(arm: &Arm, problem: &Problem, arguments: &Arguments) -> Result<Row, Box
     let kinematics = Arc::new(arm.kinematics(problem)?);
     let scene = arm.scene(&kinematics, problem, arguments.shapes)?;
     let (start, goal) = problem.ends();
-    let (began, cpu) = (Instant::now(), cpu_time());
+    let cpu = cpu_time();
     let mut checker = ExactChecker::new(scene, Resolution::default());
-    let settings = PlanSettings { seed: arguments.seed, ..PlanSettings::default() };
+    let setup = cpu_time().saturating_sub(cpu);
+    let settings = PlanSettings {
+        seed: arguments.seed,
+        level: arguments.level.into(),
+        refine: if arguments.refine > 0 { u32::MAX } else { 0 },
+        refine_time: Some(Duration::from_millis(arguments.refine)),
+        ..PlanSettings::default()
+    };
+    let (began, cpu) = (Instant::now(), cpu_time());
     let stop = Stop::new(Some(began + Duration::from_secs_f64(arguments.timeout)), None);
     let found = plan(&mut checker, start, &[goal.to_vec()], &settings, &stop);
     let (total, cpu) = (began.elapsed(), cpu_time().saturating_sub(cpu));
     let timeout = matches!(found, Err(PlanError::Timeout(_)));
     let mut row = row(problem, found, total, cpu);
+    row.setup_us = setup.as_secs_f64() * 1e6;
     row.late_us = timeout.then_some((total.as_secs_f64() - arguments.timeout) * 1e6);
-    if let Some(path) = &row.path {
+    if let Some(path) = row.path.as_ref().filter(|_| !arguments.paths_only) {
         let bounds = bounds(kinematics.names(), kinematics.limits())?;
         let free = |a: &[f64], b: &[f64]| checker.motion_is_free(a, b, &Stop::never());
         let began = Instant::now();
@@ -189,6 +263,7 @@ fn row(problem: &Problem, found: Result<Plan, PlanError>, total: Duration, cpu: 
             cost: Some(plan.length),
             duration_s: None,
             cpu_us: Some(us(cpu)),
+            setup_us: 0.0,
             checks: Some(plan.checks),
             timing_us: None,
             path: Some(plan.path),
@@ -212,6 +287,7 @@ fn row(problem: &Problem, found: Result<Plan, PlanError>, total: Duration, cpu: 
                 duration_s: none,
                 path: None,
                 cpu_us: None,
+                setup_us: 0.0,
                 checks: None,
                 timing_us: None,
                 why,
@@ -222,7 +298,7 @@ fn row(problem: &Problem, found: Result<Plan, PlanError>, total: Duration, cpu: 
     }
 }
 
-fn report(rows: &[Row], level: &Level) {
+fn report(rows: &[Row], level: LevelName) {
     let mut families: Vec<&str> = rows.iter().map(|r| r.problem.as_str()).collect();
     families.dedup();
     println!(
@@ -268,10 +344,18 @@ fn report(rows: &[Row], level: &Level) {
         println!("{} ran out of time, and ended at most {worst:.2} ms after that", late.len());
     }
     println!("solved / solvable / all; solvable: start and goal are inside the limits and collision-free");
+    let costs: Vec<f64> = rows.iter().filter_map(|r| r.cost).collect();
+    println!("cost, mean over all solved: {:.3} rad", costs.iter().sum::<f64>() / costs.len().max(1) as f64);
     println!(
         "\ntiming, re-checks included: median {:.3} ms, p95 {:.3} ms",
         quantile(timing.clone(), 0.5),
         quantile(timing, 0.95)
+    );
+    let setup: Vec<f64> = rows.iter().map(|r| r.setup_us / 1e3).collect();
+    println!(
+        "scene prepared, not in these times: median {:.3} ms, max {:.3} ms",
+        quantile(setup.clone(), 0.5),
+        quantile(setup, 1.0)
     );
     let mut checks: Vec<f64> = rows.iter().filter_map(|r| r.checks).map(|n| n as f64).collect();
     checks.sort_by(f64::total_cmp);

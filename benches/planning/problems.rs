@@ -147,6 +147,27 @@ impl Arm {
 }
 
 impl Problem {
+    /// Returns it in the text format of VAMP's program: lengths [m], angles about x, y, z [rad]. As in VAMP, cylinders
+    /// are capsules, and boxes in the family `box`.
+    pub fn text(&self) -> Result<String, Box<dyn Error>> {
+        let words = |values: &[f64]| values.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
+        let mut text = format!("P {} {} {} {}\n", self.problem, self.index, words(&self.start), words(&self.goal));
+        for thing in &self.obstacles {
+            let (a, b, c) = DQuat::from_array(thing.quat_xyzw).normalize().to_euler(glamx::EulerRot::XYZ);
+            let place = format!("{} {}", words(&thing.position), words(&[a, b, c]));
+            let line = match (thing.kind.as_str(), thing.size.as_slice()) {
+                ("sphere", [r]) => format!("S {place} {r}"),
+                ("box", size) => format!("B {place} {}", words(&size.iter().map(|s| s / 2.0).collect::<Vec<_>>())),
+                ("cylinder", [r, l]) if self.problem == "box" => format!("B {place} {}", words(&[*r, *r, l / 2.0])),
+                ("cylinder", [r, l]) => format!("C {place} {r} {l}"),
+                (kind, _) => return Err(format!("VAMP has no {kind:?}").into()),
+            };
+            text += &line;
+            text.push('\n');
+        }
+        Ok(text)
+    }
+
     /// Returns its start and goal.
     pub fn ends(&self) -> (&[f64], &[f64]) {
         (&self.start, &self.goal)

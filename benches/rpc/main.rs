@@ -1,7 +1,9 @@
 //! `make bench`: cost of talking to a run: a stop during a flood of requests, the round trip, and the effect of readers
-//! on the tick, and what `dimos proxy` adds. Prints and judges figures; no figure fails it. `cargo bench --bench rpc --
-//! stops` measures stops only, `-- proxy` the proxy.
+//! on the tick, what `dimos proxy` adds, and plans from request to result. Prints and judges figures; no figure fails
+//! it. `cargo bench --bench rpc -- stops` measures stops only; the other parts: `proxy plans worlds round-trip readers
+//! python`.
 
+mod plans;
 mod proxy;
 mod stops;
 #[path = "../support/mod.rs"]
@@ -33,9 +35,11 @@ fn main() -> ExitCode {
     let effort = Effort::from_environment();
     println!("\ndimos: cost of talking to a run{}\n", effort.of(" (quick)", ""));
     machine::print();
-    let parts: [Part; 5] = [
+    let parts: [Part; 7] = [
         ("stops", stops::measure),
         ("proxy", proxy::measure),
+        ("plans", plans::measure),
+        ("worlds", plans::worlds),
         ("round-trip", round_trip),
         ("readers", readers),
         ("python", python),

@@ -26,9 +26,14 @@ pub struct LiveRun {
 impl LiveRun {
     /// Starts `dimos run BLUEPRINT` with further arguments, without waiting.
     pub fn start(blueprint: &str, arguments: &[&str]) -> std::io::Result<Self> {
+        Self::named(blueprint, NAME, arguments)
+    }
+
+    /// Same, with a name of its own.
+    pub fn named(blueprint: &str, name: &str, arguments: &[&str]) -> std::io::Result<Self> {
         let home = tempfile::tempdir()?;
         let mut command = Command::new(env!("CARGO_BIN_EXE_dimos"));
-        command.args(["run", blueprint, "--name", NAME, "--record"]).arg(home.path().join("log.mcap")).args(arguments);
+        command.args(["run", blueprint, "--name", name, "--record"]).arg(home.path().join("log.mcap")).args(arguments);
         command.env("XDG_RUNTIME_DIR", home.path()).env("XDG_STATE_HOME", home.path());
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
         let started = Instant::now();
@@ -58,7 +63,7 @@ impl LiveRun {
             if let Some(status) = self.child.try_wait().map_err(|e| e.to_string())? {
                 return Err(format!("the run ended during startup: {status}"));
             }
-            match Client::find(&folder, Some(NAME)) {
+            match Client::find(&folder, None) {
                 Ok(client) => return Ok(client),
                 Err(e) if self.started.elapsed() > UP_LIMIT => return Err(e.to_string()),
                 Err(_) => std::thread::sleep(Duration::from_millis(5)),

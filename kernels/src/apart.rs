@@ -8,8 +8,8 @@
 
 use std::sync::Arc;
 
-use crate::block::{Block, Lanes};
-use crate::bodies::{Body, Frames, forward, point};
+use crate::block::{Block, Lanes, Portable};
+use crate::bodies::{Body, Frames, Prepared, forward, point};
 use crate::cover::{Node, Tree};
 use crate::obstacle::{BoxCore, Core, CylinderCore, Obstacle, Placed, Squared};
 use crate::width::{Vectors, Width};
@@ -22,7 +22,8 @@ const ROUNDING: (f64, f64) = (1e-5, 4e-6);
 const VISITS: usize = 48;
 /// A ball is good enough if it is outside of its solid by no more than this part of the motion on half a stretch.
 const FINE: f32 = 0.5;
-/// Most balls that wait for their turn: each visit removes one and adds two.
+/// Most balls that wait for their turn: each visit removes one and adds two. Trees are not deeper, so that it also
+/// holds for more visits.
 const STACK: usize = VISITS + 2;
 
 /// A link: its cover, carried by a body.
@@ -47,7 +48,7 @@ pub enum Pair {
 
 /// What is compared with a link.
 #[derive(Debug, Clone, Copy)]
-enum Other {
+pub(crate) enum Other {
     Link(usize),
     /// Core and radius.
     Box(BoxCore, f32),
@@ -59,22 +60,25 @@ enum Other {
 
 /// A pair, prepared.
 #[derive(Debug, Clone, Copy)]
-struct Compared {
-    link: usize,
-    other: Other,
+pub(crate) struct Compared {
+    pub link: usize,
+    pub other: Other,
+    /// Index of the obstacle, if it is one.
+    pub obstacle: Option<usize>,
     /// Largest error of the distance [m].
-    rounding: f32,
+    pub rounding: f32,
 }
 
 /// Robots and obstacles, prepared for lanes.
 #[derive(Debug, Clone)]
 pub struct Scene {
-    bodies: Vec<Body>,
-    links: Vec<Link>,
-    trees: Vec<Arc<Tree>>,
-    pairs: Vec<Compared>,
-    variables: usize,
-    width: Width,
+    pub(crate) bodies: Vec<Body>,
+    pub(crate) prepared: Prepared,
+    pub(crate) links: Vec<Link>,
+    pub(crate) trees: Vec<Arc<Tree>>,
+    pub(crate) pairs: Vec<Compared>,
+    pub(crate) variables: usize,
+    pub(crate) width: Width,
 }
 
 /// Sixteen stretches of motion.
@@ -142,16 +146,33 @@ impl Scene {
             .map(|pair| match *pair {
                 Pair::Links(a, b) => {
                     assert!(a < links.len() && b < links.len(), "a pair has two links");
-                    Compared { link: a, other: Other::Link(b), rounding: rounding(links[a].extent, links[b].extent) }
+                    let rounding = rounding(links[a].extent, links[b].extent);
+                    Compared { link: a, other: Other::Link(b), obstacle: None, rounding }
                 }
                 Pair::Obstacle(link, obstacle) => {
                     assert!(link < links.len(), "a pair has a link");
                     let rounding = rounding(links[link].extent, obstacles[obstacle].extent());
-                    Compared { link, other: others[obstacle], rounding }
+                    Compared { link, other: others[obstacle], obstacle: Some(obstacle), rounding }
                 }
             })
             .collect();
-        Self { bodies, links, trees, pairs, variables, width }
+        Self { prepared: Prepared::new(&bodies), bodies, links, trees, pairs, variables, width }
+    }
+
+    /// Returns the box around an obstacle in the world: its lowest and highest corner [m], rounded outwards.
+    pub(crate) fn bounds(&self, other: &Other) -> ([f32; 3], [f32; 3]) {
+        match other {
+            Other::Box(core, radius) => core.placed.bounds(core.half, *radius),
+            Other::Cylinder(core, radius) => core.placed.bounds([core.radius, core.radius, core.half], *radius),
+            Other::Cover(body, tree, radius) => match (&self.bodies[*body], self.trees[*tree].nodes.first()) {
+                (Body::Fixed(frame), Some(root)) => {
+                    let placed = Placed::new(frame);
+                    placed.moved(root.center).bounds([0.0; 3], root.radius + radius)
+                }
+                _ => ([f32::NEG_INFINITY; 3], [f32::INFINITY; 3]),
+            },
+            Other::Link(_) => ([f32::NEG_INFINITY; 3], [f32::INFINITY; 3]),
+        }
     }
 
     /// Adds the pairs that are not proven apart to `close`, each with its lanes as bits; considers only `pairs`. Ends and
@@ -175,7 +196,7 @@ impl Scene {
             // SAFETY: see above.
             #[cfg(target_arch = "x86_64")]
             Vectors::Avx2 => unsafe { avx2(self, stretches, pairs, buffers, close) },
-            Vectors::Portable => find::<crate::block::Portable>(self, stretches, pairs, buffers, close),
+            Vectors::Portable => find::<Portable>(self, stretches, pairs, buffers, close),
         }
     }
 }
@@ -225,14 +246,14 @@ fn find<B: Block>(
     buffers: &mut Buffers,
     close: &mut Vec<(u32, u16)>,
 ) -> Option<u32> {
-    forward::<B>(&scene.bodies, stretches.q, &mut buffers.frames);
+    forward::<B>(&scene.prepared, stretches.q, &mut buffers.frames);
     let frames = &buffers.frames;
     let mut current = usize::MAX;
     let mut center = [B::splat(0.0); 3];
     for i in 0..=pairs.len() {
         let index = if i == 0 { stretches.likely } else { Some(pairs[i - 1]) };
         let Some(index) = index else { continue };
-        let Compared { link: at, other, rounding } = &scene.pairs[index as usize];
+        let Compared { link: at, other, rounding, .. } = &scene.pairs[index as usize];
         let link = &scene.links[*at];
         let (frame, nodes) = (&frames[link.body], &link.tree.nodes[..]);
         let Some(root) = nodes.first() else {
@@ -248,18 +269,8 @@ fn find<B: Block>(
         let moved = stretches.half * reach;
         let outer = B::splat(pad + rounding + moved);
         let inner = if stretches.ends_at_touch { pad - rounding } else { f32::NEG_INFINITY };
-        let gap = Gap { outer, inner, fine: moved * FINE };
-        let found = match other {
-            Other::Box(core, radius) => to_core(frame, nodes, &center, &gap.more(*radius), stretches.lanes, core),
-            Other::Cylinder(core, radius) => to_core(frame, nodes, &center, &gap.more(*radius), stretches.lanes, core),
-            Other::Cover(body, tree, radius) => {
-                to_cover(frame, nodes, &frames[*body], &scene.trees[*tree].nodes, &gap.more(*radius), stretches.lanes)
-            }
-            Other::Link(b) => {
-                let b = &scene.links[*b];
-                to_cover(frame, nodes, &frames[b.body], &b.tree.nodes, &gap, stretches.lanes)
-            }
-        };
+        let gap = Gap { outer, inner, fine: moved * FINE, visits: VISITS };
+        let found = compare(scene, frames, link, other, &center, &gap, stretches.lanes);
         if found.touch != 0 {
             return Some(index);
         }
@@ -270,6 +281,31 @@ fn find<B: Block>(
     None
 }
 
+/// Compares a link, whose largest ball is at `center`, with something else.
+#[inline(always)]
+fn compare<B: Block>(
+    scene: &Scene,
+    frames: &[Frames],
+    link: &Link,
+    other: &Other,
+    center: &[B; 3],
+    gap: &Gap<B>,
+    lanes: u16,
+) -> Found {
+    let (frame, nodes) = (&frames[link.body], &link.tree.nodes[..]);
+    match other {
+        Other::Box(core, radius) => to_core(frame, nodes, center, &gap.more(*radius), lanes, core),
+        Other::Cylinder(core, radius) => to_core(frame, nodes, center, &gap.more(*radius), lanes, core),
+        Other::Cover(body, tree, radius) => {
+            to_cover(frame, nodes, &frames[*body], &scene.trees[*tree].nodes, &gap.more(*radius), lanes)
+        }
+        Other::Link(b) => {
+            let b = &scene.links[*b];
+            to_cover(frame, nodes, &frames[b.body], &b.tree.nodes, gap, lanes)
+        }
+    }
+}
+
 /// What balls are compared with: apart beyond `outer`, touching within `inner` [m].
 #[derive(Clone, Copy)]
 struct Gap<B> {
@@ -277,12 +313,14 @@ struct Gap<B> {
     inner: f32,
     /// A ball that is outside of its solid by no more than this is not replaced by its parts.
     fine: f32,
+    /// Most balls, or pairs of them, that are replaced by their parts.
+    visits: usize,
 }
 
 impl<B: Block> Gap<B> {
     #[inline(always)]
     fn more(&self, radius: f32) -> Self {
-        Self { outer: self.outer.add(B::splat(radius)), inner: self.inner + radius, fine: self.fine }
+        Self { outer: self.outer.add(B::splat(radius)), inner: self.inner + radius, ..*self }
     }
 
     /// Compares the squared distance of the centres of a ball and something else; `inner` is negative without an inner
@@ -323,7 +361,7 @@ fn to_core<B: Block, C: Squared>(
             continue;
         }
         visits += 1;
-        if visits > VISITS {
+        if visits > gap.visits {
             close |= lanes;
             continue;
         }
@@ -382,7 +420,7 @@ fn to_cover<B: Block>(f: &Frames, a: &[Node], g: &Frames, b: &[Node], gap: &Gap<
         let parent = if first { one } else { two };
         visits += 1;
         let fine = one.radius - one.inner + two.radius - two.inner <= gap.fine;
-        if parent.count == 0 || fine || visits > VISITS || open + parent.count as usize > STACK {
+        if parent.count == 0 || fine || visits > gap.visits || open + parent.count as usize > STACK {
             close |= found.close;
             continue;
         }
@@ -393,6 +431,10 @@ fn to_cover<B: Block>(f: &Frames, a: &[Node], g: &Frames, b: &[Node], gap: &Gap<
     }
     Found { close, touch: 0 }
 }
+
+mod sweep;
+
+pub use sweep::{Levers, Pieces};
 
 #[cfg(test)]
 mod tests;

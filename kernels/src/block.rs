@@ -53,6 +53,8 @@ pub trait Block: Copy {
     fn select(mask: Self::Mask, a: Self, b: Self) -> Self;
     /// The mask as bits, lane 0 lowest.
     fn bits(mask: Self::Mask) -> u16;
+    /// The largest of the numbers, none of which is not a number.
+    fn largest(self) -> f32;
 
     /// `-self`.
     #[inline(always)]
@@ -160,6 +162,15 @@ impl Block for Portable {
     fn bits(mask: Self::Mask) -> u16 {
         mask.iter().enumerate().fold(0, |bits, (i, set)| bits | (u16::from(*set) << i))
     }
+
+    #[inline(always)]
+    fn largest(self) -> f32 {
+        let mut most = self.0[0];
+        for i in 1..LANES {
+            most = if self.0[i] > most { self.0[i] } else { most };
+        }
+        most
+    }
 }
 
 /// Blocks in the vectors of x86 processors. Their methods may only run where the processor has the feature: kernels are
@@ -261,6 +272,11 @@ pub(crate) mod x86 {
         fn bits(mask: Self::Mask) -> u16 {
             mask
         }
+
+        #[inline(always)]
+        fn largest(self) -> f32 {
+            unsafe { _mm512_reduce_max_ps(self.0) }
+        }
     }
 
     /// Sixteen lanes in two vectors of AVX2.
@@ -355,6 +371,16 @@ pub(crate) mod x86 {
         fn bits(mask: Self::Mask) -> u16 {
             let (low, high) = unsafe { (_mm256_movemask_ps(mask.0), _mm256_movemask_ps(mask.1)) };
             low as u16 | (high as u16) << 8
+        }
+
+        #[inline(always)]
+        fn largest(self) -> f32 {
+            unsafe {
+                let eight = _mm256_max_ps(self.0, self.1);
+                let four = _mm_max_ps(_mm256_castps256_ps128(eight), _mm256_extractf128_ps::<1>(eight));
+                let two = _mm_max_ps(four, _mm_movehl_ps(four, four));
+                _mm_cvtss_f32(_mm_max_ss(two, _mm_movehdup_ps(two)))
+            }
         }
     }
 }

@@ -24,13 +24,101 @@ pub(crate) type Frames = [Lanes; 12];
 /// A frame in registers: columns x, y, z, and the origin.
 type Columns<B> = [[B; 3]; 4];
 
+/// Bodies, prepared: what is zero or one in a joint's frame costs nothing.
+#[derive(Debug, Clone)]
+pub(crate) struct Prepared(Vec<Step>);
+
+#[derive(Debug, Clone)]
+enum Step {
+    Fixed([[f32; 3]; 4]),
+    Moving(Moving),
+}
+
+#[derive(Debug, Clone)]
+struct Moving {
+    parent: usize,
+    /// The axes of the joint at zero, in the parent.
+    axes: Axes,
+    /// The joint's origin in the parent [m].
+    translation: [f32; 3],
+    slides: bool,
+    variable: usize,
+    multiplier: f32,
+    offset: f32,
+}
+
+/// The axes of a frame in another.
+#[derive(Debug, Clone, Copy)]
+enum Axes {
+    /// Each is one of the other's axes, times 1 or -1.
+    Permuted([(usize, f32); 3]),
+    Any([[f32; 3]; 3]),
+}
+
+/// Components smaller than this are zero.
+const SAME: f64 = 1e-9;
+
+impl Axes {
+    fn of(rotation: &[[f64; 3]; 3]) -> Self {
+        let along = |v: &[f64; 3]| (0..3).find(|i| (0..3).all(|j| j == *i || v[j].abs() < SAME));
+        match rotation.each_ref().map(along) {
+            [Some(x), Some(y), Some(z)] => {
+                let sign = |column: usize, i: usize| (i, if rotation[column][i] > 0.0 { 1.0 } else { -1.0 });
+                Self::Permuted([sign(0, x), sign(1, y), sign(2, z)])
+            }
+            _ => Self::Any(rotation.map(single)),
+        }
+    }
+}
+
+impl Prepared {
+    pub fn new(bodies: &[Body]) -> Self {
+        let step = |body: &Body| match body {
+            Body::Fixed(frame) => {
+                let [x, y, z] = frame.rotation.map(single);
+                Step::Fixed([x, y, z, single(frame.translation)])
+            }
+            Body::Moving { parent, joint } => Step::Moving(Moving {
+                parent: *parent,
+                axes: Axes::of(&joint.origin.rotation),
+                translation: joint.origin.translation.map(|x| if x.abs() < SAME { 0.0 } else { x as f32 }),
+                slides: joint.slides,
+                variable: joint.variable,
+                multiplier: joint.multiplier as f32,
+                offset: joint.offset as f32,
+            }),
+        };
+        Self(bodies.iter().map(step).collect())
+    }
+}
+
+fn single(v: [f64; 3]) -> [f32; 3] {
+    v.map(|x| x as f32)
+}
+
 /// Computes the frames of bodies. `q` has one entry per variable.
 #[inline(always)]
-pub(crate) fn forward<B: Block>(bodies: &[Body], q: &[Lanes], frames: &mut [Frames]) {
-    for (i, body) in bodies.iter().enumerate() {
-        let frame = match body {
-            Body::Fixed(frame) => fixed::<B>(frame),
-            Body::Moving { parent, joint } => moved::<B>(&frames[*parent], joint, &q[joint.variable]),
+pub(crate) fn forward<B: Block>(bodies: &Prepared, q: &[Lanes], frames: &mut [Frames]) {
+    // All sines first, in place of two of the numbers to come: they do not wait for each other.
+    for (i, step) in bodies.0.iter().enumerate() {
+        if let Step::Moving(joint) = step {
+            let position = B::load(&q[joint.variable]).mul_add(B::splat(joint.multiplier), B::splat(joint.offset));
+            if joint.slides {
+                position.store(&mut frames[i][0]);
+            } else {
+                let (sin, cos) = sin_cos(position);
+                sin.store(&mut frames[i][0]);
+                cos.store(&mut frames[i][1]);
+            }
+        }
+    }
+    for (i, step) in bodies.0.iter().enumerate() {
+        let frame = match step {
+            Step::Fixed([x, y, z, origin]) => [splat(x), splat(y), splat(z), splat(origin)],
+            Step::Moving(joint) => {
+                let (first, second) = (B::load(&frames[i][0]), B::load(&frames[i][1]));
+                moved::<B>(&frames[joint.parent], joint, first, second)
+            }
         };
         for c in 0..4 {
             for r in 0..3 {
@@ -40,39 +128,55 @@ pub(crate) fn forward<B: Block>(bodies: &[Body], q: &[Lanes], frames: &mut [Fram
     }
 }
 
+/// Returns the frame of a body by that of its parent. `first` is its position if it slides; otherwise they are the sine
+/// and the cosine.
 #[inline(always)]
-fn fixed<B: Block>(frame: &Frame) -> Columns<B> {
-    let [x, y, z] = &frame.rotation;
-    [splat(x), splat(y), splat(z), splat(&frame.translation)]
-}
-
-#[inline(always)]
-fn moved<B: Block>(parent: &Frames, joint: &Joint, q: &Lanes) -> Columns<B> {
-    let parent: Columns<B> = [at(parent, 0), at(parent, 3), at(parent, 6), at(parent, 9)];
-    let [x, y, z] = &joint.origin.rotation;
-    let (x, y, z) = (turn(&parent, x), turn(&parent, y), turn(&parent, z));
-    let origin = turn(&parent, &joint.origin.translation);
-    let origin = [origin[0].add(parent[3][0]), origin[1].add(parent[3][1]), origin[2].add(parent[3][2])];
-    let position = B::load(q).mul_add(B::splat(joint.multiplier as f32), B::splat(joint.offset as f32));
+fn moved<B: Block>(parent: &Frames, joint: &Moving, first: B, second: B) -> Columns<B> {
+    let mut origin = at::<B>(parent, 9);
+    for k in 0..3 {
+        if joint.translation[k] != 0.0 {
+            let (t, axis) = (B::splat(joint.translation[k]), at::<B>(parent, 3 * k));
+            for r in 0..3 {
+                origin[r] = axis[r].mul_add(t, origin[r]);
+            }
+        }
+    }
+    let (x, y, z, signs) = match &joint.axes {
+        Axes::Permuted([x, y, z]) => {
+            let z_axis = at::<B>(parent, 3 * z.0);
+            let sign = B::splat(z.1);
+            let z_axis = [z_axis[0].mul(sign), z_axis[1].mul(sign), z_axis[2].mul(sign)];
+            (at::<B>(parent, 3 * x.0), at::<B>(parent, 3 * y.0), z_axis, [B::splat(x.1), B::splat(y.1)])
+        }
+        Axes::Any([x, y, z]) => {
+            let frame: Columns<B> = [at(parent, 0), at(parent, 3), at(parent, 6), at(parent, 9)];
+            (turn(&frame, x), turn(&frame, y), turn(&frame, z), [B::splat(1.0); 2])
+        }
+    };
     if joint.slides {
-        let slid =
-            [z[0].mul_add(position, origin[0]), z[1].mul_add(position, origin[1]), z[2].mul_add(position, origin[2])];
+        let slid = [z[0].mul_add(first, origin[0]), z[1].mul_add(first, origin[1]), z[2].mul_add(first, origin[2])];
+        let x = [x[0].mul(signs[0]), x[1].mul(signs[0]), x[2].mul(signs[0])];
+        let y = [y[0].mul(signs[1]), y[1].mul(signs[1]), y[2].mul(signs[1])];
         return [x, y, z, slid];
     }
-    let (sin, cos) = sin_cos(position);
-    let turned_x =
-        [x[0].mul_add(cos, y[0].mul(sin)), x[1].mul_add(cos, y[1].mul(sin)), x[2].mul_add(cos, y[2].mul(sin))];
+    let (sin_x, cos_x) = (first.mul(signs[0]), second.mul(signs[0]));
+    let (sin_y, cos_y) = (first.mul(signs[1]), second.mul(signs[1]));
+    let turned_x = [
+        x[0].mul_add(cos_x, y[0].mul(sin_y)),
+        x[1].mul_add(cos_x, y[1].mul(sin_y)),
+        x[2].mul_add(cos_x, y[2].mul(sin_y)),
+    ];
     let turned_y = [
-        x[0].neg_mul_add(sin, y[0].mul(cos)),
-        x[1].neg_mul_add(sin, y[1].mul(cos)),
-        x[2].neg_mul_add(sin, y[2].mul(cos)),
+        x[0].neg_mul_add(sin_x, y[0].mul(cos_y)),
+        x[1].neg_mul_add(sin_x, y[1].mul(cos_y)),
+        x[2].neg_mul_add(sin_x, y[2].mul(cos_y)),
     ];
     [turned_x, turned_y, z, origin]
 }
 
 #[inline(always)]
-fn splat<B: Block>(v: &[f64; 3]) -> [B; 3] {
-    [B::splat(v[0] as f32), B::splat(v[1] as f32), B::splat(v[2] as f32)]
+fn splat<B: Block>(v: &[f32; 3]) -> [B; 3] {
+    [B::splat(v[0]), B::splat(v[1]), B::splat(v[2])]
 }
 
 #[inline(always)]
@@ -82,8 +186,8 @@ fn at<B: Block>(frame: &Frames, from: usize) -> [B; 3] {
 
 /// Turns a constant vector into the world.
 #[inline(always)]
-fn turn<B: Block>(frame: &Columns<B>, v: &[f64; 3]) -> [B; 3] {
-    let (a, b, c) = (B::splat(v[0] as f32), B::splat(v[1] as f32), B::splat(v[2] as f32));
+fn turn<B: Block>(frame: &Columns<B>, v: &[f32; 3]) -> [B; 3] {
+    let (a, b, c) = (B::splat(v[0]), B::splat(v[1]), B::splat(v[2]));
     let [x, y, z, _] = frame;
     [
         x[0].mul_add(a, y[0].mul_add(b, z[0].mul(c))),

@@ -72,6 +72,24 @@ impl Placed {
         Self { columns: [single(x), single(y), single(z)], origin: single(&frame.translation) }
     }
 
+    /// Returns the same frame, with its origin at a point of it.
+    pub fn moved(&self, p: [f32; 3]) -> Self {
+        let [x, y, z] = &self.columns;
+        let origin = [0, 1, 2].map(|i| self.origin[i] + x[i] * p[0] + y[i] * p[1] + z[i] * p[2]);
+        Self { origin, ..*self }
+    }
+
+    /// Returns the box in the world around a box in this frame and all within a radius of it: its corners, a little
+    /// outside.
+    pub fn bounds(&self, half: [f32; 3], radius: f32) -> ([f32; 3], [f32; 3]) {
+        let [x, y, z] = &self.columns;
+        let reach = [0, 1, 2].map(|i| {
+            let most = x[i].abs() * half[0] + y[i].abs() * half[1] + z[i].abs() * half[2] + radius;
+            most + 1e-6 * (most + self.origin[i].abs())
+        });
+        ([0, 1, 2].map(|i| self.origin[i] - reach[i]), [0, 1, 2].map(|i| self.origin[i] + reach[i]))
+    }
+
     #[inline(always)]
     fn local<B: Block>(&self, p: &[B; 3]) -> [B; 3] {
         let [x, y, z] = &self.columns;

@@ -70,7 +70,7 @@ pub(super) fn home_of(key: &str) -> Option<String> {
 }
 
 /// Groups of the schema, and their paths in a blueprint.
-const GROUPS: [(&str, &str); 10] = [
+const GROUPS: [(&str, &str); 12] = [
     ("", ""),
     ("/$defs/CoordinatorConfig", "coordinator"),
     ("/$defs/HardwareEntry", "hardware"),
@@ -81,6 +81,8 @@ const GROUPS: [(&str, &str); 10] = [
     ("/$defs/RobotEntry", "planner.robots"),
     ("/$defs/RecordingConfig", "recording"),
     ("/$defs/ViewConfig", "view"),
+    ("/$defs/ShareEntry", "share"),
+    ("/$defs/PythonDimosEntry", "share.python_dimos"),
 ];
 
 /// Makes all keys of a list entry optional except its id: a blueprint with includes may contain parts of entries. A

@@ -8,10 +8,12 @@ use crate::blueprint::assets::Assets;
 use crate::blueprint::catalog::Catalog;
 use crate::blueprint::limits::JointOverride;
 use crate::blueprint::planner::{ViewBackend, ViewConfig};
-use crate::blueprint::schema::{BlueprintFile, CoordinatorConfig, HardwareType, OnExit, RecordingConfig, RpcConfig};
+use crate::blueprint::schema::{
+    BlueprintFile, CoordinatorConfig, GuardConfig, HardwareType, OnExit, RecordingConfig, RpcConfig,
+};
 use crate::blueprint::task_robots::{self, Base};
 use crate::blueprint::{
-    arms, assets, park, planner_check, planner_files, planner_models, task_leaders, tasks, tick_clock,
+    arms, assets, park, planner_check, planner_files, planner_models, share, task_leaders, tasks, tick_clock,
 };
 use crate::control::task_leader::LeaderJoint;
 use crate::control::task_spec::TaskSpec;
@@ -37,12 +39,16 @@ pub struct Blueprint {
     pub tasks: Vec<Task>,
     /// Motion planning. Its files have not been read yet.
     pub planner: Option<PlannerConfig>,
+    /// Distance that the collision guard keeps from obstacles and other arms [m]; `None`: streams are not guarded.
+    pub guard: Option<f64>,
     /// The live view, given as `view` or as `planner.visualization`.
     pub view: Option<ViewConfig>,
     /// The log.
     pub recording: RecordingConfig,
     /// The socket.
     pub rpc: RpcConfig,
+    /// How the run is on a network; `None`: not at all.
+    pub share: Option<share::ShareConfig>,
     /// Files that are fetched on first use.
     pub assets: Vec<UsedAsset>,
     /// The complete blueprint as YAML, with includes and arguments merged; recorded in the log.
@@ -229,6 +235,7 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
         planner_models::check(&mut checker, planner, &described, &config);
         config
     });
+    let guard = guard(&mut checker, file.guard.as_ref(), planner.is_some());
     task_robots::resolve(&mut checker, &file.tasks, &mut tasks, planner.as_ref(), &hardware);
     task_leaders::resolve(&mut checker, &file.tasks, &mut tasks, &hardware);
     let assets = assets::resolved(&checker, &file.tasks, file.planner.as_ref());
@@ -241,6 +248,9 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
         let diag = Diag::warning(what).note("anyone who reads the traffic has the token, and can command the arms");
         checker.error(view.at, diag.hint("remove `host` and connect through ssh: docs/view.md"));
     }
+    let known: Vec<&str> = hardware.arms.iter().flat_map(|arm| &arm.joints).map(String::as_str).collect();
+    let joints = (!checker.incomplete).then_some(known.as_slice());
+    let share = file.share.as_ref().map(|entry| share::resolve(&mut checker, entry, joints));
     Blueprint {
         name: name.value,
         description: file.description,
@@ -248,11 +258,23 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
         arms: hardware.arms,
         tasks,
         planner,
+        guard,
         view: view.map(|v| v.value),
         recording: file.recording,
         rpc: file.rpc,
+        share,
         assets,
         source_yaml: String::new(),
         sources: Vec::new(),
     }
+}
+
+/// Returns the margin of the collision guard, which needs the planner's robots.
+fn guard(checker: &mut Checker<'_>, guard: Option<&Located<GuardConfig>>, planner: bool) -> Option<f64> {
+    let config = guard.map_or_else(GuardConfig::default, |guard| guard.value.clone());
+    if let Some(guard) = guard.filter(|_| config.enabled && !planner && !checker.incomplete) {
+        let diag = Diag::error("the collision guard has no robots: this blueprint has no `planner`");
+        checker.error(guard.at, diag.hint("add `planner`, or remove `guard`"));
+    }
+    (config.enabled && planner).then_some(config.margin)
 }

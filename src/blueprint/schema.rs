@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use crate::blueprint::limits::LimitsEntry;
 use crate::blueprint::parts::{MountingEntry, PayloadEntry, StopInputEntry};
 use crate::blueprint::planner::{PlannerEntry, ViewConfig};
+use crate::blueprint::share::ShareEntry;
 use crate::blueprint::size::Size;
 use crate::blueprint::tick_clock::TickClock;
 use crate::yaml::range::{self, tick_rate};
@@ -35,12 +36,17 @@ pub struct BlueprintFile {
     pub tasks: Vec<Located<TaskEntry>>,
     /// Motion planning.
     pub planner: Option<Located<PlannerEntry>>,
+    /// The collision guard of streams: servo, velocity, chunks, poses, twists, followers, jogging. Default: enabled if
+    /// there is a planner.
+    pub guard: Option<Located<GuardConfig>>,
     /// The live view in the browser.
     pub view: Option<Located<ViewConfig>>,
     /// The log of the run.
     pub recording: RecordingConfig,
     /// The socket for client programs.
     pub rpc: RpcConfig,
+    /// The run on a network.
+    pub share: Option<Located<ShareEntry>>,
     /// Files that are fetched on first use, by name: archives of robot descriptions, meshes, point clouds. Robots and
     /// obstacles refer to files and folders in them by `asset:NAME/path`; see `docs/models.md`.
     pub assets: Keyed<AssetEntry>,
@@ -71,6 +77,25 @@ impl Default for CoordinatorConfig {
             publish_joint_state: true,
             joint_state_frame_id: "coordinator".to_owned(),
         }
+    }
+}
+
+/// The collision guard: arms that follow streams decelerate to rest before they touch something in the planner's world,
+/// another arm or themselves.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct GuardConfig {
+    /// Whether streams are guarded.
+    pub enabled: bool,
+    /// Distance that is kept from obstacles and other arms [m].
+    #[serde(deserialize_with = "range::non_negative")]
+    #[schemars(range(min = 0.0))]
+    pub margin: f64,
+}
+
+impl Default for GuardConfig {
+    fn default() -> Self {
+        Self { enabled: true, margin: 0.01 }
     }
 }
 

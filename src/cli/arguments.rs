@@ -1,13 +1,50 @@
 //! Arguments shared by several verbs, and parsers of their values.
 
+use std::sync::OnceLock;
 use std::time::Duration;
 
 use clap::Args;
 
 use super::exit::Result;
 use crate::blueprint::Overrides;
-use crate::rpc::client::{self, Client};
+use crate::rpc::client::{self, Client, ClientError};
 use crate::rpc::run_dir::{LiveRun, RunDir};
+use crate::share;
+
+/// Where the run is, if it is on another computer, and whether the command line says so.
+static PLACE: OnceLock<Option<(String, bool)>> = OnceLock::new();
+
+/// Sets the place, once: `--at`, else `DIMOS_AT`.
+pub(super) fn set_place(given: Option<String>) {
+    let named = || std::env::var("DIMOS_AT").ok().filter(|place| !place.is_empty());
+    let _ = PLACE.set(given.map(|place| (place, true)).or_else(|| Some((named()?, false))));
+}
+
+/// Returns where the run is, if it is on another computer: an endpoint, or a name in `places.yaml`.
+pub fn place() -> Option<&'static str> {
+    PLACE.get()?.as_ref().map(|(place, _)| place.as_str())
+}
+
+/// Returns whether the place is given as `--at`, not as `DIMOS_AT`.
+pub fn is_place_given() -> bool {
+    matches!(PLACE.get(), Some(Some((_, true))))
+}
+
+/// Connects to the run of this name, here or at the place of `--at`; without a name, to the only live run there.
+pub fn connect(run: Option<&str>) -> std::result::Result<Client, ClientError> {
+    match place() {
+        Some(place) => share::connect(place, run),
+        None => Client::find(&RunDir::standard(), run),
+    }
+}
+
+/// Connects to a run that was found, here or on another computer.
+pub fn connect_to(run: &LiveRun) -> std::result::Result<Client, ClientError> {
+    match &run.at {
+        Some(place) => share::connect(place, Some(&run.name)),
+        None => Client::connect(&run.name, &run.socket),
+    }
+}
 
 /// Arguments that select a run and the output format.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Args)]
@@ -45,23 +82,32 @@ impl Changes {
 impl Target {
     /// Connects to the run.
     pub fn connect(&self) -> Result<Client> {
-        Ok(Client::find(&RunDir::standard(), self.run.as_deref())?)
+        Ok(connect(self.run.as_deref())?)
     }
 
     /// Connects to the run, if one is live or named.
     pub fn connect_if_live(&self) -> Result<Option<Client>> {
-        match Client::find(&RunDir::standard(), self.run.as_deref()) {
-            Err(client::ClientError::NoRun) => Ok(None),
+        match connect(self.run.as_deref()) {
+            Err(ClientError::NoRun) => Ok(None),
             found => Ok(Some(found?)),
         }
     }
 
-    /// Returns the named run, or all live runs.
+    /// Returns the named run, or all live runs, here or at the place of `--at`.
     pub fn named_or_all(&self) -> Result<Vec<LiveRun>> {
+        if let Some(place) = place() {
+            let mut live = share::runs(place)?;
+            let Some(name) = &self.run else { return Ok(live) };
+            let at = live.iter().position(|run| run.name == *name);
+            return match at {
+                Some(at) => Ok(vec![live.swap_remove(at)]),
+                None => Err(ClientError::UnknownRun { name: name.clone(), live }.into()),
+            };
+        }
         let folder = RunDir::standard();
         Ok(match &self.run {
             Some(name) => vec![client::find(&folder, Some(name))?],
-            None => folder.runs().map_err(client::ClientError::from)?,
+            None => folder.runs().map_err(ClientError::from)?,
         })
     }
 }

@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use serde_json::json;
 
+use super::arguments::{Target, connect_to, is_place_given, place};
 use super::banner;
 use super::exit::{Exit, Failure, Result};
 use super::run::Args;
@@ -20,6 +21,7 @@ use crate::rpc::client::{self, Client, ClientError};
 use crate::rpc::report::{ArmReport, StatusReport};
 use crate::rpc::run_dir::{Claim, LiveRun, RunDir};
 use crate::runtime::{AttachedPlanner, Ending, LinkEvent};
+use crate::share::Relay;
 use crate::view::{self, Shown, View};
 
 /// A planner attached to a run, in its own process.
@@ -31,6 +33,8 @@ pub struct Attached {
     arms: Vec<ArmReport>,
     planner: AttachedPlanner,
     view: Option<View>,
+    /// The way to a run on another computer.
+    _relay: Option<Relay>,
     /// Its name among the planners; released when it ends.
     _claim: Claim,
     ending: (Sender<Ending>, Receiver<Ending>),
@@ -38,6 +42,10 @@ pub struct Attached {
 
 /// Returns the run that a blueprint's planner attaches to; `None` if it starts its own.
 pub fn chosen(args: &Args, blueprint: &Blueprint) -> Result<Option<LiveRun>> {
+    // Only `--at`: a place in the environment does not decide where a run starts.
+    if let Some(place) = place().filter(|_| is_place_given()) {
+        return at_place(place, args, blueprint).map(Some);
+    }
     let folder = RunDir::standard();
     let run = match (&args.attach, &blueprint.planner) {
         (Some(_), None) => {
@@ -56,8 +64,35 @@ pub fn chosen(args: &Args, blueprint: &Blueprint) -> Result<Option<LiveRun>> {
     Ok(run)
 }
 
+/// Returns the run at a place that a planner attaches to.
+fn at_place(place: &str, args: &Args, blueprint: &Blueprint) -> Result<LiveRun> {
+    if blueprint.planner.is_none() {
+        let what = format!("a run starts on the computer of its arms, and {} has no planner to attach", blueprint.name);
+        return Err(Failure::usage(what).hint("omit --at; on another computer, start it there: through ssh"));
+    }
+    if args.standalone || args.record.is_some() {
+        let option = if args.standalone { "--standalone" } else { "--record" };
+        return Err(Failure::usage(format!("with --at a planner is attached to a run: omit {option}")));
+    }
+    let target = Target { run: args.attach.clone(), json: args.json };
+    let mut runs = target.named_or_all()?;
+    if args.attach.is_some()
+        && let Some(run) = runs.pop()
+    {
+        return named_run(run, args, blueprint);
+    }
+    let names: Vec<String> = runs.iter().map(|run| run.name.clone()).collect();
+    matching_run(runs, args, blueprint)?.ok_or_else(|| {
+        let what = match names.is_empty() {
+            true => format!("{place} shares no run with this client"),
+            false => format!("no run at {place} has the arms of {}: {}", blueprint.name, names.join(", ")),
+        };
+        Failure::new(Exit::Failed, what).hint("--attach RUN says what a run lacks; `dimos status --at` lists them")
+    })
+}
+
 fn named_run(run: LiveRun, args: &Args, blueprint: &Blueprint) -> Result<LiveRun> {
-    let status = Client::connect(&run.name, &run.socket)?.call(Status {})?;
+    let status = connect_to(&run)?.call(Status {})?;
     let Mismatch { missing, .. } = mismatch(&status, args, blueprint);
     if missing.is_empty() {
         return Ok(run);
@@ -70,7 +105,7 @@ fn matching_run(runs: Vec<LiveRun>, args: &Args, blueprint: &Blueprint) -> Resul
     let mut fit: Vec<(LiveRun, StatusReport)> = Vec::new();
     for run in runs {
         // A run that does not answer is starting or shutting down.
-        let asked = Client::connect(&run.name, &run.socket).and_then(|mut client| client.call(Status {}));
+        let asked = connect_to(&run).and_then(|mut client| client.call(Status {}));
         let Ok(status) = asked else { continue };
         let Mismatch { missing, differs } = mismatch(&status, args, blueprint);
         if missing.is_empty() && differs.is_empty() {
@@ -143,7 +178,11 @@ fn missing_task(run: &StatusReport, robot: &RobotConfig) -> Option<String> {
 
 impl Attached {
     /// Attaches a blueprint's planner to a run.
-    pub fn start(args: &Args, blueprint: &Blueprint, run: LiveRun, terminal: &Terminal) -> Result<Self> {
+    pub fn start(args: &Args, blueprint: &Blueprint, mut run: LiveRun, terminal: &Terminal) -> Result<Self> {
+        let relay = run.at.as_deref().map(|place| Relay::start(place, &run.name)).transpose()?;
+        if let Some(relay) = &relay {
+            run.socket = relay.socket().to_owned();
+        }
         let name = args.name.clone().unwrap_or_else(|| blueprint.name.clone());
         let claim = RunDir::standard().planners().claim(&name);
         let claim = claim.map_err(|e| Failure::new(Exit::Failed, e.to_string()).hint(e.hint()))?;
@@ -175,7 +214,8 @@ impl Attached {
             served.inspect_err(|why| tracing::warn!("no live view: {why}")).ok()
         });
         let arms = reports.map(|(status, _)| status.arms).unwrap_or_default();
-        Ok(Self { name, blueprint: blueprint.name.clone(), run, arms, planner, view, _claim: claim, ending: channel() })
+        let (blueprint, ending) = (blueprint.name.clone(), channel());
+        Ok(Self { name, blueprint, run, arms, planner, view, _relay: relay, _claim: claim, ending })
     }
 
     /// Returns the URL of its live view, with the token, if it serves one.
@@ -239,7 +279,8 @@ impl Attached {
             );
         }
         terminal.note(format_args!("planner {}  (pid {pid}, dimos {})", self.name, crate::VERSION));
-        terminal.note(format_args!("  attached to run {}", self.run.name));
+        let place = self.run.at.as_ref().map(|place| format!(" at {place}")).unwrap_or_default();
+        terminal.note(format_args!("  attached to run {}{place}", self.run.name));
         for arm in &self.arms {
             let standing = banner::standing(arm.simulated, &arm.address);
             terminal.note(format_args!("  arm        {}: {standing}, {}", arm.hardware_id, arm.adapter));
@@ -250,7 +291,7 @@ impl Attached {
         }
         if let Some(view) = &self.view {
             let line = url.map_or_else(|| banner::view_without_token(view.address()), str::to_owned);
-            terminal.note(format_args!("  view       {line}"));
+            terminal.private(format_args!("  view       {line}"));
         }
         terminal.note("Press Ctrl-C to detach; the run continues. In another terminal: dimos plan");
     }

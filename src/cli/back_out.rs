@@ -11,18 +11,26 @@ use super::follow::{Signals, follow};
 use super::goal::{has_planner, plan, show};
 use super::output::{self, Table, fixed, span};
 use crate::planning::path::length;
+use crate::planning::thin::thin;
 use crate::planning::timing::time_within;
 use crate::planning::topp::JointBound;
 use crate::recording::replay::LogReader;
 use crate::replay::motion::{RecordedMotion, tcp_path};
 use crate::replay::recorded::Recorded;
-use crate::replay::retrace::{Back, Retrace, RetraceError, retrace};
-use crate::rpc::api::{Execute, ExecutePlan, Motion, Plan, PlanGoal, Planner, Point, State, Status, Trajectory};
+use crate::replay::retrace::{Back, ON_PATH, Retrace, RetraceError, retrace};
+use crate::rpc::api::{
+    Execute, ExecutePlan, MAX_LINE, Motion, Plan, PlanGoal, Planner, Point, State, Status, Trajectory,
+};
 use crate::rpc::client::Client;
 use crate::rpc::report::{ArmReport, StatusReport};
+use crate::trajectory::JointTrajectory;
 
 /// Deviation from the logged path at its corners [rad]: between two corners it is straight.
 const DEVIATION: f64 = 1e-3;
+/// Largest distance from the logged path of a direct way back [rad]: a long, curved one has too many points otherwise.
+const FARTHEST: f64 = 0.02;
+/// Bytes of a request besides its trajectory, at most.
+const ENVELOPE: usize = 256;
 /// Parts of the log that are searched, from its end [s]; at last, all of it.
 const WINDOWS: [f64; 3] = [60.0, 1200.0, 1e9];
 /// Longest delay of the log behind the run.
@@ -185,7 +193,7 @@ fn way_back(
     let mut delays = [LOG_DELAY].into_iter();
     loop {
         let (stamp, joints, now) = present(client, arm)?;
-        let from = retraced_to(client, status, &joints);
+        let from = retraced_to(client, status, &joints, &now);
         let mut result = Err(RetraceError::TooShort);
         for window in WINDOWS {
             let since = ((from.unwrap_or(stamp).min(stamp) - window).max(0.0) * 1e9) as u64;
@@ -222,11 +230,17 @@ fn way_back(
     }
 }
 
-/// Returns the time in the log to which the newest motion of these joints retraced it [s since 1970], if it did.
-fn retraced_to(client: &mut Client, status: &StatusReport, joints: &[String]) -> Option<f64> {
+/// Returns the time in the log to which the newest motion of these joints retraced it [s since 1970], if it did and
+/// nothing has moved them since: a stream, a hand or the arm's controller, which are no motions of a task.
+fn retraced_to(client: &mut Client, status: &StatusReport, joints: &[String], now: &[f64]) -> Option<f64> {
     let moves = status.tasks.iter().filter(|task| task.joints.iter().any(|joint| joints.contains(joint)));
     let newest = moves.filter_map(|task| task.motion).max()?;
-    client.call(Motion { motion: newest }).ok()?.retraces_to
+    let motion = client.call(Motion { motion: newest }).ok()?;
+    let ends = motion.deviation.unwrap_or_default();
+    let is_there = |(joint, q): (&String, &f64)| {
+        ends.iter().filter(|end| end.joint == *joint).all(|end| (end.actual - q).abs() <= ON_PATH)
+    };
+    motion.retraces_to.filter(|_| joints.iter().zip(now).all(is_there))
 }
 
 fn describe(arm: &str, joints: &[String], way: &Retrace, ago: f64) {
@@ -258,10 +272,11 @@ fn request(client: &mut Client, arm: &str, joints: &[String], way: &Retrace, spe
         retrace: Some(way.path.iter().map(row).collect()),
         ..PlanGoal::default()
     };
-    Ok(Plan { goals: vec![goal], speed, seed: 0, timeout: None, through: Vec::new(), blend: 0.0, by_number: true })
+    Ok(Plan { goals: vec![goal], speed, by_number: true, ..Plan::default() })
 }
 
-/// Returns the way as a trajectory within `speed` of the arm's limits, from where the arm is.
+/// Returns the way as a trajectory within `speed` of the arm's limits, from where the arm is. It is as close to the
+/// logged path as one request allows.
 fn timed(client: &mut Client, log: &Path, arm: &str, way: &Retrace, speed: f64) -> Result<Trajectory> {
     let fail = |e: String| Failure::new(Exit::Failed, format!("no trajectory: {e}"));
     let opened = LogReader::open_for(log, &[]).map_err(|e| Failure::of(Exit::Failed, e))?;
@@ -274,15 +289,32 @@ fn timed(client: &mut Client, log: &Path, arm: &str, way: &Retrace, speed: f64) 
         jerk: l.jerk_max[j] * speed,
     };
     let (_, joints, now) = present(client, arm)?;
-    let mut path = vec![now];
-    path.extend(way.path.iter().cloned());
     let bounds: Vec<JointBound> = (0..joints.len()).map(bound).collect();
-    let timed = time_within(&joints, &path, &bounds, &vec![DEVIATION; path.len()], 1.0, |_, _| true);
-    let points = timed.map_err(|e| fail(e.to_string()))?.trajectory.points.into_iter().map(|p| Point {
+    let whole: Vec<Vec<f64>> = std::iter::once(now).chain(way.path.iter().cloned()).collect();
+    // Half of the distance is for the straight lines, half for the blends between them.
+    let (mut path, mut deviation) = (whole.clone(), DEVIATION);
+    while deviation <= FARTHEST / 2.0 {
+        let timed = time_within(&joints, &path, &bounds, &vec![deviation; path.len()], 1.0, |_, _| true);
+        let trajectory = request_of(&joints, timed.map_err(|e| fail(e.to_string()))?.trajectory);
+        if serde_json::to_string(&trajectory).is_ok_and(|text| text.len() + ENVELOPE <= MAX_LINE) {
+            if deviation > DEVIATION {
+                output::note(format_args!("a long way: within {} rad of the logged path", 2.0 * deviation));
+            }
+            return Ok(trajectory);
+        }
+        deviation *= 2.0;
+        path = thin(&whole, deviation);
+    }
+    Err(Failure::new(Exit::Failed, "the way back is too long for one direct motion")
+        .hint("go back in parts: --time 10s, --distance 0.5, or --motions"))
+}
+
+fn request_of(joints: &[String], trajectory: JointTrajectory) -> Trajectory {
+    let points = trajectory.points.into_iter().map(|p| Point {
         time_from_start: p.time_from_start,
         positions: p.positions,
         velocities: Some(p.velocities),
         accelerations: Some(p.accelerations).filter(|a| !a.is_empty()),
     });
-    Ok(Trajectory { joint_names: joints, points: points.collect() })
+    Trajectory { joint_names: joints.to_vec(), points: points.collect() }
 }

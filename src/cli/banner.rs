@@ -31,7 +31,12 @@ pub(super) fn print(
     if json {
         return terminal.json(&Started { event: "started", socket, report });
     }
-    text(report, socket, url, end).iter().for_each(|line| terminal.note(line));
+    for line in text(report, socket, url, end) {
+        match url {
+            Some(url) if line.contains(url) => terminal.private(line),
+            _ => terminal.note(line),
+        }
+    }
 }
 
 /// Returns the banner's lines.

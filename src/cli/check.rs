@@ -9,6 +9,7 @@ use super::exit::{Exit, Failure, Result};
 use super::output::{self, Table};
 use super::{banner, fetch};
 use crate::blueprint::{self, Catalog, Limit, Loaded, OnExit, Overrides, Summary};
+use crate::share;
 
 /// Arguments of `check`.
 #[derive(Debug, clap::Args)]
@@ -67,6 +68,8 @@ pub fn report(name: &str, overrides: &Overrides, catalog: Catalog<'_>, as_json: 
     let loaded = load(name, overrides, catalog)?;
     let summary = loaded.blueprint.as_ref().map(Summary::of);
     let robots = loaded.blueprint.as_ref().map(robots::of).unwrap_or_else(|| Ok(Vec::new()));
+    let shared = loaded.blueprint.as_ref().and_then(|blueprint| blueprint.share.as_ref());
+    let certificates = shared.map_or(Ok(None), share::check_gateway);
     if as_json {
         let mut document = loaded.to_json();
         document["blueprint"] = json!(summary);
@@ -74,17 +77,29 @@ pub fn report(name: &str, overrides: &Overrides, catalog: Catalog<'_>, as_json: 
             Ok(robots) => document["robots"] = json!(robots),
             Err(what) => document["valid"] = robots::refuse(&mut document["problems"], what),
         }
+        match &certificates {
+            Ok(soon) => document["certificates"] = json!(soon),
+            Err(error) => {
+                robots::refuse(&mut document["diagnostics"], &error.message);
+                (document["ok"], document["errors"]) = (json!(false), json!(loaded.errors() + 1));
+            }
+        }
         output::json(&document);
-        return Ok(if summary.is_some() && robots.is_ok() { Exit::Ok } else { Exit::Usage });
+        let valid = summary.is_some() && robots.is_ok() && certificates.is_ok();
+        return Ok(if valid { Exit::Ok } else { Exit::Usage });
     }
     let Some(summary) = summary else { return Err(mistakes(&loaded)) };
     print_warnings(&loaded);
     let robots = robots.map_err(Failure::usage)?;
+    let soon = certificates.map_err(|error| Failure::usage(error.message).maybe_hint(error.hint))?;
     print(&summary);
     robots.iter().for_each(robots::print);
     let awaited = loaded.blueprint.iter().flat_map(|blueprint| blueprint.awaited_assets());
     for asset in awaited {
         output::note(format_args!("{} is not downloaded yet: its contents were not checked", asset.name));
+    }
+    if let Some(text) = soon {
+        output::note(format_args!("warning: {text}\nhint: make a new certificate: docs/many-machines.md"));
     }
     output::line("");
     output::line("no mistakes");

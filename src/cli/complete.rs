@@ -15,7 +15,7 @@ use clap_complete::engine::{
 
 use super::run_record::RunRecord;
 use crate::blueprint::{self, Catalog};
-use crate::rpc::api::{Planner, Status, World};
+use crate::rpc::api::{Planner, Poses, Status, World};
 use crate::rpc::client::Client;
 use crate::rpc::report::StatusReport;
 use crate::rpc::run_dir::RunDir;
@@ -32,28 +32,31 @@ static ADAPTERS: OnceLock<Vec<String>> = OnceLock::new();
 /// [`VARIABLE`] from the environment.
 pub fn answer(catalog: Catalog<'_>) {
     let _ = ADAPTERS.set(catalog.adapters.names().into_iter().map(|name| name.to_string()).collect());
-    CompleteEnv::with_factory(|| with_candidates(super::command())).var(VARIABLE).complete();
+    CompleteEnv::with_factory(|| with_candidates("", super::command())).var(VARIABLE).complete();
 }
 
-/// Returns the command line with the candidates of each argument's values.
-fn with_candidates(command: Command) -> Command {
+/// Returns a verb of `parent` with the candidates of each argument's values.
+fn with_candidates(parent: &str, command: Command) -> Command {
     let verb = command.get_name().to_owned();
-    command.mut_args(|arg| candidates(&verb, arg)).mut_subcommands(with_candidates)
+    command.mut_args(|arg| candidates(parent, &verb, arg)).mut_subcommands(|below| with_candidates(&verb, below))
 }
 
-fn candidates(verb: &str, arg: Arg) -> Arg {
+fn candidates(parent: &str, verb: &str, arg: Arg) -> Arg {
     let of = |all: fn() -> BTreeSet<String>| {
         ArgValueCandidates::new(move || all().into_iter().map(CompletionCandidate::new).collect())
     };
     let value = arg.get_value_names().and_then(|names| names.first()).map(|name| name.as_str().to_owned());
     match (arg.get_id().as_str(), verb) {
         ("blueprint", _) => arg.add(ArgValueCompleter::new(blueprints as fn(&OsStr) -> Vec<CompletionCandidate>)),
-        ("arm" | "robot", _) => arg.add(of(arms)),
+        ("arm" | "arms" | "robot", _) => arg.add(of(arms)),
         ("task", _) => arg.add(of(tasks)),
         ("named", _) => arg.add(of(named_poses)),
+        ("through", _) => arg.add(of(waypoints)),
+        ("frame", _) => arg.add(of(frames)),
         ("run" | "attach", _) if arg.get_action().takes_values() => arg.add(of(runs)),
         ("name", "down" | "status") => arg.add(of(runs_and_planners)),
         ("name", "logs") => arg.add(of(recorded_runs)),
+        ("name", _) if parent == "pose" => arg.add(of(saved_poses)),
         ("name", "move" | "remove" | "attach" | "detach") => arg.add(of(objects)),
         ("name", "test" | "emulate") => arg.add(of(adapters)),
         _ if value.as_deref() == Some("ADAPTER") => arg.add(of(adapters)),
@@ -99,9 +102,23 @@ fn statuses() -> Vec<StatusReport> {
     of_each_run(|client| client.call(Status {}).ok())
 }
 
+fn saved_poses() -> BTreeSet<String> {
+    of_each_run(|client| client.call(Poses {}).ok()).into_iter().flat_map(|reply| reply.poses.into_keys()).collect()
+}
+
+/// Returns the poses of the blueprints, and the saved ones, which a run without a planner has, too.
 fn named_poses() -> BTreeSet<String> {
     let replies = of_each_run(|client| client.call(Planner {}).ok());
-    replies.into_iter().flat_map(|reply| reply.robots).flat_map(|robot| robot.named_poses.into_keys()).collect()
+    let robots = replies.into_iter().flat_map(|reply| reply.robots);
+    robots.flat_map(|robot| robot.named_poses.into_keys()).chain(saved_poses()).collect()
+}
+
+fn waypoints() -> BTreeSet<String> {
+    named_poses().into_iter().chain(["gripper:open", "gripper:close"].map(str::to_owned)).collect()
+}
+
+fn frames() -> BTreeSet<String> {
+    objects().into_iter().chain(["map", "base", "tool"].map(str::to_owned)).collect()
 }
 
 fn objects() -> BTreeSet<String> {
@@ -133,7 +150,7 @@ mod tests {
 
     /// What the engine offers for the last of these words.
     fn offered(words: &[&str]) -> Vec<String> {
-        let mut command = with_candidates(crate::cli::command());
+        let mut command = with_candidates("", crate::cli::command());
         let arguments = words.iter().map(|word| (*word).into()).collect();
         let found = clap_complete::engine::complete(&mut command, arguments, words.len() - 1, None).unwrap();
         found.iter().map(|candidate| candidate.get_value().to_string_lossy().into_owned()).collect()

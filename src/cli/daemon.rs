@@ -131,10 +131,15 @@ fn spawn(text_log: &Path) -> io::Result<(Child, UnixStream)> {
     Ok((command.spawn()?, ours))
 }
 
-/// Returns this program's arguments, with the text log inserted after the verb.
+/// Returns this program's arguments, with the text log inserted after the verb, which `--at PLACE` may precede.
 fn arguments(own: impl Iterator<Item = OsString>, text_log: &Path) -> Vec<OsString> {
     let mut arguments: Vec<OsString> = own.skip(1).collect();
-    let behind_verb = arguments.len().min(1);
+    let before_verb = match arguments.first().and_then(|first| first.to_str()) {
+        Some("--at") => 2,
+        Some(first) if first.starts_with("--at=") => 1,
+        _ => 0,
+    };
+    let behind_verb = arguments.len().min(before_verb + 1);
     arguments.splice(behind_verb..behind_verb, ["--text-log".into(), text_log.into()]);
     arguments
 }
@@ -252,6 +257,9 @@ mod tests {
     fn the_new_process_gets_the_same_arguments() {
         let own = ["/bin/dimos", "run", "-d", "x", "--", "y"].map(OsString::from);
         let expected = ["run", "--text-log", "f.log", "-d", "x", "--", "y"].map(OsString::from);
+        assert_eq!(arguments(own.into_iter(), Path::new("f.log")), expected);
+        let own = ["/bin/dimos", "--at", "cell1", "run", "x", "-d"].map(OsString::from);
+        let expected = ["--at", "cell1", "run", "--text-log", "f.log", "x", "-d"].map(OsString::from);
         assert_eq!(arguments(own.into_iter(), Path::new("f.log")), expected);
     }
 

@@ -4,12 +4,14 @@ use std::time::{Duration, Instant};
 
 use serde_json::json;
 
+use super::arguments::{connect, place};
 use super::attach;
 use super::exit::{Exit, Failure, Result};
 use super::output;
 use super::run_record::{RunRecord, RunState};
 use crate::rpc::api::{Shutdown, Status};
 use crate::rpc::client::{self, Client, ClientError};
+use crate::rpc::error::Code;
 use crate::rpc::run_dir::{LiveRun, RunDir};
 
 /// Maximum wait for a controlled stop, with some margin; with an arm that parks.
@@ -36,6 +38,9 @@ pub struct Args {
 pub fn run(args: &Args) -> Result {
     let folder = RunDir::standard();
     let name = args.name.as_deref().or(args.run.as_deref());
+    if let Some(place) = place() {
+        return elsewhere(args, place, name);
+    }
     let found = match find(&folder, name) {
         Ok(found) => found,
         // A planner in its own process is not a run: only its name ends it.
@@ -95,6 +100,41 @@ pub fn run(args: &Args) -> Result {
             Ok(Exit::Ok)
         }
     }
+}
+
+/// Shuts down a run on another computer, and waits until its gateway says that it has ended.
+fn elsewhere(args: &Args, place: &str, name: Option<&str>) -> Result {
+    let mut client = connect(name)?;
+    let run = client.run().to_owned();
+    client.call(Shutdown {})?;
+    let requested = Instant::now();
+    let mut status = client.call(Status {});
+    let (log, pid) = status.as_ref().map_or((None, None), |status| (status.log.clone(), Some(status.pid)));
+    let parks = status.as_ref().is_ok_and(|status| status.arms.iter().any(|arm| arm.on_exit == "park"));
+    let timeout = if parks { PARKING_TIMEOUT } else { SHUTDOWN_TIMEOUT };
+    while status.is_ok() {
+        if requested.elapsed() > timeout {
+            let what = format!("run {run} at {place} is still shutting down after {} s", timeout.as_secs());
+            return Err(Failure::new(Exit::Failed, what).hint("its terminal or `dimos logs` there shows the reason"));
+        }
+        std::thread::sleep(POLL_PERIOD);
+        status = client.call(Status {});
+    }
+    match status {
+        Err(ClientError::Refused(refusal)) if refusal.code == Code::ShuttingDown => {}
+        Err(error) => {
+            let what = format!("run {run} at {place} is shutting down, and its end was not seen: {error}");
+            return Err(Failure::new(Exit::Failed, what).hint(format!("dimos status --at {place}")));
+        }
+        Ok(_) => {}
+    }
+    if args.json {
+        output::json(&json!({"ended": run, "pid": pid, "log": log, "at": place}));
+        return Ok(Exit::Ok);
+    }
+    let log = log.map_or_else(String::new, |log| format!("; log on its computer: {log}"));
+    output::note(format_args!("{run} at {place} ended{log}"));
+    Ok(Exit::Ok)
 }
 
 /// Returns the failure of `down` without a name where only planners are left.

@@ -26,6 +26,9 @@ pub struct Args {
     /// If an obstacle blocks the motion, stop, plan again and continue
     #[arg(long, conflicts_with_all = ["file", "no_wait"])]
     pub replan: bool,
+    /// Execute a plan of --level fast, which is not proven free of contact
+    #[arg(long, conflicts_with = "file")]
+    pub unproven: bool,
     /// Return when the motion has begun
     #[arg(long)]
     pub no_wait: bool,
@@ -56,12 +59,15 @@ pub fn run(args: &Args) -> Result {
             begun
         }
         None => {
-            let begun = client.call(ExecutePlan { plan: args.plan, replan: args.replan, ..ExecutePlan::default() })?;
+            let begun = client.call(ExecutePlan {
+                plan: args.plan,
+                replan: args.replan,
+                unproven: args.unproven,
+                ..ExecutePlan::default()
+            })?;
             let (motion, task) = (begun.motion, &begun.task);
-            output::note(format_args!(
-                "motion {motion} on {task}: {:.2} s, planned, collision-checked",
-                begun.duration
-            ));
+            let checked = if args.unproven { "" } else { ", collision-checked" };
+            output::note(format_args!("motion {motion} on {task}: {:.2} s, planned{checked}", begun.duration));
             begun
         }
     };

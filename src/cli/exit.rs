@@ -186,6 +186,7 @@ fn exit_of(code: Code) -> Exit {
         | Code::UnknownMotion
         | Code::InvalidParams
         | Code::InvalidTrajectory => Exit::Usage,
+        Code::Unreachable => Exit::Hardware,
         _ => Exit::Failed,
     }
 }

@@ -13,7 +13,8 @@ use super::grip::{self, GripAction};
 use super::output::{self, fixed};
 use super::recorded_path;
 use crate::rpc::api::{
-    Cancel, DEFAULT_SPEED, JointPath, PATH_TOLERANCE, Plan, PlanGoal, PlanSummary, Planner, Planning, PoseSpec,
+    Cancel, DEFAULT_SPEED, JointPath, PATH_TOLERANCE, Plan, PlanGoal, PlanLevel, PlanSummary, Planner, Planning,
+    PoseSpec,
 };
 use crate::rpc::client::{Client, ClientError};
 use crate::rpc::{Code, RpcError};
@@ -126,7 +127,8 @@ fn waypoint(text: &str) -> std::result::Result<Waypoint, String> {
     let mut planned = PlanGoal::default();
     match text.split_once(':') {
         Some((kind @ ("pose" | "line"), list)) => {
-            (planned.pose, planned.frame) = pose_in_frame(list)?;
+            let numbers = |e| format!("{kind}: takes x,y,z, and r,p,y or a quaternion, as numbers: {e}");
+            (planned.pose, planned.frame) = pose_in_frame(list).map_err(numbers)?;
             planned.linear = kind == "line";
         }
         Some(("named", name)) => planned.named = Some(name.to_owned()),
@@ -171,6 +173,12 @@ fn pose(list: &str) -> std::result::Result<PoseSpec, String> {
     Ok(PoseSpec { xyz, rpy, quat })
 }
 
+/// Parses how a plan is checked.
+fn level(text: &str) -> std::result::Result<PlanLevel, String> {
+    let all = [PlanLevel::Fast, PlanLevel::Certified, PlanLevel::Exact];
+    all.into_iter().find(|level| level.name() == text).ok_or_else(|| "must be fast, certified or exact".into())
+}
+
 /// Settings of the search and the speed.
 #[derive(Debug, Clone, clap::Args)]
 pub struct Search {
@@ -183,6 +191,13 @@ pub struct Search {
     /// Seed of the search: the same request with the same seed gives the same plan
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
+    /// Look for a shorter path in N more rounds: 100 take some 10 ms
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub refine: u32,
+    /// How the plan is checked: certified proves it free of contact, between samples too; exact also finds the
+    /// clearance to 0.5 mm; fast checks samples only, and is executed only with --unproven
+    #[arg(long, value_name = "LEVEL", default_value = PlanLevel::default().name(), value_parser = level)]
+    pub level: PlanLevel,
     /// Maximum planning time: 5s, or a number of seconds; default: the blueprint's planning_timeout
     #[arg(long, value_name = "TIME", value_parser = super::arguments::duration)]
     pub timeout: Option<Duration>,
@@ -271,6 +286,8 @@ impl Goal {
             goals: through.pop().map_or_else(|| self.of(robot, path, search), |last| vec![last]),
             speed: search.speed,
             seed: search.seed,
+            level: search.level,
+            refine: search.refine,
             timeout: search.timeout.map(|t| t.as_secs_f64()),
             through,
             blend: self.blend,
@@ -333,6 +350,11 @@ pub fn plan(client: &mut Client, request: Plan, signals: &Signals) -> Result<Pla
     }
 }
 
+/// Describes how a plan was checked.
+pub fn checked(level: PlanLevel) -> &'static str {
+    if level == PlanLevel::Fast { "checked at samples only" } else { "collision-checked" }
+}
+
 /// Prints a plan's figures.
 pub fn show(planned: &Planned) {
     let s = &planned.summary;
@@ -344,10 +366,18 @@ pub fn show(planned: &Planned) {
         output::line(format_args!("  straight line: {} % of the way", fixed(fraction * 100.0, 1)));
     }
     match (s.clearance, &s.closest) {
-        (Some(clearance), Some([a, b])) => {
-            output::line(format_args!("  clearance {} m, between {a} and {b}", fixed(clearance, 4)));
+        (Some(depth), Some([a, b])) if depth < 0.0 => {
+            output::line(format_args!("  begins in contact: {a} and {b}, {} m deep", fixed(-depth, 4)));
         }
-        (Some(clearance), None) => output::line(format_args!("  clearance {} m", fixed(clearance, 4))),
+        (Some(clearance), Some([a, b])) => {
+            output::line(format_args!("  proven clearance {} m, least between {a} and {b}", fixed(clearance, 4)));
+        }
+        (Some(clearance), None) => {
+            output::line(format_args!("  proven clearance {} m or more", fixed(clearance, 4)));
+        }
+        (None, _) if s.level == PlanLevel::Fast => {
+            output::line("  not proven free of contact: checked at samples only");
+        }
         _ => {}
     }
     for clamped in &s.goal_clamped {

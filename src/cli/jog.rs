@@ -12,6 +12,7 @@ mod active_motions;
 mod drive;
 mod fingers;
 mod keys;
+mod link;
 mod screen;
 mod session;
 pub(super) mod terminal;

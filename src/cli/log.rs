@@ -8,14 +8,13 @@ mod info;
 mod lerobot;
 mod list;
 mod plot;
+pub mod progress;
 mod rosbag;
 mod what_if;
 
-use std::io::{self, IsTerminal, Write};
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
-
-use indicatif::{ProgressBar, ProgressStyle};
 
 use super::arguments::{setting, time};
 use super::exit::{Exit, Failure, Result};
@@ -178,18 +177,21 @@ pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
         Command::Doctor(log) => doctor::run(&log.path()?, log.json),
         Command::Verify(log) => replay::verify_log(&log.path()?, catalog.tasks, log.json),
         Command::WhatIf { log, set, output } => {
-            what_if::run(&log.path()?, catalog.tasks, set, output.as_deref(), log.json)
+            let run = || what_if::run(&log.path()?, catalog.tasks, set, output.as_deref(), log.json);
+            output.as_deref().map_or_else(run, |to| whole_or_nothing(to, run))
         }
         Command::Cut { log, part, output } => copy::cut(&log.path()?, part, output, log.json),
         Command::Recover { log, output } => copy::recover(&log.path()?, output.as_deref(), log.json),
         Command::Export { log, part, topic, output, parquet, rosbag2, lerobot, fps, task } => {
             let path = log.path()?;
-            match (parquet, rosbag2, lerobot) {
+            let run = || match (parquet, rosbag2, lerobot) {
                 (Some(to), ..) => export::parquet(&path, part, to, log.json),
                 (_, Some(to), _) => rosbag::run(&path, part, to, log.json),
                 (.., Some(to)) => lerobot::run(&path, part, to, *fps, task.as_deref(), log.json),
                 _ => export::csv(&path, part, topic.as_deref(), output.as_deref(), log.json),
-            }
+            };
+            let to = parquet.as_deref().or(rosbag2.as_deref()).or(lerobot.as_deref()).or(output.as_deref());
+            to.map_or_else(run, |to| whole_or_nothing(to, run))
         }
         Command::Plot { log, part, joint, output } => plot::run(&log.path()?, part, joint, output, log.json),
     }
@@ -242,23 +244,18 @@ fn unreadable(error: ReplayError) -> Failure {
     Failure::of(Exit::Usage, error)
 }
 
-/// Returns a bar for reading a log, on a terminal.
-fn progress() -> impl FnMut(&Scan) {
-    let bar = if io::stderr().is_terminal() { ProgressBar::new(1) } else { ProgressBar::hidden() };
-    if let Ok(style) = ProgressStyle::with_template("[{bar:40}] {percent:>3} %") {
-        bar.set_style(style.progress_chars("=> "));
+/// Writes a new file or folder. If that fails, removes what there is of it: the next attempt finds its name free.
+fn whole_or_nothing(to: &Path, write: impl FnOnce() -> Result) -> Result {
+    // Also what a broken link leads to is not ours.
+    let before = to.symlink_metadata().is_ok();
+    let result = write();
+    if result.is_err() && !before {
+        let _ = if to.is_dir() { std::fs::remove_dir_all(to) } else { std::fs::remove_file(to) };
     }
-    move |scan: &Scan| {
-        let (at, length) = scan.position();
-        bar.set_length(length);
-        bar.set_position(at);
-        if at >= length {
-            bar.finish_and_clear();
-        }
-    }
+    result
 }
 
-/// Returns what a log lacks; `None` if it is whole, or the log of a live run.
+/// Returns what is missing in the part of a log that was read; `None` if nothing is, or if the run is live.
 fn loss(scan: &Scan) -> Option<String> {
     let damaged = scan.damage.first().map(|(at, why)| {
         let more = scan.damage.len() - 1;
@@ -267,8 +264,11 @@ fn loss(scan: &Scan) -> Option<String> {
             if more > 0 { format!(" ({more} more chunks)") } else { String::new() }
         )
     });
-    let cut = || scan.cut.clone().filter(|_| !scan.is_live());
-    damaged.or_else(cut).or_else(|| (!scan.complete && !scan.is_live()).then(|| "it was not closed".to_owned()))
+    let ended_early = || {
+        let lacks = !scan.complete && !scan.is_live() && scan.part_reaches_end();
+        lacks.then(|| scan.cut.clone().unwrap_or_else(|| "it was not closed".to_owned()))
+    };
+    damaged.or_else(ended_early)
 }
 
 /// Returns the exit code for a log, and prints what it lacks.

@@ -1,4 +1,5 @@
-//! `dimos logs [RUN] [-f]`: the text log of a run without a terminal, live or ended.
+//! `dimos logs [RUN] [-f]`: the text log of a run without a terminal, live or ended. Of a run on another computer, the
+//! lines that it keeps for its clients.
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -7,9 +8,11 @@ use std::time::Duration;
 
 use anyhow::Context;
 
+use super::arguments::{connect, place};
 use super::exit::{Exit, Failure, Result};
-use super::output;
 use super::run_record::{RunRecord, RunState};
+use super::{lasting, output};
+use crate::rpc::api::TextLog;
 use crate::rpc::client::ClientError;
 use crate::rpc::run_dir::RunDir;
 
@@ -35,7 +38,11 @@ pub struct Args {
 
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
-    let record = find(args.name.as_deref().or(args.run.as_deref()))?;
+    let name = args.name.as_deref().or(args.run.as_deref());
+    if place().is_some() {
+        return elsewhere(args, name);
+    }
+    let record = find(name)?;
     if args.json {
         output::json(&record);
         return Ok(Exit::Ok);
@@ -52,6 +59,43 @@ pub fn run(args: &Args) -> Result {
             Err(Failure::new(Exit::Fault, what).hint("`dimos status` shows what is known of it"))
         }
         _ => Ok(Exit::Ok),
+    }
+}
+
+/// Prints the latest lines of a run on another computer, and further ones with --follow until Ctrl-C.
+fn elsewhere(args: &Args, name: Option<&str>) -> Result {
+    if args.json {
+        let failure = Failure::usage("--json shows files of this computer, not those of another");
+        return Err(failure.hint("`dimos status --json` has the paths on the run's computer"));
+    }
+    let mut client = connect(name)?;
+    let (mut log, mut after) = (None, 0);
+    loop {
+        let report = match client.call(TextLog { after }) {
+            Err(error) if args.follow && lasting::is_lost(&error) => {
+                client = lasting::again(client.run(), &error)?;
+                continue;
+            }
+            report => report?,
+        };
+        // Another run now, with other numbers.
+        if log.replace(report.log).is_some_and(|log| log != report.log) && after > 0 {
+            after = 0;
+            continue;
+        }
+        if report.lost > 0 && after > 0 {
+            output::note(format_args!("({} lines are missing: the run keeps the latest 1000)", report.lost));
+        }
+        if !report.lines.iter().all(|line| output::data(format!("{line}\n").as_bytes())) {
+            return Ok(Exit::Ok);
+        }
+        after = report.last;
+        if report.lines.is_empty() {
+            if !args.follow {
+                return Ok(Exit::Ok);
+            }
+            std::thread::sleep(POLL_PERIOD);
+        }
     }
 }
 

@@ -22,6 +22,7 @@ mod goal;
 mod grip;
 pub mod job;
 pub mod jog;
+mod lasting;
 pub mod list_adapters;
 pub mod list_blueprints;
 pub mod log;
@@ -40,6 +41,8 @@ pub mod replay;
 pub mod run;
 pub mod run_record;
 pub mod schema;
+pub mod share;
+mod share_child;
 pub mod speed;
 pub mod state;
 pub mod status;
@@ -78,6 +81,10 @@ fn after_help() -> String {
 #[command(name = "dimos", version = crate::VERSION, about = "Runs robot arms from a blueprint", after_help = after_help())]
 #[command(arg_required_else_help = true)]
 struct Cli {
+    /// Talk to runs on another computer: an endpoint (tls/HOST:PORT) or a name in places.yaml; default: $DIMOS_AT.
+    /// May also follow the verb
+    #[arg(long, value_name = "PLACE")]
+    at: Option<String>,
     #[command(subcommand)]
     command: Command,
 }
@@ -126,6 +133,8 @@ enum Command {
     Proxy(proxy::Args),
     /// Print the URL of the live view, a page in the browser; or show a log, robot model or blueprint in it
     View(view::Args),
+    /// Share a run with other computers, which reach it with --at
+    Share(share::Args),
     /// Shut down a run: decelerate, release the arms, close the log
     Down(down::Args),
     /// Show the text log of a run that was started with --daemon, live or dead
@@ -152,6 +161,25 @@ enum Command {
     Man(man::Args),
     #[command(about = "Play a log in the terminal, verify it, or repeat its motion with an arm")]
     Replay(replay::ReplayArgs),
+}
+
+impl Command {
+    /// Returns whether the verb can talk to a run on another computer.
+    fn talks_to_runs(&self) -> bool {
+        match self {
+            Self::Status(_) | Self::State(_) | Self::Move(_) | Self::Plan(_) | Self::Preview(_) | Self::Execute(_) => {
+                true
+            }
+            Self::World(_) | Self::Do(_) | Self::BackOut(_) | Self::Cancel(_) | Self::Speed(_) | Self::Pause(_) => true,
+            Self::Resume(_) | Self::Stop(_) | Self::Arm(_) | Self::Pose(_) | Self::Jog(_) | Self::Task(_) => true,
+            Self::Proxy(_) | Self::Run(_) | Self::View(_) | Self::Down(_) | Self::Logs(_) => true,
+            Self::Share(_) | Self::Log(_) => false,
+            Self::Adapter(_) | Self::ListAdapters(_) | Self::ListBlueprints(_) | Self::Check(_) | Self::Schema(_) => {
+                false
+            }
+            Self::Model(_) | Self::Doctor(_) | Self::Completions(_) | Self::Man(_) | Self::Replay(_) => false,
+        }
+    }
 }
 
 /// The whole program, with what another crate adds to it.
@@ -267,7 +295,8 @@ pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
 fn command_line(catalog: Catalog<'_>) -> ExitCode {
     // First of all: it changes the environment, and no thread may read that meanwhile.
     complete::answer(catalog);
-    let typed = separated(std::env::args_os()).into_iter().map(spelled_out).collect::<Vec<_>>();
+    set_threads_of_the_network();
+    let typed = place_first(separated(std::env::args_os()).into_iter().map(spelled_out).collect());
     let json = typed.iter().take_while(|word| *word != "--").any(|word| word == "--json");
     let result = match command().try_get_matches_from(&typed) {
         Ok(arguments) => dispatch(&arguments, catalog),
@@ -298,6 +327,14 @@ fn command_line(catalog: Catalog<'_>) -> ExitCode {
     }
 }
 
+/// Sets how many threads the network has, unless the user has. No other thread runs yet.
+fn set_threads_of_the_network() {
+    let (name, value) = crate::share::THREADS;
+    if !name.is_empty() && std::env::var_os(name).is_none() {
+        crate::rt::host::set_variable(name, value);
+    }
+}
+
 fn dispatch(arguments: &ArgMatches, catalog: Catalog<'_>) -> exit::Result {
     match added(verbs(), arguments) {
         Some((verb, own)) => (verb.run)(own),
@@ -315,6 +352,11 @@ fn usage_failure(error: &clap::Error) -> exit::Failure {
 }
 
 fn built_in(cli: &Cli, catalog: Catalog<'_>) -> exit::Result {
+    if cli.at.is_some() && !cli.command.talks_to_runs() {
+        let failure = exit::Failure::usage("this verb works on this computer only");
+        return Err(failure.hint("omit --at; through ssh it works there"));
+    }
+    arguments::set_place(cli.at.clone());
     let registry = catalog.adapters;
     match &cli.command {
         Command::Run(args) => run::run(args, catalog),
@@ -338,6 +380,7 @@ fn built_in(cli: &Cli, catalog: Catalog<'_>) -> exit::Result {
         Command::Task(args) => task::run(args),
         Command::Proxy(args) => proxy::run(args),
         Command::View(args) => view::run(args, catalog),
+        Command::Share(args) => share::run(args),
         Command::Down(args) => down::run(args),
         Command::Log(args) => log::run(args, catalog),
         Command::Logs(args) => logs::run(args),
@@ -369,6 +412,23 @@ fn separated(arguments: impl Iterator<Item = OsString>) -> Vec<OsString> {
             }
             _ => words.push(argument),
         }
+    }
+    words
+}
+
+/// Moves `--at PLACE` before the verb, where the parser expects it. `--at` before a number is a position of `world`.
+fn place_first(mut words: Vec<OsString>) -> Vec<OsString> {
+    let end = words.iter().position(|word| word == "--").unwrap_or(words.len());
+    let is_place = |word: &OsString| word.to_str().is_some_and(|text| text.parse::<f64>().is_err());
+    let found = words.iter().take(end).enumerate().skip(2).find_map(|(at, word)| {
+        let one_word =
+            word.to_str().and_then(|text| text.strip_prefix("--at=")).is_some_and(|p| p.parse::<f64>().is_err());
+        let two_words = word == "--at" && words.get(at + 1).filter(|_| at + 1 < end).is_some_and(is_place);
+        (one_word || two_words).then_some(at..at + 1 + usize::from(two_words))
+    });
+    if let Some(range) = found {
+        let place: Vec<OsString> = words.drain(range).collect();
+        words.splice(1..1, place);
     }
     words
 }
@@ -449,6 +509,25 @@ mod tests {
         assert_eq!(read("move a --pose 0.3,-.1,0.4 --rpy 0 1 0"), words("move a --pose 0.3 -.1 0.4 --rpy 0 1 0"));
         for same in ["move a --pose 0.3,x,0.4", "move a 0.3,0.1", "move --goal a=0.1,0.2", "run --set x=1,2"] {
             assert_eq!(read(same), words(same));
+        }
+    }
+
+    #[test]
+    fn a_place_may_follow_the_verb_and_is_no_position() {
+        let moved = |line: &str| {
+            let words = place_first(line.split(' ').map(OsString::from).collect());
+            words.iter().map(|word| word.to_string_lossy()).collect::<Vec<_>>().join(" ")
+        };
+        assert_eq!(moved("dimos state --at cell1 --watch"), "dimos --at cell1 state --watch");
+        assert_eq!(moved("dimos state --at=tls/cell1:1"), "dimos --at=tls/cell1:1 state");
+        assert_eq!(
+            moved("dimos world add cup --at 0.3 -0.1 0.4 --at cell1"),
+            "dimos --at cell1 world add cup --at 0.3 -0.1 0.4"
+        );
+        for same in
+            ["dimos --at cell1 state", "dimos world move cup --at 1 2 3", "dimos x -- --at cell1", "dimos state --at"]
+        {
+            assert_eq!(moved(same), same);
         }
     }
 

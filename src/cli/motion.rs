@@ -4,10 +4,10 @@
 use super::arguments::Target;
 use super::exit::{Exit, Failure, Result};
 use super::follow::{Signals, follow, follow_until};
-use super::goal::{Goal, Leg, Search, has_planner, plan, show};
+use super::goal::{Goal, Leg, Search, checked, has_planner, plan, show};
 use super::{output, recorded_path};
 use crate::rpc::Code;
-use crate::rpc::api::{Cancel, ExecutePlan, Move, MoveNative, MoveReply, Plan, Planner, Poses, State};
+use crate::rpc::api::{Cancel, ExecutePlan, Move, MoveNative, MoveReply, Plan, PlanLevel, Planner, Poses, State};
 use crate::rpc::client::Client;
 use crate::telemetry::describe::percent;
 
@@ -51,6 +51,9 @@ pub struct Args {
     /// If an obstacle blocks the motion, stop, plan again and continue
     #[arg(long, conflicts_with_all = ["direct", "no_wait", "path"])]
     pub replan: bool,
+    /// Execute a plan of --level fast, which is not proven free of contact
+    #[arg(long, conflicts_with = "direct")]
+    pub unproven: bool,
     /// Return when the motion has begun
     #[arg(long)]
     pub no_wait: bool,
@@ -64,6 +67,10 @@ pub fn run(args: &Args) -> Result {
     if args.goal.has_grips() && (args.no_wait || args.direct) {
         return Err(Failure::usage("a motion with gripper actions is planned, and waits for each part")
             .hint("without --no-wait and --direct"));
+    }
+    if args.search.level == PlanLevel::Fast && !args.unproven {
+        return Err(Failure::usage("a plan of --level fast is not proven free of contact: nothing has moved")
+            .hint("leave --level out, or add --unproven"));
     }
     let mut client = args.target_run.connect()?;
     let signals = Signals::watch();
@@ -161,8 +168,14 @@ fn plan_and_begin(args: &Args, request: Plan, client: &mut Client, signals: &Sig
         show(&planned);
     }
     signals.check()?;
-    let begun = client.call(ExecutePlan { plan: Some(planned.plan), replan: args.replan, ..ExecutePlan::default() })?;
-    output::note(format_args!("motion {} on {}: planned, collision-checked", begun.motion, begun.task));
+    let begun = client.call(ExecutePlan {
+        plan: Some(planned.plan),
+        replan: args.replan,
+        unproven: args.unproven,
+        ..ExecutePlan::default()
+    })?;
+    let checked = checked(planned.summary.level);
+    output::note(format_args!("motion {} on {}: planned, {checked}", begun.motion, begun.task));
     let reply = serde_json::to_value(&begun).unwrap_or_default();
     Ok((begun.motion, begun.task, reply))
 }

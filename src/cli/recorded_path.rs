@@ -6,9 +6,12 @@ use super::exit::{Exit, Failure, Result};
 use super::{output, trajectory_file};
 use crate::planning::thin::thin;
 use crate::recording::replay::{LogReader, Payload, ReplayError, Selection};
-use crate::rpc::api::{JointPath, MAX_PATH};
+use crate::rpc::api::{JointPath, MAX_LINE, MAX_PATH};
 use crate::rpc::client::ClientError;
 use crate::rpc::{Code, RpcError};
+
+/// Bytes of a request besides its waypoints, at most.
+const ENVELOPE: usize = 1024;
 
 /// Columns of joint positions [rad], in rows of time.
 struct Record {
@@ -49,9 +52,15 @@ pub fn read(file: &Path, joints: &[String], tolerance: f64) -> Result<JointPath>
     let rows: Vec<Vec<f64>> = record.rows.iter().filter_map(row).collect();
     // Half of the tolerance is for the straight lines, half for the blends between them.
     let points = thin(&rows, tolerance / 2.0);
+    let points: Vec<Vec<f64>> = points.iter().map(|row| row.iter().map(|q| rounded(*q)).collect()).collect();
     let (path, count) = (file.display(), points.len());
-    if !(2..=MAX_PATH).contains(&count) {
-        let what = format!("{path}: {} positions make {count} waypoints (2 to {MAX_PATH})", rows.len());
+    let fits = serde_json::to_string(&points).is_ok_and(|text| text.len() + ENVELOPE <= MAX_LINE);
+    if !(2..=MAX_PATH).contains(&count) || !fits {
+        let what = format!("{path}: {} positions make {count} waypoints, ", rows.len())
+            + &match fits {
+                true => format!("must be 2 to {MAX_PATH}"),
+                false => format!("more than a request can have ({MAX_LINE} bytes)"),
+            };
         return Err(Failure::usage(what).hint("a larger --tolerance makes fewer"));
     }
     output::note(format_args!(
@@ -59,6 +68,11 @@ pub fn read(file: &Path, joints: &[String], tolerance: f64) -> Result<JointPath>
         rows.len()
     ));
     Ok(JointPath { points, tolerance: tolerance / 2.0 })
+}
+
+/// Returns a position to 1e-7 rad, which is finer than any encoder and half as long in a request.
+fn rounded(q: f64) -> f64 {
+    (q * 1e7).round() / 1e7
 }
 
 /// Reads the joint states of a log.

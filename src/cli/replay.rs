@@ -23,7 +23,7 @@ use crate::recording::files;
 use crate::recording::replay::{LogInfo, LogReader, ReplayError};
 use crate::replay::recorded::RecordedError;
 use keys::Keys;
-use player::{Pace, Part, RealTime, Waiting, play};
+use player::{Pace, Part, RealTime, Waiting, delay, play};
 use view::{JsonLines, Live, Plain, View};
 
 /// Play a log in the terminal, verify it, or repeat its motion with an arm
@@ -44,7 +44,7 @@ use view::{JsonLines, Live, Plain, View};
 #[derive(Debug, Clone, Args)]
 #[command(override_usage = "dimos replay <LOG | --last> [OPTIONS]")]
 pub struct ReplayArgs {
-    /// Log file (.mcap)
+    /// Log file (.mcap): of several the first, or their folder; a name alone is also looked for in the folder of logs
     #[arg(value_name = "LOG", required_unless_present = "last", conflicts_with = "last")]
     pub log: Option<PathBuf>,
     /// Play the newest log
@@ -59,15 +59,27 @@ pub struct ReplayArgs {
     /// Wait for the space bar; needs a terminal
     #[arg(short = 'p', long, conflicts_with_all = ["json", "verify", "blueprint"])]
     pub start_paused: bool,
+    /// Wait this long before the first message
+    #[arg(short, long, value_name = "TIME", default_value = "0", value_parser = time, conflicts_with_all = ["verify", "blueprint"])]
+    pub delay: Duration,
+    /// Ignore the keyboard, except for Ctrl-C
+    #[arg(long, conflicts_with_all = ["start_paused", "verify", "blueprint"])]
+    pub disable_keyboard_controls: bool,
     /// Start this long after the first message, e.g. 1.5, 10s or 2m
     #[arg(long, value_name = "TIME", default_value = "0", value_parser = time)]
     pub start_offset: Duration,
     /// Play this much of the log, e.g. 1.5, 10s or 2m
-    #[arg(long, value_name = "TIME", value_parser = duration, alias = "playback-duration")]
+    #[arg(long, value_name = "TIME", value_parser = duration, visible_alias = "playback-duration")]
     pub duration: Option<Duration>,
+    /// End at this Unix time [s]
+    #[arg(long, value_name = "UNIX_TIME", value_parser = time, conflicts_with_all = ["duration", "verify"])]
+    pub playback_until_sec: Option<Duration>,
     /// Play only these topics, separated by commas
     #[arg(long, value_name = "TOPIC", value_delimiter = ',')]
     pub topics: Vec<String>,
+    /// Play all but these topics, separated by commas
+    #[arg(long, value_name = "TOPIC", value_delimiter = ',', conflicts_with_all = ["topics", "verify", "blueprint"])]
+    pub exclude_topics: Vec<String>,
     /// Replay the whole log through the control code and compare its commands bit for bit
     #[arg(long, conflicts_with_all = ["rate", "looping", "start_offset", "duration", "topics"])]
     pub verify: bool,
@@ -118,6 +130,10 @@ enum SelectionError {
     Empty { path: PathBuf, live: bool },
     #[error("the log {path} is only {length:.3} s long\nhint: use a shorter --start-offset")]
     TooShort { path: PathBuf, length: f64 },
+    #[error("--playback-until-sec is before the first message that is played, at {from:.3} s\nhint: it is a Unix time")]
+    Over { from: f64 },
+    #[error("--exclude-topics leaves no topic of the log")]
+    Nothing,
 }
 
 fn folder_text(folder: &Option<PathBuf>) -> String {
@@ -162,7 +178,7 @@ fn try_run(args: &ReplayArgs, catalog: Catalog<'_>) -> anyhow::Result<Exit> {
     let began = log.info().span.map_or(part.from, |(start, _)| start);
     let out = io::stdout();
     let tty = out.is_terminal();
-    let keys = tty && !args.json && io::stdin().is_terminal();
+    let keys = tty && !args.json && !args.disable_keyboard_controls && io::stdin().is_terminal();
     if args.start_paused && !keys {
         return Err(Failure::usage("--start-paused waits for a key, and there is no terminal").into());
     }
@@ -178,6 +194,9 @@ fn try_run(args: &ReplayArgs, catalog: Catalog<'_>) -> anyhow::Result<Exit> {
         }
     };
     let mut time: Box<dyn Waiting> = if keys { Box::new(Keys::open()?) } else { Box::new(RealTime) };
+    if let Some(interrupted) = delay(args.delay, time.as_mut()) {
+        return Ok(if interrupted { Exit::Interrupted } else { Exit::Ok });
+    }
     let end = play(&mut log, &part, Pace::new(args.rate, args.start_paused), view.as_mut(), time.as_mut())?;
     drop((view, time));
     if let Some(cut) = &end.cut {
@@ -197,7 +216,7 @@ fn try_run(args: &ReplayArgs, catalog: Catalog<'_>) -> anyhow::Result<Exit> {
 
 fn log_path(args: &ReplayArgs) -> anyhow::Result<PathBuf> {
     if let Some(path) = &args.log {
-        return Ok(files::log_at(path));
+        return Ok(super::log::found(path));
     }
     let folder = files::log_folder();
     let newest = folder.as_deref().map(files::newest).transpose()?.flatten();
@@ -206,7 +225,7 @@ fn log_path(args: &ReplayArgs) -> anyhow::Result<PathBuf> {
 
 fn choose(args: &ReplayArgs, info: &LogInfo, path: &Path) -> std::result::Result<Part, SelectionError> {
     let path = path.to_owned();
-    if let Some(topic) = args.topics.iter().find(|t| !info.topics.contains_key(*t)) {
+    if let Some(topic) = args.topics.iter().chain(&args.exclude_topics).find(|t| !info.topics.contains_key(*t)) {
         let topics = info.topics.keys().cloned().collect::<Vec<_>>().join(", ");
         return Err(SelectionError::NoTopic { path, topic: topic.clone(), topics });
     }
@@ -216,8 +235,20 @@ fn choose(args: &ReplayArgs, info: &LogInfo, path: &Path) -> std::result::Result
     if from > end {
         return Err(SelectionError::TooShort { path, length: (end - start) as f64 * 1e-9 });
     }
-    let to = args.duration.map_or(end, |d| from.saturating_add(nanoseconds(d)).min(end));
-    Ok(Part { topics: args.topics.clone(), from, to, looping: args.looping })
+    let to = args.duration.map(|d| from.saturating_add(nanoseconds(d)));
+    let to = to.or(args.playback_until_sec.map(nanoseconds)).map_or(end, |to| to.min(end));
+    if to < from {
+        return Err(SelectionError::Over { from: from as f64 * 1e-9 });
+    }
+    let mut topics = args.topics.clone();
+    if !args.exclude_topics.is_empty() {
+        topics = info.topics.keys().filter(|topic| !args.exclude_topics.contains(topic)).cloned().collect();
+        // No topics mean all of them.
+        if topics.is_empty() {
+            return Err(SelectionError::Nothing);
+        }
+    }
+    Ok(Part { topics, from, to, looping: args.looping })
 }
 
 /// Returns the number of joints of all arms: grippers follow them in `/joint_states`.

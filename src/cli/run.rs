@@ -17,6 +17,8 @@ use super::attach::{self, Attached};
 use super::daemon::StartingProcess;
 use super::exit::{Exit, Failure, Result};
 use super::run_record::RunRecord;
+use super::share;
+use super::share_child::ShareChild;
 use super::text_log::Terminal;
 use super::{banner, check, daemon};
 use crate::blueprint::Catalog;
@@ -93,9 +95,9 @@ pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
     match &args.text_log {
         None if args.daemon => daemon::start(args, catalog),
         None => match bring_up(args, catalog)? {
-            (Up::Run(run), signals, terminal) => {
+            (Up::Run(run, share), signals, terminal) => {
                 let record = RunRecord::begin(&run.status(), None);
-                let keep = Keep { duration: args.duration, json: args.json, seen: true };
+                let keep = Keep { duration: args.duration, json: args.json, seen: true, share };
                 keep_up(*run, signals, &terminal, keep, Some(record))
             }
             (Up::Planner(planner), signals, terminal) => {
@@ -118,7 +120,7 @@ fn in_background(args: &Args, catalog: Catalog<'_>, text_log: &Path) -> Result {
         }
     };
     let (endings, notified) = match &up {
-        Up::Run(run) => (run.endings(), starter.up(&run.status(), run.socket(), run.view_url(), None)),
+        Up::Run(run, _) => (run.endings(), starter.up(&run.status(), run.socket(), run.view_url(), None)),
         Up::Planner(planner) => {
             (planner.endings(), starter.up(&planner.report(), None, planner.view_url(), Some(planner.run())))
         }
@@ -127,21 +129,21 @@ fn in_background(args: &Args, catalog: Catalog<'_>, text_log: &Path) -> Result {
         terminal.note("the starting process exited before the run was ready");
         let _ = endings.send(Ending::Asked);
     }
-    let run = match up {
-        Up::Run(run) => *run,
+    let (run, share) = match up {
+        Up::Run(run, share) => (*run, share),
         Up::Planner(planner) => {
             watch(signals, endings)?;
             return planner.keep_up(&terminal, args, Some(text_log));
         }
     };
     let record = RunRecord::begin(&run.status(), Some(text_log));
-    keep_up(run, signals, &terminal, Keep { duration: args.duration, json: false, seen: notified }, Some(record))
+    keep_up(run, signals, &terminal, Keep { duration: args.duration, json: false, seen: notified, share }, Some(record))
 }
 
 /// What `dimos run` keeps up.
 enum Up {
-    /// A run.
-    Run(Box<Run>),
+    /// A run, and its gateway to other computers.
+    Run(Box<Run>, Option<ShareChild>),
     /// An attached planner.
     Planner(Box<Attached>),
 }
@@ -163,20 +165,29 @@ fn bring_up(args: &Args, catalog: Catalog<'_>) -> Result<(Up, Signals, Terminal)
         let planner = Attached::start(args, blueprint, run, &terminal).inspect_err(|_| terminal.flush())?;
         return Ok((Up::Planner(Box::new(planner)), signals, terminal));
     }
-    let run = Run::start(blueprint, args.options()).map_err(|error| {
+    let options = Options { text: Some(terminal.kept()), ..args.options() };
+    let run = Run::start(blueprint, options).map_err(|error| {
         terminal.flush();
         if let Some(manager) = ServiceManager::from_env() {
             manager.status(&error.to_string());
         }
         Failure::from(error)
     })?;
-    Ok((Up::Run(Box::new(run)), signals, terminal))
+    let share = match &blueprint.share {
+        Some(config) => {
+            share::lines(config).iter().for_each(|line| terminal.note(format_args!("shared {line}")));
+            let child = ShareChild::start(run.name(), config, terminal.clone());
+            Some(child.context("cannot start the gateway to other computers")?)
+        }
+        None => None,
+    };
+    Ok((Up::Run(Box::new(run), share), signals, terminal))
 }
 
 /// Keeps a started run up until a signal, its duration, `dimos down` or a fault ends it, and stops it. Reports on the
 /// terminal.
 pub fn until_its_end(run: Run, duration: Option<Duration>, json: bool) -> Result {
-    keep_up(run, signals()?, &terminal()?, Keep { duration, json, seen: true }, None)
+    keep_up(run, signals()?, &terminal()?, Keep { duration, json, seen: true, share: None }, None)
 }
 
 fn signals() -> Result<Signals> {
@@ -194,13 +205,15 @@ struct Keep {
     /// Whether a client or a terminal was shown that the run is up: otherwise no one expects its arms to move at
     /// its end.
     seen: bool,
+    /// Its gateway to other computers.
+    share: Option<ShareChild>,
 }
 
 fn keep_up(
     run: Run,
     mut signals: Signals,
     terminal: &Terminal,
-    Keep { duration, json, mut seen }: Keep,
+    Keep { duration, json, mut seen, share }: Keep,
     record: Option<RunRecord>,
 ) -> Result {
     for signal in signals.pending() {
@@ -216,6 +229,7 @@ fn keep_up(
     let socket = run.socket().unwrap_or_else(|| Path::new("none"));
     banner::print(terminal, &report, socket, url, how_to_end, json);
     let ending = run.wait_for_end(duration);
+    share.iter().for_each(ShareChild::run_ends);
     // A terminal that is lost has no one before it who expects a motion.
     let unwatched = matches!(ending, Ending::Fault(_) | Ending::Log(_) | Ending::Signal(SIGHUP));
     let parks = seen && !unwatched && report.arms.iter().any(banner::parks);
@@ -224,6 +238,7 @@ fn keep_up(
         terminal.note(format_args!("{}: decelerating to rest, {then}", why(&ending)));
     }
     let ended = if parks { run.park_and_stop() } else { run.stop() };
+    drop(share);
     print_summary(terminal, &report, &ending, &ended, json);
     let exit = match &ending {
         Ending::Fault(_) => Exit::Fault,
@@ -279,6 +294,8 @@ fn print_summary(terminal: &Terminal, report: &StatusReport, ending: &Ending, en
         log: Option<&'a PathBuf>,
         #[serde(skip_serializing_if = "Option::is_none")]
         log_cut: Option<&'a String>,
+        #[serde(skip_serializing_if = "<[PathBuf]>::is_empty")]
+        fault_logs: &'a [PathBuf],
     }
     if json {
         let log = ended.log.as_ref();
@@ -291,6 +308,7 @@ fn print_summary(terminal: &Terminal, report: &StatusReport, ending: &Ending, en
             parked: &ended.parked,
             log,
             log_cut: ended.log_cut.as_ref(),
+            fault_logs: &ended.fault_logs,
         });
     }
     for trouble in &ended.troubles {
@@ -302,6 +320,12 @@ fn print_summary(terminal: &Terminal, report: &StatusReport, ending: &Ending, en
     match (&ended.log, &ended.log_cut) {
         (Some(_), Some(cut)) => terminal.note(format_args!("run {} ended; the log is incomplete: {cut}", report.run)),
         (Some(log), None) => terminal.note(format_args!("run {} ended; log: {}", report.run, log.display())),
-        (None, _) => terminal.note(format_args!("run {} ended; no log was written", report.run)),
+        (None, _) if ended.fault_logs.is_empty() => {
+            terminal.note(format_args!("run {} ended; no log was written", report.run));
+        }
+        (None, _) => {
+            let logs: Vec<_> = ended.fault_logs.iter().map(|log| log.display().to_string()).collect();
+            terminal.note(format_args!("run {} ended; logs of faults: {}", report.run, logs.join(", ")));
+        }
     }
 }

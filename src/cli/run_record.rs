@@ -88,17 +88,19 @@ impl RunRecord {
 
     fn keep(&self) {
         let Some(folder) = files::log_folder() else { return };
-        let write = || {
-            std::fs::create_dir_all(&folder)?;
-            // Readers find the old record or the new one, never a partial one.
-            let fresh = folder.join(format!(".{}.json.{}", self.run, self.pid));
-            std::fs::write(&fresh, serde_json::to_vec_pretty(self)?)?;
-            std::fs::rename(&fresh, path_in(&folder, &self.run))?;
-            io::Result::Ok(())
-        };
-        if let Err(error) = write() {
+        if let Err(error) = self.keep_in(&folder) {
             tracing::info!("cannot write the run's record: {}: {error}", folder.display());
         }
+    }
+
+    fn keep_in(&self, folder: &Path) -> io::Result<()> {
+        std::fs::create_dir_all(folder)?;
+        // Readers find the old record or the new one, never a partial one.
+        let fresh = folder.join(format!(".{}.json.{}", self.run, self.pid));
+        let written = std::fs::write(&fresh, serde_json::to_vec_pretty(self)?);
+        let kept = written.and_then(|()| std::fs::rename(&fresh, path_in(folder, &self.run)));
+        // A full disk keeps no part of it.
+        kept.inspect_err(|_| drop(std::fs::remove_file(&fresh)))
     }
 
     /// Returns the record of a name.
@@ -237,6 +239,16 @@ mod tests {
         let pid = child.id();
         child.wait().unwrap();
         assert_eq!(process_began(pid), None);
+    }
+
+    #[test]
+    fn a_record_that_cannot_be_kept_leaves_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        let blocking = path_in(folder.path(), "r");
+        std::fs::create_dir(&blocking).unwrap();
+        assert!(record(1, 0).keep_in(folder.path()).is_err());
+        let left: Vec<_> = std::fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().path()).collect();
+        assert_eq!(left, [blocking]);
     }
 
     #[test]

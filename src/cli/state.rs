@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use super::arguments::{Target, hertz};
 use super::exit::{Exit, Result};
+use super::lasting;
 use super::output::{self, Table, fixed, number};
 use crate::rpc::api::State;
 use crate::rpc::report::{ArmStateReport, JointReport, PoseReport, StateReport};
@@ -31,7 +32,14 @@ pub fn run(args: &Args) -> Result {
     let period = Duration::from_secs_f64(1.0 / args.hz);
     let mut next = Instant::now();
     loop {
-        let report = client.call(State {})?;
+        let report = match client.call(State {}) {
+            Err(error) if args.watch && lasting::is_lost(&error) => {
+                client = lasting::again(client.run(), &error)?;
+                screen = Screen::new(screen.live);
+                continue;
+            }
+            report => report?,
+        };
         let lines = match args.target_run.json {
             true => vec![serde_json::to_string(&report).unwrap_or_default()],
             false => table(&report),

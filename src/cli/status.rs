@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::arguments::Target;
+use super::arguments::{Target, connect_to, place};
 use super::arm::parts::{io_lines, joint_lines, payload_text};
 use super::arm::tool::tcp_text;
 use super::attach;
@@ -12,7 +12,7 @@ use super::output::{self, Table, Tone, number, span, toned};
 use super::run_record::{RunRecord, RunState};
 use super::speed::describe;
 use crate::rpc::api::{SpeedReport, Status};
-use crate::rpc::client::{Client, ClientError};
+use crate::rpc::client::ClientError;
 use crate::rpc::report::{ArmReport, Percentiles, PlannerStatus, StatusReport, TaskReport};
 use crate::rpc::report::{LED_BY_CONTROLLER, end_of_lead};
 use crate::rpc::run_dir::LiveRun;
@@ -104,6 +104,10 @@ pub fn run(args: &Args) -> Result {
 
 /// Returns the runs that failed and have not been started again.
 fn failed_runs(live: &[LiveRun]) -> Vec<FailedRun> {
+    // The records are those of this computer.
+    if place().is_some() {
+        return Vec::new();
+    }
     let dead = RunRecord::all().into_iter().filter(|r| !live.iter().any(|l| l.name == r.run) && r.ended_abnormally());
     let failed = |record: RunRecord| {
         let state = match record.state() {
@@ -123,12 +127,17 @@ fn print_failed(failed: &FailedRun) {
 }
 
 fn request_status(run: &LiveRun) -> std::result::Result<StatusReport, ClientError> {
-    Client::connect(&run.name, &run.socket)?.call(Status {})
+    connect_to(run)?.call(Status {})
 }
 
 fn overview(runs: Vec<LiveRun>, json: bool) {
     let failed_runs = failed_runs(&runs);
-    let answers = runs.into_iter().map(|run| match request_status(&run) {
+    // At once: each of many runs on other computers takes a few milliseconds.
+    let replies: Vec<_> = std::thread::scope(|scope| {
+        let asked: Vec<_> = runs.iter().map(|run| scope.spawn(|| request_status(run))).collect();
+        asked.into_iter().filter_map(|reply| reply.join().ok()).collect()
+    });
+    let answers = runs.into_iter().zip(replies).map(|(run, reply)| match reply {
         Ok(report) => RunEntry::Answered { state: "live", report: Box::new(report) },
         Err(error) => RunEntry::NoReply {
             run: run.name,
@@ -208,6 +217,20 @@ fn print(r: &StatusReport, verbose: bool) {
     if let Some(address) = &r.view {
         output::line(format_args!("  view {}", banner::view_without_token(address)));
     }
+    if let Some(share) = &r.share {
+        let clients = if share.clients.is_empty() { "no clients".to_owned() } else { share.clients.join(", ") };
+        if !share.endpoints.is_empty() {
+            output::line(format_args!("  shared at {}: {clients}", share.endpoints.join(", ")));
+        }
+        for face in &share.faces {
+            let what = match &face.reason {
+                Some(reason) => format!("DOES NOT SERVE: {reason}"),
+                None if face.command => "its programs may move the arms".to_owned(),
+                None => "its programs read".to_owned(),
+            };
+            output::line(format_args!("  shared with {} as {}: {what}", face.face, face.name));
+        }
+    }
     if let Some(recorder) = r.recorder.as_ref().filter(|recorder| verbose || recorder.dropped > 0) {
         output::line(format_args!("  {} messages logged, {} dropped", recorder.messages, recorder.dropped));
     }
@@ -279,7 +302,8 @@ fn attention(r: &StatusReport) -> Vec<String> {
 /// Returns the planners in their own processes that are attached to none of these runs.
 fn waiting<'r>(runs: impl Iterator<Item = &'r StatusReport>) -> Vec<LiveRun> {
     let attached = runs.filter_map(|run| run.planner.as_ref()?.attached.as_ref()?.pid).collect::<Vec<_>>();
-    attach::live().into_iter().filter(|planner| !attached.contains(&(planner.pid as i32))).collect()
+    let live = if place().is_some() { Vec::new() } else { attach::live() };
+    live.into_iter().filter(|planner| !attached.contains(&(planner.pid as i32))).collect()
 }
 
 /// Prints the planners of runs as a table, with the run if there are several.

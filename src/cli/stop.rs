@@ -2,13 +2,13 @@
 
 use std::collections::BTreeMap;
 
-use super::arguments::Target;
+use super::arguments::{self, Target, connect_to};
 use super::exit::{Exit, Failure};
 use super::other_users;
 use super::output::{self, Table, Tone, toned};
 use crate::rpc::api::{Confirmation, Stop, StopReply};
-use crate::rpc::client::{Client, ClientError};
-use crate::rpc::run_dir::LiveRun;
+use crate::rpc::client::{ClientError, find};
+use crate::rpc::run_dir::{LiveRun, RunDir};
 use crate::rpc::{Code, RpcError};
 
 /// Arguments of `stop`.
@@ -33,7 +33,7 @@ type Replies<'a> = Vec<(&'a LiveRun, Result<StopReply, ClientError>)>;
 
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
-    let runs = args.target_run.named_or_all()?;
+    let (runs, unreached) = runs(args)?;
     let replies = of_each(&runs, |run| stop(run, args));
     let done: BTreeMap<&str, &StopReply> =
         replies.iter().filter_map(|(run, r)| r.as_ref().ok().map(|r| (run.name.as_str(), r))).collect();
@@ -43,15 +43,45 @@ pub fn run(args: &Args) -> Result {
         (false, true) => output::json(&done),
         (false, false) => print(&done),
     }
-    if args.target_run.run.is_none() {
+    if args.target_run.run.is_none() && !arguments::is_place_given() {
         for other in other_users::runs() {
             output::note(format_args!("not stopped: run {other}; only that user can stop it"));
         }
     }
     if runs.is_empty() {
-        return Err(ClientError::NoRun.into());
+        return Err(unreached.unwrap_or_else(|| ClientError::NoRun.into()));
     }
-    result(replies)
+    let result = result(replies);
+    match (result, unreached) {
+        (Ok(_), Some(unreached)) => Err(Failure { exit: Exit::Failed, ..unreached }),
+        (Err(failure), Some(unreached)) => {
+            output::failure(&unreached);
+            Err(failure)
+        }
+        (result, None) => result,
+    }
+}
+
+/// Returns the runs to stop, and why a place was not reached. Without `--at`: those of this computer, and those of
+/// `DIMOS_AT`.
+fn runs(args: &Args) -> Result<(Vec<LiveRun>, Option<Failure>)> {
+    if arguments::place().is_none() || arguments::is_place_given() {
+        return Ok((args.target_run.named_or_all()?, None));
+    }
+    let folder = RunDir::standard();
+    let mut runs = match &args.target_run.run {
+        Some(name) => find(&folder, Some(name)).into_iter().collect(),
+        None => folder.runs().map_err(ClientError::from)?,
+    };
+    match args.target_run.named_or_all() {
+        Ok(remote) => {
+            runs.extend(remote);
+            Ok((runs, None))
+        }
+        // The run may be here.
+        Err(failure) if failure.exit == Exit::Usage && !runs.is_empty() => Ok((runs, None)),
+        Err(failure) => Ok((runs, Some(failure))),
+    }
 }
 
 /// Returns the result of the verb: a failure unless every arm of every run confirmed.
@@ -90,7 +120,7 @@ fn of_each(runs: &[LiveRun], stop: impl Fn(&LiveRun) -> Result<StopReply, Client
 }
 
 fn stop(run: &LiveRun, args: &Args) -> Result<StopReply, ClientError> {
-    Client::connect(&run.name, &run.socket)?.call(Stop { arm: args.arm.clone() })
+    connect_to(run)?.call(Stop { arm: args.arm.clone() })
 }
 
 fn print(done: &BTreeMap<&str, &StopReply>) {
@@ -114,7 +144,7 @@ mod tests {
 
     #[test]
     fn a_run_whose_stop_panics_is_not_stopped() {
-        let run = |name: &str| LiveRun { name: name.into(), pid: 1, socket: "none".into() };
+        let run = |name: &str| LiveRun { name: name.into(), pid: 1, socket: "none".into(), at: None };
         let runs = [run("left"), run("right")];
         let stopped = |_: &LiveRun| Ok(StopReply { arms: [("arm".into(), Confirmation::Confirmed)].into() });
         assert_eq!(result(of_each(&runs, stopped)), Ok(Exit::Ok));

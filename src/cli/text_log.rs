@@ -10,9 +10,12 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::Duration;
 
 use serde::Serialize;
-use tracing_subscriber::filter::LevelFilter;
+use tracing_subscriber::filter::{LevelFilter, Targets};
 use tracing_subscriber::fmt::MakeWriter;
 use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::{Layer, Registry};
+
+use crate::rpc::api::TextLines;
 
 /// Capacity of the queue [lines].
 const QUEUE: usize = 1024;
@@ -21,32 +24,48 @@ const FLUSH_TIMEOUT: Duration = Duration::from_millis(500);
 
 enum Item {
     Note(Vec<u8>),
+    /// Shown here, and kept for no client.
+    Private(Vec<u8>),
     Data(Vec<u8>),
     /// Answered when everything before it is written.
     Flush(SyncSender<()>),
 }
+
+/// Reads the log beside the terminal.
+pub type Reader = Box<dyn Layer<Registry> + Send + Sync>;
 
 /// Sender of lines to the terminal. Never blocks.
 #[derive(Clone)]
 pub struct Terminal {
     items: SyncSender<Item>,
     dropped: Arc<AtomicU64>,
+    kept: TextLines,
 }
 
 impl Terminal {
     /// Starts the thread and the text log. `DIMOS_LOG` sets its level: error, warn (default), info, debug.
     pub fn start() -> io::Result<Self> {
+        Self::start_with(|_| None)
+    }
+
+    /// As [`start`](Self::start), with a further reader of the log, made for this terminal.
+    pub fn start_with(reader: impl FnOnce(&Self) -> Option<Reader>) -> io::Result<Self> {
         let level = std::env::var("DIMOS_LOG").ok().and_then(|l| l.parse::<LevelFilter>().ok());
         let (items, received) = sync_channel(QUEUE);
         let dropped = Arc::new(AtomicU64::new(0));
-        let lost = dropped.clone();
-        std::thread::Builder::new().name("terminal".into()).spawn(move || write(&received, &lost))?;
-        let terminal = Self { items, dropped };
+        let (lost, kept) = (dropped.clone(), TextLines::default());
+        let keep = kept.clone();
+        std::thread::Builder::new().name("terminal".into()).spawn(move || write(&received, &lost, &keep))?;
+        let terminal = Self { items, dropped, kept };
         let layer = tracing_subscriber::fmt::layer()
             .with_ansi(super::output::colour(&io::stderr()))
             .with_target(false)
             .with_writer(terminal.clone());
-        let subscriber = tracing_subscriber::registry().with(level.unwrap_or(LevelFilter::WARN)).with(layer);
+        let level = level.unwrap_or(LevelFilter::WARN);
+        // What the network library says is for its developers; what matters of it is said in our words.
+        let network = if level >= LevelFilter::DEBUG { level } else { LevelFilter::OFF };
+        let levels = Targets::new().with_default(level).with_target("zenoh", network);
+        let subscriber = tracing_subscriber::registry().with(reader(&terminal)).with(layer.with_filter(levels));
         // A program that embeds this one may have its own log; then that one is used.
         let _ = tracing::subscriber::set_global_default(subscriber);
         Ok(terminal)
@@ -55,6 +74,16 @@ impl Terminal {
     /// Prints a line for people, to stderr.
     pub fn note(&self, text: impl Display) {
         self.send(Item::Note(format!("{text}\n").into_bytes()));
+    }
+
+    /// Prints a line for the person at this terminal only, to stderr: clients that ask for the text log do not get it.
+    pub fn private(&self, text: impl Display) {
+        self.send(Item::Private(format!("{text}\n").into_bytes()));
+    }
+
+    /// Returns what it prints for people, for clients. A terminal that is paused (Ctrl-S) pauses that too.
+    pub fn kept(&self) -> TextLines {
+        self.kept.clone()
     }
 
     /// Prints a line of JSON, to stdout.
@@ -81,11 +110,15 @@ impl Terminal {
     }
 }
 
-fn write(items: &Receiver<Item>, lost: &AtomicU64) {
+fn write(items: &Receiver<Item>, lost: &AtomicU64, kept: &TextLines) {
     for item in items {
         match item {
             // A closed pipe is not an error.
-            Item::Note(line) => drop(io::stderr().write_all(&line)),
+            Item::Note(line) => {
+                kept.push(&String::from_utf8_lossy(&line));
+                let _ = io::stderr().write_all(&line);
+            }
+            Item::Private(line) => drop(io::stderr().write_all(&line)),
             Item::Data(line) => drop(super::output::data(&line)),
             Item::Flush(done) => drop(done.send(())),
         }

@@ -2,22 +2,21 @@
 //! or a blueprint, until Ctrl-C.
 
 #[cfg(feature = "view")]
+mod elsewhere;
+#[cfg(feature = "view")]
 mod log;
 #[cfg(feature = "view")]
 mod posed;
 
-use std::path::PathBuf;
-
 use serde_json::json;
 
-use super::arguments::Target;
+use super::arguments::{Target, is_place_given, place};
 use super::exit::{Exit, Failure, Result};
 use super::model::With;
 use super::output;
 use crate::blueprint::Catalog;
-use crate::rpc::api::Status;
-use crate::rpc::client::{self, Client};
-use crate::rpc::run_dir::{LiveRun, RunDir, view_file};
+use crate::rpc::client;
+use crate::rpc::run_dir::RunDir;
 
 /// Arguments of `view`.
 #[derive(Debug, clap::Args)]
@@ -25,7 +24,8 @@ use crate::rpc::run_dir::{LiveRun, RunDir, view_file};
 The URL contains a token: with that of a run, everything that `dimos` can do to the arms can be done from the page. A \
 new run has a new one. Through ssh: ssh -L 7000:127.0.0.1:7000 HOST, then open the URL in the local browser.
 WHAT is a log (.mcap; a file name alone is looked for in the folder of logs too), a robot model (.urdf, .xacro, \
-builtin:xarm6), or a blueprint. It is shown until Ctrl-C; nothing is connected and nothing moves.")]
+builtin:xarm6), or a blueprint. It is shown until Ctrl-C; nothing is connected and nothing moves.
+With --at the page of a run on another computer is served from this one, until Ctrl-C.")]
 pub struct Args {
     /// Show this log, robot model or blueprint; default: the URL of the live run
     #[arg(value_name = "WHAT", conflicts_with = "run")]
@@ -43,20 +43,26 @@ pub struct Args {
 
 /// Runs the verb.
 pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
+    if is_place_given() && (args.what.is_some() || args.last) {
+        let failure = Failure::usage("files are shown from this computer: --at shows a run");
+        return Err(failure.hint("omit --at, or omit the file"));
+    }
     if let Some(what) = &args.what {
         return open(args, what, catalog);
     }
     not_of_a_model(args, "what is shown")?;
+    if let Some(place) = place().filter(|_| !args.last) {
+        return open_elsewhere(args, place);
+    }
     if args.last {
         return open(args, &super::log::newest()?.to_string_lossy(), catalog);
     }
     let run = client::find(&RunDir::standard(), args.target_run.run.as_deref())?;
-    let read = |file: PathBuf| std::fs::read_to_string(file).ok();
-    let Some(text) = of_planner(&run).and_then(read).or_else(|| read(view_file(&run.socket))) else {
+    let Some(url) = client::view_url(&run.name, &run.socket) else {
         let hint = "the blueprint of the run, or of a planner attached to it, needs a robot model or a section `view`";
         return Err(Failure::new(Exit::Failed, format!("run {} has no live view", run.name)).hint(hint));
     };
-    print(args, "run", &run.name, text.trim());
+    print(args, "run", &run.name, &url);
     Ok(Exit::Ok)
 }
 
@@ -74,13 +80,6 @@ fn print(args: &Args, kind: &str, name: &str, url: &str) {
         true => output::json(&json!({kind: name, "url": url})),
         false => output::line(url),
     }
-}
-
-/// Returns the file of the planner that is attached to a run, whose page also has the planner's robots.
-fn of_planner(run: &LiveRun) -> Option<PathBuf> {
-    let status = Client::connect(&run.name, &run.socket).ok()?.call(Status {}).ok()?;
-    let name = status.planner?.attached?.name;
-    Some(RunDir::standard().planners().path().join(format!("{name}.view")))
 }
 
 /// Serves the page on something that is not live.
@@ -113,6 +112,21 @@ fn open(args: &Args, what: &str, catalog: Catalog<'_>) -> Result {
     let view = View::open(&ViewConfig::default(), subject)
         .map_err(|why| Failure::new(Exit::Failed, format!("the page cannot be served: {why}")))?;
     print(args, kind, what, view.url());
+    serve(&signals)
+}
+
+/// Serves the page of a run on another computer from this one.
+#[cfg(feature = "view")]
+fn open_elsewhere(args: &Args, place: &str) -> Result {
+    let signals = super::follow::Signals::watch_with_hangup();
+    let served = elsewhere::open(place, args.target_run.run.as_deref())?;
+    print(args, "run", &served.run, served.view.url());
+    serve(&signals)
+}
+
+/// Waits for the signal that ends the page.
+#[cfg(feature = "view")]
+fn serve(signals: &super::follow::Signals) -> Result {
     output::note(format_args!("open the URL in a browser; Ctrl-C ends the page"));
     loop {
         if let Some(signal) = signals.last() {
@@ -120,6 +134,11 @@ fn open(args: &Args, what: &str, catalog: Catalog<'_>) -> Result {
         }
         std::thread::sleep(std::time::Duration::from_millis(100));
     }
+}
+
+#[cfg(not(feature = "view"))]
+fn open_elsewhere(_: &Args, _: &str) -> Result {
+    Err(Failure::new(Exit::Failed, "this build has no live view (cargo feature `view`)"))
 }
 
 #[cfg(not(feature = "view"))]

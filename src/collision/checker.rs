@@ -26,6 +26,17 @@ impl Stop {
         Self { deadline, cancelled }
     }
 
+    /// Returns the same condition with a deadline that is no later than `at`.
+    pub fn or_at(&self, at: Instant) -> Self {
+        Self { deadline: Some(self.deadline.map_or(at, |own| own.min(at))), ..self.clone() }
+    }
+
+    /// Returns the same condition with half of the time that is left: what follows needs the rest.
+    pub fn halfway(&self) -> Self {
+        let now = Instant::now();
+        self.deadline.map_or_else(|| self.clone(), |own| self.or_at(now + own.saturating_duration_since(now) / 2))
+    }
+
     /// Returns whether the flag is set.
     pub fn is_cancelled(&self) -> bool {
         self.cancelled.as_ref().is_some_and(|flag| flag.load(Ordering::Relaxed))
@@ -71,6 +82,19 @@ pub trait CollisionChecker {
     /// Returns whether nothing touches on the straight line between two configurations, ends included, at the
     /// resolution; `false` if stopped.
     fn motion_is_free(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool;
+
+    /// Same, but gives up where the answer takes long, mostly along a surface: then `false`. For cuts that a path can
+    /// do without.
+    fn motion_is_easily_free(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool {
+        self.motion_is_free(from, to, stop)
+    }
+
+    /// Returns whether nothing touches at samples of the straight line between two configurations, the first of which
+    /// is known to be free. Quick: nothing is proven between the samples, and what hardly does not touch may count as
+    /// touching.
+    fn motion_looks_free(&mut self, from: &[f64], to: &[f64]) -> bool {
+        self.motion_is_free(from, to, &Stop::never())
+    }
 
     /// Returns the first contact found, in no particular order.
     fn first_contact(&mut self, q: &[f64]) -> Option<Pair>;

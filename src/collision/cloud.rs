@@ -5,7 +5,9 @@ use glamx::{DAffine3, DVec3};
 use super::pairs::point::local;
 
 /// Points per leaf.
-const LEAF: usize = 8;
+const LEAF: usize = 4;
+/// Halves with more points than these are sorted at the same time.
+const MANY: usize = 200_000;
 
 /// Points, sorted so that each node of the tree is a range of them.
 #[derive(Debug, Clone, PartialEq)]
@@ -24,8 +26,9 @@ impl Cloud {
             return None;
         }
         let depth = points.len().div_ceil(LEAF).next_power_of_two().trailing_zeros();
-        let mut boxes = vec![(DVec3::ZERO, DVec3::ZERO); (2 << depth) - 1];
-        split(&mut points, 0, &mut boxes);
+        sort(&mut points, depth);
+        let mut boxes = vec![(DVec3::INFINITY, DVec3::NEG_INFINITY); (2 << depth) - 1];
+        bound(&points, 0, &mut boxes);
         Some(Self { points, boxes, depth })
     }
 
@@ -115,20 +118,40 @@ impl Cloud {
     }
 }
 
-/// Sorts points into halves along the longest side, down to the leaves.
-fn split(points: &mut [DVec3], node: usize, boxes: &mut [(DVec3, DVec3)]) {
-    let low = points.iter().copied().fold(DVec3::INFINITY, DVec3::min);
-    let high = points.iter().copied().fold(DVec3::NEG_INFINITY, DVec3::max);
-    boxes[node] = (low, high);
-    if 2 * node + 1 >= boxes.len() {
+/// Sorts points into halves along the longest side, and these again, `depth` times.
+fn sort(points: &mut [DVec3], depth: u32) {
+    if depth == 0 || points.is_empty() {
         return;
     }
+    let (low, high) = corners(points);
     let axis = (high - low).max_position();
     let middle = points.len() / 2;
-    if !points.is_empty() {
-        points.select_nth_unstable_by(middle.min(points.len() - 1), |a, b| a[axis].total_cmp(&b[axis]));
-    }
+    points.select_nth_unstable_by(middle, |a, b| a[axis].total_cmp(&b[axis]));
     let (left, right) = points.split_at_mut(middle);
-    split(left, 2 * node + 1, boxes);
-    split(right, 2 * node + 2, boxes);
+    if left.len() < MANY {
+        sort(left, depth - 1);
+        sort(right, depth - 1);
+        return;
+    }
+    std::thread::scope(|scope| {
+        scope.spawn(|| sort(left, depth - 1));
+        sort(right, depth - 1);
+    });
+}
+
+fn corners(points: &[DVec3]) -> (DVec3, DVec3) {
+    points.iter().fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(low, high), p| (low.min(*p), high.max(*p)))
+}
+
+/// Fills the boxes of a node of sorted points and of all below it.
+fn bound(points: &[DVec3], node: usize, boxes: &mut [(DVec3, DVec3)]) -> (DVec3, DVec3) {
+    let found = if 2 * node + 1 >= boxes.len() {
+        corners(points)
+    } else {
+        let (left, right) = points.split_at(points.len() / 2);
+        let (a, b) = (bound(left, 2 * node + 1, boxes), bound(right, 2 * node + 2, boxes));
+        (a.0.min(b.0), a.1.max(b.1))
+    };
+    boxes[node] = found;
+    found
 }

@@ -3,6 +3,7 @@
 
 use std::sync::Arc;
 
+use dimos_kernels::discrete::Proof;
 use glamx::{DAffine3, DVec3};
 
 use crate::robot::model::Limits;
@@ -15,6 +16,9 @@ use super::pairs::{self, Placed, point};
 use super::report::{Contact, Pair};
 use super::scene::{LinkShape, Scene};
 use super::shape::Core;
+
+/// Number of exact checks of configurations for a motion that need not be free.
+const EXACT_CHECKS: u64 = 64;
 
 /// Distance of a pair compared to a margin.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -45,8 +49,12 @@ pub struct ExactChecker {
     /// Excludes most pairs, sixteen configurations at a time.
     pub(super) lanes: InLanes,
     pub(super) checks: u64,
+    /// Number of exact checks of configurations after which the check of a motion gives up.
+    pub(super) exact_checks_left: u64,
     /// Padding of each pair [m], parallel to `pairs`: closer counts as touching.
     pub(super) pads: Vec<f64>,
+    /// The largest of them.
+    pub(super) most_pad: f64,
     /// Pairs that never move relative to the world.
     still: Vec<Pair>,
 }
@@ -76,6 +84,8 @@ impl ExactChecker {
         let lanes = InLanes::new(&scene, &pairs);
         let mut made = Self {
             pads,
+            most_pad: 0.0,
+            exact_checks_left: u64::MAX,
             still,
             frames,
             pairs,
@@ -100,6 +110,12 @@ impl ExactChecker {
 
     /// Returns the index of a pair that touches at a configuration.
     pub(super) fn first_touch(&mut self, q: &[f64]) -> Option<usize> {
+        let pads = (&self.pads[..], self.most_pad);
+        let finite = q.iter().all(|x| x.is_finite());
+        if finite && self.lanes.touching((q, q), pads, self.witness, Proof::Samples, 1.0).0.is_none() {
+            self.checks += 1;
+            return None;
+        }
         self.lanes.set(q);
         let (none, all) = (self.lanes.none.clone(), self.lanes.all.clone());
         let found = self.lanes.find((1, 0.0), &none, &self.pads, &all, self.witness);
@@ -240,31 +256,6 @@ impl ExactChecker {
         best
     }
 
-    /// Returns the smallest distance, below `below` [m], of two things that can collide and move relative to each
-    /// other, at any of up to sixteen configurations; `None` if there is none.
-    pub fn closest(&mut self, configurations: &[Vec<f64>], below: f64) -> Option<Contact> {
-        self.lanes.find_closer(configurations, below);
-        let mut best: Option<Contact> = None;
-        for (lane, q) in configurations.iter().enumerate() {
-            if !self.lanes.close.iter().any(|(_, lanes)| lanes >> lane & 1 == 1) {
-                continue;
-            }
-            self.place(q);
-            for i in 0..self.lanes.close.len() {
-                let (pair, lanes) = self.lanes.close[i];
-                let pair = self.pairs[pair as usize];
-                let limit = best.as_ref().map_or(below, |contact| contact.distance);
-                if lanes >> lane & 1 == 1
-                    && self.least_distance(pair) < limit
-                    && let Some(contact) = self.contact(pair).filter(|contact| contact.distance < limit)
-                {
-                    best = Some(contact);
-                }
-            }
-        }
-        best
-    }
-
     /// Returns a lower bound of a pair's distance, from the links' bounding balls.
     fn least_distance(&self, pair: Pair) -> f64 {
         let ball = |l: usize| (self.center(&self.scene.links[l]), self.scene.links[l].ball.1);
@@ -344,6 +335,21 @@ impl CollisionChecker for ExactChecker {
 
     fn motion_is_free(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool {
         self.check_motion(from, to, stop)
+    }
+
+    fn motion_is_easily_free(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool {
+        self.is_free_within(EXACT_CHECKS, from, to, stop)
+    }
+
+    fn motion_looks_free(&mut self, from: &[f64], to: &[f64]) -> bool {
+        if self.always.is_some() {
+            return false;
+        }
+        let (found, samples) =
+            self.lanes.touching((from, to), (&self.pads, self.most_pad), self.witness, Proof::None, 1.0);
+        self.checks += samples;
+        self.witness = found.or(self.witness);
+        found.is_none()
     }
 
     fn first_contact(&mut self, q: &[f64]) -> Option<Pair> {

@@ -8,19 +8,28 @@ use dimos_kernels::apart::{self, Buffers, Stretches};
 use dimos_kernels::block::{LANES, Lanes};
 use dimos_kernels::bodies::Body;
 use dimos_kernels::chain::Frame;
-use dimos_kernels::cover::{Place, Tree};
+use dimos_kernels::discrete::{self, Discrete, Motion, Proof};
 use dimos_kernels::obstacle::{Core, Obstacle};
 use glamx::DAffine3;
 
 use super::report::Pair;
 use super::scene::{LinkShape, PlacedObstacle, Scene};
-use super::shape;
+use super::{cover, shape};
+
+/// Samples of a discrete check of a motion [1/rad], in the norm of all joints: as VAMP has for most arms.
+const SAMPLES_PER_RAD: f64 = 32.0;
+/// Most blocks of samples of one motion.
+const MOST_BLOCKS: f64 = 4096.0;
 
 /// A scene in lanes, and buffers.
 #[derive(Debug, Clone)]
 pub(super) struct InLanes {
     scene: Arc<apart::Scene>,
+    discrete: Arc<Discrete>,
     buffers: Buffers,
+    samples: discrete::Buffers,
+    /// For each entry of a configuration, the number of joints that it moves, each with its multiplier.
+    turned: Vec<f64>,
     /// One entry per joint.
     pub q: Vec<Lanes>,
     /// The pairs that are not apart, each with its lanes.
@@ -29,43 +38,29 @@ pub(super) struct InLanes {
     pub all: Arc<[u32]>,
     /// No motion.
     pub none: Arc<[f64]>,
-    margins: Vec<f64>,
 }
 
 impl InLanes {
     /// Prepares a scene; `pairs` are those of the checker.
     pub fn new(scene: &Scene, pairs: &[Pair]) -> Self {
-        let mut bodies = Vec::new();
+        let all: Arc<[u32]> = (0..pairs.len() as u32).collect();
+        let in_lanes = Arc::new(compile(scene, pairs));
+        let mut turned = vec![0.0; scene.dof()];
         for robot in &scene.robots {
-            let first = bodies.len();
-            bodies.push(Body::Fixed(frame(&robot.base)));
-            for body in 1..robot.kinematics.bodies() {
-                let Some((parent, mut joint)) = robot.kinematics.joint(body) else { continue };
-                joint.variable += robot.first_joint;
-                bodies.push(Body::Moving { parent: first + parent, joint });
+            for (_, joint) in (1..robot.kinematics.bodies()).filter_map(|body| robot.kinematics.joint(body)) {
+                turned[robot.first_joint + joint.variable] += joint.multiplier.abs();
             }
         }
-        let link = |link: &LinkShape| {
-            let base = scene.robots.get(link.robot).map_or(0.0, |robot| robot.base.translation.length());
-            apart::Link { body: link.frame, tree: Arc::new(cover(link)), extent: base + reach(link) }
-        };
-        let links = scene.links.iter().map(link).collect();
-        let obstacles: Vec<Obstacle> = scene.obstacles.iter().map(|o| obstacle(o, &mut bodies)).collect();
-        let pair = |pair: &Pair| match *pair {
-            Pair::Links(a, b) => apart::Pair::Links(a, b),
-            Pair::Obstacle(link, obstacle) => apart::Pair::Obstacle(link, obstacle),
-        };
-        let all: Arc<[u32]> = (0..pairs.len() as u32).collect();
-        let pairs: Vec<apart::Pair> = pairs.iter().map(pair).collect();
-        let scene_in_lanes = apart::Scene::new(bodies, links, &obstacles, &pairs, Width::widest());
         Self {
-            scene: Arc::new(scene_in_lanes),
+            discrete: Arc::new(Discrete::new(in_lanes.clone())),
+            scene: in_lanes,
             buffers: Buffers::default(),
+            samples: discrete::Buffers::default(),
+            turned,
             q: vec![Lanes::splat(0.0); scene.dof()],
             close: Vec::new(),
             none: vec![0.0; all.len()].into(),
             all,
-            margins: Vec::new(),
         }
     }
 
@@ -88,20 +83,27 @@ impl InLanes {
         self.scene.close(&stretches, pairs, &mut self.buffers, &mut self.close).map(|pair| pair as usize)
     }
 
-    /// Fills `close` with the pairs that may be closer than `margin` [m] at up to sixteen configurations.
-    pub fn find_closer(&mut self, configurations: &[Vec<f64>], margin: f64) {
-        self.close.clear();
-        for (lane, configuration) in configurations.iter().enumerate().take(LANES) {
-            for (to, q) in self.q.iter_mut().zip(configuration) {
-                to.0[lane] = *q as f32;
-            }
-        }
-        self.margins.clear();
-        self.margins.resize(self.all.len(), margin);
-        let lanes = u16::MAX >> (LANES - configurations.len().clamp(1, LANES));
-        let (q, reach, pads) = (&self.q, &self.none, &self.margins);
-        let stretches = Stretches { q, half: 0.0, lanes, reach, pads, likely: None, ends_at_touch: false };
-        self.scene.close(&stretches, &self.all, &mut self.buffers, &mut self.close);
+    /// Returns a pair that touches at samples of a motion, or that does not prove what it has to, and the number of
+    /// samples. `likely` is compared first; each of `parts` of the motion gets as many samples as the whole of it
+    /// would.
+    pub fn touching(
+        &mut self,
+        (from, to): (&[f64], &[f64]),
+        (pads, pad): (&[f64], f64),
+        likely: Option<usize>,
+        proof: Proof<'_>,
+        parts: f64,
+    ) -> (Option<usize>, u64) {
+        let length = from.iter().zip(to).map(|(a, b)| (b - a) * (b - a)).sum::<f64>().sqrt();
+        let blocks = (length * parts * SAMPLES_PER_RAD / LANES as f64).ceil().clamp(1.0, MOST_BLOCKS) as usize;
+        let motion = Motion { from, to, blocks, pads, pad, likely: likely.map(|pair| pair as u32), proof };
+        let found = self.discrete.touching(&motion, &mut self.samples).map(|pair| pair as usize);
+        (found, (blocks * LANES) as u64)
+    }
+
+    /// Returns the sum of the angles by which all joints turn on a motion [rad].
+    pub fn turn(&self, from: &[f64], to: &[f64]) -> f64 {
+        self.turned.iter().zip(from.iter().zip(to)).map(|(number, (a, b))| number * (b - a).abs()).sum()
     }
 
     /// Sets one configuration, without motion.
@@ -112,6 +114,32 @@ impl InLanes {
     }
 }
 
+/// Prepares a scene in lanes; `pairs` are those of the checker.
+pub(super) fn compile(scene: &Scene, pairs: &[Pair]) -> apart::Scene {
+    let mut bodies = Vec::new();
+    for robot in &scene.robots {
+        let first = bodies.len();
+        bodies.push(Body::Fixed(frame(&robot.base)));
+        for body in 1..robot.kinematics.bodies() {
+            let Some((parent, mut joint)) = robot.kinematics.joint(body) else { continue };
+            joint.variable += robot.first_joint;
+            bodies.push(Body::Moving { parent: first + parent, joint });
+        }
+    }
+    let link = |link: &LinkShape| {
+        let base = scene.robots.get(link.robot).map_or(0.0, |robot| robot.base.translation.length());
+        apart::Link { body: link.frame, tree: cover::of_link(&link.solids), extent: base + reach(link) }
+    };
+    let links = scene.links.iter().map(link).collect();
+    let obstacles: Vec<Obstacle> = scene.obstacles.iter().map(|o| obstacle(o, &mut bodies)).collect();
+    let pair = |pair: &Pair| match *pair {
+        Pair::Links(a, b) => apart::Pair::Links(a, b),
+        Pair::Obstacle(link, obstacle) => apart::Pair::Obstacle(link, obstacle),
+    };
+    let pairs: Vec<apart::Pair> = pairs.iter().map(pair).collect();
+    apart::Scene::new(bodies, links, &obstacles, &pairs, Width::widest())
+}
+
 fn frame(at: &DAffine3) -> Frame {
     Frame { rotation: at.matrix3.to_cols_array_2d(), translation: at.translation.to_array() }
 }
@@ -119,16 +147,6 @@ fn frame(at: &DAffine3) -> Frame {
 /// Returns the most that any point of a link is away from its robot's base, over all joints [m].
 fn reach(link: &LinkShape) -> f64 {
     link.levers.iter().copied().fold(link.ball.0.length() + link.ball.1, f64::max)
-}
-
-/// Returns the cover of a link.
-fn cover(link: &LinkShape) -> Tree {
-    let place = |solid: &shape::Solid| Place {
-        rotation: solid.frame.matrix3.to_cols_array_2d(),
-        translation: solid.frame.translation.to_array(),
-        radius: solid.radius,
-    };
-    Tree::join(&link.solids.iter().map(|solid| (&**solid.cover(), place(solid))).collect::<Vec<_>>())
 }
 
 /// Returns an obstacle; a body is added for one that is a cover.

@@ -8,24 +8,31 @@
 //! A snapshot never changes: perception, planning and a viewer each keep their own, without locks.
 
 pub mod allowed_pairs;
+mod ball;
 pub mod body;
 pub mod checker;
 pub mod cloud;
+mod cover;
 pub mod exact;
+pub mod kept;
 mod lanes;
 mod motion;
+pub mod own_margins;
 mod padding;
 pub mod pairs;
 pub mod ply;
 pub mod report;
 pub mod scene;
 pub mod shape;
+pub mod sweep;
 pub mod world;
 
 pub use checker::{CollisionChecker, Resolution, Stop};
 pub use exact::ExactChecker;
+pub use own_margins::OwnMargins;
 pub use scene::Scene;
 pub use shape::Solid;
+pub use sweep::Sweep;
 pub use world::World;
 
 #[cfg(test)]

@@ -3,10 +3,16 @@
 //! arms). A pair farther apart than its margin is free on the whole piece; for the other pairs, the piece is split. So
 //! most pairs need few checks, and a motion that passes is also free between the samples.
 //!
-//! Sixteen pieces at a time are checked with covers, down to pieces on which nothing moves far; what is left is checked
-//! exactly, split in two each time. All pieces of one size are checked before smaller ones, which finds contacts early.
+//! First, covers are swept from sample to sample: balls at two samples that are somewhat larger contain all that is in
+//! between, so that most motions that look free are proven to be with no more samples. A half that is not is swept
+//! again, with twice as many.
+//!
+//! What is left is checked in pieces, sixteen at a time with covers, down to pieces on which nothing moves far, and
+//! then exactly, split in two each time. All pieces of one size are checked before smaller ones, which finds contacts
+//! early.
 
 use dimos_kernels::block::LANES;
+use dimos_kernels::discrete::Proof;
 
 use super::checker::Stop;
 use super::exact::{ExactChecker, Gap};
@@ -21,6 +27,9 @@ const LANES_END: f64 = 0.004;
 const MANY: usize = 24;
 /// Pieces that are checked for contacts exactly before all are split.
 const TRIES: usize = 3;
+
+/// A motion that cannot be proven by sweeping is halved this often.
+const HALVINGS: i32 = 3;
 
 /// A piece of a motion, and its unproven pairs.
 #[derive(Debug, Clone, Copy)]
@@ -78,6 +87,14 @@ impl Pieces {
         self.next.clear();
     }
 
+    /// Removes all pieces, also those that a check left when it ended early.
+    fn clear(&mut self) {
+        self.now.clear();
+        self.next.clear();
+        self.pairs_now.clear();
+        self.pairs_next.clear();
+    }
+
     /// Makes the pieces found the ones to check.
     fn advance(&mut self) {
         std::mem::swap(&mut self.now, &mut self.next);
@@ -95,7 +112,55 @@ impl ExactChecker {
             return false;
         }
         let mut pieces = std::mem::replace(&mut self.pieces, Pieces::new(0, 0));
-        let free = self.check_motion_with(&mut pieces, from, to, stop);
+        let finite = from.iter().chain(to).all(|x| x.is_finite());
+        let free = if finite {
+            self.sweep(&mut pieces, (from, to), 0, true, stop)
+        } else {
+            self.check_motion_with(&mut pieces, from, to, stop)
+        };
+        self.pieces = pieces;
+        free
+    }
+
+    /// Proves a motion by sweeping covers, and halves of it where that fails; those that touch, and short ones, are
+    /// checked in pieces, unless only covers are asked for.
+    fn sweep(
+        &mut self,
+        p: &mut Pieces,
+        (from, to): (&[f64], &[f64]),
+        halved: i32,
+        in_pieces: bool,
+        stop: &Stop,
+    ) -> bool {
+        self.measure(p, from, to);
+        let (pads, parts) = ((&self.pads[..], self.most_pad), f64::from(halved).exp2());
+        let proof = Proof::Motion { reach: &p.reach, turn: self.lanes.turn(from, to) };
+        let (left, samples) = self.lanes.touching((from, to), pads, self.witness, proof, parts);
+        self.checks += samples;
+        let Some(pair) = left else { return true };
+        self.witness = Some(pair);
+        let (touching, _) = self.lanes.touching((from, to), pads, self.witness, Proof::None, parts);
+        if halved == HALVINGS || touching.is_some() {
+            return in_pieces && self.check_motion_with(p, from, to, stop);
+        }
+        let middle: Vec<f64> = from.iter().zip(to).map(|(a, b)| 0.5 * (a + b)).collect();
+        !stop.is_over()
+            && self.sweep(p, (from, &middle), halved + 1, in_pieces, stop)
+            && self.sweep(p, (&middle, to), halved + 1, in_pieces, stop)
+    }
+
+    /// Returns whether nothing touches on a motion; gives up after this number of exact checks of configurations.
+    pub(super) fn is_free_within(&mut self, exact_checks: u64, from: &[f64], to: &[f64], stop: &Stop) -> bool {
+        self.exact_checks_left = exact_checks;
+        let free = self.check_motion(from, to, stop);
+        self.exact_checks_left = u64::MAX;
+        free
+    }
+
+    /// Returns whether covers alone prove that nothing touches on a motion: quick.
+    pub(super) fn is_free_by_covers(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool {
+        let mut pieces = std::mem::replace(&mut self.pieces, Pieces::new(0, 0));
+        let free = self.sweep(&mut pieces, (from, to), 0, false, stop);
         self.pieces = pieces;
         free
     }
@@ -103,8 +168,7 @@ impl ExactChecker {
     fn check_motion_with(&mut self, p: &mut Pieces, from: &[f64], to: &[f64], stop: &Stop) -> bool {
         let most = self.measure(p, from, to);
         let mut size = 1.0 / LANES as f64;
-        p.now.clear();
-        p.pairs_now.clear();
+        p.clear();
         p.now.extend((0..LANES).map(|i| Piece { start: i as f64 * size, first: 0, last: 0 }));
         loop {
             let checked = p.now.len();
@@ -228,9 +292,10 @@ impl ExactChecker {
     fn check_middles(&mut self, p: &mut Pieces, from: &[f64], to: &[f64], size: f64, stop: &Stop) -> bool {
         for i in 0..p.now.len() {
             let piece = p.now[i];
-            if stop.is_over() {
+            if stop.is_over() || self.exact_checks_left == 0 {
                 return false;
             }
+            self.exact_checks_left -= 1;
             p.place(from, to, piece.start + 0.5 * size);
             self.place(&p.q);
             let first = p.pairs_next.len() as u32;

@@ -14,12 +14,14 @@ impl ExactChecker {
                 Pair::Links(..) => 0.0,
             };
         }
+        self.most_pad = padding.max(0.0);
         self
     }
 
     /// Sets the padding of all pairs [m], those of links of one robot included: to measure what is close.
     pub fn with_margin(mut self, margin: f64) -> Self {
         self.pads.fill(margin);
+        self.most_pad = margin.max(0.0);
         self
     }
 
@@ -32,6 +34,7 @@ impl ExactChecker {
     pub fn set_pad(&mut self, pair: usize, pad: f64) {
         if let Some(own) = self.pads.get_mut(pair) {
             *own = pad;
+            self.most_pad = self.most_pad.max(pad);
         }
     }
 

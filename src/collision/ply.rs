@@ -130,9 +130,8 @@ fn binary(
         return bad(format!("the file ends after {} of {count} points", body.len() / size.max(1)));
     }
     let offset = |field: usize| fields[..field].iter().map(|f| f.0).sum::<usize>();
-    let value = |record: &[u8], field: usize| {
-        let (length, kind) = fields[field];
-        let at = offset(field);
+    let [x, y, z] = wanted.map(|field| (offset(field), fields[field]));
+    let value = |record: &[u8], (at, (length, kind)): (usize, (usize, char))| {
         let mut bytes = [0; 8];
         for (i, b) in record[at..at + length].iter().enumerate() {
             bytes[if little { i } else { length - 1 - i }] = *b;
@@ -147,8 +146,7 @@ fn binary(
             _ => bits as f64,
         }
     };
-    let point =
-        |record: &[u8]| DVec3::new(value(record, wanted[0]), value(record, wanted[1]), value(record, wanted[2]));
+    let point = |record: &[u8]| DVec3::new(value(record, x), value(record, y), value(record, z));
     Ok(body.chunks_exact(size.max(1)).take(count).map(point).collect())
 }
 

@@ -1,15 +1,15 @@
 //! Solids: everything within a radius of a core. A sphere is a point with a radius, a capsule a segment with a radius,
 //! and padding enlarges the radius, so only distances between a few kinds of cores are needed.
 
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
 
 use dimos_kernels::Width;
-use dimos_kernels::cover::{Inside, Tree};
 use dimos_kernels::support::Vertices;
 use glamx::{DAffine3, DVec3};
 use parry3d_f64::shape::{ConvexPolyhedron, SupportMap, TriMesh, TriMeshFlags};
 
 use super::cloud::Cloud;
+use super::cover::Covers;
 
 /// Why a shape is not usable.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -161,8 +161,8 @@ pub struct Solid {
     pub radius: f64,
     /// The core's frame.
     pub frame: DAffine3,
-    /// The core's cover, made when it is first needed; shared by all copies.
-    cover: Arc<OnceLock<Arc<Tree>>>,
+    /// Covers, made when they are first needed; shared by all copies.
+    pub(super) covers: Arc<Covers>,
 }
 
 fn positive(what: &'static str, x: f64) -> Result<f64, ShapeError> {
@@ -171,7 +171,7 @@ fn positive(what: &'static str, x: f64) -> Result<f64, ShapeError> {
 
 impl Solid {
     fn of(core: Core, radius: f64, frame: DAffine3) -> Result<Self, ShapeError> {
-        if frame.is_finite() { Ok(Self { core, radius, frame, cover: Arc::default() }) } else { Err(ShapeError::Pose) }
+        if frame.is_finite() { Ok(Self { core, radius, frame, covers: Arc::default() }) } else { Err(ShapeError::Pose) }
     }
 
     /// Creates a box with these full extents [m].
@@ -238,59 +238,11 @@ impl Solid {
         self
     }
 
-    /// Returns balls that contain the core, in its own frame: without `radius`.
-    pub fn cover(&self) -> &Arc<Tree> {
-        self.cover.get_or_init(|| Arc::new(cover(&self.core)))
-    }
-
     /// Returns a bounding ball in the carrier frame: centre and radius [m].
     pub fn ball(&self) -> (DVec3, f64) {
         let (middle, radius) = self.place(&DAffine3::IDENTITY).ball();
         (middle, radius + self.radius)
     }
-}
-
-/// Number of sides of the prism that replaces a cylinder in its cover: 0.5 % wider.
-const SIDES: usize = 32;
-
-fn cover(core: &Core) -> Tree {
-    match core {
-        Core::Point => Tree::of_point(),
-        Core::Segment { half } => Tree::of_segment(*half),
-        Core::Box { half } => {
-            let corner = |k: usize| DVec3::new(sign(k), sign(k >> 1), sign(k >> 2)) * *half;
-            of_hull(&(0..8).map(corner).collect::<Vec<_>>())
-        }
-        Core::Cylinder { half, radius } => {
-            let outside = radius / (std::f64::consts::PI / SIDES as f64).cos();
-            let side = |k: usize| {
-                let (sin, cos) = (std::f64::consts::TAU * (k / 2) as f64 / SIDES as f64).sin_cos();
-                DVec3::new(outside * cos, outside * sin, half * sign(k))
-            };
-            of_hull(&(0..2 * SIDES).map(side).collect::<Vec<_>>())
-        }
-        Core::Hull(hull) => of_polyhedron(&hull.polyhedron),
-        Core::Mesh(mesh) => {
-            let inside = |p: [f64; 3]| mesh.holds(DVec3::from_array(p));
-            let triangles = mesh.surface.triangles().map(|t| [t.a, t.b, t.c].map(|p| p.to_array()));
-            Tree::of_triangles(triangles, if mesh.closed { Inside::Test(&inside) } else { Inside::Nothing })
-        }
-        Core::Cloud(cloud) => Tree::of_points(cloud.points().iter().map(|p| p.to_array())),
-    }
-}
-
-fn sign(bit: usize) -> f64 {
-    if bit & 1 == 1 { 1.0 } else { -1.0 }
-}
-
-fn of_hull(points: &[DVec3]) -> Tree {
-    ConvexPolyhedron::from_convex_hull(points).as_ref().map(of_polyhedron).unwrap_or_default()
-}
-
-fn of_polyhedron(polyhedron: &ConvexPolyhedron) -> Tree {
-    let (points, triangles) = polyhedron.to_trimesh();
-    let corner = |i: u32| points[i as usize].to_array();
-    Tree::of_triangles(triangles.iter().map(|t| t.map(corner)), Inside::Convex)
 }
 
 /// A core at its pose, in the common frame of a query.

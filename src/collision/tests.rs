@@ -263,3 +263,31 @@ fn a_decomposition_contains_the_mesh_and_leaves_its_gap_free() {
         assert!(touched(mode, DVec3::new(0.05, 0.3, 0.0)), "{mode:?}");
     }
 }
+
+/// Pieces of a motion that touched were checked again as pieces of the next one, past its end.
+#[test]
+fn a_check_does_not_depend_on_earlier_ones() {
+    let world =
+        one_arm(&[ball("near", DVec3::new(0.9, 0.35, 0.1), 0.1), ball("far", DVec3::new(-0.3, 0.8, 0.1), 0.15)]);
+    let mut random = Random::new(3);
+    let (fresh, mut used) = (checker(&world), checker(&world));
+    let (mut free, mut number) = (0, 0);
+    for _ in 0..300 {
+        let from: Vec<f64> = (0..3).map(|_| random.between(-3.0, 3.0)).collect();
+        if !used.is_free(&from) {
+            continue;
+        }
+        for _ in 0..4 {
+            // Up to just before the first contact, and a little farther.
+            let to: Vec<f64> = from.iter().map(|q| (q + random.between(-0.7, 0.7)).clamp(-3.1, 3.1)).collect();
+            for part in [0.25, 0.5, 0.75, 1.0] {
+                let end: Vec<f64> = from.iter().zip(&to).map(|(a, b)| a + (b - a) * part).collect();
+                let now = used.motion_is_free(&from, &end, &Stop::never());
+                assert_eq!(now, fresh.clone().motion_is_free(&from, &end, &Stop::never()), "{from:?} to {end:?}");
+                (free, number) = (free + u32::from(now), number + 1);
+            }
+        }
+    }
+    println!("{free} of {number} motions are free");
+    assert!(free > number / 4 && free < number);
+}

@@ -1,6 +1,7 @@
 //! A world that can change: robots, obstacles, held objects. Planning uses its snapshots.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use glamx::DAffine3;
 
@@ -82,12 +83,25 @@ pub enum WorldError {
     Padding(f64),
 }
 
+/// Identifies the obstacles and held objects of a world: worlds of the same version have the same ones.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Version(u64);
+
+impl Version {
+    /// Returns one that no world had before.
+    fn next() -> Self {
+        static LAST: AtomicU64 = AtomicU64::new(0);
+        Self(LAST.fetch_add(1, Ordering::Relaxed) + 1)
+    }
+}
+
 /// Robots and the objects around them.
 #[derive(Debug, Clone, Default)]
 pub struct World {
     robots: Vec<Robot>,
     obstacles: Vec<Obstacle>,
     attached: Vec<Attached>,
+    version: Version,
 }
 
 fn check_padding(padding: f64) -> Result<(), WorldError> {
@@ -121,6 +135,7 @@ impl World {
         if self.obstacles.iter().any(|o| o.name == obstacle.name) || self.attached(&obstacle.name).is_some() {
             return Err(WorldError::Taken(obstacle.name));
         }
+        self.version = Version::next();
         self.obstacles.push(obstacle);
         Ok(())
     }
@@ -130,6 +145,7 @@ impl World {
         match self.obstacles.iter().position(|o| o.name == obstacle.name) {
             Some(at) => {
                 check_padding(obstacle.padding)?;
+                self.version = Version::next();
                 self.obstacles[at] = obstacle;
                 Ok(())
             }
@@ -141,6 +157,7 @@ impl World {
     pub fn move_to(&mut self, name: &str, frame: DAffine3) -> Result<(), WorldError> {
         let unknown = || WorldError::Unknown(name.to_owned());
         let obstacle = self.obstacles.iter_mut().find(|o| o.name == name).ok_or_else(unknown)?;
+        self.version = Version::next();
         obstacle.solid.frame = frame;
         Ok(())
     }
@@ -148,11 +165,13 @@ impl World {
     /// Removes an obstacle.
     pub fn remove(&mut self, name: &str) -> Result<Obstacle, WorldError> {
         let at = self.obstacles.iter().position(|o| o.name == name);
+        self.version = Version::next();
         at.map(|at| self.obstacles.remove(at)).ok_or_else(|| WorldError::Unknown(name.to_owned()))
     }
 
     /// Removes all obstacles.
     pub fn clear(&mut self) {
+        self.version = Version::next();
         self.obstacles.clear();
     }
 
@@ -163,7 +182,12 @@ impl World {
 
     /// Returns the same world with its robots replaced one by one.
     pub fn with_robots(&self, robots: Vec<Robot>) -> Self {
-        Self { robots, ..self.clone() }
+        Self { robots, obstacles: self.obstacles.clone(), attached: self.attached.clone(), version: self.version }
+    }
+
+    /// Returns the version of its obstacles and held objects; robots do not count.
+    pub fn version(&self) -> Version {
+        self.version
     }
 
     /// Returns the robots.
@@ -195,6 +219,7 @@ impl World {
         if taken {
             return Err(WorldError::Taken(object.name));
         }
+        self.version = Version::next();
         self.attached.push(object);
         Ok(())
     }
@@ -202,6 +227,7 @@ impl World {
     /// Detaches a held object and returns it.
     pub fn detach(&mut self, name: &str) -> Result<Attached, WorldError> {
         let at = self.attached(name).ok_or_else(|| WorldError::Unknown(name.to_owned()))?;
+        self.version = Version::next();
         Ok(self.attached.remove(at))
     }
 

@@ -236,9 +236,28 @@ impl Limiter {
         self.velocity
     }
 
-    fn slow_down(&mut self, dt: f64) {
+    /// Decelerates from an earlier command instead of the latest one. The request remains the one that was followed
+    /// last, so that the step of the next one counts from it. `at`: measured position in velocity mode [rad]. Returns
+    /// the position or velocity to command.
+    pub fn brake_from(&mut self, before: &Self, at: Option<f64>, dt: f64) -> f64 {
+        let (request, request_velocity) = (self.request, self.request_velocity);
+        *self = *before;
+        let value = match at {
+            Some(at) => self.hold_velocity(at, dt),
+            None => self.hold_position(dt),
+        };
+        (self.request, self.request_velocity) = (request, request_velocity);
+        value
+    }
+
+    /// Returns the velocity after the next step of a deceleration to rest [rad/s].
+    pub fn braked(&self, dt: f64) -> f64 {
         let change = self.bounds.acceleration * dt;
-        self.velocity -= self.velocity.clamp(-change, change);
+        self.velocity - self.velocity.clamp(-change, change)
+    }
+
+    fn slow_down(&mut self, dt: f64) {
+        self.velocity = self.braked(dt);
     }
 
     /// Returns the range of commanded positions: a joint outside its limits may stay or move in, not further out.

@@ -13,6 +13,7 @@ pub mod coordinator;
 pub mod estimate;
 pub mod failsafe;
 pub mod feedback;
+pub mod guard;
 pub mod limit;
 pub mod pace;
 pub mod path_clock;

@@ -97,6 +97,11 @@ impl Task {
         Some((*pair.0, pair.1.joint))
     }
 
+    /// Returns whether it takes this kind of target.
+    pub fn takes(&self, kind: TargetKind) -> bool {
+        self.takes.contains(&kind)
+    }
+
     /// Returns whether it applies the speed override itself.
     pub fn applies_speed(&self) -> bool {
         self.body.applies_speed()
@@ -118,7 +123,7 @@ impl Task {
             Target::Trajectory(motion) => {
                 let own = motion.joints.iter().all(|j| self.joints.contains(j));
                 let whole = motion.joints.len() == motion.spline.joints();
-                if !(own && whole && self.takes.contains(&TargetKind::Trajectory)) {
+                if !(own && whole && self.takes(TargetKind::Trajectory)) {
                     return Err(Outcome::WrongTask(self.index));
                 }
                 if self.is_active() { Err(Outcome::AlreadyExecuting(self.index)) } else { Ok(()) }
@@ -134,7 +139,7 @@ impl Task {
 
     /// Passes a target to the body. Returns whether the task becomes active with it.
     pub fn accept(&mut self, tick: &Tick<'_>, target: &Target<'_>) -> Result<bool, Outcome> {
-        if !self.takes.contains(&target.kind()) {
+        if !self.takes(target.kind()) {
             return Err(Outcome::WrongTask(self.index));
         }
         let (cx, body, _) = self.parts(tick);

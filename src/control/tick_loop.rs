@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::time::Duration;
 
 use super::coordinator::Coordinator;
+use super::guard::GuardWorld;
 use super::pace::{Pacer, Source, Start};
 use super::request::{Envelope, Motion};
 use crate::arm::{ArmCommand, ArmState};
@@ -82,10 +83,32 @@ pub struct TickPorts {
     pub arm_views: Vec<SlotWriter<ArmSample>>,
     /// Latest views for rpc, one per task.
     pub task_views: Vec<SlotWriter<TaskView>>,
+    /// Worlds of the collision guard, if streams are guarded.
+    pub guard: Option<GuardPorts>,
     /// What starts the ticks.
     pub source: Source,
     /// Shared with its observers.
     pub pulse: Arc<Pulse>,
+}
+
+/// The tick's ends of the rings of the collision guard.
+pub struct GuardPorts {
+    /// New robots and obstacles.
+    pub worlds: rtrb::Consumer<Box<GuardWorld>>,
+    /// Those that they replaced, to be freed on another thread.
+    pub retired: rtrb::Producer<Box<GuardWorld>>,
+}
+
+impl GuardPorts {
+    /// Takes the newest world.
+    fn exchange(&mut self, coordinator: &mut Coordinator) {
+        while !self.retired.is_full()
+            && let Ok(world) = self.worlds.pop()
+        {
+            // There is room for it.
+            coordinator.set_guard(Some(world)).map(|old| self.retired.push(old));
+        }
+    }
 }
 
 /// Called at the start of each tick. Tests and benchmarks use it to delay, hang or end the thread.
@@ -115,6 +138,9 @@ pub fn run(
         for ((state, slot), due) in states.iter_mut().zip(&mut ports.states).zip(&ports.dues) {
             *state = slot.read();
             state.own_delay_ns = due.overdue(woke).as_nanos() as u64;
+        }
+        if let Some(guard) = &mut ports.guard {
+            guard.exchange(&mut coordinator);
         }
         let requests = &mut ports.requests;
         let output = coordinator.tick(time, &states, || requests.pop().ok());

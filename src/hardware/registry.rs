@@ -116,7 +116,7 @@ impl EmulatorAddress {
             Self::InProcess => Ok(SocketAddr::from(([127, 0, 0, 1], 0))),
             Self::Bind(address) if address.is_loopback() => Ok(SocketAddr::new(*address, port)),
             Self::Bind(address) => Err(AdapterError::Rejected(format!(
-                "{address} is not a loopback address: emulators are reachable from this computer only"
+                "{address} is not a loopback address: only programs of this computer may connect"
             ))),
             Self::Can(_) | Self::Pty => {
                 Err(AdapterError::Rejected("this arm speaks TCP: its emulator has a loopback address".to_owned()))

@@ -5,6 +5,7 @@ use super::path::between;
 use super::pipeline::{PlanFailure, PlannedMotion, stage};
 use super::planning_scene::PlanningScene;
 use super::start_contact::passes;
+use crate::collision::kept::Motion;
 use crate::collision::report::Contact;
 use crate::collision::world::World;
 use crate::collision::{CollisionChecker, Stop};
@@ -47,12 +48,11 @@ pub fn look_ahead(
     let checker = &mut stage.checker;
     checker.give_up_again(&found.given_up);
     let way = samples(&spline, elapsed);
-    let last = way.len() - 1;
-    // Slices still to check, the earliest last. A slice that is bent or blocked is split in two.
-    let mut stretches = vec![(0, last)];
+    // Slices still to check, the earliest last. A slice that is blocked is split in two.
+    let mut stretches = straight_slices(&way);
     while let Some((first, end)) = stretches.pop() {
         let ((time, from), (_, to)) = (&way[first], &way[end]);
-        if is_straight(&way[first..=end]) && passes(checker, found.escape_path.as_ref(), from, to, stop) {
+        if passes(checker, found.level, found.escape_path.as_ref(), (from, to), stop) {
             continue;
         }
         if stop.is_over() {
@@ -75,6 +75,12 @@ pub fn look_ahead(
     Ok(None)
 }
 
+/// Returns a motion as straight pieces, as long as possible.
+pub(super) fn straight_motions(spline: &Spline) -> Vec<Motion> {
+    let way = samples(spline, 0.0);
+    straight_slices(&way).into_iter().map(|(first, end)| [way[first].1.clone(), way[end].1.clone()]).collect()
+}
+
 /// Samples a motion from `elapsed` to its end [s, rad].
 fn samples(spline: &Spline, elapsed: f64) -> Vec<(f64, Vec<f64>)> {
     let mut cursor = Cursor::default();
@@ -88,6 +94,28 @@ fn samples(spline: &Spline, elapsed: f64) -> Vec<(f64, Vec<f64>)> {
         (time, samples.iter().map(|sample| sample.position).collect())
     };
     (0..=pieces).map(&mut at).collect()
+}
+
+/// Divides a motion into straight slices, as long as possible: index of the first and last sample of each, the last
+/// slice first.
+fn straight_slices(way: &[(f64, Vec<f64>)]) -> Vec<(usize, usize)> {
+    let last = way.len() - 1;
+    let (mut slices, mut first) = (Vec::new(), 0);
+    while first < last {
+        let (mut end, mut step) = (first + 1, 1);
+        while step > 0 {
+            if end + step <= last && is_straight(&way[first..=end + step]) {
+                end += step;
+                step *= 2;
+            } else {
+                step /= 2;
+            }
+        }
+        slices.push((first, end));
+        first = end;
+    }
+    slices.reverse();
+    slices
 }
 
 /// Returns whether a slice of a motion is a straight line between its first and its last configuration.

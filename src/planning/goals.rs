@@ -3,6 +3,7 @@
 use super::ahead::describe_contact;
 use super::cartesian::{LineSettings, straight_line};
 use super::ik::{Ik, IkSettings};
+use super::level::Level;
 use super::padded::{Near, Padded};
 use super::path::{Path, between, distance, length, unwind};
 use super::pipeline::{Goal, PlanFailure, Stage, late};
@@ -189,7 +190,7 @@ pub(super) fn follow(stage: &mut Stage<'_>, given: &Path, stop: &Stop) -> Result
     let mut q = stage.start.clone();
     for (k, pair) in path.windows(2).enumerate() {
         let [a, b] = pair else { continue };
-        if passes(checker, escape_path.as_ref(), a, b, stop) {
+        if passes(checker, Level::Certified, escape_path.as_ref(), (a, b), stop) {
             continue;
         }
         if let Some(failure) = late(stop) {

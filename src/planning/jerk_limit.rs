@@ -5,15 +5,13 @@
 //! the times at which `s̈` jumps now or jumped a window ago. So the average is evaluated from one of these times to the
 //! next, in exact cubics.
 //!
-//! Two candidates are averaged, and the shorter result is used. [`constant_corner_speed`] keeps the limits by
-//! construction; it is good for long lines. The other is the time-optimal motion without jerk limits. Its average is
-//! faster than the motion where that is slowest, in a corner: pieces that exceed the limits get a lower pace, in a few
-//! rounds; any remaining excess slows down the whole motion.
+//! What is averaged is the time-optimal motion without jerk limits. Its average is faster than the motion where that is
+//! slowest, in a corner: pieces that exceed the limits get a lower pace, in a few rounds; any remaining excess slows
+//! down the whole motion.
 
 use crate::trajectory::TrajectoryPoint;
 
 use super::blend::{Curve, Piece};
-use super::constant_corner_speed::constant_corner_speed;
 use super::topp::{GridPoint, JointBound, Pace, speed_grid};
 use super::verify::Excess;
 
@@ -29,8 +27,7 @@ pub(super) fn averaged(curve: &Curve, bounds: &[JointBound]) -> Vec<TrajectoryPo
     let gauge = Gauge::new(curve, bounds);
     // Time from zero to full acceleration.
     let window = bounds.iter().filter(|b| b.jerk.is_finite()).map(|b| b.acceleration / b.jerk).fold(1e-6, f64::max);
-    let steady = constant_corner_speed(curve, bounds, window).map(|points| Motion { phases: phases(&points), window });
-    let mut best: Option<(f64, Motion)> = steady.map(|motion| (motion.needed(&gauge), motion));
+    let mut best: Option<(f64, Motion)> = None;
     // Twice the window: from full acceleration to full deceleration. Where a line is too short for full acceleration,
     // half of that suffices.
     let windows: &[f64] = if curve.len() > 1 { &[2.0] } else { &[1.0, 2.0] };

@@ -1,6 +1,6 @@
 //! A given path in joint space: the motion follows it as it is, and is refused where it is not free.
 
-use super::legs::{Leg, leg};
+use super::legs::{Leg, SearchOptions, leg};
 use super::path::{Path, between, unwind_all};
 use super::path_planner::PlanError;
 use super::pipeline::{Goal, PlanFailure, Stage, StageTimes, failure_for, late};
@@ -52,7 +52,7 @@ impl JointPath {
 pub(super) fn legs_along(
     stage: &mut Stage<'_>,
     (robot, path): (usize, &JointPath),
-    seed: u64,
+    search: SearchOptions,
     stop: &Stop,
     times: &mut StageTimes,
 ) -> Result<[Leg; 2], PlanFailure> {
@@ -63,7 +63,7 @@ pub(super) fn legs_along(
         failure_for(stage, &PlanError::Outside { which: "path", joint, position, lower, upper })
     })?;
     let first = path.points.first().cloned().unwrap_or_default();
-    let approach = leg(stage, &[(robot, Goal::Joints(first))], seed, stop, times)
+    let approach = leg(stage, &[(robot, Goal::Joints(first))], search, stop, times)
         .map_err(|failure| PlanFailure { what: format!("the approach to the path: {}", failure.what), ..failure })?;
     unwind_all(&mut path.points, approach.path.last().unwrap_or(&stage.start), stage.checker.turns());
     if let Some(last) = path.points.last() {

@@ -4,6 +4,7 @@ use std::time::Instant;
 
 use super::goals;
 use super::joint_path::legs_along;
+use super::level::Level;
 use super::padded::Near;
 use super::path::{Path, distance, unwind};
 use super::path_planner::{PlanSettings, plan};
@@ -18,6 +19,14 @@ const LINE_DEVIATION: f64 = 1e-3;
 const MOST_DEVIATION: f64 = 0.5;
 /// Shortest piece at a waypoint that is blended [rad].
 const SHORTEST_BLENDED: f64 = 0.01;
+
+/// How a way is searched.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct SearchOptions {
+    pub seed: u64,
+    pub level: Level,
+    pub refine: u32,
+}
 
 /// The way to one goal.
 pub(super) struct Leg {
@@ -38,16 +47,17 @@ pub(super) fn legs(
     times: &mut StageTimes,
 ) -> Result<Vec<Leg>, PlanFailure> {
     let begin = stage.start.clone();
+    let search = SearchOptions { seed: request.seed, level: request.level, refine: request.refine };
     let mut legs: Vec<Leg> = Vec::new();
     for (i, goals) in request.through.iter().chain([&request.goals]).enumerate() {
         if let Some(at) = legs.last().and_then(|leg| leg.path.last()) {
             stage.start.clone_from(at);
         }
         if let [(robot, Goal::Path(path))] = goals.as_slice() {
-            legs.extend(legs_along(stage, (*robot, path), request.seed, stop, times)?);
+            legs.extend(legs_along(stage, (*robot, path), search, stop, times)?);
             continue;
         }
-        let found = leg(stage, goals, request.seed, stop, times).map_err(|failure| match request.through.is_empty() {
+        let found = leg(stage, goals, search, stop, times).map_err(|failure| match request.through.is_empty() {
             true => failure,
             false => PlanFailure { what: format!("waypoint {}: {}", i + 1, failure.what), ..failure },
         });
@@ -61,7 +71,7 @@ pub(super) fn legs(
 pub(super) fn leg(
     stage: &mut Stage<'_>,
     goals: &[(usize, Goal)],
-    seed: u64,
+    search: SearchOptions,
     stop: &Stop,
     times: &mut StageTimes,
 ) -> Result<Leg, PlanFailure> {
@@ -85,14 +95,15 @@ pub(super) fn leg(
             Err(PlanFailure::new("a straight line or a path is planned for one robot at a time"))
         }
         wanted => {
-            let goals = goals::configurations(stage, wanted, seed, stop)?;
+            let goals = goals::configurations(stage, wanted, search.seed, stop)?;
             for goal in &goals {
                 let mut goal = goal.clone();
                 unwind(&mut goal, &stage.start, stage.checker.turns());
                 stage.checker.give_up(Near::Goal, &goal);
             }
             took("ik", began.elapsed().as_secs_f64());
-            let settings = PlanSettings { seed, ..PlanSettings::default() };
+            let SearchOptions { seed, level, refine } = search;
+            let settings = PlanSettings { seed, level, refine, ..PlanSettings::default() };
             let start = stage.start.clone();
             let found =
                 plan(&mut stage.checker, &start, &goals, &settings, stop).map_err(|e| failure_for(stage, &e))?;
@@ -101,6 +112,9 @@ pub(super) fn leg(
             let clamped = moved.map(|(asked, (joint, used))| (joint, asked, used)).collect();
             took("search", found.search_time.as_secs_f64());
             took("shorten", found.shorten_time.as_secs_f64());
+            if refine > 0 {
+                took("refine", found.refine_time.as_secs_f64());
+            }
             Ok(Leg { path: found.path, fraction: None, clamped, deviation: TimingSettings::default().deviation })
         }
     }

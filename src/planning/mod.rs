@@ -2,9 +2,9 @@
 //! outside `planner_thread`, no clock besides the given deadline; the same seed gives the same path.
 //!
 //! ```text
-//!  pose ─▶ ik ─▶ goals ─▶ path_planner: straight line │ rrt_connect ─▶ shortcut ─▶ path
-//!                                                                                    │
-//!                                    JointTrajectory ◀─ verify ◀─ timing (topp) ◀─ blend ◀─┘
+//!  pose ─▶ ik ─▶ goals ─▶ path_planner: straight line │ portfolio ─▶ shortcut ─▶ path
+//!                                                                                 │
+//!         JointTrajectory ◀─ verify ◀─ timing: constant_corner_speed │ blend, topp ◀─┘
 //! ```
 
 pub mod ahead;
@@ -12,11 +12,15 @@ pub mod blend;
 pub mod cartesian;
 pub mod config;
 mod constant_corner_speed;
+mod double_s;
+mod four;
 mod goals;
+pub mod ignored_pairs;
 pub mod ik;
 mod jerk_limit;
 pub mod joint_path;
 mod legs;
+pub mod level;
 pub mod nearest;
 pub mod padded;
 pub mod path;
@@ -24,11 +28,14 @@ pub mod path_planner;
 pub mod pipeline;
 pub mod planner_thread;
 pub mod planning_scene;
+pub mod portfolio;
 pub mod reach;
+pub mod refine;
 pub mod revalidate;
 pub mod rrt_connect;
 pub mod sampler;
 pub mod shortcut;
+mod stage_cache;
 pub mod start_contact;
 pub mod thin;
 pub mod timing;

@@ -1,14 +1,16 @@
-//! A tree of configurations in flat arrays; nearest neighbour by a linear scan. The trees of these searches are small
-//! (some tens of nodes, seldom thousands); there, a scan is faster than an index.
+//! A tree of configurations in flat arrays, and the nodes nearest to sixteen samples at a time.
 
-use std::f64::consts::TAU;
+use dimos_kernels::Width;
+use dimos_kernels::block::{LANES, Lanes};
+use dimos_kernels::nearest::{Nearest, Nodes};
 
 /// A tree: nodes, their parents, and the sampling radius of each node.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub struct Tree {
     dof: usize,
-    turns: Vec<bool>,
     values: Vec<f64>,
+    /// The same in single precision, to find the nearest.
+    nodes: Nodes,
     parents: Vec<u32>,
     /// Samples farther away are not connected to the node [rad] (dynamic domain).
     radii: Vec<f64>,
@@ -20,7 +22,8 @@ const ROOT: u32 = u32::MAX;
 impl Tree {
     /// Creates an empty tree; `turns` marks the continuous joints.
     pub fn new(turns: &[bool]) -> Self {
-        Self { dof: turns.len(), turns: turns.to_vec(), ..Self::default() }
+        let nodes = Nodes::new(turns, Width::widest());
+        Self { dof: turns.len(), values: Vec::new(), nodes, parents: Vec::new(), radii: Vec::new() }
     }
 
     /// Returns the number of nodes.
@@ -53,45 +56,69 @@ impl Tree {
     /// Adds a node, a root if it has no parent; returns its index.
     pub fn add(&mut self, q: &[f64], parent: Option<usize>) -> usize {
         self.values.extend_from_slice(q);
+        self.nodes.add(q);
         self.parents.push(parent.map_or(ROOT, |p| p as u32));
         self.radii.push(f64::INFINITY);
         self.parents.len() - 1
     }
 
-    /// Returns the node nearest to a configuration, and its distance [rad].
+    /// Returns the node nearest to a configuration, continuous joints the short way round, and its distance [rad].
     pub fn nearest(&self, q: &[f64]) -> (usize, f64) {
-        if self.turns.contains(&true) {
-            return self.nearest_around(q);
-        }
-        let mut best = (0, f64::INFINITY);
-        for (i, node) in self.values.chunks_exact(self.dof.max(1)).enumerate() {
-            let squared: f64 = node.iter().zip(q).map(|(a, b)| (a - b) * (a - b)).sum();
-            if squared < best.1 {
-                best = (i, squared);
-            }
-        }
-        (best.0, best.1.sqrt())
-    }
-
-    /// Same for trees with continuous joints: measures them the short way round.
-    fn nearest_around(&self, q: &[f64]) -> (usize, f64) {
-        let apart = |((a, b), turns): ((&f64, &f64), &bool)| {
-            let d = a - b;
-            if *turns { d - (d / TAU).round() * TAU } else { d }
-        };
-        let mut best = (0, f64::INFINITY);
-        for (i, node) in self.values.chunks_exact(self.dof.max(1)).enumerate() {
-            let squared: f64 = node.iter().zip(q).zip(&self.turns).map(apart).map(|d| d * d).sum();
-            if squared < best.1 {
-                best = (i, squared);
-            }
-        }
-        (best.0, best.1.sqrt())
+        let (node, squared) = self.nodes.nearest(q);
+        (node, f64::from(squared).sqrt())
     }
 
     /// Returns the configurations from a node up to its root.
     pub fn way_up(&self, node: usize) -> impl Iterator<Item = &[f64]> {
         let up = |i: &usize| self.parents.get(*i).filter(|p| **p != ROOT).map(|p| *p as usize);
         std::iter::successors(Some(node), up).map(|i| self.node(i))
+    }
+}
+
+/// Sixteen samples, and the nodes of two trees nearest to each.
+#[derive(Debug, Clone)]
+pub struct Batch {
+    dof: usize,
+    values: Vec<f64>,
+    lanes: Vec<Lanes>,
+    nearest: [Nearest; 2],
+    next: usize,
+}
+
+impl Batch {
+    /// Creates one of which all samples are used.
+    pub fn new(dof: usize) -> Self {
+        let (values, lanes) = (vec![0.0; LANES * dof], vec![Lanes::splat(0.0); dof]);
+        Self { dof, values, lanes, nearest: [Nearest::NONE; 2], next: LANES }
+    }
+
+    /// Returns whether all samples are used.
+    pub fn is_used(&self) -> bool {
+        self.next >= LANES
+    }
+
+    /// Draws all samples.
+    pub fn fill(&mut self, mut draw: impl FnMut(usize, &mut [f64])) {
+        for (lane, sample) in self.values.chunks_exact_mut(self.dof.max(1)).enumerate() {
+            draw(lane, sample);
+            for (block, value) in self.lanes.iter_mut().zip(sample) {
+                block.0[lane] = *value as f32;
+            }
+        }
+        self.nearest = [Nearest::NONE; 2];
+        self.next = 0;
+    }
+
+    /// Returns the next sample, the node of a tree nearest to it, and their distance [rad]; `side` is the tree's
+    /// number.
+    pub fn next(&mut self, tree: &Tree, side: usize) -> (&[f64], usize, f64) {
+        let nearest = &mut self.nearest[side];
+        if nearest.compared < tree.len() {
+            tree.nodes.compare(&self.lanes, nearest);
+        }
+        let lane = self.next;
+        self.next += 1;
+        let sample = self.values.get(lane * self.dof..(lane + 1) * self.dof).unwrap_or_default();
+        (sample, nearest.node(lane), f64::from(nearest.squared.0[lane]).sqrt())
     }
 }

@@ -7,6 +7,7 @@ use std::sync::Arc;
 
 use super::path::between;
 use crate::collision::allowed_pairs::sample;
+use crate::collision::kept::{Kept, Motion};
 use crate::collision::report::{Contact, Pair};
 use crate::collision::{CollisionChecker, ExactChecker, Resolution, Scene, Stop};
 use crate::named::named;
@@ -95,14 +96,17 @@ impl Padded {
         self.bare.is_free(q)
     }
 
-    /// Returns the smallest distance below `below` [m] at any of up to sixteen configurations, regardless of the
-    /// padding.
-    pub fn closest(&mut self, configurations: &[Vec<f64>], below: f64) -> Option<Contact> {
-        self.bare.closest(configurations, below)
+    /// Returns the distance that motions are proven to keep, regardless of the padding; see
+    /// [`ExactChecker::kept_on`].
+    pub fn kept_on(&mut self, motions: &[Motion], exact: bool, stop: &Stop) -> Option<Kept> {
+        self.bare.kept_on(motions, exact, stop)
     }
 
     /// Adds exceptions around a start or goal for the pairs that are closer there.
     pub fn give_up(&mut self, near: Near, center: &[f64]) {
+        if self.full.is_free(center) {
+            return;
+        }
         let closer = self.full.closer_than_padding(center);
         let closer: Vec<_> = closer.into_iter().filter(|(pair, _)| self.full.pad(*pair) > 0.0).collect();
         if closer.is_empty() || self.zones.iter().any(|zone| zone.center == center) {
@@ -266,6 +270,17 @@ impl CollisionChecker for Padded {
                 || full.motion_is_free(&a, &b, stop)
         };
         !cuts.is_empty() && cuts.windows(2).all(&mut piece_is_free)
+    }
+
+    fn motion_is_easily_free(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool {
+        self.full.motion_is_easily_free(from, to, stop)
+            || (!self.cuts(from, to).is_empty() && self.motion_is_free(from, to, stop))
+    }
+
+    fn motion_looks_free(&mut self, from: &[f64], to: &[f64]) -> bool {
+        // Close to a start or goal, where the padding is less, a motion is proven or not.
+        self.full.motion_looks_free(from, to)
+            || (!self.cuts(from, to).is_empty() && self.motion_is_free(from, to, &Stop::never()))
     }
 
     fn first_contact(&mut self, q: &[f64]) -> Option<Pair> {

@@ -6,9 +6,11 @@ use crate::collision::checker::{CollisionChecker, Stop};
 use crate::collision::report::Contact;
 use crate::robot::random::Random;
 
+use super::level::Level;
 use super::path::{Path, between, distance, length, unwind};
-use super::rrt_connect::{Ended, RrtSettings, SearchCount, search};
-use super::sampler::Sampler;
+use super::portfolio::{Candidate, Ended, Portfolio};
+use super::refine::refine;
+use super::rrt_connect::{RrtSettings, SearchCount};
 use super::shortcut::{ShortcutSettings, shorten};
 use super::start_contact::MAX_START_DEPTH;
 
@@ -17,10 +19,16 @@ use super::start_contact::MAX_START_DEPTH;
 pub struct PlanSettings {
     /// Seed of all random numbers.
     pub seed: u64,
+    /// How motions are checked.
+    pub level: Level,
     /// Settings of the tree search.
     pub search: RrtSettings,
     /// Settings of the shortcutting.
     pub shortcut: ShortcutSettings,
+    /// Rounds of refinement: more give shorter paths, and take longer.
+    pub refine: u32,
+    /// Ends the refinement after this time, if given: then the path depends on the speed of the machine.
+    pub refine_time: Option<Duration>,
     /// Maximum violation of a limit at the start [rad or m]; the motion begins by moving back inside.
     pub limit_tolerance: f64,
     /// Maximum violation of a limit at the goal [rad or m]; the goal is moved to the limit. Covers rounded limits, such
@@ -34,8 +42,11 @@ impl Default for PlanSettings {
     fn default() -> Self {
         Self {
             seed: 0,
+            level: Level::default(),
             search: RrtSettings::default(),
             shortcut: ShortcutSettings::default(),
+            refine: 0,
+            refine_time: None,
             limit_tolerance: 0.02,
             goal_tolerance: 1e-3,
             contact_tolerance: MAX_START_DEPTH,
@@ -54,6 +65,8 @@ pub struct Plan {
     pub clamped: Vec<(usize, f64)>,
     /// Whether the straight line was free.
     pub straight: bool,
+    /// Whether every edge is proven free; otherwise it was only checked at samples.
+    pub proven: bool,
     /// The seed used.
     pub seed: u64,
     /// Statistics of the tree search.
@@ -64,6 +77,10 @@ pub struct Plan {
     pub search_time: Duration,
     /// Duration of the shortcutting.
     pub shorten_time: Duration,
+    /// Rounds of refinement.
+    pub refined: u32,
+    /// Their duration.
+    pub refine_time: Duration,
 }
 
 /// Why no path was found.
@@ -140,36 +157,98 @@ pub fn plan<C: CollisionChecker>(
     let lead = lead_in(checker, start, settings, stop)?;
     let from = lead.last().map_or(start, Vec::as_slice).to_vec();
     let (goals, clamped) = usable_goals(checker, &from, goals, settings)?;
-    let straight = goals.iter().find(|goal| checker.motion_is_free(&from, goal, stop));
+    // Where covers overlap at a sample, the line may still be free: a detour would be a surprise.
+    let mut line_is_free = |goal: &&Vec<f64>| {
+        !stop.is_over()
+            && match settings.level {
+                Level::Fast => checker.motion_looks_free(&from, goal),
+                Level::Certified if !checker.motion_looks_free(&from, goal) => {
+                    checker.motion_is_easily_free(&from, goal, stop)
+                }
+                Level::Certified | Level::Exact => checker.motion_is_free(&from, goal, stop),
+            }
+    };
+    let straight = goals.iter().find(&mut line_is_free).map(|goal| vec![from.clone(), goal.clone()]);
     let mut count = SearchCount::default();
-    let found = match straight {
-        Some(goal) => vec![from.clone(), goal.clone()],
+    let mut search_time = began.elapsed();
+    let is_straight = straight.is_some();
+    let mut path = match straight {
+        Some(line) => line,
         None => {
-            let mut sampler = Sampler::new(checker.limits(), &from, settings.seed);
-            let (found, made) = search(checker, &from, &goals, &settings.search, &mut sampler, stop);
-            count = made;
-            found.map_err(|ended| match ended {
-                Ended::Stopped if stop.is_cancelled() => PlanError::Cancelled,
-                Ended::Stopped => PlanError::Timeout(count),
-                Ended::Exhausted => PlanError::Exhausted(count),
-            })?
+            // Where covers touch already, no edge would look free.
+            let mut looks_free = |q: &Vec<f64>| checker.motion_looks_free(q, q);
+            let level = match settings.level {
+                Level::Certified if !stop.is_over() && (!looks_free(&from) || !goals.iter().any(looks_free)) => {
+                    Level::Exact
+                }
+                level => level,
+            };
+            let mut searches = Portfolio::new(&from, &goals, &settings.search, level, settings.seed);
+            loop {
+                let found = searches.next(checker, stop);
+                count = searches.count();
+                let found = found.map_err(|ended| match ended {
+                    Ended::Stopped if stop.is_cancelled() => PlanError::Cancelled,
+                    Ended::Stopped => PlanError::Timeout(count),
+                    Ended::Exhausted => PlanError::Exhausted(count),
+                })?;
+                search_time = began.elapsed();
+                if let Some(path) = finished(checker, &found, settings, stop) {
+                    break path;
+                }
+            }
         }
     };
-    let search_time = began.elapsed();
-    let mut path = shorten(checker, &found, &settings.shortcut, settings.seed, stop);
+    let shorten_time = began.elapsed() - search_time;
+    let refining = Instant::now();
+    let stop = settings.refine_time.map_or_else(|| stop.halfway(), |time| stop.or_at(refining + time));
+    let (refined, rounds) = refine(checker, path, &goals, settings, &stop);
+    path = refined;
     path.splice(..1, lead);
     let reached = goals.iter().position(|goal| path.last() == Some(goal));
     Ok(Plan {
         clamped: reached.and_then(|goal| clamped.get(goal).cloned()).unwrap_or_default(),
         length: length(&path),
         path,
-        straight: straight.is_some(),
+        straight: is_straight,
+        proven: settings.level.proves(),
         seed: settings.seed,
         count,
         checks: checker.checks() - looked,
         search_time,
-        shorten_time: began.elapsed() - search_time,
+        shorten_time,
+        refined: rounds,
+        refine_time: refining.elapsed(),
     })
+}
+
+/// Shortens a path that was found, and proves it if the level asks for that; `None` if it cannot be proven.
+fn finished<C: CollisionChecker>(
+    checker: &mut C,
+    found: &Candidate,
+    settings: &PlanSettings,
+    stop: &Stop,
+) -> Option<Path> {
+    let turns = checker.turns().to_vec();
+    let rounds = &settings.shortcut;
+    if found.proven {
+        return Some(shorten(&found.path, &turns, rounds, &mut |a, b| checker.motion_is_easily_free(a, b, stop)));
+    }
+    let short = shorten(&found.path, &turns, rounds, &mut |a, b| !stop.is_over() && checker.motion_looks_free(a, b));
+    if is_proven(checker, &short, settings.level, stop) {
+        return Some(short);
+    }
+    // Most often one of many edges touches between two samples: shortened again, each new edge is proven.
+    is_proven(checker, &found.path, settings.level, stop).then(|| {
+        let mut is_free =
+            |a: &[f64], b: &[f64]| checker.motion_looks_free(a, b) && checker.motion_is_easily_free(a, b, stop);
+        shorten(&found.path, &turns, rounds, &mut is_free)
+    })
+}
+
+/// Returns whether a path that looks free is proven, if its level asks for that.
+pub(super) fn is_proven<C: CollisionChecker>(checker: &mut C, path: &Path, level: Level, stop: &Stop) -> bool {
+    !level.proves() || path.windows(2).all(|edge| checker.motion_is_easily_free(&edge[0], &edge[1], stop))
 }
 
 /// Returns the path from the start to a configuration inside the limits and free of contact: usually just the start.

@@ -3,25 +3,27 @@
 use std::collections::BTreeMap;
 use std::time::Instant;
 
-use dimos_kernels::block::LANES;
 use glamx::DVec3;
 use nalgebra::{Isometry3, Vector3};
 
+use super::ahead::straight_motions;
+use super::ignored_pairs::IgnoredPair;
 use super::joint_path::JointPath;
 use super::legs::{joined, legs};
+use super::level::Level;
 use super::padded::{GivenUp, Near, Padded};
-use super::path::{Path, between, distance, length};
+use super::path::{Path, distance, length};
 use super::path_planner::{PlanError, digits_outside};
 use super::planning_scene::{PlannedRobot, PlanningScene};
+use super::stage_cache::Key;
 use super::start_contact::{EscapePath, passes};
 use super::timing::{bounds, time_within};
+use crate::collision::kept::Kept;
 use crate::collision::world::{Robot, World};
 use crate::collision::{CollisionChecker, Stop};
 use crate::robot::model::Limits;
-use crate::trajectory::{JointTrajectory, TrajectoryPoint};
+use crate::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
 
-/// Distance between clearance checks along a path [rad].
-const CLEARANCE_STEP: f64 = 0.05;
 /// A path shorter than this needs no motion [rad].
 const GOAL_TOLERANCE: f64 = 1e-6;
 /// Configurations closer than this count as the same [rad].
@@ -64,6 +66,10 @@ pub struct PlanRequest {
     pub speed: f64,
     /// Seed of all random numbers.
     pub seed: u64,
+    /// How motions are checked. Straight lines and given paths are always proven.
+    pub level: Level,
+    /// Rounds of refinement of the path: see [`refine`](super::refine).
+    pub refine: u32,
     /// Goals that the motion passes before, in order, for the same robots.
     pub through: Vec<Vec<(usize, Goal)>>,
     /// How far away an end effector may pass them [m]; 0: the motion rests at each.
@@ -81,15 +87,19 @@ pub struct PlannedMotion {
     pub path: Path,
     /// The trajectory, with the coordinator's joint names.
     pub trajectory: JointTrajectory,
-    /// Minimum clearance on the path [m] and its pair; `None` if there is nothing to collide with, or if the timeout
-    /// was reached before it was computed.
-    pub clearance: Option<(f64, [String; 2])>,
+    /// How it was checked.
+    pub level: Level,
+    /// The distance that the whole motion is proven to keep; at a start in contact, that of the contact. `None` if
+    /// there is nothing to collide with, if nothing is proven, or if the timeout was reached before it was computed.
+    pub clearance: Option<Kept>,
     /// The escape path, if the start is in contact.
     pub escape_path: Option<EscapePath>,
     /// Padding [m].
     pub padding: f64,
     /// Exceptions from the padding.
     pub given_up: Vec<GivenUp>,
+    /// Pairs of links that were not checked.
+    pub ignored: Vec<IgnoredPair>,
     /// Joints of the goal that were moved to their limits: name, requested and used position [rad or m].
     pub clamped: Vec<(String, f64, f64)>,
     /// The part of a straight line that was followed.
@@ -168,20 +178,42 @@ pub fn solve(
     let (path, deviation) = joined(&stage, &legs, request.blend);
     let clamped = legs.iter().flat_map(|leg| leg.clamped.iter().cloned()).collect();
     let timing = Instant::now();
+    let escape_path = EscapePath::of(&mut stage.checker, &path);
     let trajectory = match length(&path) < GOAL_TOLERANCE {
         true => rest(&stage.joints, &path),
-        false => timed(&mut stage, &path, &deviation, request.speed, stop)?,
+        false => timed(&mut stage, (&path, &deviation), escape_path.as_ref(), request, stop)?,
     };
     let looking = lap(&mut times, "timing", timing);
-    let clearance = clearance(&mut stage.checker, &path, stop);
+    let level = request.level;
+    let clearance = match escape_path {
+        Some(_) => contact_at(&mut stage.checker, &stage.start),
+        None if level.proves() => {
+            let spline = Spline::new(&trajectory).map_err(|e| PlanFailure::new(e.to_string()))?;
+            stage.checker.kept_on(&straight_motions(&spline), level == Level::Exact, stop)
+        }
+        None => None,
+    };
     lap(&mut times, "clearance", looking);
-    let escape_path = EscapePath::of(&mut stage.checker, &path);
     // Only one of several goals was reached.
     let reached = |center: &[f64]| path.iter().any(|at| distance(at, center) < SAME_CONFIGURATION);
     let at_end = |given_up: &&GivenUp| given_up.near != Near::Goal || reached(&given_up.center);
     let given_up = stage.checker.given_up().iter().filter(at_end).cloned().collect();
     let robots = stage.indices;
-    Ok(PlannedMotion { robots, path, trajectory, clearance, escape_path, padding, given_up, clamped, fraction, times })
+    let ignored = setup.ignored_pairs(world, &robots);
+    Ok(PlannedMotion {
+        robots,
+        path,
+        trajectory,
+        level,
+        clearance,
+        escape_path,
+        padding,
+        given_up,
+        ignored,
+        clamped,
+        fraction,
+        times,
+    })
 }
 
 /// Builds the scene of one request: `moving` robots by index, all others fixed at their positions [rad], with `padding`
@@ -193,27 +225,40 @@ pub(super) fn stage<'a>(
     positions: &[Vec<f64>],
     padding: f64,
 ) -> Result<Stage<'a>, PlanFailure> {
-    let (mut robots, mut indices, mut bodies) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut robots, mut indices, mut fixed) = (Vec::new(), Vec::new(), Vec::new());
     let (mut joints, mut limits, mut start) = (Vec::new(), Vec::new(), Vec::new());
     for (index, robot) in setup.robots.iter().enumerate() {
         let at = positions.get(index).filter(|at| at.len() == robot.joints.len());
         let at =
             at.ok_or_else(|| PlanFailure::new(format!("the joint positions of {} are unknown", robot.config.name)))?;
         if !moving.contains(&index) {
-            bodies.push(robot.fixed_at(at).map_err(PlanFailure::new)?);
+            fixed.push(at.clone());
             continue;
         }
-        bodies.push(robot.body.clone());
         robots.push(robot);
         indices.push(index);
         joints.extend(robot.config.coordinator_joints.iter().cloned());
         limits.extend_from_slice(&robot.limits);
         start.extend_from_slice(at);
     }
-    let several = if indices.len() > 1 { indices.as_slice() } else { &[] };
-    let apart = several.iter().map(|own| apart(setup, world, &bodies, (*own, moving), positions, padding));
-    let apart = apart.collect::<Result<_, _>>()?;
-    let checker = Padded::new(world.with_robots(bodies).snapshot(), padding);
+    let key = Key {
+        world: world.version(),
+        robots: setup.robots.iter().map(|robot| robot.body.kinematics.clone()).collect(),
+        moving: indices.clone(),
+        fixed,
+        padding,
+    };
+    let (checker, apart) = setup.staged.get(key, || {
+        let body = |(index, robot): (usize, &PlannedRobot)| match moving.contains(&index) {
+            true => Ok(robot.body.clone()),
+            false => robot.fixed_at(&positions[index]).map_err(PlanFailure::new),
+        };
+        let bodies = setup.robots.iter().enumerate().map(body).collect::<Result<Vec<_>, _>>()?;
+        let several = if indices.len() > 1 { indices.as_slice() } else { &[] };
+        let apart = several.iter().map(|own| apart(setup, world, &bodies, (*own, moving), positions, padding));
+        let apart = apart.collect::<Result<_, _>>()?;
+        Ok((Padded::new(world.with_robots(bodies).snapshot(), padding), apart))
+    })?;
     Ok(Stage { robots, indices, joints, limits, start, checker, apart })
 }
 
@@ -275,12 +320,18 @@ fn rest(joints: &[String], path: &Path) -> JointTrajectory {
     JointTrajectory { joint_names: joints.to_vec(), points: vec![at(0.0), at(STATIONARY_DURATION)] }
 }
 
+/// Returns the deepest contact at a configuration.
+fn contact_at(checker: &mut Padded, q: &[f64]) -> Option<Kept> {
+    let contact = checker.contacts(q).into_iter().next()?;
+    Some(Kept { distance: contact.distance, pair: Some([contact.link, contact.other]) })
+}
+
 /// Times a path within the joints' limits, and verifies the trajectory.
 fn timed(
     stage: &mut Stage<'_>,
-    path: &Path,
-    deviation: &[f64],
-    speed: f64,
+    (path, deviation): (&Path, &[f64]),
+    escape_path: Option<&EscapePath>,
+    request: &PlanRequest,
     stop: &Stop,
 ) -> Result<JointTrajectory, PlanFailure> {
     let bounds = bounds(&stage.joints, &stage.limits).map_err(|e| PlanFailure::new(e.to_string()))?;
@@ -288,15 +339,14 @@ fn timed(
     let bounds: Vec<_> = bounds
         .into_iter()
         .map(|mut b| {
-            b.velocity *= speed;
-            b.acceleration *= speed;
-            b.jerk *= speed;
+            b.velocity *= request.speed;
+            b.acceleration *= request.speed;
+            b.jerk *= request.speed;
             b
         })
         .collect();
     let checker = &mut stage.checker;
-    let escape_path = EscapePath::of(checker, path);
-    let free = |a: &[f64], b: &[f64]| passes(checker, escape_path.as_ref(), a, b, stop);
+    let free = |a: &[f64], b: &[f64]| passes(checker, request.level, escape_path, (a, b), stop);
     let timed = time_within(&stage.joints, path, &bounds, deviation, 1.0, free);
     timed.map(|timed| timed.trajectory).map_err(|e| late(stop).unwrap_or_else(|| PlanFailure::new(e.to_string())))
 }
@@ -308,27 +358,4 @@ pub(super) fn late(stop: &Stop) -> Option<PlanFailure> {
         (_, true) => Some(PlanFailure::new("no motion found before the timeout").hint("increase --timeout")),
         _ => None,
     }
-}
-
-/// Returns the minimum clearance on a path and its pair; `None` if the timeout is reached first.
-fn clearance(checker: &mut Padded, path: &Path, stop: &Stop) -> Option<(f64, [String; 2])> {
-    let mut least = checker.clearance(path.first()?)?;
-    let mut samples: Path = Vec::with_capacity(LANES);
-    for pair in path.windows(2) {
-        let [a, b] = pair else { continue };
-        let steps = (distance(a, b) / CLEARANCE_STEP).ceil().max(1.0) as usize;
-        for first in (1..=steps).step_by(LANES) {
-            if stop.is_over() {
-                return None;
-            }
-            samples.clear();
-            samples.extend((first..=steps).take(LANES).map(|step| {
-                let mut q = a.clone();
-                between(a, b, step as f64 / steps as f64, &mut q);
-                q
-            }));
-            least = checker.closest(&samples, least.distance).unwrap_or(least);
-        }
-    }
-    Some((least.distance, [least.link, least.other]))
 }

@@ -8,6 +8,8 @@ use glamx::{DAffine3, DVec3};
 use nalgebra::Isometry3;
 
 use super::config::{CLOUD_RADIUS, JointBounds, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
+use super::ignored_pairs::{IgnoredPair, of_robot};
+use super::stage_cache::StageCache;
 use super::unplanned_joints::{Measured, idle};
 use crate::collision::allowed_pairs::always_touching;
 use crate::collision::body::{MeshMode, solids, solids_of, surface};
@@ -45,6 +47,8 @@ pub struct PlannedRobot {
     pub rest: Vec<f64>,
     /// Its collision geometry at its base pose, with all planned joints.
     pub body: Robot,
+    /// Pairs of links that its SRDF allows, each with its reason.
+    pub(super) disabled: Vec<([String; 2], String)>,
 }
 
 /// All robots and the world around them.
@@ -58,6 +62,10 @@ pub struct PlanningScene {
     pub padding: f64,
     /// Pairs of links that touch in every configuration, with the robot's name; they are not checked.
     pub always_touching: Vec<(String, [String; 2])>,
+    /// Pairs of links that are not checked, for each robot.
+    pub(super) ignored: Vec<Vec<IgnoredPair>>,
+    /// Checkers of recent requests.
+    pub(super) staged: StageCache,
 }
 
 impl PlanningScene {
@@ -74,8 +82,16 @@ impl PlanningScene {
             let added = obstacle(object).and_then(|o| world.add(o).map_err(|e| e.to_string()));
             added.map_err(|e| format!("object {:?} of the world: {e}", object.name))?;
         }
-        let mut setup = Self { robots, world, padding: config.padding, always_touching: Vec::new() };
+        let mut setup = Self {
+            robots,
+            world,
+            padding: config.padding,
+            always_touching: Vec::new(),
+            ignored: Vec::new(),
+            staged: StageCache::default(),
+        };
         setup.allow_always_touching_pairs();
+        setup.ignored = setup.robots.iter().map(|robot| setup.ignored_of(robot)).collect();
         Ok(setup)
     }
 
@@ -92,6 +108,12 @@ impl PlanningScene {
     /// Returns the index of a robot by name.
     pub fn robot(&self, name: &str) -> Option<usize> {
         self.robots.iter().position(|robot| robot.config.name == name)
+    }
+
+    fn ignored_of(&self, robot: &PlannedRobot) -> Vec<IgnoredPair> {
+        let own = |(name, pair): &(String, [String; 2])| (*name == robot.config.name).then(|| pair.clone());
+        let always: Vec<[String; 2]> = self.always_touching.iter().filter_map(own).collect();
+        of_robot(robot, &always, &robot.disabled)
     }
 
     /// Allows pairs of links that touch in every configuration: checking them would forbid all motion. They are
@@ -191,7 +213,8 @@ impl PlannedRobot {
         for (name, pose) in semantics.poses_of(&config.joints).into_iter().filter(|(_, pose)| outside(pose).is_none()) {
             config.named_poses.entry(name.to_owned()).or_insert(pose);
         }
-        Ok(Self { config, model, joints, end_effector, limits, rest: posed, body })
+        let disabled = { semantics.disabled }.into_iter().map(|pair| ([pair.a, pair.b], pair.reason)).collect();
+        Ok(Self { config, model, joints, end_effector, limits, rest: posed, body, disabled })
     }
 
     fn narrow(&mut self, bounds: &BTreeMap<String, JointBounds>) -> Result<(), String> {
@@ -304,6 +327,8 @@ pub fn obstacle(object: &ObjectConfig) -> Result<Obstacle, String> {
         }
     };
     let solid = solid.map_err(|e| e.to_string())?;
+    // Now, so that the first plan does not wait for it.
+    solid.cover();
     Ok(Obstacle { name: object.name.clone(), solid, padding: object.padding })
 }
 

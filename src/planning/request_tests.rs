@@ -1,15 +1,18 @@
 //! Requests with goals at their limits, straight lines that are blocked, and several arms.
 
+use std::time::{Duration, Instant};
+
 use nalgebra::{Isometry3, Translation3};
 
 use super::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
 use super::goals::configurations;
 use super::joint_path::JointPath;
+use super::level::Level;
 use super::path_planner::PlanError;
 use super::pipeline::{Goal, PlanRequest, PlannedMotion, solve, stage};
 use super::planning_scene::PlanningScene;
 use super::thin::thin;
-use crate::collision::{CollisionChecker, Stop};
+use crate::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
 use crate::robot::kinematics::pose;
 use crate::robot::random::Random;
 use crate::trajectory::{Cursor, Sample, Spline};
@@ -19,16 +22,46 @@ fn scene(robots: Vec<RobotConfig>, objects: Vec<ObjectConfig>) -> PlanningScene 
 }
 
 fn ask(scene: &PlanningScene, goal: Goal, start: &[f64]) -> Result<PlannedMotion, String> {
+    ask_at(Level::default(), scene, goal, start)
+}
+
+fn ask_at(level: Level, scene: &PlanningScene, goal: Goal, start: &[f64]) -> Result<PlannedMotion, String> {
     let request = PlanRequest {
         goals: vec![(0, goal)],
         positions: vec![start.to_vec()],
         speed: 1.0,
         seed: 0,
+        level,
+        refine: 0,
         through: Vec::new(),
         blend: 0.0,
         by_number: false,
     };
     solve(scene, &scene.world, &request, &Stop::never()).map_err(|failure| failure.what)
+}
+
+/// The timeout ended refinement, and with it the plan: no time was left for its timing.
+#[test]
+fn refinement_leaves_time_for_the_rest_of_the_request() {
+    let at = |turn| vec![turn, -0.3, 0.6, 0.0, 0.8, 0.0];
+    // In the middle of the direct way.
+    let middle = flange(&scene(vec![RobotConfig::yourarm()], Vec::new()), 0, &at(0.0)).translation;
+    let ball = ObjectConfig { name: "ball".into(), shape: ObjectShape::Sphere(0.1), pose: middle.into(), padding: 0.0 };
+    let scene = scene(vec![RobotConfig::yourarm()], vec![ball]);
+    let request = PlanRequest {
+        goals: vec![(0, Goal::Joints(at(0.9)))],
+        positions: vec![at(-0.9)],
+        speed: 1.0,
+        seed: 0,
+        level: Level::Certified,
+        refine: u32::MAX,
+        through: Vec::new(),
+        blend: 0.0,
+        by_number: false,
+    };
+    let stop = Stop::new(Some(Instant::now() + Duration::from_secs(4)), None);
+    let motion = solve(&scene, &scene.world, &request, &stop).unwrap();
+    assert!(motion.path.len() > 2 && motion.times["refine"] > 0.1, "{:?}", motion.times);
 }
 
 /// Returns the pose of a robot's end effector in the frame `map`.
@@ -185,4 +218,49 @@ fn a_path_is_refused_where_it_is_not_free_or_leaves_the_limits() {
     assert_eq!(to(upper + 1e-3).unwrap().path.last().unwrap()[0], upper);
     let refused = to(upper + 5e-3).unwrap_err();
     assert!(refused.contains("path: arm_joint1 at 2.") && refused.contains("outside its limits"), "{refused}");
+}
+
+/// Returns the smallest distance at many places of a motion [m].
+fn closest(scene: &PlanningScene, motion: &PlannedMotion) -> f64 {
+    let mut checker = ExactChecker::new(scene.world.snapshot(), Resolution::default());
+    let spline = Spline::new(&motion.trajectory).unwrap();
+    let (mut cursor, mut at) = (Cursor::default(), vec![Sample::default(); spline.joints()]);
+    let mut distance = |k: u32| {
+        spline.sample(spline.duration() * f64::from(k) / 1000.0, &mut cursor, &mut at);
+        let q: Vec<f64> = at.iter().map(|s| s.position).collect();
+        checker.clearance(&q).unwrap().distance
+    };
+    (0..=1000).map(&mut distance).fold(f64::INFINITY, f64::min)
+}
+
+#[test]
+fn the_clearance_of_a_plan_is_proven_for_the_whole_motion() {
+    let ball = |name: &str, at: [f64; 3]| ObjectConfig {
+        name: name.into(),
+        shape: ObjectShape::Sphere(0.05),
+        pose: Isometry3::translation(at[0], at[1], at[2]),
+        padding: 0.0,
+    };
+    let scene = scene(vec![RobotConfig::yourarm()], vec![ball("a", [0.35, 0.25, 0.35]), ball("b", [0.45, -0.2, 0.2])]);
+    let home = [0.0, -0.3, 0.6, 0.0, 0.8, 0.0];
+    let mut random = Random::new(5);
+    let (mut planned, mut missing) = (0, 0.0);
+    for _ in 0..24 {
+        let goal: Vec<f64> = home.iter().map(|q| q + random.between(-1.0, 1.0)).collect();
+        let at = |level| ask_at(level, &scene, Goal::Joints(goal.clone()), &home);
+        let Ok(certified) = at(Level::Certified) else { continue };
+        let kept = certified.clearance.clone().unwrap();
+        let measured = closest(&scene, &certified);
+        assert!(kept.distance <= measured + 1e-6, "{kept:?} of {measured}");
+        planned += 1;
+        missing += measured.min(0.2) - kept.distance;
+        let exact = at(Level::Exact).unwrap();
+        let (kept, measured) = (exact.clearance.clone().unwrap(), closest(&scene, &exact));
+        // Between the samples it may be a little closer.
+        assert!(kept.distance <= measured + 1e-6 && kept.distance > measured.min(0.2) - 1e-3, "{kept:?} of {measured}");
+        assert!(exact.ignored.iter().any(|pair| pair.reason == "neighbours"));
+    }
+    let mean = missing / f64::from(planned);
+    println!("{planned} plans: {mean:.4} m less than measured");
+    assert!(planned > 6 && mean < 0.005, "{planned} plans, {mean} m");
 }

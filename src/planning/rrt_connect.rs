@@ -1,22 +1,24 @@
 //! RRT-Connect (Kuffner and LaValle, 2000): two trees, one from the start and one from the goals, grow towards random
 //! configurations and towards each other. Nodes that fail to grow attract fewer samples (dynamic domain: Yershova,
 //! Jaillet, Siméon and LaValle, 2005), and the smaller tree grows first. Every edge is checked, including the joining
-//! one.
+//! one. Where the domains are small, hardly any sample is in one: then half of the samples are drawn inside of them.
 //!
 //! Continuous joints move the short way round: a node follows its parent without a jump, and where the trees meet, the
 //! goal's half of the path is shifted by whole turns to match the start's half.
 
-use crate::collision::checker::{CollisionChecker, Stop};
+use crate::collision::checker::Stop;
+use crate::robot::model::Limits;
 
-use super::nearest::Tree;
+use super::nearest::{Batch, Tree};
 use super::path::{Path, between, distance, unwind, unwind_all};
 use super::sampler::Sampler;
 
 /// Settings of the search.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RrtSettings {
-    /// Maximum edge length [rad].
-    pub range: f64,
+    /// Maximum edge lengths [rad]: one search with each, in turn. Long edges are best in open space, short ones for
+    /// many joints and narrow passages.
+    pub ranges: [f64; 3],
     /// Radius of a node's domain after its first failure [rad].
     pub radius: f64,
     /// α: relative growth of the radius with each success, and reduction with each further failure.
@@ -25,23 +27,21 @@ pub struct RrtSettings {
     pub min_radius: f64,
     /// Maximum number of samples.
     pub max_samples: u64,
-    /// Maximum number of nodes in both trees.
+    /// Maximum number of nodes in all trees.
     pub max_nodes: usize,
 }
 
 impl Default for RrtSettings {
     fn default() -> Self {
-        Self { range: 1.0, radius: 4.0, alpha: 1e-4, min_radius: 1.0, max_samples: 10_000_000, max_nodes: 1_000_000 }
+        Self {
+            ranges: [1.0, 0.5, 0.25],
+            radius: 4.0,
+            alpha: 1e-4,
+            min_radius: 1.0,
+            max_samples: 10_000_000,
+            max_nodes: 1_000_000,
+        }
     }
-}
-
-/// Why a search ended without a path.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Ended {
-    /// Stopped by its deadline or a cancel.
-    Stopped,
-    /// Reached its maximum number of samples or nodes.
-    Exhausted,
 }
 
 /// Statistics of a search.
@@ -53,112 +53,217 @@ pub struct SearchCount {
     pub nodes: usize,
 }
 
-/// Searches a path from `start` to any of `goals`; all of them must be free. The same sampler gives the same path.
-pub fn search<C: CollisionChecker>(
-    checker: &mut C,
-    start: &[f64],
-    goals: &[Vec<f64>],
-    settings: &RrtSettings,
-    sampler: &mut Sampler,
-    stop: &Stop,
-) -> (Result<Path, Ended>, SearchCount) {
-    let dof = start.len();
-    let turns = checker.turns().to_vec();
-    let mut trees = [Tree::new(&turns), Tree::new(&turns)];
-    trees[0].add(start, None);
-    for goal in goals {
-        trees[1].add(goal, None);
-    }
-    let mut grow = TreeGrower { checker, settings, turns: &turns, stop };
-    let mut count = SearchCount::default();
-    let mut sample = vec![0.0; dof];
-    let mut at = vec![0.0; dof];
-    let mut side = 0;
-    loop {
-        count.nodes = trees[0].len() + trees[1].len();
-        if stop.is_over() {
-            return (Err(Ended::Stopped), count);
-        }
-        if count.samples >= settings.max_samples || count.nodes >= settings.max_nodes {
-            return (Err(Ended::Exhausted), count);
-        }
-        // The smaller tree grows; trees of equal size alternate.
-        side = match trees[side].len().cmp(&trees[1 - side].len()) {
-            std::cmp::Ordering::Less => side,
-            _ => 1 - side,
-        };
-        sampler.next(&mut sample);
-        count.samples += 1;
-        let (nearest, far) = trees[side].nearest(&sample);
-        if far > trees[side].radius(nearest) || far < 1e-9 {
-            continue;
-        }
-        unwind(&mut sample, trees[side].node(nearest), &turns);
-        between(trees[side].node(nearest), &sample, (settings.range / far).min(1.0), &mut at);
-        if !grow.reaches(&mut trees[side], nearest, &at) {
-            continue;
-        }
-        let added = trees[side].add(&at, Some(nearest));
-        let [first, second] = &mut trees;
-        let (own, other) = if side == 0 { (first, second) } else { (second, first) };
-        if let Some(joined) = grow.join(other, own.node(added)) {
-            let (from_start, from_goal) = if side == 0 { (added, joined) } else { (joined, added) };
-            let mut path: Path = trees[0].way_up(from_start).map(<[f64]>::to_vec).collect();
-            path.reverse();
-            let mut rest: Path = trees[1].way_up(from_goal).map(<[f64]>::to_vec).collect();
-            unwind_all(&mut rest, trees[0].node(from_start), &turns);
-            path.append(&mut rest);
-            return (Ok(super::path::tidy(&path)), count);
-        }
-    }
+/// How far a search goes before it pauses.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Quantum {
+    /// Edges checked, or samples for [`SAMPLES_PER_EDGE`] each.
+    pub edges: u64,
+    /// Samples drawn.
+    pub samples: u64,
+    /// Nodes added.
+    pub nodes: usize,
 }
 
-struct TreeGrower<'a, C> {
-    checker: &'a mut C,
-    settings: &'a RrtSettings,
-    turns: &'a [bool],
-    stop: &'a Stop,
+/// This number of samples that are not connected takes about as long as the check of an edge.
+const SAMPLES_PER_EDGE: u64 = 64;
+/// After this number of samples in a row that are outside of all domains, some are drawn inside of them.
+const MISSES: u64 = 128;
+/// The stop condition is tested once per this number of samples, and once per edge.
+const POLL: u64 = 1024;
+
+/// A search with one maximum edge length. It can be paused and continued, and the same sampler gives the same path.
+#[derive(Debug, Clone)]
+pub struct Search {
+    settings: RrtSettings,
+    range: f64,
+    /// The length that a path must be shorter than [rad].
+    most: f64,
+    limits: Vec<Limits>,
+    turns: Vec<bool>,
+    sampler: Sampler,
+    trees: [Tree; 2],
+    /// Number of goals: the first nodes of their tree.
+    goals: usize,
+    side: usize,
+    batch: Batch,
+    /// Samples outside of all domains since the last that was inside.
+    misses: u64,
+    count: SearchCount,
+    sample: Vec<f64>,
+    at: Vec<f64>,
 }
 
-impl<C: CollisionChecker> TreeGrower<'_, C> {
-    /// Tries to connect a node to a configuration; shrinks the node's domain on failure.
-    fn reaches(&mut self, tree: &mut Tree, node: usize, to: &[f64]) -> bool {
-        let free = self.checker.motion_is_free(tree.node(node), to, self.stop);
-        let radius = tree.radius(node);
-        if free {
-            if radius.is_finite() {
-                tree.set_radius(node, radius * (1.0 + self.settings.alpha));
-            }
-        } else if radius.is_finite() {
-            tree.set_radius(node, (radius * (1.0 - self.settings.alpha)).max(self.settings.min_radius));
-        } else {
-            tree.set_radius(node, self.settings.radius);
+impl Search {
+    /// Prepares a search from `start` to any of `goals`; all of them must be free.
+    pub fn new(
+        start: &[f64],
+        goals: &[Vec<f64>],
+        (limits, turns): (&[Limits], &[bool]),
+        settings: &RrtSettings,
+        range: f64,
+        seed: u64,
+    ) -> Self {
+        let dof = start.len();
+        let mut trees = [Tree::new(turns), Tree::new(turns)];
+        trees[0].add(start, None);
+        for goal in goals {
+            trees[1].add(goal, None);
         }
-        free
+        Self {
+            settings: *settings,
+            range,
+            most: f64::INFINITY,
+            limits: limits.to_vec(),
+            turns: turns.to_vec(),
+            sampler: Sampler::new(limits, start, seed),
+            count: SearchCount { samples: 0, nodes: trees[0].len() + trees[1].len() },
+            trees,
+            goals: goals.len(),
+            side: 0,
+            batch: Batch::new(dof),
+            misses: 0,
+            sample: vec![0.0; dof],
+            at: vec![0.0; dof],
+        }
     }
 
-    /// Grows a tree in equal steps towards a configuration of the other tree. Returns the index of the connecting node.
-    fn join(&mut self, tree: &mut Tree, to: &[f64]) -> Option<usize> {
-        let (mut node, far) = tree.nearest(to);
-        if far < 1e-9 {
-            return Some(node);
+    /// Looks for paths that are shorter than `most` [rad] only. Does nothing for robots with continuous joints, whose
+    /// way round is not known.
+    pub fn shorter_than(mut self, most: f64) -> Self {
+        if !self.turns.contains(&true) {
+            self.most = most;
         }
-        let steps = (far / self.settings.range).ceil().max(1.0) as usize;
-        let from = tree.node(node).to_vec();
-        let mut to = to.to_vec();
-        unwind(&mut to, &from, self.turns);
-        let mut at = vec![0.0; to.len()];
-        for k in 1..=steps {
-            between(&from, &to, k as f64 / steps as f64, &mut at);
-            if k == steps {
-                at.copy_from_slice(&to);
-            }
-            if !self.checker.motion_is_free(tree.node(node), &at, self.stop) {
+        self
+    }
+
+    /// Returns whether a path that passes a configuration may be short enough.
+    fn may_be_short(&self, q: &[f64]) -> bool {
+        // The roots: the start, and the goals.
+        let from = distance(self.trees[0].node(0), q);
+        self.most.is_infinite() || (0..self.goals).any(|goal| from + distance(q, self.trees[1].node(goal)) < self.most)
+    }
+
+    /// Returns the statistics so far.
+    pub fn count(&self) -> SearchCount {
+        self.count
+    }
+
+    /// Continues for a quantum; returns the path once it is found. `is_free` checks an edge.
+    pub fn run(
+        &mut self,
+        is_free: &mut dyn FnMut(&[f64], &[f64]) -> bool,
+        quantum: Quantum,
+        stop: &Stop,
+    ) -> Option<Path> {
+        let end = (self.count.samples + quantum.samples, self.count.nodes + quantum.nodes);
+        let mut edges = 0;
+        let mut polled = 0;
+        loop {
+            let samples = self.count.samples;
+            if edges + polled / SAMPLES_PER_EDGE >= quantum.edges || samples >= end.0 || self.count.nodes >= end.1 {
                 return None;
             }
-            node = tree.add(&at, Some(node));
+            if polled % POLL == 0 && stop.is_over() {
+                return None;
+            }
+            polled += 1;
+            if self.batch.is_used() {
+                self.draw();
+            }
+            // The smaller tree grows; trees of equal size alternate.
+            self.side = match self.trees[self.side].len().cmp(&self.trees[1 - self.side].len()) {
+                std::cmp::Ordering::Less => self.side,
+                _ => 1 - self.side,
+            };
+            let tree = &self.trees[self.side];
+            let (sample, nearest, far) = self.batch.next(tree, self.side);
+            self.count.samples += 1;
+            if far > tree.radius(nearest) || far < 1e-6 {
+                self.misses += 1;
+                continue;
+            }
+            self.misses = 0;
+            self.sample.copy_from_slice(sample);
+            unwind(&mut self.sample, tree.node(nearest), &self.turns);
+            between(tree.node(nearest), &self.sample, (self.range / far).min(1.0), &mut self.at);
+            if !self.may_be_short(&self.at) {
+                continue;
+            }
+            edges += 1;
+            let found = self.extend(nearest, is_free, &mut edges);
+            self.count.nodes = self.trees[0].len() + self.trees[1].len();
+            if found.is_some() {
+                return found;
+            }
+            if stop.is_over() {
+                return None;
+            }
         }
-        debug_assert!(distance(tree.node(node), &to) < 1e-9);
-        Some(node)
+    }
+
+    /// Draws the next samples.
+    fn draw(&mut self) {
+        let Self { sampler, limits, settings, trees, batch, .. } = self;
+        let local = self.misses >= MISSES;
+        let tree = &trees[1 - self.side];
+        batch.fill(|lane, q| {
+            if local && lane % 2 == 1 {
+                let node = sampler.below(tree.len());
+                let radius = Some(tree.radius(node)).filter(|r| r.is_finite()).unwrap_or(settings.radius);
+                sampler.next_in_ball(tree.node(node), radius, limits, q);
+            } else {
+                sampler.next(q);
+            }
+        });
+    }
+
+    /// Grows one tree to the current configuration and from there towards the other tree; returns the path if they
+    /// meet.
+    fn extend(
+        &mut self,
+        nearest: usize,
+        is_free: &mut dyn FnMut(&[f64], &[f64]) -> bool,
+        edges: &mut u64,
+    ) -> Option<Path> {
+        let [first, second] = &mut self.trees;
+        let (own, other) = if self.side == 0 { (first, second) } else { (second, first) };
+        let free = is_free(own.node(nearest), &self.at);
+        let radius = own.radius(nearest);
+        own.set_radius(
+            nearest,
+            match (free, radius.is_finite()) {
+                (true, _) => radius * (1.0 + self.settings.alpha),
+                (false, true) => (radius * (1.0 - self.settings.alpha)).max(self.settings.min_radius),
+                (false, false) => self.settings.radius,
+            },
+        );
+        if !free {
+            return None;
+        }
+        let added = own.add(&self.at, Some(nearest));
+        // The other tree grows in equal steps towards the new node.
+        let (mut node, far) = other.nearest(&self.at);
+        let from = other.node(node).to_vec();
+        let mut to = self.at.clone();
+        unwind(&mut to, &from, &self.turns);
+        let steps = (far / self.range).ceil().max(1.0) as usize;
+        for k in 1..=steps {
+            between(&from, &to, k as f64 / steps as f64, &mut self.sample);
+            if k == steps {
+                self.sample.copy_from_slice(&to);
+            }
+            *edges += 1;
+            if !is_free(other.node(node), &self.sample) {
+                return None;
+            }
+            node = other.add(&self.sample, Some(node));
+        }
+        let (from_start, from_goal) = if self.side == 0 { (added, node) } else { (node, added) };
+        let mut path: Path = self.trees[0].way_up(from_start).map(<[f64]>::to_vec).collect();
+        path.reverse();
+        let mut rest: Path = self.trees[1].way_up(from_goal).map(<[f64]>::to_vec).collect();
+        unwind_all(&mut rest, self.trees[0].node(from_start), &self.turns);
+        path.append(&mut rest);
+        Some(super::path::tidy(&path))
     }
 }

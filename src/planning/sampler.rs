@@ -1,5 +1,7 @@
 //! Sampling of configurations: a low-discrepancy sequence, shifted by a seed.
 
+use std::sync::LazyLock;
+
 use crate::robot::model::Limits;
 use crate::robot::random::Random;
 
@@ -8,15 +10,37 @@ const PRIMES: [u64; 40] = [
     113, 127, 131, 137, 139, 149, 151, 157, 163, 167, 173, 179,
 ];
 
+/// Most numbers in a table of low digits.
+const TABLE: u64 = 256;
+
+/// For each prime, the values of the low digits of all numbers up to a power of it.
+static LOW_DIGITS: LazyLock<Vec<Vec<f64>>> = LazyLock::new(|| {
+    let table = |base: &u64| {
+        let power = std::iter::successors(Some(*base), |p| Some(p * base)).take_while(|p| *p <= TABLE).last();
+        (0..power.unwrap_or(*base)).map(|index| radical_inverse(*base, index)).collect()
+    };
+    PRIMES.iter().map(table).collect()
+});
+
 /// Halton sequence (one prime per joint) with a random shift (Cranley and Patterson, 1976): evenly spread and different
 /// for every seed. Joints beyond the table of primes get pseudo-random values.
 #[derive(Debug, Clone)]
 pub struct Sampler {
-    low: Vec<f64>,
-    width: Vec<f64>,
-    shift: Vec<f64>,
+    axes: Vec<Axis>,
     index: u64,
     random: Random,
+}
+
+/// One joint.
+#[derive(Debug, Clone)]
+struct Axis {
+    low: f64,
+    width: f64,
+    shift: f64,
+    /// Place in the table of low digits.
+    place: usize,
+    /// Value of the other digits.
+    high: f64,
 }
 
 impl Sampler {
@@ -24,29 +48,57 @@ impl Sampler {
     pub fn new(limits: &[Limits], middle: &[f64], seed: u64) -> Self {
         let mut random = Random::new(seed);
         let turn = std::f64::consts::PI;
-        let around = |j: usize| middle.get(j).copied().unwrap_or(0.0);
-        let low: Vec<f64> = limits
-            .iter()
-            .enumerate()
-            .map(|(j, l)| if l.lower.is_finite() { l.lower } else { around(j) - turn })
-            .collect();
-        let high = |(j, l): (usize, &Limits)| if l.upper.is_finite() { l.upper } else { around(j) + turn };
-        let width = limits.iter().enumerate().map(high).zip(&low).map(|(h, l)| (h - l).max(0.0)).collect();
-        // Seed 0 is the unshifted sequence.
-        let shift = limits.iter().map(|_| if seed == 0 { 0.0 } else { random.unit() }).collect();
-        Self { low, width, shift, index: 0, random }
+        let axis = |(j, l): (usize, &Limits)| {
+            let around = middle.get(j).copied().unwrap_or(0.0);
+            let low = if l.lower.is_finite() { l.lower } else { around - turn };
+            let high = if l.upper.is_finite() { l.upper } else { around + turn };
+            // Seed 0 is the unshifted sequence.
+            let shift = if seed == 0 { 0.0 } else { random.unit() };
+            Axis { low, width: (high - low).max(0.0), shift, place: 0, high: 0.0 }
+        };
+        let axes = limits.iter().enumerate().map(axis).collect();
+        Self { axes, index: 0, random }
     }
 
     /// Writes the next sample.
     pub fn next(&mut self, q: &mut [f64]) {
         self.index += 1;
-        for (j, x) in q.iter_mut().enumerate() {
-            let part = match PRIMES.get(j) {
-                Some(&base) => (radical_inverse(base, self.index) + self.shift.get(j).unwrap_or(&0.0)).fract(),
+        for (j, (x, axis)) in q.iter_mut().zip(&mut self.axes).enumerate() {
+            let part = match LOW_DIGITS.get(j) {
+                Some(table) => {
+                    axis.place += 1;
+                    if axis.place == table.len() {
+                        axis.place = 0;
+                        let power = table.len() as u64;
+                        axis.high = radical_inverse(PRIMES[j], self.index / power) / power as f64;
+                    }
+                    let part = table[axis.place] + axis.high + axis.shift;
+                    if part < 1.0 { part } else { part - 1.0 }
+                }
                 None => self.random.unit(),
             };
-            *x = self.low.get(j).unwrap_or(&0.0) + part * self.width.get(j).unwrap_or(&0.0);
+            *x = axis.low + part * axis.width;
         }
+    }
+
+    /// Writes a sample that is evenly distributed in a ball about a configuration, moved to the limits where it is
+    /// outside of them.
+    pub fn next_in_ball(&mut self, center: &[f64], radius: f64, limits: &[Limits], q: &mut [f64]) {
+        let mut squared = 0.0;
+        for x in q.iter_mut() {
+            // Close to a normal distribution, which has no preferred direction.
+            *x = (0..4).map(|_| self.random.unit() - 0.5).sum();
+            squared += *x * *x;
+        }
+        let scale = radius * self.random.unit().powf(1.0 / q.len().max(1) as f64) / squared.sqrt().max(1e-9);
+        for ((x, c), l) in q.iter_mut().zip(center).zip(limits) {
+            *x = (c + *x * scale).max(l.lower).min(l.upper);
+        }
+    }
+
+    /// Returns a random index below `n`.
+    pub fn below(&mut self, n: usize) -> usize {
+        self.random.below(n)
     }
 }
 
@@ -59,4 +111,38 @@ fn radical_inverse(base: u64, mut index: u64) -> f64 {
         scale /= base as f64;
     }
     value
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_sequence_is_the_halton_sequence() {
+        let limits = [Limits { lower: 0.0, upper: 1.0, ..Limits::NONE }; 9];
+        let mut sampler = Sampler::new(&limits, &[], 0);
+        let mut q = [0.0; 9];
+        for index in 1..40_000 {
+            sampler.next(&mut q);
+            for (x, base) in q.iter().zip(PRIMES) {
+                assert!((x - radical_inverse(base, index)).abs() < 1e-12, "{index} in base {base}");
+            }
+        }
+    }
+
+    #[test]
+    fn samples_in_a_ball_fill_it_evenly_and_keep_the_limits() {
+        let limits = [Limits { lower: -1.5, upper: 3.0, ..Limits::NONE }; 3];
+        let mut sampler = Sampler::new(&limits, &[], 1);
+        let (mut q, mut inner, mut at_limit) = ([0.0; 3], 0, 0);
+        for _ in 0..8000 {
+            sampler.next_in_ball(&[0.0, 0.0, 1.0], 2.0, &limits, &mut q);
+            let away = (q[0] * q[0] + q[1] * q[1] + (q[2] - 1.0) * (q[2] - 1.0)).sqrt();
+            assert!(away <= 2.0 + 1e-12 && q.iter().all(|x| *x >= -1.5 && *x <= 3.0));
+            inner += usize::from(away < 1.0);
+            at_limit += usize::from(q[0] == -1.5);
+        }
+        // Half the radius holds an eighth of the volume.
+        assert!((800..1200).contains(&inner) && at_limit > 50, "{inner} {at_limit}");
+    }
 }

@@ -1,95 +1,87 @@
-//! Shortcutting: removes corners where the straight line is free, then cuts between random points.
+//! Shortcutting: removes corners where the straight line is free, and cuts those that remain, in turn (Geraerts and
+//! Overmars, "Creating high-quality paths for motion planning", 2007; the corners as the subdivision of a B-spline).
 
-use crate::collision::checker::{CollisionChecker, Stop};
-use crate::robot::random::Random;
-
-use super::path::{Path, between, distance, length, tidy, unwind, unwind_all};
+use super::path::{Path, between, distance, tidy, unwind, unwind_all};
 
 /// Settings of the shortcutting.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ShortcutSettings {
-    /// Number of random cuts.
-    pub tries: usize,
-    /// Maximum consecutive cuts without a gain.
-    pub max_idle_tries: usize,
-    /// Minimum part of the path that a cut must save.
-    pub gain: f64,
+    /// Maximum number of rounds.
+    pub rounds: usize,
+    /// A corner stays if cutting it would move it by no more than this [rad].
+    pub min_change: f64,
 }
 
 impl Default for ShortcutSettings {
     fn default() -> Self {
-        Self { tries: 100, max_idle_tries: 25, gain: 1e-3 }
+        Self { rounds: 5, min_change: 0.1 }
     }
 }
 
-/// Shortens a path; every new edge is checked, the other edges stay unchanged. The same seed gives the same path. When
-/// stopped, returns the path found so far.
-pub fn shorten<C: CollisionChecker>(
-    checker: &mut C,
-    path: &[Vec<f64>],
-    settings: &ShortcutSettings,
-    seed: u64,
-    stop: &Stop,
-) -> Path {
-    let turns = checker.turns().to_vec();
-    let mut path = leave_out(checker, path, &turns, stop);
-    let mut random = Random::new(seed);
-    let mut idle = 0;
-    for _ in 0..settings.tries {
-        if path.len() < 3 || idle >= settings.max_idle_tries || stop.is_over() {
+/// Checks an edge.
+pub type IsFree<'a> = &'a mut dyn FnMut(&[f64], &[f64]) -> bool;
+
+/// Shortens a path; every new edge is checked, the other edges stay unchanged or are parts of what they were. `turns`
+/// marks the continuous joints.
+pub fn shorten(path: &[Vec<f64>], turns: &[bool], settings: &ShortcutSettings, is_free: IsFree<'_>) -> Path {
+    let mut path = path.to_vec();
+    for _ in 0..settings.rounds {
+        let removed = remove_corners(&mut path, turns, is_free);
+        let cut = cut_corners(&mut path, settings.min_change, is_free);
+        path = tidy(&path);
+        if !removed && !cut {
             break;
         }
-        let whole = length(&path);
-        let (s, t) = (random.unit() * whole, random.unit() * whole);
-        let (a, mut b) = (point_at(&path, s.min(t)), point_at(&path, s.max(t)));
-        unwind(&mut b.1, &a.1, &turns);
-        idle += 1;
-        let saved = (s - t).abs() - distance(&a.1, &b.1);
-        if a.0 == b.0 || saved < settings.gain * whole || !checker.motion_is_free(&a.1, &b.1, stop) {
-            continue;
-        }
-        let mut shorter: Path = path[..=a.0].to_vec();
-        let mut rest = [&[point_at(&path, s.max(t)).1], &path[b.0 + 1..]].concat();
-        unwind_all(&mut rest, &a.1, &turns);
-        shorter.push(a.1);
-        shorter.append(&mut rest);
-        path = tidy(&shorter);
-        idle = 0;
     }
-    leave_out(checker, &path, &turns, stop)
+    path
 }
 
-/// From each configuration, connects straight to the farthest one that is reachable.
-fn leave_out<C: CollisionChecker>(checker: &mut C, path: &[Vec<f64>], turns: &[bool], stop: &Stop) -> Path {
-    let mut path = path.to_vec();
-    let mut kept: Path = path.first().cloned().into_iter().collect();
+/// From each configuration, connects straight to the farthest one that is reachable; returns whether any was removed.
+fn remove_corners(path: &mut Path, turns: &[bool], is_free: IsFree<'_>) -> bool {
+    let before = path.len();
     let mut at = 0;
-    while at + 1 < path.len() {
+    while at + 2 < path.len() {
         let free = |to: &usize| {
             let mut there = path[*to].clone();
             unwind(&mut there, &path[at], turns);
-            checker.motion_is_free(&path[at], &there, stop)
+            is_free(&path[at], &there)
         };
         let next = (at + 2..path.len()).rev().find(free);
-        let (from, next) = (path[at].clone(), next.unwrap_or(at + 1));
-        unwind_all(&mut path[next..], &from, turns);
-        kept.push(path[next].clone());
-        at = next;
+        if let Some(next) = next {
+            path.drain(at + 1..next);
+            let from = path[at].clone();
+            unwind_all(&mut path[at + 1..], &from, turns);
+        }
+        at += 1;
     }
-    kept
+    path.len() < before
 }
 
-/// Returns the point at a length along a path, and its edge.
-fn point_at(path: &[Vec<f64>], at: f64) -> (usize, Vec<f64>) {
-    let mut rest = at;
-    for (edge, pair) in path.windows(2).enumerate() {
-        let step = distance(&pair[0], &pair[1]);
-        if rest <= step || edge + 2 == path.len() {
-            let mut q = pair[0].clone();
-            between(&pair[0], &pair[1], if step > 0.0 { (rest / step).min(1.0) } else { 0.0 }, &mut q);
-            return (edge, q);
+/// Moves each corner halfway to the line between the middles of its edges, if it can be reached from there; returns
+/// whether any was moved.
+fn cut_corners(path: &mut Path, min_change: f64, is_free: IsFree<'_>) -> bool {
+    let mut cut = false;
+    let mut made: Path = Vec::with_capacity(2 * path.len());
+    made.extend(path.first().cloned());
+    for i in 1..path.len().saturating_sub(1) {
+        let (corner, after) = (&path[i], &path[i + 1]);
+        let (mut first, mut second, mut moved) = (made[made.len() - 1].clone(), corner.clone(), corner.clone());
+        if i == 1 {
+            between(&path[0], corner, 0.5, &mut first);
+            made.push(first.clone());
         }
-        rest -= step;
+        between(corner, after, 0.5, &mut second);
+        for (((moved, corner), a), b) in moved.iter_mut().zip(corner).zip(&first).zip(&second) {
+            *moved = 0.5 * corner + 0.25 * (a + b);
+        }
+        let moves = distance(corner, &moved) > min_change && is_free(&first, &moved) && is_free(&moved, &second);
+        made.push(if moves { moved } else { corner.clone() });
+        made.push(second);
+        cut |= moves;
     }
-    (0, path.first().cloned().unwrap_or_default())
+    made.extend(path.last().cloned().filter(|_| path.len() > 1));
+    if cut {
+        *path = made;
+    }
+    cut
 }

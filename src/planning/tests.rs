@@ -91,6 +91,28 @@ fn every_edge_of_every_plan_is_free() {
 }
 
 #[test]
+fn more_rounds_of_refinement_give_shorter_paths_and_the_same_number_the_same() {
+    // Around a post: two tangents and an arc are the shortest way.
+    let mut plane = Plane::new(vec![([0.0, 0.0], 0.4)]);
+    let (start, goals) = ([-0.9, 0.0], [vec![0.9, 0.0]]);
+    let shortest = 2.0 * (0.81_f64 - 0.16).sqrt() + 0.4 * (std::f64::consts::PI - 2.0 * (0.4_f64 / 0.9).acos());
+    for seed in 0..10 {
+        let mut refined = |refine| {
+            let settings = PlanSettings { seed, refine, ..PlanSettings::default() };
+            let found = plan(&mut plane, &start, &goals, &settings, &Stop::never()).unwrap();
+            let again = plan(&mut plane, &start, &goals, &settings, &Stop::never()).unwrap();
+            assert_eq!((&found.path, found.refined), (&again.path, refine));
+            assert!(found.path.windows(2).all(|e| plane.motion_is_free(&e[0], &e[1], &Stop::never())));
+            assert!((found.length - length(&found.path)).abs() < 1e-12);
+            found.length
+        };
+        let lengths = [0, 10, 100, 400].map(&mut refined);
+        assert!(lengths.is_sorted_by(|a, b| a >= b), "{lengths:?}");
+        assert!(lengths[3] >= shortest && lengths[3] < 1.01 * shortest, "{lengths:?} of {shortest}");
+    }
+}
+
+#[test]
 fn a_search_without_a_path_ends_at_its_maximum_counts() {
     // The goal is enclosed by a ring of overlapping posts.
     let ring = (0..40).map(|k| f64::from(k) * std::f64::consts::TAU / 40.0);

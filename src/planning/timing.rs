@@ -1,18 +1,23 @@
 //! Time parameterization: blended corners, the highest speeds that the limits allow, and a check of the result.
 //!
-//! Without jerk limits the trajectory's points are the grid points of the speed profile: on lines, the cubic between
-//! two of them is the curve itself. With jerk limits the parameter's motion `s(t)` is averaged over a time window,
-//! which keeps the curve and limits the jerk; the points are where the jerk changes.
+//! Corners are passed at constant speed ([`constant_corner_speed`](super::constant_corner_speed)): the points are where
+//! the jerk changes, and the spline through them is the motion. Where lines are short, the speed changes in corners too
+//! ([`topp`](super::topp)). Then, without jerk limits, the points are the grid points of the speed profile. With jerk
+//! limits the parameter's motion `s(t)` is averaged over a time window, which keeps the curve and limits the jerk.
 
 use crate::joint::DEFAULT_ACCELERATION;
 use crate::robot::model::Limits;
 use crate::trajectory::{JointTrajectory, TrajectoryError, TrajectoryPoint};
 
 use super::blend::{Curve, curves};
+use super::constant_corner_speed::RoundedPath;
 use super::jerk_limit::averaged;
 use super::path::{Path, tidy_with_indices};
 use super::topp::{GridPoint, JointBound, parameterize};
 use super::verify::{Excess, excess};
+
+/// Largest distance of a corner's curve from the straight pieces that are checked in its place [rad].
+const SAGITTA: f64 = 2e-4;
 
 /// Settings of the time parameterization.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -38,7 +43,7 @@ pub struct Timed {
     pub duration: f64,
     /// Deviation at each corner [rad]; 0 where the motion rests.
     pub deviation: Vec<f64>,
-    /// Largest part of its limits that the motion uses, measured on the trajectory's spline.
+    /// Largest part of its limits that the motion uses: an upper bound, measured on its spline ([`excess`]).
     pub excess: Excess,
 }
 
@@ -119,14 +124,90 @@ pub fn time_within(
         return Err(TimingError::NoMotion);
     }
     let of = |i: &usize| deviation.get(*i).copied().unwrap_or(0.0).max(0.0);
-    let mut deviation: Vec<f64> = kept.iter().map(of).collect();
-    let rounded = round_corners(&path, &mut deviation, &mut free);
-    let mut timed = emit(names, &path, bounds, &rounded, deviation, speed)?;
-    if free_throughout(&timed.trajectory, &mut free).is_err() {
+    let deviation: Vec<f64> = kept.iter().map(of).collect();
+    let rounded = RoundedPath::new(&path, bounds, &deviation);
+    if variable_is_quicker(&rounded, &path, bounds, &deviation) {
+        at_variable_corner_speed(names, &path, bounds, deviation, speed, &mut free)
+    } else {
+        at_constant_corner_speed(names, (&path, rounded), bounds, deviation, speed, &mut free)
+    }
+}
+
+/// Returns whether a motion that changes its speed in corners is quicker than one that does not. It takes ten times as
+/// long to compute, so it is not where it would gain little.
+fn variable_is_quicker(rounded: &RoundedPath<'_>, path: &Path, bounds: &[JointBound], deviation: &[f64]) -> bool {
+    let speeds = rounded.speeds();
+    if rounded.suits(&speeds) {
+        return false;
+    }
+    let duration = |curve: &Curve| {
+        let mut points = at_variable_speed(curve, bounds);
+        slow_down(&mut points, bounds);
+        points.last().map_or(0.0, |p| p.time_from_start)
+    };
+    curves(path, deviation).iter().map(duration).sum::<f64>() < rounded.duration(&speeds)
+}
+
+/// Times a path whose corners are passed at constant speed.
+fn at_constant_corner_speed(
+    names: &[String],
+    (path, mut rounded): (&Path, RoundedPath<'_>),
+    bounds: &[JointBound],
+    mut deviation: Vec<f64>,
+    speed: f64,
+    free: &mut impl FnMut(&[f64], &[f64]) -> bool,
+) -> Result<Timed, TimingError> {
+    let (mut from, mut to) = (path[0].clone(), path[0].clone());
+    for (i, deviation) in deviation.iter_mut().enumerate().take(path.len() - 1).skip(1) {
+        while !corner_is_free(&rounded, i, (&mut from, &mut to), free) {
+            *deviation = if *deviation > 2e-3 { *deviation * 0.4 } else { 0.0 };
+            rounded.blend(i, *deviation);
+        }
+    }
+    let mut points = rounded.motion(&rounded.speeds());
+    let excess = slow_down(&mut points, bounds);
+    // What is between the corners was part of the path, and is all that the motion passes besides.
+    for i in 0..path.len() - 1 {
+        rounded.ends_of_line(i, &mut from, &mut to);
+        if !free(&from, &to) {
+            return Err(TimingError::NotFree(0.0, points.last().map_or(0.0, |p| p.time_from_start)));
+        }
+    }
+    finished(names, path, (points, excess), deviation, speed)
+}
+
+/// Returns whether a corner is free, in pieces that are as straight as the motion is checked elsewhere.
+fn corner_is_free(
+    rounded: &RoundedPath<'_>,
+    i: usize,
+    (from, to): (&mut Vec<f64>, &mut Vec<f64>),
+    free: &mut impl FnMut(&[f64], &[f64]) -> bool,
+) -> bool {
+    let pieces = rounded.pieces(i, SAGITTA);
+    rounded.in_corner(i, 0.0, to);
+    (1..=pieces).all(|k| {
+        std::mem::swap(from, to);
+        rounded.in_corner(i, k as f64 / pieces as f64, to);
+        free(from, to)
+    })
+}
+
+/// Times a path by time-optimal path parameterization, with jerk limits by averaging.
+fn at_variable_corner_speed(
+    names: &[String],
+    path: &Path,
+    bounds: &[JointBound],
+    mut deviation: Vec<f64>,
+    speed: f64,
+    free: &mut impl FnMut(&[f64], &[f64]) -> bool,
+) -> Result<Timed, TimingError> {
+    let rounded = round_corners(path, &mut deviation, free);
+    let mut timed = emit(names, path, bounds, &rounded, deviation, speed)?;
+    if free_throughout(&timed.trajectory, free).is_err() {
         // Between its points the trajectory deviates slightly from a blended curve. Without blending it does not.
         let sharp = vec![0.0; path.len()];
-        timed = emit(names, &path, bounds, &curves(&path, &sharp), sharp, speed)?;
-        free_throughout(&timed.trajectory, &mut free)?;
+        timed = emit(names, path, bounds, &curves(path, &sharp), sharp, speed)?;
+        free_throughout(&timed.trajectory, free)?;
     }
     Ok(timed)
 }
@@ -167,11 +248,10 @@ fn emit(
     deviation: Vec<f64>,
     speed: f64,
 ) -> Result<Timed, TimingError> {
-    let jerky = bounds.iter().any(|b| b.jerk.is_finite());
     let mut points: Vec<TrajectoryPoint> = Vec::new();
     let mut excess = Excess::default();
     for curve in curves {
-        let mut own = if jerky { averaged(curve, bounds) } else { on_grid(curve, &parameterize(curve, bounds)) };
+        let mut own = at_variable_speed(curve, bounds);
         excess = excess.max(slow_down(&mut own, bounds));
         let start = points.last().map_or(0.0, |p| p.time_from_start);
         let skip = usize::from(!points.is_empty());
@@ -180,6 +260,23 @@ fn emit(
             p
         }));
     }
+    finished(names, path, (points, excess), deviation, speed)
+}
+
+/// Returns the points of the motion along a curve, before it is slowed down to what its spline needs.
+fn at_variable_speed(curve: &Curve, bounds: &[JointBound]) -> Vec<TrajectoryPoint> {
+    let jerky = bounds.iter().any(|b| b.jerk.is_finite());
+    if jerky { averaged(curve, bounds) } else { on_grid(curve, &parameterize(curve, bounds)) }
+}
+
+/// Returns a trajectory of points that keep the bounds, at a part of its speed.
+fn finished(
+    names: &[String],
+    path: &Path,
+    (mut points, excess): (Vec<TrajectoryPoint>, Excess),
+    deviation: Vec<f64>,
+    speed: f64,
+) -> Result<Timed, TimingError> {
     // The ends are exactly those of the path.
     if let (Some(first), Some(last)) = (points.first_mut(), path.first()) {
         first.positions.clone_from(last);

@@ -188,7 +188,7 @@ impl SpeedGrid {
                 (full.last(), self.intervals.get(i.wrapping_sub(1)))
             {
                 let pace = paces[to.piece];
-                switches(&from, &to, push * pace.acceleration, most * pace.x, 0.0, &mut full);
+                switches(&from, &to, push * pace.acceleration, most * pace.x, &mut full);
             }
             full.push(to);
         }
@@ -198,7 +198,7 @@ impl SpeedGrid {
 }
 
 /// Computes the times of points from their speeds.
-pub(super) fn set_times(points: &mut [GridPoint]) {
+fn set_times(points: &mut [GridPoint]) {
     let mut last = GridPoint::default();
     for point in points {
         point.time = last.time;
@@ -209,21 +209,10 @@ pub(super) fn set_times(points: &mut [GridPoint]) {
     }
 }
 
-/// Returns the points of a line where acceleration ends and deceleration begins; in between it cruises for `cruise`
-/// [s], or does not exceed the speed of its faster end.
-pub(super) fn switches(
-    from: &GridPoint,
-    to: &GridPoint,
-    push: f64,
-    fastest: f64,
-    cruise: f64,
-    out: &mut Vec<GridPoint>,
-) {
+/// Adds the points of a line where acceleration ends and deceleration begins.
+fn switches(from: &GridPoint, to: &GridPoint, push: f64, fastest: f64, out: &mut Vec<GridPoint>) {
     let length = to.s - from.s;
-    let free = 0.5 * (from.x + to.x) + push * length;
-    // p² + push·cruise·p = free, for the speed p that leaves this time.
-    let lost = 0.5 * push * cruise;
-    let peak = ((lost * lost + free).sqrt() - lost).powi(2).max(from.x).max(to.x).min(fastest);
+    let peak = (0.5 * (from.x + to.x) + push * length).max(from.x).max(to.x).min(fastest);
     let (up, down) = ((peak - from.x) / (2.0 * push), (peak - to.x) / (2.0 * push));
     let mut add = |along: f64| {
         let last = out.last().map_or(from.s, |p| p.s);
@@ -237,13 +226,13 @@ pub(super) fn switches(
 }
 
 /// Returns the maximum `u` on a line.
-pub(super) fn hardest(line: &Piece, bounds: &[JointBound]) -> f64 {
+fn hardest(line: &Piece, bounds: &[JointBound]) -> f64 {
     let u = line.direction.iter().zip(bounds).map(|(d1, b)| b.acceleration / d1.abs().max(1e-12));
     u.fold(f64::INFINITY, f64::min)
 }
 
 /// Returns the maximum `x` on a line.
-pub(super) fn fastest(line: &Piece, bounds: &[JointBound]) -> f64 {
+fn fastest(line: &Piece, bounds: &[JointBound]) -> f64 {
     let speed = line.direction.iter().zip(bounds).map(|(d1, b)| b.velocity / d1.abs().max(1e-12));
     speed.fold(f64::INFINITY, f64::min).powi(2)
 }

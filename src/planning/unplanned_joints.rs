@@ -24,19 +24,18 @@ pub struct Measured {
 impl PlanningScene {
     /// Returns the scene with the joints that are not planned at their measured positions; `None` if nothing changed.
     pub fn with_idle_joints(&self, measured: &Measured) -> Option<Self> {
-        let mut changed = false;
-        let mut now = self.clone();
-        for robot in &mut now.robots {
+        let mut now: Option<Self> = None;
+        for (index, robot) in self.robots.iter().enumerate() {
             let rest = robot.model.positions(&idle(&robot.config, &robot.model, &robot.joints, measured));
             if rest.iter().zip(&robot.rest).all(|(a, b)| (a - b).abs() <= NOISE) {
                 continue;
             }
             let Ok(kinematics) = robot.compiled(&robot.model, &rest) else { continue };
-            robot.body = Robot { kinematics: kinematics.into(), ..robot.body.clone() };
-            robot.rest = rest;
-            changed = true;
+            let now = now.get_or_insert_with(|| self.clone());
+            let body = Robot { kinematics: kinematics.into(), ..robot.body.clone() };
+            now.robots[index] = PlannedRobot { body, rest, ..robot.clone() };
         }
-        changed.then_some(now)
+        now
     }
 }
 

@@ -89,7 +89,12 @@ impl RecordReader {
         if magic != MAGIC {
             return Err(ReplayError::NotMcap { path: path.to_owned() });
         }
-        Ok(Self { path: path.to_owned(), file, length, at: magic.len() as u64, ended: false, attachments: false, live })
+        let at = magic.len() as u64;
+        let mut records = Self { path: path.to_owned(), file, length, at, ended: false, attachments: false, live };
+        // A log that has its end is closed; its last sync to a slow disk may keep the lock for a while.
+        records.live = live && records.summary_start()?.is_none();
+        records.rewind()?;
+        Ok(records)
     }
 
     /// Returns whether a live run was writing the file when it was opened.

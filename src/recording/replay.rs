@@ -103,8 +103,7 @@ impl LogReader {
             None => None,
         }
         .map_or_else(|| scan(&mut records, &mut channels, topics), Ok)?;
-        // A run that is just ending has closed its log already.
-        info.live = records.is_live() && !info.complete;
+        info.live = records.is_live();
         info.topics = channels.topics();
         info.metadata = metadata(&mut records)?;
         records.rewind()?;

@@ -131,7 +131,7 @@ impl LoggedRobots {
     }
 
     /// Returns the transforms that do not change.
-    pub(super) fn fixed(&self, stamp: &Header) -> TFMessage {
+    pub fn fixed(&self, stamp: &Header) -> TFMessage {
         let transform = |joint: &Joint, model: &RobotModel| transform(stamp, model, joint, joint.origin);
         let all = self.combined();
         let fixed = all.joints.iter().filter(|joint| !joint.is_movable());
@@ -140,7 +140,7 @@ impl LoggedRobots {
 
     /// Returns the transforms at these positions of all arms' joints [rad], and the tool centre points; `tool` finds
     /// the tool of the robot with a joint. Robots with a joint whose position is unknown are left out.
-    pub(super) fn moved<'a>(
+    pub fn moved<'a>(
         &self,
         stamp: &Header,
         positions: &[f64],

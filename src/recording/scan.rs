@@ -64,6 +64,8 @@ pub struct Scan {
     pub cut: Option<String>,
     /// Whether it was closed properly.
     pub complete: bool,
+    /// Newest Unix time of a message seen so far, read or not [ns].
+    latest: u64,
     /// Statistics at its end.
     pub statistics: Option<Statistics>,
     bytes: Vec<u8>,
@@ -91,6 +93,7 @@ impl Scan {
             damage: Vec::new(),
             cut: None,
             complete: false,
+            latest: 0,
             statistics: None,
             bytes: Vec::new(),
             messages: Vec::new(),
@@ -159,6 +162,11 @@ impl Scan {
         self.records.is_live()
     }
 
+    /// Returns whether the part reaches to the end of what can be read: only then it lacks what a cut has taken.
+    pub fn part_reaches_end(&self) -> bool {
+        self.part.1 >= self.latest
+    }
+
     /// Returns the position, and the length of the file [bytes].
     pub fn position(&self) -> (u64, u64) {
         self.records.position()
@@ -210,7 +218,9 @@ impl Scan {
     }
 
     fn unpack(&mut self, body: &[u8]) -> Result<(), mcap::McapError> {
-        if chunk_header(body)?.message_start_time > self.part.1 {
+        let header = chunk_header(body)?;
+        self.latest = self.latest.max(header.message_end_time);
+        if header.message_start_time > self.part.1 {
             return Ok(());
         }
         unpack_chunk(body, |opcode, body| self.learn(opcode, body))
@@ -227,6 +237,7 @@ impl Scan {
     pub(super) fn learn(&mut self, opcode: u8, body: &[u8]) {
         match parse_record(opcode, body) {
             Ok(Record::Message { header, data }) => {
+                self.latest = self.latest.max(header.log_time);
                 let start = self.bytes.len();
                 self.bytes.extend_from_slice(&data);
                 self.messages.push(RawMessage {

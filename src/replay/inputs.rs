@@ -7,11 +7,14 @@ use super::requests;
 use crate::arm::{ArmState, Interference, Link, VelocitySource};
 use crate::clock::Mono;
 use crate::control::coordinator::TickTime;
+use crate::control::guard::Verdict;
 use crate::control::request::{Envelope, Request};
 use crate::joint::{ControlMode, Joints, MAX_DOF};
 use crate::recording::cdr::{CdrError, Decoder, Encoder};
 use crate::recording::messages::{ArmInput, ArmOutput, Event, JointState, Text, Tick};
 use crate::recording::wire::{Field, Message};
+use crate::telemetry::Guarded;
+use crate::telemetry::describe::Names;
 
 /// Length of the header before every message [bytes].
 const HEADER: usize = 4;
@@ -91,6 +94,16 @@ impl LoggedTick {
             late_ns: self.tick.overrun_ns,
             woke_late_ns: self.tick.late_ns,
         }
+    }
+
+    /// Returns the new verdicts of the collision guard: its world is not in the log, so they are inputs of the tick.
+    pub fn guard_verdicts<'a>(&'a self, names: &'a Names) -> impl Iterator<Item = (u16, Verdict)> + 'a {
+        let verdicts = self.events.iter().filter(|event| event.kind == "guard");
+        verdicts.filter_map(|event| {
+            let arm = names.arms.iter().position(|arm| arm.hardware_id == event.arm)? as u16;
+            let distance = event.values.first().copied().filter(|_| event.status == "blocked");
+            Some((arm, distance.map(|distance| Guarded { distance, ..Guarded::default() })))
+        })
     }
 }
 

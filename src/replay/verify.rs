@@ -57,12 +57,21 @@ pub struct Verification {
 
 /// Replays a log and compares. Rejects a log with another config version, or with a task type that `table` lacks.
 pub fn verify(path: &Path, table: &TaskTable) -> Result<Verification, RecordedError> {
+    verify_with(path, table, &mut |_, _| ())
+}
+
+/// Same; `progress` gets how much of how much is read [bytes].
+pub fn verify_with(
+    path: &Path,
+    table: &TaskTable,
+    progress: &mut dyn FnMut(u64, u64),
+) -> Result<Verification, RecordedError> {
     let recorded = Recorded::open(path)?;
     recorded.check_version()?;
     let tasks = table.build(&recorded.config.tasks);
     let tasks = tasks.map_err(|what| RecordedError::Unfit { path: path.to_owned(), what })?;
     let mut run = Rerun::new(&recorded, &recorded.config, tasks);
-    let end = run.read(path)?;
+    let end = run.read(path, progress)?;
     Ok(run.finish(end))
 }
 
@@ -117,12 +126,19 @@ impl<'a> Rerun<'a> {
         self
     }
 
-    /// Reads all files of the log. Returns where it is cut.
-    pub fn read(&mut self, path: &Path) -> Result<Option<ReplayError>, RecordedError> {
-        for part in parts(path)? {
+    /// Reads all files of the log; `progress` gets how much of how much is read [bytes]. Returns where it is cut.
+    pub fn read(
+        &mut self,
+        path: &Path,
+        progress: &mut dyn FnMut(u64, u64),
+    ) -> Result<Option<ReplayError>, RecordedError> {
+        let (parts, mut before) = (parts(path)?, 0);
+        let length = parts.iter().filter_map(|part| Some(part.metadata().ok()?.len())).sum();
+        for part in parts {
             let mut records = RecordReader::open(&part)?;
             self.counts.live = records.is_live();
             loop {
+                progress(before + records.position().0, length);
                 match records.next_record() {
                     Ok(Some(record)) => {
                         if let Err(damage) = self.record(&record) {
@@ -137,6 +153,7 @@ impl<'a> Rerun<'a> {
                     return Ok(None);
                 }
             }
+            before += records.position().1;
         }
         Ok(None)
     }
@@ -205,6 +222,9 @@ impl<'a> Rerun<'a> {
             *state = arm.state;
         }
         self.counts.requests += self.requests.len() as u64;
+        for (arm, verdict) in logged.guard_verdicts(&self.recorded.names) {
+            self.coordinator.replay_guard(arm, verdict);
+        }
         let mut requests = self.requests.drain(..);
         let output = self.coordinator.tick(logged.time(), &self.states, || requests.next());
         drop(requests);

@@ -77,7 +77,8 @@ pub struct Row<'a> {
     pub rerun: f64,
 }
 
-/// Replays a log with changed values of its `coordinator.json`; `each` gets every command that differs.
+/// Replays a log with changed values of its `coordinator.json`; `each` gets every command that differs, and
+/// `progress` how much of how much is read [bytes].
 ///
 /// # Errors
 /// The log cannot be verified, a path does not exist, or a value does not fit.
@@ -86,6 +87,7 @@ pub fn what_if(
     table: &TaskTable,
     changes: &[(String, String)],
     mut each: impl FnMut(Row<'_>),
+    progress: &mut dyn FnMut(u64, u64),
 ) -> Result<WhatIf, RecordedError> {
     let recorded = Recorded::open(path)?;
     recorded.check_version()?;
@@ -123,7 +125,7 @@ pub fn what_if(
         found.events.extend(both.take(room).map(|(logged, text)| EventChange { time, logged, text }));
     };
     let mut run = Rerun::new(&recorded, &config, tasks).seen_by(&mut see);
-    let cut = run.read(path)?;
+    let cut = run.read(path, progress)?;
     let ran = run.finish(cut);
     (found.ticks, found.length) = (ran.ticks, ran.length);
     found.joints = joints.into_iter().filter(|change| change.ticks > 0).collect();

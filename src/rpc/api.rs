@@ -15,7 +15,9 @@ pub use super::arm_api::*;
 pub use super::attach_api::*;
 pub use super::cartesian_api::*;
 use super::error::{Code, RpcError};
+pub use super::gateway_api::*;
 use super::lease::Subject;
+pub use super::model_api::*;
 pub use super::motion_api::*;
 pub use super::parts_api::*;
 pub use super::planner_api::*;
@@ -24,6 +26,7 @@ pub use super::poses_api::*;
 use super::report::{MotionReport, StateReport, StatusReport};
 use super::schema::MethodSchema;
 use super::streams::Streams;
+pub use super::text_api::*;
 pub use super::world_api::*;
 
 /// Maximum length of a request line, including its newline [bytes].
@@ -61,6 +64,10 @@ pub trait Backend: Send + Sync + 'static {
     fn register_planner(&self, planner: RegisterPlanner, proxy: Arc<PlannerProxy>) -> Result<Registered, RpcError> {
         let _ = (planner, proxy);
         Err(RpcError::new(Code::Unsupported, "this run cannot have a planner"))
+    }
+    /// Called when a face of the gateway serves no more, or not at all.
+    fn face_fell(&self, face: &FaceReport) {
+        let _ = face;
     }
     /// Called once on the thread that answers `stop`, `cancel`, `status` and `shutdown`, before the first request.
     fn prepare_urgent_thread(&self) {}
@@ -102,7 +109,7 @@ macro_rules! methods {
 
         /// Names of all methods; the last ones are answered by the connection itself.
         pub const METHODS: &[&str] = &[$($name,)* "subscribe", "unsubscribe", "lease", "release",
-            "register_planner", "planner_answer"];
+            "register_planner", "planner_answer", "on_behalf_of", "register_gateway"];
 
         /// Returns the schemas of each method in the table.
         pub(super) fn method_schemas(generator: &mut SchemaGenerator) -> Vec<MethodSchema> {
@@ -160,6 +167,8 @@ methods! {
     "status" Status -> StatusReport;
     /// The latest joint states and commands.
     "state" State -> StateReport;
+    /// What the run has printed for people: its text log.
+    "text_log" TextLog -> TextLogReport;
     /// Moves an arm to a joint target, directly: not collision-checked; in a run with a planner only with `direct`.
     /// Ends the client's own streams to the arm. Replies when the motion begins; `motion` reports its progress.
     "move" Move -> MoveReply, check Move::valid;
@@ -200,6 +209,10 @@ methods! {
     "arm_payload" ArmPayload -> PayloadReply;
     /// Sets the load at an arm's flange, and reads it back. The arm must be at rest.
     "arm_payload_set" ArmPayloadSet -> PayloadReply, check ArmPayloadSet::valid;
+    /// The robots of the run in one URDF, and the transforms in it that do not change.
+    "robot_description" RobotDescription -> DescriptionReport;
+    /// The poses of the robots' links and tool centre points after the last tick.
+    "transforms" Transforms -> TransformsReport;
     /// The saved poses of the run's blueprint.
     "poses" Poses -> PosesReport;
     /// Saves the measured joint positions of arms under a name, for the goal `named` of `plan`.

@@ -8,9 +8,9 @@ use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 
-use super::api::{MAX_LINE, Method};
+use super::api::{MAX_LINE, Method, Status};
 use super::error::{Code, RpcError};
-use super::run_dir::{LiveRun, RunDir, RunDirError};
+use super::run_dir::{self, LiveRun, RunDir, RunDirError};
 use super::server::CALL_TIMEOUT;
 use super::wire::Incoming;
 use crate::yaml::{did_you_mean, quote};
@@ -64,6 +64,11 @@ pub enum ClientError {
 }
 
 impl ClientError {
+    /// Returns whether nothing came in time.
+    pub fn is_timeout(&self) -> bool {
+        matches!(self, Self::Io { error, .. } if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut))
+    }
+
     /// Returns what the user can do about it.
     pub fn hint(&self) -> Option<String> {
         match self {
@@ -72,7 +77,7 @@ impl ClientError {
             Self::UnknownRun { live, .. } if live.is_empty() => Self::NoRun.hint(),
             Self::UnknownRun { name, live } => did_you_mean(name, live.iter().map(|r| r.name.as_str()), "live"),
             Self::RunDir(error) => Some(error.hint().into()),
-            Self::Io { error, .. } if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) => {
+            Self::Io { .. } if self.is_timeout() => {
                 Some("the process is live but does not answer; its log may say why".into())
             }
             Self::Io { .. } => Some("the run is starting or has just ended; see `dimos status`".into()),
@@ -137,6 +142,20 @@ pub fn find(folder: &RunDir, name: Option<&str>) -> Result<LiveRun, ClientError>
     }
 }
 
+/// Returns the URL of a run's live view, with its token: that of a planner attached to the run, whose page also has the
+/// planner's robots, if it serves one here.
+pub fn view_url(run: &str, socket: &Path) -> Option<String> {
+    let of_planner = || {
+        let status = Client::connect(run, socket).ok()?.call(Status {}).ok()?;
+        let name = status.planner?.attached?.name;
+        run_dir::check_name(&name).ok()?;
+        let planners = RunDir::at(socket.parent()?).planners();
+        std::fs::read_to_string(planners.path().join(format!("{name}.view"))).ok()
+    };
+    let text = of_planner().or_else(|| std::fs::read_to_string(run_dir::view_file(socket)).ok())?;
+    Some(text.trim().to_owned())
+}
+
 impl Client {
     /// Connects to the run of this name; without a name, to the only live run.
     pub fn find(folder: &RunDir, name: Option<&str>) -> Result<Self, ClientError> {
@@ -149,6 +168,11 @@ impl Client {
         UnixStream::connect(socket)
             .and_then(|stream| Self::over(stream, run, REPLY_TIMEOUT))
             .map_err(|error| ClientError::Io { run: run.to_owned(), error })
+    }
+
+    /// Talks over a stream that leads to the run's socket; `run` is the name used in errors.
+    pub fn of_stream(stream: UnixStream, run: &str) -> io::Result<Self> {
+        Self::over(stream, run, REPLY_TIMEOUT)
     }
 
     fn over(stream: UnixStream, run: &str, timeout: Duration) -> io::Result<Self> {
@@ -208,6 +232,10 @@ impl Client {
             let incoming = self.read(deadline)?;
             if incoming.stream.is_some() {
                 return Ok(message(incoming));
+            }
+            // Not a late reply: the connection is being closed, and this is why.
+            if let (None, Some(refusal)) = (incoming.id, incoming.error) {
+                return Err(refusal.into());
             }
         }
     }
@@ -339,7 +367,6 @@ mod tests {
     use std::thread::{sleep, spawn};
 
     use super::*;
-    use crate::rpc::api::Status;
 
     const TIMEOUT: Duration = Duration::from_millis(200);
 

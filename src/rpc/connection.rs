@@ -21,9 +21,10 @@ use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::{sleep, timeout};
 
 use super::api::{
-    Backend, Done, Lease, LeaseReply, MAX_ANSWER, MAX_LINE, MAX_SUBSCRIPTIONS, Method, PlannerAnswer, RegisterPlanner,
-    Registered, Release, Reply, Request, read_params,
+    Backend, Done, Lease, LeaseReply, MAX_ANSWER, MAX_LINE, MAX_SUBSCRIPTIONS, Method, OnBehalfOf, PlannerAnswer,
+    RegisterGateway, RegisterPlanner, Registered, Release, Reply, Request, read_params,
 };
+use super::commanded::Commanded;
 use super::connection_limit::Permit;
 use super::error::{Code, RpcError};
 use super::lease::{Leases, Lessee, Subject};
@@ -64,6 +65,8 @@ pub(super) async fn serve(transfer: Transfer, backend: Arc<dyn Backend>) -> Opti
         subscriptions: BTreeMap::new(),
         next: 1,
         planner: None,
+        behalf: None,
+        is_gateway: false,
     };
     let Some((lessee, permit)) = connection.answer_requests(&mut from_client).await else {
         if timeout(CLOSE_TIMEOUT, &mut writer).await.is_err() {
@@ -108,6 +111,10 @@ struct Connection {
     next: u64,
     /// The planner that registered on this connection.
     planner: Option<RegisteredPlanner>,
+    /// If it speaks for a client of a gateway: whether the motions that began on it are cancelled with it.
+    behalf: Option<(bool, Commanded)>,
+    /// Whether the run's gateway registered on it.
+    is_gateway: bool,
 }
 
 /// A registered planner; closed when dropped.
@@ -136,29 +143,40 @@ struct Disconnected;
 impl Connection {
     /// Answers requests until the connection ends (`None`) or is silent for [`RETURN_AFTER`].
     async fn answer_requests(mut self, from: &mut (impl AsyncBufRead + Unpin)) -> Option<(Lessee, Permit)> {
+        if self.is_silent(from).await {
+            return Some((self.lessee, self.permit));
+        }
+        if let Some((true, commanded)) = &mut self.behalf {
+            commanded.cancel(&self.lessee, &*self.backend).await;
+        }
+        None
+    }
+
+    /// Answers requests. Returns whether the connection is silent, and has not ended.
+    async fn is_silent(&mut self, from: &mut (impl AsyncBufRead + Unpin)) -> bool {
         let mut line = Vec::new();
         loop {
             let max_line = self.max_line();
             if self.pending.is_empty() {
-                self.permit.set_pinned(!self.subscriptions.is_empty() || self.planner.is_some());
+                self.permit.set_pinned(!self.subscriptions.is_empty() || self.planner.is_some() || self.is_gateway);
                 self.permit.set_idle();
             }
             let read = tokio::select! {
                 biased;
                 reason = self.permit.evicted() => {
                     let _ = timeout(CLOSE_TIMEOUT, self.reply::<Done>(&Value::Null, Err(reason))).await;
-                    return None;
+                    return false;
                 }
                 done = oldest(&mut self.pending), if !self.pending.is_empty() => {
                     if self.send_oldest(done).await.is_err() {
-                        return None;
+                        return false;
                     }
                     continue;
                 }
                 // Polled before the line, so that no bytes are read that would be lost with the transfer.
                 () = sleep(RETURN_AFTER), if line.is_empty() && self.is_plain() => {
                     if line.is_empty() {
-                        return Some((self.lessee, self.permit));
+                        return true;
                     }
                     continue;
                 }
@@ -168,18 +186,18 @@ impl Connection {
                 Line::Complete => self.permit.set_busy(),
                 Line::End => {
                     let _ = self.finish_pending().await;
-                    return None;
+                    return false;
                 }
                 Line::TooLong => {
                     let error = RpcError::new(Code::TooLarge, format!("the line is longer than {max_line} bytes"));
                     let error = error.hint("send less at once; the connection is closed now");
                     let _ = self.reply::<Done>(&Value::Null, Err(error)).await;
                     let _ = timeout(CLOSE_TIMEOUT, skip_line(from)).await;
-                    return None;
+                    return false;
                 }
             }
             if !line.trim_ascii().is_empty() && self.answer(&line).await.is_err() {
-                return None;
+                return false;
             }
             line.clear();
         }
@@ -187,7 +205,7 @@ impl Connection {
 
     /// Returns whether the connection only sends requests and receives replies.
     fn is_plain(&self) -> bool {
-        self.pending.is_empty() && self.next == 1 && self.planner.is_none()
+        self.pending.is_empty() && self.next == 1 && self.planner.is_none() && self.behalf.is_none() && !self.is_gateway
     }
 
     async fn answer(&mut self, line: &[u8]) -> Result<(), Disconnected> {
@@ -226,6 +244,18 @@ impl Connection {
                 let result = self.planner_answer(params);
                 self.reply(&id, result).await
             }
+            OnBehalfOf::NAME => {
+                let result = self.on_behalf_of(params);
+                self.reply(&id, result).await
+            }
+            RegisterGateway::NAME => {
+                let result = read_params(params).and_then(|gateway| self.lessee.register_gateway(gateway));
+                self.is_gateway |= result.is_ok();
+                if let Ok(fallen) = &result {
+                    fallen.iter().for_each(|face| self.backend.face_fell(face));
+                }
+                self.reply(&id, result.map(|_| Done {})).await
+            }
             _ => match Request::read(&method, params) {
                 Ok(request) => self.request(id, method, request).await,
                 Err(error) => self.reply::<Done>(&id, Err(error)).await,
@@ -240,11 +270,15 @@ impl Connection {
         };
         let is_target =
             matches!(request, Request::Servo(_) | Request::Velocity(_) | Request::Twist(_) | Request::Pose(_));
+        let commands = self.behalf.is_some().then(|| request.clone());
         let mut answer = self.call(method, request);
         if !is_target {
             self.finish_pending().await?;
             let result = answer.await;
             self.lessee.settle(&arms, may_take_effect(&result));
+            if let (Some((_, commanded)), Some(request), Ok(reply)) = (&mut self.behalf, commands, &result) {
+                commanded.note(&request, reply, &arms);
+            }
             return self.reply(&id, result).await;
         }
         // The first poll sends it to the tick.
@@ -296,10 +330,21 @@ impl Connection {
 
     fn register_planner(&mut self, params: Value) -> Result<Registered, RpcError> {
         let planner: RegisterPlanner = read_params(params)?;
-        let proxy = Arc::new(PlannerProxy::new(self.queue.clone(), self.lessee.pid()));
+        let proxy =
+            Arc::new(PlannerProxy::new(self.queue.clone(), self.lessee.pid().filter(|_| self.behalf.is_none())));
         let registered = self.backend.register_planner(planner, proxy.clone())?;
         self.planner = Some(RegisteredPlanner(proxy));
         Ok(registered)
+    }
+
+    fn on_behalf_of(&mut self, params: Value) -> Result<Done, RpcError> {
+        let OnBehalfOf { client, cancel_at_end } = read_params(params)?;
+        if self.behalf.is_some() {
+            return Err(RpcError::new(Code::InvalidParams, "this connection has said already for whom it speaks"));
+        }
+        self.lessee.set_client(client);
+        self.behalf = Some((cancel_at_end, Commanded::default()));
+        Ok(Done {})
     }
 
     fn planner_answer(&self, params: Value) -> Result<Done, RpcError> {

@@ -19,8 +19,20 @@ pub enum Code {
     TooManyConnections,
     /// The connection has the maximum number of subscriptions.
     TooManySubscriptions,
-    /// The socket belongs to another user; the connection ends.
+    /// The socket belongs to another user, and the connection ends; or the role of the client does not include the
+    /// request.
     Forbidden,
+    /// No one listens at the place, or it does not accept this client's certificate.
+    Unreachable,
+    /// The connection to another computer is lost. A request that was pending may still take effect. If the client held
+    /// a lease, it must take it again.
+    Lost,
+    /// The client has the maximum number of requests pending.
+    TooManyRequests,
+    /// Another gateway shares the run.
+    HasGateway,
+    /// Another coordinator is on the bus of Python dimos.
+    HasCoordinator,
     /// No such method.
     UnknownMethod,
     /// The parameters do not fit the method.
@@ -49,6 +61,8 @@ pub enum Code {
     NoPlan,
     /// The world has changed since the plan was made, and now blocks it.
     PlanOutdated,
+    /// The plan is not proven to be free of contact, and the request does not say that this is wanted.
+    PlanUnproven,
     /// No such object in the world.
     UnknownObject,
     /// The object does not allow the request: an arm holds it, or none does.

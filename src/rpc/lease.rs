@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use serde_json::json;
 
-use super::api::{Attach, Backend, ExecutePlan, Presence, Reply, Request};
+use super::api::{Attach, Backend, ExecutePlan, FaceReport, GatewayReport, Presence, RegisterGateway, Reply, Request};
 use super::error::{Code, RpcError};
 use super::report::CommanderReport;
 use crate::sync::lock;
@@ -65,6 +65,7 @@ pub(super) fn need(request: &Request) -> Need<'_> {
         Request::ArmToolSet(t) => Need::NoOtherHolder(Subject::Arm(&t.arm)),
         Request::Attach(Attach { mass: Some(_), .. }) | Request::Detach(_) => Need::NoOtherHolderOfLoad,
         Request::ArmIoSet(io) => Need::NoOtherHolder(Subject::Arm(&io.arm)),
+        Request::RobotDescription(_) | Request::Transforms(_) | Request::TextLog(_) => Need::Nothing,
         Request::Poses(_) | Request::PoseSave(_) | Request::PoseRemove(_) => Need::Nothing,
         Request::Status(_) | Request::State(_) | Request::Motion(_) | Request::ArmIo(_) => Need::Nothing,
         Request::ArmPayload(_) | Request::ArmTool(_) | Request::Grip(_) => Need::Nothing,
@@ -97,13 +98,17 @@ impl Holder {
     }
 }
 
-/// The leases of a run, by arm.
+/// The leases of a run, by arm, and its gateway.
 #[derive(Debug, Default)]
-pub(super) struct Leases(Mutex<BTreeMap<String, Holder>>);
+pub(super) struct Leases {
+    holders: Mutex<BTreeMap<String, Holder>>,
+    /// The gateway, and the connection that registered it.
+    gateway: Mutex<Option<(u64, GatewayReport)>>,
+}
 
 impl Leases {
     fn lock(&self) -> MutexGuard<'_, BTreeMap<String, Holder>> {
-        lock(&self.0)
+        lock(&self.holders)
     }
 
     /// Returns whether a connection holds the lease of any arm.
@@ -111,9 +116,10 @@ impl Leases {
         self.lock().values().any(|holder| holder.connection == connection)
     }
 
-    /// Adds the lease holders to a `status` reply.
+    /// Adds the lease holders and the gateway to a `status` reply.
     pub fn complete(&self, mut reply: Reply) -> Reply {
         if let Reply::Status(status) = &mut reply {
+            status.share = lock(&self.gateway).as_ref().map(|(_, report)| Box::new(report.clone()));
             let held = self.lock();
             for arm in &mut status.arms {
                 arm.commander = held.get(&arm.hardware_id).map(Holder::report);
@@ -129,6 +135,8 @@ pub(super) struct Lessee {
     leases: Arc<Leases>,
     connection: u64,
     pid: Option<i32>,
+    /// On whose behalf it speaks, if it is a connection of a gateway.
+    client: Option<String>,
     /// Dropped with the connection.
     alive: Arc<()>,
 }
@@ -136,12 +144,43 @@ pub(super) struct Lessee {
 impl Lessee {
     /// Creates a lessee without leases. `connection` is unique within the run; `pid` is the client's process.
     pub fn new(leases: Arc<Leases>, connection: u64, pid: Option<i32>) -> Self {
-        Self { leases, connection, pid, alive: Arc::default() }
+        Self { leases, connection, pid, client: None, alive: Arc::default() }
     }
 
     /// Returns the client's process, if the system reports it.
     pub fn pid(&self) -> Option<i32> {
         self.pid
+    }
+
+    /// Shows another name than that of the process to those who ask who commands an arm.
+    pub fn set_client(&mut self, client: String) {
+        self.client = Some(client);
+    }
+
+    /// Returns whether this connection holds the leases of all these arms.
+    pub fn holds_all(&self, arms: &[String]) -> bool {
+        let held = self.leases.lock();
+        arms.iter().all(|arm| held.get(arm).is_some_and(|holder| holder.connection == self.connection))
+    }
+
+    /// Makes this connection that of the run's gateway, or updates what it says of itself. Fails if the run has another
+    /// one. Returns the faces that serve no more.
+    pub fn register_gateway(&self, gateway: RegisterGateway) -> Result<Vec<FaceReport>, RpcError> {
+        let mut registered = lock(&self.leases.gateway);
+        if let Some((_, other)) = registered.as_ref().filter(|(connection, _)| *connection != self.connection) {
+            let process = other.pid.map(|pid| format!(" (pid {pid})")).unwrap_or_default();
+            let faces = other.faces.iter().map(|face| face.face.as_str());
+            let places: Vec<&str> = other.endpoints.iter().map(String::as_str).chain(faces).collect();
+            let text = format!("the run is shared already at {}{process}", places.join(", "));
+            return Err(
+                RpcError::new(Code::HasGateway, text).hint("end that `dimos share` first: a run has one gateway")
+            );
+        }
+        let RegisterGateway { endpoints, clients, faces } = gateway;
+        let known = registered.take().map(|(_, known)| known.faces).unwrap_or_default();
+        let fallen = faces.iter().filter(|face| !face.serves && !known.contains(face)).cloned().collect();
+        *registered = Some((self.connection, GatewayReport { pid: self.pid, endpoints, clients, faces }));
+        Ok(fallen)
     }
 
     /// Returns the leases of the run.
@@ -207,7 +246,8 @@ impl Lessee {
                 Some(holder) => holder.kept |= kept,
                 None => {
                     let (connection, pid, since) = (self.connection, self.pid, Instant::now());
-                    held.insert(arm.clone(), Holder { connection, pid, program: program(pid), since, kept });
+                    let program = self.client.clone().unwrap_or_else(|| program(pid));
+                    held.insert(arm.clone(), Holder { connection, pid, program, since, kept });
                 }
             }
         }
@@ -242,6 +282,7 @@ impl Lessee {
 impl Drop for Lessee {
     fn drop(&mut self) {
         self.leases.lock().retain(|_, holder| holder.connection != self.connection);
+        lock(&self.leases.gateway).take_if(|(connection, _)| *connection == self.connection);
     }
 }
 

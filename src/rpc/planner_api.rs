@@ -90,6 +90,13 @@ pub struct Plan {
     /// Seed of the search; the same request from the same state with the same seed gives the same plan.
     #[serde(default)]
     pub seed: u64,
+    /// How motions are checked.
+    #[serde(default, skip_serializing_if = "PlanLevel::is_default")]
+    pub level: PlanLevel,
+    /// Rounds of refinement: each looks for a shorter path. The same number gives the same plan, unless
+    /// they end early: at half of the time until the timeout.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub refine: u32,
     /// Maximum planning time [s]; default: the blueprint's `planning_timeout`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub timeout: Option<f64>,
@@ -108,7 +115,40 @@ pub struct Plan {
 impl Default for Plan {
     fn default() -> Self {
         let (goals, through, speed) = (Vec::new(), Vec::new(), default_speed());
-        Self { goals, speed, seed: 0, timeout: None, through, blend: 0.0, by_number: false }
+        let level = PlanLevel::default();
+        Self { goals, speed, seed: 0, level, refine: 0, timeout: None, through, blend: 0.0, by_number: false }
+    }
+}
+
+fn is_zero(number: &u32) -> bool {
+    *number == 0
+}
+
+/// How the motions of a plan are checked.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum PlanLevel {
+    /// At samples, 32 per radian: quick, nothing is proven. Such a plan is executed only with `unproven`.
+    Fast,
+    /// Proven free of contact, between the samples too.
+    #[default]
+    Certified,
+    /// The same, searched with proven motions only, and with the clearance to 0.5 mm.
+    Exact,
+}
+
+impl PlanLevel {
+    /// Returns its name in requests.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Fast => "fast",
+            Self::Certified => "certified",
+            Self::Exact => "exact",
+        }
+    }
+
+    fn is_default(&self) -> bool {
+        *self == Self::default()
     }
 }
 
@@ -241,10 +281,15 @@ pub struct PlanSummary {
     pub length: f64,
     /// Duration of the motion [s].
     pub duration: f64,
-    /// Minimum distance to an obstacle or between checked links [m]; missing if nothing is near.
+    /// How it was checked.
+    #[serde(default)]
+    pub level: PlanLevel,
+    /// Distance to obstacles and between checked links that the whole motion is proven to keep, between samples too
+    /// [m]; at most 0.2. It may be some millimetres more; with the level `exact`, 0.5 mm. Negative: the depth of a
+    /// contact at the start. Missing if nothing can collide, or nothing is proven.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub clearance: Option<f64>,
-    /// The two bodies with this distance.
+    /// The two bodies that are not proven to stay farther apart; missing if none are near.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub closest: Option<[String; 2]>,
     /// Required distance to obstacles and other arms [m].
@@ -348,6 +393,10 @@ pub struct PreviewReply {
     pub plan: u64,
     /// Figures of the plan.
     pub summary: PlanSummary,
+    /// Pairs of links that were not checked against each other, by reason: neighbours, those of the SRDF or the
+    /// blueprint, those that touch in every configuration, what is held.
+    #[serde(default)]
+    pub ignored_pairs: BTreeMap<String, Vec<[String; 2]>>,
     /// The motion, with the coordinator's joint names.
     pub trajectory: Trajectory,
     /// For each robot, the position of its tool centre point at each point of the trajectory: x, y, z [m] in `map`.
@@ -370,6 +419,9 @@ pub struct ExecutePlan {
     /// Whether a motion that an obstacle blocks is planned again from where it stopped, and continues.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub replan: bool,
+    /// Required for a plan of the level `fast`: it is not proven to be free.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub unproven: bool,
     /// If the motion retraces the log: time in it of the goal [s since 1970]. `motion` reports it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub retraces_to: Option<f64>,

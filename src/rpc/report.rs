@@ -8,7 +8,7 @@ mod state;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::api::SpeedReport;
+use super::api::{GatewayReport, SpeedReport};
 
 pub use arm::*;
 pub use motion::*;
@@ -54,6 +54,9 @@ pub struct StatusReport {
     /// Address of the live view, without its token; absent without one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub view: Option<String>,
+    /// The gateway to other computers; absent without one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub share: Option<Box<GatewayReport>>,
 }
 
 impl StatusReport {

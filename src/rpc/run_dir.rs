@@ -75,8 +75,10 @@ pub struct LiveRun {
     pub name: String,
     /// Process id; 0 while unknown.
     pub pid: u32,
-    /// Its socket; missing while the run starts.
+    /// Its socket; missing while the run starts. Empty if it is on another computer.
     pub socket: PathBuf,
+    /// Where it is, if it is on another computer.
+    pub at: Option<String>,
 }
 
 /// A claimed run name. Dropping it removes the socket and releases the name.
@@ -107,6 +109,11 @@ impl RunDir {
     /// Returns the directory for attached planners: they have a lock, but no socket.
     pub fn planners(&self) -> Self {
         Self(self.0.join("planners"))
+    }
+
+    /// Returns the directory for sockets that lead to runs on other computers.
+    pub fn relays(&self) -> Self {
+        Self(self.0.join("relays"))
     }
 
     /// Returns its path.
@@ -181,7 +188,9 @@ impl RunDir {
                     remove_files(&socket)?;
                     remove(&path)?;
                 }
-                Err(TryLockError::WouldBlock) => runs.push(LiveRun { name, pid: read_pid(&mut file), socket }),
+                Err(TryLockError::WouldBlock) => {
+                    runs.push(LiveRun { name, pid: read_pid(&mut file), socket, at: None })
+                }
                 _ => {}
             }
         }

@@ -4,8 +4,8 @@ use schemars::{JsonSchema, Schema, SchemaGenerator, generate::SchemaSettings};
 use serde_json::{Map, Value, json};
 
 use super::api::{
-    Lease, Method, PLANNER_REQUESTS, PlannerAnswer, PlannerRequest, RECHECK, Recheck, RecheckReply, RegisterPlanner,
-    Release, method_schemas,
+    Lease, Method, OnBehalfOf, PLANNER_REQUESTS, PlannerAnswer, PlannerRequest, RECHECK, Recheck, RecheckReply,
+    RegisterGateway, RegisterPlanner, Release, method_schemas,
 };
 use super::error::RpcError;
 use super::streams::{EventReport, JointState, Stream, Subscribe, Unsubscribe};
@@ -43,6 +43,8 @@ pub fn json_schema() -> Value {
         MethodSchema::of::<Release>(g),
         MethodSchema::of::<RegisterPlanner>(g),
         MethodSchema::of::<PlannerAnswer>(g),
+        MethodSchema::of::<OnBehalfOf>(g),
+        MethodSchema::of::<RegisterGateway>(g),
     ]);
     let planner_requests = [MethodSchema::named::<Recheck, RecheckReply>(RECHECK, g)];
     let streams = json!({

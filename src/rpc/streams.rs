@@ -102,8 +102,8 @@ pub struct EventReport {
     pub stamp: f64,
     /// Its severity.
     pub level: Level,
-    /// Its kind, for programs: `request`, `task`, `preempted`, `mode_conflict`, `arm`, `limited`, `overrun`,
-    /// `degraded`, `stop`.
+    /// Its kind, for programs: `request`, `task`, `preempted`, `mode_conflict`, `arm`, `limited`, `overrun`, `speed`,
+    /// `degraded`, `guard`, `stop`, `share`.
     pub kind: String,
     /// The arm that it concerns.
     #[serde(default, skip_serializing_if = "Option::is_none")]

@@ -38,6 +38,10 @@ const READY_LIMIT: Duration = Duration::from_secs(2);
 impl Service {
     pub(super) async fn stop(&self, call: api::Stop) -> Result<Reply, RpcError> {
         let arm = call.arm.as_deref().map(|a| self.arm_index(a)).transpose()?;
+        let stopped = self.stops.iter().enumerate().filter(|(i, _)| arm.is_none_or(|a| usize::from(a) == *i));
+        for (_, count) in stopped {
+            count.fetch_add(1, Ordering::Relaxed);
+        }
         self.ask(Request::Stop { arm }).await?;
         let limit = Instant::now() + STOP_LIMIT;
         let mut arms = BTreeMap::new();
@@ -80,6 +84,8 @@ impl Service {
     pub(super) async fn reset(&self, id: String) -> Result<Reply, RpcError> {
         let arm = self.arm_index(&id)?;
         let device = self.device(arm)?;
+        let count = || self.stops.get(usize::from(arm)).map_or(0, |count| count.load(Ordering::Relaxed));
+        let stops = count();
         let view = self.arm_view(arm as usize);
         let cause = view.filter(|v| v.phase == Phase::Held).map(|v| cause_text(v.cause));
         if cause.is_some() {
@@ -93,7 +99,16 @@ impl Service {
             self.next_tick().await;
             self.until(self.next_report(arm), || self.seen(arm, |view| view.state.error == 0)).await;
         }
-        self.ask(Request::Reset { arm }).await?;
+        if count() == stops {
+            self.ask(Request::Reset { arm }).await?;
+        }
+        // Clearing an error may take seconds. A stop that comes meanwhile holds the arm, also one in the reset's tick.
+        if count() != stops {
+            self.ask(Request::Stop { arm: Some(arm) }).await?;
+            let what = format!("{id} was stopped while its hold was being cleared: it stays held");
+            return Err(RpcError::new(Code::ArmLatched, what)
+                .hint(format!("when it may move again: `dimos arm reset {id}`, then `dimos arm enable {id}`")));
+        }
         let mut reply = self.phase_of(id, arm);
         // The state is read once more before the arm is enabled.
         reply.note = cause.map(|cause| format!("was held: {cause}"));

@@ -16,12 +16,13 @@ use super::start::robots;
 use crate::planning::config::PlannerConfig;
 use crate::planning::planning_scene::PlanningScene;
 use crate::rpc::api::{RegisterPlanner, RegisteredRobot};
+use crate::rpc::error::Code;
 use crate::rpc::planner_stub::{PlannerStub, RegisterError};
 
 /// First pause before a reconnect; each further one is twice as long.
 const FIRST_PAUSE: Duration = Duration::from_millis(200);
 /// Longest pause.
-const LONGEST_PAUSE: Duration = Duration::from_secs(3);
+const LONGEST_PAUSE: Duration = Duration::from_millis(400);
 
 /// Change of the connection to the run.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -147,6 +148,8 @@ impl Process {
                 Ok(end) if end.registered.limits == *limits => return end,
                 Ok(_) => "the run has other limits now: start the planner again".to_owned(),
                 Err(RegisterError::Io(_)) => continue,
+                // Still not there, on another computer.
+                Err(RegisterError::Refused(refusal)) if is_away(refusal.code) => continue,
                 Err(RegisterError::Refused(refusal)) => refusal.message,
             };
             if why != last {
@@ -158,6 +161,10 @@ impl Process {
 }
 
 type Limits = std::collections::BTreeMap<String, crate::rpc::api::CommandLimits>;
+
+fn is_away(code: Code) -> bool {
+    matches!(code, Code::Unreachable | Code::Lost | Code::ShuttingDown)
+}
 
 fn refused(why: RegisterError) -> StartError {
     match why {

@@ -1,6 +1,7 @@
 //! What a log has for 3D viewers besides motion: the robots with their meshes, and the objects of the world.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use super::planner_port::isometry;
 use super::service::Service;
@@ -23,27 +24,41 @@ const MAX_MESHES: usize = 8 << 20;
 /// The objects of the world that were logged last: the change count of the world, and the objects.
 pub(super) type LoggedWorld = Option<(u64, BTreeMap<String, WorldObject>)>;
 
+/// The robots of a run, with the names of its joints.
+pub(super) struct Described {
+    pub robots: Arc<LoggedRobots>,
+    /// All of them in one URDF; `None` without a model.
+    pub urdf: Option<String>,
+}
+
 impl Service {
     /// Logs the robots, before the first tick. Returns files to attach: their description and meshes.
     pub(super) fn log_robots(&self) -> Vec<LogAttachment> {
-        let robots = std::sync::Arc::new(LoggedRobots::new(self.modelled()));
-        let all = robots.combined();
-        let description = match urdf_rs::write_to_string(&urdf_rs::Robot::from(&all)) {
-            Ok(description) if !robots.is_empty() => description,
-            Ok(_) => return Vec::new(),
-            Err(e) => {
-                tracing::warn!("the log has no robot description: {e}");
-                return Vec::new();
-            }
-        };
+        let Described { robots, urdf: Some(description) } = self.described() else { return Vec::new() };
         let urdf = LogAttachment {
             name: "robot_description.urdf".to_owned(),
             media_type: "application/xml".to_owned(),
             data: description.clone().into_bytes(),
         };
-        *lock(&self.logged_robots) = robots.clone();
+        let meshes = meshes(&robots.combined());
+        let (robots, description) = (robots.clone(), description.clone());
         self.parts.dispatcher.note(Note::Robots { stamp: MonotonicClock.now(), robots, description });
-        std::iter::once(urdf).chain(meshes(&all)).collect()
+        std::iter::once(urdf).chain(meshes).collect()
+    }
+
+    /// Returns the robots of the run. They are named and described once, when they are first needed.
+    pub(super) fn described(&self) -> &Described {
+        self.described.get_or_init(|| {
+            let robots = Arc::new(LoggedRobots::new(self.modelled()));
+            let urdf = match urdf_rs::write_to_string(&urdf_rs::Robot::from(&robots.combined())) {
+                Ok(urdf) => Some(urdf).filter(|_| !robots.is_empty()),
+                Err(e) => {
+                    tracing::warn!("the robots have no description: {e}");
+                    None
+                }
+            };
+            Described { robots, urdf }
+        })
     }
 
     /// Returns the robots of the planner in this process; without one, those of tasks that have a model.
@@ -118,7 +133,7 @@ impl Service {
         let gone = before.keys().filter(|name| !objects.contains_key(*name));
         let gone = gone.map(|name| Marker { ns: namespace(name), action: 2, ..Marker::default() });
         let changed = objects.values().filter(|object| before.get(&object.name) != Some(object));
-        let robots = lock(&self.logged_robots).clone();
+        let robots = self.described().robots.clone();
         let markers: Vec<Marker> = gone.chain(changed.map(|object| marker(object, &robots))).collect();
         if !markers.is_empty() {
             let markers = MarkerArray { markers };

@@ -14,10 +14,12 @@ mod chunk_requests;
 mod control_config;
 pub(crate) mod device_lock;
 mod dispatch;
+mod faces;
 mod goal_frames;
 mod grip_judge;
 mod gripper_requests;
 mod gripper_targets;
+mod guard_worlds;
 mod handle;
 mod in_process;
 mod late_stops;
@@ -25,6 +27,7 @@ mod lead_requests;
 mod log_file;
 mod log_throttle;
 mod logged_scene;
+mod model_requests;
 mod motion_requests;
 mod motions;
 mod park;
@@ -70,10 +73,12 @@ use crate::control::request::Request;
 use crate::control::tick_loop::{Probe, Pulse};
 use crate::planning::planner_thread::Solver;
 use crate::recording::recorder::Recorder;
+use crate::rpc::api::TextLines;
 use crate::rpc::report::ArmReport;
 use crate::rpc::run_dir::RunDir;
 use crate::rpc::server::Server;
 use crate::rt::host::LatencyHold;
+use crate::sync::lock;
 use crate::view::View;
 use arms::Arms;
 use dispatch::{Dispatcher, OutcomeThread};
@@ -117,6 +122,8 @@ pub struct Options {
     pub service_manager: Option<ServiceManager>,
     /// Whether the live view is served, as the blueprint says.
     pub view: bool,
+    /// The lines that the program prints, for clients that ask for its text log.
+    pub text: Option<TextLines>,
 }
 
 impl Default for Options {
@@ -130,6 +137,7 @@ impl Default for Options {
             hold_latency: true,
             service_manager: None,
             view: false,
+            text: None,
         }
     }
 }
@@ -208,6 +216,8 @@ pub struct Ended {
     pub log: Option<PathBuf>,
     /// Why the log ended before the run, if so.
     pub log_cut: Option<String>,
+    /// The logs of faults, if the run was not recorded.
+    pub fault_logs: Vec<PathBuf>,
 }
 
 /// A live run. All requests are methods of its [`Handle`], and thus of the run itself.
@@ -337,6 +347,7 @@ impl Run {
         if let Err(e) = recorder.finish() {
             ended.log_cut = e.to_string().lines().next().map(str::to_owned);
         }
+        ended.fault_logs = std::mem::take(&mut lock(&self.handle.service.fault_logs));
         ended
     }
 

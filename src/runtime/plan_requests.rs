@@ -12,6 +12,7 @@ use super::service::internal;
 use super::tcp::TcpModel;
 use crate::collision::Stop;
 use crate::planning::joint_path::JointPath;
+use crate::planning::level::Level;
 use crate::planning::padded::GivenUp;
 use crate::planning::path::length;
 use crate::planning::pipeline::{Goal, PlanRequest, PlannedMotion};
@@ -19,7 +20,7 @@ use crate::planning::planner_thread::{BeginError, Job, Progress};
 use crate::planning::planning_scene::{PlannedRobot, PlanningScene};
 use crate::planning::reach::Reached;
 use crate::robot::kinematics::{frame, pose};
-use crate::rpc::api::{self, Moment, PlanSummary, ReleasedPlan};
+use crate::rpc::api::{self, ExecutePlan, Moment, PlanLevel, PlanSummary, ReleasedPlan};
 use crate::rpc::report::ToolReport;
 use crate::rpc::{Code, RpcError};
 use crate::trajectory::{Cursor, JointTrajectory, Sample, Spline, TrajectoryPoint};
@@ -37,8 +38,9 @@ impl PlannerPort {
         let positions = all_positions(&scene, moment)?;
         let waypoint = |goal| Ok(vec![self.goal_of(&scene, goal, moment)?]);
         let through = plan.through.iter().map(waypoint).collect::<Result<Vec<_>, RpcError>>()?;
-        let api::Plan { speed, seed, blend, by_number, .. } = *plan;
-        let request = PlanRequest { goals, positions, speed, seed, through, blend, by_number };
+        let api::Plan { speed, seed, refine, blend, by_number, .. } = *plan;
+        let level = Level::of_name(plan.level.name()).ok_or_else(internal)?;
+        let request = PlanRequest { goals, positions, speed, seed, level, refine, through, blend, by_number };
         let id = moment.plan;
         self.thread.begin(id, request, plan.timeout.map(Duration::from_secs_f64)).map_err(|why| {
             let error = RpcError::new(Code::Planning, why.to_string());
@@ -116,8 +118,12 @@ impl PlannerPort {
             tcps.insert(name.clone(), TcpModel::of(robot).report());
             first += robot.joints.len();
         }
+        let mut ignored_pairs: BTreeMap<String, Vec<[String; 2]>> = BTreeMap::new();
+        for pair in &found.ignored {
+            ignored_pairs.entry(pair.reason.clone()).or_default().push(pair.links.clone());
+        }
         let (plan, summary, trajectory) = (job.id, summary(&job, &found), api_trajectory(trajectory));
-        Ok(api::PreviewReply { plan, summary, trajectory, end_effectors, orientations, tcps })
+        Ok(api::PreviewReply { plan, summary, ignored_pairs, trajectory, end_effectors, orientations, tcps })
     }
 
     /// Solves the inverse kinematics of a pose, on another thread.
@@ -143,8 +149,14 @@ impl PlannerPort {
     }
 
     /// Returns a plan for the coordinator to execute, if it is still collision-free.
-    pub(super) async fn release(&self, plan: Option<u64>, moment: &Moment) -> Result<ReleasedPlan, RpcError> {
-        let (job, found) = found(self, plan)?;
+    pub(super) async fn release(&self, call: &ExecutePlan, moment: &Moment) -> Result<ReleasedPlan, RpcError> {
+        let (job, found) = found(self, call.plan)?;
+        if !found.level.proves() && !call.unproven {
+            let what = format!("plan {} is not proven free of contact: it was checked at samples only", job.id);
+            return Err(
+                RpcError::new(Code::PlanUnproven, what).hint("plan again without --level fast, or add --unproven")
+            );
+        }
         let setup = self.thread.setup();
         // Several robots move in one trajectory: one task must have the joints of all.
         let tasks: Vec<_> = found.robots.iter().filter_map(|&r| setup.robots.get(r)?.config.task.as_ref()).collect();
@@ -273,14 +285,23 @@ fn summary(job: &Job, found: &PlannedMotion) -> PlanSummary {
         waypoints: found.path.len(),
         length: length(&found.path),
         duration: found.trajectory.duration(),
-        clearance: found.clearance.as_ref().map(|(distance, _)| *distance),
-        closest: found.clearance.as_ref().map(|(_, pair)| pair.clone()),
+        level: level(found.level),
+        clearance: found.clearance.as_ref().map(|kept| kept.distance),
+        closest: found.clearance.as_ref().and_then(|kept| kept.pair.clone()),
         padding: found.padding,
         padding_given_up: found.given_up.iter().map(given_up).collect(),
         goal_clamped: found.clamped.iter().map(clamped).collect(),
         fraction: found.fraction,
         seed: job.request.seed,
         times: found.times.clone(),
+    }
+}
+
+fn level(level: Level) -> PlanLevel {
+    match level {
+        Level::Fast => PlanLevel::Fast,
+        Level::Certified => PlanLevel::Certified,
+        Level::Exact => PlanLevel::Exact,
     }
 }
 

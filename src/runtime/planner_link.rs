@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use serde_json::Value;
 
-use super::planner_port::PlannerPort;
+use super::planner_port::{PlannerPort, run_blocking};
 use super::service::{Service, internal};
 use super::tcp::TcpModel;
 use crate::control::config::CoordinatorConfig;
@@ -15,8 +15,8 @@ use crate::control::limit::Bounds;
 use crate::control::task_body::TargetKind;
 use crate::joint::DEFAULT_JERK;
 use crate::rpc::api::{
-    self, CommandLimits, Moment, PlannerReport, RECHECK, Recheck, RecheckReply, RegisterPlanner, Registered,
-    ReleasedPlan, Reply, Request as Call,
+    self, CommandLimits, ExecutePlan, Moment, PlannerReport, RECHECK, Recheck, RecheckReply, RegisterPlanner,
+    Registered, ReleasedPlan, Reply, Request as Call,
 };
 use crate::rpc::planner_proxy::{PlannerProxy, gone};
 use crate::rpc::report::{AttachedReport, PlannerStatus};
@@ -77,11 +77,11 @@ impl Planner<'_> {
         }
     }
 
-    async fn release(&self, plan: Option<u64>, moment: Moment) -> Result<ReleasedPlan, RpcError> {
+    async fn release(&self, execute: &ExecutePlan, moment: Moment) -> Result<ReleasedPlan, RpcError> {
         match self {
-            Self::Own(port) => port.release(plan, &moment).await,
+            Self::Own(port) => port.release(execute, &moment).await,
             Self::Attached(planner) => {
-                let (method, params) = Call::ExecutePlan(api::ExecutePlan { plan, ..Default::default() }).written();
+                let (method, params) = Call::ExecutePlan(execute.clone()).written();
                 let released = planner.line.ask(method, params, moment, SLOW_QUERY_TIMEOUT).await?;
                 serde_json::from_value(released)
                     .map_err(|e| RpcError::new(Code::Internal, format!("the planner released no plan: {e}")))
@@ -110,7 +110,7 @@ impl Service {
         let limit = if matches!(call, Call::WorldAdd(_)) { SLOW_QUERY_TIMEOUT } else { QUERY_TIMEOUT };
         match call {
             Call::ExecutePlan(execute) => {
-                let released = planner.release(execute.plan, self.moment(0)).await?;
+                let released = planner.release(&execute, self.moment(0)).await?;
                 self.end_streams(&self.joints_named(&released.trajectory.joint_names)?).await?;
                 let replan = execute.replan.then_some(execute.presence);
                 let begun = self.execute_released(&planner, released, replan).await?;
@@ -130,6 +130,9 @@ impl Service {
                     if matches!(call, Call::Attach(_) | Call::Detach(_)) { self.moment(0) } else { Moment::default() };
                 let changed = planner.answer(call, moment, limit).await;
                 // Also after an error or a timeout: the change may have been made.
+                if let Some(guard) = self.parts.guard.clone() {
+                    run_blocking(move || guard.wait()).await?;
+                }
                 self.recheck(&planner).await;
                 changed
             }
@@ -337,7 +340,7 @@ pub(super) async fn answer_encoded(port: &PlannerPort, asked: api::PlannerReques
     }
     match Call::read(&asked.method, asked.params)? {
         Call::ExecutePlan(execute) => {
-            let released = port.release(execute.plan, &asked.moment).await?;
+            let released = port.release(&execute, &asked.moment).await?;
             serde_json::to_value(released).map_err(encoded)
         }
         call => serde_json::to_value(port.answer(call, &asked.moment).await?).map_err(encoded),

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use super::motions::UnderWay;
 use super::service::{Service, internal};
 use crate::joint::STANDSTILL;
-use crate::rpc::api::{ExecutePlan, Plan, PlanGoal, Planner, Planning, Reply, Request as Call};
+use crate::rpc::api::{ExecutePlan, Plan, PlanGoal, PlanLevel, Planner, Planning, Reply, Request as Call};
 use crate::rpc::{Code, RpcError};
 use crate::sync::lock;
 use crate::telemetry::{Phase, TaskState};
@@ -66,6 +66,7 @@ impl Service {
             self.resolve(&mut request, motion.plan).await?;
         }
         request.by_number = true;
+        let unproven = request.level == PlanLevel::Fast; // Its motion was executed.
         let Reply::Plan(begun) = self.planner_call(Call::Plan(request)).await? else { return Err(internal()) };
         loop {
             if let Err(ended) = self.may_go_on(motion) {
@@ -82,7 +83,8 @@ impl Service {
         }
         self.may_go_on(motion)?;
         let presence = motion.replan.clone().flatten();
-        let execute = ExecutePlan { plan: Some(begun.plan), replan: true, presence, ..ExecutePlan::default() };
+        let execute =
+            ExecutePlan { plan: Some(begun.plan), replan: true, unproven, presence, ..ExecutePlan::default() };
         match self.planner_call(Call::ExecutePlan(execute)).await? {
             Reply::ExecutePlan(begun) => Ok(begun.motion),
             _ => Err(internal()),

@@ -10,7 +10,7 @@ use crate::arm::{ArmState, VelocitySource};
 use crate::clock::WallOffset;
 use crate::hardware::device::Connected;
 use crate::hardware::registry::Teach;
-use crate::rpc::api::{LoadReport, SpeedReport};
+use crate::rpc::api::{LoadReport, SpeedReport, TextLog, TextLogReport};
 use crate::rpc::report::*;
 use crate::rpc::streams::{EventReport, JointState, Level};
 use crate::rpc::{Code, RpcError};
@@ -25,6 +25,8 @@ impl Service {
         let (parts, pulse) = (&self.parts, &self.parts.pulse);
         let started = parts.wall.wall(self.now()) as i64 - self.started.elapsed().as_nanos() as i64;
         StatusReport {
+            // Added by the server, which knows its connections.
+            share: None,
             run: parts.run.clone(),
             pid: std::process::id(),
             version: crate::VERSION.to_owned(),
@@ -68,6 +70,12 @@ impl Service {
             planner: None, // filled in by the `status` method
             view: self.view.get().cloned(),
         }
+    }
+
+    /// Returns the reply to `text_log`.
+    pub(super) fn text_log(&self, request: TextLog) -> Result<TextLogReport, RpcError> {
+        let none = || RpcError::new(Code::Unsupported, "this run keeps no text log: another program started it");
+        self.parts.text.as_ref().map(|text| text.after(request.after)).ok_or_else(none)
     }
 
     /// Returns the speed override.
@@ -214,7 +222,7 @@ impl Service {
         self.parts.pulse.ticks.load(Relaxed).saturating_sub(1)
     }
 
-    fn wall_seconds(&self) -> f64 {
+    pub(super) fn wall_seconds(&self) -> f64 {
         self.parts.wall.wall(self.now()) as f64 * 1e-9
     }
 

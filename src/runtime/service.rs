@@ -13,9 +13,10 @@ use super::Ending;
 use super::dispatch::{Dispatcher, SendError, log_of};
 use super::gripper_requests::LatestGrip;
 use super::gripper_targets::{Counters, GripperTargets};
+use super::guard_worlds::GuardWorlds;
 use super::late_stops::LateStops;
 use super::log_throttle::LogThrottle;
-use super::logged_scene::LoggedWorld;
+use super::logged_scene::{Described, LoggedWorld};
 use super::motions::Motions;
 use super::payloads::HeldLoads;
 use super::planner_link::Attached;
@@ -30,9 +31,10 @@ use crate::control::tick_loop::Pulse;
 use crate::hardware::device::{Connected, Details, Device};
 use crate::joint::STANDSTILL;
 use crate::recording::recorder::{Notice, RecorderStats};
-use crate::recording::robots::LoggedRobots;
 use crate::recording::tcp_log::TcpChains;
-use crate::rpc::api::{self, Backend, BoxFuture, Done, RegisterPlanner, Registered, Reply, Request as Call};
+use crate::rpc::api::{
+    self, Backend, BoxFuture, Done, FaceReport, RegisterPlanner, Registered, Reply, Request as Call,
+};
 use crate::rpc::planner_proxy::PlannerProxy;
 use crate::rpc::report::StatusReport;
 use crate::rpc::run_dir::Claim;
@@ -62,6 +64,10 @@ pub struct ServiceParts {
     pub log: Option<PathBuf>,
     pub endings: Sender<Ending>,
     pub planner: Option<PlannerPort>,
+    /// The collision guard of streams.
+    pub guard: Option<Arc<GuardWorlds>>,
+    /// What the run prints, if it is kept.
+    pub text: Option<api::TextLines>,
 }
 
 /// The run, for its clients.
@@ -70,16 +76,20 @@ pub struct Service {
     pub(super) started: Instant,
     pub(super) motions: Mutex<Motions>,
     pub(super) recorder: OnceLock<Arc<RecorderStats>>,
+    /// The logs of faults, of a run that is not recorded.
+    pub(super) fault_logs: Mutex<Vec<PathBuf>>,
     /// Address of the live view.
     pub(super) view: OnceLock<String>,
     /// The arms' tool centre points, for the log.
     pub(super) logged_tcps: TcpChains,
-    /// The robots of the log, with the names of their frames.
-    pub(super) logged_robots: Mutex<Arc<LoggedRobots>>,
+    /// The robots with their names in the run.
+    pub(super) described: OnceLock<Described>,
     /// The objects of the world, as logged.
     pub(super) logged_world: Mutex<LoggedWorld>,
     pub(super) log_throttle: LogThrottle,
     pub(super) late_stops: LateStops,
+    /// Per arm, the number of stops that clients have ordered.
+    pub(super) stops: Vec<AtomicU64>,
     pub(super) progress: Progress,
     /// One gripper order per arm at a time, so that each gets its own answer.
     pub(super) grippers: Vec<tokio::sync::Mutex<()>>,
@@ -121,6 +131,7 @@ impl Service {
         Self {
             progress: Progress::default(),
             grippers: parts.devices.iter().map(|_| tokio::sync::Mutex::default()).collect(),
+            stops: parts.devices.iter().map(|_| AtomicU64::new(0)).collect(),
             natives: parts.devices.iter().map(|_| AtomicBool::default()).collect(),
             grips: parts.devices.iter().map(|_| Mutex::default()).collect(),
             gripper_targets: parts.devices.iter().map(|_| Mutex::default()).collect(),
@@ -133,9 +144,10 @@ impl Service {
             started: Instant::now(),
             motions: Mutex::default(),
             recorder: OnceLock::new(),
+            fault_logs: Mutex::default(),
             view: OnceLock::new(),
             logged_tcps: TcpChains::default(),
-            logged_robots: Mutex::default(),
+            described: OnceLock::new(),
             logged_world: Mutex::default(),
             log_throttle: LogThrottle::default(),
             late_stops: LateStops::default(),
@@ -224,6 +236,7 @@ impl Service {
             ),
             Notice::Fault(Ok(path)) => {
                 tracing::warn!("the time before and after the fault is in the log {}", path.display());
+                lock(&self.fault_logs).push(path.to_owned());
             }
             Notice::Fault(Err(error)) => tracing::warn!("there is no log of the fault: {error}"),
             Notice::Stopped(error) => {
@@ -331,8 +344,9 @@ impl Service {
     }
 
     async fn answer(&self, call: Call) -> Result<Reply, RpcError> {
-        let changes = !matches!(call, Call::Status(_) | Call::State(_) | Call::Motion(_) | Call::Grip(_));
-        if changes && self.is_closed() {
+        let reads =
+            matches!(call, Call::Status(_) | Call::State(_) | Call::TextLog(_) | Call::Motion(_) | Call::Grip(_));
+        if !reads && self.is_closed() {
             let stops = self.stoppable.load(Ordering::Acquire);
             match call {
                 Call::Stop(_) if stops => {}
@@ -380,6 +394,9 @@ impl Service {
             Call::ArmToolSet(t) => self.set_tool(t).await,
             Call::ArmIo(io) => self.io(&io.arm).await.map(Reply::ArmIo),
             Call::ArmIoSet(io) => self.set_io(io).await,
+            Call::RobotDescription(_) => Ok(Reply::RobotDescription(self.robot_description())),
+            Call::TextLog(log) => self.text_log(log).map(Reply::TextLog),
+            Call::Transforms(_) => Ok(Reply::Transforms(self.transforms())),
             Call::Poses(_) => self.poses().await.map(Reply::Poses),
             Call::PoseSave(save) => self.save_pose(save).await.map(Reply::PoseSave),
             Call::PoseRemove(remove) => self.remove_pose(remove).await.map(|()| Reply::PoseRemove(Done {})),
@@ -435,6 +452,10 @@ impl Backend for Service {
 
     fn register_planner(&self, planner: RegisterPlanner, line: Arc<PlannerProxy>) -> Result<Registered, RpcError> {
         self.register(planner, line)
+    }
+
+    fn face_fell(&self, face: &FaceReport) {
+        self.report_face(face);
     }
 
     fn prepare_urgent_thread(&self) {

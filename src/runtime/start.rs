@@ -17,6 +17,7 @@ use std::time::{Duration, Instant};
 use super::arms::{self, Arms, BroughtUp, Slots};
 use super::control_config::{coordinator_config, names_of, tasks};
 use super::dispatch::{Dispatcher, OutcomeThread};
+use super::guard_worlds::{GuardEnds, GuardWorlds};
 use super::log_file::{attachments, log_device_note, log_path, metadata, no_log, retain, storage};
 use super::planner_link::command_limits;
 use super::planner_port::PlannerPort;
@@ -165,7 +166,12 @@ impl Connected<'_> {
         // Dropped in reverse order: the arms before the name.
         let Self { prepared, mut arms, slots, connected, config, planner, pulse, notes, noted } = self;
         let source = source(prepared.blueprint, &mut arms, &connected)?;
-        let (ports, ends) = wires(&config, slots, &arms, source, pulse.clone())?;
+        let margin = prepared.blueprint.guard.filter(|_| planner.is_some());
+        let (ports, ends) = wires(&config, slots, &arms, source, pulse.clone(), margin.is_some())?;
+        let guard = match (&planner, margin, ends.guard) {
+            (Some(port), Some(margin), Some(ends)) => Some(guard(port, &prepared.names, margin, ends)?),
+            _ => None,
+        };
         let dispatcher = Arc::new(Dispatcher::new(ends.requests, notes));
         let (endings, ended) = channel();
         let parts = ServiceParts {
@@ -185,6 +191,8 @@ impl Connected<'_> {
             log: prepared.log.clone(),
             endings: endings.clone(),
             planner,
+            guard: guard.clone(),
+            text: prepared.options.text.clone(),
         };
         let service = Arc::new_cyclic(|me| Service::new(parts, me.clone()));
         let recorder = start_recorder(&prepared, &config, ends.samples, noted, &service)?;
@@ -194,6 +202,9 @@ impl Connected<'_> {
         let outcomes = outcomes.map_err(no_thread("outcomes"))?;
         let Options { probe, service_manager: manager, .. } = prepared.options;
         let tick = Tick::start(&config, prepared.tasks, ports, probe, endings.clone()).map_err(no_thread("tick"))?;
+        if let Some(guard) = guard {
+            guard.run(&Arc::downgrade(&service)).map_err(no_thread("guard"))?;
+        }
         let watchdog = start_watchdog(&pulse, &config, &endings, manager.as_ref())?;
         let run = Run {
             arms,
@@ -276,6 +287,13 @@ fn start_watchdog(
     let alive = watchdog_ping(manager);
     let watchdog = Watchdog::start(pulse.beat.clone(), config.period(), endings.clone(), alive);
     watchdog.map_err(no_thread("watchdog"))
+}
+
+fn guard(port: &PlannerPort, names: &Names, margin: f64, ends: GuardEnds) -> Result<Arc<GuardWorlds>, StartError> {
+    GuardWorlds::start(port, names, margin, ends).map(Arc::new).map_err(|what| {
+        let hint = "set guard.enabled: false to run without the collision guard";
+        StartError::other(format!("no collision guard: {what}"), hint)
+    })
 }
 
 fn no_thread(name: &'static str) -> impl FnOnce(std::io::Error) -> StartError {

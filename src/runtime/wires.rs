@@ -5,11 +5,12 @@ use std::sync::Arc;
 use super::StartError;
 use super::arms::{Arms, Slots};
 use super::dispatch::REQUEST_RING;
+use super::guard_worlds::GuardEnds;
 use crate::arm::{ArmCommand, ArmState};
 use crate::control::config::CoordinatorConfig;
 use crate::control::pace::Source;
 use crate::control::request::{Envelope, Motion};
-use crate::control::tick_loop::{Pulse, TickPorts};
+use crate::control::tick_loop::{GuardPorts, Pulse, TickPorts};
 use crate::rt::host;
 use crate::rt::slot::{SlotReader, slot};
 use crate::rt::wake::Wake;
@@ -27,6 +28,7 @@ pub(super) struct Ends {
     pub samples: rtrb::Consumer<Sample>,
     pub arm_views: Vec<SlotReader<ArmSample>>,
     pub task_views: Vec<SlotReader<TaskView>>,
+    pub guard: Option<GuardEnds>,
 }
 
 /// Creates all of them. Answers of a device thread wake the same thread as replies of the tick.
@@ -36,6 +38,7 @@ pub(super) fn wires(
     arms: &Arms,
     source: Source,
     pulse: Arc<Pulse>,
+    guarded: bool,
 ) -> Result<(TickPorts, Ends), StartError> {
     let reply_wake = Wake::new().map_err(|e| StartError::other(format!("no eventfd: {e}"), "see ulimit -n"))?;
     for device in &arms.devices {
@@ -55,6 +58,7 @@ pub(super) fn wires(
     };
     let (arm_writers, arm_views) = config.arms.iter().map(|_| slot(nothing)).unzip();
     let (task_writers, task_views) = config.tasks.iter().map(|_| slot(TaskView::default())).unzip();
+    let (guard_ports, guard) = guarded.then(guard_wires).unzip();
     let ports = TickPorts {
         states: slots.states,
         commands: slots.commands,
@@ -67,10 +71,18 @@ pub(super) fn wires(
         samples: sample_producer,
         arm_views: arm_writers,
         task_views: task_writers,
+        guard: guard_ports,
         source,
         pulse,
     };
-    Ok((ports, Ends { requests, replies, reply_wake, retired, samples, arm_views, task_views }))
+    Ok((ports, Ends { requests, replies, reply_wake, retired, samples, arm_views, task_views, guard }))
+}
+
+/// Creates the rings of the collision guard. The tick takes a world each tick: a few are enough.
+fn guard_wires() -> (GuardPorts, GuardEnds) {
+    let (world_producer, worlds) = rtrb::RingBuffer::new(4);
+    let (retired_producer, retired) = rtrb::RingBuffer::new(8);
+    (GuardPorts { worlds, retired: retired_producer }, GuardEnds { worlds: world_producer, retired })
 }
 
 /// Touches every page of the ring, so that filling it for the first time causes no page fault.

@@ -4,7 +4,7 @@
 
 use serde::Serialize;
 
-use super::{Age, Bound, Cause, Event, LimitKind, Outcome, Phase, Reason, TaskState};
+use super::{Age, Bound, Cause, Event, Guarded, LimitKind, Outcome, Phase, Reason, TaskState};
 use crate::named::named;
 
 /// The names behind the tick's indices, in the order of the blueprint.
@@ -60,7 +60,8 @@ named! {
 /// An event with names and a sentence. Fields that do not apply are `None` or empty.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Described {
-    /// `request`, `task`, `preempted`, `mode_conflict`, `arm`, `limited`, `overrun` or `degraded`.
+    /// `request`, `task`, `preempted`, `mode_conflict`, `arm`, `limited`, `overrun`, `speed`, `degraded`, `guard`,
+    /// `stop` or `share`.
     pub kind: &'static str,
     /// Severity.
     pub severity: Severity,
@@ -128,7 +129,24 @@ pub fn describe(event: &Event, names: &Names) -> Described {
             let text = "ten consecutive ticks were late by a period or more".into();
             plain("degraded", Severity::Error, "late", text)
         }
+        Event::Guard(arm, guarded) => {
+            let arm = names.arm(arm);
+            let d = match guarded {
+                Some(pair) => {
+                    let text = format!("collision guard: {arm} decelerates, {}", apart(&pair));
+                    let d = plain("guard", Severity::Warn, "blocked", text);
+                    Described { values: vec![pair.distance], ..d }
+                }
+                None => plain("guard", Severity::Info, "released", format!("collision guard: {arm} is free to move")),
+            };
+            Described { arm: Some(arm), ..d }
+        }
     }
+}
+
+/// Returns what the collision guard keeps apart as text.
+fn apart(pair: &Guarded) -> String {
+    format!("{} and {} at {:.0} mm", pair.link, pair.other, pair.distance * 1e3)
 }
 
 fn plain(kind: &'static str, severity: Severity, status: &'static str, text: String) -> Described {
@@ -242,6 +260,7 @@ fn task_changed(task: u16, state: TaskState, reason: Reason, names: &Names) -> D
             d.values = vec![value];
         }
         Reason::Preempted(_, joint) | Reason::NonFinite(joint) => d.joint = Some(names.joint(joint)),
+        Reason::Guarded(arm) => d.arm = Some(names.arm(arm)),
         Reason::ArmHeld(arm, cause) | Reason::LeaderLost(arm, cause) => {
             d.arm = Some(names.arm(arm));
             d.values = code(cause);
@@ -272,6 +291,7 @@ pub fn reason_text(reason: &Reason, names: &Names) -> String {
             format!("the position of its leader {} is unknown{}", names.arm(arm), because(cause))
         }
         Reason::LeaderAway(joint, by) => format!("{} was {} from its leader", names.joint(joint), angle(by)),
+        Reason::Guarded(arm) => format!("the collision guard stopped {}", names.arm(arm)),
     }
 }
 
@@ -284,6 +304,7 @@ pub fn bound_text(bound: Bound, names: &Names) -> String {
         Bound::Acceleration(joint) => format!("the acceleration limit of {}", names.joint(joint)),
         Bound::Singularity => "a singularity nearby".into(),
         Bound::Invalid => "a target that is not finite".into(),
+        Bound::Guard(pair) => format!("the collision guard: {}", apart(&pair)),
     }
 }
 

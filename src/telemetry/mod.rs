@@ -2,12 +2,15 @@
 //! passes events on to rpc and the text log. Nothing here allocates.
 
 pub mod describe;
+mod label;
 
 use serde::{Deserialize, Serialize};
 
 use crate::arm::{ArmCommand, ArmState};
 use crate::clock::Mono;
 use crate::named::named;
+
+pub use label::Label;
 
 /// One entry of the ring.
 // The ring holds values: a box would allocate in the tick.
@@ -240,10 +243,23 @@ pub enum Reason {
     LeaderLost(u16, Cause),
     /// A joint was too far from its leader's to approach it: joint, distance [rad].
     LeaderAway(u16, f64),
+    /// The collision guard stopped the arm: the arm.
+    Guarded(u16),
+}
+
+/// Two things that the collision guard keeps apart.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Guarded {
+    /// A link.
+    pub link: Label,
+    /// Another link, or an obstacle.
+    pub other: Label,
+    /// Their distance at the setpoints [m]; a lower bound.
+    pub distance: f64,
 }
 
 /// What limits the motion of a task.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum Bound {
     /// Nothing.
     #[default]
@@ -258,6 +274,8 @@ pub enum Bound {
     Singularity,
     /// Its target or its state is not finite.
     Invalid,
+    /// The collision guard.
+    Guard(Guarded),
 }
 
 named! {
@@ -295,6 +313,8 @@ pub enum Event {
     Speed(f64, bool),
     /// Ten consecutive ticks were late by a period or more.
     Degraded,
+    /// The collision guard begins to decelerate an arm, or releases it: the arm, what it keeps apart.
+    Guard(u16, Option<Guarded>),
 }
 
 /// Outcome of a request, with the reference system's names where they exist.

@@ -73,6 +73,11 @@ impl View {
         Self::serve(config, subject, None, None)
     }
 
+    /// Starts serving pages of a run whose scene comes from elsewhere; each page connects to this socket.
+    pub fn through(config: &ViewConfig, subject: Arc<dyn Subject>, socket: &Path) -> Result<Self, String> {
+        Self::serve(config, subject, Some(socket.to_owned()), None)
+    }
+
     fn serve(
         config: &ViewConfig,
         subject: Arc<dyn Subject>,
@@ -214,7 +219,12 @@ async fn answer(site: &Site, request: &Request) -> Reply {
         return content("application/json", scene.json.clone().into_bytes());
     }
     let (subject, what, rest, query) = (site.subject.clone(), what.to_owned(), rest.to_owned(), request.query.clone());
+    let whole = path.to_owned();
     let reply = spawn_blocking(move || match what.as_str() {
+        "mesh" | "object" if let Some(file) = subject.file(&whole) => match file {
+            Ok(bytes) => Reply { keep: what == "mesh" && rest.contains('-'), ..content("model/stl", bytes) },
+            Err(why) => Reply::text(404, why),
+        },
         "mesh" => mesh(&scene, &rest),
         "object" => match subject.object(&rest).map(|object| stl::of_object(&object.shape)) {
             Some(Ok(bytes)) => content("application/octet-stream", bytes),

@@ -18,6 +18,13 @@ pub trait Subject: Send + Sync {
     /// Answers a further request, by its path without `/` and its query, with JSON or the reason why not. `None`:
     /// there is no such path.
     fn answer(&self, path: &str, query: &str) -> Option<Result<String, String>>;
+
+    /// Returns a file of the scene, `mesh/…` or `object/…`, from where the scene comes from. `None`: the scene and
+    /// [`object`](Self::object) have it.
+    fn file(&self, path: &str) -> Option<Result<Vec<u8>, String>> {
+        let _ = path;
+        None
+    }
 }
 
 /// A live run.

@@ -30,7 +30,8 @@ fn good() -> String {
 }
 
 /// Paths below which keys are free.
-const FREE: [&str; 6] = ["planner.world", "xacro_args", "package_paths", "named_poses", "collision_shapes", "assets"];
+const FREE: [&str; 7] =
+    ["planner.world", "xacro_args", "package_paths", "named_poses", "collision_shapes", "assets", "share.users"];
 
 struct Place {
     path: String,

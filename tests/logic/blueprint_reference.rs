@@ -7,9 +7,10 @@ use std::path::Path;
 
 use dimos::blueprint::planner::{GripperJointEntry, ObjectEntry, PlannerEntry, PoseEntry, RobotEntry, ViewConfig};
 use dimos::blueprint::schema::{AssetEntry, BlueprintFile, CountedJoints, HardwareEntry, TaskEntry};
+use dimos::blueprint::share::{IdentityEntry, PythonDimosEntry, ShareEntry};
 use dimos::blueprint::{
-    Catalog, CoordinatorConfig, LimitsEntry, MountingEntry, PayloadEntry, RecordingConfig, RpcConfig, StopInputEntry,
-    full_schema, json_schema,
+    Catalog, CoordinatorConfig, GuardConfig, LimitsEntry, MountingEntry, PayloadEntry, RecordingConfig, RpcConfig,
+    StopInputEntry, full_schema, json_schema,
 };
 use dimos::control::task_spec::{TaskSpec, TaskTable};
 use dimos::hardware::registry::Registry;
@@ -75,15 +76,19 @@ const SECTIONS: [Section; 9] = [
     section("`tasks[]`", TASKS, "/$defs/TaskEntry", keys::<TaskEntry>),
 ];
 /// Those behind the parameters of the task types.
-const SECTIONS_AFTER_TASKS: [Section; 9] = [
+const SECTIONS_AFTER_TASKS: [Section; 13] = [
     section("`planner`", "", "/$defs/PlannerEntry", keys::<PlannerEntry>),
     section("`planner.robots[]`", "A list of robots, merged by `name`.", "/$defs/RobotEntry", keys::<RobotEntry>),
     section("`planner.robots[].gripper_joint`", "", "/$defs/GripperJointEntry", keys::<GripperJointEntry>),
     section("`planner.robots[].base_pose`", "", "/$defs/PoseEntry", keys::<PoseEntry>),
     section("`planner.world`", "A group of obstacles by name.", "/$defs/ObjectEntry", keys::<ObjectEntry>),
+    section("`guard`", "", "/$defs/GuardConfig", keys::<GuardConfig>),
     section("`view`", "", "/$defs/ViewConfig", keys::<ViewConfig>),
     section("`recording`", "", "/$defs/RecordingConfig", keys::<RecordingConfig>),
     section("`rpc`", "", "/$defs/RpcConfig", keys::<RpcConfig>),
+    section("`share`", "", "/$defs/ShareEntry", keys::<ShareEntry>),
+    section("`share.identity`", "", "/$defs/IdentityEntry", keys::<IdentityEntry>),
+    section("`share.python_dimos`", "", "/$defs/PythonDimosEntry", keys::<PythonDimosEntry>),
     section("`assets`", "A group of files by name.", "/$defs/AssetEntry", keys::<AssetEntry>),
 ];
 

@@ -15,6 +15,7 @@ use dimos::control::task_spec::TaskTable;
 use dimos::joint::{ControlMode, JointLimits, joints_of};
 use dimos::planning::ahead::{look_ahead, rests_before};
 use dimos::planning::config::{JointBounds, ObjectConfig, ObjectShape};
+use dimos::planning::level::Level;
 use dimos::planning::pipeline::{self, Goal, PlannedMotion, solve};
 use dimos::planning::planning_scene::{PlanningScene, obstacle};
 use dimos::robot::random::Random;
@@ -147,6 +148,8 @@ fn motion(setup: &PlanningScene, checker: &mut ExactChecker, random: &mut Random
         positions: vec![start],
         speed,
         seed,
+        level: Level::default(),
+        refine: 0,
         through: Vec::new(),
         blend: 0.0,
         by_number: false,

@@ -33,7 +33,11 @@ fn suite(stall: bool) -> (Option<i32>, String, String) {
     let path = format!("{}:{}", folder.path().display(), std::env::var("PATH").unwrap());
     let mut command = Command::new("python3");
     command.arg(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/suite.py")).current_dir(folder.path());
-    command.env("PATH", path).env_remove("CARGO_TARGET_DIR").env("STALL", if stall { "yes" } else { "" });
+    command
+        .env("PATH", path)
+        .env_remove("CARGO_TARGET_DIR")
+        .env_remove("FEATURES")
+        .env("STALL", if stall { "yes" } else { "" });
     let output = command.output().unwrap();
     let runs = fs::read_to_string(folder.path().join("runs")).unwrap();
     (output.status.code(), String::from_utf8(output.stdout).unwrap(), runs)

@@ -18,7 +18,7 @@ use dimos::recording::storage::{FaultLog, Storage};
 use dimos::recording::{fault_ring, files};
 use dimos::replay::recorded::RecordedError;
 use dimos::replay::verify::{Finding, verify};
-use dimos::replay::what_if::what_if;
+use dimos::replay::what_if::{Row, what_if};
 use dimos::telemetry::TaskState;
 
 use crate::support::virtual_run::{VirtualRun, one_arm};
@@ -169,6 +169,20 @@ fn a_log_is_split_by_size_and_stored_without_compression() {
     assert_eq!(reproducible(&log).ticks, 6001);
 }
 
+#[test]
+fn a_closed_log_is_not_live_while_its_last_sync_still_has_the_lock() {
+    let folder = tempfile::tempdir().unwrap();
+    let log = folder.path().join("run.mcap");
+    let mut run = begin(Some(&log), Storage::default());
+    swing(&mut run, 200);
+    run.finish();
+    let syncing = std::fs::File::open(&log).unwrap();
+    files::mark_as_being_written(&syncing);
+    let found = reproducible(&log);
+    assert!(!found.live && found.ticks > 200, "{found:?}");
+    assert!(!LogReader::open(&log).unwrap().info().live);
+}
+
 /// A run without a log, in whose ring are 30 s. Waits for the log of its fault, which the recorder's thread writes.
 fn faulty(folder: &Path, before: u64) -> PathBuf {
     let samples = fault_ring::capacity(100.0, 1);
@@ -234,9 +248,12 @@ fn what_if_a_limit_were_lower() {
     let with = |path: &str, value: &str| {
         let mut rows = Vec::new();
         let changes = [(path.to_owned(), value.to_owned())];
-        let found = what_if(&log, &TaskTable::builtin(), &changes, |row| {
-            rows.push((row.tick, row.joint.to_owned(), row.logged, row.rerun));
-        });
+        let mut read = Vec::new();
+        let each = |row: Row<'_>| rows.push((row.tick, row.joint.to_owned(), row.logged, row.rerun));
+        let found = what_if(&log, &TaskTable::builtin(), &changes, each, &mut |at, of| read.push((at, of)));
+        // The summary at the end is not read.
+        let most = read.last().is_some_and(|(at, of)| at <= of && 10 * at > 9 * of);
+        assert!(found.is_err() || read.is_sorted() && most, "{read:?}");
         (found, rows)
     };
     // The same values change nothing.

@@ -28,6 +28,7 @@ mod english;
 mod faults;
 mod follow;
 mod gaps;
+mod guard;
 mod guards_virtual;
 mod help;
 mod host_stalls;

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use dimos::arm::{ArmCommand, ArmState, Link};
 use dimos::clock::{Clock, MonotonicClock};
+use dimos::collision::World;
 use dimos::control::config::{CartesianParams, CoordinatorConfig, TaskKind, TaskKinematics};
 use dimos::control::coordinator::Coordinator;
 use dimos::control::request::{Envelope, Goal, Request};
@@ -25,6 +26,7 @@ use dimos::rt::wake::Wake;
 use dimos::telemetry::{ArmSample, Cause, Event, Phase, Sample, TaskState, TaskView};
 
 use crate::support::delegate::delegate;
+use crate::support::guarded::{Guarded, cloud, cuboid, robot};
 use crate::support::rig::*;
 use dimos::rt::counting::{watch, watched_calls};
 
@@ -120,6 +122,31 @@ fn ticks_with_every_task_type_do_not_allocate() {
     assert_eq!(watched_calls(), 0);
 }
 
+/// With the proof of every way to rest, whether arms are free, stopped, released, or too close from the start.
+#[test]
+fn guarded_ticks_do_not_allocate() {
+    let mut world = World::new();
+    world.add_robot(robot("fer", "arm", glamx::DAffine3::IDENTITY)).unwrap();
+    world.add(cuboid("table", [2.0, 2.0, 0.1], [0.0, 0.0, -0.08])).unwrap();
+    world.add(cuboid("wall", [1.0, 0.1, 1.0], [0.4, 0.5, 0.5])).unwrap();
+    world.add(cloud("cloud", 500, 1.3)).unwrap();
+    let home = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785];
+    let mut cell = Guarded::new(world, &home, (2.0, 8.0), vec![task("servo", servo(), 0..7, 10)]);
+    cell.rig.around = watch;
+    let mut target = home;
+    for k in 0..1200 {
+        for (joint, (at, home)) in target.iter_mut().zip(home).enumerate() {
+            *at = home + 1.2 * (0.02 * f64::from(k) * (1.0 + 0.1 * joint as f64)).sin();
+        }
+        cell.rig.servo(0, &target);
+        cell.rig.tick();
+        cell.rig.retired.clear();
+    }
+    let stops = cell.rig.count(|event| matches!(event, Event::Guard(..)));
+    assert!(stops > 4 && cell.rig.phase(0) == Phase::Ready, "{stops}");
+    assert_eq!(watched_calls(), 0);
+}
+
 /// The thread that ticks: rings, slots, wakes and the histogram, beside the coordinator.
 #[test]
 fn the_tick_loop_does_not_allocate() {
@@ -160,6 +187,7 @@ fn the_tick_loop_does_not_allocate() {
         samples,
         arm_views: vec![arm_view],
         task_views,
+        guard: None,
         source: dimos::control::pace::Source::Host,
         pulse: pulse.clone(),
     };

@@ -8,7 +8,9 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
-use dimos::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
+use dimos::collision::body::{MeshMode, solids};
+use dimos::collision::world::{Obstacle, Robot};
+use dimos::collision::{CollisionChecker, ExactChecker, Resolution, Solid, Stop, World};
 use dimos::planning::blend::curves;
 use dimos::planning::cartesian::{LineSettings, Shortfall, straight_line};
 use dimos::planning::path::{distance, tidy};
@@ -18,7 +20,9 @@ use dimos::planning::timing::{TimingSettings, time};
 use dimos::planning::topp::{JointBound, parameterize};
 use dimos::robot::kinematics::Kinematics;
 use dimos::robot::random::Random;
+use dimos::robot::{builtin, urdf};
 use dimos::trajectory::{Cursor, Sample, Spline};
+use glamx::{DAffine3, DVec3};
 use problems::{Arm, Problem, Shapes, load};
 use serde_json::json;
 
@@ -117,7 +121,8 @@ fn what_cannot_be_planned_is_said() {
     // Shortcutting and timing end too.
     let long: Vec<Vec<f64>> = (0..40).map(|k| start.iter().map(|x| x + 0.01 * f64::from(k % 7)).collect()).collect();
     let looked = checker.checks();
-    shorten(&mut checker, &long, &ShortcutSettings::default(), 0, &cancelled);
+    let mut is_free = |a: &[f64], b: &[f64]| checker.motion_is_free(a, b, &cancelled);
+    shorten(&long, &[false; 7], &ShortcutSettings::default(), &mut is_free);
     assert_eq!(checker.checks(), looked);
 }
 
@@ -128,11 +133,62 @@ fn a_goal_that_cannot_be_reached_takes_no_longer_than_it_may() {
     let (mut checker, _) = checker(&arm, cage);
     let (start, goal) = cage.ends();
     // The way is there, the time is not.
-    let deadline = Instant::now() + Duration::from_millis(2);
+    let deadline = Instant::now() + Duration::from_micros(50);
     let began = Instant::now();
     let found = plan(&mut checker, start, &[goal.to_vec()], &PlanSettings::default(), &Stop::new(Some(deadline), None));
     assert!(matches!(found, Err(PlanError::Timeout(_))), "{found:?}");
     assert!(began.elapsed() < Duration::from_secs(1), "{:?}", began.elapsed());
+}
+
+/// Two arms 0.5 m apart with a box and a post between them.
+fn two_arms() -> ExactChecker {
+    let model = Arc::new(urdf::from_text("yourarm.urdf", builtin::text("yourarm").unwrap()).unwrap());
+    let mut world = World::new();
+    for (name, y) in [("left", 0.25), ("right", -0.25)] {
+        let robot = Robot {
+            name: name.into(),
+            model: model.clone(),
+            kinematics: Arc::new(Kinematics::whole(&model).unwrap()),
+            solids: solids(&model, MeshMode::Hull).unwrap(),
+            base: DAffine3::from_translation(DVec3::Y * y),
+            padding: 0.0,
+            allowed: vec![],
+        };
+        world.add_robot(robot).unwrap();
+    }
+    let at = |x, y, z| DAffine3::from_translation(DVec3::new(x, y, z));
+    let things = [
+        ("box", Solid::cuboid(DVec3::new(0.1, 0.2, 0.3), at(0.35, 0.0, 0.15))),
+        ("post", Solid::cylinder(0.03, 0.6, at(-0.3, 0.1, 0.3))),
+    ];
+    for (name, solid) in things {
+        world.add(Obstacle { name: name.into(), solid: solid.unwrap(), padding: 0.0 }).unwrap();
+    }
+    ExactChecker::new(world.snapshot(), Resolution::default())
+}
+
+#[test]
+fn two_arms_are_planned_together_without_any_setting() {
+    let mut checker = two_arms();
+    let limits = checker.limits().to_vec();
+    let mut random = Random::new(4);
+    let mut free = |checker: &mut ExactChecker| loop {
+        let q: Vec<f64> = limits.iter().map(|l| 0.7 * random.between(l.lower, l.upper)).collect();
+        if checker.is_free(&q) {
+            return q;
+        }
+    };
+    let mut settings = PlanSettings::default();
+    settings.search.max_samples = 1_000_000;
+    let mut searched = 0;
+    for number in 0..16 {
+        let (start, goal) = (free(&mut checker), free(&mut checker));
+        let found = plan(&mut checker, &start, std::slice::from_ref(&goal), &settings, &Stop::never());
+        let found = found.unwrap_or_else(|error| panic!("{number}: {error}: {start:?} to {goal:?}"));
+        assert!(found.proven && found.path.windows(2).all(|e| checker.motion_is_free(&e[0], &e[1], &Stop::never())));
+        searched += usize::from(!found.straight);
+    }
+    assert!(searched > 5, "{searched}");
 }
 
 #[test]
@@ -222,7 +278,7 @@ fn jerk_stays_within_its_limits_and_speed_scales_the_whole() {
 fn straight_lines_are_straight_and_end_where_they_must() {
     let Some(folder) = shared("models/xarm6") else { return };
     let path = folder.join("xarm6.urdf");
-    let model = dimos::robot::urdf::from_text("xarm6", &std::fs::read_to_string(path).unwrap()).unwrap();
+    let model = urdf::from_text("xarm6", &std::fs::read_to_string(path).unwrap()).unwrap();
     let tip = model.link_index("link6").unwrap();
     let joints = model.chain(0, tip).unwrap().into_iter().filter(|&j| model.joints[j].is_independent());
     let kinematics = Kinematics::new(&model, &joints.collect::<Vec<_>>(), &[]).unwrap();

@@ -8,6 +8,7 @@ use dimos::blueprint::{self, Overrides, find, load};
 use dimos::collision::Stop;
 use dimos::hardware::registry::Registry;
 use dimos::planning::config::{JointBounds, PlannerConfig};
+use dimos::planning::level::Level;
 use dimos::planning::pipeline::{Goal, PlanFailure, PlanRequest, PlannedMotion, solve};
 use dimos::planning::planning_scene::{PlannedRobot, PlanningScene};
 use dimos::pose::{from_xyz_rpy, to_xyz_rpy};
@@ -56,6 +57,8 @@ fn plan(
         positions: positions.to_vec(),
         speed: 1.0,
         seed: 0,
+        level: Level::default(),
+        refine: 0,
         through: Vec::new(),
         blend: 0.0,
         by_number: false,

@@ -105,6 +105,30 @@ fn what_cannot_be_is_refused() {
     }
 }
 
+/// A pseudo-terminal gets another number at each start; the link has the same path.
+#[test]
+fn a_link_gives_a_pseudo_terminal_a_path_that_stays() {
+    let home = Home::new();
+    let link = home.path().join("so101");
+    for _ in 0..2 {
+        let emulator = emulate(&home, "so101 --link so101");
+        assert!(emulator.out().contains(&format!("so101 SIMULATED at {}\n", link.display())), "{}", emulator.out());
+        let run = home.run(&format!("coordinator-so101 --address arm={} --no-record", link.display()));
+        home.dimos("move arm 0.1 0 0 0 0").with(0);
+        run.end(Signal::TERM).with(143);
+        // A crash leaves the link behind.
+        emulator.signal(Signal::KILL);
+        let _ = emulator.wait();
+        assert!(link.is_symlink());
+    }
+    emulate(&home, "so101 --link so101").end(Signal::INT).with(130);
+    assert!(!link.is_symlink());
+    home.write("file", "kept");
+    home.dimos("adapter emulate so101 --link file").with(2).says(&["--link file: there is a file already"]);
+    assert_eq!(std::fs::read_to_string(home.path().join("file")).unwrap(), "kept");
+    home.dimos("adapter emulate so101 --link a --bind 127.0.0.1").with(2).says(&["cannot be used with"]);
+}
+
 #[test]
 fn what_it_says_fits_the_model() {
     let (home, address) = (Home::new(), own_address());

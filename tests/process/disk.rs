@@ -75,6 +75,20 @@ fn a_disk_that_fills_up_ends_the_run_with_a_log_that_is_whole() {
 }
 
 #[test]
+fn a_run_without_a_log_names_the_log_of_its_fault_at_the_end() {
+    let home = Home::new();
+    let fault = "options: {sim: {faults: [{at: 1.0, kind: error_code}]}}";
+    home.write("f.yaml", &format!("include: [coordinator-yourarm]\nhardware: [{{hardware_id: arm, {fault}}}]\n"));
+    let run = home.run("f.yaml --no-record");
+    eventually("its arm is held", || home.status()["arms"][0]["phase"] == "held");
+    let ended = run.end(Signal::INT).with(130);
+    let logs = home.logs();
+    assert_eq!(logs.len(), 1);
+    ended.says(&["ended; logs of faults: ", &logs[0].display().to_string()]);
+    home.dimos("log verify --last").with(0);
+}
+
+#[test]
 fn a_disk_without_any_room_left_ends_the_run() {
     let home = Home::new();
     let Some(disk) = Disk::mount(&home, 8) else { return };

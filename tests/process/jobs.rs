@@ -487,3 +487,40 @@ fn an_arm_backs_out_the_way_it_came_and_not_through_obstacles() {
     let _run = home.run("coordinator-yourarm --no-record");
     home.dimos("back-out --direct").with(1).says(&["this run writes no log"]);
 }
+
+/// Measured positions of the arm in a log [rad].
+fn measured(log: &std::path::Path) -> Vec<Vec<f64>> {
+    let joints: Vec<String> = (1..=6).map(|k| format!("arm_joint{k}")).collect();
+    dimos::replay::motion::RecordedMotion::measured(log, &joints, 0, u64::MAX).unwrap().rows
+}
+
+#[test]
+fn a_long_and_curved_way_back_is_one_direct_motion() {
+    let home = Home::new();
+    let run = home.run("coordinator-yourarm");
+    let distance = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+    home.dimos("move arm 0.3 -0.2 0.5 0 0.4 0").with(0);
+    let there = home.positions("arm");
+    // A shorter rest is none.
+    std::thread::sleep(Duration::from_millis(400));
+    // The arm's own controller turns the wrist far, on a curve in the joints.
+    home.dimos("move arm --native --pose 0.3 0 0.3").with(0);
+    let came = measured(&home.logs()[0]);
+    assert!(distance(&home.positions("arm"), &there) > 1.0, "{:?}", home.positions("arm"));
+    home.dimos("back-out --direct").with(0).says(&["within ", " rad of the logged path", "not collision-checked"]);
+    assert!(distance(&home.positions("arm"), &there) < 4e-3, "{:?}", home.positions("arm"));
+    let back = measured(&home.logs()[0]);
+    let off = |q: &Vec<f64>| came.iter().map(|p| distance(p, q)).fold(f64::INFINITY, f64::min);
+    let farthest = back.iter().skip(came.len()).map(off).fold(0.0, f64::max);
+    assert!(back.len() > came.len() + 100 && farthest < 0.03, "{farthest} rad from the way it came");
+    // What moves the arm after a way back, without a task, is its last motion.
+    home.dimos("move arm --native --pose 0.3 0 0.3").with(0);
+    home.dimos("move arm --native --pose 0.25 0.1 0.3").with(0);
+    let last = home.positions("arm");
+    home.dimos("move arm --native --pose 0.3 0 0.3").with(0);
+    let goal = home.dimos("back-out --direct --check --json").with(0).json()["goal"].clone();
+    let goal: Vec<f64> = serde_json::from_value(goal).unwrap();
+    assert!(distance(&goal, &last) < 4e-3, "{goal:?} instead of {last:?}");
+    home.dimos("down").with(0);
+    drop(run);
+}

@@ -6,7 +6,7 @@ use std::net::Shutdown as Half;
 use std::os::unix::net::UnixStream;
 
 use dimos::rpc::Code;
-use dimos::rpc::api::{Lease, Move, Release, State, Status, Velocity};
+use dimos::rpc::api::{Lease, Motion, Move, OnBehalfOf, RegisterGateway, Release, State, Status, Velocity};
 use dimos::rpc::client::{Client, ClientError};
 use dimos::rpc::report::CommanderReport;
 use serde_json::Value;
@@ -163,4 +163,62 @@ fn arms_have_leases_of_their_own() {
     right.call(motion("right_arm", 6)).unwrap();
     assert!(matches!(right.call(Lease::default()), Err(ClientError::Refused(e)) if e.message.contains("left_arm")));
     home.dimos("arm disable right_arm").with(1).says(&["right_arm is commanded by"]);
+}
+
+#[test]
+fn motions_of_a_connection_that_speaks_for_another_client_end_with_it() {
+    let (home, _run) = up("");
+    let mut watcher = home.client();
+    for cancel_at_end in [true, false] {
+        let mut gateway = home.client();
+        let client = "alice (dimos jog on laptop)".to_owned();
+        gateway.call(OnBehalfOf { client: client.clone(), cancel_at_end }).unwrap();
+        let twice = gateway.call(OnBehalfOf { client: client.clone(), cancel_at_end: false });
+        assert!(matches!(twice, Err(ClientError::Refused(e)) if e.code == Code::InvalidParams));
+        let target = if cancel_at_end { 0.8 } else { 0.0 };
+        let motion = gateway.call(Move::new("arm", vec![target, 0.0, 0.0, 0.0, 0.0, 0.0], 0.3)).unwrap().motion;
+        assert_eq!(commander(&mut watcher).unwrap().program, client);
+        home.dimos("move arm 0 0 0 0 0 0").with(1).says(&["arm is commanded by alice (dimos jog on laptop) (pid "]);
+        eventually("the arm moves", || !is_at_rest(&mut watcher));
+        drop(gateway);
+        eventually("the lease is free", || commander(&mut watcher).is_none());
+        eventually("the motion ends", || watcher.call(Motion { motion }).unwrap().done);
+        let reached = watcher.call(Motion { motion }).unwrap().state == "COMPLETED";
+        assert_eq!(reached, !cancel_at_end, "cancel_at_end {cancel_at_end}");
+    }
+}
+
+#[test]
+fn a_motion_of_another_client_survives_the_connection_that_moved_before_it() {
+    let (home, _run) = up("");
+    let (mut gateway, mut other) = (home.client(), home.client());
+    gateway.call(OnBehalfOf { client: "alice".into(), cancel_at_end: true }).unwrap();
+    let first = gateway.call(Move::new("arm", vec![0.1, 0.0, 0.0, 0.0, 0.0, 0.0], 1.0)).unwrap().motion;
+    eventually("it has moved", || other.call(Motion { motion: first }).unwrap().done);
+    gateway.call(Release::default()).unwrap();
+    let second = other.call(Move::new("arm", vec![0.6, 0.0, 0.0, 0.0, 0.0, 0.0], 0.5)).unwrap().motion;
+    drop(gateway);
+    eventually("the second motion ends", || other.call(Motion { motion: second }).unwrap().done);
+    assert_eq!(other.call(Motion { motion: second }).unwrap().state, "COMPLETED");
+}
+
+#[test]
+fn a_run_has_one_gateway_until_its_connection_ends() {
+    let (home, _run) = up("");
+    let (mut one, mut two) = (home.client(), home.client());
+    let gateway = |clients: &[&str]| RegisterGateway {
+        endpoints: vec!["tls/0.0.0.0:7447".into()],
+        clients: clients.iter().map(|name| (*name).to_owned()).collect(),
+        faces: Vec::new(),
+    };
+    one.call(gateway(&[])).unwrap();
+    one.call(gateway(&["alice"])).unwrap();
+    let refused = two.call(gateway(&[])).unwrap_err();
+    assert!(matches!(&refused, ClientError::Refused(e) if e.code == Code::HasGateway), "{refused}");
+    let status = two.call(Status {}).unwrap();
+    assert_eq!(status.share.unwrap().clients, ["alice"]);
+    home.dimos("status").with(0).shows(&["shared at tls/0.0.0.0:7447: alice"]);
+    drop(one);
+    eventually("the run is not shared", || two.call(Status {}).unwrap().share.is_none());
+    two.call(gateway(&[])).unwrap();
 }

@@ -89,6 +89,40 @@ fn a_log_is_listed_checked_printed_cut_and_exported() {
     home.dimos("log plot --last --joint elbow -o plot.svg").with(2).says(&["joints: arm_joint1"]);
     home.dimos("log cat --last --topics /nothing").with(2).says(&["topics: "]);
     home.dimos("log export --last --topic /nothing").with(2).says(&["topics: "]);
+    // What fails leaves nothing: the next attempt finds the name free.
+    for failing in ["export --last --topic /nothing -o new", "what-if --last --set arms.arm.nothing=1 -o new"] {
+        home.dimos(&format!("log {failing}")).with(2);
+        assert!(!home.path().join("new").exists(), "{failing}");
+    }
+    home.dimos("log what-if --last --set rate=90 -o new").with(0);
+    home.dimos("log export --last -o new").with(1).says(&["cannot write new"]);
+    assert!(home.path().join("new").exists(), "a file that was there before is kept");
+
+    played(&home, Path::new(&log), &seen);
+}
+
+/// Checks which messages of a log are played: the options of `ros2 bag play`.
+fn played(home: &Home, log: &Path, seen: &[(String, u64)]) {
+    let name = log.file_name().unwrap().display();
+    let play = |options: &str| {
+        let out = home.dimos(&format!("replay {name} --json --rate 1000000 {options}")).with(0).out;
+        let topic = |line: &str| serde_json::from_str::<Value>(line).unwrap()["topic"].as_str().unwrap().to_owned();
+        out.lines().map(topic).collect::<Vec<_>>()
+    };
+    let all = seen.iter().map(|(_, count)| count).sum::<u64>() as usize;
+    assert_eq!(play("").len(), all, "a log is found by its name alone");
+    let fewer = play("--exclude-topics /joint_states,/tf");
+    assert!(fewer.len() < all && !fewer.iter().any(|topic| topic == "/joint_states" || topic == "/tf"));
+    home.dimos(&format!("replay {name} --exclude-topics /nothing")).with(2).says(&["has no topic /nothing"]);
+    let info = home.dimos(&format!("log info {name} --json")).with(0).json();
+    let start = info["start"].as_u64().unwrap() as f64 * 1e-9;
+    let part = play("--playback-duration 0.5").len();
+    let until = play(&format!("--playback-until-sec {:.3}", start + 0.5)).len();
+    assert!(part > 10 && part.abs_diff(until) < 20 && until < all / 2, "{part}, {until} of {all}");
+    home.dimos(&format!("replay {name} --playback-until-sec 5")).with(2).says(&["before the first message"]);
+    let began = std::time::Instant::now();
+    play("--topics /tf_static --delay 0.5 --disable-keyboard-controls");
+    assert!(began.elapsed().as_secs_f64() >= 0.5);
 }
 
 /// Start and length of the contents of each chunk of an MCAP file.
@@ -124,6 +158,19 @@ fn the_log_of_a_killed_run_is_recovered() {
     home.dimos("log info --last").with(5).shows(&["cut"]);
     home.dimos("log cat --last --topics /dimos/tick").with(5);
     home.dimos("log verify --last").with(5);
+    // A part before the cut is whole.
+    home.dimos("log cut --last -o end.mcap").with(5).says(&["the log was not whole: it ends at byte"]);
+    let verbs = [
+        "cut --to 0.2 -o b.mcap",
+        "export --to 0.2",
+        "export --to 0.2 --topic /dimos/tick",
+        "export --to 0.2 --rosbag2 b",
+    ];
+    for verb in verbs.into_iter().chain(["cat --to 0.2", "plot --to 0.2 -o b.svg"]) {
+        let begin = home.dimos(&format!("log {verb} --last")).with(0);
+        assert!(!begin.err.contains("warning"), "{verb}: {}", begin.err);
+    }
+    home.dimos("log export --last -o all.csv").with(5);
     let recovered = home.dimos("log recover --last --json").with(5).json();
     let file = recovered["file"].as_str().unwrap();
     assert!(recovered["messages"].as_u64().unwrap() > 100 && file.ends_with("-recovered.mcap"), "{recovered}");

@@ -75,6 +75,35 @@ fn a_plan_is_shown_then_carried_out() {
     is_at(&home, "arm", &HOME);
 }
 
+#[test]
+fn a_plan_says_how_it_was_checked_and_an_unproven_one_is_executed_only_if_asked_for() {
+    let (home, _run) = up();
+    let goal = "arm 0.3 -0.2 0.5 0 0.4 0";
+    let clearance = |level: &str| {
+        let planned = home.dimos(&format!("plan {goal} --level {level} --json")).with(0).json();
+        assert_eq!(planned["summary"]["level"], level);
+        planned["summary"]["clearance"].as_f64()
+    };
+    let (certified, exact) = (clearance("certified").unwrap(), clearance("exact").unwrap());
+    assert!(certified > 0.0 && certified <= exact && exact < certified + 0.01, "{certified} of {exact}");
+    let planned = home.dimos(&format!("plan {goal}")).with(0).out;
+    assert!(planned.contains("proven clearance") && planned.contains("least between arm/"), "{planned}");
+    let preview = home.dimos("preview --json").with(0).json();
+    let neighbours = preview["ignored_pairs"]["neighbours"].as_array().unwrap();
+    assert!(neighbours.iter().any(|pair| pair[0] == "arm/link1" && pair[1] == "arm/link2"), "{neighbours:?}");
+    assert_eq!(clearance("fast"), None);
+    let fast = home.dimos("preview").with(0).out;
+    assert!(fast.contains("not proven free of contact"), "{fast}");
+    home.dimos("execute").with(1).says(&["PLAN_UNPROVEN", "add --unproven"]);
+    home.dimos(&format!("move {goal} --level fast")).with(2).says(&["nothing has moved"]);
+    home.dimos(&format!("plan {goal} --level quick")).with(2).says(&["must be fast, certified or exact"]);
+    is_at(&home, "arm", &HOME);
+    home.dimos("execute --unproven").with(0);
+    is_at(&home, "arm", &[0.3, -0.2, 0.5, 0.0, 0.4, 0.0]);
+    home.dimos("move arm --named home --level fast --unproven").with(0).says(&["planned, checked at samples only"]);
+    is_at(&home, "arm", &HOME);
+}
+
 /// `preview --hz`: the plan as the arm gets it, as CSV and as JSON.
 fn sampled(home: &Home, plan: &Value) {
     let text = home.dimos("preview --hz 50").with(0).out;

@@ -280,6 +280,12 @@ fn bash_completes_what_exists_now() {
     has("dimos task stream serv", "servo_arm");
     has("dimos adapter test you", "yourarm");
     has("dimos jo", "jog");
+    home.dimos("pose save grasp").with(0);
+    has("dimos pose remove ", "grasp");
+    has("dimos pose save other ", "bare");
+    has("dimos move arm --named ", "grasp");
+    has("dimos move arm --through gri", "gripper:close");
+    has("dimos plan arm --by 0 0 0.1 --frame ", "tool");
 }
 
 /// A failed write to stdout is a failure; a closed pipe is none.

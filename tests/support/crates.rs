@@ -49,7 +49,8 @@ pub fn share_builds(folder: &Path) {
         assert_eq!(manifest.matches(once).count(), 1, "{once} in {manifest}");
     }
     let manifest = manifest.replace("[dependencies]\n", &format!("[dependencies]\n{}\n", used.trim()));
-    fs::write(folder.join("Cargo.toml"), manifest.replace(&path, "path = \"..\" }")).unwrap();
+    let features = if cfg!(feature = "share") { ", features = [\"share\"]" } else { "" };
+    fs::write(folder.join("Cargo.toml"), manifest.replace(&path, &format!("path = \"..\"{features} }}"))).unwrap();
 }
 
 /// Removes what the cargo that runs this test has set. With its `CARGO_PKG_NAME` or `OUT_DIR`, build scripts such as

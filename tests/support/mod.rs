@@ -3,14 +3,19 @@
 #![allow(dead_code, reason = "each test binary uses a part")]
 
 pub mod busy;
+pub mod cable;
+pub mod certificates;
 pub mod crates;
 pub mod delegate;
 pub mod fake_arms;
 pub mod fake_run;
 pub mod file_server;
+pub mod guarded;
 pub mod loopback;
+pub mod network;
 pub mod program;
 pub mod python;
+pub mod python_dimos;
 pub mod rig;
 pub mod shared;
 pub mod sim_arm;

@@ -107,6 +107,14 @@ test('a log is scrubbed and played: arm, table, plan and marks', async () => {
   });
   assert.ok(coloured > 300, `the joints are drawn: ${coloured} pixels`);
   await page.locator('.events .seekable').first().click();
+  for (const width of [1100, 1280, 1400]) {
+    await page.setViewportSize({width, height: 760});
+    const [end, choice] = await page.evaluate(() => [
+      Math.max(...[...document.querySelectorAll('.plot-head > *')].map((each) => each.getBoundingClientRect().right)),
+      document.querySelector('.plots > .choice').getBoundingClientRect().left,
+    ]);
+    assert.ok(end <= choice, `${width}: the heads of the plots end at ${end}, the time span is chosen at ${choice}`);
+  }
   assert.deepEqual(page.errors, []);
   await page.context().close();
 });

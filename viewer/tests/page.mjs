@@ -150,7 +150,7 @@ test('on a phone, Stop is on screen and nothing is wider than it', async () => {
   await phone.context().close();
 });
 
-// The last one: the run was suspended, so its arms are held afterwards.
+// The last ones: the run was suspended, so its arms are held afterwards.
 test('a lost connection is shown, disables acts, and recovers', async () => {
   run.child.kill('SIGSTOP');
   await text(page, '#age', /^no data for \d/);
@@ -167,4 +167,18 @@ test('a lost connection is shown, disables acts, and recovers', async () => {
     page.errors.filter((text) => !/WebSocket|net::/.test(text)),
     [],
   );
+});
+
+test('a page does not command the run that has taken the address of its own', async () => {
+  // To that run its token is a wrong one.
+  await page.evaluate(() => {
+    for (const link of [window.dimos.run.work, window.dimos.run.watch]) {
+      link.token = 'f'.repeat(32);
+      link.drop();
+    }
+  });
+  await text(page, '#age', /^another run has taken this address/);
+  await page.waitForSelector('#pause:disabled');
+  await page.waitForTimeout(1500);
+  assert.match(await page.textContent('#age'), /^another run/, 'and it does not try again');
 });

@@ -61,11 +61,13 @@ class Client(Planning):
         return {task["name"] for task in self.status()["tasks"] if joints & set(task["joints"])}
 
     def execute(self, motion: Union[Plan, int, Mapping[str, Any], None] = None, task: Optional[str] = None,
-                wait: bool = True, *, replan: bool = False) -> Dict[str, Any]:
+                wait: bool = True, *, replan: bool = False, unproven: bool = False) -> Dict[str, Any]:
         """Executes a plan (by default the newest of `plan`), or follows a trajectory: joint_names, and points of
-        time_from_start [s], positions [rad], velocities [rad/s]. A trajectory is not collision-checked."""
+        time_from_start [s], positions [rad], velocities [rad/s]. A trajectory is not collision-checked, a plan of the
+        level "fast" at samples only: it needs `unproven`."""
         if motion is None or isinstance(motion, (Plan, int)):
-            begun = self.call("execute_plan", plan=plan_number(motion), replan=replan or None)
+            begun = self.call("execute_plan", plan=plan_number(motion), replan=replan or None,
+                              unproven=unproven or None)
         else:
             begun = self.call("execute", trajectory=dict(motion), task=task)
         return self.wait(begun["motion"]) if wait else begun

@@ -38,11 +38,14 @@ def runs() -> Dict[str, Path]:
 
 class Connection:
     """A connection to a run."""
-    def __init__(self, path: Union[str, Path], timeout: float = 15.0) -> None:
-        """Connects to a socket. `timeout` [s] bounds every wait for the run."""
+    def __init__(self, path: Union[str, Path, socket.socket], timeout: float = 15.0) -> None:
+        """Connects to a socket, or uses one. `timeout` [s] bounds every wait for the run."""
         self.timeout, self._next_id, self._unread = timeout, 0, b""
         self._replies: Dict[int, Dict[str, Any]] = {}
         self._queues: Dict[int, Deque[Dict[str, Any]]] = {}
+        if isinstance(path, socket.socket):
+            self._socket = path
+            return
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._socket.settimeout(timeout)
         try:
@@ -60,6 +63,15 @@ class Connection:
         if not live or run not in (None, *live):
             raise NoRun("NO_RUN", f"no run is live{f' by the name of {run}' if run else ''}", "start one: dimos run")
         return cls(live[run or next(iter(live))], timeout)
+
+    @classmethod
+    def at(cls: Type[_Self], place: str, run: Optional[str] = None, user: Optional[str] = None,
+           identity: Optional[str] = None, timeout: float = 15.0) -> _Self:
+        """Connects to a run on another computer: `tls/HOST:PORT`. `identity` is a folder with ca.pem and the certificate
+        and key of `user`, by default the only one in it. Needs eclipse-zenoh."""
+        from .network import connect
+
+        return cls(connect(place, run, user, identity), timeout)
 
     def close(self) -> None:
         """Ends the connection and what it leases. A motion that has begun continues; a stream goes stale."""

@@ -102,7 +102,8 @@ class Plan:
 
     @property
     def clearance(self) -> Optional[float]:
-        """Smallest distance to an obstacle or between links [m]; None if nothing is near."""
+        """Distance to obstacles and between links that the whole motion is proven to keep [m]; None if nothing is
+        proven or nothing can collide."""
         return self.summary.get("clearance")
 
 

@@ -12,7 +12,7 @@ use std::collections::BinaryHeap;
 
 pub use cell::Inside;
 
-use ball::{Ball, Plane, around, enclosing};
+use ball::{Ball, Plane};
 use cell::Cell;
 use vector::{Vector, bounds, cross, direction, dot, sub};
 
@@ -96,14 +96,13 @@ impl Tree {
         Self { nodes: vec![node(&Ball { center: [0.0; 3], radius: 0.0 }, 0.0)] }
     }
 
-    /// Covers points [m].
-    pub fn of_points(points: impl Iterator<Item = [f64; 3]>) -> Self {
-        let mut points: Vec<Vector> = points.collect();
+    /// Covers points [m] that are sorted so that those of a half, of its halves, and so on, are close to each other.
+    pub fn of_sorted_points<P: Copy + Into<[f64; 3]>>(points: &[P]) -> Self {
         let mut nodes = vec![node(&Ball { center: [0.0; 3], radius: 0.0 }, NONE)];
         if points.is_empty() {
             return Self::default();
         }
-        halve(&mut points, 0, &mut nodes);
+        halve(points, 0, &mut nodes);
         Self { nodes }
     }
 
@@ -205,26 +204,32 @@ fn planes(triangles: &[Vec<Vector>]) -> Vec<Plane> {
     planes
 }
 
-/// Splits points along the longest side, down to the leaves.
-fn halve(points: &mut [Vector], at: usize, nodes: &mut Vec<Node>) {
+/// Covers the halves of sorted points, down to the leaves, then all of them. Returns their ball and their box.
+fn halve<P: Copy + Into<[f64; 3]>>(points: &[P], at: usize, nodes: &mut Vec<Node>) -> (Ball, [Vector; 2]) {
+    let middle = |low: Vector, high: Vector| std::array::from_fn(|i| 0.5 * (low[i] + high[i]));
     if points.len() <= POINTS {
-        let inner = if points.len() == 1 { 0.0 } else { NONE };
-        nodes[at] = node(&around(points, &[]).0, inner);
-        return;
+        let (low, high) = bounds(points.iter().map(|p| (*p).into()));
+        let center = middle(low, high);
+        let radius = points.iter().map(|p| vector::distance((*p).into(), center)).fold(0.0, f64::max);
+        let ball = Ball { center, radius };
+        nodes[at] = node(&ball, if points.len() == 1 { 0.0 } else { NONE });
+        return (ball, [low, high]);
     }
-    let (low, high) = bounds(points.iter().copied());
-    let center: Vector = std::array::from_fn(|i| 0.5 * (low[i] + high[i]));
-    let radius = points.iter().map(|p| vector::distance(*p, center)).fold(0.0, f64::max);
-    nodes[at] = node(&Ball { center, radius }, NONE);
-    let axis = longest(low, high);
-    let middle = points.len() / 2;
-    points.select_nth_unstable_by(middle, |a, b| a[axis].total_cmp(&b[axis]));
     let first = nodes.len();
-    (nodes[at].first, nodes[at].count) = (first as u32, 2);
     nodes.extend([nodes[at]; 2]);
-    let (left, right) = points.split_at_mut(middle);
-    halve(left, first, nodes);
-    halve(right, first + 1, nodes);
+    let (left, right) = points.split_at(points.len() / 2);
+    let (a, [a_low, a_high]) = halve(left, first, nodes);
+    let (b, [b_low, b_high]) = halve(right, first + 1, nodes);
+    let low = std::array::from_fn(|i| a_low[i].min(b_low[i]));
+    let high = std::array::from_fn(|i| a_high[i].max(b_high[i]));
+    let center = middle(low, high);
+    // Both contain all points: the balls of the halves, and the corners of the box.
+    let halves = [a, b].map(|half| vector::distance(half.center, center) + half.radius);
+    let radius = halves[0].max(halves[1]).min(vector::distance(low, center));
+    let ball = Ball { center, radius };
+    nodes[at] = node(&ball, NONE);
+    (nodes[at].first, nodes[at].count) = (first as u32, 2);
+    (ball, [low, high])
 }
 
 fn longest(low: Vector, high: Vector) -> usize {
@@ -243,7 +248,14 @@ fn node(ball: &Ball, inner: f64) -> Node {
 }
 
 fn around_all(parts: &[(Ball, &Tree, Place)]) -> Node {
-    node(&enclosing(&parts.iter().map(|p| p.0).collect::<Vec<_>>()), NONE)
+    node(&ball::enclosing(&parts.iter().map(|p| p.0).collect::<Vec<_>>()), NONE)
+}
+
+/// Returns centre and radius of a ball around balls [m].
+pub(crate) fn enclosing(nodes: &[Node]) -> ([f32; 3], f32) {
+    let ball = |node: &Node| Ball { center: node.center.map(f64::from), radius: f64::from(node.radius) };
+    let all = node(&ball::enclosing(&nodes.iter().map(ball).collect::<Vec<_>>()), NONE);
+    (all.center, all.radius)
 }
 
 fn moved(node: &Node, place: &Place) -> (Ball, f64) {

@@ -79,8 +79,9 @@ fn balls_of_a_convex_solid_are_hardly_outside_and_inner_balls_are_inside() {
 #[test]
 fn points_segments_and_joined_solids_are_covered() {
     let mut numbers = Numbers(3);
-    let points: Vec<Vector> = (0..500).map(|_| std::array::from_fn(|_| numbers.next())).collect();
-    let cloud = Tree::of_points(points.iter().copied());
+    let mut points: Vec<Vector> = (0..500).map(|_| std::array::from_fn(|_| numbers.next())).collect();
+    points.sort_by(|a, b| a[0].total_cmp(&b[0]));
+    let cloud = Tree::of_sorted_points(&points);
     assert!(points.iter().all(|p| covered(&cloud, 0, *p)));
     let segment = Tree::of_segment(0.3);
     assert!((0..=100).all(|i| covered(&segment, 0, [0.0, 0.0, 0.006 * f64::from(i) - 0.3])));
@@ -103,6 +104,6 @@ fn points_segments_and_joined_solids_are_covered() {
 #[test]
 fn nothing_has_no_cover() {
     assert_eq!(Tree::of_triangles(std::iter::empty(), Inside::Convex), Tree::default());
-    assert_eq!(Tree::of_points(std::iter::empty()), Tree::default());
+    assert_eq!(Tree::of_sorted_points::<Vector>(&[]), Tree::default());
     assert_eq!(Tree::join(&[]), Tree::default());
 }

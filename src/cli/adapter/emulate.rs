@@ -3,7 +3,7 @@
 
 use std::io::{self, IsTerminal};
 use std::net::IpAddr;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
@@ -42,6 +42,9 @@ pub struct Args {
     /// Stand on a new pseudo-terminal [default for arms on a serial line]
     #[arg(long, group = "place")]
     pub pty: bool,
+    /// Also make the pseudo-terminal reachable under this path, a symbolic link, which stays the same between starts
+    #[arg(long, value_name = "PATH", conflicts_with_all = ["bind", "can"])]
+    pub link: Option<PathBuf>,
     /// What goes wrong, and when (repeatable); `list` shows what can
     #[arg(long, value_name = "SCRIPT")]
     pub fault: Vec<String>,
@@ -67,7 +70,9 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
         emulator.inject(*fault).map_err(Failure::usage)?;
     }
     let signals = Signals::watch_with_hangup();
-    announce(args, &row, dof, &emulator.address(), registry);
+    let link = args.link.as_deref().map(|path| Link::to(&emulator.address(), path)).transpose()?;
+    let address = link.as_ref().map_or_else(|| emulator.address(), |link| link.address.clone());
+    announce(args, &row, dof, &address, registry);
     let bar = if args.json || !io::stderr().is_terminal() { ProgressBar::hidden() } else { ProgressBar::new_spinner() };
     if let Ok(style) = ProgressStyle::with_template("SIMULATED {wide_msg}") {
         bar.set_style(style);
@@ -91,6 +96,42 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
     tell(&bar, zero);
     bar.finish_and_clear();
     Ok(ended)
+}
+
+/// A symbolic link to a pseudo-terminal; removed when it is dropped, unless another one has replaced it.
+struct Link {
+    path: PathBuf,
+    device: String,
+    /// The address by way of the link.
+    address: String,
+}
+
+impl Link {
+    /// Makes the link. One that is there already is replaced, any other file is not.
+    fn to(address: &str, path: &Path) -> Result<Self> {
+        let failed = |what: String| Failure::usage(format!("--link {}: {what}", path.display()));
+        let (scheme, device) = match address.find("/dev/") {
+            Some(at) => address.split_at(at),
+            None => return Err(failed(format!("the emulator is at {address}, which is no pseudo-terminal"))),
+        };
+        let path = std::path::absolute(path).map_err(|e| failed(e.to_string()))?;
+        match std::fs::symlink_metadata(&path) {
+            Ok(there) if !there.is_symlink() => return Err(failed("there is a file already".to_owned())),
+            Ok(_) => std::fs::remove_file(&path).map_err(|e| failed(e.to_string()))?,
+            Err(_) => {}
+        }
+        std::os::unix::fs::symlink(device, &path).map_err(|e| failed(e.to_string()))?;
+        let address = format!("{scheme}{}", path.display());
+        Ok(Self { path, device: device.to_owned(), address })
+    }
+}
+
+impl Drop for Link {
+    fn drop(&mut self) {
+        if std::fs::read_link(&self.path).is_ok_and(|device| device == Path::new(&self.device)) {
+            let _ = std::fs::remove_file(&self.path);
+        }
+    }
 }
 
 /// Prints the events of the emulator since the last call: no thread that serves a client waits for a terminal.

@@ -10,6 +10,7 @@ use super::Finding;
 use crate::recording::files::log_folder;
 use crate::rpc::run_dir::RunDir;
 use crate::rt::host::WATCHDOG_PRIORITY;
+use crate::share;
 
 /// Type of CAN links in `/sys/class/net/*/type` (ARPHRD_CAN).
 const CAN: &str = "280";
@@ -44,6 +45,7 @@ impl Host {
         findings.push(sockets());
         findings.extend(self.can_links());
         findings.extend(self.serial_ports());
+        findings.extend(certificates());
         findings
     }
 
@@ -170,6 +172,22 @@ impl Host {
 }
 
 /// Checks the free space for logs.
+/// Returns one finding per place of other computers: whether our certificates for it can be used.
+fn certificates() -> Vec<Finding> {
+    let check = "certificates";
+    let examined = share::check_places().into_iter().map(|(place, result)| match result {
+        Ok(None) => Finding::ok(check, format!("place {place}: in order")),
+        Ok(Some(soon)) => {
+            Finding::warn(check, format!("place {place}: {soon}"), "make a new one: docs/many-machines.md")
+        }
+        Err(error) => {
+            let fix = error.hint.unwrap_or_else(|| "docs/many-machines.md shows how to make certificates".to_owned());
+            Finding::warn(check, format!("place {place}: {}", error.message), fix)
+        }
+    });
+    examined.collect()
+}
+
 fn log_room() -> Finding {
     let check = "log folder";
     let Some(folder) = log_folder() else {

@@ -231,7 +231,7 @@ impl<'r> Runner<'r, '_> {
         } else {
             let (goals, through) = (vec![goal.clone()], motion.through.clone());
             let request =
-                Plan { goals, speed: *speed, seed: 0, timeout: None, through, blend: motion.blend, by_number: true };
+                Plan { goals, speed: *speed, through, blend: motion.blend, by_number: true, ..Plan::default() };
             let found = plan(self.client, request, self.signals).map_err(|failure| {
                 // Another client's `cancel`, maybe at a waypoint.
                 let cancelled = failure.what.starts_with("no plan: ") && failure.what.ends_with("cancelled");

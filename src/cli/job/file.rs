@@ -166,7 +166,7 @@ impl Reader {
     fn steps(&mut self, node: NodeId, nesting: usize) -> Vec<Step> {
         let items = self.tree.items(node).to_vec();
         if items.is_empty() {
-            self.wrong::<()>(node, "expected a list of steps", Some("start each step with `- `"));
+            self.wrong::<()>(node, "expected a list of one or more steps", Some("start each step with `- `"));
         }
         if nesting > MAX_NESTING {
             self.wrong::<()>(node, format!("steps are nested deeper than {MAX_NESTING} times"), None);

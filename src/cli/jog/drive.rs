@@ -2,7 +2,9 @@
 
 use std::time::{Duration, Instant};
 
+use super::link;
 use crate::cli::exit::{Failure, Result};
+use crate::cli::lasting;
 use crate::rpc::api::{Cancel, Servo, Twist, TwistFrame, Velocity};
 use crate::rpc::client::{Client, ClientError};
 use crate::rpc::report::{ArmReport, ArmStateReport, TaskReport};
@@ -197,6 +199,7 @@ pub type Sent = std::result::Result<(), ClientError>;
 pub fn refusal(sent: Sent) -> Result<Option<String>> {
     match sent {
         Ok(()) => Ok(None),
+        Err(error) if lasting::is_lost(&error) => Err(link::lost(error)),
         Err(ClientError::Refused(error)) => Ok(Some(match error.hint {
             Some(hint) => format!("{}; {hint}", error.message),
             None => error.message,

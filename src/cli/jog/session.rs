@@ -8,12 +8,13 @@ use super::active_motions::ActiveMotions;
 use super::drive::{self, ArmView, Demand, Drives, Kind, Stream, refusal};
 use super::fingers::Fingers;
 use super::keys::{KeyAction, Motion, meaning};
+use super::link::{self, Link};
 use super::screen::{self, View};
 use super::terminal::Terminal;
 use super::watch::{ArmSnapshot, Watch};
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::follow::Signals;
-use crate::rpc::api::{Gripper, Release, State, Stop, TwistFrame};
+use crate::rpc::api::{Gripper, Lease, Release, State, Stop, TwistFrame};
 use crate::rpc::client::Client;
 
 /// Time between two targets.
@@ -67,6 +68,7 @@ pub struct Session {
     resting: Option<Instant>,
     fingers: Fingers,
     message: Option<(String, bool)>,
+    link: Link,
 }
 
 impl Session {
@@ -78,7 +80,8 @@ impl Session {
             message = Some((missing_task(&setting.arm, !setting.joint_mode), false));
         }
         let (held, speed, fingers) = (ActiveMotions::default(), FIRST_SPEED, Fingers::default());
-        Self { client, watch, drives, setting, held, speed, joint: 0, stream: None, resting: None, fingers, message }
+        let (stream, resting, link) = (None, None, Link::Up);
+        Self { client, watch, drives, setting, held, speed, joint: 0, stream, resting, fingers, message, link }
     }
 
     /// Jogs until the user leaves, a signal arrives, or the terminal or the run is lost. In every case the arm
@@ -102,11 +105,11 @@ impl Session {
             loop {
                 let timeout = beat.saturating_duration_since(Instant::now());
                 match terminal.event(timeout).map_err(no_terminal)? {
-                    Some((Event::Key(key), at)) => {
-                        if let Some(exit) = self.key(&key, at)? {
-                            return Ok(exit);
-                        }
-                    }
+                    Some((Event::Key(key), at)) => match self.key(&key, at) {
+                        Ok(Some(exit)) => return Ok(exit),
+                        Ok(None) => {}
+                        Err(failure) => self.endure(failure)?,
+                    },
                     // Without keyboard focus there are no key-ups.
                     Some((Event::FocusLost, _)) => self.held.clear(),
                     _ => {}
@@ -119,7 +122,9 @@ impl Session {
             if let Some(lost) = &seen.lost {
                 return Err(lost.clone());
             }
-            self.command(&seen)?;
+            if let Err(failure) = self.keep_the_link(&seen).and_then(|()| self.command(&seen)) {
+                self.endure(failure)?;
+            }
             beats = beats.wrapping_add(1);
             if beats.is_multiple_of(PER_DRAWING) {
                 if !terminal.is_there() {
@@ -134,6 +139,15 @@ impl Session {
 
     fn key(&mut self, key: &KeyEvent, now: Instant) -> Result<Option<Exit>> {
         let Some(wish) = meaning(key, self.setting.joint_mode) else { return Ok(None) };
+        if !matches!(self.link, Link::Up) && !matches!(wish, KeyAction::Leave { .. }) {
+            let (resume, stops) = (matches!(wish, KeyAction::Rest), matches!(wish, KeyAction::Stop));
+            match &self.link {
+                Link::Back if resume => self.resume()?,
+                Link::Back if stops => self.stop()?,
+                _ => {}
+            }
+            return Ok(None);
+        }
         match (wish, key.kind) {
             (KeyAction::Move(motion), KeyEventKind::Press) => {
                 self.message = None;
@@ -231,8 +245,51 @@ impl Session {
         refusal(released).map(|_| ())
     }
 
+    /// Survives the loss of a connection to another computer: the arm is brought to rest there, and nothing moves it
+    /// again without the user. Other failures end jog.
+    fn endure(&mut self, failure: Failure) -> Result<()> {
+        if !link::is_loss(&failure) {
+            return Err(failure);
+        }
+        self.held.clear();
+        (self.stream, self.resting) = (None, None);
+        self.message = Some((format!("{}; the arm decelerates to rest; connecting again", failure.what), true));
+        self.link = Link::lost(&self.setting.run);
+        Ok(())
+    }
+
+    /// Notices a loss while nothing is sent, and that the run is back.
+    fn keep_the_link(&mut self, seen: &ArmSnapshot) -> Result<()> {
+        match &self.link {
+            Link::Up => seen.away.clone().map_or(Ok(()), Err),
+            Link::Lost(connecting) => {
+                if seen.away.is_none()
+                    && let Some(client) = connecting.back()
+                {
+                    (self.client, self.link) = (client, Link::Back);
+                    self.message = Some(("connected again: Space takes the lease of the arm again".into(), true));
+                }
+                Ok(())
+            }
+            Link::Back => Ok(()),
+        }
+    }
+
+    /// Takes the lease again after a loss.
+    fn resume(&mut self) -> Result<()> {
+        let leased = self.client.call(Lease { arm: Some(self.setting.arm.clone()) }).map(drop);
+        match refusal(leased)? {
+            None => (self.link, self.message) = (Link::Up, None),
+            Some(refused) => self.message = Some((format!("{refused}; Space tries again"), true)),
+        }
+        Ok(())
+    }
+
     /// Sends the next target, or brings a moving arm to rest.
     fn command(&mut self, seen: &ArmSnapshot) -> Result<()> {
+        if !matches!(self.link, Link::Up) {
+            return Ok(());
+        }
         let now = Instant::now();
         match self.demand(now) {
             Some(demand) => self.go(demand, seen, now),

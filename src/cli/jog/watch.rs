@@ -8,11 +8,13 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use serde_json::Value;
 
+use super::link;
+use crate::cli::arguments;
 use crate::cli::exit::{Failure, Result};
+use crate::cli::lasting;
 use crate::rpc::api::{State, Status};
 use crate::rpc::client::{Client, ClientError};
 use crate::rpc::report::{ArmReport, ArmStateReport, TaskReport};
-use crate::rpc::run_dir::RunDir;
 use crate::rpc::streams::{Stream, Subscribe};
 use crate::sync::lock;
 
@@ -38,6 +40,8 @@ pub struct ArmSnapshot {
     pub bound: Option<(String, Instant)>,
     /// Why reading has ended.
     pub lost: Option<Failure>,
+    /// Why nothing is read from another computer at present.
+    pub away: Option<Failure>,
 }
 
 /// Reads a run until dropped.
@@ -50,13 +54,21 @@ pub struct Watch {
 impl Watch {
     /// Starts reading an arm of a run.
     pub fn start(run: &str, arm: &str) -> Result<Self> {
-        let mut client = Client::find(&RunDir::standard(), Some(run))?;
+        let mut client = arguments::connect(Some(run))?;
         let seen = Arc::new(Mutex::new(ArmSnapshot::default()));
         let ending = Arc::new(AtomicBool::new(false));
         let (arm, to, end) = (arm.to_owned(), seen.clone(), ending.clone());
         let reading = move || {
-            if let Err(error) = read(&mut client, &arm, &to, &end) {
-                lock(&to).lost = Some(error.into());
+            while let Err(error) = read(&mut client, &arm, &to, &end) {
+                if !lasting::is_lost(&error) {
+                    lock(&to).lost = Some(error.into());
+                    return;
+                }
+                lock(&to).away = Some(link::lost(error));
+                let run = client.run().to_owned();
+                let Some(back) = link::attempts(&run, || !end.load(Ordering::Relaxed)) else { return };
+                client = back;
+                lock(&to).away = None;
             }
         };
         let thread = std::thread::Builder::new().name("jog-watch".into()).spawn(reading);

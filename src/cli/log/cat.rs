@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
-use super::{Part, ended, unreadable, written};
+use super::{Part, ended, progress, unreadable, written};
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::recording::replay::LogReader;
 use crate::recording::scan::{Item, Scan};
@@ -20,8 +20,9 @@ pub fn run(path: &Path, part: &Part, topics: &[String], json: bool) -> Result {
     let began = from.saturating_sub(part.from.as_nanos() as u64);
     let mut scan = Scan::open_part(path, topics, (from, to)).map_err(unreadable)?;
     let mut out = BufWriter::with_capacity(256 * 1024, io::stdout().lock());
-    let (mut line, mut unknown) = (String::new(), 0);
+    let (mut line, mut unknown, mut bar) = (String::new(), 0, progress::of_scan(true));
     while let Some(item) = scan.next_item().map_err(unreadable)? {
+        bar(&scan);
         let Item::Messages = item else { continue };
         for (message, channel, bytes) in scan.messages() {
             if !(from..=to).contains(&message.time) || !(topics.is_empty() || topics.contains(&channel.topic)) {

@@ -16,10 +16,10 @@ pub fn cut(path: &Path, part: &Part, to: &Path, json: bool) -> Result {
     let mut scan = Scan::open(path).map_err(unreadable)?;
     scan.part = part;
     let name = path.file_name().unwrap_or_default().to_string_lossy();
-    let written = copy(&mut scan, to, Some(&name), progress()).map_err(|e| failure(e, to))?;
-    print("cut", &scan, &written, to, json);
-    // Only damage inside the part matters; a cut after it does not.
-    Ok(if scan.damage.is_empty() { Exit::Ok } else { Exit::Log })
+    let written = copy(&mut scan, to, Some(&name), progress::of_scan(false)).map_err(|e| failure(e, to))?;
+    let loss = loss(&scan);
+    print("cut", loss.as_deref(), &written, to, json);
+    Ok(if loss.is_some() { Exit::Log } else { Exit::Ok })
 }
 
 /// Writes what can be read of a log.
@@ -31,9 +31,10 @@ pub fn recover(path: &Path, to: Option<&Path>, json: bool) -> Result {
     }
     let beside = path.with_file_name(format!("{}-recovered.mcap", path.file_stem().unwrap_or_default().display()));
     let to = to.unwrap_or(&beside);
-    let written = copy(&mut scan, to, None, progress()).map_err(|e| failure(e, to))?;
-    print("recovered", &scan, &written, to, json);
-    Ok(if loss(&scan).is_some() { Exit::Log } else { Exit::Ok })
+    let written = copy(&mut scan, to, None, progress::of_scan(false)).map_err(|e| failure(e, to))?;
+    let loss = loss(&scan);
+    print("recovered", loss.as_deref(), &written, to, json);
+    Ok(if loss.is_some() { Exit::Log } else { Exit::Ok })
 }
 
 /// Returns the failure of a copy; removes what there is of the new file.
@@ -46,9 +47,9 @@ pub fn failure(error: RewriteError, to: &Path) -> Failure {
     Failure::of(exit, error)
 }
 
-fn print(done: &str, scan: &Scan, written: &Written, to: &Path, as_json: bool) {
+fn print(done: &str, loss: Option<&str>, written: &Written, to: &Path, as_json: bool) {
     let length = written.span.map_or(0.0, |(start, end)| (end - start) as f64 * 1e-9);
-    let (messages, loss) = (written.messages, loss(scan));
+    let messages = written.messages;
     if as_json {
         output::json(&json!({"file": to, "messages": messages, "length": length, "loss": loss}));
         return;

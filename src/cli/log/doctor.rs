@@ -17,7 +17,7 @@ use crate::recording::wire::Message;
 /// Checks a log and prints the findings.
 pub fn run(path: &Path, json: bool) -> Result {
     let mut scan = Scan::open(path).map_err(unreadable)?;
-    let (mut found, mut bar) = (Findings::default(), progress());
+    let (mut found, mut bar) = (Findings::default(), progress::of_scan(false));
     while let Some(item) = scan.next_item().map_err(unreadable)? {
         match item {
             Item::Messages => found.batch(&scan),

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use serde_json::{Value, json};
 
-use super::{Part, ended, unreadable, written};
+use super::{Part, ended, progress, unreadable, written};
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output;
 use crate::recording::messages::JointState;
@@ -22,7 +22,7 @@ pub fn csv(path: &Path, part: &Part, topic: Option<&str>, to: Option<&Path>, jso
         None => Box::new(BufWriter::new(io::stdout().lock())),
         Some(to) => Box::new(new_file(to)?),
     };
-    let mut rows = Rows { out: &mut *out, began, count: 0 };
+    let mut rows = Rows { out: &mut *out, began, count: 0, prints: to.is_none() };
     let exit = match topic {
         Some(topic) => rows.topic(path, topic, (from, until))?,
         None => rows.joints(path, (from, until))?,
@@ -44,13 +44,13 @@ pub fn parquet(path: &Path, part: &Part, to: &Path, json: bool) -> Result {
     let part_of_log = part.of(path)?;
     let began = part_of_log.0.saturating_sub(part.from.as_nanos() as u64);
     let out = new_file(to)?;
-    let names = joint_names(path, part_of_log)?;
+    let names = joint_names(path, part_of_log, false)?;
     let numbers = || Column::Numbers(Vec::new());
     let mut columns = vec![("time".to_owned(), numbers()), ("log_time".to_owned(), Column::Integers(Vec::new()))];
     columns.extend(columns_of(&names).map(|name| (name, numbers())));
     let failed = |e| cannot_write(to, e);
     let mut file = ParquetWriter::new(out, columns).map_err(failed)?;
-    let exit = joint_rows(path, part_of_log, names.len(), |time, values| {
+    let exit = joint_rows(path, part_of_log, names.len(), false, |time, values| {
         for (column, value) in file.columns.iter_mut().skip(2).zip(values) {
             if let Column::Numbers(list) = column {
                 list.push(value.unwrap_or(f64::NAN));
@@ -81,10 +81,11 @@ const STATES: &str = "/joint_states";
 const COMMANDS: &str = "/joint_commands";
 
 /// Returns the names in joint states; a gripper gets its name when it is first measured.
-fn joint_names(path: &Path, (from, to): (u64, u64)) -> Result<Vec<String>> {
+fn joint_names(path: &Path, (from, to): (u64, u64), prints: bool) -> Result<Vec<String>> {
     let mut names: Vec<String> = Vec::new();
     let mut log = LogReader::open(path).map_err(unreadable)?;
-    each(&mut log, Selection { topics: vec![STATES.to_owned()], from, to }, |entry| {
+    let states = Selection { topics: vec![STATES.to_owned()], from, to };
+    each(&mut log, states, progress::bar(prints), |entry| {
         if let Payload::JointState(state) = entry.data
             && state.name.len() > names.len()
         {
@@ -106,6 +107,7 @@ fn joint_rows(
     path: &Path,
     (from, to): (u64, u64),
     joints: usize,
+    prints: bool,
     mut row: impl FnMut(u64, &[Option<f64>]) -> Result<bool>,
 ) -> Result {
     let mut log = LogReader::open(path).map_err(unreadable)?;
@@ -120,7 +122,8 @@ fn joint_rows(
         let values: Vec<Option<f64>> = (0..joints).flat_map(values).collect();
         row(time, &values)
     };
-    let cut = each(&mut log, Selection { topics: vec![STATES.to_owned(), COMMANDS.to_owned()], from, to }, |entry| {
+    let both = Selection { topics: vec![STATES.to_owned(), COMMANDS.to_owned()], from, to };
+    let cut = each(&mut log, both, progress::bar(prints), |entry| {
         let Payload::JointState(values) = entry.data else { return Ok(true) };
         if entry.topic == COMMANDS {
             commands = values;
@@ -147,6 +150,8 @@ struct Rows<'a> {
     /// Unix time of the log's beginning [ns].
     began: u64,
     count: u64,
+    /// Whether they go to standard output.
+    prints: bool,
 }
 
 impl Rows<'_> {
@@ -169,16 +174,19 @@ impl Rows<'_> {
 
     /// Writes joint states and commands, a row for each state.
     fn joints(&mut self, path: &Path, part: (u64, u64)) -> Result {
-        let names = joint_names(path, part)?;
+        let names = joint_names(path, part, self.prints)?;
         self.heading(columns_of(&names))?;
-        joint_rows(path, part, names.len(), |time, values| self.row(time, values.iter().copied().map(cell)))
+        joint_rows(path, part, names.len(), self.prints, |time, values| {
+            self.row(time, values.iter().copied().map(cell))
+        })
     }
 
     /// Writes the messages of a topic, with the columns of the first one.
     fn topic(&mut self, path: &Path, topic: &str, part: (u64, u64)) -> Result {
         let mut scan = Scan::open_part(path, &[topic.to_owned()], part).map_err(unreadable)?;
-        let (mut columns, mut text) = (Vec::<String>::new(), String::new());
+        let (mut columns, mut text, mut bar) = (Vec::<String>::new(), String::new(), progress::of_scan(self.prints));
         while let Some(item) = scan.next_item().map_err(unreadable)? {
+            bar(&scan);
             let Item::Messages = item else { continue };
             for (message, channel, bytes) in scan.messages() {
                 if channel.topic != topic || !(part.0..=part.1).contains(&message.time) {
@@ -208,22 +216,27 @@ impl Rows<'_> {
     }
 }
 
-/// Reads the selected messages of a log until `take` returns `false`; returns the cut.
+/// Reads the selected messages of a log until `take` returns `false`; returns the cut, if they reach to it. `progress`
+/// gets how much of how much time is read [ns].
 pub fn each(
     log: &mut LogReader,
     selection: Selection,
+    mut progress: impl FnMut(u64, u64),
     mut take: impl FnMut(Entry) -> Result<bool>,
 ) -> Result<Option<ReplayError>> {
+    let (from, length) = (selection.from, selection.to.saturating_sub(selection.from));
+    let reaches_end = log.info().span.is_none_or(|(_, end)| selection.to >= end);
     log.select(selection).map_err(unreadable)?;
     loop {
         match log.next_entry() {
             Ok(Some(entry)) => {
+                progress(entry.log_time.saturating_sub(from), length);
                 if !take(entry)? {
                     return Ok(None);
                 }
             }
             Ok(None) => return Ok(None),
-            Err(cut @ ReplayError::Cut { .. }) => return Ok(Some(cut)),
+            Err(cut @ ReplayError::Cut { .. }) => return Ok(Some(cut).filter(|_| reaches_end)),
             Err(e) => return Err(unreadable(e)),
         }
     }

@@ -18,7 +18,7 @@ pub fn run(path: &Path, json: bool) -> Result {
     let reader = LogReader::open(path).map_err(unreadable)?;
     let info = reader.info();
     let mut scan = Scan::open(path).map_err(unreadable)?;
-    let (mut counts, mut attachments, mut bar) = (BTreeMap::<u16, u64>::new(), Vec::new(), progress());
+    let (mut counts, mut attachments, mut bar) = (BTreeMap::<u16, u64>::new(), Vec::new(), progress::of_scan(false));
     while let Some(item) = scan.next_item().map_err(unreadable)? {
         match item {
             Item::Messages => {

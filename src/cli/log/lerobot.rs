@@ -7,7 +7,7 @@ use std::path::Path;
 use serde_json::{Value, json};
 
 use super::export::{cannot_write, each, new_file};
-use super::{Part, unreadable};
+use super::{Part, progress, unreadable};
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output;
 use crate::recording::parquet::{Column, ParquetWriter};
@@ -173,14 +173,19 @@ impl Frames {
         let grippers: Vec<String> = grippers.map(|arm| format!("{arm}_gripper")).collect();
         let arms: BTreeMap<String, Vec<String>> =
             log.info().metadata.get("arms").and_then(|text| serde_json::from_str(text).ok()).unwrap_or_default();
-        each(log, Selection { topics: vec!["/joint_states".to_owned()], from, to }, |entry| {
-            if let Payload::JointState(state) = entry.data {
-                // Joint states have the order of the arms, and then grippers, which may be joints of a model.
-                joints = arms.values().map(Vec::len).sum::<usize>().min(state.name.len());
-                names = state.name.into_iter().take(joints).collect();
-            }
-            Ok(false)
-        })?;
+        each(
+            log,
+            Selection { topics: vec!["/joint_states".to_owned()], from, to },
+            |_, _| (),
+            |entry| {
+                if let Payload::JointState(state) = entry.data {
+                    // Joint states have the order of the arms, and then grippers, which may be joints of a model.
+                    joints = arms.values().map(Vec::len).sum::<usize>().min(state.name.len());
+                    names = state.name.into_iter().take(joints).collect();
+                }
+                Ok(false)
+            },
+        )?;
         names.extend(grippers);
         let unknown = vec![f64::NAN; names.len()];
         let (state, action, figures) = (unknown.clone(), unknown, Default::default());
@@ -196,7 +201,7 @@ impl Frames {
     ) -> Result<Option<String>> {
         let mut topics = vec!["/joint_states".to_owned(), "/joint_commands".to_owned()];
         topics.extend(arms.keys().flat_map(|arm| [format!("/gripper/{arm}"), format!("/dimos/outputs/{arm}")]));
-        let cut = each(log, Selection { topics, from, to }, |entry| {
+        let cut = each(log, Selection { topics, from, to }, progress::bar(false), |entry| {
             if entry.log_time != self.at {
                 self.frames_before(entry.log_time).map_err(failed)?;
                 self.at = entry.log_time;

@@ -6,7 +6,7 @@ use std::path::Path;
 use serde_json::json;
 
 use super::export::each;
-use super::{Part, unreadable};
+use super::{Part, progress, unreadable};
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output;
 use crate::recording::replay::{LogReader, Payload, Selection};
@@ -34,7 +34,7 @@ pub fn run(path: &Path, part: &Part, joints: &[String], to: &Path, json: bool) -
     let mut log = LogReader::open(path).map_err(unreadable)?;
     let (mut names, mut curves) = (Vec::<String>::new(), Vec::<[Curve; 2]>::new());
     let topics = vec!["/joint_states".to_owned(), "/joint_commands".to_owned()];
-    let cut = each(&mut log, Selection { topics, from, to: until }, |entry| {
+    let cut = each(&mut log, Selection { topics, from, to: until }, progress::bar(false), |entry| {
         let Payload::JointState(values) = entry.data else { return Ok(true) };
         let time = entry.log_time.saturating_sub(began) as f64 * 1e-9;
         let kind = usize::from(entry.topic == "/joint_commands");
@@ -73,7 +73,11 @@ pub fn run(path: &Path, part: &Part, joints: &[String], to: &Path, json: bool) -
     svg.push_str("</svg>\n");
     std::fs::write(to, svg).map_err(|e| Failure::new(Exit::Failed, format!("cannot write {}: {e}", to.display())))?;
     let count = drawn.len();
-    output::done(format_args!("{count} joints: {}", to.display()), json!({"file": to, "joints": count}), json);
+    output::done(
+        format_args!("{count} {}: {}", if count == 1 { "joint" } else { "joints" }, to.display()),
+        json!({"file": to, "joints": count}),
+        json,
+    );
     Ok(match cut.filter(|_| !log.info().live) {
         Some(cut) => {
             output::note(format_args!("warning: {cut}"));

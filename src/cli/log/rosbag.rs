@@ -21,7 +21,7 @@ pub fn run(path: &Path, part: &Part, folder: &Path, json: bool) -> Result {
     let to = folder.join(&name);
     let mut scan = Scan::open(path).map_err(unreadable)?;
     scan.part = part;
-    copy(&mut scan, &to, None, progress()).map_err(|e| failure(e, &to))?;
+    copy(&mut scan, &to, None, progress::of_scan(false)).map_err(|e| failure(e, &to))?;
     let metadata = metadata(&to, &name).map_err(unreadable)?;
     let file = folder.join("metadata.yaml");
     std::fs::write(&file, metadata).map_err(|e| cannot_write(&file, e))?;

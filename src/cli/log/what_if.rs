@@ -7,10 +7,11 @@ use std::time::Instant;
 
 use serde_json::json;
 
+use super::progress;
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output::{self, Table, fixed, number};
 use crate::control::task_spec::TaskTable;
-use crate::replay::what_if::{WhatIf, what_if};
+use crate::replay::what_if::{Row, WhatIf, what_if};
 
 /// Number of events that are printed.
 const SHOWN: usize = 20;
@@ -24,13 +25,14 @@ pub fn run(path: &Path, table: &TaskTable, set: &[(String, String)], to: Option<
     let mut rows = file.map(BufWriter::new);
     let mut failed = rows.as_mut().and_then(|rows| writeln!(rows, "tick,time,joint,logged,rerun").err());
     let began = Instant::now();
-    let found = what_if(path, table, set, |row| {
+    let each = |row: Row<'_>| {
         if let (Some(rows), None) = (&mut rows, &failed) {
             let cell = |value: f64| if value.is_finite() { format!("{value:?}") } else { String::new() };
             let (logged, rerun) = (cell(row.logged), cell(row.rerun));
             failed = writeln!(rows, "{},{:.9},{},{logged},{rerun}", row.tick, row.time, row.joint).err();
         }
-    });
+    };
+    let found = what_if(path, table, set, each, &mut progress::bar(false));
     let found = found.map_err(|e| Failure::of(Exit::Usage, e))?;
     let ratio = found.length / began.elapsed().as_secs_f64().max(1e-9);
     failed = failed.or_else(|| rows.and_then(|mut rows| rows.flush().err()));

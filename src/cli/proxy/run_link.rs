@@ -15,13 +15,13 @@ use anyhow::Context;
 use nalgebra::Isometry3;
 
 use super::replies::Commands;
+use crate::cli::arguments;
 use crate::cli::exit::Result;
 use crate::joint::Joints;
 use crate::pose::from_xyz_rpy;
 use crate::rpc::api::{Method, Motion, State, Status, Stop};
 use crate::rpc::client::{Client, ClientError, Sender};
 use crate::rpc::report::{ArmReport, ArmStateReport, StatusReport};
-use crate::rpc::run_dir::RunDir;
 use crate::sync::lock;
 
 /// Period of reading the joints.
@@ -228,7 +228,7 @@ pub struct RunLink {
 impl RunLink {
     /// Connects to a run, and returns once an arm's state is known.
     pub fn open(run: &str, arm: &str, streams: [Option<String>; 2]) -> Result<Self> {
-        let connect = || Client::find(&RunDir::standard(), Some(run));
+        let connect = || arguments::connect(Some(run));
         let shared = Arc::new(Shared::new(arm, streams));
         let (mut state, mut urgent, mut replies) = (connect()?, connect()?, connect()?);
         read_state(&mut state, &shared)?;

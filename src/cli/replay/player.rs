@@ -123,6 +123,19 @@ impl Pace {
     }
 }
 
+/// Waits before a log plays. Returns `None` to play, and otherwise whether it was interrupted.
+pub fn delay(by: Duration, time: &mut dyn Waiting) -> Option<bool> {
+    let until = time.time().after(by);
+    loop {
+        match time.wait(Some(until)) {
+            None => return None,
+            Some(Key::End { interrupted }) => return Some(interrupted),
+            // There is nothing to pause yet.
+            Some(_) => {}
+        }
+    }
+}
+
 /// Plays a part of a log.
 pub fn play(
     log: &mut LogReader,
@@ -320,6 +333,16 @@ mod tests {
         assert_eq!(seen.iter().map(|(_, at)| *at).collect::<Vec<_>>(), [0, 100, 190, 281]);
         let (seen, end) = typed(true, &[(20, Key::End { interrupted: true })]);
         assert!(seen.is_empty() && end.interrupted);
+    }
+
+    #[test]
+    fn a_delay_is_waited_for_unless_a_key_ends_it() {
+        let delayed = |keys: &[(u64, Key)]| {
+            let mut time = Typed { clock: VirtualClock::default(), keys: keys.to_vec() };
+            (delay(Duration::from_millis(500), &mut time), time.clock.now().0 / 1_000_000)
+        };
+        assert_eq!(delayed(&[(100, Key::Pause), (200, Key::Faster(true))]), (None, 500));
+        assert_eq!(delayed(&[(300, Key::End { interrupted: true })]), (Some(true), 300));
     }
 
     #[test]

@@ -13,11 +13,11 @@ use super::super::model::chain::end_of_arm;
 use super::super::model::{self, With};
 use super::super::output;
 use crate::blueprint::{Blueprint, Catalog, Overrides, Summary};
-use crate::collision::scene::{Unchecked, unchecked};
 use crate::collision::{ExactChecker, Resolution};
 use crate::joint::JointLimits;
 use crate::planning::config::{ObjectConfig, PlannerConfig, RobotConfig};
-use crate::planning::planning_scene::{PlannedRobot, PlanningScene};
+use crate::planning::ignored_pairs::IgnoredPair;
+use crate::planning::planning_scene::PlanningScene;
 use crate::pose::to_xyz_rpy;
 use crate::robot::kinematics::pose;
 use crate::robot::urdf::Meshes;
@@ -161,7 +161,9 @@ impl Posed {
     /// Returns the pairs of links that are never checked, each with the reason.
     fn ignored(&self) -> Vec<[String; 3]> {
         let Ok((setup, _)) = &self.setup else { return Vec::new() };
-        setup.robots.iter().flat_map(|robot| ignored(robot, setup)).collect()
+        let robots: Vec<usize> = (0..setup.robots.len()).collect();
+        let pairs = setup.ignored_pairs(&setup.world, &robots).into_iter();
+        pairs.map(|IgnoredPair { links: [a, b], reason }| [a, b, reason]).collect()
     }
 }
 
@@ -222,35 +224,6 @@ fn alone(robot: &ShownRobot, name: String) -> Result<RobotConfig> {
         max_jerk: None,
         named_poses: BTreeMap::new(),
     })
-}
-
-fn ignored(robot: &PlannedRobot, setup: &PlanningScene) -> Vec<[String; 3]> {
-    let (body, name) = (&robot.body, &robot.config.name);
-    let disabled = load(&Source { meshes: Meshes::Ignore, ..robot.config.source() }).semantics.disabled;
-    let links: Vec<usize> =
-        (0..body.solids.len()).filter(|link| body.solids.get(*link).is_some_and(|s| !s.is_empty())).collect();
-    let link = |index: usize| body.model.links.get(index).map_or("", |link| link.name.as_str());
-    let mut pairs = Vec::new();
-    for (number, b) in links.iter().enumerate() {
-        for a in links.iter().take(number) {
-            let (first, second) = (link(*a), link(*b));
-            let is = |x: &str, y: &str| (x == first && y == second) || (x == second && y == first);
-            let always = || setup.always_touching.iter().any(|(own, [x, y])| own == name && is(x, y));
-            let reason = match unchecked(body, *a, *b) {
-                None => continue,
-                Some(Unchecked::Fixed) => "fixed to each other".to_owned(),
-                Some(Unchecked::Neighbours) => "neighbours".to_owned(),
-                Some(Unchecked::Allowed) => match disabled.iter().find(|pair| is(&pair.a, &pair.b)) {
-                    Some(pair) => format!("SRDF: {}", pair.reason),
-                    None if always() => "touch in every configuration".to_owned(),
-                    None => "collision_exclusion_pairs of the blueprint".to_owned(),
-                },
-            };
-            let full = |link: &str| if name.is_empty() { link.to_owned() } else { format!("{name}/{link}") };
-            pairs.push([full(first), full(second), reason]);
-        }
-    }
-    pairs
 }
 
 #[cfg(test)]

@@ -85,7 +85,7 @@ impl ArmControl {
     }
 
     /// Keeps the command that leaves the tick, to know later what was written.
-    pub(super) fn issue(&mut self, now: Mono) {
+    pub fn issue(&mut self, now: Mono) {
         let Some(mode) = self.command.mode else { return };
         let mut issued = Issued { seq: self.command.seq, at: now, position: [0.0; MAX_DOF], velocity: [0.0; MAX_DOF] };
         let out = issued.position.iter_mut().zip(&mut issued.velocity);

@@ -105,7 +105,7 @@ impl ArmControl {
 
     /// Returns the lowest and highest position that each joint may have when a velocity command takes effect [rad]: the
     /// measurement is old, and the joint still follows earlier commands.
-    fn ahead(&self, dt: f64) -> Option<[(f64, f64); MAX_DOF]> {
+    pub(super) fn ahead(&self, dt: f64) -> Option<[(f64, f64); MAX_DOF]> {
         let state = self.feedback.state();
         let range = self.tracking.range(state)?;
         let age = self.feedback.freshness().age;

@@ -9,6 +9,7 @@
 
 mod delivery;
 mod follow;
+mod guarded;
 mod led;
 mod rest;
 
@@ -43,6 +44,8 @@ pub struct ArmControl {
     /// Its phase.
     pub failsafe: Failsafe,
     limiters: Vec<Limiter>,
+    /// The limiters before the requests of this tick.
+    before: Vec<Limiter>,
     /// The limit that changed the joint's command in the last tick.
     limited: Vec<Option<LimitKind>>,
     command: ArmCommand,
@@ -99,8 +102,10 @@ impl ArmControl {
                 at(&l.acceleration_max, crate::joint::DEFAULT_ACCELERATION),
             )
         };
+        let limiters: Vec<Limiter> = (0..config.dof).map(|j| Limiter::new(bound(j))).collect();
         Self {
-            limiters: (0..config.dof).map(|j| Limiter::new(bound(j))).collect(),
+            before: limiters.clone(),
+            limiters,
             limited: vec![None; config.dof],
             feedback: Feedback::new(&config),
             tracking: Tracking::new(&config, period),
@@ -256,8 +261,8 @@ impl ArmControl {
         self.command.gripper_seq = self.command.gripper_seq.wrapping_add(1);
     }
 
-    /// Makes the arm's next command. `ask` gives the request to each of its joints; `report` gets the joint, the limit
-    /// and the request whenever a limit begins to change a command.
+    /// Makes the arm's next command, to be [issued](Self::issue). `ask` gives the request to each of its joints;
+    /// `report` gets the joint, the limit and the request whenever a limit begins to change a command.
     pub fn route(
         &mut self,
         demand: Demand,
@@ -276,7 +281,8 @@ impl ArmControl {
         let foreign = held && self.failsafe.cause().is_foreign();
         self.rest.enter(held, foreign);
         self.check_gap(now);
-        let routed = match phase {
+        self.before.copy_from_slice(&self.limiters);
+        match phase {
             Phase::Unknown | Phase::Disabled => {
                 self.command.mode = None;
                 Routed::NotReady
@@ -308,9 +314,7 @@ impl ArmControl {
                 Routed::NotReady
             }
             Phase::Ready => self.follow(demand, ask, dt, report),
-        };
-        self.issue(now);
-        routed
+        }
     }
 
     /// Returns the cause of the latched hold for a refusal.

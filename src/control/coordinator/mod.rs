@@ -2,6 +2,7 @@
 //! sleeps nor does I/O, takes no lock, allocates and frees nothing. The same states, requests and times give the same
 //! commands, bit for bit.
 
+mod guarding;
 mod requests;
 mod tick_output;
 
@@ -10,6 +11,7 @@ use std::time::Duration;
 use super::arbitrate::Arbiter;
 use super::arm_control::{ArmControl, JointRequest, Routed};
 use super::config::CoordinatorConfig;
+use super::guard::Guard;
 use super::limit::Refusal;
 use super::request::Envelope;
 use super::speed_override::SpeedOverride;
@@ -49,6 +51,7 @@ pub struct Coordinator {
     speed: SpeedOverride,
     shutting_down: bool,
     started: bool,
+    guard: Guard,
     output: TickOutput,
 }
 
@@ -66,12 +69,13 @@ impl Coordinator {
             .collect();
         let priorities: Vec<i32> = tasks.iter().map(|t| t.priority).collect();
         // Each request has an outcome and may change a task; arms, tasks and joints report a few events at most.
-        let events = 2 * REQUESTS_PER_TICK + 4 * (arms.len() + tasks.len()) + arm_of.len();
+        let events = 2 * REQUESTS_PER_TICK + 6 * (arms.len() + tasks.len()) + arm_of.len();
         Self {
             period: 1.0 / config.rate,
             period_ns: Duration::from_secs_f64(1.0 / config.rate).as_nanos().max(1) as u64,
             arbiter: Arbiter::new(&priorities, arm_of.clone(), arms.len()),
             joints: vec![JointView::default(); arm_of.len()],
+            guard: Guard::new(arms.len()),
             output: TickOutput::new(arms.len(), tasks.len(), events, 2 * tasks.len() + REQUESTS_PER_TICK),
             arms,
             tasks,
@@ -285,6 +289,7 @@ impl Coordinator {
                 time.next,
                 |j, kind, asked| output.report(Event::Limited((first + j) as u16, kind, asked)),
             );
+            self.guard.note(i, routed == Routed::Sent);
             if routed != Routed::Sent {
                 for joint in first..first + dof {
                     if let Some((task, _)) = arbiter.winner(joint)
@@ -305,6 +310,8 @@ impl Coordinator {
                 self.refuse(i, first + j, refusal, time.now);
             }
         }
+        self.guard();
+        self.arms.iter_mut().for_each(|arm| arm.issue(time.now));
     }
 
     /// Ends the task whose request was refused with a fault, and holds the arm.
@@ -335,7 +342,10 @@ impl Coordinator {
         }
         for (view, task) in self.output.tasks.iter_mut().zip(&self.tasks) {
             *view = task.view();
-            if view.bound == Bound::None && task.granted && task.is_active() {
+            let guarded = |joint: &u16| self.guard.blocked(self.arm_of.get(usize::from(*joint)).copied()?);
+            if let Some(pair) = task.moving_joints().iter().find_map(guarded).filter(|_| task.is_active()) {
+                view.bound = Bound::Guard(pair);
+            } else if view.bound == Bound::None && task.granted && task.is_active() {
                 let limited = |joint: &u16| self.arms.iter().find_map(|arm| arm.limited(usize::from(*joint)));
                 view.bound = task.moving_joints().iter().find_map(limited).unwrap_or_default();
             }

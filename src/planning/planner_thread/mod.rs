@@ -18,8 +18,8 @@ use super::planning_scene::PlanningScene;
 use super::reach::{Reached, reach};
 use super::revalidate::revalidate;
 use super::unplanned_joints::Measured;
-use crate::collision::Stop;
 use crate::collision::world::World;
+use crate::collision::{Scene, Stop};
 use crate::sync::lock;
 use worker::{Shared, WorkItem, Worker};
 
@@ -110,6 +110,14 @@ impl PlannerThread {
     /// Returns the change count of the world.
     pub fn version(&self) -> u64 {
         lock(&self.world).1
+    }
+
+    /// Returns the present world with the robots as they are now, and its change count.
+    pub fn snapshot(&self) -> (Arc<Scene>, u64) {
+        let now = lock(&self.now);
+        let world = lock(&self.world);
+        let robots = now.robots.iter().map(|robot| robot.body.clone()).collect();
+        (world.0.with_robots(robots).snapshot(), world.1)
     }
 
     /// Begins request `id`. It ends after `timeout`, or the planner's default timeout.

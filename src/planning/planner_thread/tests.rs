@@ -4,6 +4,7 @@ use nalgebra::Isometry3;
 
 use super::*;
 use crate::planning::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
+use crate::planning::level::Level;
 use crate::planning::pipeline::Goal;
 
 const HOME: [f64; 6] = [0.0, -0.3, 0.6, 0.0, 0.8, 0.0];
@@ -38,6 +39,8 @@ fn turn(from: f64, to: f64, seed: u64) -> PlanRequest {
         positions: vec![at(from)],
         speed: 0.5,
         seed,
+        level: Level::default(),
+        refine: 0,
         through: Vec::new(),
         blend: 0.0,
         by_number: false,

@@ -44,7 +44,10 @@ export function header(context: Context): {element: HTMLElement; stop: HTMLEleme
 
 function dataAge({run}: Context): {text: string; level: string} {
   const broken = [run.work, run.watch].find((each) => each.state !== 'open');
-  if (broken?.state === 'refused') return {text: 'refused: open the address that the run prints', level: 'bad'};
+  // The token was right before.
+  if (broken?.state === 'refused') {
+    return {text: 'another run has taken this address: open the one that `dimos view` prints', level: 'bad'};
+  }
   if (broken?.state === 'lost') {
     const wait = broken.retryAt - performance.now();
     const next = broken.retryAt && wait > 0 ? `next attempt in ${(wait / 1000).toFixed(1)} s` : 'reconnecting…';

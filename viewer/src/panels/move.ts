@@ -171,9 +171,9 @@ function showReport(report: HTMLElement, {flow}: Context): void {
   const summary = flow.stage === 'planned' || flow.stage === 'executing' ? flow.preview?.summary : null;
   if (summary) {
     const clearance =
-      summary.clearance === null
+      typeof summary.clearance !== 'number'
         ? ''
-        : ` · clearance ${figure(summary.clearance * 1000, 1)} mm` +
+        : ` · clearance ≥ ${figure(summary.clearance * 1000, 1)} mm` +
           (summary.closest ? ` (${summary.closest.join(' – ')})` : '');
     line('', `${figure(summary.duration, 1)} s · ${figure(summary.length, 2)} rad${clearance}`);
     if (typeof summary.fraction === 'number' && summary.fraction < 1) {

@@ -59,7 +59,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
         check: |address| Endpoint::parse(address, protocol::PORT).map(|endpoint| endpoint.to_string()),
     },
     holds_when_disabled: HOLDS_WHEN_DISABLED,
-    teach: Teach::No("its protocol has no hand guiding, and the arm falls without its motors"),
+    teach: Teach::No("its protocol has no hand guiding, and without its motors its brakes hold it"),
     gripper: true,
     options: OptionsSpec::of::<Options>(),
     check,

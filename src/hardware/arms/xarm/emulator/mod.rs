@@ -151,7 +151,7 @@ impl XArmEmulator {
     ) -> AdapterResult<Self> {
         options.check(&model.limits())?;
         let firmware = options.firmware()?;
-        let (ports, address) = listen(ip, in_process, options.port_503)?;
+        let (ports, address) = listen(WHO, ip, in_process, options.port_503)?;
         let controller = Controller::new(model, firmware, gripper, options, MonotonicClock.now())?;
         let server = TcpServer::with_ports("xarm", controller, ports, CLIENTS).map_err(cannot_serve)?;
         Ok(Self { server, address })
@@ -248,7 +248,7 @@ impl<A: ControlledArm> ControlBox<A> {
     /// address.
     pub fn start(model: Model, gripper: GripperKind, arm: A, ip: IpAddr) -> AdapterResult<Self> {
         let ip = EmulatorAddress::Bind(ip).tcp(CONTROL_PORT)?.ip();
-        let (ports, address) = listen(ip, false, true)?;
+        let (ports, address) = listen("xArm control box", ip, false, true)?;
         let firmware = SimOptions::default().firmware()?;
         let controller = Controller::around(introduce(model), firmware, gripper, arm);
         let server = TcpServer::with_ports("xarm", controller, ports, CLIENTS).map_err(cannot_serve)?;
@@ -274,17 +274,17 @@ fn cannot_serve(error: io::Error) -> AdapterError {
 }
 
 /// Listens at the arm's own ports, or at free ones. Returns the ports and their address.
-fn listen(ip: IpAddr, free: bool, second: bool) -> AdapterResult<(Vec<(TcpListener, Port)>, String)> {
+fn listen(who: &str, ip: IpAddr, free: bool, second: bool) -> AdapterResult<(Vec<(TcpListener, Port)>, String)> {
     let (control, reports) = if free {
         let free = |_| {
             let control = ports_in_a_row(ip, 0, 1 + u16::from(second)).ok()?;
             Some((control, ports_in_a_row(ip, 0, REPORT_PORTS).ok()?))
         };
         let found = (0..ATTEMPTS).find_map(free);
-        found.ok_or_else(|| AdapterError::Io(format!("{WHO}: no free ports at {ip}")))?
+        found.ok_or_else(|| AdapterError::Io(format!("{who}: no free ports at {ip}")))?
     } else {
         let at = |first, count| {
-            let failed = |e: io::Error| cannot_listen(WHO, SocketAddr::new(ip, first), &e);
+            let failed = |e: io::Error| cannot_listen(who, SocketAddr::new(ip, first), &e);
             ports_in_a_row(ip, first, count).map_err(failed)
         };
         (at(CONTROL_PORT, 1 + u16::from(second))?, at(REPORT_PORT, REPORT_PORTS)?)

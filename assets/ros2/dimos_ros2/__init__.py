@@ -1,0 +1,1 @@
+"""A run of dimos as a node of ROS 2."""

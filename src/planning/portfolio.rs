@@ -1,0 +1,149 @@
+//! Several searches for one path, a quantum of each in turn: with long and with short edges; with edges that are
+//! checked at samples only, which is quick, and with proven ones, which reach where covers are too thick. Whichever
+//! finds a path first by the count of edges, not by time: the same request gives the same path.
+
+use crate::collision::checker::{CollisionChecker, Stop};
+
+use super::level::Level;
+use super::path::Path;
+use super::rrt_connect::{Quantum, RrtSettings, Search, SearchCount};
+
+/// Why a search ended without a path.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Ended {
+    /// Stopped by its deadline or a cancel.
+    Stopped,
+    /// Reached its maximum number of samples or nodes.
+    Exhausted,
+}
+
+/// A path that was found.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Candidate {
+    /// Its configurations.
+    pub path: Path,
+    /// Whether every edge is proven.
+    pub proven: bool,
+}
+
+/// Edges that each search checks in its first turn; twice as many in each further one.
+const FIRST_QUANTUM: u64 = 256;
+/// A proven edge takes about as long as this number of edges that look free or not.
+const PROOF_COST: u64 = 4;
+/// The turns become no longer after this number of doublings.
+const DOUBLINGS: u32 = 6;
+
+/// Which edges a search may use.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Edges {
+    /// Those that look free.
+    Looking,
+    /// Those that look free and are easily proven.
+    Checked,
+    /// Those that are proven, also where covers touch.
+    Proven,
+}
+
+/// The searches.
+#[derive(Debug, Clone)]
+pub struct Portfolio {
+    start: Vec<f64>,
+    goals: Vec<Vec<f64>>,
+    members: Vec<Member>,
+    settings: RrtSettings,
+    turn: usize,
+    round: u32,
+    /// Statistics of searches that ended.
+    ended: SearchCount,
+}
+
+#[derive(Debug, Clone)]
+struct Member {
+    range: f64,
+    seed: u64,
+    edges: Edges,
+    /// Prepared at its first turn.
+    search: Option<Search>,
+}
+
+impl Portfolio {
+    /// Prepares the searches from `start` to any of `goals`; all of them must be free.
+    pub fn new(start: &[f64], goals: &[Vec<f64>], settings: &RrtSettings, level: Level, seed: u64) -> Self {
+        let mut members = Vec::new();
+        for edges in [Edges::Looking, Edges::Proven] {
+            if (level == Level::Fast && edges == Edges::Proven) || (level == Level::Exact && edges == Edges::Looking) {
+                continue;
+            }
+            for (number, range) in (0..).zip(settings.ranges) {
+                let seed = if number == 0 { seed } else { seed.rotate_left(32) + number };
+                members.push(Member { range, seed, edges, search: None });
+            }
+        }
+        Self {
+            start: start.to_vec(),
+            goals: goals.to_vec(),
+            members,
+            settings: *settings,
+            turn: 0,
+            round: 0,
+            ended: SearchCount::default(),
+        }
+    }
+
+    /// Returns the statistics of all searches.
+    pub fn count(&self) -> SearchCount {
+        let counts = self.members.iter().filter_map(|member| member.search.as_ref().map(Search::count));
+        counts.fold(self.ended, |sum, count| SearchCount {
+            samples: sum.samples + count.samples,
+            nodes: sum.nodes + count.nodes,
+        })
+    }
+
+    /// Returns the next path. At the next call, the search that found it begins again with proven edges, or has ended
+    /// if they were; the others continue.
+    pub fn next<C: CollisionChecker>(&mut self, checker: &mut C, stop: &Stop) -> Result<Candidate, Ended> {
+        loop {
+            let count = self.count();
+            if stop.is_over() {
+                return Err(Ended::Stopped);
+            }
+            let most = &self.settings;
+            if self.members.is_empty() || count.samples >= most.max_samples || count.nodes >= most.max_nodes {
+                return Err(Ended::Exhausted);
+            }
+            if self.turn >= self.members.len() {
+                self.turn = 0;
+                self.round = (self.round + 1).min(DOUBLINGS);
+            }
+            let Member { range, seed, edges, search } = &mut self.members[self.turn];
+            let (start, goals) = (&self.start, &self.goals);
+            let search = search.get_or_insert_with(|| {
+                Search::new(start, goals, (checker.limits(), checker.turns()), most, *range, *seed)
+            });
+            let checked = *edges;
+            let quantum = Quantum {
+                edges: (FIRST_QUANTUM << self.round) / if checked == Edges::Proven { PROOF_COST } else { 1 },
+                samples: most.max_samples - count.samples,
+                nodes: most.max_nodes - count.nodes,
+            };
+            let mut is_free = |from: &[f64], to: &[f64]| match checked {
+                Edges::Looking => checker.motion_looks_free(from, to),
+                Edges::Checked => checker.motion_looks_free(from, to) && checker.motion_is_easily_free(from, to, stop),
+                Edges::Proven => checker.motion_is_free(from, to, stop),
+            };
+            if let Some(path) = search.run(&mut is_free, quantum, stop) {
+                let count = search.count();
+                self.ended.samples += count.samples;
+                self.ended.nodes += count.nodes;
+                let member = &mut self.members[self.turn];
+                if checked == Edges::Looking {
+                    (member.edges, member.search) = (Edges::Checked, None);
+                } else {
+                    self.members.remove(self.turn);
+                }
+                return Ok(Candidate { path, proven: checked != Edges::Looking });
+            }
+            self.turn += 1;
+        }
+    }
+}

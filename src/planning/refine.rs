@@ -1,0 +1,104 @@
+//! Refinement: a path that was found is made shorter, for as many rounds as are asked for. In turn, another search
+//! tries another way, and random cuts shorten the best path. A search uses samples only where a shorter path may
+//! pass: their distances from start and goal add up to less than the best length (Gammell, Srinivasa and Barfoot,
+//! "Informed RRT*", 2014).
+//!
+//! The rounds are counted, so the same request gives the same path, and more rounds never give a longer one.
+
+use crate::collision::checker::{CollisionChecker, Stop};
+use crate::robot::random::Random;
+
+use super::path::{Path, between, distance, length, tidy};
+use super::path_planner::{PlanSettings, is_proven};
+use super::rrt_connect::{Quantum, Search};
+use super::shortcut::shorten;
+
+/// Cuts that are tried in a round.
+const CUTS: usize = 24;
+/// Effort of a round's search: edges, samples, nodes. A path that is worth it is found quickly or with another seed.
+const EFFORT: Quantum = Quantum { edges: 512, samples: 32_768, nodes: 4096 };
+/// A path is shorter if it is by this [rad].
+const SHORTER: f64 = 1e-6;
+
+/// Makes a free path from its first configuration to any of `goals` shorter. Returns the path and the number of rounds,
+/// at most `settings.refine`; fewer if stopped.
+pub fn refine<C: CollisionChecker>(
+    checker: &mut C,
+    path: Path,
+    goals: &[Vec<f64>],
+    settings: &PlanSettings,
+    stop: &Stop,
+) -> (Path, u32) {
+    let Some(start) = path.first().cloned() else { return (path, 0) };
+    let mut best = path;
+    let mut random = Random::new(settings.seed);
+    for round in 0..settings.refine {
+        // Nothing is shorter than a straight line to the nearest goal.
+        if stop.is_over() || best.len() <= 2 {
+            return (best, round);
+        }
+        let tried = if round % 2 == 0 {
+            cut(checker, &best, &mut random)
+        } else {
+            let range = settings.search.ranges[(round / 2) as usize % settings.search.ranges.len()];
+            let search = (&settings.search, range, random.bits());
+            another(checker, (&start, goals), length(&best), search, settings, stop)
+        };
+        let shorter = tried.filter(|tried| length(tried) < length(&best) - SHORTER);
+        if let Some(shorter) = shorter
+            && is_proven(checker, &shorter, settings.level, stop)
+        {
+            best = shorter;
+        }
+    }
+    (best, settings.refine)
+}
+
+/// Searches for another path that is shorter than `most` [rad].
+fn another<C: CollisionChecker>(
+    checker: &mut C,
+    (start, goals): (&[f64], &[Vec<f64>]),
+    most: f64,
+    (search, range, seed): (&super::rrt_connect::RrtSettings, f64, u64),
+    settings: &PlanSettings,
+    stop: &Stop,
+) -> Option<Path> {
+    let turns = checker.turns().to_vec();
+    let limits = checker.limits().to_vec();
+    let mut search = Search::new(start, goals, (&limits, &turns), search, range, seed).shorter_than(most);
+    let found = search.run(&mut |a, b| checker.motion_looks_free(a, b), EFFORT, stop)?;
+    Some(shorten(&found, &turns, &settings.shortcut, &mut |a, b| checker.motion_looks_free(a, b)))
+}
+
+/// Cuts from random places of a path to others (Geraerts and Overmars, 2007).
+fn cut<C: CollisionChecker>(checker: &mut C, path: &Path, random: &mut Random) -> Option<Path> {
+    let mut path = path.clone();
+    let mut shorter = false;
+    for _ in 0..CUTS {
+        let whole = length(&path);
+        let (a, b) = (random.between(0.0, whole), random.between(0.0, whole));
+        let (first, last) = (place(&path, a.min(b)), place(&path, a.max(b)));
+        if first.0 == last.0 || !checker.motion_looks_free(&first.1, &last.1) {
+            continue;
+        }
+        path.splice(first.0 + 1..=last.0, [first.1, last.1]);
+        path = tidy(&path);
+        shorter = true;
+    }
+    shorter.then_some(path)
+}
+
+/// Returns the configuration of a path after a length [rad], and the index of its edge.
+fn place(path: &Path, after: f64) -> (usize, Vec<f64>) {
+    let mut left = after;
+    for (i, edge) in path.windows(2).enumerate() {
+        let own = distance(&edge[0], &edge[1]);
+        if left <= own || i + 2 == path.len() {
+            let mut at = edge[0].clone();
+            between(&edge[0], &edge[1], if own > 0.0 { (left / own).min(1.0) } else { 0.0 }, &mut at);
+            return (i, at);
+        }
+        left -= own;
+    }
+    (0, path[0].clone())
+}

@@ -1,0 +1,28 @@
+//! Faces of the run to other systems, which the gateway serves: what becomes of them is an event of the run.
+
+use std::sync::atomic::Ordering;
+
+use super::service::Service;
+use crate::rpc::api::FaceReport;
+use crate::telemetry::describe::{Described, Severity};
+
+impl Service {
+    /// Reports that a face of the gateway serves no more, or not at all.
+    pub(super) fn report_face(&self, face: &FaceReport) {
+        let reason = face.reason.as_deref().unwrap_or("no reason is known");
+        let described = Described {
+            kind: "share",
+            severity: Severity::Error,
+            status: "down",
+            text: format!("{} does not serve: {reason}", face.face),
+            arm: None,
+            request: None,
+            task: None,
+            joint: None,
+            values: Vec::new(),
+        };
+        self.parts.dispatcher.log(described.severity, described.text.clone());
+        let tick = self.parts.pulse.ticks.load(Ordering::Relaxed);
+        self.report_event(tick, &described, self.parts.wall);
+    }
+}

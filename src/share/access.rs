@@ -1,0 +1,89 @@
+//! Rules of access for zenoh: who may send and receive which keys. What is not allowed is denied, before it reaches any
+//! code of ours. The classes of requests are checked in [`class`](super::class), which can answer with the reason.
+
+use serde_json::{Value, json};
+
+use super::class::role_of;
+use super::{keys, python_dimos};
+use crate::blueprint::share::{ANYONE, ShareConfig};
+
+/// Returns the rules of a run's gateway.
+///
+/// A rule lets a message pass if its key includes that of the message. So the rules for what the gateway itself
+/// declares, with wildcards, are wide, and those for what clients send name the client's user.
+pub fn control(run: &str, config: &ShareConfig) -> Value {
+    let mut rules = vec![
+        rule("list", "ingress", &["declare_liveliness_subscriber", "liveliness_query"], &[keys::alive("*")]),
+        rule("streams", "ingress", &["declare_subscriber"], &[keys::stream(run, "**")]),
+        rule("read", "egress", &["put", "liveliness_token", "reply"], &[keys::stream(run, "**"), keys::alive(run)]),
+        rule(
+            "serve",
+            "egress",
+            &["declare_queryable", "reply", "declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"],
+            &[format!("dimos/{run}/**")],
+        ),
+    ];
+    if let Some(face) = &config.python_dimos {
+        let (streams, calls) = (python_dimos::streams(face), python_dimos::calls(face));
+        let served = ["put", "reply", "declare_queryable"];
+        rules.push(rule("python_dimos", "egress", &served, &[streams.clone(), calls]));
+        rules.push(rule("python_dimos states", "ingress", &["declare_subscriber"], &[streams]));
+    }
+    let (mut subjects, mut policies) = (Vec::new(), Vec::new());
+    let mut users: Vec<&str> = config.users.keys().map(String::as_str).collect();
+    // Someone without a certificate comes by tcp only; then the role of `-` is that of an observer, unless given.
+    let open = config.listen.iter().chain(&config.connect).any(|endpoint| !endpoint.tls);
+    users.retain(|user| *user != ANYONE);
+    if open {
+        users.push(ANYONE);
+    }
+    for user in users {
+        let (from, to, asks) = (format!("from {user}"), format!("to {user}"), format!("asks {user}"));
+        rules.push(rule(&from, "ingress", &["declare_subscriber"], &[format!("dimos/{run}/to/{user}/**")]));
+        rules.push(rule(&to, "egress", &["put"], &[format!("dimos/{run}/to/{user}/**")]));
+        let sent = ["query", "put", "liveliness_token"];
+        rules.push(rule(&asks, "ingress", &sent, &[format!("dimos/{run}/by/{user}/**")]));
+        subjects.push(match user {
+            ANYONE => json!({"id": user, "link_protocols": ["tcp"]}),
+            _ => json!({"id": user, "link_protocols": ["tls"], "cert_common_names": [user]}),
+        });
+        let mut own = vec!["list".to_owned(), "streams".into(), "read".into(), "serve".into(), from, to, asks];
+        if let (Some(face), Some(role)) = (&config.python_dimos, role_of(user, config)) {
+            let calls = format!("python_dimos of {user}");
+            let keys = python_dimos::calls_of(role, config, face);
+            rules.push(rule(&calls, "ingress", &["query"], &keys));
+            own.extend([calls, "python_dimos".into(), "python_dimos states".into()]);
+        }
+        policies.push(json!({"rules": own, "subjects": [user]}));
+    }
+    json!({"access_control": {
+        "enabled": true, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies,
+    }})
+}
+
+/// Returns the rules of a session that talks to programs on this computer only.
+pub fn this_computer_only() -> Value {
+    let messages = [
+        "put",
+        "delete",
+        "declare_subscriber",
+        "query",
+        "declare_queryable",
+        "reply",
+        "liveliness_token",
+        "declare_liveliness_subscriber",
+        "liveliness_query",
+    ];
+    let both = json!({
+        "id": "all", "permission": "allow", "flows": ["ingress", "egress"], "messages": messages, "key_exprs": ["**"],
+    });
+    json!({"access_control": {
+        "enabled": true, "default_permission": "deny", "rules": [both],
+        "subjects": [{"id": "here", "interfaces": ["lo"]}],
+        "policies": [{"rules": ["all"], "subjects": ["here"]}],
+    }})
+}
+
+fn rule(id: &str, flow: &str, messages: &[&str], key_exprs: &[String]) -> Value {
+    json!({"id": id, "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": key_exprs})
+}

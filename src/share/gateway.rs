@@ -1,0 +1,433 @@
+//! The gateway: a client of a run's socket that gives it to other computers.
+//!
+//! ```text
+//!  client ─ zenoh ─▶ queryable: key, role, form ─▶ Remote: a connection per client, one more for stop, cancel ─▶ run
+//!         ◀─ streams that everyone may read, read once ────────────────────────────────────────────────────── run
+//! ```
+//!
+//! The run sees clients of its socket and nothing else: their leases are those of their connections, which this process
+//! closes when a client is lost. It decides nothing that the run decides.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::io::{self, BufRead, BufReader, Write};
+use std::os::unix::net::UnixStream;
+use std::path::PathBuf;
+use std::sync::atomic::Ordering;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, SyncSender, channel, sync_channel};
+use std::sync::{Arc, Mutex, Weak};
+use std::time::{Duration, Instant};
+
+use serde_json::{Value, json};
+use zenoh::qos::{CongestionControl, Priority};
+use zenoh::query::Query;
+use zenoh::sample::{Sample, SampleKind};
+use zenoh::{Session, Wait};
+
+use super::class::{Class, PAGE, permit};
+use super::keys::{self, Who};
+use super::page::Pages;
+use super::remote::{Closed, Remote, Request, Ways, refuse};
+use super::{certificates, python_dimos, settings, streams};
+use crate::blueprint::share::{OnLost, ShareConfig};
+use crate::rpc::api::{FaceReport, Lease, MAX_ANSWER, MAX_LINE, METHODS, Method, PlannerAnswer, RegisterGateway};
+use crate::rpc::error::{Code, RpcError};
+use crate::sync::lock;
+
+/// Period of the checks of the clients.
+const PERIOD: Duration = Duration::from_millis(50);
+/// A client without a token is forgotten after this silence.
+const FORGET_AFTER: Duration = Duration::from_secs(10);
+/// Lost commanders that are remembered.
+const MAX_LOST: usize = 256;
+/// Time for the last answers to clients when the run has ended.
+const LAST_ANSWERS: Duration = Duration::from_millis(200);
+/// Time from the message that the run has ended to the end of the session.
+const END_LEAD: Duration = Duration::from_millis(50);
+/// Refusals that may wait to be sent.
+const MAX_REFUSED: usize = 1024;
+/// Room for the rest of a line beside the params [bytes].
+const ENVELOPE: usize = 256;
+
+/// A running gateway.
+pub struct Gateway {
+    shared: Arc<Shared>,
+    /// What happens: the clients have changed, or the run has ended.
+    news: Receiver<News>,
+    control: UnixStream,
+    /// The face to Python dimos, or why it does not serve.
+    python_dimos: Option<Result<python_dimos::Face, RpcError>>,
+    /// Declarations; they end with it.
+    _declared: Vec<Box<dyn Send>>,
+}
+
+/// What the gateway's loop reacts to.
+enum News {
+    Clients,
+    Faces,
+    RunEnded,
+}
+
+struct Shared {
+    run: String,
+    socket: PathBuf,
+    config: ShareConfig,
+    session: Session,
+    news: Sender<News>,
+    clients: Mutex<BTreeMap<Who, Arc<Remote>>>,
+    /// Commanders whose leases ended because they were silent.
+    lost: Mutex<VecDeque<Who>>,
+    pages: Pages,
+    refused: SyncSender<(Query, RpcError)>,
+}
+
+impl Gateway {
+    /// Starts the gateway of a run. Fails if the run has another one.
+    pub fn start(run: &str, socket: PathBuf, config: ShareConfig) -> Result<Self, RpcError> {
+        if let Some((what, hint)) = config.mistake() {
+            return Err(RpcError::new(Code::InvalidParams, what).hint(hint));
+        }
+        if let Some(soon) = certificates::check_gateway(&config)? {
+            tracing::warn!("share: {soon}");
+        }
+        let mut control = UnixStream::connect(&socket).map_err(|e| failed(format!("run {run}: {e}")))?;
+        let endpoints = config.listen.iter().chain(&config.connect).map(ToString::to_string).collect();
+        register(&mut control, &RegisterGateway { endpoints, ..RegisterGateway::default() })
+            .map_err(|e| failed(e.to_string()))?;
+        let mut replies = BufReader::new(control.try_clone().map_err(|e| failed(e.to_string()))?);
+        accepted(&mut replies)?;
+
+        let (news, received) = channel();
+        let settings = settings::of_gateway(run, &config)?;
+        let places: Vec<String> = config.listen.iter().map(ToString::to_string).collect();
+        let session = zenoh::open(settings).wait().map_err(|error| {
+            tracing::debug!("share: {error}");
+            let text = format!("cannot listen at {}", places.join(", "));
+            RpcError::new(Code::Unreachable, text).hint("another program may have the port, or the address is not ours")
+        })?;
+        let pages = Pages::start(run, &socket).map_err(|e| failed(e.to_string()))?;
+        let (refused, refusing) = sync_channel::<(Query, RpcError)>(MAX_REFUSED);
+        std::thread::Builder::new()
+            .name("share-refuse".into())
+            .spawn(move || refusing.into_iter().for_each(|(query, error)| refuse(&query, &error)))
+            .map_err(|e| failed(e.to_string()))?;
+        let shared = Arc::new(Shared {
+            run: run.to_owned(),
+            socket,
+            config,
+            session,
+            news: news.clone(),
+            clients: Mutex::default(),
+            lost: Mutex::default(),
+            pages,
+            refused,
+        });
+        std::thread::Builder::new()
+            .name("run-end".into())
+            .spawn(move || {
+                // Replies to what is registered; then the end of the connection.
+                let _ = io::copy(&mut replies, &mut io::sink());
+                let _ = news.send(News::RunEnded);
+            })
+            .map_err(|e| failed(e.to_string()))?;
+        let declared = shared.declare().map_err(|e| failed(e.to_string()))?;
+        let face = shared.config.python_dimos.as_ref().map(|config| {
+            let (run, news) = ((shared.run.as_str(), shared.socket.clone()), shared.news.clone());
+            python_dimos::Face::start(run, &shared.session, &shared.config, config, move || {
+                let _ = news.send(News::Faces);
+            })
+        });
+        if let Some(Err(error)) = &face {
+            tracing::error!("share: {error}");
+        }
+        let _ = shared.news.send(News::Faces);
+        Ok(Self { shared, news: received, control, python_dimos: face, _declared: declared })
+    }
+
+    /// Returns why a face does not serve; `None`: all do.
+    pub fn face_error(&self) -> Option<&RpcError> {
+        self.python_dimos.as_ref().and_then(|face| face.as_ref().err())
+    }
+
+    fn faces(&self) -> Vec<FaceReport> {
+        let report = |face: &Result<python_dimos::Face, RpcError>| match face {
+            Ok(face) => Some(face.report()),
+            Err(error) => {
+                let hint = error.hint.as_ref().map(|hint| format!(" (hint: {hint})")).unwrap_or_default();
+                let config = self.shared.config.python_dimos.as_ref()?;
+                Some(python_dimos::report(config, Some(format!("{}{hint}", error.message))))
+            }
+        };
+        self.python_dimos.iter().filter_map(report).collect()
+    }
+
+    /// Serves until the run ends.
+    pub fn serve(mut self) {
+        loop {
+            match self.news.recv_timeout(PERIOD) {
+                Ok(News::RunEnded) => break,
+                Ok(News::Clients | News::Faces) => {
+                    let (endpoints, clients) = (self.shared.endpoints(), self.shared.titles());
+                    let gateway = RegisterGateway { endpoints, clients, faces: self.faces() };
+                    if register(&mut self.control, &gateway).is_err() {
+                        break;
+                    }
+                }
+                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => break,
+            }
+            self.shared.look_after_clients();
+        }
+        self.say_that_the_run_has_ended();
+        self._declared.clear();
+        self.python_dimos.take();
+        let _ = self.shared.session.close().wait();
+    }
+
+    /// Sends it to all clients, and answers what they have asked.
+    fn say_that_the_run_has_ended(&self) {
+        let shared = &self.shared;
+        let clients: Vec<Arc<Remote>> = lock(&shared.clients).values().cloned().collect();
+        clients.iter().for_each(|remote| remote.close(Closed::RunEnded));
+        let end = shared.session.put(keys::end(&shared.run), "").priority(Priority::RealTime);
+        let _ = end.congestion_control(CongestionControl::Block).express(true).wait();
+        let began = Instant::now();
+        while clients.iter().any(|remote| !remote.has_ended()) && began.elapsed() < LAST_ANSWERS {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        // The end of the declarations would overtake it, and look like a loss.
+        std::thread::sleep(END_LEAD.saturating_sub(began.elapsed()));
+    }
+}
+
+impl Shared {
+    fn declare(self: &Arc<Self>) -> zenoh::Result<Vec<Box<dyn Send>>> {
+        let mut declared: Vec<Box<dyn Send>> = Vec::new();
+        let weak: Weak<Self> = Arc::downgrade(self);
+        let requests = self.session.declare_queryable(keys::requests(&self.run));
+        let at_request = weak.clone();
+        declared.push(Box::new(
+            requests
+                .callback(move |query| {
+                    if let Some(shared) = at_request.upgrade() {
+                        shared.receive(query);
+                    }
+                })
+                .wait()?,
+        ));
+        let tokens = self.session.liveliness().declare_subscriber(keys::client(&self.run, "*", "*")).history(true);
+        let at_token = weak.clone();
+        declared.push(Box::new(
+            tokens
+                .callback(move |sample| {
+                    if let Some(shared) = at_token.upgrade() {
+                        shared.see_token(&sample);
+                    }
+                })
+                .wait()?,
+        ));
+        let beats = self.session.declare_subscriber(keys::beat(&self.run, "*", "*"));
+        declared.push(Box::new(
+            beats
+                .callback(move |sample| {
+                    if let Some(shared) = weak.upgrade() {
+                        shared.see_beat(&sample);
+                    }
+                })
+                .wait()?,
+        ));
+        declared.extend(streams::publish(&self.session, &self.run, &self.socket)?);
+        // Last: who sees it can ask.
+        declared.push(Box::new(self.session.liveliness().declare_token(keys::alive(&self.run)).wait()?));
+        Ok(declared)
+    }
+
+    fn endpoints(&self) -> Vec<String> {
+        self.config.listen.iter().chain(&self.config.connect).map(ToString::to_string).collect()
+    }
+
+    fn titles(&self) -> Vec<String> {
+        lock(&self.clients).values().map(|remote| remote.title()).collect()
+    }
+
+    /// Takes a request, or refuses it. Never waits.
+    fn receive(&self, query: Query) {
+        match self.checked(&query) {
+            Ok((_, _, method, params, _)) if method == PAGE => {
+                if let Some((query, error)) = self.pages.queue(query, params) {
+                    self.refuse(query, error);
+                }
+            }
+            Ok((who, class, method, params, bytes)) => match self.client(&who) {
+                Ok(remote) => {
+                    remote.is_alive();
+                    if class == Class::End {
+                        tracing::warn!("share: {method} by {}", remote.title());
+                    }
+                    remote.queue(Request { query, class, method, params, bytes });
+                }
+                Err(error) => self.refuse(query, error),
+            },
+            Err(error) => self.refuse(query, error),
+        }
+    }
+
+    /// Refuses a request on a separate thread: this one receives and sends everything, and must not wait. Beyond what
+    /// may wait there, a request gets no reply.
+    fn refuse(&self, query: Query, error: RpcError) {
+        let _ = self.refused.try_send((query, error));
+    }
+
+    fn checked(&self, query: &Query) -> Result<(Who, Class, String, Value, usize), RpcError> {
+        let key = query.key_expr().as_str();
+        let Some((who, class, method)) = Who::of_request(key, &self.run) else {
+            let text = "the key names no client, class and method, or several";
+            return Err(RpcError::new(Code::Malformed, text).hint("docs/many-machines.md lists the keys"));
+        };
+        match Class::of(method) {
+            None => return Err(RpcError::unknown(Code::UnknownMethod, "method", method, METHODS)),
+            Some(right) if right != class => {
+                let text = format!("`{method}` is of the class {}, not {}", right.name(), class.name());
+                return Err(RpcError::new(Code::Malformed, text));
+            }
+            Some(_) => permit(&who.user, method, class, &self.config)?,
+        }
+        if query.attachment().is_some() || !query.parameters().is_empty() {
+            return Err(RpcError::new(Code::Malformed, "a request has no attachment and no parameters in its key"));
+        }
+        let bytes = query.payload().map_or(0, |payload| payload.len());
+        let limit = if method == PlannerAnswer::NAME { MAX_ANSWER } else { MAX_LINE } - ENVELOPE;
+        if bytes > limit {
+            let error = RpcError::new(Code::TooLarge, format!("the request has {bytes} bytes (limit {limit})"));
+            return Err(error.hint("send less at once"));
+        }
+        let payload = query.payload().map(|payload| payload.to_bytes()).unwrap_or_default();
+        let params = match payload.is_empty() {
+            true => Value::Null,
+            false => serde_json::from_slice(&payload)
+                .map_err(|e| RpcError::new(Code::Malformed, format!("not JSON: {e}")))?,
+        };
+        if !params.is_object() && !params.is_null() {
+            return Err(RpcError::new(Code::Malformed, "the payload is not a JSON object with the parameters"));
+        }
+        self.still_commands(&who, method, class)?;
+        Ok((who, class, method.to_owned(), params, bytes))
+    }
+
+    /// Fails for a commander that was lost, until it takes its lease again.
+    fn still_commands(&self, who: &Who, method: &str, class: Class) -> Result<(), RpcError> {
+        let mut lost = lock(&self.lost);
+        if !lost.contains(who) || !matches!(class, Class::Move | Class::Enable) {
+            return Ok(());
+        }
+        if method == Lease::NAME {
+            lost.retain(|other| other != who);
+            return Ok(());
+        }
+        let timeout = self.config.client_timeout;
+        let text = format!("the lease has ended: this client was silent for more than {timeout} s");
+        Err(RpcError::new(Code::Lost, text).hint("take the lease again with `lease`, or start the program again"))
+    }
+
+    /// Returns a client; a new one gets its connections.
+    fn client(&self, who: &Who) -> Result<Arc<Remote>, RpcError> {
+        let mut clients = lock(&self.clients);
+        clients.retain(|_, remote| !remote.is_closed());
+        if let Some(remote) = clients.get(who) {
+            return Ok(remote.clone());
+        }
+        let limit = self.config.max_clients;
+        if clients.len() >= limit {
+            let error = RpcError::new(Code::TooManyConnections, format!("{limit} clients are connected already"));
+            return Err(error.hint("`dimos status` names them; the limit is `share.max_clients`"));
+        }
+        let ways = Ways {
+            session: &self.session,
+            run: &self.run,
+            socket: &self.socket,
+            cancel_at_end: self.config.on_lost == OnLost::Cancel,
+        };
+        let remote = Remote::start(who.clone(), &ways).map_err(|e| failed(format!("no thread for a client: {e}")))?;
+        clients.insert(who.clone(), remote.clone());
+        let _ = self.news.send(News::Clients);
+        Ok(remote)
+    }
+
+    fn see_token(&self, sample: &Sample) {
+        let Some(who) = Who::of_token(sample.key_expr().as_str(), &self.run) else { return };
+        match sample.kind() {
+            SampleKind::Put => {
+                if let Ok(remote) = self.client(&who) {
+                    remote.has_token.store(true, Ordering::Release);
+                    remote.is_alive();
+                }
+            }
+            SampleKind::Delete => self.lose(&who, "it has closed its connection"),
+        }
+    }
+
+    fn see_beat(&self, sample: &Sample) {
+        let Some(who) = Who::of_token(sample.key_expr().as_str(), &self.run) else { return };
+        let Some(remote) = lock(&self.clients).get(&who).cloned() else { return };
+        remote.is_alive();
+        let name = sample.payload().to_bytes();
+        if let Ok(name) = std::str::from_utf8(&name)
+            && !name.is_empty()
+        {
+            let name: String = name.chars().filter(|c| !c.is_control()).take(40).collect();
+            if *lock(&remote.name) != name {
+                *lock(&remote.name) = name;
+                let _ = self.news.send(News::Clients);
+            }
+        }
+    }
+
+    /// Ends the connections of commanders that are silent, and of clients that never had a token.
+    fn look_after_clients(&self) {
+        let timeout = Duration::from_secs_f64(self.config.client_timeout);
+        let silent = |remote: &&Arc<Remote>| {
+            let silence = remote.silence();
+            (remote.commands.load(Ordering::Acquire) && silence > timeout)
+                || (!remote.has_token.load(Ordering::Acquire) && silence > FORGET_AFTER)
+        };
+        let silent: Vec<Who> = lock(&self.clients).values().filter(silent).map(|remote| remote.who.clone()).collect();
+        for who in silent {
+            self.lose(&who, "it has been silent");
+        }
+    }
+
+    /// Closes the connections of a client: the run frees its leases, and cancels its motions if it is to.
+    fn lose(&self, who: &Who, why: &str) {
+        let Some(remote) = lock(&self.clients).remove(who) else { return };
+        if remote.commands.load(Ordering::Acquire) {
+            tracing::warn!("share: the commander {} is lost: {why}", remote.title());
+            let mut lost = lock(&self.lost);
+            if lost.len() == MAX_LOST {
+                lost.pop_front();
+            }
+            lost.push_back(who.clone());
+        }
+        remote.close(Closed::Lost);
+        let _ = self.news.send(News::Clients);
+    }
+}
+
+fn failed(text: String) -> RpcError {
+    RpcError::new(Code::Internal, text)
+}
+
+/// Sends what the gateway says of itself.
+fn register(control: &mut UnixStream, gateway: &RegisterGateway) -> io::Result<()> {
+    let line = json!({"id": 1, "method": RegisterGateway::NAME, "params": gateway});
+    control.write_all(format!("{line}\n").as_bytes())
+}
+
+/// Reads the first reply: whether this is the run's only gateway.
+fn accepted(replies: &mut impl BufRead) -> Result<(), RpcError> {
+    let mut line = String::new();
+    replies.read_line(&mut line).map_err(|e| failed(format!("the run does not answer: {e}")))?;
+    let mut reply: Value = serde_json::from_str(&line).map_err(|e| failed(format!("reply of the run: {e}")))?;
+    match serde_json::from_value(reply["error"].take()) {
+        Ok(error) => Err(error),
+        Err(_) => Ok(()),
+    }
+}

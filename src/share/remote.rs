@@ -1,0 +1,293 @@
+//! One client on another computer: two connections to the run's socket, each with its own thread and queue. Requests
+//! that end motion have the second one, so that a `stop` never waits behind a slow request of the same client.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::path::Path;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
+
+use serde_json::{Value, json};
+use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader, Lines};
+use tokio::net::UnixStream;
+use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
+use tokio::sync::mpsc::{Receiver, Sender, channel};
+use tokio::sync::watch;
+use zenoh::bytes::Encoding;
+use zenoh::qos::Priority;
+use zenoh::query::Query;
+use zenoh::{Session, Wait};
+
+use super::class::Class;
+use super::keys::{self, Who};
+use crate::rpc::api::{Method, OnBehalfOf, PLANNER_REQUESTS, RegisterPlanner, Release};
+use crate::rpc::error::{Code, RpcError};
+use crate::sync::lock;
+
+/// Requests of a client that may wait for their replies; more are refused.
+const MAX_PENDING: usize = 32;
+/// Requests that may wait to be refused; beyond, they are dropped.
+const QUEUE: usize = 1024;
+/// Bytes of requests that may wait.
+const MAX_QUEUED: usize = 32 << 20;
+/// Id of the first request, which says for whom the connection speaks.
+const BEHALF: u64 = 0;
+/// Time within which a run that closes a connection turns out to have ended.
+const END_TIMEOUT: Duration = Duration::from_millis(50);
+/// Encoding of an error.
+const ERROR_SCHEMA: &str = "dimos-error";
+
+/// A request, checked as far as its key and form go.
+pub(super) struct Request {
+    pub query: Query,
+    pub class: Class,
+    pub method: String,
+    pub params: Value,
+    /// Length of the payload [bytes].
+    pub bytes: usize,
+}
+
+/// A client.
+pub(super) struct Remote {
+    pub who: Who,
+    /// What it calls itself.
+    pub name: Mutex<String>,
+    /// Its last sign of life: a beat, a request, its token.
+    pub seen: Mutex<Instant>,
+    /// Whether its token was seen.
+    pub has_token: AtomicBool,
+    /// Whether it may hold a lease, or is the planner: then silence matters.
+    pub commands: AtomicBool,
+    ordered: Queue,
+    urgent: Queue,
+    end: watch::Sender<Option<Closed>>,
+}
+
+/// Why the connections of a client were closed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Closed {
+    /// It is lost, or the run has refused it.
+    Lost,
+    /// The run has ended.
+    RunEnded,
+}
+
+/// The queue to one connection.
+struct Queue {
+    to: Sender<Request>,
+    waiting: AtomicUsize,
+}
+
+/// What the threads of a client need.
+pub(super) struct Ways<'a> {
+    pub session: &'a Session,
+    pub run: &'a str,
+    pub socket: &'a Path,
+    pub cancel_at_end: bool,
+}
+
+impl Remote {
+    /// Starts the threads of a client.
+    pub fn start(who: Who, ways: &Ways<'_>) -> io::Result<std::sync::Arc<Self>> {
+        let ((ordered, from_ordered), (urgent, from_urgent)) = (channel(QUEUE), channel(QUEUE));
+        let queue = |to| Queue { to, waiting: AtomicUsize::new(0) };
+        let remote = std::sync::Arc::new(Self {
+            name: Mutex::new(format!("client {}", who.id.get(..8).unwrap_or(&who.id))),
+            who,
+            seen: Mutex::new(Instant::now()),
+            has_token: AtomicBool::new(false),
+            commands: AtomicBool::new(false),
+            ordered: queue(ordered),
+            urgent: queue(urgent),
+            end: watch::Sender::new(None),
+        });
+        for (name, from, urgent) in [("client", from_ordered, false), ("client-stop", from_urgent, true)] {
+            let (remote, session, run) = (remote.clone(), ways.session.clone(), ways.run.to_owned());
+            let (socket, cancel_at_end) = (ways.socket.to_owned(), ways.cancel_at_end);
+            std::thread::Builder::new().name(name.into()).spawn(move || {
+                let line = Line { remote, session, run, pending: BTreeMap::new(), next: BEHALF + 1 };
+                let runtime = tokio::runtime::Builder::new_current_thread().enable_io().enable_time().build();
+                let served = runtime.map(|runtime| runtime.block_on(line.serve(from, &socket, urgent, cancel_at_end)));
+                if let Err(e) = served {
+                    tracing::warn!("share: cannot serve a client: {e}");
+                }
+            })?;
+        }
+        Ok(remote)
+    }
+
+    /// Returns the client as people know it: `alice (dimos jog on laptop)`.
+    pub fn title(&self) -> String {
+        let user = if self.who.user == crate::blueprint::share::ANYONE { "someone" } else { &self.who.user };
+        format!("{user} ({})", lock(&self.name))
+    }
+
+    /// Notes a sign of life.
+    pub fn is_alive(&self) {
+        *lock(&self.seen) = Instant::now();
+    }
+
+    /// Returns the time since its last sign of life.
+    pub fn silence(&self) -> Duration {
+        lock(&self.seen).elapsed()
+    }
+
+    /// Queues a request. Drops it if too much waits: nothing here waits for the client or the run.
+    pub fn queue(&self, request: Request) {
+        let queue = if request.class == Class::End { &self.urgent } else { &self.ordered };
+        let bytes = request.bytes;
+        if queue.waiting.fetch_add(bytes, Ordering::AcqRel) + bytes > MAX_QUEUED || queue.to.try_send(request).is_err()
+        {
+            queue.waiting.fetch_sub(bytes, Ordering::AcqRel);
+        }
+    }
+
+    /// Closes its connections: its leases end.
+    pub fn close(&self, why: Closed) {
+        // The first reason is the cause of later ones.
+        self.end.send_if_modified(|closed| closed.is_none() && closed.replace(why).is_none());
+    }
+
+    /// Returns whether it was closed.
+    pub fn is_closed(&self) -> bool {
+        self.end.borrow().is_some()
+    }
+
+    /// Returns whether its threads have answered what was pending, and have ended.
+    pub fn has_ended(&self) -> bool {
+        self.end.receiver_count() == 0
+    }
+}
+
+/// Sends a refusal.
+pub(super) fn refuse(query: &Query, error: &RpcError) {
+    let body = serde_json::to_vec(error).unwrap_or_default();
+    let _ = query.reply_err(body).encoding(Encoding::APPLICATION_JSON.with_schema(ERROR_SCHEMA)).wait();
+}
+
+/// One connection to the run.
+struct Line {
+    remote: std::sync::Arc<Remote>,
+    session: Session,
+    run: String,
+    /// Requests without a reply, by number, with their methods.
+    pending: BTreeMap<u64, Request>,
+    next: u64,
+}
+
+impl Line {
+    async fn serve(mut self, mut requests: Receiver<Request>, socket: &Path, urgent: bool, cancel_at_end: bool) {
+        let mut end = self.remote.end.subscribe();
+        let stream = match UnixStream::connect(socket).await {
+            Ok(stream) => stream,
+            Err(e) => {
+                tracing::warn!("share: the run does not accept a connection: {e}");
+                return self.remote.close(Closed::Lost);
+            }
+        };
+        let (from, to) = stream.into_split();
+        let mut from = BufReader::new(from).lines();
+        let (lines, waiting) = channel(2 * MAX_PENDING);
+        let writer = tokio::spawn(write(to, waiting));
+        // Before the first request: a client says its name before it asks.
+        let mut behalf = (!urgent).then_some(cancel_at_end);
+        loop {
+            tokio::select! {
+                biased;
+                _ = end.wait_for(Option::is_some) => break,
+                line = next_line(&mut from) => match line {
+                    Some(line) => self.take(line),
+                    None => break,
+                },
+                Some(request) = requests.recv() => {
+                    let queue = if urgent { &self.remote.urgent } else { &self.remote.ordered };
+                    queue.waiting.fetch_sub(request.bytes, Ordering::AcqRel);
+                    if let Some(cancel_at_end) = behalf.take() {
+                        let behalf = OnBehalfOf { client: self.remote.title(), cancel_at_end };
+                        let line = json!({"id": BEHALF, "method": OnBehalfOf::NAME, "params": behalf});
+                        let _ = lines.send(format!("{line}\n")).await;
+                    }
+                    if let Some(line) = self.ask(request)
+                        && lines.send(line).await.is_err()
+                    {
+                        break;
+                    }
+                }
+            }
+        }
+        writer.abort();
+        // A run that ends closes all connections: this one perhaps first.
+        let ended = tokio::time::timeout(END_TIMEOUT, end.wait_for(Option::is_some)).await;
+        let why = ended.ok().and_then(|closed| closed.ok().and_then(|closed| *closed)).unwrap_or(Closed::Lost);
+        self.remote.close(why);
+        let error = match why {
+            Closed::Lost => RpcError::new(Code::Lost, "the gateway has closed the connection of this client"),
+            Closed::RunEnded => RpcError::new(Code::ShuttingDown, format!("run {} has ended", self.run)),
+        };
+        for request in self.pending.values() {
+            refuse(&request.query, &error.clone().hint("it may still take effect; ask for `status`"));
+        }
+    }
+
+    /// Returns the line of a request for the run; `None` if too many wait already.
+    fn ask(&mut self, request: Request) -> Option<String> {
+        if self.pending.len() >= MAX_PENDING {
+            let error = RpcError::new(Code::TooManyRequests, format!("{MAX_PENDING} requests wait for their replies"));
+            refuse(&request.query, &error.hint("wait for replies before you send more"));
+            return None;
+        }
+        let number = self.next;
+        self.next += 1;
+        let mut request = request;
+        let line = json!({"id": number, "method": request.method, "params": request.params.take()});
+        self.pending.insert(number, request);
+        Some(format!("{line}\n"))
+    }
+
+    /// Passes a line of the run on to the client.
+    fn take(&mut self, line: String) {
+        let Ok(mut incoming) = serde_json::from_str::<Value>(&line) else { return };
+        if let Some(stream) = incoming["stream"].as_str() {
+            let key = keys::to(&self.run, &self.remote.who.user, &self.remote.who.id, stream);
+            let priority = if stream == PLANNER_REQUESTS { Priority::DataHigh } else { Priority::RealTime };
+            let _ = self.session.put(key, line).priority(priority).express(true).wait();
+            return;
+        }
+        let Some(request) = incoming["id"].as_u64().and_then(|id| self.pending.remove(&id)) else { return };
+        match serde_json::from_value::<RpcError>(incoming["error"].take()) {
+            Ok(error) => refuse(&request.query, &error),
+            Err(_) => {
+                self.remote.note(&request);
+                let result = incoming["result"].take().to_string();
+                let _ = request.query.reply(request.query.key_expr().clone(), result).express(true).wait();
+            }
+        }
+    }
+}
+
+impl Remote {
+    /// Notes what an accepted request means for the lease.
+    fn note(&self, request: &Request) {
+        match request.method.as_str() {
+            Release::NAME => {}
+            RegisterPlanner::NAME => self.commands.store(true, Ordering::Release),
+            _ if request.class == Class::Move => self.commands.store(true, Ordering::Release),
+            _ => {}
+        }
+    }
+}
+
+/// Returns the next line; `None` when the run has closed the connection.
+async fn next_line(from: &mut Lines<BufReader<OwnedReadHalf>>) -> Option<String> {
+    from.next_line().await.ok().flatten()
+}
+
+/// Writes lines to the run. In a task of its own: a run whose replies are not read does not read requests.
+async fn write(mut to: OwnedWriteHalf, mut lines: Receiver<String>) {
+    while let Some(line) = lines.recv().await {
+        if to.write_all(line.as_bytes()).await.is_err() {
+            return;
+        }
+    }
+}
