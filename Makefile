@@ -1,4 +1,4 @@
-# run install dist viewer check test test-fast · test-tools test-rerun test-lerobot deny mutants ·
+# run install dist viewer check test test-fast · test-tools test-rerun test-lerobot judge-hiroz deny mutants ·
 # bench bench-quick bench-page bench-share jitter soak
 
 PYTHON ?= python3
@@ -38,7 +38,7 @@ PAGE := viewer/dist/index.html
 PAGE_SOURCES := $(wildcard viewer/*.json viewer/*.mjs) $(shell find viewer/src -type f 2>/dev/null)
 NODE := $(if $(wildcard viewer/package.json),$(shell command -v npm))
 
-.PHONY: run install dist shipped viewer viewer-if-possible check lint spelling licences test test-fast test-tools test-rerun test-lerobot deny mutants bench bench-quick bench-page bench-share jitter soak
+.PHONY: run install dist shipped viewer viewer-if-possible check lint spelling licences test test-fast test-tools test-rerun test-lerobot judge-hiroz deny mutants bench bench-quick bench-page bench-share jitter soak
 
 # Builds the program to try it, not optimized, and starts the shipped blueprint; its arm is simulated. Ends with Ctrl-C.
 run: viewer-if-possible
@@ -135,6 +135,11 @@ test-rerun: .venv/readers-installed
 	.venv/bin/pip install -q rerun-sdk==0.41.0
 	.venv/bin/rerun analytics disable
 	DIMOS_RERUN=1 cargo test --locked --test process readers::rerun
+
+# An action client of ROS 2 in Rust, which compiles zenoh once more.
+judge-hiroz: .venv/readers-installed
+	cargo build --manifest-path tests/hiroz/Cargo.toml --target-dir $(TARGET)/hiroz
+	DIMOS_HIROZ=$(abspath $(TARGET))/hiroz/debug/judge-hiroz cargo test --locked --features share --test process hiroz
 
 # LeRobot with all that it asks for is large (torch), so it has a venv of its own.
 test-lerobot:

@@ -70,7 +70,7 @@ pub(super) fn home_of(key: &str) -> Option<String> {
 }
 
 /// Groups of the schema, and their paths in a blueprint.
-const GROUPS: [(&str, &str); 12] = [
+const GROUPS: [(&str, &str); 13] = [
     ("", ""),
     ("/$defs/CoordinatorConfig", "coordinator"),
     ("/$defs/HardwareEntry", "hardware"),
@@ -83,6 +83,7 @@ const GROUPS: [(&str, &str); 12] = [
     ("/$defs/ViewConfig", "view"),
     ("/$defs/ShareEntry", "share"),
     ("/$defs/PythonDimosEntry", "share.python_dimos"),
+    ("/$defs/RosEntry", "share.ros"),
 ];
 
 /// Makes all keys of a list entry optional except its id: a blueprint with includes may contain parts of entries. A

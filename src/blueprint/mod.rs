@@ -21,6 +21,7 @@ mod planner_models;
 mod python_dimos;
 mod registry;
 mod resolve;
+mod ros;
 pub mod schema;
 pub mod share;
 pub mod size;

@@ -12,11 +12,13 @@ use serde::{Deserialize, Serialize};
 use crate::blueprint::planner_files::file;
 use crate::blueprint::python_dimos;
 use crate::blueprint::resolve::Checker;
+use crate::blueprint::ros;
 use crate::named::named;
 use crate::yaml::range::positive;
 use crate::yaml::{Diag, Keyed, Located, NodeId, quote};
 
 pub use crate::blueprint::python_dimos::{PythonDimosConfig, PythonDimosEntry};
+pub use crate::blueprint::ros::{Distro, RosConfig, RosEntry, is_ros_name};
 
 /// User name of clients without a certificate.
 pub const ANYONE: &str = "-";
@@ -53,6 +55,8 @@ pub struct ShareEntry {
     pub max_clients: Located<usize>,
     /// The run as the coordinator of Python dimos.
     pub python_dimos: Option<Located<PythonDimosEntry>>,
+    /// The run as a node of ROS 2.
+    pub ros: Option<Located<RosEntry>>,
 }
 
 impl Default for ShareEntry {
@@ -69,6 +73,7 @@ impl Default for ShareEntry {
             remote_enable: false,
             max_clients: 32.into(),
             python_dimos: None,
+            ros: None,
         }
     }
 }
@@ -215,6 +220,9 @@ pub struct ShareConfig {
     /// The run as the coordinator of Python dimos.
     #[serde(default)]
     pub python_dimos: Option<PythonDimosConfig>,
+    /// The run as a node of ROS 2.
+    #[serde(default)]
+    pub ros: Option<RosConfig>,
 }
 
 /// Certificates in PEM.
@@ -244,6 +252,7 @@ impl Default for ShareConfig {
             remote_enable: entry.remote_enable,
             max_clients: entry.max_clients.value,
             python_dimos: None,
+            ros: None,
         }
     }
 }
@@ -251,18 +260,20 @@ impl Default for ShareConfig {
 impl ShareConfig {
     /// Returns what is wrong with it as a whole, with a hint; `None` if nothing is.
     pub fn mistake(&self) -> Option<(String, &'static str)> {
-        if self.listen.is_empty() && self.connect.is_empty() && self.python_dimos.is_none() {
-            let hint = "give `listen: [tls/0.0.0.0:7447]`, `connect` to a router, or a face: `python_dimos: {}`";
+        let faces = self.python_dimos.is_some() || self.ros.is_some();
+        if self.listen.is_empty() && self.connect.is_empty() && !faces {
+            let hint =
+                "give `listen: [tls/0.0.0.0:7447]`, `connect` to a router, or a face: `python_dimos: {}`, `ros: {}`";
             return Some(("it listens nowhere".into(), hint));
         }
-        if let Some(open) = self.listen.iter().chain(&self.connect).find(|e| !e.tls && !e.is_loopback())
+        let endpoints = || self.listen.iter().chain(&self.connect).chain(self.ros.as_ref().map(|ros| &ros.router));
+        if let Some(open) = endpoints().find(|e| !e.tls && !e.is_loopback())
             && !self.insecure
         {
             let text = format!("{open} is open to the network, not encrypted, and asks for no certificate");
             return Some((text, "use tls/ with certificates (docs/many-machines.md), or set `insecure: true`"));
         }
-        let tls = self.listen.iter().chain(&self.connect).find(|e| e.tls);
-        if let Some(tls) = tls.filter(|_| self.identity.is_none()) {
+        if let Some(tls) = endpoints().find(|e| e.tls).filter(|_| self.identity.is_none()) {
             return Some((
                 format!("{tls} needs certificates"),
                 "give `identity: {ca, cert, key}`: docs/many-machines.md",
@@ -306,6 +317,7 @@ pub(super) fn resolve(checker: &mut Checker<'_>, entry: &Located<ShareEntry>, jo
         remote_enable: entry.remote_enable,
         max_clients: entry.max_clients.value,
         python_dimos: entry.python_dimos.as_ref().map(|face| python_dimos::resolve(checker, face, joints)),
+        ros: entry.ros.as_ref().map(|face| ros::resolve(checker, face)),
     };
     if !(1..=MOST_CLIENTS).contains(&config.max_clients) {
         let diag = Diag::error(format!("max_clients is {} (limit {MOST_CLIENTS})", config.max_clients));
@@ -315,11 +327,12 @@ pub(super) fn resolve(checker: &mut Checker<'_>, entry: &Located<ShareEntry>, jo
     let whole = |list| {
         !checker.tree.is_damaged(list) && !checker.tree.items(list).iter().any(|item| checker.lost.dropped(*item))
     };
-    let read = ["listen", "connect", "insecure", "identity", "users", "python_dimos"]
+    let read = ["listen", "connect", "insecure", "identity", "users", "python_dimos", "ros"]
         .iter()
         .all(|key| checker.has(entry.at, key) && checker.tree.get(entry.at, key).is_none_or(whole));
     if let Some((what, hint)) = config.mistake().filter(|_| read) {
-        let endpoints = entry.listen.iter().chain(&entry.connect);
+        let router = entry.ros.as_ref().map(|ros| &ros.router);
+        let endpoints = entry.listen.iter().chain(&entry.connect).chain(router);
         let named = endpoints.filter(|e| what.starts_with(&e.to_string())).map(|e| e.at).next();
         let user = entry.users.0.iter().find(|(name, _)| what.starts_with(&quote(name))).map(|(name, _)| name.at);
         checker.error(named.or(user).unwrap_or(entry.at), Diag::error(what).hint(hint));

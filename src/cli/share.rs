@@ -10,7 +10,9 @@ use serde_json::json;
 use super::exit::{Exit, Failure, Result};
 use super::output;
 use super::text_log::Terminal;
-use crate::blueprint::share::{ANYONE, Endpoint, Identity, OnLost, PythonDimosConfig, Role, ShareConfig};
+use crate::blueprint::share::{
+    ANYONE, Distro, Endpoint, Identity, OnLost, PythonDimosConfig, Role, RosConfig, ShareConfig, is_ros_name,
+};
 use crate::rpc::client;
 use crate::rpc::client::ClientError;
 use crate::rpc::run_dir::RunDir;
@@ -27,7 +29,7 @@ pub struct Args {
     #[arg(long, value_name = "RUN")]
     run: Option<String>,
     /// Listen here: tls/0.0.0.0:7447, or tcp/127.0.0.1:7447 (repeatable)
-    #[arg(long, value_name = "ENDPOINT", required_unless_present_any = ["connect", "python_dimos", "config"])]
+    #[arg(long, value_name = "ENDPOINT", required_unless_present_any = ["connect", "python_dimos", "ros", "config"])]
     listen: Vec<Endpoint>,
     /// Join the router there (repeatable)
     #[arg(long, value_name = "ENDPOINT")]
@@ -51,8 +53,20 @@ pub struct Args {
     /// Be the ControlCoordinator of Python dimos 0.0.15 on this computer
     #[arg(long)]
     python_dimos: bool,
-    /// Let Python dimos move arms: every program on this computer can then
-    #[arg(long, requires = "python_dimos")]
+    /// Be the node `dimos` of ROS 2, through the router of rmw_zenoh: tcp/127.0.0.1:7447, or this one
+    #[arg(long, value_name = "ROUTER", num_args = 0..=1)]
+    ros: Option<Option<Endpoint>>,
+    /// Domain of ROS 2
+    #[arg(long, value_name = "NUMBER", default_value_t = 0, env = "ROS_DOMAIN_ID", value_parser = clap::value_parser!(u32).range(0..=232))]
+    ros_domain: u32,
+    /// Namespace of the node of ROS 2
+    #[arg(long, value_name = "NAME", default_value = "", hide_default_value = true, value_parser = namespace)]
+    ros_namespace: String,
+    /// Distribution of the other nodes of ROS 2: jazzy, kilted, lyrical
+    #[arg(long, value_name = "DISTRO", default_value = "jazzy", value_parser = distro)]
+    ros_distro: Distro,
+    /// Let Python dimos and ROS move arms: every program that reaches them can then
+    #[arg(long)]
     command: bool,
     /// Multicast group of the bus of Python dimos, if it has another one (ZENOH_SCOUT_ADDR)
     #[arg(long, value_name = "GROUP", env = "ZENOH_SCOUT_ADDR")]
@@ -72,6 +86,17 @@ fn user(text: &str) -> std::result::Result<(String, Role), String> {
     Ok((name.to_owned(), Role::of_name(role).ok_or_else(wrong)?))
 }
 
+fn namespace(text: &str) -> std::result::Result<String, String> {
+    let name = text.trim_matches('/');
+    let good = name.is_empty() || is_ros_name(name);
+    good.then(|| name.to_owned()).ok_or_else(|| "has letters, digits and '_', in parts separated by '/'".to_owned())
+}
+
+fn distro(text: &str) -> std::result::Result<Distro, String> {
+    let names: Vec<&str> = Distro::ALL.iter().map(|distro| distro.name()).collect();
+    Distro::of_name(text).ok_or_else(|| format!("must be one of {}", names.join(", ")))
+}
+
 fn on_lost(text: &str) -> std::result::Result<OnLost, String> {
     OnLost::of_name(text).ok_or_else(|| "must be cancel or finish".to_owned())
 }
@@ -85,6 +110,12 @@ impl Args {
         if let Some(config) = &self.config {
             return Ok(config.clone());
         }
+        if self.command && !self.python_dimos && self.ros.is_none() {
+            let failure = Failure::usage("--command lets a face move arms, and there is none");
+            return Err(
+                failure.hint("add --python-dimos or --ros; users of an endpoint get a role: --user NAME=operator")
+            );
+        }
         Ok(ShareConfig {
             listen: self.listen.clone(),
             connect: self.connect.clone(),
@@ -97,6 +128,13 @@ impl Args {
                 command: self.command,
                 scout_addr: self.scout_addr.clone().filter(|group| !group.is_empty()),
                 ..PythonDimosConfig::default()
+            }),
+            ros: self.ros.as_ref().map(|router| RosConfig {
+                router: router.clone().unwrap_or_else(|| RosConfig::default().router),
+                domain: self.ros_domain,
+                namespace: self.ros_namespace.clone(),
+                distro: self.ros_distro,
+                command: self.command,
             }),
             ..ShareConfig::default()
         })
@@ -143,6 +181,9 @@ pub fn run(args: &Args) -> Result {
                 if let Some(face) = &config.python_dimos {
                     shared["python_dimos"] = json!({"name": face.name, "command": face.command});
                 }
+                if let Some(face) = &config.ros {
+                    shared["ros"] = json!({"router": face.router, "domain": face.domain, "command": face.command});
+                }
                 output::json(&shared);
             }
             false => {
@@ -180,9 +221,19 @@ pub(super) fn lines(config: &ShareConfig) -> Vec<String> {
     let mut lines: Vec<String> =
         listen.chain(config.connect.iter().map(|endpoint| line("through", endpoint))).collect();
     if let Some(face) = &config.python_dimos {
-        let end = if config.observers_stop || face.command { "reads, and ends motion" } else { "reads" };
-        let who = if face.command { "EVERY PROGRAM ON THIS COMPUTER MAY MOVE THE ARMS" } else { end };
+        let who = if face.command { "EVERY PROGRAM ON THIS COMPUTER MAY MOVE THE ARMS" } else { reads(config) };
         lines.push(format!("with Python dimos as {} (multicast on lo): {who}", face.name));
     }
+    if let Some(face) = &config.ros {
+        let who = if face.command { "EVERY NODE THAT REACHES THE ROUTER MAY MOVE THE ARMS" } else { reads(config) };
+        let domain = if face.domain == 0 { String::new() } else { format!(", domain {}", face.domain) };
+        let distro = face.distro.name();
+        lines.push(format!("with ROS 2 {distro} through {}{domain}: {who}", face.router));
+    }
     lines
+}
+
+/// Returns what a face does that may not command.
+fn reads(config: &ShareConfig) -> &'static str {
+    if config.observers_stop { "reads, and ends motion" } else { "reads" }
 }

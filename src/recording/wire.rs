@@ -107,6 +107,8 @@ pub(crate) use sequences;
 
 numbers! {
     u8 => "uint8", "uint8[]";
+    i8 => "int8", "int8[]";
+    u16 => "uint16", "uint16[]";
     i32 => "int32", "int32[]";
     u32 => "uint32", "uint32[]";
     u64 => "uint64", "uint64[]";
@@ -114,6 +116,22 @@ numbers! {
     f64 => "float64", "float64[]";
 }
 sequences! { String => "string[]"; }
+
+/// Octets of a fixed number, such as those of a UUID.
+impl Field for [u8; 16] {
+    const ROS: &'static str = "uint8[16]";
+    const MIN_SIZE: usize = 16;
+    fn put(&self, out: &mut Encoder) {
+        self.iter().for_each(|octet| octet.put(out));
+    }
+    fn get(from: &mut Decoder<'_>) -> Result<Self, CdrError> {
+        let mut octets = [0; 16];
+        for octet in &mut octets {
+            *octet = u8::get(from)?;
+        }
+        Ok(octets)
+    }
+}
 
 impl Field for bool {
     const ROS: &'static str = "bool";

@@ -27,7 +27,7 @@ use super::class::{Class, PAGE, permit};
 use super::keys::{self, Who};
 use super::page::Pages;
 use super::remote::{Closed, Remote, Request, Ways, refuse};
-use super::{certificates, python_dimos, settings, streams};
+use super::{certificates, python_dimos, ros, settings, streams};
 use crate::blueprint::share::{OnLost, ShareConfig};
 use crate::rpc::api::{FaceReport, Lease, MAX_ANSWER, MAX_LINE, METHODS, Method, PlannerAnswer, RegisterGateway};
 use crate::rpc::error::{Code, RpcError};
@@ -56,6 +56,8 @@ pub struct Gateway {
     control: UnixStream,
     /// The face to Python dimos, or why it does not serve.
     python_dimos: Option<Result<python_dimos::Face, RpcError>>,
+    /// The face to ROS 2, or why it does not serve.
+    ros: Option<Result<ros::Face, RpcError>>,
     /// Declarations; they end with it.
     _declared: Vec<Box<dyn Send>>,
 }
@@ -130,34 +132,49 @@ impl Gateway {
             })
             .map_err(|e| failed(e.to_string()))?;
         let declared = shared.declare().map_err(|e| failed(e.to_string()))?;
-        let face = shared.config.python_dimos.as_ref().map(|config| {
-            let (run, news) = ((shared.run.as_str(), shared.socket.clone()), shared.news.clone());
-            python_dimos::Face::start(run, &shared.session, &shared.config, config, move || {
-                let _ = news.send(News::Faces);
-            })
+        let changed = || {
+            let news = shared.news.clone();
+            move || drop(news.send(News::Faces))
+        };
+        let python_dimos = shared.config.python_dimos.as_ref().map(|config| {
+            let run = (shared.run.as_str(), shared.socket.clone());
+            python_dimos::Face::start(run, &shared.session, &shared.config, config, changed())
         });
-        if let Some(Err(error)) = &face {
+        let ros = shared
+            .config
+            .ros
+            .as_ref()
+            .map(|config| ros::Face::start((&shared.run, &shared.socket), &shared.config, config, changed()));
+        let gateway = Self { shared, news: received, control, python_dimos, ros, _declared: declared };
+        if let Some(error) = gateway.face_error() {
             tracing::error!("share: {error}");
         }
-        let _ = shared.news.send(News::Faces);
-        Ok(Self { shared, news: received, control, python_dimos: face, _declared: declared })
+        let _ = gateway.shared.news.send(News::Faces);
+        Ok(gateway)
     }
 
-    /// Returns why a face does not serve; `None`: all do.
+    /// Returns why a face cannot serve; `None`: all can.
     pub fn face_error(&self) -> Option<&RpcError> {
-        self.python_dimos.as_ref().and_then(|face| face.as_ref().err())
+        let python_dimos = self.python_dimos.as_ref().and_then(|face| face.as_ref().err());
+        python_dimos.or_else(|| self.ros.as_ref().and_then(|face| face.as_ref().err()))
     }
 
     fn faces(&self) -> Vec<FaceReport> {
-        let report = |face: &Result<python_dimos::Face, RpcError>| match face {
-            Ok(face) => Some(face.report()),
-            Err(error) => {
-                let hint = error.hint.as_ref().map(|hint| format!(" (hint: {hint})")).unwrap_or_default();
-                let config = self.shared.config.python_dimos.as_ref()?;
-                Some(python_dimos::report(config, Some(format!("{}{hint}", error.message))))
-            }
+        let why = |error: &RpcError| {
+            let hint = error.hint.as_ref().map(|hint| format!(" (hint: {hint})")).unwrap_or_default();
+            Some(format!("{}{hint}", error.message))
         };
-        self.python_dimos.iter().filter_map(report).collect()
+        let config = &self.shared.config;
+        let python_dimos =
+            config.python_dimos.as_ref().zip(self.python_dimos.as_ref()).map(|(config, face)| match face {
+                Ok(face) => face.report(),
+                Err(error) => python_dimos::report(config, why(error)),
+            });
+        let ros = config.ros.as_ref().zip(self.ros.as_ref()).map(|(config, face)| match face {
+            Ok(face) => face.report(),
+            Err(error) => ros::report(config, why(error)),
+        });
+        python_dimos.into_iter().chain(ros).collect()
     }
 
     /// Serves until the run ends.
@@ -180,6 +197,7 @@ impl Gateway {
         self.say_that_the_run_has_ended();
         self._declared.clear();
         self.python_dimos.take();
+        self.ros.take();
         let _ = self.shared.session.close().wait();
     }
 

@@ -35,9 +35,13 @@ mod remote;
 #[cfg(feature = "share")]
 mod remote_runs;
 #[cfg(feature = "share")]
+mod ros;
+#[cfg(feature = "share")]
 mod settings;
 #[cfg(feature = "share")]
 mod streams;
+#[cfg(feature = "share")]
+mod thinning;
 #[cfg(not(feature = "share"))]
 mod without_share;
 

@@ -8,7 +8,7 @@ use zenoh::Config;
 
 use super::access;
 use super::place::Place;
-use crate::blueprint::share::{Identity, PythonDimosConfig, ShareConfig};
+use crate::blueprint::share::{Identity, PythonDimosConfig, RosConfig, ShareConfig};
 use crate::rpc::error::{Code, RpcError};
 
 /// Largest message that is accepted [bytes]: an answer of a planner.
@@ -138,6 +138,25 @@ fn python_dimos_values(config: &PythonDimosConfig) -> Value {
     with_common(more)
 }
 
+/// Returns the settings of a node of ROS 2: a client of its router, for which it waits.
+pub fn of_ros(config: &RosConfig, identity: Option<&Identity>) -> Result<Config, RpcError> {
+    built(&ros_values(config, identity))
+}
+
+fn ros_values(config: &RosConfig, identity: Option<&Identity>) -> Value {
+    let mut more = json!({
+        "mode": "client",
+        "listen": {"endpoints": []},
+        "connect": {"endpoints": [config.router.to_string()], "timeout_ms": -1, "exit_on_failure": false},
+        // What later subscribers get is distinguished by its time.
+        "timestamping": {"enabled": true},
+    });
+    if let Some(identity) = identity.filter(|_| config.router.tls) {
+        merge(&mut more, tls(identity));
+    }
+    with_common(more)
+}
+
 /// Mutual TLS: both ends show a certificate, and look at that of the other.
 fn tls(identity: &Identity) -> Value {
     json!({"transport": {"link": {"tls": {
@@ -196,6 +215,10 @@ mod tests {
         assert_eq!(gateway["listen"]["endpoints"], json!(["tcp/127.0.0.1:7447"]));
         assert_eq!(client["listen"]["endpoints"], json!([]));
         assert_eq!(gateway["access_control"]["enabled"], true);
+        let ros = ros_values(&RosConfig::default(), None);
+        assert_eq!((&ros["mode"], &ros["listen"]["endpoints"]), (&json!("client"), &json!([])));
+        assert_eq!(ros["scouting"]["multicast"]["enabled"], false);
+        built(&ros).unwrap();
         let bus = PythonDimosConfig { scout_addr: Some("224.0.0.224:7500".into()), ..PythonDimosConfig::default() };
         let bus = python_dimos_values(&bus);
         // Multicast never leaves this computer.

@@ -46,6 +46,11 @@ const PARTS: &[(&str, &str, &str)] = &[
     ("blueprint", "control", "task_robot"),
     ("blueprint", "control", "task_spec"),
     ("blueprint", "planning", "config"),
+    // Messages of ROS 2 are those of a log.
+    ("share", "recording", "cdr"),
+    ("share", "recording", "wire"),
+    ("share", "recording", "messages"),
+    ("share", "recording", "display_messages"),
     ("view", "control", "config"),
     ("view", "planning", "config"),
     // Obstacles that are point clouds.

@@ -44,6 +44,7 @@ mod python_dimos;
 mod readers;
 mod remote_peers;
 mod remote_shim;
+mod ros;
 mod ros2;
 mod rpc_page;
 mod share;

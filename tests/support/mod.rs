@@ -17,6 +17,7 @@ pub mod program;
 pub mod python;
 pub mod python_dimos;
 pub mod rig;
+pub mod ros;
 pub mod shared;
 pub mod sim_arm;
 pub mod skip;

@@ -27,7 +27,6 @@ mod python_error;
 mod results;
 mod rival;
 mod states;
-mod thinning;
 mod trajectories;
 
 pub(super) use face::{Face, report};

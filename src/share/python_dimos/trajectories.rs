@@ -3,8 +3,8 @@
 use super::names::Names;
 use super::pickle_node::{Class, Id, Pickled};
 use super::pickle_reader::PickleError;
-use super::thinning::thinned;
 use crate::rpc::api::{Execute, MAX_LINE, Point, Trajectory};
+use crate::share::thinning::thinned;
 
 /// Largest number of points: more do not fit into a request to the run.
 const MAX_POINTS: usize = 20_000;

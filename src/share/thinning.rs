@@ -1,5 +1,5 @@
-//! Fewer points for a long trajectory: planners of Python dimos make 100 a second, and a request to the run holds 1200
-//! points of six joints.
+//! Fewer points for a long trajectory: planners of Python dimos and ROS make 100 a second, and a request to the run
+//! holds 1200 points of six joints.
 
 use crate::rpc::api::Point;
 
