@@ -181,12 +181,15 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
     }
     let urdf = arguments.urdf.as_ref().ok_or("--urdf is needed")?;
     let began = Instant::now();
-    let arm = Arm::load(urdf, arguments.srdf.as_deref(), packages(&arguments.package)?)?;
+    let mut arm = Arm::load(urdf, arguments.srdf.as_deref(), packages(&arguments.package)?)?;
     if let Some(tip) = &arguments.ik {
         parts::ik(arm.model(), tip, if arguments.quick { 200 } else { 20_000 }, arguments.seed)?;
     }
     let Some(problems) = &arguments.problems else { return Ok(()) };
     let problems = load(problems, arguments.limit)?;
+    if let Some(first) = problems.first() {
+        arm.allow_always_touching_pairs(&Arc::new(arm.kinematics(first)?));
+    }
     println!("loaded    {} problems and {} in {:.0?}", problems.len(), arm.model().name, began.elapsed());
     let peer = peer::Peer::of(arguments.peer.as_deref(), &problems, arguments.peer_range)?;
     let mut rows: Vec<Row> = Vec::new();

@@ -9,6 +9,7 @@ use std::sync::Arc;
 use dimos::collision::body::{MeshMode, solids};
 use dimos::collision::world::{Obstacle, Robot};
 use dimos::collision::{Scene, Solid, World};
+use dimos::planning::planning_scene::always_touch;
 use dimos::robot::Source;
 use dimos::robot::kinematics::Kinematics;
 use dimos::robot::model::{JointKind, RobotModel};
@@ -121,6 +122,26 @@ impl Arm {
         Ok(Kinematics::new(&self.model, &joints, &rest)?)
     }
 
+    fn robot(&self, kinematics: &Arc<Kinematics>) -> Robot {
+        Robot {
+            name: String::new(),
+            model: self.model.clone(),
+            kinematics: kinematics.clone(),
+            solids: self.solids.clone(),
+            base: DAffine3::IDENTITY,
+            padding: 0.0,
+            allowed: self.allowed.clone(),
+        }
+    }
+
+    /// Allows pairs of links that touch in every configuration, as a run does, and prints them.
+    pub fn allow_always_touching_pairs(&mut self, kinematics: &Arc<Kinematics>) {
+        for [a, b] in always_touch(&self.robot(kinematics)) {
+            println!("note      {a} and {b} touch in every configuration: not checked");
+            self.allowed.push((a, b));
+        }
+    }
+
     /// Returns the scene of a problem.
     pub fn scene(
         &self,
@@ -129,15 +150,7 @@ impl Arm {
         shapes: Shapes,
     ) -> Result<Arc<Scene>, Box<dyn Error>> {
         let mut world = World::new();
-        world.add_robot(Robot {
-            name: String::new(),
-            model: self.model.clone(),
-            kinematics: kinematics.clone(),
-            solids: self.solids.clone(),
-            base: DAffine3::IDENTITY,
-            padding: 0.0,
-            allowed: self.allowed.clone(),
-        })?;
+        world.add_robot(self.robot(kinematics))?;
         for thing in &problem.obstacles {
             let solid = solid(thing, &problem.problem, shapes)?;
             world.add(Obstacle { name: thing.name.clone(), solid, padding: 0.0 })?;

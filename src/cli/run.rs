@@ -165,6 +165,11 @@ fn bring_up(args: &Args, catalog: Catalog<'_>) -> Result<(Up, Signals, Terminal)
         let planner = Attached::start(args, blueprint, run, &terminal).inspect_err(|_| terminal.flush())?;
         return Ok((Up::Planner(Box::new(planner)), signals, terminal));
     }
+    // A build without the network would run it, and not be reached.
+    if let Some(config) = blueprint.share.as_ref().filter(|_| cfg!(not(feature = "share"))) {
+        crate::share::check_gateway(config)
+            .map_err(|error| Failure::usage(format!("share: {}", error.message)).maybe_hint(error.hint))?;
+    }
     let options = Options { text: Some(terminal.kept()), ..args.options() };
     let run = Run::start(blueprint, options).map_err(|error| {
         terminal.flush();

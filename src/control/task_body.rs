@@ -36,7 +36,8 @@ pub struct JointView {
     pub arm: u16,
     /// When position and velocity were measured.
     pub stamp: Mono,
-    /// Why they are not those of the joint at present: no recent state, a lost connection, an error of the arm.
+    /// Why they are not those of the joint at present: no recent state, a lost connection, an error of the arm; or that
+    /// a person has stopped the arm.
     pub fault: Cause,
 }
 

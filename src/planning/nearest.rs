@@ -16,6 +16,9 @@ pub struct Tree {
     radii: Vec<f64>,
 }
 
+/// Nodes for which a new tree has room.
+const ROOM: usize = 64;
+
 /// Parent index of a root.
 const ROOT: u32 = u32::MAX;
 
@@ -23,7 +26,9 @@ impl Tree {
     /// Creates an empty tree; `turns` marks the continuous joints.
     pub fn new(turns: &[bool]) -> Self {
         let nodes = Nodes::new(turns, Width::widest());
-        Self { dof: turns.len(), values: Vec::new(), nodes, parents: Vec::new(), radii: Vec::new() }
+        let dof = turns.len();
+        let values = Vec::with_capacity(ROOM * dof);
+        Self { dof, values, nodes, parents: Vec::with_capacity(ROOM), radii: Vec::with_capacity(ROOM) }
     }
 
     /// Returns the number of nodes.
@@ -75,11 +80,15 @@ impl Tree {
     }
 }
 
+/// The values of a joint in sixteen samples.
+pub type Row = [f64; LANES];
+
 /// Sixteen samples, and the nodes of two trees nearest to each.
 #[derive(Debug, Clone)]
 pub struct Batch {
-    dof: usize,
-    values: Vec<f64>,
+    /// For each joint its values in all samples.
+    values: Vec<Row>,
+    /// The same in single precision.
     lanes: Vec<Lanes>,
     nearest: [Nearest; 2],
     next: usize,
@@ -88,8 +97,8 @@ pub struct Batch {
 impl Batch {
     /// Creates one of which all samples are used.
     pub fn new(dof: usize) -> Self {
-        let (values, lanes) = (vec![0.0; LANES * dof], vec![Lanes::splat(0.0); dof]);
-        Self { dof, values, lanes, nearest: [Nearest::NONE; 2], next: LANES }
+        let (values, lanes) = (vec![[0.0; LANES]; dof], vec![Lanes::splat(0.0); dof]);
+        Self { values, lanes, nearest: [Nearest::NONE; 2], next: LANES }
     }
 
     /// Returns whether all samples are used.
@@ -97,28 +106,30 @@ impl Batch {
         self.next >= LANES
     }
 
-    /// Draws all samples.
-    pub fn fill(&mut self, mut draw: impl FnMut(usize, &mut [f64])) {
-        for (lane, sample) in self.values.chunks_exact_mut(self.dof.max(1)).enumerate() {
-            draw(lane, sample);
-            for (block, value) in self.lanes.iter_mut().zip(sample) {
-                block.0[lane] = *value as f32;
-            }
+    /// Draws all samples: `draw` writes them, a row for each joint.
+    pub fn fill(&mut self, draw: impl FnOnce(&mut [Row])) {
+        draw(&mut self.values);
+        for (block, row) in self.lanes.iter_mut().zip(&self.values) {
+            block.0.iter_mut().zip(row).for_each(|(lane, value)| *lane = *value as f32);
         }
         self.nearest = [Nearest::NONE; 2];
         self.next = 0;
     }
 
-    /// Returns the next sample, the node of a tree nearest to it, and their distance [rad]; `side` is the tree's
-    /// number.
-    pub fn next(&mut self, tree: &Tree, side: usize) -> (&[f64], usize, f64) {
+    /// Returns the lane of the next sample, the node of a tree nearest to it, and their distance [rad]; `side` is the
+    /// tree's number.
+    pub fn next(&mut self, tree: &Tree, side: usize) -> (usize, usize, f64) {
         let nearest = &mut self.nearest[side];
         if nearest.compared < tree.len() {
             tree.nodes.compare(&self.lanes, nearest);
         }
         let lane = self.next;
         self.next += 1;
-        let sample = self.values.get(lane * self.dof..(lane + 1) * self.dof).unwrap_or_default();
-        (sample, nearest.node(lane), f64::from(nearest.squared.0[lane]).sqrt())
+        (lane, nearest.node(lane), f64::from(nearest.squared.0[lane]).sqrt())
+    }
+
+    /// Copies the sample of a lane.
+    pub fn sample(&self, lane: usize, q: &mut [f64]) {
+        q.iter_mut().zip(&self.values).for_each(|(q, row)| *q = row[lane]);
     }
 }

@@ -9,7 +9,7 @@ use crate::robot::random::Random;
 use super::level::Level;
 use super::path::{Path, between, distance, length, unwind};
 use super::portfolio::{Candidate, Ended, Portfolio};
-use super::refine::refine;
+use super::refine::{cut, refine};
 use super::rrt_connect::{RrtSettings, SearchCount};
 use super::shortcut::{ShortcutSettings, shorten};
 use super::start_contact::MAX_START_DEPTH;
@@ -193,7 +193,7 @@ pub fn plan<C: CollisionChecker>(
                     Ended::Exhausted => PlanError::Exhausted(count),
                 })?;
                 search_time = began.elapsed();
-                if let Some(path) = finished(checker, &found, settings, stop) {
+                if let Some(path) = finished(checker, &found, count.nodes, settings, stop) {
                     break path;
                 }
             }
@@ -222,10 +222,17 @@ pub fn plan<C: CollisionChecker>(
     })
 }
 
-/// Shortens a path that was found, and proves it if the level asks for that; `None` if it cannot be proven.
+/// Smallest and largest number of random cuts of a path.
+const CUTS: (usize, usize) = (32, 256);
+/// A search with more nodes takes longer, and so may the cuts of its path.
+const NODES_PER_CUT: usize = 8;
+
+/// Shortens a path that was found, and proves it if the level asks for that; `None` if it cannot be proven. `nodes`:
+/// those of the search.
 fn finished<C: CollisionChecker>(
     checker: &mut C,
     found: &Candidate,
+    nodes: usize,
     settings: &PlanSettings,
     stop: &Stop,
 ) -> Option<Path> {
@@ -234,7 +241,10 @@ fn finished<C: CollisionChecker>(
     if found.proven {
         return Some(shorten(&found.path, &turns, rounds, &mut |a, b| checker.motion_is_easily_free(a, b, stop)));
     }
-    let short = shorten(&found.path, &turns, rounds, &mut |a, b| !stop.is_over() && checker.motion_looks_free(a, b));
+    let mut looks_free = |a: &[f64], b: &[f64]| !stop.is_over() && checker.motion_looks_free(a, b);
+    let short = shorten(&found.path, &turns, rounds, &mut looks_free);
+    let cuts = (nodes / NODES_PER_CUT).clamp(CUTS.0, CUTS.1);
+    let short = cut(&short, cuts, &mut Random::new(settings.seed), &mut looks_free).unwrap_or(short);
     if is_proven(checker, &short, settings.level, stop) {
         return Some(short);
     }

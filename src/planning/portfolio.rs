@@ -28,6 +28,10 @@ pub struct Candidate {
 
 /// Edges that each search checks in its first turn; twice as many in each further one.
 const FIRST_QUANTUM: u64 = 256;
+/// The first search gets this many times as many edges: most often it finds the path, and then the others were in vain.
+const MAIN_SHARE: u64 = 8;
+/// With more joints than one arm has, short edges are best: a long one is hardly ever free.
+const ONE_ARM: usize = 8;
 /// A proven edge takes about as long as this number of edges that look free or not.
 const PROOF_COST: u64 = 4;
 /// The turns become no longer after this number of doublings.
@@ -60,6 +64,8 @@ pub struct Portfolio {
 #[derive(Debug, Clone)]
 struct Member {
     range: f64,
+    /// Place in the order of the ranges.
+    number: u64,
     seed: u64,
     edges: Edges,
     /// Prepared at its first turn.
@@ -69,14 +75,17 @@ struct Member {
 impl Portfolio {
     /// Prepares the searches from `start` to any of `goals`; all of them must be free.
     pub fn new(start: &[f64], goals: &[Vec<f64>], settings: &RrtSettings, level: Level, seed: u64) -> Self {
-        let mut members = Vec::new();
+        let (mut members, mut ranges) = (Vec::new(), settings.ranges);
+        if start.len() > ONE_ARM {
+            ranges.reverse();
+        }
         for edges in [Edges::Looking, Edges::Proven] {
             if (level == Level::Fast && edges == Edges::Proven) || (level == Level::Exact && edges == Edges::Looking) {
                 continue;
             }
-            for (number, range) in (0..).zip(settings.ranges) {
+            for (number, range) in (0..).zip(ranges) {
                 let seed = if number == 0 { seed } else { seed.rotate_left(32) + number };
-                members.push(Member { range, seed, edges, search: None });
+                members.push(Member { range, number, seed, edges, search: None });
             }
         }
         Self {
@@ -115,14 +124,16 @@ impl Portfolio {
                 self.turn = 0;
                 self.round = (self.round + 1).min(DOUBLINGS);
             }
-            let Member { range, seed, edges, search } = &mut self.members[self.turn];
+            let Member { range, number, seed, edges, search } = &mut self.members[self.turn];
             let (start, goals) = (&self.start, &self.goals);
             let search = search.get_or_insert_with(|| {
                 Search::new(start, goals, (checker.limits(), checker.turns()), most, *range, *seed)
             });
             let checked = *edges;
+            let share = if *number == 0 { MAIN_SHARE } else { 1 };
+            let cost = if checked == Edges::Proven { PROOF_COST } else { 1 };
             let quantum = Quantum {
-                edges: (FIRST_QUANTUM << self.round) / if checked == Edges::Proven { PROOF_COST } else { 1 },
+                edges: (FIRST_QUANTUM << self.round) * share / cost,
                 samples: most.max_samples - count.samples,
                 nodes: most.max_nodes - count.nodes,
             };

@@ -11,7 +11,7 @@ use crate::robot::random::Random;
 use super::path::{Path, between, distance, length, tidy};
 use super::path_planner::{PlanSettings, is_proven};
 use super::rrt_connect::{Quantum, Search};
-use super::shortcut::shorten;
+use super::shortcut::{IsFree, shorten};
 
 /// Cuts that are tried in a round.
 const CUTS: usize = 24;
@@ -38,7 +38,7 @@ pub fn refine<C: CollisionChecker>(
             return (best, round);
         }
         let tried = if round % 2 == 0 {
-            cut(checker, &best, &mut random)
+            cut(&best, CUTS, &mut random, &mut |a, b| checker.motion_looks_free(a, b))
         } else {
             let range = settings.search.ranges[(round / 2) as usize % settings.search.ranges.len()];
             let search = (&settings.search, range, random.bits());
@@ -70,20 +70,22 @@ fn another<C: CollisionChecker>(
     Some(shorten(&found, &turns, &settings.shortcut, &mut |a, b| checker.motion_looks_free(a, b)))
 }
 
-/// Cuts from random places of a path to others (Geraerts and Overmars, 2007).
-fn cut<C: CollisionChecker>(checker: &mut C, path: &Path, random: &mut Random) -> Option<Path> {
-    let mut path = path.clone();
-    let mut shorter = false;
-    for _ in 0..CUTS {
-        let whole = length(&path);
+/// Cuts from random places of a path to others (Geraerts and Overmars, 2007); `None` if none makes it shorter.
+pub(super) fn cut(path: &Path, cuts: usize, random: &mut Random, is_free: IsFree<'_>) -> Option<Path> {
+    let (mut path, mut whole, mut shorter) = (path.clone(), length(path), false);
+    for _ in 0..cuts {
+        // A straight path has no corner to cut.
+        if path.len() <= 2 {
+            break;
+        }
         let (a, b) = (random.between(0.0, whole), random.between(0.0, whole));
         let (first, last) = (place(&path, a.min(b)), place(&path, a.max(b)));
-        if first.0 == last.0 || !checker.motion_looks_free(&first.1, &last.1) {
+        if first.0 == last.0 || !is_free(&first.1, &last.1) {
             continue;
         }
         path.splice(first.0 + 1..=last.0, [first.1, last.1]);
         path = tidy(&path);
-        shorter = true;
+        (whole, shorter) = (length(&path), true);
     }
     shorter.then_some(path)
 }

@@ -6,6 +6,8 @@
 //! Continuous joints move the short way round: a node follows its parent without a jump, and where the trees meet, the
 //! goal's half of the path is shifted by whole turns to match the start's half.
 
+use dimos_kernels::block::LANES;
+
 use crate::collision::checker::Stop;
 use crate::robot::model::Limits;
 
@@ -38,7 +40,7 @@ impl Default for RrtSettings {
             radius: 4.0,
             alpha: 1e-4,
             min_radius: 1.0,
-            max_samples: 10_000_000,
+            max_samples: 100_000_000,
             max_nodes: 1_000_000,
         }
     }
@@ -68,8 +70,9 @@ pub struct Quantum {
 const SAMPLES_PER_EDGE: u64 = 64;
 /// After this number of samples in a row that are outside of all domains, some are drawn inside of them.
 const MISSES: u64 = 128;
-/// The stop condition is tested once per this number of samples, and once per edge.
+/// The stop condition is tested once per this number of samples, and of edges: a clock takes as long as a short edge.
 const POLL: u64 = 1024;
+const POLL_EDGES: u64 = 8;
 
 /// A search with one maximum edge length. It can be paused and continued, and the same sampler gives the same path.
 #[derive(Debug, Clone)]
@@ -91,6 +94,8 @@ pub struct Search {
     count: SearchCount,
     sample: Vec<f64>,
     at: Vec<f64>,
+    /// Both ends of the way on which the other tree grows.
+    ends: [Vec<f64>; 2],
 }
 
 impl Search {
@@ -124,6 +129,7 @@ impl Search {
             misses: 0,
             sample: vec![0.0; dof],
             at: vec![0.0; dof],
+            ends: [vec![0.0; dof], vec![0.0; dof]],
         }
     }
 
@@ -138,9 +144,12 @@ impl Search {
 
     /// Returns whether a path that passes a configuration may be short enough.
     fn may_be_short(&self, q: &[f64]) -> bool {
+        if self.most.is_infinite() {
+            return true;
+        }
         // The roots: the start, and the goals.
         let from = distance(self.trees[0].node(0), q);
-        self.most.is_infinite() || (0..self.goals).any(|goal| from + distance(q, self.trees[1].node(goal)) < self.most)
+        (0..self.goals).any(|goal| from + distance(q, self.trees[1].node(goal)) < self.most)
     }
 
     /// Returns the statistics so far.
@@ -156,8 +165,7 @@ impl Search {
         stop: &Stop,
     ) -> Option<Path> {
         let end = (self.count.samples + quantum.samples, self.count.nodes + quantum.nodes);
-        let mut edges = 0;
-        let mut polled = 0;
+        let (mut edges, mut polled, mut polled_edges) = (0, 0, 0);
         loop {
             let samples = self.count.samples;
             if edges + polled / SAMPLES_PER_EDGE >= quantum.edges || samples >= end.0 || self.count.nodes >= end.1 {
@@ -176,14 +184,14 @@ impl Search {
                 _ => 1 - self.side,
             };
             let tree = &self.trees[self.side];
-            let (sample, nearest, far) = self.batch.next(tree, self.side);
+            let (lane, nearest, far) = self.batch.next(tree, self.side);
             self.count.samples += 1;
             if far > tree.radius(nearest) || far < 1e-6 {
                 self.misses += 1;
                 continue;
             }
             self.misses = 0;
-            self.sample.copy_from_slice(sample);
+            self.batch.sample(lane, &mut self.sample);
             unwind(&mut self.sample, tree.node(nearest), &self.turns);
             between(tree.node(nearest), &self.sample, (self.range / far).min(1.0), &mut self.at);
             if !self.may_be_short(&self.at) {
@@ -195,8 +203,11 @@ impl Search {
             if found.is_some() {
                 return found;
             }
-            if stop.is_over() {
-                return None;
+            if edges >= polled_edges + POLL_EDGES {
+                polled_edges = edges;
+                if stop.is_over() {
+                    return None;
+                }
             }
         }
     }
@@ -206,13 +217,15 @@ impl Search {
         let Self { sampler, limits, settings, trees, batch, .. } = self;
         let local = self.misses >= MISSES;
         let tree = &trees[1 - self.side];
-        batch.fill(|lane, q| {
-            if local && lane % 2 == 1 {
+        batch.fill(|samples| {
+            sampler.fill(samples);
+            if !local {
+                return;
+            }
+            for lane in (1..LANES).step_by(2) {
                 let node = sampler.below(tree.len());
                 let radius = Some(tree.radius(node)).filter(|r| r.is_finite()).unwrap_or(settings.radius);
-                sampler.next_in_ball(tree.node(node), radius, limits, q);
-            } else {
-                sampler.next(q);
+                sampler.fill_from_ball((tree.node(node), radius), limits, lane, samples);
             }
         });
     }
@@ -243,14 +256,15 @@ impl Search {
         let added = own.add(&self.at, Some(nearest));
         // The other tree grows in equal steps towards the new node.
         let (mut node, far) = other.nearest(&self.at);
-        let from = other.node(node).to_vec();
-        let mut to = self.at.clone();
-        unwind(&mut to, &from, &self.turns);
+        let [from, to] = &mut self.ends;
+        from.copy_from_slice(other.node(node));
+        to.copy_from_slice(&self.at);
+        unwind(to, from, &self.turns);
         let steps = (far / self.range).ceil().max(1.0) as usize;
         for k in 1..=steps {
-            between(&from, &to, k as f64 / steps as f64, &mut self.sample);
+            between(from, to, k as f64 / steps as f64, &mut self.sample);
             if k == steps {
-                self.sample.copy_from_slice(&to);
+                self.sample.copy_from_slice(to);
             }
             *edges += 1;
             if !is_free(other.node(node), &self.sample) {

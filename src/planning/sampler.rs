@@ -2,6 +2,9 @@
 
 use std::sync::LazyLock;
 
+use dimos_kernels::block::LANES;
+
+use super::nearest::Row;
 use crate::robot::model::Limits;
 use crate::robot::random::Random;
 
@@ -10,6 +13,8 @@ const PRIMES: [u64; 40] = [
     113, 127, 131, 137, 139, 149, 151, 157, 163, 167, 173, 179,
 ];
 
+/// Values in the table of radii.
+const RADII: usize = 256;
 /// Most numbers in a table of low digits.
 const TABLE: u64 = 256;
 
@@ -29,6 +34,8 @@ pub struct Sampler {
     axes: Vec<Axis>,
     index: u64,
     random: Random,
+    /// Values of u^(1/n); empty until they are needed.
+    radii: Vec<f64>,
 }
 
 /// One joint.
@@ -57,43 +64,70 @@ impl Sampler {
             Axis { low, width: (high - low).max(0.0), shift, place: 0, high: 0.0 }
         };
         let axes = limits.iter().enumerate().map(axis).collect();
-        Self { axes, index: 0, random }
+        Self { axes, index: 0, random, radii: Vec::new() }
     }
 
-    /// Writes the next sample.
-    pub fn next(&mut self, q: &mut [f64]) {
-        self.index += 1;
-        for (j, (x, axis)) in q.iter_mut().zip(&mut self.axes).enumerate() {
-            let part = match LOW_DIGITS.get(j) {
-                Some(table) => {
-                    axis.place += 1;
-                    if axis.place == table.len() {
-                        axis.place = 0;
-                        let power = table.len() as u64;
-                        axis.high = radical_inverse(PRIMES[j], self.index / power) / power as f64;
-                    }
-                    let part = table[axis.place] + axis.high + axis.shift;
-                    if part < 1.0 { part } else { part - 1.0 }
-                }
-                None => self.random.unit(),
+    /// Writes the next samples.
+    pub fn fill(&mut self, samples: &mut [Row]) {
+        for (j, (row, axis)) in samples.iter_mut().zip(&mut self.axes).enumerate() {
+            let Some(table) = LOW_DIGITS.get(j) else {
+                row.iter_mut().for_each(|x| *x = axis.low + self.random.unit() * axis.width);
+                continue;
             };
-            *x = axis.low + part * axis.width;
+            let mut done = 0;
+            while done < LANES {
+                axis.place += 1;
+                if axis.place >= table.len() {
+                    axis.place = 0;
+                    let power = table.len() as u64;
+                    axis.high = radical_inverse(PRIMES[j], (self.index + done as u64 + 1) / power) / power as f64;
+                }
+                // Neighbours in the table are of neighbouring samples.
+                let run = (table.len() - axis.place).min(LANES - done);
+                for (x, low) in row[done..done + run].iter_mut().zip(&table[axis.place..axis.place + run]) {
+                    let part = low + axis.high + axis.shift;
+                    *x = axis.low + (if part < 1.0 { part } else { part - 1.0 }) * axis.width;
+                }
+                done += run;
+                axis.place += run - 1;
+            }
         }
+        self.index += LANES as u64;
     }
 
     /// Writes a sample that is evenly distributed in a ball about a configuration, moved to the limits where it is
     /// outside of them.
-    pub fn next_in_ball(&mut self, center: &[f64], radius: f64, limits: &[Limits], q: &mut [f64]) {
+    pub fn fill_from_ball(
+        &mut self,
+        (center, radius): (&[f64], f64),
+        limits: &[Limits],
+        lane: usize,
+        samples: &mut [Row],
+    ) {
         let mut squared = 0.0;
-        for x in q.iter_mut() {
-            // Close to a normal distribution, which has no preferred direction.
-            *x = (0..4).map(|_| self.random.unit() - 0.5).sum();
-            squared += *x * *x;
+        for row in samples.iter_mut() {
+            // Close to a normal distribution, which has no preferred direction: a sum of four numbers of 16 bits.
+            let bits = self.random.bits();
+            let sum: u64 = [0, 16, 32, 48].iter().map(|shift| (bits >> shift) & 0xffff).sum();
+            let x = sum as f64 - 2.0 * f64::from(u16::MAX);
+            row[lane] = x;
+            squared += x * x;
         }
-        let scale = radius * self.random.unit().powf(1.0 / q.len().max(1) as f64) / squared.sqrt().max(1e-9);
-        for ((x, c), l) in q.iter_mut().zip(center).zip(limits) {
-            *x = (c + *x * scale).max(l.lower).min(l.upper);
+        let scale = radius * self.part_of_radius(samples.len()) / squared.sqrt().max(1e-9);
+        for ((row, c), l) in samples.iter_mut().zip(center).zip(limits) {
+            row[lane] = (c + row[lane] * scale).max(l.lower).min(l.upper);
         }
+    }
+
+    /// Returns the distance from the middle of a sample in a ball of radius 1: u^(1/n) for an even u, from a table.
+    fn part_of_radius(&mut self, joints: usize) -> f64 {
+        if self.radii.is_empty() {
+            let part = |k: usize| (k as f64 / RADII as f64).powf(1.0 / joints.max(1) as f64);
+            self.radii = (0..=RADII).map(part).collect();
+        }
+        let at = self.random.unit() * RADII as f64;
+        let below = (at as usize).min(RADII - 1);
+        self.radii[below] + (at - below as f64) * (self.radii[below + 1] - self.radii[below])
     }
 
     /// Returns a random index below `n`.
@@ -121,11 +155,14 @@ mod tests {
     fn the_sequence_is_the_halton_sequence() {
         let limits = [Limits { lower: 0.0, upper: 1.0, ..Limits::NONE }; 9];
         let mut sampler = Sampler::new(&limits, &[], 0);
-        let mut q = [0.0; 9];
-        for index in 1..40_000 {
-            sampler.next(&mut q);
-            for (x, base) in q.iter().zip(PRIMES) {
-                assert!((x - radical_inverse(base, index)).abs() < 1e-12, "{index} in base {base}");
+        let mut rows = [[0.0; LANES]; 9];
+        for batch in 0..2500 {
+            sampler.fill(&mut rows);
+            for (row, base) in rows.iter().zip(PRIMES) {
+                for (lane, x) in row.iter().enumerate() {
+                    let index = (batch * LANES + lane + 1) as u64;
+                    assert!((x - radical_inverse(base, index)).abs() < 1e-12, "{index} in base {base}");
+                }
             }
         }
     }
@@ -134,9 +171,10 @@ mod tests {
     fn samples_in_a_ball_fill_it_evenly_and_keep_the_limits() {
         let limits = [Limits { lower: -1.5, upper: 3.0, ..Limits::NONE }; 3];
         let mut sampler = Sampler::new(&limits, &[], 1);
-        let (mut q, mut inner, mut at_limit) = ([0.0; 3], 0, 0);
-        for _ in 0..8000 {
-            sampler.next_in_ball(&[0.0, 0.0, 1.0], 2.0, &limits, &mut q);
+        let (mut rows, mut inner, mut at_limit) = ([[0.0; LANES]; 3], 0, 0);
+        for number in 0..8000 {
+            sampler.fill_from_ball((&[0.0, 0.0, 1.0], 2.0), &limits, number % LANES, &mut rows);
+            let q = rows.map(|row| row[number % LANES]);
             let away = (q[0] * q[0] + q[1] * q[1] + (q[2] - 1.0) * (q[2] - 1.0)).sqrt();
             assert!(away <= 2.0 + 1e-12 && q.iter().all(|x| *x >= -1.5 && *x <= 3.0));
             inner += usize::from(away < 1.0);

@@ -1,7 +1,5 @@
 //! Faces of the run to other systems, which the gateway serves: what becomes of them is an event of the run.
 
-use std::sync::atomic::Ordering;
-
 use super::service::Service;
 use crate::rpc::api::FaceReport;
 use crate::telemetry::describe::{Described, Severity};
@@ -21,8 +19,6 @@ impl Service {
             joint: None,
             values: Vec::new(),
         };
-        self.parts.dispatcher.log(described.severity, described.text.clone());
-        let tick = self.parts.pulse.ticks.load(Ordering::Relaxed);
-        self.report_event(tick, &described, self.parts.wall);
+        self.report_now(&described, self.parts.wall);
     }
 }

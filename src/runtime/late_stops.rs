@@ -74,8 +74,6 @@ impl Service {
             joint: None,
             values: Vec::new(),
         };
-        self.parts.dispatcher.log(described.severity, described.text.clone());
-        let tick = self.parts.pulse.ticks.load(Ordering::Relaxed);
-        self.report_event(tick, &described, wall);
+        self.report_now(&described, wall);
     }
 }

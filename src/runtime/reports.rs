@@ -384,6 +384,12 @@ impl Service {
         });
     }
 
+    /// Records an event that no tick has made, and reports it.
+    pub(super) fn report_now(&self, described: &Described, wall: WallOffset) {
+        self.parts.dispatcher.log(described.severity, described.text.clone());
+        self.report_event(self.parts.pulse.ticks.load(Relaxed), described, wall);
+    }
+
     /// Logs an event and publishes it to subscribers.
     pub(super) fn report_event(&self, tick: u64, described: &Described, wall: WallOffset) {
         if let Some(line) = self.log_throttle.line(described, Instant::now()) {

@@ -162,6 +162,11 @@ impl Cause {
         matches!(self, Self::ModeChanged | Self::PowerChanged | Self::StoppedElsewhere)
     }
 
+    /// Returns whether a person has stopped the arm.
+    pub fn is_of_a_person(self) -> bool {
+        matches!(self, Self::Operator | Self::StopInput)
+    }
+
     /// Returns its name in rpc and logs.
     pub fn name(self) -> &'static str {
         match self {

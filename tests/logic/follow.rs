@@ -334,18 +334,30 @@ fn the_speed_override_slows_it_and_a_pause_is_followed_by_an_approach() {
 }
 
 #[test]
-fn it_is_started_and_cancelled_and_ends_when_its_arm_is_stopped_but_not_with_its_leader() {
+fn it_is_started_and_cancelled_and_ends_when_its_arm_or_its_leader_is_stopped() {
     let mut rig = Rig::new(100.0, vec![arm("leader", 6), arm("follower", 6)], vec![task_of(follow(|_| {}))]);
     rig.make_ready();
     assert_eq!(rig.ask(Request::Start { task: 0 }), Outcome::Accepted);
     assert_eq!(rig.ask(Request::Start { task: 0 }), Outcome::AlreadyExecuting(0));
     until_in_step(&mut rig);
-    rig.ask(Request::Stop { arm: Some(0) });
-    rig.run_for(0.5);
-    assert_eq!(rig.phase(LEADER), Phase::Held);
-    assert_eq!((rig.tasks[0].state, rig.tasks[0].reason), (TaskState::Executing, Reason::InStep));
     assert_eq!(rig.ask(Request::Cancel { task: Some(0) }), Outcome::Cancelled);
     assert_eq!((rig.tasks[0].state, rig.tasks[0].distance), (TaskState::Idle, None));
+    assert_eq!(rig.ask(Request::Start { task: 0 }), Outcome::Accepted);
+    until_in_step(&mut rig);
+    rig.ask(Request::Stop { arm: Some(0) });
+    rig.run(2);
+    assert_eq!(rig.phase(LEADER), Phase::Held);
+    assert!(matches!(rig.tasks[0].reason, Reason::ArmHeld(0, Cause::Operator)), "{:?}", rig.tasks[0]);
+    // A hand that moves the leader all the same moves nothing else.
+    let rests = rig.arms[FOLLOWER].q.clone();
+    rig.arms[LEADER].q[1] += 0.3;
+    rig.run_for(1.0);
+    assert!((rig.arms[FOLLOWER].q[1] - rests[1]).abs() < 0.02, "{:?}", rig.arms[FOLLOWER].q);
+    assert!(matches!(rig.ask(Request::Start { task: 0 }), Outcome::ArmLatched(0, _)));
+    rig.ask(Request::Reset { arm: 0 });
+    rig.run_for(0.2);
+    rig.arms[LEADER].q[1] -= 0.3;
+    rig.run_for(0.2);
     assert_eq!(rig.ask(Request::Start { task: 0 }), Outcome::Accepted);
     rig.ask(Request::Stop { arm: Some(1) });
     assert!(matches!(rig.tasks[0].reason, Reason::ArmHeld(1, Cause::Operator)), "{:?}", rig.tasks[0]);

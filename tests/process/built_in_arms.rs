@@ -158,6 +158,7 @@ fn every_shipped_blueprint_is_without_mistakes_and_starts() {
         assert_eq!(blueprint["problem"], Value::Null, "{name}");
         let checked = home.dimos(&format!("check {name}")).with(0);
         assert_eq!(checked.err, "", "{name} has warnings");
+        assert!(!checked.out.contains("warning"), "{name}: {}", checked.out);
         let started = home.dimos(&format!("run {name} --no-record --duration 0.2")).with(0);
         let phase = if WITH_BRAKES.contains(&name) { "SIMULATED, ur, disabled" } else { "ready" };
         started.says(&[&format!("run {name}  SIMULATED"), phase, "duration reached"]);

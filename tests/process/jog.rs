@@ -370,7 +370,7 @@ fn what_is_missing_is_said_before_the_screen_is_taken() {
     let terminal = Terminal::new(100, 24);
     terminal.start(&home, "jog arm").wait().with(2);
     terminal.until("no task of the run can be jogged on arm");
-    terminal.until("- {name: velocity_arm, type: velocity, joint_names: {hardware: arm}, priority: 20}");
+    terminal.until("- {name: servo_arm, type: servo, joint_names: {hardware: arm}, priority: 20}");
     eventually("the terminal is given back", || terminal.is_as_before());
     let terminal = Terminal::new(100, 24);
     terminal.start(&home, "jog rarm").wait().with(2);

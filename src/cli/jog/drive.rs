@@ -76,11 +76,13 @@ impl Drives {
 /// Returns the line to add to a blueprint's tasks, for a mode.
 pub fn line(arm: &str, joint_mode: bool) -> String {
     match joint_mode {
-        true => format!("- {{name: velocity_{arm}, type: velocity, joint_names: {{hardware: {arm}}}, priority: 20}}"),
-        // With a planner in the blueprint the description is known, and `params` can be omitted.
+        // Every arm takes positions.
+        true => format!("- {{name: servo_{arm}, type: servo, joint_names: {{hardware: {arm}}}, priority: 20}}"),
         false => format!(
-            "- {{name: twist_{arm}, type: eef_twist, joint_names: {{hardware: {arm}}}, priority: 20, params: \
-             {{model_path: builtin:yourarm, end_effector_link: flange, joint_prefix: {arm}_}}}}"
+            "- {{name: twist_{arm}, type: eef_twist, joint_names: {{hardware: {arm}}}, priority: 21, params: \
+             {{model_path: MODEL, end_effector_link: LINK, joint_prefix: {arm}_}}}}\n        \
+             # MODEL and LINK: the arm's own description, a file or builtin:NAME, and its flange in it; `params` can be \
+             left out where the blueprint has a planner for the arm"
         ),
     }
 }

@@ -6,6 +6,7 @@ use std::path::Path;
 
 use super::{Part, ended, progress, unreadable, written};
 use crate::cli::exit::{Exit, Failure, Result};
+use crate::cli::output;
 use crate::recording::replay::LogReader;
 use crate::recording::scan::{Item, Scan};
 
@@ -46,11 +47,11 @@ pub fn run(path: &Path, part: &Part, topics: &[String], json: bool) -> Result {
             }
         }
     }
-    if !written(&mut out, "")? || out.flush().is_err() {
+    if !written(&mut out, "")? || !output::written(out.flush()) {
         return Ok(Exit::Ok);
     }
     if unknown > 0 {
-        crate::cli::output::note(format_args!("warning: {unknown} messages cannot be decoded by their schema"));
+        output::note(format_args!("warning: {unknown} messages cannot be decoded by their schema"));
         return Ok(Exit::Log);
     }
     Ok(ended(&scan))

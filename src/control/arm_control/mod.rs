@@ -175,6 +175,15 @@ impl ArmControl {
         }
     }
 
+    /// Returns why no other arm may follow it: its position is unknown, or a person has stopped it.
+    pub fn not_to_follow(&self) -> Cause {
+        let cause = self.failsafe.cause();
+        match self.unknown_position() {
+            Cause::None if self.failsafe.phase() == Phase::Held && cause.is_of_a_person() => cause,
+            unknown => unknown,
+        }
+    }
+
     /// Returns the distance of a joint from the range of its setpoints of the last `lag` seconds [rad].
     pub fn tracking_error(&self, joint: usize) -> f64 {
         self.tracking.error(joint)

@@ -118,6 +118,8 @@ impl Bench {
 
     /// Resets the arm's latch, enables it and waits until it is ready.
     pub fn enable(&mut self) -> Result<(), String> {
+        // The leader, if there is one, too: a task may follow no arm that a person has stopped.
+        self.ask(Request::Reset { arm: 1 });
         self.ask(Request::Reset { arm: 0 });
         self.ask(Request::Enabled { arm: 0 });
         self.run(0.5);

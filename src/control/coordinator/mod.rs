@@ -136,7 +136,7 @@ impl Coordinator {
                 let (phase, cause) = (arm.failsafe.phase(), arm.failsafe.cause());
                 self.output.report(Event::Arm(i as u16, phase, cause));
             }
-            let fault = arm.unknown_position();
+            let fault = arm.not_to_follow();
             let views = self.joints.iter_mut().skip(arm.first()).zip(arm.limiters());
             for (j, (view, limiter)) in views.enumerate() {
                 *view = JointView {

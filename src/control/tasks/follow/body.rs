@@ -174,6 +174,10 @@ impl FollowTask {
 
     /// Returns the reason to report, or the end of the task without its leader.
     fn await_leader(&mut self, cx: &Context<'_>, view: &JointView) -> Step {
+        if view.fault.is_of_a_person() {
+            // Who stops the leader expects that what follows it stops, too.
+            return Step::End(TaskState::Aborted, Reason::ArmHeld(view.arm, view.fault));
+        }
         let (since, reason) = *self.lost.get_or_insert((cx.now, Reason::LeaderLost(view.arm, view.fault)));
         if cx.now.seconds_since(since) >= self.params.leader_timeout {
             return Step::End(TaskState::Aborted, reason);
@@ -233,6 +237,9 @@ impl TaskBody for FollowTask {
             _ => return Err(Outcome::WrongTask(cx.task)),
         }
         for (joint, view, leader, target) in self.pairs(cx) {
+            if leader.fault.is_of_a_person() {
+                return Err(Outcome::ArmLatched(leader.arm, leader.fault));
+            }
             if leader.fault != Cause::None {
                 return Err(Outcome::StartStateUnavailable(leader.arm));
             }
