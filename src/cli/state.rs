@@ -4,12 +4,15 @@ use std::io::{self, IsTerminal, Write};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use super::arguments::{Target, hertz};
+use super::arguments::{Target, hertz, place};
 use super::exit::{Exit, Result};
 use super::lasting;
 use super::output::{self, Table, fixed, number};
 use crate::rpc::api::State;
+use crate::rpc::client::{self, ClientError};
+use crate::rpc::error::{Code, RpcError};
 use crate::rpc::report::{ArmStateReport, JointReport, PoseReport, StateReport};
+use crate::rpc::run_dir::RunDir;
 
 /// Arguments of `state`.
 #[derive(Debug, clap::Args)]
@@ -30,9 +33,15 @@ pub fn run(args: &Args) -> Result {
     let mut client = args.target_run.connect()?;
     let mut screen = Screen::new(args.watch && io::stdout().is_terminal());
     let period = Duration::from_secs_f64(1.0 / args.hz);
-    let mut next = Instant::now();
+    let (mut next, mut shown) = (Instant::now(), false);
     loop {
         let report = match client.call(State {}) {
+            Err(ClientError::Io { .. } | ClientError::Refused(RpcError { code: Code::ShuttingDown, .. }))
+                if shown && place().is_none() && has_ended(client.run()) =>
+            {
+                output::note(format_args!("run {} has ended", client.run()));
+                return Ok(Exit::Ok);
+            }
             Err(error) if args.watch && lasting::is_lost(&error) => {
                 client = lasting::again(client.run(), &error)?;
                 screen = Screen::new(screen.live);
@@ -47,9 +56,19 @@ pub fn run(args: &Args) -> Result {
         if !output::written(screen.show(&lines)) || !args.watch {
             return Ok(Exit::Ok);
         }
+        shown = true;
         next = (next + period).max(Instant::now());
         sleep(next.saturating_duration_since(Instant::now()));
     }
+}
+
+/// Returns whether a run of this computer ends within two seconds: its process outlives its connections.
+fn has_ended(name: &str) -> bool {
+    let is_live = || client::find(&RunDir::standard(), Some(name)).is_ok();
+    (0..40).any(|attempt| {
+        sleep(Duration::from_millis(if attempt == 0 { 0 } else { 50 }));
+        !is_live()
+    })
 }
 
 /// Output of --watch: redrawn in place on a terminal, appended elsewhere.

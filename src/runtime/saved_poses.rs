@@ -6,6 +6,7 @@ use std::path::PathBuf;
 
 use super::planner_port::run_blocking;
 use super::service::{Service, internal};
+use crate::blueprint::Blueprint;
 use crate::rpc::api::{self, SavedPose};
 use crate::rpc::{Code, RpcError};
 
@@ -25,15 +26,25 @@ fn folder() -> Option<PathBuf> {
     Some(settings.join("dimos"))
 }
 
+/// Returns a number that is another one for another path: FNV-1a in 32 bits.
+fn digest(bytes: &[u8]) -> u32 {
+    bytes.iter().fold(0x811c_9dc5, |sum: u32, byte| (sum ^ u32::from(*byte)).wrapping_mul(0x0100_0193))
+}
+
 /// The file of a blueprint's poses.
 #[derive(Debug, Clone)]
 struct PoseFile(PathBuf);
 
 impl PoseFile {
-    fn of(blueprint: &str) -> Result<Self, RpcError> {
+    fn of(blueprint: &Blueprint) -> Result<Self, RpcError> {
         // A blueprint's name may have any character.
         let plain = |c: char| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '_' };
-        let name: String = blueprint.chars().map(plain).collect();
+        let mut name: String = blueprint.name.chars().map(plain).collect();
+        // Two cells may have a file of the same name, and other poses. A shipped blueprint is in no file.
+        let file = blueprint.sources.first().and_then(|(file, _)| std::fs::canonicalize(file).ok());
+        if let Some(file) = file {
+            name.push_str(&format!("-{:08x}", digest(file.as_os_str().as_encoded_bytes())));
+        }
         let folder = folder().ok_or_else(|| {
             RpcError::new(Code::Unsupported, "no folder for poses: neither XDG_CONFIG_HOME nor HOME is set")
                 .hint("set one of them to an absolute path")
@@ -80,7 +91,7 @@ impl PoseFile {
 
 impl Service {
     fn pose_file(&self) -> Result<PoseFile, RpcError> {
-        PoseFile::of(&self.parts.blueprint.name)
+        PoseFile::of(&self.parts.blueprint)
     }
 
     /// Returns the saved poses.

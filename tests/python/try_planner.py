@@ -51,6 +51,10 @@ def poses_and_several_goals(robot):
     refused(dimos.Refused, "INVALID_PARAMS", lambda: robot.plan("arm", HOME, named="home"))
     refused(dimos.Refused, "INVALID_PARAMS", lambda: robot.world_add("two", sphere=0.1, box=[1, 1, 1]))
     refused(dimos.Refused, "UNKNOWN_ROBOT", lambda: robot.named_poses("amr"))
+    robot.call("pose_save", name="here")
+    assert is_at(robot, robot.named_poses("arm")["here"])
+    robot.call("pose_remove", name="here")
+    refused(dimos.Refused, "INVALID_PARAMS", lambda: robot.move("arm", "home"))
 
 
 def carries_an_object(robot):

@@ -52,11 +52,16 @@ class Planning(Streams):
         return self.call("preview", plan=plan_number(plan), hz=hz)
 
     def named_poses(self, arm: str) -> Dict[str, List[float]]:
-        """The named poses of an arm [rad]."""
+        """The named poses of an arm [rad], saved ones too."""
         robots = {robot["name"]: robot for robot in self.call("planner")["robots"]}
         if arm not in robots:
             raise Refused("UNKNOWN_ROBOT", f"the planner has no robot named {arm}", f"it has {', '.join(robots)}")
-        poses: Dict[str, List[float]] = robots[arm]["named_poses"]
+        joints: List[str] = robots[arm]["joints"]
+        poses: Dict[str, List[float]] = dict(robots[arm]["named_poses"])
+        for name, arms in self.call("poses")["poses"].items():
+            at = {joint: position for of_arm in arms.values() for joint, position in of_arm.items()}
+            if all(joint in at for joint in joints):
+                poses.setdefault(name, [at[joint] for joint in joints])
         return poses
 
     def world_add(self, name: str, *, box: Optional[Sequence[float]] = None, sphere: Optional[float] = None,

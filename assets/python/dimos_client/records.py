@@ -5,10 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Dict, List, Optional, Sequence, Union
 
+from .errors import Refused
+
 
 def numbers(values: Sequence[float]) -> List[float]:
     """Plain numbers, also of an array of another library."""
-    return [float(value) for value in values]
+    try:
+        return [float(value) for value in values]
+    except (TypeError, ValueError):
+        hint = f"a named pose: named={values!r}" if isinstance(values, str) else None
+        raise Refused("INVALID_PARAMS", f"{values!r} is not a list of numbers", hint) from None
 
 
 @dataclass(frozen=True)

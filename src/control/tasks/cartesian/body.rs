@@ -66,7 +66,7 @@ impl TaskBody for CartesianTask {
         let target = self.target.filter(|(_, at)| fresh(at)).map(|(target, _)| target);
         self.timed_out = target.is_none();
         let ended = || match self.slowing {
-            true => Step::End(TaskState::Aborted, Reason::Cancelled),
+            true => Step::End(TaskState::Idle, Reason::Cancelled),
             false => Step::End(TaskState::Idle, Reason::Timeout),
         };
         let ending = self.slowing || self.timed_out;
