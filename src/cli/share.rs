@@ -3,6 +3,8 @@
 
 use std::path::{Path, PathBuf};
 use std::process::exit;
+use std::thread::sleep;
+use std::time::{Duration, Instant};
 
 use rustix::process::{Signal, set_parent_process_death_signal};
 use serde_json::json;
@@ -17,6 +19,9 @@ use crate::rpc::client;
 use crate::rpc::client::ClientError;
 use crate::rpc::run_dir::RunDir;
 use crate::share::{Gateway, refusals};
+
+/// Time in which a face joins its router, if that is there.
+const JOIN_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Arguments of `share`.
 #[derive(Debug, clap::Args)]
@@ -192,6 +197,11 @@ pub fn run(args: &Args) -> Result {
                 output::note("Press Ctrl-C to end that; the run continues.");
             }
         }
+        let began = Instant::now();
+        while !gateway.not_serving().is_empty() && began.elapsed() < JOIN_TIMEOUT {
+            sleep(Duration::from_millis(10));
+        }
+        gateway.not_serving().iter().for_each(|what| output::note(format_args!("warning: {what}")));
     }
     gateway.serve();
     if is_child {

@@ -159,6 +159,12 @@ impl Gateway {
         python_dimos.or_else(|| self.ros.as_ref().and_then(|face| face.as_ref().err()))
     }
 
+    /// Returns which faces do not serve at present, and why: one may wait for its router.
+    pub fn not_serving(&self) -> Vec<String> {
+        let down = |face: FaceReport| Some(format!("{} does not serve: {}", face.face, face.reason?));
+        self.faces().into_iter().filter_map(down).collect()
+    }
+
     fn faces(&self) -> Vec<FaceReport> {
         let why = |error: &RpcError| {
             let hint = error.hint.as_ref().map(|hint| format!(" (hint: {hint})")).unwrap_or_default();

@@ -25,6 +25,11 @@ impl Gateway {
         None
     }
 
+    /// Returns which faces do not serve.
+    pub fn not_serving(&self) -> Vec<String> {
+        match *self {}
+    }
+
     /// Serves until the run ends.
     pub fn serve(self) {
         match self {}

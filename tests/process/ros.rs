@@ -227,6 +227,11 @@ fn a_router_that_comes_and_goes_is_waited_for() {
         eventually("it serves no more", || face(&home)["serves"] == false);
     }
     assert_eq!(home.status()["arms"][0]["phase"], "ready");
+    drop(run);
+    let home = Home::new();
+    let _run = home.run("coordinator-mock --no-record");
+    let by_hand = home.start(&format!("share --ros tcp/127.0.0.1:{}", ros.port));
+    by_hand.until("warning: ros does not serve: no router at tcp/127.0.0.1:");
 }
 
 /// N12: the encoding of ROS.
