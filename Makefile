@@ -43,7 +43,7 @@ NODE := $(if $(wildcard viewer/package.json),$(shell command -v npm))
 # Builds the program to try it, not optimized, and starts the shipped blueprint; its arm is simulated. Ends with Ctrl-C.
 run: viewer-if-possible
 	@[ -e $(TARGET)/quick/dimos ] || echo "building dimos: 3 to 5 minutes the first time" >&2
-	@cargo run --profile quick --locked -- run coordinator-yourarm || [ $$? -eq 130 ]
+	@trap : INT; cargo run --profile quick --locked -- run coordinator-yourarm || [ $$? -eq 130 ]
 
 # Installs program, man pages, completions and blueprints below PREFIX; below /usr/local also the systemd unit.
 install: shipped

@@ -53,7 +53,7 @@ enum Action {
 Exit code 0: the fingers are where they were sent, or hold an object. 1: blocked, or no outcome within --timeout.
 
   dimos arm gripper arm close --force 20
-  dimos arm gripper arm close --attach cup        # with a planner: cup is part of the arm once it is held
+  dimos arm gripper arm close --attach cup    # cup is part of the arm then
   dimos arm gripper arm open --detach")]
     Gripper(GripperArgs),
     /// List serial ports, and find the arm's by unplugging it or by asking each; no run needed

@@ -1,9 +1,15 @@
 //! `dimos cancel`: ends motions by decelerating within limits.
 
+use std::time::Duration;
+
 use super::arguments::Target;
 use super::exit::{Exit, Result};
 use super::output;
-use crate::rpc::api::Cancel;
+use crate::rpc::api::{Cancel, Status};
+use crate::rpc::report::TaskReport;
+
+/// Time in which a client that streams sends its next targets.
+const STREAM_PERIOD: Duration = Duration::from_millis(250);
 
 /// Arguments of `cancel`.
 #[derive(Debug, clap::Args)]
@@ -34,6 +40,15 @@ pub fn run(args: &Args) -> Result {
     }
     if reply.tasks.is_empty() && !reply.planning {
         output::note("nothing was moving");
+    }
+    let cancelled = |task: &&TaskReport| reply.tasks.get(&task.name).is_some_and(|status| status == "CANCELLED");
+    if reply.tasks.values().any(|status| status == "CANCELLED") {
+        std::thread::sleep(STREAM_PERIOD);
+        let tasks = client.call(Status {})?.tasks;
+        for task in tasks.iter().filter(cancelled).filter(|task| task.state == "EXECUTING") {
+            let name = &task.name;
+            output::note(format_args!("{name} executes again: a client sends it targets; `dimos stop` holds the arm"));
+        }
     }
     Ok(Exit::Ok)
 }

@@ -109,8 +109,8 @@ pub fn report(name: &str, overrides: &Overrides, catalog: Catalog<'_>, as_json: 
 fn print(summary: &Summary) {
     let rate = summary.coordinator.tick_rate;
     let about = Some(&summary.description).filter(|text| !text.is_empty());
-    output::line(about.map_or_else(|| summary.name.clone(), |about| format!("{}: {about}", summary.name)));
-    output::line(format_args!("files: {}; tick: {rate} Hz", summary.files.join(", ")));
+    output::wrapped(about.map_or_else(|| summary.name.clone(), |about| format!("{}: {about}", summary.name)));
+    output::wrapped(format_args!("files: {}; tick: {rate} Hz", summary.files.join(", ")));
     for arm in &summary.arms {
         let standing = banner::standing(arm.simulated, &arm.address);
         output::line("");
@@ -122,7 +122,7 @@ fn print(summary: &Summary) {
             OnExit::Disable => "are disabled, it FALLS unless supported",
             OnExit::Park => "move the arm to its park pose, then are disabled",
         };
-        output::line(format_args!("  motors: {motors}; at exit they {exit} ({})", arm.on_exit_from.name()));
+        output::wrapped(format_args!("  motors: {motors}; at exit they {exit} ({})", arm.on_exit_from.name()));
         let mut table =
             Table::new(&["  JOINT", ">LOWER rad", ">UPPER rad", ">rad/s", ">rad/s²", ">rad/s³", "~WHERE FROM"]);
         for joint in &arm.joints {

@@ -13,9 +13,11 @@ use clap_complete::engine::{
     ArgValueCandidates, ArgValueCompleter, CompletionCandidate, PathCompleter, ValueCompleter,
 };
 
+use super::log;
 use super::run_record::RunRecord;
-use crate::blueprint::{self, Catalog};
-use crate::rpc::api::{Planner, Poses, Status, World};
+use crate::blueprint::{self, Catalog, Overrides};
+use crate::robot::builtin;
+use crate::rpc::api::{Planner, Poses, State, Status, World};
 use crate::rpc::client::Client;
 use crate::rpc::report::StatusReport;
 use crate::rpc::run_dir::RunDir;
@@ -27,11 +29,24 @@ const TIMEOUT: Duration = Duration::from_millis(500);
 
 /// Names of the adapters of this program.
 static ADAPTERS: OnceLock<Vec<String>> = OnceLock::new();
+/// The blueprint that was typed: its arms, and the keys of `--set`.
+static TYPED: OnceLock<Typed> = OnceLock::new();
+
+/// What a blueprint has, each followed by `=`.
+#[derive(Default)]
+struct Typed {
+    arms: BTreeSet<String>,
+    keys: BTreeSet<String>,
+}
 
 /// Answers the shell and exits if it asks for completions. Call it before any thread is started: it removes
 /// [`VARIABLE`] from the environment.
 pub fn answer(catalog: Catalog<'_>) {
     let _ = ADAPTERS.set(catalog.adapters.names().into_iter().map(|name| name.to_string()).collect());
+    if std::env::var_os(VARIABLE).is_some() {
+        let words = std::env::args().skip_while(|word| word != "--").skip(1);
+        let _ = TYPED.set(Typed::of(words, catalog));
+    }
     CompleteEnv::with_factory(|| with_candidates("", super::command())).var(VARIABLE).complete();
 }
 
@@ -52,6 +67,18 @@ fn candidates(parent: &str, verb: &str, arg: Arg) -> Arg {
         ("task", _) => arg.add(of(tasks)),
         ("named", _) => arg.add(of(named_poses)),
         ("through", _) => arg.add(of(waypoints)),
+        ("several", _) => arg.add(of(goals)),
+        ("opening", _) => arg.add(of(|| ["open", "close"].map(str::to_owned).into())),
+        ("joint", _) => arg.add(of(joints)),
+        ("address", "run" | "check") => {
+            arg.add(of(|| TYPED.get().map_or_else(BTreeSet::new, |typed| typed.arms.clone())))
+        }
+        ("set", "run" | "check") => arg.add(of(|| TYPED.get().map_or_else(BTreeSet::new, |typed| typed.keys.clone()))),
+        ("file", _) if parent == "model" => {
+            arg.add(ArgValueCompleter::new(models as fn(&OsStr) -> Vec<CompletionCandidate>))
+        }
+        ("log", _) if !arg.get_action().takes_values() => arg,
+        ("log", _) => arg.add(ArgValueCompleter::new(logs as fn(&OsStr) -> Vec<CompletionCandidate>)),
         ("frame", _) => arg.add(of(frames)),
         ("run" | "attach", _) if arg.get_action().takes_values() => arg.add(of(runs)),
         ("name", "down" | "status") => arg.add(of(runs_and_planners)),
@@ -75,6 +102,41 @@ fn blueprints(typed: &OsStr) -> Vec<CompletionCandidate> {
     let is_yaml = |path: &std::path::Path| path.extension().is_some_and(|e| e == "yaml" || e == "yml");
     let files = PathCompleter::any().filter(is_yaml).complete(typed);
     names.map(CompletionCandidate::new).chain(files).collect()
+}
+
+/// Returns the built-in robots, and files.
+fn models(typed: &OsStr) -> Vec<CompletionCandidate> {
+    let text = typed.to_string_lossy();
+    let names = builtin::names().map(|name| format!("builtin:{name}")).filter(|name| name.starts_with(&*text));
+    names.map(CompletionCandidate::new).chain(PathCompleter::any().complete(typed)).collect()
+}
+
+/// Returns the logs where runs keep them, and log files here.
+fn logs(typed: &OsStr) -> Vec<CompletionCandidate> {
+    let text = typed.to_string_lossy();
+    let is_log = |path: &std::path::Path| path.extension().is_some_and(|e| e == "mcap");
+    let kept = log::kept().into_iter().filter(|name| name.starts_with(&*text));
+    kept.map(CompletionCandidate::new).chain(PathCompleter::any().filter(is_log).complete(typed)).collect()
+}
+
+impl Typed {
+    /// Reads the blueprint that a command line names.
+    fn of(words: impl Iterator<Item = String>, catalog: Catalog<'_>) -> Self {
+        let mut words = words.skip_while(|word| word != "run" && word != "check").skip(1);
+        let name = words.find(|word| !word.starts_with('-')).filter(|name| !name.is_empty());
+        let found = name.and_then(|name| blueprint::find(&name).ok());
+        let loaded = found.map(|found| blueprint::load(&found, &Overrides::default(), catalog));
+        let Some(blueprint) = loaded.and_then(|loaded| loaded.blueprint) else { return Self::default() };
+        let of_arm = ["address", "adapter_type", "auto_enable", "on_exit", "options", "limits"];
+        let arms = blueprint.arms.iter().map(|arm| &arm.hardware_id);
+        let keys = arms.clone().flat_map(|arm| of_arm.map(|key| format!("hardware.{arm}.{key}=")));
+        let tasks = blueprint
+            .tasks
+            .iter()
+            .flat_map(|task| ["priority", "params"].map(|key| format!("tasks.{}.{key}=", task.name)));
+        let keys = keys.chain(tasks).chain(["coordinator.tick_rate=", "planner.planning_timeout="].map(str::to_owned));
+        Self { arms: arms.map(|arm| format!("{arm}=")).collect(), keys: keys.collect() }
+    }
 }
 
 fn runs() -> BTreeSet<String> {
@@ -115,6 +177,18 @@ fn named_poses() -> BTreeSet<String> {
 
 fn waypoints() -> BTreeSet<String> {
     named_poses().into_iter().chain(["gripper:open", "gripper:close"].map(str::to_owned)).collect()
+}
+
+/// Returns `--goal` of each arm: `ARM=`, and `ARM=named:POSE`.
+fn goals() -> BTreeSet<String> {
+    let (arms, poses) = (arms(), named_poses());
+    let named = |arm: &String| poses.iter().map(|pose| format!("{arm}=named:{pose}")).collect::<Vec<_>>();
+    arms.iter().flat_map(|arm| named(arm).into_iter().chain([format!("{arm}=")])).collect()
+}
+
+fn joints() -> BTreeSet<String> {
+    let arms = of_each_run(|client| client.call(State {}).ok()).into_iter().flat_map(|state| state.arms);
+    arms.flat_map(|arm| arm.joints).map(|joint| joint.name).collect()
 }
 
 fn frames() -> BTreeSet<String> {
@@ -163,6 +237,8 @@ mod tests {
         assert_eq!(offered(&["dimos", "adapter", "test", "you"]), ["yourarm"]);
         assert_eq!(offered(&["dimos", "arm", "calibrate", "xa"]), ["xarm"]);
         assert_eq!(offered(&["dimos", "list-ad"]), ["list-adapters"]);
+        assert!(offered(&["dimos", "model", "info", "builtin:your"]).contains(&"builtin:yourarm".to_owned()));
+        assert_eq!(offered(&["dimos", "arm", "gripper", "arm", "cl"]), ["close"]);
         assert!(offered(&["dimos", "run", "x", "--addr"]).contains(&"--address".to_owned()));
     }
 }

@@ -11,13 +11,17 @@ use super::exit::{Exit, Failure, Result};
 use super::follow::Signals;
 use super::output;
 use crate::rpc::api::{
-    Attach, Detach, Grip, GripOutcome, GripReport, Gripper, GripperReply, Planner, Status, World, WorldObject,
+    Attach, Detach, GRASP_REACH, Grip, GripOutcome, GripReport, Gripper, GripperReply, Planner, Status, World,
+    WorldObject,
 };
 use crate::rpc::client::Client;
 use crate::rpc::report::ArmReport;
+use crate::yaml::did_you_mean;
 
 /// Poll period of the outcome.
 const POLL_PERIOD: Duration = Duration::from_millis(20);
+/// Positions are rounded in files; this far out of its range a position is still in it [m or rad].
+const SAME_POSITION: f64 = 1e-6;
 
 /// Requested position of a gripper.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -57,6 +61,47 @@ impl Opening {
                 Err(Failure::new(Exit::Failed, what).hint(format!("give it as a number: dimos arm gripper {arm} 0.04")))
             }
         }
+    }
+}
+
+/// Returns the failure for an object that the planner does not know.
+pub fn unknown_object(name: &str, world: &[WorldObject]) -> Failure {
+    let known = did_you_mean(name, world.iter().map(|object| object.name.as_str()), "it has");
+    let hint = known.unwrap_or_else(|| "`dimos world add` adds one".to_owned());
+    Failure::usage(format!("the planner's world has no object {name}: nothing has moved")).hint(hint)
+}
+
+/// Returns why a gripper cannot do what is asked, and a hint. What this finds is found before anything moves.
+pub fn impossible(arm: &ArmReport, to: Opening, force: Option<f64>) -> Option<(String, Option<String>)> {
+    let name = &arm.hardware_id;
+    let say = |what: String, hint: Option<String>| Some((what, hint));
+    let Some(unit) = &arm.gripper_unit else { return say(format!("{name} has no gripper"), None) };
+    match (to, arm.gripper_range) {
+        (Opening::Open | Opening::Close, None) => {
+            return say(
+                format!("the gripper of {name} reports no range"),
+                Some(format!("give its position in {unit}")),
+            );
+        }
+        (Opening::Position(at), Some([closed, open]))
+            if at < closed.min(open) - SAME_POSITION || at > closed.max(open) + SAME_POSITION =>
+        {
+            let hint = format!("closed is {closed} {unit}, open {open} {unit}");
+            return say(format!("the gripper of {name} cannot go to {at} {unit}"), Some(hint));
+        }
+        _ => {}
+    }
+    match (force, arm.gripper_force_range) {
+        (Some(_), None) => {
+            let hint = Some("command its position without a force".to_owned());
+            say(format!("the gripper of {name} has no force control"), hint)
+        }
+        (Some(force), Some([least, most])) if !(least..=most).contains(&force) => {
+            let unit = arm.gripper_force_unit.as_deref().unwrap_or("N");
+            let hint = format!("give {least} to {most} {unit}, or no force for the one set in the arm");
+            say(format!("the gripper of {name} cannot hold with {force} {unit}"), Some(hint))
+        }
+        _ => None,
     }
 }
 
@@ -144,9 +189,8 @@ impl GripAction {
                     let attach = Attach {
                         name: name.clone(),
                         robot: arm.to_owned(),
-                        link: None,
-                        touch_links: Vec::new(),
-                        mass: None,
+                        within: Some(GRASP_REACH),
+                        ..Attach::default()
                     };
                     client.call(attach)?;
                 }
@@ -199,8 +243,7 @@ impl GripAction {
                 }
                 None => Ok(Some((true, vec![name.clone()]))),
             },
-            None => Err(Failure::new(Exit::Failed, format!("no object {name} in the planner's world"))
-                .hint("`dimos world list` lists the objects, `dimos world add` adds one")),
+            None => Err(unknown_object(name, &world)),
         }
     }
 }

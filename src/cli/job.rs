@@ -30,13 +30,13 @@ use times::Times;
 Every mistake of the file, and every name that the run does not have, is reported before anything moves.
 
   steps:
-    - move: home                                         a named or saved pose
+    - move: home                             a named or saved pose
     - move: {by: {xyz: [0, 0, -0.05]}, linear: true, speed: 20%}
-    - gripper: {to: close, object: true}                 a fault if it then holds nothing
+    - gripper: {to: close, object: true}     a fault if it holds nothing then
     - wait: {input: di0, is: high, timeout: 5s}
-    - repeat: {times: 3, steps: [{output: {do0: 1}}, {wait: 500ms}, {output: {do0: 0}}]}
-  repeat: 10                                             or forever
-  on_fault: [{gripper: open}, {move: home}]              default: stop
+    - repeat: {times: 3, steps: [{output: {do0: 1}}, {output: {do0: 0}}]}
+  repeat: 10                                 or forever
+  on_fault: [{gripper: open}, {move: home}]  default: stop
 
 Ctrl-C, `dimos stop` and `dimos cancel` end the job; nothing moves afterwards, and no hold is cleared. Exit code 1 names \
 the step.")]

@@ -43,7 +43,8 @@ reports it (kitty keyboard protocol).
 
 Needs a task of type eef_twist, and one of type velocity (or servo) for single joints; the blueprints keyboard-teleop-… \
 have both.
-Not collision-checked. This is not a safety function: keep the arm's own stop within reach.")]
+In a run with a planner the arm stops before it touches itself, another arm or an obstacle that the planner knows; \
+without one it is not collision-checked. This is not a safety function: keep the arm's own stop within reach.")]
 pub struct Args {
     /// Name of the arm (hardware_id)
     arm: String,

@@ -13,7 +13,7 @@ use crate::joint::{JointLimits, MAX_DOF};
 LEVEL  how far it is proven
          works       compiles, connects
          conformant  passes the conformance suite against a test double
-         emulated    passes it against an emulator of its real wire format, which
+         emulated    passes it against an emulator of its wire format, which
                      `address: sim` starts
 HOLDS  whether the arm keeps its pose when its motors are disabled
 TEACH  how it is led by hand (dimos arm teach)")]
@@ -29,33 +29,33 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
         output::json(&registry.rows().iter().map(to_json).chain(registry.absent().map(lacking)).collect::<Vec<_>>());
         return Ok(Exit::Ok);
     }
-    lines(registry).iter().for_each(output::line);
+    lines(registry).iter().for_each(output::wrapped);
     Ok(Exit::Ok)
 }
 
 /// Returns the table, and a paragraph for each adapter.
 fn lines(registry: &Registry) -> Vec<String> {
-    let mut table = Table::new(&["NAME", "LEVEL", "TRANSPORT", ">DOF", "UNITS", ">RATE Hz", "HOLDS", "TEACH"]);
+    let mut table = Table::new(&["NAME", "LEVEL", "TRANSPORT", ">DOF", ">RATE Hz", "HOLDS", "TEACH"]);
     for row in registry.rows() {
         table.row([
             row.name.to_owned(),
             row.level.name().to_owned(),
             row.transport.to_owned(),
             dof(row),
-            row.wire_units.to_owned(),
             format!("{:.0}", row.native_rate),
             if row.holds_when_disabled { "yes" } else { "no, falls" }.to_owned(),
             teach(row).to_owned(),
         ]);
     }
     for absent in registry.absent() {
-        let nothing = ["-"; 6].map(str::to_owned);
+        let nothing = ["-"; 5].map(str::to_owned);
         table.row([absent.name.to_owned(), "not in this build".to_owned()].into_iter().chain(nothing));
     }
     let mut lines = table.lines();
     for row in registry.rows() {
         lines.extend([String::new(), format!("{}: {}", row.name, row.about)]);
         lines.push(format!("  address: {}", row.address.form));
+        lines.push(format!("  units on the wire: {}", row.wire_units));
         lines.push(format!("  modes: {}", modes(row).join(", ")));
         // The limits of an adapter for any number of joints are those of no arm.
         if let Some((dof, limits)) = limits(row).filter(|_| row.dof.1 < MAX_DOF) {

@@ -215,6 +215,12 @@ pub(super) fn newest() -> Result<PathBuf> {
     newest.flatten().ok_or_else(none)
 }
 
+/// Returns the names of the logs in the folder of logs.
+pub(super) fn kept() -> Vec<String> {
+    let logs = files::log_folder().and_then(|folder| files::all(&folder).ok()).unwrap_or_default();
+    logs.iter().filter_map(|path| path.file_name()?.to_str().map(str::to_owned)).collect()
+}
+
 /// Returns the path of a log, which may be the name alone of one in the folder of logs.
 pub(super) fn found(path: &Path) -> PathBuf {
     let listed = files::log_folder().map(|folder| folder.join(path));

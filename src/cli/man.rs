@@ -13,6 +13,8 @@ use clap_mangen::roff::{Roff, bold, roman};
 use super::exit::{Exit, Result};
 use super::output;
 
+mod examples;
+
 /// Arguments of `man`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
@@ -43,11 +45,14 @@ const FILES: &[(&str, &str)] = &[
     ("$XDG_STATE_HOME/dimos/RUN-TIME.log", "text log of a run that was started with --daemon"),
     ("$XDG_STATE_HOME/dimos/RUN.json", "record of the latest run of that name: how it ended"),
     ("$XDG_CACHE_HOME/dimos", "downloaded robot descriptions; ~/.cache without the variable"),
+    ("$XDG_CONFIG_HOME/dimos/places.yaml", "names of places on other computers, for --at"),
     ("./blueprints, $XDG_CONFIG_HOME/dimos/blueprints", "blueprints that are run by name"),
 ];
 
 /// Environment variables that the program reads.
 const ENVIRONMENT: &[(&str, &str)] = &[
+    ("DIMOS_AT", "place whose runs the verbs talk to, as --at"),
+    ("DIMOS_IDENTITY", "folder of the certificates that this computer shows a place"),
     ("DIMOS_BLUEPRINT_PATH", "further folders with blueprints, separated by colons"),
     ("DIMOS_LOG", "level of the text log: error, warn (default), info, debug"),
     ("NO_COLOR", "if set and not empty: no colours"),
@@ -59,30 +64,31 @@ pub fn run(args: &Args) -> Result {
     let mut command = super::command().disable_help_subcommand(true);
     command.build();
     let Some(dir) = &args.dir else {
-        let page = page(&command, true).context("cannot render the manual page")?;
+        let page = page(&command, "").context("cannot render the manual page")?;
         output::data(&page);
         return Ok(Exit::Ok);
     };
-    let pages = fs::create_dir_all(dir).and_then(|()| write_pages(&command, dir, true));
+    let pages = fs::create_dir_all(dir).and_then(|()| write_pages(&command, dir, ""));
     pages.with_context(|| dir.display().to_string())?;
     output::note(format_args!("pages are in {}", dir.display()));
     Ok(Exit::Ok)
 }
 
 /// Writes the page of a verb and those of the verbs below it.
-fn write_pages(command: &Command, dir: &Path, is_first: bool) -> io::Result<()> {
-    fs::write(dir.join(Man::new(command.clone()).get_filename()), page(command, is_first)?)?;
+fn write_pages(command: &Command, dir: &Path, path: &str) -> io::Result<()> {
+    fs::write(dir.join(Man::new(command.clone()).get_filename()), page(command, path)?)?;
     let verbs = command.get_subcommands().filter(|verb| !verb.is_hide_set());
-    verbs.into_iter().try_for_each(|verb| write_pages(verb, dir, false))
+    verbs.into_iter().try_for_each(|verb| write_pages(verb, dir, format!("{path} {}", verb.get_name()).trim_start()))
 }
 
-/// Returns the page of a verb.
-fn page(command: &Command, is_first: bool) -> io::Result<Vec<u8>> {
+/// Returns the page of the verb at `path`; empty: the first page.
+fn page(command: &Command, path: &str) -> io::Result<Vec<u8>> {
+    let is_first = path.is_empty();
     let man = Man::new(command.clone());
     let mut page = Vec::new();
     man.render_title(&mut page)?;
     man.render_name_section(&mut page)?;
-    man.render_synopsis_section(&mut page)?;
+    synopsis(command).to_writer(&mut page)?;
     man.render_description_section(&mut page)?;
     if command.get_arguments().any(|arg| !arg.is_hide_set()) {
         man.render_options_section(&mut page)?;
@@ -94,7 +100,8 @@ fn page(command: &Command, is_first: bool) -> io::Result<Vec<u8>> {
     let epilogue = command.get_after_long_help().or(command.get_after_help());
     // The epilogue of the first page repeats its sections.
     let epilogue = epilogue.filter(|_| !is_first).map(ToString::to_string).unwrap_or_default();
-    notes(&mut roff, &epilogue);
+    let more = examples::OF_VERBS.iter().find(|(verb, _)| *verb == path).map_or(&[][..], |(_, examples)| examples);
+    notes(&mut roff, &epilogue, more);
     if is_first {
         table(&mut roff, "EXAMPLES", EXAMPLES);
     }
@@ -109,9 +116,20 @@ fn page(command: &Command, is_first: bool) -> io::Result<Vec<u8>> {
     Ok(page)
 }
 
-/// Adds an epilogue: examples are its indented lines, notes everything else.
-fn notes(roff: &mut Roff, epilogue: &str) {
-    let (examples, notes): (Vec<&str>, Vec<&str>) = epilogue.lines().partition(|line| line.starts_with("  dimos "));
+/// Returns the usage lines of the help, which name the values of options and arguments.
+fn synopsis(command: &Command) -> Roff {
+    let mut roff = Roff::default();
+    roff.control("SH", ["SYNOPSIS"]);
+    let usage = command.clone().term_width(0).render_usage().to_string();
+    for line in usage.trim_start_matches("Usage:").lines() {
+        roff.text([bold(line.trim())]).control("br", []);
+    }
+    roff
+}
+
+/// Adds an epilogue, and further examples: examples are its indented lines, notes everything else.
+fn notes(roff: &mut Roff, epilogue: &str, more: &[&str]) {
+    let (mut examples, notes): (Vec<&str>, Vec<&str>) = epilogue.lines().partition(|line| line.starts_with("  dimos "));
     if notes.iter().any(|line| !line.trim().is_empty()) {
         roff.control("SH", ["NOTES"]);
         for line in notes {
@@ -122,6 +140,7 @@ fn notes(roff: &mut Roff, epilogue: &str) {
             };
         }
     }
+    examples.extend(more);
     if !examples.is_empty() {
         roff.control("SH", ["EXAMPLES"]);
         for line in examples {

@@ -115,6 +115,11 @@ impl File {
     fn refuse(&self, loaded: &Loaded) -> Failure {
         refuse(loaded, &self.file)
     }
+
+    /// Returns the failure of a description with mistakes.
+    fn refused(&self) -> Failure {
+        has_mistakes(&self.file)
+    }
 }
 
 /// Returns the robot of a description; prints its mistakes and warnings to stderr.
@@ -133,6 +138,10 @@ fn refuse(loaded: &Loaded, file: &Path) -> Failure {
         return Failure { hint: diag.hint.clone(), ..Failure::usage(diag.message.clone()) };
     }
     output::note(loaded.render(output::colour(&std::io::stderr())).trim_end());
+    has_mistakes(file)
+}
+
+fn has_mistakes(file: &Path) -> Failure {
     Failure::usage(format!("{} has mistakes", file.display()))
 }
 

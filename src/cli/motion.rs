@@ -5,9 +5,12 @@ use super::arguments::Target;
 use super::exit::{Exit, Failure, Result};
 use super::follow::{Signals, follow, follow_until};
 use super::goal::{Goal, Leg, Search, checked, has_planner, plan, show};
+use super::grip::{self, Objects};
 use super::{output, recorded_path};
 use crate::rpc::Code;
-use crate::rpc::api::{Cancel, ExecutePlan, Move, MoveNative, MoveReply, Plan, PlanLevel, Planner, Poses, State};
+use crate::rpc::api::{
+    Cancel, ExecutePlan, Move, MoveNative, MoveReply, Plan, PlanLevel, Planner, Poses, State, Status, World,
+};
 use crate::rpc::client::Client;
 use crate::telemetry::describe::percent;
 
@@ -140,7 +143,9 @@ fn run_legs(args: &Args, arm: &str, client: &mut Client, signals: &Signals) -> R
         return Err(Failure::usage(format!("{arm} has no named pose {name}: nothing has moved"))
             .hint("`dimos pose list` lists the poses"));
     }
-    for leg in args.goal.legs(arm, &args.search) {
+    let legs = args.goal.legs(arm, &args.search);
+    check_grips(arm, client, &legs)?;
+    for leg in legs {
         match leg {
             Leg::Motion(request) => {
                 let (motion, task, _) = plan_and_begin(args, request, client, signals)?;
@@ -156,6 +161,24 @@ fn run_legs(args: &Args, arm: &str, client: &mut Client, signals: &Signals) -> R
         }
     }
     Ok(Exit::Ok)
+}
+
+/// Fails if one of the gripper actions cannot be done: no such gripper, position or object.
+fn check_grips(arm: &str, client: &mut Client, legs: &[Leg]) -> Result<()> {
+    let report = client.call(Status {})?.arms.into_iter().find(|report| report.hardware_id == arm);
+    let objects = client.call(World {})?.objects;
+    for leg in legs {
+        let (Leg::Grip(action), Some(report)) = (leg, &report) else { continue };
+        if let Some((what, hint)) = grip::impossible(report, action.opening, action.force) {
+            return Err(Failure::usage(format!("{what}: nothing has moved")).maybe_hint(hint));
+        }
+        if let Objects::Attach(name) | Objects::Either(name) = &action.objects
+            && !objects.iter().any(|object| object.name == *name)
+        {
+            return Err(grip::unknown_object(name, &objects));
+        }
+    }
+    Ok(())
 }
 
 type Begun = (u64, String, serde_json::Value);

@@ -16,12 +16,38 @@ const MIN_COLUMNS: u16 = 40;
 /// Minimum width of a column whose text may wrap [columns]: no word of it is longer.
 const MIN_TEXT: u16 = 20;
 
+/// Constraint of such a column.
+const TEXT: ColumnConstraint = ColumnConstraint::LowerBoundary(Width::Fixed(MIN_TEXT));
+
 /// The first failed write to stdout.
 static FAILED_WRITE: OnceLock<String> = OnceLock::new();
 
 /// Prints a line of data to stdout. [`finish`] reports a write that failed.
 pub fn line(text: impl Display) {
     written(writeln!(io::stdout().lock(), "{text}"));
+}
+
+/// Prints a sentence to stdout; a terminal that is narrower gets it in several lines, indented below the first.
+pub fn wrapped(text: impl Display) {
+    folded(&text.to_string(), width(io::stdout())).iter().for_each(line);
+}
+
+/// Breaks a text at blanks.
+fn folded(text: &str, width: Option<u16>) -> Vec<String> {
+    let Some(width) = width.map(usize::from) else { return vec![text.to_owned()] };
+    let indent = text.len() - text.trim_start().len() + 2;
+    let mut lines: Vec<String> = Vec::new();
+    for word in text.split(' ') {
+        match lines.last_mut() {
+            Some(last) if last.chars().count() + 1 + word.chars().count() <= width => {
+                last.push(' ');
+                last.push_str(word);
+            }
+            Some(_) => lines.push(format!("{:indent$}{word}", "")),
+            None => lines.push(word.to_owned()),
+        }
+    }
+    lines
 }
 
 /// Prints data as it is to stdout; returns whether it still can be written.
@@ -131,15 +157,15 @@ impl Table {
         }
         let title = |h: &&str| Cell::new(h.trim_start_matches(['>', '~'])).add_attribute(Attribute::Bold);
         table.set_header(headings.iter().map(title).collect::<Vec<_>>());
-        for (column, heading) in table.column_iter_mut().zip(headings) {
-            column.set_padding((0, 2));
+        let last = headings.len().saturating_sub(1);
+        for (index, (column, heading)) in table.column_iter_mut().zip(headings).enumerate() {
+            // Blanks at the end of a line that is full would wrap.
+            column.set_padding((0, if index == last { 0 } else { 2 }));
             if heading.starts_with('>') {
                 column.set_cell_alignment(CellAlignment::Right);
             }
-            column.set_constraint(match heading.starts_with('~') {
-                true => ColumnConstraint::LowerBoundary(Width::Fixed(MIN_TEXT)),
-                false => ColumnConstraint::ContentWidth,
-            });
+            let is_text = heading.starts_with('~');
+            column.set_constraint(if is_text { TEXT } else { ColumnConstraint::ContentWidth });
         }
         Self(table)
     }
@@ -151,7 +177,15 @@ impl Table {
 
     /// Returns its lines as printed.
     pub fn lines(&self) -> Vec<String> {
-        self.0.lines().map(|row| row.trim_end().to_owned()).collect()
+        let mut table = self.0.clone();
+        // A text that is shorter takes no more room than it has.
+        let contents = table.column_max_content_widths();
+        for (column, content) in table.column_iter_mut().zip(contents) {
+            if column.constraint() == Some(&TEXT) && content < MIN_TEXT {
+                column.set_constraint(ColumnConstraint::ContentWidth);
+            }
+        }
+        table.lines().map(|row| row.trim_end().to_owned()).collect()
     }
 
     /// Prints it to stdout.
@@ -199,6 +233,15 @@ mod tests {
             assert_eq!(width(&terminal), usable, "{columns}");
         }
         assert_eq!(width(std::fs::File::open("/dev/null").unwrap()), None);
+    }
+
+    #[test]
+    fn a_long_sentence_is_broken_at_blanks_and_indented() {
+        let text = "  arm: inputs: di0=1 di1=1 and µ of all sorts";
+        assert_eq!(folded(text, None), [text]);
+        assert_eq!(folded(text, Some(80)), [text]);
+        assert_eq!(folded(text, Some(20)), ["  arm: inputs: di0=1", "    di1=1 and µ of", "    all sorts"]);
+        assert_eq!(folded("a /a/path/without/any/blanks b", Some(20)), ["a", "  /a/path/without/any/blanks", "  b"]);
     }
 
     #[test]

@@ -20,7 +20,7 @@ Next: `dimos preview` shows the plan, `dimos execute` executes it. `dimos move` 
 
   dimos plan arm 0.3 -0.2 0.5 0 0.4 0
   dimos plan arm --pose 0.3 0.1 0.4 --rpy 0 1.57 0
-  dimos plan arm --by 0 0 -0.05 --frame tool                              back by 5 cm along the tool's z axis
+  dimos plan arm --by 0 0 -0.05 --frame tool    # back by 5 cm
   dimos plan arm --named home
   dimos plan --goal left=named:home --goal right=0.5,-0.3,0.6,0,0.8,0"
 )]

@@ -161,7 +161,9 @@ impl RunRecord {
             Some(_) => format!("its text log: dimos logs {}", self.run),
             None => format!("start it again: dimos run {} --name {}", self.blueprint, self.run),
         };
-        Some(Failure::new(Exit::Failed, what).hint(hint))
+        // The name of a run that has ended as asked is one that no live run has.
+        let exit = if self.ended_abnormally() { Exit::Failed } else { Exit::Usage };
+        Some(Failure::new(exit, what).hint(hint))
     }
 }
 

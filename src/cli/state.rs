@@ -146,7 +146,7 @@ fn of_arm(arm: &ArmStateReport) -> Vec<String> {
         lines.push(format!("gripper  {gripper:.4} {unit}{}", force(arm)));
     }
     let poses = [(&arm.pose, ""), (&arm.device_pose, " (device)")];
-    lines.extend(poses.iter().filter_map(|(pose, whose)| Some(pose_line(pose.as_ref()?, whose))));
+    lines.extend(poses.iter().filter_map(|(pose, whose)| Some(pose_lines(pose.as_ref()?, whose))).flatten());
     if let Some([fx, fy, fz, tx, ty, tz]) = arm.wrench {
         lines.push(format!("wrench   force {fx:.2} {fy:.2} {fz:.2} N, torque {tx:.3} {ty:.3} {tz:.3} Nm"));
     }
@@ -154,9 +154,10 @@ fn of_arm(arm: &ArmStateReport) -> Vec<String> {
 }
 
 /// Returns a pose with enough digits for `dimos move ARM --pose … --rpy …` to move nothing.
-fn pose_line(pose: &PoseReport, whose: &str) -> String {
+fn pose_lines(pose: &PoseReport, whose: &str) -> [String; 2] {
     let three = |values: [f64; 3]| values.map(|v| fixed(v, 6)).join(" ");
-    format!("pose     {}{whose}  xyz {} m  rpy {} rad", pose.label(), three(pose.xyz), three(pose.rpy))
+    let numbers = format!("         xyz {} m  rpy {} rad", three(pose.xyz), three(pose.rpy));
+    [format!("pose     {}{whose}", pose.label()), numbers]
 }
 
 /// Returns the measured force of the gripper; empty if it measures none.

@@ -123,7 +123,7 @@ fn failed_runs(live: &[LiveRun]) -> Vec<FailedRun> {
 fn print_failed(failed: &FailedRun) {
     output::line("");
     output::line(failed.record.describe_end().unwrap_or_default());
-    failed.last_words.iter().for_each(|text| output::line(format_args!("  {text}")));
+    failed.last_words.iter().for_each(|text| output::wrapped(format_args!("  {text}")));
 }
 
 fn request_status(run: &LiveRun) -> std::result::Result<StatusReport, ClientError> {
@@ -158,18 +158,19 @@ fn overview(runs: Vec<LiveRun>, json: bool) {
     if found.is_empty() {
         return output::note("no run is live\nhint: start one: dimos run coordinator-yourarm");
     }
-    let mut table = Table::new(&["RUN", ">PID", "UP", "BLUEPRINT", "~ARMS", "LOG"]);
+    let mut table = Table::new(&["RUN", ">PID", "UP", "BLUEPRINT", "~ARMS"]);
+    let mut logs: Vec<(&str, String)> = Vec::new();
     for found in &found {
         match found {
             RunEntry::Answered { report: r, .. } => {
                 let arms: Vec<String> = r.arms.iter().map(|a| format!("{} {}", a.hardware_id, a.phase)).collect();
-                let log = r.log.clone().unwrap_or_else(|| "-".into());
+                logs.extend(r.log.clone().map(|log| (r.run.as_str(), log)));
                 let arms = format!("{} {}", arms.join(", "), r.standing()).trim_end().to_owned();
-                table.row([r.run.clone(), r.pid.to_string(), span(r.uptime), r.blueprint.clone(), arms, log]);
+                table.row([r.run.clone(), r.pid.to_string(), span(r.uptime), r.blueprint.clone(), arms]);
             }
             RunEntry::NoReply { run, pid, error, .. } => {
                 let [pid, error] = [pid.to_string(), error.clone()];
-                table.row([run.as_str(), &pid, "-", "-", &error, "-"]);
+                table.row([run.as_str(), &pid, "-", "-", &error]);
             }
             RunEntry::Failed(FailedRun { record, state, .. }) => {
                 let how = match *state {
@@ -178,17 +179,18 @@ fn overview(runs: Vec<LiveRun>, json: bool) {
                     _ => "FAULT",
                 };
                 let how = toned(how, Tone::Bad);
-                let log = record.log.as_ref().map_or_else(|| "-".into(), |log| log.display().to_string());
+                logs.extend(record.log.as_ref().map(|log| (record.run.as_str(), log.display().to_string())));
                 let [run, pid, blueprint] = [record.run.clone(), record.pid.to_string(), record.blueprint.clone()];
-                table.row([run.into(), pid.into(), "-".into(), blueprint.into(), how, log.into()]);
+                table.row([run.into(), pid.into(), "-".into(), blueprint.into(), how]);
             }
             RunEntry::Waits { run, pid, .. } => {
                 let pid = pid.to_string();
-                table.row([run.as_str(), &pid, "-", "-", "a planner waiting for its run", "-"]);
+                table.row([run.as_str(), &pid, "-", "-", "a planner waiting for its run"]);
             }
         }
     }
     table.print();
+    logs.iter().for_each(|(run, log)| output::wrapped(format_args!("  {run}: log {log}")));
     let planners: Vec<_> =
         found.iter().filter_map(answered).filter_map(|r| Some((r.run.as_str(), r.planner.as_ref()?))).collect();
     if !planners.is_empty() {
@@ -210,17 +212,17 @@ fn answered(entry: &RunEntry) -> Option<&StatusReport> {
 fn print(r: &StatusReport, verbose: bool) {
     output::line(banner::heading(r));
     let trouble = attention(r);
-    trouble.iter().for_each(|text| output::line(format_args!("  ! {text}")));
+    trouble.iter().for_each(|text| output::wrapped(format_args!("  ! {text}")));
     let blueprint = &r.blueprint;
-    output::line(format_args!("  pid {}, up {}, blueprint {blueprint}, dimos {}", r.pid, span(r.uptime), r.version));
-    output::line(format_args!("  log {}", r.log.as_deref().unwrap_or("none")));
+    output::wrapped(format_args!("  pid {}, up {}, blueprint {blueprint}, dimos {}", r.pid, span(r.uptime), r.version));
+    output::wrapped(format_args!("  log {}", r.log.as_deref().unwrap_or("none")));
     if let Some(address) = &r.view {
-        output::line(format_args!("  view {}", banner::view_without_token(address)));
+        output::wrapped(format_args!("  view {}", banner::view_without_token(address)));
     }
     if let Some(share) = &r.share {
         let clients = if share.clients.is_empty() { "no clients".to_owned() } else { share.clients.join(", ") };
         if !share.endpoints.is_empty() {
-            output::line(format_args!("  shared at {}: {clients}", share.endpoints.join(", ")));
+            output::wrapped(format_args!("  shared at {}: {clients}", share.endpoints.join(", ")));
         }
         for face in &share.faces {
             let what = match &face.reason {
@@ -228,11 +230,11 @@ fn print(r: &StatusReport, verbose: bool) {
                 None if face.command => "its programs may move the arms".to_owned(),
                 None => "its programs read".to_owned(),
             };
-            output::line(format_args!("  shared with {} as {}: {what}", face.face, face.name));
+            output::wrapped(format_args!("  shared with {} as {}: {what}", face.face, face.name));
         }
     }
     if let Some(recorder) = r.recorder.as_ref().filter(|recorder| verbose || recorder.dropped > 0) {
-        output::line(format_args!("  {} messages logged, {} dropped", recorder.messages, recorder.dropped));
+        output::wrapped(format_args!("  {} messages logged, {} dropped", recorder.messages, recorder.dropped));
     }
     output::line("");
     print_arms(&r.arms, verbose);
@@ -324,7 +326,7 @@ fn print_planners<'r>(planners: impl Iterator<Item = (&'r str, &'r PlannerStatus
         errors.extend(planner.error.as_ref());
     }
     table.print();
-    errors.iter().for_each(|error| output::line(format_args!("  {error}")));
+    errors.iter().for_each(|error| output::wrapped(format_args!("  {error}")));
 }
 
 fn print_arms(arms: &[ArmReport], verbose: bool) {
@@ -351,35 +353,35 @@ fn print_arms(arms: &[ArmReport], verbose: bool) {
     for arm in arms {
         let name = &arm.hardware_id;
         let standing = banner::standing(arm.simulated, &arm.address);
-        output::line(format_args!("  {name}: {standing}, {}; at exit: {}", arm.adapter, at_exit(arm)));
+        output::wrapped(format_args!("  {name}: {standing}, {}; at exit: {}", arm.adapter, at_exit(arm)));
         if let Some(codes) = arm.device_state.as_ref().filter(|_| verbose) {
             let (state, mode) = (codes.state, codes.mode);
-            output::line(format_args!("  {name}: device state {state}, mode {mode} (the vendor's numbers)"));
+            output::wrapped(format_args!("  {name}: device state {state}, mode {mode} (the vendor's numbers)"));
         }
         for line in joint_lines(&arm.joints).iter().filter(|_| verbose) {
-            output::line(format_args!("  {name}: {line}"));
+            output::wrapped(format_args!("  {name}: {line}"));
         }
         if let Some(line) = gripper_line(arm) {
-            output::line(format_args!("  {name}: {line}"));
+            output::wrapped(format_args!("  {name}: {line}"));
         }
         if let Some(tcp) = &arm.tcp {
-            output::line(format_args!("  {name}: poses in map are those of {}", tcp_text(tcp)));
+            output::wrapped(format_args!("  {name}: poses in map are those of {}", tcp_text(tcp)));
         }
         if let Some(load) = &arm.payload {
-            output::line(format_args!("  {name}: payload {}", payload_text(load)));
+            output::wrapped(format_args!("  {name}: payload {}", payload_text(load)));
         }
         if let Some(io) = arm.io.as_ref().filter(|_| verbose) {
-            io_lines(io).iter().for_each(|line| output::line(format_args!("  {name}: {line}")));
+            io_lines(io).iter().for_each(|line| output::wrapped(format_args!("  {name}: {line}")));
         }
         for fault in &arm.faults {
             let over = if fault.over { "over" } else { "active" };
             let (ago, count) = (span(fault.since), fault.count);
-            output::line(format_args!("  {name} {ago} ago, {count}×, {over}: {}", fault.text));
+            output::wrapped(format_args!("  {name} {ago} ago, {count}×, {over}: {}", fault.text));
         }
         if let Some(c) = &arm.commander {
             let process = c.pid.map(|pid| format!(" (pid {pid})")).unwrap_or_default();
             let held = span(c.held_for);
-            output::line(format_args!("  {name} is commanded by {}{process} for {held}", c.program));
+            output::wrapped(format_args!("  {name} is commanded by {}{process} for {held}", c.program));
         }
         let counted: Vec<String> = arm
             .counters
@@ -388,7 +390,7 @@ fn print_arms(arms: &[ArmReport], verbose: bool) {
             .map(|(what, n)| format!("{n} {}", what.replace('_', " ")))
             .collect();
         if verbose && !counted.is_empty() {
-            output::line(format_args!("  {name} counted {}", counted.join(", ")));
+            output::wrapped(format_args!("  {name} counted {}", counted.join(", ")));
         }
     }
 }
@@ -425,14 +427,14 @@ pub(super) fn print_tasks(tasks: &[TaskReport]) {
     table.print();
     for task in tasks {
         if let Some(reason) = &task.reason {
-            output::line(format_args!("  {} is {}: {reason}", task.name, task.state));
+            output::wrapped(format_args!("  {} is {}: {reason}", task.name, task.state));
         }
         if let Some(distance) = task.distance {
             let text = format!("{distance:.3} rad ({:.1}°) from its leader", distance.to_degrees());
-            output::line(format_args!("  {} is {text}", task.name));
+            output::wrapped(format_args!("  {} is {text}", task.name));
         }
         if let Some(bound) = &task.bound {
-            output::line(format_args!("  {} is limited by {bound}", task.name));
+            output::wrapped(format_args!("  {} is limited by {bound}", task.name));
         }
         if let Some(sent) = &task.stream {
             let counts = [
@@ -442,7 +444,7 @@ pub(super) fn print_tasks(tasks: &[TaskReport]) {
             let sent = counts.iter().filter(|(_, count, _)| *count > 0);
             let sent: Vec<_> =
                 sent.map(|(what, count, late)| format!("{count} {what}, {late} of them late and dropped")).collect();
-            output::line(format_args!("  {} was sent {}", task.name, sent.join("; ")));
+            output::wrapped(format_args!("  {} was sent {}", task.name, sent.join("; ")));
         }
     }
 }
@@ -476,11 +478,11 @@ fn print_timing(r: &StatusReport, verbose: bool) {
     row("lateness", &t.lateness_us);
     row("compute", &t.compute_us);
     table.print();
-    output::line(format_args!("  ticks: {}, overruns: {}, periods skipped: {}", t.count, t.overruns, t.skipped));
+    output::wrapped(format_args!("  ticks: {}, overruns: {}, periods skipped: {}", t.count, t.overruns, t.skipped));
     if !clocked.is_empty() {
-        output::line(format_args!("  ticks without a state of the arm that clocks them: {}", t.without_state));
+        output::wrapped(format_args!("  ticks without a state of the arm that clocks them: {}", t.without_state));
     }
     for text in r.realtime.iter().filter(|measure| verbose && measure.granted).flat_map(banner::realtime) {
-        output::line(format_args!("  {text}"));
+        output::wrapped(format_args!("  {text}"));
     }
 }

@@ -48,15 +48,15 @@ pub struct Source {
 
 impl Source {
     /// Reads a whole file, so that a mistake in its last line moves nothing. Opens it once: it may be a pipe.
-    pub fn file(path: &Path, width: Width) -> Result<Self> {
+    pub fn file(path: &Path, width: Width, verb: &'static str) -> Result<Self> {
         let file = File::open(path).map_err(|e| Failure::usage(format!("{}: {e}", path.display())))?;
-        let targets = Lines::new(file, path.display().to_string(), width).collect::<Result<Vec<_>>>()?;
+        let targets = Lines::new(file, path.display().to_string(), width, verb).collect::<Result<Vec<_>>>()?;
         Ok(Self::read(targets.into_iter().map(Ok)))
     }
 
-    /// Opens stdin, read line by line.
-    pub fn stdin(width: Width) -> Self {
-        Self::read(Lines::new(io::stdin(), "stdin".into(), width))
+    /// Opens stdin, read line by line. The help of `verb` shows the format.
+    pub fn stdin(width: Width, verb: &'static str) -> Self {
+        Self::read(Lines::new(io::stdin(), "stdin".into(), width, verb))
     }
 
     /// Reads on a separate thread, so that a wait for the next line can be abandoned.
@@ -95,17 +95,19 @@ struct Lines<R> {
     from: BufReader<R>,
     name: String,
     width: Width,
+    /// The verb whose help shows the format.
+    verb: &'static str,
     line: usize,
 }
 
 impl<R: Read> Lines<R> {
-    fn new(from: R, name: String, width: Width) -> Self {
-        Self { from: BufReader::new(from), name, width, line: 0 }
+    fn new(from: R, name: String, width: Width, verb: &'static str) -> Self {
+        Self { from: BufReader::new(from), name, width, verb, line: 0 }
     }
 
     fn mistake(&self, what: impl std::fmt::Display) -> Failure {
         Failure::usage(format!("{}:{}: {what}", self.name, self.line))
-            .hint("`dimos task stream --help` shows the format")
+            .hint(format!("`dimos {} --help` shows the format", self.verb))
     }
 }
 
@@ -158,14 +160,14 @@ mod tests {
         writer.write_all(b"1 2\n3 4\n").unwrap();
         drop(writer);
         let path = format!("/proc/self/fd/{}", reader.as_raw_fd());
-        let mut source = Source::file(Path::new(&path), Width::Joints(2)).unwrap();
+        let mut source = Source::file(Path::new(&path), Width::Joints(2), "task stream").unwrap();
         let mut next = || source.next(Duration::from_secs(5)).unwrap();
         assert_eq!((next(), next(), next()), (Some(vec![1.0, 2.0]), Some(vec![3.0, 4.0]), None));
         assert!(source.is_over());
     }
 
     fn all(text: &str, width: usize) -> Vec<std::result::Result<Vec<f64>, String>> {
-        let lines = Lines::new(text.as_bytes(), "t".into(), Width::Joints(width));
+        let lines = Lines::new(text.as_bytes(), "t".into(), Width::Joints(width), "task stream");
         lines.map(|target| target.map_err(|failure| failure.what)).collect()
     }
 

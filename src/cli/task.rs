@@ -104,8 +104,8 @@ pub fn run(args: &Args) -> Result {
                 Targets::Positions | Targets::Velocities => Width::Joints(joints),
             };
             let (source, rate) = match file.as_deref().filter(|path| path.as_os_str() != "-") {
-                Some(path) => (Source::file(path, width)?, hz.or(Some(FILE_RATE))),
-                None => (Source::stdin(width), *hz),
+                Some(path) => (Source::file(path, width, "task stream")?, hz.or(Some(FILE_RATE))),
+                None => (Source::stdin(width, "task stream"), *hz),
             };
             stream(&mut client, &report, targets, source, rate, target_run.json)
         }

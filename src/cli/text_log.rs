@@ -50,7 +50,14 @@ impl Terminal {
 
     /// As [`start`](Self::start), with a further reader of the log, made for this terminal.
     pub fn start_with(reader: impl FnOnce(&Self) -> Option<Reader>) -> io::Result<Self> {
-        let level = std::env::var("DIMOS_LOG").ok().and_then(|l| l.parse::<LevelFilter>().ok());
+        let asked = std::env::var("DIMOS_LOG").ok().filter(|level| !level.is_empty());
+        let level = asked.as_ref().and_then(|level| level.parse::<LevelFilter>().ok());
+        if let (Some(asked), None) = (&asked, level) {
+            let levels = "error, warn, info or debug";
+            super::output::note(format_args!(
+                "warning: DIMOS_LOG={asked} is no level\nhint: {levels}; warn is used now"
+            ));
+        }
         let (items, received) = sync_channel(QUEUE);
         let dropped = Arc::new(AtomicU64::new(0));
         let (lost, kept) = (dropped.clone(), TextLines::default());

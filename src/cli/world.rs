@@ -215,7 +215,8 @@ pub fn run(args: &Args) -> Result {
         Command::Attach(a) => {
             let (name, robot) = (a.name.clone(), a.robot.clone());
             let (link, touch_links) = (a.link.clone(), a.touch.clone());
-            let reply = a.target_run.connect()?.call(Attach { name, robot, link, touch_links, mass: a.mass })?;
+            let reply =
+                a.target_run.connect()?.call(Attach { name, robot, link, touch_links, mass: a.mass, within: None })?;
             if a.target_run.json {
                 output::json(&reply);
             } else {
@@ -268,16 +269,27 @@ fn load(file: &Path) -> Result<Vec<WorldObject>> {
         Some(at) => Failure::usage(format!("{}:{}:{}: {e}", file.display(), at.line(), at.column())),
         None => wrong(e.to_string()),
     })?;
-    let entry = |(name, value): (String, Value)| match serde_json::from_value::<WorldEntry>(value) {
-        Ok(entry) => Ok((name, entry)),
-        Err(e) => {
-            let line =
-                text.lines().position(|line| line.trim_start().starts_with(&format!("{name}:"))).unwrap_or(0) + 1;
-            Err(Failure::usage(format!("{}:{line}: {name}: {e}", file.display()))
-                .hint("an object is written as under `planner.world` in a blueprint"))
-        }
+    let line_of = |name: &str| {
+        let starts = format!("{name}:");
+        text.lines().position(|line| line.trim_start().starts_with(&starts)).unwrap_or(0) + 1
     };
-    let mut objects = typed.into_iter().map(entry).collect::<Result<BTreeMap<_, _>>>()?;
+    let (mut objects, mut mistakes) = (BTreeMap::new(), Vec::new());
+    for (name, value) in typed {
+        match serde_json::from_value::<WorldEntry>(value).map_err(|e| e.to_string()) {
+            Ok(entry) => match WorldAdd(entry.clone().named(name.clone())).valid() {
+                Ok(()) => drop(objects.insert(name, entry)),
+                Err(why) => mistakes.push((line_of(&name), format!("{name}: {why}"))),
+            },
+            Err(why) => mistakes.push((line_of(&name), format!("{name}: {why}"))),
+        }
+    }
+    if !mistakes.is_empty() {
+        mistakes.sort();
+        let each: Vec<String> =
+            mistakes.iter().map(|(line, why)| format!("{}:{line}: {why}", file.display())).collect();
+        let hint = "an object is written as under `planner.world` in a blueprint; nothing was added";
+        return Err(Failure::usage(each.join("\n")).hint(hint));
+    }
     let resolve = |path: &mut String| full_path(&folder.join(&path)).map(|full| *path = full);
     for entry in objects.values_mut() {
         if let ShapeSpec::Mesh(path) | ShapeSpec::Cloud(path) = &mut entry.shape {

@@ -63,7 +63,8 @@ pub struct WorldObject {
 pub struct WorldAdd(pub WorldObject);
 
 impl WorldAdd {
-    pub(super) fn valid(&self) -> Result<(), String> {
+    /// Returns what is wrong with the object, if anything.
+    pub fn valid(&self) -> Result<(), String> {
         let Self(object) = self;
         if object.name.is_empty() || object.held_by.is_some() {
             return Err("an object needs a name, and `held_by` is set by `attach` only".into());
@@ -135,7 +136,7 @@ pub struct WorldRemove {
 }
 
 /// Parameters of `attach`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Attach {
     /// The object's name.
@@ -152,13 +153,24 @@ pub struct Attach {
     /// inertia are those of a solid body of the object's shape; of a mesh or cloud, a point mass at its origin.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mass: Option<f64>,
+    /// Largest distance of its surface from the tool centre point [m]: a farther one is refused, as it is not what the
+    /// gripper holds; default: any distance.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub within: Option<f64>,
 }
+
+/// `within` of an object that a gripper has just closed on [m]: the length of a large gripper, for robots whose tool
+/// centre point is left at the flange.
+pub const GRASP_REACH: f64 = 0.2;
 
 impl Attach {
     pub(super) fn valid(&self) -> Result<(), String> {
-        match self.mass {
-            Some(mass) if !(mass > 0.0 && mass <= 1000.0) => {
+        match (self.mass, self.within) {
+            (Some(mass), _) if !(mass > 0.0 && mass <= 1000.0) => {
                 Err(format!("mass is {mass} kg, must be above 0, at most 1000"))
+            }
+            (_, Some(within)) if !(within >= 0.0 && within.is_finite()) => {
+                Err(format!("within is {within} m, must be 0 or more"))
             }
             _ => Ok(()),
         }

@@ -189,7 +189,11 @@ impl Service {
         if let Err(error) = ordered {
             let _ = self.take_over(&native.name, arm).await;
             self.set_native(arm, false);
-            return drop(begun.send(Err(refused(&native.name, "does not move there", &error))));
+            let why = match error {
+                AdapterError::Unsupported => no_native_motions(&native.name),
+                error => refused(&native.name, "does not move there", &error),
+            };
+            return drop(begun.send(Err(why)));
         }
         let text = format!("{}: native motion {}, not collision-checked", native.name, native.motion);
         self.parts.dispatcher.log(Severity::Info, text);
@@ -310,6 +314,11 @@ impl Service {
 }
 
 /// Returns the requested pose; without an orientation, that of the present one.
+fn no_native_motions(arm: &str) -> RpcError {
+    RpcError::new(Code::Unsupported, format!("the controller of {arm} takes no poses"))
+        .hint("a run with a planner moves to poses: `dimos move` without --native")
+}
+
 fn goal(call: &api::MoveNative, now: &Isometry3<f64>) -> Isometry3<f64> {
     let turned = call.pose.rpy.is_some() || call.pose.quat.is_some();
     let rotation = if turned { isometry(&call.pose).rotation } else { now.rotation };

@@ -4,10 +4,13 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
+use glamx::DAffine3;
 use nalgebra::{Isometry3, Matrix3, Vector3};
 
 use super::planner_port::{PlannerPort, isometry, positions_of, robot_index, run_blocking, spec};
 use super::service::internal;
+use crate::collision::pairs;
+use crate::collision::shape::Placed;
 use crate::collision::world::{Attached, Obstacle, World};
 use crate::planning::config::{ObjectConfig, ObjectShape};
 use crate::planning::planning_scene::{PlannedRobot, obstacle};
@@ -36,6 +39,7 @@ impl PlannerPort {
             Some(mass) => Some(load_of(&object.shape, mass, &(in_flange(robot, &link, moment)? * at))),
             None => None,
         };
+        call.within.map_or(Ok(()), |within| self.near_enough(robot, &call.name, within, moment))?;
         let mut touch_links = call.touch_links.clone();
         touch_links.extend(robot.moved_together_with(&link));
         let held = |world: &mut World| {
@@ -60,6 +64,28 @@ impl PlannerPort {
         object.held_by = Some([call.robot.clone(), link]);
         objects.insert(call.name.clone(), object);
         Ok(AttachReply { load, payload: None })
+    }
+
+    /// Fails if an object is farther than `within` [m] from the tool centre point of a robot.
+    fn near_enough(&self, robot: &PlannedRobot, name: &str, within: f64, moment: &Moment) -> Result<(), RpcError> {
+        let joints = positions_of(&robot.config.name, &robot.config.coordinator_joints, moment)?;
+        let tcp = Placed::Point(robot.tcp_pose(&joints).translation);
+        let distance = |world: &mut World| {
+            let solid = &world.obstacles().iter().find(|obstacle| obstacle.name == name)?.solid;
+            Some(pairs::distance(&tcp, &solid.place(&DAffine3::IDENTITY)) - solid.radius)
+        };
+        match self.thread.world(distance) {
+            Some(distance) if distance > within => {
+                let (arm, tcp) = (&robot.config.name, robot.config.tcp_name());
+                let what = format!("{name} is {distance:.3} m from {tcp} of {arm}: it is not what the gripper holds");
+                let hint = format!(
+                    "put it where it is: `dimos world move {name} --at X Y Z`; or attach it from there: `dimos world \
+                     attach {name} {arm}`"
+                );
+                Err(RpcError::new(Code::WrongObject, what).hint(hint))
+            }
+            _ => Ok(()),
+        }
     }
 
     pub(super) fn detach(&self, name: &str, moment: &Moment) -> Result<Done, RpcError> {
@@ -270,6 +296,7 @@ mod tests {
             link: None,
             touch_links: Vec::new(),
             mass: Some(2.0),
+            within: None,
         };
         let load = port.attach(&attach("ball"), &moment).unwrap().load.unwrap();
         assert!((load.center[2] - 0.172).abs() < 1e-9, "{:?}: its fingers are 172 mm in front of it", load.center);
@@ -291,8 +318,7 @@ mod tests {
         let (port, moment) = with_a_ball(before);
         let to =
             api::WorldMove { name: "ball".into(), pose: spec(&Isometry3::translation(after[0], after[1], after[2])) };
-        let attach =
-            api::Attach { name: "ball".into(), robot: "arm".into(), link: None, touch_links: Vec::new(), mass: None };
+        let attach = api::Attach { name: "ball".into(), robot: "arm".into(), ..api::Attach::default() };
         let moved = std::thread::scope(|scope| {
             // Both requests wait for the world, the move first.
             let moved = port.thread.world(|_| {

@@ -290,7 +290,9 @@ pub fn reason_text(reason: &Reason, names: &Names) -> String {
         Reason::LeaderLost(arm, cause) => {
             format!("the position of its leader {} is unknown{}", names.arm(arm), because(cause))
         }
-        Reason::LeaderAway(joint, by) => format!("{} was {} from its leader", names.joint(joint), angle(by)),
+        Reason::LeaderAway(joint, by) => {
+            format!("{} was {} from its leader, more than `max_approach`", names.joint(joint), angle(by))
+        }
         Reason::Guarded(arm) => format!("the collision guard stopped {}", names.arm(arm)),
     }
 }

@@ -44,6 +44,18 @@ fn no_epilogue_is_wrapped_in_its_source() {
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }
 
+/// Examples and tables are not wrapped, so they are this short as written.
+#[test]
+fn no_example_is_wider_than_80_columns() {
+    let mut wrong = Vec::new();
+    each(&program(), "dimos", &mut |path, verb| {
+        let text = verb.get_after_long_help().or(verb.get_after_help()).map(ToString::to_string).unwrap_or_default();
+        let long = text.lines().filter(|line| line.starts_with(' ') && line.chars().count() > 80);
+        wrong.extend(long.map(|line| format!("{path}: {line}")));
+    });
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
 #[test]
 fn usage_lines_have_the_order_that_is_parsed() {
     for (line, usage) in

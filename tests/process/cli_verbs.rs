@@ -120,7 +120,8 @@ JOINT       POSITION rad     deg  VELOCITY rad/s             EFFORT Nm  COMMAND
 arm_joint1        1.5000   85.94         -0.0100                     -   1.5000
 arm_joint2       -0.2500  -14.32         -0.0100  estimated          -  -0.2500
 gripper  0.0400 m
-pose     link_tcp in map  xyz 0.100000 0.200000 0.300000 m  rpy 0.000000 0.000000 0.000000 rad
+pose     link_tcp in map
+         xyz 0.100000 0.200000 0.300000 m  rpy 0.000000 0.000000 0.000000 rad
 ";
     assert_eq!(state, expected, "\n{state}");
     let status = home.run("status").with(0).out;

@@ -43,13 +43,18 @@ fn the_outcome_is_awaited_and_objects_are_attached_only_when_they_are_held() {
 
     // Attach: nothing is attached that is not held, and a wrong name moves nothing.
     home.dimos("arm gripper arm open").with(0);
-    home.dimos("arm gripper arm close --attach cup").with(1).says(&["no object cup", "hint: "]);
+    home.dimos("arm gripper arm close --attach cup").with(2).says(&["no object cup", "hint: "]);
     home.dimos("arm gripper arm open --detach").with(1).says(&["arm holds no object", "hint: "]);
-    home.dimos("world add cup --sphere 0.02 --at 0.9 0.2 0.5").with(0);
+    home.dimos("world add cup --sphere 0.02 --at 0.266 0 0.314").with(0);
     home.dimos("arm gripper arm close --attach cup").with(1).says(&["closed at 0.0000 m", "cup is not attached"]);
     assert_eq!(held_by(&home, "cup"), None);
     home.dimos("arm gripper arm open").with(0);
     arm.put_object(0.03);
+    // What is held is at the fingers.
+    home.dimos("world add box --sphere 0.02 --at 0.266 0.4 0.314").with(0);
+    let far = home.dimos("arm gripper arm close --attach box").with(1);
+    far.says(&["box is 0.383 m from flange of arm: it is not what the gripper holds", "dimos world attach box arm"]);
+    assert_eq!(held_by(&home, "box"), None);
     let grip = home.dimos("arm gripper arm close --force 12.5 --attach cup --json").with(0).json();
     assert_eq!((&grip["outcome"], &grip["attached"][0]), (&"holding".into(), &"cup".into()), "{grip}");
     assert!((grip["position"].as_f64().unwrap() - 0.03).abs() < 1e-6 && grip["force"] == 12.5, "{grip}");
@@ -73,7 +78,7 @@ fn gripper_actions_between_waypoints_are_awaited_and_end_the_motion_when_they_fa
     let (home, arm) = home();
     let _run = home.run(&format!("grips.yaml --no-record --set hardware.arm.address={}", arm.address()));
     home.dimos("arm gripper arm open").with(0);
-    home.dimos("world add cup --sphere 0.02 --at 0.9 0.2 0.5").with(0);
+    home.dimos("world add cup --sphere 0.02 --at 0.2607 0.0528 0.314").with(0);
     let through = "0.2,-0.3,0.6,0,0.8,0 gripper:close:cup home gripper:open:cup 0.1,-0.3,0.6,0,0.8,0 --speed 1";
     arm.put_object(0.03);
     let moved = home.dimos(&format!("move arm --through {through}")).with(0);
@@ -89,6 +94,11 @@ fn gripper_actions_between_waypoints_are_awaited_and_end_the_motion_when_they_fa
     assert!((joint - 0.2).abs() < 0.01, "it is at the first waypoint: {joint}");
     // What is wrong is found before anything moves.
     home.dimos("move arm --through gripper:open home nowhere").with(2).says(&["no named pose nowhere"]);
+    let at = home.positions("arm");
+    for (action, wrong) in [("gripper:0.5", "cannot go to 0.5 m"), ("gripper:close:cap", "did you mean `cup`?")] {
+        home.dimos(&format!("move arm --through home {action} home")).with(2).says(&[wrong, "nothing has moved"]);
+    }
+    assert!(at.iter().zip(home.positions("arm")).all(|(a, b)| (a - b).abs() < 1e-3));
     home.dimos("move arm --through home gripper:ajar").with(2).says(&["`open` or `close`"]);
     home.dimos("plan arm --through home gripper:close zero").with(2).says(&["a plan has no gripper actions"]);
 }

@@ -397,7 +397,7 @@ fn the_recipes_of_the_page_work() {
     // Names that the run does not have, each at its place.
     home.write(
         "names.yaml",
-        "steps:\n  - move: hom\n  - move: {joints: [1, 2]}\n  - wait: {input: di31}\n  - attach: prat\n  - gripper: {to: open, arm: amr}\n",
+        "steps:\n  - move: hom\n  - move: {joints: [1, 2]}\n  - wait: {input: di31}\n  - attach: prat\n  - gripper: {to: open, arm: amr}\n  - gripper: 0.5\n  - gripper: {to: open, force: 1000}\n",
     );
     let before = home.positions("arm");
     for verb in ["do names.yaml", "do --check names.yaml"] {
@@ -411,6 +411,10 @@ fn the_recipes_of_the_page_work() {
             "did you mean `part`?",
             "names.yaml:6:5",
             "did you mean `arm`?",
+            "names.yaml:7:5",
+            "cannot go to 0.5 m",
+            "names.yaml:8:5",
+            "cannot hold with 1000 N",
             "nothing has moved",
         ]);
     }

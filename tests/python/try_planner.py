@@ -62,6 +62,7 @@ def carries_an_object(robot):
     robot.attach("cup", "arm", touch_links=["link6"])
     cup = next(thing for thing in robot.world_list() if thing["name"] == "cup")
     assert cup["held_by"][0] == "arm", cup
+    refused(dimos.Refused, "UNKNOWN_OBJECT", lambda: robot.gripper("arm", "close", attach="cap"))
     robot.detach("cup")
     robot.world_remove()
     assert robot.world_list() == []

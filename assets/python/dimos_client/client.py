@@ -9,6 +9,7 @@ from .errors import ArmNotReady, MotionFailed, Refused
 from .planning import Goals, Planning, plan_number, where_to
 from .records import ArmState, Goal, Grip, Plan, Pose, Waypoint, numbers
 
+GRASP_REACH = 0.2  # m, how far what a gripper has just closed on may be from the tool centre point
 STALLED = 15.0  # s without progress, after which `wait` cancels a motion
 
 
@@ -99,7 +100,12 @@ class Client(Planning):
         """Moves a gripper to a position (an opening [m], or the angle [rad] of a rotary one), to "open" or "close",
         with a largest `force` (unit and range are in `status`) and a `speed` (0.01-1 of its top speed) if it has them.
         Waits until the fingers rest, at most `timeout` [s] (20), and returns where and why: `outcome`, as the run
-        judges it. If it holds something, `attach` is attached to the arm in the planner."""
+        judges it. If it holds something, `attach`, which is at the fingers, is attached to the arm in the planner."""
+        if attach is not None:
+            known = [entry["name"] for entry in self.world_list()]
+            if attach not in known:
+                raise Refused("UNKNOWN_OBJECT", f"the planner's world has no object {attach}: nothing has moved",
+                              f"it has: {', '.join(known) or 'none'}")
         span: Optional[List[float]] = self._report(arm).get("gripper_range")
         if isinstance(opening, str):
             if opening not in ("open", "close"):
@@ -119,7 +125,7 @@ class Client(Planning):
         grip = Grip(report["position"], report["unit"], report["outcome"] or "moving", report.get("force"),
                     report["force_unit"], report["elapsed"])
         if attach is not None and grip.holding:
-            self.attach(attach, arm)
+            self.attach(attach, arm, within=GRASP_REACH)
         return grip
 
     def _report(self, arm: str) -> Dict[str, Any]:

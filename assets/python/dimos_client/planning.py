@@ -94,10 +94,12 @@ class Planning(Streams):
         return objects
 
     def attach(self, name: str, arm: str, link: Optional[str] = None, touch_links: Sequence[str] = (),
-               mass: Optional[float] = None) -> Dict[str, Any]:
+               mass: Optional[float] = None, within: Optional[float] = None) -> Dict[str, Any]:
         """Attaches an object, where it is, to a `link` of an arm (default: its end effector), which may touch it and so
-        may `touch_links`. With `mass` [kg] the arm's controller is set to carry it: the reply has load and payload."""
-        return self.call("attach", name=name, robot=arm, link=link, touch_links=list(touch_links), mass=mass)
+        may `touch_links`. With `mass` [kg] the arm's controller is set to carry it: the reply has load and payload. An
+        object farther than `within` [m] from the tool centre point is refused."""
+        return self.call("attach", name=name, robot=arm, link=link, touch_links=list(touch_links), mass=mass,
+                         within=within)
 
     def detach(self, name: str) -> None:
         """Detaches an object; it remains where it is."""

@@ -394,8 +394,7 @@ impl Reader {
     }
 
     fn attach(&mut self, node: NodeId, arm: &mut String) -> Option<Act> {
-        let mut attach =
-            Attach { name: String::new(), robot: String::new(), link: None, touch_links: Vec::new(), mass: None };
+        let mut attach = Attach::default();
         if self.tree.text(node).is_some() {
             attach.name = self.parsed(node, word)?;
             return Some(Act::Attach(attach));

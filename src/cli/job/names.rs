@@ -6,7 +6,7 @@ use super::step::{Act, Job, Motion, Step};
 use super::times::all;
 use crate::cli::exit::Result;
 use crate::cli::goal::has_planner;
-use crate::cli::grip::Opening;
+use crate::cli::grip;
 use crate::rpc::api::{Attach, PlanGoal, Planner, Poses, RobotReport, State, Status, World};
 use crate::rpc::client::Client;
 use crate::rpc::report::{ArmReport, ArmStateReport};
@@ -101,18 +101,12 @@ impl Names {
         };
         match &step.act {
             Act::Move(motion) => self.motion(step, motion, arm),
-            Act::Gripper { to, object, .. } => {
-                let ranged = arm.gripper_range.is_some();
-                match (&arm.gripper_unit, to) {
-                    (None, _) => say(format!("{} has no gripper", step.arm), None),
-                    (_, Opening::Open | Opening::Close) if !ranged => {
-                        say(format!("the gripper of {} reports no range", step.arm), Some("give m or rad".into()))
-                    }
-                    _ if object.is_some() && !ranged => {
-                        say(format!("the gripper of {} cannot tell whether it holds something", step.arm), None)
-                    }
-                    _ => None,
-                }
+            Act::Gripper { to, force, object, .. } => {
+                let wrong = grip::impossible(arm, *to, *force).map(|(what, hint)| (step.at, what, hint));
+                wrong.or_else(|| match object.is_some() && arm.gripper_range.is_none() {
+                    true => say(format!("the gripper of {} cannot tell whether it holds something", step.arm), None),
+                    false => None,
+                })
             }
             Act::Input { input, .. } => missing(input),
             Act::Output(outputs) => outputs.keys().find_map(|name| missing(name)),

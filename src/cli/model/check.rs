@@ -31,7 +31,7 @@ pub(super) fn run(file: &File) -> Result {
     let fine = summary.is_some() && !loaded.has_errors();
     if file.json {
         output::json(&serde_json::json!({"valid": fine, "problems": loaded.reports(), "files": loaded.files}));
-        return Ok(if fine { Exit::Ok } else { Exit::Usage });
+        return if fine { Ok(Exit::Ok) } else { Err(file.refused()) };
     }
     let Some(summary) = summary.filter(|_| fine) else { return Err(file.refuse(&loaded)) };
     let text = loaded.render(output::colour(&std::io::stderr()));

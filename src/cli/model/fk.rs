@@ -62,7 +62,7 @@ pub fn run(args: &Args) -> Result {
 
 /// Prints a line per configuration of stdin.
 fn batch(args: &Args, robot: &RobotModel, chain: &Chain<'_>) -> Result {
-    let mut configurations = Source::stdin(Width::Joints(chain.joints.len()));
+    let mut configurations = Source::stdin(Width::Joints(chain.joints.len()), "model fk");
     while !configurations.is_over() {
         let Some(positions) = configurations.next(Duration::from_secs(1))? else { continue };
         let pose = pose(robot, chain, &positions);
@@ -88,7 +88,7 @@ fn report(chain: &Chain<'_>, positions: &[f64], pose: &Isometry3<f64>) -> serde_
     let (xyz, rpy) = to_xyz_rpy(pose);
     json!({
         "link": chain.name(chain.link), "base": chain.name(chain.base), "joints": chain.names(),
-        "positions": positions, "xyz": xyz, "rpy": rpy, "quat_xyzw": pose.rotation.quaternion().coords.as_slice(),
+        "positions": positions, "xyz": xyz, "rpy": rpy, "quat": pose.rotation.quaternion().coords.as_slice(),
     })
 }
 

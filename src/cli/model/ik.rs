@@ -112,19 +112,20 @@ pub fn run(args: &Args) -> Result {
             show(args, &chain, &found, &seed, error, turn.is_none());
             Ok(Exit::Ok)
         }
-        Err(failure) if args.file.json => {
+        Err(failure) => {
+            let best: Vec<String> = failure.best.iter().map(|v| output::fixed(*v, 4)).collect();
+            let hint = format!("the closest configuration found is {}", best.join(" "));
+            let refused = Failure::new(Exit::Failed, failure.to_string()).hint(hint);
+            if !args.file.json {
+                return Err(refused);
+            }
             output::json(&json!({
                 "reached": false, "link": name, "base": chain.name(chain.base), "joints": chain.names(),
                 "best": failure.best, "position_only": turn.is_none(), "position_error": failure.position,
                 "rotation_error": failure.rotation, "limit": failure.limit.as_ref().map(|(_, joint)| joint),
                 "attempts": failure.attempts,
             }));
-            Ok(Exit::Failed)
-        }
-        Err(failure) => {
-            let best: Vec<String> = failure.best.iter().map(|v| output::fixed(*v, 4)).collect();
-            let hint = format!("the closest configuration found is {}", best.join(" "));
-            Err(Failure::new(Exit::Failed, failure.to_string()).hint(hint))
+            Err(refused)
         }
     }
 }

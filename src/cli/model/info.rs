@@ -29,30 +29,14 @@ pub(super) fn info(file: &File) -> Result {
     output::line(format_args!("{}: {links} links, {joints} joints, {independent} of them independent", robot.name));
     output::line(format_args!("root: {root}"));
     output::line("");
-    let headings = [
-        "JOINT",
-        "TYPE",
-        "PARENT → CHILD",
-        ">LOWER rad",
-        ">UPPER rad",
-        ">LOWER °",
-        ">UPPER °",
-        ">SPEED /s",
-        ">ACC /s²",
-        "NOTE",
-    ];
-    let mut table = Table::new(&headings);
-    for joint in &robot.joints {
-        table.row(joint_row(&robot, joint));
-    }
-    table.print();
+    print_joints(&robot);
     output::line("");
-    let mut table = Table::new(&["LINK", ">MASS kg", "VISUAL", "COLLISION"]);
+    let mut table = Table::new(&["LINK", ">MASS kg", "~VISUAL", "~COLLISION"]);
     for link in &robot.links {
         let mass = output::number(link.inertial.as_ref().map(|i| i.mass), 3);
-        let cells =
-            [link.name.clone(), mass, shapes(&link.visuals, &mut meshes), shapes(&link.collisions, &mut meshes)];
-        table.row(cells);
+        let (visual, collision) = (shapes(&link.visuals, &mut meshes), shapes(&link.collisions, &mut meshes));
+        let collision = if collision == visual && !visual.is_empty() { "the same".to_owned() } else { collision };
+        table.row([link.name.clone(), mass, visual, collision]);
     }
     table.print();
     print_semantics(&robot, &loaded.semantics);
@@ -73,11 +57,32 @@ fn complete(robot: &RobotModel, meshes: &mut MeshSizes) -> Result {
     }
 }
 
+/// Prints the joints; without the columns that are empty for all of them.
+fn print_joints(robot: &RobotModel) {
+    let headings =
+        ["JOINT", "TYPE", "PARENT → CHILD", ">RANGE rad", ">RANGE °", ">SPEED /s", ">ACC /s²", ">JERK /s³", "~NOTE"];
+    let rows: Vec<Vec<String>> = robot.joints.iter().map(|joint| joint_row(robot, joint)).collect();
+    let is_shown =
+        |column: &usize| rows.iter().any(|row| !matches!(row.get(*column).map_or("", |cell| cell), "" | "-"));
+    let shown: Vec<usize> = (0..headings.len()).filter(is_shown).collect();
+    let mut table = Table::new(&shown.iter().filter_map(|column| headings.get(*column).copied()).collect::<Vec<_>>());
+    for row in &rows {
+        table.row(shown.iter().filter_map(|column| row.get(*column).cloned()));
+    }
+    table.print();
+}
+
 fn joint_row(robot: &RobotModel, joint: &Joint) -> Vec<String> {
     let name = |link: usize| robot.links.get(link).map_or("?", |l| l.name.as_str());
     let limits = &joint.limits;
     let finite = |value: f64| Some(value).filter(|v| v.is_finite());
-    let degrees = |value: f64| finite(value).filter(|_| joint.kind.is_angle()).map(f64::to_degrees);
+    let range = |factor: f64, decimals: usize| match (finite(limits.lower), finite(limits.upper)) {
+        (Some(lower), Some(upper)) => {
+            format!("{}…{}", output::fixed(lower * factor, decimals), output::fixed(upper * factor, decimals))
+        }
+        _ => "-".to_owned(),
+    };
+    let degrees = if joint.kind.is_angle() { range(1f64.to_degrees(), 1) } else { "-".to_owned() };
     let note = match joint.mimic {
         Some(mimic) => {
             let leader = robot.joints.get(mimic.leader).map_or("?", |j| j.name.as_str());
@@ -90,12 +95,11 @@ fn joint_row(robot: &RobotModel, joint: &Joint) -> Vec<String> {
         joint.name.clone(),
         joint.kind.name().to_owned(),
         format!("{} → {}", name(joint.parent), name(joint.child)),
-        output::number(finite(limits.lower), 4),
-        output::number(finite(limits.upper), 4),
-        output::number(degrees(limits.lower), 1),
-        output::number(degrees(limits.upper), 1),
-        output::number(finite(limits.velocity), 3),
-        output::number(limits.acceleration, 3),
+        range(1.0, 3),
+        degrees,
+        output::number(finite(limits.velocity), 2),
+        output::number(limits.acceleration, 2),
+        output::number(limits.jerk, 1),
         note,
     ]
 }
