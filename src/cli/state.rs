@@ -128,7 +128,8 @@ fn of_arm(arm: &ArmStateReport) -> Vec<String> {
     let simulated = if arm.simulated { "  SIMULATED" } else { "" };
     let age = arm.age_ms.map_or_else(|| "no state yet".into(), |ms| format!("state {ms:.1} ms old"));
     let mut lines = vec![format!("{}{simulated}  {age}", arm.hardware_id)];
-    let mut table = Table::new(&["JOINT", ">POSITION rad", ">deg", ">VELOCITY rad/s", "", ">EFFORT Nm", ">COMMAND"]);
+    let mut table =
+        Table::new(&["JOINT", ">POSITION rad", ">deg", ">VELOCITY rad/s", "", ">EFFORT Nm", ">COMMAND rad"]);
     for joint in &arm.joints {
         table.row([
             joint.name.clone(),
@@ -168,7 +169,7 @@ fn force(arm: &ArmStateReport) -> String {
 
 /// Returns the source of a velocity unless it is measured.
 fn source(joint: &JointReport) -> &str {
-    if joint.velocity_source == "estimated" { "estimated" } else { "" }
+    if joint.velocity_source == "estimated" { "est." } else { "" }
 }
 
 #[cfg(test)]

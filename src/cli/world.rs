@@ -275,11 +275,8 @@ fn load(file: &Path) -> Result<Vec<WorldObject>> {
     };
     let (mut objects, mut mistakes) = (BTreeMap::new(), Vec::new());
     for (name, value) in typed {
-        match serde_json::from_value::<WorldEntry>(value).map_err(|e| e.to_string()) {
-            Ok(entry) => match WorldAdd(entry.clone().named(name.clone())).valid() {
-                Ok(()) => drop(objects.insert(name, entry)),
-                Err(why) => mistakes.push((line_of(&name), format!("{name}: {why}"))),
-            },
+        match entry(&name, value, folder) {
+            Ok(entry) => drop(objects.insert(name, entry)),
             Err(why) => mistakes.push((line_of(&name), format!("{name}: {why}"))),
         }
     }
@@ -290,13 +287,16 @@ fn load(file: &Path) -> Result<Vec<WorldObject>> {
         let hint = "an object is written as under `planner.world` in a blueprint; nothing was added";
         return Err(Failure::usage(each.join("\n")).hint(hint));
     }
-    let resolve = |path: &mut String| full_path(&folder.join(&path)).map(|full| *path = full);
-    for entry in objects.values_mut() {
-        if let ShapeSpec::Mesh(path) | ShapeSpec::Cloud(path) = &mut entry.shape {
-            resolve(path)?;
-        }
-    }
     Ok(objects.into_iter().map(|(name, entry)| entry.named(name)).collect())
+}
+
+/// Returns an object of a file in this folder, with whole paths; or what is wrong with it.
+fn entry(name: &str, value: Value, folder: &Path) -> std::result::Result<WorldEntry, String> {
+    let mut entry = serde_json::from_value::<WorldEntry>(value).map_err(|e| e.to_string())?;
+    if let ShapeSpec::Mesh(path) | ShapeSpec::Cloud(path) = &mut entry.shape {
+        *path = full_path(&folder.join(&path)).map_err(|failure| failure.what)?;
+    }
+    WorldAdd(entry.clone().named(name.to_owned())).valid().map(|()| entry)
 }
 
 fn list(client: &mut Client, json: bool) -> Result<()> {

@@ -13,6 +13,7 @@ pub mod cartesian;
 pub mod config;
 mod constant_corner_speed;
 mod double_s;
+pub mod enclosure;
 mod four;
 mod goals;
 pub mod ignored_pairs;

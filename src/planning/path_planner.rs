@@ -6,6 +6,7 @@ use crate::collision::checker::{CollisionChecker, Stop};
 use crate::collision::report::Contact;
 use crate::robot::random::Random;
 
+use super::enclosure::{Enclosed, enclosed};
 use super::level::Level;
 use super::path::{Path, between, distance, length, unwind};
 use super::portfolio::{Candidate, Ended, Portfolio};
@@ -114,6 +115,14 @@ pub enum PlanError {
         /// The contacts, the deepest first.
         contacts: Vec<Contact>,
     },
+    /// No way out of the start, or of every goal, was found.
+    #[error("the {which} is enclosed, between {}", .enclosed.pairs())]
+    Enclosed {
+        /// "start" or "goal".
+        which: &'static str,
+        /// What encloses it; of several goals, the nearest.
+        enclosed: Enclosed,
+    },
     /// The timeout was reached.
     #[error("no path found in time, after {} samples and {} nodes", .0.samples, .0.nodes)]
     Timeout(SearchCount),
@@ -187,10 +196,14 @@ pub fn plan<C: CollisionChecker>(
             loop {
                 let found = searches.next(checker, stop);
                 count = searches.count();
+                if found == Err(Ended::Pausing) {
+                    not_enclosed(checker, &from, &goals, settings.seed, stop)?;
+                    continue;
+                }
                 let found = found.map_err(|ended| match ended {
                     Ended::Stopped if stop.is_cancelled() => PlanError::Cancelled,
                     Ended::Stopped => PlanError::Timeout(count),
-                    Ended::Exhausted => PlanError::Exhausted(count),
+                    Ended::Pausing | Ended::Exhausted => PlanError::Exhausted(count),
                 })?;
                 search_time = began.elapsed();
                 if let Some(path) = finished(checker, &found, count.nodes, settings, stop) {
@@ -220,6 +233,26 @@ pub fn plan<C: CollisionChecker>(
         refined: rounds,
         refine_time: refining.elapsed(),
     })
+}
+
+/// Fails if the start, or every goal, is enclosed.
+fn not_enclosed<C: CollisionChecker>(
+    checker: &mut C,
+    start: &[f64],
+    goals: &[Vec<f64>],
+    seed: u64,
+    stop: &Stop,
+) -> Result<(), PlanError> {
+    if let Some(enclosed) = enclosed(checker, start, goals, seed, stop) {
+        return Err(PlanError::Enclosed { which: "start", enclosed });
+    }
+    let to = [start.to_vec()];
+    let mut nearest = None;
+    for goal in goals {
+        let Some(enclosed) = enclosed(checker, goal, &to, seed, stop) else { return Ok(()) };
+        nearest.get_or_insert(enclosed);
+    }
+    nearest.map_or(Ok(()), |enclosed| Err(PlanError::Enclosed { which: "goal", enclosed }))
 }
 
 /// Smallest and largest number of random cuts of a path.

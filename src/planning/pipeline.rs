@@ -285,6 +285,11 @@ fn apart(
     Ok(Padded::new(world.with_robots(bodies).snapshot(), padding))
 }
 
+/// Formats a position.
+fn fixed(position: f64) -> String {
+    format!("{position:.2}")
+}
+
 /// Converts a path planner's error to a failure with joint names.
 pub(super) fn failure_for(stage: &Stage<'_>, error: &PlanError) -> PlanFailure {
     match error {
@@ -301,6 +306,18 @@ pub(super) fn failure_for(stage: &Stage<'_>, error: &PlanError) -> PlanFailure {
             .hint("move the arm out of contact with `dimos move … --direct` or by hand, or correct the world"),
         PlanError::Collides { .. } => {
             PlanFailure::new(error.to_string()).hint("choose another goal, or correct the world")
+        }
+        PlanError::Enclosed { which, enclosed } => {
+            let name = stage.joints.get(enclosed.joint).map_or("a joint", String::as_str);
+            let kinds = stage.robots.iter().flat_map(|robot| robot.body.kinematics.kinds());
+            let unit = { kinds }.nth(enclosed.joint).map_or("rad", |kind| kind.unit());
+            let [low, high] = enclosed.reached;
+            let (low, high) = (fixed(low), fixed(high));
+            let pairs = if enclosed.contacts.is_empty() { String::new() } else { format!(", by {}", enclosed.pairs()) };
+            PlanFailure::new(format!(
+                "the {which} is enclosed: {name} does not leave {low} … {high} {unit} there{pairs}"
+            ))
+            .hint("move the obstacle, or choose another goal; a very narrow way out may have been missed")
         }
         PlanError::Timeout(_) => PlanFailure::new(error.to_string()).hint("increase --timeout, or try another --seed"),
         PlanError::Cancelled => PlanFailure::cancelled(),

@@ -11,6 +11,8 @@ use super::rrt_connect::{Quantum, RrtSettings, Search, SearchCount};
 /// Why a search ended without a path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Ended {
+    /// Took long, said once: it can be continued.
+    Pausing,
     /// Stopped by its deadline or a cancel.
     Stopped,
     /// Reached its maximum number of samples or nodes.
@@ -34,6 +36,8 @@ const MAIN_SHARE: u64 = 8;
 const ONE_ARM: usize = 8;
 /// A proven edge takes about as long as this number of edges that look free or not.
 const PROOF_COST: u64 = 4;
+/// After this number of rounds it pauses.
+const ROUNDS_TO_PAUSE: u32 = 3;
 /// The turns become no longer after this number of doublings.
 const DOUBLINGS: u32 = 6;
 
@@ -57,6 +61,7 @@ pub struct Portfolio {
     settings: RrtSettings,
     turn: usize,
     round: u32,
+    paused: bool,
     /// Statistics of searches that ended.
     ended: SearchCount,
 }
@@ -95,6 +100,7 @@ impl Portfolio {
             settings: *settings,
             turn: 0,
             round: 0,
+            paused: false,
             ended: SearchCount::default(),
         }
     }
@@ -123,6 +129,9 @@ impl Portfolio {
             if self.turn >= self.members.len() {
                 self.turn = 0;
                 self.round = (self.round + 1).min(DOUBLINGS);
+            }
+            if self.round == ROUNDS_TO_PAUSE && !std::mem::replace(&mut self.paused, true) {
+                return Err(Ended::Pausing);
             }
             let Member { range, number, seed, edges, search } = &mut self.members[self.turn];
             let (start, goals) = (&self.start, &self.goals);

@@ -63,8 +63,17 @@ impl CollisionChecker for Plane {
     fn clearance(&mut self, _: &[f64]) -> Option<Contact> {
         None
     }
-    fn contacts(&mut self, _: &[f64]) -> Vec<Contact> {
-        Vec::new()
+    fn contacts(&mut self, q: &[f64]) -> Vec<Contact> {
+        let deep = self.posts.iter().enumerate().filter(|(_, (c, r))| distance(c, q) <= *r);
+        let contact = |(post, (c, r)): (usize, &([f64; 2], f64))| Contact {
+            pair: Pair::Obstacle(0, post),
+            link: "point".into(),
+            other: format!("post {post}"),
+            distance: distance(c, q) - r,
+            on_link: DVec3::ZERO,
+            on_other: DVec3::ZERO,
+        };
+        deep.map(contact).collect()
     }
     fn checks(&self) -> u64 {
         self.checks
@@ -117,6 +126,18 @@ fn a_search_without_a_path_ends_at_its_maximum_counts() {
     // The goal is enclosed by a ring of overlapping posts.
     let ring = (0..40).map(|k| f64::from(k) * std::f64::consts::TAU / 40.0);
     let mut plane = Plane::new(ring.map(|a| ([0.3 * a.cos(), 0.3 * a.sin()], 0.04)).collect());
+    let found = plan(&mut plane, &[-0.9, -0.9], &[vec![0.0, 0.0]], &PlanSettings::default(), &Stop::never());
+    let Err(PlanError::Enclosed { which: "goal", enclosed }) = found else { panic!("{found:?}") };
+    assert!(enclosed.reached.iter().all(|end| (0.2..0.27).contains(&end.abs())), "{enclosed:?}");
+    assert!(!enclosed.contacts.is_empty() && enclosed.pairs().contains("obstacle \"post "), "{}", enclosed.pairs());
+    let found =
+        plan(&mut plane, &[0.0, 0.0], &[vec![-0.9, 0.0], vec![0.9, 0.9]], &PlanSettings::default(), &Stop::never());
+    assert!(matches!(found, Err(PlanError::Enclosed { which: "start", .. })), "{found:?}");
+    // One of several goals is not enclosed.
+    let goals = [vec![0.0, 0.0], vec![0.9, 0.9]];
+    let found = plan(&mut plane, &[-0.9, -0.9], &goals, &PlanSettings::default(), &Stop::never()).unwrap();
+    assert_eq!(found.path.last(), Some(&goals[1]));
+
     let mut settings = PlanSettings::default();
     settings.search.max_samples = 5000;
     let found = plan(&mut plane, &[-0.9, -0.9], &[vec![0.0, 0.0]], &settings, &Stop::never());

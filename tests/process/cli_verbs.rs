@@ -102,7 +102,7 @@ fn several_runs_need_a_name() {
     assert!(home.run("state --run right").with(0).out.contains("arm_joint1"));
     assert_eq!(right.asked().len(), 1);
     let overview = home.run("status").with(0).out;
-    assert_eq!(overview.lines().count(), 3, "{overview}");
+    assert_eq!(overview.lines().count(), 5, "two runs, and their logs: {overview}");
     let json: Value = serde_json::from_str(&home.run("status --json").with(0).out).unwrap();
     assert_eq!(json.as_array().unwrap().len(), 2);
     let stopped = home.run("stop --all").with(0).out;
@@ -116,9 +116,9 @@ fn tables_align() {
     let state = home.run("state").with(0).out;
     let expected = "\
 arm  SIMULATED  state 2.5 ms old
-JOINT       POSITION rad     deg  VELOCITY rad/s             EFFORT Nm  COMMAND
-arm_joint1        1.5000   85.94         -0.0100                     -   1.5000
-arm_joint2       -0.2500  -14.32         -0.0100  estimated          -  -0.2500
+JOINT       POSITION rad     deg  VELOCITY rad/s        EFFORT Nm  COMMAND rad
+arm_joint1        1.5000   85.94         -0.0100                -       1.5000
+arm_joint2       -0.2500  -14.32         -0.0100  est.          -      -0.2500
 gripper  0.0400 m
 pose     link_tcp in map
          xyz 0.100000 0.200000 0.300000 m  rpy 0.000000 0.000000 0.000000 rad

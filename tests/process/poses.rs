@@ -18,7 +18,9 @@ fn pose(home: &Home, arm: &str) -> (Isometry3<f64>, Value) {
 /// The numbers that `state` prints for the first pose with this label, as arguments of `move`.
 fn printed(home: &Home, label: &str) -> String {
     let out = home.dimos("state").with(0).out;
-    let line = out.lines().find(|line| line.contains(label)).unwrap_or_else(|| panic!("no {label:?} in {out}"));
+    // The numbers are in the line below.
+    let line = out.lines().skip_while(|line| !line.contains(label)).nth(1);
+    let line = line.unwrap_or_else(|| panic!("no {label:?} in {out}"));
     let numbers: Vec<&str> = line.split_whitespace().filter(|word| word.parse::<f64>().is_ok()).collect();
     let [x, y, z, r, p, w] = numbers[..] else { panic!("{line}") };
     format!("--pose {x} {y} {z} --rpy {r} {p} {w}")

@@ -227,6 +227,7 @@ halt -f
 
 fn start(folder: &Path) -> Child {
     let console = File::create(folder.join("console")).expect("a file for the console");
+    let preloaded = whole_state(folder);
     let folder = folder.display();
     let mut guest = Command::new(tool("linux.uml").expect("looked for before"));
     guest
@@ -235,8 +236,17 @@ fn start(folder: &Path) -> Child {
         .stdin(Stdio::null())
         .stderr(console.try_clone().expect("the same file"))
         .stdout(console)
+        .envs(preloaded.map(|library| ("LD_PRELOAD", library)))
         .process_group(0);
     on_one_processor(|| guest.spawn()).expect("user-mode Linux starts")
+}
+
+/// Compiles what lets the guest's kernel run on processors with more state than it knows: see the file.
+fn whole_state(folder: &Path) -> Option<PathBuf> {
+    let (source, library) = (folder.join("xstate.c"), folder.join("xstate.so"));
+    fs::write(&source, include_str!("uml_xstate.c")).ok()?;
+    let compiled = Command::new("gcc").args(["-O2", "-shared", "-fPIC", "-o"]).args([&library, &source]).status();
+    compiled.is_ok_and(|status| status.success()).then_some(library)
 }
 
 /// Runs `f` on one processor: what it starts stays there.

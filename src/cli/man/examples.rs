@@ -17,7 +17,7 @@ pub(super) const OF_VERBS: &[(&str, &[&str])] = &[
         ],
     ),
     ("world move", &["dimos world move cup --at 0.4 -0.1 0.05 --rpy 0 0 1.57"]),
-    ("world remove", &["dimos world remove cup", "dimos world remove"]),
+    ("world remove", &["dimos world remove cup", "dimos world remove --all"]),
     ("world load", &["dimos world load cell.yaml"]),
     ("world attach", &["dimos world attach cup arm --mass 0.3"]),
     ("world detach", &["dimos world detach cup"]),
@@ -65,7 +65,7 @@ pub(super) const OF_VERBS: &[(&str, &[&str])] = &[
     ("log plot", &["dimos log plot log.mcap --joint arm_joint2 --output joint2.svg"]),
     ("log what-if", &["dimos log what-if log.mcap --set arms.arm.velocity_max=0.5"]),
     ("replay", &["dimos replay --last", "dimos replay log.mcap --rate 4"]),
-    ("adapter", &["dimos adapter new servobot", "dimos adapter test servobot"]),
+    ("adapter", &["dimos adapter new servobot --dof 6 --transport serial", "dimos adapter test servobot"]),
     ("adapter test", &["dimos adapter test xarm", "dimos adapter test xarm --address 192.168.1.185"]),
     ("adapter emulate", &["dimos adapter emulate xarm"]),
     ("list-adapters", &["dimos list-adapters", "dimos list-adapters --json"]),
@@ -80,8 +80,8 @@ pub(super) const OF_VERBS: &[(&str, &[&str])] = &[
     ("model fk", &["dimos model fk builtin:yourarm 0.3 -0.2 0.5 0 0.4 0"]),
     ("model ik", &["dimos model ik builtin:yourarm --pose 0.3 0 0.4 --rpy 3.14 0 0"]),
     ("model collide", &["dimos model collide builtin:yourarm 0.3 -0.2 0.5 0 0.4 0"]),
-    ("model assets", &["dimos model assets list"]),
-    ("model assets list", &["dimos model assets list"]),
+    ("model assets", &["dimos model assets list fr3-planner"]),
+    ("model assets list", &["dimos model assets list fr3-planner"]),
     ("model assets fetch", &["dimos model assets fetch fr3-planner"]),
     ("model assets clean", &["dimos model assets clean fr3-planner"]),
     ("doctor", &["dimos doctor"]),
@@ -100,6 +100,7 @@ mod tests {
 
     #[test]
     fn the_examples_are_what_the_program_reads() {
+        let mut wrong = Vec::new();
         for (verb, examples) in OF_VERBS {
             for example in *examples {
                 assert!(
@@ -107,8 +108,9 @@ mod tests {
                     "{verb}"
                 );
                 let read = crate::cli::command().try_get_matches_from(words(example));
-                assert!(read.is_ok(), "{example}: {}", read.unwrap_err());
+                wrong.extend(read.err().map(|error| format!("{example}: {error}")));
             }
         }
+        assert!(wrong.is_empty(), "{}", wrong.join("\n"));
     }
 }
