@@ -9,7 +9,7 @@ use super::banner;
 use super::exit::{Exit, Failure, Result};
 use super::follow::{Signals, follow};
 use super::goal::{has_planner, plan, show};
-use super::output::{self, Table, fixed, span};
+use super::output::{self, Table, fixed, signed, span};
 use crate::planning::path::length;
 use crate::planning::thin::thin;
 use crate::planning::timing::time_within;
@@ -250,7 +250,7 @@ fn describe(arm: &str, joints: &[String], way: &Retrace, ago: f64) {
     let (Some(first), Some(last)) = (way.path.first(), way.path.last()) else { return };
     let mut table = Table::new(&["JOINT", ">NOW rad", ">GOAL rad", ">BY rad"]);
     for (j, joint) in joints.iter().enumerate() {
-        table.row([joint.clone(), fixed(first[j], 4), fixed(last[j], 4), format!("{:+.4}", last[j] - first[j])]);
+        table.row([joint.clone(), fixed(first[j], 4), fixed(last[j], 4), signed(last[j] - first[j], 4)]);
     }
     table.print();
 }

@@ -9,7 +9,7 @@ use indicatif::{ProgressBar, ProgressFinish, ProgressStyle};
 
 use super::banner;
 use super::exit::{Exit, Failure, Result};
-use super::output::{self, Table, Tone, fixed, toned};
+use super::output::{self, Table, Tone, fixed, signed, toned};
 use crate::rpc::api::{Cancel, Motion, Status};
 use crate::rpc::client::Client;
 use crate::rpc::report::{Deviation, MotionReport};
@@ -179,8 +179,8 @@ pub fn show_deviation(deviation: &[Deviation]) {
             joint.joint.as_str().into(),
             fixed(joint.target, 4).into(),
             fixed(joint.actual, 4).into(),
-            toned(format_args!("{off:+.4}"), tone),
-            toned(format_args!("{:+.3}", off.to_degrees()), tone),
+            toned(signed(off, 4), tone),
+            toned(signed(off.to_degrees(), 3), tone),
         ]);
     }
     table.print();

@@ -51,10 +51,10 @@ mod targets;
 pub mod task;
 mod text_log;
 mod trajectory_file;
+mod typed;
 pub mod view;
 pub mod world;
 
-use std::ffi::OsString;
 use std::process::ExitCode;
 use std::sync::OnceLock;
 
@@ -296,7 +296,7 @@ fn command_line(catalog: Catalog<'_>) -> ExitCode {
     // First of all: it changes the environment, and no thread may read that meanwhile.
     complete::answer(catalog);
     set_threads_of_the_network();
-    let typed = place_first(separated(std::env::args_os()).into_iter().map(spelled_out).collect());
+    let typed = typed::as_parsed(std::env::args_os());
     let json = typed.iter().take_while(|word| *word != "--").any(|word| word == "--json");
     let result = match command().try_get_matches_from(&typed) {
         Ok(arguments) => dispatch(&arguments, catalog),
@@ -397,50 +397,6 @@ fn built_in(cli: &Cli, catalog: Catalog<'_>) -> exit::Result {
     }
 }
 
-/// Options whose numbers may also be separated by commas, as those of `--goal`.
-const LISTS: [&str; 4] = ["--pose", "--rpy", "--quat", "--at"];
-
-/// Separates numbers behind one of [`LISTS`] that were typed with commas: `--pose 0.3,0.1,0.4`.
-fn separated(arguments: impl Iterator<Item = OsString>) -> Vec<OsString> {
-    let mut words: Vec<OsString> = Vec::new();
-    for argument in arguments {
-        let in_list = words.last().is_some_and(|last| LISTS.iter().any(|list| last == *list));
-        let parts = argument.to_str().filter(|text| in_list && text.contains(','));
-        match parts.map(|text| text.split(',').map(|part| part.trim().to_owned()).collect::<Vec<_>>()) {
-            Some(parts) if parts.iter().all(|part| part.parse::<f64>().is_ok()) => {
-                words.extend(parts.into_iter().map(OsString::from));
-            }
-            _ => words.push(argument),
-        }
-    }
-    words
-}
-
-/// Moves `--at PLACE` before the verb, where the parser expects it. `--at` before a number is a position of `world`.
-fn place_first(mut words: Vec<OsString>) -> Vec<OsString> {
-    let end = words.iter().position(|word| word == "--").unwrap_or(words.len());
-    let is_place = |word: &OsString| word.to_str().is_some_and(|text| text.parse::<f64>().is_err());
-    let found = words.iter().take(end).enumerate().skip(2).find_map(|(at, word)| {
-        let one_word =
-            word.to_str().and_then(|text| text.strip_prefix("--at=")).is_some_and(|p| p.parse::<f64>().is_err());
-        let two_words = word == "--at" && words.get(at + 1).filter(|_| at + 1 < end).is_some_and(is_place);
-        (one_word || two_words).then_some(at..at + 1 + usize::from(two_words))
-    });
-    if let Some(range) = found {
-        let place: Vec<OsString> = words.drain(range).collect();
-        words.splice(1..1, place);
-    }
-    words
-}
-
-/// Negative numbers in plain decimals: of `-0.5`, `-.5` and `-5e-1` the parser takes only the first for a number.
-fn spelled_out(argument: OsString) -> OsString {
-    match argument.to_str().filter(|text| text.starts_with('-')).and_then(|text| text.parse::<f64>().ok()) {
-        Some(number) if number.is_finite() => number.to_string().into(),
-        _ => argument,
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -499,45 +455,6 @@ mod tests {
             "a --record f --no-record",
         ] {
             assert_eq!(read::<run::Args>(wrong).unwrap_err().exit_code(), 2, "{wrong:?}");
-        }
-    }
-
-    #[test]
-    fn numbers_of_a_pose_may_be_separated_by_commas() {
-        let read = |line: &str| -> Vec<OsString> { separated(line.split(' ').map(OsString::from)) };
-        let words = |line: &str| line.split(' ').map(OsString::from).collect::<Vec<_>>();
-        assert_eq!(read("move a --pose 0.3,-.1,0.4 --rpy 0 1 0"), words("move a --pose 0.3 -.1 0.4 --rpy 0 1 0"));
-        for same in ["move a --pose 0.3,x,0.4", "move a 0.3,0.1", "move --goal a=0.1,0.2", "run --set x=1,2"] {
-            assert_eq!(read(same), words(same));
-        }
-    }
-
-    #[test]
-    fn a_place_may_follow_the_verb_and_is_no_position() {
-        let moved = |line: &str| {
-            let words = place_first(line.split(' ').map(OsString::from).collect());
-            words.iter().map(|word| word.to_string_lossy()).collect::<Vec<_>>().join(" ")
-        };
-        assert_eq!(moved("dimos state --at cell1 --watch"), "dimos --at cell1 state --watch");
-        assert_eq!(moved("dimos state --at=tls/cell1:1"), "dimos --at=tls/cell1:1 state");
-        assert_eq!(
-            moved("dimos world add cup --at 0.3 -0.1 0.4 --at cell1"),
-            "dimos --at cell1 world add cup --at 0.3 -0.1 0.4"
-        );
-        for same in
-            ["dimos --at cell1 state", "dimos world move cup --at 1 2 3", "dimos x -- --at cell1", "dimos state --at"]
-        {
-            assert_eq!(moved(same), same);
-        }
-    }
-
-    #[test]
-    fn negative_numbers_are_spelled_out() {
-        for (typed, meant) in [("-.5", "-0.5"), ("-1e-3", "-0.001"), ("-0.30000000000000004", "-0.30000000000000004")] {
-            assert_eq!(spelled_out(typed.into()), meant);
-        }
-        for same in ["-0.5", "-0", "-x", "-.", "--", ".5", "1e-3", "-inf", "-nan"] {
-            assert_eq!(spelled_out(same.into()), same);
         }
     }
 }

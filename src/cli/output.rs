@@ -208,6 +208,13 @@ pub fn fixed(value: f64, decimals: usize) -> String {
     }
 }
 
+/// Formats a difference with its sign: `+0.50`, `-0.50`, `0.00`.
+pub fn signed(value: f64, decimals: usize) -> String {
+    let text = fixed(value, decimals);
+    let plus = !text.starts_with('-') && text.bytes().any(|digit| matches!(digit, b'1'..=b'9'));
+    if plus { format!("+{text}") } else { text }
+}
+
 /// Formats a duration: `2 h 5 min`, `12.3 s`.
 pub fn span(seconds: f64) -> String {
     let whole = seconds as u64;
@@ -233,6 +240,11 @@ mod tests {
             assert_eq!(width(&terminal), usable, "{columns}");
         }
         assert_eq!(width(std::fs::File::open("/dev/null").unwrap()), None);
+    }
+
+    #[test]
+    fn a_difference_has_its_sign_and_nothing_has_none() {
+        assert_eq!([0.5, -0.5, 0.0, -0.004].map(|value| signed(value, 2)), ["+0.50", "-0.50", "0.00", "0.00"]);
     }
 
     #[test]

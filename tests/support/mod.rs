@@ -18,6 +18,7 @@ pub mod python;
 pub mod python_dimos;
 pub mod rig;
 pub mod ros;
+pub mod scripted;
 pub mod shared;
 pub mod sim_arm;
 pub mod skip;

@@ -1,15 +1,15 @@
 //! Runs that are shared with other computers, here all the same one; and a client of them that is none of our code.
 
-use std::io::{BufRead, BufReader, Write};
 use std::net::TcpListener;
 use std::path::Path;
-use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use serde_json::{Value, json};
 
 use super::program::{Ended, Home, Started};
 use super::python::python_with;
+use super::scripted::Scripted;
 use super::skip::skip;
 
 /// A mock arm that is moved directly.
@@ -88,9 +88,7 @@ impl Shared {
 
 /// eclipse-zenoh, driven by `tests/readers/zenoh_client.py`.
 pub struct Judge {
-    child: Child,
-    to: ChildStdin,
-    from: BufReader<ChildStdout>,
+    script: Scripted,
     /// What it answered first: its id, or why it was refused.
     pub opened: Value,
 }
@@ -101,34 +99,15 @@ impl Judge {
     pub fn open(at: &str, user: &str, more: Value) -> Option<Self> {
         let python = python_with(&["zenoh"])?;
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/readers/zenoh_client.py");
-        let mut child = Command::new(python)
-            .arg(script)
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .stderr(Stdio::null())
-            .spawn()
-            .unwrap();
-        let (to, from) = (child.stdin.take().unwrap(), BufReader::new(child.stdout.take().unwrap()));
-        let mut judge = Self { child, to, from, opened: Value::Null };
-        let mut opening = json!({"at": at, "run": "cell", "user": user});
-        opening.as_object_mut().unwrap().extend(more.as_object().cloned().unwrap_or_default());
-        judge.opened = judge.say(&opening);
-        Some(judge)
-    }
-
-    fn say(&mut self, command: &Value) -> Value {
-        writeln!(self.to, "{command}").unwrap();
-        let mut line = String::new();
-        self.from.read_line(&mut line).unwrap();
-        serde_json::from_str(&line).unwrap_or_else(|e| panic!("{command}: {e}: {line:?}"))
+        let mut script = Scripted::start(Command::new(python).arg(script).stderr(Stdio::null()));
+        let opened = script.say(json!({"at": at, "run": "cell", "user": user}), more);
+        Some(Self { script, opened })
     }
 
     /// Does what the script names so.
     #[track_caller]
     pub fn does(&mut self, what: &str, arguments: Value) -> Value {
-        let mut command = json!({"do": what});
-        command.as_object_mut().unwrap().extend(arguments.as_object().cloned().unwrap_or_default());
-        self.say(&command)
+        self.script.does(what, arguments)
     }
 
     /// Sends a request; what came back.
@@ -144,13 +123,7 @@ impl Judge {
     }
 
     pub fn pid(&self) -> u32 {
-        self.child.id()
-    }
-}
-
-impl Drop for Judge {
-    fn drop(&mut self) {
-        let _ = (self.child.kill(), self.child.wait());
+        self.script.pid()
     }
 }
 

@@ -9,6 +9,7 @@ use serde_json::{Value, json};
 use super::network::{free_port, is_built};
 use super::program::{Home, Started, eventually};
 use super::python::python_with;
+use super::scripted::Scripted;
 
 fn reader(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/readers").join(name)
@@ -92,42 +93,20 @@ impl Ros {
 
     /// A client of services and actions. `more`: domain, distro, namespace.
     pub fn client(&self, more: Value) -> RosClient {
-        let mut child = Command::new(&self.python)
-            .arg(reader("ros2_client.py"))
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .spawn()
-            .unwrap();
-        let (to, from) = (child.stdin.take().unwrap(), BufReader::new(child.stdout.take().unwrap()));
-        let mut client = RosClient { child, to, from };
-        let mut opening = json!({"port": self.port});
-        opening.as_object_mut().unwrap().extend(more.as_object().cloned().unwrap_or_default());
-        client.say(&opening);
-        client
+        let mut script = Scripted::start(Command::new(&self.python).arg(reader("ros2_client.py")));
+        script.say(json!({"port": self.port}), more);
+        RosClient(script)
     }
 }
 
 /// A client of services and actions of ROS 2.
-pub struct RosClient {
-    child: Child,
-    to: ChildStdin,
-    from: BufReader<ChildStdout>,
-}
+pub struct RosClient(Scripted);
 
 impl RosClient {
-    fn say(&mut self, command: &Value) -> Value {
-        writeln!(self.to, "{command}").unwrap();
-        let mut line = String::new();
-        self.from.read_line(&mut line).unwrap();
-        serde_json::from_str(&line).unwrap_or_else(|e| panic!("{command}: {e}: {line:?}"))
-    }
-
     /// Does what the script names so.
     #[track_caller]
     pub fn does(&mut self, what: &str, arguments: Value) -> Value {
-        let mut command = json!({"do": what});
-        command.as_object_mut().unwrap().extend(arguments.as_object().cloned().unwrap_or_default());
-        self.say(&command)
+        self.0.does(what, arguments)
     }
 
     /// Sends a goal to `traj_arm`; its number, or nothing if it is rejected. `more`: tolerances and the like.
@@ -145,11 +124,5 @@ impl RosClient {
         let goal = self.goal(points, more);
         assert!(goal.is_string(), "the goal was rejected");
         self.does("result", json!({"goal": goal}))
-    }
-}
-
-impl Drop for RosClient {
-    fn drop(&mut self) {
-        let _ = (self.child.kill(), self.child.wait());
     }
 }

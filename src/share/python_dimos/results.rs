@@ -42,10 +42,14 @@ impl Execution {
 
     /// Returns the `TrajectoryExecutionResult`.
     pub fn result(self, message: impl Into<Value>) -> Value {
-        let status = Value::Member(TASK_MODULE, "TrajectoryExecutionStatus", self as i64);
-        let state = Value::Dict(vec![("status", status), ("message", message.into())]);
-        Value::Object(TASK_MODULE, "TrajectoryExecutionResult", Box::new(state))
+        outcome(["TrajectoryExecutionStatus", "TrajectoryExecutionResult"], self as i64, message.into())
     }
+}
+
+/// Returns an object of a class, with a member of the enumeration of its status.
+fn outcome([status, class]: [&'static str; 2], member: i64, message: Value) -> Value {
+    let status = Value::Member(TASK_MODULE, status, member);
+    Value::Object(TASK_MODULE, class, Box::new(Value::Dict(vec![("status", status), ("message", message)])))
 }
 
 /// Outcome of a cancellation: `TrajectoryCancellationStatus`.
@@ -64,9 +68,7 @@ pub enum Cancellation {
 impl Cancellation {
     /// Returns the `TrajectoryCancellationResult`.
     pub fn result(self, message: impl Into<Value>) -> Value {
-        let status = Value::Member(TASK_MODULE, "TrajectoryCancellationStatus", self as i64);
-        let state = Value::Dict(vec![("status", status), ("message", message.into())]);
-        Value::Object(TASK_MODULE, "TrajectoryCancellationResult", Box::new(state))
+        outcome(["TrajectoryCancellationStatus", "TrajectoryCancellationResult"], self as i64, message.into())
     }
 }
 
