@@ -11,6 +11,8 @@ use crate::collision::checker::{CollisionChecker, Stop};
 use crate::collision::report::{Contact, Pair};
 use crate::robot::random::Random;
 
+/// Most joints: with those of two arms, so few edges reach too little to say anything.
+const JOINTS: usize = 8;
 /// Edges that are tried.
 const EDGES: usize = 6000;
 /// Length of an edge [rad].
@@ -63,6 +65,9 @@ pub fn enclosed<C: CollisionChecker>(
     seed: u64,
     stop: &Stop,
 ) -> Option<Enclosed> {
+    if from.len() > JOINTS {
+        return None;
+    }
     let mut explored = Explored::new(checker, from, seed);
     explored.grow(checker, others, EDGES / 2, stop)?;
     let before = explored.reached.clone();
