@@ -132,7 +132,7 @@ impl Explored {
     ) -> Option<()> {
         let turns = checker.turns().to_vec();
         for edge in 0..edges {
-            if edge % BIAS == 0 && stop.is_over() {
+            if edge.is_multiple_of(BIAS) && stop.is_over() {
                 return None;
             }
             self.draw(others, edge);
@@ -157,7 +157,7 @@ impl Explored {
     }
 
     fn draw(&mut self, others: &[Vec<f64>], edge: usize) {
-        if let Some(other) = others.get((edge / BIAS) % others.len().max(1)).filter(|_| edge % BIAS == 0) {
+        if let Some(other) = others.get((edge / BIAS) % others.len().max(1)).filter(|_| edge.is_multiple_of(BIAS)) {
             return self.sample.copy_from_slice(other);
         }
         let around = (edge % 4 == 1).then(|| self.random.below(self.tree.len()));

@@ -53,6 +53,10 @@ const FORCE_CLAMPS: u8 = 35;
 const FORCE_IS_LOST: u8 = 36;
 const FORCE_REMAINS: u8 = 37;
 const FORCE_CONTROL_ONLY_CLAIMED: u8 = 38;
+const DROPS_POWER_ON_DISCONNECTING: u8 = 39;
+const IGNORES_SPEED: u8 = 40;
+const CLEARING_ENABLES: u8 = 41;
+const GRIPPER_HURRIES_JOINTS: u8 = 42;
 const NO_MISTAKE: u8 = 255;
 
 /// The modes of an arm that takes only setpoints.
@@ -134,9 +138,20 @@ impl<const MISTAKE: u8> Wrong<MISTAKE> {
 
 impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
     delegate!(
-        inner: disconnect, state_fd, get_dof, get_limits, get_control_mode, read_state, write_joint_velocities,
-        write_clear_errors
+        inner: state_fd, get_dof, get_limits, get_control_mode, read_state, write_joint_velocities
     );
+
+    fn disconnect(&mut self) {
+        if MISTAKE == DROPS_POWER_ON_DISCONNECTING {
+            let _ = self.inner.write_enable(false);
+        }
+        self.inner.disconnect();
+    }
+
+    fn write_clear_errors(&mut self) -> AdapterResult<()> {
+        self.inner.write_clear_errors()?;
+        if MISTAKE == CLEARING_ENABLES { self.inner.write_enable(true) } else { Ok(()) }
+    }
 
     fn connect(&mut self) -> AdapterResult<()> {
         let result = self.inner.connect();
@@ -264,6 +279,7 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
             return self.inner.write_joint_positions(&positions, velocity);
         }
         self.goal = positions.try_into().ok();
+        let velocity = if MISTAKE == IGNORES_SPEED { 1.0 } else { velocity };
         let result = self.inner.write_joint_positions(positions, velocity);
         if MISTAKE == MOVES_WITHOUT_POWER { Ok(()) } else { result }
     }
@@ -326,6 +342,9 @@ impl<const MISTAKE: u8> Gripper for Wrong<MISTAKE> {
             STOP_LOCKS_GRIPPER if self.stopped => return Err(AdapterError::Rejected("stopped".into())),
             _ => self.gripper = position,
         }
+        if let Some(goal) = self.goal.filter(|_| MISTAKE == GRIPPER_HURRIES_JOINTS) {
+            self.inner.write_joint_positions(&goal, 1.0)?;
+        }
         let gripper = self.inner.gripper().ok_or(AdapterError::Unsupported)?;
         match (MISTAKE, self.force) {
             (GRIPPER_CLAMPS, _) => gripper.write_gripper_position(position.clamp(0.0, 0.08)),
@@ -356,6 +375,11 @@ fn each_mistake_is_found_by_the_check_for_it() {
         (Wrong::<ZERO_VELOCITIES>::SPEC, "velocities_are_kept"),
         (Wrong::<FAILS_WITHOUT_SENSOR>::SPEC, "optional_parts_never_fail"),
         (Wrong::<DROPS_POWER_ON_LEAVING>::SPEC, "leaving_moves_nothing"),
+        (Wrong::<DROPS_POWER_ON_DISCONNECTING>::FALLING, "leaving_moves_nothing"),
+        (Wrong::<IGNORES_SPEED>::SPEC, "planned_speed_is_kept"),
+        (Wrong::<IGNORES_SPEED>::WIRED, "planned_speed_is_kept"),
+        (Wrong::<CLEARING_ENABLES>::WIRED, "clearing_enables_nothing"),
+        (Wrong::<GRIPPER_HURRIES_JOINTS>::WIRED, "gripper_moves_no_joint"),
         (Wrong::<WRONG_SIGN_BOTH_WAYS>::WIRED, "joints_are_the_arms_own"),
         (Wrong::<IGNORES_MODEL>::WIRED, "wrong_model_is_refused"),
         (Wrong::<HIDES_SILENCE>::WIRED, "silence_is_noticed"),
@@ -410,12 +434,16 @@ fn each_mistake_is_found_by_the_check_for_it() {
 fn without_a_mistake_the_same_checks_pass() {
     let cases: &[(AdapterSpec, &str)] = &[
         (Wrong::<NO_MISTAKE>::FALLING, "disabled_arms_do_not_move"),
+        (Wrong::<NO_MISTAKE>::FALLING, "leaving_moves_nothing"),
         (Wrong::<NO_MISTAKE>::PUSHED, "reads_do_not_allocate"),
         (Wrong::<NO_MISTAKE>::WIRED, "enabling_moves_nothing"),
         (Wrong::<NO_MISTAKE>::SERVOS, "velocities_are_those_of_motion"),
         (Wrong::<NO_MISTAKE>::WIRED, "late_answers_are_not_new"),
         (Wrong::<NO_MISTAKE>::WIRED, "enabled_means_every_motor"),
         (Wrong::<NO_MISTAKE>::WIRED, "stop_without_answer"),
+        (Wrong::<NO_MISTAKE>::WIRED, "planned_speed_is_kept"),
+        (Wrong::<NO_MISTAKE>::WIRED, "clearing_enables_nothing"),
+        (Wrong::<NO_MISTAKE>::WIRED, "gripper_moves_no_joint"),
         (Wrong::<NO_MISTAKE>::WIRED, "gripper_range_is_kept"),
         (Wrong::<NO_MISTAKE>::WIRED, "gripper_force_is_kept"),
     ];

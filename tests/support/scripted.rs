@@ -1,4 +1,4 @@
-//! A script of another program that does what it is told, line by line: each line of JSON gets one as its answer.
+//! A script of another program that answers line by line: to each line of JSON with one of its own.
 
 use std::io::{BufRead, BufReader, Write};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};

@@ -290,11 +290,12 @@ impl ManipulatorAdapter for AcmeAdapter {
     fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()> {
         let angles = finite::<DOF>(positions)?;
         let servos = self.not_older(WRITABLE)?;
-        if let Some(joint) = servos.iter().take(DOF).position(|servo| !servo.on) {
-            return Err(AdapterError::Rejected(format!("the motor of joint {} is off", joint + 1)));
-        }
+        // First: servos that switch their motor off in an error are in error, not off.
         if let Some(error) = error_of(&servos) {
             return Err(fault(error.into(), protocol::error_text(error)));
+        }
+        if let Some(joint) = servos.iter().take(DOF).position(|servo| !servo.on) {
+            return Err(AdapterError::Rejected(format!("the motor of joint {} is off", joint + 1)));
         }
         let mut goals = servos.map(|servo| servo.goal); // the gripper keeps its own
         let joints = goals.iter_mut().zip(self.calibration.joints()).zip(angles);
@@ -365,9 +366,9 @@ impl Gripper for AcmeAdapter {
         if !servos[DOF].on {
             return Err(AdapterError::Rejected("the motor of the gripper is off".into()));
         }
-        let mut goals = servos.map(|servo| servo.goal);
-        goals[DOF] = self.calibration.of_opening(position);
-        self.write_goals(goals)
+        // To its servo alone: the goals of the others, sent again, would end a slow motion of the joints with a fast one.
+        let goal = self.calibration.of_opening(position);
+        self.confirmed(Request::Goal(SERVOS as u8, goal), |i, servo| i != DOF || servo.goal == goal)
     }
 
     fn get_gripper_range(&mut self) -> Option<(f64, f64)> {

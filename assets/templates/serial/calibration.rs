@@ -15,7 +15,8 @@ const JOINT: Range = Range { zero: 2048, low: 114, high: 3982, reversed: false }
 /// The gripper, closed and open. YOUR ARM.
 const GRIPPER: Range = Range { zero: 1000, low: 1000, high: 3000, reversed: false };
 
-/// Zero and range of a servo [counts]. The gripper is closed at `low` and open at `high`; it needs no zero.
+/// Zero and range of a servo [counts]. The gripper is closed at `low` and open at `high`, a reversed one the other way
+/// round; it needs no zero.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Range {
@@ -105,14 +106,20 @@ impl Calibration {
 
     /// The gripper's opening at a position [m].
     pub fn opening(&self, counts: i32) -> f64 {
-        let Range { low, high, .. } = self.gripper();
-        f64::from(counts - low) / f64::from(high - low) * OPEN
+        let (closed, open) = self.jaw();
+        f64::from(counts - closed) / f64::from(open - closed) * OPEN
     }
 
     /// The gripper's position at an opening [m].
     pub fn of_opening(&self, opening: f64) -> i32 {
-        let Range { low, high, .. } = self.gripper();
-        low + (opening / OPEN * f64::from(high - low)).round() as i32
+        let (closed, open) = self.jaw();
+        closed + (opening / OPEN * f64::from(open - closed)).round() as i32
+    }
+
+    /// The gripper's positions closed and open.
+    fn jaw(&self) -> (i32, i32) {
+        let Range { low, high, reversed, .. } = self.gripper();
+        if reversed { (high, low) } else { (low, high) }
     }
 }
 
@@ -131,6 +138,8 @@ mod tests {
         let calibration = Calibration::of(&[range; SERVOS]).unwrap();
         assert_eq!((calibration.opening(500), calibration.opening(3000)), (0.0, OPEN));
         assert_eq!(calibration.of_opening(OPEN / 2.0), 1750);
+        let calibration = Calibration::of(&[Range { reversed: true, ..range }; SERVOS]).unwrap();
+        assert_eq!((calibration.opening(3000), calibration.of_opening(OPEN)), (0.0, 500), "a gripper that is reversed");
         assert_eq!(Calibration::of(&[]), Ok(Calibration::default()));
         assert!(Calibration::of(&[range]).is_err() == (SERVOS > 1));
         for wrong in [Range { low: 3000, ..range }, Range { high: 4096, ..range }, Range { zero: -1, ..range }] {

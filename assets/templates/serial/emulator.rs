@@ -137,6 +137,16 @@ impl Servos {
                 let speed = words(2).next().unwrap_or_default();
                 self.go(f64::from(speed) * TAU / 4096.0 / TOP_SPEED);
             }
+            (1.., 0x04, [g0, g1, s0, s1]) if usize::from(servo) <= SERVOS => {
+                let servo = usize::from(servo) - 1;
+                let goal = u16::from_be_bytes([*g0, *g1]);
+                self.goals[servo] = goal;
+                if servo == DOF {
+                    return self.grip();
+                }
+                self.angles[servo] = (f64::from(goal) - 2048.0) * TAU / 4096.0;
+                self.go(f64::from(u16::from_be_bytes([*s0, *s1])) * TAU / 4096.0 / TOP_SPEED);
+            }
             (0, 0x05, []) => {
                 let _ = self.arm.clear_error();
             }
@@ -152,7 +162,12 @@ impl Servos {
         if self.arm.enabled() {
             self.arm.take_goal(&self.angles[..DOF], if speed > 0.0 { speed.min(1.0) } else { 1.0 }, speed == 0.0);
         }
-        if self.grips {
+        self.grip();
+    }
+
+    /// Sends the gripper to its goal.
+    fn grip(&mut self) {
+        if self.grips && self.arm.error() == 0 {
             self.gripper.move_to((f64::from(self.goals[DOF]) - GRIPPER.1) / GRIPPER.0);
         }
     }
@@ -226,6 +241,7 @@ mod tests {
             (golden::HELLO, 3, 0x01, &[][..]),
             (golden::STATE, 0, 0x02, &[]),
             (golden::MOTORS, 0, 0x03, &[1]),
+            (golden::GOAL, 3, 0x04, &[8, 0, 0, 0]),
             (golden::CLEAR, 0, 0x05, &[]),
         ] {
             let frame = bytes(golden);

@@ -11,6 +11,8 @@ pub const HELLO: &str = "a5 03 01 00 a9";
 pub const STATE: &str = "a5 00 02 00 a7";
 /// MOTORS on.
 pub const MOTORS: &str = "a5 00 03 01 01 aa";
+/// GOALS of servo 3 alone: 2048, no top speed.
+pub const GOAL: &str = "a5 03 04 04 0800 0000 b8";
 /// CLEAR.
 pub const CLEAR: &str = "a5 00 05 00 aa";
 

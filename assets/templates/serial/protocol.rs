@@ -12,6 +12,7 @@
 //!                             goal u16
 //! 03 MOTORS  all: 0 off, 1 on (a servo then goes to its goal)                           no reply
 //! 04 GOALS   all: for each servo position u16, top speed u16 [counts/s], 0 = none       no reply
+//! 04 GOALS   one servo: position u16, top speed u16                                     no reply
 //! 05 CLEAR   all: clears errors                                                         no reply
 //!
 //! error  bits: 1 overload, 2 too hot, 4 supply voltage
@@ -44,6 +45,8 @@ pub enum Request<'a> {
     Motors(bool),
     /// Positions, and a top speed [counts/s] for all; 0 = none.
     Goals(&'a [i32; SERVOS], u16),
+    /// The same for one servo (from 1), without a top speed.
+    Goal(u8, i32),
     Clear,
 }
 
@@ -69,6 +72,11 @@ pub fn encode<'a>(request: Request<'_>, frame: &'a mut [u8; MAX_REQUEST]) -> &'a
                 put(&speed.to_be_bytes());
             }
             (0, 0x04)
+        }
+        Request::Goal(servo, goal) => {
+            put(&(goal as u16).to_be_bytes());
+            put(&[0, 0]);
+            (servo, 0x04)
         }
         Request::Clear => (0, 0x05),
     };
@@ -173,6 +181,7 @@ mod tests {
             (Request::Motors(true), bytes(golden::MOTORS)),
             (Request::Clear, bytes(golden::CLEAR)),
             (Request::Goals(&goals, 500), golden::goals()),
+            (Request::Goal(3, 2048), bytes(golden::GOAL)),
         ] {
             assert_eq!(encode(request, &mut frame), golden, "{request:?}");
         }

@@ -17,6 +17,7 @@ const OBSERVATION_TIME: Duration = Duration::from_millis(500);
 /// The checks of this file.
 pub const CHECKS: &[Check] = &[
     Check::new(Faults, "errors_have_code_and_text", "an error is reported, refuses motion, is cleared", errors),
+    Check::new(Faults, "clearing_enables_nothing", "an error is cleared with the motors off", clearing),
     Check::new(Faults, "estop_needs_two_acts", "after an E-stop: clear, then enable", estop),
     Check::new(Faults, "noise_is_survived", "noise costs at most three readings", noise),
     Check::new(Faults, "damage_is_survived", "a damaged reply costs at most three readings", damage),
@@ -36,11 +37,28 @@ fn errors(context: &mut Context) -> Result<(), String> {
     require(code == i32::from(CODE) && !text.is_empty(), || format!("error {code}, text {text:?}"))?;
     let start = context.positions()?;
     let refused = context.adapter.write_joint_positions(&start, 0.1);
-    require(matches!(refused, Err(AdapterError::Fault { .. })), || format!("motion in error: {refused:?}"))?;
+    let is_fault = matches!(refused, Err(AdapterError::Fault { .. }));
+    require(is_fault, || format!("motion in error: expected AdapterError::Fault, it answers {refused:?}"))?;
     context.clear_errors().map_err(|e| format!("write_clear_errors: {e}"))?;
     context.until("the error to be cleared", |context| Ok(context.error()?.0 == 0))?;
     context.stays(&start, 0.005)?;
     context.activate()
+}
+
+fn clearing(context: &mut Context) -> Result<(), String> {
+    if !context.prepare(Fault::new(FaultKind::ErrorCode).code(CODE)) {
+        return context.skip("its emulator cannot be in error");
+    }
+    context.connect()?;
+    if context.enabled()? {
+        context.adapter.write_enable(false).map_err(|e| format!("write_enable: {e}"))?;
+        context.until("the motors to go off", |context| Ok(!context.enabled()?))?;
+    }
+    context.trigger_faults()?;
+    context.until("the error", |context| Ok(context.error()?.0 != 0))?;
+    context.clear_errors().map_err(|e| format!("write_clear_errors: {e}"))?;
+    context.until("the error to be cleared", |context| Ok(context.error()?.0 == 0))?;
+    require(!context.enabled()?, || "clearing switched the motors on".into())
 }
 
 fn estop(context: &mut Context) -> Result<(), String> {

@@ -3,13 +3,16 @@
 use super::Check;
 use super::Needs::Motion;
 use super::context::{Context, require};
+use super::motion::slow_move;
 use crate::arm::{GripperInfo, GripperUnit};
 use crate::hardware::adapter::AdapterError;
+use crate::joint::ControlMode;
 
 /// The checks of this file.
 pub const CHECKS: &[Check] = &[
     Check::new(Motion, "gripper_is_in_its_unit", "the gripper moves to its target [m or rad]", unit),
     Check::new(Motion, "gripper_range_is_kept", "positions outside its range are refused and move nothing", range),
+    Check::new(Motion, "gripper_moves_no_joint", "its commands change no motion of the joints", moves_no_joint),
     Check::new(Motion, "gripper_force_is_kept", "forces outside their range are refused, others reach the arm", force),
 ];
 
@@ -45,6 +48,15 @@ fn target(info: &GripperInfo, from: f64) -> f64 {
 fn arrives(context: &mut Context, unit: GripperUnit, target: f64) -> Result<(), String> {
     let tolerance = in_unit(unit, TOLERANCE);
     context.until("the gripper", |context| Ok(context.gripper()?.is_some_and(|now| (now - target).abs() < tolerance)))
+}
+
+/// A command that writes the goals of all servos again makes a slow motion a fast one.
+fn moves_no_joint(context: &mut Context) -> Result<(), String> {
+    let Some((info, from)) = ready(context)? else { return context.skip("it has no gripper") };
+    if !context.row.modes.contains(&ControlMode::Position) {
+        return context.skip("it has no position mode");
+    }
+    slow_move(context, |context| context.command_gripper(target(&info, from)))
 }
 
 /// Checks for a third of a second that the gripper does not move.
