@@ -333,6 +333,26 @@ fn a_gripper_takes_forces_within_its_range_and_a_rotary_one_any_angle() {
 }
 
 #[test]
+fn a_gripper_takes_a_speed_above_zero_up_to_one_if_it_has_speed_control() {
+    let (mut quick, mut plain) = (arm("quick", 6), arm("plain", 6));
+    (quick.gripper, plain.gripper) = (true, true);
+    quick.gripper_info.has_speed = true;
+    let mut rig = Rig::new(100.0, vec![quick, plain], one(trajectory()));
+    rig.make_ready();
+    let grip = |arm, speed| Request::Gripper { arm, opening: 0.02, force: None, speed };
+    for speed in [0.0, -0.1, 1.1, f64::NAN] {
+        assert_eq!(rig.ask(grip(0, Some(speed))), Outcome::NoGripperSpeed(0), "{speed}");
+    }
+    assert_eq!(rig.ask(grip(1, Some(0.5))), Outcome::NoGripperSpeed(1));
+    assert_eq!((rig.commands[0].gripper_seq, rig.commands[1].gripper_seq), (0, 0), "refused ones move nothing");
+    for speed in [0.01, 1.0] {
+        assert_eq!(rig.ask(grip(0, Some(speed))), Outcome::Accepted, "{speed}");
+        assert_eq!(rig.commands[0].gripper_speed, Some(speed));
+    }
+    assert_eq!(rig.ask(grip(1, None)), Outcome::Accepted);
+}
+
+#[test]
 fn a_motion_needs_only_the_arms_that_it_moves() {
     let mut rig = Rig::two_arms(vec![task("both", trajectory(), 0..13, 10)]);
     assert_eq!(rig.ask(Request::Stop { arm: Some(1) }), Outcome::Accepted);
