@@ -41,11 +41,15 @@ pub fn run(args: &Args) -> Result {
     if reply.tasks.is_empty() && !reply.planning {
         output::note("nothing was moving");
     }
-    let cancelled = |task: &&TaskReport| reply.tasks.get(&task.name).is_some_and(|status| status == "CANCELLED");
-    if reply.tasks.values().any(|status| status == "CANCELLED") {
+    // A stream continues with the next target of its client.
+    let was_stream = |task: &TaskReport| {
+        reply.tasks.get(&task.name).is_some_and(|status| status == "CANCELLED") && !task.takes("execute")
+    };
+    let tasks = client.call(Status {})?.tasks;
+    if tasks.iter().any(was_stream) {
         std::thread::sleep(STREAM_PERIOD);
         let tasks = client.call(Status {})?.tasks;
-        for task in tasks.iter().filter(cancelled).filter(|task| task.state == "EXECUTING") {
+        for task in tasks.iter().filter(|task| was_stream(task) && task.state == "EXECUTING") {
             let name = &task.name;
             output::note(format_args!("{name} executes again: a client sends it targets; `dimos stop` holds the arm"));
         }

@@ -77,8 +77,9 @@ fn candidates(parent: &str, verb: &str, arg: Arg) -> Arg {
         ("file", _) if parent == "model" => {
             arg.add(ArgValueCompleter::new(models as fn(&OsStr) -> Vec<CompletionCandidate>))
         }
-        ("log", _) if !arg.get_action().takes_values() => arg,
-        ("log", _) => arg.add(ArgValueCompleter::new(logs as fn(&OsStr) -> Vec<CompletionCandidate>)),
+        ("log", _) if arg.get_action().takes_values() => {
+            arg.add(ArgValueCompleter::new(logs as fn(&OsStr) -> Vec<CompletionCandidate>))
+        }
         ("frame", _) => arg.add(of(frames)),
         ("run" | "attach", _) if arg.get_action().takes_values() => arg.add(of(runs)),
         ("name", "down" | "status") => arg.add(of(runs_and_planners)),

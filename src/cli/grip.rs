@@ -68,7 +68,7 @@ impl Opening {
 pub fn unknown_object(name: &str, world: &[WorldObject]) -> Failure {
     let known = did_you_mean(name, world.iter().map(|object| object.name.as_str()), "it has");
     let hint = known.unwrap_or_else(|| "`dimos world add` adds one".to_owned());
-    Failure::usage(format!("the planner's world has no object {name}: nothing has moved")).hint(hint)
+    Failure::usage(format!("the planner's world has no object {name}")).hint(hint)
 }
 
 /// Returns why a gripper cannot do what is asked, and a hint. What this finds is found before anything moves.

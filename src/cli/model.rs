@@ -115,11 +115,6 @@ impl File {
     fn refuse(&self, loaded: &Loaded) -> Failure {
         refuse(loaded, &self.file)
     }
-
-    /// Returns the failure of a description with mistakes.
-    fn refused(&self) -> Failure {
-        has_mistakes(&self.file)
-    }
 }
 
 /// Returns the robot of a description; prints its mistakes and warnings to stderr.
@@ -141,6 +136,7 @@ fn refuse(loaded: &Loaded, file: &Path) -> Failure {
     has_mistakes(file)
 }
 
+/// Returns the failure of a description with mistakes.
 fn has_mistakes(file: &Path) -> Failure {
     Failure::usage(format!("{} has mistakes", file.display()))
 }

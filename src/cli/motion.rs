@@ -175,7 +175,8 @@ fn check_grips(arm: &str, client: &mut Client, legs: &[Leg]) -> Result<()> {
         if let Objects::Attach(name) | Objects::Either(name) = &action.objects
             && !objects.iter().any(|object| object.name == *name)
         {
-            return Err(grip::unknown_object(name, &objects));
+            let failure = grip::unknown_object(name, &objects);
+            return Err(Failure { what: format!("{}: nothing has moved", failure.what), ..failure });
         }
     }
     Ok(())

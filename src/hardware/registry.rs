@@ -88,6 +88,11 @@ pub trait Emulator: Send {
     fn true_positions(&self) -> Option<Joints> {
         None
     }
+    /// Returns whether all motors of its joints are on, whether or not a client is connected; `None` if unknown, or if
+    /// its controller holds the arm without being asked.
+    fn motors_on(&self) -> Option<bool> {
+        None
+    }
     /// Returns the largest force that its gripper was given, in the unit of the adapter's force; `None` if it has no
     /// gripper with force control.
     fn gripper_force(&self) -> Option<f64> {

@@ -9,7 +9,7 @@ use crate::robot::random::Random;
 use super::enclosure::{Enclosed, enclosed};
 use super::level::Level;
 use super::path::{Path, between, distance, length, unwind};
-use super::portfolio::{Candidate, Ended, Portfolio};
+use super::portfolio::{Candidate, Halt, Portfolio};
 use super::refine::{cut, refine};
 use super::rrt_connect::{RrtSettings, SearchCount};
 use super::shortcut::{ShortcutSettings, shorten};
@@ -196,15 +196,16 @@ pub fn plan<C: CollisionChecker>(
             loop {
                 let found = searches.next(checker, stop);
                 count = searches.count();
-                if found == Err(Ended::Pausing) {
-                    not_enclosed(checker, &from, &goals, settings.seed, stop)?;
-                    continue;
-                }
-                let found = found.map_err(|ended| match ended {
-                    Ended::Stopped if stop.is_cancelled() => PlanError::Cancelled,
-                    Ended::Stopped => PlanError::Timeout(count),
-                    Ended::Pausing | Ended::Exhausted => PlanError::Exhausted(count),
-                })?;
+                let found = match found {
+                    Ok(found) => found,
+                    Err(Halt::TookLong) => {
+                        not_enclosed(checker, &from, &goals, settings.seed, stop)?;
+                        continue;
+                    }
+                    Err(Halt::Stopped) if stop.is_cancelled() => return Err(PlanError::Cancelled),
+                    Err(Halt::Stopped) => return Err(PlanError::Timeout(count)),
+                    Err(Halt::Exhausted) => return Err(PlanError::Exhausted(count)),
+                };
                 search_time = began.elapsed();
                 if let Some(path) = finished(checker, &found, count.nodes, settings, stop) {
                     break path;

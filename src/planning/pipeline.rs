@@ -285,18 +285,16 @@ fn apart(
     Ok(Padded::new(world.with_robots(bodies).snapshot(), padding))
 }
 
-/// Formats a position.
-fn fixed(position: f64) -> String {
-    format!("{position:.2}")
-}
-
 /// Converts a path planner's error to a failure with joint names.
 pub(super) fn failure_for(stage: &Stage<'_>, error: &PlanError) -> PlanFailure {
+    let name_and_unit = |joint: usize| {
+        let kinds = stage.robots.iter().flat_map(|robot| robot.body.kinematics.kinds());
+        let unit = { kinds }.nth(joint).map_or("rad", |kind| kind.unit());
+        (stage.joints.get(joint).map_or("a joint", String::as_str), unit)
+    };
     match error {
         PlanError::Outside { which, joint, position, lower, upper } => {
-            let name = stage.joints.get(*joint).map_or("a joint", String::as_str);
-            let kinds = stage.robots.iter().flat_map(|robot| robot.body.kinematics.kinds());
-            let unit = { kinds }.nth(*joint).map_or("rad", |kind| kind.unit());
+            let (name, unit) = name_and_unit(*joint);
             let digits = digits_outside(*position, *lower, *upper);
             let limits = format!("{lower:.digits$} … {upper:.digits$} {unit}");
             PlanFailure::new(format!("{which}: {name} at {position:.digits$} {unit} is outside its limits {limits}"))
@@ -308,14 +306,10 @@ pub(super) fn failure_for(stage: &Stage<'_>, error: &PlanError) -> PlanFailure {
             PlanFailure::new(error.to_string()).hint("choose another goal, or correct the world")
         }
         PlanError::Enclosed { which, enclosed } => {
-            let name = stage.joints.get(enclosed.joint).map_or("a joint", String::as_str);
-            let kinds = stage.robots.iter().flat_map(|robot| robot.body.kinematics.kinds());
-            let unit = { kinds }.nth(enclosed.joint).map_or("rad", |kind| kind.unit());
-            let [low, high] = enclosed.reached;
-            let (low, high) = (fixed(low), fixed(high));
-            let pairs = if enclosed.contacts.is_empty() { String::new() } else { format!(", by {}", enclosed.pairs()) };
+            let ((name, unit), [low, high]) = (name_and_unit(enclosed.joint), enclosed.reached);
+            let by = if enclosed.contacts.is_empty() { String::new() } else { format!(", by {}", enclosed.pairs()) };
             PlanFailure::new(format!(
-                "the {which} is enclosed: {name} does not leave {low} … {high} {unit} there{pairs}"
+                "the {which} is enclosed: {name} does not leave {low:.2} … {high:.2} {unit} there{by}"
             ))
             .hint("move the obstacle, or choose another goal; a very narrow way out may have been missed")
         }

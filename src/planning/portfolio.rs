@@ -8,11 +8,11 @@ use super::level::Level;
 use super::path::Path;
 use super::rrt_connect::{Quantum, RrtSettings, Search, SearchCount};
 
-/// Why a search ended without a path.
+/// Why a search returned without a path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Ended {
-    /// Took long, said once: it can be continued.
-    Pausing,
+pub enum Halt {
+    /// It has taken long. Returned once; the search can be continued.
+    TookLong,
     /// Stopped by its deadline or a cancel.
     Stopped,
     /// Reached its maximum number of samples or nodes.
@@ -36,8 +36,8 @@ const MAIN_SHARE: u64 = 8;
 const ONE_ARM: usize = 8;
 /// A proven edge takes about as long as this number of edges that look free or not.
 const PROOF_COST: u64 = 4;
-/// After this number of rounds it pauses.
-const ROUNDS_TO_PAUSE: u32 = 3;
+/// After this number of rounds it has taken long.
+const LONG_ROUNDS: u32 = 3;
 /// The turns become no longer after this number of doublings.
 const DOUBLINGS: u32 = 6;
 
@@ -61,7 +61,7 @@ pub struct Portfolio {
     settings: RrtSettings,
     turn: usize,
     round: u32,
-    paused: bool,
+    took_long: bool,
     /// Statistics of searches that ended.
     ended: SearchCount,
 }
@@ -100,7 +100,7 @@ impl Portfolio {
             settings: *settings,
             turn: 0,
             round: 0,
-            paused: false,
+            took_long: false,
             ended: SearchCount::default(),
         }
     }
@@ -116,22 +116,22 @@ impl Portfolio {
 
     /// Returns the next path. At the next call, the search that found it begins again with proven edges, or has ended
     /// if they were; the others continue.
-    pub fn next<C: CollisionChecker>(&mut self, checker: &mut C, stop: &Stop) -> Result<Candidate, Ended> {
+    pub fn next<C: CollisionChecker>(&mut self, checker: &mut C, stop: &Stop) -> Result<Candidate, Halt> {
         loop {
             let count = self.count();
             if stop.is_over() {
-                return Err(Ended::Stopped);
+                return Err(Halt::Stopped);
             }
             let most = &self.settings;
             if self.members.is_empty() || count.samples >= most.max_samples || count.nodes >= most.max_nodes {
-                return Err(Ended::Exhausted);
+                return Err(Halt::Exhausted);
             }
             if self.turn >= self.members.len() {
                 self.turn = 0;
                 self.round = (self.round + 1).min(DOUBLINGS);
             }
-            if self.round == ROUNDS_TO_PAUSE && !std::mem::replace(&mut self.paused, true) {
-                return Err(Ended::Pausing);
+            if self.round == LONG_ROUNDS && !std::mem::replace(&mut self.took_long, true) {
+                return Err(Halt::TookLong);
             }
             let Member { range, number, seed, edges, search } = &mut self.members[self.turn];
             let (start, goals) = (&self.start, &self.goals);

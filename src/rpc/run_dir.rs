@@ -18,6 +18,8 @@ const MAX_SOCKET_PATH: usize = 107;
 const ATTEMPTS: u32 = 20;
 /// Attempts while the lock file has no pid: its holder is about to write it, or is listing the runs.
 const ATTEMPTS_UNNAMED: u32 = 400;
+/// For a run to release its name after its connections: 10 s.
+const ATTEMPTS_RELEASED: u32 = 2000;
 /// Pause between attempts.
 const PAUSE: Duration = Duration::from_millis(5);
 
@@ -212,6 +214,24 @@ impl RunDir {
         }
         Ok(())
     }
+}
+
+/// Waits until a run whose connections have closed has released its name. Returns whether it ended in order: then it
+/// removes its socket, and a run that was killed leaves it.
+pub fn has_ended_in_order(socket: &Path) -> bool {
+    let lock = socket.with_extension("lock");
+    for _ in 0..ATTEMPTS_RELEASED {
+        // Asked first: the socket is removed before the name is released.
+        let is_held = File::open(&lock).is_ok_and(|file| matches!(file.try_lock(), Err(TryLockError::WouldBlock)));
+        if !socket.exists() {
+            return true;
+        }
+        if !is_held {
+            return false;
+        }
+        std::thread::sleep(PAUSE);
+    }
+    true
 }
 
 impl Claim {

@@ -31,6 +31,7 @@ use super::{certificates, python_dimos, ros, settings, streams};
 use crate::blueprint::share::{OnLost, ShareConfig};
 use crate::rpc::api::{FaceReport, Lease, MAX_ANSWER, MAX_LINE, METHODS, Method, PlannerAnswer, RegisterGateway};
 use crate::rpc::error::{Code, RpcError};
+use crate::rpc::run_dir::has_ended_in_order;
 use crate::sync::lock;
 
 /// Period of the checks of the clients.
@@ -67,6 +68,8 @@ enum News {
     Clients,
     Faces,
     RunEnded,
+    /// It was killed: its end is not announced.
+    RunLost,
 }
 
 struct Shared {
@@ -123,12 +126,14 @@ impl Gateway {
             pages,
             refused,
         });
+        let socket = shared.socket.clone();
         std::thread::Builder::new()
             .name("run-end".into())
             .spawn(move || {
                 // Replies to what is registered; then the end of the connection.
                 let _ = io::copy(&mut replies, &mut io::sink());
-                let _ = news.send(News::RunEnded);
+                let ended = has_ended_in_order(&socket);
+                let _ = news.send(if ended { News::RunEnded } else { News::RunLost });
             })
             .map_err(|e| failed(e.to_string()))?;
         let declared = shared.declare().map_err(|e| failed(e.to_string()))?;
@@ -187,20 +192,22 @@ impl Gateway {
     pub fn serve(mut self) {
         loop {
             match self.news.recv_timeout(PERIOD) {
-                Ok(News::RunEnded) => break,
+                Ok(News::RunEnded) => {
+                    self.say_that_the_run_has_ended();
+                    break;
+                }
+                Ok(News::RunLost) => break,
                 Ok(News::Clients | News::Faces) => {
                     let (endpoints, clients) = (self.shared.endpoints(), self.shared.titles());
                     let gateway = RegisterGateway { endpoints, clients, faces: self.faces() };
-                    if register(&mut self.control, &gateway).is_err() {
-                        break;
-                    }
+                    // Where that fails, the end of the connection is news of its own.
+                    let _ = register(&mut self.control, &gateway);
                 }
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => break,
             }
             self.shared.look_after_clients();
         }
-        self.say_that_the_run_has_ended();
         self._declared.clear();
         self.python_dimos.take();
         self.ros.take();

@@ -9,6 +9,7 @@ mod adapter_test;
 mod adding_an_arm;
 #[cfg(feature = "fetch")]
 mod assets;
+mod back_out;
 mod built_in_arms;
 mod changed_world;
 mod cli_verbs;

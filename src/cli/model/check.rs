@@ -1,7 +1,7 @@
 //! `dimos model check`: every mistake of a description, its meshes, its SRDF and its limits.
 
-use super::File;
 use super::meshes::MeshSizes;
+use super::{File, has_mistakes};
 use crate::cli::exit::{Exit, Result};
 use crate::cli::output;
 use crate::planning::planning_scene::{always_touch, whole};
@@ -31,7 +31,7 @@ pub(super) fn run(file: &File) -> Result {
     let fine = summary.is_some() && !loaded.has_errors();
     if file.json {
         output::json(&serde_json::json!({"valid": fine, "problems": loaded.reports(), "files": loaded.files}));
-        return if fine { Ok(Exit::Ok) } else { Err(file.refused()) };
+        return if fine { Ok(Exit::Ok) } else { Err(has_mistakes(&file.file)) };
     }
     let Some(summary) = summary.filter(|_| fine) else { return Err(file.refuse(&loaded)) };
     let text = loaded.render(output::colour(&std::io::stderr()));

@@ -146,6 +146,10 @@ impl<C: CanController + HasArm> Emulator for CanServer<C> {
     fn true_positions(&self) -> Option<Joints> {
         Some(self.with(|controller, now| controller.joints_at(now).0))
     }
+
+    fn motors_on(&self) -> Option<bool> {
+        Some(self.with(|controller, _| controller.arm().enabled()))
+    }
 }
 
 impl<C: CanController> Drop for CanServer<C> {

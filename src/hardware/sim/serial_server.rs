@@ -69,6 +69,10 @@ impl<C: Controller + HasArm> Emulator for SerialServer<C> {
     fn true_positions(&self) -> Option<Joints> {
         Some(self.with(|controller, now| controller.joints_at(now).0))
     }
+
+    fn motors_on(&self) -> Option<bool> {
+        Some(self.with(|controller, _| controller.arm().enabled()))
+    }
 }
 
 impl<C: Controller> Drop for SerialServer<C> {

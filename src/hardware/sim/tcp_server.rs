@@ -144,6 +144,10 @@ impl<C: Controller + HasArm> Emulator for TcpServer<C> {
     fn true_positions(&self) -> Option<Joints> {
         Some(self.with(|controller, now| controller.joints_at(now).0))
     }
+
+    fn motors_on(&self) -> Option<bool> {
+        Some(self.with(|controller, _| controller.arm().enabled()))
+    }
 }
 
 impl<C: Controller> Drop for TcpServer<C> {

@@ -217,6 +217,10 @@ impl Emulator for PiperEmulator {
         self.server.true_positions()
     }
 
+    fn motors_on(&self) -> Option<bool> {
+        self.server.motors_on()
+    }
+
     fn gripper_force(&self) -> Option<f64> {
         self.server.with(|controller, _| controller.has_gripper.then_some(controller.gripper.max_force))
     }

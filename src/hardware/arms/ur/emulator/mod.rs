@@ -268,6 +268,10 @@ impl Emulator for UrEmulator {
     fn true_positions(&self) -> Option<Joints> {
         self.server.true_positions()
     }
+
+    fn motors_on(&self) -> Option<bool> {
+        self.server.motors_on()
+    }
 }
 
 /// Returns the limits within which the emulated joints move.

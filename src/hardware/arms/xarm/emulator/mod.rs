@@ -232,6 +232,10 @@ impl Emulator for XArmEmulator {
         self.server.true_positions()
     }
 
+    fn motors_on(&self) -> Option<bool> {
+        self.server.motors_on()
+    }
+
     fn gripper_force(&self) -> Option<f64> {
         self.server.with(|controller, _| controller.tool.force())
     }

@@ -119,6 +119,10 @@ impl Emulator for YourArmEmulator {
         self.server.true_positions()
     }
 
+    fn motors_on(&self) -> Option<bool> {
+        self.server.motors_on()
+    }
+
     fn gripper_force(&self) -> Option<f64> {
         Some(self.server.with(|controller, _| controller.gripper.max_force))
     }

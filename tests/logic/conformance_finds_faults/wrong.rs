@@ -1,0 +1,358 @@
+//! An adapter with one mistake, around one that has none.
+
+use dimos::clock::{Clock, MonotonicClock};
+use dimos::hardware::adapter::*;
+use dimos::hardware::arms::{mock, xarm, yourarm};
+use dimos::hardware::registry::{AdapterConfig, AdapterSpec};
+use dimos::joint::ControlMode;
+
+use crate::support::delegate::delegate;
+
+pub type Inner = Box<dyn ManipulatorAdapter>;
+
+/// What is wrong with an adapter.
+pub const DEGREES: u8 = 0;
+pub const WRONG_SIGN: u8 = 1;
+pub const SWAPPED_JOINTS: u8 = 2;
+pub const IGNORES_STOP: u8 = 3;
+pub const MOVES_ON_ACTIVATION: u8 = 4;
+pub const ENABLES_ON_CONNECT: u8 = 5;
+pub const HIDES_ERRORS: u8 = 6;
+pub const CLAIMS_TO_BE_CONNECTED: u8 = 7;
+pub const ACCEPTS_ANY_MODE: u8 = 8;
+pub const ZERO_VELOCITIES: u8 = 9;
+pub const FAILS_WITHOUT_SENSOR: u8 = 10;
+pub const DROPS_POWER_ON_LEAVING: u8 = 11;
+pub const HIDES_SILENCE: u8 = 12;
+pub const RESTAMPS_STATES: u8 = 13;
+pub const CLEARS_ERRORS_ON_CONNECT: u8 = 14;
+pub const STOP_DROPS_POWER: u8 = 15;
+pub const CONFIRMS_ALWAYS: u8 = 16;
+pub const STOP_CLEARS_ERRORS: u8 = 17;
+pub const STOP_IS_FINAL: u8 = 18;
+pub const MOVES_ON_RECONNECTING: u8 = 19;
+pub const STALE_STATE_AFTER_CONNECT: u8 = 20;
+pub const WRONG_SIGN_BOTH_WAYS: u8 = 21;
+pub const IGNORES_MODEL: u8 = 22;
+pub const CANNOT_STOP_AFTER_RECONNECTING: u8 = 23;
+pub const VELOCITIES_IN_DEGREES: u8 = 24;
+pub const MOVES_WITHOUT_POWER: u8 = 25;
+pub const ALLOCATES_FOR_NEWS: u8 = 26;
+pub const GRIPPER_IGNORES_STOP: u8 = 27;
+pub const STOP_LOCKS_GRIPPER: u8 = 28;
+pub const ENABLES_AT_OLD_GOAL: u8 = 29;
+pub const VELOCITIES_SCALED: u8 = 30;
+pub const TAKES_LATE_ANSWERS: u8 = 31;
+pub const ENABLED_BY_ONE_MOTOR: u8 = 32;
+pub const GRIPPER_IN_MILLIMETRES: u8 = 33;
+pub const GRIPPER_CLAMPS: u8 = 34;
+pub const FORCE_CLAMPS: u8 = 35;
+pub const FORCE_IS_LOST: u8 = 36;
+pub const FORCE_REMAINS: u8 = 37;
+pub const FORCE_CONTROL_ONLY_CLAIMED: u8 = 38;
+pub const DROPS_POWER_ON_DISCONNECTING: u8 = 39;
+pub const IGNORES_SPEED: u8 = 40;
+pub const CLEARING_ENABLES: u8 = 41;
+pub const GRIPPER_HURRIES_JOINTS: u8 = 42;
+pub const NO_MISTAKE: u8 = 255;
+
+/// The modes of an arm that takes only setpoints.
+const SERVO: &[ControlMode] = &[ControlMode::ServoPosition];
+
+/// An arm with one mistake.
+pub struct Wrong<const MISTAKE: u8> {
+    inner: Inner,
+    /// How often it was connected.
+    connections: u32,
+    /// It was stopped once.
+    stopped: bool,
+    /// Where the gripper was sent [m].
+    gripper: f64,
+    /// With which force.
+    force: Option<f64>,
+    /// The last reading.
+    last: Option<JointReading>,
+    /// The last positions it was sent to [rad].
+    goal: Option<[f64; 6]>,
+    /// A reading failed: from now on each is the one before.
+    late: bool,
+    /// What its motors were ordered.
+    ordered: bool,
+    /// The next reading is to be the last once more.
+    repeat: bool,
+}
+
+impl<const MISTAKE: u8> Wrong<MISTAKE> {
+    /// Around the arm in memory.
+    pub const SPEC: AdapterSpec = AdapterSpec {
+        name: "wrong",
+        dof: (6, 6),
+        create: |config: &AdapterConfig| Ok(Box::new(Self::around((mock::SPEC.create)(config)?))),
+        ..mock::SPEC
+    };
+    /// Around an arm with a wire and an emulator.
+    pub const WIRED: AdapterSpec = AdapterSpec {
+        name: "wrong",
+        create: |config: &AdapterConfig| Ok(Box::new(Self::around((yourarm::SPEC.create)(config)?))),
+        ..yourarm::SPEC
+    };
+
+    /// Around an arm that streams its state.
+    pub const PUSHED: AdapterSpec = AdapterSpec {
+        name: "wrong",
+        create: |config: &AdapterConfig| Ok(Box::new(Self::around((xarm::SPEC.create)(config)?))),
+        ..xarm::SPEC
+    };
+    /// Around an arm with a wire that has no velocity mode.
+    pub const SERVOS: AdapterSpec = AdapterSpec { modes: SERVO, ..Self::WIRED };
+    /// Around an arm that is said to fall without power.
+    pub const FALLING: AdapterSpec = AdapterSpec { holds_when_disabled: false, ..Self::SPEC };
+
+    fn around(inner: Inner) -> Self {
+        Self {
+            inner,
+            connections: 0,
+            stopped: false,
+            gripper: 0.0,
+            force: None,
+            last: None,
+            goal: None,
+            late: false,
+            ordered: false,
+            repeat: false,
+        }
+    }
+
+    fn spoil(values: &mut [f64]) {
+        match MISTAKE {
+            DEGREES => values.iter_mut().for_each(|value| *value = value.to_degrees()),
+            WRONG_SIGN | WRONG_SIGN_BOTH_WAYS => values[1] = -values[1],
+            SWAPPED_JOINTS => values.swap(1, 2),
+            _ => {}
+        }
+    }
+}
+
+impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
+    delegate!(
+        inner: state_fd, get_dof, get_limits, get_control_mode, read_state, write_joint_velocities
+    );
+
+    fn disconnect(&mut self) {
+        if MISTAKE == DROPS_POWER_ON_DISCONNECTING {
+            let _ = self.inner.write_enable(false);
+        }
+        self.inner.disconnect();
+    }
+
+    fn write_clear_errors(&mut self) -> AdapterResult<()> {
+        self.inner.write_clear_errors()?;
+        if MISTAKE == CLEARING_ENABLES { self.inner.write_enable(true) } else { Ok(()) }
+    }
+
+    fn connect(&mut self) -> AdapterResult<()> {
+        let result = self.inner.connect();
+        if MISTAKE == IGNORES_MODEL {
+            return Ok(());
+        }
+        result?;
+        self.connections += 1;
+        self.repeat = MISTAKE == STALE_STATE_AFTER_CONNECT;
+        match MISTAKE {
+            ENABLES_ON_CONNECT => self.inner.write_enable(true),
+            CLEARS_ERRORS_ON_CONNECT => self.inner.write_clear_errors(),
+            MOVES_ON_RECONNECTING if self.connections > 1 => {
+                let mut positions = [0.0; 6];
+                self.inner.read_joint_positions(&mut positions)?;
+                self.inner.write_joint_positions(&positions.map(|value| value + 0.1), 0.5)
+            }
+            CANNOT_STOP_AFTER_RECONNECTING if self.connections > 1 => self.inner.write_joint_positions(&[1.0; 6], 0.01),
+            _ => Ok(()),
+        }
+    }
+
+    fn is_connected(&self) -> bool {
+        MISTAKE == CLAIMS_TO_BE_CONNECTED || self.inner.is_connected()
+    }
+
+    fn activate(&mut self) -> AdapterResult<()> {
+        self.inner.activate()?;
+        self.ordered = true;
+        if let Some(goal) = self.goal.filter(|_| MISTAKE == ENABLES_AT_OLD_GOAL) {
+            return self.inner.write_joint_positions(&goal, 0.5);
+        }
+        if MISTAKE == MOVES_ON_ACTIVATION { self.inner.write_joint_positions(&[0.1; 6], 0.5) } else { Ok(()) }
+    }
+
+    fn deactivate(&mut self) -> AdapterResult<()> {
+        self.inner.deactivate()?;
+        if MISTAKE == DROPS_POWER_ON_LEAVING { self.inner.write_enable(false) } else { Ok(()) }
+    }
+
+    fn get_info(&self) -> ManipulatorInfo {
+        let info = self.inner.get_info();
+        if MISTAKE == VELOCITIES_SCALED { ManipulatorInfo { modes: SERVO, ..info } } else { info }
+    }
+
+    fn read_enabled(&mut self) -> AdapterResult<bool> {
+        let enabled = self.inner.read_enabled()?;
+        Ok(if MISTAKE == ENABLED_BY_ONE_MOTOR { self.ordered } else { enabled })
+    }
+
+    fn write_enable(&mut self, on: bool) -> AdapterResult<()> {
+        self.inner.write_enable(on)?;
+        self.ordered = on;
+        Ok(())
+    }
+
+    fn set_control_mode(&mut self, mode: ControlMode) -> AdapterResult<()> {
+        let result = self.inner.set_control_mode(mode);
+        if MISTAKE == ACCEPTS_ANY_MODE { Ok(()) } else { result }
+    }
+
+    fn read_joint_positions(&mut self, positions: &mut [f64]) -> AdapterResult<()> {
+        self.inner.read_joint_positions(positions)?;
+        Self::spoil(positions);
+        Ok(())
+    }
+
+    fn read_joints(&mut self, reading: &mut JointReading) -> AdapterResult<()> {
+        if let Some(last) = self.last.filter(|_| std::mem::take(&mut self.repeat)) {
+            *reading = last;
+            return Ok(());
+        }
+        match (self.inner.read_joints(reading), self.last) {
+            (Err(_), Some(last)) if MISTAKE == HIDES_SILENCE => *reading = last,
+            (Err(error), _) if MISTAKE == TAKES_LATE_ANSWERS => {
+                self.late = true;
+                return Err(error);
+            }
+            (Ok(()), Some(last)) if self.late => {
+                self.last = Some(*reading);
+                *reading = last;
+                return Ok(());
+            }
+            (result, _) => result?,
+        }
+        Self::spoil(&mut reading.position[..6]);
+        if MISTAKE == ALLOCATES_FOR_NEWS && self.last.is_some_and(|last| last.stamp != reading.stamp) {
+            std::hint::black_box(reading.position.to_vec());
+        }
+        if MISTAKE == ZERO_VELOCITIES {
+            reading.velocity = Some(Default::default());
+        }
+        if let Some(velocity) = reading.velocity.as_mut().filter(|_| MISTAKE == VELOCITIES_IN_DEGREES) {
+            *velocity = velocity.map(f64::to_degrees);
+        }
+        if let Some(velocity) = reading.velocity.as_mut().filter(|_| MISTAKE == VELOCITIES_SCALED) {
+            *velocity = velocity.map(|v| -651.0 * v);
+        }
+        if MISTAKE == RESTAMPS_STATES {
+            reading.stamp = Some(MonotonicClock.now());
+        }
+        self.last = Some(*reading);
+        Ok(())
+    }
+
+    fn read_joint_velocities(&mut self, velocities: &mut [f64]) -> AdapterResult<bool> {
+        let known = self.inner.read_joint_velocities(velocities)?;
+        if MISTAKE == ZERO_VELOCITIES {
+            velocities.fill(0.0);
+        }
+        Ok(known)
+    }
+
+    fn read_error(&mut self) -> AdapterResult<(i32, String)> {
+        let error = self.inner.read_error()?;
+        Ok(if MISTAKE == HIDES_ERRORS { (0, String::new()) } else { error })
+    }
+
+    fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()> {
+        if MISTAKE == STOP_IS_FINAL && self.stopped {
+            return Err(AdapterError::Rejected("stopped".into()));
+        }
+        if let (WRONG_SIGN_BOTH_WAYS, Ok(mut positions)) = (MISTAKE, <[f64; 6]>::try_from(positions)) {
+            Self::spoil(&mut positions);
+            return self.inner.write_joint_positions(&positions, velocity);
+        }
+        self.goal = positions.try_into().ok();
+        let velocity = if MISTAKE == IGNORES_SPEED { 1.0 } else { velocity };
+        let result = self.inner.write_joint_positions(positions, velocity);
+        if MISTAKE == MOVES_WITHOUT_POWER { Ok(()) } else { result }
+    }
+
+    fn write_stop(&mut self) -> AdapterResult<Stop> {
+        self.stopped = true;
+        match MISTAKE {
+            IGNORES_STOP if self.inner.is_connected() => Ok(Stop::Confirmed),
+            CANNOT_STOP_AFTER_RECONNECTING if self.connections > 1 => Ok(Stop::Confirmed),
+            CONFIRMS_ALWAYS => self.inner.write_stop().or(Ok(Stop::Confirmed)),
+            STOP_DROPS_POWER => self.inner.write_enable(false).map(|()| Stop::Confirmed),
+            STOP_CLEARS_ERRORS => self.inner.write_clear_errors().map(|()| Stop::Confirmed),
+            // The arm's own stop holds the gripper too; this one does not.
+            GRIPPER_IGNORES_STOP | STOP_LOCKS_GRIPPER => {
+                let stop = self.inner.write_stop()?;
+                let gripper = self.inner.gripper().ok_or(AdapterError::Unsupported)?;
+                gripper.write_gripper_position(self.gripper).map(|()| stop)
+            }
+            _ => self.inner.write_stop(),
+        }
+    }
+
+    fn gripper(&mut self) -> Option<&mut dyn Gripper> {
+        if self.inner.gripper().is_some() { Some(self) } else { None }
+    }
+
+    fn force_torque(&mut self) -> Option<&mut dyn ForceTorque> {
+        if MISTAKE == FAILS_WITHOUT_SENSOR { Some(self) } else { None }
+    }
+}
+
+impl<const MISTAKE: u8> Gripper for Wrong<MISTAKE> {
+    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
+        let position = self.inner.gripper().map_or(Ok(None), |gripper| gripper.read_gripper_position())?;
+        Ok(position.map(|metres| if MISTAKE == GRIPPER_IN_MILLIMETRES { 1000.0 * metres } else { metres }))
+    }
+    fn get_gripper_force_range(&mut self) -> Option<(f64, f64)> {
+        self.inner.gripper().and_then(|gripper| gripper.get_gripper_force_range())
+    }
+    fn write_gripper_position_with_force(&mut self, position: f64, force: f64) -> AdapterResult<()> {
+        let gripper = self.inner.gripper().ok_or(AdapterError::Unsupported)?;
+        let (least, most) = gripper.get_gripper_force_range().ok_or(AdapterError::Unsupported)?;
+        self.force = (least..=most).contains(&force).then_some(force);
+        match MISTAKE {
+            FORCE_CONTROL_ONLY_CLAIMED => Err(AdapterError::Unsupported),
+            FORCE_CLAMPS => gripper.write_gripper_position_with_force(position, force.max(least).min(most)),
+            FORCE_IS_LOST if (least..=most).contains(&force) => gripper.write_gripper_position(position),
+            _ => gripper.write_gripper_position_with_force(position, force),
+        }
+    }
+    fn read_gripper_force(&mut self) -> AdapterResult<Option<f64>> {
+        self.inner.gripper().map_or(Ok(None), |gripper| gripper.read_gripper_force())
+    }
+    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
+        self.inner.gripper().and_then(|gripper| gripper.get_gripper_range())
+    }
+    fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
+        match MISTAKE {
+            GRIPPER_IGNORES_STOP if self.stopped => return Ok(()),
+            STOP_LOCKS_GRIPPER if self.stopped => return Err(AdapterError::Rejected("stopped".into())),
+            _ => self.gripper = position,
+        }
+        if let Some(goal) = self.goal.filter(|_| MISTAKE == GRIPPER_HURRIES_JOINTS) {
+            self.inner.write_joint_positions(&goal, 1.0)?;
+        }
+        let gripper = self.inner.gripper().ok_or(AdapterError::Unsupported)?;
+        match (MISTAKE, self.force) {
+            (GRIPPER_CLAMPS, _) => gripper.write_gripper_position(position.clamp(0.0, 0.08)),
+            (FORCE_REMAINS, Some(force)) => gripper.write_gripper_position_with_force(position, force),
+            _ => gripper.write_gripper_position(position),
+        }
+    }
+}
+
+impl<const MISTAKE: u8> ForceTorque for Wrong<MISTAKE> {
+    fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>> {
+        Err(AdapterError::Unsupported)
+    }
+}
