@@ -59,7 +59,7 @@ impl Default for Supervision {
 named! {
     /// A change of the arm's condition that this run did not order: made at its panel, by hand guiding, or by another
     /// program.
-    #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
     pub enum Interference {
         /// None was seen.
         #[default]
@@ -75,7 +75,7 @@ named! {
 
 named! {
     /// Where a velocity came from.
-    #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
     pub enum VelocitySource {
         /// Not known at all (yet).
         #[default]
@@ -89,7 +89,7 @@ named! {
 
 named! {
     /// How the device thread's connection to the arm is doing.
-    #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
     pub enum Link {
         /// Not connected.
         #[default]
@@ -104,7 +104,7 @@ named! {
 }
 
 /// An end-effector pose in the arm's base frame, as the arm's controller states it.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Pose {
     /// x, y, z [m].
     pub xyz: [f64; 3],
@@ -113,7 +113,7 @@ pub struct Pose {
 }
 
 /// Latest known state of an arm. Device thread → tick.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ArmState {
     /// Counts the states published by the device thread; 0 = none yet.
     pub seq: u64,
@@ -188,7 +188,7 @@ impl Default for ArmState {
 }
 
 /// Command of the tick to an arm. Tick → device thread.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ArmCommand {
     /// Counts the commands of this arm; 0 = none yet.
     pub seq: u64,

@@ -34,6 +34,4 @@ pub struct FaultLog {
     pub folder: PathBuf,
     /// Number of logs to keep there; 0 = all.
     pub keep: usize,
-    /// Samples of the tick that are kept in memory: see [`super::fault_ring::capacity`].
-    pub samples: usize,
 }

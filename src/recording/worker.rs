@@ -102,7 +102,7 @@ where
             notes,
             executes: PendingExecutes::default(),
             latest: BTreeMap::new(),
-            faults: faults.map(|faults| (faults.clone(), FaultRing::new(faults.samples))),
+            faults: faults.map(|faults| (faults.clone(), FaultRing::new())),
             until: None,
             faulted: false,
             on_notice,

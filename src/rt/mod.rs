@@ -1,5 +1,6 @@
 //! Real-time primitives: latest-value slots, wake-ups, scheduling, memory. The only module with `unsafe`.
 
+pub mod arrival;
 pub mod counting;
 pub mod due;
 pub mod heartbeat;

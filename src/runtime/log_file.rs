@@ -14,7 +14,7 @@ use crate::recording::log_writer::LogAttachment;
 use crate::recording::notes::Notes;
 use crate::recording::recorder::Note;
 use crate::recording::storage::{FaultLog, Storage};
-use crate::recording::{CONFIG_VERSION_KEY, COORDINATOR, disk_space, fault_ring, files};
+use crate::recording::{CONFIG_VERSION_KEY, COORDINATOR, disk_space, files};
 use crate::telemetry::describe::{Names, Severity};
 
 /// Returns the path of the log, if there is one. An error if the disk lacks space for it.
@@ -46,7 +46,7 @@ fn log_folder(blueprint: &Blueprint) -> Option<PathBuf> {
 }
 
 /// Returns how the blueprint wants logs to be stored.
-pub(super) fn storage(blueprint: &Blueprint, options: &Options, config: &CoordinatorConfig) -> Storage {
+pub(super) fn storage(blueprint: &Blueprint, options: &Options) -> Storage {
     let recording = &blueprint.recording;
     let time = |seconds: f64| (seconds > 0.0).then(|| Duration::from_secs_f64(seconds.min(1e9)));
     let folder = log_folder(blueprint).filter(|_| recording.fault_log && options.record != Record::Off);
@@ -59,7 +59,6 @@ pub(super) fn storage(blueprint: &Blueprint, options: &Options, config: &Coordin
         fault_log: folder.map(|folder| FaultLog {
             folder,
             keep: recording.keep as usize,
-            samples: fault_ring::capacity(config.rate, config.arms.len()),
         }),
     }
 }

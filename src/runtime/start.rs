@@ -236,7 +236,7 @@ fn start_recorder(
     let (blueprint, wall) = (prepared.blueprint, prepared.wall);
     service.log_tcps();
     let mut attachments = attachments(blueprint, config);
-    let storage = storage(blueprint, &prepared.options, config);
+    let storage = storage(blueprint, &prepared.options);
     if prepared.log.is_some() || storage.fault_log.is_some() {
         attachments.extend(service.log_robots());
         service.log_world();

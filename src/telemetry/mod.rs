@@ -26,7 +26,7 @@ pub enum Sample {
 }
 
 /// State and command of one arm in a tick.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ArmSample {
     /// Index of the arm, in the order of the blueprint.
     pub arm: u16,
@@ -41,7 +41,7 @@ pub struct ArmSample {
 }
 
 /// Timing of a tick.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct TickSample {
     /// Index of the tick, counted from 0.
     pub tick: u64,
@@ -63,7 +63,7 @@ pub struct TickSample {
 
 named! {
     /// Phase of an arm.
-    #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
     pub enum Phase {
         /// No state yet.
         #[default]
@@ -98,7 +98,7 @@ named! {
 }
 
 /// Age of a state and its limit.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Age {
     /// Age without this computer's own delays [µs].
     pub age_us: u32,
@@ -109,7 +109,7 @@ pub struct Age {
 }
 
 /// Why an arm is held.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub enum Cause {
     /// No cause.
     #[default]

@@ -15,7 +15,7 @@ use dimos::recording::records::{RecordReader, check_sections, chunk_header};
 use dimos::recording::replay::{LogReader, Payload, Selection};
 use dimos::recording::scan::{Item, Scan};
 use dimos::recording::storage::{FaultLog, Storage};
-use dimos::recording::{fault_ring, files};
+use dimos::recording::files;
 use dimos::replay::recorded::RecordedError;
 use dimos::replay::verify::{Finding, verify};
 use dimos::replay::what_if::{Row, what_if};
@@ -185,8 +185,7 @@ fn a_closed_log_is_not_live_while_its_last_sync_still_has_the_lock() {
 
 /// A run without a log, in whose ring are 30 s. Waits for the log of its fault, which the recorder's thread writes.
 fn faulty(folder: &Path, before: u64) -> PathBuf {
-    let samples = fault_ring::capacity(100.0, 1);
-    let fault_log = Some(FaultLog { folder: folder.to_owned(), keep: 0, samples });
+    let fault_log = Some(FaultLog { folder: folder.to_owned(), keep: 0 });
     let mut run = begin(None, Storage { fault_log, ..Storage::default() });
     swing(&mut run, before - 2);
     assert_eq!(files::all(folder).unwrap(), <[PathBuf; 0]>::default(), "nothing is written before a fault");

@@ -2,6 +2,7 @@
 //! command only where the settings say so.
 
 use std::net::{SocketAddr, UdpSocket};
+use std::os::fd::AsFd;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -12,7 +13,7 @@ use super::control::Control;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::sim::tcp_server::TcpServer;
 use crate::rt::histogram::Histogram;
-use crate::rt::host;
+use crate::rt::{arrival, host};
 
 /// A cycle that begins later than this leaves its client too little time: the clock continues from there.
 const LATE: Duration = Duration::from_micros(300);
@@ -102,21 +103,23 @@ pub(super) fn run(
     let (mut states, mut commands) = (Way::new(network, 0x9E37_79B9), Way::new(network, 0x7F4A_7C15));
     let mut buffer = [0; BUFFER];
     let mut due = MonotonicClock.now().after(period);
-    let mut sent = due;
+    let (mut sent, mut sent_before) = (due, due);
     // Whether a state of a motion is on its way to a client, and nothing has come from there since.
     let mut awaited = false;
     while !ends.load(Ordering::Acquire) {
         // Commands are taken as they come: when they came is measured.
         while readable_before(socket, if awaited { due.after(pace.command_wait) } else { due }) {
-            let now = MonotonicClock.now();
             awaited = false;
             server.with(|control, _| {
                 for _ in 0..MOST {
                     let Ok((length, from)) = socket.recv_from(&mut buffer) else { break };
+                    let arrived = arrival::of_last_packet(socket.as_fd()).unwrap_or_else(|_| MonotonicClock.now());
                     let bytes = buffer.get(..length).unwrap_or_default();
                     commands.pass(from, bytes, |_, bytes| {
                         if control.take_command(bytes) {
-                            answers.record(now.since(sent).as_nanos() as u64);
+                            // One that arrived before the newest state answers the one before it.
+                            let state = if arrived < sent { sent_before } else { sent };
+                            answers.record(arrived.since(state).as_nanos() as u64);
                         }
                     });
                 }
@@ -133,7 +136,7 @@ pub(super) fn run(
             let hand = if control.id.is_multiple_of(HAND) { control.hand.state() } else { None };
             (state, hand, control.motion.is_some())
         });
-        sent = MonotonicClock.now();
+        (sent_before, sent) = (sent, MonotonicClock.now());
         awaited = false;
         if let Some((to, bytes)) = state {
             states.pass(to, &bytes, |to, bytes| awaited |= socket.send_to(bytes, to).is_ok() && moves);
