@@ -9,7 +9,7 @@
 use std::sync::Arc;
 
 use crate::block::{Block, Lanes, Portable};
-use crate::bodies::{Body, Frames, Prepared, forward, point};
+use crate::bodies::{Body, Frames, Prepared, between, carried, forward, point, seen_from};
 use crate::cover::{Node, Tree};
 use crate::obstacle::{BoxCore, Core, CylinderCore, Obstacle, Placed, Squared};
 use crate::width::{Vectors, Width};
@@ -335,6 +335,21 @@ impl<B: Block> Gap<B> {
     }
 }
 
+impl<B: Block> Gap<B> {
+    /// Compares two balls whose centres have this squared distance.
+    #[inline(always)]
+    fn compare_balls(&self, squared: B, one: &Node, two: &Node, lanes: u16) -> Found {
+        let inner = if one.inner.min(two.inner) < 0.0 { -1.0 } else { one.inner + two.inner };
+        self.compare(squared, one.radius + two.radius, inner, lanes)
+    }
+
+    /// Returns whether two balls are not replaced by their parts: they have none, or are fine enough.
+    #[inline(always)]
+    fn are_last(&self, one: &Node, two: &Node) -> bool {
+        (one.count == 0 && two.count == 0) || one.radius - one.inner + two.radius - two.inner <= self.fine
+    }
+}
+
 /// Finds the lanes in which the smallest balls of a cover are close to a core.
 #[inline(always)]
 fn to_core<B: Block, C: Squared>(
@@ -389,13 +404,17 @@ fn to_core<B: Block, C: Squared>(
 /// Finds the lanes in which the smallest balls of two covers are close to each other.
 #[inline(always)]
 fn to_cover<B: Block>(f: &Frames, a: &[Node], g: &Frames, b: &[Node], gap: &Gap<B>, lanes: u16) -> Found {
-    if a.is_empty() || b.is_empty() {
-        return Found { close: lanes, touch: 0 };
+    let (Some(one), Some(two)) = (a.first(), b.first()) else { return Found { close: lanes, touch: 0 } };
+    let squared = between(&point::<B>(f, &one.center), &point(g, &two.center));
+    let all = gap.compare_balls(squared, one, two, lanes);
+    if all.close == 0 || all.touch != 0 || gap.are_last(one, two) {
+        return all;
     }
+    let f = seen_from::<B>(f, g);
     let mut close = 0;
     let mut stack = [(0, 0, 0); STACK];
     let (mut open, mut visits) = (1, 0);
-    stack[0] = (0, 0, lanes);
+    stack[0] = (0, 0, all.close);
     while open > 0 {
         open -= 1;
         let (i, j, lanes) = stack[open];
@@ -403,30 +422,38 @@ fn to_cover<B: Block>(f: &Frames, a: &[Node], g: &Frames, b: &[Node], gap: &Gap<
         if lanes == 0 {
             continue;
         }
-        let (one, two) = (&a[i as usize], &b[j as usize]);
-        let (p, q) = (point::<B>(f, &one.center), point::<B>(g, &two.center));
-        let d = [p[0].sub(q[0]), p[1].sub(q[1]), p[2].sub(q[2])];
-        let squared = d[0].mul_add(d[0], d[1].mul_add(d[1], d[2].mul(d[2])));
-        let inner = if one.inner.min(two.inner) < 0.0 { -1.0 } else { one.inner + two.inner };
-        let found = gap.compare(squared, one.radius + two.radius, inner, lanes);
-        if found.touch != 0 {
-            return found;
-        }
-        if found.close == 0 {
+        visits += 1;
+        if visits > gap.visits {
+            close |= lanes;
             continue;
         }
+        let (one, two) = (&a[i as usize], &b[j as usize]);
         // The larger ball is replaced by its parts.
         let first = one.count != 0 && (two.count == 0 || one.radius >= two.radius);
-        let parent = if first { one } else { two };
-        visits += 1;
-        let fine = one.radius - one.inner + two.radius - two.inner <= gap.fine;
-        if parent.count == 0 || fine || visits > gap.visits || open + parent.count as usize > STACK {
-            close |= found.close;
-            continue;
-        }
-        for k in parent.first..parent.first + parent.count {
-            stack[open] = if first { (k, j, found.close) } else { (i, k, found.close) };
-            open += 1;
+        let (parent, rest, nodes) = if first { (one, two, a) } else { (two, one, b) };
+        let center = carried::<B>(!first, &f, &rest.center);
+        let (start, end) = (parent.first, parent.first + parent.count);
+        // Two at a time: neither waits for the other.
+        for at in (start..end).step_by(2) {
+            let (x, y) = (&nodes[at as usize], &nodes[(at + 1).min(end - 1) as usize]);
+            let from_x = between(&carried::<B>(first, &f, &x.center), &center);
+            let from_y = between(&carried::<B>(first, &f, &y.center), &center);
+            let of_x = gap.compare_balls(from_x, x, rest, lanes);
+            let of_y = gap.compare_balls(from_y, y, rest, if at + 1 < end { lanes } else { 0 });
+            for (part, node, found) in [(at, x, of_x), (at + 1, y, of_y)] {
+                if found.touch != 0 {
+                    return found;
+                }
+                if found.close == 0 {
+                    continue;
+                }
+                if open == STACK || gap.are_last(node, rest) {
+                    close |= found.close;
+                } else {
+                    stack[open] = if first { (part, j, found.close) } else { (i, part, found.close) };
+                    open += 1;
+                }
+            }
         }
     }
     Found { close, touch: 0 }

@@ -196,6 +196,42 @@ fn turn<B: Block>(frame: &Columns<B>, v: &[f32; 3]) -> [B; 3] {
     ]
 }
 
+/// Returns a frame as it is seen from another: points of the one are then where they are for the other, at the cost of
+/// one point each instead of two.
+#[inline(always)]
+pub(crate) fn seen_from<B: Block>(frame: &Frames, base: &Frames) -> Frames {
+    let [x, y, z, origin] = [at::<B>(base, 0), at(base, 3), at(base, 6), at(base, 9)];
+    let mut seen = [Lanes::splat(0.0); 12];
+    for c in 0..4 {
+        let mut v = at::<B>(frame, 3 * c);
+        if c == 3 {
+            v = [v[0].sub(origin[0]), v[1].sub(origin[1]), v[2].sub(origin[2])];
+        }
+        dot(&x, &v).store(&mut seen[3 * c]);
+        dot(&y, &v).store(&mut seen[3 * c + 1]);
+        dot(&z, &v).store(&mut seen[3 * c + 2]);
+    }
+    seen
+}
+
+#[inline(always)]
+fn dot<B: Block>(u: &[B; 3], v: &[B; 3]) -> B {
+    u[0].mul_add(v[0], u[1].mul_add(v[1], u[2].mul(v[2])))
+}
+
+/// Returns a constant point of `frame` if it is carried by that, otherwise the point itself.
+#[inline(always)]
+pub(crate) fn carried<B: Block>(carries: bool, frame: &Frames, p: &[f32; 3]) -> [B; 3] {
+    if carries { point(frame, p) } else { splat(p) }
+}
+
+/// Returns the square of the distance of two points.
+#[inline(always)]
+pub(crate) fn between<B: Block>(p: &[B; 3], q: &[B; 3]) -> B {
+    let d = [p[0].sub(q[0]), p[1].sub(q[1]), p[2].sub(q[2])];
+    dot(&d, &d)
+}
+
 /// Returns a constant point of a body in the world.
 #[inline(always)]
 pub(crate) fn point<B: Block>(frame: &Frames, p: &[f32; 3]) -> [B; 3] {

@@ -2,12 +2,11 @@
 
 use std::io;
 use std::os::fd::{AsRawFd, BorrowedFd};
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::clock::{Clock, Mono, MonotonicClock, wall_now};
 
-/// Longest plausible age of a packet that was just read; a step of the wall clock is not taken for an age.
-const MAX_AGE: Duration = Duration::from_millis(100);
+/// Longest plausible age of a packet that was just read [ns]; a step of the wall clock is not taken for an age.
+const MAX_AGE: u64 = 100_000_000;
 
 /// Returns when the packet arrived that was read last from a socket. The kernel notes that from the first call on; for
 /// a packet before that, or if the wall clock was set meanwhile, it is now.
@@ -22,10 +21,9 @@ pub fn of_last_packet(socket: BorrowedFd<'_>) -> io::Result<Mono> {
         return Err(io::Error::last_os_error());
     }
     let now = MonotonicClock.now();
-    let arrived = Duration::new(stamp.tv_sec as u64, stamp.tv_nsec as u32);
-    let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    let age = wall.checked_sub(arrived).filter(|age| *age <= MAX_AGE).unwrap_or_default();
-    Ok(Mono(now.0.saturating_sub(age.as_nanos() as u64)))
+    let arrived = stamp.tv_sec as u64 * 1_000_000_000 + stamp.tv_nsec as u64;
+    let age = wall_now().checked_sub(arrived).filter(|age| *age <= MAX_AGE).unwrap_or_default();
+    Ok(Mono(now.0.saturating_sub(age)))
 }
 
 /// The request for it: `linux/sockios.h`.
@@ -36,6 +34,7 @@ mod tests {
     use super::*;
     use std::net::UdpSocket;
     use std::os::fd::AsFd;
+    use std::time::Duration;
 
     #[test]
     fn a_packet_that_waited_is_as_old_as_it_is() {

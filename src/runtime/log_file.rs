@@ -56,10 +56,7 @@ pub(super) fn storage(blueprint: &Blueprint, options: &Options) -> Storage {
         sync_every: time(recording.sync_every),
         split_size: Some(recording.split_size.0).filter(|size| *size > 0).map(|size| size.max(1_000_000)),
         split_after: time(recording.split_after).map(|after| after.max(Duration::from_secs(1))),
-        fault_log: folder.map(|folder| FaultLog {
-            folder,
-            keep: recording.keep as usize,
-        }),
+        fault_log: folder.map(|folder| FaultLog { folder, keep: recording.keep as usize }),
     }
 }
 

@@ -43,10 +43,20 @@ impl JointStep {
     /// Returns the position at a time in ticks of `dt` [s] [rad]: setpoints are met at whole ticks, and approached
     /// evenly between them.
     pub fn position(&self, time: f64, dt: f64) -> f64 {
+        self.course(dt)(time)
+    }
+
+    /// Returns the position as a function of the time: for many times of one step.
+    pub fn course(&self, dt: f64) -> impl Fn(f64) -> f64 {
+        let (step, ticks) = (*self, self.braking_ticks());
+        move |time| step.position_within(time, dt, ticks)
+    }
+
+    fn position_within(&self, time: f64, dt: f64, braking_ticks: f64) -> f64 {
         if time <= 1.0 {
             return self.from + (self.to - self.from) * time;
         }
-        let time = (time - 1.0).min(self.braking_ticks());
+        let time = (time - 1.0).min(braking_ticks);
         let whole = time.floor();
         let speed = self.velocity.abs();
         // The k-th step has the speed less k decreases.

@@ -15,8 +15,13 @@ use crate::telemetry::Guarded;
 
 /// Most checks in one tick. Then all arms that follow streams decelerate.
 const ROUNDS: usize = 4;
+/// Checks that may end with the first pair that stopped an arm before; later ones find all.
+const FEW: usize = 2;
 /// Most checks for pairs that something else brought too close.
 const ALLOWANCES: usize = 2;
+
+/// Ticks after which the distance is measured again of what stops an arm: it is only reported.
+const REPORT: u64 = 16;
 
 /// Verdict on an arm: `Some` decelerates it.
 pub type Verdict = Option<Guarded>;
@@ -130,7 +135,7 @@ impl Guard {
                 // What brakes on its proven path needs no proof, unless something else moves towards it.
                 let moving = (streaming | executing) & !braking;
                 let asked = |arms: u64| arms & streaming != 0 && arms & moving != 0 && arms & unknown == 0;
-                let conflicts = world.find_conflicts(dt, asked);
+                let conflicts = world.find_conflicts(dt, rounds < FEW, asked);
                 if conflicts.is_empty() {
                     break;
                 }
@@ -141,8 +146,13 @@ impl Guard {
                 let hit = conflicts.to_brake(streaming & !braking, resting, executing & !braking, self.ticks);
                 rounds += 1;
                 let hit = if rounds > ROUNDS { (streaming | executing & conflicts.arms()) & !braking } else { hit };
+                let ticks = self.ticks;
+                let is_new = |arm: usize| {
+                    let before = self.verdicts.get(arm).is_some_and(Option::is_some);
+                    !before || (ticks + arm as u64).is_multiple_of(REPORT)
+                };
                 for (arm, found) in found.iter_mut().enumerate().filter(|(arm, _)| hit & bit(*arm) != 0) {
-                    *found = Some(world.conflict_of(bit(arm)).unwrap_or_default());
+                    *found = is_new(arm).then(|| world.conflict_of(bit(arm)).unwrap_or_default());
                 }
                 world.hold(hit, self.ticks);
                 braking |= hit;

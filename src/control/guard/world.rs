@@ -13,6 +13,8 @@ const REFINEMENTS: usize = 8;
 /// A piece on which a pair approaches from its middle by less than this is not refined further: it is free if the pair
 /// keeps its distance at the end [m]. So an arm at the margin is not kept from leaving by what it might do on the way.
 const FINEST: f64 = 0.0003;
+/// A pair that is not proven free on more pieces than these is looked for in conflict at their ends first.
+const MANY: u32 = Sweep::PIECES as u32 / 4;
 /// What rounding may take off a distance [m].
 const ROUNDING: f32 = 1e-5;
 /// Parts into which a piece is refined.
@@ -209,8 +211,9 @@ impl GuardWorld {
         }
     }
 
-    /// Finds the pairs that the motion does not keep apart, among those for which `asked` holds of their arms.
-    pub fn find_conflicts(&mut self, dt: f64, asked: impl Fn(u64) -> bool) -> Conflicts {
+    /// Finds the pairs that the motion does not keep apart, among those for which `asked` holds of their arms; with
+    /// `any`, only those that stop an arm already if one of them does it again.
+    pub fn find_conflicts(&mut self, dt: f64, any: bool, asked: impl Fn(u64) -> bool) -> Conflicts {
         self.conflicts.clear();
         self.active.clear();
         let active = self.pairs.iter().enumerate().filter(|(_, pair)| asked(pair.arms));
@@ -219,26 +222,39 @@ impl GuardWorld {
             return Conflicts::default();
         }
         self.divide();
-        for k in 0..Sweep::PIECES {
-            let (from, to) = (self.edge(k), self.edge(k + 1));
-            self.place(k, from, to, dt);
-        }
-        self.open.clear();
         self.ask();
-        let none = Lanes::splat(0.0);
-        for (pair, pieces) in self.sweep.close(u16::MAX, &none, &self.asked, &self.active) {
-            for k in (0..Sweep::PIECES).filter(|k| pieces >> k & 1 == 1) {
-                let edge = |k: usize| self.edges.get(k).copied().unwrap_or_default();
-                self.open.push(Piece { from: edge(k), to: edge(k + 1), pair: *pair });
-            }
+        self.refined.clear();
+        if any {
+            self.refined.extend(self.holding.iter().filter(|pair| self.active.contains(pair)));
+            self.look_at_ends(dt);
         }
-        self.refine(dt);
+        if self.conflicts.is_empty() {
+            self.find_all_conflicts(dt);
+        }
         let mut found = Conflicts::default();
         for pair in &self.conflicts {
             let arms = self.pairs.get(*pair as usize).map_or(0, |pair| pair.arms);
             *(if arms.is_power_of_two() { &mut found.alone } else { &mut found.together }) |= arms;
         }
         found
+    }
+
+    fn find_all_conflicts(&mut self, dt: f64) {
+        self.place_pieces(dt);
+        self.open.clear();
+        self.refined.clear();
+        let none = Lanes::splat(0.0);
+        for (pair, pieces) in self.sweep.close(u16::MAX, &none, &self.asked, &self.active) {
+            if pieces.count_ones() > MANY {
+                self.refined.push(*pair);
+            }
+            for k in (0..Sweep::PIECES).filter(|k| pieces >> k & 1 == 1) {
+                let edge = |k: usize| self.edges.get(k).copied().unwrap_or_default();
+                self.open.push(Piece { from: edge(k), to: edge(k + 1), pair: *pair });
+            }
+        }
+        self.look_at_ends(dt);
+        self.refine(dt);
     }
 
     /// Returns the pair that is in the way of an arm, and its distance at the next setpoints [m].
@@ -264,7 +280,7 @@ impl GuardWorld {
 
     fn allow(&mut self, pair: u32) -> bool {
         // Most pairs are far: one look.
-        self.place_still(0.0);
+        self.place_still(0.0, 1);
         if !self.is_close(pair, -CLOSER) {
             return false;
         }
@@ -283,10 +299,7 @@ impl GuardWorld {
             return;
         }
         self.divide();
-        for k in 0..Sweep::PIECES {
-            let (from, to) = (self.edge(k), self.edge(k + 1));
-            self.place(k, from, to, dt);
-        }
+        self.place_pieces(dt);
         let close = self.sweep.close(u16::MAX, &Lanes::splat(0.0), &self.margins, &self.near);
         let (pads, margins) = (&mut self.pads, &self.margins);
         self.near.retain(|pair| {
@@ -357,25 +370,57 @@ impl GuardWorld {
         }
     }
 
-    fn edge(&self, k: usize) -> f64 {
-        self.edges.get(k).copied().unwrap_or_default()
+    /// Sets the pieces of the divided motion.
+    fn place_pieces(&mut self, dt: f64) {
+        for (joint, step) in self.steps.iter().enumerate() {
+            let at = step.course(dt);
+            // It never turns back on the way.
+            let mut a = at(0.0);
+            for (piece, edge) in self.edges.iter().skip(1).enumerate() {
+                let b = at(*edge);
+                self.sweep.set(piece, joint, 0.5 * (a + b), 0.5 * (b - a).abs() + step.spread);
+                a = b;
+            }
+        }
     }
 
-    /// Sets a piece of the motion.
-    fn place(&mut self, piece: usize, from: f64, to: f64, dt: f64) {
-        for (joint, step) in self.steps.iter().enumerate() {
-            // It never turns back on the way.
-            let (a, b) = (step.position(from, dt), step.position(to, dt));
+    /// Sets a piece of the motion, for those joints whose bits are set.
+    fn place(&mut self, piece: usize, (from, to): (f64, f64), joints: u64, dt: f64) {
+        for (joint, step) in self.steps.iter().enumerate().filter(|(joint, _)| joints >> joint.min(&63) & 1 == 1) {
+            let at = step.course(dt);
+            let (a, b) = (at(from), at(to));
             self.sweep.set(piece, joint, 0.5 * (a + b), 0.5 * (b - a).abs() + step.spread);
         }
     }
 
-    /// Sets all pieces to the same time, without motion, and where the joints most likely are.
-    fn place_still(&mut self, time: f64) {
+    /// Returns the joints that move the members of a pair relative to each other, as bits; the last bit is that of all
+    /// beyond.
+    fn joints_of(&self, pair: u32) -> u64 {
+        self.sweep.levers(pair as usize).iter().fold(0, |all, (joint, _)| all | 1 << joint.min(&63))
+    }
+
+    /// Sets the first `pieces` to the same time, without motion, and where the joints most likely are.
+    fn place_still(&mut self, time: f64, pieces: usize) {
         for (joint, step) in self.steps.iter().enumerate() {
             let q = step.from + (step.to - step.from) * time;
-            (0..Sweep::PIECES).for_each(|piece| self.sweep.set(piece, joint, q, 0.0));
+            (0..pieces).for_each(|piece| self.sweep.set(piece, joint, q, 0.0));
         }
+    }
+
+    /// Finds pairs in conflict among the refined ones: those that are too close at the end of a piece. They need no
+    /// refinement.
+    fn look_at_ends(&mut self, dt: f64) {
+        if self.refined.is_empty() {
+            return;
+        }
+        for (joint, step) in self.steps.iter().enumerate() {
+            let at = step.course(dt);
+            for (piece, edge) in self.edges.iter().skip(1).enumerate() {
+                self.sweep.set(piece, joint, at(*edge), step.spread);
+            }
+        }
+        let close = self.sweep.close(u16::MAX, &Lanes::splat(-ROUNDING), &self.asked, &self.refined);
+        self.conflicts.extend(close.iter().map(|(pair, _)| *pair));
     }
 
     /// Refines the open pieces, a batch at a time, until they are proven free or in conflict.
@@ -393,32 +438,38 @@ impl GuardWorld {
     /// Refines the open pieces from `at` on. Returns whether it needed a check; with none `left` all are in conflict.
     fn refine_batch(&mut self, at: usize, left: usize, dt: f64) -> bool {
         self.refined.clear();
-        let mut margin = Lanes::splat(0.0);
-        let mut ends = [false; BATCH];
-        for (slot, end) in ends.iter_mut().enumerate() {
-            let Some(piece) = self.open.get(at + slot).copied() else { continue };
+        let mut joints = 0;
+        for slot in 0..BATCH {
+            let Some(piece) = self.open.get(at + slot) else { continue };
             if self.conflicts.contains(&piece.pair) {
                 continue;
             }
             if left == 0 {
                 self.conflicts.push(piece.pair);
-                continue;
-            }
-            if !self.refined.contains(&piece.pair) {
+            } else if !self.refined.contains(&piece.pair) {
                 self.refined.push(piece.pair);
-            }
-            *end = self.approach(&piece, dt) <= FINEST;
-            for (lane, from, to) in piece.parts(slot) {
-                if *end {
-                    self.place(lane, piece.to, piece.to, dt);
-                    margin.0.get_mut(lane).into_iter().for_each(|margin| *margin = -ROUNDING);
-                } else {
-                    self.place(lane, from, to, dt);
-                }
+                joints |= self.joints_of(piece.pair);
             }
         }
         if self.refined.is_empty() {
             return false;
+        }
+        let mut margin = Lanes::splat(0.0);
+        let mut ends = [false; BATCH];
+        for (slot, end) in ends.iter_mut().enumerate() {
+            let Some(piece) = self.open.get(at + slot).copied() else { continue };
+            if !self.refined.contains(&piece.pair) {
+                continue;
+            }
+            *end = self.approach(&piece, dt) <= FINEST;
+            for (lane, from, to) in piece.parts(slot) {
+                if *end {
+                    self.place(lane, (piece.to, piece.to), joints, dt);
+                    margin.0.get_mut(lane).into_iter().for_each(|margin| *margin = -ROUNDING);
+                } else {
+                    self.place(lane, (from, to), joints, dt);
+                }
+            }
         }
         let close = self.sweep.close(u16::MAX, &margin, &self.asked, &self.refined);
         for (slot, end) in ends.into_iter().enumerate() {
@@ -452,7 +503,7 @@ impl GuardWorld {
     /// Returns the distance of a pair at a time [ticks] that covers prove, up to `ahead` more than it must keep [m];
     /// `None` if none is proven.
     fn distance(&mut self, pair: u32, time: f64, ahead: f32) -> Option<f32> {
-        self.place_still(time);
+        self.place_still(time, Sweep::PIECES);
         let pad = self.pads.get(pair as usize).copied()?;
         self.sweep.distance(pair, pad + ahead, &self.pads)
     }
