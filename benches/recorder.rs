@@ -1,5 +1,7 @@
-//! The recorder without a tick: four arms at 1 kHz for a minute, samples as fast as it takes them, and how fast a log
-//! of a million messages is decoded (`--quick`: all shorter).
+//! The recorder: without a tick, four arms at 1 kHz for a minute, samples as fast as it takes them, and how fast a log
+//! of a million messages is decoded. Beside a tick of four arms at 1 kHz: how much later it wakes than without a
+//! recorder, in interleaved pairs of runs, and what is lost in ten minutes (`--quick`: all shorter; `-- alone`: without
+//! the runs).
 
 #[path = "support/mod.rs"]
 #[allow(dead_code, reason = "shared with the other benchmarks")]
@@ -16,8 +18,11 @@ use dimos::joint::{ControlMode, joints_of, make_joints};
 use dimos::recording::notes::channel;
 use dimos::recording::recorder::{Recorder, RecorderConfig};
 use dimos::recording::replay::LogReader;
+use dimos::rpc::api::Status;
 use dimos::telemetry::describe::{ArmNames, Names};
 use dimos::telemetry::{ArmSample, Cause, Phase, Sample, TickSample};
+use support::measure::{quantile, verdict};
+use support::run::{LiveRun, keep_moving};
 
 const ARMS: u16 = 4;
 const PERIOD: u64 = 1_000_000;
@@ -42,6 +47,57 @@ fn main() {
     let mut reader = LogReader::open(&log).expect("the log can be read");
     let read = std::iter::from_fn(|| reader.next_entry().expect("the log is whole")).map(std::hint::black_box).count();
     report("decoded", read as u64, began.elapsed(), "");
+    if std::env::args().any(|a| a == "alone") {
+        return;
+    }
+    if let Err(e) = beside_a_tick(effort) {
+        println!("FAILED: {e}");
+        std::process::exit(1);
+    }
+}
+
+/// Compares the lateness of the tick with and without a recorder, and counts what is lost in a long run.
+fn beside_a_tick(effort: support::Effort) -> Result<(), String> {
+    let (pairs, seconds) = (effort.of(1, 7), effort.of(1, 20));
+    let (mut with, mut without, mut ratios) = (Vec::new(), Vec::new(), Vec::new());
+    for pair in 0..pairs {
+        // Each is first in turn.
+        let mut late = [0.0; 2];
+        for k in [pair % 2, 1 - pair % 2] {
+            late[k] = run(k == 1, seconds)?.0;
+        }
+        without.push(late[0]);
+        with.push(late[1]);
+        ratios.push(late[1] / late[0]);
+    }
+    let [without, with, ratio] = [without, with, ratios].map(|all| quantile(&all, 0.5));
+    println!(
+        "lateness of a tick of {ARMS} arms at 1 kHz, p99, medians of {pairs} pairs of {seconds} s: {with:.0} µs recorded, \
+         {without:.0} µs not; ratio {ratio:.2} (goal ≤ 1.10: {})",
+        verdict(ratio <= 1.1)
+    );
+    let seconds = effort.of(2, 600);
+    let (_, messages, lost) = run(true, seconds)?;
+    println!(
+        "{ARMS} arms at 1 kHz beside the tick, {seconds} s: {messages} messages, {lost} samples lost (goal 0: {})",
+        verdict(lost == 0)
+    );
+    Ok(())
+}
+
+/// Runs four arms in motion. Returns the p99 of the tick's lateness [µs], the messages written, and the samples lost.
+fn run(recorded: bool, seconds: u64) -> Result<(f64, u64, u64), String> {
+    let blueprint = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/support/four-arms.yaml");
+    let blueprint = blueprint.to_str().ok_or("the path of the blueprint is no text")?;
+    let arguments: &[&str] = if recorded { &[] } else { &["--set", "recording.fault_log=false"] };
+    let start = if recorded { LiveRun::start } else { LiveRun::unrecorded };
+    let mut run = start(blueprint, arguments).map_err(|e| e.to_string())?;
+    let mut client = run.client()?;
+    keep_moving(&mut client, seconds as f64 + 4.0)?;
+    std::thread::sleep(Duration::from_secs(seconds));
+    let status = client.call(Status {}).map_err(|e| e.to_string())?;
+    let (messages, lost) = status.recorder.map_or((0, 0), |recorder| (recorder.messages, recorder.dropped));
+    run.end(|_| (status.ticks.lateness_us.p99, messages, lost))
 }
 
 fn report(what: &str, messages: u64, took: Duration, more: &str) {

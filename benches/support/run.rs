@@ -29,11 +29,27 @@ impl LiveRun {
         Self::named(blueprint, NAME, arguments)
     }
 
+    /// Same, without a log.
+    pub fn unrecorded(blueprint: &str, arguments: &[&str]) -> std::io::Result<Self> {
+        Self::spawn(tempfile::tempdir()?, blueprint, NAME, &["--no-record"], arguments)
+    }
+
     /// Same, with a name of its own.
     pub fn named(blueprint: &str, name: &str, arguments: &[&str]) -> std::io::Result<Self> {
         let home = tempfile::tempdir()?;
+        let log = home.path().join("log.mcap").display().to_string();
+        Self::spawn(home, blueprint, name, &["--record", &log], arguments)
+    }
+
+    fn spawn(
+        home: tempfile::TempDir,
+        blueprint: &str,
+        name: &str,
+        recording: &[&str],
+        arguments: &[&str],
+    ) -> std::io::Result<Self> {
         let mut command = Command::new(env!("CARGO_BIN_EXE_dimos"));
-        command.args(["run", blueprint, "--name", name, "--record"]).arg(home.path().join("log.mcap")).args(arguments);
+        command.args(["run", blueprint, "--name", name]).args(recording).args(arguments);
         command.env("XDG_RUNTIME_DIR", home.path()).env("XDG_STATE_HOME", home.path());
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
         let started = Instant::now();

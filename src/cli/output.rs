@@ -4,12 +4,15 @@ use std::fmt::Display;
 use std::io::{self, IsTerminal, Write};
 use std::os::fd::AsFd;
 use std::sync::OnceLock;
+use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
+use std::time::Duration;
 
 use comfy_table::presets::NOTHING;
 use comfy_table::{Attribute, Cell, CellAlignment, Color, ColumnConstraint, ContentArrangement, Width};
 use serde::Serialize;
 
 use super::exit::{Exit, Failure};
+use crate::rpc::run_dir::LiveRun;
 
 /// Minimum width of a squeezed table [columns]; below, the terminal wraps the lines.
 const MIN_COLUMNS: u16 = 40;
@@ -92,6 +95,21 @@ pub fn json(value: &impl Serialize) {
 /// Prints a line of diagnostics to stderr.
 pub fn note(text: impl Display) {
     let _ = writeln!(io::stderr().lock(), "{text}");
+}
+
+/// Prints a note if a run has not answered after a second, unless the result was dropped by then: `advice`, what the
+/// user can do meanwhile.
+#[must_use]
+pub fn note_if_slow(run: &LiveRun, advice: &'static str) -> Sender<()> {
+    const SLOW: Duration = Duration::from_secs(1);
+    let (answered, answer) = channel::<()>();
+    let who = format!("run {} (pid {})", run.name, run.pid);
+    std::thread::spawn(move || {
+        if answer.recv_timeout(SLOW) == Err(RecvTimeoutError::Timeout) {
+            note(format_args!("{who} has not answered for {} s: {advice}", SLOW.as_secs()));
+        }
+    });
+    answered
 }
 
 /// Prints why a verb failed, to stderr.

@@ -127,6 +127,7 @@ fn print_failed(failed: &FailedRun) {
 }
 
 fn request_status(run: &LiveRun) -> std::result::Result<StatusReport, ClientError> {
+    let _slow = output::note_if_slow(run, "still waiting; `dimos stop` may not reach it either");
     connect_to(run)?.call(Status {})
 }
 

@@ -1,8 +1,6 @@
 //! `dimos stop`: a latched hold at once. An operational stop, not a safety function.
 
 use std::collections::BTreeMap;
-use std::sync::mpsc::{RecvTimeoutError, channel};
-use std::time::Duration;
 
 use super::arguments::{self, Target, connect_to};
 use super::exit::{Exit, Failure};
@@ -12,9 +10,6 @@ use crate::rpc::api::{Confirmation, Stop, StopReply};
 use crate::rpc::client::{ClientError, find};
 use crate::rpc::run_dir::{LiveRun, RunDir};
 use crate::rpc::{Code, RpcError};
-
-/// Time after which a run without an answer is said to have none.
-const SLOW: Duration = Duration::from_secs(1);
 
 /// Arguments of `stop`.
 #[derive(Debug, clap::Args)]
@@ -125,14 +120,7 @@ fn of_each(runs: &[LiveRun], stop: impl Fn(&LiveRun) -> Result<StopReply, Client
 }
 
 fn stop(run: &LiveRun, args: &Args) -> Result<StopReply, ClientError> {
-    let (_answered, answer) = channel::<()>();
-    let (name, pid) = (run.name.clone(), run.pid);
-    std::thread::spawn(move || {
-        if answer.recv_timeout(SLOW) == Err(RecvTimeoutError::Timeout) {
-            let what = format!("run {name} (pid {pid}) has not answered for {} s", SLOW.as_secs());
-            output::note(format_args!("{what}: its arms may still move; use their own stop"));
-        }
-    });
+    let _slow = output::note_if_slow(run, "its arms may still move; use their own stop");
     connect_to(run)?.call(Stop { arm: args.arm.clone() })
 }
 

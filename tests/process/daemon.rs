@@ -280,6 +280,19 @@ fn a_stopped_process_sends_no_watchdog_pings() {
 }
 
 #[test]
+fn who_asks_a_stopped_process_is_not_left_without_a_word() {
+    let home = Home::new();
+    let run = home.run(RUN);
+    run.signal(Signal::STOP);
+    let status = home.start("status");
+    status.until(&format!("run coordinator-mock (pid {}) has not answered for 1 s: still waiting", run.pid()));
+    run.signal(Signal::CONT);
+    let ended = status.wait();
+    assert!(ended.with(0).out.contains("coordinator-mock"));
+    run.end(Signal::INT).with(130);
+}
+
+#[test]
 fn the_service_manager_hears_why_it_does_not_come_up() {
     let home = Home::new();
     let manager = Manager::new(&home);

@@ -130,14 +130,20 @@ impl Guard {
         if streaming != 0 {
             world.widen(blocked, resting, self.ticks);
             let (mut rounds, mut allowances) = (0, 0);
+            // Arms that are not proven free of conflicts with what they do now.
+            let mut open = u64::MAX;
             loop {
                 world.set_steps(|joint| step(joint, braking).unwrap_or_default());
                 // What brakes on its proven path needs no proof, unless something else moves towards it.
                 let moving = (streaming | executing) & !braking;
-                let asked = |arms: u64| arms & streaming != 0 && arms & moving != 0 && arms & unknown == 0;
+                let asked =
+                    |arms: u64| arms & streaming != 0 && arms & moving != 0 && arms & unknown == 0 && arms & open != 0;
                 let conflicts = world.find_conflicts(dt, rounds < FEW, asked);
                 if conflicts.is_empty() {
                     break;
+                }
+                if conflicts.are_all {
+                    open = conflicts.arms();
                 }
                 if allowances < ALLOWANCES && world.allow_conflicts() {
                     allowances += 1;
@@ -156,6 +162,7 @@ impl Guard {
                 }
                 world.hold(hit, self.ticks);
                 braking |= hit;
+                open |= hit;
                 if hit == 0 || rounds > ROUNDS {
                     break;
                 }

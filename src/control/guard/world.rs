@@ -42,6 +42,8 @@ pub struct Conflicts {
     alone: u64,
     /// Arms that are in each other's way.
     together: u64,
+    /// Whether all other pairs are proven free.
+    pub are_all: bool,
 }
 
 impl Conflicts {
@@ -228,10 +230,11 @@ impl GuardWorld {
             self.refined.extend(self.holding.iter().filter(|pair| self.active.contains(pair)));
             self.look_at_ends(dt);
         }
-        if self.conflicts.is_empty() {
+        let are_all = self.conflicts.is_empty();
+        if are_all {
             self.find_all_conflicts(dt);
         }
-        let mut found = Conflicts::default();
+        let mut found = Conflicts { are_all, ..Conflicts::default() };
         for pair in &self.conflicts {
             let arms = self.pairs.get(*pair as usize).map_or(0, |pair| pair.arms);
             *(if arms.is_power_of_two() { &mut found.alone } else { &mut found.together }) |= arms;
