@@ -28,6 +28,7 @@ use dimos::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
 use dimos::planning::level::Level;
 use dimos::planning::path_planner::{Plan, PlanError, PlanSettings, plan};
 use dimos::planning::timing::{TimingSettings, bounds, time};
+use dimos_kernels::Width;
 use problems::{Arm, Problem, Shapes, load, packages};
 use serde::Serialize;
 
@@ -67,6 +68,9 @@ struct Arguments {
     /// Use only the first N problems
     #[arg(long, value_name = "N")]
     limit: Option<usize>,
+    /// Vectors to use, of those that this processor has: avx512, avx2, portable. The paths are the same
+    #[arg(long, value_name = "NAME")]
+    lanes: Option<String>,
     /// Timeout per problem [s]
     #[arg(long, default_value_t = 10.0)]
     timeout: f64,
@@ -169,8 +173,27 @@ fn main() -> ExitCode {
     }
 }
 
+/// Uses these vectors, or the widest; prints which, and which were not run.
+fn choose_lanes(name: Option<&str>) -> Result<(), String> {
+    let usable = Width::usable();
+    let found = name.map(|name| usable.iter().find(|width| width.name() == name).ok_or(name)).transpose();
+    let chosen = match found {
+        Ok(width) => width.copied().unwrap_or_else(Width::widest),
+        Err(name) => return Err(format!("this processor has no lanes {name:?}")),
+    };
+    chosen.prefer();
+    let state = |name: &str| match usable.iter().find(|width| width.name() == name) {
+        Some(width) if *width == chosen => format!("{name} run"),
+        Some(_) => format!("{name} not run (--lanes {name})"),
+        None => format!("{name} NOT RUN: this processor has none"),
+    };
+    println!("lanes     {}\n", ["avx512", "avx2", "portable"].map(state).join(", "));
+    Ok(())
+}
+
 fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
     machine::print();
+    choose_lanes(arguments.lanes.as_deref())?;
     let nothing = arguments.problems.is_none() && arguments.ik.is_none();
     if arguments.timing || nothing {
         parts::timing(if arguments.quick { 1 } else { 100 }, arguments.seed)?;

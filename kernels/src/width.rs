@@ -1,5 +1,7 @@
 //! The vectors that the processor has.
 
+use std::sync::OnceLock;
+
 /// Which vectors kernels use; always some that this processor has. All give the same bits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Width(pub(crate) Vectors);
@@ -16,31 +18,45 @@ pub(crate) enum Vectors {
     Portable,
 }
 
+/// What [`Width::prefer`] has set.
+static PREFERRED: OnceLock<Width> = OnceLock::new();
+
 impl Width {
-    /// Returns the widest vectors of this processor.
+    /// Returns the vectors to use: the widest of this processor, unless others were preferred.
     pub fn widest() -> Self {
-        #[cfg(target_arch = "x86_64")]
-        {
-            if is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("fma") {
-                return Self(Vectors::Avx512);
-            }
-            if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
-                return Self(Vectors::Avx2);
-            }
-        }
-        Self(Vectors::Portable)
+        PREFERRED.get().copied().unwrap_or_else(|| Self::usable().first().copied().unwrap_or(Self(Vectors::Portable)))
+    }
+
+    /// Makes [`widest`](Self::widest) return this one from now on: to compare widths in one program. Returns whether it
+    /// is the first that is preferred; later ones are not.
+    pub fn prefer(self) -> bool {
+        PREFERRED.set(self).is_ok()
     }
 
     /// Returns the widths that this processor can use, widest first.
     pub fn usable() -> Vec<Self> {
-        let mut widths = vec![Self::widest()];
+        let mut widths = Vec::new();
         #[cfg(target_arch = "x86_64")]
-        if widths == [Self(Vectors::Avx512)] && is_x86_feature_detected!("avx2") {
-            widths.push(Self(Vectors::Avx2));
+        if is_x86_feature_detected!("fma") {
+            if is_x86_feature_detected!("avx512f") {
+                widths.push(Self(Vectors::Avx512));
+            }
+            if is_x86_feature_detected!("avx2") {
+                widths.push(Self(Vectors::Avx2));
+            }
         }
-        if !widths.contains(&Self(Vectors::Portable)) {
-            widths.push(Self(Vectors::Portable));
-        }
+        widths.push(Self(Vectors::Portable));
         widths
+    }
+
+    /// Returns its name: `avx512`, `avx2` or `portable`.
+    pub fn name(self) -> &'static str {
+        match self.0 {
+            #[cfg(target_arch = "x86_64")]
+            Vectors::Avx512 => "avx512",
+            #[cfg(target_arch = "x86_64")]
+            Vectors::Avx2 => "avx2",
+            Vectors::Portable => "portable",
+        }
     }
 }

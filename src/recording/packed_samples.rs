@@ -86,12 +86,15 @@ pub(super) mod tests {
     use super::*;
     use crate::arm::{ArmCommand, ArmState, Link};
     use crate::joint::{ControlMode, joints_of};
-    use crate::robot::random::Random;
     use crate::telemetry::{Cause, Outcome, Phase};
 
     /// A tick of arms with seven joints whose measurements are noise in every digit.
-    pub fn tick(random: &mut Random, tick: u64, deadline: Mono, arms: u16) -> Vec<Sample> {
-        let mut noise = || joints_of(&std::array::from_fn::<f64, 7, _>(|_| random.between(-3.0, 3.0)));
+    pub fn tick(tick: u64, deadline: Mono, arms: u16) -> Vec<Sample> {
+        let mut at = 1e3 * tick as f64;
+        let mut noise = || {
+            at += 1.0;
+            joints_of(&std::array::from_fn::<f64, 7, _>(|joint| (at * (joint + 2) as f64).sin()))
+        };
         let mut samples: Vec<Sample> = (0..arms)
             .map(|arm| {
                 let state = ArmState {
@@ -118,13 +121,12 @@ pub(super) mod tests {
 
     #[test]
     fn a_block_returns_its_samples_bit_for_bit_and_in_order() {
-        let mut random = Random::new(3);
         let mut samples = Vec::new();
         for k in 0..50 {
             if k % 20 == 7 {
                 samples.push(Sample::Event(k, Event::Request(k, Outcome::Accepted)));
             }
-            samples.extend(tick(&mut random, k, Mono(1000 + k), 2));
+            samples.extend(tick(k, Mono(1000 + k), 2));
         }
         if let Some(Sample::Arm(arm)) = samples.first_mut() {
             arm.state.position[0] = -0.0;

@@ -97,7 +97,7 @@ pub fn set_fifo(priority: i32) -> io::Result<()> {
 }
 
 /// Keeps the calling thread on the last of its processors: interrupts are usually served by the first. Threads that
-/// hand over to each other in turn wake sooner there than on processors that are idle meanwhile.
+/// wake each other in turn wake sooner there than on processors that are idle meanwhile.
 pub fn stay_on_last_processor() -> io::Result<()> {
     let allowed = rustix::thread::sched_getaffinity(None)?;
     let last = (0..rustix::thread::CpuSet::MAX_CPU).rev().find(|processor| allowed.is_set(*processor));
