@@ -10,13 +10,14 @@ use crate::joint::{JointLimits, MAX_DOF};
 /// Arguments of `list-adapters`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
-LEVEL  how far it is proven
-         works       compiles, connects
-         conformant  passes the conformance suite against a test double
-         emulated    passes it against an emulator of its wire format, which
-                     `address: sim` starts
-HOLDS  whether the arm keeps its pose when its motors are disabled
-TEACH  how it is led by hand (dimos arm teach)")]
+LEVEL    how far it is proven
+           works       compiles, connects
+           conformant  passes the conformance suite against a test double
+           emulated    passes it against an emulator of its wire format, which
+                       `address: sim` starts
+HOLDS    whether the arm keeps its pose when its motors are disabled
+GRIPPER  whether the adapter drives one
+TEACH    how it is led by hand (dimos arm teach)")]
 pub struct Args {
     /// Print JSON
     #[arg(long)]
@@ -35,7 +36,7 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
 
 /// Returns the table, and a paragraph for each adapter.
 fn lines(registry: &Registry) -> Vec<String> {
-    let mut table = Table::new(&["NAME", "LEVEL", "TRANSPORT", ">DOF", ">RATE Hz", "HOLDS", "TEACH"]);
+    let mut table = Table::new(&["NAME", "LEVEL", "TRANSPORT", ">DOF", ">RATE Hz", "HOLDS", "GRIPPER", "TEACH"]);
     for row in registry.rows() {
         table.row([
             row.name.to_owned(),
@@ -44,11 +45,12 @@ fn lines(registry: &Registry) -> Vec<String> {
             dof(row),
             format!("{:.0}", row.native_rate),
             if row.holds_when_disabled { "yes" } else { "no, falls" }.to_owned(),
+            if row.gripper { "yes" } else { "no" }.to_owned(),
             teach(row).to_owned(),
         ]);
     }
     for absent in registry.absent() {
-        let nothing = ["-"; 5].map(str::to_owned);
+        let nothing = ["-"; 6].map(str::to_owned);
         table.row([absent.name.to_owned(), "not in this build".to_owned()].into_iter().chain(nothing));
     }
     let mut lines = table.lines();

@@ -30,13 +30,6 @@ pub enum Source {
     },
 }
 
-impl Source {
-    /// Returns whether it is an arm.
-    pub fn is_device(&self) -> bool {
-        matches!(self, Self::Device { .. })
-    }
-}
-
 /// The start of a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Start {

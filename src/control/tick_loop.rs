@@ -123,12 +123,7 @@ pub fn run(
     mut probe: Option<Probe>,
 ) {
     let pulse = ports.pulse.clone();
-    let fifo = host::enter_realtime(host::TICK_PRIORITY);
-    pulse.fifo.store(fifo, Ordering::Relaxed);
-    // Beside the device thread of the arm that clocks it.
-    if fifo && ports.source.is_device() {
-        let _ = host::stay_on_last_processor();
-    }
+    pulse.fifo.store(host::enter_realtime(host::TICK_PRIORITY), Ordering::Relaxed);
     let mut states = vec![ArmState::default(); ports.states.len()];
     let mut pacer = Pacer::new(ports.source, clock.now(), period);
     let (mut tick, mut dropped) = (0u64, 0u32);

@@ -62,6 +62,10 @@ pub trait Service {
 
     // --- Calibration ---
 
+    /// Returns the number of counts of one turn.
+    fn counts_per_turn(&self) -> i32 {
+        4096
+    }
     /// Takes the present pose as the middle of each motor's turn. Writes nothing.
     fn take_middle(&mut self) -> AdapterResult<()> {
         Err(AdapterError::Unsupported)
@@ -74,8 +78,9 @@ pub trait Service {
     fn calibration(&self, _ranges: &[(i32, i32)]) -> AdapterResult<String> {
         Err(AdapterError::Unsupported)
     }
-    /// Writes the calibration of a file to the motors, and reads it back. Returns the names of the motors that had
-    /// another one. After a failure some motors may have the new one: the same call again writes the others.
+    /// Reads the calibration of the motors, and writes that of a file to those that have another one. Returns their
+    /// names. The caller calls it again to see that the motors have kept it: then there are none. After a failure some
+    /// motors may have the new one: the same call again writes the others.
     fn write_calibration(&mut self, _file: &Path) -> AdapterResult<Vec<&'static str>> {
         Err(AdapterError::Unsupported)
     }

@@ -10,6 +10,7 @@ const LEVEL: i32 = 1;
 
 /// A sample in a block. Events are kept beside, as they are: they are few.
 #[derive(Debug, Serialize, Deserialize)]
+#[allow(clippy::large_enum_variant, reason = "most are the large one")]
 enum Packed {
     Arm(ArmSample),
     Tick(TickSample),

@@ -96,16 +96,6 @@ pub fn set_fifo(priority: i32) -> io::Result<()> {
     }
 }
 
-/// Keeps the calling thread on the last of its processors: interrupts are usually served by the first. Threads that
-/// wake each other in turn wake sooner there than on processors that are idle meanwhile.
-pub fn stay_on_last_processor() -> io::Result<()> {
-    let allowed = rustix::thread::sched_getaffinity(None)?;
-    let last = (0..rustix::thread::CpuSet::MAX_CPU).rev().find(|processor| allowed.is_set(*processor));
-    let mut only = rustix::thread::CpuSet::new();
-    last.into_iter().for_each(|processor| only.set(processor));
-    Ok(rustix::thread::sched_setaffinity(None, &only)?)
-}
-
 fn set_other() {
     // SAFETY: as in `set_fifo`.
     let param: libc::sched_param = unsafe { std::mem::zeroed() };

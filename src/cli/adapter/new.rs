@@ -94,7 +94,7 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
 }
 
 /// The next commands, and the purpose of each.
-type Next = [(String, &'static str); 4];
+type Next = Vec<(String, &'static str)>;
 
 /// A line to add to a source file by hand.
 #[derive(Debug, serde::Serialize)]
@@ -112,14 +112,15 @@ fn own_crate(args: &Args, arm: &Arm) -> Result<(Plan, Vec<Line>, Next)> {
     let folder = args.path.join(&arm.name.kebab);
     let files = arm.own_crate(&dimos(args.dimos.as_deref())?);
     let new = files.into_iter().map(|(path, text)| (folder.join(path), text)).collect();
-    let next = [
+    let next = vec![
         (format!("cd {} && cargo test", shown(&folder)), "its bytes, and the conformance suite"),
         (format!("cargo run -- run {}", arm.blueprint()), "with its emulator"),
         (
             format!("cargo run -- run {}", arm.planner()),
             "the same with a planner: `cargo run -- plan arm --named home`",
         ),
-        ("grep -rn 'YOUR ARM' src robots".to_owned(), "what to change"),
+        ("grep -rn 'YOUR ARM' src robots".to_owned(), "what to change; the robot has no gripper"),
+        ("git init && git add -A".to_owned(), "with the Cargo.lock of the first build: the same versions everywhere"),
     ];
     Ok((Plan { new, folders: vec![folder] }, Vec::new(), next))
 }
@@ -138,7 +139,7 @@ fn in_tree(args: &Args, arm: &Arm) -> Result<(Plan, Vec<Line>, Next)> {
     ];
     let new = arm.in_tree().into_iter().map(|(path, text)| (root.join(path), text)).collect();
     let folder = root.join("src/hardware/arms").join(name);
-    let next = [
+    let next = vec![
         (
             "DIMOS_REGENERATE=1 cargo test --test logic blueprint_reference".to_owned(),
             "brings the generated pages up to date",

@@ -144,7 +144,15 @@ impl Report {
             Some(_) => "; each joint moved as commanded",
         };
         let (passed, failed, skipped) = (self.count("passed"), self.count("failed"), self.count("skipped"));
-        format!("{passed} checks passed, {failed} failed, {skipped} do not apply{motion}")
+        let emulated = self.checks.iter().filter(|row| !self.simulated && row.only_emulated).count();
+        let not_run = match emulated {
+            0 => String::new(),
+            n => format!(", {n} not run: only an emulated arm can be moved and disturbed for them"),
+        };
+        format!(
+            "{passed} checks passed, {failed} failed, {} do not apply{not_run}{motion}",
+            skipped - emulated.min(skipped)
+        )
     }
 
     fn title(&self) -> String {

@@ -11,25 +11,26 @@ use super::super::follow::Signals;
 use super::super::output;
 use super::bus::{self, failure};
 use super::live_table::{Place, Seen, lines};
-use crate::hardware::adapter::AdapterError;
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::registry::Registry;
 use crate::hardware::service::{Motor, Service};
 use crate::message::Message;
 
 /// How often positions are read and shown.
 const PERIOD: Duration = Duration::from_millis(50);
-/// A smaller range was not recorded: the joint was not moved [counts].
-const SMALLEST: i32 = 100;
+/// A smaller range was not recorded: the joint was not moved [part of a turn].
+const SMALLEST: f64 = 0.025;
 /// End of the name of a calibration that is not written to the motors yet.
 const PART: &str = "part";
-/// A joint cannot turn this far between two readings: it passed the end of its turn [counts].
-const JUMP: i32 = 2048;
+/// A joint cannot turn this far between two readings: it passed the end of its turn [part of a turn].
+const JUMP: f64 = 0.5;
 
 /// Arguments of `arm calibrate`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
 The motors are off and nothing moves the arm: you do. Nothing is written before the ranges are complete; Ctrl-C changes nothing.
-Then the calibration is saved as FILE.part in LeRobot's format, written to the motors, read back, and renamed to FILE.
+Then the calibration is saved as FILE.part (of an SO-101: in LeRobot's format), written to the motors, read back, and
+renamed to FILE.
 If writing fails, FILE.part remains: --restore FILE.part writes it again. A run uses the file with the adapter's option `calibration`.")]
 pub struct Args {
     #[command(flatten)]
@@ -73,7 +74,7 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
 }
 
 fn restore(arm: &mut dyn Service, file: &Path) -> Result {
-    let changed = arm.write_calibration(file).map_err(failure)?;
+    let changed = write_and_read_back(arm, file).map_err(failure)?;
     match changed.as_slice() {
         [] => output::note(format_args!("the motors have the calibration of {} already", file.display())),
         changed => output::note(format_args!("written and read back: {}", changed.join(", "))),
@@ -83,6 +84,19 @@ fn restore(arm: &mut dyn Service, file: &Path) -> Result {
         output::note(format_args!("now give the file its name: mv {} {}", file.display(), whole.display()));
     }
     Ok(Exit::Ok)
+}
+
+/// Writes a calibration to the motors, and sees that they have kept it: what was kept is not written again. Returns the
+/// names of the motors that had another one.
+fn write_and_read_back(arm: &mut dyn Service, file: &Path) -> AdapterResult<Vec<&'static str>> {
+    let changed = arm.write_calibration(file)?;
+    match arm.write_calibration(file)?.as_slice() {
+        [] => Ok(changed),
+        lost => Err(AdapterError::Rejected(format!(
+            "motors do not keep the calibration that is written to them: {}\nhint: see whether their memory is locked",
+            lost.join(", ")
+        ))),
+    }
 }
 
 impl Args {
@@ -102,7 +116,7 @@ impl Args {
         let mut ranges = Vec::new();
         for (motor, seen) in arm.motors().iter().zip(&seen) {
             let (low, high) = motor.range.unwrap_or((seen.low, seen.high));
-            if high - low < SMALLEST {
+            if f64::from(high - low) < SMALLEST * f64::from(arm.counts_per_turn()) {
                 let what = format!("{} was not moved: its range is {} counts", motor.name, high - low);
                 return Err(Failure::new(Exit::Failed, what).hint("nothing was written; calibrate again"));
             }
@@ -118,7 +132,7 @@ impl Args {
             let hint = "no motor was changed; save the text above as a file, and write it with --restore";
             return Err(error.hint(hint));
         }
-        arm.write_calibration(&part).map_err(|error| self.not_written(error, &part))?;
+        write_and_read_back(arm, &part).map_err(|error| self.not_written(error, &part))?;
         std::fs::rename(&part, file)
             .with_context(|| format!("the motors are calibrated, but {} cannot be renamed", part.display()))?;
         lines(arm.motors(), &seen).iter().for_each(output::line);
@@ -143,10 +157,11 @@ impl Args {
     fn record(&self, arm: &mut dyn Service, signals: &Signals) -> Result<Vec<Seen>> {
         let mut seen: Vec<Seen> = arm.positions().map_err(failure)?.into_iter().map(Seen::at).collect();
         let (began, mut place) = (Instant::now(), Place::default());
+        let jump = (JUMP * f64::from(arm.counts_per_turn())) as i32;
         ask::discard_typed();
         loop {
             for ((motor, seen), position) in arm.motors().iter().zip(&mut seen).zip(arm.positions().map_err(failure)?) {
-                if seen.take(position) > JUMP && motor.range.is_none() {
+                if seen.take(position) > jump && motor.range.is_none() {
                     let what = format!("{} passed the end of its turn: its middle was not where it began", motor.name);
                     return Err(
                         Failure::new(Exit::Failed, what).hint("nothing was written; begin again in the middle pose")
@@ -183,4 +198,48 @@ fn write(file: &Path, text: &str) -> Result<()> {
 
 fn absolute(file: &Path) -> PathBuf {
     file.canonicalize().unwrap_or_else(|_| file.to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MOTORS: &[Motor] = &[Motor { name: "pan", id: 1, range: None }, Motor { name: "lift", id: 2, range: None }];
+
+    /// Motors that say that they were written; those from `forgets` on keep nothing.
+    struct Motors {
+        forgets: usize,
+        written: usize,
+    }
+
+    impl Service for Motors {
+        fn motors(&self) -> &'static [Motor] {
+            MOTORS
+        }
+        fn identify(&mut self) -> AdapterResult<String> {
+            Ok("two motors".to_owned())
+        }
+        fn powered(&mut self) -> AdapterResult<Vec<&'static str>> {
+            Ok(Vec::new())
+        }
+        fn release(&mut self) -> AdapterResult<()> {
+            Ok(())
+        }
+        fn write_calibration(&mut self, _file: &Path) -> AdapterResult<Vec<&'static str>> {
+            let others = MOTORS.iter().enumerate().filter(|(at, _)| self.written == 0 || *at >= self.forgets);
+            let names = others.map(|(_, motor)| motor.name).collect();
+            self.written += 1;
+            Ok(names)
+        }
+    }
+
+    #[test]
+    fn motors_that_forget_what_is_written_are_named() {
+        let mut good = Motors { forgets: 2, written: 0 };
+        let changed = write_and_read_back(&mut good, Path::new("arm.json")).unwrap();
+        assert_eq!((changed, good.written), (vec!["pan", "lift"], 2));
+        let mut forgetful = Motors { forgets: 1, written: 0 };
+        let error = write_and_read_back(&mut forgetful, Path::new("arm.json")).unwrap_err();
+        assert!(Message::of(&error).what.ends_with("written to them: lift"), "{error}");
+    }
 }

@@ -106,6 +106,7 @@ fn own_joints(context: &mut Context) -> Result<(), String> {
     if !context.row.modes.contains(&ControlMode::Position) || context.true_positions().is_none() {
         return context.skip("its emulator has no true positions");
     }
+    context.leave_out_calibration()?;
     context.ready(ControlMode::Position)?;
     let start = context.positions()?;
     let target = context.nearby(&start)?;

@@ -93,6 +93,7 @@ fn silence(context: &mut Context) -> Result<(), String> {
 /// may count once, and on a busy computer the next one too; an adapter that discards nothing lags one reading behind
 /// from then on.
 fn late(context: &mut Context) -> Result<(), String> {
+    context.leave_out_calibration()?;
     if !STALLS.iter().all(|seconds| context.prepare(Fault::new(FaultKind::Stall).lasting(*seconds))) {
         return context.skip("its emulator cannot answer late");
     }

@@ -162,11 +162,7 @@ impl Worker {
 
     /// Runs until it is ordered to finish. A panic of the adapter affects this arm only.
     pub(super) fn run(mut self, mut adapter: Box<dyn ManipulatorAdapter>, orders: Receiver<Order>) {
-        let fifo = host::enter_realtime(host::DEVICE_PRIORITY);
-        // The tick that it clocks runs there too. Without priority they would wait for ordinary threads on it.
-        if fifo && self.config.pace.is_some() {
-            let _ = host::stay_on_last_processor();
-        }
+        host::enter_realtime(host::DEVICE_PRIORITY);
         let outcome = catch_unwind(AssertUnwindSafe(|| while !self.cycle(&mut *adapter, &orders) {}));
         if let Err(panic) = outcome {
             self.trouble(&format!("the adapter panicked: {}", panic_text(&*panic)));

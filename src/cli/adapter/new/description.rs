@@ -50,7 +50,8 @@ pub fn urdf(name: &str, about: &str, dof: u8, limits_in: &str) -> String {
     let mut out = format!(
         "<?xml version=\"1.0\"?>\n\
          <!-- {about}, as a planner sees it. YOUR ARM: lengths [m], axes, limits and shapes are made up. Put in those of\n     \
-         the data sheet, or use the vendor's description in its place. Keep the limits those of {limits_in}. -->\n\
+         the data sheet, or use the vendor's description in its place. Keep the limits those of {limits_in}.\n     \
+         A gripper is not part of it: give the link `flange` its shape, or the planner does not know of it. -->\n\
          <robot name=\"{name}\">\n"
     );
     link(&mut out, "base_link", &[cylinder(0.07, 0.1, 0.05)]);
