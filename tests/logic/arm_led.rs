@@ -104,6 +104,20 @@ fn a_controller_that_is_too_fast_or_out_of_range_is_stopped_and_latched_and_a_ha
     once.arms[0].v[0] = 0.0;
     once.run(3);
     assert_eq!(once.phase(0), Phase::Led, "one velocity may be noise");
+    let mut twice = led(LedBy::Controller);
+    for _ in 0..2 {
+        twice.arms[0].v[0] = 1.3 * V_MAX;
+        twice.tick();
+    }
+    twice.arms[0].v[0] = 0.0;
+    twice.run(3);
+    assert_eq!(twice.phase(0), Phase::Held, "two are not");
+
+    let mut below = led(LedBy::Controller);
+    lead(&mut below, -0.5, (RANGE - 0.01) / 0.5);
+    assert_eq!(below.phase(0), Phase::Led, "inside its range");
+    lead(&mut below, -0.5, 0.06);
+    assert!(matches!(below.samples[0].cause, Cause::LedOutOfRange(0, q) if q < -RANGE), "{:?}", below.samples[0]);
 
     let mut rig = led(LedBy::Controller);
     rig.arms[0].q[0] = RANGE - 0.05;
@@ -128,6 +142,24 @@ fn a_controller_that_is_too_fast_or_out_of_range_is_stopped_and_latched_and_a_ha
     hand.run_for(0.5);
     let outside = hand.ask(Request::Lead { arm: 0, by: LedBy::Controller });
     assert!(matches!(outside, Outcome::OutOfLimits(0, by) if by > 0.04), "{outside:?}");
+}
+
+#[test]
+fn the_joint_that_keeps_a_controller_from_starting_is_named_over_all_arms() {
+    let mut rig = Rig::new(100.0, vec![arm("left", 6), arm("right", 6)], Vec::new());
+    rig.make_ready();
+    assert_eq!(rig.ask(Request::Lead { arm: 1, by: LedBy::Hand }), Outcome::Accepted);
+    for _ in 0..400 {
+        rig.arms[1].setpoint = None;
+        rig.arms[1].q[2] += (RANGE + 0.05) / 400.0;
+        rig.tick();
+    }
+    rig.ask(Request::PrepareDisable { arm: 1 });
+    rig.run(3);
+    rig.ask(Request::Enabled { arm: 1 });
+    rig.run_for(0.5);
+    let outside = rig.ask(Request::Lead { arm: 1, by: LedBy::Controller });
+    assert!(matches!(outside, Outcome::OutOfLimits(8, by) if by > 0.04), "{outside:?}");
 }
 
 #[test]

@@ -88,6 +88,7 @@ fn cancel_slows_down_along_the_path() {
     assert_eq!((rig.tasks[0].state, rig.tasks[0].reason), (TaskState::Aborted, Reason::Cancelled));
     assert_eq!(rig.retired, [1]);
     assert_eq!(rig.ask(Request::Cancel { task: Some(0) }), Outcome::AlreadyStopped);
+    assert_eq!(rig.ask(Request::Cancel { task: Some(1) }), Outcome::WrongTask(1), "there is one task");
     assert_eq!(rig.execute(0, sweep(2, 0..6, 5.0, 0.0, 1.0)).name(), "START_STATE_MISMATCH");
 }
 

@@ -46,3 +46,82 @@ impl ArmControl {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+    use crate::arm::ArmState;
+    use crate::clock::Mono;
+    use crate::control::config::ArmConfig;
+    use crate::control::stalls::Stalls;
+    use crate::joint::{JointLimits, joints_of};
+
+    const PERIOD: Duration = Duration::from_millis(10);
+    const DT: f64 = 0.01;
+
+    /// Two joints whose limiters were at `before` [rad, rad/s] and are at `now`.
+    fn arm(mode: ControlMode, before: (f64, f64), now: (f64, f64)) -> ArmControl {
+        let mut limits = JointLimits::uniform(2, 3.0, 2.0).with_defaults();
+        limits.acceleration_max = vec![5.0; 2];
+        let config = ArmConfig {
+            name: "arm".into(),
+            dof: 2,
+            limits,
+            modes: vec![ControlMode::ServoPosition, ControlMode::Velocity],
+            gripper: false,
+            gripper_info: Default::default(),
+            own_velocity: Vec::new(),
+            read_period: PERIOD,
+            write_period: PERIOD,
+            supervision: Default::default(),
+        };
+        let mut arm = ArmControl::new(config, 0, PERIOD);
+        arm.command.mode = Some(mode);
+        arm.before.iter_mut().for_each(|limiter| limiter.rewind(before.0, before.1));
+        arm.limiters.iter_mut().for_each(|limiter| limiter.rewind(now.0, now.1));
+        arm
+    }
+
+    fn see(arm: &mut ArmControl, seq: u64, positions: [f64; 2]) {
+        let stamp = Mono(1_000_000_000 + seq * 10_000_000);
+        let state = ArmState { seq, stamp, dof: 2, position: joints_of(&positions), ..ArmState::default() };
+        arm.feedback.read(&state, stamp, &Stalls::default());
+    }
+
+    fn close(a: JointStep, b: JointStep) -> bool {
+        let pairs =
+            [(a.from, b.from), (a.to, b.to), (a.velocity, b.velocity), (a.decrease, b.decrease), (a.spread, b.spread)];
+        pairs.iter().all(|(a, b)| (a - b).abs() < 1e-12)
+    }
+
+    #[test]
+    fn an_arm_is_placed_with_its_first_state_and_at_rest_as_its_setpoints_were() {
+        let mut moving = arm(ControlMode::ServoPosition, (0.5, 0.3), (0.503, 0.3));
+        assert!(!moving.is_placed() && !moving.was_at_rest());
+        see(&mut moving, 1, [0.5, 0.5]);
+        assert!(moving.is_placed());
+        assert!(arm(ControlMode::ServoPosition, (0.5, 0.0), (0.503, 0.3)).was_at_rest());
+    }
+
+    #[test]
+    fn the_step_is_that_of_the_limiters_and_braking_the_first_of_the_deceleration() {
+        let arm = arm(ControlMode::ServoPosition, (0.5, 0.4), (0.506, 0.42));
+        let step = JointStep { from: 0.5, to: 0.506, velocity: 0.42, decrease: 5.0 * DT, spread: 0.0 };
+        assert_eq!(arm.step(1, false, DT), step);
+        let braking = JointStep { to: 0.5 + 0.35 * DT, velocity: 0.35, ..step };
+        assert!(close(arm.step(1, true, DT), braking), "{:?}", arm.step(1, true, DT));
+        assert_eq!(arm.step(2, false, DT), JointStep::at(0.0), "no such joint");
+    }
+
+    #[test]
+    fn with_velocities_the_step_begins_where_the_joint_may_be() {
+        let mut arm = arm(ControlMode::Velocity, (0.0, 0.4), (0.0, 0.42));
+        see(&mut arm, 1, [0.2, 0.7]);
+        let step = JointStep { from: 0.7, to: 0.7 + 0.42 * DT, velocity: 0.42, decrease: 5.0 * DT, spread: 0.0 };
+        assert!(close(arm.step(1, false, DT), step), "{:?}", arm.step(1, false, DT));
+        let braking = JointStep { to: 0.7 + 0.35 * DT, velocity: 0.35, ..step };
+        assert!(close(arm.step(1, true, DT), braking), "{:?}", arm.step(1, true, DT));
+    }
+}
