@@ -29,8 +29,7 @@ const JUMP: f64 = 0.5;
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
 The motors are off and nothing moves the arm: you do. Nothing is written before the ranges are complete; Ctrl-C changes nothing.
-Then the calibration is saved as FILE.part (of an SO-101: in LeRobot's format), written to the motors, read back, and
-renamed to FILE.
+Then the calibration is saved as FILE.part (of an SO-101: in LeRobot's format), written to the motors, read back, and renamed to FILE.
 If writing fails, FILE.part remains: --restore FILE.part writes it again. A run uses the file with the adapter's option `calibration`.")]
 pub struct Args {
     #[command(flatten)]
