@@ -15,7 +15,8 @@ use crate::obstacle::{BoxCore, Core, CylinderCore, Obstacle, Placed, Squared};
 use crate::width::{Vectors, Width};
 
 /// Errors of single precision: a constant part [m], and one per metre of distance from the origin. Frames are a product
-/// of up to some twenty rotations, each rounded to 6e-8; measured errors are a tenth of this.
+/// of up to some twenty rotations, each rounded to 6e-8; measured errors are a tenth of this. One body as it is seen from
+/// another adds one product.
 const ROUNDING: (f64, f64) = (1e-5, 4e-6);
 /// Most balls, or pairs of them, that are replaced by their parts for one pair; the rest is left to the caller. More
 /// would take longer than to be exact.
@@ -333,9 +334,7 @@ impl<B: Block> Gap<B> {
         let touch = if close == 0 || within == 0.0 { 0 } else { B::bits(B::less(squared, B::splat(within * within))) };
         Found { close, touch: touch & lanes }
     }
-}
 
-impl<B: Block> Gap<B> {
     /// Compares two balls whose centres have this squared distance.
     #[inline(always)]
     fn compare_balls(&self, squared: B, one: &Node, two: &Node, lanes: u16) -> Found {

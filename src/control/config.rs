@@ -87,6 +87,24 @@ pub struct ArmConfig {
 }
 
 impl ArmConfig {
+    /// An arm of two joints from -3 to 3 rad, with states and setpoints every 10 ms.
+    #[cfg(test)]
+    pub(super) fn of_two_joints(velocity: f64) -> Self {
+        let period = Duration::from_millis(10);
+        Self {
+            name: "arm".into(),
+            dof: 2,
+            limits: JointLimits::uniform(2, 3.0, velocity).with_defaults(),
+            modes: vec![ControlMode::ServoPosition, ControlMode::Velocity],
+            gripper: false,
+            gripper_info: GripperInfo::default(),
+            own_velocity: Vec::new(),
+            read_period: period,
+            write_period: period,
+            supervision: Supervision::default(),
+        }
+    }
+
     /// The mode in which positions are streamed to it.
     pub fn position_mode(&self) -> Option<ControlMode> {
         [ControlMode::ServoPosition, ControlMode::Position].into_iter().find(|m| self.modes.contains(m))

@@ -6,18 +6,7 @@ use crate::joint::{ControlMode, JointLimits, joints_of};
 const PERIOD: Duration = Duration::from_millis(10);
 
 fn config() -> ArmConfig {
-    let mut config = ArmConfig {
-        name: "arm".into(),
-        dof: 2,
-        limits: JointLimits::uniform(2, 3.0, 1.0).with_defaults(),
-        modes: vec![ControlMode::ServoPosition],
-        gripper: false,
-        gripper_info: Default::default(),
-        own_velocity: Vec::new(),
-        read_period: PERIOD,
-        write_period: PERIOD,
-        supervision: crate::arm::Supervision::default(),
-    };
+    let mut config = ArmConfig { modes: vec![ControlMode::ServoPosition], ..ArmConfig::of_two_joints(1.0) };
     config.supervision.stale_after = Duration::from_millis(50);
     config
 }

@@ -2,26 +2,14 @@
 
 use super::*;
 use crate::control::limit::Bounds;
-use crate::joint::{ControlMode, JointLimits, joints_of};
+use crate::joint::{ControlMode, joints_of};
 
 const PERIOD: Duration = Duration::from_millis(10);
 const DT: f64 = 0.01;
 
 fn tracking() -> Tracking {
     let supervision = crate::arm::Supervision { lag: 0.05, accuracy: 0.005, ..Default::default() };
-    let config = ArmConfig {
-        name: "arm".into(),
-        dof: 2,
-        limits: JointLimits::uniform(2, 3.0, 1.0).with_defaults(),
-        modes: vec![ControlMode::ServoPosition, ControlMode::Velocity],
-        gripper: false,
-        gripper_info: Default::default(),
-        own_velocity: Vec::new(),
-        read_period: PERIOD,
-        write_period: PERIOD,
-        supervision,
-    };
-    Tracking::new(&config, PERIOD)
+    Tracking::new(&ArmConfig { supervision, ..ArmConfig::of_two_joints(1.0) }, PERIOD)
 }
 
 fn at(ms: u64) -> Mono {

@@ -46,7 +46,7 @@ fn a_new_crate_builds_passes_its_tests_and_runs() {
     let made = home.dimos("adapter new acme-arm --dof 7 --transport tcp").with(0);
     let next: Vec<&str> = made.out.lines().skip_while(|line| *line != "next:").skip(1).collect();
     assert_eq!(next.len(), 5, "{}", made.out);
-    assert!(next[3].contains("no gripper") && next[4].contains("Cargo.lock"), "{}", made.out);
+    assert!(next[3].contains("the URDF has no gripper") && next[4].contains("Cargo.lock"), "{}", made.out);
     assert!(next[0].contains("cd acme-arm && cargo test"), "{}", made.out);
     let folder = home.path().join("acme-arm");
     let programs = cargo_test(&folder);

@@ -18,7 +18,7 @@ use dimos::joint::Joints;
 use super::calibration::Calibration;
 use super::{DOF, Options, SERVOS, TOP_SPEED, limits, wire};
 
-/// The faults that the servos can play.
+/// The faults that the servos can play. YOUR ARM: leave out what yours cannot have.
 pub const PLAYABLE: &[FaultKind] = &[
     FaultKind::Stall,
     FaultKind::Silent,
@@ -33,7 +33,7 @@ pub const PLAYABLE: &[FaultKind] = &[
     FaultKind::Pushed,
     FaultKind::MotorOff,
 ];
-/// Counts between closed and open, and when closed; the gripper's speed [1/s].
+/// Counts between closed and open, and when closed; the gripper's speed [1/s]. YOUR ARM
 const GRIPPER: (f64, f64) = (2000.0, 1000.0);
 const GRIPPER_SPEED: f64 = 2.0;
 

@@ -2,7 +2,7 @@
 
 use crate::apart::{Compared, Other, Scene};
 use crate::block::{Block, LANES, Lanes};
-use crate::bodies::{Frames, forward, point};
+use crate::bodies::{Frames, between, forward, point};
 use crate::cover::Node;
 use crate::obstacle::Squared;
 
@@ -175,12 +175,7 @@ fn check_block<B: Block>(
         let pairs = &discrete.link_pairs[bodies.pairs.0 as usize..bodies.pairs.1 as usize];
         let (a, b) = (&buffers.centers[bodies.a as usize], &buffers.centers[bodies.b as usize]);
         let (one, two) = (&discrete.carried[bodies.a as usize], &discrete.carried[bodies.b as usize]);
-        let d = [
-            B::load(&a[0]).sub(B::load(&b[0])),
-            B::load(&a[1]).sub(B::load(&b[1])),
-            B::load(&a[2]).sub(B::load(&b[2])),
-        ];
-        let squared = d[0].mul_add(d[0], d[1].mul_add(d[1], d[2].mul(d[2])));
+        let squared = between(&load::<B>(a), &load(b));
         let mut reach = 0.0_f32;
         if steps.part != 0.0 {
             for pair in pairs {
@@ -227,6 +222,11 @@ fn body_touches<B: Block>(
     None
 }
 
+#[inline(always)]
+fn load<B: Block>(point: &[Lanes; 3]) -> [B; 3] {
+    [B::load(&point[0]), B::load(&point[1]), B::load(&point[2])]
+}
+
 /// Returns whether a number is smaller than another in any lane; so is what is not a number.
 #[inline(always)]
 fn any_below<B: Block>(squared: B, limit: f32) -> bool {
@@ -241,9 +241,8 @@ fn near<B: Block>(scene: &Scene, frames: &[Frames], other: &Other, center: &[B; 
         Other::Cylinder(core, radius) => any_below::<B>(core.squared(center), gap.squared(*radius)),
         Other::Cover(body, tree, radius) => {
             let Some(root) = scene.trees[*tree].nodes.first() else { return true };
-            let p = point::<B>(&frames[*body], &root.center);
-            let d = [p[0].sub(center[0]), p[1].sub(center[1]), p[2].sub(center[2])];
-            any_below::<B>(d[0].mul_add(d[0], d[1].mul_add(d[1], d[2].mul(d[2]))), gap.squared(*radius + root.radius))
+            let squared = between(&point::<B>(&frames[*body], &root.center), center);
+            any_below::<B>(squared, gap.squared(*radius + root.radius))
         }
         Other::Link(_) => true,
     }
@@ -324,9 +323,7 @@ fn covers_touch<B: Block>(f: &Frames, a: &[Node], g: &Frames, b: &[Node], gap: &
         open -= 1;
         let (i, j) = stack[open];
         let (one, two) = (&a[i as usize], &b[j as usize]);
-        let (p, q) = (point::<B>(f, &one.center), point::<B>(g, &two.center));
-        let d = [p[0].sub(q[0]), p[1].sub(q[1]), p[2].sub(q[2])];
-        let squared = d[0].mul_add(d[0], d[1].mul_add(d[1], d[2].mul(d[2])));
+        let squared = between(&point::<B>(f, &one.center), &point(g, &two.center));
         if !any_below::<B>(squared, gap.squared(one.radius + two.radius)) {
             continue;
         }

@@ -119,7 +119,7 @@ fn own_crate(args: &Args, arm: &Arm) -> Result<(Plan, Vec<Line>, Next)> {
             format!("cargo run -- run {}", arm.planner()),
             "the same with a planner: `cargo run -- plan arm --named home`",
         ),
-        ("grep -rn 'YOUR ARM' src robots".to_owned(), "what to change; the robot has no gripper"),
+        ("grep -rn 'YOUR ARM' src robots".to_owned(), "what to change; the URDF has no gripper"),
         ("git init && git add -A".to_owned(), "with the Cargo.lock of the first build: the same versions everywhere"),
     ];
     Ok((Plan { new, folders: vec![folder] }, Vec::new(), next))

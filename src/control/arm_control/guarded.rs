@@ -56,27 +56,15 @@ mod tests {
     use crate::clock::Mono;
     use crate::control::config::ArmConfig;
     use crate::control::stalls::Stalls;
-    use crate::joint::{JointLimits, joints_of};
+    use crate::joint::joints_of;
 
     const PERIOD: Duration = Duration::from_millis(10);
     const DT: f64 = 0.01;
 
     /// Two joints whose limiters were at `before` [rad, rad/s] and are at `now`.
     fn arm(mode: ControlMode, before: (f64, f64), now: (f64, f64)) -> ArmControl {
-        let mut limits = JointLimits::uniform(2, 3.0, 2.0).with_defaults();
-        limits.acceleration_max = vec![5.0; 2];
-        let config = ArmConfig {
-            name: "arm".into(),
-            dof: 2,
-            limits,
-            modes: vec![ControlMode::ServoPosition, ControlMode::Velocity],
-            gripper: false,
-            gripper_info: Default::default(),
-            own_velocity: Vec::new(),
-            read_period: PERIOD,
-            write_period: PERIOD,
-            supervision: Default::default(),
-        };
+        let mut config = ArmConfig::of_two_joints(2.0);
+        config.limits.acceleration_max = vec![5.0; 2];
         let mut arm = ArmControl::new(config, 0, PERIOD);
         arm.command.mode = Some(mode);
         arm.before.iter_mut().for_each(|limiter| limiter.rewind(before.0, before.1));
