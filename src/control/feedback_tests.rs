@@ -1,9 +1,7 @@
 //! What is believed of an arm's readings, and how old it is.
 
 use super::*;
-use crate::joint::{ControlMode, JointLimits, joints_of};
-
-const PERIOD: Duration = Duration::from_millis(10);
+use crate::joint::{ControlMode, joints_of};
 
 fn config() -> ArmConfig {
     let mut config = ArmConfig { modes: vec![ControlMode::ServoPosition], ..ArmConfig::of_two_joints(1.0) };

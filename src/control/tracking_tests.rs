@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::control::limit::Bounds;
-use crate::joint::{ControlMode, joints_of};
+use crate::joint::joints_of;
 
 const PERIOD: Duration = Duration::from_millis(10);
 const DT: f64 = 0.01;

@@ -93,6 +93,19 @@ pub trait Emulator: Send {
     fn motors_on(&self) -> Option<bool> {
         None
     }
+    /// Returns how often a motor of its joints was switched on or off; `None` if unknown.
+    fn motor_switches(&self) -> Option<u32> {
+        None
+    }
+    /// Returns the temperatures of its drives [°C]; `None` if unknown.
+    fn temperatures(&self) -> Option<Joints> {
+        None
+    }
+    /// Returns the true position of its gripper, in the unit of the adapter [m or rad]; `None` if unknown, or without a
+    /// gripper.
+    fn gripper_position(&self) -> Option<f64> {
+        None
+    }
     /// Returns the largest force that its gripper was given, in the unit of the adapter's force; `None` if it has no
     /// gripper with force control.
     fn gripper_force(&self) -> Option<f64> {

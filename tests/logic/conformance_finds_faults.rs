@@ -68,6 +68,20 @@ fn each_mistake_is_found_by_the_check_for_it() {
         (Wrong::<TAKES_LATE_ANSWERS>::WIRED, "late_answers_are_not_new"),
         (Wrong::<ENABLED_BY_ONE_MOTOR>::WIRED, "enabled_means_every_motor"),
         (Wrong::<CONFIRMS_ALWAYS>::WIRED, "stop_without_answer"),
+        (Wrong::<TOGGLES_POWER_ON_CONNECT>::WIRED, "connecting_changes_nothing"),
+        (Wrong::<TOGGLES_POWER_ON_CONNECT>::WIRED, "leaving_moves_nothing"),
+        (Wrong::<TOO_SLOW>::SPEC, "planned_speed_is_kept"),
+        (Wrong::<TOO_SLOW>::WIRED, "planned_speed_is_kept"),
+        (Wrong::<SERVO_TOO_SLOW>::SPEC, "fast_set_points_are_followed"),
+        (Wrong::<SERVO_TOO_SLOW>::WIRED, "fast_set_points_are_followed"),
+        (Wrong::<CONFIRMS_UNSEEN>::BUS, "lost_commands_are_noticed"),
+        (Wrong::<ERRORS_OF_FIRST_ONLY>::BUS, "errors_of_any_joint"),
+        (Wrong::<LONG_TIMEOUT>::WIRED, "a_lost_answer_holds_no_arm"),
+        (Wrong::<STATUS_SHIFTED>::BUS, "joint_status_is_read"),
+        (Wrong::<STATUS_SHIFTED>::WIRED, "joint_status_is_read"),
+        (Wrong::<GRIPPER_REVERSED>::WIRED, "gripper_is_the_arms_own"),
+        (Wrong::<CLAIMS_TO_HOLD>::BUS, "disabled_arms_do_not_move"),
+        (Wrong::<ONE_VELOCITY_REVERSED>::SERVOS, "velocities_are_those_of_motion"),
     ];
     std::thread::scope(|scope| {
         for (row, name) in cases {
@@ -99,6 +113,17 @@ fn without_a_mistake_the_same_checks_pass() {
         (Wrong::<NO_MISTAKE>::WIRED, "gripper_moves_no_joint"),
         (Wrong::<NO_MISTAKE>::WIRED, "gripper_range_is_kept"),
         (Wrong::<NO_MISTAKE>::WIRED, "gripper_force_is_kept"),
+        (Wrong::<NO_MISTAKE>::WIRED, "connecting_changes_nothing"),
+        (Wrong::<NO_MISTAKE>::SPEC, "planned_speed_is_kept"),
+        (Wrong::<NO_MISTAKE>::SPEC, "fast_set_points_are_followed"),
+        (Wrong::<NO_MISTAKE>::WIRED, "fast_set_points_are_followed"),
+        (Wrong::<NO_MISTAKE>::BUS, "lost_commands_are_noticed"),
+        (Wrong::<NO_MISTAKE>::BUS, "errors_of_any_joint"),
+        (Wrong::<NO_MISTAKE>::WIRED, "a_lost_answer_holds_no_arm"),
+        (Wrong::<NO_MISTAKE>::BUS, "joint_status_is_read"),
+        (Wrong::<NO_MISTAKE>::WIRED, "joint_status_is_read"),
+        (Wrong::<NO_MISTAKE>::WIRED, "gripper_is_the_arms_own"),
+        (Wrong::<NO_MISTAKE>::BUS, "disabled_arms_do_not_move"),
     ];
     std::thread::scope(|scope| {
         for (row, name) in cases {
@@ -138,6 +163,7 @@ fn the_small_slow_motion_ends_where_something_is_odd() {
         (Wrong::<STOP_DROPS_POWER>::SPEC, "the motors went off"),
         (Wrong::<VELOCITIES_IN_DEGREES>::SPEC, "are they in rad/s"),
         (Wrong::<STOP_IS_FINAL>::SPEC, "stopped"),
+        (Wrong::<IGNORES_SPEED>::SPEC, "times as fast as ordered"),
     ];
     std::thread::scope(|scope| {
         for (row, says) in cases {

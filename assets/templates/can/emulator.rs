@@ -43,6 +43,9 @@ impl CanController for AcmeController {
     /// What the arm refuses it ignores, as arms on CAN do.
     fn on_frame(&mut self, frame: &CanFrame, now: Mono, answers: &mut Vec<CanFrame>) {
         self.arm.advance(now);
+        if self.arm.loses_command() {
+            return;
+        }
         let _refusal = match (frame.id, frame.bytes()) {
             (0x150, [1, on, ..]) => self.arm.enable(*on != 0),
             (0x150, [2, mode @ 0..=1, speed @ 1..=100, ..]) => {

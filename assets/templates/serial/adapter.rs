@@ -300,11 +300,13 @@ impl ManipulatorAdapter for AcmeAdapter {
         let mut goals = servos.map(|servo| servo.goal); // the gripper keeps its own
         let joints = goals.iter_mut().zip(self.calibration.joints()).zip(angles);
         joints.for_each(|((goal, range), angle)| *goal = range.counts(angle));
-        let speed = match self.mode {
-            ControlMode::Position => (velocity * TOP_SPEED * TURN / TAU).max(1.0) as u16,
-            _ => 0,
-        };
-        self.tell(Request::Goals(&goals, speed))
+        match self.mode {
+            ControlMode::Position => {
+                let speed = (velocity * TOP_SPEED * TURN / TAU).max(1.0) as u16;
+                self.confirmed(Request::Goals(&goals, speed), |i, servo| goals.get(i) == Some(&servo.goal))
+            }
+            _ => self.tell(Request::Goals(&goals, 0)), // the next setpoint follows at once
+        }
     }
 
     /// Makes the position of each servo that [`must_stop`] its goal; the others keep theirs.

@@ -16,12 +16,13 @@ use dimos::hardware::transport::Scan;
 use dimos::joint::Joints;
 
 use super::calibration::Calibration;
-use super::{DOF, Options, SERVOS, TOP_SPEED, limits, wire};
+use super::{DOF, OPEN, Options, SERVOS, TOP_SPEED, limits, wire};
 
 /// The faults that the servos can play. YOUR ARM: leave out what yours cannot have.
 pub const PLAYABLE: &[FaultKind] = &[
     FaultKind::Stall,
     FaultKind::Silent,
+    FaultKind::LostCommand,
     FaultKind::Disconnect,
     FaultKind::ErrorCode,
     FaultKind::PowerLoss,
@@ -68,6 +69,10 @@ impl HasArm for Servos {
     fn arm(&mut self) -> &mut SimArm {
         &mut self.arm
     }
+
+    fn gripper_position(&mut self) -> Option<f64> {
+        Some(self.gripper.position * OPEN)
+    }
 }
 
 impl Controller for Servos {
@@ -80,7 +85,10 @@ impl Controller for Servos {
         self.arm.client_came();
         self.arm.advance(now);
         self.gripper.advance(now.seconds_since(std::mem::replace(&mut self.now, now)));
-        self.execute(servo, opcode, payload, answer);
+        let lost = matches!((servo, opcode), (0, 0x03..)) && self.arm.loses_command();
+        if !lost {
+            self.execute(servo, opcode, payload, answer);
+        }
         // Only what is answered can be lost.
         let delivery = if answer.is_empty() { Delivery::Send } else { self.arm.delivery() };
         if matches!(delivery, Delivery::PowerLoss(_)) {
@@ -180,7 +188,7 @@ impl Servos {
             let velocity = if joint { velocities[i] * 4096.0 / TAU } else { 0.0 };
             let on = if joint { self.arm.motor(i) } else { self.grips };
             let moving = if joint { velocity.abs() > 3.0 } else { self.gripper.moving() };
-            let error = if i == 0 { self.arm.error() as u8 } else { 0 };
+            let error = self.arm.error_of(i) as u8;
             put_state(answer, i as u8 + 1, error, (on, moving), position, velocity.round() as i16, goal);
         }
     }

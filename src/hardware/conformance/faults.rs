@@ -17,6 +17,7 @@ const OBSERVATION_TIME: Duration = Duration::from_millis(500);
 /// The checks of this file.
 pub const CHECKS: &[Check] = &[
     Check::new(Faults, "errors_have_code_and_text", "an error is reported, refuses motion, is cleared", errors),
+    Check::new(Faults, "errors_of_any_joint", "an error of the last joint is reported", last_joint),
     Check::new(Faults, "clearing_enables_nothing", "an error is cleared with the motors off", clearing),
     Check::new(Faults, "estop_needs_two_acts", "after an E-stop: clear, then enable", estop),
     Check::new(Faults, "noise_is_survived", "noise costs at most three readings", noise),
@@ -43,6 +44,19 @@ fn errors(context: &mut Context) -> Result<(), String> {
     context.until("the error to be cleared", |context| Ok(context.error()?.0 == 0))?;
     context.stays(&start, 0.005)?;
     context.activate()
+}
+
+/// Where each drive reports its own error, all of them are read.
+fn last_joint(context: &mut Context) -> Result<(), String> {
+    let joint = context.config.dof;
+    if !context.prepare(Fault { joint, ..Fault::new(FaultKind::ErrorCode).code(CODE) }) {
+        return context.skip("its emulator cannot be in error");
+    }
+    context.ready(context.first_mode())?;
+    context.trigger_faults()?;
+    context.until("the error", |context| Ok(context.error()?.0 != 0))?;
+    context.clear_errors().map_err(|e| format!("write_clear_errors: {e}"))?;
+    context.until("the error to be cleared", |context| Ok(context.error()?.0 == 0))
 }
 
 fn clearing(context: &mut Context) -> Result<(), String> {

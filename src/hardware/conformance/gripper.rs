@@ -3,7 +3,7 @@
 use super::Check;
 use super::Needs::Motion;
 use super::context::{Context, require};
-use super::motion::slow_move;
+use super::speed::slow_move;
 use crate::arm::{GripperInfo, GripperUnit};
 use crate::hardware::adapter::AdapterError;
 use crate::joint::ControlMode;
@@ -11,6 +11,7 @@ use crate::joint::ControlMode;
 /// The checks of this file.
 pub const CHECKS: &[Check] = &[
     Check::new(Motion, "gripper_is_in_its_unit", "the gripper moves to its target [m or rad]", unit),
+    Check::new(Motion, "gripper_is_the_arms_own", "its values match the emulated gripper", own_gripper),
     Check::new(Motion, "gripper_range_is_kept", "positions outside its range are refused and move nothing", range),
     Check::new(Motion, "gripper_moves_no_joint", "its commands change no motion of the joints", moves_no_joint),
     Check::new(Motion, "gripper_force_is_kept", "forces outside their range are refused, others reach the arm", force),
@@ -90,6 +91,28 @@ fn unit(context: &mut Context) -> Result<(), String> {
     context.command_gripper(target)?;
     arrives(context, info.unit, target)?;
     context.found(named)
+}
+
+/// An adapter that takes open for closed in both directions agrees with itself. The emulated gripper reveals it.
+fn own_gripper(context: &mut Context) -> Result<(), String> {
+    context.leave_out_calibration()?;
+    let Some((info, start)) = ready(context)? else { return context.skip("it has no gripper") };
+    let own = |context: &Context| context.emulator.as_ref().and_then(|emulator| emulator.gripper_position());
+    if own(context).is_none() {
+        return context.skip("the true position of its emulated gripper is unknown");
+    }
+    let (tolerance, unit) = (in_unit(info.unit, 2.0 * TOLERANCE), info.unit.name());
+    for (position, moves) in [(start, false), (target(&info, start), true)] {
+        if moves {
+            context.command_gripper(position)?;
+            arrives(context, info.unit, position)?;
+        }
+        let found = own(context).unwrap_or(f64::NAN);
+        require((found - position).abs() < tolerance, || {
+            format!("it reads {position:.4} {unit}, the emulated gripper is at {found:.4} {unit}")
+        })?;
+    }
+    Ok(())
 }
 
 fn range(context: &mut Context) -> Result<(), String> {

@@ -13,8 +13,10 @@ mod gripper;
 mod identity;
 pub mod lag;
 mod lifecycle;
+mod lost;
 mod motion;
 mod parts;
+mod speed;
 mod stale;
 mod stops;
 mod streamed_state;
@@ -85,9 +87,11 @@ pub fn checks() -> impl Iterator<Item = &'static Check> {
         gripper::CHECKS,
         streamed_state::CHECKS,
         motion::CHECKS,
+        speed::CHECKS,
         stops::CHECKS,
         faults::CHECKS,
         stale::CHECKS,
+        lost::CHECKS,
         disconnects::CHECKS,
     ]
     .into_iter()

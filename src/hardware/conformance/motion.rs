@@ -1,6 +1,5 @@
 //! Motion: units, signs, order of joints, stopping, refusing.
 
-use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use super::Check;
@@ -12,7 +11,6 @@ use crate::joint::ControlMode;
 /// The checks of this file.
 pub const CHECKS: &[Check] = &[
     Check::new(Motion, "planned_moves_arrive", "each joint moves to its target, in rad", planned_moves_arrive),
-    Check::new(Motion, "planned_speed_is_kept", "a planned motion is as slow as it was ordered", planned_speed),
     Check::new(Motion, "set_points_are_followed", "streamed positions are followed", set_points_are_followed),
     Check::new(Motion, "velocities_are_kept", "rad/s written is rad/s moved and read", velocities_are_kept),
     Check::new(Motion, "velocities_are_those_of_motion", "rad/s read is rad/s moved, in position modes", measured),
@@ -31,62 +29,6 @@ fn planned_moves_arrive(context: &mut Context) -> Result<(), String> {
     for goal in [&target, &start] {
         context.command(goal, 0.5)?;
         context.until("arrival", |context| Ok(farthest(&context.positions()?, goal) < 1e-3))?;
-    }
-    Ok(())
-}
-
-/// Speed of a slow move, as a fraction of the top speed.
-const SLOW: f64 = 0.1;
-/// Its length [rad].
-const SLOW_WAY: f64 = 0.3;
-/// Speeds are averages over this time [s].
-const WINDOW: f64 = 0.1;
-/// A joint may be this many times as fast as ordered: readings on a busy machine are late.
-const TOO_FAST: f64 = 2.5;
-
-fn planned_speed(context: &mut Context) -> Result<(), String> {
-    if !context.row.modes.contains(&ControlMode::Position) {
-        return context.skip("it has no position mode");
-    }
-    slow_move(context, |_| Ok(()))
-}
-
-/// Moves slowly for a second, and does something on the way. Fails if a joint is much faster than ordered.
-pub fn slow_move(
-    context: &mut Context,
-    on_the_way: impl FnOnce(&mut Context) -> Result<(), String>,
-) -> Result<(), String> {
-    context.ready(ControlMode::Position)?;
-    let (start, limits) = (context.positions()?, context.limits()?);
-    let ranges = limits.position_lower.iter().zip(&limits.position_upper);
-    let away = |(q, (lower, upper)): (&f64, (&f64, &f64))| match (q + SLOW_WAY <= *upper, q - SLOW_WAY >= *lower) {
-        (true, _) => q + SLOW_WAY,
-        (false, true) => q - SLOW_WAY,
-        (false, false) => *q,
-    };
-    let target: Vec<f64> = start.iter().zip(ranges).map(away).collect();
-    context.command(&target, SLOW)?;
-    let (began, mut on_the_way, mut seen) = (Instant::now(), Some(on_the_way), VecDeque::new());
-    while began.elapsed() < Duration::from_secs(1) {
-        pause(&mut *context.adapter, Duration::from_millis(10));
-        if began.elapsed() > Duration::from_millis(300)
-            && let Some(act) = on_the_way.take()
-        {
-            act(context)?;
-        }
-        let reading = context.joints()?;
-        let now = reading.stamp.map_or(began.elapsed().as_secs_f64(), |stamp| stamp.0 as f64 * 1e-9);
-        seen.push_back((now, reading.position));
-        while seen.get(1).is_some_and(|(then, _)| now - then >= WINDOW) {
-            seen.pop_front();
-        }
-        let Some((then, before)) = seen.front().filter(|(then, _)| now - then >= WINDOW) else { continue };
-        for (i, top) in limits.velocity_max.iter().enumerate() {
-            let (speed, ordered) = ((reading.position[i] - before[i]).abs() / (now - then), SLOW * top);
-            require(speed <= TOO_FAST * ordered, || {
-                format!("joint {} moves at {speed:.2} rad/s, ordered were {ordered:.2}", i + 1)
-            })?;
-        }
     }
     Ok(())
 }

@@ -78,6 +78,9 @@ fn read(context: &mut Context) -> Result<IoState, String> {
     Ok(state)
 }
 
+/// Arms report temperatures in whole degrees [°C].
+const ROUNDED: f64 = 0.5;
+
 fn joint_status(context: &mut Context) -> Result<(), String> {
     context.connect()?;
     context.joints()?;
@@ -102,6 +105,11 @@ fn joint_status(context: &mut Context) -> Result<(), String> {
         }
         let known = *joint != JointStatus::default();
         require(known, || format!("joint {}: nothing is reported; return None for the part", i + 1))?;
+    }
+    let own = context.emulator.as_ref().and_then(|emulator| emulator.temperatures());
+    for (i, (joint, own)) in joints.iter().zip(own.iter().flatten()).enumerate() {
+        let same = joint.temperature.is_none_or(|celsius| (celsius - own).abs() <= ROUNDED);
+        require(same, || format!("joint {}: {:?} °C, the emulated drive has {own} °C", i + 1, joint.temperature))?;
     }
     if let (Some(allocations), Some(monitor)) = (context.allocations, context.adapter.joint_monitor()) {
         let before = allocations();

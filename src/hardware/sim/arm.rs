@@ -93,6 +93,16 @@ pub trait HasArm {
         now
     }
 
+    /// Returns the true position of the gripper, in the unit of the adapter [m or rad]; `None` without one.
+    fn gripper_position(&mut self) -> Option<f64> {
+        None
+    }
+
+    /// Returns the temperatures of the drives [°C].
+    fn temperatures(&mut self) -> Joints {
+        std::array::from_fn(SimArm::temperature)
+    }
+
     /// Returns the true joint positions [rad] and velocities [rad/s] at `now`.
     fn joints_at(&mut self, now: Mono) -> (Joints, Joints) {
         self.advance(now);
@@ -112,6 +122,10 @@ pub struct SimArm {
     /// Whether the arm has modes. Without modes it takes any command at any time.
     has_modes: bool,
     error: u16,
+    /// The joint whose drive is in error (index from 0).
+    faulty: usize,
+    /// How often a motor was switched on or off.
+    switches: u32,
     estop_open: bool,
     /// When the E-stop line closes.
     estop_until: Option<Mono>,
@@ -148,6 +162,8 @@ impl SimArm {
             mode: ControlMode::Position,
             has_modes: true,
             error: 0,
+            faulty: 0,
+            switches: 0,
             estop_open: false,
             estop_until: None,
             velocity_timeout: None,
@@ -234,7 +250,7 @@ impl SimArm {
         self.estop_open = true;
         self.estop_until = None;
         self.error = ESTOP;
-        self.plant.enable(false);
+        self.switch_off();
     }
 
     /// Closes the E-stop line. Error and motors do not change.
@@ -243,9 +259,14 @@ impl SimArm {
         self.estop_until = None;
     }
 
-    /// Sets an error and stops the arm.
+    /// Sets an error and stops the arm. If its drives have errors of their own, the first one is in error.
     pub fn fail(&mut self, code: u16) {
-        self.error = code;
+        self.fail_joint(0, code);
+    }
+
+    /// Sets an error of a joint (index from 0) and stops the arm.
+    pub fn fail_joint(&mut self, joint: usize, code: u16) {
+        (self.error, self.faulty) = (code, joint);
         self.plant.stop();
     }
 
@@ -253,7 +274,7 @@ impl SimArm {
     pub fn restart(&mut self) {
         (self.mode, self.error, self.goal) = (ControlMode::Position, 0, None);
         self.powered_up = self.advanced_to;
-        self.plant.enable(false);
+        self.switch_off();
     }
 
     // --- State ---
@@ -322,6 +343,22 @@ impl SimArm {
     /// Returns the error code; 0 = none.
     pub fn error(&self) -> u16 {
         self.error
+    }
+
+    /// Returns the error code of the drive of a joint (index from 0); 0 = none.
+    pub fn error_of(&self, joint: usize) -> u16 {
+        if joint == self.faulty { self.error } else { 0 }
+    }
+
+    /// Returns how often a motor was switched on or off.
+    pub fn switches(&self) -> u32 {
+        self.switches
+    }
+
+    /// Returns the temperature of the drive of a joint (index from 0) without load [°C]: no two are equal, so that
+    /// mistakes show.
+    pub fn temperature(joint: usize) -> f64 {
+        31.0 + joint as f64
     }
 
     /// Returns whether the E-stop line is open.

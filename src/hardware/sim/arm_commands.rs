@@ -36,13 +36,23 @@ impl SimArm {
     /// motor comes on.
     pub fn enable_joint(&mut self, joint: usize, on: bool) {
         let before = self.plant.enabled();
-        self.plant.enable_joint(joint, on);
+        self.switch(joint, on);
         if !before
             && self.plant.enabled()
             && let Some(fault) = self.take_fault(FaultKind::Sag)
         {
             self.plant.sag(fault.amount);
         }
+    }
+
+    pub(super) fn switch(&mut self, joint: usize, on: bool) {
+        self.switches += u32::from(joint < self.dof() && self.plant.motor(joint) != on);
+        self.plant.enable_joint(joint, on);
+    }
+
+    /// Switches all motors off.
+    pub(super) fn switch_off(&mut self) {
+        (0..self.dof()).for_each(|joint| self.switch(joint, false));
     }
 
     /// Clears the error; refused while the E-stop line is open.

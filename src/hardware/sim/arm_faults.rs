@@ -12,7 +12,7 @@ impl SimArm {
             self.estop_until = fault.left(self.script_time()).map(|left| self.advanced_to.after(left));
         }
         if let Some(fault) = self.take_fault(FaultKind::ErrorCode) {
-            self.fail(fault.code);
+            self.fail_joint(fault.joint.saturating_sub(1), fault.code);
         }
         let pushed = self.take_fault(FaultKind::Pushed).map(|fault| (fault.joint.saturating_sub(1), fault));
         self.plant.hand(pushed.filter(|(_, f)| f.duration > 0.0).map(|(joint, f)| (joint, f.amount / f.duration)));
@@ -20,7 +20,7 @@ impl SimArm {
             self.plant.push(joint, fault.amount);
         }
         if let Some(fault) = self.take_fault(FaultKind::MotorOff) {
-            self.plant.enable_joint(fault.joint.saturating_sub(1), false);
+            self.switch(fault.joint.saturating_sub(1), false);
         }
         let blocked = self.take_fault(FaultKind::Blocked).map(|fault| fault.joint.saturating_sub(1));
         (0..self.dof()).for_each(|joint| self.plant.block(joint, blocked == Some(joint)));
@@ -48,6 +48,11 @@ impl SimArm {
     /// Returns whether a fault of this kind with a duration is active now. Does not count it as played.
     pub fn fault_lasts(&self, kind: FaultKind) -> bool {
         self.script.lasts(kind, self.script_time())
+    }
+
+    /// Returns whether a command without a response that has just arrived was lost on its way instead.
+    pub fn loses_command(&mut self) -> bool {
+        self.take_fault(FaultKind::LostCommand).is_some()
     }
 
     /// Returns how the response or report that is due now is delivered.

@@ -28,6 +28,7 @@ const MAX_LATE_PERIODS: u32 = 10;
 pub const PLAYABLE: &[FaultKind] = &[
     FaultKind::Stall,
     FaultKind::Silent,
+    FaultKind::LostCommand,
     FaultKind::Disconnect,
     FaultKind::ErrorCode,
     FaultKind::Estop,
@@ -149,6 +150,21 @@ impl<C: CanController + HasArm> Emulator for CanServer<C> {
 
     fn motors_on(&self) -> Option<bool> {
         Some(self.with(|controller, _| controller.arm().enabled()))
+    }
+
+    fn motor_switches(&self) -> Option<u32> {
+        Some(self.with(|controller, _| controller.arm().switches()))
+    }
+
+    fn temperatures(&self) -> Option<Joints> {
+        Some(self.with(|controller, _| controller.temperatures()))
+    }
+
+    fn gripper_position(&self) -> Option<f64> {
+        self.with(|controller, now| {
+            controller.advance(now);
+            controller.gripper_position()
+        })
     }
 }
 

@@ -36,6 +36,8 @@ pub enum FaultKind {
     Nan,
     /// Joint positions and velocities are reported as zero.
     ZeroState,
+    /// A command that has no answer does not reach the arm.
+    LostCommand,
     /// Noise precedes an answer.
     Garbage,
     /// One byte of an answer is wrong.
@@ -117,7 +119,8 @@ pub struct Fault {
     /// How far the arm sinks, for `sag`, or a joint is moved, for `pushed` [rad]; width of an `object` [m or rad].
     #[serde(default = "default_amount", deserialize_with = "non_negative")]
     pub amount: f64,
-    /// Number of the joint, from 1, for `blocked`, `pushed` and `motor_off`.
+    /// Number of the joint, from 1, for `blocked`, `pushed`, `motor_off`, and `error_code` of an arm whose drives have
+    /// an error each.
     #[serde(default = "default_joint")]
     #[schemars(range(min = 1))]
     pub joint: usize,

@@ -73,6 +73,21 @@ impl<C: Controller + HasArm> Emulator for SerialServer<C> {
     fn motors_on(&self) -> Option<bool> {
         Some(self.with(|controller, _| controller.arm().enabled()))
     }
+
+    fn motor_switches(&self) -> Option<u32> {
+        Some(self.with(|controller, _| controller.arm().switches()))
+    }
+
+    fn temperatures(&self) -> Option<Joints> {
+        Some(self.with(|controller, _| controller.temperatures()))
+    }
+
+    fn gripper_position(&self) -> Option<f64> {
+        self.with(|controller, now| {
+            controller.advance(now);
+            controller.gripper_position()
+        })
+    }
 }
 
 impl<C: Controller> Drop for SerialServer<C> {

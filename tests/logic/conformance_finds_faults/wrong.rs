@@ -1,8 +1,9 @@
 //! An adapter with one mistake, around one that has none.
 
+use dimos::arm::JointStatus;
 use dimos::clock::{Clock, MonotonicClock};
 use dimos::hardware::adapter::*;
-use dimos::hardware::arms::{mock, xarm, yourarm};
+use dimos::hardware::arms::{mock, so101, xarm, yourarm};
 use dimos::hardware::registry::{AdapterConfig, AdapterSpec};
 use dimos::joint::ControlMode;
 
@@ -54,6 +55,16 @@ pub const DROPS_POWER_ON_DISCONNECTING: u8 = 39;
 pub const IGNORES_SPEED: u8 = 40;
 pub const CLEARING_ENABLES: u8 = 41;
 pub const GRIPPER_HURRIES_JOINTS: u8 = 42;
+pub const TOGGLES_POWER_ON_CONNECT: u8 = 43;
+pub const TOO_SLOW: u8 = 44;
+pub const SERVO_TOO_SLOW: u8 = 45;
+pub const CONFIRMS_UNSEEN: u8 = 46;
+pub const ERRORS_OF_FIRST_ONLY: u8 = 47;
+pub const LONG_TIMEOUT: u8 = 48;
+pub const STATUS_SHIFTED: u8 = 49;
+pub const GRIPPER_REVERSED: u8 = 50;
+pub const CLAIMS_TO_HOLD: u8 = 51;
+pub const ONE_VELOCITY_REVERSED: u8 = 52;
 pub const NO_MISTAKE: u8 = 255;
 
 /// The modes of an arm that takes only setpoints.
@@ -80,6 +91,8 @@ pub struct Wrong<const MISTAKE: u8> {
     ordered: bool,
     /// The next reading is to be the last once more.
     repeat: bool,
+    /// The last setpoint that was passed on [rad], and when.
+    passed: Option<([f64; 6], f64)>,
 }
 
 impl<const MISTAKE: u8> Wrong<MISTAKE> {
@@ -105,6 +118,13 @@ impl<const MISTAKE: u8> Wrong<MISTAKE> {
     };
     /// Around an arm with a wire that has no velocity mode.
     pub const SERVOS: AdapterSpec = AdapterSpec { modes: SERVO, ..Self::WIRED };
+    /// Around servos on a line, whose motors have errors of their own and which fall without power.
+    pub const BUS: AdapterSpec = AdapterSpec {
+        name: "wrong",
+        create: |config: &AdapterConfig| Ok(Box::new(Self::around((so101::SPEC.create)(config)?))),
+        holds_when_disabled: MISTAKE == CLAIMS_TO_HOLD,
+        ..so101::SPEC
+    };
     /// Around an arm that is said to fall without power.
     pub const FALLING: AdapterSpec = AdapterSpec { holds_when_disabled: false, ..Self::SPEC };
 
@@ -120,7 +140,23 @@ impl<const MISTAKE: u8> Wrong<MISTAKE> {
             late: false,
             ordered: false,
             repeat: false,
+            passed: None,
         }
+    }
+
+    /// Setpoints as an adapter passes them on that limits joints to a tenth of their top speed; `None` without limits.
+    fn limited(&mut self, positions: &[f64]) -> Option<[f64; 6]> {
+        let wanted = <[f64; 6]>::try_from(positions).ok().filter(|_| MISTAKE == SERVO_TOO_SLOW)?;
+        let (now, tops) = (MonotonicClock.now().0 as f64 * 1e-9, self.inner.get_limits().ok()?.velocity_max);
+        let mut here = [0.0; 6];
+        self.inner.read_joint_positions(&mut here).ok()?;
+        let (mut at, then) = self.passed.unwrap_or((here, now));
+        for ((at, wanted), top) in at.iter_mut().zip(wanted).zip(tops) {
+            let most = 0.1 * top * (now - then);
+            *at += (wanted - *at).clamp(-most, most);
+        }
+        self.passed = Some((at, now));
+        Some(at)
     }
 
     fn spoil(values: &mut [f64]) {
@@ -159,6 +195,10 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
         self.connections += 1;
         self.repeat = MISTAKE == STALE_STATE_AFTER_CONNECT;
         match MISTAKE {
+            TOGGLES_POWER_ON_CONNECT => {
+                let on = self.inner.read_enabled()?;
+                self.inner.write_enable(!on).and_then(|()| self.inner.write_enable(on))
+            }
             ENABLES_ON_CONNECT => self.inner.write_enable(true),
             CLEARS_ERRORS_ON_CONNECT => self.inner.write_clear_errors(),
             MOVES_ON_RECONNECTING if self.connections > 1 => {
@@ -191,7 +231,11 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
 
     fn get_info(&self) -> ManipulatorInfo {
         let info = self.inner.get_info();
-        if MISTAKE == VELOCITIES_SCALED { ManipulatorInfo { modes: SERVO, ..info } } else { info }
+        match MISTAKE {
+            VELOCITIES_SCALED => ManipulatorInfo { modes: SERVO, ..info },
+            CLAIMS_TO_HOLD => ManipulatorInfo { holds_when_disabled: true, ..info },
+            _ => info,
+        }
     }
 
     fn read_enabled(&mut self) -> AdapterResult<bool> {
@@ -221,7 +265,12 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
             *reading = last;
             return Ok(());
         }
-        match (self.inner.read_joints(reading), self.last) {
+        let began = MonotonicClock.now();
+        let result = self.inner.read_joints(reading);
+        if MISTAKE == LONG_TIMEOUT && MonotonicClock.now().seconds_since(began) > 0.008 {
+            std::thread::sleep(std::time::Duration::from_millis(150));
+        }
+        match (result, self.last) {
             (Err(_), Some(last)) if MISTAKE == HIDES_SILENCE => *reading = last,
             (Err(error), _) if MISTAKE == TAKES_LATE_ANSWERS => {
                 self.late = true;
@@ -247,6 +296,9 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
         if let Some(velocity) = reading.velocity.as_mut().filter(|_| MISTAKE == VELOCITIES_SCALED) {
             *velocity = velocity.map(|v| -651.0 * v);
         }
+        if let Some(velocity) = reading.velocity.as_mut().filter(|_| MISTAKE == ONE_VELOCITY_REVERSED) {
+            velocity[2] = -velocity[2];
+        }
         if MISTAKE == RESTAMPS_STATES {
             reading.stamp = Some(MonotonicClock.now());
         }
@@ -264,6 +316,12 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
 
     fn read_error(&mut self) -> AdapterResult<(i32, String)> {
         let error = self.inner.read_error()?;
+        if MISTAKE == ERRORS_OF_FIRST_ONLY {
+            let mut joints = [JointStatus::default(); 5];
+            let monitor = self.inner.joint_monitor().ok_or(AdapterError::Unsupported)?;
+            monitor.read_joint_status(&mut joints)?;
+            return Ok(if joints[0].error == Some(0) { (0, String::new()) } else { error });
+        }
         Ok(if MISTAKE == HIDES_ERRORS { (0, String::new()) } else { error })
     }
 
@@ -276,8 +334,13 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
             return self.inner.write_joint_positions(&positions, velocity);
         }
         self.goal = positions.try_into().ok();
-        let velocity = if MISTAKE == IGNORES_SPEED { 1.0 } else { velocity };
-        let result = self.inner.write_joint_positions(positions, velocity);
+        let velocity = match MISTAKE {
+            IGNORES_SPEED => 1.0,
+            TOO_SLOW => 0.1 * velocity,
+            _ => velocity,
+        };
+        let limited = self.limited(positions);
+        let result = self.inner.write_joint_positions(limited.as_ref().map_or(positions, |all| &all[..]), velocity);
         if MISTAKE == MOVES_WITHOUT_POWER { Ok(()) } else { result }
     }
 
@@ -287,6 +350,14 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
             IGNORES_STOP if self.inner.is_connected() => Ok(Stop::Confirmed),
             CANNOT_STOP_AFTER_RECONNECTING if self.connections > 1 => Ok(Stop::Confirmed),
             CONFIRMS_ALWAYS => self.inner.write_stop().or(Ok(Stop::Confirmed)),
+            CONFIRMS_UNSEEN => {
+                let mut here = [0.0; 5];
+                self.inner.read_joint_positions(&mut here)?;
+                let mode = self.inner.get_control_mode();
+                self.inner.set_control_mode(ControlMode::ServoPosition)?;
+                self.inner.write_joint_positions(&here, 1.0)?;
+                self.inner.set_control_mode(mode).map(|()| Stop::Confirmed)
+            }
             STOP_DROPS_POWER => self.inner.write_enable(false).map(|()| Stop::Confirmed),
             STOP_CLEARS_ERRORS => self.inner.write_clear_errors().map(|()| Stop::Confirmed),
             // The arm's own stop holds the gripper too; this one does not.
@@ -303,14 +374,37 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
         if self.inner.gripper().is_some() { Some(self) } else { None }
     }
 
+    fn joint_monitor(&mut self) -> Option<&mut dyn JointMonitor> {
+        if self.inner.joint_monitor().is_some() { Some(self) } else { None }
+    }
+
     fn force_torque(&mut self) -> Option<&mut dyn ForceTorque> {
         if MISTAKE == FAILS_WITHOUT_SENSOR { Some(self) } else { None }
+    }
+}
+
+impl<const MISTAKE: u8> JointMonitor for Wrong<MISTAKE> {
+    fn read_joint_status(&mut self, joints: &mut [JointStatus]) -> AdapterResult<()> {
+        self.inner.joint_monitor().ok_or(AdapterError::Unsupported)?.read_joint_status(joints)?;
+        if MISTAKE == STATUS_SHIFTED {
+            joints.rotate_left(1);
+        }
+        Ok(())
+    }
+}
+
+impl<const MISTAKE: u8> Wrong<MISTAKE> {
+    /// A gripper's position as an adapter sees it that takes open for closed.
+    fn reversed(&mut self, position: f64) -> f64 {
+        let range = self.inner.gripper().and_then(|gripper| gripper.get_gripper_range());
+        range.filter(|_| MISTAKE == GRIPPER_REVERSED).map_or(position, |(closed, open)| closed + open - position)
     }
 }
 
 impl<const MISTAKE: u8> Gripper for Wrong<MISTAKE> {
     fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
         let position = self.inner.gripper().map_or(Ok(None), |gripper| gripper.read_gripper_position())?;
+        let position = position.map(|position| self.reversed(position));
         Ok(position.map(|metres| if MISTAKE == GRIPPER_IN_MILLIMETRES { 1000.0 * metres } else { metres }))
     }
     fn get_gripper_force_range(&mut self) -> Option<(f64, f64)> {
@@ -339,6 +433,7 @@ impl<const MISTAKE: u8> Gripper for Wrong<MISTAKE> {
             STOP_LOCKS_GRIPPER if self.stopped => return Err(AdapterError::Rejected("stopped".into())),
             _ => self.gripper = position,
         }
+        let position = self.reversed(position);
         if let Some(goal) = self.goal.filter(|_| MISTAKE == GRIPPER_HURRIES_JOINTS) {
             self.inner.write_joint_positions(&goal, 1.0)?;
         }

@@ -9,7 +9,7 @@ use std::time::Duration;
 use super::bus::Bus;
 use super::calibration::{Calibration, Range};
 use super::protocol::{SERVOS, Servo, TURN, register};
-use super::servos::{error_of, must_stop};
+use super::servos::{WRITES, error_of, must_stop};
 use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, TOP_SPEED, check, limits};
 use crate::clock::Mono;
 use crate::hardware::adapter::{
@@ -73,7 +73,8 @@ impl So101Adapter {
         self.calibration.0.get(servo).copied().unwrap_or(Calibration::default().0[0])
     }
 
-    /// Writes goals of the joints with a top speed [counts/s, 0 = none]; the gripper keeps its own.
+    /// Writes goals of the joints with a top speed [counts/s, 0 = none]; the gripper keeps its own. A planned move has
+    /// a top speed, and is written until the servos show it; after a setpoint the next one follows at once.
     fn drive(&mut self, joints: [f64; DOF], speed: u16) -> AdapterResult<()> {
         let servos = self.not_older(WRITABLE)?;
         if let Some(joint) = servos.iter().take(DOF).position(|servo| !servo.on) {
@@ -82,7 +83,7 @@ impl So101Adapter {
         if let Some((code, text)) = error_of(&servos) {
             return Err(AdapterError::Fault { code, text });
         }
-        let mut values = [[0; 7]; SERVOS];
+        let (mut values, mut goals) = ([[0; 7]; SERVOS], [0; SERVOS]);
         for (j, value) in values.iter_mut().enumerate() {
             let held = servos.get(j).map_or(0, |servo| servo.goal);
             let (goal, speed) = match joints.get(j) {
@@ -90,13 +91,19 @@ impl So101Adapter {
                 None => (self.gripper_goal.unwrap_or(held), self.gripper_speed),
             };
             let ([g0, g1], [s0, s1]) = ((goal.max(0) as u16).to_le_bytes(), speed.to_le_bytes());
+            goals.iter_mut().skip(j).take(1).for_each(|to| *to = goal.max(0));
             *value = [ACCELERATION, g0, g1, 0, 0, s0, s1];
         }
-        let seen = self.state;
-        self.write(register::ACCELERATION, values)?;
-        // Goals change nothing of what was measured.
-        self.state = seen;
-        Ok(())
+        for _ in 0..WRITES {
+            let seen = self.state;
+            self.write(register::ACCELERATION, values)?;
+            // Goals change nothing of what was measured.
+            self.state = seen;
+            if speed == 0 || self.fetch()?.iter().zip(&goals).all(|(servo, goal)| servo.goal == *goal) {
+                return Ok(());
+            }
+        }
+        Err(AdapterError::Protocol("so101: the servos do not take their goals".into()))
     }
 
     fn angles(&self, of: impl Fn(usize, Range) -> f64) -> Joints {

@@ -16,7 +16,7 @@ const CYCLE: Retry = Retry { each: Duration::from_millis(30), times: 3 };
 /// A state answers further questions for this time.
 const STATE_AGE: Duration = Duration::from_millis(5);
 /// How often torque and goals are written until the servos show them: nothing acknowledges a write to all.
-const WRITES: u32 = 4;
+pub(super) const WRITES: u32 = 4;
 /// A goal this far from the joint is that joint's position [counts]: encoders flicker.
 const SAME: i32 = 3;
 /// A joint at rest further than this from its goal has not started yet, or is blocked [counts]; nearer, it droops.

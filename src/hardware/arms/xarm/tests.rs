@@ -390,7 +390,7 @@ fn an_arm_in_error_is_disabled_all_the_same() {
 #[test]
 fn grippers_conform() {
     let gripper = |check: &&Check| check.name.contains("gripper");
-    assert_eq!(checks().filter(gripper).count(), 5);
+    assert_eq!(checks().filter(gripper).count(), 6);
     std::thread::scope(|scope| {
         for (check, gripper) in checks().filter(gripper).flat_map(|check| [(check, "xarm"), (check, "xarm_g2")]) {
             scope.spawn(move || {

@@ -1,5 +1,6 @@
 //! The motion of one joint: out and back in one mode, and a stop on the way.
 
+use std::collections::VecDeque;
 use std::ops::Range;
 use std::time::Duration;
 
@@ -17,6 +18,9 @@ const GOAL_TOLERANCE: f64 = 0.3 * DEGREE;
 const MAX_OVERSHOOT: f64 = 1.0 * DEGREE;
 /// Tracking error that counts as unexpected [rad].
 const MAX_TRACKING_ERROR: f64 = 1.5 * DEGREE;
+/// A planned move may be this many times as fast as ordered; its speed is an average over this time [s].
+const MAX_SPEED_RATIO: f64 = 2.5;
+const SPEED_WINDOW: f64 = 0.05;
 /// How long one move may take.
 pub(super) const MOVE_TIMEOUT: Duration = Duration::from_secs(15);
 /// Readings from one setpoint of a stream to the next. A reading right after each setpoint only would always see the
@@ -38,6 +42,20 @@ pub(super) struct Observed {
     moved: f64,
     others: f64,
     integral: Option<f64>,
+}
+
+/// Adds a position [rad] to the recent path. Returns the speed [rad/s] and its ratio to the ordered one if it is too
+/// fast.
+fn check_speed(path: &mut VecDeque<(Mono, f64)>, at: Mono, moved: f64, ordered: f64) -> Result<(), (f64, f64)> {
+    path.push_back((at, moved));
+    while path.get(1).is_some_and(|(then, _)| at.seconds_since(*then) >= SPEED_WINDOW) {
+        path.pop_front();
+    }
+    let Some((then, before)) = path.front().filter(|(then, _)| at.seconds_since(*then) >= SPEED_WINDOW) else {
+        return Ok(());
+    };
+    let speed = (moved - before).abs() / at.seconds_since(*then);
+    if speed > MAX_SPEED_RATIO * ordered { Err((speed, speed / ordered)) } else { Ok(()) }
 }
 
 impl FirstMotion<'_> {
@@ -87,6 +105,7 @@ impl FirstMotion<'_> {
         let began = MonotonicClock.now();
         let (mut seen, mut last) = (Observed::default(), None);
         let (mut streamed, mut before_this) = (0.0, began);
+        let mut path = VecDeque::new();
         let (mut still, mut point) = (0, if stream { from } else { to });
         self.trace.iter_mut().for_each(Trace::begin_wave);
         for sample in 0_u32.. {
@@ -115,6 +134,13 @@ impl FirstMotion<'_> {
             seen = self.check_motion(joint, from, to, &positions, seen)?;
             if let Some(trace) = &mut self.trace {
                 trace.saw(now, at, seen.moved);
+            }
+            if !stream {
+                check_speed(&mut path, at, seen.moved, SPEED * top).map_err(|(speed, ratio)| {
+                    let what =
+                        format!("joint {} moves at {speed:.2} rad/s, {ratio:.1} times as fast as ordered", joint + 1);
+                    FirstMotionEnd::Unexpected(what)
+                })?;
             }
             if stream && (seen.moved - point).abs() > MAX_TRACKING_ERROR {
                 let behind = (seen.moved - point).abs().to_degrees();

@@ -373,6 +373,10 @@ impl HasArm for Control {
         &mut self.arm
     }
 
+    fn gripper_position(&mut self) -> Option<f64> {
+        Some(self.hand.width())
+    }
+
     /// The cycle advances the arm.
     fn advance(&mut self, _now: Mono) {}
 

@@ -44,6 +44,11 @@ impl Hand {
         Self { fingers, homed: true, grasped: false, motion: None, client: None, messages: 0 }
     }
 
+    /// Returns the distance of the fingers [m].
+    pub fn width(&self) -> f64 {
+        self.fingers.position
+    }
+
     /// Processes the command at the front of a connection's bytes. Returns the answers that are due.
     pub fn request(&mut self, who: Who, at: IpAddr, bytes: &[u8], answers: &mut Vec<(Who, Vec<u8>)>) -> Scan<Delivery> {
         let Some([a, b, c, d, e, f, g, h, i, j]) = bytes.first_chunk::<10>().copied() else { return Scan::More };

@@ -244,6 +244,10 @@ impl Emulator for FrankaEmulator {
     fn true_positions(&self) -> Option<Joints> {
         self.server.true_positions()
     }
+
+    fn gripper_position(&self) -> Option<f64> {
+        self.server.gripper_position()
+    }
 }
 
 /// Returns the limits within which the emulated joints move: the controller's, with a drive that is stronger.

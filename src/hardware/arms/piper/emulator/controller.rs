@@ -265,6 +265,9 @@ impl CanController for Controller {
     fn on_frame(&mut self, frame: &CanFrame, now: Mono, answers: &mut Vec<CanFrame>) {
         self.advance(now);
         self.arm.client_came();
+        if self.arm.loses_command() {
+            return;
+        }
         self.trace.push(|| (now, *frame));
         self.execute(frame, answers);
     }

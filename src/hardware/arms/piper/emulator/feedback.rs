@@ -4,6 +4,7 @@ use super::super::protocol::DOF;
 use super::controller::{Controller, first, millidegrees};
 use super::kinematics::Links;
 use super::wire::{self, Status};
+use crate::hardware::sim::arm::SimArm;
 use crate::hardware::sim::faults::FaultKind;
 use crate::hardware::sim::reach::Chain;
 use crate::hardware::transport::can::CanFrame;
@@ -52,8 +53,9 @@ impl Controller {
         }
         if self.ticks.is_multiple_of(5) {
             for joint in 1..=DOF as u16 {
-                let on = self.arm.motor(usize::from(joint - 1));
-                out.push(wire::driver(joint, 240, [35, 30], if on { 0x40 } else { 0 }, if on { 400 } else { 20 }));
+                let (on, celsius) =
+                    (self.arm.motor(usize::from(joint - 1)), SimArm::temperature((joint - 1).into()) as i8);
+                out.push(wire::driver(joint, 240, [celsius, 30], if on { 0x40 } else { 0 }, if on { 400 } else { 20 }));
             }
         }
         if let Some(muted) = &self.muted {

@@ -33,6 +33,7 @@ use controller::Controller;
 pub(super) const PLAYABLE: &[FaultKind] = &[
     FaultKind::Stall,
     FaultKind::Silent,
+    FaultKind::LostCommand,
     FaultKind::ErrorCode,
     FaultKind::Estop,
     FaultKind::PowerLoss,
@@ -219,6 +220,18 @@ impl Emulator for PiperEmulator {
 
     fn motors_on(&self) -> Option<bool> {
         self.server.motors_on()
+    }
+
+    fn motor_switches(&self) -> Option<u32> {
+        self.server.motor_switches()
+    }
+
+    fn temperatures(&self) -> Option<Joints> {
+        self.server.temperatures()
+    }
+
+    fn gripper_position(&self) -> Option<f64> {
+        self.server.gripper_position()
     }
 
     fn gripper_force(&self) -> Option<f64> {

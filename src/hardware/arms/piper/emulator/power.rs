@@ -83,6 +83,10 @@ impl HasArm for Controller {
         &mut self.arm
     }
 
+    fn gripper_position(&mut self) -> Option<f64> {
+        self.has_gripper.then_some(self.gripper.position)
+    }
+
     /// An E-stop that ends after its duration leaves no error.
     fn advance(&mut self, now: Mono) {
         let (before, open) = (self.arm.now(), self.arm.estop_open());

@@ -229,6 +229,10 @@ impl HasArm for Controller {
         &mut self.arm
     }
 
+    fn gripper_position(&mut self) -> Option<f64> {
+        Some(self.gripper.position)
+    }
+
     /// Stops a commanded arm when no request arrives within the timeout: the client may hang.
     fn advance(&mut self, now: Mono) {
         let deadline = self.heard.after(SILENCE_TIMEOUT);

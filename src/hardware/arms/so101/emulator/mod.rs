@@ -23,6 +23,7 @@ pub use servos::Servos;
 const PLAYABLE: &[FaultKind] = &[
     FaultKind::Stall,
     FaultKind::Silent,
+    FaultKind::LostCommand,
     FaultKind::Disconnect,
     FaultKind::ErrorCode,
     FaultKind::PowerLoss,

@@ -175,7 +175,7 @@ impl Servos {
 
     /// The error bits of a servo.
     fn error(&self, servo: usize) -> u8 {
-        if servo == 0 { self.arm.error() as u8 } else { 0 }
+        self.arm.error_of(servo) as u8
     }
 
     /// What is read from registers of a servo.
@@ -194,7 +194,14 @@ impl Servos {
         set(58, &with_sign(speed.round() as i32).to_le_bytes());
         set(
             60,
-            &[0, 0, self.voltage, 31, u8::from(self.held.iter().any(|(held, ..)| *held == servo)), self.error(servo)],
+            &[
+                0,
+                0,
+                self.voltage,
+                SimArm::temperature(servo) as u8,
+                u8::from(self.held.iter().any(|(held, ..)| *held == servo)),
+                self.error(servo),
+            ],
         );
         set(66, &[u8::from(speed.abs() > 3.0)]);
         (address..address + length).map(|i| all.get(i).copied().unwrap_or_default()).collect()
@@ -259,7 +266,7 @@ impl Servos {
             let off = goals.get(servo).zip(positions.get(servo)).map_or(0.0, |(goal, position)| goal - position);
             off.abs() < 0.01
         };
-        if self.arm.error() != 0 && near(0) {
+        if (0..SERVOS).any(|servo| self.error(servo) != 0 && near(servo)) {
             let _ = self.arm.clear_error();
         }
         for servo in 0..SERVOS {
@@ -354,6 +361,12 @@ impl HasArm for Servos {
     fn arm(&mut self) -> &mut SimArm {
         &mut self.arm
     }
+
+    /// From closed, the end of its range.
+    fn gripper_position(&mut self) -> Option<f64> {
+        let closed = RANGES.last().map_or(0.0, |range| range.0);
+        self.arm.joints().0.get(SERVOS - 1).map(|angle| angle - closed)
+    }
 }
 
 impl Controller for Servos {
@@ -368,7 +381,11 @@ impl Controller for Servos {
         if self.arm.take_fault(FaultKind::WrongModel).is_some() {
             self.wrong_model = true;
         }
-        self.execute(id, instruction, &parameters, answer);
+        // Writes to several servos have no status.
+        let unanswered = matches!((id, instruction), (_, 0x83) | (ALL, 0x03..=0x05));
+        if !(unanswered && self.arm.loses_command()) {
+            self.execute(id, instruction, &parameters, answer);
+        }
         // Only what is answered can be lost.
         let delivery = if answer.is_empty() { Delivery::Send } else { self.arm.delivery() };
         if matches!(delivery, Delivery::PowerLoss(_)) {

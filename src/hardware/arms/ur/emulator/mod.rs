@@ -272,6 +272,14 @@ impl Emulator for UrEmulator {
     fn motors_on(&self) -> Option<bool> {
         self.server.motors_on()
     }
+
+    fn motor_switches(&self) -> Option<u32> {
+        self.server.motor_switches()
+    }
+
+    fn temperatures(&self) -> Option<Joints> {
+        self.server.temperatures()
+    }
 }
 
 /// Returns the limits within which the emulated joints move.

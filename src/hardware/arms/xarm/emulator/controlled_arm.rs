@@ -241,6 +241,10 @@ impl HasArm for super::controller::Controller<SimArm> {
         &mut self.arm
     }
 
+    fn gripper_position(&mut self) -> Option<f64> {
+        Some(self.tool.opening())
+    }
+
     fn advance(&mut self, now: Mono) {
         self.advance(now);
     }

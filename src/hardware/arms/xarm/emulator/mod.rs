@@ -236,6 +236,18 @@ impl Emulator for XArmEmulator {
         self.server.motors_on()
     }
 
+    fn motor_switches(&self) -> Option<u32> {
+        self.server.motor_switches()
+    }
+
+    fn temperatures(&self) -> Option<Joints> {
+        self.server.temperatures()
+    }
+
+    fn gripper_position(&self) -> Option<f64> {
+        self.server.gripper_position()
+    }
+
     fn gripper_force(&self) -> Option<f64> {
         self.server.with(|controller, _| controller.tool.force())
     }

@@ -1,5 +1,7 @@
 //! The reports, byte by byte as the vendor's page "Data Description of TCP port" has them.
 
+use crate::hardware::sim::arm::SimArm;
+
 /// What a report shows, in units of the wire.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Snapshot {
@@ -158,7 +160,7 @@ fn rich(s: &Snapshot, out: &mut Vec<u8>) {
     packet.floats(181, &[10_000.0, 1.0, 50_000.0, 0.1, 1000.0]);
     packet.floats(201, &[20.0, 0.01, 20.0, 1e-4, std::f32::consts::PI]);
     packet.floats(221, &[100.0, 40.0]);
-    packet.bytes(245, &[30; 7]);
+    packet.bytes(245, &std::array::from_fn::<u8, 7, _>(|joint| SimArm::temperature(joint) as u8));
     (0..7).for_each(|joint| packet.bytes(341 + 2 * joint, &4800_u16.to_be_bytes()));
     packet.floats(355, &s.torque.map(|torque| torque / 10.0));
     packet.floats(256, &s.velocity);

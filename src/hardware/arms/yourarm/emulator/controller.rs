@@ -14,7 +14,7 @@ use crate::hardware::sim::reach::Chain;
 use crate::hardware::sim::stream;
 use crate::hardware::sim::trace::Trace;
 use crate::hardware::transport::Scan;
-use crate::joint::{ControlMode, Joints};
+use crate::joint::{ControlMode, Joints, joints_of};
 use crate::pose;
 
 /// Pose at power-up [rad] if the options give none: not zero, so that mistakes show.
@@ -30,9 +30,8 @@ const MAX_LOAD: f32 = 5.0;
 /// Rated torque of each joint [Nm], and torque per motor current [Nm/A].
 const RATED_TORQUE: [f64; DOF] = [60.0, 60.0, 40.0, 15.0, 15.0, 10.0];
 const TORQUE_PER_AMPERE: f64 = 10.0;
-/// Supply voltage [V], and temperature of a motor without load [°C].
+/// Supply voltage [V].
 const SUPPLY: f64 = 48.0;
-const AMBIENT: f64 = 30.0;
 /// Encoder offsets of this arm's factory calibration [deg].
 const OFFSETS: [f32; DOF] = [1.5, -2.0, 0.0, 0.25, 10.0, -0.5];
 /// Error of a drive whose motor has lost its power.
@@ -192,7 +191,7 @@ impl Controller {
         let (mut drives, torques) = ([Default::default(); DOF], first(&self.arm.efforts()));
         for (i, (drive, (torque, rated))) in drives.iter_mut().zip(torques.into_iter().zip(RATED_TORQUE)).enumerate() {
             let load = torque / rated;
-            let values = [AMBIENT + i as f64 + 20.0 * load.abs(), torque / TORQUE_PER_AMPERE, SUPPLY, 100.0 * load];
+            let values = [SimArm::temperature(i) + 20.0 * load.abs(), torque / TORQUE_PER_AMPERE, SUPPLY, 100.0 * load];
             // With all motors off none has lost its power.
             let error = if any_on && !self.arm.motor(i) { DRIVE_OFF } else { 0 };
             *drive = (values.map(|v| v as f32), error);
@@ -252,6 +251,14 @@ fn radians(degrees: [f32; DOF]) -> [f64; DOF] {
 impl HasArm for Controller {
     fn arm(&mut self) -> &mut SimArm {
         &mut self.arm
+    }
+
+    fn gripper_position(&mut self) -> Option<f64> {
+        Some(self.gripper.position)
+    }
+
+    fn temperatures(&mut self) -> Joints {
+        joints_of(&self.drives().map(|([celsius, ..], _)| celsius.into()))
     }
 
     fn advance(&mut self, now: Mono) {

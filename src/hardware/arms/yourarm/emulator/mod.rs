@@ -123,6 +123,18 @@ impl Emulator for YourArmEmulator {
         self.server.motors_on()
     }
 
+    fn motor_switches(&self) -> Option<u32> {
+        self.server.motor_switches()
+    }
+
+    fn temperatures(&self) -> Option<Joints> {
+        self.server.temperatures()
+    }
+
+    fn gripper_position(&self) -> Option<f64> {
+        self.server.gripper_position()
+    }
+
     fn gripper_force(&self) -> Option<f64> {
         Some(self.server.with(|controller, _| controller.gripper.max_force))
     }
