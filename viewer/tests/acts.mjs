@@ -23,8 +23,8 @@ after(async () => {
 const near = (a, b, tolerance = 0.01) => a.every((value, i) => Math.abs(value - b[i]) < tolerance);
 const joint1 = () => watch.positions.left_joint1;
 const press = async (on, name) => {
-  const {x, y, width, height} = await on.locator(`[data-jog="${name}"]`).boundingBox();
-  await on.mouse.move(x + width / 2, y + height / 2);
+  // Waits until the button neither moves nor is covered: the panel may still be laid out.
+  await on.locator(`[data-jog="${name}"]`).hover();
   await on.mouse.down();
 };
 
