@@ -84,33 +84,32 @@ pub trait Emulator: Send {
     fn address(&self) -> String;
     /// Injects a fault that begins `fault.at` seconds from now; the error lists the faults that the emulator can play.
     fn inject(&self, fault: Fault) -> Result<(), String>;
-    /// Returns the true joint positions [rad], for checks and for display; `None` if unknown.
+    /// Returns what is true of the emulated arm, whatever it reports; for checks and for display.
+    fn truth(&self) -> Truth {
+        Truth::default()
+    }
+    /// Returns the true joint positions [rad]; `None` if unknown.
     fn true_positions(&self) -> Option<Joints> {
-        None
+        self.truth().positions
     }
-    /// Returns whether all motors of its joints are on, whether or not a client is connected; `None` if unknown, or if
-    /// its controller holds the arm without being asked.
-    fn motors_on(&self) -> Option<bool> {
-        None
-    }
-    /// Returns how often a motor of its joints was switched on or off; `None` if unknown.
-    fn motor_switches(&self) -> Option<u32> {
-        None
-    }
-    /// Returns the temperatures of its drives [°C]; `None` if unknown.
-    fn temperatures(&self) -> Option<Joints> {
-        None
-    }
-    /// Returns the true position of its gripper, in the unit of the adapter [m or rad]; `None` if unknown, or without a
-    /// gripper.
-    fn gripper_position(&self) -> Option<f64> {
-        None
-    }
-    /// Returns the largest force that its gripper was given, in the unit of the adapter's force; `None` if it has no
-    /// gripper with force control.
-    fn gripper_force(&self) -> Option<f64> {
-        None
-    }
+}
+
+/// What is true of an emulated arm. What is unknown is `None`.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Truth {
+    /// Joint positions [rad].
+    pub positions: Option<Joints>,
+    /// Whether all motors of its joints are on, whether or not a client is connected; also `None` if its controller
+    /// holds the arm without being asked.
+    pub motors_on: Option<bool>,
+    /// How often a motor of its joints was switched on or off.
+    pub motor_switches: Option<u32>,
+    /// Temperatures of the joints' drives [°C].
+    pub temperatures: Option<Joints>,
+    /// Position of its gripper, in the unit of the adapter [m or rad].
+    pub gripper_position: Option<f64>,
+    /// Largest force that its gripper was given, in the unit of the adapter's force; `None` without force control.
+    pub gripper_force: Option<f64>,
 }
 
 /// Where an emulator listens.

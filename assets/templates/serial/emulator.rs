@@ -7,7 +7,7 @@ use std::f64::consts::TAU;
 
 use dimos::clock::{Clock, Mono, MonotonicClock};
 use dimos::hardware::adapter::AdapterResult;
-use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
+use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, Truth};
 use dimos::hardware::sim::arm::{Delivery, HasArm, SimArm};
 use dimos::hardware::sim::faults::FaultKind;
 use dimos::hardware::sim::gripper::Gripper;
@@ -70,8 +70,8 @@ impl HasArm for Servos {
         &mut self.arm
     }
 
-    fn gripper_position(&mut self) -> Option<f64> {
-        Some(self.gripper.position * OPEN)
+    fn complete(&self, truth: &mut Truth) {
+        truth.gripper_position = Some(self.gripper.position * OPEN);
     }
 }
 

@@ -7,7 +7,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult, JointReading, ManipulatorAdapter};
-use crate::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, EmulatorAddress};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, EmulatorAddress, Truth};
 use crate::hardware::sim::faults::Fault;
 use crate::joint::{ControlMode, JointLimits};
 
@@ -235,10 +235,14 @@ impl Context {
         self.until("the last setpoint", |context| Ok(farthest(&context.positions()?, goal) < 1e-3))
     }
 
+    /// Returns what is true of the emulated arm; nothing is known of a real one.
+    pub fn truth(&self) -> Truth {
+        self.emulator.as_ref().map_or(Truth::default(), |emulator| emulator.truth())
+    }
+
     /// Returns the true joint positions of the emulated arm [rad]; `None` if they are unknown.
     pub fn true_positions(&self) -> Option<Vec<f64>> {
-        let all = self.emulator.as_ref()?.true_positions()?;
-        Some(all.get(..self.config.dof).unwrap_or_default().to_vec())
+        Some(self.truth().positions?.get(..self.config.dof).unwrap_or_default().to_vec())
     }
 
     /// Returns joint positions [rad] that were measured after this call.

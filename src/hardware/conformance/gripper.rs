@@ -97,8 +97,7 @@ fn unit(context: &mut Context) -> Result<(), String> {
 fn own_gripper(context: &mut Context) -> Result<(), String> {
     context.leave_out_calibration()?;
     let Some((info, start)) = ready(context)? else { return context.skip("it has no gripper") };
-    let own = |context: &Context| context.emulator.as_ref().and_then(|emulator| emulator.gripper_position());
-    if own(context).is_none() {
+    if context.truth().gripper_position.is_none() {
         return context.skip("the true position of its emulated gripper is unknown");
     }
     let (tolerance, unit) = (in_unit(info.unit, 2.0 * TOLERANCE), info.unit.name());
@@ -107,7 +106,7 @@ fn own_gripper(context: &mut Context) -> Result<(), String> {
             context.command_gripper(position)?;
             arrives(context, info.unit, position)?;
         }
-        let found = own(context).unwrap_or(f64::NAN);
+        let found = context.truth().gripper_position.unwrap_or(f64::NAN);
         require((found - position).abs() < tolerance, || {
             format!("it reads {position:.4} {unit}, the emulated gripper is at {found:.4} {unit}")
         })?;
@@ -150,22 +149,21 @@ fn force(context: &mut Context) -> Result<(), String> {
         require(result.is_err(), || format!("a force of {force} {unit} is taken"))?;
     }
     rests(context, info.unit, start)?;
-    let reached = |context: &Context| context.emulator.as_ref().and_then(|emulator| emulator.gripper_force());
     // A command has reached the arm once the gripper is at its target.
     context.command_gripper(target)?;
     arrives(context, info.unit, target)?;
-    let own = reached(context);
+    let own = context.truth().gripper_force;
     let (low, middle) = (least + (most - least) / 8.0, (least + most) / 2.0);
     for (position, force) in [(start, middle), (target, low)] {
         command(context, position, force).map_err(|e| format!("write_gripper_position_with_force: {e}"))?;
         arrives(context, info.unit, position)?;
-        let reached = reached(context);
+        let reached = context.truth().gripper_force;
         let same = reached.is_none_or(|reached| (reached - force).abs() <= (most - least) / 100.0);
         require(same, || format!("{force} {unit} was commanded, the arm has {reached:?} {unit}"))?;
     }
     context.command_gripper(start)?;
     arrives(context, info.unit, start)?;
-    let after = reached(context);
+    let after = context.truth().gripper_force;
     require(after == own, || format!("without a force the arm has {own:?} {unit}, after a force {after:?} {unit}"))?;
     let measured = context.adapter.gripper().map_or(Ok(None), |gripper| gripper.read_gripper_force());
     let measured = measured.map_err(|e| format!("read_gripper_force: {e}"))?;

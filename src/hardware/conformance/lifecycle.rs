@@ -52,15 +52,10 @@ fn not_connected_is_said(context: &mut Context) -> Result<(), String> {
     Ok(())
 }
 
-/// Returns how often the emulated arm's motors were switched.
-fn switches(context: &Context) -> Option<u32> {
-    context.emulator.as_ref().and_then(|emulator| emulator.motor_switches())
-}
-
 fn connecting_changes_nothing(context: &mut Context) -> Result<(), String> {
-    let untouched = switches(context);
+    let untouched = context.truth().motor_switches;
     context.connect()?;
-    require(switches(context) == untouched, || "connect switched motors on and off".into())?;
+    require(context.truth().motor_switches == untouched, || "connect switched motors on and off".into())?;
     require(context.adapter.is_connected(), || "is_connected is false".into())?;
     let start = context.positions()?;
     // A real arm is in the state in which its last user left it; an emulator has just been switched on.
@@ -121,12 +116,11 @@ fn leaving_moves_nothing(context: &mut Context) -> Result<(), String> {
     context.adapter.disconnect();
     context.adapter.disconnect();
     require(!context.adapter.is_connected(), || "is_connected is true".into())?;
-    let motors = context.emulator.as_ref().map(|emulator| emulator.motors_on());
-    let untouched = switches(context);
+    let before = context.truth();
     context.connect()?;
-    require(switches(context) == untouched, || "connect switched motors off and on".into())?;
+    require(context.truth().motor_switches == before.motor_switches, || "connect switched motors off and on".into())?;
     // An adapter may say that an arm is not enabled before it is activated again: the emulator has the motors.
-    let on = motors.map_or_else(|| context.enabled(), |motors| Ok(motors != Some(false)))?;
+    let on = if context.emulator.is_some() { before.motors_on != Some(false) } else { context.enabled()? };
     require(on, || "disconnect switched the motors off: an arm without brakes falls".into())?;
     context.stays(&start, 0.005)
 }

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 use super::Check;
 use super::Needs::Faults;
 use super::context::{Context, farthest, pause, require};
+use super::stops::set_off;
 use crate::hardware::adapter::{JointReading, Stop};
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::joint::ControlMode;
@@ -20,8 +21,6 @@ pub const CHECKS: &[Check] = &[
     Check::new(Faults, "a_lost_answer_holds_no_arm", "one lost answer costs less than stale_after", answers),
 ];
 
-/// Speed of the planned moves, as a fraction of the top speed.
-const SPEED: f64 = 0.1;
 /// How long a stopped arm is observed, and how far it may move meanwhile [rad].
 const OBSERVATION_TIME: Duration = Duration::from_millis(300);
 const COASTING: f64 = 0.01;
@@ -48,9 +47,7 @@ fn commands(context: &mut Context) -> Result<(), String> {
         if context.command(&near, 0.5).is_ok() {
             context.until("a planned move", |context| Ok(farthest(&context.positions()?, &near) < 1e-3))?;
         }
-        let (start, far) = (context.standstill()?, context.far()?);
-        context.command(&far, SPEED)?;
-        context.until("motion", |context| Ok(farthest(&context.positions()?, &start) > 0.01))?;
+        set_off(context)?;
         context.trigger_faults()?;
         if context.adapter.write_stop() == Ok(Stop::Confirmed) {
             let here = context.positions()?;

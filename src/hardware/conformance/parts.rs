@@ -106,8 +106,7 @@ fn joint_status(context: &mut Context) -> Result<(), String> {
         let known = *joint != JointStatus::default();
         require(known, || format!("joint {}: nothing is reported; return None for the part", i + 1))?;
     }
-    let own = context.emulator.as_ref().and_then(|emulator| emulator.temperatures());
-    for (i, (joint, own)) in joints.iter().zip(own.iter().flatten()).enumerate() {
+    for (i, (joint, own)) in joints.iter().zip(context.truth().temperatures.iter().flatten()).enumerate() {
         let same = joint.temperature.is_none_or(|celsius| (celsius - own).abs() <= ROUNDED);
         require(same, || format!("joint {}: {:?} °C, the emulated drive has {own} °C", i + 1, joint.temperature))?;
     }

@@ -60,7 +60,7 @@ fn stop_at_rest(context: &mut Context) -> Result<(), String> {
 }
 
 /// Starts a long move, and waits until the arm is moving.
-fn set_off(context: &mut Context) -> Result<Vec<f64>, String> {
+pub fn set_off(context: &mut Context) -> Result<Vec<f64>, String> {
     let start = context.positions()?;
     let far = context.far()?;
     context.command(&far, SLOW)?;

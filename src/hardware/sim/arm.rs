@@ -7,6 +7,7 @@ pub use super::delivery::Delivery;
 pub use super::options::{SimOptions, check_pose, check_range};
 use crate::clock::Mono;
 use crate::hardware::adapter::AdapterResult;
+use crate::hardware::registry::Truth;
 use crate::hardware::sim::faults::{FaultKind, FaultScript};
 use crate::hardware::sim::plant::{Drive, Plant};
 use crate::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
@@ -93,21 +94,30 @@ pub trait HasArm {
         now
     }
 
-    /// Returns the true position of the gripper, in the unit of the adapter [m or rad]; `None` without one.
-    fn gripper_position(&mut self) -> Option<f64> {
-        None
-    }
-
-    /// Returns the temperatures of the drives [°C].
-    fn temperatures(&mut self) -> Joints {
-        std::array::from_fn(SimArm::temperature)
-    }
-
     /// Returns the true joint positions [rad] and velocities [rad/s] at `now`.
     fn joints_at(&mut self, now: Mono) -> (Joints, Joints) {
         self.advance(now);
         self.arm().joints()
     }
+
+    /// Returns what is true at `now`. A controller does not replace this; what more it knows it adds in
+    /// [`HasArm::complete`].
+    fn truth(&mut self, now: Mono) -> Truth {
+        let (positions, _) = self.joints_at(now);
+        let arm = self.arm();
+        let mut truth = Truth {
+            positions: Some(positions),
+            motors_on: Some(arm.enabled()),
+            motor_switches: Some(arm.switches()),
+            temperatures: Some(std::array::from_fn(SimArm::temperature)),
+            ..Truth::default()
+        };
+        self.complete(&mut truth);
+        truth
+    }
+
+    /// Adds what only the controller knows: its gripper, drives with other temperatures.
+    fn complete(&self, _truth: &mut Truth) {}
 }
 
 /// A simulated arm. Initially disabled, in position mode.

@@ -14,9 +14,8 @@ use super::events::{self, SimEvent};
 use super::faults::{Fault, FaultKind};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
-use crate::hardware::registry::{Emulator, EmulatorAddress};
+use crate::hardware::registry::{Emulator, EmulatorAddress, Truth};
 use crate::hardware::transport::can::{CanAddress, CanEvent, CanFilter, CanFrame};
-use crate::joint::Joints;
 use crate::rt::host;
 use crate::rt::wake::Wake;
 use crate::sync::lock;
@@ -144,27 +143,8 @@ impl<C: CanController + HasArm> Emulator for CanServer<C> {
         self.with(|controller, now| controller.arm().inject(fault, now))
     }
 
-    fn true_positions(&self) -> Option<Joints> {
-        Some(self.with(|controller, now| controller.joints_at(now).0))
-    }
-
-    fn motors_on(&self) -> Option<bool> {
-        Some(self.with(|controller, _| controller.arm().enabled()))
-    }
-
-    fn motor_switches(&self) -> Option<u32> {
-        Some(self.with(|controller, _| controller.arm().switches()))
-    }
-
-    fn temperatures(&self) -> Option<Joints> {
-        Some(self.with(|controller, _| controller.temperatures()))
-    }
-
-    fn gripper_position(&self) -> Option<f64> {
-        self.with(|controller, now| {
-            controller.advance(now);
-            controller.gripper_position()
-        })
+    fn truth(&self) -> Truth {
+        self.with(|controller, now| controller.truth(now))
     }
 }
 

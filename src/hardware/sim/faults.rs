@@ -36,7 +36,7 @@ pub enum FaultKind {
     Nan,
     /// Joint positions and velocities are reported as zero.
     ZeroState,
-    /// A command that has no answer does not reach the arm.
+    /// A command does not reach the arm, on a wire on which commands have no answer.
     LostCommand,
     /// Noise precedes an answer.
     Garbage,

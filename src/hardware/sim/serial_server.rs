@@ -12,9 +12,8 @@ use super::faults::Fault;
 use super::stream::{Controller, Ending, Shared};
 use crate::clock::Mono;
 use crate::hardware::adapter::{AdapterError, AdapterResult};
-use crate::hardware::registry::{Emulator, EmulatorAddress};
+use crate::hardware::registry::{Emulator, EmulatorAddress, Truth};
 use crate::hardware::transport::serial::Pty;
-use crate::joint::Joints;
 use crate::rt::host;
 use crate::sync::lock;
 
@@ -66,27 +65,8 @@ impl<C: Controller + HasArm> Emulator for SerialServer<C> {
         self.with(|controller, now| controller.arm().inject(fault, now))
     }
 
-    fn true_positions(&self) -> Option<Joints> {
-        Some(self.with(|controller, now| controller.joints_at(now).0))
-    }
-
-    fn motors_on(&self) -> Option<bool> {
-        Some(self.with(|controller, _| controller.arm().enabled()))
-    }
-
-    fn motor_switches(&self) -> Option<u32> {
-        Some(self.with(|controller, _| controller.arm().switches()))
-    }
-
-    fn temperatures(&self) -> Option<Joints> {
-        Some(self.with(|controller, _| controller.temperatures()))
-    }
-
-    fn gripper_position(&self) -> Option<f64> {
-        self.with(|controller, now| {
-            controller.advance(now);
-            controller.gripper_position()
-        })
+    fn truth(&self) -> Truth {
+        self.with(|controller, now| controller.truth(now))
     }
 }
 

@@ -22,8 +22,7 @@ use super::stream::{Controller, Ending, Line, Shared};
 use super::tcp_listener::ListenerThread;
 use crate::clock::Mono;
 use crate::hardware::adapter::{AdapterError, AdapterResult};
-use crate::hardware::registry::{Emulator, EmulatorAddress};
-use crate::joint::Joints;
+use crate::hardware::registry::{Emulator, EmulatorAddress, Truth};
 use crate::rt::host;
 use crate::rt::wake::Wake;
 use crate::sync::lock;
@@ -141,27 +140,8 @@ impl<C: Controller + HasArm> Emulator for TcpServer<C> {
         })
     }
 
-    fn true_positions(&self) -> Option<Joints> {
-        Some(self.with(|controller, now| controller.joints_at(now).0))
-    }
-
-    fn motors_on(&self) -> Option<bool> {
-        Some(self.with(|controller, _| controller.arm().enabled()))
-    }
-
-    fn motor_switches(&self) -> Option<u32> {
-        Some(self.with(|controller, _| controller.arm().switches()))
-    }
-
-    fn temperatures(&self) -> Option<Joints> {
-        Some(self.with(|controller, _| controller.temperatures()))
-    }
-
-    fn gripper_position(&self) -> Option<f64> {
-        self.with(|controller, now| {
-            controller.advance(now);
-            controller.gripper_position()
-        })
+    fn truth(&self) -> Truth {
+        self.with(|controller, now| controller.truth(now))
     }
 }
 

@@ -9,65 +9,12 @@ use dimos::joint::ControlMode;
 
 use crate::support::delegate::delegate;
 
+mod mistakes;
 mod parts;
 
-pub type Inner = Box<dyn ManipulatorAdapter>;
+pub use mistakes::*;
 
-/// What is wrong with an adapter.
-pub const DEGREES: u8 = 0;
-pub const WRONG_SIGN: u8 = 1;
-pub const SWAPPED_JOINTS: u8 = 2;
-pub const IGNORES_STOP: u8 = 3;
-pub const MOVES_ON_ACTIVATION: u8 = 4;
-pub const ENABLES_ON_CONNECT: u8 = 5;
-pub const HIDES_ERRORS: u8 = 6;
-pub const CLAIMS_TO_BE_CONNECTED: u8 = 7;
-pub const ACCEPTS_ANY_MODE: u8 = 8;
-pub const ZERO_VELOCITIES: u8 = 9;
-pub const FAILS_WITHOUT_SENSOR: u8 = 10;
-pub const DROPS_POWER_ON_LEAVING: u8 = 11;
-pub const HIDES_SILENCE: u8 = 12;
-pub const RESTAMPS_STATES: u8 = 13;
-pub const CLEARS_ERRORS_ON_CONNECT: u8 = 14;
-pub const STOP_DROPS_POWER: u8 = 15;
-pub const CONFIRMS_ALWAYS: u8 = 16;
-pub const STOP_CLEARS_ERRORS: u8 = 17;
-pub const STOP_IS_FINAL: u8 = 18;
-pub const MOVES_ON_RECONNECTING: u8 = 19;
-pub const STALE_STATE_AFTER_CONNECT: u8 = 20;
-pub const WRONG_SIGN_BOTH_WAYS: u8 = 21;
-pub const IGNORES_MODEL: u8 = 22;
-pub const CANNOT_STOP_AFTER_RECONNECTING: u8 = 23;
-pub const VELOCITIES_IN_DEGREES: u8 = 24;
-pub const MOVES_WITHOUT_POWER: u8 = 25;
-pub const ALLOCATES_FOR_NEWS: u8 = 26;
-pub const GRIPPER_IGNORES_STOP: u8 = 27;
-pub const STOP_LOCKS_GRIPPER: u8 = 28;
-pub const ENABLES_AT_OLD_GOAL: u8 = 29;
-pub const VELOCITIES_SCALED: u8 = 30;
-pub const TAKES_LATE_ANSWERS: u8 = 31;
-pub const ENABLED_BY_ONE_MOTOR: u8 = 32;
-pub const GRIPPER_IN_MILLIMETRES: u8 = 33;
-pub const GRIPPER_CLAMPS: u8 = 34;
-pub const FORCE_CLAMPS: u8 = 35;
-pub const FORCE_IS_LOST: u8 = 36;
-pub const FORCE_REMAINS: u8 = 37;
-pub const FORCE_CONTROL_ONLY_CLAIMED: u8 = 38;
-pub const DROPS_POWER_ON_DISCONNECTING: u8 = 39;
-pub const IGNORES_SPEED: u8 = 40;
-pub const CLEARING_ENABLES: u8 = 41;
-pub const GRIPPER_HURRIES_JOINTS: u8 = 42;
-pub const TOGGLES_POWER_ON_CONNECT: u8 = 43;
-pub const TOO_SLOW: u8 = 44;
-pub const SERVO_TOO_SLOW: u8 = 45;
-pub const CONFIRMS_UNSEEN: u8 = 46;
-pub const ERRORS_OF_FIRST_ONLY: u8 = 47;
-pub const LONG_TIMEOUT: u8 = 48;
-pub const STATUS_SHIFTED: u8 = 49;
-pub const GRIPPER_REVERSED: u8 = 50;
-pub const CLAIMS_TO_HOLD: u8 = 51;
-pub const ONE_VELOCITY_REVERSED: u8 = 52;
-pub const NO_MISTAKE: u8 = 255;
+pub type Inner = Box<dyn ManipulatorAdapter>;
 
 /// The modes of an arm that takes only setpoints.
 const SERVO: &[ControlMode] = &[ControlMode::ServoPosition];

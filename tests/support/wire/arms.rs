@@ -6,9 +6,8 @@ use std::time::{Duration, Instant};
 
 use dimos::clock::Mono;
 use dimos::hardware::arms::ur::emulator::UrEmulator;
-use dimos::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, EmulatorAddress, Registry};
+use dimos::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, EmulatorAddress, Registry, Truth};
 use dimos::hardware::sim::faults::Fault;
-use dimos::joint::Joints;
 use dimos::rpc::run_dir::RunDir;
 use dimos::runtime::{Record, Run};
 use serde_json::{Value, json};
@@ -145,8 +144,8 @@ impl Emulator for Shared {
         self.0.inject(fault)
     }
 
-    fn true_positions(&self) -> Option<Joints> {
-        self.0.true_positions()
+    fn truth(&self) -> Truth {
+        self.0.truth()
     }
 }
 

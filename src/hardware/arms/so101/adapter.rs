@@ -9,7 +9,7 @@ use std::time::Duration;
 use super::bus::Bus;
 use super::calibration::{Calibration, Range};
 use super::protocol::{SERVOS, Servo, TURN, register};
-use super::servos::{WRITES, error_of, must_stop};
+use super::servos::{error_of, must_stop};
 use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, TOP_SPEED, check, limits};
 use crate::clock::Mono;
 use crate::hardware::adapter::{
@@ -83,27 +83,29 @@ impl So101Adapter {
         if let Some((code, text)) = error_of(&servos) {
             return Err(AdapterError::Fault { code, text });
         }
-        let (mut values, mut goals) = ([[0; 7]; SERVOS], [0; SERVOS]);
-        for (j, value) in values.iter_mut().enumerate() {
-            let held = servos.get(j).map_or(0, |servo| servo.goal);
-            let (goal, speed) = match joints.get(j) {
-                Some(angle) => (self.range(j).counts(*angle), speed),
-                None => (self.gripper_goal.unwrap_or(held), self.gripper_speed),
+        let (mut values, mut goals) = ([[0; 7]; SERVOS], servos.map(|servo| servo.goal));
+        for (j, (value, goal)) in values.iter_mut().zip(&mut goals).enumerate() {
+            let speed = match joints.get(j) {
+                Some(angle) => {
+                    *goal = self.range(j).counts(*angle).max(0);
+                    speed
+                }
+                None => {
+                    *goal = self.gripper_goal.unwrap_or(*goal).max(0);
+                    self.gripper_speed
+                }
             };
-            let ([g0, g1], [s0, s1]) = ((goal.max(0) as u16).to_le_bytes(), speed.to_le_bytes());
-            goals.iter_mut().skip(j).take(1).for_each(|to| *to = goal.max(0));
+            let ([g0, g1], [s0, s1]) = ((*goal as u16).to_le_bytes(), speed.to_le_bytes());
             *value = [ACCELERATION, g0, g1, 0, 0, s0, s1];
         }
-        for _ in 0..WRITES {
-            let seen = self.state;
-            self.write(register::ACCELERATION, values)?;
-            // Goals change nothing of what was measured.
-            self.state = seen;
-            if speed == 0 || self.fetch()?.iter().zip(&goals).all(|(servo, goal)| servo.goal == *goal) {
-                return Ok(());
-            }
+        if speed > 0 {
+            return self.write_motion(register::ACCELERATION, values, &goals);
         }
-        Err(AdapterError::Protocol("so101: the servos do not take their goals".into()))
+        let seen = self.state;
+        self.write(register::ACCELERATION, values)?;
+        // Goals change nothing of what was measured.
+        self.state = seen;
+        Ok(())
     }
 
     fn angles(&self, of: impl Fn(usize, Range) -> f64) -> Joints {

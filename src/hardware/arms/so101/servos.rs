@@ -16,7 +16,7 @@ const CYCLE: Retry = Retry { each: Duration::from_millis(30), times: 3 };
 /// A state answers further questions for this time.
 const STATE_AGE: Duration = Duration::from_millis(5);
 /// How often torque and goals are written until the servos show them: nothing acknowledges a write to all.
-pub(super) const WRITES: u32 = 4;
+const WRITES: u32 = 4;
 /// A goal this far from the joint is that joint's position [counts]: encoders flicker.
 const SAME: i32 = 3;
 /// A joint at rest further than this from its goal has not started yet, or is blocked [counts]; nearer, it droops.
@@ -71,24 +71,44 @@ impl So101Adapter {
         }
     }
 
-    /// Writes goals until the servos show them.
-    pub(super) fn write_goals(&mut self, goals: [i32; SERVOS]) -> AdapterResult<()> {
+    /// Writes the same registers of all servos until they show it. Returns whether they do.
+    fn confirmed<const N: usize>(
+        &mut self,
+        address: u8,
+        values: [[u8; N]; SERVOS],
+        shown: impl Fn(usize, &Servo) -> bool,
+    ) -> AdapterResult<bool> {
         for _ in 0..WRITES {
-            self.write(register::GOAL, goals.map(|goal| (goal.max(0) as u16).to_le_bytes()))?;
-            if self.fetch()?.iter().zip(&goals).all(|(servo, goal)| servo.goal == *goal) {
-                return Ok(());
+            self.write(address, values)?;
+            if self.fetch()?.iter().enumerate().all(|(j, servo)| shown(j, servo)) {
+                return Ok(true);
             }
         }
-        Err(AdapterError::Protocol("so101: the servos do not take their goals".into()))
+        Ok(false)
+    }
+
+    /// Writes registers with the goals in them until the servos show these.
+    pub(super) fn write_motion<const N: usize>(
+        &mut self,
+        address: u8,
+        values: [[u8; N]; SERVOS],
+        goals: &[i32; SERVOS],
+    ) -> AdapterResult<()> {
+        match self.confirmed(address, values, |j, servo| goals.get(j) == Some(&servo.goal))? {
+            true => Ok(()),
+            false => Err(AdapterError::Protocol("so101: the servos do not take their goals".into())),
+        }
+    }
+
+    /// Writes goals until the servos show them.
+    pub(super) fn write_goals(&mut self, goals: [i32; SERVOS]) -> AdapterResult<()> {
+        self.write_motion(register::GOAL, goals.map(|goal| (goal.max(0) as u16).to_le_bytes()), &goals)
     }
 
     /// Switches all motors on or off until the servos show it.
     pub(super) fn write_torque(&mut self, on: bool) -> AdapterResult<()> {
-        for _ in 0..WRITES {
-            self.write(register::TORQUE, [[u8::from(on)]; SERVOS])?;
-            if self.fetch()?.iter().all(|servo| servo.on == on) {
-                return Ok(());
-            }
+        if self.confirmed(register::TORQUE, [[u8::from(on)]; SERVOS], |_, servo| servo.on == on)? {
+            return Ok(());
         }
         let what = if on { "on" } else { "off" };
         Err(AdapterError::Protocol(format!("so101: not all motors can be switched {what}")))

@@ -10,6 +10,7 @@ use super::{PLAYABLE, SimOptions};
 use crate::clock::Mono;
 use crate::hardware::adapter::AdapterResult;
 use crate::hardware::arms::franka::model::{JointRange, Model};
+use crate::hardware::registry::Truth;
 use crate::hardware::sim::arm::{ESTOP, HasArm, Measured, SimArm};
 use crate::hardware::sim::delivery::Delivery;
 use crate::hardware::sim::faults::FaultKind;
@@ -373,8 +374,9 @@ impl HasArm for Control {
         &mut self.arm
     }
 
-    fn gripper_position(&mut self) -> Option<f64> {
-        Some(self.hand.width())
+    fn complete(&self, truth: &mut Truth) {
+        truth.motors_on = None; // the controller releases and applies the brakes
+        truth.gripper_position = Some(self.hand.width());
     }
 
     /// The cycle advances the arm.

@@ -30,11 +30,11 @@ use super::protocol::{DOF, PORT};
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::check::ConfigError;
-use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
+use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, Truth};
 use crate::hardware::sim::arm;
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::sim::tcp_server::{Port, TcpServer, emulator_ports};
-use crate::joint::{JointLimits, Joints};
+use crate::joint::JointLimits;
 use crate::rt::histogram::{self, Histogram};
 use clock::{Network, Pace};
 use control::Control;
@@ -241,12 +241,8 @@ impl Emulator for FrankaEmulator {
         self.server.inject(fault)
     }
 
-    fn true_positions(&self) -> Option<Joints> {
-        self.server.true_positions()
-    }
-
-    fn gripper_position(&self) -> Option<f64> {
-        self.server.gripper_position()
+    fn truth(&self) -> Truth {
+        self.server.truth()
     }
 }
 

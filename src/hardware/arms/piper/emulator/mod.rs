@@ -21,7 +21,7 @@ use super::{GripperKind, NATIVE_RATE, Options, limits};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::AdapterResult;
 use crate::hardware::check::ConfigError;
-use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
+use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, Truth};
 use crate::hardware::sim::arm::{self, HasArm};
 use crate::hardware::sim::can_server::{CanController, CanServer};
 use crate::hardware::sim::faults::{Fault, FaultKind};
@@ -214,27 +214,7 @@ impl Emulator for PiperEmulator {
         self.server.inject(fault)
     }
 
-    fn true_positions(&self) -> Option<Joints> {
-        self.server.true_positions()
-    }
-
-    fn motors_on(&self) -> Option<bool> {
-        self.server.motors_on()
-    }
-
-    fn motor_switches(&self) -> Option<u32> {
-        self.server.motor_switches()
-    }
-
-    fn temperatures(&self) -> Option<Joints> {
-        self.server.temperatures()
-    }
-
-    fn gripper_position(&self) -> Option<f64> {
-        self.server.gripper_position()
-    }
-
-    fn gripper_force(&self) -> Option<f64> {
-        self.server.with(|controller, _| controller.has_gripper.then_some(controller.gripper.max_force))
+    fn truth(&self) -> Truth {
+        self.server.truth()
     }
 }

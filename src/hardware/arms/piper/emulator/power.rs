@@ -5,6 +5,7 @@ use std::time::Duration;
 use super::super::protocol::DOF;
 use super::controller::{Controller, state};
 use crate::clock::Mono;
+use crate::hardware::registry::Truth;
 use crate::hardware::sim::arm::{HasArm, SimArm};
 use crate::hardware::sim::faults::FaultKind;
 
@@ -83,8 +84,9 @@ impl HasArm for Controller {
         &mut self.arm
     }
 
-    fn gripper_position(&mut self) -> Option<f64> {
-        self.has_gripper.then_some(self.gripper.position)
+    fn complete(&self, truth: &mut Truth) {
+        truth.gripper_position = self.has_gripper.then_some(self.gripper.position);
+        truth.gripper_force = self.has_gripper.then_some(self.gripper.max_force);
     }
 
     /// An E-stop that ends after its duration leaves no error.

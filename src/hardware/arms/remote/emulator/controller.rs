@@ -7,6 +7,7 @@ use super::wire::{self, Command, Request};
 use super::{PLAYABLE, SILENCE_TIMEOUT};
 use crate::clock::Mono;
 use crate::hardware::adapter::{AdapterError, AdapterResult};
+use crate::hardware::registry::Truth;
 use crate::hardware::sim::arm::{Delivery, HasArm, Measured, SimArm, SimOptions};
 use crate::hardware::sim::faults::FaultKind;
 use crate::hardware::sim::gripper::Gripper;
@@ -229,8 +230,8 @@ impl HasArm for Controller {
         &mut self.arm
     }
 
-    fn gripper_position(&mut self) -> Option<f64> {
-        Some(self.gripper.position)
+    fn complete(&self, truth: &mut Truth) {
+        truth.gripper_position = Some(self.gripper.position);
     }
 
     /// Stops a commanded arm when no request arrives within the timeout: the client may hang.

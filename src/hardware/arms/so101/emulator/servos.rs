@@ -6,6 +6,7 @@ use super::wire::{ALL, packet, status};
 use super::{PLAYABLE, RANGES, SPEED, SimOptions, limits};
 use crate::clock::Mono;
 use crate::hardware::adapter::AdapterResult;
+use crate::hardware::registry::Truth;
 use crate::hardware::sim::arm::{Delivery, HasArm, SimArm};
 use crate::hardware::sim::faults::FaultKind;
 use crate::hardware::sim::stream::Controller;
@@ -362,10 +363,11 @@ impl HasArm for Servos {
         &mut self.arm
     }
 
-    /// From closed, the end of its range.
-    fn gripper_position(&mut self) -> Option<f64> {
+    /// The gripper's position counts from closed, the end of its range.
+    fn complete(&self, truth: &mut Truth) {
         let closed = RANGES.last().map_or(0.0, |range| range.0);
-        self.arm.joints().0.get(SERVOS - 1).map(|angle| angle - closed)
+        let angles = self.arm.joints().0;
+        truth.gripper_position = angles.get(SERVOS - 1).map(|angle| angle - closed);
     }
 }
 

@@ -33,11 +33,11 @@ use super::model::Model;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::check::ConfigError;
-use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
+use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, Truth};
 use crate::hardware::sim::arm;
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::sim::tcp_server::{Port, TcpServer, emulator_ports};
-use crate::joint::{JointLimits, Joints};
+use crate::joint::JointLimits;
 use controller::Controller;
 
 /// The faults that the controller can play. Its joints have one supply, so no single motor goes off.
@@ -265,20 +265,8 @@ impl Emulator for UrEmulator {
         self.server.inject(fault)
     }
 
-    fn true_positions(&self) -> Option<Joints> {
-        self.server.true_positions()
-    }
-
-    fn motors_on(&self) -> Option<bool> {
-        self.server.motors_on()
-    }
-
-    fn motor_switches(&self) -> Option<u32> {
-        self.server.motor_switches()
-    }
-
-    fn temperatures(&self) -> Option<Joints> {
-        self.server.temperatures()
+    fn truth(&self) -> Truth {
+        self.server.truth()
     }
 }
 

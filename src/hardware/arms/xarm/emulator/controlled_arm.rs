@@ -6,6 +6,7 @@ use nalgebra::Isometry3;
 
 use super::super::model::VELOCITY;
 use crate::clock::Mono;
+use crate::hardware::registry::Truth;
 use crate::hardware::sim::arm::{self, Delivery, HasArm, SimArm};
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::joint::Joints;
@@ -241,8 +242,9 @@ impl HasArm for super::controller::Controller<SimArm> {
         &mut self.arm
     }
 
-    fn gripper_position(&mut self) -> Option<f64> {
-        Some(self.tool.opening())
+    fn complete(&self, truth: &mut Truth) {
+        truth.gripper_position = Some(self.tool.opening());
+        truth.gripper_force = self.tool.force();
     }
 
     fn advance(&mut self, now: Mono) {

@@ -31,7 +31,7 @@ use super::{Options, model_of};
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::check::ConfigError;
-use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
+use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, Truth};
 use crate::hardware::sim::arm::{self, HasArm, SimArm};
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::sim::tcp_server::{ATTEMPTS, Port, TcpServer, cannot_listen, ports_in_a_row};
@@ -228,28 +228,8 @@ impl Emulator for XArmEmulator {
         self.server.inject(fault)
     }
 
-    fn true_positions(&self) -> Option<Joints> {
-        self.server.true_positions()
-    }
-
-    fn motors_on(&self) -> Option<bool> {
-        self.server.motors_on()
-    }
-
-    fn motor_switches(&self) -> Option<u32> {
-        self.server.motor_switches()
-    }
-
-    fn temperatures(&self) -> Option<Joints> {
-        self.server.temperatures()
-    }
-
-    fn gripper_position(&self) -> Option<f64> {
-        self.server.gripper_position()
-    }
-
-    fn gripper_force(&self) -> Option<f64> {
-        self.server.with(|controller, _| controller.tool.force())
+    fn truth(&self) -> Truth {
+        self.server.truth()
     }
 }
 

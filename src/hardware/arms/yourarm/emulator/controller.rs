@@ -6,6 +6,7 @@ use super::kinematics::Links;
 use super::wire::{self, Frame, Report, Request, put_drives, put_floats, put_hello, put_io, put_report, reply, status};
 use crate::clock::Mono;
 use crate::hardware::adapter::AdapterResult;
+use crate::hardware::registry::Truth;
 use crate::hardware::sim::arm::{Delivery, HasArm, Refusal, SimArm, SimOptions};
 use crate::hardware::sim::faults::FaultKind;
 use crate::hardware::sim::gripper::Gripper;
@@ -253,12 +254,10 @@ impl HasArm for Controller {
         &mut self.arm
     }
 
-    fn gripper_position(&mut self) -> Option<f64> {
-        Some(self.gripper.position)
-    }
-
-    fn temperatures(&mut self) -> Joints {
-        joints_of(&self.drives().map(|([celsius, ..], _)| celsius.into()))
+    fn complete(&self, truth: &mut Truth) {
+        truth.temperatures = Some(joints_of(&self.drives().map(|([celsius, ..], _)| celsius.into())));
+        truth.gripper_position = Some(self.gripper.position);
+        truth.gripper_force = Some(self.gripper.max_force);
     }
 
     fn advance(&mut self, now: Mono) {

@@ -12,7 +12,7 @@ use std::net::SocketAddr;
 use super::protocol::PORT;
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::AdapterResult;
-use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
+use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, Truth};
 use crate::hardware::sim::arm::HasArm;
 pub use crate::hardware::sim::arm::SimOptions;
 use crate::hardware::sim::faults::Fault;
@@ -115,27 +115,7 @@ impl Emulator for YourArmEmulator {
         self.server.inject(fault)
     }
 
-    fn true_positions(&self) -> Option<Joints> {
-        self.server.true_positions()
-    }
-
-    fn motors_on(&self) -> Option<bool> {
-        self.server.motors_on()
-    }
-
-    fn motor_switches(&self) -> Option<u32> {
-        self.server.motor_switches()
-    }
-
-    fn temperatures(&self) -> Option<Joints> {
-        self.server.temperatures()
-    }
-
-    fn gripper_position(&self) -> Option<f64> {
-        self.server.gripper_position()
-    }
-
-    fn gripper_force(&self) -> Option<f64> {
-        Some(self.server.with(|controller, _| controller.gripper.max_force))
+    fn truth(&self) -> Truth {
+        self.server.truth()
     }
 }
