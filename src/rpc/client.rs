@@ -110,6 +110,8 @@ pub struct Message {
     pub subscription: u64,
     /// Messages that this client missed just before this one.
     pub lost: u64,
+    /// Whether it was published before the subscription.
+    pub past: bool,
     /// The published value.
     pub data: Value,
 }
@@ -358,6 +360,7 @@ fn message(incoming: Incoming) -> Message {
         stream: incoming.stream.unwrap_or_default(),
         subscription: incoming.subscription,
         lost: incoming.lost,
+        past: incoming.past,
         data: incoming.data,
     }
 }

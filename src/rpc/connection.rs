@@ -383,9 +383,12 @@ impl Connection {
         }
         let number = self.next;
         self.next += 1;
-        let from = self.backend.streams().reader(wanted.stream);
-        let subscription =
-            Subscription { number, stream: wanted.stream.name(), from, limit: RateLimit::new(wanted.rate) };
+        let (mut past, from) = self.backend.streams().reader(wanted.stream);
+        if !wanted.past {
+            past.clear();
+        }
+        let limit = RateLimit::new(wanted.rate);
+        let subscription = Subscription { number, stream: wanted.stream.name(), past, from, limit };
         Ok((SubscribeReply { subscription: number }, subscription))
     }
 

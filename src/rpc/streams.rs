@@ -1,21 +1,32 @@
 //! The streams that a run publishes, and the requests to subscribe to them.
 //!
 //! Each message is encoded once, by the publisher, and kept in a ring of fixed length. Every subscriber reads the ring
-//! at its own pace: a slow subscriber loses its oldest messages, receives their number, and delays no other.
+//! at its own pace: a slow subscriber loses its oldest messages, receives their number, and delays no other. The last
+//! minutes are kept for those who subscribe later: a page that is opened after a fault shows how it came about.
 
-use std::sync::Arc;
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use tokio::sync::broadcast;
 
 use super::api::Method;
+use crate::clock::Mono;
 use crate::named::named;
+use crate::sync::lock;
 
 /// Joint states buffered for slow readers.
 const STATES_KEPT: usize = 256;
 /// Events buffered for slow readers.
 const EVENTS_KEPT: usize = 1024;
+/// Time between joint states kept for later subscribers.
+const PAST_PERIOD: Duration = Duration::from_millis(200);
+/// Joint states kept for later subscribers: of 3 minutes.
+const PAST_STATES: usize = 900;
+/// Events kept for later subscribers.
+const PAST_EVENTS: usize = 200;
 
 named! {
     /// The streams of a run.
@@ -38,6 +49,17 @@ pub struct Subscribe {
     /// Maximum rate of messages [Hz]; without it, all of them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rate: Option<f64>,
+    /// First send what was published before: joint states of the last 3 minutes at 5 Hz, the last 200 events. These
+    /// messages have `"past": true`.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub past: bool,
+}
+
+impl Subscribe {
+    /// Subscribes to all further messages of a stream.
+    pub fn to(stream: Stream) -> Self {
+        Self { stream, rate: None, past: false }
+    }
 }
 
 /// Reply to `subscribe`.
@@ -134,47 +156,89 @@ pub enum Level {
 /// Publishes the streams of a run. Cheap to clone; never waits for a reader.
 #[derive(Debug, Clone)]
 pub struct Streams {
-    joint_state: broadcast::Sender<Arc<str>>,
-    events: broadcast::Sender<Arc<str>>,
+    joint_state: Published,
+    events: Published,
+    /// When the next joint state is kept for later subscribers.
+    due: Arc<Mutex<Mono>>,
 }
 
 impl Default for Streams {
     fn default() -> Self {
-        Self { joint_state: broadcast::Sender::new(STATES_KEPT), events: broadcast::Sender::new(EVENTS_KEPT) }
-    }
-}
-
-impl Streams {
-    /// Publishes the state of a tick. Calls `build` only if there are subscribers. Allocates: not for the tick thread.
-    pub fn publish_joint_state(&self, build: impl FnOnce() -> JointState) {
-        publish(&self.joint_state, build);
-    }
-
-    /// Returns whether the joint state has subscribers.
-    pub fn has_joint_state_readers(&self) -> bool {
-        self.joint_state.receiver_count() > 0
-    }
-
-    /// Publishes an event. Calls `build` only if there are subscribers. Allocates: not for the tick thread.
-    pub fn publish_event(&self, build: impl FnOnce() -> EventReport) {
-        publish(&self.events, build);
-    }
-
-    /// Subscribes to a stream.
-    pub(super) fn reader(&self, stream: Stream) -> broadcast::Receiver<Arc<str>> {
-        match stream {
-            Stream::CoordinatorJointState => self.joint_state.subscribe(),
-            Stream::Events => self.events.subscribe(),
+        Self {
+            joint_state: Published::new(STATES_KEPT, PAST_STATES),
+            events: Published::new(EVENTS_KEPT, PAST_EVENTS),
+            due: Arc::default(),
         }
     }
 }
 
-fn publish<T: Serialize>(to: &broadcast::Sender<Arc<str>>, build: impl FnOnce() -> T) {
-    if to.receiver_count() == 0 {
-        return;
+impl Streams {
+    /// Publishes the state of a tick; keeps it for later subscribers if [`Self::is_state_due`]. Allocates: not for the
+    /// tick thread.
+    pub fn publish_joint_state(&self, now: Mono, state: &JointState) {
+        let keep = self.is_state_due(now);
+        if keep {
+            *lock(&self.due) = now.after(PAST_PERIOD);
+        }
+        self.joint_state.send(state, keep);
     }
-    // These types have string keys only, so encoding cannot fail. Sending fails if the last subscriber has just left.
-    if let Ok(text) = serde_json::to_string(&build()) {
-        let _ = to.send(text.into());
+
+    /// Returns whether the joint state has subscribers.
+    pub fn has_joint_state_readers(&self) -> bool {
+        self.joint_state.sender.receiver_count() > 0
+    }
+
+    /// Returns whether a joint state is to be kept for later subscribers.
+    pub fn is_state_due(&self, now: Mono) -> bool {
+        now >= *lock(&self.due)
+    }
+
+    /// Publishes an event, and keeps it for later subscribers. Allocates: not for the tick thread.
+    pub fn publish_event(&self, event: &EventReport) {
+        self.events.send(event, true);
+    }
+
+    /// Subscribes to a stream. Also returns what was published before, the oldest first: with the messages of the
+    /// receiver nothing is missing, and nothing is there twice.
+    pub(super) fn reader(&self, stream: Stream) -> (Vec<Arc<str>>, broadcast::Receiver<Arc<str>>) {
+        match stream {
+            Stream::CoordinatorJointState => self.joint_state.reader(),
+            Stream::Events => self.events.reader(),
+        }
+    }
+}
+
+/// One stream: its subscribers, and its past.
+#[derive(Debug, Clone)]
+struct Published {
+    sender: broadcast::Sender<Arc<str>>,
+    past: Arc<Mutex<VecDeque<Arc<str>>>>,
+    /// Maximum number of messages in `past`.
+    most: usize,
+}
+
+impl Published {
+    fn new(kept: usize, most: usize) -> Self {
+        Self { sender: broadcast::Sender::new(kept), past: Arc::default(), most }
+    }
+
+    fn send<T: Serialize>(&self, message: &T, keep: bool) {
+        // These types have string keys only, so encoding cannot fail.
+        let Ok(text) = serde_json::to_string(message) else { return };
+        let text: Arc<str> = text.into();
+        let mut past = lock(&self.past);
+        if keep {
+            if past.len() == self.most {
+                past.pop_front();
+            }
+            past.push_back(text.clone());
+        }
+        // Fails if there is no subscriber.
+        let _ = self.sender.send(text);
+    }
+
+    fn reader(&self) -> (Vec<Arc<str>>, broadcast::Receiver<Arc<str>>) {
+        let past = lock(&self.past);
+        (past.iter().cloned().collect(), self.sender.subscribe())
     }
 }

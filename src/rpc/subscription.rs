@@ -15,6 +15,8 @@ pub(super) struct Subscription {
     pub number: u64,
     /// The stream's name.
     pub stream: &'static str,
+    /// Messages that were published before, the oldest first.
+    pub past: Vec<Arc<str>>,
     /// Receives the published messages.
     pub from: broadcast::Receiver<Arc<str>>,
     /// Limits the rate.
@@ -22,8 +24,13 @@ pub(super) struct Subscription {
 }
 
 impl Subscription {
-    /// Sends published messages until the client has disconnected.
+    /// Sends the past, then published messages until the client has disconnected.
     pub async fn forward(mut self, queue: mpsc::Sender<String>) {
+        for data in std::mem::take(&mut self.past) {
+            if queue.send(wire::past_message(self.stream, self.number, &data)).await.is_err() {
+                return;
+            }
+        }
         let mut lost = 0;
         loop {
             match self.from.recv().await {

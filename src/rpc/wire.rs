@@ -73,6 +73,11 @@ pub(super) fn message(stream: &str, subscription: u64, lost: u64, data: &str) ->
     format!("{{\"stream\":\"{stream}\",\"subscription\":{subscription}{lost},\"data\":{data}}}\n")
 }
 
+/// Encodes a message that was published before the subscription.
+pub(super) fn past_message(stream: &str, subscription: u64, data: &str) -> String {
+    format!("{{\"stream\":\"{stream}\",\"subscription\":{subscription},\"past\":true,\"data\":{data}}}\n")
+}
+
 /// A line received by a client: a reply or a message of a subscription.
 #[derive(Debug, Deserialize)]
 pub(super) struct Incoming {
@@ -85,6 +90,8 @@ pub(super) struct Incoming {
     pub subscription: u64,
     #[serde(default)]
     pub lost: u64,
+    #[serde(default)]
+    pub past: bool,
     #[serde(default)]
     pub data: Value,
 }

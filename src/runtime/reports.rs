@@ -352,36 +352,40 @@ impl Service {
         })
     }
 
-    /// Publishes the joint state of the last tick to subscribers, unless that was done already.
+    /// Publishes the joint state of the last tick, unless that was done already: to subscribers, and now and then for
+    /// later ones.
     pub fn publish(&self, ticked: bool) {
-        let listened_to = self.parts.streams.has_joint_state_readers();
-        let wanted = listened_to && self.parts.blueprint.coordinator.publish_joint_state;
-        self.parts.pulse.streaming.store(wanted, Relaxed);
+        let (streams, now) = (&self.parts.streams, self.now());
+        let published = self.parts.blueprint.coordinator.publish_joint_state;
+        let listened_to = published && streams.has_joint_state_readers();
+        self.parts.pulse.streaming.store(listened_to, Relaxed);
         // The tick also wakes this thread for replies; a late wake-up publishes the newest tick.
         let ticks = self.parts.pulse.ticks.load(Relaxed);
-        if !(wanted && ticked) || self.published.swap(ticks, Relaxed) == ticks {
-            return;
+        let wanted = (listened_to && ticked) || (published && streams.is_state_due(now));
+        if wanted && ticks > 0 && self.published.swap(ticks, Relaxed) != ticks {
+            streams.publish_joint_state(now, &self.joint_state());
         }
-        self.parts.streams.publish_joint_state(|| {
-            let mut out = JointState {
-                tick: self.last_tick(),
-                stamp: self.wall_seconds(),
-                frame_id: self.parts.blueprint.coordinator.joint_state_frame_id.clone(),
-                ..JointState::default()
-            };
-            for (i, arm) in self.parts.blueprint.arms.iter().enumerate() {
-                let Some(view) = self.arm_view(i) else { continue };
-                let s = &view.state;
-                let velocities = s.velocity_source != VelocitySource::Absent;
-                for (j, name) in arm.joints.iter().enumerate() {
-                    out.name.push(name.clone());
-                    out.position.push(s.position.get(j).copied().filter(|_| s.seq > 0));
-                    out.velocity.push(s.velocity.get(j).copied().filter(|_| velocities));
-                    out.effort.push(s.effort.and_then(|e| e.get(j).copied()));
-                }
+    }
+
+    fn joint_state(&self) -> JointState {
+        let mut out = JointState {
+            tick: self.last_tick(),
+            stamp: self.wall_seconds(),
+            frame_id: self.parts.blueprint.coordinator.joint_state_frame_id.clone(),
+            ..JointState::default()
+        };
+        for (i, arm) in self.parts.blueprint.arms.iter().enumerate() {
+            let Some(view) = self.arm_view(i) else { continue };
+            let s = &view.state;
+            let velocities = s.velocity_source != VelocitySource::Absent;
+            for (j, name) in arm.joints.iter().enumerate() {
+                out.name.push(name.clone());
+                out.position.push(s.position.get(j).copied().filter(|_| s.seq > 0));
+                out.velocity.push(s.velocity.get(j).copied().filter(|_| velocities));
+                out.effort.push(s.effort.and_then(|e| e.get(j).copied()));
             }
-            out
-        });
+        }
+        out
     }
 
     /// Records an event that no tick has made, and reports it.
@@ -399,7 +403,7 @@ impl Service {
                 Severity::Error => tracing::error!("{line}"),
             }
         }
-        self.parts.streams.publish_event(|| EventReport {
+        self.parts.streams.publish_event(&EventReport {
             tick,
             stamp: wall.wall(self.now()) as f64 * 1e-9,
             level: match described.severity {

@@ -217,6 +217,7 @@ impl Line {
         let params = &request["params"];
         if method == Subscribe::NAME
             && params.get("rate").is_none_or(Value::is_null)
+            && params["past"] != true
             && let Some(stream) = params["stream"].as_str().and_then(Stream::of_name)
         {
             let number = OWN_SUBSCRIPTIONS + subscribers.len() as u64;

@@ -67,7 +67,7 @@ impl Reader {
 
     fn publish(&self, seq: &mut u64) -> Result<(), ClientError> {
         let mut client = Client::connect(&self.run, &self.socket)?;
-        client.call(Subscribe { stream: self.stream, rate: None })?;
+        client.call(Subscribe::to(self.stream))?;
         while self.wanted.load(Ordering::Acquire) {
             let message = match client.next_message() {
                 Ok(message) => message,

@@ -6,6 +6,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::time::Duration;
 
+use dimos::clock::Mono;
 use dimos::rpc::Code;
 use dimos::rpc::api::{MAX_CONNECTIONS, MAX_LINE, MAX_SUBSCRIPTIONS, Move, RESERVED_CONNECTIONS, State, Status};
 use dimos::rpc::client::{Client, ClientError};
@@ -168,10 +169,10 @@ fn subscriptions_deliver_what_is_published_until_they_end() {
     let folder = tempfile::tempdir().unwrap();
     let (server, backend) = start(folder.path(), "test", FakeBackend::default());
     let mut client = Client::connect("test", server.socket()).unwrap();
-    let states = client.call(Subscribe { stream: Stream::CoordinatorJointState, rate: None }).unwrap().subscription;
-    let events = client.call(Subscribe { stream: Stream::Events, rate: None }).unwrap().subscription;
-    backend.streams.publish_joint_state(|| JointState { tick: 1, effort: vec![None], ..Default::default() });
-    backend.streams.publish_event(|| EventReport { text: "held".into(), ..Default::default() });
+    let states = client.call(Subscribe::to(Stream::CoordinatorJointState)).unwrap().subscription;
+    let events = client.call(Subscribe::to(Stream::Events)).unwrap().subscription;
+    backend.streams.publish_joint_state(Mono::ZERO, &JointState { tick: 1, effort: vec![None], ..Default::default() });
+    backend.streams.publish_event(&EventReport { text: "held".into(), ..Default::default() });
     let mut messages = [client.next_message().unwrap(), client.next_message().unwrap()];
     messages.sort_by_key(|m| m.subscription);
     let [state, event] = messages;
@@ -180,9 +181,39 @@ fn subscriptions_deliver_what_is_published_until_they_end() {
     assert_eq!((event.subscription, &event.data["text"]), (events, &json!("held")));
 
     client.call(Unsubscribe { subscription: states }).unwrap();
-    backend.streams.publish_joint_state(JointState::default);
-    backend.streams.publish_event(|| EventReport { text: "after".into(), ..Default::default() });
+    backend.streams.publish_joint_state(Mono::ZERO, &JointState::default());
+    backend.streams.publish_event(&EventReport { text: "after".into(), ..Default::default() });
     assert_eq!(client.next_message().unwrap().data["text"], json!("after"));
+}
+
+#[test]
+fn a_later_subscriber_gets_the_past_if_it_asks() {
+    let folder = tempfile::tempdir().unwrap();
+    let (server, backend) = start(folder.path(), "test", FakeBackend::default());
+    for tick in 0..1000 {
+        // 100 Hz: one in 20 is kept.
+        let now = Mono(1).after(Duration::from_millis(10 * tick));
+        backend.streams.publish_joint_state(now, &JointState { tick, ..Default::default() });
+        backend.streams.publish_event(&EventReport { tick, ..Default::default() });
+    }
+    let mut client = Client::connect("test", server.socket()).unwrap();
+    let states = Subscribe { stream: Stream::CoordinatorJointState, rate: Some(0.01), past: true };
+    let events = Subscribe { past: true, ..Subscribe::to(Stream::Events) };
+    let ticks = |client: &mut Client, most: usize| -> Vec<u64> {
+        (0..most)
+            .map(|_| client.next_message().unwrap())
+            .inspect(|message| assert!(message.past && message.lost == 0))
+            .map(|message| message.data["tick"].as_u64().unwrap())
+            .collect()
+    };
+    client.call(states).unwrap();
+    assert_eq!(ticks(&mut client, 50), (0..1000).step_by(20).collect::<Vec<_>>());
+    client.call(events).unwrap();
+    assert_eq!(ticks(&mut client, 200), (800..1000).collect::<Vec<_>>());
+    // Then what is published from now on, once.
+    backend.streams.publish_event(&EventReport { tick: 1000, ..Default::default() });
+    let next = client.next_message().unwrap();
+    assert_eq!((next.past, next.data["tick"].as_u64()), (false, Some(1000)));
 }
 
 #[test]
@@ -191,14 +222,14 @@ fn a_rate_thins_a_stream_out() {
     let (server, backend) = start(folder.path(), "test", FakeBackend::default());
     let mut client = Client::connect("test", server.socket()).unwrap();
     // One message in 100 s: of a burst only the first gets through, however slow the machine is.
-    client.call(Subscribe { stream: Stream::CoordinatorJointState, rate: Some(0.01) }).unwrap();
-    client.call(Subscribe { stream: Stream::Events, rate: None }).unwrap();
+    client.call(Subscribe { stream: Stream::CoordinatorJointState, rate: Some(0.01), past: false }).unwrap();
+    client.call(Subscribe::to(Stream::Events)).unwrap();
     for tick in 0..50 {
-        backend.streams.publish_joint_state(|| JointState { tick, ..Default::default() });
+        backend.streams.publish_joint_state(Mono::ZERO, &JointState { tick, ..Default::default() });
     }
     assert_eq!(client.next_message().unwrap().data["tick"], json!(0));
     client.call(State {}).unwrap(); // the burst has been read by now
-    backend.streams.publish_event(EventReport::default);
+    backend.streams.publish_event(&EventReport::default());
     assert_eq!(client.next_message().unwrap().stream, "events");
 }
 
@@ -207,13 +238,13 @@ fn a_slow_reader_loses_its_own_messages_only_and_is_told() {
     const BURST: u64 = 20_000;
     let folder = tempfile::tempdir().unwrap();
     let (server, backend) = start(folder.path(), "test", FakeBackend::default());
-    let subscribe = Subscribe { stream: Stream::CoordinatorJointState, rate: None };
+    let subscribe = Subscribe::to(Stream::CoordinatorJointState);
     let mut slow = Client::connect("test", server.socket()).unwrap();
     slow.call(subscribe.clone()).unwrap();
     let mut quick = Client::connect("test", server.socket()).unwrap();
     quick.call(subscribe).unwrap();
     for tick in 0..BURST {
-        backend.streams.publish_joint_state(|| JointState { tick, name: vec!["j".repeat(100)], ..Default::default() });
+        backend.streams.publish_joint_state(Mono::ZERO, &JointState { tick, name: vec!["j".repeat(100)], ..Default::default() });
         let message = quick.next_message().unwrap();
         assert_eq!((message.data["tick"].as_u64(), message.lost), (Some(tick), 0));
     }

@@ -63,7 +63,7 @@ fn calls_are_checked_as_over_the_socket() {
     let unknown = run.reset("amr").unwrap_err();
     assert_eq!((unknown.code, unknown.hint.as_deref()), (Code::UnknownArm, Some("did you mean `arm`?")));
     assert_eq!(run.servo("traj_arm", &[0.0; 7]).unwrap_err().code, Code::WrongTask);
-    let stream = Subscribe { stream: Stream::Events, rate: None };
+    let stream = Subscribe::to(Stream::Events);
     assert_eq!(run.call(stream).unwrap_err().code, Code::UnknownMethod, "streams are on the socket");
 }
 

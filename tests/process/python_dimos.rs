@@ -242,7 +242,7 @@ fn n13_of_two_coordinators_on_a_bus_ours_is_refused_or_ends() {
     let (home, _run) = cell(&bus, ", command: true");
     let mut events = home.client();
     let stream = dimos::rpc::streams::Stream::Events;
-    events.call(dimos::rpc::streams::Subscribe { stream, rate: None }).unwrap();
+    events.call(dimos::rpc::streams::Subscribe::to(stream)).unwrap();
     let slow = bus.says("begin", "").pop().unwrap();
     assert_eq!(status(&slow), "ACCEPTED");
     let _theirs = bus.coordinator();

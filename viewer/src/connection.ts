@@ -23,7 +23,7 @@ export class Connection {
   /** The server has as many pages as it serves. */
   full = false;
   onState: () => void = () => {};
-  onStream: (stream: string, data: unknown, lost: number) => void = () => {};
+  onStream: (stream: string, data: unknown, lost: number, past: boolean) => void = () => {};
 
   private socket: WebSocket | null = null;
   private pending = new Map<number, Pending>();
@@ -93,7 +93,7 @@ export class Connection {
 
   private take(message: Record<string, unknown>): void {
     if (typeof message.stream === 'string') {
-      this.onStream(message.stream, message.data, (message.lost as number | undefined) ?? 0);
+      this.onStream(message.stream, message.data, (message.lost as number | undefined) ?? 0, message.past === true);
       return;
     }
     const pending = this.pending.get(message.id as number);

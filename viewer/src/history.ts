@@ -96,6 +96,12 @@ export class History {
   }
 
   takeJoints(state: JointState): void {
+    this.takePast(state);
+    this.takeTick(state);
+  }
+
+  /** A state whose time is not exactly that of its tick: it tells nothing of lateness. */
+  takePast(state: JointState): void {
     const names = state.name.join();
     if (names !== this.names) {
       this.names = names;
@@ -117,7 +123,6 @@ export class History {
         indices.map((i) => state.effort[i]),
       );
     }
-    this.takeTick(state);
   }
 
   /** `follows`: whether an arm is commanded by positions, so that there is a tracking error. */

@@ -46,6 +46,7 @@ async function main(): Promise<void> {
   context.gizmo = new Gizmo(stage);
   context.view = new View(stage, context, token);
   run.onJoints.on((state) => context.history.takeJoints(state));
+  run.onPastJoints.on((state) => context.history.takePast(state));
   // While it is jogged the mode may be another one than that of the newest status.
   const follows = (arm: string) => !run.streaming && run.arm(arm)?.mode.endsWith('position') !== false;
   run.onState.on((state) => context.history.takeState(state, follows));

@@ -35,6 +35,8 @@ export class Run {
   lost = 0;
 
   readonly onJoints = new Signal<JointState>();
+  /** Joint states from before the page was opened or connected again. */
+  readonly onPastJoints = new Signal<JointState>();
   readonly onState = new Signal<State>();
   readonly onStatus = new Signal<Status>();
   readonly onWorld = new Signal();
@@ -60,7 +62,7 @@ export class Run {
   }
 
   start(): void {
-    this.work.onStream = (stream, data, lost) => this.takeStream(stream, data, lost);
+    this.work.onStream = (...message) => this.takeStream(...message);
     this.work.onState = () => {
       if (this.work.state === 'open') void this.begin();
       this.onLink.emit();
@@ -120,8 +122,8 @@ export class Run {
 
   private async begin(): Promise<void> {
     try {
-      await this.work.request('subscribe', {stream: 'coordinator_joint_state', rate: JOINT_RATE});
-      await this.work.request('subscribe', {stream: 'events'});
+      await this.work.request('subscribe', {stream: 'coordinator_joint_state', rate: JOINT_RATE, past: true});
+      await this.work.request('subscribe', {stream: 'events', past: true});
       if (this.scene.planner) this.planner = await this.work.request<PlannerReport>('planner');
       await this.readPoses();
     } catch (error) {
@@ -129,14 +131,18 @@ export class Run {
     }
   }
 
-  private takeStream(stream: string, data: unknown, lost: number): void {
-    if (stream === 'coordinator_joint_state') {
+  private takeStream(stream: string, data: unknown, lost: number, past: boolean): void {
+    if (stream === 'coordinator_joint_state' && past) {
+      this.onPastJoints.emit(data as JointState);
+    } else if (stream === 'coordinator_joint_state') {
       this.received = performance.now();
       this.lost += lost;
       this.joints = data as JointState;
       this.onJoints.emit(this.joints);
     } else if (stream === 'events') {
       const event = data as RunEvent;
+      // After a lost connection the run repeats what is known.
+      if (past && event.stamp <= (this.events.at(-1)?.stamp ?? 0)) return;
       this.events.push(event);
       if (this.events.length > EVENTS_KEPT) this.events.shift();
       this.onEvent.emit(event);

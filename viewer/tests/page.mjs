@@ -116,6 +116,21 @@ test('Stop holds the moving arm and says so; Reset and Enable are separate acts'
   assert.ok(near(run.positions(), held, 1e-3), 'neither moves the arm');
 });
 
+test('a page that is opened later shows how it came about', async () => {
+  const later = await open(browser, run.url);
+  const opened = Date.now() / 1000;
+  await text(later, '#age', /^live$/);
+  await later.click('[data-tab=events]');
+  await text(later, '#events', /arm is held \(stopped by an operator\)/);
+  const [times, joint2] = await later.evaluate(() => {
+    const [times, , joint2] = window.dimos.history.arms.get('arm').position.since(0, 10_000, false);
+    return [times, joint2];
+  });
+  assert.ok(times[0] < opened - 2, `begins ${opened - times[0]} s before it was opened`);
+  assert.ok(Math.max(...joint2) - Math.min(...joint2) > 0.2, 'the motions that the other page has seen');
+  await later.context().close();
+});
+
 test('a wrong token shows nothing of the run', async () => {
   const stranger = await open(browser, run.url.replace(/#.*/, '#00000000000000000000000000000000'));
   await text(stranger, '#message', /refuses this token/);
@@ -163,6 +178,9 @@ test('a lost connection is shown, disables acts, and recovers', async () => {
   run.child.kill('SIGCONT');
   await text(page, '#age', /^live$/);
   await page.waitForSelector('#pause:enabled');
+  await text(page, '#events', /the process did not run|held/);
+  const events = await page.locator('#events li').allTextContents();
+  assert.deepEqual([...new Set(events)], events, 'each event once');
   assert.deepEqual(
     page.errors.filter((text) => !/WebSocket|net::/.test(text)),
     [],

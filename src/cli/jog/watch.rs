@@ -102,7 +102,7 @@ fn read(
     to: &Mutex<ArmSnapshot>,
     ending: &AtomicBool,
 ) -> std::result::Result<(), ClientError> {
-    client.call(Subscribe { stream: Stream::Events, rate: None })?;
+    client.call(Subscribe::to(Stream::Events))?;
     let mut next = Instant::now();
     for round in 0_u32.. {
         if ending.load(Ordering::Relaxed) {

@@ -93,7 +93,7 @@ impl Reader {
 
     fn read(&self) -> Result<(), ClientError> {
         let mut client = Client::connect(&self.run, &self.socket)?;
-        client.call(Subscribe { stream: Stream::CoordinatorJointState, rate: None })?;
+        client.call(Subscribe::to(Stream::CoordinatorJointState))?;
         while !self.has_ended() {
             let message = match client.next_message() {
                 Ok(message) => message,

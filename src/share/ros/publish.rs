@@ -84,7 +84,7 @@ pub fn publish(node: &Node, source: &Source) -> zenoh::Result<()> {
 }
 
 fn publish_joints(source: &Source, mut client: Client, topic: &Topic) -> Result<(), ClientError> {
-    client.call(Subscribe { stream: Stream::CoordinatorJointState, rate: Some(JOINT_STATES) })?;
+    client.call(Subscribe { stream: Stream::CoordinatorJointState, rate: Some(JOINT_STATES), past: false })?;
     while !source.has_ended() {
         match client.next_message() {
             Ok(message) => {

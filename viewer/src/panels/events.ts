@@ -7,7 +7,7 @@ import {clock} from '../units';
 const SHOWN = 200;
 
 export function eventsPanel(context: Context): HTMLElement {
-  const none = el('li', {class: 'minor', text: 'none since this page was opened'});
+  const none = el('li', {class: 'minor', text: 'none yet'});
   const list = el('ol', {class: 'events', id: 'events'}, none);
   const add = (event: RunEvent) => {
     none.remove();
