@@ -150,6 +150,10 @@ fn in_tree(args: &Args, arm: &Arm) -> Result<(Plan, Vec<Line>, Next)> {
             format!("cargo run -- run {}", arm.planner()),
             "the same with a planner: `cargo run -- plan arm --named home`",
         ),
+        (
+            format!("grep -rn 'YOUR ARM' src/hardware/arms/{name} assets/robots/{name}.urdf"),
+            "what to change; the URDF has no gripper",
+        ),
     ];
     Ok((Plan { new, folders: vec![folder] }, lines, next))
 }
