@@ -134,7 +134,7 @@ fn lateness(time: Duration, loads: impl FnOnce(&Arc<AtomicBool>) -> Result<Vec<L
 fn reader(stop: &Arc<AtomicBool>) -> Load {
     let stop = stop.clone();
     Box::new(move |mut client| {
-        let stream = Subscribe { stream: Stream::CoordinatorJointState, rate: None };
+        let stream = Subscribe::to(Stream::CoordinatorJointState);
         if client.call(stream).is_ok() {
             while !stop.load(Ordering::Relaxed) && client.next_message().is_ok() {}
         }

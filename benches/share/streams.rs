@@ -79,7 +79,7 @@ fn subscribe(shared: &Shared, count: usize, time: Duration) -> Result<Vec<Seen>,
     let mut reading: Vec<JoinHandle<Seen>> = Vec::new();
     for _ in 0..count {
         let (mut client, stop) = (shared.connect()?, stop.clone());
-        client.call(Subscribe { stream: Stream::CoordinatorJointState, rate: None }).map_err(text)?;
+        client.call(Subscribe::to(Stream::CoordinatorJointState)).map_err(text)?;
         reading.push(std::thread::spawn(move || read(&mut client, &stop)));
     }
     std::thread::sleep(time);
