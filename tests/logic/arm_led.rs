@@ -188,6 +188,15 @@ fn stops_faults_and_the_end_of_the_run_reach_a_led_arm() {
     assert_eq!((elsewhere.phase(0), elsewhere.samples[0].cause), (Phase::Held, Cause::StoppedElsewhere));
     assert_eq!(elsewhere.arms[0].stops, 1, "or its controller continues when it is released");
 
+    // Another client controls it now: a stop of this run would be a command to that client's arm.
+    let mut of_another = Rig::one_arm(one(trajectory()));
+    of_another.arms[0].state.interference = dimos::arm::Interference::Mode;
+    of_another.run(2);
+    assert_eq!((of_another.phase(0), of_another.samples[0].cause), (Phase::Held, Cause::ModeChanged));
+    of_another.ask(Request::Stop { arm: None });
+    of_another.run(2);
+    assert_eq!(of_another.arms[0].stops, 0);
+
     let mut silent = led(LedBy::Controller);
     silent.arms[0].silent = true;
     silent.run_for(0.2);

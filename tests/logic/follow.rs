@@ -365,15 +365,53 @@ fn it_is_started_and_cancelled_and_ends_when_its_arm_or_its_leader_is_stopped() 
 }
 
 #[test]
+fn a_leader_that_is_held_for_another_reason_than_a_person_is_still_followed() {
+    let mut rig = Rig::new(100.0, vec![arm("leader", 6), arm("follower", 6)], vec![task_of(follow(|_| {}))]);
+    rig.make_ready();
+    assert_eq!(rig.ask(Request::Start { task: 0 }), Outcome::Accepted);
+    until_in_step(&mut rig);
+    // A hand moves it against its motors.
+    rig.arms[LEADER].blocked = true;
+    led(&mut rig, 1.0, |t| [0.4 * t, 0.0, 0.0, 0.0, 0.0, 0.0]);
+    assert_eq!(rig.phase(LEADER), Phase::Held);
+    assert!(!rig.samples[LEADER].cause.is_of_a_person(), "{:?}", rig.samples[LEADER].cause);
+    rig.run_for(2.0);
+    assert_eq!(rig.tasks[0].state, TaskState::Executing, "{:?}", rig.tasks[0]);
+    assert!((rig.arms[FOLLOWER].q[0] - 0.4).abs() < 0.02, "{:?}", rig.arms[FOLLOWER].q);
+}
+
+#[test]
 fn with_auto_start_it_begins_when_its_arm_is_ready_whatever_the_leaders_motors_do() {
-    let task = TaskConfig { auto_start: true, ..task_of(follow(|_| {})) };
-    let mut rig = Rig::new(100.0, vec![arm("leader", 6), arm("follower", 6)], vec![task]);
+    let task = || TaskConfig { auto_start: true, ..task_of(follow(|_| {})) };
+    let mut rig = Rig::new(100.0, vec![arm("leader", 6), arm("follower", 6)], vec![task()]);
     rig.arms[LEADER].enabled = false;
     rig.run(5);
     assert_eq!(rig.tasks[0].state, TaskState::Idle);
     rig.ask(Request::Enabled { arm: 1 });
     rig.run_for(0.5);
     assert_eq!(rig.tasks[0].state, TaskState::Executing, "{:?}", rig.events);
+
+    // Without the leader's position it waits, and so it does for an arm that it has nothing to do with.
+    for other in [LEADER, 2] {
+        let arms = vec![arm("leader", 6), arm("follower", 6), arm("other", 6)];
+        let mut rig = Rig::new(100.0, arms, vec![task()]);
+        rig.arms[LEADER].enabled = false;
+        rig.arms[2].enabled = other != 2;
+        rig.arms[LEADER].silent = other == LEADER;
+        rig.run(5);
+        for arm in if other == 2 { vec![1] } else { vec![1, 2] } {
+            rig.ask(Request::Enabled { arm });
+        }
+        rig.run_for(0.5);
+        assert_eq!(rig.tasks[0].state, TaskState::Idle, "{other}");
+        (rig.arms[LEADER].silent, rig.arms[2].enabled) = (false, true);
+        rig.run(5);
+        if other == 2 {
+            rig.ask(Request::Enabled { arm: 2 });
+        }
+        rig.run_for(0.5);
+        assert_eq!(rig.tasks[0].state, TaskState::Executing, "{other}: {:?}", rig.events);
+    }
 }
 
 #[test]

@@ -280,6 +280,53 @@ fn a_trajectory_towards_an_arm_that_follows_a_stream_ends_before_contact() {
     assert!(cell.distance_to("right") > 0.008, "{}", cell.distance_to("right"));
 }
 
+#[test]
+fn the_first_arms_trajectory_ends_as_well() {
+    let tasks = vec![task("left", trajectory(), 0..7, 10), task("right", servo(), 7..14, 10)];
+    let mut cell = Guarded::new(cell(), &home(), FAST, tasks);
+    let mut right = home()[7..].to_vec();
+    let reaching = [0.0, 0.4, 0.0, -1.6, 0.0, 2.0, 0.785];
+    cell.lead(1, &mut right, &reaching, 200);
+    let joints: Vec<u16> = (0..7).collect();
+    let sent = motion(1, &joints, &[(0.0, &home()[..7]), (2.5, &reaching)]);
+    let id = cell.rig.send(Request::Execute { task: 0, motion: sent });
+    cell.hold(1, &right, 300);
+    assert_eq!(cell.rig.outcome(id), Outcome::Accepted);
+    assert_eq!((cell.rig.tasks[0].state, cell.rig.tasks[0].reason), (TaskState::Aborted, Reason::Guarded(0)));
+}
+
+/// Its zeros would be somewhere, and no arm is there.
+#[test]
+fn an_arm_that_was_never_read_is_in_nothings_way() {
+    let tasks = || vec![task("left", servo(), 0..7, 10)];
+    let mut world = World::new();
+    for (name, x) in [("left", 0.0), ("right", 0.75)] {
+        world.add_robot(robot("fer", name, DAffine3::from_translation(DVec3::new(x, 0.0, 0.0)))).unwrap();
+    }
+    let reaching = [0.0, 1.2, 0.0, -0.4, 0.0, 0.1, 0.785];
+    let reached = |known: bool| {
+        let mut cell = Guarded::unready(world.clone(), &[HOME, [0.0; 7]].concat(), FAST, tasks());
+        cell.rig.arms[1].silent = !known;
+        cell.rig.arms[1].enabled = false;
+        cell.rig.run(2);
+        assert_eq!(cell.rig.ask(Request::Enabled { arm: 0 }), Outcome::Accepted);
+        cell.rig.run_for(0.3);
+        cell.take_world(|_| {});
+        let mut target = HOME.to_vec();
+        for _ in 0..200 {
+            for (at, goal) in target.iter_mut().zip(&reaching) {
+                *at += (goal - *at).clamp(-0.02, 0.02);
+            }
+            cell.rig.servo(0, &target);
+            cell.rig.tick();
+        }
+        (cell.rig.arms[0].q[1], blocked(&cell))
+    };
+    let ((with, stops), (without, none)) = (reached(true), reached(false));
+    assert!(stops > 0 && with < 1.1, "{with} {stops}");
+    assert!(none == 0 && (without - 1.2).abs() < 1e-6, "{without} {none}");
+}
+
 /// The world of the guard is not in the log: its verdicts are.
 #[test]
 fn a_guarded_run_replays_bit_for_bit() {

@@ -244,7 +244,9 @@ fn a_slow_reader_loses_its_own_messages_only_and_is_told() {
     let mut quick = Client::connect("test", server.socket()).unwrap();
     quick.call(subscribe).unwrap();
     for tick in 0..BURST {
-        backend.streams.publish_joint_state(Mono::ZERO, &JointState { tick, name: vec!["j".repeat(100)], ..Default::default() });
+        backend
+            .streams
+            .publish_joint_state(Mono::ZERO, &JointState { tick, name: vec!["j".repeat(100)], ..Default::default() });
         let message = quick.next_message().unwrap();
         assert_eq!((message.data["tick"].as_u64(), message.lost), (Some(tick), 0));
     }

@@ -5,7 +5,7 @@ use dimos::control::point_to_point::point_to_point;
 use dimos::control::request::{Motion, Request};
 use dimos::joint::{JointLimits, make_joints};
 use dimos::telemetry::{Event, Outcome, Reason, TaskState};
-use dimos::trajectory::{Cursor, Sample, Spline};
+use dimos::trajectory::{Cursor, JointTrajectory, Sample, Spline, TrajectoryPoint};
 
 use crate::support::rig::*;
 
@@ -118,6 +118,34 @@ fn a_motion_pauses_on_its_path_and_ends_where_it_should() {
     }
     assert_eq!(rig.tasks[0].state, TaskState::Completed);
     assert_eq!(rig.commanded(0), goal);
+}
+
+#[test]
+fn a_pause_takes_effect_also_where_the_path_needs_all_of_the_acceleration() {
+    let mut rig = rig(one(trajectory()));
+    // To the top speed at the acceleration limit, and back to rest.
+    let top = V_MAX / A_MAX;
+    let point = |t: f64, q: f64, v: f64, a: f64| TrajectoryPoint {
+        time_from_start: t,
+        positions: vec![q],
+        velocities: vec![v],
+        accelerations: vec![a],
+    };
+    let rise = 0.5 * V_MAX * top;
+    let points = vec![
+        point(0.0, 0.0, 0.0, A_MAX),
+        point(top, rise, V_MAX, A_MAX),
+        point(top + 1e-3, rise + V_MAX * 1e-3, V_MAX, 0.0),
+        point(top + 0.4, rise + V_MAX * 0.4, V_MAX, 0.0),
+        point(2.0 * top + 1.0, rise + V_MAX * 0.4 + 0.4, 0.0, 0.0),
+    ];
+    let spline = Spline::new(&JointTrajectory { joint_names: vec!["j0".into()], points }).unwrap();
+    rig.execute(0, Box::new(Motion { id: 7, joints: vec![0], spline }));
+    rig.run(10);
+    rig.ask(Request::Pause { on: true });
+    let took = rig.run_until(5.0, |rig| rig.speed(0) == 0.0);
+    // A tenth of the limit is left for it: 0.70 s.
+    assert!(took < 0.74, "{took} s");
 }
 
 #[test]

@@ -65,6 +65,15 @@ pub struct Guarded {
 impl Guarded {
     /// The arms of a world's robots at `home` with these limits of velocity and acceleration, ready and guarded.
     pub fn new(world: World, home: &[f64], limits: (f64, f64), tasks: Vec<TaskConfig>) -> Self {
+        let mut made = Self::unready(world, home, limits, tasks);
+        made.rig.make_ready();
+        made.take_world(|_| {});
+        assert_eq!(made.contact(), None, "the start");
+        made
+    }
+
+    /// The same before the first tick, without a guard.
+    pub fn unready(world: World, home: &[f64], limits: (f64, f64), tasks: Vec<TaskConfig>) -> Self {
         let config = |robot: &Robot| -> ArmConfig {
             let own = robot.kinematics.limits();
             let mut arm = arm(&robot.name, own.len());
@@ -83,11 +92,7 @@ impl Guarded {
         }
         let checker = ExactChecker::new(world.snapshot(), Resolution::default());
         let own = OwnMargins::of(&world.snapshot(), MARGINS.1);
-        let mut made = Self { rig, world, own, checker, last: home.to_vec() };
-        made.rig.make_ready();
-        made.take_world(|_| {});
-        assert_eq!(made.contact(), None, "the start");
-        made
+        Self { rig, world, own, checker, last: home.to_vec() }
     }
 
     /// Changes the world, as a run does: prepared elsewhere, taken by the next tick.

@@ -68,15 +68,13 @@ impl Coordinator {
             })
             .collect();
         let priorities: Vec<i32> = tasks.iter().map(|t| t.priority).collect();
-        // Each request has an outcome and may change a task; arms, tasks and joints report a few events at most.
-        let events = 2 * REQUESTS_PER_TICK + 6 * (arms.len() + tasks.len()) + arm_of.len();
         Self {
             period: 1.0 / config.rate,
             period_ns: Duration::from_secs_f64(1.0 / config.rate).as_nanos().max(1) as u64,
             arbiter: Arbiter::new(&priorities, arm_of.clone(), arms.len()),
             joints: vec![JointView::default(); arm_of.len()],
             guard: Guard::new(arms.len()),
-            output: TickOutput::new(arms.len(), tasks.len(), events, 2 * tasks.len() + REQUESTS_PER_TICK),
+            output: TickOutput::new(arms.len(), tasks.len(), arm_of.len()),
             arms,
             tasks,
             arm_of,

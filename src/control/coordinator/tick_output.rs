@@ -1,5 +1,6 @@
 //! Times and output of a tick.
 
+use super::REQUESTS_PER_TICK;
 use crate::arm::ArmCommand;
 use crate::clock::Mono;
 use crate::control::request::Motion;
@@ -41,8 +42,12 @@ pub struct TickOutput {
 }
 
 impl TickOutput {
-    /// Creates the output of this many arms and tasks, with room for events and for motions that end in one tick.
-    pub(super) fn new(arms: usize, tasks: usize, events: usize, motions: usize) -> Self {
+    /// Creates the output of this many arms, tasks and joints, with room for all that one tick reports and retires.
+    pub(super) fn new(arms: usize, tasks: usize, joints: usize) -> Self {
+        // Each request has an outcome and may change a task; arms, tasks and joints report a few events at most.
+        let events = 2 * REQUESTS_PER_TICK + 6 * (arms + tasks) + joints;
+        // Each task may end the motion that it has, and each request one more.
+        let motions = 2 * tasks + REQUESTS_PER_TICK;
         Self {
             commands: vec![ArmCommand::default(); arms],
             arms: Vec::with_capacity(arms),
@@ -69,8 +74,19 @@ mod tests {
     use super::*;
 
     #[test]
+    fn there_is_room_for_a_few_events_of_each_arm_task_joint_and_request() {
+        let room = |arms, tasks, joints| {
+            let output = TickOutput::new(arms, tasks, joints);
+            (output.events.capacity() - 2 * REQUESTS_PER_TICK, output.retired.capacity() - REQUESTS_PER_TICK)
+        };
+        assert_eq!(room(2, 0, 0), (12, 0));
+        assert_eq!(room(0, 3, 0), (18, 6));
+        assert_eq!(room(2, 3, 13), (12 + 18 + 13, 6));
+    }
+
+    #[test]
     fn events_that_do_not_fit_are_counted_and_nothing_is_allocated() {
-        let mut output = TickOutput::new(1, 1, 3, 1);
+        let mut output = TickOutput::new(1, 1, 3);
         let room = output.events.capacity();
         for k in 0..room as u32 + 2 {
             output.report(Event::Overrun(k, 0));

@@ -170,6 +170,13 @@ impl Health {
         })
     }
 
+    /// Does something while a reader holds the values that change slowly.
+    #[cfg(test)]
+    pub(super) fn while_details_are_read(&self, act: impl FnOnce()) {
+        let _held = lock(&self.details);
+        act();
+    }
+
     /// Returns recent episodes, the newest last.
     pub fn episodes(&self) -> Vec<Episode> {
         lock(&self.text).episodes.iter().cloned().collect()

@@ -74,7 +74,6 @@ impl Worker {
         let Pending { way, reply, .. } = &pending;
         let mode = match way {
             _ if ahead > 0 => Err(AdapterError::Timeout("the tick did not pass the arm on".to_owned())),
-            _ if !self.connected => Err(AdapterError::NotConnected),
             Way::Hand => adapter.hand_guiding().map_or(Err(AdapterError::Unsupported), |arm| arm.begin_hand_guiding()),
             Way::To(..) if adapter.cartesian().is_none() => Err(AdapterError::Unsupported),
             Way::To(..) => adapter.set_control_mode(ControlMode::Position),
@@ -89,9 +88,8 @@ impl Worker {
             (Way::To(pose, speed), Some(arm)) => mode.and_then(|()| arm.write_cartesian_position(pose, *speed)),
             _ => mode,
         };
-        match result {
-            Err(ref error) if !matches!(error, AdapterError::Unsupported) => self.after_error(adapter, error),
-            _ => {}
+        if let Err(error) = &result {
+            self.after_error(adapter, error);
         }
         self.lead.active = result.is_ok();
         // Another one than that is another client's.

@@ -215,6 +215,14 @@ fn errors_of_the_connection_end_it_and_others_do_not() {
     bench.worker.after_error(&mut bench.adapter, &AdapterError::Timeout("no answer".into()));
     assert!(!bench.worker.connected);
     assert!(!bench.worker.plausible.stable(bench.worker.state.stamp));
+
+    // The third failed write faults the link before the next reading.
+    let mut bench = Bench::enabled();
+    for (failures, link) in [(2, Link::Up), (3, Link::Faulted)] {
+        bench.worker.write_errors = failures;
+        bench.worker.after_error(&mut bench.adapter, &AdapterError::Rejected("no".into()));
+        assert_eq!(bench.states.read().link, link);
+    }
 }
 
 #[test]

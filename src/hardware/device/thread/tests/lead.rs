@@ -105,6 +105,46 @@ fn an_order_that_comes_after_the_stop_of_its_lead_is_refused() {
 }
 
 #[test]
+fn an_order_whose_lead_never_comes_is_refused_in_the_end_and_an_arm_without_poses_at_once() {
+    let mut bench = holding();
+    let early = native(&bench);
+    for _ in 0..700 {
+        bench.tick(|c| c.mode = None);
+    }
+    assert_eq!(early.try_recv(), Ok(Err(AdapterError::Timeout("the tick did not pass the arm on".into()))));
+    let mut plain = Bench::enabled();
+    plain.hold_at(0.0);
+    plain.arm.clear_calls();
+    let answer = native(&plain);
+    idle(&mut plain);
+    assert_eq!(answer.try_recv(), Ok(Err(AdapterError::Unsupported)));
+    for bench in [&bench, &plain] {
+        assert_eq!((bench.count("set_control_mode"), bench.count("write_cartesian_position")), (0, 0));
+    }
+}
+
+#[test]
+fn an_order_that_is_not_carried_out_yet_ends_with_the_motors_and_with_the_connection() {
+    let mut bench = holding();
+    bench.arm.fail("set_control_mode", AdapterError::Rejected("under way".into()));
+    let answer = native(&bench);
+    idle(&mut bench);
+    let (reply, disabled) = sync_channel(1);
+    bench._orders.send(Order::Disable(reply)).unwrap();
+    idle(&mut bench);
+    assert_eq!(disabled.try_recv(), Ok(Ok(())));
+    assert_eq!(answer.try_recv(), Ok(Err(AdapterError::Rejected("the motors were switched off".into()))));
+    assert_eq!(bench.count("write_cartesian_position"), 0);
+
+    let mut bench = holding();
+    bench.arm.fail("write_cartesian_position", AdapterError::NotConnected);
+    let answer = native(&bench);
+    idle(&mut bench);
+    assert_eq!(answer.try_recv(), Ok(Err(AdapterError::NotConnected)));
+    assert_eq!(bench.states.read().link, crate::arm::Link::Faulted, "at once");
+}
+
+#[test]
 fn an_order_that_comes_before_its_lead_waits_for_it() {
     let mut bench = holding();
     let early = native(&bench);
@@ -126,19 +166,29 @@ fn a_stop_that_the_arm_does_not_take_at_once_begins_no_motion() {
 
 #[test]
 fn an_arm_whose_motors_were_switched_off_is_not_taken_over() {
-    let mut bench = holding();
-    let answer = native(&bench);
-    idle(&mut bench);
-    assert_eq!(answer.try_recv(), Ok(Ok(())));
+    let led = || {
+        let mut bench = holding();
+        let answer = native(&bench);
+        idle(&mut bench);
+        assert_eq!(answer.try_recv(), Ok(Ok(())));
+        bench
+    };
     let ask = |order: fn(std::sync::mpsc::SyncSender<AdapterResult<()>>) -> Order, bench: &mut Bench| {
         let (reply, answer) = sync_channel(1);
         bench._orders.send(order(reply)).unwrap();
-        stop(bench);
+        bench.stepping(Duration::from_millis(1), stop);
         answer.recv().unwrap()
     };
-    ask(Order::Disable, &mut bench).unwrap();
-    assert!(matches!(ask(Order::TakeOver, &mut bench), Err(AdapterError::Rejected(_))));
-    assert!(!bench.states.read().enabled);
+    let mut by_the_run = led();
+    ask(Order::Disable, &mut by_the_run).unwrap();
+    assert!(matches!(ask(Order::TakeOver, &mut by_the_run), Err(AdapterError::Rejected(_))));
+    assert!(!by_the_run.states.read().enabled);
+    let mut by_others = led();
+    drop(by_others.arm.clone().enabled(false));
+    (0..5).for_each(|_| drop(idle(&mut by_others)));
+    assert!(matches!(ask(Order::TakeOver, &mut by_others), Err(AdapterError::Rejected(_))));
+    let mut with_motors = led();
+    assert_eq!(ask(Order::TakeOver, &mut with_motors), Ok(()));
 }
 
 #[test]

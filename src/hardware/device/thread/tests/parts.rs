@@ -22,6 +22,8 @@ struct Parts {
     taken_as: Vec<Load>,
     gravity: [f64; 3],
     mounting: Option<AdapterError>,
+    /// It takes a mounting, and stays with its own.
+    keeps_mounting: bool,
     /// Readings that fail: inputs, joints, load.
     failing: [Option<AdapterError>; 3],
     read: [u32; 3],
@@ -148,7 +150,9 @@ impl Payload for Equipped {
             return Err(error);
         }
         self.parts.written.push(format!("gravity {gravity:?}"));
-        self.parts.gravity = gravity;
+        if !self.parts.keeps_mounting {
+            self.parts.gravity = gravity;
+        }
         Ok(())
     }
 }
@@ -246,16 +250,20 @@ fn the_mounting_is_set_if_it_differs_and_read_back() {
     let (refused, _) = mount(DOWN, Some(AdapterError::Unsupported));
     assert!(refused.unwrap_err().starts_with("the mounting of this arm cannot be set\nhint: "));
     assert_eq!(mount(DOWN, Some(AdapterError::Rejected("no".into()))).0, Err("no".into()));
+    let (mut bench, mut arm) = equipped(Setup { gravity: Some(UP), ..Setup::default() });
+    arm.parts.keeps_mounting = true;
+    let refused = bench.worker.configure(&mut arm).unwrap_err().to_string();
+    assert!(refused.contains("the controller reports gravity along [0.000, 0.000, -1.000]"), "{refused}");
 }
 
 #[test]
 fn the_stop_input_is_read_in_every_cycle_and_unread_it_is_no_state() {
     let (mut bench, mut arm) =
         equipped(Setup { stop_input: Some(StopInput { input: 1, open: false }), ..Setup::default() });
-    for _ in 0..30 {
+    for _ in 0..120 {
         assert!(!cycle(&mut bench, &mut arm).stop_input_open);
     }
-    assert_eq!(arm.parts.read[0], 30, "once per cycle, also where it would be its turn among slow readings");
+    assert_eq!(arm.parts.read[0], 120, "once per cycle, also where it would be its turn among slow readings");
     arm.parts.io.digital_inputs = 0b01;
     assert!(cycle(&mut bench, &mut arm).stop_input_open);
     assert_eq!(bench.worker.health.details().io, Some(arm.parts.io));
@@ -305,6 +313,13 @@ fn slow_values_are_read_in_turn_five_times_a_second_and_published_with_their_cha
     let details = bench.worker.health.details();
     assert_eq!((details.io_seq, details.payload_seq, details.payload), (2, 2, Some(kg(3.0))));
     assert_eq!(details.io.map(|io| io.digital_inputs), Some(0));
+    // What a reader keeps from being published is published when it lets go.
+    arm.parts.load = kg(4.0);
+    bench.worker.health.clone().while_details_are_read(|| (0..60).for_each(|_| drop(cycle(&mut bench, &mut arm))));
+    assert_eq!(bench.worker.health.details().payload, Some(kg(3.0)));
+    arm.parts.failing[2] = Some(AdapterError::Timeout("no load".into()));
+    cycle(&mut bench, &mut arm);
+    assert_eq!(bench.worker.health.details().payload, Some(kg(4.0)));
     // An output was set: inputs and outputs are next.
     let before = arm.parts.read[0];
     bench.worker.slow.read_io_next();

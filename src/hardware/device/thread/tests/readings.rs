@@ -277,3 +277,13 @@ fn setpoints_start_at_the_arm_once_its_motors_were_off() {
     bench.hold_at(0.3);
     assert_eq!(bench.written(), [0.0, 0.3]);
 }
+
+#[test]
+fn while_its_motors_are_on_setpoints_continue_from_the_last_one_however_far_the_arm_lags() {
+    let mut bench = Bench::enabled();
+    let setpoints: Vec<f64> = (0..60).map(|k| f64::from(k) * 0.02).collect();
+    for setpoint in &setpoints {
+        bench.hold_at(*setpoint);
+    }
+    assert_eq!(bench.written(), setpoints, "the mock arm stays at 0");
+}
