@@ -24,6 +24,7 @@ mod conformance_finds_faults;
 mod conformance_pushed;
 mod coordinator;
 mod device_stops;
+mod device_streams;
 mod english;
 mod faults;
 mod follow;
