@@ -257,8 +257,10 @@ pub fn worlds(effort: Effort) -> Result<(), String> {
         let goals = cell.goals(effort.of(5, 200))?;
         rows.push(cell.plans(&goals)?.row(&format!("{points} points")));
         if points == 10_000 {
-            let times = under_way(&cell, &goals, effort.of(5, 100))?;
+            let times = under_way(&mut cell, &goals, effort.of(5, 100), false)?;
             adding.push(Measure::new("check of the rest of a motion", "ms", times).goal(Goal::AtMost(1.0)));
+            let times = under_way(&mut cell, &goals, effort.of(5, 100), true)?;
+            adding.push(Measure::new("the same, the first after a change", "ms", times).goal(Goal::AtMost(1.0)));
         }
     }
     let mut cell = Cell::up(CELL, 3)?;
@@ -290,10 +292,11 @@ fn write_ply(file: &Path, points: &[[f64; 3]]) -> std::io::Result<()> {
     points.iter().flatten().try_for_each(|x| out.write_all(&(*x as f32).to_le_bytes()))
 }
 
-/// Times the check of the rest of planned motions in the world of a cell, from a tenth of their duration on [ms].
-fn under_way(cell: &Cell, goals: &[Vec<f64>], number: usize) -> Result<Vec<f64>, String> {
+/// Times the check of the rest of planned motions in the world of a cell, from a tenth of their duration on [ms];
+/// `changed`: each the first one after an obstacle was moved that is in nothing's way.
+fn under_way(cell: &mut Cell, goals: &[Vec<f64>], number: usize, changed: bool) -> Result<Vec<f64>, String> {
     let mut times = Vec::new();
-    for q in goals.iter().take(number) {
+    for (k, q) in goals.iter().take(number).enumerate() {
         let request = PlanRequest {
             goals: vec![(0, PlanningGoal::Joints(q.clone()))],
             positions: cell.start.clone(),
@@ -308,6 +311,12 @@ fn under_way(cell: &Cell, goals: &[Vec<f64>], number: usize) -> Result<Vec<f64>,
         let deadline = Stop::new(Some(Instant::now() + Duration::from_secs(5)), None);
         let Ok(motion) = solve(&cell.scene, &cell.world, &request, &deadline) else { continue };
         let elapsed = 0.1 * motion.trajectory.duration();
+        if changed {
+            let pose = Isometry3::translation(5.0, 0.01 * k as f64, 0.0);
+            let shape = ObjectShape::Box([0.1; 3]);
+            let moved = ObjectConfig { name: "moved".into(), shape, pose, padding: 0.0 };
+            cell.world.put(obstacle(&moved)?).map_err(|e| e.to_string())?;
+        }
         let began = Instant::now();
         let blocked = look_ahead(&cell.scene, &cell.world, &motion, &cell.start, elapsed, &Stop::never());
         times.push(began.elapsed().as_secs_f64() * 1e3);
