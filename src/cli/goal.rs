@@ -185,8 +185,8 @@ pub struct Search {
     /// Fraction of the velocity and acceleration limits to use: 0.01–1, or 1–100%
     #[arg(long, value_name = "FRACTION", default_value_t = DEFAULT_SPEED, value_parser = speed)]
     pub speed: f64,
-    /// Move the tool centre point on a straight line to --pose or by --by
-    #[arg(long, requires = "tcp")]
+    /// Move the tool centre point on a straight line to --pose or by --by; waypoints of --through have line: for that
+    #[arg(long, requires = "tcp", conflicts_with = "through")]
     pub linear: bool,
     /// Seed of the search: the same request with the same seed gives the same plan
     #[arg(long, value_name = "N", default_value_t = 0)]

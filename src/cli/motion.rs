@@ -22,6 +22,8 @@ use crate::telemetry::describe::percent;
 dimos move ARM Q… [OPTIONS]
        dimos move ARM --named NAME [OPTIONS]
        dimos move ARM --pose X Y Z [--rpy R P Y | --quat X Y Z W] [OPTIONS]
+       dimos move ARM --by X Y Z [--frame FRAME] [OPTIONS]
+       dimos move ARM --through WAYPOINT… [--blend DISTANCE] [OPTIONS]
        dimos move ARM --path FILE [--tolerance ANGLE] [OPTIONS]
        dimos move --goal ARM=GOAL… [OPTIONS]",
     after_help = "\

@@ -14,6 +14,9 @@ use super::output;
 dimos plan ARM Q… [OPTIONS]
        dimos plan ARM --named NAME [OPTIONS]
        dimos plan ARM --pose X Y Z [--rpy R P Y | --quat X Y Z W] [OPTIONS]
+       dimos plan ARM --by X Y Z [--frame FRAME] [OPTIONS]
+       dimos plan ARM --through WAYPOINT… [--blend DISTANCE] [OPTIONS]
+       dimos plan ARM --path FILE [--tolerance ANGLE] [OPTIONS]
        dimos plan --goal ARM=GOAL… [OPTIONS]",
     after_help = "\
 Next: `dimos preview` shows the plan, `dimos execute` executes it. `dimos move` plans and executes in one step.

@@ -209,7 +209,8 @@ pub fn run(args: &Args) -> Result {
                 client.call(WorldAdd(object.clone()))?;
             }
             let added: Vec<&str> = names.iter().filter(|name| !replaced.iter().any(|r| r == *name)).copied().collect();
-            let text = format!("{} objects added, {} replaced", added.len(), replaced.len());
+            let objects = if added.len() == 1 { "object" } else { "objects" };
+            let text = format!("{} {objects} added, {} replaced", added.len(), replaced.len());
             done(text, json!({"added": added, "replaced": replaced}), a.target_run.json);
         }
         Command::Attach(a) => {

@@ -168,7 +168,7 @@ pub(super) fn line(stage: &mut Stage<'_>, target: &DAffine3, stop: &Stop) -> Res
     let reason = contact.map_or(reason, |contact| format!(": {contact}"));
     let part = 100.0 * line.fraction;
     Err(PlanFailure::new(format!("only {part:.1} % of the straight line is possible{reason}"))
-        .hint("omit --linear for any collision-free path, or choose a closer pose"))
+        .hint("omit --linear (in a waypoint: line:) for any collision-free path, or choose a closer pose"))
 }
 
 /// Follows given configurations straight in joint space, from the stage's start; fails where they are blocked.

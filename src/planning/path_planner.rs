@@ -199,7 +199,7 @@ pub fn plan<C: CollisionChecker>(
                 let found = match found {
                     Ok(found) => found,
                     Err(Halt::TookLong) => {
-                        not_enclosed(checker, &from, &goals, settings.seed, stop)?;
+                        not_enclosed(checker, &from, &goals, settings, stop)?;
                         continue;
                     }
                     Err(Halt::Stopped) if stop.is_cancelled() => return Err(PlanError::Cancelled),
@@ -236,24 +236,27 @@ pub fn plan<C: CollisionChecker>(
     })
 }
 
-/// Fails if the start, or every goal, is enclosed.
+/// Fails if every goal, or the start, is enclosed.
 fn not_enclosed<C: CollisionChecker>(
     checker: &mut C,
     start: &[f64],
     goals: &[Vec<f64>],
-    seed: u64,
+    settings: &PlanSettings,
     stop: &Stop,
 ) -> Result<(), PlanError> {
-    if let Some(enclosed) = enclosed(checker, start, goals, seed, stop) {
-        return Err(PlanError::Enclosed { which: "start", enclosed });
-    }
+    let how = (settings.seed, settings.level.proves());
     let to = [start.to_vec()];
     let mut nearest = None;
-    for goal in goals {
-        let Some(enclosed) = enclosed(checker, goal, &to, seed, stop) else { return Ok(()) };
-        nearest.get_or_insert(enclosed);
+    // What both say of a wall between them is plainer of the goal: the start has most of the space as a rule.
+    if goals.iter().all(|goal| enclosed(checker, goal, &to, how, stop).map(|e| nearest.get_or_insert(e)).is_some())
+        && let Some(enclosed) = nearest
+    {
+        return Err(PlanError::Enclosed { which: "goal", enclosed });
     }
-    nearest.map_or(Ok(()), |enclosed| Err(PlanError::Enclosed { which: "goal", enclosed }))
+    match enclosed(checker, start, goals, how, stop) {
+        Some(enclosed) => Err(PlanError::Enclosed { which: "start", enclosed }),
+        None => Ok(()),
+    }
 }
 
 /// Smallest and largest number of random cuts of a path.

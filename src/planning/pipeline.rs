@@ -19,6 +19,7 @@ use super::stage_cache::Key;
 use super::start_contact::{EscapePath, passes};
 use super::timing::{bounds, time_within};
 use crate::collision::kept::Kept;
+use crate::collision::report::Pair;
 use crate::collision::world::{Robot, World};
 use crate::collision::{CollisionChecker, Stop};
 use crate::robot::model::Limits;
@@ -311,7 +312,11 @@ pub(super) fn failure_for(stage: &Stage<'_>, error: &PlanError) -> PlanFailure {
             PlanFailure::new(format!(
                 "the {which} is enclosed: {name} does not leave {low:.2} … {high:.2} {unit} there{by}"
             ))
-            .hint("move the obstacle, or choose another goal; a very narrow way out may have been missed")
+            .hint(if enclosed.contacts.iter().any(|contact| matches!(contact.pair, Pair::Obstacle(..))) {
+                "move the obstacle, or choose another goal; a very narrow way out may have been missed"
+            } else {
+                "choose another goal; a very narrow way out may have been missed"
+            })
         }
         PlanError::Timeout(_) => PlanFailure::new(error.to_string()).hint("increase --timeout, or try another --seed"),
         PlanError::Cancelled => PlanFailure::cancelled(),

@@ -37,7 +37,7 @@ const ONE_ARM: usize = 8;
 /// A proven edge takes about as long as this number of edges that look free or not.
 const PROOF_COST: u64 = 4;
 /// After this number of rounds it has taken long.
-const LONG_ROUNDS: u32 = 3;
+const LONG_ROUNDS: u32 = 5;
 /// The turns become no longer after this number of doublings.
 const DOUBLINGS: u32 = 6;
 

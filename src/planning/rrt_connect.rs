@@ -175,14 +175,14 @@ impl Search {
                 return None;
             }
             polled += 1;
-            if self.batch.is_used() {
-                self.draw();
-            }
             // The smaller tree grows; trees of equal size alternate.
             self.side = match self.trees[self.side].len().cmp(&self.trees[1 - self.side].len()) {
                 std::cmp::Ordering::Less => self.side,
                 _ => 1 - self.side,
             };
+            if self.batch.is_used() {
+                self.draw();
+            }
             let tree = &self.trees[self.side];
             let (lane, nearest, far) = self.batch.next(tree, self.side);
             self.count.samples += 1;
@@ -216,7 +216,7 @@ impl Search {
     fn draw(&mut self) {
         let Self { sampler, limits, settings, trees, batch, .. } = self;
         let local = self.misses >= MISSES;
-        let tree = &trees[1 - self.side];
+        let tree = &trees[self.side];
         batch.fill(|samples| {
             sampler.fill(samples);
             if !local {

@@ -4,9 +4,11 @@ use std::sync::Arc;
 
 use glamx::{DAffine3, DVec3};
 
+use super::enclosure::enclosed;
 use super::padded::{Near, Padded};
 use super::path::{distance, length};
 use super::path_planner::{PlanError, PlanSettings, plan};
+use super::rrt_connect::{Quantum, RrtSettings, Search};
 use crate::collision::body::{MeshMode, solids};
 use crate::collision::checker::{CollisionChecker, Resolution, Stop};
 use crate::collision::report::{Contact, Pair};
@@ -78,6 +80,79 @@ impl CollisionChecker for Plane {
     fn checks(&self) -> u64 {
         self.checks
     }
+}
+
+/// Eight joints, and a wall across the first one with a window in the next three.
+struct Walled {
+    limits: [Limits; 8],
+    /// Half of a window's width [rad].
+    window: f64,
+    checks: u64,
+}
+
+impl CollisionChecker for Walled {
+    fn dof(&self) -> usize {
+        8
+    }
+    fn limits(&self) -> &[Limits] {
+        &self.limits
+    }
+    fn turns(&self) -> &[bool] {
+        &[false; 8]
+    }
+    fn resolution(&self) -> Resolution {
+        Resolution::default()
+    }
+    fn is_free(&mut self, q: &[f64]) -> bool {
+        self.checks += 1;
+        !(0.4..0.5).contains(&q[0]) || q[1..4].iter().all(|x| (x - 2.0).abs() < self.window)
+    }
+    fn motion_is_free(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool {
+        let steps = (distance(from, to) / 0.02).ceil().max(1.0);
+        let at = |k: f64| from.iter().zip(to).map(|(a, b)| a + (b - a) * k / steps).collect::<Vec<f64>>();
+        !stop.is_over() && (0..=steps as usize).all(|k| self.is_free(&at(k as f64)))
+    }
+    fn first_contact(&mut self, q: &[f64]) -> Option<Pair> {
+        (!self.is_free(q)).then_some(Pair::Links(0, 1))
+    }
+    fn clearance(&mut self, _: &[f64]) -> Option<Contact> {
+        None
+    }
+    fn contacts(&mut self, _: &[f64]) -> Vec<Contact> {
+        Vec::new()
+    }
+    fn checks(&self) -> u64 {
+        self.checks
+    }
+}
+
+#[test]
+fn a_window_in_a_wall_is_a_way_out_and_a_wall_without_one_encloses() {
+    let limits = [Limits { lower: -3.0, upper: 3.0, ..Limits::NONE }; 8];
+    let (from, other) = ([1.0, -2.0, -2.0, -2.0, 0.0, 0.0, 0.0, 0.0], vec![-1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+    for seed in 0..3 {
+        let encloses = |window| {
+            let mut walled = Walled { limits, window, checks: 0 };
+            enclosed(&mut walled, &from, std::slice::from_ref(&other), (seed, true), &Stop::never())
+        };
+        // Half a percent of the wall; no joint but the first is held up.
+        assert_eq!(encloses(0.5), None, "seed {seed}");
+        let found = encloses(0.0).unwrap();
+        assert!(found.joint == 0 && (0.5..0.54).contains(&found.reached[0]), "seed {seed}: {found:?}");
+    }
+}
+
+#[test]
+fn a_tree_that_does_not_grow_gets_samples_that_it_can_use() {
+    let limits = [Limits { lower: -3.0, upper: 3.0, ..Limits::NONE }; 8];
+    let settings = RrtSettings { radius: 0.5, min_radius: 0.5, ..RrtSettings::default() };
+    let mut search = Search::new(&[-1.0; 8], &[vec![2.0; 8]], (&limits, &[false; 8]), &settings, 0.5, 0);
+    // The start's tree grows, and nothing leads away from the goal.
+    let mut is_free = |from: &[f64], to: &[f64]| from[0] < 0.0 && to[0] < 0.0;
+    let quantum = Quantum { edges: 2000, samples: 1_000_000, nodes: 100_000 };
+    assert_eq!(search.run(&mut is_free, quantum, &Stop::never()), None);
+    // Of 128 samples between the limits none is near the goal; then half of the next are.
+    assert!(search.count().samples < 64_000, "{:?}", search.count());
 }
 
 #[test]

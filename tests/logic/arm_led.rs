@@ -159,6 +159,21 @@ fn the_joint_that_keeps_a_controller_from_starting_is_named_over_all_arms() {
 }
 
 #[test]
+fn each_lead_has_a_number_of_its_own_and_a_refused_one_has_none() {
+    let mut rig = led(LedBy::Hand);
+    let first = rig.commands[0].lead_seq;
+    rig.ask(Request::Stop { arm: None });
+    let lead = || Request::Lead { arm: 0, by: LedBy::Controller };
+    assert_eq!(rig.ask(lead()), Outcome::ArmLatched(0, Cause::Operator));
+    rig.ask(Request::Reset { arm: 0 });
+    rig.ask(Request::Enabled { arm: 0 });
+    rig.run_for(0.5);
+    assert_eq!(rig.commands[0].lead_seq, first);
+    assert_eq!(rig.ask(lead()), Outcome::Accepted);
+    assert_eq!(rig.commands[0].lead_seq, first + 1);
+}
+
+#[test]
 fn stops_faults_and_the_end_of_the_run_reach_a_led_arm() {
     let mut stopped = led(LedBy::Controller);
     lead(&mut stopped, 0.5, 0.3);
@@ -184,9 +199,11 @@ fn stops_faults_and_the_end_of_the_run_reach_a_led_arm() {
 
     let mut elsewhere = led(LedBy::Controller);
     elsewhere.arms[0].state.interference = dimos::arm::Interference::Stop;
-    elsewhere.run(2);
+    elsewhere.tick();
     assert_eq!((elsewhere.phase(0), elsewhere.samples[0].cause), (Phase::Held, Cause::StoppedElsewhere));
     assert_eq!(elsewhere.arms[0].stops, 1, "or its controller continues when it is released");
+    elsewhere.run(5);
+    assert_eq!(elsewhere.arms[0].stops, 1, "once");
 
     // Another client controls it now: a stop of this run would be a command to that client's arm.
     let mut of_another = Rig::one_arm(one(trajectory()));
@@ -213,6 +230,7 @@ fn stops_faults_and_the_end_of_the_run_reach_a_led_arm() {
     lost.run_for(0.1);
     assert_eq!((lost.phase(0), lost.samples[0].cause), (Phase::Held, Cause::LinkLost));
     let owed = lost.arms[0].stops;
+    assert_eq!(lost.ask(Request::Enabled { arm: 0 }), Outcome::ArmLatched(0, Cause::LinkLost));
     lost.arms[0].link = dimos::arm::Link::Up;
     lost.run(2);
     assert_eq!(lost.arms[0].stops, owed + 1, "as soon as it can be reached");

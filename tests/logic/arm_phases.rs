@@ -151,8 +151,11 @@ fn activating_again_and_again_does_not_sink() {
 
 #[test]
 fn an_arm_that_was_carried_away_while_off_is_held_where_it_is() {
-    let mut rig = Rig::one_arm(one(trajectory()));
-    for (off, carried) in [(true, 0.03), (true, 0.4), (false, 0.4)] {
+    for (off, carried, accuracy) in [(true, 0.03, 0.005), (true, 0.03, 0.02), (true, 0.4, 0.005), (false, 0.4, 0.005)] {
+        let mut inexact = arm("arm", 6);
+        inexact.supervision.accuracy = accuracy;
+        let mut rig = Rig::new(100.0, vec![inexact], one(trajectory()));
+        rig.make_ready();
         assert_eq!(rig.ask(Request::PrepareDisable { arm: 0 }), Outcome::Accepted);
         rig.run_for(0.6);
         rig.arms[0].enabled = !off;
@@ -172,6 +175,27 @@ fn an_arm_that_was_carried_away_while_off_is_held_where_it_is() {
         assert!((rig.arms[0].q[0] - there).abs() < 0.005, "{} from {there}", rig.arms[0].q[0]);
         assert_eq!(rig.phase(0), Phase::Ready);
     }
+}
+
+#[test]
+fn an_arm_that_lost_its_connection_is_held_where_it_came_to_rest() {
+    let mut inexact = arm("arm", 6);
+    inexact.supervision.accuracy = 0.02;
+    let mut rig = Rig::new(100.0, vec![inexact], one(trajectory()));
+    rig.make_ready();
+    rig.arms[0].link = Link::Faulted;
+    rig.arms[0].setpoint = None;
+    for _ in 0..40 {
+        rig.arms[0].q.iter_mut().for_each(|q| *q += 0.03 / 40.0);
+        rig.run(1);
+    }
+    let there = rig.arms[0].q[0];
+    rig.arms[0].link = Link::Up;
+    rig.run(3);
+    assert_eq!(rig.ask(Request::Reset { arm: 0 }), Outcome::Accepted);
+    assert_eq!(rig.ask(Request::Enabled { arm: 0 }), Outcome::Accepted);
+    rig.run_for(0.5);
+    assert_eq!((rig.phase(0), rig.arms[0].q[0]), (Phase::Ready, there), "not where it was sent last");
 }
 
 #[test]

@@ -138,6 +138,21 @@ fn a_trajectory_that_takes_over_from_a_velocity_does_not_fault() {
 }
 
 #[test]
+fn a_motion_begins_when_the_first_setpoint_of_its_start_is_written() {
+    let mut rig = Rig::one_arm(vec![task("t", trajectory(), 0..6, 10), task("v", velocity(), 0..6, 5)]);
+    rig.velocity(1, &[0.0; 6]);
+    rig.run(5);
+    // The arm changes its mode, and takes no setpoint.
+    rig.arms[0].deaf = true;
+    assert_eq!(rig.execute(0, sweep(1, 0..6, 0.0, 0.5, 1.0)), Outcome::Accepted);
+    rig.arms[0].mode = rig.commands[0].mode.unwrap();
+    rig.run(5);
+    assert_eq!((rig.tasks[0].elapsed, rig.commanded(0)), (0.0, vec![0.0; 6]));
+    rig.arms[0].deaf = false;
+    rig.run_until(2.0, |r| r.tasks[0].state == TaskState::Completed);
+}
+
+#[test]
 fn two_trajectory_tasks_on_two_arms_run_at_once() {
     let mut rig = Rig::two_arms(vec![task("l", trajectory(), 0..7, 10), task("r", trajectory(), 7..13, 10)]);
     assert_eq!(rig.execute(0, sweep(1, 0..7, 0.0, 0.5, 1.0)), Outcome::Accepted);

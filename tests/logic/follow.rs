@@ -183,8 +183,8 @@ fn a_leader_that_is_lost_is_waited_for_at_rest_and_approached_again() {
     type Set = fn(&mut SimArm, bool);
     let faults: [(&str, Set); 3] = [
         ("stale", |arm, on| arm.silent = on),
-        ("link", |arm, on| arm.link = if on { Link::Down } else { Link::Up }),
-        ("error", |arm, on| arm.error = if on { 31 } else { 0 }),
+        ("link_lost", |arm, on| arm.link = if on { Link::Down } else { Link::Up }),
+        ("arm_fault", |arm, on| arm.error = if on { 31 } else { 0 }),
     ];
     for (name, set) in faults {
         let mut rig = in_step(task_of(follow(|_| {})));
@@ -194,7 +194,8 @@ fn a_leader_that_is_lost_is_waited_for_at_rest_and_approached_again() {
         set(&mut rig.arms[LEADER], true);
         rig.run_for(0.5);
         assert_eq!((rig.speed(FOLLOWER), rig.tasks[0].state), (0.0, TaskState::Executing), "{name}");
-        assert!(matches!(rig.tasks[0].reason, Reason::LeaderLost(0, _)), "{name}: {:?}", rig.tasks[0]);
+        let lost = matches!(rig.tasks[0].reason, Reason::LeaderLost(0, cause) if cause.name() == name);
+        assert!(lost, "{name}: {:?}", rig.tasks[0]);
         assert_eq!(rig.count(|e| matches!(e, Event::Task(0, _, Reason::LeaderLost(..)))), 1, "{name}: reported once");
         assert_eq!(rig.tasks[0].distance, None, "{name}: it is not known");
         let held = rig.commanded(FOLLOWER);

@@ -13,6 +13,7 @@ use dimos::collision::world::{Obstacle, Robot};
 use dimos::collision::{CollisionChecker, ExactChecker, Resolution, Solid, Stop, World};
 use dimos::planning::blend::curves;
 use dimos::planning::cartesian::{LineSettings, Shortfall, straight_line};
+use dimos::planning::level::Level;
 use dimos::planning::path::{distance, tidy};
 use dimos::planning::path_planner::{PlanError, PlanSettings, plan};
 use dimos::planning::shortcut::{ShortcutSettings, shorten};
@@ -140,22 +141,28 @@ fn a_goal_that_cannot_be_reached_takes_no_longer_than_it_may() {
     assert!(began.elapsed() < Duration::from_secs(1), "{:?}", began.elapsed());
 }
 
-/// Two arms 0.5 m apart with a box and a post between them.
-fn two_arms() -> ExactChecker {
+/// A world with a `yourarm` for each name, at a place along y [m].
+fn world_of(arms: &[(&str, f64)]) -> World {
     let model = Arc::new(urdf::from_text("yourarm.urdf", builtin::text("yourarm").unwrap()).unwrap());
     let mut world = World::new();
-    for (name, y) in [("left", 0.25), ("right", -0.25)] {
+    for (name, y) in arms {
         let robot = Robot {
-            name: name.into(),
+            name: (*name).into(),
             model: model.clone(),
             kinematics: Arc::new(Kinematics::whole(&model).unwrap()),
             solids: solids(&model, MeshMode::Hull).unwrap(),
-            base: DAffine3::from_translation(DVec3::Y * y),
+            base: DAffine3::from_translation(DVec3::Y * *y),
             padding: 0.0,
             allowed: vec![],
         };
         world.add_robot(robot).unwrap();
     }
+    world
+}
+
+/// Two arms 0.5 m apart with a box and a post between them.
+fn two_arms() -> ExactChecker {
+    let mut world = world_of(&[("left", 0.25), ("right", -0.25)]);
     let at = |x, y, z| DAffine3::from_translation(DVec3::new(x, y, z));
     let things = [
         ("box", Solid::cuboid(DVec3::new(0.1, 0.2, 0.3), at(0.35, 0.0, 0.15))),
@@ -189,6 +196,18 @@ fn two_arms_are_planned_together_without_any_setting() {
         searched += usize::from(!found.straight);
     }
     assert!(searched > 5, "{searched}");
+}
+
+#[test]
+fn a_folded_elbow_cannot_be_reached_from_a_straight_one_and_the_links_in_the_way_are_named() {
+    let mut checker = ExactChecker::new(world_of(&[("arm", 0.0)]).snapshot(), Resolution::default());
+    for goal in [[0.3, -0.4, 2.3, 0.5, -0.8, 0.2], [-0.8, 0.6, 2.4, -1.0, 0.6, 1.0]] {
+        let settings = PlanSettings { level: Level::Fast, ..PlanSettings::default() };
+        let found = plan(&mut checker, &[0.0; 6], &[goal.to_vec()], &settings, &Stop::never());
+        let Err(PlanError::Enclosed { which: "goal", enclosed }) = found else { panic!("{found:?}") };
+        assert!(enclosed.joint == 2 && (1.85..2.0).contains(&enclosed.reached[0]), "{enclosed:?}");
+        assert!(enclosed.pairs().contains("link \"arm/link1\" and link \"arm/link5\""), "{}", enclosed.pairs());
+    }
 }
 
 #[test]

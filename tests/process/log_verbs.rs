@@ -86,6 +86,11 @@ fn a_log_is_listed_checked_printed_cut_and_exported() {
     home.dimos("log plot --last --joint arm_joint1 -o plot.svg").with(0);
     let plot = std::fs::read_to_string(home.path().join("plot.svg")).unwrap();
     assert!(plot.contains("arm_joint1") && plot.contains("limits -") && !plot.contains("arm_joint2"), "{plot}");
+    home.dimos("log plot --last --joint arm_gripper -o grip.svg").with(0);
+    let grip = std::fs::read_to_string(home.path().join("grip.svg")).unwrap();
+    assert!(grip.contains("position [m]") && !grip.contains("commanded"), "{grip}");
+    home.dimos("log plot --last -o plot.png").with(2).says(&["the drawing is SVG", "-o plot.svg"]);
+    assert!(!home.path().join("plot.png").exists());
     home.dimos("log plot --last --joint elbow -o plot.svg").with(2).says(&["joints: arm_joint1"]);
     home.dimos("log cat --last --topics /nothing").with(2).says(&["topics: "]);
     home.dimos("log export --last --topic /nothing").with(2).says(&["topics: "]);

@@ -84,6 +84,14 @@ test('an obstacle is added by hand, in the way of a goal, and removed', async ()
   await page.waitForSelector('[data-object=block]');
   const block = run.json('world', 'list').objects.find((object) => object.name === 'block');
   assert.deepEqual(block.pose.xyz, [0.4, 0, 0.55]);
+  // Another one of that name does not take its place.
+  await page.fill('#object-name', 'block');
+  await page.locator('#object-at input').first().fill('0.9');
+  await click('#object-add');
+  await text(page, '#notice', /there is an obstacle named block/);
+  assert.deepEqual(run.json('world', 'list').objects.find(({name}) => name === 'block').pose.xyz, [0.4, 0, 0.55]);
+  await click('#notice >> text=✕');
+  await page.fill('#object-name', '');
   await click('[data-tab=move]');
   await click('[data-pose=zero]');
   await click('#plan');

@@ -7,6 +7,7 @@ use serde_json::json;
 
 use super::export::each;
 use super::{Part, progress, unreadable};
+use crate::arm::GripperUnit;
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output;
 use crate::recording::replay::{LogReader, Payload, Selection};
@@ -29,6 +30,11 @@ type Curve = Vec<(f64, f64)>;
 
 /// Draws joints of a log.
 pub fn run(path: &Path, part: &Part, joints: &[String], to: &Path, json: bool) -> Result {
+    if to.extension().is_some_and(|extension| !extension.eq_ignore_ascii_case("svg")) {
+        let svg = to.with_extension("svg");
+        let what = format!("{}: the drawing is SVG, not another format", to.display());
+        return Err(Failure::usage(what).hint(format!("-o {}; browsers open and convert it", svg.display())));
+    }
     let (from, until) = part.of(path)?;
     let began = from.saturating_sub(part.from.as_nanos() as u64);
     let mut log = LogReader::open(path).map_err(unreadable)?;
@@ -68,7 +74,12 @@ pub fn run(path: &Path, part: &Part, joints: &[String], to: &Path, json: bool) -
     );
     for (row, (name, curves)) in drawn.iter().enumerate() {
         let limits = recorded.as_ref().and_then(|recorded| limits(recorded, name));
-        panel(&mut svg, TOP + PANEL * row as f64, name, curves, limits, span);
+        let unit = match (limits, recorded.as_ref().and_then(|recorded| gripper_unit(recorded, name))) {
+            (Some(_), _) => "rad",
+            (None, Some(unit)) => unit.name(),
+            (None, None) => "m or rad",
+        };
+        panel(&mut svg, TOP + PANEL * row as f64, (name, unit), curves, limits, span);
     }
     svg.push_str("</svg>\n");
     std::fs::write(to, svg).map_err(|e| Failure::new(Exit::Failed, format!("cannot write {}: {e}", to.display())))?;
@@ -96,8 +107,21 @@ fn limits(recorded: &Recorded, name: &str) -> Option<[f64; 2]> {
     })
 }
 
+/// Returns the unit of an arm's gripper by the name of its positions.
+fn gripper_unit(recorded: &Recorded, name: &str) -> Option<GripperUnit> {
+    let arm = name.strip_suffix("_gripper")?;
+    recorded.config.arms.iter().find(|config| config.name == arm).map(|config| config.gripper_info.unit)
+}
+
 /// Draws a joint: axes, limits, curves.
-fn panel(svg: &mut String, y: f64, name: &str, curves: &[Curve; 2], limits: Option<[f64; 2]>, span: (f64, f64)) {
+fn panel(
+    svg: &mut String,
+    y: f64,
+    (name, unit): (&str, &str),
+    curves: &[Curve; 2],
+    limits: Option<[f64; 2]>,
+    span: (f64, f64),
+) {
     let values = || curves.iter().flatten().map(|(_, value)| *value);
     let (lower, upper) = (values().fold(f64::MAX, f64::min), values().fold(f64::MIN, f64::max));
     // A joint at rest is a line, not noise.
@@ -143,13 +167,13 @@ fn panel(svg: &mut String, y: f64, name: &str, curves: &[Curve; 2], limits: Opti
         let _ =
             writeln!(svg, "<polyline points=\"{points}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"{width}\"/>");
     }
-    let (name, unit) = (escaped(name), if limits.is_some() { "rad" } else { "m or rad" });
+    let (name, title) = (escaped(name), if curves[1].is_empty() { "" } else { "commanded" });
     let range = limits.map_or_else(String::new, |[lower, upper]| format!("limits {lower:.3} to {upper:.3} rad"));
     let [measured, commanded, limit] = COLOURS;
     let _ = writeln!(
         svg,
         "<text x=\"{LEFT}\" y=\"{0:.1}\"><tspan font-weight=\"bold\">{name}</tspan> position [{unit}]  \
-         <tspan fill=\"{measured}\">measured</tspan>  <tspan fill=\"{commanded}\">commanded</tspan>  \
+         <tspan fill=\"{measured}\">measured</tspan>  <tspan fill=\"{commanded}\">{title}</tspan>  \
          <tspan fill=\"{limit}\">{range}</tspan></text><text x=\"{right}\" y=\"{1:.1}\" text-anchor=\"end\">time [s]</text>",
         y - 4.0,
         bottom + 32.0

@@ -112,4 +112,20 @@ mod tests {
         let braking = JointStep { to: 0.7 + 0.35 * DT, velocity: 0.35, ..step };
         assert!(close(arm.step(1, true, DT), braking), "{:?}", arm.step(1, true, DT));
     }
+
+    #[test]
+    fn with_velocities_a_joint_may_be_anywhere_on_the_way_that_its_setpoints_take_it_since_it_was_measured() {
+        let mut arm = arm(ControlMode::Velocity, (0.0, 0.0), (0.0, 0.0));
+        let stamp = Mono(2_000_000_000);
+        arm.tracking.push(stamp, &joints_of(&[0.4, -0.2]));
+        // 8 ms old, of which this computer could not read for 3 ms.
+        let state = ArmState { seq: 1, stamp, dof: 2, own_delay_ns: 3_000_000, ..ArmState::default() };
+        arm.feedback.read(&state, stamp.after(Duration::from_millis(8)), &Stalls::default());
+        let time = arm.config.supervision.lag + 0.008 + DT;
+        for (joint, velocity) in [(0, 0.4), (1, -0.2)] {
+            let step = arm.step(joint, false, DT);
+            assert!((step.from - 0.5 * velocity * time).abs() < 1e-12, "{step:?}");
+            assert!((step.spread - 0.5 * f64::abs(velocity) * time).abs() < 1e-12, "{step:?}");
+        }
+    }
 }

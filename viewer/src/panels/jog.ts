@@ -107,7 +107,7 @@ export function jogPanel(context: Context): HTMLElement {
     setText(title, run.scene.arms.length > 1 ? `Jog ${context.selected}` : 'Jog');
     setClass(frames.element, 'hidden', jog.mode !== 'tool');
     setClass(missing, 'hidden', !!drive || !run.status);
-    if (!drive) missing.replaceChildren(el('span', {text: missingTask(context.selected, jog.mode)}));
+    if (!drive) missing.replaceChildren(el('span', {text: missingTask(context, jog.mode)}));
     speed.value = String(jog.speed);
     setText(speedText, speedOf(jog));
     const ready = !!drive && !flow.busy;
@@ -261,11 +261,16 @@ function speedOf(jog: Jog): string {
   return `${percent} · ${figure(share * TOP.linear * 1000, 0)} mm/s · ${turn(share * TOP.angular)}`;
 }
 
-/** Why a mode is not there, with the line to add: the words of `dimos jog`. */
-function missingTask(arm: string, mode: JogMode): string {
+/** Why a mode is not there, with the line to add: that of `dimos jog`. */
+function missingTask({selected: arm, run}: Context, mode: JogMode): string {
+  // A planner knows the arm's model.
+  const params = run.scene.planner
+    ? '}'
+    : `, params: {model_path: MODEL, end_effector_link: LINK, joint_prefix: ${arm}_}} ` +
+      '(MODEL: the description of the arm, a file or builtin:NAME; LINK: its flange in it)';
   return mode === 'joints'
     ? `no task of the run moves single joints of ${arm}; add to tasks of the blueprint: ` +
-        `- {name: velocity_${arm}, type: velocity, joint_names: {hardware: ${arm}}, priority: 20}`
+        `- {name: servo_${arm}, type: servo, joint_names: {hardware: ${arm}}, priority: 20}`
     : `no task of the run moves the end effector of ${arm}; add to tasks of the blueprint: ` +
-        `- {name: twist_${arm}, type: eef_twist, joint_names: {hardware: ${arm}}, priority: 20, params: {…}}`;
+        `- {name: twist_${arm}, type: eef_twist, joint_names: {hardware: ${arm}}, priority: 21${params}`;
 }

@@ -137,6 +137,11 @@ function addPart(context: Context): HTMLElement {
     'Add',
     async () => {
       const given = name.value.trim() || nextName(kind, context.run.world);
+      if (context.run.world.some((object) => object.name === given)) {
+        // The run would replace it.
+        const hint = `give another name; or remove ${given} first`;
+        return context.onNotice.emit({text: `there is an obstacle named ${given}`, hint});
+      }
       const pose = {xyz: at.map((each) => each.value) as Vec3};
       if (await context.act('world_add', {name: given, shape: shape(), pose})) {
         name.value = '';

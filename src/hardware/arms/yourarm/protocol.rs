@@ -201,7 +201,7 @@ pub fn status_text(status: u8) -> &'static str {
         4 => "the motors are disabled",
         5 => "it is in another mode",
         6 => "the arm is moving",
-        7 => "the target is outside the arm's limits or out of reach",
+        7 => "a value is outside the arm's limits, or the target is out of reach",
         IN_ERROR => "it is in error",
         9 => "there is no gripper",
         10 => "there is no such channel",

@@ -146,12 +146,15 @@ fn an_order_that_is_not_carried_out_yet_ends_with_the_motors_and_with_the_connec
 
 #[test]
 fn an_order_that_comes_before_its_lead_waits_for_it() {
-    let mut bench = holding();
-    let early = native(&bench);
-    bench.tick(|c| c.mode = None);
-    assert!(early.try_recv().is_err() && bench.count("write_cartesian_position") == 0);
-    idle(&mut bench);
-    assert_eq!(early.try_recv(), Ok(Ok(())));
+    // The newest command that came is of the lead before it, or of an earlier one.
+    for lead_seq in [0, u32::MAX] {
+        let mut bench = holding();
+        let early = native(&bench);
+        bench.tick(|c| (c.mode, c.lead_seq) = (None, lead_seq));
+        assert!(early.try_recv().is_err() && bench.count("write_cartesian_position") == 0);
+        idle(&mut bench);
+        assert_eq!(early.try_recv(), Ok(Ok(())));
+    }
 }
 
 #[test]
@@ -185,7 +188,9 @@ fn an_arm_whose_motors_were_switched_off_is_not_taken_over() {
     assert!(!by_the_run.states.read().enabled);
     let mut by_others = led();
     drop(by_others.arm.clone().enabled(false));
-    (0..5).for_each(|_| drop(idle(&mut by_others)));
+    for _ in 0..5 {
+        idle(&mut by_others);
+    }
     assert!(matches!(ask(Order::TakeOver, &mut by_others), Err(AdapterError::Rejected(_))));
     let mut with_motors = led();
     assert_eq!(ask(Order::TakeOver, &mut with_motors), Ok(()));

@@ -24,6 +24,8 @@ struct Parts {
     mounting: Option<AdapterError>,
     /// It takes a mounting, and stays with its own.
     keeps_mounting: bool,
+    /// It knows its calibration offsets.
+    reports_offsets: bool,
     /// Readings that fail: inputs, joints, load.
     failing: [Option<AdapterError>; 3],
     read: [u32; 3],
@@ -129,6 +131,10 @@ impl JointMonitor for Equipped {
         assert_eq!(joints.len(), DOF);
         joints[0].temperature = Some(40.0);
         self.parts.read(1)
+    }
+    fn read_calibration_offsets(&mut self, offsets: &mut [f64]) -> AdapterResult<bool> {
+        offsets.copy_from_slice(&[0.1, -0.2, 0.3]);
+        Ok(self.parts.reports_offsets)
     }
 }
 
@@ -315,7 +321,11 @@ fn slow_values_are_read_in_turn_five_times_a_second_and_published_with_their_cha
     assert_eq!(details.io.map(|io| io.digital_inputs), Some(0));
     // What a reader keeps from being published is published when it lets go.
     arm.parts.load = kg(4.0);
-    bench.worker.health.clone().while_details_are_read(|| (0..60).for_each(|_| drop(cycle(&mut bench, &mut arm))));
+    bench.worker.health.clone().while_details_are_read(|| {
+        for _ in 0..60 {
+            cycle(&mut bench, &mut arm);
+        }
+    });
     assert_eq!(bench.worker.health.details().payload, Some(kg(3.0)));
     arm.parts.failing[2] = Some(AdapterError::Timeout("no load".into()));
     cycle(&mut bench, &mut arm);
@@ -325,6 +335,17 @@ fn slow_values_are_read_in_turn_five_times_a_second_and_published_with_their_cha
     bench.worker.slow.read_io_next();
     cycle(&mut bench, &mut arm);
     assert_eq!(arm.parts.read[0], before + 1);
+}
+
+#[test]
+fn calibration_offsets_are_told_with_the_connection_if_the_arm_knows_them() {
+    let offsets = |reports_offsets: bool| {
+        let (mut bench, mut arm) = equipped(Setup::default());
+        arm.parts.reports_offsets = reports_offsets;
+        bench.worker.connect(&mut arm).unwrap().calibration_offsets
+    };
+    assert_eq!(offsets(true), Some(crate::joint::joints_of(&[0.1, -0.2, 0.3])));
+    assert_eq!(offsets(false), None);
 }
 
 #[test]
