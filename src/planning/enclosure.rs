@@ -151,8 +151,8 @@ impl Explored {
         (0..self.reached.len()).all(|joint| whole(joint) || self.still(joint) == [true; 2])
     }
 
-    /// Returns how far a position is outside of what was reached [rad or m], if that is far and the joint got no farther
-    /// on that side.
+    /// Returns how far a position is outside of what was reached [rad or m], if that is far and the joint got no
+    /// farther on that side.
     fn gap(&self, joint: usize, other: f64) -> Option<f64> {
         let [low, high] = self.reached[joint];
         let (below, above) = (low - other, other - high);

@@ -15,7 +15,8 @@ pub fn distance(a: &[f64], b: &[f64]) -> f64 {
 
 /// Returns the length of a path [rad], in the Euclidean norm of all joints.
 pub fn length(path: &[Vec<f64>]) -> f64 {
-    path.windows(2).map(|pair| distance(&pair[0], &pair[1])).sum()
+    // The sum of no numbers is -0.
+    0.0 + path.windows(2).map(|pair| distance(&pair[0], &pair[1])).sum::<f64>()
 }
 
 /// Shifts the continuous joints of `q` by whole turns to the positions nearest to `near`. All other joints, and those

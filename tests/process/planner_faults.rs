@@ -105,14 +105,13 @@ fn f23_a_search_without_end_in_the_real_program_disturbs_no_motion() {
     home.write("lab.yaml", BLUEPRINT);
     let _run = home.run("lab.yaml --no-record");
     home.dimos("move arm 1.5 -0.3 0.6 0 0.8 0 --speed 1").with(0);
-    // Walls that leave no way, and thousands of things to look at on every one.
-    home.dimos("world add front --box 2 0.02 4 --at 1.1 0 0").with(0);
-    home.dimos("world add back --box 2 0.02 4 --at -1.1 0 0").with(0);
+    // A wall to pass over, and thousands of things to look at on a path that is refined without end.
+    home.dimos("world add front --box 2 0.02 1.1 --at 1.1 0 0").with(0);
     let points: String = (0..20_000).map(|k| format!("{} {} 3\n", k % 200, k / 200)).collect();
     let head = "ply\nformat ascii 1.0\nelement vertex 20000\nproperty float x\nproperty float y\nproperty float z\nend_header\n";
     home.write("cloud.ply", &(head.to_owned() + &points));
     home.dimos("world add cloud --cloud cloud.ply --at 0 0 0").with(0);
-    let planning = home.start("plan arm -1.5 -0.3 0.6 0 0.8 0 --timeout 90s");
+    let planning = home.start("plan arm -1.5 -0.3 0.6 0 0.8 0 --timeout 180s --refine 1000000000");
     eventually("it plans", || home.status()["planner"]["state"] == "PLANNING");
     let host = Watch::of_processors();
     let mut goal = 1.5;
@@ -134,6 +133,13 @@ fn f23_a_search_without_end_in_the_real_program_disturbs_no_motion() {
     });
     home.dimos("cancel").with(0);
     planning.wait().with(1).says(&["no plan: cancelled"]);
+    // Walls that leave no way are named, without the whole timeout.
+    home.dimos("world remove cloud").with(0);
+    home.dimos("world add front --box 2 0.02 4 --at 1.1 0 0").with(0);
+    home.dimos("world add back --box 2 0.02 4 --at -1.1 0 0").with(0);
+    let enclosed =
+        ["the goal is enclosed: arm_joint1 does not leave -2.", "obstacle \"front\"", "hint: move the obstacle"];
+    home.dimos("plan arm -1.5 -0.3 0.6 0 0.8 0 --timeout 60s").with(1).says(&enclosed);
 }
 
 #[test]
