@@ -17,7 +17,7 @@ use crate::robot::random::Random;
 /// Most joints: with those of two arms, so few edges reach too little to say anything.
 const JOINTS: usize = 8;
 /// Edges that are tried.
-const EDGES: usize = 12_000;
+const EDGES: usize = 6000;
 /// Length of an edge [rad].
 const STEP: f64 = 0.15;
 /// A quarter of the samples are within this distance of what is reached [rad].

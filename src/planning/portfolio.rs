@@ -31,13 +31,13 @@ pub struct Candidate {
 /// Edges that each search checks in its first turn; twice as many in each further one.
 const FIRST_QUANTUM: u64 = 256;
 /// The first search gets this many times as many edges: most often it finds the path, and then the others were in vain.
-const MAIN_SHARE: u64 = 8;
+const MAIN_SHARE: u64 = 16;
 /// With more joints than one arm has, short edges are best: a long one is hardly ever free.
 const ONE_ARM: usize = 8;
 /// A proven edge takes about as long as this number of edges that look free or not.
 const PROOF_COST: u64 = 4;
 /// After this number of rounds it has taken long.
-const LONG_ROUNDS: u32 = 5;
+const LONG_ROUNDS: u32 = 4;
 /// The turns become no longer after this number of doublings.
 const DOUBLINGS: u32 = 6;
 
