@@ -32,8 +32,10 @@ pub struct Candidate {
 const FIRST_QUANTUM: u64 = 256;
 /// The first search gets this many times as many edges: most often it finds the path, and then the others were in vain.
 const MAIN_SHARE: u64 = 16;
-/// With more joints than one arm has, short edges are best: a long one is hardly ever free.
+/// With more joints than one arm has, short edges are best: a long one is hardly ever free. The other searches find the
+/// path more often then, and the first one gets this many times as many edges.
 const ONE_ARM: usize = 8;
+const MAIN_SHARE_OF_ARMS: u64 = 4;
 /// A proven edge takes about as long as this number of edges that look free or not.
 const PROOF_COST: u64 = 4;
 /// After this number of rounds it has taken long.
@@ -139,7 +141,8 @@ impl Portfolio {
                 Search::new(start, goals, (checker.limits(), checker.turns()), most, *range, *seed)
             });
             let checked = *edges;
-            let share = if *number == 0 { MAIN_SHARE } else { 1 };
+            let main_share = if start.len() > ONE_ARM { MAIN_SHARE_OF_ARMS } else { MAIN_SHARE };
+            let share = if *number == 0 { main_share } else { 1 };
             let cost = if checked == Edges::Proven { PROOF_COST } else { 1 };
             let quantum = Quantum {
                 edges: (FIRST_QUANTUM << self.round) * share / cost,
