@@ -30,6 +30,8 @@ const STILL: f64 = 0.04;
 const STILL_PART: f64 = 0.02;
 /// A joint that gets this part of its range is not enclosed.
 const WHOLE: f64 = 0.9;
+/// How far outside of what a joint reached the other end must be [rad or m].
+const GAP: f64 = 0.1;
 /// Positions of a joint at which a wall is looked for: this far from what was reached, the first one, and each twice
 /// as far as the one before [rad or m].
 const WALLS: usize = 8;
@@ -37,9 +39,7 @@ const FIRST_WALL: f64 = 0.01;
 /// Configurations that are tried at each of them, and at the one that counts.
 const TRIES: usize = 256;
 const LAST_TRIES: usize = 4096;
-/// How far outside of that part the other end must be [rad].
-const GAP: f64 = 0.1;
-/// Configurations at its end that are checked for what is in the way.
+/// Configurations at the end of what was reached that are checked for what is in the way.
 const LOOKS: usize = 40;
 /// How far they are moved on [rad].
 const BEYOND: f64 = 0.05;
