@@ -53,6 +53,8 @@ pub trait Block: Copy {
     fn select(mask: Self::Mask, a: Self, b: Self) -> Self;
     /// The mask as bits, lane 0 lowest.
     fn bits(mask: Self::Mask) -> u16;
+    /// The mask with these bits.
+    fn mask(bits: u16) -> Self::Mask;
     /// The largest of the numbers, none of which is not a number.
     fn largest(self) -> f32;
 
@@ -161,6 +163,11 @@ impl Block for Portable {
     #[inline(always)]
     fn bits(mask: Self::Mask) -> u16 {
         mask.iter().enumerate().fold(0, |bits, (i, set)| bits | (u16::from(*set) << i))
+    }
+
+    #[inline(always)]
+    fn mask(bits: u16) -> Self::Mask {
+        std::array::from_fn(|i| bits >> i & 1 == 1)
     }
 
     #[inline(always)]
@@ -274,6 +281,11 @@ pub(crate) mod x86 {
         }
 
         #[inline(always)]
+        fn mask(bits: u16) -> Self::Mask {
+            bits
+        }
+
+        #[inline(always)]
         fn largest(self) -> f32 {
             unsafe { _mm512_reduce_max_ps(self.0) }
         }
@@ -371,6 +383,16 @@ pub(crate) mod x86 {
         fn bits(mask: Self::Mask) -> u16 {
             let (low, high) = unsafe { (_mm256_movemask_ps(mask.0), _mm256_movemask_ps(mask.1)) };
             low as u16 | (high as u16) << 8
+        }
+
+        #[inline(always)]
+        fn mask(bits: u16) -> Self::Mask {
+            unsafe {
+                let (all, lanes) = (_mm256_set1_epi32(i32::from(bits)), _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128));
+                let high = _mm256_slli_epi32::<8>(lanes);
+                let set = |lanes| _mm256_castsi256_ps(_mm256_cmpeq_epi32(_mm256_and_si256(all, lanes), lanes));
+                (set(lanes), set(high))
+            }
         }
 
         #[inline(always)]

@@ -10,6 +10,8 @@
 //! those around sixteen obstacles at a time, then the ball around all that the body carries, its links, and their parts.
 
 mod check;
+mod gap;
+mod touch;
 
 use std::sync::Arc;
 
@@ -131,6 +133,8 @@ pub struct Buffers {
     q: Vec<Lanes>,
     frames: Vec<Frames>,
     centers: Vec<[Lanes; 3]>,
+    /// Pairs that touched lately, at configurations that were checked each for itself.
+    frequent: Vec<u32>,
 }
 
 impl Discrete {
@@ -238,9 +242,7 @@ impl Discrete {
         if let Proof::Motion { reach, .. } = motion.proof {
             assert!(reach.len() >= scene.pairs.len(), "every pair has a reach");
         }
-        buffers.q.resize(scene.variables, Lanes::splat(0.0));
-        buffers.frames.resize(scene.bodies.len(), [Lanes::splat(0.0); 12]);
-        buffers.centers.resize(self.carried.len(), [Lanes::splat(0.0); 3]);
+        self.make_room(buffers);
         match scene.width.0 {
             // SAFETY: only `Width` makes one, and only of vectors that this processor has.
             #[cfg(target_arch = "x86_64")]
@@ -250,6 +252,38 @@ impl Discrete {
             Vectors::Avx2 => unsafe { avx2(self, motion, buffers) },
             Vectors::Portable => check::check::<crate::block::Portable>(self, motion, buffers),
         }
+    }
+}
+
+impl Discrete {
+    /// Returns the lanes of `sought` in which something touches. The sixteen configurations are independent of each
+    /// other: `q` has one entry per variable. `pads` and `pad` are those of a [`Motion`].
+    ///
+    /// # Panics
+    /// If a slice is too short.
+    pub fn touching_lanes(&self, q: &[Lanes], (pads, pad): (&[f64], f64), sought: u16, buffers: &mut Buffers) -> u16 {
+        let scene = &*self.scene;
+        assert!(q.len() >= scene.variables, "a configuration is whole");
+        assert!(pads.len() >= scene.pairs.len(), "every pair has a padding");
+        self.make_room(buffers);
+        buffers.q.copy_from_slice(&q[..scene.variables]);
+        let none = &[][..];
+        let motion = Motion { from: none, to: none, blocks: 1, pads, pad, likely: None, proof: Proof::None };
+        match scene.width.0 {
+            // SAFETY: only `Width` makes one, and only of vectors that this processor has.
+            #[cfg(target_arch = "x86_64")]
+            Vectors::Avx512 => unsafe { each_avx512(self, &motion, sought, buffers) },
+            // SAFETY: see above.
+            #[cfg(target_arch = "x86_64")]
+            Vectors::Avx2 => unsafe { each_avx2(self, &motion, sought, buffers) },
+            Vectors::Portable => check::check_each::<crate::block::Portable>(self, &motion, sought, buffers),
+        }
+    }
+
+    fn make_room(&self, buffers: &mut Buffers) {
+        buffers.q.resize(self.scene.variables, Lanes::splat(0.0));
+        buffers.frames.resize(self.scene.bodies.len(), [Lanes::splat(0.0); 12]);
+        buffers.centers.resize(self.carried.len(), [Lanes::splat(0.0); 3]);
     }
 }
 
@@ -273,6 +307,18 @@ fn avx512(discrete: &Discrete, motion: &Motion<'_>, buffers: &mut Buffers) -> Op
 #[target_feature(enable = "avx2,fma")]
 fn avx2(discrete: &Discrete, motion: &Motion<'_>, buffers: &mut Buffers) -> Option<u32> {
     check::check::<crate::block::x86::Avx2>(discrete, motion, buffers)
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,fma")]
+fn each_avx512(discrete: &Discrete, motion: &Motion<'_>, sought: u16, buffers: &mut Buffers) -> u16 {
+    check::check_each::<crate::block::x86::Avx512>(discrete, motion, sought, buffers)
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma")]
+fn each_avx2(discrete: &Discrete, motion: &Motion<'_>, sought: u16, buffers: &mut Buffers) -> u16 {
+    check::check_each::<crate::block::x86::Avx2>(discrete, motion, sought, buffers)
 }
 
 #[cfg(test)]

@@ -11,6 +11,7 @@ pub mod bodies;
 pub mod chain;
 pub mod cover;
 pub mod discrete;
+pub mod halton;
 pub mod ik;
 pub mod nearest;
 pub mod obstacle;

@@ -33,8 +33,23 @@ impl Nearest {
     pub const NONE: Self = Self { squared: Lanes::splat(f32::INFINITY), node: Lanes::splat(0.0), compared: 0 };
 
     /// Returns the index of the node nearest to the sample of a lane.
+    #[inline]
     pub fn node(&self, lane: usize) -> usize {
         self.node.0[lane] as usize
+    }
+
+    /// Returns the distance from that node to the sample of a lane.
+    #[inline]
+    pub fn distance(&self, lane: usize) -> f64 {
+        f64::from(self.squared.0[lane]).sqrt()
+    }
+
+    /// Takes a lane of another one, which was compared with the same nodes as the lanes that are used here.
+    #[inline]
+    pub fn copy_lane(&mut self, lane: usize, other: &Self, from: usize) {
+        self.squared.0[lane] = other.squared.0[from];
+        self.node.0[lane] = other.node.0[from];
+        self.compared = other.compared;
     }
 }
 

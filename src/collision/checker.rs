@@ -4,6 +4,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
+use dimos_kernels::block::Lanes;
+
 use crate::robot::model::Limits;
 
 use super::report::{Contact, Pair};
@@ -94,6 +96,12 @@ pub trait CollisionChecker {
     /// touching.
     fn motion_looks_free(&mut self, from: &[f64], to: &[f64]) -> bool {
         self.motion_is_free(from, to, &Stop::never())
+    }
+
+    /// Returns those of `lanes` at whose configurations something looks as if it touched: no motion that ends there
+    /// looks free. `q`: a block per joint [rad or m]. A lane that is not returned says nothing.
+    fn look_blocked(&mut self, _q: &[Lanes], _lanes: u16) -> u16 {
+        0
     }
 
     /// Returns the first contact found, in no particular order.

@@ -3,6 +3,7 @@
 
 use std::sync::Arc;
 
+use dimos_kernels::block::Lanes;
 use dimos_kernels::discrete::Proof;
 use glamx::{DAffine3, DVec3};
 
@@ -350,6 +351,14 @@ impl CollisionChecker for ExactChecker {
         self.checks += samples;
         self.witness = found.or(self.witness);
         found.is_none()
+    }
+
+    fn look_blocked(&mut self, q: &[Lanes], lanes: u16) -> u16 {
+        if self.always.is_some() {
+            return lanes;
+        }
+        self.checks += u64::from(lanes.count_ones());
+        self.lanes.touching_lanes(q, (&self.pads, self.most_pad), lanes)
     }
 
     fn first_contact(&mut self, q: &[f64]) -> Option<Pair> {

@@ -101,6 +101,11 @@ impl InLanes {
         (found, (blocks * LANES) as u64)
     }
 
+    /// Returns those of `lanes` in which something touches. `q`: a block per joint [rad or m].
+    pub fn touching_lanes(&mut self, q: &[Lanes], pads: (&[f64], f64), lanes: u16) -> u16 {
+        self.discrete.touching_lanes(q, pads, lanes, &mut self.samples)
+    }
+
     /// Returns the sum of the angles by which all joints turn on a motion [rad].
     pub fn turn(&self, from: &[f64], to: &[f64]) -> f64 {
         self.turned.iter().zip(from.iter().zip(to)).map(|(number, (a, b))| number * (b - a).abs()).sum()

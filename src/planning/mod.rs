@@ -9,10 +9,12 @@
 
 pub mod ahead;
 pub mod blend;
+mod candidates;
 pub mod cartesian;
 pub mod config;
 mod constant_corner_speed;
 mod double_s;
+pub mod edges;
 pub mod enclosure;
 mod four;
 mod goals;

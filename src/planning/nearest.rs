@@ -19,6 +19,9 @@ pub struct Tree {
 /// Nodes for which a new tree has room.
 const ROOM: usize = 64;
 
+/// Samples nearer to a node than this are none [rad].
+const SAME: f64 = 1e-6;
+
 /// Parent index of a root.
 const ROOT: u32 = u32::MAX;
 
@@ -51,6 +54,12 @@ impl Tree {
         self.radii.get(i).copied().unwrap_or(f64::INFINITY)
     }
 
+    /// Returns whether the sample of a lane is in the domain of the node nearest to it, and not at the node.
+    pub fn is_in_domain(&self, nearest: &Nearest, lane: usize) -> bool {
+        let (radius, squared) = (self.radius(nearest.node(lane)), f64::from(nearest.squared.0[lane]));
+        squared <= radius * radius && squared > SAME * SAME
+    }
+
     /// Sets the sampling radius of a node [rad].
     pub fn set_radius(&mut self, i: usize, radius: f64) {
         if let Some(r) = self.radii.get_mut(i) {
@@ -73,6 +82,13 @@ impl Tree {
         (node, f64::from(squared).sqrt())
     }
 
+    /// Compares the nodes that were added since with sixteen samples, a block per joint.
+    pub fn compare(&self, samples: &[Lanes], nearest: &mut Nearest) {
+        if nearest.compared < self.len() {
+            self.nodes.compare(samples, nearest);
+        }
+    }
+
     /// Returns the configurations from a node up to its root.
     pub fn way_up(&self, node: usize) -> impl Iterator<Item = &[f64]> {
         let up = |i: &usize| self.parents.get(*i).filter(|p| **p != ROOT).map(|p| *p as usize);
@@ -80,16 +96,11 @@ impl Tree {
     }
 }
 
-/// The values of a joint in sixteen samples.
-pub type Row = [f64; LANES];
-
 /// Sixteen samples, and the nodes of two trees nearest to each.
 #[derive(Debug, Clone)]
 pub struct Batch {
     /// For each joint its values in all samples.
-    values: Vec<Row>,
-    /// The same in single precision.
-    lanes: Vec<Lanes>,
+    samples: Vec<Lanes>,
     nearest: [Nearest; 2],
     next: usize,
 }
@@ -97,8 +108,7 @@ pub struct Batch {
 impl Batch {
     /// Creates one of which all samples are used.
     pub fn new(dof: usize) -> Self {
-        let (values, lanes) = (vec![[0.0; LANES]; dof], vec![Lanes::splat(0.0); dof]);
-        Self { values, lanes, nearest: [Nearest::NONE; 2], next: LANES }
+        Self { samples: vec![Lanes::splat(0.0); dof], nearest: [Nearest::NONE; 2], next: LANES }
     }
 
     /// Returns whether all samples are used.
@@ -106,30 +116,31 @@ impl Batch {
         self.next >= LANES
     }
 
-    /// Draws all samples: `draw` writes them, a row for each joint.
-    pub fn fill(&mut self, draw: impl FnOnce(&mut [Row])) {
-        draw(&mut self.values);
-        for (block, row) in self.lanes.iter_mut().zip(&self.values) {
-            block.0.iter_mut().zip(row).for_each(|(lane, value)| *lane = *value as f32);
-        }
+    /// Draws all samples: `draw` writes them, a block for each joint.
+    pub fn fill(&mut self, draw: impl FnOnce(&mut [Lanes])) {
+        draw(&mut self.samples);
         self.nearest = [Nearest::NONE; 2];
         self.next = 0;
     }
 
-    /// Returns the lane of the next sample, the node of a tree nearest to it, and their distance [rad]; `side` is the
-    /// tree's number.
-    pub fn next(&mut self, tree: &Tree, side: usize) -> (usize, usize, f64) {
+    /// Returns the lane of the next sample in the domain of the node of a tree that is nearest to it, and the number of
+    /// samples that were used; `side` is the tree's number.
+    pub fn next(&mut self, tree: &Tree, side: usize) -> (Option<usize>, u64) {
         let nearest = &mut self.nearest[side];
-        if nearest.compared < tree.len() {
-            tree.nodes.compare(&self.lanes, nearest);
-        }
-        let lane = self.next;
-        self.next += 1;
-        (lane, nearest.node(lane), f64::from(nearest.squared.0[lane]).sqrt())
+        tree.compare(&self.samples, nearest);
+        let first = self.next;
+        let found = (first..LANES).find(|&lane| tree.is_in_domain(nearest, lane));
+        self.next = found.map_or(LANES, |lane| lane + 1);
+        (found, (self.next - first) as u64)
     }
 
-    /// Copies the sample of a lane.
-    pub fn sample(&self, lane: usize, q: &mut [f64]) {
-        q.iter_mut().zip(&self.values).for_each(|(q, row)| *q = row[lane]);
+    /// Returns the nodes of a tree nearest to the samples.
+    pub fn nearest(&self, side: usize) -> &Nearest {
+        &self.nearest[side]
+    }
+
+    /// Copies the sample of a lane to a lane of others.
+    pub fn copy_to(&self, lane: usize, to: usize, samples: &mut [Lanes]) {
+        samples.iter_mut().zip(&self.samples).for_each(|(to_block, block)| to_block.0[to] = block.0[lane]);
     }
 }

@@ -5,6 +5,8 @@
 use std::f64::consts::TAU;
 use std::sync::Arc;
 
+use dimos_kernels::block::{LANES, Lanes};
+
 use super::path::between;
 use crate::collision::allowed_pairs::sample;
 use crate::collision::kept::{Kept, Motion};
@@ -281,6 +283,16 @@ impl CollisionChecker for Padded {
         // Close to a start or goal, where the padding is less, a motion is proven or not.
         self.full.motion_looks_free(from, to)
             || (!self.cuts(from, to).is_empty() && self.motion_is_free(from, to, &Stop::never()))
+    }
+
+    fn look_blocked(&mut self, q: &[Lanes], lanes: u16) -> u16 {
+        let blocked = self.full.look_blocked(q, lanes);
+        let in_zone = |lane: usize| {
+            let at: Vec<f64> = q.iter().map(|block| f64::from(block.0[lane])).collect();
+            self.zones.iter().any(|zone| zone.holds(&at, self.full.turns()))
+        };
+        // Close to a start or goal, the padding is less.
+        (0..LANES).filter(|lane| blocked >> lane & 1 == 1 && !in_zone(*lane)).fold(0, |all, lane| all | 1 << lane)
     }
 
     fn first_contact(&mut self, q: &[f64]) -> Option<Pair> {

@@ -4,6 +4,7 @@
 
 use crate::collision::checker::{CollisionChecker, Stop};
 
+use super::edges::{Checked, Edges};
 use super::level::Level;
 use super::path::Path;
 use super::rrt_connect::{Quantum, RrtSettings, Search, SearchCount};
@@ -33,26 +34,14 @@ const FIRST_QUANTUM: u64 = 256;
 /// The first search gets this many times as many edges: most often it finds the path, and then the others were in vain.
 const MAIN_SHARE: u64 = 16;
 /// With more joints than one arm has, short edges are best: a long one is hardly ever free. The other searches find the
-/// path more often then, and the first one gets this many times as many edges.
+/// path as often then, and all get the same number of edges.
 const ONE_ARM: usize = 8;
-const MAIN_SHARE_OF_ARMS: u64 = 4;
 /// A proven edge takes about as long as this number of edges that look free or not.
 const PROOF_COST: u64 = 4;
 /// After this number of rounds it has taken long.
 const LONG_ROUNDS: u32 = 4;
 /// The turns become no longer after this number of doublings.
 const DOUBLINGS: u32 = 6;
-
-/// Which edges a search may use.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Edges {
-    /// Those that look free.
-    Looking,
-    /// Those that look free and are easily proven.
-    Checked,
-    /// Those that are proven, also where covers touch.
-    Proven,
-}
 
 /// The searches.
 #[derive(Debug, Clone)]
@@ -141,7 +130,7 @@ impl Portfolio {
                 Search::new(start, goals, (checker.limits(), checker.turns()), most, *range, *seed)
             });
             let checked = *edges;
-            let main_share = if start.len() > ONE_ARM { MAIN_SHARE_OF_ARMS } else { MAIN_SHARE };
+            let main_share = if start.len() > ONE_ARM { 1 } else { MAIN_SHARE };
             let share = if *number == 0 { main_share } else { 1 };
             let cost = if checked == Edges::Proven { PROOF_COST } else { 1 };
             let quantum = Quantum {
@@ -149,12 +138,8 @@ impl Portfolio {
                 samples: most.max_samples - count.samples,
                 nodes: most.max_nodes - count.nodes,
             };
-            let mut is_free = |from: &[f64], to: &[f64]| match checked {
-                Edges::Looking => checker.motion_looks_free(from, to),
-                Edges::Checked => checker.motion_looks_free(from, to) && checker.motion_is_easily_free(from, to, stop),
-                Edges::Proven => checker.motion_is_free(from, to, stop),
-            };
-            if let Some(path) = search.run(&mut is_free, quantum, stop) {
+            let mut check = Checked { checker, edges: checked, stop };
+            if let Some(path) = search.run(&mut check, quantum, stop) {
                 let count = search.count();
                 self.ended.samples += count.samples;
                 self.ended.nodes += count.nodes;

@@ -8,6 +8,7 @@
 use crate::collision::checker::{CollisionChecker, Stop};
 use crate::robot::random::Random;
 
+use super::edges::{Checked, Edges};
 use super::path::{Path, between, distance, length, tidy};
 use super::path_planner::{PlanSettings, is_proven};
 use super::rrt_connect::{Quantum, Search};
@@ -66,7 +67,7 @@ fn another<C: CollisionChecker>(
     let turns = checker.turns().to_vec();
     let limits = checker.limits().to_vec();
     let mut search = Search::new(start, goals, (&limits, &turns), search, range, seed).shorter_than(most);
-    let found = search.run(&mut |a, b| checker.motion_looks_free(a, b), EFFORT, stop)?;
+    let found = search.run(&mut Checked { checker, edges: Edges::Looking, stop }, EFFORT, stop)?;
     Some(shorten(&found, &turns, &settings.shortcut, &mut |a, b| checker.motion_looks_free(a, b)))
 }
 

@@ -1,7 +1,7 @@
 //! RRT-Connect (Kuffner and LaValle, 2000): two trees, one from the start and one from the goals, grow towards random
 //! configurations and towards each other. Nodes that fail to grow attract fewer samples (dynamic domain: Yershova,
 //! Jaillet, Siméon and LaValle, 2005), and the smaller tree grows first. Every edge is checked, including the joining
-//! one. Where the domains are small, hardly any sample is in one: then half of the samples are drawn inside of them.
+//! one. Half of the samples are drawn in the domains of random nodes: of the others, hardly any is in one.
 //!
 //! Continuous joints move the short way round: a node follows its parent without a jump, and where the trees meet, the
 //! goal's half of the path is shifted by whole turns to match the start's half.
@@ -11,6 +11,8 @@ use dimos_kernels::block::LANES;
 use crate::collision::checker::Stop;
 use crate::robot::model::Limits;
 
+use super::candidates::{Candidates, aim};
+use super::edges::EdgeCheck;
 use super::nearest::{Batch, Tree};
 use super::path::{Path, between, distance, unwind, unwind_all};
 use super::sampler::Sampler;
@@ -27,7 +29,7 @@ pub struct RrtSettings {
     pub alpha: f64,
     /// Minimum radius [rad].
     pub min_radius: f64,
-    /// Maximum number of samples.
+    /// Maximum number of samples; the batch of sixteen in which it is reached is the last.
     pub max_samples: u64,
     /// Maximum number of nodes in all trees.
     pub max_nodes: usize,
@@ -68,11 +70,16 @@ pub struct Quantum {
 
 /// This number of samples that are not connected takes about as long as the check of an edge.
 const SAMPLES_PER_EDGE: u64 = 64;
-/// After this number of samples in a row that are outside of all domains, some are drawn inside of them.
-const MISSES: u64 = 128;
-/// The stop condition is tested once per this number of samples, and of edges: a clock takes as long as a short edge.
+/// The first samples are drawn anywhere between the limits, later ones half in the domains of nodes.
+const ANYWHERE: u64 = 16;
+/// After this number of edges in a row that were not free, the ends of the next ones are checked together.
+const FAILURES: u64 = 8;
+/// Most rounds of looking for samples that are in domains: each gives one, or uses up a batch.
+const ROUNDS: usize = 32;
+/// The stop condition is tested once per this number of samples, and of edges that are checked: a clock takes as long
+/// as a short edge.
 const POLL: u64 = 1024;
-const POLL_EDGES: u64 = 8;
+const POLL_CHECKS: u64 = 8;
 
 /// A search with one maximum edge length. It can be paused and continued, and the same sampler gives the same path.
 #[derive(Debug, Clone)]
@@ -89,8 +96,10 @@ pub struct Search {
     goals: usize,
     side: usize,
     batch: Batch,
-    /// Samples outside of all domains since the last that was inside.
-    misses: u64,
+    /// Edges in a row that were not free.
+    failures: u64,
+    /// Samples for each tree.
+    candidates: [Candidates; 2],
     count: SearchCount,
     sample: Vec<f64>,
     at: Vec<f64>,
@@ -126,7 +135,8 @@ impl Search {
             goals: goals.len(),
             side: 0,
             batch: Batch::new(dof),
-            misses: 0,
+            failures: 0,
+            candidates: [Candidates::new(dof), Candidates::new(dof)],
             sample: vec![0.0; dof],
             at: vec![0.0; dof],
             ends: [vec![0.0; dof], vec![0.0; dof]],
@@ -157,69 +167,110 @@ impl Search {
         self.count
     }
 
-    /// Continues for a quantum; returns the path once it is found. `is_free` checks an edge.
-    pub fn run(
-        &mut self,
-        is_free: &mut dyn FnMut(&[f64], &[f64]) -> bool,
-        quantum: Quantum,
-        stop: &Stop,
-    ) -> Option<Path> {
+    /// Continues for a quantum; returns the path once it is found.
+    pub fn run(&mut self, check: &mut dyn EdgeCheck, quantum: Quantum, stop: &Stop) -> Option<Path> {
         let end = (self.count.samples + quantum.samples, self.count.nodes + quantum.nodes);
-        let (mut edges, mut polled, mut polled_edges) = (0, 0, 0);
+        let (began, mut polled) = (self.count.samples, None);
+        // Edges that were tried, and those of them that needed a check of their own.
+        let (mut edges, mut checked, mut polled_checks) = (0, 0, 0);
         loop {
             let samples = self.count.samples;
-            if edges + polled / SAMPLES_PER_EDGE >= quantum.edges || samples >= end.0 || self.count.nodes >= end.1 {
+            let cost = edges + (samples - began) / SAMPLES_PER_EDGE;
+            if cost >= quantum.edges || samples >= end.0 || self.count.nodes >= end.1 {
                 return None;
             }
-            if polled % POLL == 0 && stop.is_over() {
-                return None;
-            }
-            polled += 1;
-            // The smaller tree grows; trees of equal size alternate.
-            self.side = match self.trees[self.side].len().cmp(&self.trees[1 - self.side].len()) {
-                std::cmp::Ordering::Less => self.side,
-                _ => 1 - self.side,
-            };
-            if self.batch.is_used() {
-                self.draw();
-            }
-            let tree = &self.trees[self.side];
-            let (lane, nearest, far) = self.batch.next(tree, self.side);
-            self.count.samples += 1;
-            if far > tree.radius(nearest) || far < 1e-6 {
-                self.misses += 1;
-                continue;
-            }
-            self.misses = 0;
-            self.batch.sample(lane, &mut self.sample);
-            unwind(&mut self.sample, tree.node(nearest), &self.turns);
-            between(tree.node(nearest), &self.sample, (self.range / far).min(1.0), &mut self.at);
-            if !self.may_be_short(&self.at) {
-                continue;
-            }
-            edges += 1;
-            let found = self.extend(nearest, is_free, &mut edges);
-            self.count.nodes = self.trees[0].len() + self.trees[1].len();
-            if found.is_some() {
-                return found;
-            }
-            if edges >= polled_edges + POLL_EDGES {
-                polled_edges = edges;
+            if polled.is_none_or(|polled| samples >= polled + POLL) || checked >= polled_checks + POLL_CHECKS {
+                (polled, polled_checks) = (Some(samples), checked);
                 if stop.is_over() {
                     return None;
                 }
             }
+            // The smaller tree grows; trees of equal size alternate.
+            if self.trees[self.side].len() >= self.trees[1 - self.side].len() {
+                self.side = 1 - self.side;
+            }
+            let side = self.side;
+            if self.candidates[side].is_empty() {
+                self.fill(end.0, check);
+                if self.candidates[side].is_empty() {
+                    continue;
+                }
+            }
+            let tree = &self.trees[side];
+            let Some((lane, nearest, far)) = self.candidates[side].next(tree) else { continue };
+            if self.candidates[side].is_blocked(lane, nearest) {
+                edges += 1;
+                self.failures += 1;
+                self.adapt(nearest, false);
+                continue;
+            }
+            self.candidates[side].sample(lane, &mut self.at);
+            aim(tree.node(nearest), far, (&self.turns, self.range), &mut self.at);
+            // Samples are drawn in single precision.
+            self.at.iter_mut().zip(&self.limits).for_each(|(q, l)| *q = q.max(l.lower).min(l.upper));
+            if !self.may_be_short(&self.at) {
+                continue;
+            }
+            (edges, checked) = (edges + 1, checked + 1);
+            let free = check.is_free(self.trees[side].node(nearest), &self.at);
+            self.adapt(nearest, free);
+            if !free {
+                self.failures += 1;
+                continue;
+            }
+            self.failures = 0;
+            let found = self.extend(nearest, check, &mut edges);
+            self.count.nodes = self.trees[0].len() + self.trees[1].len();
+            if found.is_some() {
+                return found;
+            }
         }
+    }
+
+    /// Draws samples for the tree that grows, up to a number of all samples: one that is in a domain, or sixteen where
+    /// edges fail, whose ends are then checked together.
+    fn fill(&mut self, end: u64, check: &mut dyn EdgeCheck) {
+        let together = self.failures >= FAILURES;
+        let most = if together { LANES } else { 1 };
+        self.candidates[self.side].clear();
+        for _ in 0..ROUNDS {
+            if self.candidates[self.side].len() == most || self.count.samples >= end {
+                break;
+            }
+            if self.batch.is_used() {
+                self.draw();
+            }
+            let (lane, used) = self.batch.next(&self.trees[self.side], self.side);
+            self.count.samples += used;
+            if let Some(lane) = lane {
+                self.candidates[self.side].add(&self.batch, lane, self.side);
+            }
+        }
+        if together {
+            let Self { candidates, trees, turns, range, side, at, .. } = self;
+            candidates[*side].look(&trees[*side], (turns, *range), at, check);
+        }
+    }
+
+    /// Adapts the domain of a node to whether an edge from it was free.
+    fn adapt(&mut self, node: usize, free: bool) {
+        let (settings, tree) = (&self.settings, &mut self.trees[self.side]);
+        let radius = tree.radius(node);
+        let radius = match (free, radius.is_finite()) {
+            (true, _) => radius * (1.0 + settings.alpha),
+            (false, true) => (radius * (1.0 - settings.alpha)).max(settings.min_radius),
+            (false, false) => settings.radius,
+        };
+        tree.set_radius(node, radius);
     }
 
     /// Draws the next samples.
     fn draw(&mut self) {
-        let Self { sampler, limits, settings, trees, batch, .. } = self;
-        let local = self.misses >= MISSES;
+        let Self { sampler, limits, settings, trees, batch, count, .. } = self;
         let tree = &trees[self.side];
         batch.fill(|samples| {
             sampler.fill(samples);
-            if !local {
+            if count.samples < ANYWHERE {
                 return;
             }
             for lane in (1..LANES).step_by(2) {
@@ -230,29 +281,11 @@ impl Search {
         });
     }
 
-    /// Grows one tree to the current configuration and from there towards the other tree; returns the path if they
-    /// meet.
-    fn extend(
-        &mut self,
-        nearest: usize,
-        is_free: &mut dyn FnMut(&[f64], &[f64]) -> bool,
-        edges: &mut u64,
-    ) -> Option<Path> {
+    /// Adds the current configuration, the end of a free edge, to the tree that grows, and grows the other one towards
+    /// it; returns the path if they meet.
+    fn extend(&mut self, nearest: usize, check: &mut dyn EdgeCheck, edges: &mut u64) -> Option<Path> {
         let [first, second] = &mut self.trees;
         let (own, other) = if self.side == 0 { (first, second) } else { (second, first) };
-        let free = is_free(own.node(nearest), &self.at);
-        let radius = own.radius(nearest);
-        own.set_radius(
-            nearest,
-            match (free, radius.is_finite()) {
-                (true, _) => radius * (1.0 + self.settings.alpha),
-                (false, true) => (radius * (1.0 - self.settings.alpha)).max(self.settings.min_radius),
-                (false, false) => self.settings.radius,
-            },
-        );
-        if !free {
-            return None;
-        }
         let added = own.add(&self.at, Some(nearest));
         // The other tree grows in equal steps towards the new node.
         let (mut node, far) = other.nearest(&self.at);
@@ -267,7 +300,7 @@ impl Search {
                 self.sample.copy_from_slice(to);
             }
             *edges += 1;
-            if !is_free(other.node(node), &self.sample) {
+            if !check.is_free(other.node(node), &self.sample) {
                 return None;
             }
             node = other.add(&self.sample, Some(node));

@@ -1,53 +1,25 @@
 //! Sampling of configurations: a low-discrepancy sequence, shifted by a seed.
 
-use std::sync::LazyLock;
+use dimos_kernels::Width;
+use dimos_kernels::block::Lanes;
+use dimos_kernels::halton::{Halton, VARIABLES};
 
-use dimos_kernels::block::LANES;
-
-use super::nearest::Row;
 use crate::robot::model::Limits;
 use crate::robot::random::Random;
 
-const PRIMES: [u64; 40] = [
-    3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47, 53, 59, 61, 67, 71, 73, 79, 83, 89, 97, 101, 103, 107, 109,
-    113, 127, 131, 137, 139, 149, 151, 157, 163, 167, 173, 179,
-];
-
 /// Values in the table of radii.
 const RADII: usize = 256;
-/// Most numbers in a table of low digits.
-const TABLE: u64 = 256;
 
-/// For each prime, the values of the low digits of all numbers up to a power of it.
-static LOW_DIGITS: LazyLock<Vec<Vec<f64>>> = LazyLock::new(|| {
-    let table = |base: &u64| {
-        let power = std::iter::successors(Some(*base), |p| Some(p * base)).take_while(|p| *p <= TABLE).last();
-        (0..power.unwrap_or(*base)).map(|index| radical_inverse(*base, index)).collect()
-    };
-    PRIMES.iter().map(table).collect()
-});
-
-/// Halton sequence (one prime per joint) with a random shift (Cranley and Patterson, 1976): evenly spread and different
-/// for every seed. Joints beyond the table of primes get pseudo-random values.
+/// The Halton sequence with a random shift: evenly spread and different for every seed. Joints that it is too short for
+/// get pseudo-random values.
 #[derive(Debug, Clone)]
 pub struct Sampler {
-    axes: Vec<Axis>,
-    index: u64,
+    halton: Halton,
+    /// Least value and range of the other joints.
+    others: Vec<(f32, f32)>,
     random: Random,
     /// Values of u^(1/n); empty until they are needed.
     radii: Vec<f64>,
-}
-
-/// One joint.
-#[derive(Debug, Clone)]
-struct Axis {
-    low: f64,
-    width: f64,
-    shift: f64,
-    /// Place in the table of low digits.
-    place: usize,
-    /// Value of the other digits.
-    high: f64,
 }
 
 impl Sampler {
@@ -60,39 +32,21 @@ impl Sampler {
             let low = if l.lower.is_finite() { l.lower } else { around - turn };
             let high = if l.upper.is_finite() { l.upper } else { around + turn };
             // Seed 0 is the unshifted sequence.
-            let shift = if seed == 0 { 0.0 } else { random.unit() };
-            Axis { low, width: (high - low).max(0.0), shift, place: 0, high: 0.0 }
+            let shift = if seed == 0 { 0.0 } else { random.unit() as f32 };
+            [low as f32, (high - low).max(0.0) as f32, shift]
         };
-        let axes = limits.iter().enumerate().map(axis).collect();
-        Self { axes, index: 0, random, radii: Vec::new() }
+        let axes: Vec<[f32; 3]> = limits.iter().enumerate().map(axis).collect();
+        let others = axes.iter().skip(VARIABLES).map(|[low, width, _]| (*low, *width)).collect();
+        Self { halton: Halton::new(axes.into_iter(), Width::widest()), others, random, radii: Vec::new() }
     }
 
-    /// Writes the next samples.
-    pub fn fill(&mut self, samples: &mut [Row]) {
-        for (j, (row, axis)) in samples.iter_mut().zip(&mut self.axes).enumerate() {
-            let Some(table) = LOW_DIGITS.get(j) else {
-                row.iter_mut().for_each(|x| *x = axis.low + self.random.unit() * axis.width);
-                continue;
-            };
-            let mut done = 0;
-            while done < LANES {
-                axis.place += 1;
-                if axis.place >= table.len() {
-                    axis.place = 0;
-                    let power = table.len() as u64;
-                    axis.high = radical_inverse(PRIMES[j], (self.index + done as u64 + 1) / power) / power as f64;
-                }
-                // Neighbours in the table are of neighbouring samples.
-                let run = (table.len() - axis.place).min(LANES - done);
-                for (x, low) in row[done..done + run].iter_mut().zip(&table[axis.place..axis.place + run]) {
-                    let part = low + axis.high + axis.shift;
-                    *x = axis.low + (if part < 1.0 { part } else { part - 1.0 }) * axis.width;
-                }
-                done += run;
-                axis.place += run - 1;
-            }
+    /// Writes the next samples, a block for each joint, in single precision: rounding may move one a little out of the
+    /// limits.
+    pub fn fill(&mut self, samples: &mut [Lanes]) {
+        self.halton.next(samples);
+        for (block, (low, width)) in samples.iter_mut().skip(VARIABLES).zip(&self.others) {
+            block.0.iter_mut().for_each(|x| *x = low + self.random.unit() as f32 * width);
         }
-        self.index += LANES as u64;
     }
 
     /// Writes a sample that is evenly distributed in a ball about a configuration, moved to the limits where it is
@@ -102,7 +56,7 @@ impl Sampler {
         (center, radius): (&[f64], f64),
         limits: &[Limits],
         lane: usize,
-        samples: &mut [Row],
+        samples: &mut [Lanes],
     ) {
         let mut squared = 0.0;
         for row in samples.iter_mut() {
@@ -110,12 +64,12 @@ impl Sampler {
             let bits = self.random.bits();
             let sum: u64 = [0, 16, 32, 48].iter().map(|shift| (bits >> shift) & 0xffff).sum();
             let x = sum as f64 - 2.0 * f64::from(u16::MAX);
-            row[lane] = x;
+            row.0[lane] = x as f32;
             squared += x * x;
         }
         let scale = radius * self.part_of_radius(samples.len()) / squared.sqrt().max(1e-9);
         for ((row, c), l) in samples.iter_mut().zip(center).zip(limits) {
-            row[lane] = (c + row[lane] * scale).max(l.lower).min(l.upper);
+            row.0[lane] = (c + f64::from(row.0[lane]) * scale).max(l.lower).min(l.upper) as f32;
         }
     }
 
@@ -136,34 +90,20 @@ impl Sampler {
     }
 }
 
-/// Returns the digits of `index` mirrored at the radix point.
-fn radical_inverse(base: u64, mut index: u64) -> f64 {
-    let (mut value, mut scale) = (0.0, 1.0 / base as f64);
-    while index > 0 {
-        value += (index % base) as f64 * scale;
-        index /= base;
-        scale /= base as f64;
-    }
-    value
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use dimos_kernels::block::LANES;
 
     #[test]
-    fn the_sequence_is_the_halton_sequence() {
-        let limits = [Limits { lower: 0.0, upper: 1.0, ..Limits::NONE }; 9];
-        let mut sampler = Sampler::new(&limits, &[], 0);
-        let mut rows = [[0.0; LANES]; 9];
-        for batch in 0..2500 {
-            sampler.fill(&mut rows);
-            for (row, base) in rows.iter().zip(PRIMES) {
-                for (lane, x) in row.iter().enumerate() {
-                    let index = (batch * LANES + lane + 1) as u64;
-                    assert!((x - radical_inverse(base, index)).abs() < 1e-12, "{index} in base {base}");
-                }
-            }
+    fn more_joints_than_the_sequence_has_variables_are_sampled_between_their_limits() {
+        let limits: Vec<Limits> =
+            (0..43).map(|j| Limits { lower: f64::from(j), upper: f64::from(j + 1), ..Limits::NONE }).collect();
+        let mut samples = vec![Lanes::splat(f32::NAN); limits.len()];
+        Sampler::new(&limits, &[], 7).fill(&mut samples);
+        for (block, l) in samples.iter().zip(&limits) {
+            assert!(block.0.iter().all(|x| (l.lower - 1e-5..l.upper + 1e-5).contains(&f64::from(*x))), "{block:?}");
+            assert!(block.0.windows(2).any(|pair| pair[0] != pair[1]));
         }
     }
 
@@ -171,12 +111,12 @@ mod tests {
     fn samples_in_a_ball_fill_it_evenly_and_keep_the_limits() {
         let limits = [Limits { lower: -1.5, upper: 3.0, ..Limits::NONE }; 3];
         let mut sampler = Sampler::new(&limits, &[], 1);
-        let (mut rows, mut inner, mut at_limit) = ([[0.0; LANES]; 3], 0, 0);
+        let (mut rows, mut inner, mut at_limit) = ([Lanes::splat(0.0); 3], 0, 0);
         for number in 0..8000 {
             sampler.fill_from_ball((&[0.0, 0.0, 1.0], 2.0), &limits, number % LANES, &mut rows);
-            let q = rows.map(|row| row[number % LANES]);
+            let q = rows.map(|row| f64::from(row.0[number % LANES]));
             let away = (q[0] * q[0] + q[1] * q[1] + (q[2] - 1.0) * (q[2] - 1.0)).sqrt();
-            assert!(away <= 2.0 + 1e-12 && q.iter().all(|x| *x >= -1.5 && *x <= 3.0));
+            assert!(away <= 2.0 + 1e-6 && q.iter().all(|x| *x >= -1.5 && *x <= 3.0));
             inner += usize::from(away < 1.0);
             at_limit += usize::from(q[0] == -1.5);
         }

@@ -2,8 +2,10 @@
 
 use std::sync::Arc;
 
+use dimos_kernels::block::{LANES, Lanes};
 use glamx::{DAffine3, DVec3};
 
+use super::edges::EdgeCheck;
 use super::enclosure::enclosed;
 use super::padded::{Near, Padded};
 use super::path::{distance, length};
@@ -142,15 +144,27 @@ fn a_window_in_a_wall_is_a_way_out_and_a_wall_without_one_encloses() {
     }
 }
 
+/// Edges are free where the first joint is negative.
+struct LeftOnly;
+
+impl EdgeCheck for LeftOnly {
+    fn is_free(&mut self, from: &[f64], to: &[f64]) -> bool {
+        from[0] < 0.0 && to[0] < 0.0
+    }
+
+    fn blocked(&mut self, q: &[Lanes], lanes: u16) -> u16 {
+        (0..LANES).filter(|lane| q[0].0[*lane] >= 0.0).fold(0, |all, lane| all | 1 << lane) & lanes
+    }
+}
+
 #[test]
 fn a_tree_that_does_not_grow_gets_samples_that_it_can_use() {
     let limits = [Limits { lower: -3.0, upper: 3.0, ..Limits::NONE }; 8];
     let settings = RrtSettings { radius: 0.5, min_radius: 0.5, ..RrtSettings::default() };
     let mut search = Search::new(&[-1.0; 8], &[vec![2.0; 8]], (&limits, &[false; 8]), &settings, 0.5, 0);
     // The start's tree grows, and nothing leads away from the goal.
-    let mut is_free = |from: &[f64], to: &[f64]| from[0] < 0.0 && to[0] < 0.0;
     let quantum = Quantum { edges: 2000, samples: 1_000_000, nodes: 100_000 };
-    assert_eq!(search.run(&mut is_free, quantum, &Stop::never()), None);
+    assert_eq!(search.run(&mut LeftOnly, quantum, &Stop::never()), None);
     // Of 128 samples between the limits none is near the goal; then half of the next are.
     assert!(search.count().samples < 64_000, "{:?}", search.count());
 }
@@ -216,7 +230,7 @@ fn a_search_without_a_path_ends_at_its_maximum_counts() {
     let mut settings = PlanSettings::default();
     settings.search.max_samples = 5000;
     let found = plan(&mut plane, &[-0.9, -0.9], &[vec![0.0, 0.0]], &settings, &Stop::never());
-    assert!(matches!(found, Err(PlanError::Exhausted(count)) if count.samples == 5000), "{found:?}");
+    assert!(matches!(found, Err(PlanError::Exhausted(count)) if (5000..5016).contains(&count.samples)), "{found:?}");
     settings.search.max_nodes = 50;
     let found = plan(&mut plane, &[-0.9, -0.9], &[vec![0.0, 0.0]], &settings, &Stop::never());
     assert!(

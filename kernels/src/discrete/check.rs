@@ -1,72 +1,18 @@
 //! The check itself, for one width.
 
-use crate::apart::{Compared, Other, Scene};
+use crate::apart::Compared;
 use crate::block::{Block, LANES, Lanes};
 use crate::bodies::{Frames, between, forward, point};
-use crate::cover::Node;
-use crate::obstacle::Squared;
 
+use super::gap::{Gap, Steps, gap_of, reach_of};
+use super::touch::{below, covers_touch, near, pair_touches};
 use super::{Buffers, Carried, Discrete, Motion, NO_PAIR, Proof, Standing};
 
-/// Most balls that wait to be replaced by their parts, for one pair; a pair that needs more counts as touching.
-const STACK: usize = 64;
-/// How much nearer than their radii balls count as touching.
-#[derive(Debug, Clone, Copy)]
-struct Gap {
-    /// Padding and bulge [m].
-    more: f32,
-    /// Square of half of a chord [m²].
-    squared: f32,
-    /// Padding, without the rest [m].
-    pad: f32,
-    rounding: f32,
-}
-
-impl Gap {
-    #[inline(always)]
-    fn new(pad: f32, reach: f32, steps: &Steps) -> Self {
-        let chord = reach * steps.part;
-        // The second derivative of a place is at most twice the product of what turns and what moves.
-        let bulge = 0.25 * steps.turn * chord;
-        Self { more: pad + bulge, squared: 0.25 * chord * chord, pad, rounding: steps.rounding }
-    }
-
-    /// Returns the squared distance below which a ball touches.
-    #[inline(always)]
-    fn squared(&self, radius: f32) -> f32 {
-        let radius = radius + self.more;
-        let reach = radius.mul_add(radius, self.squared).sqrt() + self.rounding;
-        reach * reach
-    }
-
-    #[inline(always)]
-    fn more(&self, radius: f32) -> Self {
-        Self { more: self.more + radius, pad: self.pad + radius, ..*self }
-    }
-}
-
-/// The steps between samples.
-#[derive(Debug, Clone, Copy)]
-struct Steps {
-    /// The part of the motion between two samples, if it is swept.
-    part: f32,
-    /// The sum of the angles by which the joints turn on it [rad].
-    turn: f32,
-    rounding: f32,
-}
-
-#[inline(always)]
-fn reach_of(motion: &Motion<'_>, pair: u32) -> f32 {
-    match motion.proof {
-        Proof::Motion { reach, .. } => reach[pair as usize] as f32,
-        _ => 0.0,
-    }
-}
-
-#[inline(always)]
-fn gap_of(motion: &Motion<'_>, pair: u32, steps: &Steps) -> Gap {
-    Gap::new(motion.pads[pair as usize] as f32, reach_of(motion, pair), steps)
-}
+/// Pairs that touched lately and are compared first where each lane counts.
+const FREQUENT: usize = 8;
+/// What is skipped for all lanes is farther than this where each lane counts [m]: what is found in one does not depend
+/// on the others, nor on rounding.
+const ROUNDING: f32 = 1e-5;
 
 /// Returns a pair that touches in any lane of any block.
 #[inline(always)]
@@ -95,30 +41,115 @@ pub(super) fn check<B: Block>(discrete: &Discrete, motion: &Motion<'_>, buffers:
             }
             buffers.q[j] = Lanes(lanes);
         }
-        let found = check_block::<B>(discrete, motion, block == 0, &steps, buffers);
-        if found.is_some() {
-            return found;
+        let mut found = Found { pair: NO_PAIR, touching: 0, sought: u16::MAX };
+        check_block::<B, false>(discrete, motion, block == 0, &steps, buffers, &mut found);
+        if found.touching != 0 {
+            return Some(found.pair);
         }
     }
     None
 }
 
+/// Returns the lanes of `sought` in which anything touches. `motion` has no proof and no likely pair.
 #[inline(always)]
-fn check_block<B: Block>(
+pub(super) fn check_each<B: Block>(
+    discrete: &Discrete,
+    motion: &Motion<'_>,
+    sought: u16,
+    buffers: &mut Buffers,
+) -> u16 {
+    let steps = Steps { part: 0.0, turn: 0.0, rounding: 0.0 };
+    let mut found = Found { pair: NO_PAIR, touching: 0, sought };
+    check_block::<B, true>(discrete, motion, true, &steps, buffers, &mut found);
+    let pair = found.pair;
+    if pair != NO_PAIR && !buffers.frequent.contains(&pair) {
+        buffers.frequent.truncate(FREQUENT - 1);
+        buffers.frequent.push(pair);
+    }
+    found.touching
+}
+
+/// Compares the pairs that touched lately; returns whether the check is over.
+#[inline(always)]
+fn check_frequent<B: Block>(
+    discrete: &Discrete,
+    motion: &Motion<'_>,
+    steps: &Steps,
+    buffers: &mut Buffers,
+    found: &mut Found,
+) -> bool {
+    let scene = &*discrete.scene;
+    for place in 0..buffers.frequent.len() {
+        let pair = buffers.frequent[place];
+        let Some(Compared { link, other, .. }) = scene.pairs.get(pair as usize) else { continue };
+        let (link, gap) = (&scene.links[*link], gap_of(motion, pair, steps));
+        let (frames, nodes) = (&buffers.frames[..], &link.tree.nodes);
+        let touching =
+            pair_touches::<B, true>(scene, frames, link.body, nodes, other, &gap, (false, found.left::<true>()));
+        if touching != 0 && place > 0 {
+            buffers.frequent.swap(place, place - 1);
+        }
+        if found.ends::<true>(pair, touching) {
+            return true;
+        }
+    }
+    found.pair = NO_PAIR;
+    false
+}
+
+/// Where something touches.
+struct Found {
+    /// A pair that does.
+    pair: u32,
+    /// Lanes in which a pair is known to.
+    touching: u16,
+    /// Lanes of interest.
+    sought: u16,
+}
+
+impl Found {
+    /// The lanes that are still to be checked: all, up to the first that touches.
+    #[inline(always)]
+    fn left<const EACH: bool>(&self) -> u16 {
+        if EACH { self.sought & !self.touching } else { u16::MAX }
+    }
+
+    /// Takes the lanes in which a pair touches; returns whether the check is over.
+    #[inline(always)]
+    fn ends<const EACH: bool>(&mut self, pair: u32, touching: u16) -> bool {
+        if touching == 0 {
+            return false;
+        }
+        self.pair = pair;
+        self.touching |= touching;
+        !EACH || self.left::<EACH>() == 0
+    }
+}
+
+/// Checks a block: to the first pair that touches in any lane, or for `EACH` lane whether something touches in it.
+#[inline(always)]
+fn check_block<B: Block, const EACH: bool>(
     discrete: &Discrete,
     motion: &Motion<'_>,
     first: bool,
     steps: &Steps,
     buffers: &mut Buffers,
-) -> Option<u32> {
+    found: &mut Found,
+) {
     let scene = &*discrete.scene;
     forward::<B>(&scene.prepared, &buffers.q, &mut buffers.frames);
+    if EACH && check_frequent::<B>(discrete, motion, steps, buffers, found) {
+        return;
+    }
     let frames = &buffers.frames[..];
     if let Some(likely) = motion.likely.filter(|_| first) {
         let Compared { link, other, .. } = &scene.pairs[likely as usize];
         let (link, gap) = (&scene.links[*link], gap_of(motion, likely, steps));
-        if pair_touches::<B>(scene, frames, link.body, &link.tree.nodes, other, &gap, false) {
-            return Some(likely);
+        let nodes = &link.tree.nodes;
+        let left = (false, found.left::<EACH>());
+        let touching = pair_touches::<B, EACH>(scene, frames, link.body, nodes, other, &gap, left);
+        if found.ends::<EACH>(likely, touching) {
+            return;
         }
     }
     let most = motion.pad as f32;
@@ -139,11 +170,16 @@ fn check_block<B: Block>(
             }
         }
         let gap = Gap::new(most, reach, steps);
-        let around = gap.squared(carried.radius).sqrt();
+        let around = gap.squared(carried.radius).sqrt() + if EACH { ROUNDING } else { 0.0 };
         let (mut low, mut high) = ([B::splat(0.0); 3], [B::splat(0.0); 3]);
         for i in 0..3 {
-            low[i] = B::splat(-center[i].neg().largest() - around);
-            high[i] = B::splat(center[i].largest() + around);
+            let (mut least, mut most) = (center[i].neg(), center[i]);
+            if EACH {
+                let (left, none) = (B::mask(found.left::<EACH>()), B::splat(f32::NEG_INFINITY));
+                (least, most) = (B::select(left, least, none), B::select(left, most, none));
+            }
+            low[i] = B::splat(-least.largest() - around);
+            high[i] = B::splat(most.largest() + around);
         }
         for group in carried.groups.0..carried.groups.1 {
             let boxes = &discrete.boxes[group as usize];
@@ -161,12 +197,13 @@ fn check_block<B: Block>(
                     break;
                 }
                 let standing = &discrete.obstacles[at as usize];
-                if !near::<B>(scene, frames, &standing.other, &center, &gap.more(carried.radius)) {
+                let around = carried.radius + if EACH { ROUNDING } else { 0.0 };
+                let near = near::<B>(scene, frames, &standing.other, &center, &gap.more(around));
+                if near & found.left::<EACH>() == 0 {
                     continue;
                 }
-                let found = body_touches::<B>(discrete, motion, frames, carried, standing, steps);
-                if found.is_some() {
-                    return found;
+                if body_touches::<B, EACH>(discrete, motion, frames, (carried, near), standing, steps, found) {
+                    return;
                 }
             }
         }
@@ -182,30 +219,33 @@ fn check_block<B: Block>(
                 reach = reach.max(reach_of(motion, pair.pair));
             }
         }
-        if !any_below::<B>(squared, Gap::new(most, reach, steps).squared(one.radius + two.radius)) {
+        let around = one.radius + two.radius + if EACH { ROUNDING } else { 0.0 };
+        let near = below::<B>(squared, Gap::new(most, reach, steps).squared(around)) & found.left::<EACH>();
+        if near == 0 {
             continue;
         }
         let (f, g) = (&frames[one.body], &frames[two.body]);
         for pair in pairs {
             let (a, b) = (&discrete.links[pair.a as usize].tree.nodes, &discrete.links[pair.b as usize].tree.nodes);
-            if covers_touch::<B>(f, a, g, b, &gap_of(motion, pair.pair, steps)) {
-                return Some(pair.pair);
+            let touching = covers_touch::<B, EACH>(f, a, g, b, &gap_of(motion, pair.pair, steps), found.left::<EACH>());
+            if found.ends::<EACH>(pair.pair, touching) {
+                return;
             }
         }
     }
-    None
 }
 
-/// Returns a pair of a body's links and an obstacle that touches in any lane.
+/// Checks the pairs of a body's links and an obstacle; returns whether the check is over.
 #[inline(always)]
-fn body_touches<B: Block>(
+fn body_touches<B: Block, const EACH: bool>(
     discrete: &Discrete,
     motion: &Motion<'_>,
     frames: &[Frames],
-    carried: &Carried,
+    (carried, near): (&Carried, u16),
     standing: &Standing,
     steps: &Steps,
-) -> Option<u32> {
+    found: &mut Found,
+) -> bool {
     let (first, last) = carried.links;
     for member in first..last {
         let pair = discrete.pairs[(standing.pairs + member - first) as usize];
@@ -214,130 +254,17 @@ fn body_touches<B: Block>(
         }
         let (nodes, gap) = (&discrete.links[member as usize].tree.nodes, gap_of(motion, pair, steps));
         // The ball of the only link of a body is that of the body: it is near.
-        let only = last - first == 1;
-        if pair_touches::<B>(&discrete.scene, frames, carried.body, nodes, &standing.other, &gap, only) {
-            return Some(pair);
+        let only = (last - first == 1, found.left::<EACH>() & if EACH { near } else { u16::MAX });
+        let touching =
+            pair_touches::<B, EACH>(&discrete.scene, frames, carried.body, nodes, &standing.other, &gap, only);
+        if found.ends::<EACH>(pair, touching) {
+            return true;
         }
     }
-    None
+    false
 }
 
 #[inline(always)]
 fn load<B: Block>(point: &[Lanes; 3]) -> [B; 3] {
     [B::load(&point[0]), B::load(&point[1]), B::load(&point[2])]
-}
-
-/// Returns whether a number is smaller than another in any lane; so is what is not a number.
-#[inline(always)]
-fn any_below<B: Block>(squared: B, limit: f32) -> bool {
-    B::bits(B::less(B::splat(limit), squared)) != u16::MAX
-}
-
-/// Returns whether points are nearer to an obstacle than a distance in any lane.
-#[inline(always)]
-fn near<B: Block>(scene: &Scene, frames: &[Frames], other: &Other, center: &[B; 3], gap: &Gap) -> bool {
-    match other {
-        Other::Box(core, radius) => any_below::<B>(core.squared(center), gap.squared(*radius)),
-        Other::Cylinder(core, radius) => any_below::<B>(core.squared(center), gap.squared(*radius)),
-        Other::Cover(body, tree, radius) => {
-            let Some(root) = scene.trees[*tree].nodes.first() else { return true };
-            let squared = between(&point::<B>(&frames[*body], &root.center), center);
-            any_below::<B>(squared, gap.squared(*radius + root.radius))
-        }
-        Other::Link(_) => true,
-    }
-}
-
-/// Returns whether a cover touches something in any lane; `near`: its largest ball is known to do so.
-#[inline(always)]
-fn pair_touches<B: Block>(
-    scene: &Scene,
-    frames: &[Frames],
-    body: usize,
-    nodes: &[Node],
-    other: &Other,
-    gap: &Gap,
-    near: bool,
-) -> bool {
-    let frame = &frames[body];
-    match other {
-        Other::Box(core, radius) => cover_touches::<B, _>(frame, nodes, &gap.more(*radius), core, near),
-        Other::Cylinder(core, radius) => cover_touches::<B, _>(frame, nodes, &gap.more(*radius), core, near),
-        Other::Cover(fixed, tree, radius) => {
-            covers_touch::<B>(frame, nodes, &frames[*fixed], &scene.trees[*tree].nodes, &gap.more(*radius))
-        }
-        Other::Link(other) => {
-            let other = &scene.links[*other];
-            covers_touch::<B>(frame, nodes, &frames[other.body], &other.tree.nodes, gap)
-        }
-    }
-}
-
-/// Returns whether the smallest balls of a cover touch a core in any lane.
-#[inline(always)]
-fn cover_touches<B: Block, C: Squared>(frame: &Frames, nodes: &[Node], gap: &Gap, core: &C, near: bool) -> bool {
-    let Some(root) = nodes.first() else { return true };
-    let mut stack = [0; STACK];
-    let mut open = 1;
-    if near && root.count != 0 {
-        open = 0;
-        for part in root.first..root.first + root.count.min(STACK as u32) {
-            stack[open] = part;
-            open += 1;
-        }
-    }
-    while open > 0 {
-        open -= 1;
-        let node = &nodes[stack[open] as usize];
-        let squared = core.squared(&point::<B>(frame, &node.center));
-        if !any_below::<B>(squared, gap.squared(node.radius)) {
-            continue;
-        }
-        if node.count == 0 || open + node.count as usize > STACK || surely::<B>(squared, node.inner, gap) {
-            return true;
-        }
-        for part in node.first..node.first + node.count {
-            stack[open] = part;
-            open += 1;
-        }
-    }
-    false
-}
-
-/// Returns whether balls inside of solids touch in any lane.
-#[inline(always)]
-fn surely<B: Block>(squared: B, inner: f32, gap: &Gap) -> bool {
-    let within = inner + gap.pad;
-    inner >= 0.0 && B::bits(B::less(squared, B::splat(within * within))) != 0
-}
-
-/// Returns whether the smallest balls of two covers touch in any lane.
-#[inline(always)]
-fn covers_touch<B: Block>(f: &Frames, a: &[Node], g: &Frames, b: &[Node], gap: &Gap) -> bool {
-    if a.is_empty() || b.is_empty() {
-        return true;
-    }
-    let mut stack = [(0, 0); STACK];
-    let mut open = 1;
-    while open > 0 {
-        open -= 1;
-        let (i, j) = stack[open];
-        let (one, two) = (&a[i as usize], &b[j as usize]);
-        let squared = between(&point::<B>(f, &one.center), &point(g, &two.center));
-        if !any_below::<B>(squared, gap.squared(one.radius + two.radius)) {
-            continue;
-        }
-        // The larger ball is replaced by its parts.
-        let first = one.count != 0 && (two.count == 0 || one.radius >= two.radius);
-        let parent = if first { one } else { two };
-        let inner = if one.inner.min(two.inner) < 0.0 { -1.0 } else { one.inner + two.inner };
-        if parent.count == 0 || open + parent.count as usize > STACK || surely::<B>(squared, inner, gap) {
-            return true;
-        }
-        for part in parent.first..parent.first + parent.count {
-            stack[open] = if first { (part, j) } else { (i, part) };
-            open += 1;
-        }
-    }
-    false
 }

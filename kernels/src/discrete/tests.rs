@@ -130,3 +130,41 @@ fn the_pair_that_touches_is_named() {
     }
     assert!(found > 20, "{found}");
 }
+
+#[test]
+fn each_lane_has_the_verdict_that_it_has_alone() {
+    let mut numbers = Numbers(21);
+    let (mut touching, mut free) = (0, 0);
+    for _ in 0..12 {
+        let state = numbers.0;
+        let scenes: Vec<Discrete> = Width::usable()
+            .into_iter()
+            .map(|width| {
+                numbers.0 = state;
+                Discrete::new(scene(&mut numbers, width))
+            })
+            .collect();
+        // Pairs that touched before are compared first: that changes nothing.
+        let mut buffers = vec![Buffers::default(); scenes.len()];
+        for round in 0..40_u16 {
+            let lanes: [[f64; 4]; LANES] =
+                std::array::from_fn(|_| [2.0, 2.0, 2.0, 0.2].map(|most| most * numbers.next()));
+            let q: Vec<Lanes> = (0..4).map(|j| Lanes(std::array::from_fn(|k| lanes[k][j] as f32))).collect();
+            let sought = u16::MAX ^ (round.wrapping_mul(0x9e37) & 0x5a5a);
+            let found: Vec<u16> = scenes
+                .iter()
+                .zip(&mut buffers)
+                .map(|(scene, buffers)| scene.touching_lanes(&q, (&[0.003; 90], 0.003), sought, buffers))
+                .collect();
+            assert!(found.iter().all(|other| *other == found[0]), "{found:?}");
+            for (lane, q) in lanes.iter().enumerate() {
+                let alone = check(&scenes[0], q, q, 1, false).is_some();
+                let (asked, touches) = (sought >> lane & 1 == 1, found[0] >> lane & 1 == 1);
+                assert_eq!(touches, asked && alone, "{q:?}");
+                touching += usize::from(asked && alone);
+                free += usize::from(asked && !alone);
+            }
+        }
+    }
+    assert!(touching > 500 && free > 500, "{touching} touching, {free} free");
+}
