@@ -1,5 +1,7 @@
 //! `dimos down`: shuts down a run like SIGTERM, or a planner that is attached to one.
 
+use std::io::ErrorKind;
+use std::net::{TcpStream, ToSocketAddrs};
 use std::time::{Duration, Instant};
 
 use serde_json::json;
@@ -122,6 +124,8 @@ fn elsewhere(args: &Args, place: &str, name: Option<&str>) -> Result {
     }
     match status {
         Err(ClientError::Refused(refusal)) if refusal.code == Code::ShuttingDown => {}
+        // The gateway ended, with the run, before it could answer.
+        Err(_) if nothing_listens(place) => {}
         Err(error) => {
             let what = format!("run {run} at {place} is shutting down, and its end was not seen: {error}");
             return Err(Failure::new(Exit::Failed, what).hint(format!("dimos status --at {place}")));
@@ -135,6 +139,18 @@ fn elsewhere(args: &Args, place: &str, name: Option<&str>) -> Result {
     let log = log.map_or_else(String::new, |log| format!("; log on its computer: {log}"));
     output::note(format_args!("{run} at {place} ended{log}"));
     Ok(Exit::Ok)
+}
+
+/// Returns whether a computer answers that nothing listens at a place, `tcp/HOST:PORT`. A connection that is lost for
+/// another reason gets no such answer.
+fn nothing_listens(place: &str) -> bool {
+    let address = place.split_once('/').map_or(place, |(_, address)| address);
+    let addresses: Vec<_> = address.to_socket_addrs().into_iter().flatten().collect();
+    let refuses = |address| {
+        let tried = TcpStream::connect_timeout(address, Duration::from_secs(1));
+        tried.is_err_and(|error| error.kind() == ErrorKind::ConnectionRefused)
+    };
+    !addresses.is_empty() && addresses.iter().all(refuses)
 }
 
 /// Returns the failure of `down` without a name where only planners are left.
@@ -151,4 +167,19 @@ fn find(folder: &RunDir, name: Option<&str>) -> Result<LiveRun> {
         let dead = name.and_then(RunRecord::of).and_then(|record| record.failure());
         dead.unwrap_or_else(|| error.into())
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_port_that_was_closed_refuses() {
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let place = format!("tcp/{}", listener.local_addr().unwrap());
+        assert!(!nothing_listens(&place));
+        drop(listener);
+        assert!(nothing_listens(&place));
+        assert!(!nothing_listens("tcp/no port") && !nothing_listens(""));
+    }
 }
