@@ -8,8 +8,8 @@ use super::level::Level;
 use super::padded::Near;
 use super::path::{Path, distance, unwind};
 use super::path_planner::{PlanSettings, plan};
-use super::pipeline::{Goal, PlanFailure, PlanRequest, Stage, StageTimes, failure_for};
-use super::timing::TimingSettings;
+use super::pipeline::{Goal, PlanFailure, PlanRequest, Stage, StageTimes, bounds_at, failure_for};
+use super::timing::{TimingSettings, time};
 use crate::collision::{CollisionChecker, Stop};
 use crate::robot::kinematics::frame;
 
@@ -26,6 +26,8 @@ pub(super) struct SearchOptions {
     pub seed: u64,
     pub level: Level,
     pub refine: u32,
+    /// Part of the speed of the motion.
+    pub speed: f64,
 }
 
 /// The way to one goal.
@@ -39,6 +41,9 @@ pub(super) struct Leg {
     pub deviation: f64,
 }
 
+/// A path, and the joints of its goal that were moved to their limits: index and requested position [rad or m].
+type Way = (Path, Vec<(usize, f64)>);
+
 /// Plans the way through all waypoints to the goals.
 pub(super) fn legs(
     stage: &mut Stage<'_>,
@@ -47,7 +52,8 @@ pub(super) fn legs(
     times: &mut StageTimes,
 ) -> Result<Vec<Leg>, PlanFailure> {
     let begin = stage.start.clone();
-    let search = SearchOptions { seed: request.seed, level: request.level, refine: request.refine };
+    let PlanRequest { seed, level, refine, speed, .. } = *request;
+    let search = SearchOptions { seed, level, refine, speed };
     let mut legs: Vec<Leg> = Vec::new();
     for (i, goals) in request.through.iter().chain([&request.goals]).enumerate() {
         if let Some(at) = legs.last().and_then(|leg| leg.path.last()) {
@@ -102,22 +108,44 @@ pub(super) fn leg(
                 stage.checker.give_up(Near::Goal, &goal);
             }
             took("ik", began.elapsed().as_secs_f64());
-            let SearchOptions { seed, level, refine } = search;
+            let SearchOptions { seed, level, refine, speed } = search;
             let settings = PlanSettings { seed, level, refine, ..PlanSettings::default() };
             let start = stage.start.clone();
             let found =
                 plan(&mut stage.checker, &start, &goals, &settings, stop).map_err(|e| failure_for(stage, &e))?;
-            let used = |joint: usize| Some((stage.joints.get(joint)?.clone(), *found.path.last()?.get(joint)?));
-            let moved = found.clamped.iter().filter_map(|(joint, asked)| Some((*asked, used(*joint)?)));
-            let clamped = moved.map(|(asked, (joint, used))| (joint, asked, used)).collect();
             took("search", found.search_time.as_secs_f64());
             took("shorten", found.shorten_time.as_secs_f64());
+            let choosing = Instant::now();
+            let (path, clamped) = quickest(stage, speed, found.longer, (found.path, found.clamped));
             if refine > 0 {
-                took("refine", found.refine_time.as_secs_f64());
+                took("refine", (found.refine_time + choosing.elapsed()).as_secs_f64());
             }
-            Ok(Leg { path: found.path, fraction: None, clamped, deviation: TimingSettings::default().deviation })
+            let used = |joint: usize| Some((stage.joints.get(joint)?.clone(), *path.last()?.get(joint)?));
+            let moved = clamped.iter().filter_map(|(joint, asked)| Some((*asked, used(*joint)?)));
+            let clamped = moved.map(|(asked, (joint, used))| (joint, asked, used)).collect();
+            Ok(Leg { path, fraction: None, clamped, deviation: TimingSettings::default().deviation })
         }
     }
+}
+
+/// Returns the path of the quickest motion, of the shortest path and of others. The shortest one may turn more often, or
+/// by more of the slower joints.
+fn quickest(stage: &mut Stage<'_>, speed: f64, others: Vec<Way>, shortest: Way) -> Way {
+    let Ok(bounds) = bounds_at(stage, speed) else { return shortest };
+    let Stage { joints, checker, .. } = stage;
+    let mut duration = |way: &Way| {
+        let free = |a: &[f64], b: &[f64]| checker.motion_looks_free(a, b);
+        let timed = time(joints, &way.0, &bounds, &TimingSettings::default(), free);
+        timed.map_or(f64::INFINITY, |timed| timed.duration)
+    };
+    let mut best = (if others.is_empty() { 0.0 } else { duration(&shortest) }, shortest);
+    for way in others {
+        let duration = duration(&way);
+        if duration < best.0 {
+            best = (duration, way);
+        }
+    }
+    best.1
 }
 
 /// Joins the legs to one path, with the maximum deviation at each of its configurations [rad]. At a waypoint it is that

@@ -78,6 +78,9 @@ pub struct Plan {
     pub search_time: Duration,
     /// Duration of the shortcutting.
     pub shorten_time: Duration,
+    /// The paths that refinement made shorter, the longest first, each with what was `clamped`: one of them may be the
+    /// quicker motion.
+    pub longer: Vec<(Path, Vec<(usize, f64)>)>,
     /// Rounds of refinement.
     pub refined: u32,
     /// Their duration.
@@ -181,7 +184,7 @@ pub fn plan<C: CollisionChecker>(
     let mut count = SearchCount::default();
     let mut search_time = began.elapsed();
     let is_straight = straight.is_some();
-    let mut path = match straight {
+    let path = match straight {
         Some(line) => line,
         None => {
             // Where covers touch already, no edge would look free.
@@ -216,12 +219,16 @@ pub fn plan<C: CollisionChecker>(
     let shorten_time = began.elapsed() - search_time;
     let refining = Instant::now();
     let stop = settings.refine_time.map_or_else(|| stop.halfway(), |time| stop.or_at(refining + time));
-    let (refined, rounds) = refine(checker, path, &goals, settings, &stop);
-    path = refined;
-    path.splice(..1, lead);
-    let reached = goals.iter().position(|goal| path.last() == Some(goal));
+    let (paths, rounds) = refine(checker, path, &goals, settings, &stop);
+    let whole = |mut path: Path| {
+        let reached = goals.iter().position(|goal| path.last() == Some(goal));
+        path.splice(..1, lead.iter().cloned());
+        (path, reached.and_then(|goal| clamped.get(goal).cloned()).unwrap_or_default())
+    };
+    let mut longer: Vec<(Path, Clamped)> = paths.into_iter().map(whole).collect();
+    let (path, clamped) = longer.pop().unwrap_or_default();
     Ok(Plan {
-        clamped: reached.and_then(|goal| clamped.get(goal).cloned()).unwrap_or_default(),
+        clamped,
         length: length(&path),
         path,
         straight: is_straight,
@@ -231,6 +238,7 @@ pub fn plan<C: CollisionChecker>(
         checks: checker.checks() - looked,
         search_time,
         shorten_time,
+        longer,
         refined: rounds,
         refine_time: refining.elapsed(),
     })

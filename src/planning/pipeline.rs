@@ -18,6 +18,7 @@ use super::planning_scene::{PlannedRobot, PlanningScene};
 use super::stage_cache::Key;
 use super::start_contact::{EscapePath, passes};
 use super::timing::{bounds, time_within};
+use super::topp::JointBound;
 use crate::collision::kept::Kept;
 use crate::collision::report::Pair;
 use crate::collision::world::{Robot, World};
@@ -350,21 +351,23 @@ fn timed(
     request: &PlanRequest,
     stop: &Stop,
 ) -> Result<JointTrajectory, PlanFailure> {
-    let bounds = bounds(&stage.joints, &stage.limits).map_err(|e| PlanFailure::new(e.to_string()))?;
-    // Half the speed means half the velocity and half the acceleration, as in a direct move.
-    let bounds: Vec<_> = bounds
-        .into_iter()
-        .map(|mut b| {
-            b.velocity *= request.speed;
-            b.acceleration *= request.speed;
-            b.jerk *= request.speed;
-            b
-        })
-        .collect();
+    let bounds = bounds_at(stage, request.speed)?;
     let checker = &mut stage.checker;
     let free = |a: &[f64], b: &[f64]| passes(checker, request.level, escape_path, (a, b), stop);
     let timed = time_within(&stage.joints, path, &bounds, deviation, 1.0, free);
     timed.map(|timed| timed.trajectory).map_err(|e| late(stop).unwrap_or_else(|| PlanFailure::new(e.to_string())))
+}
+
+/// Returns the bounds of the joints at a part of their speed: half the speed means half the velocity and half the
+/// acceleration, as in a direct move.
+pub(super) fn bounds_at(stage: &Stage<'_>, speed: f64) -> Result<Vec<JointBound>, PlanFailure> {
+    let mut bounds = bounds(&stage.joints, &stage.limits).map_err(|e| PlanFailure::new(e.to_string()))?;
+    for b in &mut bounds {
+        b.velocity *= speed;
+        b.acceleration *= speed;
+        b.jerk *= speed;
+    }
+    Ok(bounds)
 }
 
 /// Returns the failure if the request was cancelled or its timeout was reached.

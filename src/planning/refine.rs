@@ -20,23 +20,25 @@ const CUTS: usize = 24;
 const EFFORT: Quantum = Quantum { edges: 512, samples: 32_768, nodes: 4096 };
 /// A path is shorter if it is by this [rad].
 const SHORTER: f64 = 1e-6;
+/// A path is worth keeping beside a longer one if it is shorter than this part of it.
+const DIFFERS: f64 = 0.99;
 
-/// Makes a free path from its first configuration to any of `goals` shorter. Returns the path and the number of rounds,
-/// at most `settings.refine`; fewer if stopped.
+/// Makes a free path from its first configuration to any of `goals` shorter. Returns the given path and shorter ones,
+/// the shortest last, and the number of rounds, at most `settings.refine`; fewer if stopped.
 pub fn refine<C: CollisionChecker>(
     checker: &mut C,
     path: Path,
     goals: &[Vec<f64>],
     settings: &PlanSettings,
     stop: &Stop,
-) -> (Path, u32) {
-    let Some(start) = path.first().cloned() else { return (path, 0) };
-    let mut best = path;
+) -> (Vec<Path>, u32) {
+    let Some(start) = path.first().cloned() else { return (vec![path], 0) };
+    let (mut best, mut all) = (path.clone(), vec![path]);
     let mut random = Random::new(settings.seed);
     for round in 0..settings.refine {
         // Nothing is shorter than a straight line to the nearest goal.
         if stop.is_over() || best.len() <= 2 {
-            return (best, round);
+            return (all, round);
         }
         let tried = if round % 2 == 0 {
             cut(&best, CUTS, &mut random, &mut |a, b| checker.motion_looks_free(a, b))
@@ -49,10 +51,17 @@ pub fn refine<C: CollisionChecker>(
         if let Some(shorter) = shorter
             && is_proven(checker, &shorter, settings.level, stop)
         {
+            // Of many that are hardly shorter, the last is enough.
+            if let [.., before, last] = &all[..]
+                && length(last) > DIFFERS * length(before)
+            {
+                all.pop();
+            }
+            all.push(shorter.clone());
             best = shorter;
         }
     }
-    (best, settings.refine)
+    (all, settings.refine)
 }
 
 /// Searches for another path that is shorter than `most` [rad].

@@ -8,6 +8,7 @@ use super::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
 use super::goals::configurations;
 use super::joint_path::JointPath;
 use super::level::Level;
+use super::path::length;
 use super::path_planner::PlanError;
 use super::pipeline::{Goal, PlanRequest, PlannedMotion, solve, stage};
 use super::planning_scene::PlanningScene;
@@ -62,6 +63,38 @@ fn refinement_leaves_time_for_the_rest_of_the_request() {
     let stop = Stop::new(Some(Instant::now() + Duration::from_secs(4)), None);
     let motion = solve(&scene, &scene.world, &request, &stop).unwrap();
     assert!(motion.path.len() > 2 && motion.times["refine"] > 0.1, "{:?}", motion.times);
+}
+
+/// A shorter path may turn more, or by more of the slower joints: its motion took longer.
+#[test]
+fn a_refined_plan_is_no_slower() {
+    let at = |turn| vec![turn, -0.3, 0.6, 0.0, 0.8, 0.0];
+    let middle = flange(&scene(vec![RobotConfig::yourarm()], Vec::new()), 0, &at(0.0)).translation;
+    let wall = ObjectShape::Box([0.1, 0.02, 0.4]);
+    let wall = ObjectConfig { name: "wall".into(), shape: wall, pose: middle.into(), padding: 0.0 };
+    let scene = scene(vec![RobotConfig::yourarm()], vec![wall]);
+    let (mut shorter, mut quicker) = (0, 0);
+    for seed in 0..24 {
+        let [plain, refined] = [0, 60].map(|refine| {
+            let request = PlanRequest {
+                goals: vec![(0, Goal::Joints(at(0.9)))],
+                positions: vec![at(-0.9)],
+                speed: 1.0,
+                seed,
+                level: Level::Certified,
+                refine,
+                through: Vec::new(),
+                blend: 0.0,
+                by_number: false,
+            };
+            let motion = solve(&scene, &scene.world, &request, &Stop::never()).unwrap();
+            (motion.trajectory.duration(), length(&motion.path))
+        });
+        assert!(refined.0 <= plain.0, "seed {seed}: {:.3} s, refined {:.3} s", plain.0, refined.0);
+        quicker += usize::from(refined.0 < plain.0);
+        shorter += usize::from(refined.1 < plain.1);
+    }
+    assert!(quicker > 16 && shorter > 16, "{quicker} quicker, {shorter} shorter");
 }
 
 /// Returns the pose of a robot's end effector in the frame `map`.
