@@ -30,11 +30,12 @@ pub fn read(data: &[u8]) -> Result<Vec<DVec3>, PlyError> {
         at.ok_or_else(|| PlyError(format!("vertices have no property {name:?}")))
     };
     let wanted = [index("x")?, index("y")?, index("z")?];
-    let points = match header.format {
+    let mut points = match header.format {
         Format::Ascii => ascii(body, header.count, fields.len(), wanted)?,
         format => binary(body, header.count, &fields, wanted, format == Format::Little)?,
     };
-    Ok(points.into_iter().filter(|p| p.is_finite()).collect())
+    points.retain(|p| p.is_finite());
+    Ok(points)
 }
 
 struct Header {
@@ -131,23 +132,31 @@ fn binary(
     }
     let offset = |field: usize| fields[..field].iter().map(|f| f.0).sum::<usize>();
     let [x, y, z] = wanted.map(|field| (offset(field), fields[field]));
-    let value = |record: &[u8], (at, (length, kind)): (usize, (usize, char))| {
-        let mut bytes = [0; 8];
-        for (i, b) in record[at..at + length].iter().enumerate() {
-            bytes[if little { i } else { length - 1 - i }] = *b;
-        }
-        let bits = u64::from_le_bytes(bytes);
-        match (kind, length) {
-            ('f', 4) => f64::from(f32::from_bits(bits as u32)),
-            ('f', _) => f64::from_bits(bits),
-            ('i', 1) => f64::from(bits as u8 as i8),
-            ('i', 2) => f64::from(bits as u16 as i16),
-            ('i', _) => f64::from(bits as u32 as i32),
-            _ => bits as f64,
+    let value = |record: &[u8], (at, kind): (usize, (usize, char))| {
+        let from = &record[at..];
+        match kind {
+            (4, 'f') => f64::from(f32::from_le_bytes(bytes(from, little))),
+            (_, 'f') => f64::from_le_bytes(bytes(from, little)),
+            (1, 'i') => f64::from(i8::from_le_bytes(bytes(from, little))),
+            (2, 'i') => f64::from(i16::from_le_bytes(bytes(from, little))),
+            (_, 'i') => f64::from(i32::from_le_bytes(bytes(from, little))),
+            (1, _) => f64::from(u8::from_le_bytes(bytes(from, little))),
+            (2, _) => f64::from(u16::from_le_bytes(bytes(from, little))),
+            _ => f64::from(u32::from_le_bytes(bytes(from, little))),
         }
     };
     let point = |record: &[u8]| DVec3::new(value(record, x), value(record, y), value(record, z));
     Ok(body.chunks_exact(size.max(1)).take(count).map(point).collect())
+}
+
+/// Returns the first bytes of a value, the lowest first.
+fn bytes<const N: usize>(from: &[u8], little: bool) -> [u8; N] {
+    let mut bytes = [0; N];
+    bytes.copy_from_slice(&from[..N]);
+    if !little {
+        bytes.reverse();
+    }
+    bytes
 }
 
 #[cfg(test)]

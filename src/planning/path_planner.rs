@@ -268,7 +268,7 @@ fn not_enclosed<C: CollisionChecker>(
 }
 
 /// Smallest and largest number of random cuts of a path.
-const CUTS: (usize, usize) = (8, 256);
+const CUTS: (usize, usize) = (10, 256);
 /// A search with more nodes takes longer, and so may the cuts of its path.
 const NODES_PER_CUT: usize = 8;
 
