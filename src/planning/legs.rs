@@ -128,8 +128,8 @@ pub(super) fn leg(
     }
 }
 
-/// Returns the path of the quickest motion, of the shortest path and of others. The shortest one may turn more often, or
-/// by more of the slower joints.
+/// Returns the path of the quickest motion, of the shortest path and of others. The shortest one may turn more often,
+/// or by more of the slower joints.
 fn quickest(stage: &mut Stage<'_>, speed: f64, others: Vec<Way>, shortest: Way) -> Way {
     let Ok(bounds) = bounds_at(stage, speed) else { return shortest };
     let Stage { joints, checker, .. } = stage;

@@ -71,7 +71,7 @@ pub struct Quantum {
 /// This number of samples that are not connected takes about as long as the check of an edge.
 const SAMPLES_PER_EDGE: u64 = 64;
 /// The first samples are drawn anywhere between the limits, later ones half in the domains of nodes.
-const ANYWHERE: u64 = 16;
+const ANYWHERE: u64 = 48;
 /// After this number of edges in a row that were not free, the ends of the next ones are checked together.
 const FAILURES: u64 = 8;
 /// Most rounds of looking for samples that are in domains: each gives one, or uses up a batch.
