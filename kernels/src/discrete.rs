@@ -8,6 +8,8 @@
 //! are found by the first block (the "rake" of Thomason, Kingston and Kavraki, "Motions in microseconds via vectorized
 //! sampling-based planning", 2024). Covers are compared from coarse to fine: the box around all places of a body with
 //! those around sixteen obstacles at a time, then the ball around all that the body carries, its links, and their parts.
+//!
+//! Sixteen configurations that are no motion get a verdict each, by the same comparison; it then goes on to the last lane.
 
 mod check;
 mod gap;
@@ -253,9 +255,7 @@ impl Discrete {
             Vectors::Portable => check::check::<crate::block::Portable>(self, motion, buffers),
         }
     }
-}
 
-impl Discrete {
     /// Returns the lanes of `sought` in which something touches. The sixteen configurations are independent of each
     /// other: `q` has one entry per variable. `pads` and `pad` are those of a [`Motion`].
     ///
@@ -267,6 +267,8 @@ impl Discrete {
         assert!(pads.len() >= scene.pairs.len(), "every pair has a padding");
         self.make_room(buffers);
         buffers.q.copy_from_slice(&q[..scene.variables]);
+        // Buffers may have been used for another scene.
+        buffers.frequent.retain(|pair| (*pair as usize) < scene.pairs.len());
         let none = &[][..];
         let motion = Motion { from: none, to: none, blocks: 1, pads, pad, likely: None, proof: Proof::None };
         match scene.width.0 {

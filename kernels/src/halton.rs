@@ -153,7 +153,9 @@ mod tests {
                 for (lane, x) in row.0.iter().enumerate() {
                     let index = (batch * LANES + lane + 1) as u64;
                     let exact = radical_inverse(base, index);
-                    assert!((f64::from(*x) - exact).abs() < 1e-6, "{index} in base {base}: {x}, {exact}");
+                    // Single precision, rounded three times.
+                    let error = (f64::from(*x) - exact).abs();
+                    assert!(error < 1.5 * f64::from(f32::EPSILON), "{index} in base {base}: {x}, {exact}");
                 }
             }
         }

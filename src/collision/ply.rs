@@ -187,6 +187,33 @@ mod tests {
     }
 
     #[test]
+    fn every_type_is_read_in_either_byte_order() {
+        let types: [(&str, &[u8], f64); 8] = [
+            ("char", &(-3_i8).to_be_bytes(), -3.0),
+            ("uchar", &[253], 253.0),
+            ("short", &(-300_i16).to_be_bytes(), -300.0),
+            ("ushort", &65_000_u16.to_be_bytes(), 65_000.0),
+            ("int", &(-70_000_i32).to_be_bytes(), -70_000.0),
+            ("uint", &4_000_000_000_u32.to_be_bytes(), 4e9),
+            ("float", &(-0.5_f32).to_be_bytes(), -0.5),
+            ("double", &0.1_f64.to_be_bytes(), 0.1),
+        ];
+        for (name, value, expected) in types {
+            for order in ["little", "big"] {
+                let mut value = value.to_vec();
+                if order == "little" {
+                    value.reverse();
+                }
+                let properties = ["x", "y", "z"].map(|axis| format!("property {name} {axis}\n")).concat();
+                let header =
+                    format!("ply\nformat binary_{order}_endian 1.0\nelement vertex 1\n{properties}end_header\n");
+                let data = [header.into_bytes(), value.repeat(3)].concat();
+                assert_eq!(read(&data).unwrap(), [DVec3::splat(expected)], "{name}, {order}");
+            }
+        }
+    }
+
+    #[test]
     fn a_damaged_file_gives_an_error() {
         let whole = format!("ply\nformat ascii 1.0\n{HEADER}0.5 -0.25 200 4\n1.5 2 0 -8\n");
         for end in 0..whole.len() - 8 {

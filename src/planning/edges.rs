@@ -27,7 +27,7 @@ pub enum Edges {
 
 /// Checks edges with a collision checker.
 #[derive(Debug)]
-pub struct Checked<'a, C> {
+pub struct EdgeChecker<'a, C> {
     /// The checker.
     pub checker: &'a mut C,
     /// Which edges may be used.
@@ -36,7 +36,7 @@ pub struct Checked<'a, C> {
     pub stop: &'a Stop,
 }
 
-impl<C: CollisionChecker> EdgeCheck for Checked<'_, C> {
+impl<C: CollisionChecker> EdgeCheck for EdgeChecker<'_, C> {
     fn is_free(&mut self, from: &[f64], to: &[f64]) -> bool {
         let Self { checker, stop, .. } = self;
         match self.edges {

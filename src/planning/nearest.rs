@@ -124,13 +124,14 @@ impl Batch {
     }
 
     /// Returns the lane of the next sample in the domain of the node of a tree that is nearest to it, and the number of
-    /// samples that were used; `side` is the tree's number.
-    pub fn next(&mut self, tree: &Tree, side: usize) -> (Option<usize>, u64) {
+    /// samples that were used, at most `most`; `side` is the tree's number.
+    pub fn next(&mut self, tree: &Tree, side: usize, most: u64) -> (Option<usize>, u64) {
         let nearest = &mut self.nearest[side];
         tree.compare(&self.samples, nearest);
         let first = self.next;
-        let found = (first..LANES).find(|&lane| tree.is_in_domain(nearest, lane));
-        self.next = found.map_or(LANES, |lane| lane + 1);
+        let end = LANES.min(first + most.min(LANES as u64) as usize);
+        let found = (first..end).find(|&lane| tree.is_in_domain(nearest, lane));
+        self.next = found.map_or(end, |lane| lane + 1);
         (found, (self.next - first) as u64)
     }
 

@@ -287,6 +287,9 @@ impl CollisionChecker for Padded {
 
     fn look_blocked(&mut self, q: &[Lanes], lanes: u16) -> u16 {
         let blocked = self.full.look_blocked(q, lanes);
+        if self.zones.is_empty() {
+            return blocked;
+        }
         let in_zone = |lane: usize| {
             let at: Vec<f64> = q.iter().map(|block| f64::from(block.0[lane])).collect();
             self.zones.iter().any(|zone| zone.holds(&at, self.full.turns()))

@@ -4,7 +4,7 @@
 
 use crate::collision::checker::{CollisionChecker, Stop};
 
-use super::edges::{Checked, Edges};
+use super::edges::{EdgeChecker, Edges};
 use super::level::Level;
 use super::path::Path;
 use super::rrt_connect::{Quantum, RrtSettings, Search, SearchCount};
@@ -138,7 +138,7 @@ impl Portfolio {
                 samples: most.max_samples - count.samples,
                 nodes: most.max_nodes - count.nodes,
             };
-            let mut check = Checked { checker, edges: checked, stop };
+            let mut check = EdgeChecker { checker, edges: checked, stop };
             if let Some(path) = search.run(&mut check, quantum, stop) {
                 let count = search.count();
                 self.ended.samples += count.samples;

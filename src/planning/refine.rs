@@ -8,7 +8,7 @@
 use crate::collision::checker::{CollisionChecker, Stop};
 use crate::robot::random::Random;
 
-use super::edges::{Checked, Edges};
+use super::edges::{EdgeChecker, Edges};
 use super::path::{Path, between, distance, length, tidy};
 use super::path_planner::{PlanSettings, is_proven};
 use super::rrt_connect::{Quantum, Search};
@@ -33,21 +33,22 @@ pub fn refine<C: CollisionChecker>(
     stop: &Stop,
 ) -> (Vec<Path>, u32) {
     let Some(start) = path.first().cloned() else { return (vec![path], 0) };
-    let (mut best, mut all) = (path.clone(), vec![path]);
+    let mut all = vec![path];
     let mut random = Random::new(settings.seed);
     for round in 0..settings.refine {
+        let best = &all[all.len() - 1];
         // Nothing is shorter than a straight line to the nearest goal.
         if stop.is_over() || best.len() <= 2 {
             return (all, round);
         }
         let tried = if round % 2 == 0 {
-            cut(&best, CUTS, &mut random, &mut |a, b| checker.motion_looks_free(a, b))
+            cut(best, CUTS, &mut random, &mut |a, b| checker.motion_looks_free(a, b))
         } else {
             let range = settings.search.ranges[(round / 2) as usize % settings.search.ranges.len()];
             let search = (&settings.search, range, random.bits());
-            another(checker, (&start, goals), length(&best), search, settings, stop)
+            another(checker, (&start, goals), length(best), search, settings, stop)
         };
-        let shorter = tried.filter(|tried| length(tried) < length(&best) - SHORTER);
+        let shorter = tried.filter(|tried| length(tried) < length(best) - SHORTER);
         if let Some(shorter) = shorter
             && is_proven(checker, &shorter, settings.level, stop)
         {
@@ -57,8 +58,7 @@ pub fn refine<C: CollisionChecker>(
             {
                 all.pop();
             }
-            all.push(shorter.clone());
-            best = shorter;
+            all.push(shorter);
         }
     }
     (all, settings.refine)
@@ -76,7 +76,7 @@ fn another<C: CollisionChecker>(
     let turns = checker.turns().to_vec();
     let limits = checker.limits().to_vec();
     let mut search = Search::new(start, goals, (&limits, &turns), search, range, seed).shorter_than(most);
-    let found = search.run(&mut Checked { checker, edges: Edges::Looking, stop }, EFFORT, stop)?;
+    let found = search.run(&mut EdgeChecker { checker, edges: Edges::Looking, stop }, EFFORT, stop)?;
     Some(shorten(&found, &turns, &settings.shortcut, &mut |a, b| checker.motion_looks_free(a, b)))
 }
 

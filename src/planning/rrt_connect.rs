@@ -29,7 +29,7 @@ pub struct RrtSettings {
     pub alpha: f64,
     /// Minimum radius [rad].
     pub min_radius: f64,
-    /// Maximum number of samples; the batch of sixteen in which it is reached is the last.
+    /// Maximum number of samples.
     pub max_samples: u64,
     /// Maximum number of nodes in all trees.
     pub max_nodes: usize,
@@ -240,7 +240,8 @@ impl Search {
             if self.batch.is_used() {
                 self.draw();
             }
-            let (lane, used) = self.batch.next(&self.trees[self.side], self.side);
+            let left = end - self.count.samples;
+            let (lane, used) = self.batch.next(&self.trees[self.side], self.side, left);
             self.count.samples += used;
             if let Some(lane) = lane {
                 self.candidates[self.side].add(&self.batch, lane, self.side);

@@ -144,6 +144,48 @@ fn a_window_in_a_wall_is_a_way_out_and_a_wall_without_one_encloses() {
     }
 }
 
+/// What is free are the pipes of a grid of them. Ends of edges are checked together, or not.
+struct Pipes {
+    looks: bool,
+    checked: usize,
+}
+
+fn is_in_pipe(q: impl Iterator<Item = f32>) -> bool {
+    q.map(|x| (6.0 * x).cos()).sum::<f32>() < -0.8
+}
+
+impl EdgeCheck for Pipes {
+    fn is_free(&mut self, from: &[f64], to: &[f64]) -> bool {
+        self.checked += 1;
+        (1..=16).all(|k| is_in_pipe(from.iter().zip(to).map(|(a, b)| (a + (b - a) * f64::from(k) / 16.0) as f32)))
+    }
+
+    fn blocked(&mut self, q: &[Lanes], lanes: u16) -> u16 {
+        let touches = |lane: &usize| self.looks && !is_in_pipe(q.iter().map(|block| block.0[*lane]));
+        (0..LANES).filter(touches).fold(0, |all, lane| all | 1 << lane) & lanes
+    }
+}
+
+#[test]
+fn a_search_that_checks_ends_together_is_the_same_with_fewer_checks() {
+    let limits = [Limits { lower: -2.0, upper: 2.0, ..Limits::NONE }; 3];
+    let (mut found, mut checked) = (0, [0, 0]);
+    for seed in 0..20 {
+        let [alone, together] = [false, true].map(|looks| {
+            let (start, goal) = ([-1.57; 3], vec![vec![1.57; 3]]);
+            let mut search = Search::new(&start, &goal, (&limits, &[false; 3]), &RrtSettings::default(), 0.4, seed);
+            let mut pipes = Pipes { looks, checked: 0 };
+            let quantum = Quantum { edges: 4000, samples: 100_000, nodes: 10_000 };
+            let path = search.run(&mut pipes, quantum, &Stop::never());
+            checked[usize::from(looks)] += pipes.checked;
+            (path, search.count())
+        });
+        assert_eq!(alone, together, "seed {seed}");
+        found += usize::from(alone.0.is_some());
+    }
+    assert!(found > 5 && 2 * checked[1] < checked[0], "{found} found, {checked:?} checked");
+}
+
 /// Edges are free where the first joint is negative.
 struct LeftOnly;
 
@@ -165,7 +207,7 @@ fn a_tree_that_does_not_grow_gets_samples_that_it_can_use() {
     // The start's tree grows, and nothing leads away from the goal.
     let quantum = Quantum { edges: 2000, samples: 1_000_000, nodes: 100_000 };
     assert_eq!(search.run(&mut LeftOnly, quantum, &Stop::never()), None);
-    // Of 128 samples between the limits none is near the goal; then half of the next are.
+    // Of the samples between the limits none is near the goal; half of them are drawn there.
     assert!(search.count().samples < 64_000, "{:?}", search.count());
 }
 
@@ -230,7 +272,7 @@ fn a_search_without_a_path_ends_at_its_maximum_counts() {
     let mut settings = PlanSettings::default();
     settings.search.max_samples = 5000;
     let found = plan(&mut plane, &[-0.9, -0.9], &[vec![0.0, 0.0]], &settings, &Stop::never());
-    assert!(matches!(found, Err(PlanError::Exhausted(count)) if (5000..5016).contains(&count.samples)), "{found:?}");
+    assert!(matches!(found, Err(PlanError::Exhausted(count)) if count.samples == 5000), "{found:?}");
     settings.search.max_nodes = 50;
     let found = plan(&mut plane, &[-0.9, -0.9], &[vec![0.0, 0.0]], &settings, &Stop::never());
     assert!(
@@ -269,6 +311,27 @@ fn a_pair_is_always_closer_than_the_padding_if_it_is_so_within_the_limits() {
     checker.give_up(Near::Start, &[4.1]);
     let near: Vec<Near> = checker.given_up().iter().map(|given_up| given_up.near).collect();
     assert_eq!(near, [Near::Everywhere]);
+}
+
+#[test]
+fn what_is_within_the_padding_only_is_not_blocked_near_a_start() {
+    let mut world = World::new();
+    world.add_robot(pointer(-2.0, 2.0)).unwrap();
+    // 10 mm from the arm at 0 rad, and in the arm's way at -0.5 rad: half a metre out.
+    for (name, turn, below) in [("near", 0.0_f64, -0.11), ("in the way", -0.5, 0.0)] {
+        let at = DAffine3::from_translation(DVec3::new(0.5 * turn.cos(), 0.5 * turn.sin(), below));
+        let solid = Solid::sphere(0.05, at).unwrap();
+        world.add(Obstacle { name: name.into(), solid, padding: 0.0 }).unwrap();
+    }
+    let mut checker = Padded::new(world.snapshot(), 0.03);
+    let q = [Lanes(std::array::from_fn(|lane| [0.0, 1.5, -0.5][lane % 3]))];
+    let [near, free, in_the_way] = [0o111111, 0o22222, 0o44444];
+    assert_eq!(checker.look_blocked(&q, u16::MAX) & free, 0);
+    assert_eq!(checker.look_blocked(&q, u16::MAX), near | in_the_way);
+    checker.give_up(Near::Start, &[0.0]);
+    assert!(checker.is_free(&[0.0]), "{:?}", checker.given_up());
+    assert_eq!(checker.look_blocked(&q, u16::MAX), in_the_way);
+    assert_eq!(checker.look_blocked(&q, 0o4), 0o4);
 }
 
 #[test]

@@ -5,7 +5,7 @@ use crate::block::{Block, LANES, Lanes};
 use crate::bodies::{Frames, between, forward, point};
 
 use super::gap::{Gap, Steps, gap_of, reach_of};
-use super::touch::{below, covers_touch, near, pair_touches};
+use super::touch::{Touching, below, covers_touch, near, pair_touches};
 use super::{Buffers, Carried, Discrete, Motion, NO_PAIR, Proof, Standing};
 
 /// Pairs that touched lately and are compared first where each lane counts.
@@ -41,9 +41,9 @@ pub(super) fn check<B: Block>(discrete: &Discrete, motion: &Motion<'_>, buffers:
             }
             buffers.q[j] = Lanes(lanes);
         }
-        let mut found = Found { pair: NO_PAIR, touching: 0, sought: u16::MAX };
+        let mut found = Found::among(u16::MAX);
         check_block::<B, false>(discrete, motion, block == 0, &steps, buffers, &mut found);
-        if found.touching != 0 {
+        if found.pair != NO_PAIR {
             return Some(found.pair);
         }
     }
@@ -59,14 +59,14 @@ pub(super) fn check_each<B: Block>(
     buffers: &mut Buffers,
 ) -> u16 {
     let steps = Steps { part: 0.0, turn: 0.0, rounding: 0.0 };
-    let mut found = Found { pair: NO_PAIR, touching: 0, sought };
+    let mut found = Found::among(sought);
     check_block::<B, true>(discrete, motion, true, &steps, buffers, &mut found);
     let pair = found.pair;
     if pair != NO_PAIR && !buffers.frequent.contains(&pair) {
         buffers.frequent.truncate(FREQUENT - 1);
         buffers.frequent.push(pair);
     }
-    found.touching
+    found.touching.lanes
 }
 
 /// Compares the pairs that touched lately; returns whether the check is over.
@@ -78,14 +78,9 @@ fn check_frequent<B: Block>(
     buffers: &mut Buffers,
     found: &mut Found,
 ) -> bool {
-    let scene = &*discrete.scene;
     for place in 0..buffers.frequent.len() {
         let pair = buffers.frequent[place];
-        let Some(Compared { link, other, .. }) = scene.pairs.get(pair as usize) else { continue };
-        let (link, gap) = (&scene.links[*link], gap_of(motion, pair, steps));
-        let (frames, nodes) = (&buffers.frames[..], &link.tree.nodes);
-        let touching =
-            pair_touches::<B, true>(scene, frames, link.body, nodes, other, &gap, (false, found.left::<true>()));
+        let touching = compare::<B, true>(discrete, motion, pair, steps, &buffers.frames, found);
         if touching != 0 && place > 0 {
             buffers.frequent.swap(place, place - 1);
         }
@@ -97,32 +92,48 @@ fn check_frequent<B: Block>(
     false
 }
 
-/// Where something touches.
-struct Found {
-    /// A pair that does.
+/// Returns the lanes in which one pair touches.
+#[inline(always)]
+fn compare<B: Block, const EACH: bool>(
+    discrete: &Discrete,
+    motion: &Motion<'_>,
     pair: u32,
-    /// Lanes in which a pair is known to.
-    touching: u16,
-    /// Lanes of interest.
-    sought: u16,
+    steps: &Steps,
+    frames: &[Frames],
+    found: &Found,
+) -> u16 {
+    let scene = &*discrete.scene;
+    let Compared { link, other, .. } = &scene.pairs[pair as usize];
+    let (link, gap) = (&scene.links[*link], gap_of(motion, pair, steps));
+    let left = (false, found.left::<EACH>());
+    pair_touches::<B, EACH>(scene, frames, link.body, &link.tree.nodes, other, &gap, left)
+}
+
+/// A pair that touches, and the lanes in which any does.
+struct Found {
+    pair: u32,
+    touching: Touching,
 }
 
 impl Found {
-    /// The lanes that are still to be checked: all, up to the first that touches.
+    #[inline(always)]
+    fn among(sought: u16) -> Self {
+        Self { pair: NO_PAIR, touching: Touching::among(sought) }
+    }
+
+    /// The lanes that are still to be checked.
     #[inline(always)]
     fn left<const EACH: bool>(&self) -> u16 {
-        if EACH { self.sought & !self.touching } else { u16::MAX }
+        self.touching.left::<EACH>()
     }
 
     /// Takes the lanes in which a pair touches; returns whether the check is over.
     #[inline(always)]
-    fn ends<const EACH: bool>(&mut self, pair: u32, touching: u16) -> bool {
-        if touching == 0 {
-            return false;
+    fn ends<const EACH: bool>(&mut self, pair: u32, lanes: u16) -> bool {
+        if lanes != 0 {
+            self.pair = pair;
         }
-        self.pair = pair;
-        self.touching |= touching;
-        !EACH || self.left::<EACH>() == 0
+        self.touching.ends::<EACH>(lanes)
     }
 }
 
@@ -143,11 +154,7 @@ fn check_block<B: Block, const EACH: bool>(
     }
     let frames = &buffers.frames[..];
     if let Some(likely) = motion.likely.filter(|_| first) {
-        let Compared { link, other, .. } = &scene.pairs[likely as usize];
-        let (link, gap) = (&scene.links[*link], gap_of(motion, likely, steps));
-        let nodes = &link.tree.nodes;
-        let left = (false, found.left::<EACH>());
-        let touching = pair_touches::<B, EACH>(scene, frames, link.body, nodes, other, &gap, left);
+        let touching = compare::<B, EACH>(discrete, motion, likely, steps, frames, found);
         if found.ends::<EACH>(likely, touching) {
             return;
         }

@@ -69,19 +69,22 @@ fn check(discrete: &Discrete, from: &[f64], to: &[f64], blocks: usize, swept: bo
     discrete.touching(&motion, &mut Buffers::default())
 }
 
+/// The same scene, checked on every width.
+fn on_every_width(numbers: &mut Numbers) -> Vec<Discrete> {
+    let state = numbers.0;
+    let mut on = |width| {
+        numbers.0 = state;
+        Discrete::new(scene(numbers, width))
+    };
+    Width::usable().into_iter().map(&mut on).collect()
+}
+
 #[test]
 fn a_swept_motion_touches_nowhere_and_what_touches_is_found() {
     let mut numbers = Numbers(5);
     let (mut proven, mut touching, mut between) = (0, 0, 0);
     for _ in 0..12 {
-        let state = numbers.0;
-        let scenes: Vec<Discrete> = Width::usable()
-            .into_iter()
-            .map(|width| {
-                numbers.0 = state;
-                Discrete::new(scene(&mut numbers, width))
-            })
-            .collect();
+        let scenes = on_every_width(&mut numbers);
         for _ in 0..60 {
             let mut q = || -> Vec<f64> { [2.0, 2.0, 2.0, 0.2].map(|most| most * numbers.next()).to_vec() };
             let (from, aim) = (q(), q());
@@ -136,14 +139,7 @@ fn each_lane_has_the_verdict_that_it_has_alone() {
     let mut numbers = Numbers(21);
     let (mut touching, mut free) = (0, 0);
     for _ in 0..12 {
-        let state = numbers.0;
-        let scenes: Vec<Discrete> = Width::usable()
-            .into_iter()
-            .map(|width| {
-                numbers.0 = state;
-                Discrete::new(scene(&mut numbers, width))
-            })
-            .collect();
+        let scenes = on_every_width(&mut numbers);
         // Pairs that touched before are compared first: that changes nothing.
         let mut buffers = vec![Buffers::default(); scenes.len()];
         for round in 0..40_u16 {

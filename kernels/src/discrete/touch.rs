@@ -8,8 +8,38 @@ use crate::obstacle::Squared;
 
 use super::gap::Gap;
 
-/// Most balls that wait to be replaced by their parts, for one pair; a pair that needs more counts as touching.
+/// Most balls that wait to be replaced by their parts, for one pair. A pair that needs more counts as touching, unless
+/// each lane counts: then nothing is said of its lanes.
 const STACK: usize = 64;
+
+/// Lanes in which something touches. All that is sought is the first of them, or for `EACH` lane whether it is one.
+pub(super) struct Touching {
+    sought: u16,
+    /// Those found so far.
+    pub lanes: u16,
+}
+
+impl Touching {
+    #[inline(always)]
+    pub fn among(sought: u16) -> Self {
+        Self { sought, lanes: 0 }
+    }
+
+    /// The lanes that are still to be checked.
+    #[inline(always)]
+    pub fn left<const EACH: bool>(&self) -> u16 {
+        // Until the first one is found, these are all: a constant, which costs nothing.
+        if EACH { self.sought & !self.lanes } else { u16::MAX }
+    }
+
+    /// Takes lanes that touch; returns whether no more are sought.
+    #[inline(always)]
+    pub fn ends<const EACH: bool>(&mut self, lanes: u16) -> bool {
+        self.lanes |= lanes;
+        lanes != 0 && (!EACH || self.left::<EACH>() == 0)
+    }
+}
+
 /// Returns the lanes in which a number is smaller than another; so is what is not a number.
 #[inline(always)]
 pub(super) fn below<B: Block>(squared: B, limit: f32) -> u16 {
@@ -67,10 +97,11 @@ fn cover_touches<B: Block, C: Squared, const EACH: bool>(
     nodes: &[Node],
     gap: &Gap,
     core: &C,
-    (near, mut left): (bool, u16),
+    (near, left): (bool, u16),
 ) -> u16 {
     let Some(root) = nodes.first() else { return left };
-    let mut touching = 0;
+    let mut touching = Touching::among(left);
+    // For each ball the lanes in which it may be close: what a lane finds does not depend on the others.
     let (mut stack, mut stack_lanes) = ([0; STACK], [0; STACK]);
     stack_lanes[0] = u16::MAX;
     let mut open = 1;
@@ -85,21 +116,16 @@ fn cover_touches<B: Block, C: Squared, const EACH: bool>(
         open -= 1;
         let node = &nodes[stack[open] as usize];
         let squared = core.squared(&point::<B>(frame, &node.center));
-        let close =
-            below::<B>(squared, gap.squared(node.radius)) & if EACH { left & stack_lanes[open] } else { u16::MAX };
+        let lanes = if EACH { stack_lanes[open] } else { u16::MAX } & touching.left::<EACH>();
+        let close = below::<B>(squared, gap.squared(node.radius)) & lanes;
         if close == 0 {
             continue;
         }
-        let full = open + node.count as usize > STACK;
-        let sure =
-            if node.count == 0 || (full && !EACH) { close } else { surely::<B>(squared, node.inner, gap) & close };
-        touching |= sure;
-        left &= !sure;
-        if left == 0 || (!EACH && sure != 0) {
-            return touching;
-        }
-        let close = close & left;
-        if EACH && (close == 0 || full) {
+        let Some(close) = settle::<B, EACH>(squared, (node.inner, gap), (node.count, open), close, &mut touching)
+        else {
+            break;
+        };
+        if close == 0 {
             continue;
         }
         for part in node.first..node.first + node.count {
@@ -107,7 +133,26 @@ fn cover_touches<B: Block, C: Squared, const EACH: bool>(
             open += 1;
         }
     }
-    touching
+    touching.lanes
+}
+
+/// Takes the lanes in which a ball touches, of those in which it is `close`: all if it has no parts, otherwise those
+/// in which the ball inside of it does. Returns the lanes in which its parts are to be compared, `None` if no more are
+/// sought. `count`: its number of parts; `open`: of balls that wait.
+#[inline(always)]
+fn settle<B: Block, const EACH: bool>(
+    squared: B,
+    (inner, gap): (f32, &Gap),
+    (count, open): (u32, usize),
+    close: u16,
+    touching: &mut Touching,
+) -> Option<u16> {
+    let full = open + count as usize > STACK;
+    let sure = if count == 0 || (full && !EACH) { close } else { surely::<B>(squared, inner, gap) & close };
+    if touching.ends::<EACH>(sure) {
+        return None;
+    }
+    Some(if EACH && full { 0 } else { close & touching.left::<EACH>() })
 }
 
 /// Returns the lanes in which balls inside of solids touch.
@@ -125,12 +170,12 @@ pub(super) fn covers_touch<B: Block, const EACH: bool>(
     g: &Frames,
     b: &[Node],
     gap: &Gap,
-    mut left: u16,
+    left: u16,
 ) -> u16 {
     if a.is_empty() || b.is_empty() {
         return left;
     }
-    let mut touching = 0;
+    let mut touching = Touching::among(left);
     let (mut stack, mut stack_lanes) = ([(0, 0); STACK], [0; STACK]);
     stack_lanes[0] = u16::MAX;
     let mut open = 1;
@@ -139,8 +184,8 @@ pub(super) fn covers_touch<B: Block, const EACH: bool>(
         let (i, j) = stack[open];
         let (one, two) = (&a[i as usize], &b[j as usize]);
         let squared = between(&point::<B>(f, &one.center), &point(g, &two.center));
-        let close = below::<B>(squared, gap.squared(one.radius + two.radius))
-            & if EACH { left & stack_lanes[open] } else { u16::MAX };
+        let lanes = if EACH { stack_lanes[open] } else { u16::MAX } & touching.left::<EACH>();
+        let close = below::<B>(squared, gap.squared(one.radius + two.radius)) & lanes;
         if close == 0 {
             continue;
         }
@@ -148,15 +193,10 @@ pub(super) fn covers_touch<B: Block, const EACH: bool>(
         let first = one.count != 0 && (two.count == 0 || one.radius >= two.radius);
         let parent = if first { one } else { two };
         let inner = if one.inner.min(two.inner) < 0.0 { -1.0 } else { one.inner + two.inner };
-        let full = open + parent.count as usize > STACK;
-        let sure = if parent.count == 0 || (full && !EACH) { close } else { surely::<B>(squared, inner, gap) & close };
-        touching |= sure;
-        left &= !sure;
-        if left == 0 || (!EACH && sure != 0) {
-            return touching;
-        }
-        let close = close & left;
-        if EACH && (close == 0 || full) {
+        let Some(close) = settle::<B, EACH>(squared, (inner, gap), (parent.count, open), close, &mut touching) else {
+            break;
+        };
+        if close == 0 {
             continue;
         }
         for part in parent.first..parent.first + parent.count {
@@ -165,5 +205,5 @@ pub(super) fn covers_touch<B: Block, const EACH: bool>(
             open += 1;
         }
     }
-    touching
+    touching.lanes
 }
