@@ -173,6 +173,23 @@ test('an arm is led by hand, its pose is saved, and it is held again; with motor
   assert.ok(!(await page.isChecked('#support')), 'each time is a deliberate one');
 });
 
+test('an arm that was selected just now is jogged as long as the key is held', async () => {
+  await page.click('[data-tab=jog]');
+  if ((await page.getAttribute('#jog-keys', 'aria-pressed')) !== 'true') await page.click('#jog-keys');
+  await page.click('[data-arm=right] .card-head');
+  await text(page, '#jog-missing', /of right/);
+  // Both within one task of the page, so that no message of the run comes between.
+  await page.evaluate(() => {
+    document.querySelector('[data-arm=left] .card-head').click();
+    window.dispatchEvent(new KeyboardEvent('keydown', {key: '-', code: 'Minus'}));
+  });
+  await page.waitForTimeout(3000);
+  const [moved, speed] = [joint1(), watch.velocities.left_joint1];
+  await page.evaluate(() => window.dispatchEvent(new KeyboardEvent('keyup', {key: '-', code: 'Minus'})));
+  assert.ok(Math.abs(speed) > 0.01, `after 3 s it still moves: ${speed} rad/s at ${moved} rad`);
+  await watch.resting('left_joint1');
+});
+
 test('Space is Stop where nothing is typed, also while a button of jog is held', async () => {
   await page.click('[data-tab=move]');
   await page.fill('.move .save input', 'a b');

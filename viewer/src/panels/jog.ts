@@ -177,14 +177,17 @@ export function jogPanel(context: Context): HTMLElement {
   // Also where the pointer left its button, or the button was disabled meanwhile.
   for (const name of ['pointerup', 'pointercancel', 'lostpointercapture'] as const)
     window.addEventListener(name, (event) => jog.release(`pointer ${event.pointerId}`), {capture: true});
-  // What was chosen, where the arm has a task for it, else the other.
+  // What was chosen, where the arm has a task for it, else the other. At once with the selection: a change of mode
+  // releases what is held, which may be pressed before the next status comes.
   let chosenFor = '';
-  run.onStatus.on(() => {
-    if (chosenFor === context.selected) return;
+  const follow = () => {
+    if (chosenFor === context.selected || !run.status) return;
     chosenFor = context.selected;
     const other = wanted === 'tool' ? 'joints' : 'tool';
     jog.set({mode: jog.drive(wanted) || !jog.drive(other) ? wanted : other});
-  });
+  };
+  context.onSelect.on(follow);
+  run.onStatus.on(follow);
   jog.changed.on(show);
   flow.changed.on(show);
   context.onSelect.on(show);
