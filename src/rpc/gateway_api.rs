@@ -49,6 +49,9 @@ pub struct RegisterGateway {
     /// Its faces to other systems: Python dimos.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub faces: Vec<FaceReport>,
+    /// Whether it does not listen yet: it is the run's only gateway already, and not in `status`.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub starting: bool,
 }
 
 /// A face of the run to another system.

@@ -102,8 +102,17 @@ impl Holder {
 #[derive(Debug, Default)]
 pub(super) struct Leases {
     holders: Mutex<BTreeMap<String, Holder>>,
-    /// The gateway, and the connection that registered it.
-    gateway: Mutex<Option<(u64, GatewayReport)>>,
+    gateway: Mutex<Option<Gateway>>,
+}
+
+/// The gateway of a run.
+#[derive(Debug)]
+struct Gateway {
+    /// The connection that registered it.
+    connection: u64,
+    /// Whether it does not listen yet.
+    starting: bool,
+    report: GatewayReport,
 }
 
 impl Leases {
@@ -119,7 +128,9 @@ impl Leases {
     /// Adds the lease holders and the gateway to a `status` reply.
     pub fn complete(&self, mut reply: Reply) -> Reply {
         if let Reply::Status(status) = &mut reply {
-            status.share = lock(&self.gateway).as_ref().map(|(_, report)| Box::new(report.clone()));
+            let gateway = lock(&self.gateway);
+            let listening = gateway.as_ref().filter(|gateway| !gateway.starting);
+            status.share = listening.map(|gateway| Box::new(gateway.report.clone()));
             let held = self.lock();
             for arm in &mut status.arms {
                 arm.commander = held.get(&arm.hardware_id).map(Holder::report);
@@ -167,7 +178,8 @@ impl Lessee {
     /// one. Returns the faces that serve no more.
     pub fn register_gateway(&self, gateway: RegisterGateway) -> Result<Vec<FaceReport>, RpcError> {
         let mut registered = lock(&self.leases.gateway);
-        if let Some((_, other)) = registered.as_ref().filter(|(connection, _)| *connection != self.connection) {
+        if let Some(Gateway { report: other, .. }) = registered.as_ref().filter(|own| own.connection != self.connection)
+        {
             let process = other.pid.map(|pid| format!(" (pid {pid})")).unwrap_or_default();
             let faces = other.faces.iter().map(|face| face.face.as_str());
             let places: Vec<&str> = other.endpoints.iter().map(String::as_str).chain(faces).collect();
@@ -176,10 +188,11 @@ impl Lessee {
                 RpcError::new(Code::HasGateway, text).hint("end that `dimos share` first: a run has one gateway")
             );
         }
-        let RegisterGateway { endpoints, clients, faces } = gateway;
-        let known = registered.take().map(|(_, known)| known.faces).unwrap_or_default();
+        let RegisterGateway { endpoints, clients, faces, starting } = gateway;
+        let known = registered.take().map(|known| known.report.faces).unwrap_or_default();
         let fallen = faces.iter().filter(|face| !face.serves && !known.contains(face)).cloned().collect();
-        *registered = Some((self.connection, GatewayReport { pid: self.pid, endpoints, clients, faces }));
+        let report = GatewayReport { pid: self.pid, endpoints, clients, faces };
+        *registered = Some(Gateway { connection: self.connection, starting, report });
         Ok(fallen)
     }
 
@@ -282,7 +295,7 @@ impl Lessee {
 impl Drop for Lessee {
     fn drop(&mut self) {
         self.leases.lock().retain(|_, holder| holder.connection != self.connection);
-        lock(&self.leases.gateway).take_if(|(connection, _)| *connection == self.connection);
+        lock(&self.leases.gateway).take_if(|gateway| gateway.connection == self.connection);
     }
 }
 

@@ -12,7 +12,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::io::{self, BufRead, BufReader, Write};
 use std::os::unix::net::UnixStream;
 use std::path::PathBuf;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, SyncSender, channel, sync_channel};
 use std::sync::{Arc, Mutex, Weak};
 use std::time::{Duration, Instant};
@@ -26,7 +26,7 @@ use zenoh::{Session, Wait};
 use super::class::{Class, PAGE, permit};
 use super::keys::{self, Who};
 use super::page::Pages;
-use super::remote::{Closed, Remote, Request, Ways, refuse};
+use super::remote::{Closed, Remote, Request, Ways, ended, refuse};
 use super::{certificates, python_dimos, ros, settings, streams};
 use crate::blueprint::share::{OnLost, ShareConfig};
 use crate::rpc::api::{FaceReport, Lease, MAX_ANSWER, MAX_LINE, METHODS, Method, PlannerAnswer, RegisterGateway};
@@ -79,6 +79,8 @@ struct Shared {
     session: Session,
     news: Sender<News>,
     clients: Mutex<BTreeMap<Who, Arc<Remote>>>,
+    /// Set with the lock of `clients`: there are no new ones.
+    run_ended: AtomicBool,
     /// Commanders whose leases ended because they were silent.
     lost: Mutex<VecDeque<Who>>,
     pages: Pages,
@@ -96,7 +98,7 @@ impl Gateway {
         }
         let mut control = UnixStream::connect(&socket).map_err(|e| failed(format!("run {run}: {e}")))?;
         let endpoints = config.listen.iter().chain(&config.connect).map(ToString::to_string).collect();
-        register(&mut control, &RegisterGateway { endpoints, ..RegisterGateway::default() })
+        register(&mut control, &RegisterGateway { endpoints, starting: true, ..RegisterGateway::default() })
             .map_err(|e| failed(e.to_string()))?;
         let mut replies = BufReader::new(control.try_clone().map_err(|e| failed(e.to_string()))?);
         accepted(&mut replies)?;
@@ -122,6 +124,7 @@ impl Gateway {
             session,
             news: news.clone(),
             clients: Mutex::default(),
+            run_ended: AtomicBool::new(false),
             lost: Mutex::default(),
             pages,
             refused,
@@ -150,11 +153,12 @@ impl Gateway {
             .ros
             .as_ref()
             .map(|config| ros::Face::start((&shared.run, &shared.socket), &shared.config, config, changed()));
-        let gateway = Self { shared, news: received, control, python_dimos, ros, _declared: declared };
+        let mut gateway = Self { shared, news: received, control, python_dimos, ros, _declared: declared };
         if let Some(error) = gateway.face_error() {
             tracing::error!("share: {error}");
         }
-        let _ = gateway.shared.news.send(News::Faces);
+        // Where that fails, the end of the connection is news of its own.
+        let _ = gateway.announce();
         Ok(gateway)
     }
 
@@ -188,6 +192,13 @@ impl Gateway {
         python_dimos.into_iter().chain(ros).collect()
     }
 
+    /// Tells the run where it listens and what it serves.
+    fn announce(&mut self) -> io::Result<()> {
+        let (endpoints, clients) = (self.shared.endpoints(), self.shared.titles());
+        let (faces, starting) = (self.faces(), false);
+        register(&mut self.control, &RegisterGateway { endpoints, clients, faces, starting })
+    }
+
     /// Serves until the run ends.
     pub fn serve(mut self) {
         loop {
@@ -198,10 +209,7 @@ impl Gateway {
                 }
                 Ok(News::RunLost) => break,
                 Ok(News::Clients | News::Faces) => {
-                    let (endpoints, clients) = (self.shared.endpoints(), self.shared.titles());
-                    let gateway = RegisterGateway { endpoints, clients, faces: self.faces() };
-                    // Where that fails, the end of the connection is news of its own.
-                    let _ = register(&mut self.control, &gateway);
+                    let _ = self.announce();
                 }
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => break,
@@ -217,7 +225,11 @@ impl Gateway {
     /// Sends it to all clients, and answers what they have asked.
     fn say_that_the_run_has_ended(&self) {
         let shared = &self.shared;
-        let clients: Vec<Arc<Remote>> = lock(&shared.clients).values().cloned().collect();
+        let clients: Vec<Arc<Remote>> = {
+            let clients = lock(&shared.clients);
+            shared.run_ended.store(true, Ordering::Release);
+            clients.values().cloned().collect()
+        };
         clients.iter().for_each(|remote| remote.close(Closed::RunEnded));
         let end = shared.session.put(keys::end(&shared.run), "").priority(Priority::RealTime);
         let _ = end.congestion_control(CongestionControl::Block).express(true).wait();
@@ -294,7 +306,9 @@ impl Shared {
                     if class == Class::End {
                         tracing::warn!("share: {method} by {}", remote.title());
                     }
-                    remote.queue(Request { query, class, method, params, bytes });
+                    if let Some(query) = remote.queue(Request { query, class, method, params, bytes }) {
+                        self.refuse(query, remote.over(&self.run));
+                    }
                 }
                 Err(error) => self.refuse(query, error),
             },
@@ -362,6 +376,9 @@ impl Shared {
     /// Returns a client; a new one gets its connections.
     fn client(&self, who: &Who) -> Result<Arc<Remote>, RpcError> {
         let mut clients = lock(&self.clients);
+        if self.run_ended.load(Ordering::Acquire) {
+            return Err(ended(&self.run));
+        }
         clients.retain(|_, remote| !remote.is_closed());
         if let Some(remote) = clients.get(who) {
             return Ok(remote.clone());

@@ -12,6 +12,7 @@ use serde_json::{Value, json};
 use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader, Lines};
 use tokio::net::UnixStream;
 use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
+use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::mpsc::{Receiver, Sender, channel};
 use tokio::sync::watch;
 use zenoh::bytes::Encoding;
@@ -33,8 +34,9 @@ const QUEUE: usize = 1024;
 const MAX_QUEUED: usize = 32 << 20;
 /// Id of the first request, which says for whom the connection speaks.
 const BEHALF: u64 = 0;
-/// Time within which a run that closes a connection turns out to have ended.
-const END_TIMEOUT: Duration = Duration::from_millis(50);
+/// Time within which a run that closes a connection turns out to have ended: on a busy computer it takes a while from
+/// the end of its connections to that of its name.
+const END_TIMEOUT: Duration = Duration::from_millis(500);
 /// Encoding of an error.
 const ERROR_SCHEMA: &str = "dimos-error";
 
@@ -133,14 +135,30 @@ impl Remote {
         lock(&self.seen).elapsed()
     }
 
-    /// Queues a request. Drops it if too much waits: nothing here waits for the client or the run.
-    pub fn queue(&self, request: Request) {
+    /// Queues a request. Drops it if too much waits: nothing here waits for the client or the run. Returns one that comes
+    /// after the end of the connections.
+    pub fn queue(&self, request: Request) -> Option<Query> {
         let queue = if request.class == Class::End { &self.urgent } else { &self.ordered };
         let bytes = request.bytes;
-        if queue.waiting.fetch_add(bytes, Ordering::AcqRel) + bytes > MAX_QUEUED || queue.to.try_send(request).is_err()
-        {
-            queue.waiting.fetch_sub(bytes, Ordering::AcqRel);
+        let waiting = queue.waiting.fetch_add(bytes, Ordering::AcqRel) + bytes;
+        let sent = if waiting > MAX_QUEUED { Err(TrySendError::Full(request)) } else { queue.to.try_send(request) };
+        let Err(unsent) = sent else { return None };
+        queue.waiting.fetch_sub(bytes, Ordering::AcqRel);
+        match unsent {
+            TrySendError::Full(_) => None,
+            TrySendError::Closed(request) => Some(request.query),
         }
+    }
+
+    /// Returns the error of a request that comes after the end of the connections.
+    pub fn over(&self, run: &str) -> RpcError {
+        let error = match *self.end.borrow() {
+            Some(Closed::RunEnded) => ended(run),
+            Some(Closed::Lost) | None => {
+                RpcError::new(Code::Lost, "the gateway has closed the connection of this client")
+            }
+        };
+        error.hint("it may still take effect; ask for `status`")
     }
 
     /// Closes its connections: its leases end.
@@ -160,6 +178,11 @@ impl Remote {
     }
 }
 
+/// Returns the error of all requests to a run that has ended.
+pub(super) fn ended(run: &str) -> RpcError {
+    RpcError::new(Code::ShuttingDown, format!("run {run} has ended"))
+}
+
 /// Sends a refusal.
 pub(super) fn refuse(query: &Query, error: &RpcError) {
     let body = serde_json::to_vec(error).unwrap_or_default();
@@ -177,15 +200,37 @@ struct Line {
 }
 
 impl Line {
+    /// Serves until the connection ends, and refuses what is without a reply then.
     async fn serve(mut self, mut requests: Receiver<Request>, socket: &Path, urgent: bool, cancel_at_end: bool) {
         let mut end = self.remote.end.subscribe();
-        let stream = match UnixStream::connect(socket).await {
-            Ok(stream) => stream,
-            Err(e) => {
-                tracing::warn!("share: the run does not accept a connection: {e}");
-                return self.remote.close(Closed::Lost);
-            }
-        };
+        let connected = UnixStream::connect(socket).await;
+        let refused = connected.as_ref().err().map(ToString::to_string);
+        if let Ok(stream) = connected {
+            self.exchange(stream, &mut requests, &mut end, urgent, cancel_at_end).await;
+        }
+        // A run that ends closes all connections: this one perhaps first.
+        let is_closed = tokio::time::timeout(END_TIMEOUT, end.wait_for(Option::is_some)).await.is_ok();
+        if let Some(why) = refused.filter(|_| !is_closed) {
+            tracing::warn!("share: the run does not accept a connection: {why}");
+        }
+        self.remote.close(Closed::Lost);
+        let error = self.remote.over(&self.run);
+        requests.close();
+        let queued = std::iter::from_fn(|| requests.try_recv().ok());
+        for request in std::mem::take(&mut self.pending).into_values().chain(queued) {
+            refuse(&request.query, &error);
+        }
+    }
+
+    /// Passes requests and replies on until either side ends the connection.
+    async fn exchange(
+        &mut self,
+        stream: UnixStream,
+        requests: &mut Receiver<Request>,
+        end: &mut watch::Receiver<Option<Closed>>,
+        urgent: bool,
+        cancel_at_end: bool,
+    ) {
         let (from, to) = stream.into_split();
         let mut from = BufReader::new(from).lines();
         let (lines, waiting) = channel(2 * MAX_PENDING);
@@ -217,17 +262,6 @@ impl Line {
             }
         }
         writer.abort();
-        // A run that ends closes all connections: this one perhaps first.
-        let ended = tokio::time::timeout(END_TIMEOUT, end.wait_for(Option::is_some)).await;
-        let why = ended.ok().and_then(|closed| closed.ok().and_then(|closed| *closed)).unwrap_or(Closed::Lost);
-        self.remote.close(why);
-        let error = match why {
-            Closed::Lost => RpcError::new(Code::Lost, "the gateway has closed the connection of this client"),
-            Closed::RunEnded => RpcError::new(Code::ShuttingDown, format!("run {} has ended", self.run)),
-        };
-        for request in self.pending.values() {
-            refuse(&request.query, &error.clone().hint("it may still take effect; ask for `status`"));
-        }
     }
 
     /// Returns the line of a request for the run; `None` if too many wait already.

@@ -209,8 +209,12 @@ fn a_run_has_one_gateway_until_its_connection_ends() {
     let gateway = |clients: &[&str]| RegisterGateway {
         endpoints: vec!["tls/0.0.0.0:7447".into()],
         clients: clients.iter().map(|name| (*name).to_owned()).collect(),
-        faces: Vec::new(),
+        ..RegisterGateway::default()
     };
+    one.call(RegisterGateway { starting: true, ..gateway(&[]) }).unwrap();
+    assert_eq!(two.call(Status {}).unwrap().share, None, "it does not listen yet");
+    let refused = two.call(gateway(&[])).unwrap_err();
+    assert!(matches!(&refused, ClientError::Refused(e) if e.code == Code::HasGateway), "{refused}");
     one.call(gateway(&[])).unwrap();
     one.call(gateway(&["alice"])).unwrap();
     let refused = two.call(gateway(&[])).unwrap_err();

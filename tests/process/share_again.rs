@@ -67,6 +67,23 @@ fn a_watcher_says_what_is_lost_and_goes_on_when_it_is_back() {
 }
 
 #[test]
+fn every_request_that_is_pending_at_the_end_of_a_run_is_told_of_it() {
+    if !is_built() {
+        return;
+    }
+    let shared = Shared::start("");
+    let watchers: Vec<Started> =
+        (0..12).map(|_| Started::of(shared.command("state --watch --json --hz 1000").stdin(Stdio::null()))).collect();
+    watchers.iter().for_each(|watch| watch.until("arm_joint1"));
+    shared.home.dimos("down").with(0);
+    for watch in watchers {
+        watch.until("waiting for it");
+        assert!(watch.err().contains("has ended; waiting for it"), "{}", watch.err());
+        watch.end(Signal::INT);
+    }
+}
+
+#[test]
 fn jog_survives_a_loss_and_moves_nothing_until_its_user_says_so() {
     if !is_built() {
         return;

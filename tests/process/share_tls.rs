@@ -3,6 +3,7 @@
 use std::process::Stdio;
 use std::time::{Duration, Instant};
 
+use dimos::rpc::api::Status;
 use serde_json::{Value, json};
 
 use crate::support::certificates::Authority;
@@ -70,6 +71,27 @@ fn n10_what_a_role_does_not_include_is_forbidden_by_name_and_reaches_no_run() {
     cell.as_user("alice", "arm reset arm").with(1).says(&["[FORBIDDEN]", "share.remote_enable"]);
     cell.as_user("carol", "state").with(1).says(&["answers, but shares no run with carol", "share.users"]);
     cell.as_user("bob", "stop").with(0).shows(&["confirmed"]);
+}
+
+#[test]
+fn a_run_whose_status_says_where_it_is_shared_listens_there() {
+    if !is_built() {
+        return;
+    }
+    let home = Home::new();
+    let Some(lab) = Authority::create(&home.path().join("lab")) else { return };
+    lab.sign("cell1", "DNS:localhost,IP:127.0.0.1", 30);
+    let port = free_port();
+    let identity = "{ca: lab/ca.pem, cert: lab/cell1.pem, key: lab/cell1.key}";
+    home.write("cell.yaml", &format!("{CELL}share: {{listen: ['tls/127.0.0.1:{port}'], identity: {identity}}}\n"));
+    let run = home.run("cell.yaml --no-record");
+    let mut client = home.client();
+    let end = Instant::now() + Duration::from_secs(20);
+    // Without a pause: what is asked here is the moment.
+    while client.call(Status {}).unwrap().share.is_none() {
+        assert!(Instant::now() < end, "{}", run.err());
+    }
+    std::net::TcpStream::connect(("127.0.0.1", port)).expect("it listens");
 }
 
 #[test]
