@@ -135,8 +135,8 @@ impl Remote {
         lock(&self.seen).elapsed()
     }
 
-    /// Queues a request. Drops it if too much waits: nothing here waits for the client or the run. Returns one that comes
-    /// after the end of the connections.
+    /// Queues a request. Drops it if too much waits: nothing here waits for the client or the run. Returns a request
+    /// that comes after the end of the connections.
     pub fn queue(&self, request: Request) -> Option<Query> {
         let queue = if request.class == Class::End { &self.urgent } else { &self.ordered };
         let bytes = request.bytes;
