@@ -192,7 +192,7 @@ impl Gateway {
         python_dimos.into_iter().chain(ros).collect()
     }
 
-    /// Tells the run where it listens and what it serves.
+    /// Reports to the run where it listens and what it serves.
     fn announce(&mut self) -> io::Result<()> {
         let (endpoints, clients) = (self.shared.endpoints(), self.shared.titles());
         let (faces, starting) = (self.faces(), false);

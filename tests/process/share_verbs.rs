@@ -124,6 +124,8 @@ fn the_page_of_a_run_elsewhere_is_served_here() {
     eventually("the run is shared", || home.status()["share"].is_object());
     let view = Started::of(home.as_typed(&format!("--at tcp/127.0.0.1:{port} view")).stdin(Stdio::null()));
     view.until("Ctrl-C ends the page");
+    // The two outputs are read by two threads.
+    eventually("the URL is printed", || view.out().contains("/#"));
     let (there, here) = (view.out(), home.dimos("view").with(0).out);
     assert_ne!(there, here);
     // The same robots, from another server with another token.
