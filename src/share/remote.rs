@@ -152,13 +152,12 @@ impl Remote {
 
     /// Returns the error of a request that comes after the end of the connections.
     pub fn over(&self, run: &str) -> RpcError {
-        let error = match *self.end.borrow() {
+        match *self.end.borrow() {
             Some(Closed::RunEnded) => ended(run),
             Some(Closed::Lost) | None => {
                 RpcError::new(Code::Lost, "the gateway has closed the connection of this client")
             }
-        };
-        error.hint("it may still take effect; ask for `status`")
+        }
     }
 
     /// Closes its connections: its leases end.
@@ -215,9 +214,12 @@ impl Line {
         }
         self.remote.close(Closed::Lost);
         let error = self.remote.over(&self.run);
+        for request in self.pending.values() {
+            refuse(&request.query, &error.clone().hint("it may still take effect; ask for `status`"));
+        }
+        // The run has seen nothing of the others.
         requests.close();
-        let queued = std::iter::from_fn(|| requests.try_recv().ok());
-        for request in std::mem::take(&mut self.pending).into_values().chain(queued) {
+        while let Ok(request) = requests.try_recv() {
             refuse(&request.query, &error);
         }
     }
