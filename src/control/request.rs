@@ -31,6 +31,16 @@ pub enum Request {
         /// The task; `None`: all.
         task: Option<u16>,
     },
+    /// The rest of a motion is no longer known to be free: something is in its way, or it could not be checked. It
+    /// decelerates along its path if it rests in time, else its arms are held.
+    WayBlocked {
+        /// Its task.
+        task: u16,
+        /// Its number: another motion of the task continues.
+        motion: u64,
+        /// Whether it rests in time.
+        in_time: bool,
+    },
     /// New target of a servo task [rad], in the order of the task's joints.
     Servo {
         /// The task.

@@ -84,6 +84,11 @@ impl Task {
         self.motion.as_ref().map_or(&self.joints, |motion| &motion.joints)
     }
 
+    /// Returns the number of its motion, if it executes one.
+    pub fn motion_id(&self) -> Option<u64> {
+        self.motion.as_ref().map(|motion| motion.id)
+    }
+
     /// Returns whether it follows this joint.
     pub fn is_led_by(&self, joint: u16) -> bool {
         self.leader.iter().any(|leader| leader.joint == joint)
@@ -189,6 +194,8 @@ impl Task {
                 }
                 None
             }
+            // Why it decelerated is known here only.
+            Step::End(state, Reason::Cancelled) if self.state == TaskState::Cancelling => self.end(state, self.reason),
             Step::End(state, reason) => self.end(state, reason),
         }
     }
@@ -221,15 +228,15 @@ impl Task {
         }
     }
 
-    /// Cancels the task. Returns the motion that ended with it, to be freed on another thread; `None` if the task was
-    /// not active.
-    pub fn cancel(&mut self) -> Option<Option<Box<Motion>>> {
+    /// Cancels the task for a reason. Returns the motion that ended with it, to be freed on another thread; `None` if
+    /// the task was not active.
+    pub fn cancel(&mut self, reason: Reason) -> Option<Option<Box<Motion>>> {
         match self.state {
             TaskState::Cancelling => Some(None),
             TaskState::Executing => Some(match self.body.cancel() {
                 OnCancel::Decelerate => {
                     self.state = TaskState::Cancelling;
-                    self.reason = Reason::Cancelled;
+                    self.reason = reason;
                     None
                 }
                 OnCancel::End => self.end(TaskState::Idle, Reason::StreamEnded),

@@ -27,6 +27,11 @@ enum LoggedRequest {
     Cancel {
         task: Option<u16>,
     },
+    WayBlocked {
+        task: u16,
+        motion: u64,
+        in_time: bool,
+    },
     Servo {
         task: u16,
         target: Vec<Option<f64>>,
@@ -127,6 +132,7 @@ fn request(logged: LoggedRequest, joints: &[String]) -> Result<Request, String> 
             Request::Chunk { task, start: Mono(start), motion: along(0, &trajectory, joints)? }
         }
         LoggedRequest::Cancel { task } => Request::Cancel { task },
+        LoggedRequest::WayBlocked { task, motion, in_time } => Request::WayBlocked { task, motion, in_time },
         LoggedRequest::Servo { task, target } => Request::Servo { task, target: values(&target) },
         LoggedRequest::Velocity { task, target } => Request::Velocity { task, target: values(&target) },
         LoggedRequest::Pose { task, position, orientation } => {
@@ -190,6 +196,7 @@ mod tests {
         for request in [
             Request::Cancel { task: None },
             Request::Cancel { task: Some(3) },
+            Request::WayBlocked { task: 3, motion: 7, in_time: true },
             Request::Servo { task: 1, target },
             Request::Velocity { task: 2, target },
             Request::Start { task: 3 },

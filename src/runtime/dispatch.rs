@@ -86,6 +86,7 @@ impl Dispatcher {
             request,
             Request::Stop { .. }
                 | Request::Cancel { .. }
+                | Request::WayBlocked { .. }
                 | Request::EndNative { .. }
                 | Request::Pause { on: true }
                 | Request::Shutdown
@@ -144,6 +145,9 @@ pub fn log_of(request: &Request) -> Value {
     match request {
         Request::Execute { task, motion } => json!({"execute": {"task": task, "motion": motion.id}}),
         Request::Cancel { task } => json!({"cancel": {"task": task}}),
+        Request::WayBlocked { task, motion, in_time } => {
+            json!({"way_blocked": {"task": task, "motion": motion, "in_time": in_time}})
+        }
         Request::Servo { task, target } => json!({"servo": {"task": task, "target": target}}),
         Request::Velocity { task, target } => json!({"velocity": {"task": task, "target": target}}),
         Request::Chunk { task, start, .. } => json!({"chunk": {"task": task, "start": start.0}}),

@@ -103,18 +103,9 @@ impl Service {
         };
         tracing::warn!("motion {} on {}: {text}", motion.number, self.parts.names.task(motion.task));
         let again = lock(&self.motions).blocked(motion.number, text, in_time);
-        if in_time {
-            let _ = self.ask(Request::Cancel { task: Some(motion.task) }).await;
-            if again {
-                self.go_around(motion);
-            }
-            return;
-        }
-        let arms = motion.joints.iter().filter_map(|joint| self.locate(*joint)).map(|(arm, _)| arm as u16);
-        let mut arms: Vec<u16> = arms.collect();
-        arms.dedup();
-        for arm in arms {
-            let _ = self.ask(Request::Stop { arm: Some(arm) }).await;
+        let _ = self.ask(Request::WayBlocked { task: motion.task, motion: motion.number, in_time }).await;
+        if again {
+            self.go_around(motion);
         }
     }
 

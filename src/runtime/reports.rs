@@ -271,7 +271,7 @@ impl Service {
         report.state = end.state.name().to_owned();
         report.done = true;
         // Cancelled or held is the state; the obstacle is the reason.
-        let was_stopped = matches!(end.reason, Reason::Cancelled | Reason::ArmHeld(..));
+        let was_stopped = matches!(end.reason, Reason::Cancelled | Reason::WayBlocked | Reason::ArmHeld(..));
         let blocked = planned.blocked.clone().filter(|_| was_stopped);
         report.error = blocked.or_else(|| self.reason(&end.reason));
         match &planned.next {

@@ -240,6 +240,7 @@ fn task_changed(task: u16, state: TaskState, reason: Reason, names: &Names) -> D
         (_, Reason::None | Reason::Cancelled | Reason::StreamEnded) => Severity::Info,
         (_, Reason::Approaching | Reason::InStep) => Severity::Info,
         (_, Reason::ArmHeld(_, Cause::Operator | Cause::StopInput | Cause::Shutdown)) => Severity::Warn,
+        (_, Reason::WayBlocked) => Severity::Warn,
         (TaskState::Aborted | TaskState::Fault, _) => Severity::Error,
         _ => Severity::Warn,
     };
@@ -249,7 +250,7 @@ fn task_changed(task: u16, state: TaskState, reason: Reason, names: &Names) -> D
     let text = format!("task {name} is {}{colon}{why}", state.name());
     let mut d = Described { task: Some(name), ..plain("task", severity, state.name(), text) };
     match reason {
-        Reason::None | Reason::Cancelled | Reason::Timeout | Reason::StreamEnded => {}
+        Reason::None | Reason::Cancelled | Reason::Timeout | Reason::StreamEnded | Reason::WayBlocked => {}
         Reason::Approaching | Reason::InStep => {}
         Reason::PathTolerance(joint, value)
         | Reason::GoalTolerance(joint, value)
@@ -274,6 +275,7 @@ pub fn reason_text(reason: &Reason, names: &Names) -> String {
     match *reason {
         Reason::None => String::new(),
         Reason::Cancelled => "cancelled".into(),
+        Reason::WayBlocked => "the rest of its way is no longer known to be free".into(),
         Reason::Timeout => "no target within its timeout".into(),
         Reason::StreamEnded => "its stream was ended".into(),
         Reason::PathTolerance(joint, by) => format!("{} was {} from the path", names.joint(joint), angle(by)),
@@ -359,6 +361,7 @@ pub fn cause_text(cause: Cause) -> String {
         Cause::StoppedElsewhere => "the panel or another program stopped the arm".into(),
         Cause::PowerChanged => "the panel or another program enabled the motors".into(),
         Cause::StopInput => "the stop input is open".into(),
+        Cause::WayBlocked => "it could not rest before what is in its way".into(),
         Cause::Shutdown => "the run is shutting down".into(),
     }
 }

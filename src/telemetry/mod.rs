@@ -151,6 +151,8 @@ pub enum Cause {
     StoppedElsewhere,
     /// The arm's stop input is open.
     StopInput,
+    /// Something was in the way of its motion, or that could not be checked, and it could not rest before it.
+    WayBlocked,
     /// The run is shutting down.
     Shutdown,
 }
@@ -189,6 +191,7 @@ impl Cause {
             Self::PowerChanged => "power_changed",
             Self::StoppedElsewhere => "stopped_elsewhere",
             Self::StopInput => "stop_input",
+            Self::WayBlocked => "way_blocked",
             Self::Shutdown => "shutdown",
         }
     }
@@ -222,6 +225,8 @@ pub enum Reason {
     None,
     /// An operator's cancel.
     Cancelled,
+    /// The rest of its motion was no longer known to be free.
+    WayBlocked,
     /// No target within its timeout.
     Timeout,
     /// Its stream was ended by the client, or by an operator's cancel.

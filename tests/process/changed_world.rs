@@ -205,5 +205,7 @@ fn what_appears_inside_the_braking_distance_is_met_with_a_stop_that_says_so() {
     let ended = cell.run.wait(begun.motion).unwrap();
     let error = ended.error.unwrap_or_default();
     assert!(ended.state == "ABORTED" && error.contains("closer than the arm can brake"), "{error}");
-    assert_eq!(cell.run.status().arms[0].phase, "held");
+    let arm = &cell.run.status().arms[0];
+    // No operator has stopped it.
+    assert_eq!((&*arm.phase, arm.cause.as_ref().map(|cause| &*cause.name)), ("held", Some("way_blocked")));
 }

@@ -455,4 +455,6 @@ fn a_motion_of_an_attached_planner_obeys_a_world_that_changes() {
     home.dimos("world add late --sphere 0.03 --at 0.17 0.215 0.36").with(0);
     moving.wait().with(1).says(&["ABORTED", "obstacle \"late\"", "the arm rests before it"]);
     assert!(home.positions("arm")[0] > 1.0);
+    // No client has cancelled it.
+    home.dimos("status cell").with(0).shows(&["the rest of its way is no longer known to be free"]);
 }

@@ -21,9 +21,18 @@ use crate::rpc::report::ArmReport;
 
 /// Poll period of a wait.
 const POLL_PERIOD: Duration = Duration::from_millis(50);
-/// Causes of a hold by a person or another program: a job neither clears them nor continues after them.
-const BY_OTHERS: [&str; 7] =
-    ["operator_stop", "stop_input", "stopped_elsewhere", "mode_changed", "power_changed", "power_lost", "shutdown"];
+/// Causes of a hold by a person or another program, or by what somebody has put in the way: a job neither clears them
+/// nor continues after them.
+const BY_OTHERS: [&str; 8] = [
+    "operator_stop",
+    "stop_input",
+    "stopped_elsewhere",
+    "mode_changed",
+    "power_changed",
+    "power_lost",
+    "way_blocked",
+    "shutdown",
+];
 
 /// Why a job ends before its time.
 pub enum End {

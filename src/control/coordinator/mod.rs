@@ -177,6 +177,12 @@ impl Coordinator {
 
     /// Latches an arm's hold and ends its tasks.
     fn hold(&mut self, arm: usize, cause: Cause, now: Mono) {
+        self.latch(arm, cause, now);
+        self.end_tasks_of_held_arms();
+    }
+
+    /// Latches an arm's hold.
+    fn latch(&mut self, arm: usize, cause: Cause, now: Mono) {
         if let Some(a) = self.arms.get_mut(arm) {
             let before = (a.failsafe.phase(), a.failsafe.cause());
             a.failsafe.hold(cause, now);
@@ -184,7 +190,6 @@ impl Coordinator {
                 self.output.report(Event::Arm(arm as u16, a.failsafe.phase(), a.failsafe.cause()));
             }
         }
-        self.end_tasks_of_held_arms();
     }
 
     fn end_tasks_of_held_arms(&mut self) {

@@ -24,10 +24,11 @@ impl Coordinator {
                         Outcome::Accepted
                     });
                 }
-                self.cancel(None)
+                self.cancel(None, Reason::Cancelled)
             }
             Request::Stop { arm } => self.stop(arm, now),
-            Request::Cancel { task } => self.cancel(task),
+            Request::Cancel { task } => self.cancel(task, Reason::Cancelled),
+            Request::WayBlocked { task, motion, in_time } => self.way_blocked(now, (task, motion), in_time),
             Request::Execute { motion, .. } | Request::Chunk { motion, .. } if self.shutting_down => {
                 self.output.retired.push(motion);
                 Outcome::ShuttingDown
@@ -121,7 +122,27 @@ impl Coordinator {
         Outcome::Accepted
     }
 
-    fn cancel(&mut self, which: Option<u16>) -> Outcome {
+    /// Ends a motion whose way is blocked: along its path, or by holding its arms.
+    fn way_blocked(&mut self, now: Mono, (task, motion): (u16, u64), in_time: bool) -> Outcome {
+        let Some(moving) = self.tasks.get(usize::from(task)) else { return Outcome::WrongTask(task) };
+        if moving.motion_id() != Some(motion) {
+            return Outcome::AlreadyStopped;
+        }
+        if in_time {
+            return self.cancel(Some(task), Reason::WayBlocked);
+        }
+        for k in 0.. {
+            let joint = self.tasks.get(usize::from(task)).and_then(|task| task.moving_joints().get(k).copied());
+            let Some(joint) = joint else { break };
+            if let Some(&arm) = self.arm_of.get(usize::from(joint)) {
+                self.latch(usize::from(arm), Cause::WayBlocked, now);
+            }
+        }
+        self.end_tasks_of_held_arms();
+        Outcome::Accepted
+    }
+
+    fn cancel(&mut self, which: Option<u16>, reason: Reason) -> Outcome {
         if let Some(task) = which.filter(|&t| t as usize >= self.tasks.len()) {
             return Outcome::WrongTask(task);
         }
@@ -131,7 +152,7 @@ impl Coordinator {
                 continue;
             }
             if let Some(task) = self.tasks.get_mut(t)
-                && let Some(motion) = task.cancel()
+                && let Some(motion) = task.cancel(reason)
             {
                 self.output.retired.extend(motion);
                 outcome = Outcome::Cancelled;
