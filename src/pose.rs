@@ -3,6 +3,8 @@
 //! Lengths are in m, angles in rad. Roll, pitch and yaw turn about fixed axes: R = Rz(yaw)·Ry(pitch)·Rx(roll), as in
 //! URDF. Quaternions are x, y, z, w.
 
+use std::f64::consts::PI;
+
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 
 /// Returns the pose with this position [m] and these roll, pitch, yaw [rad].
@@ -13,7 +15,10 @@ pub fn from_xyz_rpy(xyz: [f64; 3], [roll, pitch, yaw]: [f64; 3]) -> Isometry3<f6
 /// Cosine of the pitch below which roll and yaw turn about the same axis: the yaw is then all of it.
 const GIMBAL_LOCK: f64 = 1e-7;
 
-/// Returns position [m] and roll, pitch, yaw [rad] of a pose. At a pitch of ±π/2 the roll is zero.
+/// An angle this close to -π is written as π [rad]: rounding alone decides between them.
+const HALF_TURN: f64 = 1e-9;
+
+/// Returns position [m] and roll, pitch, yaw [rad] of a pose. At a pitch of ±π/2 the roll is zero; a half turn is π.
 pub fn to_xyz_rpy(pose: &Isometry3<f64>) -> ([f64; 3], [f64; 3]) {
     let r = pose.rotation.to_rotation_matrix();
     let cos_pitch = r[(0, 0)].hypot(r[(1, 0)]);
@@ -22,7 +27,8 @@ pub fn to_xyz_rpy(pose: &Isometry3<f64>) -> ([f64; 3], [f64; 3]) {
         true => (r[(2, 1)].atan2(r[(2, 2)]), r[(1, 0)].atan2(r[(0, 0)])),
         false => (0.0, (-r[(0, 1)]).atan2(r[(1, 1)])),
     };
-    (pose.translation.vector.into(), [roll, pitch, yaw])
+    let signed = |angle: f64| if angle < HALF_TURN - PI { PI } else { angle };
+    (pose.translation.vector.into(), [signed(roll), pitch, signed(yaw)])
 }
 
 /// Returns the name of the point whose pose is an arm's: a link, or the tool on it.
@@ -64,6 +70,17 @@ mod tests {
         let (xyz, rpy) = ([0.1, -0.2, 0.3], [0.4, -0.5, 2.6]);
         let (there, back) = to_xyz_rpy(&from_xyz_rpy(xyz, rpy));
         assert!(there == xyz && back.iter().zip(rpy).all(|(a, b)| (a - b).abs() < 1e-12), "{back:?}");
+    }
+
+    #[test]
+    fn a_half_turn_has_one_sign() {
+        for (roll, yaw) in [(PI, 0.3), (-PI, 0.3), (-PI + 1e-12, -PI), (PI - 1e-12, -PI + 4e-16)] {
+            let (_, [r, _, y]) = to_xyz_rpy(&from_xyz_rpy([0.0; 3], [roll, 0.2, yaw]));
+            assert!((r - PI).abs() < 1e-11, "{r} for {roll}");
+            assert!((y - yaw).abs() < 1e-11 || (y - PI).abs() < 1e-11, "{y} for {yaw}");
+        }
+        let (_, [roll, ..]) = to_xyz_rpy(&from_xyz_rpy([0.0; 3], [-PI + 1e-6, 0.0, 0.0]));
+        assert!((roll + PI - 1e-6).abs() < 1e-12, "{roll}");
     }
 
     /// Gimbal lock is common: a gripper that points forwards.

@@ -30,14 +30,16 @@ pub struct Contact {
     pub on_other: DVec3,
 }
 
+/// The precision is that of the distance: 4 digits if none is given.
 impl fmt::Display for Contact {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { link, other, distance, .. } = self;
+        let digits = f.precision().unwrap_or(4);
         let kind = if matches!(self.pair, Pair::Links(..)) { "link" } else { "obstacle" };
         if *distance > 0.0 {
-            write!(f, "link {link:?} is {distance:.4} m from {kind} {other:?}")
+            write!(f, "link {link:?} is {distance:.digits$} m from {kind} {other:?}")
         } else {
-            write!(f, "link {link:?} is {:.4} m deep in {kind} {other:?}", -distance)
+            write!(f, "link {link:?} is {:.digits$} m deep in {kind} {other:?}", -distance)
         }
     }
 }

@@ -2,6 +2,7 @@
 //! motion stops after a cancel.
 
 use super::path::between;
+use super::path_planner::digits_outside;
 use super::pipeline::{PlanFailure, PlannedMotion, stage};
 use super::planning_scene::PlanningScene;
 use super::start_contact::passes;
@@ -133,8 +134,11 @@ fn is_straight(way: &[(f64, Vec<f64>)]) -> bool {
 
 /// Describes a contact; if nothing touches, adds the padding that is violated.
 pub(super) fn describe_contact(contact: &Contact, padding: f64) -> String {
-    let kept = format!(", closer than the padding of {padding:.4} m");
-    format!("{contact}{}", if contact.distance > 0.0 { kept } else { String::new() })
+    if contact.distance <= 0.0 {
+        return contact.to_string();
+    }
+    let digits = digits_outside(contact.distance, padding, f64::INFINITY);
+    format!("{contact:.digits$}, closer than the padding of {padding:.digits$} m")
 }
 
 /// Returns whether a motion cancelled at `elapsed` [s] stops before `free_until` [s], including the delay of
@@ -160,4 +164,31 @@ pub fn rest_after_cancel(spline: &Spline, acceleration: &[f64], elapsed: f64, dt
         rate -= dt * steepest.max(f64::MIN_POSITIVE);
     }
     elapsed
+}
+
+#[cfg(test)]
+mod tests {
+    use glamx::DVec3;
+
+    use super::*;
+    use crate::collision::report::Pair;
+
+    #[test]
+    fn a_distance_that_is_hardly_too_small_does_not_look_like_the_padding() {
+        let contact = |distance: f64| Contact {
+            pair: Pair::Obstacle(0, 0),
+            link: "tip".into(),
+            other: "post".into(),
+            distance,
+            on_link: DVec3::ZERO,
+            on_other: DVec3::ZERO,
+        };
+        for (distance, text) in [
+            (0.002, "link \"tip\" is 0.0020 m from obstacle \"post\", closer than the padding of 0.0030 m"),
+            (0.002_996, "link \"tip\" is 0.002996 m from obstacle \"post\", closer than the padding of 0.003000 m"),
+            (-0.002, "link \"tip\" is 0.0020 m deep in obstacle \"post\""),
+        ] {
+            assert_eq!(describe_contact(&contact(distance), 0.003), text);
+        }
+    }
 }

@@ -6,6 +6,7 @@ use super::ik::{Ik, IkSettings};
 use super::level::Level;
 use super::padded::{Near, Padded};
 use super::path::{Path, between, distance, length, unwind};
+use super::path_planner::digits_outside;
 use super::pipeline::{Goal, PlanFailure, Stage, late};
 use super::planning_scene::PlannedRobot;
 use super::start_contact::{EscapePath, passes};
@@ -233,7 +234,11 @@ fn describe_block(
     let place = if length > 1e-3 { format!("after {along:.3} of {length:.3} m ") } else { String::new() };
     let (link, other) = (&first.link, &first.other);
     let closest = match least {
-        least if least > 0.0 => format!("within {least:.4} m (padding {:.4} m)", checker.padding()),
+        least if least > 0.0 => {
+            let padding = checker.padding();
+            let digits = digits_outside(least, padding, f64::INFINITY);
+            format!("within {least:.digits$} m (padding {padding:.digits$} m)")
+        }
         least => format!("{:.4} m deep", -least),
     };
     Some(format!("{place}link {link:?} would come too close to {kind} {other:?}, on the whole line {closest}"))

@@ -42,7 +42,7 @@ impl ShapeSpec {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct WorldObject {
-    /// Its name.
+    /// Its name: letters a to z, digits, `_` and `-`, at most 64.
     pub name: String,
     /// Its shape.
     pub shape: ShapeSpec,
@@ -57,6 +57,9 @@ pub struct WorldObject {
     pub held_by: Option<[String; 2]>,
 }
 
+/// Most bytes of a name.
+const LONGEST_NAME: usize = 64;
+
 /// Parameters of `world_add`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(transparent)]
@@ -66,8 +69,16 @@ impl WorldAdd {
     /// Returns what is wrong with the object, if anything.
     pub fn valid(&self) -> Result<(), String> {
         let Self(object) = self;
-        if object.name.is_empty() || object.held_by.is_some() {
-            return Err("an object needs a name, and `held_by` is set by `attach` only".into());
+        if object.held_by.is_some() {
+            return Err("`held_by` is set by `attach` only".into());
+        }
+        // As in a blueprint, which a saved world can become a part of.
+        let (name, good) = (&object.name, |c: char| c.is_ascii_alphanumeric() || "_-".contains(c));
+        if name.is_empty() || name.len() > LONGEST_NAME {
+            return Err(format!("name has {} characters, must have 1 to {LONGEST_NAME}", name.chars().count()));
+        }
+        if !name.chars().all(good) || name.starts_with('-') {
+            return Err(format!("name is {name:?}, must be of letters a to z, digits, _ and -, and not begin with -"));
         }
         if !(0.0..=1.0).contains(&object.padding) {
             return Err(format!("padding is {}, must be within 0–1 m", object.padding));

@@ -120,8 +120,8 @@ fn a_motion_that_cannot_rest_in_time_holds_the_arms_that_it_moves() {
         rig.run_for(0.5);
         let late = Request::WayBlocked { task: 0, motion, in_time: false };
         assert_eq!(rig.ask(late), Outcome::Accepted, "{motion}");
-        for arm in 0..2 {
-            let expected = if held[arm] { Phase::Held } else { Phase::Ready };
+        for (arm, held) in held.into_iter().enumerate() {
+            let expected = if held { Phase::Held } else { Phase::Ready };
             assert_eq!(rig.phase(arm), expected, "motion {motion}, arm {arm}");
         }
         let reason = Reason::ArmHeld(u16::from(!held[0]), Cause::WayBlocked);
