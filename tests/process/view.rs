@@ -197,8 +197,8 @@ fn a_page_with_the_token_sees_and_commands_the_run_and_no_other_does() {
     assert!(!keeps(address));
 
     // The file of an object of the world, and no other one.
-    home.dimos(&format!("world add a/part --mesh {} --at 3 0 0", home.path().join("part.obj").display())).with(0);
-    let (status, stl) = page.get("/object/a%2Fpart");
+    home.dimos(&format!("world add a-part --mesh {} --at 3 0 0", home.path().join("part.obj").display())).with(0);
+    let (status, stl) = page.get("/object/a%2Dpart");
     assert_eq!((status, stl.len()), (200, 84 + 4 * 50));
     home.dimos("world add ball --sphere 0.1 --at 3 1 0").with(0);
     for path in ["/object/ball", "/object/none", "/object/", "/messages?topics=/tf", "/pose?q=0"] {
