@@ -283,9 +283,11 @@ impl Discrete {
     }
 
     fn make_room(&self, buffers: &mut Buffers) {
-        buffers.q.resize(self.scene.variables, Lanes::splat(0.0));
-        buffers.frames.resize(self.scene.bodies.len(), [Lanes::splat(0.0); 12]);
-        buffers.centers.resize(self.carried.len(), [Lanes::splat(0.0); 3]);
+        // Most often there is room: then nothing is made to fill it.
+        let zero = Lanes::splat(0.0);
+        buffers.q.resize(self.scene.variables, zero);
+        buffers.frames.resize_with(self.scene.bodies.len(), || [zero; 12]);
+        buffers.centers.resize_with(self.carried.len(), || [zero; 3]);
     }
 }
 

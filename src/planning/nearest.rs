@@ -17,7 +17,7 @@ pub struct Tree {
 }
 
 /// Nodes for which a new tree has room.
-const ROOM: usize = 64;
+const ROOM: usize = 16;
 
 /// Samples nearer to a node than this are none [rad].
 const SAME: f64 = 1e-6;

@@ -31,7 +31,7 @@ pub fn unwind(q: &mut [f64], near: &[f64], turns: &[bool]) {
 /// Shifts all configurations of a piece of path by the same whole turns, so that the first one is nearest to `near`:
 /// the same motion, continued without a jump.
 pub fn unwind_all(path: &mut [Vec<f64>], near: &[f64], turns: &[bool]) {
-    let Some(first) = path.first().cloned() else { return };
+    let Some(first) = path.first().filter(|_| turns.contains(&true)).cloned() else { return };
     let mut moved = first.clone();
     unwind(&mut moved, near, turns);
     if moved != first {
@@ -49,26 +49,30 @@ pub fn between(a: &[f64], b: &[f64], t: f64, out: &mut [f64]) {
 }
 
 /// Returns a path without repeated configurations and without those on the line between their neighbours.
-pub fn tidy(path: &[Vec<f64>]) -> Path {
-    tidy_with_indices(path).0
+pub fn tidy(mut path: Path) -> Path {
+    let kept = tidy_indices(&path);
+    for (to, from) in kept.iter().enumerate() {
+        path.swap(to, *from);
+    }
+    path.truncate(kept.len());
+    path
 }
 
-/// Returns a [tidy] path, and the index in `path` of each of its configurations.
-pub fn tidy_with_indices(path: &[Vec<f64>]) -> (Path, Vec<usize>) {
-    let (mut tidy, mut kept) = (Path::with_capacity(path.len()), Vec::with_capacity(path.len()));
+/// Returns the index of each configuration of a path that remains when it is [tidy].
+pub fn tidy_indices(path: &[Vec<f64>]) -> Vec<usize> {
+    let mut kept: Vec<usize> = Vec::with_capacity(path.len());
     for (i, q) in path.iter().enumerate() {
-        if tidy.last().is_some_and(|last| distance(last, q) < 1e-12) {
+        if kept.last().is_some_and(|last| distance(&path[*last], q) < 1e-12) {
             continue;
         }
-        if let [.., before, middle] = tidy.as_slice() {
+        if let [.., before, middle] = kept[..] {
+            let (before, middle) = (&path[before], &path[middle]);
             let (first, second, whole) = (distance(before, middle), distance(middle, q), distance(before, q));
             if first + second - whole < 1e-12 * whole.max(1.0) {
-                tidy.pop();
                 kept.pop();
             }
         }
-        tidy.push(q.clone());
         kept.push(i);
     }
-    (tidy, kept)
+    kept
 }

@@ -71,7 +71,8 @@ struct Member {
 impl Portfolio {
     /// Prepares the searches from `start` to any of `goals`; all of them must be free.
     pub fn new(start: &[f64], goals: &[Vec<f64>], settings: &RrtSettings, level: Level, seed: u64) -> Self {
-        let (mut members, mut ranges) = (Vec::new(), settings.ranges);
+        // A search is large to move: room for all of them.
+        let (mut members, mut ranges) = (Vec::with_capacity(2 * settings.ranges.len()), settings.ranges);
         if start.len() > ONE_ARM {
             ranges.reverse();
         }

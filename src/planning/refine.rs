@@ -94,7 +94,7 @@ pub(super) fn cut(path: &Path, cuts: usize, random: &mut Random, is_free: IsFree
             continue;
         }
         path.splice(first.0 + 1..=last.0, [first.1, last.1]);
-        path = tidy(&path);
+        path = tidy(path);
         (whole, shorter) = (length(&path), true);
     }
     shorter.then_some(path)

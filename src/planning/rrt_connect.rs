@@ -14,7 +14,7 @@ use crate::robot::model::Limits;
 use super::candidates::{Candidates, aim};
 use super::edges::EdgeCheck;
 use super::nearest::{Batch, Tree};
-use super::path::{Path, between, distance, unwind, unwind_all};
+use super::path::{Path, between, distance, tidy, unwind, unwind_all};
 use super::sampler::Sampler;
 
 /// Settings of the search.
@@ -307,11 +307,12 @@ impl Search {
             node = other.add(&self.sample, Some(node));
         }
         let (from_start, from_goal) = if self.side == 0 { (added, node) } else { (node, added) };
-        let mut path: Path = self.trees[0].way_up(from_start).map(<[f64]>::to_vec).collect();
+        let mut path = Path::with_capacity(2 * LANES);
+        path.extend(self.trees[0].way_up(from_start).map(<[f64]>::to_vec));
         path.reverse();
-        let mut rest: Path = self.trees[1].way_up(from_goal).map(<[f64]>::to_vec).collect();
-        unwind_all(&mut rest, self.trees[0].node(from_start), &self.turns);
-        path.append(&mut rest);
-        Some(super::path::tidy(&path))
+        let met = path.len();
+        path.extend(self.trees[1].way_up(from_goal).map(<[f64]>::to_vec));
+        unwind_all(&mut path[met..], self.trees[0].node(from_start), &self.turns);
+        Some(tidy(path))
     }
 }

@@ -1,5 +1,7 @@
 //! Sampling of configurations: a low-discrepancy sequence, shifted by a seed.
 
+use std::sync::OnceLock;
+
 use dimos_kernels::Width;
 use dimos_kernels::block::Lanes;
 use dimos_kernels::halton::{Halton, VARIABLES};
@@ -7,8 +9,18 @@ use dimos_kernels::halton::{Halton, VARIABLES};
 use crate::robot::model::Limits;
 use crate::robot::random::Random;
 
-/// Values in the table of radii.
+/// Steps of the table of radii.
 const RADII: usize = 256;
+
+/// Returns u^(1/n) for u from 0 to 1 in even steps, where n is the number of joints. A table takes longer to make than
+/// most searches: it is made once.
+fn radii(joints: usize) -> &'static [f64] {
+    static TABLES: [OnceLock<Vec<f64>>; VARIABLES + 1] = [const { OnceLock::new() }; VARIABLES + 1];
+    // With more joints than that, all samples are about as far away.
+    let joints = joints.clamp(1, VARIABLES);
+    let part = |k: usize| (k as f64 / RADII as f64).powf(1.0 / joints as f64);
+    TABLES[joints].get_or_init(|| (0..=RADII).map(part).collect())
+}
 
 /// The Halton sequence with a random shift: evenly spread and different for every seed. Joints that it is too short for
 /// get pseudo-random values.
@@ -18,8 +30,6 @@ pub struct Sampler {
     /// Least value and range of the other joints.
     others: Vec<(f32, f32)>,
     random: Random,
-    /// Values of u^(1/n); empty until they are needed.
-    radii: Vec<f64>,
 }
 
 impl Sampler {
@@ -37,7 +47,7 @@ impl Sampler {
         };
         let axes: Vec<[f32; 3]> = limits.iter().enumerate().map(axis).collect();
         let others = axes.iter().skip(VARIABLES).map(|[low, width, _]| (*low, *width)).collect();
-        Self { halton: Halton::new(axes.into_iter(), Width::widest()), others, random, radii: Vec::new() }
+        Self { halton: Halton::new(axes.into_iter(), Width::widest()), others, random }
     }
 
     /// Writes the next samples, a block for each joint, in single precision: rounding may move one a little out of the
@@ -75,13 +85,10 @@ impl Sampler {
 
     /// Returns the distance from the middle of a sample in a ball of radius 1: u^(1/n) for an even u, from a table.
     fn part_of_radius(&mut self, joints: usize) -> f64 {
-        if self.radii.is_empty() {
-            let part = |k: usize| (k as f64 / RADII as f64).powf(1.0 / joints.max(1) as f64);
-            self.radii = (0..=RADII).map(part).collect();
-        }
+        let radii = radii(joints);
         let at = self.random.unit() * RADII as f64;
         let below = (at as usize).min(RADII - 1);
-        self.radii[below] + (at - below as f64) * (self.radii[below + 1] - self.radii[below])
+        radii[below] + (at - below as f64) * (radii[below + 1] - radii[below])
     }
 
     /// Returns a random index below `n`.

@@ -28,7 +28,7 @@ pub fn shorten(path: &[Vec<f64>], turns: &[bool], settings: &ShortcutSettings, i
     for _ in 0..settings.rounds {
         let removed = remove_corners(&mut path, turns, is_free);
         let cut = cut_corners(&mut path, settings.min_change, is_free);
-        path = tidy(&path);
+        path = tidy(path);
         if !removed && !cut {
             break;
         }

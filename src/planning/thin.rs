@@ -104,7 +104,7 @@ mod tests {
         let points: Vec<Vec<f64>> = (0..=400).map(|k| vec![(f64::from(k) * 0.05).sin(), 0.0]).collect();
         let path = thin(&points, 0.005);
         // 20 rad of a sine: six turns between the ends.
-        let turns = tidy(&path);
+        let turns = tidy(path.clone());
         assert_eq!(turns.len(), 8, "{path:?}");
         for q in &turns[1..7] {
             assert!((q[0].abs() - 1.0).abs() < 0.005, "{q:?}");

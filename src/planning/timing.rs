@@ -12,7 +12,7 @@ use crate::trajectory::{JointTrajectory, TrajectoryError, TrajectoryPoint};
 use super::blend::{Curve, curves};
 use super::constant_corner_speed::RoundedPath;
 use super::jerk_limit::averaged;
-use super::path::{Path, tidy_with_indices};
+use super::path::{Path, tidy_indices};
 use super::topp::{GridPoint, JointBound, parameterize};
 use super::verify::{Excess, excess};
 
@@ -119,7 +119,8 @@ pub fn time_within(
     if !(speed > 0.0 && speed <= 1.0) {
         return Err(TimingError::Speed(speed));
     }
-    let (path, kept) = tidy_with_indices(path);
+    let kept = tidy_indices(path);
+    let path: Path = kept.iter().map(|i| path[*i].clone()).collect();
     if path.len() < 2 || bounds.len() != dof {
         return Err(TimingError::NoMotion);
     }

@@ -226,7 +226,7 @@ fn speeds_are_as_high_as_toppras() {
                 })
                 .collect();
             let names: Vec<String> = (0..6).map(|j| format!("j{j}")).collect();
-            let all = curves(&tidy(&path), &vec![0.1; n]);
+            let all = curves(&tidy(path.clone()), &vec![0.1; n]);
             let [curve] = all.as_slice() else { continue };
             let (mut s, mut q, mut start) = (Vec::new(), Vec::new(), 0.0);
             for (p, piece) in curve.iter().enumerate() {

@@ -76,7 +76,7 @@ fn every_sample_keeps_all_limits_and_the_corners_deviation() {
                     continue;
                 }
                 let q: Vec<f64> = samples.iter().map(|s| s.position).collect();
-                assert!(off(&tidy(path), &q) <= deviation + 1e-6, "{what}: {} off at {k} ms", off(path, &q));
+                assert!(off(&tidy(path.clone()), &q) <= deviation + 1e-6, "{what}: {} off at {k} ms", off(path, &q));
             }
             assert!(samples.iter().all(|s| s.velocity.abs() < 0.2), "{what} is not at rest at its end");
             assert_eq!(timed.trajectory.points[0].positions, path[0]);

@@ -17,32 +17,44 @@ const ROUNDING: f32 = 1e-5;
 /// Returns a pair that touches in any lane of any block.
 #[inline(always)]
 pub(super) fn check<B: Block>(discrete: &Discrete, motion: &Motion<'_>, buffers: &mut Buffers) -> Option<u32> {
-    let scene = &*discrete.scene;
-    let blocks = motion.blocks.max(1);
-    let (first, part, steps) = match motion.proof {
+    let (samples, rounding) = ((LANES * motion.blocks.max(1)) as f32, discrete.rounding);
+    match motion.proof {
         Proof::Motion { turn, .. } => {
-            let part = 1.0 / (LANES * blocks - 1) as f32;
-            (1, part, Steps { part, turn: turn as f32 * part, rounding: discrete.rounding })
+            // Its beginning is the first sample.
+            let part = 1.0 / (samples - 1.0);
+            let steps = Steps::<true> { part, turn: turn as f32 * part, rounding };
+            check_blocks::<B, true>(discrete, motion, 1, &steps, buffers)
         }
-        Proof::Samples => {
-            (0, 1.0 / (LANES * blocks) as f32, Steps { part: 0.0, turn: 0.0, rounding: discrete.rounding })
+        Proof::Samples | Proof::None => {
+            let rounding = if matches!(motion.proof, Proof::None) { 0.0 } else { rounding };
+            let steps = Steps::<false> { part: 1.0 / samples, turn: 0.0, rounding };
+            check_blocks::<B, false>(discrete, motion, 0, &steps, buffers)
         }
-        Proof::None => (0, 1.0 / (LANES * blocks) as f32, Steps { part: 0.0, turn: 0.0, rounding: 0.0 }),
-    };
+    }
+}
+
+/// Returns a pair that touches in any lane of any block, of which the first one begins with sample `first`.
+#[inline(always)]
+fn check_blocks<B: Block, const SWEPT: bool>(
+    discrete: &Discrete,
+    motion: &Motion<'_>,
+    first: usize,
+    steps: &Steps<SWEPT>,
+    buffers: &mut Buffers,
+) -> Option<u32> {
+    let blocks = motion.blocks.max(1);
     for block in 0..blocks {
         // Samples number i, in lane k: i = (k + 1) · blocks − block, from 1.
-        for j in 0..scene.variables {
-            let (from, to) = (motion.from[j], motion.to[j]);
-            let (start, delta) = (from as f32, (to - from) as f32);
-            let mut lanes = [0.0; LANES];
-            for k in 0..LANES {
-                let i = (k + 1) * blocks - block - first;
-                lanes[k] = (i as f32 * part).mul_add(delta, start);
-            }
-            buffers.q[j] = Lanes(lanes);
+        let mut parts = Lanes::splat(0.0);
+        for (k, part) in parts.0.iter_mut().enumerate() {
+            *part = ((k + 1) * blocks - block - first) as u32 as f32 * steps.part;
+        }
+        let parts = B::load(&parts);
+        for ((q, from), to) in buffers.q.iter_mut().zip(motion.from).zip(motion.to) {
+            parts.mul_add(B::splat((to - from) as f32), B::splat(*from as f32)).store(q);
         }
         let mut found = Found::among(u16::MAX);
-        check_block::<B, false>(discrete, motion, block == 0, &steps, buffers, &mut found);
+        check_block::<B, false, SWEPT>(discrete, motion, block == 0, steps, buffers, &mut found);
         if found.pair != NO_PAIR {
             return Some(found.pair);
         }
@@ -58,9 +70,9 @@ pub(super) fn check_each<B: Block>(
     sought: u16,
     buffers: &mut Buffers,
 ) -> u16 {
-    let steps = Steps { part: 0.0, turn: 0.0, rounding: 0.0 };
+    let steps = Steps::<false> { part: 0.0, turn: 0.0, rounding: 0.0 };
     let mut found = Found::among(sought);
-    check_block::<B, true>(discrete, motion, true, &steps, buffers, &mut found);
+    check_block::<B, true, false>(discrete, motion, true, &steps, buffers, &mut found);
     let pair = found.pair;
     if pair != NO_PAIR && !buffers.frequent.contains(&pair) {
         buffers.frequent.truncate(FREQUENT - 1);
@@ -71,16 +83,16 @@ pub(super) fn check_each<B: Block>(
 
 /// Compares the pairs that touched lately; returns whether the check is over.
 #[inline(always)]
-fn check_frequent<B: Block>(
+fn check_frequent<B: Block, const SWEPT: bool>(
     discrete: &Discrete,
     motion: &Motion<'_>,
-    steps: &Steps,
+    steps: &Steps<SWEPT>,
     buffers: &mut Buffers,
     found: &mut Found,
 ) -> bool {
     for place in 0..buffers.frequent.len() {
         let pair = buffers.frequent[place];
-        let touching = compare::<B, true>(discrete, motion, pair, steps, &buffers.frames, found);
+        let touching = compare::<B, true, SWEPT>(discrete, motion, pair, steps, &buffers.frames, found);
         if touching != 0 && place > 0 {
             buffers.frequent.swap(place, place - 1);
         }
@@ -94,11 +106,11 @@ fn check_frequent<B: Block>(
 
 /// Returns the lanes in which one pair touches.
 #[inline(always)]
-fn compare<B: Block, const EACH: bool>(
+fn compare<B: Block, const EACH: bool, const SWEPT: bool>(
     discrete: &Discrete,
     motion: &Motion<'_>,
     pair: u32,
-    steps: &Steps,
+    steps: &Steps<SWEPT>,
     frames: &[Frames],
     found: &Found,
 ) -> u16 {
@@ -106,7 +118,7 @@ fn compare<B: Block, const EACH: bool>(
     let Compared { link, other, .. } = &scene.pairs[pair as usize];
     let (link, gap) = (&scene.links[*link], gap_of(motion, pair, steps));
     let left = (false, found.left::<EACH>());
-    pair_touches::<B, EACH>(scene, frames, link.body, &link.tree.nodes, other, &gap, left)
+    pair_touches::<B, EACH, SWEPT>(scene, frames, link.body, &link.tree.nodes, other, &gap, left)
 }
 
 /// A pair that touches, and the lanes in which any does.
@@ -139,22 +151,22 @@ impl Found {
 
 /// Checks a block: to the first pair that touches in any lane, or for `EACH` lane whether something touches in it.
 #[inline(always)]
-fn check_block<B: Block, const EACH: bool>(
+fn check_block<B: Block, const EACH: bool, const SWEPT: bool>(
     discrete: &Discrete,
     motion: &Motion<'_>,
     first: bool,
-    steps: &Steps,
+    steps: &Steps<SWEPT>,
     buffers: &mut Buffers,
     found: &mut Found,
 ) {
     let scene = &*discrete.scene;
     forward::<B>(&scene.prepared, &buffers.q, &mut buffers.frames);
-    if EACH && check_frequent::<B>(discrete, motion, steps, buffers, found) {
+    if EACH && check_frequent::<B, SWEPT>(discrete, motion, steps, buffers, found) {
         return;
     }
     let frames = &buffers.frames[..];
     if let Some(likely) = motion.likely.filter(|_| first) {
-        let touching = compare::<B, EACH>(discrete, motion, likely, steps, frames, found);
+        let touching = compare::<B, EACH, SWEPT>(discrete, motion, likely, steps, frames, found);
         if found.ends::<EACH>(likely, touching) {
             return;
         }
@@ -170,24 +182,26 @@ fn check_block<B: Block, const EACH: bool>(
             continue;
         }
         let mut reach = 0.0_f32;
-        if steps.part != 0.0 {
+        if SWEPT {
             for member in carried.links.0..carried.links.1 {
                 let pair = discrete.links[member as usize].pair;
                 reach = if pair == NO_PAIR { reach } else { reach.max(reach_of(motion, pair)) };
             }
         }
         let gap = Gap::new(most, reach, steps);
-        let around = gap.squared(carried.radius).sqrt() + if EACH { ROUNDING } else { 0.0 };
-        let (mut low, mut high) = ([B::splat(0.0); 3], [B::splat(0.0); 3]);
-        for i in 0..3 {
-            let (mut least, mut most) = (center[i].neg(), center[i]);
-            if EACH {
-                let (left, none) = (B::mask(found.left::<EACH>()), B::splat(f32::NEG_INFINITY));
-                (least, most) = (B::select(left, least, none), B::select(left, most, none));
+        let around = gap.distance(carried.radius) + if EACH { ROUNDING } else { 0.0 };
+        let [x, y, z] = center;
+        let mut sides = [x, y, z, x.neg(), y.neg(), z.neg()];
+        if EACH {
+            let (left, none) = (B::mask(found.left::<EACH>()), B::splat(f32::NEG_INFINITY));
+            for side in &mut sides {
+                *side = B::select(left, *side, none);
             }
-            low[i] = B::splat(-least.largest() - around);
-            high[i] = B::splat(most.largest() + around);
         }
+        // The box around all places, whose lower corner is that of the negative numbers.
+        let (sides, around) = (B::largest(sides), B::splat(around));
+        let high = [sides[0].add(around), sides[1].add(around), sides[2].add(around)];
+        let low = [sides[3].add(around).neg(), sides[4].add(around).neg(), sides[5].add(around).neg()];
         for group in carried.groups.0..carried.groups.1 {
             let boxes = &discrete.boxes[group as usize];
             let mut apart = 0;
@@ -205,11 +219,11 @@ fn check_block<B: Block, const EACH: bool>(
                 }
                 let standing = &discrete.obstacles[at as usize];
                 let around = carried.radius + if EACH { ROUNDING } else { 0.0 };
-                let near = near::<B>(scene, frames, &standing.other, &center, &gap.more(around));
+                let near = near::<B, SWEPT>(scene, frames, &standing.other, &center, &gap.more(around));
                 if near & found.left::<EACH>() == 0 {
                     continue;
                 }
-                if body_touches::<B, EACH>(discrete, motion, frames, (carried, near), standing, steps, found) {
+                if body_touches::<B, EACH, SWEPT>(discrete, motion, frames, (carried, near), standing, steps, found) {
                     return;
                 }
             }
@@ -221,7 +235,7 @@ fn check_block<B: Block, const EACH: bool>(
         let (one, two) = (&discrete.carried[bodies.a as usize], &discrete.carried[bodies.b as usize]);
         let squared = between(&load::<B>(a), &load(b));
         let mut reach = 0.0_f32;
-        if steps.part != 0.0 {
+        if SWEPT {
             for pair in pairs {
                 reach = reach.max(reach_of(motion, pair.pair));
             }
@@ -234,7 +248,8 @@ fn check_block<B: Block, const EACH: bool>(
         let (f, g) = (&frames[one.body], &frames[two.body]);
         for pair in pairs {
             let (a, b) = (&discrete.links[pair.a as usize].tree.nodes, &discrete.links[pair.b as usize].tree.nodes);
-            let touching = covers_touch::<B, EACH>(f, a, g, b, &gap_of(motion, pair.pair, steps), found.left::<EACH>());
+            let touching =
+                covers_touch::<B, EACH, SWEPT>(f, a, g, b, &gap_of(motion, pair.pair, steps), found.left::<EACH>());
             if found.ends::<EACH>(pair.pair, touching) {
                 return;
             }
@@ -244,13 +259,13 @@ fn check_block<B: Block, const EACH: bool>(
 
 /// Checks the pairs of a body's links and an obstacle; returns whether the check is over.
 #[inline(always)]
-fn body_touches<B: Block, const EACH: bool>(
+fn body_touches<B: Block, const EACH: bool, const SWEPT: bool>(
     discrete: &Discrete,
     motion: &Motion<'_>,
     frames: &[Frames],
     (carried, near): (&Carried, u16),
     standing: &Standing,
-    steps: &Steps,
+    steps: &Steps<SWEPT>,
     found: &mut Found,
 ) -> bool {
     let (first, last) = carried.links;
@@ -263,7 +278,7 @@ fn body_touches<B: Block, const EACH: bool>(
         // The ball of the only link of a body is that of the body: it is near.
         let only = (last - first == 1, found.left::<EACH>() & if EACH { near } else { u16::MAX });
         let touching =
-            pair_touches::<B, EACH>(&discrete.scene, frames, carried.body, nodes, &standing.other, &gap, only);
+            pair_touches::<B, EACH, SWEPT>(&discrete.scene, frames, carried.body, nodes, &standing.other, &gap, only);
         if found.ends::<EACH>(pair, touching) {
             return true;
         }

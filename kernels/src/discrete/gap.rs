@@ -2,9 +2,9 @@
 
 use super::{Motion, Proof};
 
-/// How much nearer than their radii balls count as touching.
+/// How much nearer than their radii balls count as touching; `SWEPT`: also between samples.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Gap {
+pub(super) struct Gap<const SWEPT: bool> {
     /// Padding and bulge [m].
     pub more: f32,
     /// Square of half of a chord [m²].
@@ -14,23 +14,32 @@ pub(super) struct Gap {
     pub rounding: f32,
 }
 
-impl Gap {
+impl<const SWEPT: bool> Gap<SWEPT> {
     #[inline(always)]
-    pub fn new(pad: f32, reach: f32, steps: &Steps) -> Self {
+    pub fn new(pad: f32, reach: f32, steps: &Steps<SWEPT>) -> Self {
+        if !SWEPT {
+            return Self { more: pad, squared: 0.0, pad, rounding: steps.rounding };
+        }
         let chord = reach * steps.part;
         // The second derivative of a place is at most twice the product of what turns and what moves.
         let bulge = 0.25 * steps.turn * chord;
         Self { more: pad + bulge, squared: 0.25 * chord * chord, pad, rounding: steps.rounding }
     }
 
-    /// Returns the squared distance below which a ball touches.
+    /// Returns the distance below which a ball touches.
+    #[inline(always)]
+    pub fn distance(&self, radius: f32) -> f32 {
+        let radius = radius + self.more;
+        // The root is slow.
+        let swept = if SWEPT { radius.mul_add(radius, self.squared).sqrt() } else { radius };
+        swept + self.rounding
+    }
+
+    /// Returns its square.
     #[inline(always)]
     pub fn squared(&self, radius: f32) -> f32 {
-        let radius = radius + self.more;
-        // The root is slow, and without a chord it changes nothing.
-        let swept = if self.squared == 0.0 { radius } else { radius.mul_add(radius, self.squared).sqrt() };
-        let reach = swept + self.rounding;
-        reach * reach
+        let distance = self.distance(radius);
+        distance * distance
     }
 
     #[inline(always)]
@@ -39,10 +48,10 @@ impl Gap {
     }
 }
 
-/// The steps between samples.
+/// The steps between samples; `SWEPT`: what is between them counts.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Steps {
-    /// The part of the motion between two samples, if it is swept.
+pub(super) struct Steps<const SWEPT: bool> {
+    /// The part of the motion between two samples.
     pub part: f32,
     /// The sum of the angles by which the joints turn on it [rad].
     pub turn: f32,
@@ -58,6 +67,7 @@ pub(super) fn reach_of(motion: &Motion<'_>, pair: u32) -> f32 {
 }
 
 #[inline(always)]
-pub(super) fn gap_of(motion: &Motion<'_>, pair: u32, steps: &Steps) -> Gap {
-    Gap::new(motion.pads[pair as usize] as f32, reach_of(motion, pair), steps)
+pub(super) fn gap_of<const SWEPT: bool>(motion: &Motion<'_>, pair: u32, steps: &Steps<SWEPT>) -> Gap<SWEPT> {
+    let reach = if SWEPT { reach_of(motion, pair) } else { 0.0 };
+    Gap::new(motion.pads[pair as usize] as f32, reach, steps)
 }

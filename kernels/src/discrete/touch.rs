@@ -48,7 +48,13 @@ pub(super) fn below<B: Block>(squared: B, limit: f32) -> u16 {
 
 /// Returns the lanes in which points are nearer to an obstacle than a distance.
 #[inline(always)]
-pub(super) fn near<B: Block>(scene: &Scene, frames: &[Frames], other: &Other, center: &[B; 3], gap: &Gap) -> u16 {
+pub(super) fn near<B: Block, const SWEPT: bool>(
+    scene: &Scene,
+    frames: &[Frames],
+    other: &Other,
+    center: &[B; 3],
+    gap: &Gap<SWEPT>,
+) -> u16 {
     match other {
         Other::Box(core, radius) => below::<B>(core.squared(center), gap.squared(*radius)),
         Other::Cylinder(core, radius) => below::<B>(core.squared(center), gap.squared(*radius)),
@@ -64,38 +70,40 @@ pub(super) fn near<B: Block>(scene: &Scene, frames: &[Frames], other: &Other, ce
 /// Returns the lanes of `left` in which a cover touches something; unless for `EACH` lane, not all of them. `near`: its
 /// largest ball is known to do so.
 #[inline(always)]
-pub(super) fn pair_touches<B: Block, const EACH: bool>(
+pub(super) fn pair_touches<B: Block, const EACH: bool, const SWEPT: bool>(
     scene: &Scene,
     frames: &[Frames],
     body: usize,
     nodes: &[Node],
     other: &Other,
-    gap: &Gap,
+    gap: &Gap<SWEPT>,
     (near, left): (bool, u16),
 ) -> u16 {
     let frame = &frames[body];
     match other {
-        Other::Box(core, radius) => cover_touches::<B, _, EACH>(frame, nodes, &gap.more(*radius), core, (near, left)),
+        Other::Box(core, radius) => {
+            cover_touches::<B, _, EACH, SWEPT>(frame, nodes, &gap.more(*radius), core, (near, left))
+        }
         Other::Cylinder(core, radius) => {
-            cover_touches::<B, _, EACH>(frame, nodes, &gap.more(*radius), core, (near, left))
+            cover_touches::<B, _, EACH, SWEPT>(frame, nodes, &gap.more(*radius), core, (near, left))
         }
         Other::Cover(fixed, tree, radius) => {
             let (fixed, other) = (&frames[*fixed], &scene.trees[*tree].nodes);
-            covers_touch::<B, EACH>(frame, nodes, fixed, other, &gap.more(*radius), left)
+            covers_touch::<B, EACH, SWEPT>(frame, nodes, fixed, other, &gap.more(*radius), left)
         }
         Other::Link(other) => {
             let other = &scene.links[*other];
-            covers_touch::<B, EACH>(frame, nodes, &frames[other.body], &other.tree.nodes, gap, left)
+            covers_touch::<B, EACH, SWEPT>(frame, nodes, &frames[other.body], &other.tree.nodes, gap, left)
         }
     }
 }
 
 /// Returns lanes of `left` in which the smallest balls of a cover touch a core.
 #[inline(always)]
-fn cover_touches<B: Block, C: Squared, const EACH: bool>(
+fn cover_touches<B: Block, C: Squared, const EACH: bool, const SWEPT: bool>(
     frame: &Frames,
     nodes: &[Node],
-    gap: &Gap,
+    gap: &Gap<SWEPT>,
     core: &C,
     (near, left): (bool, u16),
 ) -> u16 {
@@ -121,7 +129,8 @@ fn cover_touches<B: Block, C: Squared, const EACH: bool>(
         if close == 0 {
             continue;
         }
-        let Some(close) = settle::<B, EACH>(squared, (node.inner, gap), (node.count, open), close, &mut touching)
+        let Some(close) =
+            settle::<B, EACH, SWEPT>(squared, (node.inner, gap), (node.count, open), close, &mut touching)
         else {
             break;
         };
@@ -140,15 +149,15 @@ fn cover_touches<B: Block, C: Squared, const EACH: bool>(
 /// in which the ball inside of it does. Returns the lanes in which its parts are to be compared, `None` if no more are
 /// sought. `count`: its number of parts; `open`: of balls that wait.
 #[inline(always)]
-fn settle<B: Block, const EACH: bool>(
+fn settle<B: Block, const EACH: bool, const SWEPT: bool>(
     squared: B,
-    (inner, gap): (f32, &Gap),
+    (inner, gap): (f32, &Gap<SWEPT>),
     (count, open): (u32, usize),
     close: u16,
     touching: &mut Touching,
 ) -> Option<u16> {
     let full = open + count as usize > STACK;
-    let sure = if count == 0 || (full && !EACH) { close } else { surely::<B>(squared, inner, gap) & close };
+    let sure = if count == 0 || (full && !EACH) { close } else { surely::<B, SWEPT>(squared, inner, gap) & close };
     if touching.ends::<EACH>(sure) {
         return None;
     }
@@ -157,19 +166,19 @@ fn settle<B: Block, const EACH: bool>(
 
 /// Returns the lanes in which balls inside of solids touch.
 #[inline(always)]
-fn surely<B: Block>(squared: B, inner: f32, gap: &Gap) -> u16 {
+fn surely<B: Block, const SWEPT: bool>(squared: B, inner: f32, gap: &Gap<SWEPT>) -> u16 {
     let within = inner + gap.pad;
     if inner >= 0.0 { B::bits(B::less(squared, B::splat(within * within))) } else { 0 }
 }
 
 /// Returns lanes of `left` in which the smallest balls of two covers touch.
 #[inline(always)]
-pub(super) fn covers_touch<B: Block, const EACH: bool>(
+pub(super) fn covers_touch<B: Block, const EACH: bool, const SWEPT: bool>(
     f: &Frames,
     a: &[Node],
     g: &Frames,
     b: &[Node],
-    gap: &Gap,
+    gap: &Gap<SWEPT>,
     left: u16,
 ) -> u16 {
     if a.is_empty() || b.is_empty() {
@@ -193,7 +202,8 @@ pub(super) fn covers_touch<B: Block, const EACH: bool>(
         let first = one.count != 0 && (two.count == 0 || one.radius >= two.radius);
         let parent = if first { one } else { two };
         let inner = if one.inner.min(two.inner) < 0.0 { -1.0 } else { one.inner + two.inner };
-        let Some(close) = settle::<B, EACH>(squared, (inner, gap), (parent.count, open), close, &mut touching) else {
+        let Some(close) = settle::<B, EACH, SWEPT>(squared, (inner, gap), (parent.count, open), close, &mut touching)
+        else {
             break;
         };
         if close == 0 {
