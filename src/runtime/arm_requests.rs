@@ -131,7 +131,7 @@ impl Service {
                 }
                 // Its joints would move while it is being enabled.
                 if phase == Phase::Standby {
-                    self.wait_for_rest(&id, arm, Instant::now() + self.braking_limit(arm)).await?;
+                    self.wait_for_rest(&id, arm, Instant::now()).await?;
                 }
                 order(self.device(arm)?.activate()).await.map_err(|e| refused(&id, "was not enabled", &e))?;
                 self.ask(Request::Enabled { arm }).await?;
@@ -183,10 +183,10 @@ impl Service {
     /// Disables an arm's motors: once it is at rest, or `now`.
     pub(super) async fn disable(&self, id: String, now: bool) -> Result<Reply, RpcError> {
         let arm = self.arm_index(&id)?;
-        let limit = Instant::now() + self.braking_limit(arm);
+        let began = Instant::now();
         self.ask(Request::PrepareDisable { arm }).await?;
         if !now {
-            self.wait_for_rest(&id, arm, limit).await?;
+            self.wait_for_rest(&id, arm, began).await?;
         }
         let speed = self.speed(arm);
         order(self.device(arm)?.disable()).await.map_err(|e| refused(&id, "was not disabled", &e))?;
@@ -202,21 +202,26 @@ impl Service {
         Ok(Reply::ArmDisable(reply))
     }
 
-    /// Waits until an arm is at rest; an error if it still moves at the timeout.
-    pub(super) async fn wait_for_rest(&self, id: &str, arm: u16, limit: Instant) -> Result<(), RpcError> {
+    /// Waits until an arm that brakes since `began` is at rest; an error if it still moves after the time that it needs.
+    pub(super) async fn wait_for_rest(&self, id: &str, arm: u16, began: Instant) -> Result<(), RpcError> {
         let device = self.device(arm)?;
-        let late = || Instant::now() >= limit;
         // Without a command the arm is being stopped, or this run did not move it. The motors stay on until that stop.
         let stopped = |seq| device.health().stop_sent.load(Ordering::Acquire) == seq;
-        let rests = || {
+        let rests = |late| {
             self.arm_view(arm as usize)
-                .is_none_or(|view| view.command.mode.is_none() && (stopped(view.command.stop_seq) || late()))
+                .is_none_or(|view| view.command.mode.is_none() && (stopped(view.command.stop_seq) || late))
         };
-        let look = || match self.speed(arm) {
-            speed if speed > STANDSTILL => late().then_some(Err(speed)),
-            _ => rests().then_some(Ok(())),
+        let mut braking = Duration::ZERO;
+        let look = || {
+            // A velocity may be measured far too low between two setpoints: the longest time counts.
+            braking = braking.max(self.braking_limit(arm));
+            let late = Instant::now() >= began + braking;
+            match self.speed(arm) {
+                speed if speed > STANDSTILL => late.then_some(Err(speed)),
+                _ => rests(late).then_some(Ok(())),
+            }
         };
-        let rested = self.until(limit + SETTLING_LIMIT, look).await;
+        let rested = self.until(began + BRAKING_LIMIT + SETTLING_LIMIT, look).await;
         rested.unwrap_or_else(|| Err(self.speed(arm))).map_err(|speed| still_moves(id, speed))
     }
 

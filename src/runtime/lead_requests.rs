@@ -114,9 +114,9 @@ impl Service {
 
     /// Ends the leading of an arm: it gets its own stop, unless its motors are off, and is in standby.
     pub(super) async fn end_lead(&self, name: &str, arm: u16) -> Result<(), RpcError> {
-        let limit = Instant::now() + self.braking_limit(arm);
+        let began = Instant::now();
         self.ask(Request::PrepareDisable { arm }).await?;
-        self.wait_for_rest(name, arm, limit).await
+        self.wait_for_rest(name, arm, began).await
     }
 
     /// Refuses to take over an arm that still moves.

@@ -86,7 +86,7 @@ impl Service {
         let again = resets && matches!(self.phase(arm as usize), Phase::Activating | Phase::Ready);
         if again {
             self.ask(Request::PrepareDisable { arm }).await?;
-            self.wait_for_rest(&name, arm, Instant::now() + self.braking_limit(arm)).await?;
+            self.wait_for_rest(&name, arm, Instant::now()).await?;
         }
         let device = self.device(arm)?;
         let mut actual = order(device.set_payload(*load)).await;

@@ -84,8 +84,14 @@ test('goals of two arms are planned, previewed and executed together', async () 
   await page.click('[data-arm=left] .card-head');
   await page.click('[data-pose=home]');
   await page.click('[data-arm=right] .card-head');
+  // What a joint does not reach is not taken, and the page says so while the field still has the focus.
+  await page.fill('#sliders .slider:first-child .value', '99');
+  await page.keyboard.press('Enter');
+  await text(page, '#sliders .unit-note', /joint1 reaches .* to .* only/);
+  assert.ok(Number(await page.inputValue('#sliders .slider:first-child .value')) < 9);
   await page.fill('#sliders .slider:first-child .value', '0.5');
   await page.keyboard.press('Tab');
+  await text(page, '#sliders .unit-note', /^goal in rad$/);
   await text(page, '#goals', /left: home.*right: joints/);
   const start = run.positions('left');
   await page.fill('#plan-speed', '100');

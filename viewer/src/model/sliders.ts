@@ -20,18 +20,25 @@ export function sliders(context: Context, run: Posed, robot: SceneRobot): HTMLEl
       attributes: {type: 'number', step: 'any', 'aria-label': `${name} position`},
     });
     const factor = () => (linear(joint) ? 1 : angle.factor);
+    const text = (value: number) => {
+      const digits = linear(joint) ? 4 : angle.unit === 'deg' ? 1 : 3;
+      return figure(value * factor(), digits).replace('−', '-');
+    };
     input.addEventListener('input', () => run.move(joint, lower + (Number(input.value) / STEPS) * (upper - lower)));
     output.addEventListener('change', () => {
       const value = output.valueAsNumber / factor();
-      if (Number.isFinite(value)) run.move(joint, Math.min(upper, Math.max(lower, value)));
+      if (!Number.isFinite(value)) return;
+      const within = Math.min(upper, Math.max(lower, value));
+      run.move(joint, within);
+      // The field shows what counts, also while it has the focus.
+      if (within !== value) output.value = text(within);
     });
     const show = () => {
       const value = run.position(joint);
       const step = String(Math.round(((value - lower) / (upper - lower || 1)) * STEPS));
       if (input.value !== step && document.activeElement !== input) input.value = step;
-      const digits = linear(joint) ? 4 : angle.unit === 'deg' ? 1 : 3;
-      const text = figure(value * factor(), digits).replace('−', '-');
-      if (document.activeElement !== output && output.value !== text) output.value = text;
+      const written = text(value);
+      if (document.activeElement !== output && output.value !== written) output.value = written;
     };
     return {show, element: el('label', {class: 'slider'}, el('span', {text: name, title: joint}), input, output)};
   });

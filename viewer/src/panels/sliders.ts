@@ -17,6 +17,8 @@ interface Slider {
 export function jointSliders(context: Context, editor: GoalEditor): HTMLElement {
   const element = el('div', {class: 'sliders', id: 'sliders'});
   let sliders: Slider[] = [];
+  // What was entered beyond the limits of a joint.
+  let outside = '';
 
   const limitsOf = (joint: string, index: number): [number, number] => {
     const planned = context.run.planner?.robots.find((robot) => robot.name === editor.robot?.name)?.limits[index];
@@ -39,11 +41,18 @@ export function jointSliders(context: Context, editor: GoalEditor): HTMLElement 
       });
       const slider = {joint, input, output, lower, upper};
       input.addEventListener('input', () => {
+        outside = '';
         editor.setJoint(index, lower + (Number(input.value) / STEPS) * (upper - lower));
       });
       output.addEventListener('change', () => {
         const value = output.valueAsNumber / angle.factor;
-        if (Number.isFinite(value)) editor.setJoint(index, Math.min(upper, Math.max(lower, value)));
+        if (!Number.isFinite(value)) return;
+        const within = Math.min(upper, Math.max(lower, value));
+        // The field shows what counts, also while it has the focus.
+        if (within !== value) output.value = angleText(within).replace('−', '-');
+        editor.setJoint(index, within);
+        outside = within === value ? '' : `${name} reaches ${angleText(lower)} to ${angleText(upper)} only`;
+        show();
       });
       element.append(el('label', {class: 'slider'}, el('span', {text: name, title: joint}), input, output));
       return slider;
@@ -62,10 +71,8 @@ export function jointSliders(context: Context, editor: GoalEditor): HTMLElement 
     });
     setClass(element, 'set', editor.joints !== null);
     const unit = angle.unit === 'deg' ? 'degrees' : 'rad';
-    setText(
-      element.querySelector('.unit-note')!,
-      editor.joints ? `goal in ${unit}` : `present positions in ${unit}: move a slider to set a goal`,
-    );
+    const note = editor.joints ? `goal in ${unit}` : `present positions in ${unit}: move a slider to set a goal`;
+    setText(element.querySelector('.unit-note')!, editor.joints && outside ? `${note}; ${outside}` : note);
   };
   let key = '';
   context.run.onStatus.on(() => {
