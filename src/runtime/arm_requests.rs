@@ -202,7 +202,7 @@ impl Service {
         Ok(Reply::ArmDisable(reply))
     }
 
-    /// Waits until an arm that brakes since `began` is at rest; an error if it still moves after the time that it needs.
+    /// Waits until an arm that brakes since `began` is at rest; an error if it still moves when it has had time enough.
     pub(super) async fn wait_for_rest(&self, id: &str, arm: u16, began: Instant) -> Result<(), RpcError> {
         let device = self.device(arm)?;
         // Without a command the arm is being stopped, or this run did not move it. The motors stay on until that stop.
