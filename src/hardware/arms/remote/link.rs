@@ -9,7 +9,8 @@ use std::time::Duration;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 use rustix::net::{
-    AddressFamily, RecvFlags, SendFlags, SocketAddrUnix, SocketFlags, SocketType, connect, recv, send, socket_with,
+    AddressFamily, RecvFlags, SendFlags, Shutdown, SocketAddrUnix, SocketFlags, SocketType, connect, recv, send,
+    shutdown, socket_with,
 };
 
 use super::address::Address;
@@ -28,6 +29,14 @@ pub struct Link {
     buffer: Vec<u8>,
     filled: Range<usize>,
     reads: u32,
+}
+
+impl Drop for Link {
+    /// Ends the connection now. A process that is being started holds every socket for a moment: the peer would find
+    /// the connection still open, and refuse the next one.
+    fn drop(&mut self) {
+        let _ = shutdown(&self.socket, Shutdown::Both);
+    }
 }
 
 impl Link {
