@@ -8,6 +8,14 @@ use crate::named::named;
 /// The most joints one arm may have. Arrays of this size cross between threads without allocation.
 pub const MAX_DOF: usize = 16;
 
+/// Most characters of a name.
+pub const LONGEST_NAME: usize = 64;
+
+/// Returns whether names of arms, joints, tasks and objects may contain a character. None begins with a dash.
+pub fn may_be_in_name(c: char) -> bool {
+    c.is_ascii_alphanumeric() || matches!(c, '_' | '-')
+}
+
 /// One value per joint of an arm; entries past the arm's dof are zero.
 pub type Joints = [f64; MAX_DOF];
 

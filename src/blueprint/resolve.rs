@@ -19,7 +19,7 @@ use crate::control::task_leader::LeaderJoint;
 use crate::control::task_spec::TaskSpec;
 use crate::hardware::device::Setup;
 use crate::hardware::registry::AdapterSpec;
-use crate::joint::JointLimits;
+use crate::joint::{JointLimits, LONGEST_NAME, may_be_in_name};
 use crate::planning::config::PlannerConfig;
 use crate::robot::Source;
 use crate::yaml::{Diag, Located, Lost, NOWHERE, NodeId, Severity, Tree, quote};
@@ -194,16 +194,18 @@ impl Checker<'_> {
 
     /// Returns whether a name is valid; reports it if not.
     pub(super) fn check_name(&mut self, name: &Located<String>, what: &str) -> bool {
-        let good = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-');
-        let problem = match name.value.chars().find(|c| !good(*c)) {
+        let problem = match name.value.chars().find(|c| !may_be_in_name(*c)) {
             _ if name.is_empty() => format!("the {what} is empty"),
             Some(' ') => format!("the {what} {} contains a space", quote(name)),
             Some(c) => format!("the {what} {} contains {}", quote(name), quote(&c.to_string())),
             None if name.starts_with('-') => format!("the {what} {} starts with a dash", quote(name)),
-            None if name.len() > 64 => format!("the {what} {} is longer than 64 characters", quote(name)),
+            None if name.len() > LONGEST_NAME => {
+                format!("the {what} {} is longer than {LONGEST_NAME} characters", quote(name))
+            }
             None => return true,
         };
-        let instead: String = name.value.chars().map(|c| if good(c) { c } else { '_' }).take(64).collect();
+        let instead: String =
+            name.value.chars().map(|c| if may_be_in_name(c) { c } else { '_' }).take(LONGEST_NAME).collect();
         let instead = instead.trim_start_matches('-');
         let hint = match name.value.is_ascii() && instead.chars().any(|c| c.is_ascii_alphanumeric()) {
             true => format!("use letters, digits, `_` and `-`: {instead}"),

@@ -16,12 +16,13 @@ const FEWEST: usize = 4;
 /// Up to sixteen samples for one tree.
 #[derive(Debug, Clone)]
 pub struct Candidates {
-    /// For each joint its values in all samples; then those of the ends of the edges to them.
-    blocks: Vec<Lanes>,
-    dof: usize,
+    /// For each joint its values in all samples.
+    samples: Vec<Lanes>,
     nearest: Nearest,
     number: usize,
     next: usize,
+    /// Ends of the edges to the samples, a block per joint.
+    ends: Vec<Lanes>,
     /// Nodes that these edges begin at.
     from: [usize; LANES],
     /// Lanes whose ends are known to touch.
@@ -31,12 +32,13 @@ pub struct Candidates {
 impl Candidates {
     /// Creates one without samples.
     pub fn new(dof: usize) -> Self {
+        let none = vec![Lanes::splat(0.0); dof];
         Self {
-            blocks: vec![Lanes::splat(0.0); 2 * dof],
-            dof,
+            samples: none.clone(),
             nearest: Nearest::NONE,
             number: 0,
             next: 0,
+            ends: none,
             from: [0; LANES],
             blocked: 0,
         }
@@ -60,7 +62,7 @@ impl Candidates {
     /// Adds the sample of a lane of a batch.
     pub fn add(&mut self, batch: &Batch, lane: usize, side: usize) {
         let to = self.number;
-        batch.copy_to(lane, to, &mut self.blocks[..self.dof]);
+        batch.copy_to(lane, to, &mut self.samples);
         self.nearest.copy_lane(to, batch.nearest(side), lane);
         self.number += 1;
     }
@@ -70,14 +72,14 @@ impl Candidates {
     pub fn next(&mut self, tree: &Tree) -> Option<(usize, usize, f64)> {
         let lane = self.next;
         self.next += 1;
-        tree.compare(&self.blocks[..self.dof], &mut self.nearest);
+        tree.compare(&self.samples, &mut self.nearest);
         let edge = (lane, self.nearest.node(lane), self.nearest.distance(lane));
         tree.is_in_domain(&self.nearest, lane).then_some(edge)
     }
 
     /// Copies the sample of a lane.
     pub fn sample(&self, lane: usize, q: &mut [f64]) {
-        q.iter_mut().zip(&self.blocks[..self.dof]).for_each(|(q, block)| *q = f64::from(block.0[lane]));
+        q.iter_mut().zip(&self.samples).for_each(|(q, block)| *q = f64::from(block.0[lane]));
     }
 
     /// Checks the ends of the edges to all samples, from the nodes nearest to them; `way`: see [`aim`]. `at` is scratch
@@ -93,9 +95,9 @@ impl Candidates {
             self.from[lane] = node;
             self.sample(sample, at);
             aim(tree.node(node), self.nearest.distance(sample), way, at);
-            self.blocks[self.dof..].iter_mut().zip(&*at).for_each(|(block, q)| block.0[lane] = *q as f32);
+            self.ends.iter_mut().zip(&*at).for_each(|(block, q)| block.0[lane] = *q as f32);
         }
-        self.blocked = check.blocked(&self.blocks[self.dof..], u16::MAX >> (LANES - self.number));
+        self.blocked = check.blocked(&self.ends, u16::MAX >> (LANES - self.number));
     }
 
     /// Returns whether the edge from a node to the sample of a lane is known to touch.

@@ -5,8 +5,7 @@ use std::collections::BTreeMap;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Longest name [bytes].
-const LONGEST_NAME: usize = 64;
+use crate::joint::LONGEST_NAME;
 
 /// A saved pose: joint positions [rad] by arm and joint.
 pub type SavedPose = BTreeMap<String, BTreeMap<String, f64>>;

@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use super::parts_api::LoadReport;
 use super::planner_api::PoseSpec;
+use crate::joint::{LONGEST_NAME, may_be_in_name};
 
 /// Shape of an obstacle. Its frame is at its centre; the axis of a cylinder is z.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -57,9 +58,6 @@ pub struct WorldObject {
     pub held_by: Option<[String; 2]>,
 }
 
-/// Most bytes of a name.
-const LONGEST_NAME: usize = 64;
-
 /// Parameters of `world_add`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(transparent)]
@@ -73,11 +71,11 @@ impl WorldAdd {
             return Err("`held_by` is set by `attach` only".into());
         }
         // As in a blueprint, which a saved world can become a part of.
-        let (name, good) = (&object.name, |c: char| c.is_ascii_alphanumeric() || "_-".contains(c));
+        let name = &object.name;
         if name.is_empty() || name.len() > LONGEST_NAME {
             return Err(format!("name has {} characters, must have 1 to {LONGEST_NAME}", name.chars().count()));
         }
-        if !name.chars().all(good) || name.starts_with('-') {
+        if !name.chars().all(may_be_in_name) || name.starts_with('-') {
             return Err(format!("name is {name:?}, must be of letters a to z, digits, _ and -, and not begin with -"));
         }
         if !(0.0..=1.0).contains(&object.padding) {

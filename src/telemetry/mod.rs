@@ -151,7 +151,7 @@ pub enum Cause {
     StoppedElsewhere,
     /// The arm's stop input is open.
     StopInput,
-    /// Something was in the way of its motion, or that could not be checked, and it could not rest before it.
+    /// Something appeared in the way of its motion, and it could not rest before it.
     WayBlocked,
     /// The run is shutting down.
     Shutdown,
@@ -164,9 +164,9 @@ impl Cause {
         matches!(self, Self::ModeChanged | Self::PowerChanged | Self::StoppedElsewhere)
     }
 
-    /// Returns whether a person has stopped the arm.
-    pub fn is_of_a_person(self) -> bool {
-        matches!(self, Self::Operator | Self::StopInput)
+    /// Returns whether what follows the arm stops with it: a person has stopped it, or something is in its way.
+    pub fn stops_followers(self) -> bool {
+        matches!(self, Self::Operator | Self::StopInput | Self::WayBlocked)
     }
 
     /// Returns its name in rpc and logs.

@@ -366,6 +366,21 @@ fn it_is_started_and_cancelled_and_ends_when_its_arm_or_its_leader_is_stopped() 
 }
 
 #[test]
+fn what_follows_an_arm_whose_way_is_blocked_ends_with_it() {
+    let tasks = vec![task_of(follow(|_| {})), task("t", trajectory(), 0..6, 10)];
+    let mut rig = Rig::new(100.0, vec![arm("leader", 6), arm("follower", 6)], tasks);
+    rig.make_ready();
+    assert_eq!(rig.ask(Request::Start { task: 0 }), Outcome::Accepted);
+    until_in_step(&mut rig);
+    assert_eq!(rig.execute(1, sweep(1, 0..6, 0.0, 0.6, 2.0)), Outcome::Accepted);
+    rig.run_for(1.0);
+    rig.ask(Request::WayBlocked { task: 1, motion: 1, in_time: false });
+    rig.run(2);
+    assert_eq!(rig.phase(LEADER), Phase::Held);
+    assert!(matches!(rig.tasks[0].reason, Reason::ArmHeld(0, Cause::WayBlocked)), "{:?}", rig.tasks[0]);
+}
+
+#[test]
 fn a_leader_that_is_held_for_another_reason_than_a_person_is_still_followed() {
     let mut rig = Rig::new(100.0, vec![arm("leader", 6), arm("follower", 6)], vec![task_of(follow(|_| {}))]);
     rig.make_ready();
@@ -375,7 +390,7 @@ fn a_leader_that_is_held_for_another_reason_than_a_person_is_still_followed() {
     rig.arms[LEADER].blocked = true;
     led(&mut rig, 1.0, |t| [0.4 * t, 0.0, 0.0, 0.0, 0.0, 0.0]);
     assert_eq!(rig.phase(LEADER), Phase::Held);
-    assert!(!rig.samples[LEADER].cause.is_of_a_person(), "{:?}", rig.samples[LEADER].cause);
+    assert!(!rig.samples[LEADER].cause.stops_followers(), "{:?}", rig.samples[LEADER].cause);
     rig.run_for(2.0);
     assert_eq!(rig.tasks[0].state, TaskState::Executing, "{:?}", rig.tasks[0]);
     assert!((rig.arms[FOLLOWER].q[0] - 0.4).abs() < 0.02, "{:?}", rig.arms[FOLLOWER].q);

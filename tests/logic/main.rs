@@ -54,5 +54,6 @@ mod test_support;
 mod tick_rules;
 mod verify;
 mod verify_runs;
+mod way_blocked;
 mod xacro;
 mod yaml_reader;

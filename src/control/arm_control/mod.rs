@@ -175,11 +175,11 @@ impl ArmControl {
         }
     }
 
-    /// Returns why no other arm may follow it: its position is unknown, or a person has stopped it.
+    /// Returns why no other arm may follow it: its position is unknown, or what follows it stops with it.
     pub fn not_to_follow(&self) -> Cause {
         let cause = self.failsafe.cause();
         match self.unknown_position() {
-            Cause::None if self.failsafe.phase() == Phase::Held && cause.is_of_a_person() => cause,
+            Cause::None if self.failsafe.phase() == Phase::Held && cause.stops_followers() => cause,
             unknown => unknown,
         }
     }

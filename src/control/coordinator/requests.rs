@@ -6,7 +6,7 @@ use crate::clock::Mono;
 use crate::control::arm_control::ArmControl;
 use crate::control::request::{Envelope, Motion, Request};
 use crate::control::speed_override::SpeedOverride;
-use crate::control::task::Tick;
+use crate::control::task::{Task, Tick};
 use crate::control::task_body::Target;
 use crate::telemetry::{Cause, Event, LedBy, Outcome, Reason, TaskState};
 
@@ -90,9 +90,12 @@ impl Coordinator {
 
     /// Returns the first active task that moves a joint of an arm.
     fn task_of_arm(&self, arm: u16) -> Option<u16> {
-        let moves = |joint: &u16| self.arm_of.get(usize::from(*joint)) == Some(&arm);
-        let active = self.tasks.iter().position(|task| task.is_active() && task.moving_joints().iter().any(moves));
-        active.map(|task| task as u16)
+        self.tasks.iter().position(|task| task.is_active() && self.moves(task, arm)).map(|task| task as u16)
+    }
+
+    /// Returns whether a task moves a joint of an arm.
+    fn moves(&self, task: &Task, arm: u16) -> bool {
+        task.moving_joints().iter().any(|joint| self.arm_of.get(usize::from(*joint)) == Some(&arm))
     }
 
     /// Ends the motion of an arm's own controller.
@@ -131,11 +134,10 @@ impl Coordinator {
         if in_time {
             return self.cancel(Some(task), Reason::WayBlocked);
         }
-        for k in 0.. {
-            let joint = self.tasks.get(usize::from(task)).and_then(|task| task.moving_joints().get(k).copied());
-            let Some(joint) = joint else { break };
-            if let Some(&arm) = self.arm_of.get(usize::from(joint)) {
-                self.latch(usize::from(arm), Cause::WayBlocked, now);
+        // All of them before the task ends with the first.
+        for arm in 0..self.arms.len() {
+            if self.tasks.get(usize::from(task)).is_some_and(|task| self.moves(task, arm as u16)) {
+                self.latch(arm, Cause::WayBlocked, now);
             }
         }
         self.end_tasks_of_held_arms();

@@ -17,8 +17,8 @@ interface Slider {
 export function jointSliders(context: Context, editor: GoalEditor): HTMLElement {
   const element = el('div', {class: 'sliders', id: 'sliders'});
   let sliders: Slider[] = [];
-  // What was entered beyond the limits of a joint.
-  let outside = '';
+  // The joint for which a position beyond its limits was entered, and the limit that is its goal in place of it.
+  let beyond: {index: number; goal: number; text: string} | null = null;
 
   const limitsOf = (joint: string, index: number): [number, number] => {
     const planned = context.run.planner?.robots.find((robot) => robot.name === editor.robot?.name)?.limits[index];
@@ -29,6 +29,7 @@ export function jointSliders(context: Context, editor: GoalEditor): HTMLElement 
     return [lower, upper];
   };
   const build = () => {
+    beyond = null;
     sliders = editor.names.map((joint, index) => {
       const [lower, upper] = limitsOf(joint, index);
       const name = shortJoint(joint, context.selected);
@@ -41,7 +42,6 @@ export function jointSliders(context: Context, editor: GoalEditor): HTMLElement 
       });
       const slider = {joint, input, output, lower, upper};
       input.addEventListener('input', () => {
-        outside = '';
         editor.setJoint(index, lower + (Number(input.value) / STEPS) * (upper - lower));
       });
       output.addEventListener('change', () => {
@@ -50,8 +50,9 @@ export function jointSliders(context: Context, editor: GoalEditor): HTMLElement 
         const within = Math.min(upper, Math.max(lower, value));
         // The field shows what counts, also while it has the focus.
         if (within !== value) output.value = angleText(within).replace('−', '-');
+        const text = `${name} reaches ${angleText(lower)} to ${angleText(upper)} only`;
+        beyond = within === value ? null : {index, goal: within, text};
         editor.setJoint(index, within);
-        outside = within === value ? '' : `${name} reaches ${angleText(lower)} to ${angleText(upper)} only`;
         show();
       });
       element.append(el('label', {class: 'slider'}, el('span', {text: name, title: joint}), input, output));
@@ -72,7 +73,8 @@ export function jointSliders(context: Context, editor: GoalEditor): HTMLElement 
     setClass(element, 'set', editor.joints !== null);
     const unit = angle.unit === 'deg' ? 'degrees' : 'rad';
     const note = editor.joints ? `goal in ${unit}` : `present positions in ${unit}: move a slider to set a goal`;
-    setText(element.querySelector('.unit-note')!, editor.joints && outside ? `${note}; ${outside}` : note);
+    const reaches = beyond && editor.joints?.[beyond.index] === beyond.goal ? `; ${beyond.text}` : '';
+    setText(element.querySelector('.unit-note')!, note + reaches);
   };
   let key = '';
   context.run.onStatus.on(() => {

@@ -174,7 +174,7 @@ impl FollowTask {
 
     /// Returns the reason to report, or the end of the task without its leader.
     fn await_leader(&mut self, cx: &Context<'_>, view: &JointView) -> Step {
-        if view.fault.is_of_a_person() {
+        if view.fault.stops_followers() {
             // Who stops the leader expects that what follows it stops, too.
             return Step::End(TaskState::Aborted, Reason::ArmHeld(view.arm, view.fault));
         }
@@ -237,7 +237,7 @@ impl TaskBody for FollowTask {
             _ => return Err(Outcome::WrongTask(cx.task)),
         }
         for (joint, view, leader, target) in self.pairs(cx) {
-            if leader.fault.is_of_a_person() {
+            if leader.fault.stops_followers() {
                 return Err(Outcome::ArmLatched(leader.arm, leader.fault));
             }
             if leader.fault != Cause::None {

@@ -1,12 +1,13 @@
 //! The protocol against the sheet, and the adapter against the emulator over real sockets.
 
-use std::io::{BufRead, BufReader, Write};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpListener;
 use std::time::{Duration, Instant};
 
 use super::SPEC;
 use super::address::Address;
 use super::emulator::wire;
+use super::link::Link;
 use super::protocol::{self, Act, Command, Description, Reply, WirePose};
 use super::session::Session;
 use crate::hardware::adapter::{AdapterError, JointReading, ManipulatorAdapter, Stop};
@@ -229,4 +230,19 @@ fn wrong_configurations_are_refused() {
     }
     let modes = [ControlMode::Velocity, ControlMode::Position];
     assert_eq!(super::same_modes(&modes), [ControlMode::Position, ControlMode::Velocity]);
+}
+
+#[test]
+fn a_connection_ends_when_it_is_closed_also_while_another_process_holds_its_socket() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("arm.sock");
+    let listener = std::os::unix::net::UnixListener::bind(&path).unwrap();
+    let address = Address::parse(&format!("unix:{}", path.display())).unwrap();
+    let link = Link::connect(&address, Duration::from_secs(1)).unwrap();
+    let (mut peer, _) = listener.accept().unwrap();
+    // As a process that is being started does until it executes.
+    let _held = link.fd().try_clone_to_owned().unwrap();
+    drop(link);
+    peer.set_read_timeout(Some(Duration::from_secs(2))).unwrap();
+    assert_eq!(peer.read(&mut [0; 8]).map_err(|error| error.kind()), Ok(0));
 }
