@@ -72,11 +72,11 @@ impl WorldAdd {
         }
         // As in a blueprint, which a saved world can become a part of.
         let name = &object.name;
-        if name.is_empty() || name.len() > LONGEST_NAME {
-            return Err(format!("name has {} characters, must have 1 to {LONGEST_NAME}", name.chars().count()));
-        }
         if !name.chars().all(may_be_in_name) || name.starts_with('-') {
             return Err(format!("name is {name:?}, must be of letters a to z, digits, _ and -, and not begin with -"));
+        }
+        if name.is_empty() || name.len() > LONGEST_NAME {
+            return Err(format!("name has {} characters, must have 1 to {LONGEST_NAME}", name.len()));
         }
         if !(0.0..=1.0).contains(&object.padding) {
             return Err(format!("padding is {}, must be within 0–1 m", object.padding));

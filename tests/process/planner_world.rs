@@ -27,6 +27,8 @@ fn the_world_is_changed_while_it_runs() {
     home.write("no.ply", "hello");
     let refused: &[(&str, i32, &[&str])] = &[
         ("world add a/b --sphere 1 --at 0 0 1", 2, &["name is \"a/b\", must be of letters"]),
+        (&format!("world add {} --sphere 1 --at 0 0 1", "a".repeat(65)), 2, &["name has 65 characters"]),
+        ("world add tä --sphere 1 --at 0 0 1", 2, &["name is \"tä\", must be of letters"]),
         ("world add bad --sphere -1 --at 0 0 1", 2, &["a size of the shape is -1, must be above 0"]),
         ("world add bad --box 0 1 1 --at 0 0 1", 2, &["a size of the shape is 0"]),
         ("world add bad --sphere 1 --padding -1 --at 0 0 1", 2, &["padding is -1"]),
