@@ -5,6 +5,7 @@
 //! at both ends (Fritsch and Carlson, "Monotone piecewise cubic interpolation", 1980).
 
 use serde::{Deserialize, Serialize};
+use smallvec::SmallVec;
 
 /// Maximum duration of a trajectory from a client or a file [s].
 pub const MAX_DURATION: f64 = 24.0 * 3600.0;
@@ -22,6 +23,9 @@ pub struct JointTrajectory {
     pub points: Vec<TrajectoryPoint>,
 }
 
+/// One number per joint. Up to eight are kept without an allocation: a plan has hundreds of points.
+pub type JointValues = SmallVec<[f64; 8]>;
+
 /// One point of a trajectory.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -29,13 +33,13 @@ pub struct TrajectoryPoint {
     /// Time since the start of the trajectory [s].
     pub time_from_start: f64,
     /// Joint positions [rad].
-    pub positions: Vec<f64>,
+    pub positions: JointValues,
     /// Joint velocities [rad/s]; empty if not given.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub velocities: Vec<f64>,
+    #[serde(default, skip_serializing_if = "SmallVec::is_empty")]
+    pub velocities: JointValues,
     /// Joint accelerations [rad/s²]; empty if not given.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub accelerations: Vec<f64>,
+    #[serde(default, skip_serializing_if = "SmallVec::is_empty")]
+    pub accelerations: JointValues,
 }
 
 /// Why a trajectory is not valid.
@@ -128,6 +132,10 @@ impl JointTrajectory {
         let joints = self.joint_names.len();
         if values.len() != joints && !(may_be_empty && values.is_empty()) {
             return Err(TrajectoryError::Width { point, what, given: values.len(), joints });
+        }
+        // Without an exit in between, the compiler makes vector instructions of it.
+        if values.iter().fold(true, |finite, v| finite & v.is_finite()) {
+            return Ok(());
         }
         match values.iter().position(|v| !v.is_finite()) {
             Some(j) => Err(TrajectoryError::NotFinite { point, what, joint: self.joint_names[j].clone() }),
@@ -353,7 +361,7 @@ mod tests {
     use super::*;
 
     fn point(t: f64, p: &[f64], v: &[f64], a: &[f64]) -> TrajectoryPoint {
-        TrajectoryPoint { time_from_start: t, positions: p.to_vec(), velocities: v.to_vec(), accelerations: a.to_vec() }
+        TrajectoryPoint { time_from_start: t, positions: p.into(), velocities: v.into(), accelerations: a.into() }
     }
 
     fn trajectory(points: Vec<TrajectoryPoint>) -> JointTrajectory {

@@ -168,9 +168,9 @@ fn motion() -> Spline {
         let (positions, velocities) = swing(time);
         TrajectoryPoint {
             time_from_start: time,
-            positions: positions[..DOF].to_vec(),
-            velocities: velocities[..DOF].to_vec(),
-            accelerations: Vec::new(),
+            positions: positions[..DOF].into(),
+            velocities: velocities[..DOF].into(),
+            accelerations: Default::default(),
         }
     });
     let joint_names = (0..DOF).map(|j| j.to_string()).collect();

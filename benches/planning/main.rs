@@ -166,6 +166,8 @@ impl Row {
 }
 
 fn main() -> ExitCode {
+    // As a run does.
+    dimos::rt::host::keep_freed_memory();
     let mut arguments = Arguments::parse();
     arguments.quick |= std::env::var_os("DIMOS_BENCH_QUICK").is_some_and(|v| v == "1");
     match run(&arguments) {

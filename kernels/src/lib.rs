@@ -15,6 +15,7 @@ pub mod halton;
 pub mod ik;
 pub mod nearest;
 pub mod obstacle;
+pub mod states;
 pub mod support;
 pub mod trig;
 mod width;

@@ -312,9 +312,9 @@ fn timed(client: &mut Client, log: &Path, arm: &str, way: &Retrace, speed: f64) 
 fn request_of(joints: &[String], trajectory: JointTrajectory) -> Trajectory {
     let points = trajectory.points.into_iter().map(|p| Point {
         time_from_start: p.time_from_start,
-        positions: p.positions,
-        velocities: Some(p.velocities),
-        accelerations: Some(p.accelerations).filter(|a| !a.is_empty()),
+        positions: p.positions.into_vec(),
+        velocities: Some(p.velocities.into_vec()),
+        accelerations: Some(p.accelerations.into_vec()).filter(|a| !a.is_empty()),
     });
     Trajectory { joint_names: joints.to_vec(), points: points.collect() }
 }

@@ -7,7 +7,7 @@
 use rsruckig::prelude::{DataArrayOrVec, InputParameter, Ruckig, Synchronization, ThrowErrorHandler, Trajectory};
 
 use crate::joint::JointLimits;
-use crate::trajectory::{JointTrajectory, TrajectoryPoint};
+use crate::trajectory::{JointTrajectory, JointValues, TrajectoryPoint};
 
 /// Points closer together than this are merged [s].
 const SAME_TIME: f64 = 1e-6;
@@ -106,7 +106,7 @@ pub fn point_to_point(
             time_from_start: time,
             positions: p.iter().copied().collect(),
             velocities: v.iter().copied().collect(),
-            accelerations: Vec::new(),
+            accelerations: JointValues::new(),
         });
     }
     // The ends are exactly the requested positions, without rounding errors.
@@ -124,9 +124,9 @@ fn array(n: usize) -> DataArrayOrVec<f64, 0> {
 fn stay(joints: &[String], start: &[f64], target: &[f64]) -> JointTrajectory {
     let point = |time_from_start, positions: &[f64]| TrajectoryPoint {
         time_from_start,
-        positions: positions.to_vec(),
-        velocities: vec![0.0; joints.len()],
-        accelerations: Vec::new(),
+        positions: positions.into(),
+        velocities: JointValues::from_elem(0.0, joints.len()),
+        accelerations: JointValues::new(),
     };
     JointTrajectory { joint_names: joints.to_vec(), points: vec![point(0.0, start), point(SHORTEST, target)] }
 }
@@ -191,7 +191,7 @@ mod tests {
             for speed in [0.1, 0.2, 0.5, 0.8, 1.0] {
                 let target = 2.0 * a * a * a / (j * j);
                 let motion = point_to_point(&names, &[0.0], &[target], &l, speed).unwrap();
-                assert_eq!(motion.points.last().unwrap().positions, [target]);
+                assert_eq!(motion.points.last().unwrap().positions[..], [target]);
                 let e = Spline::new(&motion).unwrap().extremes(0);
                 assert!(e.steepest <= a * speed * speed * (1.0 + 1e-4), "{e:?}");
             }

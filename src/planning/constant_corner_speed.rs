@@ -8,11 +8,11 @@
 //!
 //! Good where lines are long compared to the corners.
 
+use dimos_kernels::Width;
+use dimos_kernels::states::{BLOCK, Block, Blocks, States, Station};
+
 use super::double_s::{LineLimits, State};
-use super::four::Four;
-use super::path::Path;
 use super::topp::JointBound;
-use crate::trajectory::TrajectoryPoint;
 
 /// Minimum time between points [s]: polynomials through closer ones would amplify rounding errors of positions.
 const MIN_INTERVAL: f64 = 1e-4;
@@ -34,11 +34,13 @@ const SHORT: f64 = 7.0;
 /// A path whose corners are blended, and its limits.
 #[derive(Debug)]
 pub(super) struct RoundedPath<'a> {
-    path: &'a Path,
-    /// Numbers per configuration: joints, filled up to whole blocks.
-    stride: usize,
+    path: &'a [Vec<f64>],
+    /// Blocks per configuration.
+    blocks: usize,
+    /// The path's configurations.
+    configurations: Vec<Block>,
     /// Direction of each line, of length 1.
-    directions: Vec<f64>,
+    directions: Vec<Block>,
     lines: Vec<Line>,
     /// One per configuration; those of the ends are rests.
     corners: Vec<Corner>,
@@ -78,85 +80,99 @@ struct Progress {
 }
 
 /// Returns the progress at part `x` (0–1) of a corner.
+#[inline]
 fn progress(jerk: bool, x: f64) -> Progress {
     if !jerk {
         return Progress { area: 0.5 * x * x, part: x, curvature: 1.0 };
     }
-    if x > 0.5 {
-        let Progress { area, part, curvature } = progress(jerk, 1.0 - x);
-        return Progress { area: x - 0.5 + area, part: 1.0 - part, curvature };
-    }
-    // Slope 4.5 over the first third, up to 1.5.
-    let (ramp, flat) = (x.min(1.0 / 3.0), (x - 1.0 / 3.0).max(0.0));
+    // The second half mirrors the first, whose curvature has slope 4.5 over the first third, up to 1.5.
+    let near = x.min(1.0 - x);
+    let (ramp, flat) = (near.min(1.0 / 3.0), (near - 1.0 / 3.0).max(0.0));
     let part = 2.25 * ramp * ramp + 1.5 * flat;
     let area = 0.75 * ramp * ramp * ramp + flat * (0.25 + 0.75 * flat);
+    let (area, part) = if x > 0.5 { (x - 0.5 + area, 1.0 - part) } else { (area, part) };
     Progress { area, part, curvature: 4.5 * ramp }
 }
 
-/// Limits as factors, filled up to whole blocks.
+/// Limits as factors, block by block.
 struct Inverse {
-    velocity: Vec<f64>,
-    acceleration: Vec<f64>,
-    jerk: Vec<f64>,
+    velocity: Vec<Block>,
+    acceleration: Vec<Block>,
+    jerk: Vec<Block>,
 }
 
 impl Inverse {
-    fn of(bounds: &[JointBound], stride: usize) -> Self {
+    fn of(bounds: &[JointBound]) -> Self {
         let list = |of: fn(&JointBound) -> f64| {
-            let mut list: Vec<f64> = bounds.iter().map(|b| (1.0 + ROUNDING) / of(b)).collect();
-            list.resize(stride, 0.0);
-            list
+            let block = |bounds: &[JointBound]| {
+                let mut block = [0.0; BLOCK];
+                block.iter_mut().zip(bounds).for_each(|(inverse, b)| *inverse = (1.0 + ROUNDING) / of(b));
+                block
+            };
+            bounds.chunks(BLOCK).map(block).collect()
         };
         Self { velocity: list(|b| b.velocity), acceleration: list(|b| b.acceleration), jerk: list(|b| b.jerk) }
     }
 }
 
 /// Returns the largest `|value|·factor`.
-fn most(values: &[f64], factors: &[f64]) -> f64 {
-    let used = |first: usize| Four::load(values, first).abs() * Four::load(factors, first);
-    Four::starts(values.len()).fold(Four::default(), |most, first| most.max(used(first))).largest()
+fn most(values: &[Block], factors: &[Block]) -> f64 {
+    let mut most = [0.0_f64; BLOCK];
+    for (values, factors) in values.iter().zip(factors) {
+        for k in 0..BLOCK {
+            let used = values[k].abs() * factors[k];
+            most[k] = if used > most[k] { used } else { most[k] };
+        }
+    }
+    most.into_iter().fold(0.0, |a, b| if b > a { b } else { a })
+}
+
+/// Writes the difference of two directions or configurations; returns its length.
+fn difference(from: &[Block], to: &[Block], out: &mut [Block]) -> f64 {
+    let mut square = [0.0; BLOCK];
+    for ((out, from), to) in out.iter_mut().zip(from).zip(to) {
+        for k in 0..BLOCK {
+            out[k] = to[k] - from[k];
+            square[k] += out[k] * out[k];
+        }
+    }
+    square.into_iter().sum::<f64>().sqrt()
 }
 
 impl<'a> RoundedPath<'a> {
     /// Blends the corners of a path without repeated configurations. At configuration `i` the motion stays within
     /// `deviation[i]` [rad, Euclidean] of the path; it rests where that is 0.
-    pub fn new(path: &'a Path, bounds: &[JointBound], deviation: &[f64]) -> Self {
-        let dof = bounds.len();
-        let stride = dof.next_multiple_of(Four::LEN);
-        let inverse = Inverse::of(bounds, stride);
-        let jerk = inverse.jerk.iter().any(|inverse| *inverse > 0.0);
+    pub fn new(path: &'a [Vec<f64>], bounds: &[JointBound], deviation: &[f64]) -> Self {
+        let blocks = bounds.len().div_ceil(BLOCK);
+        let inverse = Inverse::of(bounds);
+        let jerk = inverse.jerk.as_flattened().iter().any(|inverse| *inverse > 0.0);
         let ramps = bounds.iter().map(|b| b.acceleration / b.jerk).filter(|_| jerk);
         let ramp = ramps.fold(0.0, f64::max);
-        let mut directions = vec![0.0; stride * path.len().saturating_sub(1)];
+        let mut configurations = vec![[0.0; BLOCK]; blocks * path.len()];
+        for (q, blocks) in path.iter().zip(configurations.chunks_exact_mut(blocks)) {
+            blocks.as_flattened_mut()[..q.len()].copy_from_slice(q);
+        }
+        let mut directions = vec![[0.0; BLOCK]; blocks * path.len().saturating_sub(1)];
         let mut lines = Vec::with_capacity(path.len());
-        for (pair, direction) in path.windows(2).zip(directions.chunks_exact_mut(stride)) {
-            let (a, b) = (&pair[0], &pair[1]);
-            let mut square = 0.0;
-            for ((d, a), b) in direction.iter_mut().zip(a).zip(b) {
-                *d = b - a;
-                square += *d * *d;
-            }
-            let length = square.sqrt();
+        for (i, direction) in directions.chunks_exact_mut(blocks).enumerate() {
+            let [from, to] = [i, i + 1].map(|i| &configurations[i * blocks..(i + 1) * blocks]);
+            let length = difference(from, to, direction);
             let inverse_length = 1.0 / length.max(f64::MIN_POSITIVE);
-            direction.iter_mut().for_each(|d| *d *= inverse_length);
+            direction.as_flattened_mut().iter_mut().for_each(|d| *d *= inverse_length);
             let acceleration = 1.0 / most(direction, &inverse.acceleration);
-            let jerk_limit = 1.0 / most(direction, &inverse.jerk);
             // Of joints without jerk limits among others: points of the motion have one acceleration.
-            let jerk_limit = if jerk { jerk_limit.min(acceleration / MIN_RAMP) } else { jerk_limit };
-            let limits = LineLimits { speed: 1.0 / most(direction, &inverse.velocity), acceleration, jerk: jerk_limit };
+            let ramped = |limit: f64| limit.min(acceleration / MIN_RAMP);
+            let jerk = if jerk { ramped(1.0 / most(direction, &inverse.jerk)) } else { f64::INFINITY };
+            let limits = LineLimits { speed: 1.0 / most(direction, &inverse.velocity), acceleration, jerk };
             lines.push(Line { length, limits });
         }
-        let mut rounded =
-            Self { path, stride, directions, lines, corners: vec![Corner::default(); path.len()], jerk, ramp };
-        let mut turn = vec![0.0; stride];
+        let corners = vec![Corner::default(); path.len()];
+        let mut rounded = Self { path, blocks, configurations, directions, lines, corners, jerk, ramp };
+        let mut turn = vec![[0.0; BLOCK]; blocks];
         for i in 1..path.len().saturating_sub(1) {
-            let mut square = 0.0;
-            for ((t, before), after) in turn.iter_mut().zip(rounded.direction(i - 1)).zip(rounded.direction(i)) {
-                *t = after - before;
-                square += *t * *t;
-            }
-            let used = [most(&turn, &inverse.acceleration), most(&turn, &inverse.jerk)];
-            rounded.corners[i] = Corner { half: 0.0, turn: square.sqrt(), used };
+            let length = difference(rounded.direction(i - 1), rounded.direction(i), &mut turn);
+            let used = [most(&turn, &inverse.acceleration), if jerk { most(&turn, &inverse.jerk) } else { 0.0 }];
+            rounded.corners[i] = Corner { half: 0.0, turn: length, used };
             rounded.blend(i, deviation.get(i).copied().unwrap_or(0.0));
         }
         rounded
@@ -172,8 +188,8 @@ impl<'a> RoundedPath<'a> {
         corner.half = if corner.turn > REVERSAL || deviation <= 0.0 { 0.0 } else { length.min(room) };
     }
 
-    fn direction(&self, line: usize) -> &[f64] {
-        &self.directions[line * self.stride..(line + 1) * self.stride]
+    fn direction(&self, line: usize) -> &[Block] {
+        &self.directions[line * self.blocks..(line + 1) * self.blocks]
     }
 
     /// Returns the length of a line between its corners [rad].
@@ -200,29 +216,38 @@ impl<'a> RoundedPath<'a> {
         }
     }
 
-    /// Writes the configuration at part `x` (0–1) of corner `i`.
-    pub fn in_corner(&self, i: usize, x: f64, out: &mut [f64]) {
-        let half = self.corners[i].half;
-        let area = 2.0 * half * progress(self.jerk, x).area;
-        let along = 2.0 * half * x - half - area;
-        let (before, after) = (self.direction(i - 1), self.direction(i));
-        for ((q, at), (before, after)) in out.iter_mut().zip(&self.path[i]).zip(before.iter().zip(after)) {
-            *q = at + before * along + after * area;
-        }
+    fn as_blocks(&self) -> Blocks<'_> {
+        let (configurations, directions) = (&self.configurations, &self.directions);
+        Blocks { configurations, directions, each: self.blocks }
+    }
+
+    /// Writes the ends of the straight pieces that follow corner `i` within `sagitta` [rad], in blocks; nothing for a
+    /// rest. Returns the number of blocks of each.
+    pub fn corner(&self, i: usize, sagitta: f64, factors: &mut Vec<[f64; 2]>, out: &mut Vec<Block>) -> usize {
+        let pieces = self.pieces(i, sagitta);
+        let (length, step, jerk) = (2.0 * self.corners[i].half, 1.0 / pieces.max(1) as f64, self.jerk);
+        let ends = if pieces > 0 { pieces + 1 } else { 0 };
+        factors.clear();
+        factors.extend((0..ends).map(|k| {
+            let x = k as f64 * step;
+            let after = length * progress(jerk, x).area;
+            [length * (x - 0.5) - after, after]
+        }));
+        self.as_blocks().places(i, factors, out, Width::widest());
+        self.blocks
     }
 
     /// Writes the ends of the part of a line between its corners.
     pub fn ends_of_line(&self, line: usize, from: &mut [f64], to: &mut [f64]) {
         let [first, last] = [line, line + 1].map(|i| self.corners[i].half);
-        for ((from, to), ((a, b), d)) in
-            from.iter_mut().zip(to).zip(self.path[line].iter().zip(&self.path[line + 1]).zip(self.direction(line)))
-        {
+        let ends = self.path[line].iter().zip(&self.path[line + 1]).zip(self.direction(line).as_flattened());
+        for ((from, to), ((a, b), d)) in from.iter_mut().zip(to).zip(ends) {
             (*from, *to) = (a + d * first, b - d * last);
         }
     }
 
     /// Returns the number of straight pieces that follow corner `i` within `sagitta` [rad]; 0 for a rest.
-    pub fn pieces(&self, i: usize, sagitta: f64) -> usize {
+    fn pieces(&self, i: usize, sagitta: f64) -> usize {
         let corner = &self.corners[i];
         let bend = 2.0 * corner.turn * corner.half * if self.jerk { 1.5 } else { 1.0 };
         if corner.half > 0.0 { (bend / (8.0 * sagitta)).sqrt().ceil().max(2.0) as usize } else { 0 }
@@ -271,75 +296,68 @@ impl<'a> RoundedPath<'a> {
     }
 
     /// Returns the motion at these speeds, from rest to rest.
-    pub fn motion(&self, speeds: &[f64]) -> Vec<TrajectoryPoint> {
+    pub fn motion(&self, speeds: &[f64]) -> States {
+        let stations = self.stations(speeds);
+        let mut states = States::new(self.path[0].len(), stations.len());
+        states.extend(&stations, self.as_blocks(), Width::widest());
+        states
+    }
+
+    /// Returns where the jerk changes at these speeds.
+    fn stations(&self, speeds: &[f64]) -> Vec<Station> {
         let last = self.path.len() - 1;
-        let mut points: Vec<TrajectoryPoint> = Vec::with_capacity(if self.jerk { 11 } else { 5 } * self.path.len());
+        let mut stations: Vec<Station> = Vec::with_capacity(if self.jerk { 11 } else { 5 } * self.path.len());
         let mut start = 0.0;
-        points.push(self.point(0, 0.0, &State::default()));
+        stations.push(Station::default());
         for line in 0..last {
             let (from, to) = (speeds[line], speeds[line + 1]);
             let begin = self.corners[line].half;
             let mut end = State { speed: from, ..State::default() };
             let length = self.straight(line);
             if length > 0.0 {
-                let mut before = points.last().map_or(0.0, |p| p.time_from_start);
+                let mut before = stations.last().map_or(0.0, |s| s.time);
                 self.lines[line].limits.travel(from, to, length, |state| {
                     if start + state.time - before >= MIN_INTERVAL {
-                        points.push(self.point(line, begin + state.at, &State { time: start + state.time, ..state }));
+                        stations.push(on_line(line, begin, start, state));
                         before = start + state.time;
                     }
                     end = state;
                 });
-                start += end.time;
                 // The end of the line in place of a point just before it.
-                if before < start && points.len() > 1 {
-                    points.pop();
-                    points.push(self.point(line, begin + length, &State { time: start, acceleration: 0.0, ..end }));
+                if before < start + end.time && stations.len() > 1 {
+                    stations.pop();
+                    stations.push(on_line(line, begin, start, State { at: length, acceleration: 0.0, ..end }));
                 }
+                start += end.time;
             }
             let half = self.corners[line + 1].half;
             if half > 0.0 {
                 let time = 2.0 * half / to;
                 if self.jerk && time > 3.0 * MIN_INTERVAL {
-                    points.extend(
-                        [1.0, 2.0].map(|k| self.point_in_corner(line + 1, k / 3.0, start + time * k / 3.0, to)),
-                    );
+                    for x in [1.0 / 3.0, 2.0 / 3.0] {
+                        stations.push(self.in_third(line + 1, x, start + time * x, to));
+                    }
                 }
                 start += time;
-                points.push(self.point(line + 1, half, &State { time: start, speed: to, ..State::default() }));
+                let after = [half, to, 0.0];
+                stations.push(Station { time: start, at: line + 1, before: [0.0; 3], after });
             }
         }
-        points
+        stations
     }
 
-    /// Returns the point on a line at `at` from its first configuration.
-    fn point(&self, line: usize, at: f64, state: &State) -> TrajectoryPoint {
-        let dof = self.path[0].len();
-        let (line, at) = if line + 1 < self.path.len() { (line, at) } else { (line - 1, self.lines[line - 1].length) };
-        let (q, direction) = (&self.path[line], &self.direction(line)[..dof]);
-        TrajectoryPoint {
-            time_from_start: state.time,
-            positions: q.iter().zip(direction).map(|(q, d)| q + d * at).collect(),
-            velocities: direction.iter().map(|d| d * state.speed).collect(),
-            accelerations: match self.jerk {
-                true => direction.iter().map(|d| d * state.acceleration).collect(),
-                false => Vec::new(),
-            },
-        }
-    }
-    /// Returns the point at part `x` (0–1) of a corner that is passed at constant speed.
-    fn point_in_corner(&self, i: usize, x: f64, time: f64, speed: f64) -> TrajectoryPoint {
-        let (q, dof, half) = (&self.path[i], self.path[i].len(), self.corners[i].half);
-        let (before, after) = (&self.direction(i - 1)[..dof], &self.direction(i)[..dof]);
+    /// Returns the station at part `x` (0–1) of a corner that is passed at constant speed.
+    fn in_third(&self, i: usize, x: f64, time: f64, speed: f64) -> Station {
+        let half = self.corners[i].half;
         let Progress { area, part, curvature } = progress(self.jerk, x);
-        let (along, area, square) =
-            (half * (2.0 * x - 1.0), 2.0 * half * area, curvature * speed * speed / (2.0 * half));
-        let both = || before.iter().zip(after);
-        TrajectoryPoint {
-            time_from_start: time,
-            positions: q.iter().zip(both()).map(|(q, (a, b))| q + a * along + (b - a) * area).collect(),
-            velocities: both().map(|(a, b)| (a + (b - a) * part) * speed).collect(),
-            accelerations: both().map(|(a, b)| (b - a) * square).collect(),
-        }
+        let (along, area, bend) = (half * (2.0 * x - 1.0), 2.0 * half * area, curvature * speed * speed / (2.0 * half));
+        let (before, after) = ([along - area, (1.0 - part) * speed, -bend], [area, part * speed, bend]);
+        Station { time, at: i, before, after }
     }
+}
+
+/// Returns the station of a state on a line that begins at time `start` and `begin` from its first configuration.
+fn on_line(line: usize, begin: f64, start: f64, state: State) -> Station {
+    let after = [begin + state.at, state.speed, state.acceleration];
+    Station { time: start + state.time, at: line, before: [0.0; 3], after }
 }

@@ -9,9 +9,9 @@
 //! slowest, in a corner: pieces that exceed the limits get a lower pace, in a few rounds; any remaining excess slows
 //! down the whole motion.
 
-use crate::trajectory::TrajectoryPoint;
+use dimos_kernels::states::States;
 
-use super::blend::{Curve, Piece};
+use super::blend::{Curve, Jet, Piece};
 use super::topp::{GridPoint, JointBound, Pace, speed_grid};
 use super::verify::Excess;
 
@@ -23,7 +23,7 @@ const CORRECTION_RATIO: f64 = 1.01;
 const MIN_KNOT_INTERVAL: f64 = 1e-4;
 
 /// Returns the knots of a curve's motion, to be joined by quintics.
-pub(super) fn averaged(curve: &Curve, bounds: &[JointBound]) -> Vec<TrajectoryPoint> {
+pub(super) fn averaged(curve: &Curve, bounds: &[JointBound]) -> States {
     let gauge = Gauge::new(curve, bounds);
     // Time from zero to full acceleration.
     let window = bounds.iter().filter(|b| b.jerk.is_finite()).map(|b| b.acceleration / b.jerk).fold(1e-6, f64::max);
@@ -93,39 +93,33 @@ impl Motion {
     }
 
     /// Returns the average at the ends of its legs.
-    fn knots(&self, curve: &Curve) -> Vec<TrajectoryPoint> {
-        let mut points: Vec<TrajectoryPoint> = Vec::with_capacity(2 * self.phases.len() + curve.len());
-        points.push(point(curve, &Knot::default(), 0.0));
+    fn knots(&self, curve: &Curve) -> States {
+        let joints = curve.first().map_or(0, |piece| piece.start.len());
+        let mut states = States::new(joints, 2 * self.phases.len() + curve.len());
+        add(&mut states, curve, &Knot::default(), 0.0);
         let (mut last, mut end) = (0.0, None);
         for leg in self.walk(curve) {
             if leg.time - last >= MIN_KNOT_INTERVAL {
-                points.push(point(curve, &leg.to, leg.time));
+                add(&mut states, curve, &leg.to, leg.time);
                 last = leg.time;
             }
             end = Some(leg);
         }
         // The last knot is the end, at rest.
         if let Some(leg) = end {
-            if points.len() > 1 {
-                points.pop();
+            if states.times().len() > 1 {
+                states.pop();
             }
-            points.push(point(curve, &Knot { v: 0.0, a: 0.0, ..leg.to }, leg.time));
+            add(&mut states, curve, &Knot { v: 0.0, a: 0.0, ..leg.to }, leg.time);
         }
-        points
+        states
     }
 }
 
-fn point(curve: &Curve, knot: &Knot, time: f64) -> TrajectoryPoint {
-    let piece = &curve[knot.piece];
-    let empty = || Vec::with_capacity(piece.start.len());
-    let mut point =
-        TrajectoryPoint { time_from_start: time, positions: empty(), velocities: empty(), accelerations: empty() };
-    for jet in piece.jets(knot.at) {
-        point.positions.push(jet.q);
-        point.velocities.push(jet.d1 * knot.v);
-        point.accelerations.push(jet.d2 * knot.v * knot.v + jet.d1 * knot.a);
-    }
-    point
+/// Adds the state at a knot.
+fn add(states: &mut States, curve: &Curve, knot: &Knot, time: f64) {
+    let state = |jet: Jet| [jet.q, jet.d1 * knot.v, jet.d2 * knot.v * knot.v + jet.d1 * knot.a];
+    states.push(time, curve[knot.piece].jets(knot.at).map(state));
 }
 
 /// A phase of constant acceleration of the parameter.

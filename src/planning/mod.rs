@@ -16,7 +16,6 @@ mod constant_corner_speed;
 mod double_s;
 pub mod edges;
 pub mod enclosure;
-mod four;
 mod goals;
 pub mod ignored_pairs;
 pub mod ik;

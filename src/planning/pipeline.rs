@@ -24,7 +24,7 @@ use crate::collision::report::Pair;
 use crate::collision::world::{Robot, World};
 use crate::collision::{CollisionChecker, Stop};
 use crate::robot::model::Limits;
-use crate::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
+use crate::trajectory::{JointTrajectory, JointValues, Spline, TrajectoryPoint};
 
 /// A path shorter than this needs no motion [rad].
 const GOAL_TOLERANCE: f64 = 1e-6;
@@ -327,10 +327,10 @@ pub(super) fn failure_for(stage: &Stage<'_>, error: &PlanError) -> PlanFailure {
 
 /// Returns the trajectory of robots that are already at the goal: a short rest.
 fn rest(joints: &[String], path: &Path) -> JointTrajectory {
-    let still = vec![0.0; joints.len()];
+    let still = JointValues::from_elem(0.0, joints.len());
     let at = |time| TrajectoryPoint {
         time_from_start: time,
-        positions: path.first().cloned().unwrap_or_default(),
+        positions: path.first().map(|q| JointValues::from_slice(q)).unwrap_or_default(),
         velocities: still.clone(),
         accelerations: still.clone(),
     };

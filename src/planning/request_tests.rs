@@ -227,7 +227,7 @@ fn a_led_path_is_followed_within_its_tolerance_after_a_planned_approach() {
         }
     }
     assert!(row > record.len() - 10, "it ended at row {row}");
-    let rest = |q: &Vec<f64>| q.iter().zip(&record[0]).all(|(a, b)| (a - b).abs() < 1e-3);
+    let rest = |q: &[f64]| q.iter().zip(&record[0]).all(|(a, b)| (a - b).abs() < 1e-3);
     let first = motion.trajectory.points.iter().find(|p| rest(&p.positions)).unwrap();
     assert!(first.velocities.iter().all(|v| v.abs() < 1e-6), "it rests where the path begins: {first:?}");
     // The hand took 12 s.

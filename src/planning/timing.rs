@@ -5,14 +5,18 @@
 //! ([`topp`](super::topp)). Then, without jerk limits, the points are the grid points of the speed profile. With jerk
 //! limits the parameter's motion `s(t)` is averaged over a time window, which keeps the curve and limits the jerk.
 
+use std::borrow::Cow;
+
+use dimos_kernels::states::{Block, States};
+
 use crate::joint::DEFAULT_ACCELERATION;
 use crate::robot::model::Limits;
-use crate::trajectory::{JointTrajectory, TrajectoryError, TrajectoryPoint};
+use crate::trajectory::{JointTrajectory, JointValues, TrajectoryError, TrajectoryPoint};
 
 use super::blend::{Curve, curves};
 use super::constant_corner_speed::RoundedPath;
 use super::jerk_limit::averaged;
-use super::path::{Path, tidy_indices};
+use super::path::tidy_indices;
 use super::topp::{GridPoint, JointBound, parameterize};
 use super::verify::{Excess, excess};
 
@@ -120,7 +124,8 @@ pub fn time_within(
         return Err(TimingError::Speed(speed));
     }
     let kept = tidy_indices(path);
-    let path: Path = kept.iter().map(|i| path[*i].clone()).collect();
+    let path: Cow<'_, [Vec<f64>]> =
+        if kept.len() == path.len() { path.into() } else { kept.iter().map(|i| path[*i].clone()).collect() };
     if path.len() < 2 || bounds.len() != dof {
         return Err(TimingError::NoMotion);
     }
@@ -136,15 +141,15 @@ pub fn time_within(
 
 /// Returns whether a motion that changes its speed in corners is quicker than one that does not. It takes ten times as
 /// long to compute, so it is not where it would gain little.
-fn variable_is_quicker(rounded: &RoundedPath<'_>, path: &Path, bounds: &[JointBound], deviation: &[f64]) -> bool {
+fn variable_is_quicker(rounded: &RoundedPath<'_>, path: &[Vec<f64>], bounds: &[JointBound], deviation: &[f64]) -> bool {
     let speeds = rounded.speeds();
     if rounded.suits(&speeds) {
         return false;
     }
     let duration = |curve: &Curve| {
-        let mut points = at_variable_speed(curve, bounds);
-        slow_down(&mut points, bounds);
-        points.last().map_or(0.0, |p| p.time_from_start)
+        let mut states = at_variable_speed(curve, bounds);
+        slow_down(&mut states, bounds);
+        states.duration()
     };
     curves(path, deviation).iter().map(duration).sum::<f64>() < rounded.duration(&speeds)
 }
@@ -152,51 +157,42 @@ fn variable_is_quicker(rounded: &RoundedPath<'_>, path: &Path, bounds: &[JointBo
 /// Times a path whose corners are passed at constant speed.
 fn at_constant_corner_speed(
     names: &[String],
-    (path, mut rounded): (&Path, RoundedPath<'_>),
+    (path, mut rounded): (&[Vec<f64>], RoundedPath<'_>),
     bounds: &[JointBound],
     mut deviation: Vec<f64>,
     speed: f64,
     free: &mut impl FnMut(&[f64], &[f64]) -> bool,
 ) -> Result<Timed, TimingError> {
     let (mut from, mut to) = (path[0].clone(), path[0].clone());
+    let (mut factors, mut places) = (Vec::new(), Vec::new());
     for (i, deviation) in deviation.iter_mut().enumerate().take(path.len() - 1).skip(1) {
-        while !corner_is_free(&rounded, i, (&mut from, &mut to), free) {
+        // In pieces that are as straight as the motion is checked elsewhere.
+        let mut is_free = |rounded: &RoundedPath<'_>| {
+            let each = rounded.corner(i, SAGITTA, &mut factors, &mut places);
+            let place = |k: usize| &places[k * each..(k + 1) * each].as_flattened()[..names.len()];
+            (1..places.len() / each).all(|k| free(place(k - 1), place(k)))
+        };
+        while !is_free(&rounded) {
             *deviation = if *deviation > 2e-3 { *deviation * 0.4 } else { 0.0 };
             rounded.blend(i, *deviation);
         }
     }
-    let mut points = rounded.motion(&rounded.speeds());
-    let excess = slow_down(&mut points, bounds);
+    let mut states = rounded.motion(&rounded.speeds());
+    let excess = slow_down(&mut states, bounds);
     // What is between the corners was part of the path, and is all that the motion passes besides.
     for i in 0..path.len() - 1 {
         rounded.ends_of_line(i, &mut from, &mut to);
         if !free(&from, &to) {
-            return Err(TimingError::NotFree(0.0, points.last().map_or(0.0, |p| p.time_from_start)));
+            return Err(TimingError::NotFree(0.0, states.duration()));
         }
     }
-    finished(names, path, (points, excess), deviation, speed)
-}
-
-/// Returns whether a corner is free, in pieces that are as straight as the motion is checked elsewhere.
-fn corner_is_free(
-    rounded: &RoundedPath<'_>,
-    i: usize,
-    (from, to): (&mut Vec<f64>, &mut Vec<f64>),
-    free: &mut impl FnMut(&[f64], &[f64]) -> bool,
-) -> bool {
-    let pieces = rounded.pieces(i, SAGITTA);
-    rounded.in_corner(i, 0.0, to);
-    (1..=pieces).all(|k| {
-        std::mem::swap(from, to);
-        rounded.in_corner(i, k as f64 / pieces as f64, to);
-        free(from, to)
-    })
+    finished(names, path, bounds, (states, excess), deviation, speed)
 }
 
 /// Times a path by time-optimal path parameterization, with jerk limits by averaging.
 fn at_variable_corner_speed(
     names: &[String],
-    path: &Path,
+    path: &[Vec<f64>],
     bounds: &[JointBound],
     mut deviation: Vec<f64>,
     speed: f64,
@@ -214,7 +210,11 @@ fn at_variable_corner_speed(
 }
 
 /// Returns the curves with blended corners, sharpened until they are free.
-fn round_corners(path: &Path, deviation: &mut [f64], free: &mut impl FnMut(&[f64], &[f64]) -> bool) -> Vec<Curve> {
+fn round_corners(
+    path: &[Vec<f64>],
+    deviation: &mut [f64],
+    free: &mut impl FnMut(&[f64], &[f64]) -> bool,
+) -> Vec<Curve> {
     let (mut from, mut to) = (path[0].clone(), path[0].clone());
     let mut rounded = curves(path, deviation);
     for _ in 0..8 {
@@ -243,98 +243,105 @@ fn round_corners(path: &Path, deviation: &mut [f64], free: &mut impl FnMut(&[f64
 
 fn emit(
     names: &[String],
-    path: &Path,
+    path: &[Vec<f64>],
     bounds: &[JointBound],
     curves: &[Curve],
     deviation: Vec<f64>,
     speed: f64,
 ) -> Result<Timed, TimingError> {
-    let mut points: Vec<TrajectoryPoint> = Vec::new();
+    let mut states = States::new(names.len(), 0);
     let mut excess = Excess::default();
     for curve in curves {
         let mut own = at_variable_speed(curve, bounds);
         excess = excess.max(slow_down(&mut own, bounds));
-        let start = points.last().map_or(0.0, |p| p.time_from_start);
-        let skip = usize::from(!points.is_empty());
-        points.extend(own.into_iter().skip(skip).map(|mut p| {
-            p.time_from_start += start;
-            p
-        }));
+        let start = states.duration();
+        states.append(&own, start);
     }
-    finished(names, path, (points, excess), deviation, speed)
+    finished(names, path, bounds, (states, excess), deviation, speed)
 }
 
-/// Returns the points of the motion along a curve, before it is slowed down to what its spline needs.
-fn at_variable_speed(curve: &Curve, bounds: &[JointBound]) -> Vec<TrajectoryPoint> {
-    let jerky = bounds.iter().any(|b| b.jerk.is_finite());
-    if jerky { averaged(curve, bounds) } else { on_grid(curve, &parameterize(curve, bounds)) }
+/// Returns whether the spline through states is quintic: with jerk limits accelerations have no jumps.
+fn is_quintic(bounds: &[JointBound]) -> bool {
+    bounds.iter().any(|b| b.jerk.is_finite())
 }
 
-/// Returns a trajectory of points that keep the bounds, at a part of its speed.
+/// Returns the states of the motion along a curve, before it is slowed down to what its spline needs.
+fn at_variable_speed(curve: &Curve, bounds: &[JointBound]) -> States {
+    if is_quintic(bounds) { averaged(curve, bounds) } else { on_grid(curve, &parameterize(curve, bounds)) }
+}
+
+/// Returns the trajectory of states that keep the bounds, at a part of its speed.
 fn finished(
     names: &[String],
-    path: &Path,
-    (mut points, excess): (Vec<TrajectoryPoint>, Excess),
+    path: &[Vec<f64>],
+    bounds: &[JointBound],
+    (mut states, excess): (States, Excess),
     deviation: Vec<f64>,
     speed: f64,
 ) -> Result<Timed, TimingError> {
     // The ends are exactly those of the path.
-    if let (Some(first), Some(last)) = (points.first_mut(), path.first()) {
-        first.positions.clone_from(last);
+    if let Some(last) = states.times().len().checked_sub(1) {
+        for (state, q) in [(0, &path[0]), (last, &path[path.len() - 1])] {
+            states.values_mut(state, 0).copy_from_slice(q);
+        }
     }
-    if let (Some(end), Some(goal)) = (points.last_mut(), path.last()) {
-        end.positions.clone_from(goal);
-    }
-    stretch(&mut points, 1.0 / speed);
+    states.stretch(1.0 / speed);
+    let quintic = is_quintic(bounds);
+    let point = |time_from_start: f64, [positions, velocities, accelerations]: [JointValues; 3]| TrajectoryPoint {
+        time_from_start,
+        positions,
+        velocities,
+        accelerations: if quintic { accelerations } else { JointValues::new() },
+    };
+    let times = states.times().iter();
+    let points = match states.in_one_block() {
+        // Without a copy of a copy.
+        Some(rows) => {
+            let list = |row: &Block| JointValues::from_buf_and_len(*row, names.len());
+            times.zip(rows).map(|(time, [p, v, a])| point(*time, [list(p), list(v), list(a)])).collect()
+        }
+        None => {
+            let list = |state, which| JointValues::from_slice(states.values(state, which));
+            times.enumerate().map(|(i, time)| point(*time, [list(i, 0), list(i, 1), list(i, 2)])).collect()
+        }
+    };
     let trajectory = JointTrajectory { joint_names: names.to_vec(), points };
-    trajectory.validate()?;
+    // What is wrong is said by the trajectory; that nothing is, is seen faster here.
+    if !states.are_finite_and_in_order() {
+        trajectory.validate()?;
+    }
     let excess = excess.stretched(1.0 / speed);
-    let duration = trajectory.points.last().map_or(0.0, |p| p.time_from_start);
-    Ok(Timed { trajectory, duration, deviation, excess })
+    Ok(Timed { trajectory, duration: states.duration(), deviation, excess })
 }
 
 /// Returns the grid points themselves.
-fn on_grid(curve: &Curve, grid: &[GridPoint]) -> Vec<TrajectoryPoint> {
-    let mut points: Vec<TrajectoryPoint> = Vec::with_capacity(grid.len());
+fn on_grid(curve: &Curve, grid: &[GridPoint]) -> States {
+    let joints = curve.first().map_or(0, |piece| piece.start.len());
+    let mut states = States::new(joints, grid.len());
     let last = grid.len().saturating_sub(1);
     for (i, g) in grid.iter().enumerate() {
         // Points closer than this add no information.
-        let near = |p: &TrajectoryPoint| g.time - p.time_from_start < 2e-4;
-        if points.len() > 1 && points.last().is_some_and(near) {
+        if states.times().len() > 1 && g.time - states.duration() < 2e-4 {
             if i < last {
                 continue;
             }
-            points.pop();
+            states.pop();
         }
-        let (piece, speed) = (&curve[g.piece], g.x.sqrt());
-        let (positions, velocities) = piece.jets(g.at).map(|jet| (jet.q, jet.d1 * speed)).unzip();
-        points.push(TrajectoryPoint { time_from_start: g.time, positions, velocities, accelerations: Vec::new() });
+        let speed = g.x.sqrt();
+        states.push(g.time, curve[g.piece].jets(g.at).map(|jet| [jet.q, jet.d1 * speed, 0.0]));
     }
-    points
+    states
 }
 
-/// Stretches points in time until their spline keeps all bounds; returns the use of the limits afterwards.
-fn slow_down(points: &mut [TrajectoryPoint], bounds: &[JointBound]) -> Excess {
-    let found = excess(points, bounds);
+/// Stretches a motion in time until its spline keeps all bounds; returns the use of the limits afterwards.
+fn slow_down(states: &mut States, bounds: &[JointBound]) -> Excess {
+    let found = excess(states, bounds, is_quintic(bounds));
     let factor = match found.slower() {
         slower if slower > 1.0 => slower * (1.0 + 1e-9),
         _ => 1.0,
     };
-    stretch(points, factor);
+    states.stretch(factor);
     found.stretched(factor)
-}
-
-/// Stretches the same motion in time by a factor.
-fn stretch(points: &mut [TrajectoryPoint], factor: f64) {
-    if factor == 1.0 {
-        return;
-    }
-    let inverse = 1.0 / factor;
-    for p in points {
-        p.time_from_start *= factor;
-        p.velocities.iter_mut().for_each(|v| *v *= inverse);
-        p.accelerations.iter_mut().for_each(|a| *a *= inverse * inverse);
-    }
 }
 
 /// Checks the motion as it will be sampled: from each point to the middle of its segment, and on to the next.

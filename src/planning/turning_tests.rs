@@ -144,7 +144,7 @@ fn no_jumps(found: &Plan) {
     let limits = bounds(&names, Kinematics::whole(&model(ENDLESS)).unwrap().limits()).unwrap();
     let timed = time(&names, &found.path, &limits, &TimingSettings::default(), |_, _| true).unwrap();
     let points = &timed.trajectory.points;
-    assert_eq!(points[0].positions, found.path[0]);
+    assert_eq!(points[0].positions[..], found.path[0]);
     for pair in points.windows(2) {
         let most = pair[1].time_from_start - pair[0].time_from_start + 1e-6;
         assert!(pair[0].positions.iter().zip(&pair[1].positions).all(|(a, b)| (b - a).abs() <= most), "{pair:?}");

@@ -1,8 +1,8 @@
 //! Measures how much of each limit a trajectory uses, on the curve between its points.
 
-use crate::trajectory::TrajectoryPoint;
+use dimos_kernels::Width;
+use dimos_kernels::states::{BLOCK, States};
 
-use super::four::Four;
 use super::topp::JointBound;
 
 /// The largest part of each limit that a trajectory uses: above 1 it exceeds the limit.
@@ -44,41 +44,46 @@ impl Excess {
     }
 }
 
-/// Largest effect of rounding of positions on the factors of a quintic's speed: thirty times four units.
-const POSITION_ROUNDING: f64 = 120.0 * f64::EPSILON;
-/// Measures the curve through points with velocities and, all or none, accelerations: cubic or quintic, as in `Spline`.
-/// The values are upper bounds, exact where the acceleration is constant, or linear without a change of its sign. If
-/// these exceed a limit, they are the extremes of cubics, and quintics are sampled in quarters of each segment.
-pub fn excess(points: &[TrajectoryPoint], bounds: &[JointBound]) -> Excess {
-    let quintic = points.iter().all(|p| !p.accelerations.is_empty());
-    let most = upper_bounds(points, bounds, quintic);
-    if most.slower() <= 1.0 {
+/// Bounds that exceed a limit by no more than this part need no closer look: they may be rounding errors, and a motion
+/// that is slowed down by as little is hardly slower.
+const NEGLIGIBLE: f64 = 1e-6;
+
+/// Measures the curve through states: quintic, or cubic, as in `Spline`. The values are upper bounds, exact where the
+/// acceleration is constant, or linear without a change of its sign ([`States::most`]). If these exceed a limit, they
+/// are the extremes of cubics, and quintics are sampled in quarters of each segment.
+pub fn excess(states: &States, bounds: &[JointBound], quintic: bool) -> Excess {
+    let most = upper_bounds(states, bounds, quintic);
+    if most.slower() <= 1.0 + NEGLIGIBLE {
         return most;
     }
-    // Maximum speed, acceleration and jerk per joint.
-    let mut most = vec![[0.0; 3]; bounds.len()];
-    for pair in points.windows(2) {
-        let (a, b) = (&pair[0], &pair[1]);
-        let h = b.time_from_start - a.time_from_start;
-        let inverse = 1.0 / h;
-        for (j, most) in most.iter_mut().enumerate() {
-            let d = (b.positions[j] - a.positions[j]) * inverse;
-            let speeds = (a.velocities[j], b.velocities[j]);
+    let mut all = Excess::default();
+    for (j, bound) in bounds.iter().enumerate() {
+        let mut most = [0.0; 3];
+        for (i, times) in states.times().windows(2).enumerate() {
+            let h = times[1] - times[0];
+            let inverse = 1.0 / h;
+            let [positions, speeds, accelerations] =
+                [0, 1, 2].map(|which| [states.values(i, which)[j], states.values(i + 1, which)[j]]);
+            let d = (positions[1] - positions[0]) * inverse;
             let used = if quintic {
-                of_quintic(d, speeds, (a.accelerations[j], b.accelerations[j]), h, inverse)
+                of_quintic(d, speeds, accelerations, h, inverse)
             } else {
                 of_cubic(d, speeds, h, inverse)
             };
             most.iter_mut().zip(used).for_each(|(m, u)| *m = larger(*m, u));
         }
+        all = all.max(part_of(most, bound));
     }
-    most.iter().zip(bounds).fold(Excess::default(), |all, (&[velocity, acceleration, jerk], bound)| {
-        all.max(Excess {
-            velocity: velocity / bound.velocity,
-            acceleration: acceleration / bound.acceleration,
-            jerk: jerk / bound.jerk,
-        })
-    })
+    all
+}
+
+/// Returns the parts of a joint's limits that these are.
+fn part_of([velocity, acceleration, jerk]: [f64; 3], bound: &JointBound) -> Excess {
+    Excess {
+        velocity: velocity / bound.velocity,
+        acceleration: acceleration / bound.acceleration,
+        jerk: jerk / bound.jerk,
+    }
 }
 
 fn larger(a: f64, b: f64) -> f64 {
@@ -86,7 +91,7 @@ fn larger(a: f64, b: f64) -> f64 {
 }
 
 /// Returns the maximum speed, acceleration and jerk of a cubic with mean speed `d` over `h`.
-fn of_cubic(d: f64, (v0, v1): (f64, f64), h: f64, inverse: f64) -> [f64; 3] {
+fn of_cubic(d: f64, [v0, v1]: [f64; 2], h: f64, inverse: f64) -> [f64; 3] {
     // Acceleration is linear from a0 to a1; velocity has its extreme where it is zero.
     let (a0, a1) = ((6.0 * d - 4.0 * v0 - 2.0 * v1) * inverse, (2.0 * v0 + 4.0 * v1 - 6.0 * d) * inverse);
     let mut speed = larger(v0.abs(), v1.abs());
@@ -97,7 +102,7 @@ fn of_cubic(d: f64, (v0, v1): (f64, f64), h: f64, inverse: f64) -> [f64; 3] {
 }
 
 /// Returns the maximum speed, acceleration and jerk of a quintic with mean speed `d` over `h`.
-fn of_quintic(d: f64, (v0, v1): (f64, f64), (a0, a1): (f64, f64), h: f64, inverse: f64) -> [f64; 3] {
+fn of_quintic(d: f64, [v0, v1]: [f64; 2], [a0, a1]: [f64; 2], h: f64, inverse: f64) -> [f64; 3] {
     // Speed is v0 + x·(c1 + x·(c2 + x·(c3 + x·c4))), with x from 0 to 1.
     let (c1, b1) = (a0 * h, a1 * h);
     let (rise, change) = (d - v0, v1 - v0);
@@ -115,90 +120,42 @@ fn of_quintic(d: f64, (v0, v1): (f64, f64), (a0, a1): (f64, f64), h: f64, invers
     ]
 }
 
-/// Returns upper bounds of what the spline through points uses.
-fn upper_bounds(points: &[TrajectoryPoint], bounds: &[JointBound], quintic: bool) -> Excess {
-    let Some(start) = points.first() else { return Excess::default() };
+/// Returns upper bounds of what the spline through states uses.
+fn upper_bounds(states: &States, bounds: &[JointBound], quintic: bool) -> Excess {
     let mut all = Excess::default();
-    for first in Four::starts(bounds.len()) {
-        let state = |p: &TrajectoryPoint| {
-            [Four::load(&p.positions, first), Four::load(&p.velocities, first), Four::load(&p.accelerations, first)]
-        };
-        let (mut before, mut time) = (state(start), start.time_from_start);
-        let mut most = [Four::default(); 3];
-        for point in &points[1..] {
-            let (now, h) = (state(point), point.time_from_start - time);
-            let used = if quintic { bound_of_quintic(&before, &now, h) } else { bound_of_cubic(&before, &now, h) };
-            let [speed, acceleration, jerk] = used;
-            most = [most[0].max(speed), most[1].max(acceleration), most[2].max(jerk)];
-            (before, time) = (now, point.time_from_start);
-        }
-        for (k, bound) in bounds[first..].iter().take(Four::LEN).enumerate() {
-            all = all.max(Excess {
-                velocity: most[0].0[k] / bound.velocity,
-                acceleration: most[1].0[k] / bound.acceleration,
-                jerk: most[2].0[k] / bound.jerk,
-            });
+    for (block, bounds) in bounds.chunks(BLOCK).enumerate() {
+        let most = states.most(block, quintic, Width::widest());
+        for (k, bound) in bounds.iter().enumerate() {
+            all = all.max(part_of([0, 1, 2].map(|which| most[which][k]), bound));
         }
     }
     all
-}
-
-/// Returns upper bounds of the speed, acceleration and jerk of a segment of duration `h` between two states: position,
-/// velocity, acceleration.
-#[inline(always)]
-fn bound_of_quintic(&[p0, v0, a0]: &[Four; 3], &[p1, v1, a1]: &[Four; 3], h: f64) -> [Four; 3] {
-    let inverse = 1.0 / h;
-    // Speed is v0 + x·(c1 + x·(c2 + x·(c3 + x·c4))), with x from 0 to 1 and c1 = a0·h. In a cubic, `second` and `first`
-    // would be 0: what v1 and p1 are beyond a linear acceleration. Then c4 = 30·first, c3 = −60·first − 2·second.
-    let (c1, b1) = (a0 * h, a1 * h);
-    let bend = b1 - c1;
-    let second = (v1 - v0 - (c1 + b1) * 0.5).abs();
-    let first = ((p1 - p0) * inverse - (v0 + v1) * 0.5 + bend * (1.0 / 12.0)).abs() * 30.0;
-    let noise = p0.abs().max(p1.abs()) * (POSITION_ROUNDING * inverse);
-    let (first, bend) = ((first - noise).max(Four::default()), bend.abs());
-    // Beyond the line between the values at the ends: at most 1/4 of a square's factor, 0.385 of a cube's and 0.473 of
-    // a fourth power's. A speed whose acceleration does not change its sign has its extremes at the ends.
-    let turns = (c1 * b1).where_negative(0.25);
-    let speed = v0.abs().max(v1.abs()) + first * 1.25 + second * 0.8 + turns * (first + second * 3.0 + bend * 0.5);
-    let acceleration = c1.abs().max(b1.abs()) + first * 3.04 + second * 1.5;
-    // Beyond its mean.
-    let jerk = bend + first * 14.0 + second * 6.0;
-    [speed, acceleration * inverse, jerk * (inverse * inverse)]
-}
-
-/// Returns upper bounds of the speed, acceleration and jerk of a segment of duration `h` between two states: position,
-/// velocity.
-#[inline(always)]
-fn bound_of_cubic(&[p0, v0, _]: &[Four; 3], &[p1, v1, _]: &[Four; 3], h: f64) -> [Four; 3] {
-    let inverse = 1.0 / h;
-    let d = (p1 - p0) * (6.0 * inverse);
-    // Change of speed over the segment at the rate of either end.
-    let (c0, c1) = (d - v0 * 4.0 - v1 * 2.0, v0 * 2.0 + v1 * 4.0 - d);
-    let change = (c1 - c0).abs();
-    let speed = v0.abs().max(v1.abs()) + (c0 * c1).where_negative(0.125) * change;
-    [speed, c0.abs().max(c1.abs()) * inverse, change * (inverse * inverse)]
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::robot::random::Random;
-    use crate::trajectory::{Cursor, JointTrajectory, Sample, Spline};
+    use crate::trajectory::{Cursor, JointTrajectory, Sample, Spline, TrajectoryPoint};
 
     #[test]
     fn no_sample_of_a_spline_exceeds_the_bounds() {
         let mut random = Random::new(3);
         for (joints, quintic) in [(3, true), (7, true), (7, false), (9, true)] {
-            let mut value = |scale: f64| (0..joints).map(|_| random.between(-scale, scale)).collect::<Vec<f64>>();
-            let point = |k: usize, value: &mut dyn FnMut(f64) -> Vec<f64>| TrajectoryPoint {
-                time_from_start: 0.3 * k as f64,
-                positions: value(1.0),
-                velocities: value(1.0),
-                accelerations: if quintic { value(2.0) } else { Vec::new() },
+            let mut states = States::new(joints, 20);
+            for k in 0..20 {
+                let three = |_| [1.0, 1.0, 2.0].map(|scale| random.between(-scale, scale));
+                states.push(0.3 * k as f64, (0..joints).map(three));
+            }
+            let point = |(k, time): (usize, &f64)| TrajectoryPoint {
+                time_from_start: *time,
+                positions: states.values(k, 0).into(),
+                velocities: states.values(k, 1).into(),
+                accelerations: if quintic { states.values(k, 2).into() } else { Default::default() },
             };
-            let points: Vec<_> = (0..20).map(|k| point(k, &mut value)).collect();
+            let points = states.times().iter().enumerate().map(point).collect();
             let limits = vec![JointBound { velocity: 2.0, acceleration: 30.0, jerk: 500.0 }; joints];
-            let most = upper_bounds(&points, &limits, quintic);
+            let most = upper_bounds(&states, &limits, quintic);
             let names = (0..joints).map(|j| format!("j{j}")).collect();
             let spline = Spline::new(&JointTrajectory { joint_names: names, points }).unwrap();
             let (mut cursor, mut samples) = (Cursor::default(), vec![Sample::default(); joints]);

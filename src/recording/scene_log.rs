@@ -112,9 +112,9 @@ impl TickLog {
         let time = self.wall.wall(stamp);
         let header = Header { stamp: Time::of(time), frame_id: self.frame_id.clone() };
         let points = trajectory.points.iter().map(|point| JointTrajectoryPoint {
-            positions: point.positions.clone(),
-            velocities: point.velocities.clone(),
-            accelerations: point.accelerations.clone(),
+            positions: point.positions.to_vec(),
+            velocities: point.velocities.to_vec(),
+            accelerations: point.accelerations.to_vec(),
             effort: Vec::new(),
             time_from_start: display_messages::Duration::of(point.time_from_start),
         });

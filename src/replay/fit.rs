@@ -7,7 +7,7 @@
 //! between their neighbours reproduces are left out.
 
 use super::motion::RecordedMotion;
-use crate::trajectory::{JointTrajectory, TrajectoryPoint};
+use crate::trajectory::{JointTrajectory, JointValues, TrajectoryPoint};
 
 /// Maximum deviation from leaving out a point [rad].
 const TOLERANCE: f64 = 5e-7;
@@ -35,9 +35,9 @@ pub fn fit(motion: &RecordedMotion) -> JointTrajectory {
     knots.push(rest(last));
     let points = needed(&knots, dt).into_iter().map(|k| TrajectoryPoint {
         time_from_start: k as f64 * dt,
-        positions: knots[k].positions.clone(),
-        velocities: knots[k].velocities.clone(),
-        accelerations: Vec::new(),
+        positions: knots[k].positions[..].into(),
+        velocities: knots[k].velocities[..].into(),
+        accelerations: JointValues::new(),
     });
     JointTrajectory { joint_names: motion.joints.clone(), points: points.collect() }
 }

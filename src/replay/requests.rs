@@ -238,9 +238,9 @@ mod tests {
     fn a_trajectory_makes_the_same_curve_again() {
         let point = |t: f64, q: f64, v: f64| TrajectoryPoint {
             time_from_start: t,
-            positions: vec![q, -q / 3.0],
-            velocities: vec![v, 0.1 + v],
-            accelerations: Vec::new(),
+            positions: vec![q, -q / 3.0].into(),
+            velocities: vec![v, 0.1 + v].into(),
+            accelerations: Default::default(),
         };
         let points = vec![point(0.0, 0.1, 0.0), point(1.0 / 3.0, 0.2, 0.7), point(0.7, 0.3, 0.0)];
         let trajectory = JointTrajectory { joint_names: vec!["b".into(), "a".into()], points };

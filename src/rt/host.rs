@@ -45,8 +45,24 @@ const LATENCY_REMEDY: &str = "allow it: let your group write /dev/cpu_dma_latenc
 #[derive(Debug)]
 pub struct LatencyHold(#[expect(dead_code, reason = "the kernel keeps the request while the file is open")] File);
 
+/// Freed memory up to this size is kept [bytes].
+#[cfg(target_env = "gnu")]
+const KEPT_MEMORY: libc::c_int = 8 << 20;
+
+/// Makes the allocator keep freed memory for its next use. By default glibc returns the end of the heap to the kernel
+/// from 128 KiB on, and maps each larger piece again: a page fault for every 4 KiB of a plan, and every unmapping
+/// interrupts all threads of the process, the tick too.
+pub fn keep_freed_memory() {
+    #[cfg(target_env = "gnu")]
+    for option in [libc::M_TRIM_THRESHOLD, libc::M_MMAP_THRESHOLD] {
+        // SAFETY: takes numbers only; a value that is refused changes nothing.
+        unsafe { libc::mallopt(option, KEPT_MEMORY) };
+    }
+}
+
 /// Requests all process-wide settings. Keep the returned hold for the duration of the run.
 pub fn prepare_process(hold_latency: bool) -> (Vec<Grant>, Option<LatencyHold>) {
+    keep_freed_memory();
     let mut grants = vec![probe_fifo(), lock_memory()];
     let hold = hold_latency.then(hold_cpu_latency);
     let kept = match hold {

@@ -291,9 +291,9 @@ fn capped(limits: &JointLimits, velocity: Option<f64>, acceleration: Option<f64>
 fn trajectory_of(given: api::Trajectory) -> JointTrajectory {
     let points = given.points.into_iter().map(|p| TrajectoryPoint {
         time_from_start: p.time_from_start,
-        positions: p.positions,
-        velocities: p.velocities.unwrap_or_default(),
-        accelerations: p.accelerations.unwrap_or_default(),
+        positions: p.positions.into(),
+        velocities: p.velocities.unwrap_or_default().into(),
+        accelerations: p.accelerations.unwrap_or_default().into(),
     });
     JointTrajectory { points: points.collect(), joint_names: given.joint_names }
 }

@@ -341,9 +341,9 @@ fn samples(trajectory: &JointTrajectory, hz: f64) -> Result<Vec<TrajectoryPoint>
 fn api_trajectory(trajectory: JointTrajectory) -> api::Trajectory {
     let point = |point: TrajectoryPoint| api::Point {
         time_from_start: point.time_from_start,
-        positions: point.positions,
-        velocities: Some(point.velocities).filter(|v| !v.is_empty()),
-        accelerations: Some(point.accelerations).filter(|a| !a.is_empty()),
+        positions: point.positions.into_vec(),
+        velocities: Some(point.velocities.into_vec()).filter(|v| !v.is_empty()),
+        accelerations: Some(point.accelerations.into_vec()).filter(|a| !a.is_empty()),
     };
     api::Trajectory { joint_names: trajectory.joint_names, points: trajectory.points.into_iter().map(point).collect() }
 }

@@ -83,9 +83,9 @@ mod tests {
                 .iter()
                 .map(|point| crate::trajectory::TrajectoryPoint {
                     time_from_start: point.time_from_start,
-                    positions: vec![point.positions[0]],
-                    velocities: vec![point.velocities.as_ref().unwrap()[0]],
-                    accelerations: Vec::new(),
+                    positions: [point.positions[0]][..].into(),
+                    velocities: [point.velocities.as_ref().unwrap()[0]][..].into(),
+                    accelerations: Default::default(),
                 })
                 .collect(),
         };

@@ -288,8 +288,8 @@ fn jerk_stays_within_its_limits_and_speed_scales_the_whole() {
             assert!(samples.iter().all(|s| s.velocity.abs() <= 2.0001 && s.acceleration.abs() <= 5.0001));
             before = Some(now);
         }
-        assert_eq!(full.trajectory.points[0].positions, path[0]);
-        assert_eq!(full.trajectory.points.last().unwrap().positions, path[n - 1]);
+        assert_eq!(full.trajectory.points[0].positions[..], path[0]);
+        assert_eq!(full.trajectory.points.last().unwrap().positions[..], path[n - 1]);
     }
 }
 

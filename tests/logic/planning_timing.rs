@@ -79,8 +79,8 @@ fn every_sample_keeps_all_limits_and_the_corners_deviation() {
                 assert!(off(&tidy(path.clone()), &q) <= deviation + 1e-6, "{what}: {} off at {k} ms", off(path, &q));
             }
             assert!(samples.iter().all(|s| s.velocity.abs() < 0.2), "{what} is not at rest at its end");
-            assert_eq!(timed.trajectory.points[0].positions, path[0]);
-            assert_eq!(timed.trajectory.points.last().unwrap().positions, *path.last().unwrap());
+            assert_eq!(timed.trajectory.points[0].positions[..], path[0]);
+            assert_eq!(timed.trajectory.points.last().unwrap().positions[..], *path.last().unwrap());
             assert!(timed.trajectory.points.last().unwrap().velocities.iter().all(|v| *v == 0.0));
         }
     }

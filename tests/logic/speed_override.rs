@@ -127,9 +127,9 @@ fn a_pause_takes_effect_also_where_the_path_needs_all_of_the_acceleration() {
     let top = V_MAX / A_MAX;
     let point = |t: f64, q: f64, v: f64, a: f64| TrajectoryPoint {
         time_from_start: t,
-        positions: vec![q],
-        velocities: vec![v],
-        accelerations: vec![a],
+        positions: [q][..].into(),
+        velocities: [v][..].into(),
+        accelerations: [a][..].into(),
     };
     let rise = 0.5 * V_MAX * top;
     let points = vec![

@@ -145,7 +145,7 @@ fn log_topics() {
     (run.states[0].gripper, run.states[0].wrench) = (Some(0.04), Some([0.0; 6]));
     let point = |time_from_start, position: f64| TrajectoryPoint {
         time_from_start,
-        positions: vec![position; 6],
+        positions: [position; 6][..].into(),
         ..TrajectoryPoint::default()
     };
     let motion = JointTrajectory { joint_names: make_joints("arm", 6), points: vec![point(0.0, 0.0), point(0.5, 0.1)] };

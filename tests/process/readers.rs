@@ -57,8 +57,11 @@ fn record(path: &Path) {
     notes.send(Note::Robots { stamp, robots, description: "<robot name=\"ä\"/>".into() }).unwrap();
     let marker = Marker { ns: "world/wall".into(), r#type: 1, text: "ö".into(), ..Marker::default() };
     notes.send(Note::Markers { stamp, markers: MarkerArray { markers: vec![marker] } }).unwrap();
-    let point =
-        |t: f64| TrajectoryPoint { time_from_start: t, positions: vec![t * 0.2; 6], ..TrajectoryPoint::default() };
+    let point = |t: f64| TrajectoryPoint {
+        time_from_start: t,
+        positions: [t * 0.2; 6][..].into(),
+        ..TrajectoryPoint::default()
+    };
     let trajectory = JointTrajectory { joint_names: make_joints("right", 6), points: vec![point(0.0), point(1.25)] };
     notes.send(Note::Execute { id: 2, stamp, task: 0, motion: 3, trajectory: Arc::new(trajectory) }).unwrap();
     for tick in 0..200 {

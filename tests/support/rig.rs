@@ -98,9 +98,9 @@ pub fn velocity() -> TaskKind {
 pub fn motion(id: u64, joints: &[u16], points: &[(f64, &[f64])]) -> Box<Motion> {
     let points = points.iter().map(|(t, p)| TrajectoryPoint {
         time_from_start: *t,
-        positions: p.to_vec(),
-        velocities: vec![],
-        accelerations: vec![],
+        positions: p[..].into(),
+        velocities: Default::default(),
+        accelerations: Default::default(),
     });
     let names = joints.iter().map(|j| format!("j{j}")).collect();
     let given = JointTrajectory { joint_names: names, points: points.collect() };

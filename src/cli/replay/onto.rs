@@ -312,8 +312,8 @@ fn target(approach: &Approach, state: &StateReport) -> Vec<f64> {
 fn sent(trajectory: &JointTrajectory) -> Trajectory {
     let points = trajectory.points.iter().map(|p| Point {
         time_from_start: p.time_from_start,
-        positions: p.positions.clone(),
-        velocities: Some(p.velocities.clone()),
+        positions: p.positions.to_vec(),
+        velocities: Some(p.velocities.to_vec()),
         accelerations: None,
     });
     Trajectory { joint_names: trajectory.joint_names.clone(), points: points.collect() }

@@ -18,7 +18,7 @@ use crate::joint::{ControlMode, JointLimits, Joints, MAX_DOF, joints_of};
 use crate::robot::kinematics::Kinematics;
 use crate::robot::{Source, load};
 use crate::telemetry::{Event, Outcome, Phase, TaskState};
-use crate::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
+use crate::trajectory::{JointTrajectory, JointValues, Spline, TrajectoryPoint};
 
 const DOF: usize = 6;
 /// Initial positions, away from every singular pose of the built-in robot [rad].
@@ -261,9 +261,9 @@ impl Bench {
     fn motion(&self) -> Result<Box<Motion>, String> {
         let point = |time: f64, by: f64| TrajectoryPoint {
             time_from_start: time,
-            positions: self.positions().map(|q| q + by).to_vec(),
-            velocities: vec![0.0; DOF],
-            accelerations: Vec::new(),
+            positions: self.positions().map(|q| q + by)[..].into(),
+            velocities: [0.0; DOF][..].into(),
+            accelerations: JointValues::new(),
         };
         let joint_names = (0..DOF).map(|j| j.to_string()).collect();
         let given = JointTrajectory { joint_names, points: vec![point(0.0, 0.0), point(2.0, 0.3)] };

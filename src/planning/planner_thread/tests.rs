@@ -162,7 +162,7 @@ fn a_goal_at_the_start_gives_a_short_stationary_trajectory() {
     let planner = PlannerThread::start(yourarm(Vec::new()), TIMEOUT).unwrap();
     let found = found(&planner, 1, turn(0.5, 0.5, 0));
     assert!(found.trajectory.validate().is_ok() && found.trajectory.duration() < 0.2);
-    assert!(found.trajectory.points.iter().all(|point| point.positions == found.path[0]));
+    assert!(found.trajectory.points.iter().all(|point| point.positions[..] == found.path[0]));
 }
 
 #[test]

@@ -154,9 +154,9 @@ impl Goal {
     pub fn curve(&self) -> Result<Curve, Outcome> {
         let point = |point: &Point| TrajectoryPoint {
             time_from_start: point.time_from_start,
-            positions: point.positions.clone(),
-            velocities: point.velocities.clone().unwrap_or_default(),
-            accelerations: point.accelerations.clone().unwrap_or_default(),
+            positions: point.positions[..].into(),
+            velocities: point.velocities.as_deref().unwrap_or_default().into(),
+            accelerations: point.accelerations.as_deref().unwrap_or_default().into(),
         };
         let trajectory =
             JointTrajectory { joint_names: self.joints.clone(), points: self.points.iter().map(point).collect() };

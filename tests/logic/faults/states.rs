@@ -81,9 +81,9 @@ fn f07_a_spline_that_is_not_finite_is_refused() {
     let spline = |times: [f64; 2], a: f64, b: f64, v: &[f64], acc: &[f64]| {
         let point = |t: f64, p: f64| TrajectoryPoint {
             time_from_start: t,
-            positions: vec![p],
-            velocities: v.to_vec(),
-            accelerations: acc.to_vec(),
+            positions: [p][..].into(),
+            velocities: v.into(),
+            accelerations: acc.into(),
         };
         Spline::new(&JointTrajectory {
             joint_names: vec!["j".into()],
