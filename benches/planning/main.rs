@@ -1,7 +1,7 @@
 //! Planning times over a file of problems.
 //!
 //! `cargo bench --bench planning -- --problems FILE.jsonl --urdf FILE [--srdf FILE] [--package NAME=DIR] [--level
-//! fast|certified|exact] [--shapes true|vamp] [--seed N] [--limit N] [--rounds N] [--refine MS] [--paths-only] [--peer
+//! fast|certified|exact] [--shapes true|vamp] [--seed N] [--limit N] [--rounds N] [--refine MS | --refine-rounds N] [--paths-only] [--peer
 //! PROGRAM [--peer-range RAD]] [--out FILE.json]`; `--ik LINK --urdf FILE` and `--timing` measure only these parts.
 
 mod parts;
@@ -84,6 +84,9 @@ struct Arguments {
     /// Refine each path for this long [ms]
     #[arg(long, value_name = "MS", default_value_t = 0)]
     refine: u64,
+    /// Refine each path in this number of rounds, as `dimos plan --refine`
+    #[arg(long, value_name = "N", default_value_t = 0, conflicts_with = "refine")]
+    refine_rounds: u32,
     /// Leave out the timing of the paths
     #[arg(long)]
     paths_only: bool,
@@ -255,8 +258,8 @@ fn solve(arm: &Arm, problem: &Problem, arguments: &Arguments) -> Result<Row, Box
     let settings = PlanSettings {
         seed: arguments.seed,
         level: arguments.level.into(),
-        refine: if arguments.refine > 0 { u32::MAX } else { 0 },
-        refine_time: Some(Duration::from_millis(arguments.refine)),
+        refine: if arguments.refine > 0 { u32::MAX } else { arguments.refine_rounds },
+        refine_time: Some(arguments.refine).filter(|ms| *ms > 0).map(Duration::from_millis),
         ..PlanSettings::default()
     };
     let (began, cpu) = (Instant::now(), cpu_time());
@@ -264,12 +267,19 @@ fn solve(arm: &Arm, problem: &Problem, arguments: &Arguments) -> Result<Row, Box
     let found = plan(&mut checker, start, &[goal.to_vec()], &settings, &stop);
     let (total, cpu) = (began.elapsed(), cpu_time().saturating_sub(cpu));
     let timeout = matches!(found, Err(PlanError::Timeout(_)));
+    let bounds = bounds(kinematics.names(), kinematics.limits())?;
+    // As a run does: of the paths of a refinement, that of the quickest motion is executed.
+    let quickest = found
+        .as_ref()
+        .ok()
+        .filter(|_| !arguments.paths_only)
+        .cloned()
+        .map(|plan| plan.quickest(kinematics.names(), &bounds, |a, b| checker.motion_looks_free(a, b)).0);
     let mut row = row(problem, found, total, cpu);
     row.setup_us = setup.as_secs_f64() * 1e6;
     row.check_ns = row.path.as_ref().and_then(|path| check_time(&mut checker, path));
     row.late_us = timeout.then_some((total.as_secs_f64() - arguments.timeout) * 1e6);
-    if let Some(path) = row.path.as_ref().filter(|_| !arguments.paths_only) {
-        let bounds = bounds(kinematics.names(), kinematics.limits())?;
+    if let Some(path) = &quickest {
         let free = |a: &[f64], b: &[f64]| checker.motion_is_free(a, b, &Stop::never());
         let began = Instant::now();
         let timed = time(kinematics.names(), path, &bounds, &TimingSettings::default(), free);

@@ -13,8 +13,8 @@ use super::grip::{self, GripAction};
 use super::output::{self, fixed};
 use super::recorded_path;
 use crate::rpc::api::{
-    Cancel, DEFAULT_SPEED, JointPath, PATH_TOLERANCE, Plan, PlanGoal, PlanLevel, PlanSummary, Planner, Planning,
-    PoseSpec,
+    Cancel, DEFAULT_REFINE, DEFAULT_SPEED, JointPath, PATH_TOLERANCE, Plan, PlanGoal, PlanLevel, PlanSummary, Planner,
+    Planning, PoseSpec,
 };
 use crate::rpc::client::{Client, ClientError};
 use crate::rpc::{Code, RpcError};
@@ -191,8 +191,8 @@ pub struct Search {
     /// Seed of the search: the same request with the same seed gives the same plan
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
-    /// Look for a shorter path in N more rounds: 100 take some 10 ms
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    /// Look for a shorter path in N rounds: 4 take about 0.5 ms, 100 some 20 ms, 0 takes the first path
+    #[arg(long, value_name = "N", default_value_t = DEFAULT_REFINE)]
     pub refine: u32,
     /// How the plan is checked: certified proves it free of contact, between samples too; exact also finds the
     /// clearance to 0.5 mm; fast checks samples only, and is executed only with --unproven

@@ -9,7 +9,7 @@ use super::padded::Near;
 use super::path::{Path, distance, unwind};
 use super::path_planner::{PlanSettings, plan};
 use super::pipeline::{Goal, PlanFailure, PlanRequest, Stage, StageTimes, bounds_at, failure_for};
-use super::timing::{TimingSettings, time};
+use super::timing::TimingSettings;
 use crate::collision::{CollisionChecker, Stop};
 use crate::robot::kinematics::frame;
 
@@ -40,9 +40,6 @@ pub(super) struct Leg {
     /// Maximum deviation at its corners [rad].
     pub deviation: f64,
 }
-
-/// A path, and the joints of its goal that were moved to their limits: index and requested position [rad or m].
-type Way = (Path, Vec<(usize, f64)>);
 
 /// Plans the way through all waypoints to the goals.
 pub(super) fn legs(
@@ -116,9 +113,16 @@ pub(super) fn leg(
             took("search", found.search_time.as_secs_f64());
             took("shorten", found.shorten_time.as_secs_f64());
             let choosing = Instant::now();
-            let (path, clamped) = quickest(stage, speed, found.longer, (found.path, found.clamped));
+            let refined = found.refine_time;
+            let (path, clamped) = match bounds_at(stage, speed) {
+                Ok(bounds) => {
+                    let Stage { joints, checker, .. } = stage;
+                    found.quickest(joints, &bounds, |a, b| checker.motion_looks_free(a, b))
+                }
+                Err(_) => (found.path, found.clamped),
+            };
             if refine > 0 {
-                took("refine", (found.refine_time + choosing.elapsed()).as_secs_f64());
+                took("refine", (refined + choosing.elapsed()).as_secs_f64());
             }
             let used = |joint: usize| Some((stage.joints.get(joint)?.clone(), *path.last()?.get(joint)?));
             let moved = clamped.iter().filter_map(|(joint, asked)| Some((*asked, used(*joint)?)));
@@ -126,26 +130,6 @@ pub(super) fn leg(
             Ok(Leg { path, fraction: None, clamped, deviation: TimingSettings::default().deviation })
         }
     }
-}
-
-/// Returns the path of the quickest motion, of the shortest path and of others. The shortest one may turn more often,
-/// or by more of the slower joints.
-fn quickest(stage: &mut Stage<'_>, speed: f64, others: Vec<Way>, shortest: Way) -> Way {
-    let Ok(bounds) = bounds_at(stage, speed) else { return shortest };
-    let Stage { joints, checker, .. } = stage;
-    let mut duration = |way: &Way| {
-        let free = |a: &[f64], b: &[f64]| checker.motion_looks_free(a, b);
-        let timed = time(joints, &way.0, &bounds, &TimingSettings::default(), free);
-        timed.map_or(f64::INFINITY, |timed| timed.duration)
-    };
-    let mut best = (if others.is_empty() { 0.0 } else { duration(&shortest) }, shortest);
-    for way in others {
-        let duration = duration(&way);
-        if duration < best.0 {
-            best = (duration, way);
-        }
-    }
-    best.1
 }
 
 /// Joins the legs to one path, with the maximum deviation at each of its configurations [rad]. At a waypoint it is that

@@ -14,6 +14,8 @@ use super::refine::{cut, refine};
 use super::rrt_connect::{RrtSettings, SearchCount};
 use super::shortcut::{ShortcutSettings, shorten};
 use super::start_contact::MAX_START_DEPTH;
+use super::timing::{Timed, TimingError, TimingSettings, time};
+use super::topp::JointBound;
 
 /// Settings of the path search.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -86,6 +88,44 @@ pub struct Plan {
     /// Their duration.
     pub refine_time: Duration,
 }
+
+impl Plan {
+    /// Returns the path of the quickest motion, with what was `clamped`: the shortest path may turn more often than
+    /// others, or by more of the slower joints. `names`, `bounds` and `free` are those of the timing.
+    pub fn quickest(
+        self,
+        names: &[String],
+        bounds: &[JointBound],
+        mut free: impl FnMut(&[f64], &[f64]) -> bool,
+    ) -> Way {
+        let mut ways = self.longer;
+        ways.push((self.path, self.clamped));
+        if ways.len() == 1 {
+            return ways.pop().unwrap_or_default();
+        }
+        let settings = TimingSettings::default();
+        let duration = |timed: Result<Timed, TimingError>| timed.map_or(f64::INFINITY, |timed| timed.duration);
+        // Corners that collide are passed closer, which takes longer: the shortest of these times may not be possible,
+        // but most often it is, and the checks of all others are spared.
+        let bound = |way: &Way| duration(time(names, &way.0, bounds, &settings, |_, _| true));
+        let mut ways: Vec<(f64, Way)> = ways.into_iter().rev().map(|way| (bound(&way), way)).collect();
+        ways.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let mut best = (f64::INFINITY, 0);
+        for (i, (bound, way)) in ways.iter().enumerate() {
+            if *bound >= best.0 {
+                break;
+            }
+            let duration = duration(time(names, &way.0, bounds, &settings, &mut free));
+            if duration < best.0 {
+                best = (duration, i);
+            }
+        }
+        ways.swap_remove(best.1).1
+    }
+}
+
+/// A path, and the joints of its goal that were moved to their limits: index and requested position [rad or m].
+type Way = (Path, Clamped);
 
 /// Why no path was found.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -225,7 +265,7 @@ pub fn plan<C: CollisionChecker>(
         path.splice(..1, lead.iter().cloned());
         (path, reached.and_then(|goal| clamped.get(goal).cloned()).unwrap_or_default())
     };
-    let mut longer: Vec<(Path, Clamped)> = paths.into_iter().map(whole).collect();
+    let mut longer: Vec<Way> = paths.into_iter().map(whole).collect();
     let (path, clamped) = longer.pop().unwrap_or_default();
     Ok(Plan {
         clamped,

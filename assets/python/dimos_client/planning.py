@@ -18,7 +18,7 @@ class Planning(Streams):
     def plan(self, arm: Goals, target: Optional[Sequence[float]] = None, *, named: Optional[str] = None,
              pose: Optional[Pose] = None, by: Optional[Pose] = None, frame: Optional[str] = None, linear: bool = False,
              through: Sequence[Waypoint] = (), blend: float = 0.0, speed: float = 0.5, seed: int = 0,
-             timeout: Optional[float] = None, level: str = "certified", refine: int = 0) -> Plan:
+             timeout: Optional[float] = None, level: str = "certified", refine: int = 4) -> Plan:
         """Plans a collision-free motion from where the arm is, and waits for the plan; moves nothing. The goal is one
         of `target` (joints [rad]), a `named` pose, a `pose` of the tool centre point, or a motion `by` a pose from
         where that is; both in `frame`, on a straight line if `linear`. Or one motion `through` waypoints, of which the
