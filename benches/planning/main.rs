@@ -1,8 +1,9 @@
 //! Planning times over a file of problems.
 //!
 //! `cargo bench --bench planning -- --problems FILE.jsonl --urdf FILE [--srdf FILE] [--package NAME=DIR] [--level
-//! fast|certified|exact] [--shapes true|vamp] [--seed N] [--limit N] [--rounds N] [--refine MS | --refine-rounds N] [--paths-only] [--peer
-//! PROGRAM [--peer-range RAD]] [--out FILE.json]`; `--ik LINK --urdf FILE` and `--timing` measure only these parts.
+//! fast|certified|exact] [--shapes true|vamp] [--seed N] [--limit N] [--rounds N] [--refine MS | --refine-rounds N]
+//! [--paths-only] [--peer PROGRAM [--peer-range RAD]] [--out FILE.json]`; `--ik LINK --urdf FILE` and `--timing` measure
+//! only these parts.
 
 mod parts;
 mod peer;

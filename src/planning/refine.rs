@@ -17,7 +17,7 @@ use super::shortcut::{IsFree, shorten};
 /// Cuts that are tried in a round.
 const CUTS: usize = 12;
 /// Effort of a round's search: edges, samples, nodes. A path that is worth it is found quickly or with another seed.
-const EFFORT: Quantum = Quantum { edges: 1024, samples: 65_536, nodes: 4096 };
+const EFFORT: Quantum = Quantum { edges: 512, samples: 4096, nodes: 4096 };
 /// A path is shorter if it is by this [rad].
 const SHORTER: f64 = 1e-6;
 /// A path is worth keeping beside a longer one if it is shorter than this part of it.

@@ -130,8 +130,8 @@ impl Default for Plan {
     }
 }
 
-/// Rounds of refinement of a request that does not say how many: they take about half a millisecond, and motions around
-/// obstacles become 15 % quicker.
+/// Rounds of refinement of a request that does not say how many: they take about 0.3 ms, and motions around obstacles
+/// become a tenth quicker.
 pub const DEFAULT_REFINE: u32 = 4;
 
 fn default_refine() -> u32 {

@@ -270,12 +270,13 @@ fn cancel_and_ctrl_c_end_planning_at_once() {
     let planner = || home.dimos("cancel").with(0).out.contains("planning: CANCELLED");
     eventually("it plans", planner);
     planning.wait().with(1).says(&["no plan: cancelled"]);
-    let planning = home.start(&format!("plan arm {RIGHT} --timeout 60s"));
-    eventually("the planner is busy", || home.status()["planner"]["state"] == "PLANNING");
-    home.dimos("plan arm --named home").with(1).says(&["PLANNING", "hint: "]);
     // The motion of another client continues.
     let moving = home.start("move arm 1.5 -0.3 0.6 0 0.8 0.8 --direct --speed 0.2");
     eventually("it moves", || home.positions("arm")[5] > 0.05);
+    // That the goal is enclosed is found in a second or more.
+    let planning = home.start(&format!("plan arm {RIGHT} --timeout 60s"));
+    eventually("the planner is busy", || home.status()["planner"]["state"] == "PLANNING");
+    home.dimos("plan arm --named home").with(1).says(&["PLANNING", "hint: "]);
     planning.end(Signal::INT).with(130).says(&["planning was cancelled: nothing has moved"]);
     moving.wait().with(0);
     assert!(began.elapsed().as_secs() < 40, "nothing waits for the 60 s");
@@ -307,6 +308,25 @@ fn a_planned_motion_is_cancelled_and_stopped_like_any_other() {
     client.call(ArmEnable { arm: "arm".into() }).unwrap();
     home.dimos("execute").with(0);
     is_at(&home, "arm", &HOME);
+}
+
+/// The first path that is found is a detour, as a rule.
+#[test]
+fn a_plan_is_refined_unless_that_is_turned_off() {
+    let (home, _run) = up();
+    home.dimos("move arm 0.9 -0.3 0.6 0 0.8 0 --speed 1").with(0);
+    home.dimos("world add wall --box 2 0.02 1.1 --at 1.1 0 0").with(0);
+    let duration = |options: &str| {
+        let plan = home.dimos(&format!("plan arm -0.9 -0.3 0.6 0 0.8 0 --json {options}")).with(0).json();
+        plan["summary"]["duration"].as_f64().unwrap()
+    };
+    let (mut first, mut refined) = (0.0, 0.0);
+    for seed in 0..6 {
+        first += duration(&format!("--seed {seed} --refine 0"));
+        refined += duration(&format!("--seed {seed}"));
+        assert_eq!(duration(&format!("--seed {seed}")), duration(&format!("--seed {seed} --refine 4")));
+    }
+    assert!(refined < 0.97 * first, "{refined:.2} s refined, {first:.2} s of the first paths");
 }
 
 #[test]
