@@ -2,7 +2,7 @@
 //!
 //! `cargo bench --bench planning -- --problems FILE.jsonl --urdf FILE [--srdf FILE] [--package NAME=DIR] [--level
 //! fast|certified|exact] [--shapes true|vamp] [--seed N] [--limit N] [--rounds N] [--refine MS | --refine-rounds N]
-//! [--paths-only] [--peer PROGRAM [--peer-range RAD]] [--out FILE.json]`; `--ik LINK --urdf FILE` and `--timing` measure
+//! [--paths-only] [--peer PROGRAM [--peer-range RAD]] [--out FILE.json]`; `--ik LINK --urdf FILE` and `--timing` time
 //! only these parts.
 
 mod parts;
