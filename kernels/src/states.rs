@@ -59,7 +59,7 @@ impl States {
         (self.blocks == 1).then(|| self.values.as_chunks().0)
     }
 
-    /// Returns whether all values are finite, and each time is later than the one before it.
+    /// Returns whether there are two states, all values are finite, and each time is later than the one before it.
     pub fn are_finite_and_in_order(&self) -> bool {
         let in_order = self.times.windows(2).fold(true, |good, pair| good & (pair[0] < pair[1]));
         // Zero times a number is not a number unless that is finite.
@@ -69,7 +69,7 @@ impl States {
                 zero[k] += row[k] * 0.0;
             }
         }
-        in_order && self.duration().is_finite() && zero == [0.0; BLOCK]
+        self.times.len() > 1 && in_order && self.duration().is_finite() && zero == [0.0; BLOCK]
     }
 
     /// Returns the positions (0), velocities (1) or accelerations (2) of a state.
@@ -182,7 +182,7 @@ pub struct Blocks<'a> {
 }
 
 impl Blocks<'_> {
-    /// Returns a configuration and the directions before and after it; those of the ends have one line.
+    /// Returns a configuration and the directions before and after it; at both ends of the path they are the same.
     #[inline(always)]
     fn around(&self, at: usize) -> [&[Block]; 3] {
         let (first, last) = (at * self.each, self.directions.len() - self.each);
