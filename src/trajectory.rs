@@ -133,10 +133,6 @@ impl JointTrajectory {
         if values.len() != joints && !(may_be_empty && values.is_empty()) {
             return Err(TrajectoryError::Width { point, what, given: values.len(), joints });
         }
-        // Without an exit in between, the compiler makes vector instructions of it.
-        if values.iter().fold(true, |finite, v| finite & v.is_finite()) {
-            return Ok(());
-        }
         match values.iter().position(|v| !v.is_finite()) {
             Some(j) => Err(TrajectoryError::NotFinite { point, what, joint: self.joint_names[j].clone() }),
             None => Ok(()),

@@ -4,10 +4,10 @@
 use crate::Width;
 use crate::width::Vectors;
 
-/// Number of joints of a block.
-pub const BLOCK: usize = 8;
+/// Number of joints that are computed together.
+pub const JOINTS: usize = 8;
 /// One number of each of eight joints; 0 beyond the last joint.
-pub type Block = [f64; BLOCK];
+pub type Eight = [f64; JOINTS];
 
 /// Largest effect of rounding of positions on the factors of a quintic's speed: thirty times four units.
 const POSITION_ROUNDING: f64 = 120.0 * f64::EPSILON;
@@ -19,7 +19,7 @@ pub struct States {
     blocks: usize,
     times: Vec<f64>,
     /// Of each time the positions, the velocities, the accelerations.
-    values: Vec<Block>,
+    values: Vec<Eight>,
 }
 
 /// A state on a rounded path. Position, velocity and acceleration are sums of the direction of the line before a
@@ -39,7 +39,7 @@ pub struct Station {
 impl States {
     /// Creates a list without states, with room for `capacity` of them.
     pub fn new(joints: usize, capacity: usize) -> Self {
-        let blocks = joints.div_ceil(BLOCK);
+        let blocks = joints.div_ceil(JOINTS);
         let (times, values) = (Vec::with_capacity(capacity), Vec::with_capacity(capacity * 3 * blocks));
         Self { joints, blocks, times, values }
     }
@@ -55,7 +55,7 @@ impl States {
     }
 
     /// Returns the positions, velocities and accelerations of all states, if a block holds all joints.
-    pub fn in_one_block(&self) -> Option<&[[Block; 3]]> {
+    pub fn in_one_block(&self) -> Option<&[[Eight; 3]]> {
         (self.blocks == 1).then(|| self.values.as_chunks().0)
     }
 
@@ -63,13 +63,13 @@ impl States {
     pub fn are_finite_and_in_order(&self) -> bool {
         let in_order = self.times.windows(2).fold(true, |good, pair| good & (pair[0] < pair[1]));
         // Zero times a number is not a number unless that is finite.
-        let mut zero = [0.0; BLOCK];
+        let mut zero = [0.0; JOINTS];
         for row in &self.values {
-            for k in 0..BLOCK {
+            for k in 0..JOINTS {
                 zero[k] += row[k] * 0.0;
             }
         }
-        self.times.len() > 1 && in_order && self.duration().is_finite() && zero == [0.0; BLOCK]
+        self.times.len() > 1 && in_order && self.duration().is_finite() && zero == [0.0; JOINTS]
     }
 
     /// Returns the positions (0), velocities (1) or accelerations (2) of a state.
@@ -95,10 +95,10 @@ impl States {
     pub fn push(&mut self, time: f64, joints: impl Iterator<Item = [f64; 3]>) {
         let first = self.values.len();
         self.times.push(time);
-        self.values.resize(first + 3 * self.blocks, [0.0; BLOCK]);
+        self.values.resize(first + 3 * self.blocks, [0.0; JOINTS]);
         for (j, three) in joints.take(self.joints).enumerate() {
             for (which, value) in three.into_iter().enumerate() {
-                self.values[first + which * self.blocks + j / BLOCK][j % BLOCK] = value;
+                self.values[first + which * self.blocks + j / JOINTS][j % JOINTS] = value;
             }
         }
     }
@@ -156,7 +156,7 @@ impl States {
     ///
     /// # Panics
     /// If there is no such block.
-    pub fn most(&self, block: usize, quintic: bool, width: Width) -> [Block; 3] {
+    pub fn most(&self, block: usize, quintic: bool, width: Width) -> [Eight; 3] {
         assert!(block < self.blocks, "{} blocks", self.blocks);
         match width.0 {
             // SAFETY: see above.
@@ -174,9 +174,9 @@ impl States {
 #[derive(Debug, Clone, Copy)]
 pub struct Blocks<'a> {
     /// All configurations [rad].
-    pub configurations: &'a [Block],
+    pub configurations: &'a [Eight],
     /// The direction of each line, of length 1.
-    pub directions: &'a [Block],
+    pub directions: &'a [Eight],
     /// Number of blocks of a configuration.
     pub each: usize,
 }
@@ -184,7 +184,7 @@ pub struct Blocks<'a> {
 impl Blocks<'_> {
     /// Returns a configuration and the directions before and after it; at both ends of the path they are the same.
     #[inline(always)]
-    fn around(&self, at: usize) -> [&[Block]; 3] {
+    fn around(&self, at: usize) -> [&[Eight]; 3] {
         let (first, last) = (at * self.each, self.directions.len() - self.each);
         let (before, after) = (first.saturating_sub(self.each), first.min(last));
         [
@@ -199,7 +199,7 @@ impl Blocks<'_> {
     ///
     /// # Panics
     /// If there is no such configuration.
-    pub fn places(self, at: usize, factors: &[[f64; 2]], out: &mut Vec<Block>, width: Width) {
+    pub fn places(self, at: usize, factors: &[[f64; 2]], out: &mut Vec<Eight>, width: Width) {
         out.clear();
         match width.0 {
             // SAFETY: see above.
@@ -227,33 +227,33 @@ fn extend_avx2(states: &mut States, stations: &[Station], path: Blocks<'_>) {
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f")]
-fn places_avx512(path: Blocks<'_>, at: usize, factors: &[[f64; 2]], out: &mut Vec<Block>) {
+fn places_avx512(path: Blocks<'_>, at: usize, factors: &[[f64; 2]], out: &mut Vec<Eight>) {
     places(path, at, factors, out);
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn places_avx2(path: Blocks<'_>, at: usize, factors: &[[f64; 2]], out: &mut Vec<Block>) {
+fn places_avx2(path: Blocks<'_>, at: usize, factors: &[[f64; 2]], out: &mut Vec<Eight>) {
     places(path, at, factors, out);
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f")]
-fn most_avx512(states: &States, block: usize, quintic: bool) -> [Block; 3] {
+fn most_avx512(states: &States, block: usize, quintic: bool) -> [Eight; 3] {
     most(states, block, quintic)
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn most_avx2(states: &States, block: usize, quintic: bool) -> [Block; 3] {
+fn most_avx2(states: &States, block: usize, quintic: bool) -> [Eight; 3] {
     most(states, block, quintic)
 }
 
 /// Returns `base + u·x + v·y`.
 #[inline(always)]
-fn sum(base: &Block, (u, x): (&Block, f64), (v, y): (&Block, f64)) -> Block {
-    let mut sum = [0.0; BLOCK];
-    for k in 0..BLOCK {
+fn sum(base: &Eight, (u, x): (&Eight, f64), (v, y): (&Eight, f64)) -> Eight {
+    let mut sum = [0.0; JOINTS];
+    for k in 0..JOINTS {
         sum[k] = base[k] + u[k] * x + v[k] * y;
     }
     sum
@@ -262,7 +262,7 @@ fn sum(base: &Block, (u, x): (&Block, f64), (v, y): (&Block, f64)) -> Block {
 // No closures here: they are compiled without the vectors of their caller where they are not inlined.
 #[inline(always)]
 fn extend(states: &mut States, stations: &[Station], path: Blocks<'_>) {
-    let zero = [0.0; BLOCK];
+    let zero = [0.0; JOINTS];
     for Station { at, before: [x0, x1, x2], after: [y0, y1, y2], .. } in stations {
         let [q, u, v] = path.around(*at);
         if let ([q], [u], [v]) = (q, u, v) {
@@ -280,7 +280,7 @@ fn extend(states: &mut States, stations: &[Station], path: Blocks<'_>) {
 }
 
 #[inline(always)]
-fn places(path: Blocks<'_>, at: usize, factors: &[[f64; 2]], out: &mut Vec<Block>) {
+fn places(path: Blocks<'_>, at: usize, factors: &[[f64; 2]], out: &mut Vec<Eight>) {
     let [q, before, after] = path.around(at);
     out.reserve(factors.len() * path.each);
     for [x, y] in factors {
@@ -291,8 +291,8 @@ fn places(path: Blocks<'_>, at: usize, factors: &[[f64; 2]], out: &mut Vec<Block
 }
 
 #[inline(always)]
-fn most(states: &States, block: usize, quintic: bool) -> [Block; 3] {
-    let mut most = [[0.0; BLOCK]; 3];
+fn most(states: &States, block: usize, quintic: bool) -> [Eight; 3] {
+    let mut most = [[0.0; JOINTS]; 3];
     let mut rows = states.values.chunks_exact(3 * states.blocks);
     let (Some(mut last), Some(mut time)) = (rows.next(), states.times.first().copied()) else { return most };
     for (row, now) in rows.zip(&states.times[1..]) {
@@ -300,7 +300,7 @@ fn most(states: &States, block: usize, quintic: bool) -> [Block; 3] {
         let (p0, v0, a0) = (&last[block], &last[states.blocks + block], &last[2 * states.blocks + block]);
         let (p1, v1, a1) = (&row[block], &row[states.blocks + block], &row[2 * states.blocks + block]);
         let inverse = 1.0 / h;
-        for k in 0..BLOCK {
+        for k in 0..JOINTS {
             let (ends, speeds) = ([p0[k], p1[k]], [v0[k], v1[k]]);
             let used = if quintic {
                 of_quintic(ends, speeds, [a0[k], a1[k]], h, inverse)
@@ -367,9 +367,9 @@ mod tests {
             (state >> 11) as f64 / (1_u64 << 52) as f64 - 1.0
         };
         for joints in [1_usize, 7, 8, 14] {
-            let blocks = joints.div_ceil(BLOCK);
+            let blocks = joints.div_ceil(JOINTS);
             let mut rows =
-                |n: usize| -> Vec<Block> { (0..n * blocks).map(|_| std::array::from_fn(|_| number())).collect() };
+                |n: usize| -> Vec<Eight> { (0..n * blocks).map(|_| std::array::from_fn(|_| number())).collect() };
             let (path, directions) = (rows(5), rows(4));
             let station = |k: usize| Station {
                 time: 0.1 * k as f64,
@@ -384,7 +384,7 @@ mod tests {
                     let mut states = States::new(joints, stations.len());
                     let whole = Blocks { configurations: &path, directions: &directions, each: blocks };
                     states.extend(&stations, whole, width);
-                    let mut places = vec![[7.0; BLOCK]];
+                    let mut places = vec![[7.0; JOINTS]];
                     whole.places(2, &[[0.1, 0.01 * 2.0], [0.0, 0.0]], &mut places, width);
                     assert_eq!(places[..blocks].as_flattened()[..joints], *states.values(2, 0));
                     let most = |block| [true, false].map(|quintic| states.most(block, quintic, width));
@@ -395,7 +395,7 @@ mod tests {
             assert!(made.iter().all(|one| one == &made[0]), "{joints} joints");
             // One state by its definition: the last direction serves the last configuration.
             let (states, j) = (&made[0].0, joints - 1);
-            let of = |rows: &[Block], row: usize| rows[row * blocks + j / BLOCK][j % BLOCK];
+            let of = |rows: &[Eight], row: usize| rows[row * blocks + j / JOINTS][j % JOINTS];
             for (k, s) in stations.iter().enumerate() {
                 let (u, v) = (of(&directions, s.at.saturating_sub(1)), of(&directions, s.at.min(3)));
                 let expected = of(&path, s.at) + u * s.before[0] + v * s.after[0];

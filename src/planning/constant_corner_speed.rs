@@ -9,7 +9,7 @@
 //! Good where lines are long compared to the corners.
 
 use dimos_kernels::Width;
-use dimos_kernels::states::{BLOCK, Block, Blocks, States, Station};
+use dimos_kernels::states::{Blocks, Eight, JOINTS, States, Station};
 
 use super::double_s::{LineLimits, State};
 use super::topp::JointBound;
@@ -33,14 +33,15 @@ const SHORT: f64 = 7.0;
 
 /// A path whose corners are blended, and its limits.
 #[derive(Debug)]
-pub(super) struct RoundedPath<'a> {
-    path: &'a [Vec<f64>],
+pub(super) struct RoundedPath {
+    /// Joints of a configuration.
+    joints: usize,
     /// Blocks per configuration.
     blocks: usize,
     /// The path's configurations.
-    configurations: Vec<Block>,
+    configurations: Vec<Eight>,
     /// Direction of each line, of length 1.
-    directions: Vec<Block>,
+    directions: Vec<Eight>,
     lines: Vec<Line>,
     /// One per configuration; those of the ends are rests.
     corners: Vec<Corner>,
@@ -96,30 +97,30 @@ fn progress(jerk: bool, x: f64) -> Progress {
 
 /// Limits as factors, block by block.
 struct Inverse {
-    velocity: Vec<Block>,
-    acceleration: Vec<Block>,
-    jerk: Vec<Block>,
+    velocity: Vec<Eight>,
+    acceleration: Vec<Eight>,
+    jerk: Vec<Eight>,
 }
 
 impl Inverse {
     fn of(bounds: &[JointBound]) -> Self {
         let list = |of: fn(&JointBound) -> f64| {
             let block = |bounds: &[JointBound]| {
-                let mut block = [0.0; BLOCK];
+                let mut block = [0.0; JOINTS];
                 block.iter_mut().zip(bounds).for_each(|(inverse, b)| *inverse = (1.0 + ROUNDING) / of(b));
                 block
             };
-            bounds.chunks(BLOCK).map(block).collect()
+            bounds.chunks(JOINTS).map(block).collect()
         };
         Self { velocity: list(|b| b.velocity), acceleration: list(|b| b.acceleration), jerk: list(|b| b.jerk) }
     }
 }
 
 /// Returns the largest `|value|·factor`.
-fn most(values: &[Block], factors: &[Block]) -> f64 {
-    let mut most = [0.0_f64; BLOCK];
+fn most(values: &[Eight], factors: &[Eight]) -> f64 {
+    let mut most = [0.0_f64; JOINTS];
     for (values, factors) in values.iter().zip(factors) {
-        for k in 0..BLOCK {
+        for k in 0..JOINTS {
             let used = values[k].abs() * factors[k];
             most[k] = if used > most[k] { used } else { most[k] };
         }
@@ -128,10 +129,10 @@ fn most(values: &[Block], factors: &[Block]) -> f64 {
 }
 
 /// Writes the difference of two directions or configurations; returns its length.
-fn difference(from: &[Block], to: &[Block], out: &mut [Block]) -> f64 {
-    let mut square = [0.0; BLOCK];
+fn difference(from: &[Eight], to: &[Eight], out: &mut [Eight]) -> f64 {
+    let mut square = [0.0; JOINTS];
     for ((out, from), to) in out.iter_mut().zip(from).zip(to) {
-        for k in 0..BLOCK {
+        for k in 0..JOINTS {
             out[k] = to[k] - from[k];
             square[k] += out[k] * out[k];
         }
@@ -139,20 +140,20 @@ fn difference(from: &[Block], to: &[Block], out: &mut [Block]) -> f64 {
     square.into_iter().sum::<f64>().sqrt()
 }
 
-impl<'a> RoundedPath<'a> {
+impl RoundedPath {
     /// Blends the corners of a path without repeated configurations. At configuration `i` the motion stays within
     /// `deviation[i]` [rad, Euclidean] of the path; it rests where that is 0.
-    pub fn new(path: &'a [Vec<f64>], bounds: &[JointBound], deviation: &[f64]) -> Self {
-        let blocks = bounds.len().div_ceil(BLOCK);
+    pub fn new(path: &[Vec<f64>], bounds: &[JointBound], deviation: &[f64]) -> Self {
+        let blocks = bounds.len().div_ceil(JOINTS);
         let inverse = Inverse::of(bounds);
         let jerk = inverse.jerk.as_flattened().iter().any(|inverse| *inverse > 0.0);
         let ramps = bounds.iter().map(|b| b.acceleration / b.jerk).filter(|_| jerk);
         let ramp = ramps.fold(0.0, f64::max);
-        let mut configurations = vec![[0.0; BLOCK]; blocks * path.len()];
+        let mut configurations = vec![[0.0; JOINTS]; blocks * path.len()];
         for (q, blocks) in path.iter().zip(configurations.chunks_exact_mut(blocks)) {
             blocks.as_flattened_mut()[..q.len()].copy_from_slice(q);
         }
-        let mut directions = vec![[0.0; BLOCK]; blocks * path.len().saturating_sub(1)];
+        let mut directions = vec![[0.0; JOINTS]; blocks * path.len().saturating_sub(1)];
         let mut lines = Vec::with_capacity(path.len());
         for (i, direction) in directions.chunks_exact_mut(blocks).enumerate() {
             let [from, to] = [i, i + 1].map(|i| &configurations[i * blocks..(i + 1) * blocks]);
@@ -167,8 +168,8 @@ impl<'a> RoundedPath<'a> {
             lines.push(Line { length, limits });
         }
         let corners = vec![Corner::default(); path.len()];
-        let mut rounded = Self { path, blocks, configurations, directions, lines, corners, jerk, ramp };
-        let mut turn = vec![[0.0; BLOCK]; blocks];
+        let mut rounded = Self { joints: bounds.len(), blocks, configurations, directions, lines, corners, jerk, ramp };
+        let mut turn = vec![[0.0; JOINTS]; blocks];
         for i in 1..path.len().saturating_sub(1) {
             let length = difference(rounded.direction(i - 1), rounded.direction(i), &mut turn);
             let used = [most(&turn, &inverse.acceleration), if jerk { most(&turn, &inverse.jerk) } else { 0.0 }];
@@ -188,7 +189,7 @@ impl<'a> RoundedPath<'a> {
         corner.half = if corner.turn > REVERSAL || deviation <= 0.0 { 0.0 } else { length.min(room) };
     }
 
-    fn direction(&self, line: usize) -> &[Block] {
+    fn direction(&self, line: usize) -> &[Eight] {
         &self.directions[line * self.blocks..(line + 1) * self.blocks]
     }
 
@@ -223,7 +224,7 @@ impl<'a> RoundedPath<'a> {
 
     /// Writes the ends of the straight pieces that follow corner `i` within `sagitta` [rad], in blocks; nothing for a
     /// rest. Returns the number of blocks of each.
-    pub fn corner(&self, i: usize, sagitta: f64, factors: &mut Vec<[f64; 2]>, out: &mut Vec<Block>) -> usize {
+    pub fn corner(&self, i: usize, sagitta: f64, factors: &mut Vec<[f64; 2]>, out: &mut Vec<Eight>) -> usize {
         let pieces = self.pieces(i, sagitta);
         let (length, step, jerk) = (2.0 * self.corners[i].half, 1.0 / pieces.max(1) as f64, self.jerk);
         let ends = if pieces > 0 { pieces + 1 } else { 0 };
@@ -240,7 +241,8 @@ impl<'a> RoundedPath<'a> {
     /// Writes the ends of the part of a line between its corners.
     pub fn ends_of_line(&self, line: usize, from: &mut [f64], to: &mut [f64]) {
         let [first, last] = [line, line + 1].map(|i| self.corners[i].half);
-        let ends = self.path[line].iter().zip(&self.path[line + 1]).zip(self.direction(line).as_flattened());
+        let [a, b] = [line, line + 1].map(|i| self.configurations[i * self.blocks..].as_flattened());
+        let ends = a.iter().zip(b).zip(self.direction(line).as_flattened());
         for ((from, to), ((a, b), d)) in from.iter_mut().zip(to).zip(ends) {
             (*from, *to) = (a + d * first, b - d * last);
         }
@@ -255,7 +257,7 @@ impl<'a> RoundedPath<'a> {
 
     /// Returns the speeds at all configurations [rad/s].
     pub fn speeds(&self) -> Vec<f64> {
-        let last = self.path.len() - 1;
+        let last = self.corners.len() - 1;
         let mut speeds: Vec<f64> = (0..=last).map(|i| self.corner_speed(i)).collect();
         let reached = |line: usize, from: f64, most: f64| match self.straight(line) {
             0.0 => most.min(from),
@@ -298,15 +300,15 @@ impl<'a> RoundedPath<'a> {
     /// Returns the motion at these speeds, from rest to rest.
     pub fn motion(&self, speeds: &[f64]) -> States {
         let stations = self.stations(speeds);
-        let mut states = States::new(self.path[0].len(), stations.len());
+        let mut states = States::new(self.joints, stations.len());
         states.extend(&stations, self.as_blocks(), Width::widest());
         states
     }
 
     /// Returns where the jerk changes at these speeds.
     fn stations(&self, speeds: &[f64]) -> Vec<Station> {
-        let last = self.path.len() - 1;
-        let mut stations: Vec<Station> = Vec::with_capacity(if self.jerk { 11 } else { 5 } * self.path.len());
+        let last = self.corners.len() - 1;
+        let mut stations: Vec<Station> = Vec::with_capacity(if self.jerk { 11 } else { 5 } * self.corners.len());
         let mut start = 0.0;
         stations.push(Station::default());
         for line in 0..last {

@@ -7,7 +7,7 @@
 
 use std::borrow::Cow;
 
-use dimos_kernels::states::{Block, States};
+use dimos_kernels::states::{Eight, States};
 
 use crate::joint::DEFAULT_ACCELERATION;
 use crate::robot::model::Limits;
@@ -141,7 +141,7 @@ pub fn time_within(
 
 /// Returns whether a motion that changes its speed in corners is quicker than one that does not. It takes ten times as
 /// long to compute, so it is not where it would gain little.
-fn variable_is_quicker(rounded: &RoundedPath<'_>, path: &[Vec<f64>], bounds: &[JointBound], deviation: &[f64]) -> bool {
+fn variable_is_quicker(rounded: &RoundedPath, path: &[Vec<f64>], bounds: &[JointBound], deviation: &[f64]) -> bool {
     let speeds = rounded.speeds();
     if rounded.suits(&speeds) {
         return false;
@@ -157,7 +157,7 @@ fn variable_is_quicker(rounded: &RoundedPath<'_>, path: &[Vec<f64>], bounds: &[J
 /// Times a path whose corners are passed at constant speed.
 fn at_constant_corner_speed(
     names: &[String],
-    (path, mut rounded): (&[Vec<f64>], RoundedPath<'_>),
+    (path, mut rounded): (&[Vec<f64>], RoundedPath),
     bounds: &[JointBound],
     mut deviation: Vec<f64>,
     speed: f64,
@@ -167,7 +167,7 @@ fn at_constant_corner_speed(
     let (mut factors, mut places) = (Vec::new(), Vec::new());
     for (i, deviation) in deviation.iter_mut().enumerate().take(path.len() - 1).skip(1) {
         // In pieces that are as straight as the motion is checked elsewhere.
-        let mut is_free = |rounded: &RoundedPath<'_>| {
+        let mut is_free = |rounded: &RoundedPath| {
             let each = rounded.corner(i, SAGITTA, &mut factors, &mut places);
             let place = |k: usize| &places[k * each..(k + 1) * each].as_flattened()[..names.len()];
             (1..places.len() / each).all(|k| free(place(k - 1), place(k)))
@@ -297,7 +297,7 @@ fn finished(
     let points = match states.in_one_block() {
         // Without a copy of a copy.
         Some(rows) => {
-            let list = |row: &Block| JointValues::from_buf_and_len(*row, names.len());
+            let list = |row: &Eight| JointValues::from_buf_and_len(*row, names.len());
             times.zip(rows).map(|(time, [p, v, a])| point(*time, [list(p), list(v), list(a)])).collect()
         }
         None => {

@@ -1,7 +1,7 @@
 //! Measures how much of each limit a trajectory uses, on the curve between its points.
 
 use dimos_kernels::Width;
-use dimos_kernels::states::{BLOCK, States};
+use dimos_kernels::states::{JOINTS, States};
 
 use super::topp::JointBound;
 
@@ -123,7 +123,7 @@ fn of_quintic(d: f64, [v0, v1]: [f64; 2], [a0, a1]: [f64; 2], h: f64, inverse: f
 /// Returns upper bounds of what the spline through states uses.
 fn upper_bounds(states: &States, bounds: &[JointBound], quintic: bool) -> Excess {
     let mut all = Excess::default();
-    for (block, bounds) in bounds.chunks(BLOCK).enumerate() {
+    for (block, bounds) in bounds.chunks(JOINTS).enumerate() {
         let most = states.most(block, quintic, Width::widest());
         for (k, bound) in bounds.iter().enumerate() {
             all = all.max(part_of([0, 1, 2].map(|which| most[which][k]), bound));

@@ -16,6 +16,7 @@ pub use super::attach_api::*;
 pub use super::cartesian_api::*;
 use super::error::{Code, RpcError};
 pub use super::gateway_api::*;
+pub use super::ik_api::*;
 use super::lease::Subject;
 pub use super::model_api::*;
 pub use super::motion_api::*;

@@ -23,6 +23,7 @@ mod connection;
 mod connection_limit;
 pub mod error;
 mod gateway_api;
+mod ik_api;
 mod lease;
 mod line_reader;
 mod model_api;

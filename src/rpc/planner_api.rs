@@ -116,17 +116,8 @@ impl Default for Plan {
     fn default() -> Self {
         let (goals, through, speed) = (Vec::new(), Vec::new(), default_speed());
         let level = PlanLevel::default();
-        Self {
-            goals,
-            speed,
-            seed: 0,
-            level,
-            refine: DEFAULT_REFINE,
-            timeout: None,
-            through,
-            blend: 0.0,
-            by_number: false,
-        }
+        let (refine, timeout) = (DEFAULT_REFINE, None);
+        Self { goals, speed, seed: 0, level, refine, timeout, through, blend: 0.0, by_number: false }
     }
 }
 
@@ -350,37 +341,6 @@ pub struct GoalClamped {
     pub requested: f64,
     /// Position of the limit.
     pub used: f64,
-}
-
-/// Parameters of `ik`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct Ik {
-    /// The robot's name in the planner.
-    pub robot: String,
-    /// Pose of its tool centre point in `map`; without `rpy` and `quat` the orientation is free.
-    pub pose: PoseSpec,
-    /// Joint positions to begin from [rad]; default: the present ones.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub near: Option<Vec<f64>>,
-}
-
-impl Ik {
-    pub(super) fn valid(&self) -> Result<(), String> {
-        finite("near", self.near.as_deref().unwrap_or_default())?;
-        self.pose.valid("pose")
-    }
-}
-
-/// Reply to `ik`.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
-pub struct IkReply {
-    /// Joint positions that reach the pose [rad]; absent if none were found.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub joints: Option<Vec<f64>>,
-    /// What touches there, or why there are none; absent if the pose is free.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub error: Option<String>,
 }
 
 /// Parameters of `preview`.
