@@ -103,6 +103,8 @@ pub struct Motion<'a> {
     pub to: &'a [f64],
     /// Number of blocks of sixteen samples.
     pub blocks: usize,
+    /// Number of blocks that are left out: the first one is spread over the whole motion, as a motion of one block is.
+    pub skipped: usize,
     /// For each pair of the scene, its padding [m].
     pub pads: &'a [f64],
     /// The largest of them.
@@ -270,7 +272,8 @@ impl Discrete {
         // Buffers may have been used for another scene.
         buffers.frequent.retain(|pair| (*pair as usize) < scene.pairs.len());
         let none = &[][..];
-        let motion = Motion { from: none, to: none, blocks: 1, pads, pad, likely: None, proof: Proof::None };
+        let motion =
+            Motion { from: none, to: none, blocks: 1, skipped: 0, pads, pad, likely: None, proof: Proof::None };
         match scene.width.0 {
             // SAFETY: only `Width` makes one, and only of vectors that this processor has.
             #[cfg(target_arch = "x86_64")]

@@ -90,6 +90,15 @@ impl Nodes {
         self.number += 1;
     }
 
+    /// Removes a node: it is nearest to nothing any longer. The indices of the others stay.
+    pub fn remove(&mut self, node: usize) {
+        let dof = self.turns.len();
+        if node < self.number {
+            let group = &mut self.groups[node / LANES * dof..][..dof];
+            group.iter_mut().for_each(|block| block.0[node % LANES] = f32::INFINITY);
+        }
+    }
+
     /// Compares the nodes that were added since with sixteen samples, one block per variable.
     ///
     /// # Panics

@@ -64,6 +64,17 @@ impl Default for Resolution {
     }
 }
 
+/// Which samples of a motion are looked at.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Samples {
+    /// All.
+    All,
+    /// Sixteen, spread over the motion: most motions that touch anything touch at one of these.
+    First,
+    /// All but the first.
+    Rest,
+}
+
 /// Checks collisions of one or more robots. A configuration holds the joints of all robots, one after the other.
 pub trait CollisionChecker {
     /// Returns the number of joints in a configuration.
@@ -96,6 +107,11 @@ pub trait CollisionChecker {
     /// touching.
     fn motion_looks_free(&mut self, from: &[f64], to: &[f64]) -> bool {
         self.motion_is_free(from, to, &Stop::never())
+    }
+
+    /// Same at some of its samples: a motion looks free if it does so at the first ones and at the rest.
+    fn motion_looks_free_at(&mut self, samples: Samples, from: &[f64], to: &[f64]) -> bool {
+        samples == Samples::Rest || self.motion_looks_free(from, to)
     }
 
     /// Returns those of `lanes` at whose configurations something looks as if it touched: no motion that ends there

@@ -9,7 +9,7 @@ use glamx::{DAffine3, DVec3};
 
 use crate::robot::model::Limits;
 
-use super::checker::{CollisionChecker, Resolution, Stop};
+use super::checker::{CollisionChecker, Resolution, Samples, Stop};
 use super::lanes::InLanes;
 use super::motion::Pieces;
 use super::pairs::general::nearest;
@@ -113,7 +113,7 @@ impl ExactChecker {
     pub(super) fn first_touch(&mut self, q: &[f64]) -> Option<usize> {
         let pads = (&self.pads[..], self.most_pad);
         let finite = q.iter().all(|x| x.is_finite());
-        if finite && self.lanes.touching((q, q), pads, self.witness, Proof::Samples, 1.0).0.is_none() {
+        if finite && self.lanes.touching(Samples::All, (q, q), pads, self.witness, Proof::Samples, 1.0).0.is_none() {
             self.checks += 1;
             return None;
         }
@@ -343,12 +343,16 @@ impl CollisionChecker for ExactChecker {
     }
 
     fn motion_looks_free(&mut self, from: &[f64], to: &[f64]) -> bool {
+        self.motion_looks_free_at(Samples::All, from, to)
+    }
+
+    fn motion_looks_free_at(&mut self, samples: Samples, from: &[f64], to: &[f64]) -> bool {
         if self.always.is_some() {
             return false;
         }
-        let (found, samples) =
-            self.lanes.touching((from, to), (&self.pads, self.most_pad), self.witness, Proof::None, 1.0);
-        self.checks += samples;
+        let pads = (&self.pads[..], self.most_pad);
+        let (found, looked) = self.lanes.touching(samples, (from, to), pads, self.witness, Proof::None, 1.0);
+        self.checks += looked;
         self.witness = found.or(self.witness);
         found.is_none()
     }

@@ -12,12 +12,15 @@ use dimos_kernels::discrete::{self, Discrete, Motion, Proof};
 use dimos_kernels::obstacle::{Core, Obstacle};
 use glamx::DAffine3;
 
+use super::checker::Samples;
 use super::report::Pair;
 use super::scene::{LinkShape, PlacedObstacle, Scene};
 use super::{cover, shape};
 
 /// Samples of a discrete check of a motion [1/rad], in the norm of all joints: as VAMP has for most arms.
 const SAMPLES_PER_RAD: f64 = 32.0;
+/// A motion that is longer than a number of blocks by less than this part of one is not.
+const ROUNDING: f64 = 1e-4;
 /// Most blocks of samples of one motion.
 const MOST_BLOCKS: f64 = 4096.0;
 
@@ -84,10 +87,11 @@ impl InLanes {
     }
 
     /// Returns a pair that touches at samples of a motion, or that does not prove what it has to, and the number of
-    /// samples. `likely` is compared first; each of `parts` of the motion gets as many samples as the whole of it
-    /// would.
+    /// those that were looked at. `likely` is compared first; each of `parts` of the motion gets as many samples as the
+    /// whole of it would.
     pub fn touching(
         &mut self,
+        samples: Samples,
         (from, to): (&[f64], &[f64]),
         (pads, pad): (&[f64], f64),
         likely: Option<usize>,
@@ -95,10 +99,17 @@ impl InLanes {
         parts: f64,
     ) -> (Option<usize>, u64) {
         let length = from.iter().zip(to).map(|(a, b)| (b - a) * (b - a)).sum::<f64>().sqrt();
-        let blocks = (length * parts * SAMPLES_PER_RAD / LANES as f64).ceil().clamp(1.0, MOST_BLOCKS) as usize;
-        let motion = Motion { from, to, blocks, pads, pad, likely: likely.map(|pair| pair as u32), proof };
+        // An edge of a search is 1 rad long, more or less by rounding, and gets no block for the rounding.
+        let whole = length * parts * SAMPLES_PER_RAD / LANES as f64 - ROUNDING;
+        let blocks = whole.ceil().clamp(1.0, MOST_BLOCKS) as usize;
+        let (blocks, skipped) = match samples {
+            Samples::All => (blocks, 0),
+            Samples::First => (1, 0),
+            Samples::Rest => (blocks, 1),
+        };
+        let motion = Motion { from, to, blocks, skipped, pads, pad, likely: likely.map(|pair| pair as u32), proof };
         let found = self.discrete.touching(&motion, &mut self.samples).map(|pair| pair as usize);
-        (found, (blocks * LANES) as u64)
+        (found, ((blocks - skipped) * LANES) as u64)
     }
 
     /// Returns those of `lanes` in which something touches. `q`: a block per joint [rad or m].

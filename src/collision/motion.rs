@@ -14,7 +14,7 @@
 use dimos_kernels::block::LANES;
 use dimos_kernels::discrete::Proof;
 
-use super::checker::Stop;
+use super::checker::{Samples, Stop};
 use super::exact::{ExactChecker, Gap};
 use super::report::Pair;
 
@@ -135,11 +135,11 @@ impl ExactChecker {
         self.measure(p, from, to);
         let (pads, parts) = ((&self.pads[..], self.most_pad), f64::from(halved).exp2());
         let proof = Proof::Motion { reach: &p.reach, turn: self.lanes.turn(from, to) };
-        let (left, samples) = self.lanes.touching((from, to), pads, self.witness, proof, parts);
+        let (left, samples) = self.lanes.touching(Samples::All, (from, to), pads, self.witness, proof, parts);
         self.checks += samples;
         let Some(pair) = left else { return true };
         self.witness = Some(pair);
-        let (touching, _) = self.lanes.touching((from, to), pads, self.witness, Proof::None, parts);
+        let (touching, _) = self.lanes.touching(Samples::All, (from, to), pads, self.witness, Proof::None, parts);
         if halved == HALVINGS || touching.is_some() {
             return in_pieces && self.check_motion_with(p, from, to, stop);
         }

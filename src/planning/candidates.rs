@@ -54,6 +54,11 @@ impl Candidates {
         self.number
     }
 
+    /// Forgets which nodes of the tree are nearest to the samples.
+    pub fn forget_nearest(&mut self) {
+        self.nearest = Nearest::NONE;
+    }
+
     /// Removes all samples.
     pub fn clear(&mut self) {
         (self.number, self.next, self.blocked) = (0, 0, 0);

@@ -23,6 +23,7 @@ mod jerk_limit;
 pub mod joint_path;
 mod legs;
 pub mod level;
+mod looked;
 pub mod nearest;
 pub mod padded;
 pub mod path;

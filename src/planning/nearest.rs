@@ -76,6 +76,18 @@ impl Tree {
         self.parents.len() - 1
     }
 
+    /// Removes a node and all that grew from it: no sample is connected to them any longer.
+    pub fn remove(&mut self, node: usize) {
+        // A node comes after its parent.
+        let mut removed = vec![false; self.len()];
+        for i in node..self.len() {
+            removed[i] = i == node || self.parent(i).is_some_and(|parent| removed[parent]);
+            if removed[i] {
+                self.nodes.remove(i);
+            }
+        }
+    }
+
     /// Returns the node nearest to a configuration, continuous joints the short way round, and its distance [rad].
     pub fn nearest(&self, q: &[f64]) -> (usize, f64) {
         let (node, squared) = self.nodes.nearest(q);
@@ -89,10 +101,14 @@ impl Tree {
         }
     }
 
-    /// Returns the configurations from a node up to its root.
-    pub fn way_up(&self, node: usize) -> impl Iterator<Item = &[f64]> {
-        let up = |i: &usize| self.parents.get(*i).filter(|p| **p != ROOT).map(|p| *p as usize);
-        std::iter::successors(Some(node), up).map(|i| self.node(i))
+    /// Returns the parent of a node, unless it is a root.
+    pub fn parent(&self, i: usize) -> Option<usize> {
+        self.parents.get(i).filter(|parent| **parent != ROOT).map(|parent| *parent as usize)
+    }
+
+    /// Returns a node and those above it, up to its root.
+    pub fn way_up(&self, node: usize) -> impl Iterator<Item = usize> {
+        std::iter::successors(Some(node), |i| self.parent(*i))
     }
 }
 
@@ -109,6 +125,11 @@ impl Batch {
     /// Creates one of which all samples are used.
     pub fn new(dof: usize) -> Self {
         Self { samples: vec![Lanes::splat(0.0); dof], nearest: [Nearest::NONE; 2], next: LANES }
+    }
+
+    /// Forgets which nodes of a tree are nearest to the samples.
+    pub fn forget_nearest(&mut self, side: usize) {
+        self.nearest[side] = Nearest::NONE;
     }
 
     /// Returns whether all samples are used.

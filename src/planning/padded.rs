@@ -9,6 +9,7 @@ use dimos_kernels::block::{LANES, Lanes};
 
 use super::path::between;
 use crate::collision::allowed_pairs::sample;
+use crate::collision::checker::Samples;
 use crate::collision::kept::{Kept, Motion};
 use crate::collision::report::{Contact, Pair};
 use crate::collision::{CollisionChecker, ExactChecker, Resolution, Scene, Stop};
@@ -280,8 +281,12 @@ impl CollisionChecker for Padded {
     }
 
     fn motion_looks_free(&mut self, from: &[f64], to: &[f64]) -> bool {
+        self.motion_looks_free_at(Samples::All, from, to)
+    }
+
+    fn motion_looks_free_at(&mut self, samples: Samples, from: &[f64], to: &[f64]) -> bool {
         // Close to a start or goal, where the padding is less, a motion is proven or not.
-        self.full.motion_looks_free(from, to)
+        self.full.motion_looks_free_at(samples, from, to)
             || (!self.cuts(from, to).is_empty() && self.motion_is_free(from, to, &Stop::never()))
     }
 

@@ -6,8 +6,10 @@ use crate::collision::checker::{CollisionChecker, Stop};
 use crate::collision::report::Contact;
 use crate::robot::random::Random;
 
+use super::edges::Edges;
 use super::enclosure::{Enclosed, enclosed};
 use super::level::Level;
+use super::looked::Looked;
 use super::path::{Path, between, distance, length, unwind};
 use super::portfolio::{Candidate, Halt, Portfolio};
 use super::refine::{cut, refine};
@@ -250,7 +252,8 @@ pub fn plan<C: CollisionChecker>(
                     Err(Halt::Exhausted) => return Err(PlanError::Exhausted(count)),
                 };
                 search_time = began.elapsed();
-                if let Some(path) = finished(checker, &found, count.nodes, settings, stop) {
+                if let Some((path, looked)) = finished(checker, &found, count.nodes, settings, stop) {
+                    search_time += looked;
                     break path;
                 }
             }
@@ -312,32 +315,48 @@ const CUTS: (usize, usize) = (10, 256);
 /// A search with more nodes takes longer, and so may the cuts of its path.
 const NODES_PER_CUT: usize = 8;
 
-/// Shortens a path that was found, and proves it if the level asks for that; `None` if it cannot be proven. `nodes`:
-/// those of the search.
+/// Shortens a path that was found, and checks what is left of it as far as the level asks for; `None` if it cannot be
+/// used. `nodes`: those of the search. Also returns the duration of looks that the search left out.
 fn finished<C: CollisionChecker>(
     checker: &mut C,
     found: &Candidate,
     nodes: usize,
     settings: &PlanSettings,
     stop: &Stop,
-) -> Option<Path> {
+) -> Option<(Path, Duration)> {
     let turns = checker.turns().to_vec();
-    let rounds = &settings.shortcut;
-    if found.proven {
-        return Some(shorten(&found.path, &turns, rounds, &mut |a, b| checker.motion_is_easily_free(a, b, stop)));
+    let (rounds, none) = (&settings.shortcut, Duration::ZERO);
+    if matches!(found.edges, Edges::Checked | Edges::Proven) {
+        let mut is_free = |a: &[f64], b: &[f64]| checker.motion_is_easily_free(a, b, stop);
+        return Some((shorten(&found.path, &turns, rounds, &mut is_free), none));
     }
-    let mut looks_free = |a: &[f64], b: &[f64]| !stop.is_over() && checker.motion_looks_free(a, b);
+    // A proof needs no looks before it.
+    let looks = found.edges == Edges::Looking && !settings.level.proves();
+    let mut looked = Looked::default();
+    let mut looks_free = |a: &[f64], b: &[f64]| {
+        let free = !stop.is_over() && checker.motion_looks_free(a, b);
+        if looks && free {
+            looked.add(a, b);
+        }
+        free
+    };
     let short = shorten(&found.path, &turns, rounds, &mut looks_free);
     let cuts = (nodes / NODES_PER_CUT).clamp(CUTS.0, CUTS.1);
     let short = cut(&short, cuts, &mut Random::new(settings.seed), &mut looks_free).unwrap_or(short);
+    if looks {
+        let began = Instant::now();
+        let looks_free =
+            |edge: &[Vec<f64>]| looked.has(&edge[0], &edge[1]) || checker.motion_looks_free(&edge[0], &edge[1]);
+        return short.windows(2).all(looks_free).then(|| (short, began.elapsed()));
+    }
     if is_proven(checker, &short, settings.level, stop) {
-        return Some(short);
+        return Some((short, none));
     }
     // Most often one of many edges touches between two samples: shortened again, each new edge is proven.
     is_proven(checker, &found.path, settings.level, stop).then(|| {
         let mut is_free =
             |a: &[f64], b: &[f64]| checker.motion_looks_free(a, b) && checker.motion_is_easily_free(a, b, stop);
-        shorten(&found.path, &turns, rounds, &mut is_free)
+        (shorten(&found.path, &turns, rounds, &mut is_free), none)
     })
 }
 

@@ -25,8 +25,8 @@ pub enum Halt {
 pub struct Candidate {
     /// Its configurations.
     pub path: Path,
-    /// Whether every edge is proven.
-    pub proven: bool,
+    /// How its edges were checked.
+    pub edges: Edges,
 }
 
 /// Edges that each search checks in its first turn; twice as many in each further one.
@@ -50,6 +50,7 @@ pub struct Portfolio {
     goals: Vec<Vec<f64>>,
     members: Vec<Member>,
     settings: RrtSettings,
+    level: Level,
     turn: usize,
     round: u32,
     took_long: bool,
@@ -90,6 +91,7 @@ impl Portfolio {
             goals: goals.to_vec(),
             members,
             settings: *settings,
+            level,
             turn: 0,
             round: 0,
             took_long: false,
@@ -106,8 +108,8 @@ impl Portfolio {
         })
     }
 
-    /// Returns the next path. At the next call, the search that found it begins again with proven edges, or has ended
-    /// if they were; the others continue.
+    /// Returns the next path. At the next call, the search that found it begins again with edges that are checked as far
+    /// as the level asks for, or has ended if they were; the others continue.
     pub fn next<C: CollisionChecker>(&mut self, checker: &mut C, stop: &Stop) -> Result<Candidate, Halt> {
         loop {
             let count = self.count();
@@ -146,11 +148,12 @@ impl Portfolio {
                 self.ended.nodes += count.nodes;
                 let member = &mut self.members[self.turn];
                 if checked == Edges::Looking {
-                    (member.edges, member.search) = (Edges::Checked, None);
+                    let edges = if self.level.proves() { Edges::Checked } else { Edges::Looked };
+                    (member.edges, member.search) = (edges, None);
                 } else {
                     self.members.remove(self.turn);
                 }
-                return Ok(Candidate { path, proven: checked != Edges::Looking });
+                return Ok(Candidate { path, edges: checked });
             }
             self.turn += 1;
         }

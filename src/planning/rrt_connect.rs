@@ -1,7 +1,9 @@
 //! RRT-Connect (Kuffner and LaValle, 2000): two trees, one from the start and one from the goals, grow towards random
 //! configurations and towards each other. Nodes that fail to grow attract fewer samples (dynamic domain: Yershova,
-//! Jaillet, Siméon and LaValle, 2005), and the smaller tree grows first. Every edge is checked, including the joining
-//! one. Half of the samples are drawn in the domains of random nodes: of the others, hardly any is in one.
+//! Jaillet, Siméon and LaValle, 2005), and the smaller tree grows first. Every edge is looked at, including the joining
+//! one; what takes long is checked once an edge is part of a path, and what grew from one that touches is removed (lazy
+//! checks: Sánchez and Latombe, "A single-query bi-directional probabilistic roadmap planner with lazy collision
+//! checking", 2001). Half of the samples are drawn in the domains of random nodes: of the others, hardly any is in one.
 //!
 //! Continuous joints move the short way round: a node follows its parent without a jump, and where the trees meet, the
 //! goal's half of the path is shifted by whole turns to match the start's half.
@@ -307,12 +309,31 @@ impl Search {
             node = other.add(&self.sample, Some(node));
         }
         let (from_start, from_goal) = if self.side == 0 { (added, node) } else { (node, added) };
+        if !(self.confirm(0, from_start, check) && self.confirm(1, from_goal, check)) {
+            return None;
+        }
         let mut path = Path::with_capacity(2 * LANES);
-        path.extend(self.trees[0].way_up(from_start).map(<[f64]>::to_vec));
+        path.extend(self.trees[0].way_up(from_start).map(|i| self.trees[0].node(i).to_vec()));
         path.reverse();
         let met = path.len();
-        path.extend(self.trees[1].way_up(from_goal).map(<[f64]>::to_vec));
+        path.extend(self.trees[1].way_up(from_goal).map(|i| self.trees[1].node(i).to_vec()));
         unwind_all(&mut path[met..], self.trees[0].node(from_start), &self.turns);
         Some(tidy(path))
+    }
+
+    /// Returns whether all edges from a node up to its root are confirmed; otherwise removes what grew from one that is
+    /// not.
+    fn confirm(&mut self, side: usize, node: usize, check: &mut dyn EdgeCheck) -> bool {
+        let tree = &self.trees[side];
+        let mut is_refused = |i: &usize| {
+            let parent = tree.parent(*i);
+            parent.is_some_and(|parent| !check.is_confirmed(tree.node(parent), tree.node(*i)))
+        };
+        let refused = tree.way_up(node).find(&mut is_refused);
+        let Some(refused) = refused else { return true };
+        self.trees[side].remove(refused);
+        self.batch.forget_nearest(side);
+        self.candidates[side].forget_nearest();
+        false
     }
 }

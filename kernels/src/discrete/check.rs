@@ -43,7 +43,7 @@ fn check_blocks<B: Block, const SWEPT: bool>(
     buffers: &mut Buffers,
 ) -> Option<u32> {
     let blocks = motion.blocks.max(1);
-    for block in 0..blocks {
+    for block in motion.skipped..blocks {
         // Samples number i, in lane k: i = (k + 1) · blocks − block, from 1.
         let mut parts = Lanes::splat(0.0);
         for (k, part) in parts.0.iter_mut().enumerate() {

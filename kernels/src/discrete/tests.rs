@@ -62,10 +62,22 @@ fn scene(numbers: &mut Numbers, width: Width) -> Arc<Scene> {
 const LEVERS: [f64; 4] = [1.3, 1.0, 0.7, 1.0];
 
 fn check(discrete: &Discrete, from: &[f64], to: &[f64], blocks: usize, swept: bool) -> Option<u32> {
+    check_from(0, discrete, from, to, blocks, swept)
+}
+
+/// Leaves the first blocks out.
+fn check_from(
+    skipped: usize,
+    discrete: &Discrete,
+    from: &[f64],
+    to: &[f64],
+    blocks: usize,
+    swept: bool,
+) -> Option<u32> {
     let moved: Vec<f64> = from.iter().zip(to).map(|(a, b)| (b - a).abs()).collect();
     let reach = vec![moved.iter().zip(LEVERS).map(|(d, lever)| d * lever * 2.0).sum::<f64>(); 90];
     let proof = if swept { Proof::Motion { reach: &reach, turn: moved.iter().sum() } } else { Proof::None };
-    let motion = Motion { from, to, blocks, pads: &[0.003; 90], pad: 0.003, likely: None, proof };
+    let motion = Motion { from, to, blocks, skipped, pads: &[0.003; 90], pad: 0.003, likely: None, proof };
     discrete.touching(&motion, &mut Buffers::default())
 }
 
@@ -82,7 +94,7 @@ fn on_every_width(numbers: &mut Numbers) -> Vec<Discrete> {
 #[test]
 fn a_swept_motion_touches_nowhere_and_what_touches_is_found() {
     let mut numbers = Numbers(5);
-    let (mut proven, mut touching, mut between) = (0, 0, 0);
+    let (mut proven, mut touching, mut between, mut only_rest) = (0, 0, 0, 0);
     for _ in 0..12 {
         let scenes = on_every_width(&mut numbers);
         for _ in 0..60 {
@@ -97,6 +109,11 @@ fn a_swept_motion_touches_nowhere_and_what_touches_is_found() {
             let fine = check(&scenes[0], &from, &to, 64, false);
             // The samples of the coarse check are among those of the fine one.
             assert!(looks.is_none() || fine.is_some());
+            // So is the first block, which all numbers of blocks have.
+            let (first, rest) =
+                (check(&scenes[0], &from, &to, 1, false), check_from(1, &scenes[0], &from, &to, 2, false));
+            assert_eq!(looks.is_some(), first.is_some() || rest.is_some());
+            only_rest += usize::from(first.is_none() && rest.is_some());
             assert!(swept.is_some() || fine.is_none(), "{from:?} to {to:?} is proven and touches");
             proven += usize::from(swept.is_none());
             touching += usize::from(looks.is_some());
@@ -104,6 +121,7 @@ fn a_swept_motion_touches_nowhere_and_what_touches_is_found() {
         }
     }
     assert!(proven > 60 && touching > 60 && between > 0, "{proven} proven, {touching} touching, {between} between");
+    assert!(only_rest > 0, "{only_rest}");
 }
 
 #[test]
