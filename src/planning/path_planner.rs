@@ -327,7 +327,11 @@ fn finished<C: CollisionChecker>(
     let turns = checker.turns().to_vec();
     let (rounds, none) = (&settings.shortcut, Duration::ZERO);
     if matches!(found.edges, Edges::Checked | Edges::Proven) {
-        let mut is_free = |a: &[f64], b: &[f64]| checker.motion_is_easily_free(a, b, stop);
+        // Where covers touch, nothing looks free.
+        let looks = found.edges == Edges::Checked;
+        let mut is_free = |a: &[f64], b: &[f64]| {
+            (!looks || checker.motion_looks_free(a, b)) && checker.motion_is_easily_free(a, b, stop)
+        };
         return Some((shorten(&found.path, &turns, rounds, &mut is_free), none));
     }
     // A proof needs no looks before it.
@@ -349,15 +353,7 @@ fn finished<C: CollisionChecker>(
             |edge: &[Vec<f64>]| looked.has(&edge[0], &edge[1]) || checker.motion_looks_free(&edge[0], &edge[1]);
         return short.windows(2).all(looks_free).then(|| (short, began.elapsed()));
     }
-    if is_proven(checker, &short, settings.level, stop) {
-        return Some((short, none));
-    }
-    // Most often one of many edges touches between two samples: shortened again, each new edge is proven.
-    is_proven(checker, &found.path, settings.level, stop).then(|| {
-        let mut is_free =
-            |a: &[f64], b: &[f64]| checker.motion_looks_free(a, b) && checker.motion_is_easily_free(a, b, stop);
-        (shorten(&found.path, &turns, rounds, &mut is_free), none)
-    })
+    is_proven(checker, &short, settings.level, stop).then_some((short, none))
 }
 
 /// Returns whether a path that looks free is proven, if its level asks for that.

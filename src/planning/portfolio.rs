@@ -108,8 +108,8 @@ impl Portfolio {
         })
     }
 
-    /// Returns the next path. At the next call, the search that found it begins again with edges that are checked as far
-    /// as the level asks for, or has ended if they were; the others continue.
+    /// Returns the next path. At the next call, the search that found it checks the edges of its paths as far as the level
+    /// asks for, or has ended if it did so before; the others continue.
     pub fn next<C: CollisionChecker>(&mut self, checker: &mut C, stop: &Stop) -> Result<Candidate, Halt> {
         loop {
             let count = self.count();
@@ -143,14 +143,12 @@ impl Portfolio {
             };
             let mut check = EdgeChecker { checker, edges: checked, stop };
             if let Some(path) = search.run(&mut check, quantum, stop) {
-                let count = search.count();
-                self.ended.samples += count.samples;
-                self.ended.nodes += count.nodes;
-                let member = &mut self.members[self.turn];
                 if checked == Edges::Looking {
-                    let edges = if self.level.proves() { Edges::Checked } else { Edges::Looked };
-                    (member.edges, member.search) = (edges, None);
+                    *edges = if self.level.proves() { Edges::Checked } else { Edges::Looked };
                 } else {
+                    let count = search.count();
+                    self.ended.samples += count.samples;
+                    self.ended.nodes += count.nodes;
                     self.members.remove(self.turn);
                 }
                 return Ok(Candidate { path, edges: checked });

@@ -105,6 +105,8 @@ pub struct Search {
     count: SearchCount,
     sample: Vec<f64>,
     at: Vec<f64>,
+    /// The node of each tree where they met.
+    met: Option<[usize; 2]>,
     /// Both ends of the way on which the other tree grows.
     ends: [Vec<f64>; 2],
 }
@@ -138,6 +140,7 @@ impl Search {
             side: 0,
             batch: Batch::new(dof),
             failures: 0,
+            met: None,
             candidates: [Candidates::new(dof), Candidates::new(dof)],
             sample: vec![0.0; dof],
             at: vec![0.0; dof],
@@ -169,12 +172,17 @@ impl Search {
         self.count
     }
 
-    /// Continues for a quantum; returns the path once it is found.
+    /// Continues for a quantum; returns the path once it is found. After that, begins with the same path, if the check is
+    /// another one now.
     pub fn run(&mut self, check: &mut dyn EdgeCheck, quantum: Quantum, stop: &Stop) -> Option<Path> {
         let end = (self.count.samples + quantum.samples, self.count.nodes + quantum.nodes);
         let (began, mut polled) = (self.count.samples, None);
         // Edges that were tried, and those of them that needed a check of their own.
         let (mut edges, mut checked, mut polled_checks) = (0, 0, 0);
+        let known = self.met.and_then(|_| self.joined(check));
+        if known.is_some() {
+            return known;
+        }
         loop {
             let samples = self.count.samples;
             let cost = edges + (samples - began) / SAMPLES_PER_EDGE;
@@ -308,8 +316,15 @@ impl Search {
             }
             node = other.add(&self.sample, Some(node));
         }
-        let (from_start, from_goal) = if self.side == 0 { (added, node) } else { (node, added) };
+        self.met = Some(if self.side == 0 { [added, node] } else { [node, added] });
+        self.joined(check)
+    }
+
+    /// Returns the path through the nodes where the trees met, unless an edge of it is not confirmed.
+    fn joined(&mut self, check: &mut dyn EdgeCheck) -> Option<Path> {
+        let [from_start, from_goal] = self.met?;
         if !(self.confirm(0, from_start, check) && self.confirm(1, from_goal, check)) {
+            self.met = None;
             return None;
         }
         let mut path = Path::with_capacity(2 * LANES);
