@@ -124,8 +124,10 @@ pub enum Proof<'a> {
     Samples,
     /// That nothing touches on the whole motion, from its beginning, which is then the first sample.
     Motion {
-        /// For each pair of the scene, the most that it can approach on the whole motion [m].
+        /// For each pair of the scene, the most that it can approach on a motion of which this one is a part [m].
         reach: &'a [f64],
+        /// Which part of that motion this one is: 1 for the whole.
+        part: f64,
         /// The sum of the angles by which all joints turn [rad].
         turn: f64,
     },

@@ -97,8 +97,8 @@ pub trait CollisionChecker {
     fn motion_is_free(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool;
 
     /// Same, but gives up where the answer takes long, mostly along a surface: then `false`. For cuts that a path can
-    /// do without.
-    fn motion_is_easily_free(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool {
+    /// do without. `looks_free`: whether the motion is known to look free; that spares a look.
+    fn motion_is_easily_free(&mut self, from: &[f64], to: &[f64], _looks_free: bool, stop: &Stop) -> bool {
         self.motion_is_free(from, to, stop)
     }
 

@@ -338,8 +338,8 @@ impl CollisionChecker for ExactChecker {
         self.check_motion(from, to, stop)
     }
 
-    fn motion_is_easily_free(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool {
-        self.is_free_within(EXACT_CHECKS, from, to, stop)
+    fn motion_is_easily_free(&mut self, from: &[f64], to: &[f64], looks_free: bool, stop: &Stop) -> bool {
+        self.is_free_within(EXACT_CHECKS, (from, to), looks_free, stop)
     }
 
     fn motion_looks_free(&mut self, from: &[f64], to: &[f64]) -> bool {

@@ -113,7 +113,7 @@ impl ExactChecker {
         self.most_pad = distance;
         match by {
             By::Covers => self.is_free_by_covers(from, to, stop),
-            By::Limited => self.is_free_within(EXACT_CHECKS, from, to, stop),
+            By::Limited => self.is_free_within(EXACT_CHECKS, (from, to), false, stop),
             By::Solids => self.motion_is_free(from, to, stop),
         }
     }

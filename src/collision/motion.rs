@@ -43,6 +43,8 @@ struct Piece {
 #[derive(Debug, Clone)]
 pub(super) struct Pieces {
     q: Vec<f64>,
+    /// Both ends of a part of a motion.
+    ends: [Vec<f64>; 2],
     /// For each pair, the most that it can approach on the whole motion [m].
     reach: Vec<f64>,
     now: Vec<Piece>,
@@ -61,6 +63,7 @@ impl Pieces {
         let none = Vec::new;
         Self {
             q: vec![0.0; dof],
+            ends: [vec![0.0; dof], vec![0.0; dof]],
             reach: vec![0.0; pairs],
             now: Vec::new(),
             next: Vec::new(),
@@ -71,11 +74,9 @@ impl Pieces {
         }
     }
 
-    /// Sets `q` to a point of a motion.
+    /// Sets `q` to a place on a motion.
     fn place(&mut self, from: &[f64], to: &[f64], at: f64) {
-        for ((x, a), b) in self.q.iter_mut().zip(from).zip(to) {
-            *x = a + (b - a) * at;
-        }
+        place((from, to), at, &mut self.q);
     }
 
     /// Splits all pieces into parts of a size; they keep their pairs.
@@ -104,72 +105,99 @@ impl Pieces {
     }
 }
 
+/// What is known of a motion, and how far it is checked.
+#[derive(Debug, Clone, Copy)]
+struct Effort {
+    /// It looks free.
+    looks_free: bool,
+    /// What covers do not prove is checked in pieces.
+    in_pieces: bool,
+}
+
 impl ExactChecker {
     /// Returns whether nothing touches on a motion, as defined by `CollisionChecker::motion_is_free`.
     pub(super) fn check_motion(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool {
-        // After the deadline, every call returns at once.
-        if stop.is_over() || self.always.is_some() {
-            return false;
-        }
-        let mut pieces = std::mem::replace(&mut self.pieces, Pieces::new(0, 0));
-        let finite = from.iter().chain(to).all(|x| x.is_finite());
-        let free = if finite {
-            self.sweep(&mut pieces, (from, to), 0, true, stop)
-        } else {
-            self.check_motion_with(&mut pieces, from, to, stop)
-        };
-        self.pieces = pieces;
-        free
+        self.prove((from, to), Effort { looks_free: false, in_pieces: true }, stop)
     }
 
-    /// Proves a motion by sweeping covers, and halves of it where that fails; those that touch, and short ones, are
-    /// checked in pieces, unless only covers are asked for.
-    fn sweep(
+    /// Same; gives up after this number of exact checks of configurations. `looks_free`: whether it is known to.
+    pub(super) fn is_free_within(
         &mut self,
-        p: &mut Pieces,
+        exact_checks: u64,
         (from, to): (&[f64], &[f64]),
-        halved: i32,
-        in_pieces: bool,
+        looks_free: bool,
         stop: &Stop,
     ) -> bool {
-        self.measure(p, from, to);
-        let (pads, parts) = ((&self.pads[..], self.most_pad), f64::from(halved).exp2());
-        let proof = Proof::Motion { reach: &p.reach, turn: self.lanes.turn(from, to) };
-        let (left, samples) = self.lanes.touching(Samples::All, (from, to), pads, self.witness, proof, parts);
-        self.checks += samples;
-        let Some(pair) = left else { return true };
-        self.witness = Some(pair);
-        let (touching, _) = self.lanes.touching(Samples::All, (from, to), pads, self.witness, Proof::None, parts);
-        if halved == HALVINGS || touching.is_some() {
-            return in_pieces && self.check_motion_with(p, from, to, stop);
-        }
-        let middle: Vec<f64> = from.iter().zip(to).map(|(a, b)| 0.5 * (a + b)).collect();
-        !stop.is_over()
-            && self.sweep(p, (from, &middle), halved + 1, in_pieces, stop)
-            && self.sweep(p, (&middle, to), halved + 1, in_pieces, stop)
-    }
-
-    /// Returns whether nothing touches on a motion; gives up after this number of exact checks of configurations.
-    pub(super) fn is_free_within(&mut self, exact_checks: u64, from: &[f64], to: &[f64], stop: &Stop) -> bool {
         self.exact_checks_left = exact_checks;
-        let free = self.check_motion(from, to, stop);
+        let free = self.prove((from, to), Effort { looks_free, in_pieces: true }, stop);
         self.exact_checks_left = u64::MAX;
         free
     }
 
     /// Returns whether covers alone prove that nothing touches on a motion: quick.
     pub(super) fn is_free_by_covers(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool {
+        self.prove((from, to), Effort { looks_free: false, in_pieces: false }, stop)
+    }
+
+    fn prove(&mut self, (from, to): (&[f64], &[f64]), effort: Effort, stop: &Stop) -> bool {
+        // After the deadline, every call returns at once.
+        if stop.is_over() || self.always.is_some() || !from.iter().chain(to).all(|x| x.is_finite()) {
+            return false;
+        }
         let mut pieces = std::mem::replace(&mut self.pieces, Pieces::new(0, 0));
-        let free = self.sweep(&mut pieces, (from, to), 0, false, stop);
+        self.measure(&mut pieces, from, to);
+        let free = self.sweep(&mut pieces, (from, to), (0.0, 0), effort, stop);
         self.pieces = pieces;
         free
     }
 
-    fn check_motion_with(&mut self, p: &mut Pieces, from: &[f64], to: &[f64], stop: &Stop) -> bool {
-        let most = self.measure(p, from, to);
-        let mut size = 1.0 / LANES as f64;
+    /// Proves a motion, from a place on for what is left of it after it was halved so often, by sweeping covers, and
+    /// halves of that where it fails. What touches, and what is short, is checked in pieces.
+    fn sweep(
+        &mut self,
+        p: &mut Pieces,
+        motion: (&[f64], &[f64]),
+        (at, halved): (f64, i32),
+        effort: Effort,
+        stop: &Stop,
+    ) -> bool {
+        let (parts, part) = (f64::from(halved).exp2(), f64::from(-halved).exp2());
+        let mut ends = std::mem::take(&mut p.ends);
+        place(motion, at, &mut ends[0]);
+        place(motion, at + part, &mut ends[1]);
+        let (from, to, pads) = (&ends[0][..], &ends[1][..], (&self.pads[..], self.most_pad));
+        let proof = Proof::Motion { reach: &p.reach, part, turn: self.lanes.turn(from, to) };
+        let (left, samples) = self.lanes.touching(Samples::All, (from, to), pads, self.witness, proof, parts);
+        self.checks += samples;
+        self.witness = left.or(self.witness);
+        // Halves of a motion that looks free do so, too.
+        let looks = left.is_some() && halved == 0 && !effort.looks_free;
+        let touches =
+            looks && self.lanes.touching(Samples::All, (from, to), pads, self.witness, Proof::None, parts).0.is_some();
+        p.ends = ends;
+        if left.is_none() {
+            return true;
+        }
+        if halved == HALVINGS || touches {
+            return effort.in_pieces && self.check_in_pieces(p, motion, (at, part), stop);
+        }
+        !stop.is_over()
+            && self.sweep(p, motion, (at, halved + 1), effort, stop)
+            && self.sweep(p, motion, (at + 0.5 * part, halved + 1), effort, stop)
+    }
+
+    /// Checks a part of a motion, from a place on, in pieces.
+    fn check_in_pieces(
+        &mut self,
+        p: &mut Pieces,
+        (from, to): (&[f64], &[f64]),
+        (at, part): (f64, f64),
+        stop: &Stop,
+    ) -> bool {
+        let most = p.reach.iter().copied().fold(0.0, f64::max);
+        let mut size = part / LANES as f64;
         p.clear();
-        p.now.extend((0..LANES).map(|i| Piece { start: i as f64 * size, first: 0, last: 0 }));
+        p.now.extend((0..LANES).map(|i| Piece { start: at + i as f64 * size, first: 0, last: 0 }));
         loop {
             let checked = p.now.len();
             if let Some(pair) = self.check_in_lanes(p, from, to, size) {
@@ -202,7 +230,8 @@ impl ExactChecker {
             p.split(PARTS, size);
         }
         let (first, last) =
-            (p.now.first().map_or(0.0, |piece| piece.start), p.now.last().map_or(1.0, |p| p.start + size));
+            (p.now.first().map_or(at, |piece| piece.start), p.now.last().map_or(at + part, |p| p.start + size));
+        // What is left may touch at the ends of the motion, where no other piece is.
         (last < 1.0 || self.first_touch(to).is_none())
             && (first > 0.0 || self.first_touch(from).is_none())
             && self.check_exactly(p, from, to, size, most, stop)
@@ -318,21 +347,26 @@ impl ExactChecker {
         true
     }
 
-    /// Computes how much each pair can approach on a motion; returns the maximum.
-    fn measure(&self, p: &mut Pieces, from: &[f64], to: &[f64]) -> f64 {
+    /// Computes how much each pair can approach on a motion.
+    fn measure(&self, p: &mut Pieces, from: &[f64], to: &[f64]) {
         let reach = |levers: &[f64]| {
             levers.iter().zip(from.iter().zip(to)).map(|(lever, (a, b))| lever * (b - a).abs()).sum::<f64>()
         };
         p.links.clear();
         p.links.extend(self.scene.links.iter().map(|link| reach(&link.levers)));
-        let mut most = 0.0;
         for ((to, pair), link_pair) in p.reach.iter_mut().zip(&self.pairs).zip(&self.link_pairs) {
             *to = match *pair {
                 Pair::Obstacle(link, _) => p.links[link],
                 Pair::Links(..) => reach(&self.scene.pairs[*link_pair].levers),
             };
-            most = f64::max(most, *to);
         }
-        most
+    }
+}
+
+/// Computes a place on a motion.
+fn place((from, to): (&[f64], &[f64]), at: f64, q: &mut [f64]) {
+    for ((x, a), b) in q.iter_mut().zip(from).zip(to) {
+        // Exact at the end.
+        *x = if at == 1.0 { *b } else { a + (b - a) * at };
     }
 }

@@ -56,7 +56,8 @@ impl<C: CollisionChecker> EdgeCheck for EdgeChecker<'_, C> {
         match self.edges {
             Edges::Looked => checker.motion_looks_free_at(Samples::Rest, from, to),
             Edges::Checked => {
-                checker.motion_looks_free_at(Samples::Rest, from, to) && checker.motion_is_easily_free(from, to, stop)
+                checker.motion_looks_free_at(Samples::Rest, from, to)
+                    && checker.motion_is_easily_free(from, to, true, stop)
             }
             Edges::Looking | Edges::Proven => true,
         }

@@ -275,8 +275,8 @@ impl CollisionChecker for Padded {
         !cuts.is_empty() && cuts.windows(2).all(&mut piece_is_free)
     }
 
-    fn motion_is_easily_free(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool {
-        self.full.motion_is_easily_free(from, to, stop)
+    fn motion_is_easily_free(&mut self, from: &[f64], to: &[f64], looks_free: bool, stop: &Stop) -> bool {
+        self.full.motion_is_easily_free(from, to, looks_free, stop)
             || (!self.cuts(from, to).is_empty() && self.motion_is_free(from, to, stop))
     }
 

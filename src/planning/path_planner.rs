@@ -217,7 +217,7 @@ pub fn plan<C: CollisionChecker>(
             && match settings.level {
                 Level::Fast => checker.motion_looks_free(&from, goal),
                 Level::Certified if !checker.motion_looks_free(&from, goal) => {
-                    checker.motion_is_easily_free(&from, goal, stop)
+                    checker.motion_is_easily_free(&from, goal, false, stop)
                 }
                 Level::Certified | Level::Exact => checker.motion_is_free(&from, goal, stop),
             }
@@ -330,7 +330,7 @@ fn finished<C: CollisionChecker>(
         // Where covers touch, nothing looks free.
         let looks = found.edges == Edges::Checked;
         let mut is_free = |a: &[f64], b: &[f64]| {
-            (!looks || checker.motion_looks_free(a, b)) && checker.motion_is_easily_free(a, b, stop)
+            (!looks || checker.motion_looks_free(a, b)) && checker.motion_is_easily_free(a, b, looks, stop)
         };
         return Some((shorten(&found.path, &turns, rounds, &mut is_free), none));
     }
@@ -358,7 +358,7 @@ fn finished<C: CollisionChecker>(
 
 /// Returns whether a path that looks free is proven, if its level asks for that.
 pub(super) fn is_proven<C: CollisionChecker>(checker: &mut C, path: &Path, level: Level, stop: &Stop) -> bool {
-    !level.proves() || path.windows(2).all(|edge| checker.motion_is_easily_free(&edge[0], &edge[1], stop))
+    !level.proves() || path.windows(2).all(|edge| checker.motion_is_easily_free(&edge[0], &edge[1], true, stop))
 }
 
 /// Returns the path from the start to a configuration inside the limits and free of contact: usually just the start.

@@ -61,7 +61,7 @@ pub(super) struct Steps<const SWEPT: bool> {
 #[inline(always)]
 pub(super) fn reach_of(motion: &Motion<'_>, pair: u32) -> f32 {
     match motion.proof {
-        Proof::Motion { reach, .. } => reach[pair as usize] as f32,
+        Proof::Motion { reach, part, .. } => (reach[pair as usize] * part) as f32,
         _ => 0.0,
     }
 }

@@ -76,7 +76,7 @@ fn check_from(
 ) -> Option<u32> {
     let moved: Vec<f64> = from.iter().zip(to).map(|(a, b)| (b - a).abs()).collect();
     let reach = vec![moved.iter().zip(LEVERS).map(|(d, lever)| d * lever * 2.0).sum::<f64>(); 90];
-    let proof = if swept { Proof::Motion { reach: &reach, turn: moved.iter().sum() } } else { Proof::None };
+    let proof = if swept { Proof::Motion { reach: &reach, part: 1.0, turn: moved.iter().sum() } } else { Proof::None };
     let motion = Motion { from, to, blocks, skipped, pads: &[0.003; 90], pad: 0.003, likely: None, proof };
     discrete.touching(&motion, &mut Buffers::default())
 }
