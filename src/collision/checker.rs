@@ -64,7 +64,7 @@ impl Default for Resolution {
     }
 }
 
-/// Which samples of a motion are looked at.
+/// Which samples of a motion are checked.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Samples {
     /// All.

@@ -87,7 +87,7 @@ impl InLanes {
     }
 
     /// Returns a pair that touches at samples of a motion, or that does not prove what it has to, and the number of
-    /// those that were looked at. `likely` is compared first; each of `parts` of the motion gets as many samples as the
+    /// those that were checked. `likely` is compared first; each of `parts` of the motion gets as many samples as the
     /// whole of it would.
     pub fn touching(
         &mut self,

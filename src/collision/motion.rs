@@ -45,7 +45,9 @@ pub(super) struct Pieces {
     q: Vec<f64>,
     /// Both ends of a part of a motion.
     ends: [Vec<f64>; 2],
-    /// For each pair, the most that it can approach on the whole motion [m].
+    /// The motion that was measured, from its first configuration to its last.
+    measured: [Vec<f64>; 2],
+    /// For each pair, the most that it can approach on it [m].
     reach: Vec<f64>,
     now: Vec<Piece>,
     next: Vec<Piece>,
@@ -64,6 +66,7 @@ impl Pieces {
         Self {
             q: vec![0.0; dof],
             ends: [vec![0.0; dof], vec![0.0; dof]],
+            measured: [vec![], vec![]],
             reach: vec![0.0; pairs],
             now: Vec::new(),
             next: Vec::new(),
@@ -151,8 +154,8 @@ impl ExactChecker {
         free
     }
 
-    /// Proves a motion, from a place on for what is left of it after it was halved so often, by sweeping covers, and
-    /// halves of that where it fails. What touches, and what is short, is checked in pieces.
+    /// Proves the part of a motion that begins at a place and is left after this number of halvings, by sweeping covers;
+    /// where that fails, both halves of it. What touches, and what is short, is checked in pieces.
     fn sweep(
         &mut self,
         p: &mut Pieces,
@@ -347,8 +350,16 @@ impl ExactChecker {
         true
     }
 
-    /// Computes how much each pair can approach on a motion.
+    /// Computes how much each pair can approach on a motion, unless that was the last one: a clearance is searched with
+    /// many checks of the same motion.
     fn measure(&self, p: &mut Pieces, from: &[f64], to: &[f64]) {
+        if p.measured[0] == from && p.measured[1] == to {
+            return;
+        }
+        for (own, end) in p.measured.iter_mut().zip([from, to]) {
+            own.clear();
+            own.extend_from_slice(end);
+        }
         let reach = |levers: &[f64]| {
             levers.iter().zip(from.iter().zip(to)).map(|(lever, (a, b))| lever * (b - a).abs()).sum::<f64>()
         };

@@ -67,6 +67,8 @@ struct Corner {
     turn: f64,
     /// Largest part of the acceleration and jerk limits that a joint's change of direction uses [s²/rad, s³/rad].
     used: [f64; 2],
+    /// Maximum constant speed, regardless of the lines' lengths [rad/s]; 0 where the motion rests.
+    speed: f64,
 }
 
 /// The direction in a corner is that before it, and `part` of its change.
@@ -125,7 +127,13 @@ fn most(values: &[Eight], factors: &[Eight]) -> f64 {
             most[k] = if used > most[k] { used } else { most[k] };
         }
     }
-    most.into_iter().fold(0.0, |a, b| if b > a { b } else { a })
+    halved(most, |a, b| if b > a { b } else { a })
+}
+
+/// Combines all numbers of a block, half of them with the other half: none waits for seven others.
+fn halved(block: Eight, of: impl Fn(f64, f64) -> f64) -> f64 {
+    let four: [f64; 4] = std::array::from_fn(|k| of(block[k], block[k + 4]));
+    of(of(four[0], four[2]), of(four[1], four[3]))
 }
 
 /// Writes the difference of two directions or configurations; returns its length.
@@ -137,7 +145,7 @@ fn difference(from: &[Eight], to: &[Eight], out: &mut [Eight]) -> f64 {
             square[k] += out[k] * out[k];
         }
     }
-    square.into_iter().sum::<f64>().sqrt()
+    halved(square, |a, b| a + b).sqrt()
 }
 
 impl RoundedPath {
@@ -173,7 +181,7 @@ impl RoundedPath {
         for i in 1..path.len().saturating_sub(1) {
             let length = difference(rounded.direction(i - 1), rounded.direction(i), &mut turn);
             let used = [most(&turn, &inverse.acceleration), if jerk { most(&turn, &inverse.jerk) } else { 0.0 }];
-            rounded.corners[i] = Corner { half: 0.0, turn: length, used };
+            rounded.corners[i] = Corner { turn: length, used, ..Corner::default() };
             rounded.blend(i, deviation.get(i).copied().unwrap_or(0.0));
         }
         rounded
@@ -181,12 +189,22 @@ impl RoundedPath {
 
     /// Blends corner `i` within another deviation [rad].
     pub fn blend(&mut self, i: usize, deviation: f64) {
-        let room = 0.5 * self.lines[i - 1].length.min(self.lines[i].length);
-        let jerk = self.jerk;
+        let [before, after] = [i - 1, i].map(|line| &self.lines[line]);
+        let (room, jerk) = (0.5 * before.length.min(after.length), self.jerk);
+        let most = before.limits.speed.min(after.limits.speed);
         let corner = &mut self.corners[i];
         // The middle of the corner is farthest from the path: 2·half·turn·∫σ over its first half.
         let length = deviation / (2.0 * progress(jerk, 0.5).area * corner.turn.max(1e-9));
         corner.half = if corner.turn > REVERSAL || deviation <= 0.0 { 0.0 } else { length.min(room) };
+        let ([used, used_jerk], length) = (corner.used, 2.0 * corner.half);
+        corner.speed = if corner.half <= 0.0 {
+            0.0
+        } else if jerk {
+            // Largest curvature and change of curvature for a unit turn and length.
+            most.min((length / (1.5 * used)).sqrt()).min((length * length / (4.5 * used_jerk)).cbrt())
+        } else {
+            most.min((length / used).sqrt())
+        };
     }
 
     fn direction(&self, line: usize) -> &[Eight] {
@@ -198,23 +216,6 @@ impl RoundedPath {
         let (Line { length, .. }, [a, b]) = (self.lines[line], [line, line + 1].map(|i| self.corners[i].half));
         let straight = length - a - b;
         if straight > 1e-9 * length { straight } else { 0.0 }
-    }
-
-    /// Returns the maximum constant speed in corner `i`, regardless of the lines [rad/s]; 0 where the motion rests.
-    fn corner_speed(&self, i: usize) -> f64 {
-        if self.corners[i].half <= 0.0 {
-            return 0.0;
-        }
-        let (corner, [before, after]) = (&self.corners[i], [i - 1, i].map(|line| self.lines[line].limits.speed));
-        let [acceleration, jerk] = corner.used;
-        let length = 2.0 * corner.half;
-        let most = before.min(after);
-        if self.jerk {
-            // Largest curvature and change of curvature for a unit turn and length.
-            most.min((length / (1.5 * acceleration)).sqrt()).min((length * length / (4.5 * jerk)).cbrt())
-        } else {
-            most.min((length / acceleration).sqrt())
-        }
     }
 
     fn as_blocks(&self) -> Blocks<'_> {
@@ -258,7 +259,7 @@ impl RoundedPath {
     /// Returns the speeds at all configurations [rad/s].
     pub fn speeds(&self) -> Vec<f64> {
         let last = self.corners.len() - 1;
-        let mut speeds: Vec<f64> = (0..=last).map(|i| self.corner_speed(i)).collect();
+        let mut speeds: Vec<f64> = self.corners.iter().map(|corner| corner.speed).collect();
         let reached = |line: usize, from: f64, most: f64| match self.straight(line) {
             0.0 => most.min(from),
             length => self.lines[line].limits.reached(from, most, length),
@@ -276,9 +277,9 @@ impl RoundedPath {
     /// for most corners to be passed about as fast as they allow, and no corner takes long.
     pub fn suits(&self, speeds: &[f64]) -> bool {
         let (mut slowed, mut time, mut number) = (0, 0.0, 0);
-        for (i, (corner, speed)) in self.corners.iter().zip(speeds).enumerate() {
+        for (corner, speed) in self.corners.iter().zip(speeds) {
             if corner.half > 0.0 {
-                slowed += usize::from(*speed < SLOWED * self.corner_speed(i));
+                slowed += usize::from(*speed < SLOWED * corner.speed);
                 time += 2.0 * corner.half / speed;
                 number += 1;
             }

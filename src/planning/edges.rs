@@ -24,7 +24,7 @@ pub enum Edges {
     /// Those that look free at their first samples.
     Looking,
     /// Those that look free, once they are part of a path at all samples.
-    Looked,
+    Sampled,
     /// Those that look free and, once they are part of a path, are easily proven.
     Checked,
     /// Those that are proven, also where covers touch.
@@ -46,7 +46,7 @@ impl<C: CollisionChecker> EdgeCheck for EdgeChecker<'_, C> {
     fn is_free(&mut self, from: &[f64], to: &[f64]) -> bool {
         let Self { checker, stop, .. } = self;
         match self.edges {
-            Edges::Looking | Edges::Looked | Edges::Checked => checker.motion_looks_free_at(Samples::First, from, to),
+            Edges::Looking | Edges::Sampled | Edges::Checked => checker.motion_looks_free_at(Samples::First, from, to),
             Edges::Proven => checker.motion_is_free(from, to, stop),
         }
     }
@@ -54,7 +54,7 @@ impl<C: CollisionChecker> EdgeCheck for EdgeChecker<'_, C> {
     fn is_confirmed(&mut self, from: &[f64], to: &[f64]) -> bool {
         let Self { checker, stop, .. } = self;
         match self.edges {
-            Edges::Looked => checker.motion_looks_free_at(Samples::Rest, from, to),
+            Edges::Sampled => checker.motion_looks_free_at(Samples::Rest, from, to),
             Edges::Checked => {
                 checker.motion_looks_free_at(Samples::Rest, from, to)
                     && checker.motion_is_easily_free(from, to, true, stop)
@@ -65,7 +65,7 @@ impl<C: CollisionChecker> EdgeCheck for EdgeChecker<'_, C> {
 
     fn blocked(&mut self, q: &[Lanes], lanes: u16) -> u16 {
         match self.edges {
-            Edges::Looking | Edges::Looked | Edges::Checked => self.checker.look_blocked(q, lanes),
+            Edges::Looking | Edges::Sampled | Edges::Checked => self.checker.look_blocked(q, lanes),
             // What covers refuse may be proven.
             Edges::Proven => 0,
         }

@@ -9,11 +9,11 @@ use crate::robot::random::Random;
 use super::edges::Edges;
 use super::enclosure::{Enclosed, enclosed};
 use super::level::Level;
-use super::looked::Looked;
 use super::path::{Path, between, distance, length, unwind};
 use super::portfolio::{Candidate, Halt, Portfolio};
 use super::refine::{cut, refine};
 use super::rrt_connect::{RrtSettings, SearchCount};
+use super::sampled::Sampled;
 use super::shortcut::{ShortcutSettings, shorten};
 use super::start_contact::MAX_START_DEPTH;
 use super::timing::{Timed, TimingError, TimingSettings, time};
@@ -252,8 +252,8 @@ pub fn plan<C: CollisionChecker>(
                     Err(Halt::Exhausted) => return Err(PlanError::Exhausted(count)),
                 };
                 search_time = began.elapsed();
-                if let Some((path, looked)) = finished(checker, &found, count.nodes, settings, stop) {
-                    search_time += looked;
+                if let Some((path, sampling)) = finished(checker, &found, count.nodes, settings, stop) {
+                    search_time += sampling;
                     break path;
                 }
             }
@@ -316,7 +316,7 @@ const CUTS: (usize, usize) = (10, 256);
 const NODES_PER_CUT: usize = 8;
 
 /// Shortens a path that was found, and checks what is left of it as far as the level asks for; `None` if it cannot be
-/// used. `nodes`: those of the search. Also returns the duration of looks that the search left out.
+/// used. `nodes`: those of the search. Also returns the duration of the checks that the search left out.
 fn finished<C: CollisionChecker>(
     checker: &mut C,
     found: &Candidate,
@@ -336,11 +336,11 @@ fn finished<C: CollisionChecker>(
     }
     // A proof needs no looks before it.
     let looks = found.edges == Edges::Looking && !settings.level.proves();
-    let mut looked = Looked::default();
+    let mut sampled = Sampled::default();
     let mut looks_free = |a: &[f64], b: &[f64]| {
         let free = !stop.is_over() && checker.motion_looks_free(a, b);
         if looks && free {
-            looked.add(a, b);
+            sampled.add(a, b);
         }
         free
     };
@@ -350,7 +350,7 @@ fn finished<C: CollisionChecker>(
     if looks {
         let began = Instant::now();
         let looks_free =
-            |edge: &[Vec<f64>]| looked.has(&edge[0], &edge[1]) || checker.motion_looks_free(&edge[0], &edge[1]);
+            |edge: &[Vec<f64>]| sampled.has(&edge[0], &edge[1]) || checker.motion_looks_free(&edge[0], &edge[1]);
         return short.windows(2).all(looks_free).then(|| (short, began.elapsed()));
     }
     is_proven(checker, &short, settings.level, stop).then_some((short, none))

@@ -108,8 +108,8 @@ impl Portfolio {
         })
     }
 
-    /// Returns the next path. At the next call, the search that found it checks the edges of its paths as far as the level
-    /// asks for, or has ended if it did so before; the others continue.
+    /// Returns the next path. At the next call, the search that found it checks the edges of its paths as far as the
+    /// level asks for, or has ended if it did so before; the others continue.
     pub fn next<C: CollisionChecker>(&mut self, checker: &mut C, stop: &Stop) -> Result<Candidate, Halt> {
         loop {
             let count = self.count();
@@ -144,7 +144,7 @@ impl Portfolio {
             let mut check = EdgeChecker { checker, edges: checked, stop };
             if let Some(path) = search.run(&mut check, quantum, stop) {
                 if checked == Edges::Looking {
-                    *edges = if self.level.proves() { Edges::Checked } else { Edges::Looked };
+                    *edges = if self.level.proves() { Edges::Checked } else { Edges::Sampled };
                 } else {
                     let count = search.count();
                     self.ended.samples += count.samples;

@@ -79,7 +79,7 @@ fn another<C: CollisionChecker>(
     let limits = checker.limits().to_vec();
     let mut search = Search::new(start, goals, (&limits, &turns), search, range, seed).shorter_than(most);
     // Only a proof follows.
-    let edges = if settings.level.proves() { Edges::Looking } else { Edges::Looked };
+    let edges = if settings.level.proves() { Edges::Looking } else { Edges::Sampled };
     let found = search.run(&mut EdgeChecker { checker, edges, stop }, EFFORT, stop)?;
     Some(shorten(&found, &turns, &settings.shortcut, &mut |a, b| checker.motion_looks_free(a, b)))
 }

@@ -1,6 +1,6 @@
 //! RRT-Connect (Kuffner and LaValle, 2000): two trees, one from the start and one from the goals, grow towards random
 //! configurations and towards each other. Nodes that fail to grow attract fewer samples (dynamic domain: Yershova,
-//! Jaillet, Siméon and LaValle, 2005), and the smaller tree grows first. Every edge is looked at, including the joining
+//! Jaillet, Siméon and LaValle, 2005), and the smaller tree grows first. Every edge is sampled, including the joining
 //! one; what takes long is checked once an edge is part of a path, and what grew from one that touches is removed (lazy
 //! checks: Sánchez and Latombe, "A single-query bi-directional probabilistic roadmap planner with lazy collision
 //! checking", 2001). Half of the samples are drawn in the domains of random nodes: of the others, hardly any is in one.
@@ -172,8 +172,8 @@ impl Search {
         self.count
     }
 
-    /// Continues for a quantum; returns the path once it is found. After that, begins with the same path, if the check is
-    /// another one now.
+    /// Continues for a quantum; returns the path once it is found. After that, begins with the same path: the check may
+    /// be another one now.
     pub fn run(&mut self, check: &mut dyn EdgeCheck, quantum: Quantum, stop: &Stop) -> Option<Path> {
         let end = (self.count.samples + quantum.samples, self.count.nodes + quantum.nodes);
         let (began, mut polled) = (self.count.samples, None);

@@ -224,7 +224,7 @@ fn a_tree_that_does_not_grow_gets_samples_that_it_can_use() {
     assert!(search.count().samples < 64_000, "{:?}", search.count());
 }
 
-/// Edges whose ends only are looked at, until they are part of a path.
+/// Edges of which only the ends are checked until they are part of a path.
 struct Ends {
     plane: Plane,
     refused: usize,

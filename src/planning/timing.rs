@@ -132,18 +132,23 @@ pub fn time_within(
     let of = |i: &usize| deviation.get(*i).copied().unwrap_or(0.0).max(0.0);
     let deviation: Vec<f64> = kept.iter().map(of).collect();
     let rounded = RoundedPath::new(&path, bounds, &deviation);
-    if variable_is_quicker(&rounded, &path, bounds, &deviation) {
+    let speeds = rounded.speeds();
+    if variable_is_quicker((&rounded, &speeds), &path, bounds, &deviation) {
         at_variable_corner_speed(names, &path, bounds, deviation, speed, &mut free)
     } else {
-        at_constant_corner_speed(names, (&path, rounded), bounds, deviation, speed, &mut free)
+        at_constant_corner_speed(names, (&path, rounded, speeds), bounds, deviation, speed, &mut free)
     }
 }
 
 /// Returns whether a motion that changes its speed in corners is quicker than one that does not. It takes ten times as
 /// long to compute, so it is not where it would gain little.
-fn variable_is_quicker(rounded: &RoundedPath, path: &[Vec<f64>], bounds: &[JointBound], deviation: &[f64]) -> bool {
-    let speeds = rounded.speeds();
-    if rounded.suits(&speeds) {
+fn variable_is_quicker(
+    (rounded, speeds): (&RoundedPath, &[f64]),
+    path: &[Vec<f64>],
+    bounds: &[JointBound],
+    deviation: &[f64],
+) -> bool {
+    if rounded.suits(speeds) {
         return false;
     }
     let duration = |curve: &Curve| {
@@ -151,13 +156,13 @@ fn variable_is_quicker(rounded: &RoundedPath, path: &[Vec<f64>], bounds: &[Joint
         slow_down(&mut states, bounds);
         states.duration()
     };
-    curves(path, deviation).iter().map(duration).sum::<f64>() < rounded.duration(&speeds)
+    curves(path, deviation).iter().map(duration).sum::<f64>() < rounded.duration(speeds)
 }
 
 /// Times a path whose corners are passed at constant speed.
 fn at_constant_corner_speed(
     names: &[String],
-    (path, mut rounded): (&[Vec<f64>], RoundedPath),
+    (path, mut rounded, mut speeds): (&[Vec<f64>], RoundedPath, Vec<f64>),
     bounds: &[JointBound],
     mut deviation: Vec<f64>,
     speed: f64,
@@ -165,6 +170,7 @@ fn at_constant_corner_speed(
 ) -> Result<Timed, TimingError> {
     let (mut from, mut to) = (path[0].clone(), path[0].clone());
     let (mut factors, mut places) = (Vec::new(), Vec::new());
+    let mut sharper = false;
     for (i, deviation) in deviation.iter_mut().enumerate().take(path.len() - 1).skip(1) {
         // In pieces that are as straight as the motion is checked elsewhere.
         let mut is_free = |rounded: &RoundedPath| {
@@ -175,9 +181,13 @@ fn at_constant_corner_speed(
         while !is_free(&rounded) {
             *deviation = if *deviation > 2e-3 { *deviation * 0.4 } else { 0.0 };
             rounded.blend(i, *deviation);
+            sharper = true;
         }
     }
-    let mut states = rounded.motion(&rounded.speeds());
+    if sharper {
+        speeds = rounded.speeds();
+    }
+    let mut states = rounded.motion(&speeds);
     let excess = slow_down(&mut states, bounds);
     // What is between the corners was part of the path, and is all that the motion passes besides.
     for i in 0..path.len() - 1 {

@@ -1,4 +1,4 @@
-//! Edges that were looked at as a whole: the parts of them that a path still has need no second look.
+//! Edges that are free at all samples: parts of them that a path still has need no second check.
 
 use smallvec::SmallVec;
 
@@ -10,9 +10,9 @@ const ON_EDGE: f64 = 1e-9;
 
 /// Edges that look free at all samples.
 #[derive(Debug, Clone, Default)]
-pub struct Looked(SmallVec<[[JointValues; 2]; 8]>);
+pub struct Sampled(SmallVec<[[JointValues; 2]; 8]>);
 
-impl Looked {
+impl Sampled {
     /// Adds an edge.
     pub fn add(&mut self, from: &[f64], to: &[f64]) {
         self.0.push([from, to].map(JointValues::from_slice));
@@ -44,20 +44,20 @@ mod tests {
     #[test]
     fn parts_of_an_edge_are_known_and_what_leaves_it_is_not() {
         let (a, b) = ([0.3, -2.0, 1.0], [1.1, 0.7, -2.5]);
-        let mut looked = Looked::default();
-        assert!(!looked.has(&a, &b) && !looked.has(&a, &a));
-        looked.add(&a, &b);
+        let mut sampled = Sampled::default();
+        assert!(!sampled.has(&a, &b) && !sampled.has(&a, &a));
+        sampled.add(&a, &b);
         let at = |part| {
             let mut q = [0.0; 3];
             between(&a, &b, part, &mut q);
             q
         };
-        assert!(looked.has(&a, &b) && looked.has(&b, &a) && looked.has(&at(0.2), &at(0.7)) && looked.has(&a, &a));
-        assert!(!looked.has(&a, &at(1.001)) && !looked.has(&at(-0.001), &b));
+        assert!(sampled.has(&a, &b) && sampled.has(&b, &a) && sampled.has(&at(0.2), &at(0.7)) && sampled.has(&a, &a));
+        assert!(!sampled.has(&a, &at(1.001)) && !sampled.has(&at(-0.001), &b));
         let [x, y, z] = at(0.5);
-        assert!(!looked.has(&a, &[x, y, z + 1e-6]));
-        // An end on one edge and the other end on another: the way between them was not looked at.
-        looked.add(&b, &[2.0, 2.0, 2.0]);
-        assert!(!looked.has(&at(0.5), &[2.0, 2.0, 2.0]));
+        assert!(!sampled.has(&a, &[x, y, z + 1e-6]));
+        // An end on one edge and the other end on another: the way between them was not checked.
+        sampled.add(&b, &[2.0, 2.0, 2.0]);
+        assert!(!sampled.has(&at(0.5), &[2.0, 2.0, 2.0]));
     }
 }
