@@ -154,8 +154,8 @@ impl ExactChecker {
         free
     }
 
-    /// Proves the part of a motion that begins at a place and is left after this number of halvings, by sweeping covers;
-    /// where that fails, both halves of it. What touches, and what is short, is checked in pieces.
+    /// Proves the part of a motion that begins at a place and is left after this number of halvings, by sweeping
+    /// covers; where that fails, both halves of it. What touches, and what is short, is checked in pieces.
     fn sweep(
         &mut self,
         p: &mut Pieces,
