@@ -25,6 +25,7 @@ mod gripper_joint;
 mod jobs;
 mod jog;
 mod joint_status;
+mod kernels;
 mod leader_follower;
 mod leases;
 mod library;

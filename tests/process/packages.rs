@@ -9,7 +9,7 @@ use std::process::{Command, Output, Stdio};
 use crate::support::skip::skip;
 
 /// Whether the tools are there.
-fn has(tools: &[&str]) -> bool {
+pub fn has(tools: &[&str]) -> bool {
     let missing = |tool: &&&str| {
         let found = Command::new(**tool).arg("--version").stdout(Stdio::null()).stderr(Stdio::null()).status();
         found.is_err()
@@ -20,7 +20,7 @@ fn has(tools: &[&str]) -> bool {
 }
 
 #[track_caller]
-fn done(command: &mut Command) -> String {
+pub fn done(command: &mut Command) -> String {
     let Output { status, stdout, stderr } = command.output().unwrap();
     let (out, err) = (String::from_utf8_lossy(&stdout), String::from_utf8_lossy(&stderr));
     assert!(status.success(), "{command:?}: {status}\n{out}{err}");
