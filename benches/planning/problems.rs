@@ -134,12 +134,14 @@ impl Arm {
         }
     }
 
-    /// Allows pairs of links that touch in every configuration, as a run does, and prints them.
-    pub fn allow_always_touching_pairs(&mut self, kinematics: &Arc<Kinematics>) {
-        for [a, b] in always_touch(&self.robot(kinematics)) {
+    /// Allows pairs of links that touch in every configuration, as a run does; prints and returns them.
+    pub fn allow_always_touching_pairs(&mut self, kinematics: &Arc<Kinematics>) -> Vec<[String; 2]> {
+        let pairs = always_touch(&self.robot(kinematics));
+        for [a, b] in &pairs {
             println!("note      {a} and {b} touch in every configuration: not checked");
-            self.allowed.push((a, b));
+            self.allowed.push((a.clone(), b.clone()));
         }
+        pairs
     }
 
     /// Returns the scene of a problem.

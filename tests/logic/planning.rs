@@ -2,7 +2,7 @@
 
 #[path = "../../benches/planning/problems.rs"]
 #[allow(dead_code, reason = "shared with the benchmark")]
-mod problems;
+pub mod problems;
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;

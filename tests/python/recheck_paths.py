@@ -1,5 +1,6 @@
 """Judges the paths that the planning benchmark wrote, with somebody else's kinematics and collision checks: Pinocchio
-and coal (PyPI `pin`). Every path is walked in steps of 1/128 rad, every triangle of every mesh counts.
+and coal (PyPI `pin`). Every path is walked in steps of 1/128 rad, every triangle of every mesh counts. A problem may
+name pairs of links that are `ignored`, and where joints that are not planned `rest`.
 
     python recheck_paths.py --rows rows.json --problems problems.jsonl --urdf panda.urdf --package panda=DIR
 """
@@ -52,13 +53,25 @@ class Robot:
     def link(self, geometry):
         return self.model.frames[geometry.parentFrame].name
 
-    def joint(self, name):
+    def name(self, name):
         ends = [n for n in self.model.names if n == name] or [n for n in self.model.names if n.split("_", 1)[-1] == name.split("_", 1)[-1]]
         assert len(ends) == 1, (name, ends)
-        return self.model.joints[self.model.getJointId(ends[0])].idx_q
+        return ends[0]
+
+    def joint(self, name):
+        return self.model.joints[self.model.getJointId(self.name(name))].idx_q
 
     def scene(self, problem):
         geometry = self.links.copy()
+        planned = {self.model.getJointId(self.name(name)) for name in problem["joints"]}
+
+        def mover(thing):
+            joint = thing.parentJoint
+            while joint != 0 and joint not in planned:
+                joint = self.model.parents[joint]
+            return joint
+
+        ignored = {frozenset(pair) for pair in problem.get("ignored", [])}
         count = geometry.ngeoms
         for thing in problem["obstacles"]:
             geometry.addGeometryObject(pin.GeometryObject(thing["name"], 0, 0, pose(thing), shape(thing)))
@@ -66,11 +79,12 @@ class Robot:
         for a in range(count):
             for b in range(a):
                 one, two = objects[a], objects[b]
-                near = frozenset((self.link(one), self.link(two))) in self.neighbours
-                if one.parentJoint != two.parentJoint and not near:
+                pair = frozenset((self.link(one), self.link(two)))
+                near = pair in self.neighbours or pair in ignored
+                if mover(one) != mover(two) and not near:
                     geometry.addCollisionPair(pin.CollisionPair(b, a))
             # What never moves cannot be helped.
-            if objects[a].parentJoint != 0:
+            if mover(objects[a]) != 0:
                 for o in range(count, geometry.ngeoms):
                     geometry.addCollisionPair(pin.CollisionPair(a, o))
         return geometry
@@ -83,9 +97,12 @@ class Judge:
         self.robot, self.geometry = robot, robot.scene(problem)
         self.data, self.checks = robot.model.createData(), self.geometry.createData()
         self.at = [robot.joint(name) for name in problem["joints"]]
+        self.rest = robot.rest.copy()
+        for name, position in problem.get("rest", {}).items():
+            self.rest[robot.joint(name)] = position
 
     def touches(self, q, everything=False):
-        full = self.robot.rest.copy()
+        full = self.rest.copy()
         full[self.at] = q
         hit = pin.computeCollisions(self.robot.model, self.data, self.geometry, self.checks, full, not everything)
         if not hit:
