@@ -1,5 +1,5 @@
-//! Plans of all arms between random obstacles, judged by somebody else: every path is followed in steps of 1/128 rad with
-//! Pinocchio's kinematics and coal's collision checks, which share no code with the planner.
+//! Plans of all arms between random obstacles, judged by somebody else: every path is followed in steps of 1/128 rad
+//! with Pinocchio's kinematics and coal's collision checks, which share no code with the planner.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

@@ -35,6 +35,7 @@ mod orders;
 mod packages;
 mod park;
 mod payload;
+mod planned_log;
 mod planner_arms;
 mod planner_attach;
 mod planner_faults;
