@@ -1,4 +1,4 @@
-//! What an emulated arm did on planned motions, from the run's log, judged by Pinocchio and coal: its measured positions
+//! What an emulated arm did on planned motions, from its log, judged by Pinocchio and coal: the measured positions
 //! keep clear of all that the motions were planned around.
 
 use std::path::Path;
