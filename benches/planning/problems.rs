@@ -111,7 +111,11 @@ impl Arm {
                 return Err(format!("joints {a:?} and {b:?} of the problems match the same joint of the robot").into());
             }
         }
-        // Other prismatic joints belong to a gripper: it is open.
+        Ok(Kinematics::new(&self.model, &joints, &self.rest())?)
+    }
+
+    /// Returns where joints are that no problem names: prismatic ones belong to a gripper, which is open.
+    pub fn rest(&self) -> Vec<f64> {
         let open = |j: &dimos::robot::Joint| if j.kind == JointKind::Prismatic { j.limits.upper } else { 0.0 };
         let mut rest: Vec<f64> = self.model.joints.iter().map(open).collect();
         for (j, joint) in self.model.joints.iter().enumerate() {
@@ -119,7 +123,7 @@ impl Arm {
                 rest[j] = mimic.multiplier * rest[mimic.leader] + mimic.offset;
             }
         }
-        Ok(Kinematics::new(&self.model, &joints, &rest)?)
+        rest
     }
 
     fn robot(&self, kinematics: &Arc<Kinematics>) -> Robot {

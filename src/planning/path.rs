@@ -61,34 +61,18 @@ pub fn tidy(mut path: Path) -> Path {
 /// Returns the index of each configuration of a path that remains when it is [tidy].
 pub fn tidy_indices(path: &[Vec<f64>]) -> Vec<usize> {
     let mut kept: Vec<usize> = Vec::with_capacity(path.len());
-    // The length of the last edge.
-    let mut first = 0.0;
     for (i, q) in path.iter().enumerate() {
-        let mut second = kept.last().map_or(f64::INFINITY, |last| distance(&path[*last], q));
-        if second < 1e-12 {
+        if kept.last().is_some_and(|last| distance(&path[*last], q) < 1e-12) {
             continue;
         }
         if let [.., before, middle] = kept[..] {
             let (before, middle) = (&path[before], &path[middle]);
-            if !turns(before, middle, q, (first, second)) {
-                let whole = distance(before, q);
-                if first + second - whole < 1e-12 * whole.max(1.0) {
-                    kept.pop();
-                    second = whole;
-                }
+            let (first, second, whole) = (distance(before, middle), distance(middle, q), distance(before, q));
+            if first + second - whole < 1e-12 * whole.max(1.0) {
+                kept.pop();
             }
         }
         kept.push(i);
-        first = second;
     }
     kept
-}
-
-/// Returns whether edges of these lengths turn so much that their ends are surely not on one line: quicker than to
-/// compute the length of the line.
-fn turns(before: &[f64], middle: &[f64], q: &[f64], (first, second): (f64, f64)) -> bool {
-    let product: f64 = before.iter().zip(middle).zip(q).map(|((a, b), c)| (b - a) * (c - b)).sum();
-    // The way over the middle is longer by at least first · second · (1 − cos) / (first + second).
-    let longer = first * second - product;
-    longer > 1e-10 * (first + second) * (first + second).max(1.0)
 }

@@ -328,18 +328,18 @@ fn finished<C: CollisionChecker>(
     let (rounds, none) = (&settings.shortcut, Duration::ZERO);
     if matches!(found.edges, Edges::Checked | Edges::Proven) {
         // Where covers touch, nothing looks free.
-        let looks = found.edges == Edges::Checked;
+        let look = found.edges == Edges::Checked;
         let mut is_free = |a: &[f64], b: &[f64]| {
-            (!looks || checker.motion_looks_free(a, b)) && checker.motion_is_easily_free(a, b, looks, stop)
+            (!look || checker.motion_looks_free(a, b)) && checker.motion_is_easily_free(a, b, look, stop)
         };
         return Some((shorten(&found.path, &turns, rounds, &mut is_free), none));
     }
-    // A proof needs no looks before it.
-    let looks = found.edges == Edges::Looking && !settings.level.proves();
+    // A proof samples all that it needs.
+    let samples_left = found.edges == Edges::Looking && !settings.level.proves();
     let mut sampled = Sampled::default();
     let mut looks_free = |a: &[f64], b: &[f64]| {
         let free = !stop.is_over() && checker.motion_looks_free(a, b);
-        if looks && free {
+        if samples_left && free {
             sampled.add(a, b);
         }
         free
@@ -347,7 +347,7 @@ fn finished<C: CollisionChecker>(
     let short = shorten(&found.path, &turns, rounds, &mut looks_free);
     let cuts = (nodes / NODES_PER_CUT).clamp(CUTS.0, CUTS.1);
     let short = cut(&short, cuts, &mut Random::new(settings.seed), &mut looks_free).unwrap_or(short);
-    if looks {
+    if samples_left {
         let began = Instant::now();
         let looks_free =
             |edge: &[Vec<f64>]| sampled.has(&edge[0], &edge[1]) || checker.motion_looks_free(&edge[0], &edge[1]);

@@ -3,7 +3,6 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::process::Command;
 use std::sync::Arc;
 
 use dimos::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
@@ -14,7 +13,7 @@ use dimos::robot::random::Random;
 use serde_json::{Value, json};
 
 use super::planning::problems::{Arm, Problem, Shapes};
-use crate::support::python::python_with;
+use crate::support::python::{python_with, recheck};
 use crate::support::shared::shared;
 
 /// Obstacles about each arm.
@@ -54,23 +53,14 @@ fn judged(python: &Path, name: &str, urdf: &Path, package: Option<(&str, &Path)>
     let packages: BTreeMap<String, PathBuf> = package.iter().map(|(name, at)| ((*name).into(), at.into())).collect();
     let mut arm = Arm::load(urdf, None, packages).unwrap();
     let model = arm.model();
+    // A gripper's joints are not planned.
     let moves = |j: &usize| model.joints[*j].kind != JointKind::Prismatic && !model.joints[*j].name.contains("drive");
     let joints: Vec<String> =
         model.independent_joints().into_iter().filter(moves).map(|j| model.joints[j].name.clone()).collect();
-    // As `Arm::kinematics` places the others: a gripper is open.
-    let mut rest = vec![0.0; model.joints.len()];
-    for (j, joint) in model.joints.iter().enumerate().filter(|(_, joint)| joint.kind == JointKind::Prismatic) {
-        rest[j] = joint.limits.upper;
-    }
-    for (j, joint) in model.joints.iter().enumerate() {
-        if let Some(mimic) = joint.mimic {
-            rest[j] = mimic.multiplier * rest[mimic.leader] + mimic.offset;
-        }
-    }
     let placed = model
         .joints
         .iter()
-        .zip(rest)
+        .zip(arm.rest())
         .filter(|(joint, _)| joint.kind != JointKind::Fixed && !joints.contains(&joint.name));
     let rest: serde_json::Map<String, Value> = placed.map(|(joint, at)| (joint.name.clone(), json!(at))).collect();
     let record = |index: usize, things: &[Value], [start, goal]: [&[f64]; 2], ignored: &[[String; 2]]| {
@@ -96,22 +86,11 @@ fn judged(python: &Path, name: &str, urdf: &Path, package: Option<(&str, &Path)>
         let found = plan(&mut checker, &start, std::slice::from_ref(&goal), &settings, &Stop::never());
         let Ok(found) = found else { continue };
         searched += usize::from(!found.straight);
-        problems.push(record(index, &things, [&start, &goal], &ignored).to_string());
+        problems.push(record(index, &things, [&start, &goal], &ignored));
         rows.push(json!({ "problem": name, "index": index, "solved": true, "path": found.path }));
     }
-    let folder = tempfile::tempdir().unwrap();
-    let [listed, answered] = ["problems.jsonl", "rows.json"].map(|file| folder.path().join(file));
-    std::fs::write(&listed, problems.join("\n")).unwrap();
-    std::fs::write(&answered, json!({ "rows": rows }).to_string()).unwrap();
-    let mut command = Command::new(python);
-    command.arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/recheck_paths.py"));
-    command.arg("--rows").arg(&answered).arg("--problems").arg(&listed).arg("--urdf").arg(urdf);
-    if let Some((name, at)) = package {
-        command.arg("--package").arg(format!("{name}={}", at.display()));
-    }
-    let output = command.output().unwrap();
-    let (said, error) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
-    assert!(output.status.success() && said.contains(": 0 touch; 0 unsolved"), "{name}: {said}\n{error}");
+    let said = recheck(python, urdf, package, &problems, &rows);
+    assert!(said.contains(": 0 touch; 0 unsolved"), "{name}: {said}");
     println!("{name}: {}", said.trim());
     [rows.len(), searched]
 }
@@ -120,22 +99,17 @@ fn judged(python: &Path, name: &str, urdf: &Path, package: Option<(&str, &Path)>
 fn no_path_of_any_arm_touches_anything() {
     let Some(python) = python_with(&["pinocchio", "coal"]) else { return };
     let folder = tempfile::tempdir().unwrap();
-    let (mut plans, mut searched) = (0, 0);
-    let mut add = |[number, paths]: [usize; 2]| {
-        plans += number;
-        searched += paths;
-        (plans, searched)
-    };
+    let mut judgements = Vec::new();
     for name in builtin::names() {
         let urdf = folder.path().join(format!("{name}.urdf"));
         std::fs::write(&urdf, builtin::text(name).unwrap()).unwrap();
-        add(judged(&python, name, &urdf, None));
+        judgements.push(judged(&python, name, &urdf, None));
     }
     let Some(models) = shared("models") else { return };
     for name in ["panda", "piper", "xarm6", "xarm7"] {
         let at = models.join(name);
-        add(judged(&python, name, &at.join(format!("{name}.urdf")), Some((name, &at))));
+        judgements.push(judged(&python, name, &at.join(format!("{name}.urdf")), Some((name, &at))));
     }
-    let (plans, searched) = add([0, 0]);
+    let [plans, searched] = [0, 1].map(|which| judgements.iter().map(|numbers| numbers[which]).sum::<usize>());
     assert!(plans > 80 && searched > 40, "{plans}, {searched}");
 }

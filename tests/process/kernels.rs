@@ -40,7 +40,6 @@ fn in_program(symbols: &str) -> BTreeMap<String, (u64, u64)> {
 }
 
 #[test]
-#[cfg(target_arch = "x86_64")]
 fn every_kernel_is_compiled_with_its_vectors() {
     if !has(&["nm", "objdump"]) {
         return;

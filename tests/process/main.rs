@@ -25,6 +25,7 @@ mod gripper_joint;
 mod jobs;
 mod jog;
 mod joint_status;
+#[cfg(target_arch = "x86_64")]
 mod kernels;
 mod leader_follower;
 mod leases;

@@ -1,14 +1,11 @@
 //! What an emulated arm did on planned motions, from its log, judged by Pinocchio and coal: the measured positions
 //! keep clear of all that the motions were planned around.
 
-use std::path::Path;
-use std::process::Command;
-
 use dimos::robot::builtin;
 use serde_json::json;
 
 use crate::support::program::Home;
-use crate::support::python::python_with;
+use crate::support::python::{python_with, recheck};
 
 /// Measured positions, one row a tick at which they change, from an exported log.
 fn measured(table: &str, joints: usize) -> Vec<Vec<f64>> {
@@ -54,18 +51,9 @@ fn an_emulated_arm_keeps_clear_of_what_its_motions_were_planned_around() {
             {"name": "beam", "type": "box", "size": [0.1, 0.5, 0.05], "position": [0.45, -0.2, 0.5], "quat_xyzw": still},
         ],
     });
-    let files = ["arm.urdf", "problems.jsonl", "rows.json"].map(|name| home.path().join(name));
-    let rows = json!({ "rows": [{ "problem": "log", "index": 0, "solved": true, "path": path }] });
-    let texts = [builtin::text("xarm6_gripper").unwrap().to_owned(), problem.to_string(), rows.to_string()];
-    for (file, text) in files.iter().zip(texts) {
-        std::fs::write(file, text).unwrap();
-    }
-    let mut command = Command::new(python);
-    command.arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/recheck_paths.py"));
-    for (option, file) in ["--urdf", "--problems", "--rows"].iter().zip(&files) {
-        command.arg(option).arg(file);
-    }
-    let output = command.output().unwrap();
-    let (said, error) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
-    assert!(output.status.success() && said.starts_with("1 paths") && said.contains(": 0 touch;"), "{said}\n{error}");
+    let urdf = home.path().join("arm.urdf");
+    std::fs::write(&urdf, builtin::text("xarm6_gripper").unwrap()).unwrap();
+    let row = json!({ "problem": "log", "index": 0, "solved": true, "path": path });
+    let said = recheck(&python, &urdf, None, &[problem], &[row]);
+    assert!(said.starts_with("1 paths") && said.contains(": 0 touch;"), "{said}");
 }

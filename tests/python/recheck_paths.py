@@ -53,17 +53,17 @@ class Robot:
     def link(self, geometry):
         return self.model.frames[geometry.parentFrame].name
 
-    def name(self, name):
+    def own_name(self, name):
         ends = [n for n in self.model.names if n == name] or [n for n in self.model.names if n.split("_", 1)[-1] == name.split("_", 1)[-1]]
         assert len(ends) == 1, (name, ends)
         return ends[0]
 
     def joint(self, name):
-        return self.model.joints[self.model.getJointId(self.name(name))].idx_q
+        return self.model.joints[self.model.getJointId(self.own_name(name))].idx_q
 
     def scene(self, problem):
         geometry = self.links.copy()
-        planned = {self.model.getJointId(self.name(name)) for name in problem["joints"]}
+        planned = {self.model.getJointId(self.own_name(name)) for name in problem["joints"]}
 
         def mover(thing):
             joint = thing.parentJoint

@@ -33,3 +33,29 @@ pub fn ask_python(script: &str, module: &str, question: &serde_json::Value) -> O
     assert!(output.status.success(), "the script failed");
     Some(serde_json::from_slice(&output.stdout).unwrap())
 }
+
+/// What Pinocchio and coal say of paths (`tests/python/recheck_paths.py`): problems, and the rows that the benchmark
+/// would write of them. `package`: name and folder of `package://` in the URDF.
+#[track_caller]
+pub fn recheck(
+    python: &Path,
+    urdf: &Path,
+    package: Option<(&str, &Path)>,
+    problems: &[serde_json::Value],
+    rows: &[serde_json::Value],
+) -> String {
+    let folder = tempfile::tempdir().unwrap();
+    let [listed, answered] = ["problems.jsonl", "rows.json"].map(|file| folder.path().join(file));
+    let lines: Vec<String> = problems.iter().map(ToString::to_string).collect();
+    std::fs::write(&listed, lines.join("\n")).unwrap();
+    std::fs::write(&answered, serde_json::json!({ "rows": rows }).to_string()).unwrap();
+    let mut command = Command::new(python);
+    command.arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/recheck_paths.py"));
+    command.arg("--rows").arg(&answered).arg("--problems").arg(&listed).arg("--urdf").arg(urdf);
+    if let Some((name, at)) = package {
+        command.arg("--package").arg(format!("{name}={}", at.display()));
+    }
+    let output = command.output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout).unwrap()
+}
