@@ -32,6 +32,84 @@ pub struct Supervision {
     pub tracking_tolerance: f64,
     /// Whether a pose with every joint at exactly zero is accepted without the device's confirmation.
     pub accept_zero_pose: bool,
+    /// Largest distance of a joint below its setpoint under load, beyond `accuracy` [rad]: position control without an
+    /// integral part.
+    #[serde(default)]
+    pub droop: f64,
+    /// Furthest that the setpoint of a held joint is taken back towards the joint [rad]; 0: the arm's own stop takes the
+    /// pressure off a blocked joint.
+    #[serde(default)]
+    pub relief: f64,
+    /// How far outside its range a joint may rest and still be enabled [rad].
+    #[serde(default)]
+    pub outside: f64,
+    /// Longest time without a setpoint that the arm's controller bridges; two periods of setpoints at least.
+    #[serde(default)]
+    pub gap_tolerance: Duration,
+    /// What the controller does beyond it.
+    #[serde(default)]
+    pub after_gap: AfterGap,
+    /// How the reading of each joint counts turns.
+    #[serde(default)]
+    pub topology: [Topology; MAX_DOF],
+}
+
+named! {
+    /// What an arm's controller does when no setpoint came for longer than it bridges.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+    #[serde(rename_all = "snake_case")]
+    pub enum AfterGap {
+        /// The joints go to the last setpoint, and rest there under torque.
+        #[default]
+        RestsAtSetpoint = "rests_at_setpoint",
+        /// The controller decelerates along the motion, and waits where that ends.
+        Decelerates = "decelerates",
+        /// The controller reports an error, and ends the motion.
+        Faults = "faults",
+    }
+}
+
+named! {
+    /// How the reading of a joint counts turns.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+    #[serde(rename_all = "snake_case")]
+    pub enum Topology {
+        /// The reading is the angle from zero: one that is off by whole turns is a lost turn count.
+        #[default]
+        MultiTurn = "multi_turn",
+        /// The encoder counts one turn, with a seam at which the reading jumps by a whole turn.
+        Seamed = "seamed",
+        /// The joint turns without end.
+        Endless = "endless",
+    }
+}
+
+/// A setpoint of all joints.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Setpoint {
+    /// Positions [rad].
+    pub position: Joints,
+    /// Velocities of the setpoints at that time [rad/s].
+    pub velocity: Joints,
+    /// Time of the tick that made it.
+    pub at: Mono,
+}
+
+/// Where a stop is to bring the arm to rest. Made from setpoints, never from a measurement.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct StopPoint {
+    /// Joint positions [rad]: the last setpoint of an arm at rest, the end of the braking of one in motion. `None`:
+    /// nothing was commanded since the motors came on, so the arm rests where its controller has it.
+    pub position: Option<Joints>,
+}
+
+/// What an arm's controller itself commands its joints.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Commanded {
+    /// Positions [rad].
+    pub position: Joints,
+    /// Velocities [rad/s].
+    pub velocity: Joints,
 }
 
 impl Supervision {
@@ -52,6 +130,12 @@ impl Default for Supervision {
             stale_after: Duration::from_millis(50),
             tracking_tolerance: Self::TRACKING_TOLERANCE,
             accept_zero_pose: false,
+            droop: 0.0,
+            relief: 0.0,
+            outside: 0.02,
+            gap_tolerance: Duration::ZERO,
+            after_gap: AfterGap::default(),
+            topology: [Topology::default(); MAX_DOF],
         }
     }
 }
@@ -157,6 +241,12 @@ pub struct ArmState {
     pub stop_input_open: bool,
     /// The device's own time of the measurement, on its own clock [ns], where it reports one.
     pub device_ns: Option<u64>,
+    /// What the arm's controller itself commands, where it reports that.
+    #[serde(default)]
+    pub commanded: Option<Commanded>,
+    /// `ArmCommand::seq` of the newest setpoint that the adapter, or the last check before it, refused; 0 = none.
+    #[serde(default)]
+    pub refused: u64,
 }
 
 impl Default for ArmState {
@@ -183,6 +273,8 @@ impl Default for ArmState {
             own_delay_ns: 0,
             stop_input_open: false,
             device_ns: None,
+            commanded: None,
+            refused: 0,
         }
     }
 }
@@ -217,6 +309,13 @@ pub struct ArmCommand {
     pub led: bool,
     /// Counts the times that the arm began to be led: an order to begin belongs to one of them.
     pub lead_seq: u32,
+    /// Velocities of position setpoints [rad/s].
+    #[serde(default)]
+    pub velocity: Joints,
+    /// Where the arm comes to rest from this command by braking within its limits [rad]; `None`: nothing was commanded
+    /// since the motors came on.
+    #[serde(default)]
+    pub rest: Option<Joints>,
 }
 
 impl Default for ArmCommand {
@@ -235,6 +334,8 @@ impl Default for ArmCommand {
             start_seq: 0,
             led: false,
             lead_seq: 0,
+            velocity: [0.0; MAX_DOF],
+            rest: None,
         }
     }
 }

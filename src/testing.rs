@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard};
 
-use crate::arm::Pose;
+use crate::arm::{Pose, StopPoint};
 use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
 };
@@ -110,8 +110,8 @@ struct Shared {
 /// assert_eq!(mock.calls().last(), Some(&Call::WriteJointPositions(vec![0.0; 6], 0.5)));
 ///
 /// mock.fail("write_stop", AdapterError::Timeout("no answer".into()));
-/// assert!(adapter.write_stop().is_err());
-/// assert!(adapter.write_stop().is_ok(), "it fails once");
+/// assert!(adapter.write_stop(&StopPoint::default()).is_err());
+/// assert!(adapter.write_stop(&StopPoint::default()).is_ok(), "it fails once");
 /// ```
 #[derive(Clone)]
 pub struct MockAdapter(Arc<Mutex<Shared>>);
@@ -256,7 +256,7 @@ impl ManipulatorAdapter for MockAdapter {
         Ok(())
     }
 
-    fn deactivate(&mut self) -> AdapterResult<()> {
+    fn deactivate(&mut self, _rest: &StopPoint) -> AdapterResult<()> {
         self.asked("deactivate").map(|_| ())
     }
 
@@ -329,7 +329,7 @@ impl ManipulatorAdapter for MockAdapter {
         self.called(Call::WriteJointVelocities(velocities.to_vec())).map(|_| ())
     }
 
-    fn write_stop(&mut self) -> AdapterResult<Stop> {
+    fn write_stop(&mut self, _rest: &StopPoint) -> AdapterResult<Stop> {
         self.asked("write_stop").map(|_| Stop::Confirmed)
     }
 

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
+use dimos::arm::StopPoint;
 use dimos::hardware::adapter::{AdapterResult, JointReading};
 use dimos::hardware::registry;
 use dimos::joint::ControlMode;
@@ -133,7 +134,7 @@ fn series(address: &str, cycles: usize) -> AdapterResult<Vec<f64>> {
         times.push(began.elapsed().as_secs_f64() * 1e6);
         std::thread::sleep(Duration::from_millis(10).saturating_sub(began.elapsed()));
     }
-    arm.deactivate()?;
+    arm.deactivate(&StopPoint::default())?;
     arm.disconnect();
     Ok(times)
 }

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use crate::arm::Supervision;
+use crate::arm::{Supervision, Topology};
 use crate::blueprint::resolve::{Arm, Checker};
 use crate::blueprint::schema::{HardwareEntry, Joints, OnExit};
 use crate::blueprint::{limits, park, parts};
@@ -109,7 +109,10 @@ fn arm(
     };
     let park_pose = park::resolve(checker, entry, joints, joints_known, own.as_ref(), &limits);
     let simulated = address == SIM && row.emulate.is_some();
-    let setup = parts::resolve(checker, entry, &checked.unwrap_or_default());
+    let checked = checked.unwrap_or_default();
+    let setup = parts::resolve(checker, entry, &checked);
+    let mut topology = [row.topology; MAX_DOF];
+    topology.iter_mut().zip(&checked.topology).for_each(|(joint, own)| *joint = *own);
     let default_on_exit = if row.holds_when_disabled { OnExit::Disable } else { OnExit::Hold };
     Arm {
         hardware_id: id.to_owned(),
@@ -123,7 +126,7 @@ fn arm(
         on_exit: entry.on_exit.unwrap_or(default_on_exit),
         on_exit_given: entry.on_exit.is_some(),
         park_pose,
-        supervision: supervision(entry, &row, simulated),
+        supervision: supervision(entry, &row, simulated, topology),
         setup,
         options,
         own_limits: own.unwrap_or_default(),
@@ -136,7 +139,12 @@ fn arm(
 const SIMULATED_STALE_AFTER: Duration = Duration::from_millis(250);
 
 /// Returns the adapter's supervision figures, overridden by those of the blueprint.
-fn supervision(entry: &HardwareEntry, row: &AdapterSpec, simulated: bool) -> Supervision {
+fn supervision(
+    entry: &HardwareEntry,
+    row: &AdapterSpec,
+    simulated: bool,
+    topology: [Topology; MAX_DOF],
+) -> Supervision {
     let stale_after = if simulated { row.stale_after.max(SIMULATED_STALE_AFTER) } else { row.stale_after };
     Supervision {
         accuracy: entry.accuracy.unwrap_or(row.accuracy),
@@ -144,6 +152,12 @@ fn supervision(entry: &HardwareEntry, row: &AdapterSpec, simulated: bool) -> Sup
         stale_after: entry.stale_after.map_or(stale_after, Duration::from_secs_f64),
         tracking_tolerance: entry.tracking_tolerance.unwrap_or(Supervision::TRACKING_TOLERANCE),
         accept_zero_pose: entry.accept_zero_pose,
+        droop: row.droop,
+        relief: row.relief,
+        outside: row.outside,
+        gap_tolerance: row.gap_tolerance,
+        after_gap: row.after_gap,
+        topology,
     }
 }
 

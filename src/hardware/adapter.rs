@@ -17,7 +17,7 @@ mod payload;
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
-use crate::arm::{ForceUnit, GripperInfo, GripperUnit, Pose};
+use crate::arm::{Commanded, ForceUnit, GripperInfo, GripperUnit, Pose, Setpoint, StopPoint};
 use crate::clock::Mono;
 use crate::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
 
@@ -105,6 +105,9 @@ pub struct JointReading {
     /// cannot tell. Without a confirmation, exactly zero on all joints counts as missing when the motors are to be
     /// enabled.
     pub valid: Option<bool>,
+    /// What the controller itself commands its joints, if it reports that: measured or estimated values do not belong
+    /// here.
+    pub commanded: Option<Commanded>,
 }
 
 /// The device's own state codes.
@@ -141,9 +144,10 @@ pub trait ManipulatorAdapter: Send {
     fn activate(&mut self) -> AdapterResult<()> {
         self.write_enable(true)
     }
-    /// Ends commanded motion in a regular way, before `disconnect`. The motors stay on or off.
-    fn deactivate(&mut self) -> AdapterResult<()> {
-        self.write_stop().map(|_| ())
+    /// Ends commanded motion in a regular way, before `disconnect`: the arm is to rest at `rest`. The motors stay on or
+    /// off.
+    fn deactivate(&mut self, rest: &StopPoint) -> AdapterResult<()> {
+        self.write_stop(rest).map(|_| ())
     }
 
     // --- Identity ---
@@ -193,7 +197,7 @@ pub trait ManipulatorAdapter: Send {
         let dof = self.get_dof().min(MAX_DOF);
         let mut buffer = [0.0; MAX_DOF];
         let slice = buffer.get_mut(..dof).unwrap_or_default();
-        (reading.stamp, reading.device_ns) = (None, None);
+        (reading.stamp, reading.device_ns, reading.commanded) = (None, None, None);
         self.read_joint_positions(slice)?;
         reading.position = buffer;
         let mut buffer = [0.0; MAX_DOF];
@@ -221,9 +225,15 @@ pub trait ManipulatorAdapter: Send {
     fn write_joint_velocities(&mut self, _velocities: &[f64]) -> AdapterResult<()> {
         Err(AdapterError::Unsupported)
     }
-    /// Stops all motion at once with the device's own stop; the motors stay powered. An operational stop. The device
-    /// thread holds a gripper that still moves afterwards at its current position.
-    fn write_stop(&mut self) -> AdapterResult<Stop>;
+    /// Commands joint positions that a tick made, with their velocities. By default
+    /// [`write_joint_positions`](Self::write_joint_positions).
+    fn write_setpoint(&mut self, setpoint: &Setpoint) -> AdapterResult<()> {
+        self.write_joint_positions(setpoint.position.get(..self.get_dof()).unwrap_or_default(), 1.0)
+    }
+    /// Stops all motion at once with the device's own stop; the motors stay powered. An operational stop. An arm whose
+    /// controller only takes goals is given `rest` as its goal; no adapter makes a goal from a measurement, which may be
+    /// wrong. The device thread holds a gripper that still moves afterwards at its current position.
+    fn write_stop(&mut self, rest: &StopPoint) -> AdapterResult<Stop>;
     /// Enables or disables the motors.
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()>;
     /// Clears the device's error state. Moves and enables nothing. `Busy` while that takes time: the device thread then

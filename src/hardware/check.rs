@@ -8,6 +8,7 @@ use serde::de::DeserializeOwned;
 
 use super::adapter::{AdapterError, AdapterResult};
 use super::registry::AdapterConfig;
+use crate::arm::Topology;
 use crate::joint::JointLimits;
 use crate::message::Message;
 
@@ -21,6 +22,8 @@ pub struct Checked {
     /// Largest mass at the flange that the controller takes [kg], 0 if it takes neither a load nor a mounting; `None`:
     /// known once connected.
     pub max_payload: Option<f64>,
+    /// How each joint's reading counts turns; empty: all as in the row.
+    pub topology: Vec<Topology>,
 }
 
 impl Checked {
@@ -37,6 +40,11 @@ impl Checked {
     /// Says that the controller takes loads up to this mass [kg]; 0: none.
     pub fn max_payload(self, mass: f64) -> Self {
         Self { max_payload: Some(mass), ..self }
+    }
+
+    /// Says how each joint's reading counts turns.
+    pub fn topology(self, topology: Vec<Topology>) -> Self {
+        Self { topology, ..self }
     }
 }
 

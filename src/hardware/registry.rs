@@ -6,6 +6,7 @@ use std::time::Duration;
 use schemars::{JsonSchema, Schema, SchemaGenerator};
 use serde::de::DeserializeOwned;
 
+use crate::arm::{AfterGap, Topology};
 use crate::hardware::adapter::{AdapterError, AdapterResult, ManipulatorAdapter};
 use crate::hardware::check::{Checked, ConfigError};
 use crate::hardware::service::OpenService;
@@ -166,8 +167,21 @@ pub struct AdapterSpec {
     pub native_rate: f64,
     /// Maximum position error of a joint at rest under load [rad].
     pub accuracy: f64,
+    /// Largest distance of a joint below its setpoint under load, beyond `accuracy` [rad].
+    pub droop: f64,
+    /// Furthest that the setpoint of a held joint is taken back towards the joint [rad]; 0: the arm's own stop takes the
+    /// pressure off.
+    pub relief: f64,
+    /// How far outside its range a joint may rest and still be enabled [rad].
+    pub outside: f64,
     /// Time from a setpoint to the measured motion that follows it [s]; `dimos adapter test --lag` measures it.
     pub lag: f64,
+    /// Longest time without a setpoint that the controller bridges.
+    pub gap_tolerance: Duration,
+    /// What it does beyond that time.
+    pub after_gap: AfterGap,
+    /// How the joints' readings count turns; [`Checked::topology`] has those of single joints.
+    pub topology: Topology,
     /// Maximum age of a state, beyond which the arm is held; at least three periods of the device.
     pub stale_after: Duration,
     /// The form of `address`.

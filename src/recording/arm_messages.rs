@@ -1,8 +1,8 @@
 //! Samples of one arm as messages.
 
 use super::messages::{self, ArmInput, ArmIo, ArmOutput, ArmStatus, Header, Inertia, InertiaStamped, Vector3};
-use crate::arm::{AnalogUnit, ArmCommand, ArmState, IoInfo, IoState, JointStatus, Load};
-use crate::joint::ControlMode;
+use crate::arm::{AnalogUnit, ArmCommand, ArmState, Commanded, IoInfo, IoState, JointStatus, Load};
+use crate::joint::{ControlMode, Joints};
 use crate::telemetry::describe::cause_text;
 use crate::telemetry::{ArmSample, TickSample};
 
@@ -11,7 +11,7 @@ use crate::telemetry::{ArmSample, TickSample};
 pub(super) fn input_differs(a: &ArmState, b: &ArmState) -> bool {
     let values = |s: &ArmState| (s.gripper, s.gripper_force, s.pose, s.wrench, s.effort.is_some(), s.velocity_source);
     let flags = |s: &ArmState| (s.seq, s.stamp, s.mode, s.enabled, s.error, s.link, s.self_held, s.written);
-    let more = |s: &ArmState| (s.interference, s.own_delay_ns, s.stop_input_open, s.device_ns);
+    let more = |s: &ArmState| (s.interference, s.own_delay_ns, s.stop_input_open, s.device_ns, s.refused, s.commanded);
     values(a) != values(b) || flags(a) != flags(b) || more(a) != more(b)
 }
 
@@ -46,7 +46,15 @@ pub(super) fn input(header: &Header, tick: u64, s: &ArmState) -> ArmInput {
         stop_input_open: s.stop_input_open,
         device_ns: s.device_ns.into_iter().collect(),
         gripper_force: s.gripper_force.into_iter().collect(),
+        commanded_position: of_joints(s, |commanded| &commanded.position),
+        commanded_velocity: of_joints(s, |commanded| &commanded.velocity),
+        refused: s.refused,
     }
+}
+
+/// Returns a list of what the arm's controller commands; empty if it reports nothing.
+fn of_joints(s: &ArmState, list: fn(&Commanded) -> &Joints) -> Vec<f64> {
+    s.commanded.as_ref().map_or_else(Vec::new, |commanded| list(commanded).iter().take(s.dof).copied().collect())
 }
 
 /// Returns what a tick commands an arm, except joint values.

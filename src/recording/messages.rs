@@ -315,6 +315,12 @@ message! {
         device_ns: Vec<u64>,
         /// Measured force of the gripper, in the unit in coordinator.json; empty if not reported.
         gripper_force: Vec<f64>,
+        /// Positions that the arm's controller itself commands its joints [rad]; empty if not reported.
+        commanded_position: Vec<f64>,
+        /// Velocities that it commands [rad/s]; empty if not reported.
+        commanded_velocity: Vec<f64>,
+        /// Number of the newest setpoint that was refused; 0: none.
+        refused: u64,
     }
 }
 

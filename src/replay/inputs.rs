@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use super::recorded::Recorded;
 use super::requests;
-use crate::arm::{ArmState, Interference, Link, VelocitySource};
+use crate::arm::{ArmState, Commanded, Interference, Link, VelocitySource};
 use crate::clock::Mono;
 use crate::control::coordinator::TickTime;
 use crate::control::guard::Verdict;
@@ -287,6 +287,11 @@ fn read_input(input: &ArmInput, state: &mut ArmState) -> Result<(), String> {
         own_delay_ns: input.own_delay_ns,
         stop_input_open: input.stop_input_open,
         gripper: input.gripper.first().copied(),
+        commanded: (!input.commanded_position.is_empty()).then(|| Commanded {
+            position: crate::joint::joints_of(&input.commanded_position),
+            velocity: crate::joint::joints_of(&input.commanded_velocity),
+        }),
+        refused: input.refused,
         ..ArmState::default()
     };
     Ok(())

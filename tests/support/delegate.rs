@@ -10,7 +10,7 @@ macro_rules! delegate {
     (@ disconnect $i:ident) => { delegate!(@@ $i disconnect(&mut self) -> ()); };
     (@ is_connected $i:ident) => { delegate!(@@ $i is_connected(&self) -> bool); };
     (@ activate $i:ident) => { delegate!(@@ $i activate(&mut self) -> AdapterResult<()>); };
-    (@ deactivate $i:ident) => { delegate!(@@ $i deactivate(&mut self) -> AdapterResult<()>); };
+    (@ deactivate $i:ident) => { delegate!(@@ $i deactivate(&mut self, rest: &dimos::arm::StopPoint) -> AdapterResult<()>); };
     (@ get_info $i:ident) => { delegate!(@@ $i get_info(&self) -> ManipulatorInfo); };
     (@ get_dof $i:ident) => { delegate!(@@ $i get_dof(&self) -> usize); };
     (@ get_limits $i:ident) => { delegate!(@@ $i get_limits(&mut self) -> AdapterResult<dimos::joint::JointLimits>); };
@@ -19,7 +19,7 @@ macro_rules! delegate {
     (@ read_state $i:ident) => { delegate!(@@ $i read_state(&mut self) -> AdapterResult<RobotState>); };
     (@ read_error $i:ident) => { delegate!(@@ $i read_error(&mut self) -> AdapterResult<(i32, String)>); };
     (@ read_enabled $i:ident) => { delegate!(@@ $i read_enabled(&mut self) -> AdapterResult<bool>); };
-    (@ write_stop $i:ident) => { delegate!(@@ $i write_stop(&mut self) -> AdapterResult<Stop>); };
+    (@ write_stop $i:ident) => { delegate!(@@ $i write_stop(&mut self, rest: &dimos::arm::StopPoint) -> AdapterResult<Stop>); };
     (@ write_clear_errors $i:ident) => { delegate!(@@ $i write_clear_errors(&mut self) -> AdapterResult<()>); };
     (@ gripper $i:ident) => { delegate!(@@ $i gripper(&mut self) -> Option<&mut dyn Gripper>); };
     (@ force_torque $i:ident) => { delegate!(@@ $i force_torque(&mut self) -> Option<&mut dyn ForceTorque>); };
@@ -38,6 +38,9 @@ macro_rules! delegate {
     };
     (@ write_joint_velocities $i:ident) => {
         delegate!(@@ $i write_joint_velocities(&mut self, velocities: &[f64]) -> AdapterResult<()>);
+    };
+    (@ write_setpoint $i:ident) => {
+        delegate!(@@ $i write_setpoint(&mut self, setpoint: &dimos::arm::Setpoint) -> AdapterResult<()>);
     };
     (@ write_enable $i:ident) => { delegate!(@@ $i write_enable(&mut self, enable: bool) -> AdapterResult<()>); };
     (@@ $i:ident $method:ident(&mut self $(, $value:ident: $kind:ty)*) -> $result:ty) => {

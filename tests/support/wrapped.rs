@@ -34,6 +34,12 @@ pub const ROW: AdapterSpec = AdapterSpec {
     name: "wrapped",
     about: "an arm of a test",
     stale_after: Duration::from_secs(5),
+    droop: 0.0,
+    relief: 0.0,
+    outside: 0.02,
+    gap_tolerance: Duration::ZERO,
+    after_gap: dimos::arm::AfterGap::RestsAtSetpoint,
+    topology: dimos::arm::Topology::MultiTurn,
     address: AddressForm { form: "TEXT", required: false, check: |address| Ok(address.to_owned()) },
     check: |config| Ok(Checked::new(JointLimits::uniform(config.dof, 3.0, 2.0))),
     ..mock::SPEC

@@ -8,6 +8,7 @@
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
+use dimos::arm::StopPoint;
 use dimos::clock::{Clock, Mono, MonotonicClock};
 use dimos::hardware::adapter::{
     AdapterError, AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
@@ -319,6 +320,7 @@ impl ManipulatorAdapter for AcmeAdapter {
             velocity: Some(from_wire(&state.velocities)),
             effort: None, // YOUR ARM: its torques [Nm], if it measures them; then write `read_joint_efforts` too
             valid: None,
+            commanded: None, // YOUR ARM: what the controller itself commands, if it reports that
         };
         Ok(())
     }
@@ -355,7 +357,7 @@ impl ManipulatorAdapter for AcmeAdapter {
 
     // This arm has no velocity mode, so `write_joint_velocities` is left out. `dimos check` reports tasks that need one.
 
-    fn write_stop(&mut self) -> AdapterResult<Stop> {
+    fn write_stop(&mut self, _rest: &StopPoint) -> AdapterResult<Stop> {
         self.send(&[Control::Stop.encode()])?;
         Ok(Stop::Sent) // nothing is acknowledged
     }

@@ -7,6 +7,7 @@
 use std::f64::consts::TAU;
 use std::time::Duration;
 
+use dimos::arm::StopPoint;
 use dimos::clock::{Clock, Mono, MonotonicClock};
 use dimos::hardware::adapter::{
     AdapterError, AdapterResult, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
@@ -266,6 +267,7 @@ impl ManipulatorAdapter for AcmeAdapter {
             velocity: Some(self.of_joints(&servos, velocity)),
             effort: None,
             valid: Some(true),
+            commanded: None, // YOUR ARM: what the controller itself commands, if it reports that
         };
         Ok(())
     }
@@ -310,7 +312,7 @@ impl ManipulatorAdapter for AcmeAdapter {
     }
 
     /// Makes the position of each servo that [`must_stop`] its goal; the others keep theirs.
-    fn write_stop(&mut self) -> AdapterResult<Stop> {
+    fn write_stop(&mut self, _rest: &StopPoint) -> AdapterResult<Stop> {
         let servos = self.fetch()?;
         if servos.iter().enumerate().any(|(i, servo)| servo.on && must_stop(i, servo)) {
             let here = self.calibration.inside(servos.map(|servo| servo.position));

@@ -7,6 +7,7 @@
 
 use std::time::Duration;
 
+use dimos::arm::StopPoint;
 use dimos::clock::{Clock, Mono, MonotonicClock};
 use dimos::hardware::adapter::{
     AdapterError, AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
@@ -254,6 +255,7 @@ impl ManipulatorAdapter for AcmeAdapter {
             velocity: Some(from_wire(&state.velocities)),
             effort: Some(joints_of(&state.torques)),
             valid: None,
+            commanded: None, // YOUR ARM: what the controller itself commands, if it reports that
         };
         Ok(())
     }
@@ -287,7 +289,7 @@ impl ManipulatorAdapter for AcmeAdapter {
         self.set_point(&Command::Velocity(to_wire(velocities)?)) // the controller checks the mode
     }
 
-    fn write_stop(&mut self) -> AdapterResult<Stop> {
+    fn write_stop(&mut self, _rest: &StopPoint) -> AdapterResult<Stop> {
         self.command(&Command::Stop)?;
         Ok(Stop::Confirmed) // YOUR ARM: `Sent` if the controller does not answer
     }

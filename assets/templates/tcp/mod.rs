@@ -11,6 +11,7 @@ pub mod wire;
 
 use std::time::Duration;
 
+use dimos::arm::{AfterGap, Topology};
 use dimos::hardware::check::{Checked, ConfigError};
 use dimos::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use dimos::hardware::sim::arm::{PLAYABLE, SimOptions};
@@ -41,6 +42,13 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     accuracy: 0.01,
     lag: 0.05,
     stale_after: Duration::from_millis(100),
+    // YOUR ARM: with the source of each: see docs/adding-an-arm.md. These assume nothing.
+    droop: 0.0,
+    relief: 0.0,
+    outside: 0.02,
+    gap_tolerance: Duration::ZERO,
+    after_gap: AfterGap::RestsAtSetpoint,
+    topology: Topology::MultiTurn,
     address: AddressForm {
         form: wire::FORM,
         required: true,

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
+use crate::arm::StopPoint;
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult, JointReading, ManipulatorAdapter};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, EmulatorAddress, Truth};
@@ -335,7 +336,7 @@ impl Context {
 
     /// Stops.
     pub fn stop(&mut self) -> Result<(), String> {
-        self.adapter.write_stop().map(drop).map_err(|e| format!("write_stop: {e}"))
+        self.adapter.write_stop(&StopPoint::default()).map(drop).map_err(|e| format!("write_stop: {e}"))
     }
 
     /// Returns joint positions slightly off `from` [rad]: a different amount for each joint, alternately up and down,

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use super::Check;
 use super::Needs::Faults;
 use super::context::{Context, farthest, pause, require};
+use crate::arm::StopPoint;
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, JointReading, Stop};
 use crate::hardware::sim::faults::{Fault, FaultKind};
@@ -185,7 +186,7 @@ fn stop_into_the_void(context: &mut Context) -> Result<(), String> {
     context.trigger_faults()?;
     context.until("a stop that is not taken", |context| {
         let began = Instant::now();
-        let result = context.adapter.write_stop();
+        let result = context.adapter.write_stop(&StopPoint::default());
         let took = began.elapsed();
         require(took < CALL_TIMEOUT, || format!("write_stop on a cut wire took {took:?}"))?;
         // An adapter whose stop is not confirmed may have to read before it notices.
@@ -193,7 +194,7 @@ fn stop_into_the_void(context: &mut Context) -> Result<(), String> {
         Ok(result.is_err())
     })?;
     for _ in 0..20 {
-        let result = context.adapter.write_stop();
+        let result = context.adapter.write_stop(&StopPoint::default());
         require(result != Ok(Stop::Confirmed), || "a stop is confirmed without a connection".into())?;
     }
     Ok(())

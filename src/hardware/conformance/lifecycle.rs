@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 use super::Check;
 use super::Needs::{Faults, Motion, Nothing};
 use super::context::{Context, farthest, require};
+use crate::arm::StopPoint;
 use crate::hardware::adapter::{AdapterError, JointReading};
 use crate::hardware::sim::faults::{Fault, FaultKind};
 
@@ -42,7 +43,7 @@ fn not_connected_is_said(context: &mut Context) -> Result<(), String> {
         ("read_error", adapter.read_error().err()),
         ("read_enabled", adapter.read_enabled().err()),
         ("write_joint_positions", adapter.write_joint_positions(&buffer, 0.1).err()),
-        ("write_stop", adapter.write_stop().err()),
+        ("write_stop", adapter.write_stop(&StopPoint::default()).err()),
         ("write_enable", adapter.write_enable(true).err()),
         ("write_clear_errors", adapter.write_clear_errors().err()),
     ];
@@ -111,7 +112,7 @@ fn leaving_moves_nothing(context: &mut Context) -> Result<(), String> {
     context.connect()?;
     context.activate()?;
     let start = context.positions()?;
-    context.adapter.deactivate().map_err(|e| format!("deactivate: {e}"))?;
+    context.adapter.deactivate(&StopPoint::default()).map_err(|e| format!("deactivate: {e}"))?;
     require(context.enabled()?, || "deactivate switched the motors off".into())?;
     context.adapter.disconnect();
     context.adapter.disconnect();

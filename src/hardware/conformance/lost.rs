@@ -6,6 +6,7 @@ use super::Check;
 use super::Needs::Faults;
 use super::context::{Context, farthest, pause, require};
 use super::stops::set_off;
+use crate::arm::StopPoint;
 use crate::hardware::adapter::{JointReading, Stop};
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::joint::ControlMode;
@@ -49,7 +50,7 @@ fn commands(context: &mut Context) -> Result<(), String> {
         }
         set_off(context)?;
         context.trigger_faults()?;
-        if context.adapter.write_stop() == Ok(Stop::Confirmed) {
+        if context.adapter.write_stop(&StopPoint::default()) == Ok(Stop::Confirmed) {
             let here = context.positions()?;
             pause(&mut *context.adapter, OBSERVATION_TIME);
             let moved = farthest(&context.positions()?, &here);

@@ -6,7 +6,7 @@ use super::Check;
 use super::Needs::{Faults, Motion};
 use super::context::{Context, farthest, pause, require};
 use super::gripper::in_unit;
-use crate::arm::GripperUnit;
+use crate::arm::{GripperUnit, StopPoint};
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, JointReading, Stop};
 use crate::hardware::device::gripper::GripperStop;
@@ -49,7 +49,7 @@ const COASTING: f64 = 0.008;
 fn stop_at_rest(context: &mut Context) -> Result<(), String> {
     context.connect()?;
     let start = context.positions()?;
-    context.adapter.write_stop().map_err(|e| format!("write_stop when disabled: {e}"))?;
+    context.adapter.write_stop(&StopPoint::default()).map_err(|e| format!("write_stop when disabled: {e}"))?;
     require(!context.enabled()?, || "write_stop switched the motors on".into())?;
     context.activate()?;
     for _ in 0..3 {
@@ -209,7 +209,7 @@ fn stop_without_answer(context: &mut Context) -> Result<(), String> {
     // States that were on their way.
     context.until("the silence", |context| Ok(context.adapter.read_joints(&mut JointReading::default()).is_err()))?;
     for _ in 0..3 {
-        let result = context.adapter.write_stop();
+        let result = context.adapter.write_stop(&StopPoint::default());
         require(result != Ok(Stop::Confirmed), || "a stop is confirmed although the arm is silent".into())?;
     }
     Ok(())
@@ -224,7 +224,7 @@ fn stop_in_error(context: &mut Context) -> Result<(), String> {
     context.until("the error", |context| Ok(context.error()?.0 != 0))?;
     let (start, error) = (context.standstill()?, context.error()?);
     for _ in 0..3 {
-        let result = context.adapter.write_stop();
+        let result = context.adapter.write_stop(&StopPoint::default());
         let fine = matches!(result, Ok(_) | Err(AdapterError::Fault { .. } | AdapterError::Rejected(_)));
         require(fine && context.adapter.is_connected(), || format!("write_stop in error: {result:?}"))?;
     }

@@ -168,7 +168,7 @@ impl Worker {
             self.trouble(&format!("the adapter panicked: {}", panic_text(&*panic)));
             self.state.link = Link::Faulted;
             self.states.write(&self.state);
-            let _ = catch_unwind(AssertUnwindSafe(|| adapter.write_stop()));
+            let _ = catch_unwind(AssertUnwindSafe(|| adapter.write_stop(&self.stop_point())));
             // The adapter is unusable. Dropping the receiver refuses further orders.
             let _ = catch_unwind(AssertUnwindSafe(move || drop(adapter)));
         }

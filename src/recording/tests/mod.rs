@@ -14,7 +14,7 @@ use super::messages::{ArmInput, JointState};
 use super::notes::{Notes, channel};
 use super::recorder::{Note, Notice, Recorder, RecorderConfig};
 use super::replay::{Entry, LogReader, Payload, ReplayError, Selection};
-use crate::arm::{ArmCommand, ArmState, Interference, Link, Pose, VelocitySource};
+use crate::arm::{ArmCommand, ArmState, Commanded, Interference, Link, Pose, VelocitySource};
 use crate::clock::{Mono, WallOffset};
 use crate::joint::{ControlMode, MAX_DOF, joints_of, make_joints};
 use crate::telemetry::describe::{ArmNames, Names, Severity};
@@ -77,6 +77,9 @@ fn state(arm: u16, tick: u64) -> ArmState {
         own_delay_ns: tick % 2,
         stop_input_open: tick % 5 == 3,
         device_ns: tick.is_multiple_of(2).then_some(tick * 1000),
+        commanded: (arm == 0 && tick > 2)
+            .then(|| Commanded { position: joints_of(&[x, 0.1 + 0.2, -0.0]), velocity: joints_of(&[0.0, x, 1.0]) }),
+        refused: tick / 3,
     }
 }
 
@@ -187,6 +190,11 @@ fn with_values(input: &ArmInput, states: Option<&JointState>, skip: usize, dof: 
         own_delay_ns: input.own_delay_ns,
         stop_input_open: input.stop_input_open,
         device_ns: input.device_ns.first().copied(),
+        commanded: (!input.commanded_position.is_empty()).then(|| Commanded {
+            position: joints_of(&input.commanded_position),
+            velocity: joints_of(&input.commanded_velocity),
+        }),
+        refused: input.refused,
     }
 }
 

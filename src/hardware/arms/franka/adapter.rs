@@ -11,7 +11,7 @@ use super::gripper::{FORCES, Hand, RANGE};
 use super::protocol::{DOF, PORT};
 use super::session::{LinkCounts, Session};
 use super::{HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, check};
-use crate::arm::{Load, Pose};
+use crate::arm::{Commanded, Load, Pose, StopPoint};
 use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo,
     Payload, RobotState, Stop,
@@ -100,7 +100,7 @@ impl ManipulatorAdapter for FrankaAdapter {
     }
 
     /// Ends the motion. An arm that somebody else has taken over is left as it is.
-    fn deactivate(&mut self) -> AdapterResult<()> {
+    fn deactivate(&mut self, _rest: &StopPoint) -> AdapterResult<()> {
         match self.connected()?.foreign {
             Some(_) => Ok(()),
             None => self.with(Session::finish),
@@ -203,6 +203,7 @@ impl ManipulatorAdapter for FrankaAdapter {
             velocity: Some(joints_of(&state.dq)),
             effort: Some(joints_of(&state.tau)),
             valid: Some(true),
+            commanded: Some(Commanded { position: joints_of(&state.q_d), velocity: joints_of(&state.dq_d) }),
         };
         Ok(())
     }
@@ -231,7 +232,7 @@ impl ManipulatorAdapter for FrankaAdapter {
         self.write(ControlMode::Velocity, velocities)
     }
 
-    fn write_stop(&mut self) -> AdapterResult<Stop> {
+    fn write_stop(&mut self, _rest: &StopPoint) -> AdapterResult<Stop> {
         self.with(Session::stop)
     }
 

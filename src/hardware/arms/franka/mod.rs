@@ -27,6 +27,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::arm::{AfterGap, Topology};
 use crate::hardware::check::{Checked, ConfigError, in_range};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use crate::hardware::transport::tcp::Endpoint;
@@ -54,6 +55,15 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     accuracy: 0.005,
     lag: 0.045,
     stale_after: Duration::from_millis(50),
+    // libfranka's impedance control has an integral part; its stop rests where the arm is.
+    droop: 0.0,
+    relief: 0.0,
+    outside: 0.02,
+    // Franka's FCI documentation: up to 19 lost commands are extrapolated with constant acceleration, the twentieth ends
+    // the motion.
+    gap_tolerance: Duration::from_millis(19),
+    after_gap: AfterGap::Faults,
+    topology: Topology::MultiTurn,
     address: AddressForm {
         form: "HOST[:PORT]",
         required: true,

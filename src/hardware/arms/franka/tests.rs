@@ -9,7 +9,7 @@ use super::SPEC;
 use super::adapter::FrankaAdapter;
 use super::emulator::{Datagram, FrankaEmulator};
 use super::protocol::DOF;
-use crate::arm::Load;
+use crate::arm::{Load, StopPoint};
 use crate::hardware::adapter::{AdapterError, Cartesian, Gripper, JointReading, ManipulatorAdapter, Payload, Stop};
 use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use crate::hardware::sim::faults::{Fault, FaultKind};
@@ -109,7 +109,7 @@ fn setpoints_at_any_rate_arrive() {
         let (figures, (counts, _)) = (emulator.figures(), adapter.link_quality().unwrap());
         println!("{model}: {figures:?} {counts:?}");
         assert!(figures.lost * 10 < figures.moved, "{figures:?}");
-        assert_eq!(adapter.deactivate(), Ok(()));
+        assert_eq!(adapter.deactivate(&StopPoint::default()), Ok(()));
     }
 }
 
@@ -153,7 +153,7 @@ fn enabling_holds_and_a_stop_ends_it() {
     assert!(positions(&mut adapter).iter().zip(&start).all(|(a, b)| (a - b).abs() < 1e-6));
     assert!(adapter.read_enabled().unwrap());
     stream(&mut adapter, 0.1, 1, 0.3);
-    assert_eq!(adapter.write_stop(), Ok(Stop::Confirmed));
+    assert_eq!(adapter.write_stop(&StopPoint::default()), Ok(Stop::Confirmed));
     assert!(adapter.read_enabled().unwrap(), "still enabled");
     let here = positions(&mut adapter);
     let refused = adapter.write_joint_positions(&here, 1.0).map_err(text);

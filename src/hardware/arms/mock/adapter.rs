@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::device::{Device, GRIPPER_DEFAULT_FORCE, GRIPPER_FORCE, GRIPPER_MAX};
 use super::options::Options;
 use super::{MODES, NATIVE_RATE, check, limits};
-use crate::arm::{IoInfo, IoState, JointStatus, Load};
+use crate::arm::{IoInfo, IoState, JointStatus, Load, StopPoint};
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{
     AdapterError, AdapterResult, ForceTorque, Gripper, HandGuiding, Io, JointMonitor, JointReading, ManipulatorAdapter,
@@ -179,7 +179,7 @@ impl ManipulatorAdapter for MockArm {
         self.device.arm.velocity(velocities).map_err(|refusal| self.device.arm.rejected(refusal))
     }
 
-    fn write_stop(&mut self) -> AdapterResult<Stop> {
+    fn write_stop(&mut self, _rest: &StopPoint) -> AdapterResult<Stop> {
         self.device.write()?;
         self.device.arm.stop();
         self.device.gripper.stop();

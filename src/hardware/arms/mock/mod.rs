@@ -11,6 +11,7 @@ pub use options::Options;
 
 use std::time::Duration;
 
+use crate::arm::{AfterGap, Topology};
 use crate::hardware::check::{Checked, ConfigError};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use crate::hardware::sim::io::SimIo;
@@ -36,6 +37,13 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     accuracy: 0.001,
     lag: 0.02,
     stale_after: Duration::from_millis(50),
+    // Its plant rests where it is sent, and its own stop where it is.
+    droop: 0.0,
+    relief: 0.0,
+    outside: 0.02,
+    gap_tolerance: Duration::from_millis(20),
+    after_gap: AfterGap::RestsAtSetpoint,
+    topology: Topology::MultiTurn,
     address: AddressForm { form: "none", required: false, check: |address| Ok(address.to_owned()) },
     holds_when_disabled: true,
     teach: Teach::HandGuiding,

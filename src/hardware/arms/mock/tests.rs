@@ -2,6 +2,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::MockArm;
+use crate::arm::StopPoint;
 use crate::clock::{Mono, VirtualClock};
 use crate::hardware::adapter::{AdapterError, Gripper, JointReading, ManipulatorAdapter, Stop};
 use crate::hardware::registry::AdapterConfig;
@@ -56,7 +57,7 @@ fn velocity_integrates_and_stop_decelerates() {
     assert!((a - 1.0).abs() < 1e-9 && (b + 0.5).abs() < 1e-9);
     let refused = arm.set_control_mode(ControlMode::Position);
     assert!(matches!(refused, Err(AdapterError::Rejected(_))), "no change of mode in motion: {refused:?}");
-    assert_eq!(arm.write_stop(), Ok(Stop::Confirmed));
+    assert_eq!(arm.write_stop(&StopPoint::default()), Ok(Stop::Confirmed));
     clock.advance(ms(200));
     let stopped = positions(&mut arm);
     clock.advance(ms(1000));
@@ -144,7 +145,7 @@ fn gripper_and_optional_parts() {
     arm.write_gripper_position_with_force(0.02, 5.0).unwrap();
     clock.advance(ms(1000));
     assert_eq!((arm.read_gripper_position(), arm.read_gripper_force()), (Ok(Some(0.03)), Ok(Some(5.0))));
-    arm.write_stop().unwrap();
+    arm.write_stop(&StopPoint::default()).unwrap();
     assert_eq!(arm.read_gripper_force(), Ok(Some(5.0)), "a stop keeps the grip");
     arm.write_gripper_position(0.02).unwrap();
     assert_eq!(arm.read_gripper_force(), Ok(Some(20.0)), "without a force it has its own");

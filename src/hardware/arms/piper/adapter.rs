@@ -18,7 +18,7 @@ use super::protocol::{self, DOF, WireJoints, millidegrees, radians};
 use super::session::{ESTOP, Session};
 use super::wire::{Wire, WireCounts};
 use super::{Follow, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, check};
-use crate::arm::{ForceUnit, JointStatus, Pose};
+use crate::arm::{ForceUnit, JointStatus, Pose, StopPoint};
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, Gripper, JointMonitor, JointReading, ManipulatorAdapter, ManipulatorInfo,
@@ -207,6 +207,7 @@ impl ManipulatorAdapter for PiperAdapter {
             velocity: self.velocities(),
             effort: self.efforts(),
             valid: self.arm.valid(),
+            commanded: None,
         };
         Ok(())
     }
@@ -257,7 +258,7 @@ impl ManipulatorAdapter for PiperAdapter {
 
     /// Holds the arm at the last written target, at most 0.02 rad from its position. Confirmed when the feedback shows
     /// that every joint decelerates or is at rest.
-    fn write_stop(&mut self) -> AdapterResult<Stop> {
+    fn write_stop(&mut self, _rest: &StopPoint) -> AdapterResult<Stop> {
         self.arm.refresh()?; // a hold needs a current position
         if self.arm.feedback.enabled() && self.arm.feedback.status.arm != ESTOP {
             // Use current positions, not those from before a gap in the feedback. An arm that stays silent is held at

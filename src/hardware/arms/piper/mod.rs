@@ -28,6 +28,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
+use crate::arm::{AfterGap, Topology};
 use crate::hardware::adapter_util::{above_zero, fraction};
 use crate::hardware::check::{Checked, ConfigError};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
@@ -56,6 +57,15 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     accuracy: 0.01,
     lag: 0.05,
     stale_after: Duration::from_millis(50),
+    droop: 0.0,
+    // It has goals, no stop of its own: a blocked joint presses on with its torque limit.
+    relief: 0.04,
+    // Gravity parks J2 and J3 at -1.999° and +1.971°, 0.035 rad outside their ranges (recorded on an arm).
+    outside: 0.06,
+    // MOVE J goes on to the last goal; two periods of setpoints at 100 Hz.
+    gap_tolerance: Duration::from_millis(20),
+    after_gap: AfterGap::RestsAtSetpoint,
+    topology: Topology::MultiTurn,
     address: AddressForm { form: FORMS, required: true, check: can::check },
     holds_when_disabled: HOLDS_WHEN_DISABLED,
     teach: Teach::No("its drag-teaching is begun with the button on the arm, and the arm falls without its motors"),

@@ -6,7 +6,7 @@ use super::adapter::PiperAdapter;
 use super::emulator::{PiperEmulator, SimOptions};
 use super::protocol::DOF;
 use super::{GripperKind, SPEC, golden};
-use crate::arm::Pose;
+use crate::arm::{Pose, StopPoint};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, Cartesian, Gripper, JointReading, ManipulatorAdapter, Stop};
 use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
@@ -198,7 +198,7 @@ fn connecting_and_leaving_move_nothing_and_never_take_the_power() {
     assert_eq!(arm.read_enabled(), Ok(false));
     assert!(ids(&emulator).iter().all(|id| [0x472, 0x4AF].contains(id)), "connect only asks");
     activate(&emulator, &mut arm);
-    arm.deactivate().unwrap();
+    arm.deactivate(&StopPoint::default()).unwrap();
     arm.disconnect();
     arm.disconnect();
     assert_eq!(read(&mut arm).unwrap_err(), AdapterError::NotConnected);
@@ -227,13 +227,13 @@ fn the_first_command_is_to_stay_and_the_pose_is_never_zero() {
 #[test]
 fn a_stop_holds_and_is_confirmed_by_the_motors() {
     let (emulator, mut arm) = connected();
-    assert_eq!(arm.write_stop(), Ok(Stop::Confirmed), "at rest, motors off");
+    assert_eq!(arm.write_stop(&StopPoint::default()), Ok(Stop::Confirmed), "at rest, motors off");
     activate(&emulator, &mut arm);
     arm.write_joint_positions(&[2.0, 2.0, -2.0, 0.0, 0.0, 0.0], 0.3).unwrap();
     until("motion", || read(&mut arm).unwrap().velocity.unwrap()[0] > 0.5);
     emulator.record();
     let (there, _) = emulator.joints();
-    assert_eq!(arm.write_stop(), Ok(Stop::Confirmed));
+    assert_eq!(arm.write_stop(&StopPoint::default()), Ok(Stop::Confirmed));
     assert_eq!(ids(&emulator), [0x151, 0x155, 0x156, 0x157], "a hold, no E-stop");
     until("standstill", || emulator.joints().1.iter().all(|v| v.abs() < 1e-4));
     assert!(farthest(&emulator.joints().0, &there) < 0.15 && emulator.enabled());

@@ -7,6 +7,7 @@ use super::emulator::PiperEmulator;
 use super::golden;
 use super::protocol::DOF;
 use super::tests::{START, activate, config, connected, farthest, ids, pair, read, two, until};
+use crate::arm::StopPoint;
 use crate::hardware::adapter::{AdapterError, Gripper, ManipulatorAdapter, Stop};
 use crate::hardware::registry::Emulator;
 use crate::hardware::sim::faults::{Fault, FaultKind};
@@ -40,7 +41,7 @@ fn f05_silence_is_noticed_by_the_age_of_the_state() {
     assert!(arm.is_connected(), "it may come back");
     emulator.record();
     assert!(matches!(arm.write_joint_positions(&START, 0.1), Err(AdapterError::Timeout(_))));
-    assert!(arm.write_stop().is_err(), "an arm is not sent back to where it was long ago");
+    assert!(arm.write_stop(&StopPoint::default()).is_err(), "an arm is not sent back to where it was long ago");
     assert_eq!(ids(&emulator), [0u16; 0], "nothing goes out to an arm that is silent");
     until("the end of the connection", || read(&mut arm).is_err() && !arm.is_connected());
     let start = Instant::now();
@@ -59,10 +60,10 @@ fn f05_speeds_that_are_old_are_not_told() {
     let mut values = [7.0; DOF];
     assert_eq!((arm.read_joint_velocities(&mut values), values), (Ok(false), [7.0; DOF]));
     assert_eq!((arm.read_joint_efforts(&mut values), values), (Ok(false), [7.0; DOF]));
-    assert_eq!(arm.write_stop(), Ok(Stop::Sent), "nothing shows that motor 2 is at rest");
+    assert_eq!(arm.write_stop(&StopPoint::default()), Ok(Stop::Sent), "nothing shows that motor 2 is at rest");
     emulator.mute(None);
     until("news of it", || read(&mut arm).unwrap().velocity.is_some());
-    assert_eq!(arm.write_stop(), Ok(Stop::Confirmed));
+    assert_eq!(arm.write_stop(&StopPoint::default()), Ok(Stop::Confirmed));
 }
 
 #[test]
@@ -75,7 +76,7 @@ fn f05_drivers_that_fall_silent_are_named_and_the_arm_can_still_be_stopped() {
     assert!(text.ends_with("the drivers of joints 3, 4 have said nothing for 300 ms"), "{text}");
     assert_eq!(arm.write_joint_positions(&START, 0.1), Err(error), "whether its motors are on is not known");
     emulator.record();
-    assert!(arm.write_stop().is_ok() && arm.is_connected());
+    assert!(arm.write_stop(&StopPoint::default()).is_ok() && arm.is_connected());
     until("the hold", || ids(&emulator) == [0x151, 0x155, 0x156, 0x157]);
     let off = arm.write_enable(false).unwrap_err().to_string();
     assert_eq!(off, "arm: the drivers of joints 3, 4 have said nothing for 1000 ms");
@@ -187,7 +188,7 @@ fn f15_f16_an_estop_is_told_and_never_reset_from_here() {
         let Err(AdapterError::Fault { code: 1, text }) = refused else { panic!("{refused:?}") };
         assert!(text.starts_with("E-stop") && text.contains("\nhint: "), "{text}");
     }
-    arm.write_stop().unwrap();
+    arm.write_stop(&StopPoint::default()).unwrap();
     assert_eq!((ids(&emulator), emulator.power_drops()), (vec![], 0), "nothing was sent");
     // Somebody resets the arm: it has fallen, and stays off until it is enabled.
     other(&emulator).send(&[golden::frame("150#0200000000000000")]).unwrap();
@@ -280,7 +281,7 @@ fn two_commanders_do_not_take_turns() {
         let refused = arm.write_joint_positions(&START, 0.1).err();
         refused.is_some_and(|error| error.to_string().contains("another program commands this arm\nhint: "))
     });
-    assert!(arm.write_stop().is_ok(), "a stop is always sent");
+    assert!(arm.write_stop(&StopPoint::default()).is_ok(), "a stop is always sent");
     until("the other to be gone", || {
         read(&mut arm).unwrap();
         arm.write_clear_errors().is_ok() && arm.write_joint_positions(&START, 0.1).is_ok()
@@ -315,6 +316,6 @@ fn f37_a_blocked_joint_shows_in_its_positions() {
     arm.write_joint_positions(&target, 1.0).unwrap();
     until("joint 6", || (read(&mut arm).unwrap().position[5] - 0.3).abs() < 1e-4);
     assert!((emulator.joints().0[0] - START[0]).abs() < 0.02);
-    assert_eq!(arm.write_stop(), Ok(Stop::Confirmed));
+    assert_eq!(arm.write_stop(&StopPoint::default()), Ok(Stop::Confirmed));
     assert!(emulator.inject(Fault::new(FaultKind::Panic)).is_err());
 }

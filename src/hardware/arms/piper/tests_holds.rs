@@ -8,6 +8,7 @@ use super::adapter::PiperAdapter;
 use super::emulator::PiperEmulator;
 use super::protocol::DOF;
 use super::tests::{START, activate, connected, farthest, pair, two, until};
+use crate::arm::StopPoint;
 use crate::hardware::adapter::ManipulatorAdapter;
 use crate::hardware::registry::Emulator;
 use crate::hardware::transport::can::{self, CanAddress, CanFrame};
@@ -73,7 +74,7 @@ fn stop_a_standing_arm(how: fn(i32, u64) -> i32) {
     let damage = Damage::begin(&emulator, START, how);
     emulator.record();
     for i in 0..150 {
-        let _ = arm.write_stop();
+        let _ = arm.write_stop(&StopPoint::default());
         std::thread::sleep(Duration::from_millis(i % 7));
     }
     let targets = targets(&emulator);
@@ -121,7 +122,7 @@ fn a_stop_keeps_what_was_written_where_the_arm_sags() {
         arm.write_joint_positions(&wanted, 1.0).unwrap();
         std::thread::sleep(Duration::from_millis(30));
         emulator.record();
-        arm.write_stop().unwrap();
+        arm.write_stop(&StopPoint::default()).unwrap();
         until("the hold", || !targets(&emulator).is_empty());
         let held = targets(&emulator)[0];
         assert!((held[1] - START[1] - expected).abs() < 1e-4, "{above}: {} rad", held[1] - START[1]);
@@ -159,7 +160,7 @@ fn an_arm_that_rests_just_outside_its_limits_holds_there_where_its_controller_ta
     let mut wanted = OUTSIDE;
     (wanted[1], wanted[2]) = (-0.05, 0.05);
     arm.write_joint_positions(&wanted, 1.0).unwrap();
-    arm.write_stop().unwrap();
+    arm.write_stop(&StopPoint::default()).unwrap();
     (wanted[1], wanted[2]) = (0.1, -0.1);
     arm.write_joint_positions(&wanted, 1.0).unwrap();
     until("the way back", || farthest(&emulator.joints().0, &wanted) < 1e-3);
@@ -176,7 +177,7 @@ fn an_arm_that_rests_just_outside_its_limits_holds_at_them_where_its_controller_
     assert_eq!((arm.read_enabled(), arm.read_error()), (Ok(true), Ok((0, String::new()))));
     arm.set_control_mode(crate::joint::ControlMode::ServoPosition).unwrap();
     arm.write_joint_positions(&OUTSIDE, 1.0).unwrap();
-    arm.write_stop().unwrap();
+    arm.write_stop(&StopPoint::default()).unwrap();
     until("the limits", || emulator.joints().0[1].abs() < 1e-4 && emulator.joints().0[2].abs() < 1e-4);
     assert_eq!(arm.read_error(), Ok((0, String::new())), "nothing was refused since");
     never_farther_out(&emulator);

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use super::adapter::PiperAdapter;
 use super::golden::frame;
 use super::tests::{START, activate, connected, farthest, read, until};
+use crate::arm::StopPoint;
 use crate::hardware::adapter::ManipulatorAdapter;
 use crate::hardware::registry::Emulator;
 use crate::hardware::transport::can::{self, CanAddress, CanFrame};
@@ -135,6 +136,6 @@ fn targets_of_another_program_in_the_same_mode_are_left_alone() {
     assert!(arm.write_joint_positions(&START, 1.0).is_err());
     // A stop is somebody's order, and is sent all the same: where the arm is, not where it was before.
     emulator.record();
-    arm.write_stop().unwrap();
+    arm.write_stop(&StopPoint::default()).unwrap();
     assert!(emulator.trace().iter().any(|(_, f)| f.id == 0x157));
 }

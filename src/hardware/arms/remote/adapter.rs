@@ -10,7 +10,7 @@ use super::address::Address;
 use super::protocol::{Act, Command, Description, Measured, WirePose};
 use super::session::Session;
 use super::{MODES, NATIVE_RATE, check, limits, same_modes};
-use crate::arm::{GripperUnit, Pose};
+use crate::arm::{GripperUnit, Pose, StopPoint};
 use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo,
     RobotState, Stop,
@@ -129,7 +129,7 @@ impl ManipulatorAdapter for RemoteAdapter {
         self.act(&Act::Activate, ENABLE_TIMEOUT).map(|()| self.assumed_enabled = true)
     }
 
-    fn deactivate(&mut self) -> AdapterResult<()> {
+    fn deactivate(&mut self, _rest: &StopPoint) -> AdapterResult<()> {
         self.act(&Act::Deactivate, END_TIMEOUT)
     }
 
@@ -214,6 +214,7 @@ impl ManipulatorAdapter for RemoteAdapter {
             velocity: state.velocity.map(|values| values.joints),
             effort: state.effort.map(|values| values.joints),
             valid: None,
+            commanded: None,
         };
         Ok(())
     }
@@ -259,7 +260,7 @@ impl ManipulatorAdapter for RemoteAdapter {
         self.command(mode, velocities, 1.0)
     }
 
-    fn write_stop(&mut self) -> AdapterResult<Stop> {
+    fn write_stop(&mut self, _rest: &StopPoint) -> AdapterResult<Stop> {
         let timeout = self.late()?;
         self.act(&Act::Stop, timeout).map(|()| Stop::Confirmed)
     }

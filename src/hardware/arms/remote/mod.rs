@@ -18,6 +18,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::arm::{AfterGap, Topology};
 use crate::hardware::check::{Checked, ConfigError};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use crate::hardware::sim::arm::SimOptions;
@@ -43,6 +44,13 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     accuracy: 0.02,
     lag: 0.1,
     stale_after: Duration::from_millis(200),
+    // What the server's `hello` says; nothing is assumed of an arm that is not known.
+    droop: 0.0,
+    relief: 0.0,
+    outside: 0.02,
+    gap_tolerance: Duration::ZERO,
+    after_gap: AfterGap::RestsAtSetpoint,
+    topology: Topology::MultiTurn,
     address: AddressForm {
         form: address::FORM,
         required: true,

@@ -10,6 +10,7 @@ use super::emulator::wire;
 use super::link::Link;
 use super::protocol::{self, Act, Command, Description, Reply, WirePose};
 use super::session::Session;
+use crate::arm::StopPoint;
 use crate::hardware::adapter::{AdapterError, JointReading, ManipulatorAdapter, Stop};
 use crate::hardware::registry::{self, AdapterConfig, Emulator};
 use crate::hardware::sim::faults::{Fault, FaultKind};
@@ -141,7 +142,7 @@ fn a_client_that_falls_silent_loses_the_arm() {
     assert_eq!(arm.read_enabled(), Ok(false));
     arm.activate().unwrap();
     arm.write_joint_positions(&[2.0], 0.1).unwrap();
-    assert_eq!(arm.write_stop(), Ok(Stop::Confirmed));
+    assert_eq!(arm.write_stop(&StopPoint::default()), Ok(Stop::Confirmed));
 }
 
 #[test]
@@ -154,7 +155,7 @@ fn refusals_come_with_the_next_command_and_stale_states_are_said() {
     let mut reading = JointReading::default();
     until("a late reply", || matches!(arm.read_joints(&mut reading), Err(AdapterError::Timeout(_))));
     assert!(arm.is_connected(), "late is not gone");
-    assert!(matches!(arm.write_stop(), Err(AdapterError::Timeout(_))), "no confirmation");
+    assert!(matches!(arm.write_stop(&StopPoint::default()), Err(AdapterError::Timeout(_))), "no confirmation");
     until("the end", || arm.read_joints(&mut reading).is_err() && !arm.is_connected());
 }
 

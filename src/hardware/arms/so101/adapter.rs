@@ -11,6 +11,7 @@ use super::calibration::{Calibration, Range};
 use super::protocol::{SERVOS, Servo, TURN, register};
 use super::servos::{error_of, must_stop};
 use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, TOP_SPEED, check, limits};
+use crate::arm::StopPoint;
 use crate::clock::Mono;
 use crate::hardware::adapter::{
     AdapterError, AdapterResult, Gripper, JointMonitor, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState,
@@ -193,6 +194,7 @@ impl ManipulatorAdapter for So101Adapter {
             velocity: Some(self.angles(|j, _| velocity(servos.get(j)))),
             effort: None,
             valid: Some(true),
+            commanded: None,
         };
         Ok(())
     }
@@ -220,7 +222,7 @@ impl ManipulatorAdapter for So101Adapter {
         self.drive(joints, speed)
     }
 
-    fn write_stop(&mut self) -> AdapterResult<Stop> {
+    fn write_stop(&mut self, _rest: &StopPoint) -> AdapterResult<Stop> {
         let servos = self.fetch()?;
         self.gripper_goal = None;
         if servos.iter().enumerate().any(|(j, servo)| servo.on && must_stop(j, servo)) {

@@ -25,6 +25,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::arm::{AfterGap, Topology};
 use crate::hardware::check::{Checked, ConfigError};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use crate::hardware::transport::serial::SerialAddress;
@@ -60,6 +61,17 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     accuracy: 0.03,
     lag: 0.06,
     stale_after: Duration::from_millis(100),
+    // Recorded on an arm (LeRobot data set, 50 s): p95 0.073 and 0.067, largest 0.108 rad of the shoulder.
+    droop: 0.08,
+    // It has goals, no stop of its own: a blocked joint presses on with its torque limit.
+    relief: 0.04,
+    // Leaders and followers rest against their end stops, a few counts outside of what was calibrated.
+    outside: 0.05,
+    // A servo goes on to its goal; two periods of setpoints at 100 Hz.
+    gap_tolerance: Duration::from_millis(20),
+    after_gap: AfterGap::RestsAtSetpoint,
+    // STS3215: the encoder counts one turn, 0 to 4095.
+    topology: Topology::Seamed,
     address: AddressForm {
         form: "/dev/ttyX[@BAUD]",
         required: true,

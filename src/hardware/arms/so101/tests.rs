@@ -7,7 +7,7 @@ use serde_json::json;
 use super::adapter::So101Adapter;
 use super::emulator::{Servos, start};
 use super::{DOF, SPEC};
-use crate::arm::GripperUnit;
+use crate::arm::{GripperUnit, StopPoint};
 use crate::hardware::adapter::{AdapterError, Gripper, ManipulatorAdapter, Stop};
 use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use crate::hardware::sim::faults::{Fault, FaultKind};
@@ -79,7 +79,7 @@ fn joints_and_gripper_move_in_radians() {
         assert!(near(&positions(&mut adapter)), "the joints stay");
         // Closed is at −0.175 rad of the servo.
         assert!((servos.true_positions().unwrap()[DOF] - 1.125).abs() < 3e-3);
-        assert_eq!(adapter.write_stop(), Ok(Stop::Confirmed));
+        assert_eq!(adapter.write_stop(&StopPoint::default()), Ok(Stop::Confirmed));
         assert!(adapter.write_gripper_position(open + 0.01).is_err() && adapter.write_gripper_position(-0.01).is_err());
         assert_eq!(adapter.write_gripper_position_with_force(1.0, 0.5), Err(AdapterError::Unsupported));
     }
@@ -193,13 +193,13 @@ fn a_stop_leaves_the_gripper_its_grip_and_joints_that_droop_their_goals() {
     until(|| adapter.read_state().unwrap().state >> 8 == 0);
     let held = goals(&servos);
     assert!(adapter.read_gripper_position().unwrap().unwrap() > 1.2, "the workpiece keeps it open");
-    assert_eq!(adapter.write_stop(), Ok(Stop::Confirmed));
+    assert_eq!(adapter.write_stop(&StopPoint::default()), Ok(Stop::Confirmed));
     assert_eq!(goals(&servos), held, "at rest");
     // The same while a joint moves.
     let start = positions(&mut adapter);
     adapter.write_joint_positions(&[-1.5, -0.3, 0.4, -0.1, 0.5], 0.3).unwrap();
     until(|| (positions(&mut adapter)[0] - start[0]).abs() > 0.1);
-    assert_eq!(adapter.write_stop(), Ok(Stop::Confirmed));
+    assert_eq!(adapter.write_stop(&StopPoint::default()), Ok(Stop::Confirmed));
     let stopped = goals(&servos);
     assert!(stopped[0] > 1500 && stopped[0] < held[0], "{stopped:?}");
     assert_eq!(stopped[1..], held[1..]);

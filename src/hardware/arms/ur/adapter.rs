@@ -13,7 +13,7 @@ use super::protocol::inputs::Order;
 use super::safety::Stopped;
 use super::session::Session;
 use super::{DOF, HOLDS_WHEN_DISABLED, MODES, Options, check};
-use crate::arm::Pose;
+use crate::arm::{Pose, StopPoint};
 use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, ForceTorque, Io, JointMonitor, JointReading, ManipulatorAdapter,
     ManipulatorInfo, Payload, RobotState, Stop,
@@ -96,10 +96,10 @@ impl ManipulatorAdapter for UrAdapter {
     }
 
     /// Does not stop an arm that another client has taken over.
-    fn deactivate(&mut self) -> AdapterResult<()> {
+    fn deactivate(&mut self, rest: &StopPoint) -> AdapterResult<()> {
         match self.session.as_ref().and_then(Session::foreign_change) {
             Some(_) => Ok(()),
-            None => self.write_stop().map(drop),
+            None => self.write_stop(rest).map(drop),
         }
     }
 
@@ -186,6 +186,7 @@ impl ManipulatorAdapter for UrAdapter {
             // Before power-on the positions may not be measured yet. Enabling does not use them: the controller itself
             // holds the arm, and once its motors are on they are measured.
             valid: Some(true),
+            commanded: None,
         };
         Ok(())
     }
@@ -222,7 +223,7 @@ impl ManipulatorAdapter for UrAdapter {
         self.with(|session| session.stream(Order::Speed(joints)))
     }
 
-    fn write_stop(&mut self) -> AdapterResult<Stop> {
+    fn write_stop(&mut self, _rest: &StopPoint) -> AdapterResult<Stop> {
         self.with(Session::stop)
     }
 

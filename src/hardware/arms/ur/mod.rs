@@ -36,6 +36,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::arm::{AfterGap, Topology};
 use crate::hardware::check::{Checked, ConfigError, in_range};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use crate::joint::ControlMode;
@@ -64,6 +65,15 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     accuracy: 0.002,
     lag: 0.07,
     stale_after: Duration::from_millis(50),
+    // The controller corrects its position with an integral part, and stopj rests where it decelerates to.
+    droop: 0.0,
+    relief: 0.0,
+    outside: 0.02,
+    // What `control.script` bridges: it keeps the velocity for this time, then decelerates along it.
+    gap_tolerance: Duration::from_millis(20),
+    after_gap: AfterGap::Decelerates,
+    // The controller keeps the number of turns; wrist 3 of UR3 and UR3e is endless.
+    topology: Topology::MultiTurn,
     address: AddressForm {
         form: "HOST[:FIRST_PORT]",
         required: true,

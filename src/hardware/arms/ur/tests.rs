@@ -7,6 +7,7 @@ use serde_json::json;
 use super::adapter::UrAdapter;
 use super::emulator::UrEmulator;
 use super::{DOF, SPEC};
+use crate::arm::StopPoint;
 use crate::hardware::adapter::{AdapterError, Cartesian, ForceTorque, JointReading, ManipulatorAdapter, Stop};
 use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use crate::hardware::sim::faults::{Fault, FaultKind};
@@ -78,14 +79,14 @@ pub(super) fn text(error: AdapterError) -> String {
 fn after_a_stop_the_arm_is_enabled_again_and_moves() {
     let (mut adapter, emulator) = ready(json!({}));
     stream(&mut adapter, 0.1);
-    assert_eq!(adapter.write_stop(), Ok(Stop::Confirmed));
+    assert_eq!(adapter.write_stop(&StopPoint::default()), Ok(Stop::Confirmed));
     until(&mut adapter, |_| emulator.program().is_none());
     assert!(adapter.read_enabled().unwrap(), "the motors stay on");
     let here = positions(&mut adapter);
     let refused = adapter.write_joint_positions(&here, 1.0).map_err(text);
     assert_eq!(refused, Err("the arm was stopped: enable it again".into()));
     assert_eq!(adapter.foreign_change(), None);
-    assert_eq!(adapter.write_stop(), Ok(Stop::Confirmed), "at rest, without a program");
+    assert_eq!(adapter.write_stop(&StopPoint::default()), Ok(Stop::Confirmed), "at rest, without a program");
     adapter.activate().unwrap();
     let goal = stream(&mut adapter, -0.1);
     until(&mut adapter, |adapter| (positions(adapter)[0] - goal[0]).abs() < 1e-3);
@@ -146,7 +147,7 @@ fn without_orders_the_program_stops_the_arm_and_ends() {
     std::thread::sleep(Duration::from_millis(100));
     assert_eq!(positions(&mut adapter), rest);
     // What the pendant or a lost connection ended is not stopped once more.
-    assert_eq!(adapter.deactivate(), Ok(()));
+    assert_eq!(adapter.deactivate(&StopPoint::default()), Ok(()));
     adapter.activate().unwrap();
     assert_eq!(adapter.foreign_change(), None);
 }
@@ -201,7 +202,7 @@ fn a_protective_stop_is_released_by_order_only_and_not_before_5_s() {
     let before = adapter.state().unwrap().time;
     assert_eq!(adapter.write_clear_errors(), Err(AdapterError::Busy));
     until(&mut adapter, |adapter| adapter.state().unwrap().time > before + 0.1);
-    assert_eq!(adapter.write_stop(), Ok(Stop::Confirmed));
+    assert_eq!(adapter.write_stop(&StopPoint::default()), Ok(Stop::Confirmed));
     assert_eq!(adapter.read_state().unwrap().mode, 3, "still a protective stop");
     reset(&mut adapter).unwrap();
     assert!(began.elapsed() >= Duration::from_secs(5));
@@ -292,7 +293,7 @@ fn every_model_is_moved_and_has_its_pose() {
         let pose = adapter.read_cartesian_position().unwrap().unwrap();
         assert!(pose.xyz.iter().any(|v| v.abs() > 0.1), "{pose:?}");
         assert_eq!(adapter.get_info().native_rate, if model == "ur3" { 125.0 } else { 500.0 });
-        assert_eq!(adapter.write_stop(), Ok(Stop::Confirmed));
+        assert_eq!(adapter.write_stop(&StopPoint::default()), Ok(Stop::Confirmed));
     }
     let config = AdapterConfig {
         hardware_id: "arm".into(),

@@ -10,6 +10,7 @@ use super::DOF;
 use super::adapter::UrAdapter;
 use super::emulator::UrEmulator;
 use super::tests::{arm, positions, ready, stream, text, until};
+use crate::arm::StopPoint;
 use crate::hardware::adapter::{AdapterError, ManipulatorAdapter, Stop};
 use crate::hardware::registry::{AdapterConfig, Emulator};
 use crate::hardware::sim::faults::{Fault, FaultKind};
@@ -31,7 +32,7 @@ fn start_foreign_program(emulator: &UrEmulator) -> TcpStream {
 #[test]
 fn enabling_ends_no_program_of_another_client() {
     let (mut adapter, emulator) = ready(json!({}));
-    assert_eq!(adapter.write_stop(), Ok(Stop::Confirmed));
+    assert_eq!(adapter.write_stop(&StopPoint::default()), Ok(Stop::Confirmed));
     until(&mut adapter, |_| emulator.program().is_none());
     let _script = start_foreign_program(&emulator);
     for paused in [false, true] {
@@ -48,7 +49,7 @@ fn enabling_ends_no_program_of_another_client() {
         assert_eq!(emulator.program().as_deref(), Some("rtde_control"));
     }
     // An operator's stop ends it.
-    adapter.write_stop().unwrap();
+    adapter.write_stop(&StopPoint::default()).unwrap();
     until(&mut adapter, |_| emulator.program().is_none());
     adapter.activate().unwrap();
 }
@@ -70,7 +71,7 @@ fn disabling_leaves_an_arm_that_another_program_has_taken_over() {
     until(&mut adapter, |adapter| adapter.foreign_change().is_some());
     let _script = start_foreign_program(&emulator);
     until(&mut adapter, |adapter| adapter.state().unwrap().runtime == 2);
-    assert_eq!(adapter.deactivate(), Ok(()));
+    assert_eq!(adapter.deactivate(&StopPoint::default()), Ok(()));
     let refused = text(adapter.write_enable(false).unwrap_err());
     assert_eq!(refused, "another program commands the arm\nhint: `dimos arm reset`, then disable it");
     assert_eq!((emulator.program().as_deref(), adapter.read_enabled()), (Some("rtde_control"), Ok(true)));
@@ -104,7 +105,7 @@ fn a_paused_program_is_reported_as_such() {
         emulator.press_pause();
         until(&mut adapter, |adapter| adapter.foreign_change().is_some());
         assert_eq!(adapter.foreign_change(), Some("the program on the controller was paused"));
-        adapter.write_stop().unwrap();
+        adapter.write_stop(&StopPoint::default()).unwrap();
         until(&mut adapter, |_| emulator.program().is_none());
         adapter.activate().unwrap();
     }
@@ -133,7 +134,7 @@ fn a_broken_dashboard_costs_neither_the_connection_nor_the_stop() {
     let (mut adapter, emulator) = ready(json!({}));
     emulator.break_dashboard(true);
     emulator.hang_program(true);
-    assert_eq!(adapter.write_stop(), Ok(Stop::Confirmed), "by the primary interface");
+    assert_eq!(adapter.write_stop(&StopPoint::default()), Ok(Stop::Confirmed), "by the primary interface");
     assert_eq!(emulator.program(), None);
     assert!(adapter.is_connected());
     let refused = adapter.activate().unwrap_err();

@@ -8,6 +8,7 @@ use super::adapter::UrAdapter;
 use super::emulator::UrEmulator;
 use super::tests::{positions, ready, text, until};
 use super::{DOF, Options};
+use crate::arm::StopPoint;
 use crate::hardware::adapter::{AdapterError, ManipulatorAdapter, Stop};
 use crate::joint::ControlMode;
 
@@ -110,7 +111,7 @@ fn a_long_stop_is_no_program_that_hangs() {
     std::thread::sleep(Duration::from_millis(20));
     until(&mut adapter, |adapter| adapter.write_joint_velocities(&[0.0; DOF]).is_ok());
     assert_eq!((adapter.foreign_change(), emulator.program().as_deref()), (None, Some("dimos_control")));
-    assert_eq!(adapter.write_stop(), Ok(Stop::Confirmed));
+    assert_eq!(adapter.write_stop(&StopPoint::default()), Ok(Stop::Confirmed));
 }
 
 #[test]
@@ -124,7 +125,7 @@ fn a_program_that_hangs_or_is_refused_is_reported() {
     until(&mut adapter, |adapter| adapter.foreign_change().is_some());
     assert!(adapter.foreign_change().unwrap().contains("does not answer"));
     // A stop is not confirmed by a program that hangs, but by the dashboard.
-    assert_eq!(adapter.write_stop(), Ok(Stop::Confirmed));
+    assert_eq!(adapter.write_stop(&StopPoint::default()), Ok(Stop::Confirmed));
     assert_eq!(emulator.program(), None);
     emulator.hang_program(false);
     emulator.refuse_programs(true);

@@ -15,7 +15,7 @@ use super::protocol::gripper::{FORCE_RANGE_G2, GripperKind};
 use super::report_validity::measured;
 use super::session::Session;
 use super::{HOLDS_WHEN_DISABLED, MODES, MODES_WITHOUT_VELOCITY, Options, check, model_of};
-use crate::arm::{ForceUnit, JointStatus, Load, Pose};
+use crate::arm::{ForceUnit, JointStatus, Load, Pose, StopPoint};
 use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, HandGuiding, JointMonitor, JointReading,
     ManipulatorAdapter, ManipulatorInfo, Payload, RobotState, Stop,
@@ -137,10 +137,10 @@ impl ManipulatorAdapter for XArmAdapter {
     }
 
     /// Does not stop an arm that another client has taken over.
-    fn deactivate(&mut self) -> AdapterResult<()> {
+    fn deactivate(&mut self, rest: &StopPoint) -> AdapterResult<()> {
         match self.session.as_ref().and_then(Session::foreign_change) {
             Some(_) => Ok(()),
-            None => self.write_stop().map(drop),
+            None => self.write_stop(rest).map(drop),
         }
     }
 
@@ -256,6 +256,7 @@ impl ManipulatorAdapter for XArmAdapter {
             velocity: motion.velocity.map(|velocity| self.only(&velocity)),
             effort: session.device.torques.then(|| self.only(&motion.torque)),
             valid: measured(motion, self.model, session.condition().tool),
+            commanded: None,
         };
         Ok(())
     }
@@ -300,7 +301,7 @@ impl ManipulatorAdapter for XArmAdapter {
         self.with(|session| session.stream(JOINT_VELOCITY, &command))
     }
 
-    fn write_stop(&mut self) -> AdapterResult<Stop> {
+    fn write_stop(&mut self, _rest: &StopPoint) -> AdapterResult<Stop> {
         self.target = None;
         self.with(Session::stop)
     }

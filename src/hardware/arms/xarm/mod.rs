@@ -40,6 +40,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::arm::{AfterGap, Topology};
 use crate::hardware::adapter_util::fraction;
 use crate::hardware::check::{Checked, ConfigError};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
@@ -73,6 +74,16 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     accuracy: 0.002,
     lag: 0.05,
     stale_after: Duration::from_millis(50),
+    // Positions are controlled with an integral part, and state 4 rests where the arm is.
+    droop: 0.0,
+    relief: 0.0,
+    outside: 0.02,
+    // No document says what servo mode bridges: the period between two setpoints that the vendor's examples use, until
+    // it is measured.
+    gap_tolerance: Duration::from_millis(20),
+    after_gap: AfterGap::RestsAtSetpoint,
+    // Ranges of ±2π: the controller keeps the number of turns.
+    topology: Topology::MultiTurn,
     address: AddressForm {
         form: "HOST[:CONTROL_PORT[:REPORT_PORT]]",
         required: true,

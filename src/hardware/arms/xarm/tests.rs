@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 use super::SPEC;
 use super::adapter::XArmAdapter;
 use super::emulator::XArmEmulator;
-use crate::arm::Pose;
+use crate::arm::{Pose, StopPoint};
 use crate::hardware::adapter::{
     AdapterError, Cartesian, ForceTorque, Gripper, HandGuiding, JointReading, ManipulatorAdapter, Stop,
 };
@@ -89,7 +89,7 @@ fn a_hand_guides_the_arm_in_mode_2_until_it_is_stopped_or_activated() {
         let here = six(&mut arm);
         assert!(matches!(arm.write_joint_positions(&here, 1.0), Err(AdapterError::Rejected(_))));
         if by_stop {
-            assert_eq!(arm.write_stop(), Ok(Stop::Confirmed));
+            assert_eq!(arm.write_stop(&StopPoint::default()), Ok(Stop::Confirmed));
         } else {
             arm.activate().unwrap();
             assert_eq!(arm.get_control_mode(), ControlMode::ServoPosition);
@@ -162,7 +162,7 @@ fn starting_and_stopping_asks_for_no_motion() {
     arm.connect().unwrap();
     assert_eq!(arm.read_enabled(), Ok(false));
     arm.activate().unwrap();
-    arm.deactivate().unwrap();
+    arm.deactivate(&StopPoint::default()).unwrap();
     arm.disconnect();
     assert_eq!(read(&mut arm), Err(AdapterError::NotConnected));
     let trace: Vec<_> = emulator.trace().into_iter().filter(|received| !received.second).collect();
@@ -193,7 +193,7 @@ fn modes_change_through_a_stop_and_velocities_end() {
     arm.write_joint_positions(&far, 0.05).unwrap();
     until("motion", || read(&mut arm).unwrap().velocity.unwrap()[0] < -0.02);
     assert_eq!(set(&mut arm, ControlMode::Velocity), Err(AdapterError::Rejected("the arm is moving".into())));
-    assert_eq!(arm.write_stop(), Ok(Stop::Confirmed));
+    assert_eq!(arm.write_stop(&StopPoint::default()), Ok(Stop::Confirmed));
     let refused = arm.write_joint_positions(&far, 0.05).unwrap_err().to_string();
     assert!(refused.ends_with("enable it again"), "{refused}");
 }

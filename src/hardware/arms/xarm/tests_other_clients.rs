@@ -9,6 +9,7 @@ use serde_json::json;
 use super::adapter::XArmAdapter;
 use super::emulator::XArmEmulator;
 use super::tests::{read, ready, sent, six, until};
+use crate::arm::StopPoint;
 use crate::hardware::adapter::{AdapterError, ManipulatorAdapter};
 use crate::hardware::registry::Emulator;
 use crate::hardware::sim::faults::{Fault, FaultKind};
@@ -142,7 +143,7 @@ fn an_error_of_the_arm_is_nobody_elses_doing() {
 #[test]
 fn stops_of_this_run_are_its_own() {
     let (_emulator, mut arm) = ready(json!({}), ServoPosition);
-    arm.write_stop().unwrap();
+    arm.write_stop(&StopPoint::default()).unwrap();
     for _ in 0..20 {
         read(&mut arm).unwrap();
         assert_eq!(arm.foreign_change(), None);
@@ -179,6 +180,6 @@ fn the_end_of_a_run_leaves_the_arm_to_the_client_that_took_it() {
         read(&mut arm).unwrap();
         arm.foreign_change().is_some()
     });
-    arm.deactivate().unwrap();
+    arm.deactivate(&StopPoint::default()).unwrap();
     assert_eq!(ours_after(&emulator, 19), []);
 }

@@ -3,6 +3,7 @@
 use serde_json::json;
 
 use super::tests::{pair, read, ready, sent, six, until};
+use crate::arm::StopPoint;
 use crate::hardware::adapter::{AdapterError, Gripper, ManipulatorAdapter, Stop};
 use crate::joint::ControlMode::ServoPosition;
 
@@ -22,7 +23,7 @@ fn motors_that_take_long_come_on_and_the_arm_is_ready() {
 fn slow_stops_and_clearings_are_confirmed() {
     let slow = json!([{"register": 12, "delay": 0.25}, {"register": 16, "delay": 0.25}]);
     let (_emulator, mut arm) = ready(json!({"sim": {"slow_replies": slow}}), ServoPosition);
-    assert_eq!(arm.write_stop(), Ok(Stop::Confirmed));
+    assert_eq!(arm.write_stop(&StopPoint::default()), Ok(Stop::Confirmed));
     assert_eq!(arm.write_clear_errors(), Ok(()));
     assert_eq!(arm.activate(), Ok(()));
 }
@@ -32,7 +33,7 @@ fn a_stop_that_is_never_answered_is_confirmed_by_the_reports() {
     let (emulator, mut arm) = ready(json!({}), ServoPosition);
     emulator.record();
     emulator.slow_down(12, 60.0);
-    assert_eq!(arm.write_stop(), Ok(Stop::Confirmed));
+    assert_eq!(arm.write_stop(&StopPoint::default()), Ok(Stop::Confirmed));
     assert_eq!(sent(&emulator, 12), [[4]]);
 }
 
@@ -57,7 +58,7 @@ fn a_gripper_telegram_delays_neither_set_points_nor_a_stop() {
         });
         until("the setpoint at the controller", || sent(&emulator, 29).len() == i as usize);
     }
-    assert_eq!(arm.write_stop(), Ok(Stop::Confirmed));
+    assert_eq!(arm.write_stop(&StopPoint::default()), Ok(Stop::Confirmed));
     assert!(emulator.trace().iter().all(|request| request.second == (request.register == 124)));
 }
 

@@ -11,7 +11,7 @@ use std::time::Duration;
 use super::frame::{self, MAX_FRAME, Reply, Status};
 use super::protocol::{self, Command, DOF, Hello, Mode, WireJoints};
 use super::{GRIPPER_FORCE, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, check, limits};
-use crate::arm::{AnalogUnit, IoInfo, IoState, JointStatus, Load, Pose};
+use crate::arm::{AnalogUnit, IoInfo, IoState, JointStatus, Load, Pose, StopPoint};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, Gripper, Io, JointMonitor, JointReading, ManipulatorAdapter,
@@ -269,6 +269,7 @@ impl ManipulatorAdapter for YourArmAdapter {
             velocity: Some(from_degrees(&self.state.velocities)),
             effort: Some(joints_of(&self.state.torques)),
             valid: None,
+            commanded: None,
         };
         Ok(())
     }
@@ -303,7 +304,7 @@ impl ManipulatorAdapter for YourArmAdapter {
         self.set_point(&Command::VelocityJoints(joints)) // the controller checks the mode
     }
 
-    fn write_stop(&mut self) -> AdapterResult<Stop> {
+    fn write_stop(&mut self, _rest: &StopPoint) -> AdapterResult<Stop> {
         self.command(&Command::Stop)?;
         Ok(Stop::Confirmed) // the controller replied; where an arm cannot, answer `Sent`
     }

@@ -18,6 +18,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::arm::{AfterGap, Topology};
 use crate::hardware::adapter_util::fraction;
 use crate::hardware::check::{Checked, ConfigError};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
@@ -53,6 +54,14 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     accuracy: 0.002,
     lag: 0.03,
     stale_after: Duration::from_millis(50),
+    // yourarm-protocol.md: setpoints up to two periods apart are interpolated, then the arm returns to the last one; its
+    // stop rests where it is.
+    droop: 0.0,
+    relief: 0.0,
+    outside: 0.02,
+    gap_tolerance: Duration::from_millis(20),
+    after_gap: AfterGap::RestsAtSetpoint,
+    topology: Topology::MultiTurn,
     address: AddressForm {
         form: "HOST[:PORT]",
         required: true,

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use super::emulator::wire::Request;
 use super::emulator::{SimOptions, YourArmEmulator};
 use super::{SPEC, protocol::DOF};
-use crate::arm::Pose;
+use crate::arm::{Pose, StopPoint};
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, JointReading, ManipulatorAdapter, Stop};
 use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
@@ -125,7 +125,7 @@ fn connecting_and_leaving_move_and_enable_nothing() {
     arm.connect().unwrap();
     assert_eq!(arm.read_enabled(), Ok(false));
     arm.activate().unwrap();
-    arm.deactivate().unwrap();
+    arm.deactivate(&StopPoint::default()).unwrap();
     arm.disconnect();
     arm.disconnect();
     assert_eq!(read(&mut *arm).unwrap_err(), AdapterError::NotConnected);
@@ -152,7 +152,7 @@ fn modes_change_at_standstill_only_and_velocities_time_out() {
     until("motion", || read(&mut *arm).is_ok_and(|reading| reading.velocity.unwrap()[0] > 0.01));
     let refused = arm.set_control_mode(ControlMode::ServoPosition).unwrap_err();
     assert_eq!(refused, AdapterError::Rejected("yourarm refuses SET_MODE: the arm is moving".into()));
-    assert_eq!(arm.write_stop(), Ok(Stop::Confirmed));
+    assert_eq!(arm.write_stop(&StopPoint::default()), Ok(Stop::Confirmed));
     until("standstill", || arm.set_control_mode(ControlMode::ServoPosition).is_ok());
 }
 

@@ -5,6 +5,7 @@ use std::ops::Range;
 use std::time::Duration;
 
 use super::{DEGREE, FirstMotion, FirstMotionEnd, JointMotion, MAX_STRAY, REACH, SPEED};
+use crate::arm::StopPoint;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::conformance::context::{farthest, when_there_is_room};
 use crate::hardware::conformance::lag::Trace;
@@ -232,7 +233,7 @@ impl FirstMotion<'_> {
             let positions = it.read()?.0;
             Ok(it.check_motion(0, 0.0, REACH, &positions, Observed::default())?.moved > REACH / 4.0)
         })?;
-        self.adapter.write_stop()?;
+        self.adapter.write_stop(&StopPoint::default())?;
         let at = self.read()?.0;
         let rest = self.wait_for_standstill()?;
         self.motion.stopped = Some(farthest(&rest, &at));

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use super::Worker;
 use super::tick_monitor::MAX_DELAY;
-use crate::arm::{ArmCommand, Interference};
+use crate::arm::{ArmCommand, Interference, Setpoint, StopPoint};
 use crate::hardware::adapter::{AdapterError, AdapterResult, ManipulatorAdapter, Stop};
 use crate::joint::ControlMode;
 
@@ -98,10 +98,15 @@ impl Worker {
             self.health.withheld.fetch_add(1, Relaxed);
             return Ok(());
         }
-        let values = command.values.get(..self.config.dof).unwrap_or_default();
         let written = match mode {
-            ControlMode::Velocity => adapter.write_joint_velocities(values),
-            _ => adapter.write_joint_positions(values, 1.0),
+            ControlMode::Velocity => {
+                adapter.write_joint_velocities(command.values.get(..self.config.dof).unwrap_or_default())
+            }
+            _ => adapter.write_setpoint(&Setpoint {
+                position: command.values,
+                velocity: command.velocity,
+                at: command.at,
+            }),
         };
         // A setpoint without an acknowledgement may have reached the arm: the next one continues from it.
         if matches!(written, Ok(()) | Err(AdapterError::Timeout(_))) {
@@ -120,13 +125,18 @@ impl Worker {
         now.since(*self.mode_refused_since.get_or_insert(now)) > MODE_TIMEOUT
     }
 
+    /// Returns where the arm is to rest: where braking from the newest command ends, or from the last one that had a mode.
+    pub(super) fn stop_point(&self) -> StopPoint {
+        StopPoint { position: self.last.rest }
+    }
+
     /// Sends the arm's own stop; retried in every cycle until the arm takes it.
     pub(super) fn stop(&mut self, adapter: &mut dyn ManipulatorAdapter) {
         if !self.stop_pending || !self.connected {
             return;
         }
         let power = self.ordered_power;
-        match adapter.write_stop() {
+        match adapter.write_stop(&self.stop_point()) {
             Ok(stop) => {
                 self.stop_pending = false;
                 self.lead.end("the arm was stopped");

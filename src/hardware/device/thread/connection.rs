@@ -149,7 +149,7 @@ impl Worker {
         // An arm that another program has taken over is not stopped.
         let ours = self.state.interference != Interference::Mode;
         if ours && self.connected {
-            result = adapter.deactivate();
+            result = adapter.deactivate(&self.stop_point());
             if disable {
                 self.wait_for_standstill(adapter);
                 result = result.and(adapter.write_enable(false));

@@ -150,6 +150,7 @@ impl Worker {
         self.state.device_ns = self.reading.device_ns;
         self.state.position = self.reading.position;
         self.state.effort = self.reading.effort;
+        self.state.commanded = self.reading.commanded;
         self.state.velocity = self.reading.velocity.unwrap_or_default();
         self.state.velocity_source =
             if self.reading.velocity.is_some() { VelocitySource::Measured } else { VelocitySource::Absent };

@@ -1,7 +1,7 @@
 //! Optional parts: the load and the mounting, the stop input, values that are read now and then, outputs.
 
 use super::*;
-use crate::arm::{AnalogUnit, IoInfo, IoState, JointStatus, Load, OutputValue, StopInput};
+use crate::arm::{AnalogUnit, IoInfo, IoState, JointStatus, Load, OutputValue, StopInput, StopPoint};
 use crate::hardware::adapter::{
     AdapterError, Io, JointMonitor, ManipulatorAdapter, ManipulatorInfo, Payload, RobotState, Stop,
 };
@@ -88,8 +88,8 @@ impl ManipulatorAdapter for Equipped {
     fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()> {
         self.inner.write_joint_positions(positions, velocity)
     }
-    fn write_stop(&mut self) -> AdapterResult<Stop> {
-        self.inner.write_stop()
+    fn write_stop(&mut self, _rest: &StopPoint) -> AdapterResult<Stop> {
+        self.inner.write_stop(&StopPoint::default())
     }
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
         self.inner.write_enable(enable)
