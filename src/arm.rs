@@ -36,8 +36,8 @@ pub struct Supervision {
     /// integral part.
     #[serde(default)]
     pub droop: f64,
-    /// Furthest that the setpoint of a held joint is taken back towards the joint [rad]; 0: the arm's own stop takes the
-    /// pressure off a blocked joint.
+    /// Furthest that the setpoint of a held joint is taken back towards the joint [rad]; 0: the arm's own stop takes
+    /// the pressure off a blocked joint.
     #[serde(default)]
     pub relief: f64,
     /// How far outside its range a joint may rest and still be enabled [rad].

@@ -117,11 +117,28 @@ impl Failsafe {
     pub fn hold(&mut self, cause: Cause, now: Mono) {
         let holds = match self.phase {
             Phase::Held | Phase::Unknown => false,
-            Phase::Disabled => cause == Cause::Operator,
+            // It may be about to be enabled.
+            Phase::Disabled => {
+                matches!(cause, Cause::Operator | Cause::PositionJump(..) | Cause::TurnLost(..) | Cause::SeamCrossed(_))
+            }
             Phase::Standby | Phase::Activating | Phase::Ready | Phase::Led => true,
         };
         if holds {
             self.enter(Phase::Held, cause, now);
+        }
+    }
+
+    /// Replaces the cause of a hold by one that is found while the arm is held.
+    pub fn replace_cause(&mut self, cause: Cause, now: Mono) {
+        if self.phase == Phase::Held {
+            self.enter(Phase::Held, cause, now);
+        }
+    }
+
+    /// The ramp after enabling begins now: the arm holds no setpoint yet.
+    pub fn prolong_ramp(&mut self, now: Mono) {
+        if self.phase == Phase::Activating {
+            self.since = now;
         }
     }
 
@@ -157,7 +174,8 @@ impl Failsafe {
         if self.phase != Phase::Held {
             return Outcome::Accepted;
         }
-        match trouble(state, fresh).filter(|c| *c != Cause::HeartbeatLost) {
+        // Readings that are late or not believed are a matter of enabling.
+        match trouble(state, fresh).filter(|c| !matches!(c, Cause::HeartbeatLost | Cause::Stale(_))) {
             Some(cause) => Outcome::StillFaulted(arm, cause),
             None => {
                 let phase = if state.enabled { Phase::Standby } else { Phase::Disabled };

@@ -125,8 +125,8 @@ fn a_reset_is_refused_while_the_cause_persists() {
     for (state, fresh, cause) in troubles() {
         let mut arm = Failsafe { phase: Phase::Held, cause: Cause::Operator, since: at(0), ..Failsafe::default() };
         let outcome = arm.reset(3, &state, fresh, at(10));
-        // The hold of a device thread ends when the motors are enabled.
-        if cause == Cause::HeartbeatLost {
+        // The hold of a device thread, and readings that are not believed, end when the motors are enabled.
+        if matches!(cause, Cause::HeartbeatLost | Cause::Stale(_)) {
             assert_eq!((outcome, arm.phase()), (Outcome::Accepted, Phase::Standby));
         } else {
             assert_eq!((outcome, arm.phase()), (Outcome::StillFaulted(3, cause), Phase::Held));

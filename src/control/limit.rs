@@ -6,6 +6,8 @@ use super::config::{JUMP, POSITION_MARGIN};
 use crate::joint::braking_speed;
 use crate::telemetry::LimitKind;
 
+/// Highest speed of a joint on its way back into its range [rad/s].
+pub const WAY_BACK: f64 = 0.1;
 /// Slack for rounding: a command at its limit is not "limited".
 const ROUNDING: f64 = 1e-9;
 
@@ -119,12 +121,21 @@ impl Limiter {
         }
     }
 
-    /// Moves the command towards the measured position `at` [rad], by at most `step` [rad], with zero velocity: a
-    /// blocked joint must not move when it is released.
-    pub fn draw(&mut self, at: f64, step: f64) {
+    /// Sets the command of a relief, which keeps the joint's limits itself [rad, rad/s].
+    pub fn relieve(&mut self, position: f64, velocity: f64) {
         self.forget_request();
-        self.position += (at - self.position).clamp(-step, step);
-        self.velocity = 0.0;
+        (self.position, self.velocity) = (position, velocity);
+    }
+
+    /// Corrects the position that velocities have led to by a measurement [rad].
+    pub fn correct(&mut self, by: f64) {
+        self.position += by;
+    }
+
+    /// Returns the highest speed from the present position [rad/s]: a joint outside its range goes back slowly.
+    pub fn velocity_limit(&self) -> f64 {
+        let outside = self.bounds.excess(self.position) > POSITION_MARGIN;
+        if outside { self.bounds.velocity.min(WAY_BACK) } else { self.bounds.velocity }
     }
 
     /// Returns whether the commanded velocity is 0.
@@ -156,7 +167,7 @@ impl Limiter {
         let (lower, upper) = self.range();
         let goal = target.clamp(lower, upper);
         let asked = (goal - self.position) / dt;
-        let b = Bounds { velocity: self.bounds.velocity * speed, ..self.bounds };
+        let b = Bounds { velocity: self.velocity_limit() * speed, ..self.bounds };
         let change = b.acceleration * dt;
         let possible = asked.abs() <= b.velocity * (1.0 + ROUNDING)
             && (asked - self.velocity).abs() <= change * (1.0 + ROUNDING) + ROUNDING
@@ -197,7 +208,7 @@ impl Limiter {
             return Err(Refusal::NonFinite);
         }
         self.forget_request();
-        let b = Bounds { velocity: self.bounds.velocity * speed, ..self.bounds };
+        let b = Bounds { velocity: self.velocity_limit() * speed, ..self.bounds };
         let change = b.acceleration * dt;
         let slowest = self.speeds_inside(b.lower, b.upper, at.0, dt).0;
         let fastest = self.speeds_inside(b.lower, b.upper, at.1, dt).1;
@@ -205,12 +216,12 @@ impl Limiter {
         let inside = capped.clamp(slowest, fastest);
         let before = self.velocity;
         self.velocity = inside.clamp(self.velocity - change, self.velocity + change);
-        self.position = (at.0 + at.1) / 2.0;
+        self.position += self.velocity * dt;
         // In the unit of the limit: the position that the commanded velocity leads to, the acceleration to reach it.
         let by = if capped != target {
             Some((LimitKind::Velocity, target))
         } else if inside != capped {
-            Some((LimitKind::Position, self.position + target * dt))
+            Some((LimitKind::Position, (at.0 + at.1) / 2.0 + target * dt))
         } else if self.velocity != inside {
             Some((LimitKind::Acceleration, (target - before) / dt))
         } else {
@@ -221,47 +232,34 @@ impl Limiter {
 
     /// Returns the position to command without a request: decelerates to rest, then holds.
     pub fn hold_position(&mut self, dt: f64) -> f64 {
-        self.forget_request();
-        self.slow_down(dt);
-        let (lower, upper) = self.range();
-        self.position = (self.position + self.velocity * dt).clamp(lower, upper);
+        self.decelerate(self.bounds.acceleration * dt, dt);
         self.position
     }
 
-    /// Returns the velocity to command without a request: decelerates to 0. `at`: measured position [rad].
-    pub fn hold_velocity(&mut self, at: f64, dt: f64) -> f64 {
+    /// Decelerates to rest by `decrease` [rad/s] per step, then holds.
+    pub fn decelerate(&mut self, decrease: f64, dt: f64) {
         self.forget_request();
-        self.slow_down(dt);
-        self.position = at;
-        self.velocity
+        self.velocity = self.braked(decrease);
+        let (lower, upper) = self.range();
+        self.position = (self.position + self.velocity * dt).clamp(lower, upper);
     }
 
     /// Decelerates from an earlier command instead of the latest one. The request remains the one that was followed
-    /// last, so that the step of the next one counts from it. `at`: measured position in velocity mode [rad]. Returns
-    /// the position or velocity to command.
-    pub fn brake_from(&mut self, before: &Self, at: Option<f64>, dt: f64) -> f64 {
+    /// last, so that the step of the next one counts from it.
+    pub fn decelerate_from(&mut self, before: &Self, decrease: f64, dt: f64) {
         let (request, request_velocity) = (self.request, self.request_velocity);
         *self = *before;
-        let value = match at {
-            Some(at) => self.hold_velocity(at, dt),
-            None => self.hold_position(dt),
-        };
+        self.decelerate(decrease, dt);
         (self.request, self.request_velocity) = (request, request_velocity);
-        value
     }
 
-    /// Returns the velocity after the next step of a deceleration to rest [rad/s].
-    pub fn braked(&self, dt: f64) -> f64 {
-        let change = self.bounds.acceleration * dt;
-        self.velocity - self.velocity.clamp(-change, change)
-    }
-
-    fn slow_down(&mut self, dt: f64) {
-        self.velocity = self.braked(dt);
+    /// Returns the velocity after the next step of a deceleration to rest by `decrease` [rad/s] per step.
+    pub fn braked(&self, decrease: f64) -> f64 {
+        self.velocity - self.velocity.clamp(-decrease, decrease)
     }
 
     /// Returns the range of commanded positions: a joint outside its limits may stay or move in, not further out.
-    fn range(&self) -> (f64, f64) {
+    pub fn range(&self) -> (f64, f64) {
         (self.bounds.lower.min(self.position), self.bounds.upper.max(self.position))
     }
 

@@ -53,13 +53,27 @@ impl PathClock {
         self.next = (self.next + 1) % KEPT;
     }
 
+    /// Returns the time along the path that the tick of `at` commanded [s]; the present one if that is not known.
+    pub fn at_tick(&self, at: Mono) -> f64 {
+        let known = self.kept.iter().find(|(when, _)| *when == at && at != Mono::ZERO);
+        known.map_or(self.elapsed, |(_, elapsed)| *elapsed)
+    }
+
+    /// Goes to a point of the path [s], at rest.
+    pub fn rest_at(&mut self, elapsed: f64) {
+        (self.elapsed, self.rate) = (elapsed, Rate::new(0.0));
+    }
+
+    /// Limits the rate at once.
+    pub fn limit(&mut self, most: f64) {
+        if self.rate() > most {
+            self.rate = Rate::new(most);
+        }
+    }
+
     /// Goes to the point that the tick of `at` commanded, at rest; the tick of `now` commands the same.
     pub fn rewind(&mut self, at: Mono, now: Mono) {
-        let known = self.kept.iter().find(|(when, _)| *when == at && at != Mono::ZERO);
-        if let Some((_, elapsed)) = known {
-            self.elapsed = *elapsed;
-        }
-        self.rate = Rate::new(0.0);
+        self.rest_at(self.at_tick(at));
         if let Some(mark) = self.kept.iter_mut().find(|(when, _)| *when == now) {
             mark.1 = self.elapsed;
         }

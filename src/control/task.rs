@@ -54,6 +54,8 @@ pub struct Task {
     /// Demand of its type while it is active.
     demands: Demand,
     motion: Option<Box<Motion>>,
+    /// It has ended because an arm is held, and decelerates along its path.
+    braking: bool,
     body: Box<dyn TaskBody>,
 }
 
@@ -75,6 +77,7 @@ impl Task {
             takes: spec.takes,
             demands: spec.demand,
             motion: None,
+            braking: false,
             body,
         }
     }
@@ -147,6 +150,9 @@ impl Task {
         if !self.takes(target.kind()) {
             return Err(Outcome::WrongTask(self.index));
         }
+        if self.braking {
+            return Err(Outcome::AlreadyExecuting(self.index));
+        }
         let (cx, body, _) = self.parts(tick);
         body.accept(&cx, target)?;
         // A target during the deceleration after a cancel: continues from the present motion.
@@ -169,7 +175,7 @@ impl Task {
             pace: tick.speed.of_streams(),
             task: self.index,
             joints: &self.joints,
-            active: matches!(self.state, TaskState::Executing | TaskState::Cancelling),
+            active: self.braking || matches!(self.state, TaskState::Executing | TaskState::Cancelling),
             granted: self.granted,
             motion: self.motion.as_deref(),
             views: tick.views,
@@ -181,13 +187,14 @@ impl Task {
     pub fn compute(&mut self, tick: &Tick<'_>) -> Option<Box<Motion>> {
         self.claims.clear();
         self.demand = Demand::Nothing;
-        if !self.is_active() {
+        if !self.is_active() && !self.braking {
             return None;
         }
         self.demand = self.demands;
         let (cx, body, claims) = self.parts(tick);
         match body.compute(&cx, claims) {
             Step::Continue => None,
+            Step::End(..) if self.braking => self.end(self.state, self.reason),
             Step::ContinueFor(reason) => {
                 if self.state == TaskState::Executing {
                     self.reason = reason;
@@ -198,6 +205,25 @@ impl Task {
             Step::End(state, Reason::Cancelled) if self.state == TaskState::Cancelling => self.end(state, self.reason),
             Step::End(state, reason) => self.end(state, reason),
         }
+    }
+
+    /// Ends the task for its client because an arm is held. A motion along a path decelerates along it first. Returns a
+    /// motion that is over, to be freed on another thread.
+    pub fn brake(&mut self, state: TaskState, reason: Reason) -> Option<Box<Motion>> {
+        if !self.granted || self.body.cancel() != OnCancel::Decelerate {
+            return self.end(state, reason);
+        }
+        (self.state, self.reason, self.braking) = (state, reason, true);
+        None
+    }
+
+    /// A gap in the setpoints of an arm has ended, and the arm rests where its joints are commanded: continues from the
+    /// nearest point of the path since the tick of `at`. An error has the joint that is farther than `tolerance` [rad]
+    /// from the path, and its distance.
+    pub fn rejoin(&mut self, tick: &Tick<'_>, at: Mono, tolerance: f64) -> Result<(), (u16, f64)> {
+        self.granted = false;
+        let (cx, body, _) = self.parts(tick);
+        body.rejoin(&cx, at, tolerance)
     }
 
     /// No command reached an arm since the tick of `at`: continues from the command of that tick, from rest.
@@ -212,7 +238,7 @@ impl Task {
         self.reason = reason;
         self.demand = Demand::Nothing;
         self.claims.clear();
-        self.granted = false;
+        (self.granted, self.braking) = (false, false);
         self.body.end();
         self.motion.take()
     }

@@ -32,6 +32,8 @@ pub struct JointView {
     pub jerk: f64,
     /// Distance of the joint from the range of its setpoints of the last `lag` seconds [rad].
     pub tracking_error: f64,
+    /// How far a joint that droops may be read from its setpoint at rest [rad]; 0 for one that does not.
+    pub droop: f64,
     /// Index of its arm.
     pub arm: u16,
     /// When position and velocity were measured.
@@ -227,6 +229,14 @@ pub trait TaskBody: std::fmt::Debug + Send {
     /// tick is not granted: a body that integrates from [`JointView::commanded`] then needs nothing else.
     fn rewind(&mut self, at: Mono, now: Mono) {
         let _ = (at, now);
+    }
+
+    /// A gap has ended, and the arm rests where its joints are commanded: continues from the nearest point of the path
+    /// since the tick of `at`, at rest. An error has the joint that is farther than `tolerance` [rad] from the path,
+    /// and its distance. A body without a path continues from where the joints are.
+    fn rejoin(&mut self, cx: &Context<'_>, at: Mono, tolerance: f64) -> Result<(), (u16, f64)> {
+        let _ = (cx, at, tolerance);
+        Ok(())
     }
 
     /// Returns the target with which a task with `auto_start` begins; `None`: it waits for a client.

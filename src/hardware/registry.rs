@@ -169,8 +169,8 @@ pub struct AdapterSpec {
     pub accuracy: f64,
     /// Largest distance of a joint below its setpoint under load, beyond `accuracy` [rad].
     pub droop: f64,
-    /// Furthest that the setpoint of a held joint is taken back towards the joint [rad]; 0: the arm's own stop takes the
-    /// pressure off.
+    /// Furthest that the setpoint of a held joint is taken back towards the joint [rad]; 0: the arm's own stop takes
+    /// the pressure off.
     pub relief: f64,
     /// How far outside its range a joint may rest and still be enabled [rad].
     pub outside: f64,

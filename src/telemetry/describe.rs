@@ -256,6 +256,7 @@ fn task_changed(task: u16, state: TaskState, reason: Reason, names: &Names) -> D
         | Reason::GoalTolerance(joint, value)
         | Reason::TrackingError(joint, value)
         | Reason::LeaderAway(joint, value)
+        | Reason::Gap(joint, value)
         | Reason::Jump(joint, value) => {
             d.joint = Some(names.joint(joint));
             d.values = vec![value];
@@ -296,6 +297,9 @@ pub fn reason_text(reason: &Reason, names: &Names) -> String {
             format!("{} was {} from its leader, more than `max_approach`", names.joint(joint), angle(by))
         }
         Reason::Guarded(arm) => format!("the collision guard stopped {}", names.arm(arm)),
+        Reason::Gap(joint, by) => {
+            format!("after a gap in the setpoints {} came to rest {} from the path", names.joint(joint), angle(by))
+        }
     }
 }
 
@@ -347,6 +351,38 @@ pub fn cause_text(cause: Cause) -> String {
         Cause::PositionJump(joint, by) => {
             format!("the position of joint {} jumped by {}", joint + 1, angle(by))
         }
+        Cause::TurnLost(joint, by) => format!(
+            "joint {} reads {} away: its turn count is lost; restart the arm's controller, and check its pose",
+            joint + 1,
+            angle(by)
+        ),
+        Cause::SeamCrossed(joint) => {
+            format!("joint {} crossed the seam of its encoder: turn it back into its range by hand", joint + 1)
+        }
+        Cause::ReadingInconsistent(joint, by) => {
+            format!("position and velocity of joint {} contradict each other by {}", joint + 1, angle(by))
+        }
+        Cause::ReadingFollows(joint, by) => format!(
+            "the reading of joint {} moved by {} with its setpoint without coming nearer: it is not that of the joint",
+            joint + 1,
+            angle(by)
+        ),
+        Cause::StartMismatch(joint, written, read) => format!(
+            "joint {} is commanded at {written:.4} rad and read at {read:.4} rad, which nothing explains; if the reading is \
+             right, reset and enable the arm again",
+            joint + 1
+        ),
+        Cause::OutsideRange(joint, by) => format!(
+            "joint {} is {} outside its range; move it inside by hand, or enable the arm with --outside",
+            joint + 1,
+            angle(by)
+        ),
+        Cause::Gap(joint, by) => format!(
+            "after a gap in its setpoints joint {} did not come to rest where its motion could continue: {} away",
+            joint + 1,
+            angle(by)
+        ),
+        Cause::SetpointRefused => "a setpoint was refused".into(),
         Cause::LedTooFast(joint, velocity) => format!(
             "the controller moved joint {} at {velocity:.3} rad/s, beyond 1.1 times its velocity limit",
             joint + 1
@@ -392,7 +428,13 @@ fn code(cause: Cause) -> Vec<f64> {
         | Cause::PositionJump(_, by)
         | Cause::MovedWhileActivating(_, by)
         | Cause::LedTooFast(_, by)
-        | Cause::LedOutOfRange(_, by) => vec![by],
+        | Cause::LedOutOfRange(_, by)
+        | Cause::TurnLost(_, by)
+        | Cause::ReadingInconsistent(_, by)
+        | Cause::ReadingFollows(_, by)
+        | Cause::OutsideRange(_, by)
+        | Cause::Gap(_, by) => vec![by],
+        Cause::StartMismatch(_, written, read) => vec![written, read],
         _ => Vec::new(),
     }
 }

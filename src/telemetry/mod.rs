@@ -137,6 +137,23 @@ pub enum Cause {
     Tracking(u16, f64),
     /// The measured position of a joint jumped by this much [rad].
     PositionJump(u16, f64),
+    /// The measured position of a joint is off by whole turns: its step [rad].
+    TurnLost(u16, f64),
+    /// A joint crossed the seam of its encoder under power.
+    SeamCrossed(u16),
+    /// Position and velocity of a joint contradict each other by this much [rad].
+    ReadingInconsistent(u16, f64),
+    /// The reading of a joint moved by this much with its setpoint, without coming nearer to it [rad].
+    ReadingFollows(u16, f64),
+    /// A joint is to start at the first position and is at the second one, and nothing explains the difference [rad].
+    StartMismatch(u16, f64, f64),
+    /// A joint is this far outside its range, beyond what the arm may be enabled at [rad].
+    OutsideRange(u16, f64),
+    /// After a gap in its setpoints the arm did not come to rest where its motion could continue: the joint, and how
+    /// far it is from there [rad].
+    Gap(u16, f64),
+    /// The arm's adapter refused a setpoint.
+    SetpointRefused,
     /// A joint of the arm moved this far while the arm was being enabled [rad].
     MovedWhileActivating(u16, f64),
     /// The arm's controller moved a joint (counted from 0) at this velocity, beyond 1.1 times its limit [rad/s].
@@ -184,6 +201,14 @@ impl Cause {
             Self::PowerLost => "power_lost",
             Self::Tracking(..) => "tracking",
             Self::PositionJump(..) => "position_jump",
+            Self::TurnLost(..) => "turn_lost",
+            Self::SeamCrossed(_) => "seam_crossed",
+            Self::ReadingInconsistent(..) => "reading_inconsistent",
+            Self::ReadingFollows(..) => "reading_follows",
+            Self::StartMismatch(..) => "start_mismatch",
+            Self::OutsideRange(..) => "outside_range",
+            Self::Gap(..) => "gap",
+            Self::SetpointRefused => "setpoint_refused",
             Self::MovedWhileActivating(..) => "moved_while_activating",
             Self::LedTooFast(..) => "led_too_fast",
             Self::LedOutOfRange(..) => "led_out_of_range",
@@ -255,6 +280,8 @@ pub enum Reason {
     LeaderAway(u16, f64),
     /// The collision guard stopped the arm: the arm.
     Guarded(u16),
+    /// After a gap in the setpoints a joint rested too far from the path to continue: joint, distance [rad].
+    Gap(u16, f64),
 }
 
 /// Two things that the collision guard keeps apart.

@@ -164,7 +164,10 @@ fn lost_ticks_make_no_jump() {
     let request = chunk(&rig, begin, &actions);
     rig.send(request);
     (0..150).for_each(|_| trace.tick(&mut rig));
+    // A lost period is bridged: this command is where the motion is, two periods later.
+    let before = rig.commanded(0);
     rig.tick_after(1);
+    trace.0.push(before.iter().zip(rig.commanded(0)).map(|(a, b)| 0.5 * (a + b)).collect());
     trace.0.push(rig.commanded(0));
     (0..150).for_each(|_| trace.tick(&mut rig));
     trace.keeps_its_limits();

@@ -100,16 +100,18 @@ fn a_setpoint_that_is_written_after_its_gap_was_noticed_is_where_the_arm_waits()
 }
 
 #[test]
-fn a_gap_ends_with_the_first_command_since_it_was_noticed_that_is_written() {
+fn a_gap_ends_once_the_arm_has_rested_where_it_was_sent_last() {
     let mut rig = ready(figured(0.05, 0.005), one(servo()));
     rig.arms[0].deaf = true;
     rig.run(2);
     rig.arms[0].deaf = false;
     // In this tick the last setpoint that was written is three periods old.
     rig.tick();
-    rig.servo(0, &[0.01; 6]);
-    rig.tick();
-    assert!(rig.commanded(0)[0] > 0.0);
+    for k in 0..12 {
+        rig.servo(0, &[0.01; 6]);
+        rig.tick();
+        assert_eq!(rig.commanded(0)[0] > 0.0, k >= 5, "{k}: 50 ms at rest");
+    }
 }
 
 #[test]
@@ -168,63 +170,100 @@ fn an_arm_that_lags_is_not_taken_for_one_that_does_not_follow() {
     }
 }
 
-#[test]
-fn a_blocked_joint_holds_the_arm_and_does_not_lunge_when_it_comes_free() {
-    for speed in [0.3, 0.8, 1.4] {
-        let mut config = figured(0.05, 0.005);
-        config.supervision.tracking_tolerance = 0.15;
-        let mut rig = ready(config, one(servo()));
-        let mut target = 0.0;
-        let mut blocked_at = 0.0;
-        for k in 0..200 {
-            target += speed * P;
-            rig.servo(0, &[target, 0.0, 0.0, 0.0, 0.0, 0.0]);
-            if k == 60 {
-                rig.arms[0].blocked = true;
-                blocked_at = rig.arms[0].q[0];
-            }
-            rig.tick();
-            if rig.phase(0) == Phase::Held {
-                break;
-            }
+/// Blocks joint 1 of an arm under a stream until it is held. Returns the rig and where the joint was blocked.
+fn blocked(config: ArmConfig, speed: f64, stop_takes_hold: bool) -> (Rig, f64) {
+    let mut rig = ready(config, one(servo()));
+    rig.arms[0].stop_takes_hold = stop_takes_hold;
+    let (mut target, mut blocked_at) = (0.0, 0.0);
+    for k in 0..200 {
+        target += speed * P;
+        rig.servo(0, &[target, 0.0, 0.0, 0.0, 0.0, 0.0]);
+        if k == 60 {
+            rig.arms[0].blocked = true;
+            blocked_at = rig.arms[0].q[0];
         }
-        assert!(matches!(rig.samples[0].cause, Cause::Tracking(0, by) if by < -0.15), "{:?}", rig.samples[0].cause);
-        rig.run_for(0.3);
-        let setpoint = rig.arms[0].setpoint.clone().unwrap()[0];
-        assert!((setpoint - blocked_at).abs() <= 0.055, "{speed}: {setpoint} while it is at {blocked_at}");
+        rig.tick();
+        if rig.phase(0) == Phase::Held {
+            break;
+        }
+    }
+    assert!(matches!(rig.samples[0].cause, Cause::Tracking(0, by) if by < -0.15), "{:?}", rig.samples[0].cause);
+    (rig, blocked_at)
+}
+
+#[test]
+fn a_blocked_joint_holds_the_arm_and_does_not_lunge_when_its_own_stop_has_taken_hold() {
+    for speed in [0.3, 0.8, 1.4] {
+        let (mut rig, blocked_at) = blocked(figured(0.05, 0.005), speed, true);
+        rig.run_for(1.2);
+        assert!(rig.arms[0].stops >= 1 && rig.commands[0].mode.is_none());
         rig.arms[0].blocked = false;
         rig.run_for(1.0);
-        assert!((rig.arms[0].q[0] - blocked_at).abs() <= 0.055, "{speed}");
+        assert!((rig.arms[0].q[0] - blocked_at).abs() <= 0.01, "{speed}");
     }
 }
 
 #[test]
-fn a_blocked_joint_has_its_setpoint_drawn_to_it_at_the_same_pace_at_every_hold() {
-    let mut rig = ready(figured(0.05, 0.005), one(servo()));
-    let go = |rig: &mut Rig, to: f64| {
-        let from = rig.commanded(0)[0];
-        for k in 1..=300 {
-            rig.servo(0, &[from + (to - from) * (0.005 * f64::from(k)).min(1.0), 0.0, 0.0, 0.0, 0.0, 0.0]);
-            rig.tick();
+fn the_setpoint_of_a_blocked_joint_is_taken_back_once_by_the_relief_after_the_stop() {
+    for speed in [0.3, 0.8, 1.4] {
+        let mut config = figured(0.05, 0.005);
+        config.supervision.relief = 0.04;
+        let (mut rig, blocked_at) = blocked(config, speed, false);
+        rig.run_until(2.0, |rig| rig.arms[0].stops == 1);
+        let stopped_at = rig.arms[0].setpoint.clone().unwrap()[0];
+        rig.run_for(2.0);
+        let setpoint = rig.arms[0].setpoint.clone().unwrap()[0];
+        assert!(stopped_at > blocked_at + 0.15, "{speed}: the stop comes first, where the setpoint is");
+        assert!((stopped_at - setpoint - 0.04).abs() < 1e-9, "{speed}: {stopped_at} then {setpoint}");
+        assert_eq!((rig.arms[0].stops, rig.commands[0].mode), (2, None), "{speed}: and a stop again");
+        rig.run_for(2.0);
+        assert_eq!(rig.arms[0].setpoint.clone().unwrap()[0], setpoint, "{speed}: once");
+    }
+}
+
+#[test]
+fn no_setpoint_is_taken_back_after_an_operators_stop() {
+    let mut config = figured(0.05, 0.005);
+    config.supervision.relief = 0.04;
+    let mut rig = ready(config, one(servo()));
+    for k in 1..=80 {
+        rig.arms[0].sag = 0.001 * f64::from(k);
+        rig.tick();
+    }
+    rig.run_for(0.5);
+    assert_eq!(rig.phase(0), Phase::Ready);
+    rig.ask(Request::Stop { arm: None });
+    rig.run_for(2.0);
+    assert_eq!((rig.arms[0].setpoint.clone().unwrap()[0], rig.arms[0].stops), (0.0, 1));
+}
+
+#[test]
+fn a_reading_that_slips_without_end_does_not_move_a_held_arm() {
+    for relief in [0.0, 0.04] {
+        for velocity in [true, false] {
+            let mut config = figured(0.05, 0.005);
+            config.supervision.relief = relief;
+            let mut rig = ready(config, one(servo()));
+            rig.arms[0].reports_velocity = velocity;
+            let mut slip = 0.0;
+            for k in 0..1500 {
+                // A reading that moves by itself while its velocity says nothing, and then with the arm.
+                slip += if k > 100 && slip < 0.6 { 0.004 } else { 0.0 };
+                let mut states = [rig.arms[0].observe(rig.now.after(rig.config.period()))];
+                states[0].position[0] += slip;
+                rig.now = rig.now.after(rig.config.period());
+                if k == 900 {
+                    rig.send(Request::Stop { arm: None });
+                }
+                rig.tick_with(&states, 0);
+                let (command, dt) = (rig.commands[0], rig.dt());
+                rig.arms[0].execute_command(&command, dt);
+            }
+            let stops = rig.arms[0].stops;
+            assert_eq!(rig.phase(0), Phase::Held, "{relief} {velocity}");
+            assert!(stops >= 2, "the arm's own stop, and the operator's: {stops}");
+            assert!(rig.arms[0].q[0].abs() <= relief + 1e-9, "{relief} {velocity}: {}", rig.arms[0].q[0]);
         }
-    };
-    for at in [0.5, 1.0] {
-        rig.arms[0].blocked = false;
-        go(&mut rig, at);
-        rig.arms[0].blocked = true;
-        go(&mut rig, at + 0.08);
-        assert_eq!((rig.phase(0), rig.commanded(0)[0]), (Phase::Ready, at + 0.08));
-        rig.send(Request::Stop { arm: None });
-        // As if to be there after 0.1 s, of which a tick is gone; until it is as near as a joint at rest may be.
-        let step = 0.08 * P / (0.1 - P);
-        for k in [1.0, 2.0, 3.0, 4.0, 4.0, 4.0] {
-            rig.tick();
-            let left = rig.commanded(0)[0] - at;
-            assert!((left - (0.08 - k * step)).abs() < 1e-9, "{left} after {k} steps");
-        }
-        rig.run_for(1.0);
-        assert_eq!(rig.ask(Request::Reset { arm: 0 }), Outcome::Accepted);
-        rig.make_ready();
     }
 }
 
@@ -236,16 +275,19 @@ fn an_arm_that_does_not_come_to_rest_is_stopped_after_half_a_second() {
     let mut rig = Rig::new(128.0, vec![config], one(servo()));
     rig.make_ready();
     let stops = rig.arms[0].stops;
+    for k in 1..=64 {
+        rig.servo(0, &[0.5 * f64::from(k) / 128.0; 6]);
+        rig.tick();
+    }
+    rig.send(Request::Stop { arm: Some(0) });
+    rig.run_until(1.0, |rig| rig.phase(0) == Phase::Held && rig.speed(0) == 0.0);
     // Each tick finds its joints in motion, by less than anything that is supervised.
     let ticks = (0..200).find(|k| {
         rig.arms[0].sag = 0.0005 * (k % 2) as f64;
-        if *k == 10 {
-            rig.send(Request::Stop { arm: Some(0) });
-        }
         rig.tick();
         rig.arms[0].stops > stops
     });
-    assert_eq!(ticks, Some(10 + 64), "64 ticks are 0.5 s");
+    assert!(ticks.is_some_and(|ticks| (60..=66).contains(&ticks)), "64 ticks are 0.5 s: {ticks:?}");
 }
 
 #[test]

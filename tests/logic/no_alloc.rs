@@ -214,7 +214,7 @@ fn the_tick_loop_does_not_allocate() {
         assert!(began.elapsed() < Duration::from_secs(60));
         let command = commands.read();
         if let Some(mode) = command.mode {
-            state.mode = mode;
+            (state.mode, state.written) = (mode, command.seq);
             if mode.is_position() {
                 state.position = command.values;
             }

@@ -259,8 +259,19 @@ impl Rig {
         self.tasks.clone_from(&output.tasks);
         self.retired.extend(output.retired.drain(..).map(|m| m.id));
         if self.checked {
-            self.check_wire();
+            self.check_wire(skipped);
         }
+    }
+
+    /// Carries an arm whose motors are off by hand, as fast as a hand can.
+    pub fn carry(&mut self, arm: usize, to: &[f64]) {
+        while self.arms[arm].q != to {
+            for (q, to) in self.arms[arm].q.iter_mut().zip(to) {
+                *q += (to - *q).clamp(-0.15, 0.15);
+            }
+            self.tick();
+        }
+        self.run(2);
     }
 
     pub fn run(&mut self, ticks: u64) {
@@ -301,8 +312,9 @@ impl Rig {
     }
 
     /// Checks the rules that every command must keep.
-    fn check_wire(&mut self) {
-        let dt = self.dt();
+    fn check_wire(&mut self, skipped: u32) {
+        // A single lost period is bridged: the command covers both.
+        let dt = if skipped == 1 { 2.0 * self.dt() } else { self.dt() };
         for (i, (wire, command)) in self.wire.iter_mut().zip(&self.commands).enumerate() {
             let (sample, arm, limits) = (&self.samples[i], &self.arms[i], &self.config.arms[i].limits);
             let was = wire.clone();
@@ -336,20 +348,10 @@ impl Rig {
                 }
             }
             for j in 0..arm.dof {
-                // A held joint that does not follow has its setpoint drawn to it.
-                let (from, to, q) = (wire.values[j], values[j], arm.state.position[j]);
-                let drawn =
-                    sample.phase == Phase::Held && (to - q).abs() <= (from - q).abs() && (from - q).abs() > 0.02;
-                if (drawn || gap) && mode != ControlMode::Velocity {
-                    assert!(
-                        gap || (to - from).abs() <= limits.velocity_max[j] * dt * (1.0 + 1e-9),
-                        "{}",
-                        at("drawn too fast")
-                    );
+                let to = values[j];
+                if gap && mode != ControlMode::Velocity {
                     wire.velocity[j] = 0.0;
-                    if gap {
-                        assert_eq!(Some(to), arm.written.as_ref().map(|w| w[j]), "{}", at("in a gap"));
-                    }
+                    assert_eq!(Some(to), arm.written.as_ref().map(|w| w[j]), "{}", at("in a gap"));
                     continue;
                 }
                 let velocity = match (mode == ControlMode::Velocity, switched) {

@@ -1,99 +1,179 @@
-//! Delivery of commands: until the first setpoint of a start is written, it is recomputed from the newest measurement;
-//! after a gap in delivery, motion continues from the last written setpoint.
+//! Starts, and delivery of commands: a start takes its setpoint anew; after a gap in delivery, motion continues from
+//! the last written setpoint, or from where the arm's controller has come to rest.
 
 use super::ArmControl;
-use crate::arm::Link;
+use crate::arm::{AfterGap, Link};
 use crate::clock::Mono;
-use crate::control::written::Issued;
+use crate::control::rest::anew::{self, AGREEMENT, Since};
+use crate::control::rest::written::Issued;
+use crate::control::rest::{Gap, Start, braking};
 use crate::joint::{ControlMode, MAX_DOF};
+use crate::telemetry::{Cause, Phase};
+
+/// A joint this close to where it is to rest is there, beside its accuracy and droop [rad].
+const NEAR: f64 = 0.01;
 
 impl ArmControl {
     /// Returns the time of the last written command during a gap.
     pub fn gap(&self) -> Option<Mono> {
-        self.gap_since.map(|_| self.written.last().at)
+        self.rest.gap.map(|gap| gap.last)
     }
 
-    /// Takes what the device thread has written, and compares the latest positions with their setpoints.
-    pub(super) fn take_written(&mut self, now: Mono) {
+    /// Returns the time of the last written command before a gap that has just ended: motions continue from there.
+    pub fn resumed(&self) -> Option<Mono> {
+        self.resumed
+    }
+
+    /// Takes what the device thread has written.
+    pub(super) fn take_written(&mut self) {
         let state = self.feedback.state();
-        self.written.report(state.written);
-        // An arm that lost its connection has stopped on its own, at some other position.
-        if !state.enabled || matches!(state.link, Link::Down | Link::Faulted) {
-            self.holds_written = false;
-        }
-        let follows = self.starting.is_none() && self.command.mode.is_some_and(ControlMode::is_position);
-        if !follows {
-            return self.tracking.clear_errors();
-        }
-        // Before the comparison: an arm without new setpoints moves beyond the last one.
-        if self.gap_since.is_none() && !self.returning && self.written.gap(now) {
-            self.tracking.begin_to_coast(now, &self.limiters);
-        }
-        self.tracking.compare(self.feedback.state(), &self.limiters);
-    }
-
-    /// Begins a new start: the next command does not continue the previous ones and must be where the arm is.
-    pub(super) fn start(&mut self) {
-        self.command.start_seq = self.command.start_seq.wrapping_add(1);
-        self.starting = Some(self.command.seq + 1);
-        self.tracking.restart();
-        self.rest.start();
-        self.seed_limiters();
-    }
-
-    /// Starts each joint where it is measured. A joint that still holds the position that was written last, within its
-    /// accuracy, starts at that position: otherwise it would sink a little at every start.
-    fn seed_limiters(&mut self) {
-        for (j, limiter) in self.limiters.iter_mut().enumerate() {
-            let q = self.feedback.state().position.get(j).copied().unwrap_or_default();
-            let written = self.written.last().position.get(j).copied().filter(|_| self.holds_written);
-            let near = |written: &f64| (written - q).abs() <= 2.0 * self.config.supervision.accuracy;
-            limiter.seed(written.filter(near).unwrap_or(q));
+        self.rest.written.report(state.written);
+        // Without power or a connection, anything may move the arm.
+        let lost = !state.enabled || matches!(state.link, Link::Down | Link::Faulted);
+        if lost && state.seq != 0 {
+            self.rest.forget_written();
+            self.command.rest = self.command.rest.filter(|_| state.enabled);
         }
     }
 
-    /// Finds out whether commands reach the arm, and after a gap, whether the arm is back at what was written last.
-    /// During a gap, takes the limiters back to that.
-    pub(super) fn check_gap(&mut self, now: Mono) {
-        if let Some(first) = self.starting {
-            // Each tick makes the first setpoint again from the newest measurement, until one is written.
-            if self.feedback.state().written >= first
-                && let Some(mode) = self.command.mode
-            {
-                self.starting = None;
-                self.holds_written = mode.is_position();
-            } else {
-                self.seed_limiters();
+    /// Begins a new start in this mode: the next command does not continue the previous ones.
+    pub(super) fn start(&mut self, mode: ControlMode, now: Mono) {
+        if !matches!(self.rest.start, Start::Taking(..)) {
+            self.rest.start = Start::Taking(now, mode);
+        }
+    }
+
+    /// Takes the setpoint of a start anew as soon as the arm is known to be at rest, and sees to it that it is written.
+    pub(super) fn take_anew(&mut self, now: Mono) {
+        match self.rest.start {
+            Start::None => {}
+            Start::Writing(first) if self.feedback.state().written >= first => {
+                self.rest.start = Start::None;
+                (self.rest.holds_written, self.rest.acknowledged) = (true, false);
+            }
+            // The last check before the wire has refused it: what it was taken from is no longer so.
+            Start::Writing(_) if now.since(self.started_at) > AGREEMENT * 4 => {
+                let mode = self.command.mode.or_else(|| self.config.position_mode()).unwrap_or_default();
+                self.rest.start = Start::Taking(self.started_at, mode);
+                self.command.mode = None;
+            }
+            Start::Writing(_) => {}
+            Start::Taking(since, mode) => {
+                let rests = self.feedback.is_usable() && self.feedback.rest_time() >= AGREEMENT;
+                if !rests {
+                    if now.since(since) > anew::LIMIT {
+                        let (joint, by) = self.furthest_from_enabling();
+                        self.failsafe.hold(Cause::MovedWhileActivating(joint, by), now);
+                    }
+                    return;
+                }
+                let since = Since {
+                    written: self.rest.last_written(),
+                    acknowledged: self.rest.acknowledged,
+                    outside: self.rest.outside,
+                };
+                let supervision = &self.config.supervision;
+                let is_turn = |joint, by| self.feedback.is_turn(joint, by);
+                match anew::positions(self.feedback.state(), &self.limiters, supervision, since, is_turn) {
+                    Err(cause) => self.failsafe.hold(cause, now),
+                    Ok(positions) => {
+                        for (limiter, q) in self.limiters.iter_mut().zip(positions) {
+                            limiter.seed(q);
+                        }
+                        self.command.start_seq = self.command.start_seq.wrapping_add(1);
+                        self.command.mode = Some(mode);
+                        (self.rest.start, self.started_at) = (Start::Writing(self.command.seq + 1), now);
+                        self.enabled_at = self.feedback.state().position;
+                        self.tracking.restart();
+                    }
+                }
             }
         }
-        let started = self.starting.is_none() && self.command.mode.is_some();
-        // A command from before the gap may be written after the gap was noticed.
-        let late = self.gap_since.is_some_and(|first| self.written.last().seq < first);
-        let position = self.command.mode.is_some_and(ControlMode::is_position);
-        if !(started && (late || self.written.gap(now))) {
-            self.gap_since = None;
-            self.returning =
-                started && position && self.tracking.is_coasting(now, self.feedback.state(), &self.limiters);
+    }
+
+    /// Returns whether a start is under way.
+    pub(super) fn is_starting(&self) -> bool {
+        self.rest.start != Start::None
+    }
+
+    /// Finds out whether commands reach the arm, and after a gap, whether it has come to rest where its motion can
+    /// continue. During a gap, the limiters are at the last written setpoint.
+    pub(super) fn check_gap(&mut self, now: Mono) {
+        self.resumed = None;
+        let Some(mode) = self.command.mode.or(self.rest.gap.map(|gap| gap.mode)) else { return };
+        if self.is_starting() || !matches!(self.failsafe.phase(), Phase::Ready | Phase::Activating | Phase::Held) {
+            self.rest.gap = None;
             return;
         }
-        self.gap_since.get_or_insert(self.command.seq);
-        let last = self.written.last();
-        for (limiter, (q, v)) in self.limiters.iter_mut().zip(last.position.iter().zip(&last.velocity)) {
-            // In position mode the joints are at rest at the last setpoint; in velocity mode they continue.
-            limiter.rewind(*q, if position { 0.0 } else { *v });
+        let down = matches!(self.feedback.state().link, Link::Down | Link::Faulted);
+        let waits = self.config.supervision.after_gap == AfterGap::Decelerates && mode.is_position();
+        let last = *self.rest.written.last();
+        // A command from before the gap may be written after the gap was noticed.
+        let late = self.rest.gap.is_some_and(|gap| last.seq < gap.first) && !waits;
+        if late || (self.rest.gap.is_none() && self.rest.written.gap(now)) {
+            if self.rest.gap.is_none() {
+                let time = |l: &crate::control::limit::Limiter| l.velocity().abs() / l.bounds().acceleration;
+                let longest = self.limiters.iter().map(time).fold(0.0, f64::max);
+                let first = self.command.seq + 1;
+                self.rest.begin_gap(now, first, mode, longest, self.config.supervision.lag);
+            }
+            if self.feedback.state().refused > last.seq {
+                self.failsafe.hold(Cause::SetpointRefused, now);
+            }
+            for (limiter, (q, v)) in self.limiters.iter_mut().zip(last.position.iter().zip(&last.velocity)) {
+                // In position mode the joints are to rest at the last setpoint; in velocity mode they continue.
+                limiter.rewind(*q, if mode.is_position() { 0.0 } else { *v });
+            }
+            self.tracking.pause();
+            return;
+        }
+        let Some(gap) = self.rest.gap else { return };
+        if !mode.is_position() {
+            self.rest.gap = None;
+            return;
+        }
+        self.tracking.pause();
+        self.end_gap(gap, waits, down, now);
+    }
+
+    /// Ends a gap once the arm has come to rest, or has not in time.
+    fn end_gap(&mut self, gap: Gap, waits: bool, down: bool, now: Mono) {
+        let rested = self.feedback.is_usable()
+            && self.feedback.rest_time() >= AGREEMENT
+            && self.feedback.state().stamp.since(gap.noticed) >= AGREEMENT;
+        let supervision = &self.config.supervision;
+        let tolerance = NEAR + supervision.accuracy + supervision.droop;
+        let off = self.limiters.iter().zip(&self.feedback.state().position).map(|(l, q)| q - l.position());
+        let (joint, by) = crate::control::belief::tracking::furthest(off).unwrap_or_default();
+        if rested && !down && waits {
+            // Its controller has decelerated along the motion: where it rests, the next command begins.
+            self.rest.gap = None;
+            (self.resumed, self.rest.acknowledged) = (Some(gap.last), true);
+            self.start(gap.mode, now);
+            self.take_anew(now);
+        } else if rested && !down && by.abs() <= tolerance {
+            self.rest.gap = None;
+            self.resumed = Some(gap.last);
+            self.tracking.restart();
+        } else if now >= gap.until && self.failsafe.phase() == Phase::Ready {
+            self.failsafe.hold(Cause::Gap(joint, by), now);
         }
     }
 
     /// Keeps the command that leaves the tick, to know later what was written.
-    pub fn issue(&mut self, now: Mono) {
+    pub fn issue(&mut self, now: Mono, dt: f64) {
         let Some(mode) = self.command.mode else { return };
         let mut issued = Issued { seq: self.command.seq, at: now, position: [0.0; MAX_DOF], velocity: [0.0; MAX_DOF] };
         let out = issued.position.iter_mut().zip(&mut issued.velocity);
         for ((q, v), limiter) in out.zip(&self.limiters) {
             (*q, *v) = (limiter.position(), limiter.velocity());
         }
-        self.written.issue(issued);
-        self.tracking.push(now, &self.command.values);
-        self.holds_written &= mode.is_position();
+        self.rest.written.issue(issued);
+        self.command.velocity = issued.velocity;
+        self.command.rest = Some(braking::rest_point(&self.limiters, dt));
+        if self.rest.gap.is_none() {
+            let velocities = (!mode.is_position()).then_some(&self.command.values);
+            self.tracking.push(now, &issued.position, velocities);
+        }
     }
 }

@@ -1,7 +1,10 @@
 //! How an arm follows the requests of tasks: in the mode that they need, each joint within its limits.
 
 use super::{ArmControl, JointRequest, Routed};
+use crate::arm::AfterGap;
+use crate::clock::Mono;
 use crate::control::limit::Refusal;
+use crate::control::rest::braking;
 use crate::control::task_body::Demand;
 use crate::joint::{ControlMode, MAX_DOF};
 use crate::telemetry::LimitKind;
@@ -13,6 +16,7 @@ impl ArmControl {
         demand: Demand,
         ask: impl Fn(usize) -> Option<JointRequest>,
         dt: f64,
+        now: Mono,
         mut report: impl FnMut(usize, LimitKind, f64),
     ) -> Routed {
         let Some(mode) = self.mode_for(demand) else {
@@ -27,34 +31,46 @@ impl ArmControl {
                 self.hold(present, dt);
                 return Routed::Waiting;
             }
-            // Each mode has its own start: positions from where the arm is, velocities from zero.
-            self.holds_written &= present.is_position();
-            self.start();
+            // Each mode has its own start: positions from where the arm rests, velocities from zero.
+            self.start(mode, now);
+            self.take_anew(now);
+            if self.command.mode != Some(mode) {
+                self.hold(present, dt);
+                return Routed::Waiting;
+            }
         }
-        self.command.mode = Some(mode);
-        if self.feedback.state().mode != mode || self.starting.is_some() {
-            self.hold(mode, dt);
+        if self.command.mode.is_none() && self.rest.gap.is_none() {
+            self.start(mode, now);
             return Routed::Waiting;
         }
-        if self.gap_since.is_some() || self.returning {
-            return self.wait_in_gap(mode, ask, dt);
+        if let Some(gap) = self.rest.gap {
+            let waits = self.config.supervision.after_gap == AfterGap::Decelerates && gap.mode.is_position();
+            self.command.mode = if waits { None } else { Some(gap.mode) };
+            return self.wait_in_gap(gap.mode, ask, dt);
+        }
+        if self.feedback.state().mode != mode || self.is_starting() {
+            self.hold(mode, dt);
+            return Routed::Waiting;
         }
         if let Some((j, refusal)) = self.refused(mode, &ask) {
             self.hold(mode, dt);
             return Routed::Refused(j, refusal);
         }
         let ahead = if mode == ControlMode::Velocity { self.ahead(dt) } else { None };
+        let decreases = braking::decreases(&self.limiters, dt);
         for (j, limiter) in self.limiters.iter_mut().enumerate() {
-            let at = self.feedback.state().position.get(j).copied().unwrap_or_default();
             let value = match ask(j) {
-                None if mode == ControlMode::Velocity => limiter.hold_velocity(at, dt),
-                None => limiter.hold_position(dt),
+                None => {
+                    limiter.decelerate(decreases.get(j).copied().unwrap_or_default(), dt);
+                    if mode == ControlMode::Velocity { limiter.velocity() } else { limiter.position() }
+                }
                 Some(ask) => {
                     if ask.new_task {
                         limiter.forget_request();
                     }
                     let limited = match mode {
                         ControlMode::Velocity => {
+                            let at = limiter.position();
                             let within = ahead.as_ref().and_then(|a| a.get(j)).copied().unwrap_or((at, at));
                             limiter.follow_velocity(ask.value, within, dt, ask.speed)
                         }
@@ -104,17 +120,17 @@ impl ArmControl {
     }
 
     /// Returns the lowest and highest position that each joint may have when a velocity command takes effect [rad]: the
-    /// measurement is old, and the joint still follows earlier commands.
+    /// measurement is old, the joint still follows earlier commands, and it may be where these have led it in truth.
     pub(super) fn ahead(&self, dt: f64) -> Option<[(f64, f64); MAX_DOF]> {
         let state = self.feedback.state();
-        let range = self.tracking.range(state)?;
+        let range = self.tracking.velocity_range(state)?;
         let age = self.feedback.freshness().age;
         let age = f64::from(age.age_us + age.own_us) * 1e-6;
         let time = self.config.supervision.lag + age + dt;
         let mut out = [(0.0, 0.0); MAX_DOF];
-        for (out, (q, (low, high))) in out.iter_mut().zip(state.position.iter().zip(range.low.iter().zip(&range.high)))
-        {
-            *out = (q + low.min(0.0) * time, q + high.max(0.0) * time);
+        for (j, (out, (q, limiter))) in out.iter_mut().zip(state.position.iter().zip(&self.limiters)).enumerate() {
+            let led = limiter.position();
+            *out = ((q + range.low(j).min(0.0) * time).min(led), (q + range.high(j).max(0.0) * time).max(led));
         }
         Some(out)
     }

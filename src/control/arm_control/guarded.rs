@@ -1,7 +1,8 @@
 //! What the collision guard needs of an arm: its next step, and its deceleration instead of that.
 
-use super::ArmControl;
+use super::{ArmControl, Limiter};
 use crate::control::guard::JointStep;
+use crate::control::rest::braking;
 use crate::joint::ControlMode;
 
 impl ArmControl {
@@ -12,7 +13,7 @@ impl ArmControl {
 
     /// Returns whether its commands were at rest before this tick.
     pub fn was_at_rest(&self) -> bool {
-        self.before.iter().all(super::Limiter::at_rest)
+        self.before.iter().all(Limiter::at_rest)
     }
 
     /// Returns the step of a joint of the arm in this tick, or with `braking` the first step of its deceleration
@@ -24,8 +25,10 @@ impl ArmControl {
         else {
             return JointStep::at(measured);
         };
-        let decrease = limiter.bounds().acceleration * dt;
-        let velocity = if braking { before.braked(dt) } else { limiter.velocity() };
+        // All joints brake together: after a first step of braking, each by the same as in that step.
+        let of = |limiters: &[Limiter]| braking::decreases(limiters, dt).get(joint).copied().unwrap_or_default();
+        let decrease = if braking { of(&self.before) } else { of(&self.limiters) };
+        let velocity = if braking { before.braked(decrease) } else { limiter.velocity() };
         if mode == ControlMode::Velocity {
             let (low, high) =
                 self.ahead(dt).and_then(|ahead| ahead.get(joint).copied()).unwrap_or((measured, measured));
@@ -40,9 +43,11 @@ impl ArmControl {
     /// Decelerates instead of following the requests of this tick.
     pub fn brake(&mut self, dt: f64) {
         let velocity = self.command.mode == Some(ControlMode::Velocity);
-        let joints = self.limiters.iter_mut().zip(&self.before).zip(&self.feedback.state().position);
-        for (((limiter, before), measured), out) in joints.zip(self.command.values.iter_mut()) {
-            *out = limiter.brake_from(before, velocity.then_some(*measured), dt);
+        let decreases = braking::decreases(&self.before, dt);
+        let joints = self.limiters.iter_mut().zip(&self.before).zip(decreases);
+        for (((limiter, before), decrease), out) in joints.zip(self.command.values.iter_mut()) {
+            limiter.decelerate_from(before, decrease, dt);
+            *out = if velocity { limiter.velocity() } else { limiter.position() };
         }
     }
 }
@@ -54,8 +59,8 @@ mod tests {
     use super::*;
     use crate::arm::ArmState;
     use crate::clock::Mono;
+    use crate::control::belief::stalls::Stalls;
     use crate::control::config::ArmConfig;
-    use crate::control::stalls::Stalls;
     use crate::joint::joints_of;
 
     const PERIOD: Duration = Duration::from_millis(10);
@@ -75,7 +80,7 @@ mod tests {
     fn see(arm: &mut ArmControl, seq: u64, positions: [f64; 2]) {
         let stamp = Mono(1_000_000_000 + seq * 10_000_000);
         let state = ArmState { seq, stamp, dof: 2, position: joints_of(&positions), ..ArmState::default() };
-        arm.feedback.read(&state, stamp, &Stalls::default());
+        arm.feedback.read(&state, None, false, stamp, &Stalls::default());
     }
 
     fn close(a: JointStep, b: JointStep) -> bool {
@@ -117,10 +122,10 @@ mod tests {
     fn with_velocities_a_joint_may_be_anywhere_on_the_way_that_its_setpoints_take_it_since_it_was_measured() {
         let mut arm = arm(ControlMode::Velocity, (0.0, 0.0), (0.0, 0.0));
         let stamp = Mono(2_000_000_000);
-        arm.tracking.push(stamp, &joints_of(&[0.4, -0.2]));
+        arm.tracking.push(stamp, &joints_of(&[]), Some(&joints_of(&[0.4, -0.2])));
         // 8 ms old, of which this computer could not read for 3 ms.
         let state = ArmState { seq: 1, stamp, dof: 2, own_delay_ns: 3_000_000, ..ArmState::default() };
-        arm.feedback.read(&state, stamp.after(Duration::from_millis(8)), &Stalls::default());
+        arm.feedback.read(&state, None, false, stamp.after(Duration::from_millis(8)), &Stalls::default());
         let time = arm.config.supervision.lag + 0.008 + DT;
         for (joint, velocity) in [(0, 0.4), (1, -0.2)] {
             let step = arm.step(joint, false, DT);

@@ -3,6 +3,7 @@
 
 use super::ArmControl;
 use crate::clock::Mono;
+use crate::control::rest::Relief;
 use crate::telemetry::{Cause, LedBy, Outcome, Phase};
 
 /// A joint that the arm's controller moves may have this much more than its velocity limit.
@@ -25,7 +26,8 @@ impl ArmControl {
         if outcome == Outcome::Accepted {
             self.command.mode = None;
             self.command.lead_seq = self.command.lead_seq.wrapping_add(1);
-            self.holds_written = false;
+            self.rest.forget_written();
+            self.command.rest = None;
             self.led_too_fast = (0, 0);
         }
         outcome
@@ -50,6 +52,10 @@ impl ArmControl {
     /// Orders another stop for an arm that is held and gets no setpoints: something may move it.
     pub fn stop_again(&mut self) {
         let held = self.failsafe.phase() == Phase::Held && !self.failsafe.cause().is_foreign();
+        // No relief after an operator's stop.
+        if held && self.rest.relief != Relief::None {
+            (self.rest.relief, self.command.mode) = (Relief::None, None);
+        }
         self.rest.stop_pending |= held && self.command.mode.is_none();
     }
 

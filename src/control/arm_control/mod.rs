@@ -15,23 +15,26 @@ mod rest;
 
 use std::time::Duration;
 
+use super::belief::feedback::Feedback;
+use super::belief::plausibility::Verdict;
+use super::belief::stalls::Stalls;
+use super::belief::tracking::{Tracking, furthest};
 use super::config::ArmConfig;
 use super::failsafe::{Failsafe, Freshness};
-use super::feedback::Feedback;
 use super::limit::{Bounds, Limiter, Refusal};
-use super::plausibility::Verdict;
-use super::stalls::Stalls;
+use super::rest::{Rest, Start};
 use super::task_body::Demand;
-use super::tracking::{Tracking, furthest};
-use super::written::Written;
-use crate::arm::{ArmCommand, ArmState, Link};
+use crate::arm::{ArmCommand, ArmState, Link, Topology};
 use crate::clock::Mono;
 use crate::joint::{ControlMode, Joints, MAX_DOF};
 use crate::telemetry::{Bound, Cause, LedBy, LimitKind, Outcome, Phase};
-use rest::Rest;
 
 /// A joint that moves this far while its arm is being enabled is moved by something else [rad].
 const ENABLING_TOLERANCE: f64 = 0.02;
+
+/// Part of the way that velocities have led to that measurements may correct, and the most at a time [rad].
+const DRIFT: f64 = 0.05;
+const MAX_CORRECTION: f64 = 0.05;
 
 /// One arm inside the tick.
 #[derive(Debug)]
@@ -49,18 +52,14 @@ pub struct ArmControl {
     /// The limit that changed the joint's command in the last tick.
     limited: Vec<Option<LimitKind>>,
     command: ArmCommand,
-    written: Written,
-    /// Whether the arm still holds the positions that were written last: it has been under power since.
-    holds_written: bool,
-    /// Measured positions when the arm was enabled [rad].
+    /// Measured positions when the setpoint of the last start was taken [rad], and when that was.
     enabled_at: Joints,
-    /// While the first setpoint after a start is not written: the number of its first command.
-    starting: Option<u64>,
-    /// While there is a gap in what is written: the number of the first command made from what had been written.
-    gap_since: Option<u64>,
-    /// The arm is on its way back to the last setpoint before a gap.
-    returning: bool,
+    started_at: Mono,
     rest: Rest,
+    /// Time of the last written setpoint before a gap that ended in this tick.
+    resumed: Option<Mono>,
+    /// Positions that velocities may still be corrected by measurements [rad].
+    correction: f64,
     /// Consecutive readings in which the arm's own controller moved a joint too fast, and the number of the last one.
     led_too_fast: (u8, u64),
 }
@@ -109,17 +108,15 @@ impl ArmControl {
             limited: vec![None; config.dof],
             feedback: Feedback::new(&config),
             tracking: Tracking::new(&config, period),
-            written: Written::new(period, config.write_period),
+            rest: Rest::new(&config, period),
             config,
             first,
             failsafe: Failsafe::default(),
             command: ArmCommand::default(),
-            holds_written: false,
             enabled_at: [0.0; MAX_DOF],
-            starting: None,
-            gap_since: None,
-            returning: false,
-            rest: Rest::default(),
+            started_at: Mono::ZERO,
+            resumed: None,
+            correction: 0.0,
             led_too_fast: (0, 0),
         }
     }
@@ -194,6 +191,24 @@ impl ArmControl {
         &self.command
     }
 
+    /// Returns whether a time without setpoints passes as if nothing had happened [s]: the arm's controller bridges it,
+    /// or nothing moves the arm.
+    pub fn bridges(&self, time: f64) -> bool {
+        self.command.mode.is_none() || self.rest.written.bridges(time)
+    }
+
+    /// Returns whether it can decelerate by commands.
+    pub fn can_brake(&self) -> bool {
+        let state = self.feedback.state();
+        let reached = state.enabled && state.link == Link::Up && self.rest.gap.is_none();
+        reached && self.command.mode.is_some() && !self.at_rest()
+    }
+
+    /// Returns how far a joint at rest may be from where it is commanded [rad].
+    pub fn rest_tolerance(&self) -> f64 {
+        self.config.supervision.accuracy + self.config.supervision.droop
+    }
+
     /// Returns whether no command moves the arm.
     pub fn at_rest(&self) -> bool {
         self.command.mode.is_none() || self.limiters.iter().all(Limiter::at_rest)
@@ -203,12 +218,24 @@ impl ArmControl {
     pub fn read(&mut self, state: &ArmState, now: Mono, stalls: &Stalls, dt: f64) -> bool {
         let before = (self.failsafe.phase(), self.failsafe.cause());
         let native = self.failsafe.led_by() == Some(LedBy::Controller);
-        let verdict = self.feedback.read(state, now, stalls);
-        self.take_written(now);
+        let commanded = self.command.mode.is_some() && !self.is_starting();
+        let range = if commanded { self.tracking.range(state) } else { None };
+        let driven =
+            commanded && self.rest.gap.is_none() && matches!(self.failsafe.phase(), Phase::Ready | Phase::Activating);
+        let verdict = self.feedback.read(state, range.as_ref(), driven, now, stalls);
+        self.take_written();
         self.failsafe.update(self.feedback.state(), self.feedback.freshness(), now);
-        if let Verdict::Jumped(joint, step) = verdict {
-            self.failsafe.hold(Cause::PositionJump(joint as u16, step), now);
+        if let Some(cause) = self.disbelief(verdict) {
+            self.failsafe.hold(cause, now);
         }
+        if self.failsafe.phase() == Phase::Activating || self.is_starting() {
+            self.take_anew(now);
+            if self.is_starting() {
+                self.failsafe.prolong_ramp(now);
+            }
+        }
+        self.check_gap(now);
+        self.compare(dt);
         if let Some(cause) = self.unexpected_motion(dt) {
             self.failsafe.hold(cause, now);
         }
@@ -217,20 +244,56 @@ impl ArmControl {
         before != (self.failsafe.phase(), self.failsafe.cause())
     }
 
+    /// Compares the latest positions with their setpoints, and corrects a little those that velocities have led to.
+    fn compare(&mut self, dt: f64) {
+        if self.is_starting() || self.command.mode.is_none() || self.rest.gap.is_some() {
+            return self.tracking.clear_errors();
+        }
+        self.tracking.compare(self.feedback.state(), &self.limiters);
+        if self.command.mode == Some(ControlMode::Velocity) && self.feedback.is_usable() {
+            let fastest = self.limiters.iter().fold(0.0, |most: f64, limiter| most.max(limiter.velocity().abs()));
+            self.correction = (self.correction + DRIFT * fastest * dt).min(MAX_CORRECTION);
+            let (mut used, most) = (0.0f64, self.correction);
+            for (j, limiter) in self.limiters.iter_mut().enumerate() {
+                let by = self.tracking.error(j).max(-most).min(most);
+                used = used.max(by.abs());
+                limiter.correct(by);
+            }
+            self.correction -= used;
+        }
+    }
+
+    /// Returns the cause for a hold if readings are confirmed to be false.
+    fn disbelief(&self, verdict: Verdict) -> Option<Cause> {
+        let seamed = |j: usize| self.config.supervision.topology.get(j) == Some(&Topology::Seamed);
+        match verdict {
+            Verdict::Same | Verdict::Accepted | Verdict::Rejected => None,
+            Verdict::Jumped(joint, step) => Some(Cause::PositionJump(joint as u16, step)),
+            Verdict::TurnLost(joint, _) if seamed(joint) => Some(Cause::SeamCrossed(joint as u16)),
+            Verdict::TurnLost(joint, step) => Some(Cause::TurnLost(joint as u16, step)),
+            Verdict::Inconsistent(joint, by) => Some(Cause::ReadingInconsistent(joint as u16, by)),
+        }
+    }
+
+    /// Returns the joint that is furthest from where it was when the arm was enabled, and how far [rad].
+    fn furthest_from_enabling(&self) -> (u16, f64) {
+        let moved = self.feedback.state().position.iter().zip(&self.enabled_at).take(self.config.dof);
+        furthest(moved.map(|(q, before)| q - before)).unwrap_or_default()
+    }
+
     /// Returns the cause for a hold if the arm moves without a command.
     fn unexpected_motion(&mut self, dt: f64) -> Option<Cause> {
         let state = self.feedback.state();
         let supervised = self.feedback.is_usable() && self.command.mode == Some(state.mode);
         match self.failsafe.phase() {
             Phase::Activating => {
-                let limit = ENABLING_TOLERANCE.max(2.0 * self.config.supervision.accuracy);
-                let moved = state.position.iter().zip(&self.enabled_at).take(self.config.dof);
-                let (joint, by) = furthest(moved.map(|(q, before)| q - before))?;
+                let s = &self.config.supervision;
+                let limit = ENABLING_TOLERANCE.max(2.0 * s.accuracy).max(s.accuracy + s.droop);
+                let (joint, by) = self.furthest_from_enabling();
                 (by.abs() > limit).then_some(Cause::MovedWhileActivating(joint, by))
             }
-            Phase::Ready if supervised => {
-                let velocity = self.command.mode == Some(ControlMode::Velocity);
-                self.tracking.supervise(velocity, state, dt)
+            Phase::Ready if supervised && self.rest.gap.is_none() && !self.is_starting() => {
+                self.tracking.supervise(state, dt)
             }
             Phase::Led => {
                 self.tracking.pause();
@@ -245,7 +308,15 @@ impl ArmControl {
 
     /// Clears the latched hold, unless its cause persists. `arm`: the arm's index, for the outcome.
     pub fn reset(&mut self, arm: u16, now: Mono) -> Outcome {
-        self.failsafe.reset(arm, self.feedback.state(), self.feedback.freshness(), now)
+        let cause = self.failsafe.cause();
+        let outcome = self.failsafe.reset(arm, self.feedback.state(), self.feedback.freshness(), now);
+        if outcome == Outcome::Accepted {
+            self.rest.acknowledged |= matches!(cause, Cause::StartMismatch(..));
+            if !matches!(cause, Cause::TurnLost(..)) {
+                self.feedback.acknowledge();
+            }
+        }
+        outcome
     }
 
     /// The arm was enabled: starts to hold it. An arm that still decelerates continues to do so. `arm`: the arm's
@@ -255,7 +326,8 @@ impl ArmControl {
         let outcome = self.failsafe.on_enabled(arm, self.feedback.state(), self.feedback.freshness(), now);
         let begins = outcome == Outcome::Accepted && !matches!(before, Phase::Activating | Phase::Ready);
         if begins && self.command.mode.is_none() {
-            self.start();
+            let velocity = self.config.modes.first().copied().unwrap_or_default();
+            self.start(self.config.position_mode().unwrap_or(velocity), now);
             self.enabled_at = self.feedback.state().position;
             self.rest.stop_pending = false;
         }
@@ -288,8 +360,7 @@ impl ArmControl {
         self.command.led = phase == Phase::Led;
         // An arm that another program controls gets neither a setpoint nor a stop.
         let foreign = held && self.failsafe.cause().is_foreign();
-        self.rest.enter(held, foreign);
-        self.check_gap(now);
+        self.rest.enter(held, self.failsafe.cause(), !self.at_rest(), foreign);
         self.before.copy_from_slice(&self.limiters);
         match phase {
             Phase::Unknown | Phase::Disabled => {
@@ -298,8 +369,11 @@ impl ArmControl {
             }
             _ if !self.feedback.state().enabled || foreign => {
                 self.command.mode = None;
-                if foreign && self.rest.stop_pending {
-                    self.stop();
+                if foreign {
+                    self.rest.forget_written();
+                    if self.rest.stop_pending {
+                        self.stop();
+                    }
                 }
                 Routed::NotReady
             }
@@ -310,19 +384,18 @@ impl ArmControl {
                 }
                 Routed::NotReady
             }
-            Phase::Held | Phase::Standby => {
-                self.come_to_rest(now, dt);
-                Routed::NotReady
-            }
+            Phase::Held | Phase::Standby => self.come_to_rest(demand, ask, now, dt),
             Phase::Activating => {
-                self.follow(Demand::Nothing, ask, dt, report);
+                if !matches!(self.rest.start, Start::Taking(..)) {
+                    self.follow(Demand::Nothing, ask, dt, now, report);
+                }
                 Routed::NotReady
             }
             Phase::Led => {
                 self.follow_measured();
                 Routed::NotReady
             }
-            Phase::Ready => self.follow(demand, ask, dt, report),
+            Phase::Ready => self.follow(demand, ask, dt, now, report),
         }
     }
 

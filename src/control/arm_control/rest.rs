@@ -1,112 +1,117 @@
-//! How an arm stops: it decelerates by commands, settles at the last of them, and then gets a stop from its
-//! own controller.
+//! How a held arm stops: it decelerates by commands, along the path of its motion where it has one, settles at the last
+//! of them, and gets a stop from its own controller; at once if it was at rest.
 
-use super::ArmControl;
+use super::{ArmControl, JointRequest, Routed};
 use crate::clock::Mono;
 use crate::control::limit::Limiter;
+use crate::control::rest::anew::AGREEMENT;
+use crate::control::rest::{Relief, SETTLED, SETTLING_TIME, braking};
+use crate::control::task_body::Demand;
 use crate::joint::{ControlMode, TICK_STANDSTILL};
-use crate::telemetry::Cause;
-
-/// Maximum time for a lagging arm to settle at its last command before it is stopped [s].
-const SETTLING_TIME: f64 = 0.5;
-/// The setpoint of a held, stationary joint is drawn to the joint when it is further away than this plus the joint's
-/// accuracy [rad].
-const DRAW_TOLERANCE: f64 = 0.04;
-/// Maximum time for that, within the joint's velocity limit [s].
-const DRAW_TIME: f64 = 0.1;
-
-/// State of an arm on its way to rest.
-#[derive(Debug)]
-pub(super) struct Rest {
-    /// Whether the arm's controller must still be ordered to stop, once the arm is at rest.
-    pub stop_pending: bool,
-    was_held: bool,
-    /// Time left to draw setpoints to the measured positions [s].
-    drawing: f64,
-    /// How long the commands have been at rest [s].
-    settling: f64,
-}
-
-impl Default for Rest {
-    fn default() -> Self {
-        Self { stop_pending: false, was_held: false, drawing: DRAW_TIME, settling: 0.0 }
-    }
-}
-
-impl Rest {
-    /// Takes this tick's phase: a new hold needs a stop. `foreign`: another program controls the arm.
-    pub fn enter(&mut self, held: bool, foreign: bool) {
-        self.stop_pending |= held && !self.was_held && !foreign;
-        self.was_held = held;
-    }
-
-    /// The arm starts to follow new commands.
-    pub fn start(&mut self) {
-        self.drawing = DRAW_TIME;
-    }
-}
+use crate::telemetry::{Cause, Phase};
 
 impl ArmControl {
-    /// Decelerates by commands; once at rest, orders a stop and commands nothing more.
-    pub(super) fn come_to_rest(&mut self, now: Mono, dt: f64) {
+    /// Decelerates by commands; once at rest, orders a stop and commands nothing more. `ask`: the requests of a motion
+    /// that decelerates along its path.
+    pub(super) fn come_to_rest(
+        &mut self,
+        demand: Demand,
+        ask: impl Fn(usize) -> Option<JointRequest>,
+        now: Mono,
+        dt: f64,
+    ) -> Routed {
+        if let Relief::Moving(relief) = self.rest.relief {
+            return self.relieve(relief, dt, now);
+        }
         if let Some(mode) = self.command.mode {
-            // Without a connection, an arm in velocity mode keeps its last velocity until it is stopped. After a short
-            // gap the deceleration continues.
-            let silent = now.since(self.written.last().at) > self.config.supervision.stale_after;
-            let stuck = self.gap_since.is_some() && silent && mode == ControlMode::Velocity;
-            let drawn = mode.is_position() && self.draw(dt);
-            if drawn || !(stuck || self.settled(dt)) {
-                return self.hold(mode, dt);
+            let silent = now.since(self.rest.written.last().at) > self.config.supervision.stale_after;
+            // Without a connection, an arm in velocity mode keeps its last velocity until it is stopped.
+            let stuck = self.rest.gap.is_some() && (silent || mode.is_position());
+            if !stuck {
+                if demand != Demand::Nothing && self.limiters.iter().any(|limiter| !limiter.at_rest()) {
+                    let routed = self.follow(demand, ask, dt, now, |_, _, _| {});
+                    if routed == Routed::Sent {
+                        return routed;
+                    }
+                }
+                if !self.limiters.iter().all(Limiter::at_rest) || (self.rest.moved && !self.settled(dt)) {
+                    self.hold(mode, dt);
+                    return Routed::NotReady;
+                }
             }
             self.command.mode = None;
             self.rest.stop_pending = true;
         }
         if self.rest.stop_pending {
             self.stop();
+        } else if self.rest.relief == Relief::Due {
+            self.begin_relief(now);
         }
-    }
-
-    /// Draws the setpoints of stationary joints that are too far from them to where the joints are. Returns whether
-    /// there are any.
-    fn draw(&mut self, dt: f64) -> bool {
-        let tolerance = DRAW_TOLERANCE + self.config.supervision.accuracy;
-        let mut drawn = false;
-        // A position that jumped may be wrong: no setpoint is made from it before a reset.
-        if matches!(self.failsafe.cause(), Cause::PositionJump(..)) || self.feedback.is_rejected() {
-            return false;
-        }
-        self.rest.drawing = (self.rest.drawing - dt).max(dt);
-        let (state, fresh) = (self.feedback.state(), self.feedback.freshness().fresh);
-        for (j, limiter) in self.limiters.iter_mut().enumerate().take(self.config.dof) {
-            // The setpoint of a joint that still moves decelerates like any other.
-            let stationary = state.velocity.get(j).is_none_or(|v| v.abs() <= TICK_STANDSTILL);
-            let off = stationary && self.tracking.error(j).abs() > tolerance;
-            if off && fresh && self.gap_since.is_none() {
-                let q = state.position.get(j).copied().unwrap_or_default();
-                let step = (q - limiter.position()).abs() * dt / self.rest.drawing;
-                limiter.draw(q, step.min(limiter.bounds().velocity * dt));
-                drawn = true;
-            }
-        }
-        drawn
+        Routed::NotReady
     }
 
     /// Orders a stop from the arm's controller.
     pub(super) fn stop(&mut self) {
         self.rest.stop_pending = false;
-        self.rest.settling = 0.0;
         self.command.stop_seq = self.command.stop_seq.wrapping_add(1);
+    }
+
+    /// Takes the setpoints back towards blocked joints, if the readings are trusted.
+    fn begin_relief(&mut self, now: Mono) {
+        let supervision = &self.config.supervision;
+        let Some(mode) = self.config.position_mode().filter(|_| supervision.relief > 0.0) else {
+            self.rest.relief = Relief::None;
+            return;
+        };
+        if self.failsafe.phase() != Phase::Held || !self.rest.holds_written || self.feedback.state().mode != mode {
+            self.rest.relief = Relief::None;
+            return;
+        }
+        if !self.feedback.is_usable() || self.feedback.rest_time() < AGREEMENT {
+            return;
+        }
+        let read = self.feedback.state().position;
+        self.rest.relief = Relief::None;
+        if let Some(relief) = crate::control::rest::Move::towards(&read, &self.limiters, supervision) {
+            (self.rest.relief, self.rest.still) = (Relief::Moving(relief), 0.0);
+            self.command.mode = Some(mode);
+            self.relieve(relief, 0.0, now);
+        }
+    }
+
+    /// Moves the setpoints of a relief; then judges the readings, and stops the arm again.
+    fn relieve(&mut self, relief: crate::control::rest::Move, dt: f64, now: Mono) -> Routed {
+        let usable = self.feedback.is_usable() && self.rest.gap.is_none();
+        let arrived = dt > 0.0 && usable && relief.advance(&mut self.limiters, dt);
+        for (limiter, out) in self.limiters.iter().zip(self.command.values.iter_mut()) {
+            *out = limiter.position();
+        }
+        self.rest.still = if arrived { self.rest.still + dt } else { 0.0 };
+        let judged = arrived && self.rest.still > self.config.supervision.lag + SETTLED.as_secs_f64();
+        if usable && !judged {
+            return Routed::NotReady;
+        }
+        if let Some((joint, by)) =
+            relief.followed_by(&self.feedback.state().position, self.config.dof).filter(|_| judged)
+        {
+            self.failsafe.replace_cause(Cause::ReadingFollows(joint as u16, by), now);
+        }
+        if !usable {
+            // The setpoints stay where they are.
+            self.limiters.iter_mut().for_each(|limiter| limiter.relieve(limiter.position(), 0.0));
+        }
+        self.rest.relief = Relief::None;
+        (self.command.mode, self.rest.stop_pending) = (None, true);
+        Routed::NotReady
     }
 
     /// Returns whether the arm has reached its last command. If it were stopped before, it would hold short of that
     /// command, and move by the difference at its next start.
     fn settled(&mut self, dt: f64) -> bool {
-        if !self.at_rest() {
-            self.rest.settling = 0.0;
-            return false;
-        }
-        self.rest.settling += dt;
-        self.at_standstill() || !self.feedback.freshness().fresh || self.rest.settling > SETTLING_TIME
+        self.rest.still += dt;
+        let lagged = self.rest.still > self.config.supervision.lag;
+        let rests = self.feedback.rest_time() >= SETTLED && lagged;
+        rests || !self.feedback.freshness().fresh || self.rest.still > SETTLING_TIME
     }
 
     /// Returns whether the measured velocities and the commands are at rest.
@@ -118,12 +123,14 @@ impl ArmControl {
 
     /// Commands the next step of the deceleration to rest, then the same values again.
     pub(super) fn hold(&mut self, mode: ControlMode, dt: f64) {
-        let joints = self.limiters.iter_mut().zip(&self.feedback.state().position).zip(self.command.values.iter_mut());
-        for ((limiter, q), out) in joints {
-            *out = match mode {
-                ControlMode::Velocity => limiter.hold_velocity(*q, dt),
-                _ => limiter.hold_position(dt),
-            };
+        let decreases = braking::decreases(&self.limiters, dt);
+        let joints = self.limiters.iter_mut().zip(decreases).zip(self.command.values.iter_mut());
+        for ((limiter, decrease), out) in joints {
+            limiter.decelerate(decrease, dt);
+            *out = if mode == ControlMode::Velocity { limiter.velocity() } else { limiter.position() };
+        }
+        if !self.limiters.iter().all(Limiter::at_rest) {
+            self.rest.still = 0.0;
         }
     }
 }

@@ -10,12 +10,12 @@ use std::time::Duration;
 
 use super::arbitrate::Arbiter;
 use super::arm_control::{ArmControl, JointRequest, Routed};
+use super::belief::stalls::Stalls;
 use super::config::CoordinatorConfig;
 use super::guard::Guard;
 use super::limit::Refusal;
 use super::request::Envelope;
 use super::speed_override::SpeedOverride;
-use super::stalls::Stalls;
 use super::task::{Task, Tick};
 use super::task_body::JointView;
 use super::task_leader::gripper_target;
@@ -40,6 +40,8 @@ pub struct Coordinator {
     period: f64,
     /// [ns]
     period_ns: u64,
+    /// Time that this tick covers [s]: also skipped periods that the arms' controllers bridge.
+    step: f64,
     arms: Vec<ArmControl>,
     tasks: Vec<Task>,
     arbiter: Arbiter,
@@ -70,6 +72,7 @@ impl Coordinator {
         let priorities: Vec<i32> = tasks.iter().map(|t| t.priority).collect();
         Self {
             period: 1.0 / config.rate,
+            step: 1.0 / config.rate,
             period_ns: Duration::from_secs_f64(1.0 / config.rate).as_nanos().max(1) as u64,
             arbiter: Arbiter::new(&priorities, arm_of.clone(), arms.len()),
             joints: vec![JointView::default(); arm_of.len()],
@@ -109,6 +112,7 @@ impl Coordinator {
         self.output.retired.clear();
         let late = Duration::from_nanos(time.woke_late_ns);
         self.stalls.note(time.now.after(Duration::from_nanos(time.woke_late_ns % self.period_ns)), late);
+        self.step = self.time_covered(time);
         self.read(time, states);
         self.account_for_lost_time(time);
         for _ in 0..REQUESTS_PER_TICK {
@@ -127,14 +131,22 @@ impl Coordinator {
         &mut self.output
     }
 
+    /// Returns the time that this tick covers [s]. What the controllers of all arms bridge passes as if nothing had
+    /// happened: motions go on where they would be.
+    fn time_covered(&self, time: TickTime) -> f64 {
+        let covered = self.period * f64::from(time.skipped + 1);
+        if self.arms.iter().all(|arm| arm.bridges(covered)) { covered } else { self.period }
+    }
+
     fn read(&mut self, time: TickTime, states: &[ArmState]) {
         for (i, arm) in self.arms.iter_mut().enumerate() {
             let Some(state) = states.get(i) else { continue };
-            if arm.read(state, time.now, &self.stalls, self.period) {
+            if arm.read(state, time.now, &self.stalls, self.step) {
                 let (phase, cause) = (arm.failsafe.phase(), arm.failsafe.cause());
                 self.output.report(Event::Arm(i as u16, phase, cause));
             }
             let fault = arm.not_to_follow();
+            let droop = if arm.config().supervision.droop > 0.0 { arm.rest_tolerance() } else { 0.0 };
             let views = self.joints.iter_mut().skip(arm.first()).zip(arm.limiters());
             for (j, (view, limiter)) in views.enumerate() {
                 *view = JointView {
@@ -148,6 +160,7 @@ impl Coordinator {
                     velocity_limit: limiter.bounds().velocity,
                     jerk: arm.config().limits.jerk_max.get(j).copied().unwrap_or(crate::joint::DEFAULT_JERK),
                     tracking_error: arm.tracking_error(j),
+                    droop,
                     arm: i as u16,
                     stamp: arm.state().stamp,
                     fault,
@@ -155,6 +168,26 @@ impl Coordinator {
             }
         }
         self.end_tasks_of_held_arms();
+        self.resume_after_gaps(time.now);
+    }
+
+    /// Tasks of arms whose gap has ended continue from where the arms rest.
+    fn resume_after_gaps(&mut self, now: Mono) {
+        for i in 0..self.arms.len() {
+            let Some((arm, at)) = self.arms.get(i).and_then(|arm| Some((arm, arm.resumed()?))) else { continue };
+            let (joints, tolerance) = (arm.first()..arm.first() + arm.config().dof, arm.rest_tolerance());
+            let tick = Tick { now, dt: self.step, speed: self.speed, views: &self.joints };
+            for t in 0..self.tasks.len() {
+                let Some(task) = self.tasks.get_mut(t).filter(|task| task.is_active()) else { continue };
+                if !task.moving_joints().iter().any(|joint| joints.contains(&usize::from(*joint))) {
+                    continue;
+                }
+                if let Err((joint, by)) = task.rejoin(&tick, at, tolerance) {
+                    self.end_task(t, TaskState::Aborted, Reason::Gap(joint, by));
+                    break;
+                }
+            }
+        }
     }
 
     fn account_for_lost_time(&mut self, time: TickTime) {
@@ -208,7 +241,9 @@ impl Coordinator {
 
     fn end_task(&mut self, task: usize, state: TaskState, reason: Reason) {
         if let Some(t) = self.tasks.get_mut(task) {
-            let motion = t.end(state, reason);
+            let braking = matches!(reason, Reason::ArmHeld(arm, cause)
+                if !cause.is_foreign() && self.arms.get(usize::from(arm)).is_some_and(ArmControl::can_brake));
+            let motion = if braking { t.brake(state, reason) } else { t.end(state, reason) };
             self.output.retired.extend(motion);
             self.output.report(Event::Task(task as u16, state, reason));
         }
@@ -239,8 +274,8 @@ impl Coordinator {
     }
 
     fn compute(&mut self, now: Mono) {
-        self.speed.advance(self.period);
-        let tick = Tick { now, dt: self.period, speed: self.speed, views: &self.joints };
+        self.speed.advance(self.step);
+        let tick = Tick { now, dt: self.step, speed: self.speed, views: &self.joints };
         for (t, task) in self.tasks.iter_mut().enumerate() {
             let before = (task.state, task.reason);
             let motion = task.compute(&tick);
@@ -287,7 +322,7 @@ impl Coordinator {
                     let speed = if scales { pace } else { 1.0 };
                     Some(JointRequest { value, new_task: arbiter.winner_changed(first + j), speed })
                 },
-                self.period,
+                self.step,
                 time.now,
                 time.next,
                 |j, kind, asked| output.report(Event::Limited((first + j) as u16, kind, asked)),
@@ -314,7 +349,8 @@ impl Coordinator {
             }
         }
         self.guard();
-        self.arms.iter_mut().for_each(|arm| arm.issue(time.now));
+        let dt = self.period;
+        self.arms.iter_mut().for_each(|arm| arm.issue(time.now, dt));
     }
 
     /// Ends the task whose request was refused with a fault, and holds the arm.

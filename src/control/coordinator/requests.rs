@@ -187,7 +187,7 @@ impl Coordinator {
             Target::Trajectory(motion) => &motion.joints,
             _ => &t.joints,
         })?;
-        let tick = Tick { now, dt: self.period, speed: self.speed, views: &self.joints };
+        let tick = Tick { now, dt: self.step, speed: self.speed, views: &self.joints };
         let t = self.tasks.get_mut(task as usize).ok_or(Outcome::WrongTask(task))?;
         if t.accept(&tick, target)? {
             self.output.report(Event::Task(task, TaskState::Executing, Reason::None));

@@ -7,7 +7,7 @@ use crate::arm::{ArmCommand, ArmState, Supervision};
 use crate::clock::Mono;
 use crate::joint::{ControlMode, JointLimits, Joints};
 
-/// Maximum time that one step may cover, in periods.
+/// Maximum time that one step may cover where the arm's controller bridges less, in periods.
 const PERIODS: u32 = 2;
 /// Tolerance for rounding, relative to a step and absolute [rad, rad/s].
 const ROUNDING: (f64, f64) = (1e-6, 1e-6);
@@ -69,6 +69,11 @@ impl WireGuard {
         self.last = Some(Last { mode, values: command.values, at: command.at, start_seq: command.start_seq });
     }
 
+    /// Returns whether a command continues the last setpoint, rather than to begin a start.
+    pub fn continues(&self, command: &ArmCommand, mode: ControlMode) -> bool {
+        self.last.is_some_and(|last| last.start_seq == command.start_seq && last.mode == mode)
+    }
+
     /// Returns whether a command may be written. `state` is the newest reading, `age` its age, `read_period` the period
     /// of reads.
     pub fn admits(
@@ -81,7 +86,8 @@ impl WireGuard {
     ) -> bool {
         match self.last.filter(|last| last.start_seq == command.start_seq && last.mode == mode) {
             Some(last) => {
-                let time = command.at.since(last.at).clamp(Duration::ZERO, PERIODS * self.period).as_secs_f64();
+                let most = (PERIODS * self.period).max(self.supervision.gap_tolerance);
+                let time = command.at.since(last.at).clamp(Duration::ZERO, most).as_secs_f64();
                 let limits = if mode == ControlMode::Velocity { &self.acceleration } else { &self.velocity };
                 self.within(&command.values, &last.values, |j| {
                     limits.get(j).copied().unwrap_or_default() * time * (1.0 + ROUNDING.0) + ROUNDING.1
@@ -98,8 +104,8 @@ impl WireGuard {
         }
     }
 
-    /// Returns whether the first setpoint is at the measured position, or repeats the last setpoint while the arm is
-    /// still there.
+    /// Returns whether the first setpoint is at the measured position or at what the arm's controller commands itself,
+    /// or repeats the last setpoint while the arm is still there.
     fn starts_at(&self, command: &ArmCommand, state: &ArmState) -> bool {
         // Slightly more than the tick allows, which used an earlier reading.
         let seed = self.supervision.seed_tolerance().max(2.0 * self.supervision.accuracy);
@@ -107,7 +113,11 @@ impl WireGuard {
         (0..self.dof).all(|j| {
             let (Some(value), Some(q)) = (command.values.get(j), state.position.get(j)) else { return false };
             let repeats = last.is_some_and(|last| last.values.get(j) == Some(value));
-            (value - q).abs() <= if repeats { 2.0 * self.supervision.accuracy + seed } else { seed }
+            let own = state.commanded.as_ref().and_then(|own| own.position.get(j));
+            let droop = 2.0 * self.supervision.accuracy + self.supervision.droop;
+            let commanded = own.is_some_and(|own| (value - own).abs() <= seed)
+                && (value - q).abs() <= self.supervision.tracking_tolerance;
+            commanded || (value - q).abs() <= if repeats { droop + seed } else { seed }
         })
     }
 

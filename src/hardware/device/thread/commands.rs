@@ -61,6 +61,12 @@ impl Worker {
             Ok(()) => self.write_errors = 0,
             // Not sent, but not a failure: the tick sees that it was not written.
             Err(AdapterError::Busy) => self.resend = true,
+            // The arm can be reached: the tick stops it.
+            Err(error @ AdapterError::Rejected(_)) => {
+                self.state.refused = command.seq;
+                self.health.write_errors.fetch_add(1, Relaxed);
+                self.trouble(&format!("a setpoint was refused: {error}"));
+            }
             Err(error) => {
                 if matches!(error, AdapterError::Timeout(_)) {
                     self.in_flight += 1;
@@ -96,6 +102,9 @@ impl Worker {
         let age = self.config.clock.now().since(self.state.stamp);
         if !self.guard.admits(command, mode, &self.state, age, self.config.read_period()) {
             self.health.withheld.fetch_add(1, Relaxed);
+            if self.guard.continues(command, mode) {
+                self.state.refused = command.seq;
+            }
             return Ok(());
         }
         let written = match mode {

@@ -3,13 +3,16 @@
 
 use std::time::Duration;
 
-use super::config::ArmConfig;
+use super::agreement::Agreement;
 use super::estimate::VelocityEstimator;
-use super::failsafe::Freshness;
 use super::plausibility::{JUMP_AFTER, Plausibility, Verdict};
+use super::setpoints::Range;
 use super::stalls::Stalls;
+use super::stillness::Stillness;
 use crate::arm::{ArmState, Link, VelocitySource};
 use crate::clock::Mono;
+use crate::control::config::ArmConfig;
+use crate::control::failsafe::Freshness;
 use crate::joint::Joints;
 use crate::telemetry::Age;
 
@@ -28,6 +31,10 @@ pub struct Feedback {
     /// The latest reading, while its positions are rejected.
     rejected: Option<ArmState>,
     plausibility: Plausibility,
+    agreement: Agreement,
+    /// Whether position and velocity contradicted each other since the last reset.
+    contradicted: bool,
+    stillness: Stillness,
     estimator: VelocityEstimator,
     freshness: Freshness,
 }
@@ -37,14 +44,18 @@ impl Feedback {
     pub fn new(config: &ArmConfig) -> Self {
         let l = &config.limits;
         let own = if config.own_velocity.len() == config.dof { &config.own_velocity } else { &l.velocity_max };
-        let read = config.read_period.max(Duration::from_micros(100));
+        let read = config.read_period.max(Duration::from_micros(100)).as_secs_f64();
+        let supervision = &config.supervision;
         Self {
             dof: config.dof,
             read_period: config.read_period,
-            max_age: config.supervision.stale_after.max(3 * config.read_period),
+            max_age: supervision.stale_after.max(3 * config.read_period),
             state: ArmState::default(),
             rejected: None,
-            plausibility: Plausibility::new(own, &l.position_lower, &l.position_upper, read.as_secs_f64()),
+            plausibility: Plausibility::new(own, &l.position_lower, &l.position_upper, supervision.topology, read),
+            agreement: Agreement::new(own),
+            contradicted: false,
+            stillness: Stillness::new(config.dof, supervision.accuracy),
             estimator: VelocityEstimator::default(),
             freshness: Freshness::default(),
         }
@@ -67,7 +78,25 @@ impl Feedback {
 
     /// Returns whether the state is fresh and plausible.
     pub fn is_usable(&self) -> bool {
-        self.freshness.fresh && !self.is_rejected()
+        self.freshness.fresh && !self.is_rejected() && !self.contradicted
+    }
+
+    /// Returns how long all joints have been read at rest, by positions and velocities.
+    pub fn rest_time(&self) -> Duration {
+        self.stillness.time()
+    }
+
+    /// Returns whether this difference from where a joint was commanded is that of a lost turn count [rad].
+    pub fn is_turn(&self, joint: usize, difference: f64) -> bool {
+        self.plausibility.is_turn(joint, difference)
+    }
+
+    /// An operator has seen what was rejected: the next reading counts.
+    pub fn acknowledge(&mut self) {
+        self.plausibility.acknowledge();
+        self.agreement.reset();
+        self.stillness.reset();
+        self.contradicted = false;
     }
 
     /// Returns the state as it was read, with rejected positions and estimated velocities: for the log.
@@ -80,18 +109,45 @@ impl Feedback {
         }
     }
 
-    /// Takes the latest reading. `stalls`: when the tick could not run.
-    pub fn read(&mut self, state: &ArmState, now: Mono, stalls: &Stalls) -> Verdict {
-        let verdict = self.accept(state);
+    /// Takes the latest reading. `range`: the setpoints that the arm may be following. `driven`: they are all that
+    /// moves it, so position and velocity must agree. `stalls`: when the tick could not run.
+    pub fn read(
+        &mut self,
+        state: &ArmState,
+        range: Option<&Range>,
+        driven: bool,
+        now: Mono,
+        stalls: &Stalls,
+    ) -> Verdict {
+        let mut verdict = self.accept(state, range);
         self.estimator.fill(&mut self.state);
+        match verdict {
+            Verdict::Same => {}
+            Verdict::Accepted => {
+                self.stillness.take(&self.state);
+                let contradiction = self.agreement.take(&self.state).filter(|_| driven);
+                if let Some((joint, by)) = contradiction {
+                    self.contradicted = true;
+                    verdict = Verdict::Inconsistent(joint, by);
+                }
+            }
+            _ => {
+                self.stillness.reset();
+                self.agreement.reset();
+            }
+        }
         self.freshness = self.age(now, stalls);
         verdict
     }
 
-    fn accept(&mut self, state: &ArmState) -> Verdict {
-        // Positions that are not numbers are no measurement.
-        let verdict = if self.is_finite(&state.position) { self.plausibility.take(state) } else { Verdict::Rejected };
-        if verdict == Verdict::Rejected || (verdict == Verdict::Same && self.is_rejected()) {
+    fn accept(&mut self, state: &ArmState, range: Option<&Range>) -> Verdict {
+        if matches!(state.link, Link::Down | Link::Faulted) && !state.enabled {
+            // A new connection may find the arm anywhere.
+            self.plausibility.acknowledge();
+        }
+        let verdict = self.plausibility.take(state, range);
+        let refused = !matches!(verdict, Verdict::Accepted | Verdict::Same);
+        if refused || (verdict == Verdict::Same && self.is_rejected()) {
             // The last accepted measurement stays, and ages.
             self.rejected = Some(*state);
             let before = std::mem::replace(&mut self.state, *state);
@@ -117,7 +173,8 @@ impl Feedback {
         // An arm whose readings are rejected still answers: its age counts from the latest of them until it had the
         // time to confirm a jump.
         let confirmation = JUMP_AFTER * self.read_period.max(Duration::from_millis(1));
-        let waits = self.is_rejected() && now.since(self.plausibility.stamp()) <= self.max_age + confirmation;
+        let finite = self.rejected.as_ref().is_some_and(|read| self.is_finite(&read.position));
+        let waits = finite && now.since(self.plausibility.stamp()) <= self.max_age + confirmation;
         let stamp = self.rejected.as_ref().filter(|_| waits).map_or(self.state.stamp, |read| read.stamp);
         let age = now.since(stamp);
         let device = Duration::from_nanos(self.state.own_delay_ns);

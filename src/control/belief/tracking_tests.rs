@@ -29,7 +29,7 @@ fn state(ms: u64, q: f64, v: f64) -> ArmState {
 /// How long this error lasts until the arm is held [ticks]. Half of the time that is allowed is one tick, exactly.
 fn ticks_until_held(velocity: bool, state: &ArmState, tracking: &mut Tracking) -> Option<usize> {
     let dt = if velocity { MAX_TIME.1 / 2.0 } else { MAX_TIME.0 / 2.0 };
-    (1..=9).find(|_| tracking.supervise(velocity, state, dt).is_some())
+    (1..=9).find(|_| tracking.supervise(state, dt).is_some())
 }
 
 #[test]
@@ -37,7 +37,7 @@ fn an_error_is_the_distance_from_the_setpoints_of_the_last_lag() {
     let mut t = tracking();
     assert!(t.range(&state(0, 0.0, 0.0)).is_none());
     for k in 0..=20 {
-        t.push(at(10 * k), &joints_of(&[0.01 * k as f64; 2]));
+        t.push(at(10 * k), &joints_of(&[0.01 * k as f64; 2]), None);
     }
     // The setpoints of the last 50 ms go from 0.15 to 0.20 rad; the start of the range is exact to a 16th of it.
     t.compare(&state(200, 0.16, 0.0), &limiters(0.2));
@@ -58,7 +58,7 @@ fn an_error_is_the_distance_from_the_setpoints_of_the_last_lag() {
 #[test]
 fn the_setpoint_is_near_on_the_same_side_of_zero_only() {
     let mut t = tracking();
-    t.push(at(0), &joints_of(&[-0.2, -0.2]));
+    t.push(at(0), &joints_of(&[-0.2, -0.2]), None);
     t.compare(&state(10, 0.2, 0.0), &limiters(-0.2));
     assert!((t.error(0) - 0.4).abs() < 1e-12, "{}", t.error(0));
 }
@@ -66,22 +66,22 @@ fn the_setpoint_is_near_on_the_same_side_of_zero_only() {
 #[test]
 fn an_error_above_its_tolerance_holds_after_a_tenth_of_a_second() {
     let mut t = tracking();
-    t.push(at(0), &joints_of(&[0.0; 2]));
+    t.push(at(0), &joints_of(&[0.0; 2]), None);
     let away = state(10, 0.16, 0.0);
     t.compare(&away, &limiters(0.0));
     assert_eq!(ticks_until_held(false, &away, &mut t), Some(3), "two ticks are allowed");
-    let Some(Cause::Tracking(_, by)) = t.supervise(false, &away, DT) else { panic!("no longer held") };
+    let Some(Cause::Tracking(_, by)) = t.supervise(&away, DT) else { panic!("no longer held") };
     assert!((by - 0.16).abs() < 1e-12);
 
     let mut t = tracking();
-    t.push(at(0), &joints_of(&[0.0; 2]));
+    t.push(at(0), &joints_of(&[0.0; 2]), None);
     t.compare(&state(10, 0.14, 0.0), &limiters(0.0));
     assert_eq!(ticks_until_held(false, &away, &mut t), None, "within the tolerance of 0.15 rad");
 
     // After a moment without supervision the time begins again.
     t.compare(&away, &limiters(0.0));
     for _ in 0..3 {
-        assert!((0..9).all(|_| t.supervise(false, &away, DT).is_none()));
+        assert!((0..9).all(|_| t.supervise(&away, DT).is_none()));
         t.pause();
     }
     assert_eq!(ticks_until_held(false, &away, &mut t), Some(3));
@@ -91,7 +91,7 @@ fn an_error_above_its_tolerance_holds_after_a_tenth_of_a_second() {
 fn velocities_may_differ_for_longer_and_by_more_at_speed() {
     let held_at = |setpoint: f64, measured: f64| {
         let mut t = tracking();
-        t.push(at(0), &joints_of(&[setpoint; 2]));
+        t.push(at(0), &joints_of(&[0.0; 2]), Some(&joints_of(&[setpoint; 2])));
         ticks_until_held(true, &state(10, 0.0, measured), &mut t)
     };
     assert_eq!(held_at(0.0, 0.19), None);
@@ -99,28 +99,4 @@ fn velocities_may_differ_for_longer_and_by_more_at_speed() {
     assert_eq!(held_at(1.0, 1.24), None, "a fifth of the velocity");
     assert_eq!(held_at(1.0, 1.26), Some(3));
     assert_eq!(ticks_until_held(true, &state(10, 0.0, 9.0), &mut tracking()), None, "nothing to compare with");
-}
-
-#[test]
-fn an_arm_at_speed_may_be_beyond_its_last_setpoint_until_it_is_back() {
-    let mut t = tracking();
-    t.push(at(0), &joints_of(&[0.0; 2]));
-    let mut moving = limiters(0.0);
-    moving.iter_mut().for_each(|limiter| limiter.rewind(0.0, 0.8));
-    // It brakes from 0.8 rad/s with 4 rad/s²: 0.2 s and 0.08 rad, and 0.6 s with the way back and its lag.
-    t.begin_to_coast(at(10), &moving);
-    t.compare(&state(100, 0.08, 0.0), &limiters(0.0));
-    assert_eq!(t.error(0), 0.0);
-    t.compare(&state(100, 0.13, 0.0), &limiters(0.0));
-    assert!((t.error(0) - 0.05).abs() < 1e-12, "{}", t.error(0));
-    t.compare(&state(100, -0.05, 0.0), &limiters(0.0));
-    assert!((t.error(0) + 0.05).abs() < 1e-12, "not on the other side: {}", t.error(0));
-    assert!(t.is_coasting(at(100), &state(100, 0.08, 0.0), &limiters(0.0)));
-    assert!(t.is_coasting(at(100), &state(100, 0.0, 0.2), &limiters(0.0)), "it still moves");
-    assert!(t.is_coasting(at(100), &state(9, 0.0, 0.0), &limiters(0.0)), "a state from before the gap");
-    assert!(t.is_coasting(at(100), &state(100, 0.016, 0.0), &limiters(0.0)), "not yet there");
-    assert!(t.is_coasting(at(600), &state(600, 0.08, 0.0), &limiters(0.0)));
-    assert!(!t.is_coasting(at(620), &state(620, 0.08, 0.0), &limiters(0.0)), "it takes too long");
-    assert!(!t.is_coasting(at(110), &state(110, 0.014, 0.0), &limiters(0.0)), "there, within its accuracy");
-    assert!(!t.is_coasting(at(120), &state(120, 0.08, 0.0), &limiters(0.0)), "for good");
 }

@@ -1,13 +1,13 @@
-//! The last setpoint that was written to the arm. The device thread reports the number of the newest command that it
-//! wrote; the commands of the last ticks are kept to look it up. If nothing was written for more than two periods,
-//! there is a gap: commands repeat the last written setpoint, and motion continues from there.
+//! The last setpoint that was written to the arm: a commanded arm continues from it, never from a reading. The device
+//! thread reports the number of the newest command that it wrote; the commands of the last ticks are kept to look it
+//! up. Nothing written for longer than the arm's controller bridges is a gap.
 
 use std::time::Duration;
 
 use crate::clock::Mono;
 use crate::joint::{Joints, MAX_DOF};
 
-/// A longer time between two written setpoints is a gap [periods].
+/// Two setpoints at their regular distance are no gap, even if one between them was lost [periods].
 const PERIODS: u32 = 2;
 
 /// A command as it was issued.
@@ -33,9 +33,10 @@ pub struct Written {
 }
 
 impl Written {
-    /// Creates it for this period of the tick, and this longest regular time between two setpoints on the wire.
-    pub fn new(tick: Duration, write: Duration) -> Self {
-        let limit = PERIODS * tick.max(write);
+    /// Creates it for this period of the tick, this longest regular time between two setpoints on the wire, and the
+    /// time that the arm's controller bridges.
+    pub fn new(tick: Duration, write: Duration, tolerance: Duration) -> Self {
+        let limit = tolerance.max(PERIODS * tick.max(write));
         let kept = (limit.as_nanos() / tick.as_nanos().max(1)) as usize + 4;
         let none = Issued { seq: 0, at: Mono::ZERO, position: [0.0; MAX_DOF], velocity: [0.0; MAX_DOF] };
         // Time stamps lie on the tick's grid; a period is rounded to ns.
@@ -59,12 +60,17 @@ impl Written {
         }
     }
 
+    /// Returns whether a time without a setpoint [s] is no gap.
+    pub fn bridges(&self, time: f64) -> bool {
+        time <= self.limit.as_secs_f64()
+    }
+
     /// Returns the newest written command.
     pub fn last(&self) -> &Issued {
         &self.last
     }
 
-    /// Returns whether more than two periods lie between the last written setpoint and one of `now`.
+    /// Returns whether more time than the controller bridges lies between the last written setpoint and one of `now`.
     pub fn gap(&self, now: Mono) -> bool {
         now.since(self.last.at) > self.limit
     }
@@ -77,7 +83,7 @@ mod tests {
     #[test]
     fn one_lost_write_is_no_gap_and_two_are() {
         let period = Duration::from_millis(10);
-        let mut written = Written::new(period, Duration::from_millis(4));
+        let mut written = Written::new(period, Duration::from_millis(4), Duration::ZERO);
         let at = |k: u64| Mono(k * 10_000_000);
         let issue = |w: &mut Written, k: u64| {
             let position = crate::joint::joints_of(&[k as f64]);

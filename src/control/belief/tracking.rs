@@ -3,12 +3,11 @@
 
 use std::time::Duration;
 
-use super::coast::Coast;
-use super::config::ArmConfig;
-use super::limit::Limiter;
 use super::setpoints::{Range, SetpointWindow};
 use crate::arm::ArmState;
 use crate::clock::Mono;
+use crate::control::config::ArmConfig;
+use crate::control::limit::Limiter;
 use crate::joint::{Joints, MAX_DOF};
 use crate::telemetry::Cause;
 
@@ -23,20 +22,18 @@ const AT_SETPOINT: f64 = 0.01;
 #[derive(Debug)]
 pub struct Tracking {
     dof: usize,
-    /// `supervision.lag` [s].
-    lag: f64,
-    /// `lag`, rounded to ns.
+    /// `supervision.lag`, rounded to ns.
     window: Duration,
     /// `supervision.tracking_tolerance` [rad].
     tolerance: f64,
-    /// `supervision.accuracy` [rad].
-    accuracy: f64,
-    setpoints: SetpointWindow,
-    /// Distance of each joint from the range of its setpoints of the last `lag` seconds [rad]; 0 in velocity mode.
+    /// Positions: those that were commanded, in velocity mode those that the commanded velocities lead to [rad].
+    positions: SetpointWindow,
+    /// Commanded velocities in velocity mode [rad/s].
+    velocities: SetpointWindow,
+    /// Distance of each joint from the range of its setpoints of the last `lag` seconds [rad].
     errors: Joints,
-    coast: Coast,
-    /// How long the tolerance has been exceeded [s].
-    exceeded: f64,
+    /// How long the tolerances have been exceeded [s]: of positions, of velocities.
+    exceeded: (f64, f64),
 }
 
 impl Tracking {
@@ -46,39 +43,46 @@ impl Tracking {
         let span = s.lag + s.stale_after.as_secs_f64() + 2.0 * period.as_secs_f64();
         Self {
             dof: config.dof,
-            lag: s.lag,
             window: Duration::from_secs_f64(s.lag),
             tolerance: s.tracking_tolerance,
-            accuracy: s.accuracy,
-            setpoints: SetpointWindow::new(config.dof, span),
+            positions: SetpointWindow::new(config.dof, span),
+            velocities: SetpointWindow::new(config.dof, span),
             errors: [0.0; MAX_DOF],
-            coast: Coast::default(),
-            exceeded: 0.0,
+            exceeded: (0.0, 0.0),
         }
     }
 
     /// Forgets all setpoints: new ones do not continue them.
     pub fn restart(&mut self) {
-        self.setpoints.clear();
-        self.exceeded = 0.0;
+        self.positions.clear();
+        self.velocities.clear();
+        self.exceeded = (0.0, 0.0);
     }
 
-    /// Adds the setpoints of a tick [rad or rad/s].
-    pub fn push(&mut self, now: Mono, values: &Joints) {
-        self.setpoints.push(now, values);
+    /// Adds the setpoints of a tick [rad]; in velocity mode also their velocities [rad/s].
+    pub fn push(&mut self, now: Mono, positions: &Joints, velocities: Option<&Joints>) {
+        self.positions.push(now, positions);
+        if let Some(velocities) = velocities {
+            self.velocities.push(now, velocities);
+        }
     }
 
-    /// Returns the range of the setpoints that the arm may be following in this state.
+    /// Returns the range of the positions that the arm may be following in this state.
     pub fn range(&self, state: &ArmState) -> Option<Range> {
-        self.setpoints.range(state.stamp.before(self.window))
+        self.positions.range(state.stamp.before(self.window))
     }
 
-    /// Returns the distance of a joint from the range of its setpoints [rad]; 0 inside, and in velocity mode.
+    /// Returns the range of the velocities that it may be following; `None` if none were commanded.
+    pub fn velocity_range(&self, state: &ArmState) -> Option<Range> {
+        self.velocities.range(state.stamp.before(self.window))
+    }
+
+    /// Returns the distance of a joint from the range of its setpoints [rad]; 0 inside.
     pub fn error(&self, joint: usize) -> f64 {
         self.errors.get(joint).copied().unwrap_or_default()
     }
 
-    /// Sets all errors to 0: there are no position setpoints to compare with.
+    /// Sets all errors to 0: there are no setpoints to compare with.
     pub fn clear_errors(&mut self) {
         self.errors = [0.0; MAX_DOF];
     }
@@ -92,44 +96,29 @@ impl Tracking {
             return;
         }
         let Some(range) = self.range(state) else { return };
-        let coasting = self.coast.is_possible(state.stamp);
-        let joints = state.position.iter().zip(limiters).zip(&mut self.errors).enumerate();
-        for (j, ((q, limiter), error)) in joints {
-            if near((q, limiter)) {
-                continue;
+        for (j, ((q, limiter), error)) in state.position.iter().zip(limiters).zip(&mut self.errors).enumerate() {
+            if !near((q, limiter)) {
+                *error = range.distance(j, *q);
             }
-            *error = if coasting { self.coast.error(j, *q, &range) } else { range.distance(j, *q) };
         }
     }
 
-    /// A gap begins.
-    pub fn begin_to_coast(&mut self, now: Mono, limiters: &[Limiter]) {
-        self.coast.begin(now, limiters, self.lag);
-    }
-
-    /// Returns whether the arm may still be on its way back to the last setpoint before a gap.
-    pub fn is_coasting(&mut self, now: Mono, state: &ArmState, limiters: &[Limiter]) -> bool {
-        self.coast.goes_on(now, state, limiters, AT_SETPOINT + self.accuracy)
-    }
-
-    /// Returns the cause for a hold if the tolerance has been exceeded for too long. `velocity`: the arm is in velocity
-    /// mode.
-    pub fn supervise(&mut self, velocity: bool, state: &ArmState, dt: f64) -> Option<Cause> {
-        let (joint, by) = if velocity {
-            let range = self.range(state)?;
-            furthest((0..self.dof).map(|j| velocity_error(&range, state, j)))?
-        } else {
-            furthest(self.errors.iter().copied().take(self.dof))?
-        };
-        let tolerance = if velocity { 0.0 } else { self.tolerance };
-        self.exceeded = if by.abs() > tolerance { self.exceeded + dt } else { 0.0 };
-        let limit = if velocity { MAX_TIME.1 } else { MAX_TIME.0 };
-        (self.exceeded > limit).then_some(Cause::Tracking(joint, by))
+    /// Returns the cause for a hold if a tolerance has been exceeded for too long.
+    pub fn supervise(&mut self, state: &ArmState, dt: f64) -> Option<Cause> {
+        let (joint, by) = furthest(self.errors.iter().copied().take(self.dof))?;
+        self.exceeded.0 = if by.abs() > self.tolerance { self.exceeded.0 + dt } else { 0.0 };
+        if self.exceeded.0 > MAX_TIME.0 {
+            return Some(Cause::Tracking(joint, by));
+        }
+        let range = self.velocity_range(state)?;
+        let (joint, by) = furthest((0..self.dof).map(|j| velocity_error(&range, state, j)))?;
+        self.exceeded.1 = if by.abs() > 0.0 { self.exceeded.1 + dt } else { 0.0 };
+        (self.exceeded.1 > MAX_TIME.1).then_some(Cause::Tracking(joint, by))
     }
 
     /// Restarts the time for which the tolerance is exceeded: the arm is not supervised now.
     pub fn pause(&mut self) {
-        self.exceeded = 0.0;
+        self.exceeded = (0.0, 0.0);
     }
 }
 
@@ -142,7 +131,7 @@ fn velocity_error(range: &Range, state: &ArmState, joint: usize) -> f64 {
 }
 
 /// Returns the joint with the largest absolute value, and that value.
-pub(super) fn furthest(values: impl Iterator<Item = f64>) -> Option<(u16, f64)> {
+pub fn furthest(values: impl Iterator<Item = f64>) -> Option<(u16, f64)> {
     values.zip(0u16..).map(|(v, j)| (j, v)).max_by(|a, b| a.1.abs().total_cmp(&b.1.abs()))
 }
 

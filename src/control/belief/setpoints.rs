@@ -97,6 +97,16 @@ pub struct Range {
 }
 
 impl Range {
+    /// Returns the lowest setpoint of a joint.
+    pub fn low(&self, joint: usize) -> f64 {
+        self.low.get(joint).copied().unwrap_or_default()
+    }
+
+    /// Returns the highest setpoint of a joint.
+    pub fn high(&self, joint: usize) -> f64 {
+        self.high.get(joint).copied().unwrap_or_default()
+    }
+
     /// Returns the signed distance of a joint's value from the range; 0 inside.
     pub fn distance(&self, joint: usize, value: f64) -> f64 {
         match (self.low.get(joint), self.high.get(joint)) {

@@ -30,7 +30,7 @@ fn reading(seq: u64, q: f64) -> ArmState {
 }
 
 fn read(feedback: &mut Feedback, state: &ArmState) -> Verdict {
-    feedback.read(state, state.stamp.after(Duration::from_millis(1)), &Stalls::default())
+    feedback.read(state, None, false, state.stamp.after(Duration::from_millis(1)), &Stalls::default())
 }
 
 #[test]
@@ -80,7 +80,7 @@ fn a_state_is_fresh_up_to_its_age_limit_with_a_connection() {
     let of = |change: fn(&mut ArmState), age_us: u64| {
         let (mut feedback, mut state) = (Feedback::new(&config()), reading(1, 0.1));
         change(&mut state);
-        feedback.read(&state, state.stamp.after(Duration::from_micros(age_us)), &Stalls::default());
+        feedback.read(&state, None, false, state.stamp.after(Duration::from_micros(age_us)), &Stalls::default());
         feedback.freshness()
     };
     let limit = Age { age_us: 50_000, limit_us: 50_000, own_us: 0 };
@@ -101,9 +101,9 @@ fn the_age_limit_is_three_reads_at_least() {
     let slow = ArmConfig { read_period: Duration::from_millis(40), ..config() };
     let mut feedback = Feedback::new(&slow);
     let state = reading(1, 0.1);
-    feedback.read(&state, state.stamp.after(Duration::from_millis(120)), &Stalls::default());
+    feedback.read(&state, None, false, state.stamp.after(Duration::from_millis(120)), &Stalls::default());
     assert!(feedback.freshness().fresh);
-    feedback.read(&state, state.stamp.after(Duration::from_millis(121)), &Stalls::default());
+    feedback.read(&state, None, false, state.stamp.after(Duration::from_millis(121)), &Stalls::default());
     assert!(!feedback.freshness().fresh);
 }
 
@@ -112,7 +112,7 @@ fn time_in_which_the_tick_could_not_run_is_not_the_states_age() {
     let mut stalls = Stalls::default();
     stalls.note(at(90), Duration::from_millis(70));
     let mut feedback = Feedback::new(&config());
-    feedback.read(&reading(1, 0.1), at(100), &stalls);
+    feedback.read(&reading(1, 0.1), None, false, at(100), &stalls);
     let age = feedback.freshness().age;
     assert_eq!((feedback.freshness().fresh, age.age_us, age.own_us), (true, 20_000, 70_000));
 }
@@ -125,7 +125,7 @@ fn rejected_readings_keep_a_state_fresh_until_a_jump_could_be_confirmed() {
     for seq in 2..=12 {
         let far = if seq % 2 == 0 { 2.0 } else { -2.0 };
         let state = reading(seq, far);
-        assert_eq!(feedback.read(&state, state.stamp, &Stalls::default()), Verdict::Rejected);
+        assert_eq!(feedback.read(&state, None, false, state.stamp, &Stalls::default()), Verdict::Rejected);
         assert_eq!(feedback.freshness().fresh, 10 * seq <= 10 + 50 + 30, "reading {seq}");
     }
 }
