@@ -35,6 +35,7 @@ mod help;
 mod host_stalls;
 mod kinematics;
 mod layering;
+mod lies;
 mod log_storage;
 mod model;
 mod model_verbs;

@@ -2,6 +2,7 @@
 
 #![allow(dead_code, reason = "each test binary uses a part")]
 
+pub mod arm_rows;
 pub mod busy;
 pub mod cable;
 pub mod certificates;
@@ -11,7 +12,9 @@ pub mod fake_arms;
 pub mod fake_run;
 pub mod file_server;
 pub mod guarded;
+pub mod lies;
 pub mod loopback;
+pub mod motion_judge;
 pub mod network;
 pub mod program;
 pub mod python;
@@ -24,6 +27,9 @@ pub mod sim_arm;
 pub mod skip;
 pub mod tampered;
 pub mod terminal;
+pub mod trial;
+pub mod trial_script;
+pub mod true_arm;
 pub mod uml;
 pub mod virtual_run;
 pub mod wire;

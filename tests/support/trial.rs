@@ -1,0 +1,417 @@
+//! One trial: a coordinator on a virtual clock between a true arm and, perhaps, a lie. A sequence of requests drawn from
+//! a seed, and the judgement.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use dimos::arm::ArmState;
+use dimos::clock::Mono;
+use dimos::control::config::*;
+use dimos::control::coordinator::{Coordinator, TickTime};
+use dimos::control::request::{Envelope, Request};
+use dimos::control::task_spec::TaskTable;
+use dimos::joint::Joints;
+use dimos::robot::random::Random;
+use dimos::telemetry::{Cause, Event, Outcome, Phase, TaskState, TaskView};
+
+use super::arm_rows::{Row, rows};
+use super::lies::{KINDS, Kind, Lie, OCCASIONS, Occasion, Span};
+use super::motion_judge::{Judge, Rule, Violation};
+use super::true_arm::{Traits, TrueArm, Velocities};
+
+/// The types of the tasks, each once at most.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Act {
+    Trajectory,
+    Servo,
+    Velocity,
+    Chunk,
+    Pose,
+    Twist,
+    Follow,
+}
+
+/// A hand that moves a leader: speed [rad/s] and how long [s].
+#[derive(Debug, Clone, Copy)]
+pub struct Hand {
+    pub speed: f64,
+    pub phase: f64,
+}
+
+pub struct Trial {
+    pub seed: u64,
+    pub row: Row,
+    pub rate: f64,
+    /// Its main task.
+    pub act: Act,
+    /// The lie, and the arm that it is about: 0, or 1 for the leader.
+    pub lie: Option<(usize, Lie)>,
+    pub lied_at: Option<(f64, String)>,
+    pub random: Random,
+    /// For noise, so that the requests are the same with and without it.
+    noise: Random,
+    pub coordinator: Coordinator,
+    pub arms: Vec<TrueArm>,
+    pub judges: Vec<Judge>,
+    pub now: Mono,
+    began: Mono,
+    inbox: VecDeque<Envelope>,
+    next_id: u64,
+    outcomes: Vec<(u64, Outcome)>,
+    pub phases: Vec<(Phase, Cause)>,
+    pub tasks: Vec<TaskView>,
+    /// What each task is, in their order.
+    pub acts: Vec<Act>,
+    pub said: Vec<ArmState>,
+    pub commands: Vec<dimos::arm::ArmCommand>,
+    pub hand: Option<Hand>,
+    hand_time: f64,
+    /// Velocities that are requested now [rad/s], their integral, and when they were.
+    pub velocities: Option<(Joints, Joints, f64)>,
+    /// Of a follower: whether what is read of the leader counts as requested.
+    led_by_reading: bool,
+    /// States are late for so many ticks from time to time.
+    pub late_states: bool,
+    pub verbose: bool,
+    /// Residuals of a recording, played back over the readings: per joint, at this period [s].
+    pub recorded: Option<(f64, Vec<Vec<f64>>)>,
+}
+
+/// Which trial a seed is.
+pub fn kind_of(seed: u64) -> (usize, Kind) {
+    let rows = rows().len() as u64;
+    ((seed % rows) as usize, KINDS[(seed / rows % KINDS.len() as u64) as usize])
+}
+
+impl Trial {
+    pub fn new(seed: u64, honest: bool) -> Self {
+        let mut random = Random::new(seed ^ if honest { 0x5eed_0000_0000 } else { 0 });
+        let (index, kind) = kind_of(seed);
+        let rates = rows()[index].rates();
+        let rate = if random.below(8) == 0 { rates[random.below(rates.len())] } else { rates[0] };
+        let row = rows()[index].at(rate);
+        let act = loop {
+            let act = [Act::Trajectory, Act::Servo, Act::Velocity, Act::Chunk, Act::Pose, Act::Twist, Act::Follow];
+            match act[random.below(7)] {
+                Act::Velocity if !row.has_velocity() => {}
+                Act::Pose | Act::Twist if row.robot.is_none() => {}
+                act => break act,
+            }
+        };
+        let occasion = OCCASIONS[random.below(OCCASIONS.len())];
+        let leader = act == Act::Follow && random.below(2) == 0 && occasion == Occasion::Motion;
+        let mut lie = Lie::draw(kind, occasion, row.arm.dof, row.arm.read_period.as_secs_f64(), &mut random);
+        lie.of_adapter |= leader;
+        let (config, acts) = Self::config(&row, rate, act);
+        let period = config.period();
+        let mut arms: Vec<TrueArm> = config
+            .arms
+            .iter()
+            .map(|_| {
+                let mut traits = Traits::draw(&row, &mut random);
+                if !honest && random.below(8) == 0 {
+                    traits.velocities = Velocities::Zeros;
+                }
+                let q: Vec<f64> = row.middle().iter().map(|q| q + random.between(-0.2, 0.2)).collect();
+                TrueArm::new(&row, traits, &q, period)
+            })
+            .collect();
+        if let [follower, leader] = &mut arms[..] {
+            leader.q = follower.q.iter().map(|q| q + random.between(-0.1, 0.1)).collect();
+        }
+        let judges = arms.iter().enumerate().map(|(i, a)| Judge::new(i, &row.arm, a, 1.0 / rate)).collect();
+        let begin = Mono(1_000_000_000);
+        Self {
+            seed,
+            rate,
+            act,
+            lie: (!honest).then_some((usize::from(leader), lie)),
+            lied_at: None,
+            noise: Random::new(random.bits()),
+            random,
+            coordinator: Coordinator::new(&config, TaskTable::builtin().build(&config.tasks).unwrap()),
+            phases: vec![(Phase::Unknown, Cause::None); arms.len()],
+            said: vec![ArmState::default(); arms.len()],
+            commands: vec![Default::default(); arms.len()],
+            arms,
+            judges,
+            now: begin,
+            began: begin,
+            inbox: VecDeque::new(),
+            next_id: 1,
+            outcomes: Vec::new(),
+            tasks: vec![TaskView::default(); config.tasks.len()],
+            acts,
+            hand: None,
+            hand_time: 0.0,
+            velocities: None,
+            led_by_reading: true,
+            late_states: honest,
+            verbose: false,
+            recorded: None,
+            row,
+        }
+    }
+
+    fn config(row: &Row, rate: f64, act: Act) -> (CoordinatorConfig, Vec<Act>) {
+        let s = &row.arm.supervision;
+        let dof = row.arm.dof as u16;
+        let trajectory =
+            TrajectoryParams { goal_tolerance: 0.02 + 2.0 * s.accuracy + s.droop, ..TrajectoryParams::default() };
+        let mut acts = vec![Act::Trajectory, Act::Servo, Act::Chunk];
+        acts.extend(row.has_velocity().then_some(Act::Velocity));
+        acts.extend(matches!(act, Act::Pose | Act::Twist | Act::Follow).then_some(act));
+        let kind = |act: &Act| match act {
+            Act::Trajectory => TaskKind::new("trajectory", &trajectory),
+            Act::Servo => TaskKind::new("servo", &ServoParams::default()),
+            Act::Chunk => TaskKind::new("chunk", &ChunkParams::default()),
+            Act::Velocity => TaskKind::new("velocity", &VelocityParams::default()),
+            Act::Pose | Act::Twist => {
+                let name = if *act == Act::Pose { "cartesian_ik" } else { "eef_twist" };
+                let kind = TaskKind::new(name, &CartesianParams::default());
+                row.robot.clone().map_or(kind.clone(), |robot| kind.of_robot(robot))
+            }
+            Act::Follow => {
+                let params = FollowParams { leader: Some("leader".to_owned()), ..FollowParams::default() };
+                let led = |joint| LeaderJoint { joint, scale: 1.0, offset: 0.0 };
+                TaskKind::new("follow", &params).led_by((dof..2 * dof).map(led).collect())
+            }
+        };
+        let tasks = acts.iter().enumerate().map(|(i, act)| TaskConfig {
+            name: format!("t{i}"),
+            kind: kind(act),
+            joints: (0..dof).collect(),
+            priority: 10,
+            auto_start: false,
+        });
+        let tasks = tasks.collect();
+        let mut arms = vec![row.arm.clone()];
+        if act == Act::Follow {
+            arms.push(ArmConfig { name: "leader".to_owned(), ..row.arm.clone() });
+        }
+        (CoordinatorConfig { version: CONFIG_VERSION, rate, arms, tasks }, acts)
+    }
+
+    pub fn seconds(&self) -> f64 {
+        self.now.seconds_since(self.began)
+    }
+
+    pub fn task(&self, act: Act) -> Option<u16> {
+        self.acts.iter().position(|a| *a == act).map(|i| i as u16)
+    }
+
+    pub fn send(&mut self, request: Request) -> u64 {
+        let id = self.next_id;
+        self.next_id += 1;
+        if matches!(request, Request::Stop { .. }) {
+            let now = self.seconds();
+            self.judges[0].stop_asked(now + 1.0 / self.rate, self.arms[0].enabled);
+        }
+        self.inbox.push_back(Envelope { id, request });
+        id
+    }
+
+    pub fn ask(&mut self, request: Request) -> Outcome {
+        let stop = matches!(request, Request::Stop { .. });
+        let id = self.send(request);
+        self.tick();
+        if stop && self.phases[0].0 != Phase::Held && self.arms[0].enabled {
+            let (now, phase) = (self.seconds(), self.phases[0].0);
+            self.judges[0].report(Rule::Stop, now, 0, f64::INFINITY, || format!("{phase:?} after a stop"));
+        }
+        self.outcomes.iter().rev().find(|(i, _)| *i == id).map_or(Outcome::ShuttingDown, |(_, outcome)| *outcome)
+    }
+
+    pub fn phase(&self) -> Phase {
+        self.phases[0].0
+    }
+
+    /// Returns whether something moves the arm.
+    pub fn is_active(&self) -> bool {
+        self.tasks.iter().any(|task| matches!(task.state, TaskState::Executing | TaskState::Cancelling))
+    }
+
+    pub fn begin_lie(&mut self) {
+        let now = self.seconds();
+        let text = self.lie.as_mut().map(|(arm, lie)| {
+            lie.begin();
+            format!("{lie:?} about arm {arm}")
+        });
+        self.lied_at = text.map(|text| (now, text));
+    }
+
+    /// The motors of the arm are switched.
+    pub fn switch(&mut self, on: bool) {
+        self.arms[0].switch(on);
+        if !on {
+            return;
+        }
+        let (said, truth) = (self.said[0], &self.arms[0]);
+        let (s, l) = (&self.row.arm.supervision, &self.row.arm.limits);
+        // What was wrong before the motors came on cannot be seen, unless the controller itself says where it is.
+        let lie = self.lie.as_ref().filter(|(arm, lie)| *arm == 0 && lie.is_told());
+        let seen =
+            truth.traits.reports_commanded && !lie.is_some_and(|(_, lie)| lie.of_adapter && lie.kind.is_constant());
+        let hidden = lie.is_some_and(|(_, lie)| !matches!(lie.kind, Kind::Huge | Kind::Noise)) && !seen;
+        let inside = |j: usize| {
+            let (low, high) = (l.position_lower[j] - s.outside, l.position_upper[j] + s.outside);
+            (low..=high).contains(&said.position[j])
+        };
+        let hidden = hidden && (0..truth.dof).all(inside);
+        let extra = |j: usize| {
+            let off = (said.position[j] - truth.q[j]).abs();
+            let (v, a) = (truth.traits.v_max[j], l.acceleration_max[j]);
+            // It is held as soon as the joint is seen to move.
+            let stopped = if self.row.goal_only { f64::INFINITY } else { v * (s.lag + 0.15) + v * v / (2.0 * a) };
+            let off = if hidden { off.min(stopped) + 0.02f64.max(2.0 * s.accuracy) } else { 0.0 };
+            off + truth.traits.droop[j].abs()
+        };
+        self.judges[0].placed(truth, extra);
+    }
+
+    /// What counts as the leader's motion from now on.
+    pub fn follow_begins(&mut self) {
+        self.led_by_reading = match self.lie.as_ref().filter(|(arm, _)| *arm == 1) {
+            None => true,
+            Some((_, lie)) => {
+                let certain = matches!(lie.kind, Kind::TurnLost | Kind::Huge) || matches!(lie.span, Span::Readings(_));
+                !(certain || (lie.kind == Kind::Zero && !lie.has_begun()))
+            }
+        };
+    }
+
+    pub fn tick(&mut self) {
+        let dt = 1.0 / self.rate;
+        let period = Duration::from_nanos((1e9 / self.rate).round() as u64);
+        self.now = self.now.after(period);
+        let now = self.seconds();
+        self.move_hand(dt);
+        for i in 0..self.arms.len() {
+            if self.late_states && self.arms[i].enabled {
+                // Late states, of an age that the row allows.
+                let most = (0.5 * self.row.arm.supervision.stale_after.as_secs_f64() * self.rate) as usize;
+                self.arms[i].silent = self.noise.below(60) < if self.arms[i].silent { 40 } else { 1 } && most > 2;
+            }
+            if let Some((every, rows)) = self.recorded.as_ref().filter(|_| i == 0) {
+                let row = &rows[(now / every) as usize % rows.len()];
+                let count = row.len();
+                self.arms[i].residual.iter_mut().enumerate().for_each(|(j, residual)| *residual = row[j % count]);
+            }
+            let truth = self.arms[i].observe(self.now, &mut self.noise);
+            self.said[i] = match &mut self.lie {
+                Some((arm, lie)) if *arm == i => lie.tell(&truth, dt, &mut self.noise),
+                _ => truth,
+            };
+        }
+        let time = TickTime { now: self.now, next: self.now.after(period), skipped: 0, late_ns: 0, woke_late_ns: 0 };
+        let inbox = &mut self.inbox;
+        let output = self.coordinator.tick(time, &self.said, || inbox.pop_front());
+        self.commands.clone_from(&output.commands);
+        self.tasks.clone_from(&output.tasks);
+        self.phases.clear();
+        self.phases.extend(output.arms.iter().map(|sample| (sample.phase, sample.cause)));
+        for event in &output.events {
+            if let Event::Request(id, outcome) = event {
+                self.outcomes.push((*id, *outcome));
+            }
+            if self.verbose && !matches!(event, Event::Limited(..)) {
+                println!("{now:8.3} {event:?}");
+            }
+        }
+        output.retired.clear();
+        self.requested(now, dt);
+        let active = self.is_active();
+        for (i, arm) in self.arms.iter_mut().enumerate() {
+            let command = &self.commands[i];
+            arm.take(command, &self.said[i]);
+            let written = arm.written.is_some_and(|(at, ..)| at == command.at);
+            self.judges[i].command(now, command, written, &self.said[i].position);
+            arm.advance(dt);
+            if arm.enabled {
+                self.judges[i].joints(now, arm, active && i == 0);
+            }
+        }
+        if self.verbose {
+            self.show(now);
+        }
+    }
+
+    /// Adds what streams ask for now.
+    fn requested(&mut self, now: f64, dt: f64) {
+        if let Some((v, at, since)) = &mut self.velocities
+            && self.acts.iter().zip(&self.tasks).any(|(a, t)| *a == Act::Velocity && t.state == TaskState::Executing)
+            && now - *since < 0.2 + 2.0 * dt
+        {
+            for j in 0..self.row.arm.dof {
+                at[j] += v[j] * dt;
+                self.judges[0].request(j, at[j], v[j]);
+            }
+        }
+        let follows =
+            self.acts.iter().zip(&self.tasks).any(|(a, t)| *a == Act::Follow && t.state == TaskState::Executing);
+        if follows && self.arms.len() > 1 {
+            for j in 0..self.row.arm.dof {
+                let (low, high) = (self.row.arm.limits.position_lower[j], self.row.arm.limits.position_upper[j]);
+                let truth = self.arms[1].q[j];
+                self.judges[0].request(j, truth, 1.0);
+                let said = self.said[1].position[j];
+                if self.led_by_reading && said.is_finite() && (said - truth).abs() < 3.2 {
+                    self.judges[0].request(j, said.clamp(low, high), 1.0);
+                }
+            }
+        }
+    }
+
+    fn move_hand(&mut self, dt: f64) {
+        let Some(hand) = self.hand else { return };
+        self.hand_time += dt;
+        let Some(leader) = self.arms.get_mut(1) else { return };
+        for j in 0..leader.dof {
+            let v = hand.speed * (2.5 * self.hand_time + hand.phase + j as f64).sin();
+            leader.v[j] = v;
+            leader.q[j] += v * dt;
+        }
+    }
+
+    fn show(&self, now: f64) {
+        let joint = self.lie.as_ref().map_or(0, |(_, lie)| lie.first_joint());
+        let (c, arm, said) = (&self.commands[0], &self.arms[0], &self.said[0]);
+        println!(
+            "{now:8.3} {:?} {:?} true {:.4} said {:.4} v {:.3} command {:?} {:.4} start {} stop {} seq {} written {} lie {}",
+            self.phases[0].0,
+            self.phases[0].1,
+            arm.q[joint],
+            said.position[joint],
+            said.velocity[joint],
+            c.mode,
+            c.values[joint],
+            c.start_seq,
+            c.stop_seq,
+            c.seq,
+            said.written,
+            self.lie.as_ref().is_some_and(|(_, lie)| lie.is_told()),
+        );
+    }
+
+    pub fn run_for(&mut self, seconds: f64) {
+        (0..(seconds * self.rate).ceil() as u64).for_each(|_| self.tick());
+    }
+
+    pub fn run_until(&mut self, limit: f64, mut done: impl FnMut(&Self) -> bool) -> bool {
+        for _ in 0..(limit * self.rate).ceil() as u64 {
+            if done(self) {
+                return true;
+            }
+            self.tick();
+        }
+        done(self)
+    }
+
+    /// Returns what was found, with what this trial is.
+    pub fn found(mut self) -> Vec<Violation> {
+        let truth = self.lied_at.as_ref().map_or(String::new(), |(at, text)| format!(" since {at:.3} s {text}"));
+        let what = format!("{:?} at {} Hz,{truth}", self.act, self.rate);
+        let all = self.judges.iter_mut().flat_map(|judge| std::mem::take(&mut judge.found));
+        all.map(|v| Violation { text: format!("{} ({what})", v.text), ..v }).collect()
+    }
+}
