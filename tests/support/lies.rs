@@ -60,12 +60,6 @@ impl Kind {
     pub fn is_constant(self) -> bool {
         matches!(self, Self::TurnLost | Self::SignFlipped | Self::Swapped | Self::Scaled | Self::Zero | Self::Offset)
     }
-
-    /// Returns whether a person could move an arm without power like this.
-    pub fn is_possible_by_hand(self) -> bool {
-        matches!(self, Self::Slip | Self::RunAway | Self::Creep | Self::Late | Self::Repeated | Self::Noise)
-            || matches!(self, Self::FrozenPosition | Self::FrozenVelocity | Self::Frozen)
-    }
 }
 
 /// How long it lasts.
@@ -196,12 +190,24 @@ impl Lie {
             }
     }
 
-    pub fn first_joint(&self) -> usize {
-        self.joints.trailing_zeros() as usize
+    /// Returns it in words, for a report.
+    pub fn text(&self) -> String {
+        format!(
+            "{:?} {:.4} of joints {:b} (other {}), {:?}, {} readings, bound {:.2}, velocities {}{}",
+            self.kind,
+            self.figure,
+            self.joints,
+            self.other,
+            self.span,
+            self.readings,
+            self.bound,
+            if self.consistent { "agree" } else { "do not agree" },
+            if self.of_adapter { ", of the adapter" } else { "" },
+        )
     }
 
-    pub fn about(&self, joint: usize) -> bool {
-        self.joints >> joint & 1 == 1 || (self.kind == Kind::Swapped && joint == self.other)
+    pub fn first_joint(&self) -> usize {
+        self.joints.trailing_zeros() as usize
     }
 
     /// Makes of a true reading what is told. `dt`: time since the one before [s].

@@ -19,6 +19,7 @@ pub mod network;
 pub mod program;
 pub mod python;
 pub mod python_dimos;
+pub mod recorded;
 pub mod rig;
 pub mod ros;
 pub mod scripted;

@@ -15,7 +15,7 @@ const DETECTION: f64 = 0.25;
 const SLACK: f64 = 0.003;
 /// An arm that rests for this long has ended its motion [s].
 const RESTED: f64 = 0.1;
-/// How long it may take to a stop besides its braking [s], and from rest [ticks].
+/// How long it may take to the arm's own stop besides braking [s], and from rest [ticks].
 const STOP: (f64, u32) = (0.5, 2);
 
 /// A rule that was broken: the worst case of each in a trial.
@@ -104,6 +104,8 @@ pub struct Judge {
     bounds: [(f64, f64); MAX_DOF],
     stop: Option<PendingStop>,
     last: ArmCommand,
+    /// When the setpoints moved last [s].
+    moved: f64,
     pub found: Vec<Violation>,
 }
 
@@ -127,6 +129,7 @@ impl Judge {
             bounds: [(0.0, 0.0); MAX_DOF],
             stop: None,
             last: ArmCommand::default(),
+            moved: f64::NEG_INFINITY,
             found: Vec::new(),
         }
     }
@@ -196,7 +199,7 @@ impl Judge {
     }
 
     /// Judges the command of a tick, and what of it was written.
-    pub fn command(&mut self, now: f64, command: &ArmCommand, written: bool, reading: &Joints) {
+    pub fn command(&mut self, now: f64, command: &ArmCommand, written: bool, truth: &TrueArm) {
         let finite = |values: &Joints| values.iter().all(|v| v.is_finite());
         if !finite(&command.values) || !finite(&command.velocity) || !command.rest.is_none_or(|rest| finite(&rest)) {
             self.report(Rule::Sound, now, 0, f64::INFINITY, || format!("not finite: {:?}", command.values));
@@ -219,10 +222,10 @@ impl Judge {
         }
         self.last = *command;
         let Some(mode) = command.mode.filter(|_| written) else { return };
-        self.wire(now, command, mode, reading);
+        self.wire(now, command, mode, truth);
     }
 
-    fn wire(&mut self, now: f64, command: &ArmCommand, mode: ControlMode, reading: &Joints) {
+    fn wire(&mut self, now: f64, command: &ArmCommand, mode: ControlMode, truth: &TrueArm) {
         let mut velocity = [0.0; MAX_DOF];
         let velocities = mode == ControlMode::Velocity;
         let last = self.wire.filter(|wire| wire.mode == mode && wire.start == command.start_seq);
@@ -238,9 +241,12 @@ impl Judge {
                 }
             }
             for j in 0..self.dof {
-                let at = if reading[j].is_finite() && !velocities { reading[j] } else { command.values[j] };
+                // Where the arm may rest outside of its range it may start.
                 let (lower, upper) = (self.limits.position_lower[j], self.limits.position_upper[j]);
-                self.bounds[j] = (lower.min(at).min(command.values[j]), upper.max(at).max(command.values[j]));
+                let beyond = self.s.outside + self.s.accuracy;
+                let start = command.values[j].clamp(lower - beyond, upper + beyond);
+                let low = if velocities { lower } else { lower.min(truth.q[j]).min(start) };
+                self.bounds[j] = (low, if velocities { upper } else { upper.max(truth.q[j]).max(start) });
             }
         }
         let dt = last.map_or(self.period, |wire| now - wire.at);
@@ -272,6 +278,9 @@ impl Judge {
                 });
             }
         }
+        if velocity.iter().any(|v| v.abs() > 1e-9) {
+            self.moved = now;
+        }
         self.wire = Some(Wire { at: now, values: command.values, velocity, mode, start: command.start_seq });
     }
 
@@ -283,7 +292,9 @@ impl Judge {
         let speed = self.wire.filter(|wire| now - wire.at < 1.5 * self.period && self.last.mode.is_some());
         let braking = |j: usize| speed.map_or(0.0, |w| w.velocity[j].abs() / self.limits.acceleration_max[j]);
         let longest = (0..self.dof).map(braking).fold(0.0, f64::max);
-        let by = (longest > 1e-9).then_some(now + longest + STOP.0);
+        // Setpoints at rest for less than the lag: the arm still follows them.
+        let moves = self.last.mode.is_some() && now - self.moved <= self.s.lag + self.period;
+        let by = moves.then_some(now + longest + STOP.0);
         self.stop = Some(PendingStop { at: now, ticks: 0, seq: self.last.stop_seq, by });
     }
 }

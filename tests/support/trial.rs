@@ -72,6 +72,7 @@ pub struct Trial {
     led_by_reading: bool,
     /// States are late for so many ticks from time to time.
     pub late_states: bool,
+    late_left: Vec<usize>,
     pub verbose: bool,
     /// Residuals of a recording, played back over the readings: per joint, at this period [s].
     pub recorded: Option<(f64, Vec<Vec<f64>>)>,
@@ -147,6 +148,7 @@ impl Trial {
             velocities: None,
             led_by_reading: true,
             late_states: honest,
+            late_left: vec![0; 2],
             verbose: false,
             recorded: None,
             row,
@@ -235,7 +237,7 @@ impl Trial {
         let now = self.seconds();
         let text = self.lie.as_mut().map(|(arm, lie)| {
             lie.begin();
-            format!("{lie:?} about arm {arm}")
+            format!("{:?} {} about arm {arm}", lie.occasion, lie.text())
         });
         self.lied_at = text.map(|text| (now, text));
     }
@@ -289,8 +291,13 @@ impl Trial {
         for i in 0..self.arms.len() {
             if self.late_states && self.arms[i].enabled {
                 // Late states, of an age that the row allows.
-                let most = (0.5 * self.row.arm.supervision.stale_after.as_secs_f64() * self.rate) as usize;
-                self.arms[i].silent = self.noise.below(60) < if self.arms[i].silent { 40 } else { 1 } && most > 2;
+                let most = (0.6 * self.row.arm.supervision.stale_after.as_secs_f64() * self.rate) as usize;
+                let left = &mut self.late_left[i];
+                *left = match *left {
+                    0 if self.noise.below(80) == 0 => self.noise.below(most),
+                    left => left.saturating_sub(1),
+                };
+                self.arms[i].silent = *left > 0;
             }
             if let Some((every, rows)) = self.recorded.as_ref().filter(|_| i == 0) {
                 let row = &rows[(now / every) as usize % rows.len()];
@@ -325,7 +332,7 @@ impl Trial {
             let command = &self.commands[i];
             arm.take(command, &self.said[i]);
             let written = arm.written.is_some_and(|(at, ..)| at == command.at);
-            self.judges[i].command(now, command, written, &self.said[i].position);
+            self.judges[i].command(now, command, written, arm);
             arm.advance(dt);
             if arm.enabled {
                 self.judges[i].joints(now, arm, active && i == 0);

@@ -108,6 +108,7 @@ impl Trial {
         if !self.arms[0].enabled {
             self.switch(true);
             self.wait(0.02, 0.08);
+            self.run_until(0.1, |trial| trial.said[0].enabled);
         }
         if lie {
             self.begin_lie();
@@ -164,6 +165,13 @@ impl Trial {
             Some(mode) if mode.is_position() => self.commands[0].values[..dof].to_vec(),
             _ => self.said[0].position[..dof].to_vec(),
         };
+        let known = |j: usize| here[j] > l.position_lower[j] - 0.3 && here[j] < l.position_upper[j] + 0.3;
+        if !(0..dof).all(known) {
+            // No client plans from there.
+            return self.run_for(0.2);
+        }
+        // An end effector's pose is near: joints go there without a detour.
+        let far = if matches!(act, Act::Pose | Act::Twist) { 0.3 } else { 1.0 };
         let part = self.random.between(0.15, 0.85);
         let inside = |j: usize, q: f64| q.clamp(l.position_lower[j] + 0.02, l.position_upper[j] - 0.02);
         // A rest-to-rest motion of this time, within this part of the limits.
@@ -172,7 +180,7 @@ impl Trial {
                 .min(part * l.acceleration_max[j] * seconds * seconds / 6.0)
                 .min(0.9)
         };
-        let away: Vec<f64> = (0..dof).map(|j| most(j) * self.random.between(-1.0, 1.0)).collect();
+        let away: Vec<f64> = (0..dof).map(|j| far * most(j) * self.random.between(-1.0, 1.0)).collect();
         let goal: Vec<f64> = (0..dof).map(|j| inside(j, here[j] + away[j])).collect();
         let peak = |j: usize| 1.9 * (goal[j] - here[j]).abs() / seconds;
         let mut accepted = Vec::new();
@@ -254,13 +262,11 @@ impl Trial {
                         Request::Velocity { task, target: joints_of(&v) }
                     }
                     Act::Pose => {
-                        (0..dof).for_each(|j| self.judges[0].request(j, goal[j], 0.5));
-                        (0..dof).for_each(|j| self.judges[0].request(j, here[j], 0.5));
+                        self.detour(&here, &goal);
                         Request::CartesianTarget { task, goal: pose }
                     }
                     _ => {
-                        let most = |j: usize| here[j] + 1.5 * (goal[j] - here[j]);
-                        (0..dof).for_each(|j| self.judges[0].request(j, most(j), 0.5));
+                        self.detour(&here, &goal);
                         Request::CartesianTarget { task, goal: twist }
                     }
                 };
@@ -300,6 +306,14 @@ impl Trial {
             self.judges[0].report(Rule::Honest, now, 0, 1.0, || {
                 format!("{act:?}: {refused:?}, {:?} {:?}, {phase:?}", task.state, task.reason)
             });
+        }
+    }
+
+    /// Joints on their way to a pose that is near: on the straight line of its frame they are not on that of the joints.
+    fn detour(&mut self, here: &[f64], goal: &[f64]) {
+        for (j, (from, to)) in here.iter().zip(goal).enumerate() {
+            self.judges[0].request(j, from.min(*to) - 0.25, 0.5);
+            self.judges[0].request(j, from.max(*to) + 0.25, 0.5);
         }
     }
 

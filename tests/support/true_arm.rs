@@ -81,7 +81,7 @@ impl Traits {
             v_max: limits.velocity_max.iter().map(|v| v * faster.min(1.5)).collect(),
             a_max: limits.acceleration_max.iter().map(|a| a * faster * 2.0).collect(),
             droop: (0..dof).map(|_| droop(random)).collect(),
-            noise: s.accuracy * random.between(0.0, 0.15),
+            noise: s.accuracy * random.between(0.0, 0.08),
             v_noise: random.between(0.0, 0.015),
             resolution,
             velocities,
@@ -223,7 +223,11 @@ impl TrueArm {
             velocity = [0.0; MAX_DOF];
         }
         let absent = t.velocities == Velocities::Absent;
-        let commanded = Commanded { position: self.target, velocity: self.rate };
+        let commanded = match self.drive {
+            Drive::Follow => Commanded { position: self.target, velocity: self.rate },
+            Drive::Velocity => Commanded { position: joints_of(&self.q), velocity: self.target },
+            Drive::Off | Drive::Brake => Commanded { position: joints_of(&self.q), velocity: joints_of(&self.v) },
+        };
         self.state = ArmState {
             seq: self.seq,
             stamp: now.before(Duration::from_secs_f64(t.age)),
@@ -259,8 +263,13 @@ impl TrueArm {
             return;
         }
         if mode != self.mode || (self.drive == Drive::Velocity) == mode.is_position() {
+            // Until the first setpoint has reached the drive it holds.
             self.mode = mode;
             self.queue.clear();
+            match mode.is_position() {
+                true => self.rest_here(),
+                false => (self.target, self.rate) = ([0.0; MAX_DOF], [0.0; MAX_DOF]),
+            }
         }
         self.drive = if mode == ControlMode::Velocity { Drive::Velocity } else { Drive::Follow };
         self.state.written = command.seq;
