@@ -46,7 +46,7 @@ impl Findings {
             }
             if worst.0 <= SHOWN {
                 self.shown.push(format!(
-                    "DIMOS_LIE={}{seed} {} {kind}, rule {}, {:.3} s, joint {}: {} (excess {:.4})",
+                    "DIMOS_LIE={}{seed} {} {kind}, rule {}, {:.3} s, joint {}: {} (excess {:.3e})",
                     if honest { "h" } else { "" },
                     rows()[row].name,
                     v.rule.name(),
@@ -79,7 +79,7 @@ impl Findings {
         }
         for rule in RULES {
             if let Some((cases, worst, seed)) = self.worst.get(&rule) {
-                println!("rule {:12} {cases:8} cases, worst excess {worst:.4} (seed {seed})", rule.name());
+                println!("rule {:12} {cases:8} cases, worst excess {worst:.3e} (seed {seed})", rule.name());
             }
         }
         println!("{} of {} cases broke a rule", self.broken(), self.cases);

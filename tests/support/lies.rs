@@ -190,6 +190,12 @@ impl Lie {
             }
     }
 
+    /// Returns the rate of a slip that no reading tells from rest [rad/s]; 0 of all else.
+    pub fn slow_rate(&self) -> f64 {
+        let slips = matches!(self.kind, Kind::Slip | Kind::RunAway | Kind::Creep);
+        if slips && self.figure.abs() <= 0.12 { self.figure.abs() } else { 0.0 }
+    }
+
     /// Returns it in words, for a report.
     pub fn text(&self) -> String {
         format!(

@@ -99,6 +99,8 @@ pub struct Judge {
     resting: bool,
     ended: f64,
     at_rest_since: Option<f64>,
+    /// Velocities were commanded beside a lie: where the joints are is known to the tracking tolerance only.
+    blind: bool,
     wire: Option<Wire>,
     /// How far out the setpoints of this start may be.
     bounds: [(f64, f64); MAX_DOF],
@@ -125,6 +127,7 @@ impl Judge {
             resting: true,
             ended: 0.0,
             at_rest_since: None,
+            blind: false,
             wire: None,
             bounds: [(0.0, 0.0); MAX_DOF],
             stop: None,
@@ -155,7 +158,19 @@ impl Judge {
             (self.low[j], self.high[j]) = (truth.q[j] - extra(j), truth.q[j] + extra(j));
         }
         self.speed.fill(0.0);
+        self.blind = false;
         (self.resting, self.wire, self.at_rest_since) = (true, None, None);
+    }
+
+    /// Velocities are commanded while what is read is not true.
+    pub fn blind(&mut self) {
+        self.blind = true;
+    }
+
+    /// It may move by this much more: a step that no reading tells from noise [rad].
+    pub fn widen(&mut self, by: f64) {
+        self.low.iter_mut().for_each(|low| *low -= by);
+        self.high.iter_mut().for_each(|high| *high += by);
     }
 
     /// Judges the true joints. `active`: something is requested of the arm.
@@ -170,8 +185,10 @@ impl Judge {
             let rested = self.at_rest_since.is_some_and(|since| now - since.max(self.ended) > RESTED);
             let braking = (0..self.dof).map(|j| self.speed[j] / self.limits.acceleration_max[j]).fold(0.0, f64::max);
             if rested || now - self.ended > braking + 3.0 * self.s.lag + 0.8 {
-                self.low.copy_from_slice(&truth.q);
-                self.high.copy_from_slice(&truth.q);
+                let unknown = if self.blind { self.s.tracking_tolerance + 0.05 } else { 0.0 };
+                for j in 0..self.dof {
+                    (self.low[j], self.high[j]) = (truth.q[j] - unknown, truth.q[j] + unknown);
+                }
                 self.speed.fill(0.0);
                 self.resting = true;
             }

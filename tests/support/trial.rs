@@ -10,7 +10,7 @@ use dimos::control::config::*;
 use dimos::control::coordinator::{Coordinator, TickTime};
 use dimos::control::request::{Envelope, Request};
 use dimos::control::task_spec::TaskTable;
-use dimos::joint::Joints;
+use dimos::joint::{ControlMode, Joints};
 use dimos::robot::random::Random;
 use dimos::telemetry::{Cause, Event, Outcome, Phase, TaskState, TaskView};
 
@@ -260,13 +260,15 @@ impl Trial {
             (low..=high).contains(&said.position[j])
         };
         let hidden = hidden && (0..truth.dof).all(inside);
+        // Slower than a joint that counts as at rest, until the setpoint is taken.
+        let crept = lie.map_or(0.0, |(_, lie)| 0.35 * lie.slow_rate());
         let extra = |j: usize| {
             let off = (said.position[j] - truth.q[j]).abs();
             let (v, a) = (truth.traits.v_max[j], l.acceleration_max[j]);
             // It is held as soon as the joint is seen to move.
             let stopped = if self.row.goal_only { f64::INFINITY } else { v * (s.lag + 0.15) + v * v / (2.0 * a) };
             let off = if hidden { off.min(stopped) + 0.02f64.max(2.0 * s.accuracy) } else { 0.0 };
-            off + truth.traits.droop[j].abs()
+            off + crept + truth.traits.droop[j].abs()
         };
         self.judges[0].placed(truth, extra);
     }
@@ -289,6 +291,7 @@ impl Trial {
         let now = self.seconds();
         self.move_hand(dt);
         for i in 0..self.arms.len() {
+            self.arms[i].silent = false;
             if self.late_states && self.arms[i].enabled {
                 // Late states, of an age that the row allows.
                 let most = (0.6 * self.row.arm.supervision.stale_after.as_secs_f64() * self.rate) as usize;
@@ -328,9 +331,14 @@ impl Trial {
         output.retired.clear();
         self.requested(now, dt);
         let active = self.is_active();
+        let own = self.arms[0].traits.reports_commanded;
+        let lied = self.lie.as_ref().is_some_and(|(arm, lie)| *arm == 0 && lie.is_told());
         for (i, arm) in self.arms.iter_mut().enumerate() {
             let command = &self.commands[i];
             arm.take(command, &self.said[i]);
+            if i == 0 && lied && !own && command.mode == Some(ControlMode::Velocity) {
+                self.judges[i].blind();
+            }
             let written = arm.written.is_some_and(|(at, ..)| at == command.at);
             self.judges[i].command(now, command, written, arm);
             arm.advance(dt);

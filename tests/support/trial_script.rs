@@ -111,6 +111,8 @@ impl Trial {
             self.run_until(0.1, |trial| trial.said[0].enabled);
         }
         if lie {
+            let unseen = 0.02f64.max(2.0 * self.row.arm.supervision.accuracy);
+            self.judges[0].widen(unseen);
             self.begin_lie();
             self.some_ticks(4);
         }
