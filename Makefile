@@ -199,3 +199,7 @@ soak: viewer-if-possible
 # A million lying arms and a million honest ones in virtual time, in half an hour: rows, kinds of lies, broken rules.
 lies:
 	DIMOS_LIES=1000000 cargo test --release --locked --test logic lies::as_many -- --nocapture
+
+# Pauses and lost messages at full speed in virtual time: every row, rate and length, at 200 moments each.
+pauses:
+	DIMOS_PAUSES=200 cargo test --release --locked --test logic pauses:: -- --nocapture

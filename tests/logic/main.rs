@@ -42,6 +42,7 @@ mod model_verbs;
 mod no_alloc;
 mod older_logs;
 mod pages;
+mod pauses;
 mod planned_paths;
 mod planning;
 mod planning_timing;

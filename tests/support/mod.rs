@@ -11,6 +11,7 @@ pub mod delegate;
 pub mod fake_arms;
 pub mod fake_run;
 pub mod file_server;
+pub mod gap_arm;
 pub mod guarded;
 pub mod lies;
 pub mod loopback;
