@@ -12,8 +12,9 @@ use crate::support::lies::KINDS;
 use crate::support::motion_judge::{RULES, Rule, Violation};
 use crate::support::recorded::{piper_move, ur3e};
 use crate::support::shared::shared;
-use crate::support::trial::{Trial, kind_of};
+use crate::support::trial::Trial;
 use crate::support::trial_script::{trial, trial_with};
+use crate::support::trial_setup::kind_of;
 
 /// Cases of each test.
 const CASES: u64 = 500;

@@ -3,6 +3,7 @@
 #![allow(dead_code, reason = "each test binary uses a part")]
 
 pub mod arm_rows;
+pub mod arm_traits;
 pub mod busy;
 pub mod cable;
 pub mod certificates;
@@ -17,6 +18,7 @@ pub mod lies;
 pub mod loopback;
 pub mod motion_judge;
 pub mod network;
+pub mod pause_run;
 pub mod program;
 pub mod python;
 pub mod python_dimos;
@@ -31,6 +33,7 @@ pub mod tampered;
 pub mod terminal;
 pub mod trial;
 pub mod trial_script;
+pub mod trial_setup;
 pub mod true_arm;
 pub mod uml;
 pub mod virtual_run;
