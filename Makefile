@@ -1,5 +1,5 @@
 # run install dist viewer check test test-fast · test-tools test-rerun test-lerobot judge-hiroz deny mutants ·
-# bench bench-quick bench-page bench-share jitter soak
+# bench bench-quick bench-page bench-share jitter soak lies pauses
 
 PYTHON ?= python3
 # Most tests wait rather than compute. More at a time than this and whole runs no longer keep their time.
@@ -38,7 +38,7 @@ PAGE := viewer/dist/index.html
 PAGE_SOURCES := $(wildcard viewer/*.json viewer/*.mjs) $(shell find viewer/src -type f 2>/dev/null)
 NODE := $(if $(wildcard viewer/package.json),$(shell command -v npm))
 
-.PHONY: run install dist shipped viewer viewer-if-possible check lint spelling licences test test-fast test-tools test-rerun test-lerobot judge-hiroz deny mutants bench bench-quick bench-page bench-share jitter soak
+.PHONY: run install dist shipped viewer viewer-if-possible check lint spelling licences test test-fast test-tools test-rerun test-lerobot judge-hiroz deny mutants bench bench-quick bench-page bench-share jitter soak lies pauses
 
 # Builds the program to try it, not optimized, and starts the shipped blueprint; its arm is simulated. Ends with Ctrl-C.
 run: viewer-if-possible
@@ -195,3 +195,11 @@ soak: viewer-if-possible
 	DIMOS_BRAKING=1000 cargo test --locked --test logic braking
 	DIMOS_GUARD_TARGETS=1000000 cargo test --release --locked --test logic guard::adversarial -- --nocapture
 	DIMOS_PAGE_SOAK=60 cargo test --locked --test peers several_arms -- --nocapture
+
+# A million lying arms and a million honest ones in virtual time, in half an hour: rows, kinds of lies, broken rules.
+lies:
+	DIMOS_LIES=1000000 cargo test --release --locked --test logic lies::as_many -- --nocapture
+
+# Pauses and lost messages at full speed in virtual time: every row, rate and length, at 200 moments each.
+pauses:
+	DIMOS_PAUSES=200 cargo test --release --locked --test logic pauses:: -- --nocapture
