@@ -1,7 +1,7 @@
-//! The coordinator between true arms and lying readings, and between true arms and honest ones, in virtual time: what no
-//! true joint, no setpoint and no stop may ever do, whatever an arm says. Each case is a seed:
-//! `DIMOS_LIE=123 cargo test --test logic lies::one -- --nocapture` shows every tick of it, `DIMOS_LIE=h123` of an honest
-//! one. `make lies` runs a million.
+//! The coordinator between true arms and lying readings, and between true arms and honest ones, in virtual time: what
+//! no true joint, no setpoint and no stop may ever do, whatever an arm says. Each case is a seed:
+//! `DIMOS_LIE=123 cargo test --test logic lies::one -- --nocapture` shows every tick of it, `DIMOS_LIE=h123` of an
+//! honest one. `make lies` runs a million.
 
 use std::collections::BTreeMap;
 use std::sync::Mutex;
@@ -186,7 +186,8 @@ fn as_many_as_are_asked_for() {
     let _ = std::panic::take_hook();
     let findings = findings.into_inner().unwrap();
     findings.iter().for_each(Findings::print);
-    findings.iter().for_each(Findings::assert_none);
+    findings.iter().flat_map(|all| &all.shown).for_each(|text| println!("{text}"));
+    assert_eq!(findings.iter().map(Findings::broken).sum::<u64>(), 0, "cases broke a rule");
 }
 
 /// Shows every tick of the case `DIMOS_LIE`.

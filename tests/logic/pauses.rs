@@ -72,7 +72,7 @@ fn play(seed: u64, verbose: bool) -> (String, Broken) {
                 paused = true;
                 let beyond = run.period + pause > run.tolerance + 1e-9;
                 run.rests += f64::from(u8::from(beyond));
-                // What the controller does by itself, in this pause and, beyond its tolerance, until it rests.
+                // What the controller does on its own, in this pause and, beyond its tolerance, until it rests.
                 let mut own = run.arm.clone();
                 let steps = ((run.period + pause) / STEP).round() as u64;
                 (0..steps).for_each(|_| own.step());

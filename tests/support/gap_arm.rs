@@ -1,6 +1,8 @@
 //! What each arm's controller does while no setpoint comes, from the vendors' protocols, in steps of a millisecond.
 //! Shares nothing with `dimos::control`. Without noise and droop: what it does beside the path is its reaction.
 
+#![allow(clippy::needless_range_loop, reason = "joints are indices into several arrays at once")]
+
 use super::arm_rows::Row;
 
 /// Step [s].
@@ -18,8 +20,8 @@ pub enum Silence {
     Extrapolates,
     /// UR: keeps the velocity, then decelerates along it, and waits.
     KeepsVelocity,
-    /// xArm, YourArm, remote: at the last point. Piper, SO-101: goes on to the last goal, which is the same for
-    /// setpoints of one period.
+    /// xArm, YourArm, remote: at the last point. Piper, SO-101: continues to the last goal, which is the same
+    /// for setpoints of one period.
     Rests,
 }
 

@@ -1,5 +1,7 @@
 //! What lies between a true arm and the coordinator: wrong readings, of which no message says that they are wrong.
 
+#![allow(clippy::needless_range_loop, reason = "joints are indices into several arrays at once")]
+
 use std::collections::VecDeque;
 
 use dimos::arm::ArmState;
@@ -56,7 +58,7 @@ pub const KINDS: [Kind; 16] = [
 ];
 
 impl Kind {
-    /// Returns whether it is the same all the time: begun before the motors came on, nobody can see it in positions.
+    /// Returns whether it is the same all the time: begun before the motors came on, no client can see it in positions.
     pub fn is_constant(self) -> bool {
         matches!(self, Self::TurnLost | Self::SignFlipped | Self::Swapped | Self::Scaled | Self::Zero | Self::Offset)
     }
@@ -125,7 +127,7 @@ pub struct Lie {
 }
 
 impl Lie {
-    /// Draws a lie for an arm of so many joints with readings every `period` [s].
+    /// Draws a lie for an arm with `dof` joints and readings every `period` [s].
     pub fn draw(kind: Kind, occasion: Occasion, dof: usize, period: f64, random: &mut Random) -> Self {
         let signed = |random: &mut Random, low: f64, high: f64| {
             let size = random.between(low, high);
@@ -180,7 +182,7 @@ impl Lie {
         self.begun
     }
 
-    /// Returns whether it is being told.
+    /// Returns whether the reading is wrong now.
     pub fn is_told(&self) -> bool {
         self.begun
             && match self.span {
@@ -190,7 +192,7 @@ impl Lie {
             }
     }
 
-    /// Returns the rate of a slip that no reading tells from rest [rad/s]; 0 of all else.
+    /// Returns the rate of a slip that looks like rest [rad/s]; 0 of all else.
     pub fn slow_rate(&self) -> f64 {
         let slips = matches!(self.kind, Kind::Slip | Kind::RunAway | Kind::Creep);
         if slips && self.figure.abs() <= 0.12 { self.figure.abs() } else { 0.0 }
@@ -216,7 +218,7 @@ impl Lie {
         self.joints.trailing_zeros() as usize
     }
 
-    /// Makes of a true reading what is told. `dt`: time since the one before [s].
+    /// Returns what is reported instead of a true reading. `dt`: time since the one before [s].
     pub fn tell(&mut self, truth: &ArmState, dt: f64, random: &mut Random) -> ArmState {
         self.past.push_back(*truth);
         if self.past.len() > self.readings + 1 {

@@ -167,7 +167,7 @@ impl Judge {
         self.blind = true;
     }
 
-    /// It may move by this much more: a step that no reading tells from noise [rad].
+    /// It may move by this much more: a step that looks like noise [rad].
     pub fn widen(&mut self, by: f64) {
         self.low.iter_mut().for_each(|low| *low -= by);
         self.high.iter_mut().for_each(|high| *high += by);
@@ -206,7 +206,7 @@ impl Judge {
             };
             let out = (self.low[j] - truth.q[j]).max(truth.q[j] - self.high[j]);
             let rule = if self.resting { Rule::Unasked } else { Rule::Path };
-            if !(out <= margin) {
+            if out > margin || out.is_nan() {
                 let (q, low, high) = (truth.q[j], self.low[j], self.high[j]);
                 self.report(rule, now, j, out - margin, || {
                     format!("joint at {q:.4}, requested {low:.4} to {high:.4}, margin {margin:.4} rad")

@@ -1,6 +1,8 @@
 //! A coordinator that commands a straight line of the joints, and what a controller makes of it while the run pauses:
 //! whatever leaves the line, or goes back on it, is found.
 
+#![allow(clippy::needless_range_loop, reason = "joints are indices into several arrays at once")]
+
 use std::collections::BTreeMap;
 use std::time::Duration;
 
@@ -45,7 +47,7 @@ pub struct Run {
     pub to: Vec<f64>,
     /// The last setpoint that was written: its time [s], positions, velocities.
     pub wire: Option<(f64, f64, Vec<f64>, Vec<f64>)>,
-    /// The controller has come to rest by itself: setpoints start from rest.
+    /// The controller is at rest after the gap: setpoints start from rest.
     pub from_rest: bool,
     /// Longest time without a setpoint that is bridged [s], and how often it was exceeded.
     pub tolerance: f64,

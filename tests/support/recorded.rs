@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-/// Differences per joint [rad], one row every so many seconds.
+/// Differences per joint [rad], and the period of the rows [s].
 pub type Residuals = (f64, Vec<Vec<f64>>);
 
 /// A Piper in MOVE J: staircases, joint by joint, with steps back. Against the mean of nine readings.

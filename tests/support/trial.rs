@@ -1,5 +1,7 @@
-//! One trial: a coordinator on a virtual clock between a true arm and, perhaps, a lie. A sequence of requests drawn from
-//! a seed, and the judgement.
+//! One trial: a coordinator on a virtual clock between a true arm and, perhaps, a lie. A sequence of requests drawn
+//! from a seed, and the judgement.
+
+#![allow(clippy::needless_range_loop, reason = "joints are indices into several arrays at once")]
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -68,7 +70,7 @@ pub struct Trial {
     pub velocities: Option<(Joints, Joints, f64)>,
     /// Of a follower: whether what is read of the leader counts as requested.
     pub(super) led_by_reading: bool,
-    /// States are late for so many ticks from time to time.
+    /// States are late for some ticks from time to time.
     pub late_states: bool,
     pub(super) late_left: Vec<usize>,
     pub verbose: bool,

@@ -1,5 +1,5 @@
-//! What is asked of an arm in a trial: enabled, moved by every type of task, stopped, reset, disabled, in an order drawn
-//! from the seed; when the lie begins; and what an honest arm must make of it.
+//! What is asked of an arm in a trial: enabled, moved by every type of task, stopped, reset, disabled, in an order
+//! drawn from the seed; when the lie begins; and what an honest arm must make of it.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
@@ -311,7 +311,8 @@ impl Trial {
         }
     }
 
-    /// Joints on their way to a pose that is near: on the straight line of its frame they are not on that of the joints.
+    /// Joints on their way to a pose that is near: on the straight line of its frame they are not on that of the
+    /// joints.
     fn detour(&mut self, here: &[f64], goal: &[f64]) {
         for (j, (from, to)) in here.iter().zip(goal).enumerate() {
             self.judges[0].request(j, from.min(*to) - 0.25, 0.5);
