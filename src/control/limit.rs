@@ -8,6 +8,8 @@ use crate::telemetry::LimitKind;
 
 /// Highest speed of a joint on its way back into its range [rad/s].
 pub const WAY_BACK: f64 = 0.1;
+/// A slower command is at rest [rad/s].
+const AT_REST: f64 = 1e-6;
 /// Slack for rounding: a command at its limit is not "limited".
 const ROUNDING: f64 = 1e-9;
 
@@ -138,9 +140,9 @@ impl Limiter {
         if outside { self.bounds.velocity.min(WAY_BACK) } else { self.bounds.velocity }
     }
 
-    /// Returns whether the commanded velocity is 0.
+    /// Returns whether the commanded velocity is 0, or what rounding leaves of it.
     pub fn at_rest(&self) -> bool {
-        self.velocity == 0.0
+        self.velocity.abs() <= AT_REST
     }
 
     /// Forgets the last request: the step of the next one counts from the last command.

@@ -231,8 +231,8 @@ pub trait ManipulatorAdapter: Send {
         self.write_joint_positions(setpoint.position.get(..self.get_dof()).unwrap_or_default(), 1.0)
     }
     /// Stops all motion at once with the device's own stop; the motors stay powered. An operational stop. An arm whose
-    /// controller only takes goals is given `rest` as its goal; no adapter makes a goal from a measurement, which may be
-    /// wrong. The device thread holds a gripper that still moves afterwards at its current position.
+    /// controller only takes goals is given `rest` as its goal; no adapter makes a goal from a measurement, which may
+    /// be wrong. The device thread holds a gripper that still moves afterwards at its current position.
     fn write_stop(&mut self, rest: &StopPoint) -> AdapterResult<Stop>;
     /// Enables or disables the motors.
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()>;

@@ -84,8 +84,15 @@ impl Trial {
                     self.stop();
                 }
                 self.wait(0.05, 0.3);
+                let mismatch = matches!(self.phases[0].1, Cause::StartMismatch(..));
                 self.ask(Request::Reset { arm: 0 });
                 self.wait(0.02, 0.2);
+                if mismatch {
+                    // An operator has seen both poses, and takes the one that is read.
+                    for (j, q) in self.said[0].position.into_iter().enumerate().take(self.row.arm.dof) {
+                        self.judges[0].request(j, q, self.row.arm.limits.velocity_max[j]);
+                    }
+                }
                 self.enable(false);
             }
             self.any_motion(false);

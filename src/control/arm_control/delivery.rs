@@ -106,7 +106,7 @@ impl ArmControl {
             return;
         }
         let down = matches!(self.feedback.state().link, Link::Down | Link::Faulted);
-        let waits = self.config.supervision.after_gap == AfterGap::Decelerates && mode.is_position();
+        let waits = self.config.supervision.after_gap != AfterGap::RestsAtSetpoint && mode.is_position();
         let last = *self.rest.written.last();
         // A command from before the gap may be written after the gap was noticed.
         let late = self.rest.gap.is_some_and(|gap| last.seq < gap.first) && !waits;

@@ -44,7 +44,7 @@ impl ArmControl {
             return Routed::Waiting;
         }
         if let Some(gap) = self.rest.gap {
-            let waits = self.config.supervision.after_gap == AfterGap::Decelerates && gap.mode.is_position();
+            let waits = self.config.supervision.after_gap != AfterGap::RestsAtSetpoint && gap.mode.is_position();
             self.command.mode = if waits { None } else { Some(gap.mode) };
             return self.wait_in_gap(gap.mode, ask, dt);
         }

@@ -56,6 +56,8 @@ impl ArmControl {
         if held && self.rest.relief != Relief::None {
             (self.rest.relief, self.command.mode) = (Relief::None, None);
         }
+        // Whatever the readings say, setpoints at rest are not waited for.
+        self.rest.moved &= !held;
         self.rest.stop_pending |= held && self.command.mode.is_none();
     }
 

@@ -111,7 +111,7 @@ impl ArmControl {
         self.rest.still += dt;
         let lagged = self.rest.still > self.config.supervision.lag;
         let rests = self.feedback.rest_time() >= SETTLED && lagged;
-        rests || !self.feedback.freshness().fresh || self.rest.still > SETTLING_TIME
+        rests || (lagged && !self.feedback.is_usable()) || self.rest.still > SETTLING_TIME
     }
 
     /// Returns whether the measured velocities and the commands are at rest.

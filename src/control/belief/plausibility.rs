@@ -12,8 +12,9 @@ use crate::joint::{Joints, MAX_DOF, joints_of};
 const SPEED_MARGIN: f64 = 1.5;
 /// Noise of a position that is always accepted [rad].
 const NOISE: f64 = 0.02;
-/// Fastest that a hand moves a joint whose motor is off [rad/s].
+/// Fastest that a hand moves a joint whose motor is off [rad/s], and highest acceleration of that [rad/s²].
 const HAND_SPEED: f64 = 20.0;
+const HAND_ACCELERATION: f64 = 400.0;
 /// Longest time between two readings that counts: the arm may have moved meanwhile [s].
 const LONGEST_GAP: f64 = 0.5;
 /// Number of consecutive, consistent rejected readings that are a jump.
@@ -56,6 +57,8 @@ pub struct Plausibility {
     seq: u64,
     enabled: bool,
     accepted: (Joints, Mono),
+    /// Velocities between the last two accepted readings [rad/s].
+    velocity: Joints,
     /// When the newest reading was measured, accepted or not.
     newest: Mono,
     rejected: u32,
@@ -83,6 +86,7 @@ impl Plausibility {
             seq: 0,
             enabled: false,
             accepted: none,
+            velocity: [0.0; MAX_DOF],
             newest: Mono::ZERO,
             rejected: 0,
             candidate: none,
@@ -124,6 +128,10 @@ impl Plausibility {
             None => self.worst(&self.accepted.0, &reading.0, range.filter(|_| powered), powered, dt),
         };
         let Some((joint, step)) = worst else {
+            let pairs = reading.0.iter().zip(&self.accepted.0);
+            for (v, (now, before)) in self.velocity.iter_mut().zip(pairs) {
+                *v = if first { 0.0 } else { (now - before) / dt };
+            }
             self.accepted = reading;
             self.rejected = 0;
             return Verdict::Accepted;
@@ -171,7 +179,8 @@ impl Plausibility {
                 None => (*a, *a),
             };
             let beyond = (low - b).max(b - high).max(0.0);
-            let reach = if powered { SPEED_MARGIN * speed } else { HAND_SPEED } * dt + NOISE;
+            let by_hand = self.velocity.get(j).map_or(0.0, |v| v.abs()) + HAND_ACCELERATION * dt;
+            let reach = if powered { SPEED_MARGIN * speed } else { by_hand.min(HAND_SPEED) } * dt + NOISE;
             let excess = beyond - reach;
             if excess > 0.0 && worst.is_none_or(|(_, _, by)| excess > by) {
                 worst = Some((j, b - a, excess));
@@ -252,8 +261,9 @@ mod tests {
         let mut b = plausibility();
         let off = |state| ArmState { enabled: false, ..state };
         b.take(&off(reading(1, 10, [0.0, 0.0])), None);
-        assert_eq!(b.take(&off(reading(2, 20, [0.2, 0.0])), None), Verdict::Accepted);
-        let turned = |k: u64| off(reading(3 + k, 30 + 10 * k, [0.2 + TURN, 0.0]));
+        assert_eq!(b.take(&off(reading(2, 20, [0.05, 0.0])), None), Verdict::Accepted);
+        assert_eq!(b.take(&off(reading(3, 30, [0.15, 0.0])), None), Verdict::Accepted, "5 rad/s, then 10");
+        let turned = |k: u64| off(reading(4 + k, 40 + 10 * k, [0.15 + TURN, 0.0]));
         assert_eq!(
             [0, 1, 2].map(|k| b.take(&turned(k), None)),
             [Verdict::Rejected, Verdict::Rejected, Verdict::TurnLost(0, TURN)]

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use crate::arm::ArmState;
+use crate::arm::{ArmState, VelocitySource};
 use crate::clock::Mono;
 use crate::joint::{Joints, MAX_DOF, TICK_STANDSTILL};
 
@@ -33,7 +33,9 @@ impl Stillness {
 
     /// Takes an accepted state.
     pub fn take(&mut self, state: &ArmState) {
-        let slow = state.velocity.iter().take(self.dof).all(|v| v.abs() <= TICK_STANDSTILL);
+        // An estimate has nothing that the positions have not.
+        let measured = state.velocity_source == VelocitySource::Measured;
+        let slow = !measured || state.velocity.iter().take(self.dof).all(|v| v.abs() <= TICK_STANDSTILL);
         let mut moved = state.position.iter().zip(&self.anchor).take(self.dof);
         let near = moved.all(|(q, anchor)| (q - anchor).abs() <= self.noise);
         if self.since.is_none() || !near || !slow {
@@ -55,7 +57,9 @@ mod tests {
 
     fn state(ms: u64, q: f64, v: f64) -> ArmState {
         let (position, velocity) = (joints_of(&[q]), joints_of(&[v]));
-        ArmState { seq: ms, stamp: Mono(ms * 1_000_000), dof: 1, position, velocity, ..ArmState::default() }
+        let velocity_source = VelocitySource::Measured;
+        let stamp = Mono(ms * 1_000_000);
+        ArmState { seq: ms, stamp, dof: 1, position, velocity, velocity_source, ..ArmState::default() }
     }
 
     #[test]

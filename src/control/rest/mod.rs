@@ -17,7 +17,7 @@ pub use relief::{Move, Relief};
 use written::{Issued, Written};
 
 /// Maximum time for a lagging arm to settle at its last command before it is stopped [s].
-pub const SETTLING_TIME: f64 = 0.5;
+pub const SETTLING_TIME: f64 = 0.4;
 /// How long an arm that has settled must have been read at rest.
 pub const SETTLED: Duration = Duration::from_millis(30);
 /// How long an arm may take to be at rest after a gap, beside its lag and twice its braking time [s].

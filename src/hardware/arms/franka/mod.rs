@@ -59,8 +59,8 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     droop: 0.0,
     relief: 0.0,
     outside: 0.02,
-    // Franka's FCI documentation: up to 19 lost commands are extrapolated with constant acceleration, the twentieth ends
-    // the motion.
+    // Franka's FCI documentation: up to 19 lost commands are extrapolated with constant acceleration, the twentieth
+    // ends the motion.
     gap_tolerance: Duration::from_millis(19),
     after_gap: AfterGap::Faults,
     topology: Topology::MultiTurn,
