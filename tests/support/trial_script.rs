@@ -6,7 +6,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use dimos::control::request::{Goal, Motion, Request};
 use dimos::control::tasks::chunk::curve;
 use dimos::joint::joints_of;
-use dimos::telemetry::{Outcome, Phase, TaskState};
+use dimos::telemetry::{Cause, Outcome, Phase, TaskState};
 use dimos::trajectory::Spline;
 use glamx::{DAffine3, DQuat};
 
