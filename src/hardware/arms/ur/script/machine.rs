@@ -91,11 +91,15 @@ impl Machine {
             match instruction {
                 Instruction::Number(to, value) => {
                     let value = self.number(value, controller);
-                    self.numbers.iter_mut().skip(*to).take(1).for_each(|to| *to = value);
+                    if let Some(to) = self.numbers.get_mut(*to) {
+                        *to = value;
+                    }
                 }
                 Instruction::List(to, value) => {
                     let value = self.list(value, controller);
-                    self.lists.iter_mut().skip(*to).take(1).for_each(|to| *to = value);
+                    if let Some(to) = self.lists.get_mut(*to) {
+                        *to = value;
+                    }
                 }
                 Instruction::Item(list, index, value) => {
                     let (index, value) = (self.number(index, controller), self.number(value, controller));

@@ -145,6 +145,6 @@ fn what_the_language_does_not_have_is_refused() {
         assert!(found.as_ref().is_some_and(|found| found.contains(why)), "{lines:?}: {found:?}");
     }
     assert_eq!(refused("def f():\n  a = 1\n"), Some("line 2: \"end\" is missing, found None".into()));
-    assert_eq!(refused("def f():\n  a = 1\nend\nend\n").unwrap(), "line 3: \"end\" begins no statement");
+    assert_eq!(refused("def f():\n  a = 1\nend\nend\n").unwrap(), "line 4: \"end\" begins no statement");
     assert!(refused(&format!("a = {}1{}\n", "(".repeat(5000), ")".repeat(5000))).unwrap().contains("too many"));
 }

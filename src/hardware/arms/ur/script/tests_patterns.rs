@@ -336,7 +336,7 @@ fn pattern(seed: u64) -> f64 {
         }
     }
     // It ends by order or by silence, from any velocity.
-    if dice.below(4) > 0 {
+    if dice.below(8) > 0 {
         judge.order(STOP, [0.0; 6]);
     }
     judge.steps(4.0);
