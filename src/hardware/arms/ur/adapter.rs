@@ -13,7 +13,7 @@ use super::protocol::inputs::Order;
 use super::safety::Stopped;
 use super::session::Session;
 use super::{DOF, HOLDS_WHEN_DISABLED, MODES, Options, check};
-use crate::arm::{Pose, StopPoint};
+use crate::arm::{Commanded, Pose, StopPoint};
 use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, ForceTorque, Io, JointMonitor, JointReading, ManipulatorAdapter,
     ManipulatorInfo, Payload, RobotState, Stop,
@@ -126,7 +126,7 @@ impl ManipulatorAdapter for UrAdapter {
 
     fn get_limits(&mut self) -> AdapterResult<JointLimits> {
         let device = self.session.as_ref().map(|session| session.device.limits.clone());
-        Ok(device.unwrap_or_else(|| self.options.model.limits()))
+        Ok(device.unwrap_or_else(|| self.options.limits()))
     }
 
     // --- Mode ---
@@ -175,7 +175,8 @@ impl ManipulatorAdapter for UrAdapter {
 
     fn read_joints(&mut self, reading: &mut JointReading) -> AdapterResult<()> {
         self.with(|session| session.update(Duration::ZERO))?;
-        let (state, stamp) = self.session.as_ref().ok_or(AdapterError::NotConnected)?.state();
+        let session = self.session.as_ref().ok_or(AdapterError::NotConnected)?;
+        let (state, stamp) = session.state();
         *reading = JointReading {
             stamp: Some(stamp),
             device_ns: Some((state.time * 1e9) as u64),
@@ -186,7 +187,9 @@ impl ManipulatorAdapter for UrAdapter {
             // Before power-on the positions may not be measured yet. Enabling does not use them: the controller itself
             // holds the arm, and once its motors are on they are measured.
             valid: Some(true),
-            commanded: None,
+            commanded: session
+                .enabled()
+                .then(|| Commanded { position: joints_of(&state.target), velocity: joints_of(&state.target_velocity) }),
         };
         Ok(())
     }

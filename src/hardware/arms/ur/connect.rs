@@ -1,5 +1,6 @@
 //! Connecting: identifies the arm and compares it with the blueprint. Enables and moves nothing.
 
+use std::f64::consts::TAU;
 use std::time::Duration;
 
 use super::Options;
@@ -39,7 +40,7 @@ pub fn connect(address: &Address, options: &Options) -> AdapterResult<Session> {
         model: options.model,
         software: format!("{major}.{minor}.{bugfix}"),
         serial,
-        limits: narrowed(options.model.limits(), &configuration),
+        limits: narrowed(options.model, options.limits(), &configuration),
     };
     Ok(Session::new(device, address.clone(), rtde, primary, first))
 }
@@ -73,9 +74,13 @@ fn verify(address: &Address, model: Model, kind: u32, major: u8) -> AdapterResul
 }
 
 /// Returns the limits of the model, narrowed by those of the arm's safety configuration where they make sense.
-fn narrowed(mut limits: JointLimits, found: &Configuration) -> JointLimits {
+fn narrowed(model: Model, mut limits: JointLimits, found: &Configuration) -> JointLimits {
     let ranges = limits.position_lower.iter_mut().zip(&mut limits.position_upper).zip(found.ranges);
-    for ((lower, upper), (low, high)) in ranges {
+    for (joint, ((lower, upper), (low, high))) in ranges.enumerate() {
+        // Which range a controller reports of an endless joint is not known: a turn each way does not narrow it.
+        if model.is_endless(joint) && high - low > 2.0 * TAU - 0.01 {
+            continue;
+        }
         if low.max(*lower) < high.min(*upper) {
             (*lower, *upper) = (low.max(*lower), high.min(*upper));
         }
@@ -96,13 +101,24 @@ mod tests {
     fn the_safety_configuration_narrows_the_limits() {
         let model = Model::Ur5e.limits();
         let mut found = Configuration::default();
-        assert_eq!(narrowed(model.clone(), &found), model, "zeros are no limits");
+        let limits_of = |found: &Configuration| narrowed(Model::Ur5e, Model::Ur5e.limits(), found);
+        assert_eq!(limits_of(&found), model, "zeros are no limits");
         found.ranges[2] = (-2.5, 2.0);
         found.ranges[0] = (-9.0, 9.0);
         found.speeds = [1.0, 9.0, 0.0, 3.0, 3.0, 3.0];
-        let limits = narrowed(model.clone(), &found);
+        let limits = limits_of(&found);
         assert_eq!((limits.position_lower[2], limits.position_upper[2]), (-2.5, 2.0));
         assert_eq!(limits.position_upper[0], model.position_upper[0]);
         assert_eq!((limits.velocity_max[0], limits.velocity_max[1]), (1.0, model.velocity_max[1]));
+    }
+
+    #[test]
+    fn an_endless_joint_is_narrowed_by_less_than_a_turn_each_way() {
+        for (range, upper) in [((-TAU, TAU), 1000.0), ((-6.34, 6.34), 1000.0), ((-3.0, 3.0), 3.0)] {
+            let mut found = Configuration::default();
+            (found.ranges[0], found.ranges[5]) = (range, range);
+            let limits = narrowed(Model::Ur3e, Model::Ur3e.limits(), &found);
+            assert_eq!((limits.position_upper[0], limits.position_upper[5]), (range.1.min(TAU), upper));
+        }
     }
 }

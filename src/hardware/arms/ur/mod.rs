@@ -21,6 +21,7 @@ pub mod program;
 pub mod protocol;
 mod rtde;
 mod safety;
+mod script;
 mod session;
 #[cfg(test)]
 mod tests;
@@ -39,7 +40,7 @@ use serde::{Deserialize, Serialize};
 use crate::arm::{AfterGap, Topology};
 use crate::hardware::check::{Checked, ConfigError, in_range};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
-use crate::joint::ControlMode;
+use crate::joint::{ControlMode, JointLimits};
 use address::Address;
 use model::Model;
 
@@ -102,7 +103,7 @@ pub struct Options {
     /// Gain with which the controller follows setpoints, 100 to 2000: higher is stiffer, and may vibrate.
     #[schemars(range(min = 100, max = 2000))]
     pub gain: f64,
-    /// Deceleration of a stop, 1 to 40 [rad/s²].
+    /// Deceleration of a stop, of a hold and after a gap, 1 to 40 [rad/s²]. Setpoints are followed with no more than it.
     #[schemars(range(min = 1, max = 40))]
     pub stop_deceleration: f64,
     /// Whether to read force and torque at the TCP. An e-Series arm measures them; a CB3 arm estimates them from its
@@ -125,6 +126,16 @@ impl Default for Options {
     }
 }
 
+impl Options {
+    /// Returns the limits of the configured model. No joint accelerates faster than the arm decelerates: what is
+    /// commanded stops within the way that these limits imply.
+    fn limits(&self) -> JointLimits {
+        let mut limits = self.model.limits();
+        limits.acceleration_max.iter_mut().for_each(|most| *most = most.min(self.stop_deceleration));
+        limits
+    }
+}
+
 /// Returns the limits of the configured model.
 fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("ur", SPEC.dof)?;
@@ -132,7 +143,11 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     in_range("lookahead_time", options.lookahead_time, (0.03, 0.2))?;
     in_range("gain", options.gain, (100.0, 2000.0))?;
     in_range("stop_deceleration", options.stop_deceleration, (1.0, 40.0))?;
-    let limits = options.model.limits();
+    let limits = options.limits();
     options.sim.check(&limits)?;
-    Ok(Checked::new(limits).digital_inputs(io::DIGITAL).max_payload(io::max_payload(options.model)))
+    let topology = |joint| if options.model.is_endless(joint) { Topology::Endless } else { SPEC.topology };
+    Ok(Checked::new(limits)
+        .digital_inputs(io::DIGITAL)
+        .max_payload(io::max_payload(options.model))
+        .topology((0..DOF).map(topology).collect()))
 }

@@ -34,6 +34,9 @@ pub enum Model {
     Ur30,
 }
 
+/// Range of an endless joint each way [rad]: 159 turns. A position of that size is exact to 1e-13 rad, and the wrist
+/// turns for more than 2 minutes at top speed to get there.
+const ENDLESS: f64 = 1000.0;
 /// Acceleration [rad/s²] and jerk [rad/s³] of every joint. The vendor publishes none: these are ours.
 const ACCELERATION: f64 = 8.0;
 const JERK: f64 = 200.0;
@@ -106,12 +109,18 @@ impl Model {
         if self.is_cb3() { 125.0 } else { 500.0 }
     }
 
+    /// Returns whether a joint, counted from 0, turns without end: wrist 3 of the smallest arms.
+    pub fn is_endless(self, joint: usize) -> bool {
+        joint == DOF - 1 && matches!(self, Self::Ur3 | Self::Ur3e)
+    }
+
     /// Returns the published joint limits. An arm's safety configuration may narrow them.
     pub fn limits(self) -> JointLimits {
         let [base, shoulder, elbow, wrist] = self.sheet().speed.map(f64::to_radians);
+        let range = |joint| if self.is_endless(joint) { ENDLESS } else { TAU };
         JointLimits {
-            position_lower: vec![-TAU; DOF],
-            position_upper: vec![TAU; DOF],
+            position_lower: (0..DOF).map(|joint| -range(joint)).collect(),
+            position_upper: (0..DOF).map(range).collect(),
             velocity_max: vec![base, shoulder, elbow, wrist, wrist, wrist],
             acceleration_max: vec![ACCELERATION; DOF],
             jerk_max: vec![JERK; DOF],

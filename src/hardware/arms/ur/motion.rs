@@ -41,7 +41,7 @@ impl Session {
         if self.unanswered.is_some_and(|since| MonotonicClock.now().since(since) > most) {
             return Err(AdapterError::Busy);
         }
-        self.setpoint(order)
+        self.order(order)
     }
 
     /// Ends a stream of setpoints in another mode: the arm holds.

@@ -1,6 +1,6 @@
 //! The programs that the adapter sends to the controller. The text is in `control.script`.
 
-use super::Options;
+use super::{Options, SPEC};
 use crate::joint::JointLimits;
 
 /// The control program, with its constants to be filled in. A counter, checked in each step, ends it when orders no
@@ -10,11 +10,15 @@ const CONTROL: &str = include_str!("control.script");
 const STANDARD_GRAVITY: f64 = 9.82;
 
 /// Returns the control program. `number` distinguishes its state from that of an earlier one; no joint goes faster than
-/// its top speed in `limits`.
+/// its top speed in `limits`, or beyond its range.
 pub fn control(number: i32, options: &Options, limits: &JointLimits) -> String {
-    let speeds = limits.velocity_max.iter().map(f64::to_string).collect::<Vec<_>>().join(", ");
+    // Of floats, also whole ones: the program changes items of the lists.
+    let list = |values: &[f64]| values.iter().map(|value| format!("{value:?}")).collect::<Vec<_>>().join(", ");
     CONTROL
-        .replace("@SPEEDS@", &speeds)
+        .replace("@SPEEDS@", &list(&limits.velocity_max))
+        .replace("@LOWER@", &list(&limits.position_lower))
+        .replace("@UPPER@", &list(&limits.position_upper))
+        .replace("@GAP@", &format!("{:?}", SPEC.gap_tolerance.as_secs_f64()))
         .replace("@NUMBER@", &number.to_string())
         .replace("@LOOKAHEAD@", &options.lookahead_time.to_string())
         .replace("@GAIN@", &options.gain.to_string())
@@ -59,7 +63,7 @@ mod tests {
         assert!(text.starts_with("def dimos_control():\n") && text.ends_with("\nend\n"));
         assert!(text.contains("\n  number = 7\n") && !text.contains('@'), "{text}");
         assert!(text.contains("servoj(q, 0, 0, step, 0.05, 500)") && text.contains("stopj(8)"), "{text}");
-        assert!(text.is_ascii() && text.lines().count() < 120);
+        assert!(text.is_ascii() && text.lines().count() < 220);
         // Every block is closed, and its lines are indented by two.
         let mut depth = 0_usize;
         for line in text.lines() {

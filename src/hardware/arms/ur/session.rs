@@ -23,13 +23,10 @@ use crate::joint::JointLimits;
 /// A live controller sends its state 125 or 500 times per second. Without one for this time the connection is lost,
 /// even if the socket is open.
 const STATE_TIMEOUT: Duration = Duration::from_millis(500);
-/// Without a setpoint, the last order is repeated this often: the program ends when no orders come.
+/// Without a setpoint for this time, and then this often, the arm is ordered to hold: the program, which decelerates
+/// after its own, shorter tolerance, ends when no orders come. A setpoint is never repeated, for it would be late.
 const HEARTBEAT: Duration = Duration::from_millis(60);
-/// A last setpoint is kept for this time; then the arm holds without one.
-const SETTLED: Duration = Duration::from_secs(1);
-/// Bounds of the time without a velocity after which the arm is held.
-const HOLD_AFTER: (Duration, Duration) = (Duration::from_millis(50), Duration::from_millis(150));
-/// A program that does not answer orders for this time has failed, unless it decelerates: `stopj` blocks it.
+/// A program that does not answer orders for this time has failed.
 const ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
 /// Time between two reads of the primary interface.
 const PRIMARY_PERIOD: Duration = Duration::from_millis(20);
@@ -84,11 +81,6 @@ pub struct Session {
     pub(super) unanswered: Option<Mono>,
     /// Values of the last order that had some: its positions or velocities.
     values: [f64; 6],
-    /// When the program was last seen to decelerate to a hold.
-    braking_at: Mono,
-    /// When the last setpoint was sent, and the time between it and the one before.
-    setpoint_at: Mono,
-    interval: Duration,
 }
 
 impl Session {
@@ -116,9 +108,6 @@ impl Session {
             sent_at: Mono::ZERO,
             unanswered: None,
             values: first.position,
-            braking_at: Mono::ZERO,
-            setpoint_at: Mono::ZERO,
-            interval: HOLD_AFTER.1,
         };
         session.see_safety();
         session
@@ -187,7 +176,7 @@ impl Session {
                 self.outputs = None;
             }
         }
-        if self.unanswered.is_some_and(|since| now.since(since.max(self.braking_at)) > ANSWER_TIMEOUT) {
+        if self.unanswered.is_some_and(|since| now.since(since) > ANSWER_TIMEOUT) {
             self.lose_program("the program on the controller does not answer");
         }
         if std::mem::take(&mut self.end_due) {
@@ -277,9 +266,6 @@ impl Session {
         } else if echoed && self.unanswered.is_some() {
             self.unanswered = Some(arrived);
         }
-        if state.program == program::HOLDING && !self.at_rest() {
-            self.braking_at = arrived;
-        }
         self.see_safety();
         self.see_program();
     }
@@ -293,7 +279,9 @@ impl Session {
         } else if !self.enabled() {
             self.ready = None; // the motors' state says it
         } else if state.number == number && state.program == program::SILENT {
-            self.lose_program("the program on the controller ended: no orders reached it in time");
+            self.lose_program(
+                "no order reached the program on the controller for 1 s: it decelerated after 20 ms, and has ended",
+            );
         } else if state.number == number && state.program == program::FAR {
             self.lose_program("a setpoint was farther away than the arm moves in 0.2 s: the program ended");
         } else if matches!(state.runtime, status::PAUSED | status::PAUSING) {
@@ -311,20 +299,12 @@ impl Session {
         }
     }
 
-    /// Repeats the last order where no setpoints come. The end of a stream of velocities is a hold.
+    /// Holds the arm where no setpoints come.
     fn keep_alive(&mut self, now: Mono) -> AdapterResult<()> {
-        if self.ready.is_none() {
+        if self.ready.is_none() || now.since(self.sent_at) < HEARTBEAT {
             return Ok(());
         }
-        let idle = now.since(self.setpoint_at);
-        let next = match self.last {
-            Order::Speed(_) if idle > (5 * self.interval / 2).clamp(HOLD_AFTER.0, HOLD_AFTER.1) => Order::Hold,
-            Order::Speed(_) => return Ok(()),
-            _ if now.since(self.sent_at) < HEARTBEAT => return Ok(()),
-            Order::Servo(_) if idle > SETTLED => Order::Hold,
-            last => last,
-        };
-        self.order(next)
+        self.order(Order::Hold)
     }
 
     /// Sends an order.
@@ -336,14 +316,6 @@ impl Session {
         self.unanswered.get_or_insert(self.sent_at);
         self.last = order;
         Ok(())
-    }
-
-    /// Sends a setpoint.
-    pub(super) fn setpoint(&mut self, order: Order) -> AdapterResult<()> {
-        let now = MonotonicClock.now();
-        self.interval = now.since(self.setpoint_at).min(HOLD_AFTER.1);
-        self.setpoint_at = now;
-        self.order(order)
     }
 
     /// Waits for the next state, at most 5 ms.

@@ -14,6 +14,7 @@ use crate::hardware::arms::ur::model::Model;
 use crate::hardware::sim::arm::{ESTOP, HasArm, SimArm};
 use crate::hardware::sim::faults::FaultKind;
 use crate::hardware::sim::reach::Chain;
+use crate::joint::Joints;
 
 /// Pose at power-up [rad]: upright, and no joint as another one.
 const POSE: [f64; DOF] = [0.3, -1.4, 1.5, -1.7, -1.5, 0.4];
@@ -107,6 +108,8 @@ pub struct Controller {
     pub(super) payload: (f64, [f64; 3], [f64; 6]),
     /// Acceleration of the base that balances gravity [m/s²], as programs set it.
     pub(super) gravity: [f64; 3],
+    /// Positions [rad] and velocities [rad/s] that the controller commands.
+    pub(super) commanded: ([f64; DOF], [f64; DOF]),
     /// Positions that a program gave to servoj, and when.
     pub(super) servoj: VecDeque<(Mono, [f64; DOF])>,
     pub(super) slider: f64,
@@ -150,6 +153,7 @@ impl Controller {
             inputs: (INPUTS, 0),
             payload: (0.0, [0.0; 3], [0.0; 6]),
             gravity: [0.0, 0.0, 9.82],
+            commanded: ([0.0; DOF], [0.0; DOF]),
             servoj: VecDeque::new(),
             slider: options.speed_slider,
             remote: options.remote_control,
@@ -369,6 +373,9 @@ impl Controller {
     }
 
     fn step_program(&mut self) {
+        let (before, (positions, velocities)) = (self.commanded.0, self.arm.joints());
+        let six = |values: Joints| values.first_chunk().copied().unwrap_or_default();
+        self.commanded = (six(positions), six(velocities));
         if self.paused || self.hangs || !self.may_move() {
             return;
         }
@@ -376,6 +383,7 @@ impl Controller {
         let step = self.step_time();
         let ended = program.step(&mut self.arm, &mut self.registers, &mut self.payload, step, self.model);
         if let Some(goal) = program.servoed() {
+            self.commanded = (goal, std::array::from_fn(|i| (goal[i] - before[i]) / step));
             self.servoj.push_back((self.arm.now(), goal));
             self.servoj.drain(..self.servoj.len().saturating_sub(SERVOJ_KEPT));
         }

@@ -121,9 +121,9 @@ type Source = fn(&Frame<'_>) -> Value;
 const OUTPUTS: &[(&str, Source)] = &[
     ("timestamp", |f| Value::F64(100.0 + f.controller.arm.uptime().as_secs_f64())),
     ("actual_q", |f| Value::V6(f.q())),
-    ("target_q", |f| Value::V6(f.q())),
+    ("target_q", |f| Value::V6(f.controller.commanded.0)),
     ("actual_qd", |f| Value::V6(f.qd())),
-    ("target_qd", |f| Value::V6(f.qd())),
+    ("target_qd", |f| Value::V6(f.controller.commanded.1)),
     ("target_qdd", |_| Value::V6([0.0; 6])),
     ("actual_qdd", |_| Value::V6([0.0; 6])),
     ("actual_current", |f| Value::V6(f.efforts().map(|torque| torque / 10.0))),

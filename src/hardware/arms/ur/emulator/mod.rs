@@ -1,8 +1,8 @@
 //! The emulator of a controller with its arm, for `address: sim`, for tests, and for other clients such as `ur_rtde`.
 //!
 //! Written from the protocol, and shares no code with the adapter besides the models' dimensions: two sides that share
-//! an encoder share its mistakes. Programs are not interpreted: the adapter's own and `ur_rtde`'s are recognized by
-//! their names and carried out here, and any other one starts and ends.
+//! an encoder share its mistakes. The text of the adapter's program is carried out (`super::script`), that of `ur_rtde` is
+//! recognized by its name, and any other one starts and ends.
 
 mod controller;
 mod dashboard;
@@ -15,12 +15,6 @@ mod rtde;
 mod scripts;
 #[cfg(test)]
 mod tests;
-
-/// Times of the emulated program, which are those of the adapter's text.
-#[cfg(test)]
-pub mod program_times {
-    pub use super::ours::{ENDS, FAR, FIRST, SPREAD, VELOCITY_ENDS};
-}
 
 use std::net::SocketAddr;
 use std::time::Duration;

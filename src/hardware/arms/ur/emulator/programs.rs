@@ -1,9 +1,9 @@
-//! What programs do, one step of the controller at a time: the adapter's own one, and that of `ur_rtde`.
+//! Programs, one step of the controller at a time: the adapter's own one, and that of `ur_rtde`.
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 
 use super::controller::Registers;
-use super::ours::Ours;
+use super::ours::{self, Ours};
 use crate::hardware::arms::ur::DOF;
 use crate::hardware::arms::ur::model::Model;
 use crate::hardware::sim::arm::{Refusal, SimArm};
@@ -32,7 +32,7 @@ pub(super) enum Program {
 impl Program {
     pub fn name(&self) -> &str {
         match self {
-            Self::Ours(_) => "dimos_control",
+            Self::Ours(_) => ours::NAME,
             Self::Rtde(_) => "rtde_control",
             Self::Other(name) => name,
         }

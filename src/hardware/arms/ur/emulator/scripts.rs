@@ -1,7 +1,7 @@
 //! Text on the script's ports: programs, programs that run beside them, and single commands.
 
 use super::controller::Controller;
-use super::ours::Ours;
+use super::ours::{self, Ours};
 use super::programs::{Program, RtdeControl};
 
 impl Controller {
@@ -38,9 +38,10 @@ impl Controller {
         let name = head.split('(').next().unwrap_or_default().to_owned();
         match (kind, name.as_str()) {
             ("sec", _) => text.lines().for_each(|line| self.statement(line.trim())),
-            (_, "dimos_control") => {
-                self.run(Program::Ours(Box::new(Ours::new(text))));
-            }
+            (_, ours::NAME) => match Ours::new(text) {
+                Ok(program) => self.run(Program::Ours(Box::new(program))),
+                Err(refused) => self.report_exception(refused.line as i32, &refused.what),
+            },
             (_, "rtde_control") => {
                 // The registers keep what an earlier program has left.
                 self.registers.int_out[0] = 0;

@@ -14,6 +14,8 @@ pub struct State {
     pub velocity: [f64; 6],
     /// Joint positions that the controller commands [rad].
     pub target: [f64; 6],
+    /// Joint velocities that it commands [rad/s].
+    pub target_velocity: [f64; 6],
     /// Motor currents [A].
     pub current: [f64; 6],
     /// Motor voltages [V].
@@ -134,6 +136,7 @@ const FIELDS: &[Field] = &[
     needed("actual_q", Kind::Vector6, |s, r| s.position = r.vector()),
     needed("actual_qd", Kind::Vector6, |s, r| s.velocity = r.vector()),
     needed("target_q", Kind::Vector6, |s, r| s.target = r.vector()),
+    needed("target_qd", Kind::Vector6, |s, r| s.target_velocity = r.vector()),
     needed("actual_current", Kind::Vector6, |s, r| s.current = r.vector()),
     optional("actual_joint_voltage", Kind::Vector6, |s, r| s.voltage = r.vector()),
     needed("joint_temperatures", Kind::Vector6, |s, r| s.temperature = r.vector()),
@@ -169,8 +172,11 @@ const FIELDS: &[Field] = &[
     needed("runtime_state", Kind::Unsigned, |s, r| s.runtime = r.u32()),
 ];
 
-/// Largest joint position that can be true: two turns and some more [rad].
-const FARTHEST: f64 = 15.0;
+/// Largest joint position that can be true [rad]: two turns and some more; of wrist 3, which may be endless, any that
+/// a program still takes.
+const FARTHEST: [f64; 6] = [15.0, 15.0, 15.0, 15.0, 15.0, 1e4];
+/// Largest joint velocity that can be true [rad/s].
+const FASTEST: f64 = 150.0;
 
 /// Which values a controller sends, and in which packets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -246,9 +252,12 @@ impl Recipe {
 
 impl State {
     fn is_possible(&self) -> bool {
-        let joints = self.position.iter().chain(&self.velocity).chain(&self.target);
-        joints.into_iter().all(|value| value.abs() < FARTHEST * 10.0)
-            && self.position.iter().all(|q| q.abs() < FARTHEST)
+        let near = |joints: &[f64; 6]| joints.iter().zip(FARTHEST).all(|(q, farthest)| q.abs() < farthest);
+        let slow = |joints: &[f64; 6]| joints.iter().all(|v| v.abs() < FASTEST);
+        near(&self.position)
+            && near(&self.target)
+            && slow(&self.velocity)
+            && slow(&self.target_velocity)
             && (0.0..1e12).contains(&self.time)
             && (-1..=20).contains(&self.robot_mode)
             && (0..=40).contains(&self.safety_mode)
