@@ -41,6 +41,7 @@ mod model_verbs;
 mod no_alloc;
 mod older_logs;
 mod pages;
+mod piper_rest;
 mod planned_paths;
 mod planning;
 mod planning_timing;

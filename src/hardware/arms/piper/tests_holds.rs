@@ -272,9 +272,14 @@ fn an_arm_that_rests_just_outside_its_limits_holds_at_them_where_its_controller_
 
 #[test]
 fn an_arm_that_rests_far_outside_is_not_drawn_back() {
-    let far = [0.1, -0.07, -0.7, 0.05, 0.4, -0.1];
+    let far = [0.1, 0.0, -0.7, 0.05, 0.4, -0.1];
     let (emulator, mut arm) = pair(serde_json::json!({ "sim": { "initial_positions": far } }));
-    arm.connect().unwrap();
+    // Its controller is given the range 4° to 180°.
+    super::tests_faults::other(&emulator).send(&[super::golden::frame("474#02070800287FFF00")]).unwrap();
+    until("the limit", || {
+        arm.connect().unwrap();
+        arm.get_limits().unwrap().position_lower[1] > 0.06
+    });
     emulator.record();
     let error = arm.activate().unwrap_err().to_string();
     let expected =

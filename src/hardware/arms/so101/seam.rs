@@ -6,7 +6,7 @@
 
 use super::DOF;
 use super::adapter::So101Adapter;
-use super::calibration::{NAMES, Range};
+use super::calibration::{NAMES, Range, SEAM_MARGIN};
 use super::protocol::{SERVOS, Servo, TURN, register};
 use super::turns::Turns;
 use crate::clock::Mono;
@@ -18,6 +18,9 @@ pub const SEAM_CROSSED: i32 = 512;
 /// Torque limit of such a joint [0.1 %], and its top speed on the way back [counts/s].
 pub const LOW_TORQUE: u16 = 200;
 const SLOW: u16 = 200;
+
+/// A joint that is this near to the end of its range is back [counts]: it rests beside its goal.
+const NEAR: i32 = SEAM_MARGIN * 3 / 4;
 
 /// What a servo is to be given.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -55,14 +58,14 @@ impl Seams {
         }
         *crossed = true;
         let position = turns.at();
-        if (range.low..=range.high).contains(&position) {
-            *crossed = false;
-            return Some(Order::Release);
-        }
         let goal = match position.rem_euclid(TURN as i32) > TURN as i32 / 2 {
             true => range.high,
             false => range.low,
         };
+        if servo.goal == goal && (range.low - NEAR..=range.high + NEAR).contains(&position) {
+            *crossed = false;
+            return Some(Order::Release);
+        }
         (servo.goal != goal || servo.torque_limit > LOW_TORQUE).then_some(Order::Yield(goal))
     }
 

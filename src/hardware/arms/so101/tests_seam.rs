@@ -153,6 +153,15 @@ fn no_goal_moves_at_a_seam_in_ten_thousand_states_and_pushes() {
         let moved = (model.at - before).abs();
         let back = push.abs() + 2.0 * f64::from(SEAM_MARGIN) + 60.0;
         assert!(moved <= back, "{n}: let go at {before}, it went to {} ({range:?}, goal {goal})", model.at);
+        if watch.seams.is_crossed(WRIST) {
+            // Turned back by hand, and let go: it stays on the side on which it was held, with its own torque.
+            let home = f64::from(goal) - droop;
+            watch.pass(&mut model, Some(home), 60, &mut random);
+            watch.pass(&mut model, None, 200, &mut random);
+            let (off, least) = ((model.at - home).abs(), f64::from(range.low.min(4095 - range.high)));
+            assert!(off <= least + 120.0 && !watch.seams.is_crossed(WRIST), "{n}: {} instead of {home}", model.at);
+            assert_eq!((model.servo.torque_limit, model.servo.top_speed), (1000, 0), "{n}");
+        }
         // Enabling where it is: stays, or is refused.
         let here = random.within(-50, 4145);
         match hold_goal(WRIST, range, here) {

@@ -133,7 +133,7 @@ fn a_calibration_is_refused_while_a_motor_is_on_and_restored_from_its_file() {
     assert_eq!(calibrate(&mut *arm, &ranges, &path).unwrap().len(), 6);
     let text = std::fs::read_to_string(&path).unwrap();
     assert_eq!(arm.write_calibration(&path), Ok(vec![]), "nothing is written twice");
-    std::fs::write(&path, text.replace("3100", "3050")).unwrap();
+    std::fs::write(&path, text.replace("3147", "3050")).unwrap();
     drop(arm);
     let mut adapter = So101Adapter::new(&config).unwrap();
     adapter.connect().unwrap();
