@@ -19,7 +19,7 @@ pub const SEAM_CROSSED: i32 = 512;
 pub const LOW_TORQUE: u16 = 200;
 const SLOW: u16 = 200;
 
-/// A joint that is this near to the end of its range is back [counts]: it rests beside its goal.
+/// A joint that is this near to the end of its range is back [counts]: it rests beside its goal, under load.
 const NEAR: i32 = SEAM_MARGIN * 3 / 4;
 
 /// What a servo is to be given.
@@ -62,7 +62,8 @@ impl Seams {
             true => range.high,
             false => range.low,
         };
-        if servo.goal == goal && (range.low - NEAR..=range.high + NEAR).contains(&position) {
+        // Not before it is there: with its own torque it would be thrown there when a hand lets it go.
+        if servo.goal == goal && (position - goal).abs() <= NEAR {
             *crossed = false;
             return Some(Order::Release);
         }
