@@ -312,7 +312,7 @@ fn a_joint_without_end_follows_round_the_circle() {
     until_in_step(&mut rig);
     rig.run_for(1.0);
     assert!((rig.commanded(FOLLOWER)[0] - 0.4).abs() < 1e-3, "{:?}", rig.commanded(FOLLOWER));
-    // Its reading begins a turn anew: the follower stays.
+    // Its reading loses a turn: the follower stays.
     rig.arms[LEADER].q[0] = 0.4;
     rig.run_for(1.0);
     assert!((rig.commanded(FOLLOWER)[0] - 0.4).abs() < 1e-3 && rig.tasks[0].reason == Reason::InStep);

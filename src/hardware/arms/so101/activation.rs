@@ -7,8 +7,9 @@ use super::bus::servo as name_of;
 use super::calibration::{NAMES, Range};
 use super::protocol::{SERVOS, Servo, TURN};
 use super::seam::{LOW_TORQUE, way_back};
+use super::turns::Turns;
 use super::{DOF, SPEC};
-use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 
 /// Readings agree for this long before they are believed; where no motion led to them, for longer.
@@ -18,22 +19,12 @@ const LEAPT: Duration = Duration::from_millis(250);
 const TIMEOUT: Duration = Duration::from_millis(500);
 /// Time between two of them.
 const PERIOD: Duration = Duration::from_millis(8);
-/// A joint at rest moves by less than this [counts], and is slower than this [counts/s]: encoders flicker, and the hand
-/// that holds a limp arm is not quite still.
-const SPREAD: i32 = 12;
-const SLOW: i32 = 60;
 /// A goal this far from the joint is that joint's position [counts].
 const SAME: i32 = 3;
 /// How far outside its range a joint may rest [counts]: its servo takes it to the end.
 const OUTSIDE: i32 = (SPEC.outside * TURN / std::f64::consts::TAU) as i32;
 /// Below this the servos answer, but have no force [0.1 V].
 const LOWEST_VOLTAGE: u8 = 55;
-
-/// Lowest and highest position of each servo [counts] since a time.
-struct Window {
-    since: Mono,
-    ends: [(i32, i32); SERVOS],
-}
 
 impl So101Adapter {
     /// Switches the motors on where the arm is. A servo goes to its goal when its motor comes on, so each goal is set
@@ -62,52 +53,43 @@ impl So101Adapter {
         self.write_torque(true)
     }
 
-    /// Reads until the positions of the servos whose motors are off agree for a while, at rest. Returns the last state,
-    /// and these positions.
+    /// Reads until all positions of the servos whose motors are off are accepted for a while: what moves is explained by
+    /// its velocity, as of an arm that falls. Returns the last state, and these positions.
     fn agreed(&mut self) -> AdapterResult<([Servo; SERVOS], [i32; SERVOS])> {
         let end = MonotonicClock.now().after(TIMEOUT);
-        let mut window: Option<Window> = None;
-        let mut odd = None;
+        let (mut since, mut odd) = (None, None);
         loop {
             let servos = self.fetch()?;
-            let (now, positions) = (MonotonicClock.now(), self.seams.positions);
-            let open = window.get_or_insert(Window { since: now, ends: positions.map(|at| (at, at)) });
-            for ((low, high), at) in open.ends.iter_mut().zip(positions) {
-                (*low, *high) = ((*low).min(at), (*high).max(at));
-            }
-            let ends = open.ends;
-            let moves = |j: usize, servo: &Servo| {
-                ends.get(j).is_none_or(|(low, high)| high - low > SPREAD) || servo.velocity.abs() > SLOW
+            let now = MonotonicClock.now();
+            let off = |wrong: fn(&Turns) -> bool| {
+                let each = servos.iter().enumerate().filter(|(_, servo)| !servo.on);
+                { each }.map(|(j, _)| j).find(|j| wrong(&self.seams.turns(*j)))
             };
-            let wrong =
-                |(j, servo): &(usize, &Servo)| !servo.on && (moves(*j, servo) || !self.seams.turns(*j).accepted());
-            let leapt = servos.iter().enumerate().any(|(j, servo)| !servo.on && self.seams.turns(j).leapt());
-            let long = if leapt { LEAPT } else { AGREED };
-            match servos.iter().enumerate().find(wrong) {
-                Some((j, _)) => (odd, window) = (Some((j, ends.get(j).copied().unwrap_or_default())), None),
-                None if now.since(open.since) >= long => {
-                    return Ok((servos, ends.map(|(low, high)| (low + high) / 2)));
-                }
+            let long = if off(Turns::leapt).is_some() { LEAPT } else { AGREED };
+            match off(|turns| !turns.accepted()) {
+                Some(j) => (odd, since) = (Some((j, self.seams.turns(j).at())), None),
+                None if now.since(*since.get_or_insert(now)) >= long => return Ok((servos, self.seams.positions)),
                 None => {}
             }
             if now >= end {
-                let (j, (low, high)) = odd.unwrap_or_default();
-                return Err(self.disagreement(j, low, high));
+                let (j, before) = odd.unwrap_or_default();
+                return Err(self.disagreement(j, before));
             }
             std::thread::sleep(PERIOD);
         }
     }
 
-    /// The readings of servo `j` do not agree: they are between these positions [counts].
-    fn disagreement(&self, j: usize, low: i32, high: i32) -> AdapterError {
+    /// The readings of servo `j`, which was here [counts], do not agree.
+    fn disagreement(&self, j: usize, before: i32) -> AdapterError {
         let range = self.range(j);
         let degrees = |counts: i32| range.angle(counts).to_degrees();
+        let now = self.seams.positions.get(j).copied().unwrap_or_default();
         AdapterError::Rejected(format!(
-            "{} moves, or its positions and its velocity contradict each other ({:.1}° to {:.1}°): not enabled\nhint: \
-             keep the arm still; where a position is wrong, look at the cables, and move that joint a little by hand",
+            "the positions of {} contradict each other or its velocity ({:.1}° and {:.1}°): not enabled\nhint: keep the \
+             arm still, and look at the cables",
             name_of(j as u8 + 1),
-            degrees(low),
-            degrees(high),
+            degrees(before),
+            degrees(now),
         ))
     }
 }

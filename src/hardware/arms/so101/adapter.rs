@@ -275,9 +275,13 @@ impl ManipulatorAdapter for So101Adapter {
         if error_of(&servos).is_none() {
             return Ok(());
         }
-        // An overload ends when the goal no longer asks for force. The other servos keep theirs.
+        // An overload ends when the goal no longer asks for force, or when the motor is switched off. The other servos
+        // keep their goals.
         let goals = self.relieved_goals(&servos);
         self.write_goals_of_enabled(&servos, goals)?;
+        for (id, _) in (1..).zip(&servos).filter(|(_, servo)| !servo.on && servo.error != 0) {
+            self.bus.write(id, register::TORQUE, &[0])?;
+        }
         match error_of(&self.fetch()?) {
             None => Ok(()),
             Some((_, text)) => Err(AdapterError::Rejected(format!(

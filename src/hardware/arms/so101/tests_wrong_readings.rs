@@ -106,7 +106,7 @@ fn positions_that_contradict_each_other_are_refused_with_their_figures() {
         done.store(true, std::sync::atomic::Ordering::Relaxed);
         refused.unwrap_err().to_string()
     });
-    assert!(refused.starts_with("servo 2 (shoulder_lift) moves, or its positions"), "{refused}");
+    assert!(refused.starts_with("the positions of servo 2 (shoulder_lift) contradict each other"), "{refused}");
     assert!(refused.contains("not enabled\nhint: ") && !adapter.read_enabled().unwrap(), "{refused}");
 }
 

@@ -260,6 +260,9 @@ impl Servos {
         let touches = |register: usize| (address..address + values.len()).contains(&register);
         if touches(TORQUE) {
             let on = self.byte(servo, TORQUE) == 1;
+            if !on && self.error(servo) != 0 {
+                let _ = self.arm.clear_error();
+            }
             if on != self.arm.motor(servo) {
                 self.arm.enable_joint(servo, on);
                 if !on {
@@ -269,7 +272,8 @@ impl Servos {
         }
     }
 
-    /// Sends the joints to the goals in the registers. A servo whose goal is where it is has no overload.
+    /// Sends the joints to the goals in the registers. A servo whose goal is where it is has no overload, nor has one that
+    /// is switched off.
     fn go(&mut self) {
         let mut goals = [0.0; SERVOS];
         let (positions, velocities) = self.arm.joints();
