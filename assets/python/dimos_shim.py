@@ -57,6 +57,7 @@ class Arm:  # the adapter, called from one thread only
         if do not in ACTS + MOTIONS or self.held and do in MOTIONS:
             raise RuntimeError(DISABLED if do in MOTIONS else f"{do} is not for clients")
         self.commanded |= do == "write_cartesian_position"
+        if do == "write_stop": args = ()  # the guide's has no point of rest
         self.call(do, *([self.modes[args[0].upper()]] if do == "set_control_mode" else args))
         if do in ("activate", "write_enable"): self.held = not (do == "activate" or args[0])
         self.commanded, self.due = self.commanded and do not in ("write_stop", "deactivate") and not self.held, 0.0

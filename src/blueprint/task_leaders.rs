@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::Deserialize;
 
+use crate::arm::Topology;
 use crate::blueprint::arms::{Entry, Hardware};
 use crate::blueprint::resolve::{Checker, Task};
 use crate::blueprint::schema::TaskEntry;
@@ -123,8 +124,17 @@ fn joints(
         let of = |map: &BTreeMap<String, f64>, otherwise| map.get(*name).copied().unwrap_or(otherwise);
         let before: usize = hardware.entries.iter().take(leader).map(|entry| entry.joints.len()).sum();
         let (scale, offset) = (of(&params.scale, 1.0), of(&params.offset, 0.0));
-        task.leader.push(LeaderJoint { joint: (before + joint) as u16, scale, offset });
+        let endless = turns_without_end(hardware, name);
+        task.leader.push(LeaderJoint { joint: (before + joint) as u16, scale, offset, endless });
     }
+}
+
+/// Returns whether a joint turns without end.
+fn turns_without_end(hardware: &Hardware, name: &str) -> bool {
+    hardware.arms.iter().any(|arm| {
+        let own = arm.joints.iter().position(|joint| joint == name);
+        own.and_then(|own| arm.supervision.topology.get(own)) == Some(&Topology::Endless)
+    })
 }
 
 /// Checks that the leader and the one arm of the task have grippers.

@@ -127,7 +127,7 @@ mod tests {
     #[test]
     fn every_built_in_task_is_read_from_its_log_as_it_was() {
         for spec in TaskTable::builtin().rows() {
-            let joint = |joint| LeaderJoint { joint, scale: -0.1, offset: 0.3 };
+            let joint = |joint| LeaderJoint { joint, scale: -0.1, offset: 0.3, endless: false };
             let leader = if spec.has_leader() { (6..12).map(joint).collect() } else { Vec::new() };
             let kind = TaskKind::new(spec.name, &(spec.params.default)()).led_by(leader);
             let written = task(if spec.robot { kind.of_robot(robot()) } else { kind });

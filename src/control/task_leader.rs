@@ -1,6 +1,7 @@
 //! The leader of a task that follows another arm: its parameters in the blueprint, and its joints for the tick.
 
 use std::collections::BTreeMap;
+use std::f64::consts::TAU;
 
 use serde::{Deserialize, Serialize};
 
@@ -32,12 +33,23 @@ pub struct LeaderJoint {
     pub scale: f64,
     /// What is added [rad].
     pub offset: f64,
+    /// Whether the joint that follows turns without end: angles that differ by whole turns are one place.
+    #[serde(default)]
+    pub endless: bool,
 }
 
 impl LeaderJoint {
     /// Returns the target of the joint that follows, for a position of the leader's [rad].
     pub fn target(&self, position: f64) -> f64 {
         self.scale * position + self.offset
+    }
+
+    /// Returns the same for a joint that is at `own` [rad]: where that turns without end, the way round the circle that
+    /// is shorter. A joint with a range is never a turn nearer than its numbers say.
+    pub fn target_near(&self, position: f64, own: f64) -> f64 {
+        let target = self.target(position);
+        let turns = if self.endless { ((own - target) / TAU).round() } else { 0.0 };
+        target + turns * TAU
     }
 }
 
@@ -65,6 +77,15 @@ pub fn gripper_target(position: f64, of: &GripperInfo, own: &GripperInfo, last: 
 mod tests {
     use super::*;
     use crate::arm::GripperUnit;
+
+    #[test]
+    fn only_a_joint_without_end_takes_the_shorter_way_round() {
+        let seamed = LeaderJoint { joint: 0, scale: 1.0, offset: 0.0, endless: false };
+        assert_eq!(seamed.target_near(-3.1, 3.1), -3.1);
+        let endless = LeaderJoint { endless: true, ..seamed };
+        assert!((endless.target_near(-3.1, 3.1) - (TAU - 3.1)).abs() < 1e-12);
+        assert!((endless.target_near(0.2, 2.0 * TAU) - (2.0 * TAU + 0.2)).abs() < 1e-12);
+    }
 
     #[test]
     fn a_gripper_goes_to_the_same_share_of_its_own_range() {

@@ -21,7 +21,8 @@ pub struct Motor {
     pub name: &'static str,
     /// Its number on the bus.
     pub id: u8,
-    /// Its range if that is not recorded by hand, lowest and highest position: of a joint without end stops.
+    /// Its range unless another one is recorded by hand, lowest and highest position: of a joint that may have no end
+    /// stops.
     pub range: Option<(i32, i32)>,
 }
 

@@ -21,7 +21,7 @@ const RESOLUTION: f64 = std::f64::consts::TAU / 4096.0;
 fn follow(change: impl FnOnce(&mut FollowParams)) -> TaskKind {
     let mut params = FollowParams { leader: Some("leader".to_owned()), ..FollowParams::default() };
     change(&mut params);
-    let led = |joint| LeaderJoint { joint, scale: 1.0, offset: 0.0 };
+    let led = |joint| LeaderJoint { joint, scale: 1.0, offset: 0.0, endless: false };
     TaskKind::new("follow", &params).led_by((0..6).map(led).collect())
 }
 
@@ -294,6 +294,38 @@ fn a_leader_further_than_max_approach_is_not_approached() {
 }
 
 #[test]
+fn a_leader_further_than_half_a_turn_is_approached_only_if_the_blueprint_says_so() {
+    let wide = |params: fn(&mut FollowParams)| {
+        let mut rig = rig(task_of(follow(params)));
+        rig.arms[LEADER].q[1] = 1.7;
+        assert_eq!(rig.ask(Request::Start { task: 0 }), Outcome::Accepted);
+        until_in_step(&mut rig);
+        rig.arms[LEADER].q[1] = -1.7;
+        rig.tick();
+        rig.tasks[0].reason
+    };
+    assert!(matches!(wide(|_| {}), Reason::LeaderAway(7, by) if (by - 3.4).abs() < 0.01));
+    assert_eq!(wide(|params| params.max_approach = 4.0), Reason::Approaching);
+}
+
+#[test]
+fn a_joint_without_end_follows_round_the_circle() {
+    let params = FollowParams { leader: Some("leader".to_owned()), ..FollowParams::default() };
+    let led = LeaderJoint { joint: 0, scale: 1.0, offset: 0.0, endless: true };
+    let mut rig = rig(task("follow", TaskKind::new("follow", &params).led_by(vec![led]), 6..7, 10));
+    let turn = std::f64::consts::TAU;
+    rig.arms[LEADER].q[0] = turn + 0.4;
+    assert_eq!(rig.ask(Request::Start { task: 0 }), Outcome::Accepted);
+    until_in_step(&mut rig);
+    rig.run_for(1.0);
+    assert!((rig.commanded(FOLLOWER)[0] - 0.4).abs() < 1e-3, "{:?}", rig.commanded(FOLLOWER));
+    // Its reading loses a turn: the follower stays.
+    rig.arms[LEADER].q[0] = 0.4;
+    rig.run_for(1.0);
+    assert!((rig.commanded(FOLLOWER)[0] - 0.4).abs() < 1e-3 && rig.tasks[0].reason == Reason::InStep);
+}
+
+#[test]
 fn a_leader_that_is_too_fast_is_caught_up_with_within_the_limits() {
     let mut rig = in_step(task_of(follow(|_| {})));
     // 3 rad/s, twice what the arm can do.
@@ -307,9 +339,13 @@ fn a_leader_that_is_too_fast_is_caught_up_with_within_the_limits() {
 #[test]
 fn scale_and_offset_make_the_target() {
     let params = FollowParams { leader: Some("leader".to_owned()), ..FollowParams::default() };
-    let led_by =
-        vec![LeaderJoint { joint: 5, scale: -0.5, offset: 0.2 }, LeaderJoint { joint: 0, scale: 2.0, offset: -0.1 }];
-    let kind = TaskKind::new("follow", &params).led_by(led_by);
+    let led_by = [(5, -0.5, 0.2), (0, 2.0, -0.1)].map(|(joint, scale, offset)| LeaderJoint {
+        joint,
+        scale,
+        offset,
+        endless: false,
+    });
+    let kind = TaskKind::new("follow", &params).led_by(led_by.to_vec());
     let mut rig = rig(task("follow", kind, 6..8, 10));
     rig.carry(LEADER, &[0.3, 1.0, 1.0, 1.0, 1.0, -0.8]);
     assert_eq!(rig.ask(Request::Start { task: 0 }), Outcome::Accepted);

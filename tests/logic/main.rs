@@ -43,6 +43,7 @@ mod no_alloc;
 mod older_logs;
 mod pages;
 mod pauses;
+mod piper_rest;
 mod planned_paths;
 mod planning;
 mod planning_timing;

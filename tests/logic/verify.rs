@@ -198,7 +198,7 @@ fn an_arm_that_follows_another_does_the_same_again() {
     let folder = tempfile::tempdir().unwrap();
     let mut config = one_arm(6);
     config.arms.push(ArmConfig { name: "leader".into(), ..config.arms[0].clone() });
-    let led_by = |joint| LeaderJoint { joint, scale: -0.7, offset: 0.1 + 0.2 };
+    let led_by = |joint| LeaderJoint { joint, scale: -0.7, offset: 0.1 + 0.2, endless: false };
     config.tasks.push(TaskConfig {
         name: "follow".into(),
         kind: TaskKind::new("follow", &FollowParams { gripper: true, ..FollowParams::default() })

@@ -33,8 +33,12 @@ const STATE_AGE: Duration = Duration::from_millis(5);
 const WRITABLE: Duration = Duration::from_millis(50);
 /// How often a request without a reply is sent until the servos show its effect.
 const WRITES: u32 = 4;
-/// A joint at rest this close to its goal has arrived [counts]: it droops under load. YOUR ARM.
-const ARRIVED: i32 = 40;
+/// Before the motors come on, positions agree for this long, and may take this long to do so.
+const AGREED: Duration = Duration::from_millis(50);
+const AGREED_TIMEOUT: Duration = Duration::from_millis(300);
+/// A joint at rest moves by less than this [counts], and is slower than this [counts/s]. YOUR ARM.
+const STILL: i32 = 12;
+const SLOW: i32 = 60;
 /// A joint this far outside its range is inside [counts]: encoders flicker. YOUR ARM.
 const SAME: i32 = 3;
 
@@ -134,6 +138,26 @@ impl AcmeAdapter {
         Err(AdapterError::Protocol(format!("acme: the servos do not execute {request:?}")))
     }
 
+    /// Reads until all positions agree for a while: a wrong one would be where a joint goes when its motor comes on.
+    fn agreed(&mut self) -> AdapterResult<Servos> {
+        let (first, end) = (self.fetch()?, MonotonicClock.now().after(AGREED_TIMEOUT));
+        let (mut from, mut since) = (first, MonotonicClock.now());
+        loop {
+            std::thread::sleep(STATE_AGE);
+            let (servos, now) = (self.fetch()?, MonotonicClock.now());
+            let moved = servos.iter().zip(&from).any(|(a, b)| (a.position - b.position).abs() > STILL);
+            match moved || servos.iter().any(|servo| servo.velocity.abs() > SLOW) {
+                true => (from, since) = (servos, now),
+                false if now.since(since) >= AGREED => return Ok(servos),
+                false => {}
+            }
+            if now > end {
+                let what = "the joints move, or their positions contradict each other: not enabled";
+                return Err(AdapterError::Rejected(format!("{what}\nhint: keep the arm still, look at the cables")));
+            }
+        }
+    }
+
     /// Where each servo is, inside its range. A joint outside its range is an error: its servo would move there at once.
     fn hold_goals(&self, servos: &Servos) -> AdapterResult<[i32; SERVOS]> {
         let positions = servos.map(|servo| servo.position);
@@ -167,13 +191,6 @@ impl AcmeAdapter {
 /// Velocity of a joint [rad/s].
 fn velocity(servo: &Servo, range: &super::Range) -> f64 {
     range.sign() * f64::from(servo.velocity) * TAU / TURN
-}
-
-/// Whether a stop makes the position of servo `i` its goal: if it moves, or is a joint far from its goal. A joint that
-/// droops and a gripper on a workpiece rest away from their goals: with a goal at its position, the joint would sink
-/// further, and the gripper lose its grip.
-fn must_stop(i: usize, servo: &Servo) -> bool {
-    servo.moving || i < DOF && (!servo.on || (servo.goal - servo.position).abs() > ARRIVED)
 }
 
 /// Code and text of the first servo in error.
@@ -311,14 +328,17 @@ impl ManipulatorAdapter for AcmeAdapter {
         }
     }
 
-    /// Makes the position of each servo that [`must_stop`] its goal; the others keep theirs.
-    fn write_stop(&mut self, _rest: &StopPoint) -> AdapterResult<Stop> {
+    /// Makes the point of rest the goal of the joints. The caller knows it; a measured position may be wrong. The gripper
+    /// keeps its goal, and so its grip. YOUR ARM: an arm with a stop of its own ignores the point.
+    fn write_stop(&mut self, rest: &StopPoint) -> AdapterResult<Stop> {
         let servos = self.fetch()?;
-        if servos.iter().enumerate().any(|(i, servo)| servo.on && must_stop(i, servo)) {
-            let here = self.calibration.inside(servos.map(|servo| servo.position));
-            let mut goals = servos.map(|servo| servo.goal);
-            let stopped = goals.iter_mut().zip(here).zip(&servos).enumerate();
-            stopped.filter(|(i, (_, servo))| must_stop(*i, servo)).for_each(|(_, ((goal, here), _))| *goal = here);
+        let mut goals = servos.map(|servo| servo.goal);
+        let joints =
+            goals.iter_mut().zip(&servos).zip(self.calibration.joints()).zip(rest.position.into_iter().flatten());
+        joints
+            .filter(|(((_, servo), _), angle)| servo.on && angle.is_finite())
+            .for_each(|(((goal, _), range), angle)| *goal = range.counts(angle));
+        if goals != servos.map(|servo| servo.goal) {
             self.write_goals(goals)?;
         }
         Ok(Stop::Confirmed)
@@ -328,6 +348,7 @@ impl ManipulatorAdapter for AcmeAdapter {
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
         let servos = self.fetch()?;
         if enable && !servos.iter().all(|servo| servo.on) {
+            let servos = self.agreed()?;
             let here = self.hold_goals(&servos)?;
             let mut goals = servos.map(|servo| servo.goal);
             let off = goals.iter_mut().zip(here).zip(&servos).filter(|(_, servo)| !servo.on);
@@ -431,12 +452,18 @@ mod tests {
     }
 
     #[test]
-    fn a_gripper_on_a_workpiece_and_a_joint_that_droops_keep_their_goals() {
-        let at_rest = |away: i32| Servo { on: true, goal: 2000, position: 2000 - away, ..Servo::default() };
-        let on_workpiece = at_rest(300);
-        assert!(!must_stop(DOF, &on_workpiece) && must_stop(0, &on_workpiece), "the joint has not started yet");
-        assert!(!must_stop(0, &at_rest(ARRIVED)), "it droops");
-        let moving = Servo { moving: true, ..at_rest(10) };
-        assert!(must_stop(0, &moving) && must_stop(DOF, &moving));
+    fn a_stop_goes_where_its_caller_says_and_the_gripper_keeps_its_goal() {
+        let (mut adapter, _servos) = arm();
+        adapter.activate().unwrap();
+        let held = adapter.fetch().unwrap().map(|servo| servo.goal);
+        adapter.write_stop(&StopPoint::default()).unwrap();
+        assert_eq!(adapter.fetch().unwrap().map(|servo| servo.goal), held, "nothing was commanded");
+        let mut rest = [0.0; DOF];
+        adapter.read_joint_positions(&mut rest).unwrap();
+        rest[0] += 0.2;
+        adapter.write_stop(&StopPoint { position: Some(joints_of(&rest)) }).unwrap();
+        let goals = adapter.fetch().unwrap().map(|servo| servo.goal);
+        let moved = (goals[0] - held[0]).abs();
+        assert!((100..=160).contains(&moved) && goals[DOF] == held[DOF], "{goals:?} {held:?}");
     }
 }

@@ -13,7 +13,7 @@ use super::bus::{self, failure};
 use super::live_table::{Place, Seen, lines};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::registry::Registry;
-use crate::hardware::service::{Motor, Service};
+use crate::hardware::service::Service;
 use crate::message::Message;
 
 /// How often positions are read and shown.
@@ -22,8 +22,6 @@ const PERIOD: Duration = Duration::from_millis(50);
 const SMALLEST: f64 = 0.025;
 /// End of the name of a calibration that is not written to the motors yet.
 const PART: &str = "part";
-/// A joint cannot turn this far between two readings: it passed the end of its turn [part of a turn].
-const JUMP: f64 = 0.5;
 
 /// Arguments of `arm calibrate`.
 #[derive(Debug, clap::Args)]
@@ -104,18 +102,21 @@ impl Args {
             ask::enter(signals, "Bring every joint to the middle of its range")?;
         }
         arm.take_middle().map_err(failure)?;
-        let by_hand = |motor: &&Motor| motor.range.is_none();
-        let names: Vec<_> = arm.motors().iter().filter(by_hand).map(|motor| motor.name).collect();
+        let names = |endless: bool| {
+            let motors = arm.motors().iter().filter(|motor| motor.range.is_some() == endless);
+            motors.map(|motor| motor.name).collect::<Vec<_>>().join(", ")
+        };
+        let (by_hand, endless) = (names(false), names(true));
         output::note(format_args!(
-            "Move these joints through their whole range, one after the other: {}{}",
-            names.join(", "),
-            if self.yes { String::new() } else { "; then press Enter (Ctrl-C ends this)".to_owned() }
+            "Move these joints through their whole range, one after the other: {by_hand}{}{}",
+            if endless.is_empty() { String::new() } else { format!("; also {endless}, where it has end stops") },
+            if self.yes { "" } else { "; then press Enter (Ctrl-C ends this)" }
         ));
-        let seen = self.record(arm, signals)?;
+        let (seen, turn) = (self.record(arm, signals)?, arm.counts_per_turn());
         let mut ranges = Vec::new();
         for (motor, seen) in arm.motors().iter().zip(&seen) {
-            let (low, high) = motor.range.unwrap_or((seen.low, seen.high));
-            if f64::from(high - low) < SMALLEST * f64::from(arm.counts_per_turn()) {
+            let (low, high) = seen.range(motor, turn);
+            if f64::from(high - low) < SMALLEST * f64::from(turn) {
                 let what = format!("{} was not moved: its range is {} counts", motor.name, high - low);
                 return Err(Failure::new(Exit::Failed, what).hint("nothing was written; calibrate again"));
             }
@@ -134,7 +135,7 @@ impl Args {
         write_and_read_back(arm, &part).map_err(|error| self.not_written(error, &part))?;
         std::fs::rename(&part, file)
             .with_context(|| format!("the motors are calibrated, but {} cannot be renamed", part.display()))?;
-        lines(arm.motors(), &seen).iter().for_each(output::line);
+        lines(arm.motors(), &seen, turn).iter().for_each(output::line);
         output::note(format_args!("written to the motors, read back, and saved: {}", file.display()));
         output::note(format_args!("in a blueprint: options: {{calibration: {}}}", absolute(file).display()));
         Ok(Exit::Ok)
@@ -156,18 +157,19 @@ impl Args {
     fn record(&self, arm: &mut dyn Service, signals: &Signals) -> Result<Vec<Seen>> {
         let mut seen: Vec<Seen> = arm.positions().map_err(failure)?.into_iter().map(Seen::at).collect();
         let (began, mut place) = (Instant::now(), Place::default());
-        let jump = (JUMP * f64::from(arm.counts_per_turn())) as i32;
+        let turn = arm.counts_per_turn();
         ask::discard_typed();
         loop {
             for ((motor, seen), position) in arm.motors().iter().zip(&mut seen).zip(arm.positions().map_err(failure)?) {
-                if seen.take(position) > jump && motor.range.is_none() {
+                seen.take(position, turn);
+                if seen.passed && motor.range.is_none() {
                     let what = format!("{} passed the end of its turn: its middle was not where it began", motor.name);
                     return Err(
                         Failure::new(Exit::Failed, what).hint("nothing was written; begin again in the middle pose")
                     );
                 }
             }
-            place.draw(&lines(arm.motors(), &seen));
+            place.draw(&lines(arm.motors(), &seen, turn));
             if signals.last().is_some() {
                 return Err(ask::interrupted(signals));
             }
@@ -202,6 +204,7 @@ fn absolute(file: &Path) -> PathBuf {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::hardware::service::Motor;
 
     const MOTORS: &[Motor] = &[Motor { name: "pan", id: 1, range: None }, Motor { name: "lift", id: 2, range: None }];
 

@@ -349,7 +349,7 @@ fn config(spec: &TaskSpec, robot: &TaskKinematics) -> CoordinatorConfig {
         supervision: Supervision::default(),
     };
     let kind = |name: &str, params, robot| TaskKind { name: name.to_owned(), params, robot, leader: Vec::new() };
-    let led = |joint| LeaderJoint { joint, scale: 1.0, offset: 0.0 };
+    let led = |joint| LeaderJoint { joint, scale: 1.0, offset: 0.0, endless: false };
     let leader = if spec.has_leader() { (DOF as u16..2 * DOF as u16).map(led).collect() } else { Vec::new() };
     let task = |name: &str, kind: TaskKind, joints: std::ops::Range<u16>, priority: i32| TaskConfig {
         name: name.to_owned(),

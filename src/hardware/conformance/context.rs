@@ -42,6 +42,27 @@ pub fn pause(adapter: &mut dyn ManipulatorAdapter, time: Duration) {
     }
 }
 
+/// Acceleration of arms whose limits have none [rad/s²].
+const BRAKING: f64 = 5.0;
+
+/// Returns where the arm comes to rest by braking: of its own readings, since the checks are its caller and write no
+/// stream of setpoints. None while it cannot be read.
+pub fn rest_point(adapter: &mut dyn ManipulatorAdapter) -> StopPoint {
+    let (mut reading, limits) = (JointReading::default(), adapter.get_limits().unwrap_or_default());
+    if adapter.read_joints(&mut reading).is_err() {
+        return StopPoint::default();
+    }
+    let mut position = reading.position;
+    for (i, (at, v)) in position.iter_mut().zip(reading.velocity.unwrap_or_default()).enumerate() {
+        let brakes = limits.acceleration_max.get(i).copied().filter(|a| *a > 0.0).unwrap_or(BRAKING);
+        let ends = *at + v * v.abs() / (2.0 * brakes);
+        let range = limits.position_lower.get(i).zip(limits.position_upper.get(i));
+        // A joint outside its range stays there.
+        *at = range.map_or(ends, |(lower, upper)| ends.max(lower.min(*at)).min(upper.max(*at)));
+    }
+    StopPoint { position: Some(position) }
+}
+
 /// Answers in a row that may be late on a busy machine.
 const MAX_LATE: u32 = 2;
 
@@ -336,7 +357,8 @@ impl Context {
 
     /// Stops.
     pub fn stop(&mut self) -> Result<(), String> {
-        self.adapter.write_stop(&StopPoint::default()).map(drop).map_err(|e| format!("write_stop: {e}"))
+        let rest = rest_point(&mut *self.adapter);
+        self.adapter.write_stop(&rest).map(drop).map_err(|e| format!("write_stop: {e}"))
     }
 
     /// Returns joint positions slightly off `from` [rad]: a different amount for each joint, alternately up and down,

@@ -61,7 +61,9 @@ fn plausible(context: &mut Context) -> Result<(), String> {
     context.found(format!("at {}", degrees.join(" ")))?;
     let range = limits.position_lower.iter().zip(&limits.position_upper);
     for (i, (position, (lower, upper))) in positions.iter().zip(range).enumerate() {
-        let inside = (lower - 0.01..=upper + 0.01).contains(position);
+        // A joint may rest as far outside as it may be enabled.
+        let tolerance = context.row.outside.max(0.01);
+        let inside = (lower - tolerance..=upper + tolerance).contains(position);
         require(inside, || format!("joint {}: {position} rad is outside {lower} to {upper}", i + 1))?;
     }
     Ok(())

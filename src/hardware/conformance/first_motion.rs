@@ -12,9 +12,8 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-use super::context::{CLOCKED, farthest, pause};
+use super::context::{CLOCKED, farthest, pause, rest_point};
 use super::lag::{Lag, Trace};
-use crate::arm::StopPoint;
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, JointReading, ManipulatorAdapter};
 use crate::joint::ControlMode;
@@ -275,7 +274,10 @@ impl FirstMotion<'_> {
     /// Stops, and disables the motors if they were off before and the arm does not fall without them.
     fn leave_arm(&mut self, was_on: bool) {
         // Up to three attempts: this is the one command that must not be lost.
-        let stopped = (0..3).any(|_| self.adapter.deactivate(&StopPoint::default()).is_ok());
+        let stopped = (0..3).any(|_| {
+            let rest = rest_point(self.adapter);
+            self.adapter.deactivate(&rest).is_ok()
+        });
         let holds = self.adapter.get_info().holds_when_disabled;
         self.motion.left = if !stopped {
             "the arm did not take the last stop: stop it with the vendor's own tools".to_owned()

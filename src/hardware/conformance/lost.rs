@@ -4,9 +4,8 @@ use std::time::{Duration, Instant};
 
 use super::Check;
 use super::Needs::Faults;
-use super::context::{Context, farthest, pause, require};
+use super::context::{Context, farthest, pause, require, rest_point};
 use super::stops::set_off;
-use crate::arm::StopPoint;
 use crate::hardware::adapter::{JointReading, Stop};
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::joint::ControlMode;
@@ -50,7 +49,8 @@ fn commands(context: &mut Context) -> Result<(), String> {
         }
         set_off(context)?;
         context.trigger_faults()?;
-        if context.adapter.write_stop(&StopPoint::default()) == Ok(Stop::Confirmed) {
+        let rest = rest_point(&mut *context.adapter);
+        if context.adapter.write_stop(&rest) == Ok(Stop::Confirmed) {
             let here = context.positions()?;
             pause(&mut *context.adapter, OBSERVATION_TIME);
             let moved = farthest(&context.positions()?, &here);

@@ -5,7 +5,6 @@ use std::time::{Duration, Instant};
 use super::Check;
 use super::Needs::Motion;
 use super::context::{Context, between, farthest, pause, require};
-use crate::arm::StopPoint;
 use crate::hardware::adapter::JointReading;
 use crate::joint::ControlMode;
 
@@ -163,7 +162,7 @@ fn stream_velocities(context: &mut Context) -> Result<(), String> {
         }
         measured = reading.velocity;
     }
-    context.adapter.write_stop(&StopPoint::default()).map_err(|e| format!("write_stop: {e}"))?;
+    context.stop()?;
     let (from, then) = half.ok_or("the arm's motion could not be measured")?;
     let seconds = (end.1 - then).as_secs_f64();
     for (i, ((a, b), wanted)) in from.iter().zip(&end.0).zip(&wanted).enumerate() {

@@ -91,14 +91,14 @@ impl FollowTask {
     /// Returns what each joint follows: the joint, its view, its leader's, and the target [rad].
     fn pairs<'a>(&'a self, cx: &'a Context<'_>) -> impl Iterator<Item = (u16, JointView, JointView, f64)> + 'a {
         cx.joints.iter().zip(&self.leader).map(|(&joint, leader)| {
-            let view = cx.joint(leader.joint);
-            (joint, cx.joint(joint), view, leader.target(view.position))
+            let (own, view) = (cx.joint(joint), cx.joint(leader.joint));
+            (joint, own, view, leader.target_near(view.position, own.position))
         })
     }
 
     /// Returns the joint that is too far from its leader to approach it, and the distance [rad].
     fn too_far(&self, cx: &Context<'_>) -> Option<(u16, f64)> {
-        let most = if self.params.max_approach > 0.0 { self.params.max_approach } else { f64::INFINITY };
+        let most = self.params.max_approach;
         let mut away = self.pairs(cx).map(|(joint, view, _, target)| (joint, (target - view.position).abs()));
         away.find(|(_, distance)| distance.is_nan() || *distance > most)
     }
@@ -106,9 +106,10 @@ impl FollowTask {
     /// Takes the leader's newest samples; returns whether one jumped.
     fn sample(&mut self, cx: &Context<'_>) -> bool {
         let mut jumped = false;
-        for (joint, leader) in self.joints.iter_mut().zip(&self.leader) {
+        for ((joint, leader), &index) in self.joints.iter_mut().zip(&self.leader).zip(cx.joints) {
             let view = cx.joint(leader.joint);
-            let target = leader.target(view.position);
+            let before = if self.sampled { joint.leader.sample() } else { cx.joint(index).position };
+            let target = leader.target_near(view.position, before);
             if !self.sampled {
                 joint.leader.start(target, view.stamp);
                 continue;

@@ -6,10 +6,13 @@ use schemars::JsonSchema;
 use serde::de::{Deserializer, Error};
 use serde::{Deserialize, Serialize};
 
-use crate::yaml::range::non_negative;
+use crate::yaml::range::{non_negative, positive};
 
 /// Highest speed of a joint on its way to the leader [rad/s].
 pub const MAX_APPROACH_SPEED: f64 = 0.3;
+
+/// Furthest that a joint approaches its leader where the blueprint says nothing: half a turn [rad].
+const MAX_APPROACH: f64 = std::f64::consts::PI;
 
 /// Parameters of a `follow` task. The target of a joint is `scale` · the leader's joint + `offset`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -32,9 +35,10 @@ pub struct FollowParams {
     #[schemars(extend("exclusiveMinimum" = 0.0, "maximum" = MAX_APPROACH_SPEED))]
     pub approach_speed: f64,
     /// A joint that is further than this from the leader's is not moved to it: the task refuses to start, or ends
-    /// [rad]; 0 = any distance.
-    #[serde(deserialize_with = "non_negative")]
-    #[schemars(range(min = 0.0))]
+    /// [rad], above 0. Half a turn, unless a larger value is written here: a leader whose encoder lost a turn would take
+    /// the arm with it.
+    #[serde(deserialize_with = "positive")]
+    #[schemars(extend("exclusiveMinimum" = 0.0))]
     pub max_approach: f64,
     /// Without a recent state of the leader the arm decelerates to rest. After this long the task ends [s]; before, the
     /// arm approaches the leader again.
@@ -61,7 +65,7 @@ impl Default for FollowParams {
             offset: BTreeMap::new(),
             gripper: false,
             approach_speed: MAX_APPROACH_SPEED,
-            max_approach: 0.0,
+            max_approach: MAX_APPROACH,
             leader_timeout: 2.0,
         }
     }

@@ -6,8 +6,8 @@
 //! The arm streams its state, 200 times per second; after `connect` nothing is polled. It does not acknowledge joint
 //! targets, so enabling, clearing and stopping are confirmed by its feedback.
 //!
-//! Only `write_enable(false)` disables the motors: the arm has no brakes. A stop is a hold at the current position. The
-//! arm's own E-stop command is never sent: it can only be left by a reset that lets the arm fall.
+//! Only `write_enable(false)` disables the motors: the arm has no brakes. A stop is a hold at the point that the caller
+//! gives. The arm's own E-stop command is never sent: it can only be left by a reset that lets the arm fall.
 
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
@@ -29,8 +29,6 @@ use crate::hardware::registry::AdapterConfig;
 use crate::hardware::transport::can::CanAddress;
 use crate::joint::{ControlMode, JointLimits, Joints, joints_of};
 
-/// How long a stop waits for current positions.
-const LIVE_TIMEOUT: Duration = Duration::from_millis(60);
 /// How long a stop waits for the joints to decelerate, and the change of speed that shows it [0.001 rad/s].
 const STOP_TIMEOUT: Duration = Duration::from_millis(20);
 const DECELERATION: i32 = 20;
@@ -58,6 +56,8 @@ pub struct PiperAdapter {
     mode: ControlMode,
     /// Largest torque of the last gripper command [mNm]; initially that of the options.
     gripper_torque: u16,
+    /// Target of the last gripper command since the connection [0.001 mm].
+    gripper_target: Option<i32>,
 }
 
 impl PiperAdapter {
@@ -68,7 +68,7 @@ impl PiperAdapter {
         let options: Options = config.options()?;
         let arm = Session::new(config.hardware_id.clone(), address, options.gripper.stroke().is_some());
         let gripper_torque = millinewtonmeters(options.gripper_torque);
-        Ok(Self { arm, options, mode: ControlMode::Position, gripper_torque })
+        Ok(Self { arm, options, mode: ControlMode::Position, gripper_torque, gripper_target: None })
     }
 
     /// Returns the counts since the connection was made: frames of the arm, and of the bus.
@@ -116,6 +116,7 @@ impl ManipulatorAdapter for PiperAdapter {
 
     fn connect(&mut self) -> AdapterResult<()> {
         self.disconnect();
+        self.gripper_target = None;
         self.arm.connect()
     }
 
@@ -246,9 +247,8 @@ impl ManipulatorAdapter for PiperAdapter {
             return Err(AdapterError::Busy);
         }
         let mut joints: WireJoints = positions.map(millidegrees);
-        let here = self.arm.feedback.joints.iter().zip(&self.arm.ranges);
-        for (target, (here, range)) in joints.iter_mut().zip(here) {
-            *target = hold::within(*target, *here, *range, self.arm.strict);
+        for (i, target) in joints.iter_mut().enumerate() {
+            *target = self.arm.limited(i, *target);
         }
         match self.mode {
             ControlMode::ServoPosition => self.arm.stream(self.follow(), joints),
@@ -256,19 +256,12 @@ impl ManipulatorAdapter for PiperAdapter {
         }
     }
 
-    /// Holds the arm at the last written target, at most 0.02 rad from its position. Confirmed when the feedback shows
-    /// that every joint decelerates or is at rest.
-    fn write_stop(&mut self, _rest: &StopPoint) -> AdapterResult<Stop> {
-        self.arm.refresh()?; // a hold needs a current position
-        if self.arm.feedback.enabled() && self.arm.feedback.status.arm != ESTOP {
-            // Use current positions, not those from before a gap in the feedback. An arm that stays silent is held at
-            // the old ones.
-            self.arm.watch(LIVE_TIMEOUT, Feedback::is_live)?;
-            self.arm.settle()?;
-        }
+    /// Holds the arm at the point of rest. Confirmed when the feedback shows that every joint decelerates or is at rest.
+    fn write_stop(&mut self, rest: &StopPoint) -> AdapterResult<Stop> {
+        self.arm.refresh()?; // nothing goes out to an arm that is silent
         let before = self.arm.feedback.motors.map(|motor| i32::from(motor.speed).abs());
         if self.arm.feedback.enabled() && self.arm.feedback.status.arm != ESTOP {
-            self.arm.hold(self.follow())?;
+            self.arm.stop(rest, self.follow())?;
         }
         let sent = MonotonicClock.now();
         let slower = |feedback: &Feedback| {
@@ -288,15 +281,17 @@ impl ManipulatorAdapter for PiperAdapter {
         }
         self.arm.refresh()?;
         self.arm.in_order()?;
-        self.arm.plausible()?;
+        let measured = self.arm.plausible()?;
         let were_on = self.arm.feedback.enabled();
+        if were_on {
+            self.arm.as_commanded(&measured)?;
+        }
         self.arm.release();
         self.arm.written = self.arm.written.filter(|_| were_on);
-        self.arm.take_up_hold(self.follow())?;
+        let set = self.arm.take_up_hold(&measured, self.follow())?;
         self.arm.switch_motors(true)?;
         self.arm.refresh()?;
-        self.arm.written = self.arm.written.filter(|_| were_on);
-        self.arm.hold(self.follow())?;
+        self.arm.confirm_hold(set, self.follow())?;
         self.arm.take_control()
     }
 
@@ -309,7 +304,9 @@ impl ManipulatorAdapter for PiperAdapter {
         self.arm.send(&[protocol::clear_errors()])?;
         if let Some(gripper) = self.arm.feedback.gripper.filter(|_| self.arm.feedback.gripper_errors().next().is_some())
         {
-            let frame = protocol::clear_gripper(gripper.stroke, self.gripper_torque, gripper.enabled());
+            // The frame has a target: its last one. Only a gripper that this run never commanded is told where it is.
+            let stroke = self.gripper_target.unwrap_or(gripper.stroke);
+            let frame = protocol::clear_gripper(stroke, self.gripper_torque, gripper.enabled());
             self.arm.send(&[frame])?;
         }
         let asked = MonotonicClock.now();
@@ -406,8 +403,11 @@ impl Gripper for PiperAdapter {
             return Err(self.arm.refuse(format!("gripper torque {force} Nm is not within {least} to {most} Nm")));
         }
         self.arm.may_move()?;
+        let target = (position / MICRO).round() as i32;
         self.gripper_torque = millinewtonmeters(force);
-        self.arm.send(&[protocol::gripper_target((position / MICRO).round() as i32, self.gripper_torque)])
+        self.arm.send(&[protocol::gripper_target(target, self.gripper_torque)])?;
+        self.gripper_target = Some(target);
+        Ok(())
     }
 }
 

@@ -15,14 +15,10 @@ use frame_set::FrameSet;
 use super::guard::Guard;
 use super::jump_filter::JumpFilter;
 use super::protocol::{DOF, Driver, FeedbackFrame, Gripper, Motor, MotorLimits, Status, WireJoints};
-use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::clock::Mono;
 
 /// Largest plausible joint position [0.001°].
 const MAX_ANGLE: u32 = 360_000;
-/// Positions arrive every 5 ms. After a longer gap than this, delayed ones arrive first, all at once.
-const GAP: Duration = Duration::from_millis(20);
-/// How long after a gap positions may be delayed ones.
-const DELAYED_TIME: Duration = Duration::from_millis(10);
 /// A set of zeros is implausible when a joint was farther from zero than this in the previous set [0.001°].
 const ZERO_SET_MAX_JUMP: u32 = 5_000;
 /// After this time, zeros count as the arm's real position.
@@ -54,8 +50,8 @@ pub struct Feedback {
     pub joints: WireJoints,
     /// When `joints` was completed.
     pub joints_at: Mono,
-    /// When the first positions after the latest gap arrived.
-    pub resumed_at: Mono,
+    /// When positions were last accepted to which no motion led.
+    pub jumped_at: Mono,
     /// x, y, z [0.001 mm], roll, pitch, yaw [0.001°].
     pub pose: Option<[i32; 6]>,
     /// The controller's state.
@@ -96,7 +92,7 @@ impl Default for Feedback {
         Self {
             joints: [0; DOF],
             joints_at: Mono::ZERO,
-            resumed_at: Mono::ZERO,
+            jumped_at: Mono::ZERO,
             pose: None,
             status: Status::default(),
             status_at: Mono::ZERO,
@@ -185,9 +181,7 @@ impl Feedback {
             return self.counts.damaged += 1;
         }
         self.zeros_since = (joints == [0; DOF]).then(|| self.zeros_since.unwrap_or(now));
-        if now.since(self.joints_at) > GAP {
-            self.resumed_at = now;
-        }
+        self.jumped_at = self.jump_filter.jumped_at;
         (self.joints, self.joints_at) = (joints, now);
         self.counts.sets += 1;
     }
@@ -195,12 +189,6 @@ impl Feedback {
     /// Returns whether every joint reads exactly zero, and has for less than a second.
     pub fn only_zeros(&self, now: Mono) -> bool {
         self.joints == [0; DOF] && self.zeros_since.is_none_or(|since| now.since(since) < ZEROS_TIME)
-    }
-
-    /// Returns whether the positions are current, judged by their arrival times.
-    pub fn is_live(&self) -> bool {
-        let now = MonotonicClock.now();
-        now.since(self.joints_at) <= GAP && self.joints_at.since(self.resumed_at) >= DELAYED_TIME
     }
 
     /// Returns whether positions were rejected recently, so that the accepted ones may be wrong.

@@ -25,6 +25,8 @@ pub struct JumpFilter {
     pub joints: WireJoints,
     /// When they arrived; `Mono::ZERO`: never.
     pub at: Mono,
+    /// When positions were last accepted because they agreed; `Mono::ZERO`: never.
+    pub jumped_at: Mono,
     /// The last rejected set, when it arrived, and how many consecutive ones agree with it.
     refused: WireJoints,
     refused_at: Mono,
@@ -49,7 +51,7 @@ impl JumpFilter {
             return false;
         }
         self.agreeing = 0;
-        (self.joints, self.at) = (joints, now);
+        (self.joints, self.at, self.jumped_at) = (joints, now, now);
         true
     }
 

@@ -44,8 +44,6 @@ pub struct Session {
     pub feedback: Feedback,
     /// The last joint targets [0.001°]; `None` if the arm does not follow them.
     pub written: Option<WireJoints>,
-    /// Whether they are a setpoint of a stream: the arm is at most its lag behind it.
-    pub streamed: bool,
     /// Speed [%] and mode of following in the last control frame for joint targets, unless another one followed it.
     pub control: Option<(u8, Follow)>,
     /// Joint limits [0.001°].
@@ -67,7 +65,6 @@ impl Session {
             wire: None,
             feedback,
             written: None,
-            streamed: false,
             control: None,
             ranges,
             strict: false,
@@ -110,7 +107,7 @@ impl Session {
         let frames = protocol::joint_targets(speed, follow, target);
         self.feedback.guard.order(MoveMode::Joint as u8, MonotonicClock.now());
         self.send(&frames)?;
-        (self.written, self.control, self.streamed) = (Some(target), Some((speed, follow)), false);
+        (self.written, self.control) = (Some(target), Some((speed, follow)));
         Ok(())
     }
 
@@ -120,13 +117,11 @@ impl Session {
         const SPEED: u8 = 100;
         let Status { control, mode, .. } = self.feedback.status;
         if self.control != Some((SPEED, follow)) || (control, mode) != (1, MoveMode::Joint as u8) {
-            self.write(SPEED, follow, target)?;
-            self.streamed = true;
-            return Ok(());
+            return self.write(SPEED, follow, target);
         }
         let [_, targets @ ..] = protocol::joint_targets(SPEED, follow, target);
         self.send(&targets)?;
-        (self.written, self.streamed) = (Some(target), true);
+        self.written = Some(target);
         Ok(())
     }
 
@@ -344,15 +339,9 @@ impl Session {
         if self.feedback.enabled() { Ok(()) } else { Err(self.refuse("the motors are disabled".into())) }
     }
 
-    /// An error when the measured pose cannot be true: holding there would be a jump.
-    pub fn plausible(&mut self) -> AdapterResult<()> {
-        if !self.settle()? {
-            return Err(self.refuse(
-                "its measured positions contradict each other: not enabled\nhint: look for interference on the bus \
-                 (shield, terminators), or a second arm on it"
-                    .into(),
-            ));
-        }
+    /// Returns the measured pose; an error when it cannot be true: holding there would be a jump.
+    pub fn plausible(&mut self) -> AdapterResult<WireJoints> {
+        let measured = self.agreed()?;
         if self.feedback.only_zeros(MonotonicClock.now()) {
             return Err(self.refuse(
                 "every joint reads exactly 0, as from a controller that has not measured yet: not enabled\nhint: if \
@@ -362,7 +351,7 @@ impl Session {
         }
         let limits = limits();
         let range = limits.position_lower.iter().zip(&limits.position_upper);
-        for (i, (wire, (lower, upper))) in self.feedback.joints.iter().zip(range).enumerate() {
+        for (i, (wire, (lower, upper))) in measured.iter().zip(range).enumerate() {
             let value = radians(*wire);
             if !(lower - MAX_OUTSIDE..=upper + MAX_OUTSIDE).contains(&value) {
                 let joint = i + 1;
@@ -372,7 +361,7 @@ impl Session {
                 )));
             }
         }
-        Ok(())
+        Ok(measured)
     }
 
     /// Asks for the motors to be on or off until they say that they are.

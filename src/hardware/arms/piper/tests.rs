@@ -12,7 +12,7 @@ use crate::hardware::adapter::{AdapterError, Cartesian, Gripper, JointReading, M
 use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::transport::can::CanFrame;
-use crate::joint::ControlMode;
+use crate::joint::{ControlMode, joints_of};
 
 pub const START: [f64; DOF] = [0.1, 0.6, -0.7, 0.05, 0.4, -0.1];
 
@@ -60,6 +60,11 @@ pub fn activate(emulator: &PiperEmulator, arm: &mut PiperAdapter) {
     emulator.record();
     arm.activate().unwrap();
     until("the hold", || ids(emulator).iter().filter(|id| **id == 0x157).count() == 2);
+}
+
+/// A point of rest.
+pub fn at(joints: &[f64; DOF]) -> StopPoint {
+    StopPoint { position: Some(joints_of(joints)) }
 }
 
 /// Two big-endian numbers of a frame.
@@ -232,8 +237,9 @@ fn a_stop_holds_and_is_confirmed_by_the_motors() {
     arm.write_joint_positions(&[2.0, 2.0, -2.0, 0.0, 0.0, 0.0], 0.3).unwrap();
     until("motion", || read(&mut arm).unwrap().velocity.unwrap()[0] > 0.5);
     emulator.record();
-    let (there, _) = emulator.joints();
-    assert_eq!(arm.write_stop(&StopPoint::default()), Ok(Stop::Confirmed));
+    let (there, speed) = emulator.joints();
+    let rest = std::array::from_fn(|i| there[i] + speed[i] * speed[i].abs() / 10.0);
+    assert_eq!(arm.write_stop(&at(&rest)), Ok(Stop::Confirmed));
     assert_eq!(ids(&emulator), [0x151, 0x155, 0x156, 0x157], "a hold, no E-stop");
     until("standstill", || emulator.joints().1.iter().all(|v| v.abs() < 1e-4));
     assert!(farthest(&emulator.joints().0, &there) < 0.15 && emulator.enabled());

@@ -6,7 +6,7 @@ use super::adapter::PiperAdapter;
 use super::emulator::PiperEmulator;
 use super::golden;
 use super::protocol::DOF;
-use super::tests::{START, activate, config, connected, farthest, ids, pair, read, two, until};
+use super::tests::{START, activate, at, config, connected, farthest, ids, pair, read, two, until};
 use crate::arm::StopPoint;
 use crate::hardware::adapter::{AdapterError, Gripper, ManipulatorAdapter, Stop};
 use crate::hardware::registry::Emulator;
@@ -76,7 +76,7 @@ fn f05_drivers_that_fall_silent_are_named_and_the_arm_can_still_be_stopped() {
     assert!(text.ends_with("the drivers of joints 3, 4 have said nothing for 300 ms"), "{text}");
     assert_eq!(arm.write_joint_positions(&START, 0.1), Err(error), "whether its motors are on is not known");
     emulator.record();
-    assert!(arm.write_stop(&StopPoint::default()).is_ok() && arm.is_connected());
+    assert!(arm.write_stop(&at(&START)).is_ok() && arm.is_connected());
     until("the hold", || ids(&emulator) == [0x151, 0x155, 0x156, 0x157]);
     let off = arm.write_enable(false).unwrap_err().to_string();
     assert_eq!(off, "arm: the drivers of joints 3, 4 have said nothing for 1000 ms");

@@ -17,7 +17,7 @@ use crate::hardware::adapter::{
 };
 use crate::hardware::adapter_util::fill;
 use crate::hardware::registry::AdapterConfig;
-use crate::joint::{ControlMode, JointLimits, MAX_DOF};
+use crate::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
 
 /// Longest wait for the motors: a vendor's SDK may take its time.
 const ENABLE_TIMEOUT: Duration = Duration::from_millis(2500);
@@ -260,9 +260,14 @@ impl ManipulatorAdapter for RemoteAdapter {
         self.command(mode, velocities, 1.0)
     }
 
-    fn write_stop(&mut self, _rest: &StopPoint) -> AdapterResult<Stop> {
+    fn write_stop(&mut self, rest: &StopPoint) -> AdapterResult<Stop> {
         let timeout = self.late()?;
-        self.act(&Act::Stop, timeout).map(|()| Stop::Confirmed)
+        // An older peer would refuse a stop with an argument; text cannot say what is no number.
+        let takes = self.last.as_ref().is_some_and(|described| described.stop_point);
+        let finite = |position: &Joints| position.iter().take(self.dof).all(|angle| angle.is_finite());
+        let known = rest.position.filter(|position| takes && finite(position));
+        let positions = known.map_or(Vec::new(), |position| position.iter().take(self.dof).copied().collect());
+        self.act(&Act::Stop(positions), timeout).map(|()| Stop::Confirmed)
     }
 
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {

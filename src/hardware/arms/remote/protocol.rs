@@ -37,8 +37,9 @@ pub enum Act {
     Enable(bool),
     /// `set_control_mode`
     Mode(ControlMode),
-    /// `write_stop`
-    Stop,
+    /// `write_stop`, with the joint positions at which the arm is to rest [rad]; none if nothing was commanded since the
+    /// motors came on.
+    Stop(Vec<f64>),
     /// `write_clear_errors`
     ClearErrors,
     /// `write_gripper_position` [m or rad]
@@ -55,7 +56,7 @@ impl Act {
             Self::Deactivate => "deactivate",
             Self::Enable(_) => "write_enable",
             Self::Mode(_) => "set_control_mode",
-            Self::Stop => "write_stop",
+            Self::Stop(_) => "write_stop",
             Self::ClearErrors => "write_clear_errors",
             Self::Gripper(_) => "write_gripper_position",
             Self::Cartesian(..) => "write_cartesian_position",
@@ -68,7 +69,8 @@ impl Act {
             Self::Mode(mode) => serde_json::json!([mode]),
             Self::Gripper(opening) => serde_json::json!([opening]),
             Self::Cartesian(pose, velocity) => serde_json::json!([pose, velocity]),
-            Self::Activate | Self::Deactivate | Self::Stop | Self::ClearErrors => serde_json::json!([]),
+            Self::Stop(rest) if !rest.is_empty() => serde_json::json!([rest]),
+            Self::Activate | Self::Deactivate | Self::Stop(_) | Self::ClearErrors => serde_json::json!([]),
         }
     }
 }
@@ -342,6 +344,9 @@ pub struct Description {
     /// Whether it keeps its pose when its motors are off; not where it does not say.
     #[serde(default)]
     pub holds_when_disabled: Option<bool>,
+    /// Whether `write_stop` takes the positions at which the arm is to rest.
+    #[serde(default)]
+    pub stop_point: bool,
     /// `get_limits` [rad, rad/s, rad/s², rad/s³]
     pub limits: Limits,
     /// Position of its gripper when closed and when open [m or rad].

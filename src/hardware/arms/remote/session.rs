@@ -321,7 +321,7 @@ impl Session {
     pub fn act(&mut self, act: &Act, timeout: Duration) -> AdapterResult<Option<AdapterResult<()>>> {
         let now = MonotonicClock.now();
         let same = |(asked, waited): &(Act, Mono)| asked == act && now.since(*waited) < AGAIN;
-        if !(matches!(act, Act::Stop | Act::Mode(_)) && self.act.as_ref().is_some_and(same)) {
+        if !(matches!(act, Act::Stop(_) | Act::Mode(_)) && self.act.as_ref().is_some_and(same)) {
             let number = self.next_number();
             (self.heard.awaited, self.heard.acted, self.last_act) = (number, None, number);
             protocol::act(number, act, &mut self.line);

@@ -15,7 +15,7 @@ use crate::hardware::adapter::{AdapterError, JointReading, ManipulatorAdapter, S
 use crate::hardware::registry::{self, AdapterConfig, Emulator};
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::transport::Scan;
-use crate::joint::ControlMode;
+use crate::joint::{ControlMode, joints_of};
 
 /// The lines of the sheet that begin so.
 fn sheet(start: &str) -> Vec<&'static str> {
@@ -196,9 +196,40 @@ fn a_late_refusal_of_an_earlier_act_does_not_fail_the_reads() {
     });
     let mut session = Session::open(&address, 2).unwrap();
     assert_eq!(session.act(&Act::Enable(true), Duration::from_millis(20)), Ok(None));
-    assert_eq!(session.act(&Act::Stop, Duration::from_secs(10)), Ok(Some(Ok(()))));
+    assert_eq!(session.act(&Act::Stop(Vec::new()), Duration::from_secs(10)), Ok(Some(Ok(()))));
     let state = session.newest();
     assert!(matches!(state, Ok(Ok(_))), "{state:?}");
+}
+
+#[test]
+fn a_stop_has_its_point_of_rest_only_where_the_peer_takes_one() {
+    for takes in [false, true] {
+        let [hello, .., state] = sheet("{ \"id\":")[..] else { panic!("four replies") };
+        let mut hello: serde_json::Value = serde_json::from_str(hello).unwrap();
+        hello["stop_point"] = takes.into();
+        let mut state: serde_json::Value = serde_json::from_str(state).unwrap();
+        let (said, heard) = std::sync::mpsc::channel();
+        let address = scripted(move |request| {
+            let reply = match request.what.as_str() {
+                "hello" => &mut hello,
+                "cycle" => &mut state,
+                _ => &mut serde_json::json!({}),
+            };
+            reply["id"] = request.id.into();
+            if request.what == "write_stop" {
+                said.send(serde_json::json!(request.arguments).to_string()).unwrap();
+            }
+            format!("{reply}\n")
+        });
+        let mut arm = registry::create("remote", &address.to_string(), 2).unwrap();
+        arm.connect().unwrap();
+        let at = |position: &[f64]| StopPoint { position: Some(joints_of(position)) };
+        for point in [at(&[0.1, -0.3]), StopPoint::default(), at(&[0.1, f64::NAN])] {
+            assert_eq!(arm.write_stop(&point), Ok(Stop::Confirmed));
+        }
+        let first = if takes { "[[0.1,-0.3]]" } else { "[]" };
+        assert_eq!([(); 3].map(|()| heard.recv().unwrap()), [first, "[]", "[]"]);
+    }
 }
 
 #[test]

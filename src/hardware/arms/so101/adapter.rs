@@ -9,9 +9,10 @@ use std::time::Duration;
 use super::bus::Bus;
 use super::calibration::{Calibration, Range};
 use super::protocol::{SERVOS, Servo, TURN, register};
-use super::servos::{error_of, must_stop};
+use super::seam::Seams;
+use super::servos::error_of;
 use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, TOP_SPEED, check, limits};
-use crate::arm::StopPoint;
+use crate::arm::{Commanded, StopPoint};
 use crate::clock::Mono;
 use crate::hardware::adapter::{
     AdapterError, AdapterResult, Gripper, JointMonitor, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState,
@@ -26,8 +27,6 @@ use crate::joint::{ControlMode, JointLimits, Joints, joints_of};
 const WRITABLE: Duration = Duration::from_millis(50);
 /// Acceleration of the servos, the highest [100 counts/s²].
 const ACCELERATION: u8 = 254;
-/// Below this the servos answer, but have no force [0.1 V].
-const LOWEST_VOLTAGE: u8 = 55;
 /// Slowest planned motion [counts/s]: zero would be the fastest.
 const SLOWEST: f64 = 10.0;
 
@@ -41,6 +40,10 @@ pub struct So101Adapter {
     mode: ControlMode,
     /// The last state of all servos, and when it was asked for.
     pub(super) state: Option<([Servo; SERVOS], Mono)>,
+    /// The seams of the encoders.
+    pub(super) seams: Seams,
+    /// The goals that servos had before they were taken back because of an overload [counts], until another setpoint.
+    pub(super) relieved: [Option<i32>; SERVOS],
     /// The last goal of the gripper [counts]; `None`: the goal that its servo has.
     pub(super) gripper_goal: Option<i32>,
     /// Top speed of the gripper [counts/s]; 0 = none.
@@ -63,6 +66,8 @@ impl So101Adapter {
             firmware: (0, 0),
             mode: MODES.first().copied().unwrap_or_default(),
             state: None,
+            seams: Seams::default(),
+            relieved: [None; SERVOS],
             gripper_goal: None,
             gripper_speed: 0,
             offsets: [0; SERVOS],
@@ -81,9 +86,10 @@ impl So101Adapter {
         if let Some(joint) = servos.iter().take(DOF).position(|servo| !servo.on) {
             return Err(AdapterError::Rejected(format!("the motor of joint {} is off", joint + 1)));
         }
-        if let Some((code, text)) = error_of(&servos) {
+        if let Some((code, text)) = self.error(&servos) {
             return Err(AdapterError::Fault { code, text });
         }
+        self.relieved = [None; SERVOS];
         let (mut values, mut goals) = ([[0; 7]; SERVOS], servos.map(|servo| servo.goal));
         for (j, (value, goal)) in values.iter_mut().zip(&mut goals).enumerate() {
             let speed = match joints.get(j) {
@@ -109,6 +115,16 @@ impl So101Adapter {
         Ok(())
     }
 
+    /// Returns code and text of the first error.
+    fn error(&self, servos: &[Servo; SERVOS]) -> Option<(i32, String)> {
+        self.seams.error(|j| self.range(j)).or_else(|| error_of(servos))
+    }
+
+    /// Returns the positions [rad], counted over the seam.
+    fn positions(&self) -> Joints {
+        self.angles(|j, range| range.angle(self.seams.positions.get(j).copied().unwrap_or_default()))
+    }
+
     fn angles(&self, of: impl Fn(usize, Range) -> f64) -> Joints {
         let mut values = [0.0; DOF];
         values.iter_mut().enumerate().for_each(|(j, value)| *value = of(j, self.range(j)));
@@ -130,6 +146,7 @@ impl ManipulatorAdapter for So101Adapter {
     fn disconnect(&mut self) {
         self.bus.line.close();
         (self.state, self.gripper_goal, self.gripper_speed) = (None, None, 0);
+        (self.seams, self.relieved) = (Seams::default(), [None; SERVOS]);
     }
 
     fn is_connected(&self) -> bool {
@@ -175,7 +192,8 @@ impl ManipulatorAdapter for So101Adapter {
 
     fn read_joint_positions(&mut self, positions: &mut [f64]) -> AdapterResult<()> {
         let servos = self.fetch()?;
-        fill(positions, &self.angles(|j, range| range.angle(servos.get(j).map_or(0, |servo| servo.position))));
+        self.guard_seams(&servos)?;
+        fill(positions, &self.positions());
         Ok(())
     }
 
@@ -187,14 +205,17 @@ impl ManipulatorAdapter for So101Adapter {
 
     fn read_joints(&mut self, reading: &mut JointReading) -> AdapterResult<()> {
         let servos = self.fetch()?;
+        self.guard_seams(&servos)?;
+        let goal = |j, range: Range| servos.get(j).map_or(0.0, |servo| range.angle(self.seams.goal(j, servo)));
+        let on = servos.iter().take(DOF).all(|servo| servo.on);
         *reading = JointReading {
             stamp: None,
             device_ns: None,
-            position: self.angles(|j, range| range.angle(servos.get(j).map_or(0, |servo| servo.position))),
+            position: self.positions(),
             velocity: Some(self.angles(|j, _| velocity(servos.get(j)))),
             effort: None,
             valid: Some(true),
-            commanded: None,
+            commanded: on.then(|| Commanded { position: self.angles(goal), ..Commanded::default() }),
         };
         Ok(())
     }
@@ -206,7 +227,8 @@ impl ManipulatorAdapter for So101Adapter {
     }
 
     fn read_error(&mut self) -> AdapterResult<(i32, String)> {
-        Ok(error_of(&self.recent()?).unwrap_or_default())
+        let servos = self.recent()?;
+        Ok(self.error(&servos).unwrap_or_default())
     }
 
     fn read_enabled(&mut self) -> AdapterResult<bool> {
@@ -222,62 +244,44 @@ impl ManipulatorAdapter for So101Adapter {
         self.drive(joints, speed)
     }
 
-    fn write_stop(&mut self, _rest: &StopPoint) -> AdapterResult<Stop> {
+    /// Makes the point of rest the goal of the joints; the gripper keeps its own. A motor that is off gets no goal: it
+    /// might come on.
+    fn write_stop(&mut self, rest: &StopPoint) -> AdapterResult<Stop> {
         let servos = self.fetch()?;
         self.gripper_goal = None;
-        if servos.iter().enumerate().any(|(j, servo)| servo.on && must_stop(j, servo)) {
+        if let Some(position) = rest.position {
             let mut goals = servos.map(|servo| servo.goal);
-            for (j, (goal, servo)) in goals.iter_mut().zip(&servos).enumerate() {
-                let range = self.range(j);
-                if must_stop(j, servo) {
-                    *goal = servo.position.max(range.low).min(range.high);
+            for (j, (goal, angle)) in goals.iter_mut().zip(position).enumerate().take(DOF) {
+                if angle.is_finite() && !self.seams.is_crossed(j) {
+                    *goal = self.range(j).counts(angle);
                 }
             }
-            self.write_goals(goals)?;
+            if servos.iter().zip(goals).any(|(servo, goal)| servo.on && servo.goal != goal) {
+                self.write_goals_of_enabled(&servos, goals)?;
+            }
         }
         Ok(Stop::Confirmed)
     }
 
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
-        if enable {
-            let servos = self.fetch()?;
-            if servos.iter().all(|servo| servo.on) {
-                return Ok(());
-            }
-            if let Some(servo) = servos.iter().find(|servo| servo.voltage < LOWEST_VOLTAGE) {
-                let volts = f64::from(servo.voltage) * 0.1;
-                return Err(AdapterError::Rejected(format!(
-                    "so101: the servos have {volts:.1} V\nhint: switch the arm's power supply on; USB gives them no force"
-                )));
-            }
-            let held = self.hold_goals(&servos)?;
-            // A motor that is on keeps its goal.
-            let mut goals = servos.map(|servo| servo.goal);
-            for ((goal, servo), held) in goals.iter_mut().zip(&servos).zip(held) {
-                if !servo.on {
-                    *goal = held;
-                }
-            }
-            self.gripper_goal = None;
-            self.write_goals(goals)?;
-        }
-        self.write_torque(enable)
+        if enable { self.enable() } else { self.write_torque(false) }
     }
 
     fn write_clear_errors(&mut self) -> AdapterResult<()> {
         let servos = self.fetch()?;
+        if let Some((_, text)) = self.seams.error(|j| self.range(j)) {
+            return Err(AdapterError::Rejected(text));
+        }
         if error_of(&servos).is_none() {
             return Ok(());
         }
-        // An overload ends when the goal no longer asks for force. The other servos keep theirs.
-        let held = self.hold_goals(&servos)?;
-        let mut goals = servos.map(|servo| servo.goal);
-        for ((goal, servo), held) in goals.iter_mut().zip(&servos).zip(held) {
-            if servo.error != 0 {
-                *goal = held;
-            }
+        // An overload ends when the goal no longer asks for force, or when the motor is switched off. The other servos
+        // keep their goals.
+        let goals = self.relieved_goals(&servos);
+        self.write_goals_of_enabled(&servos, goals)?;
+        for (id, _) in (1..).zip(&servos).filter(|(_, servo)| !servo.on && servo.error != 0) {
+            self.bus.write(id, register::TORQUE, &[0])?;
         }
-        self.write_goals(goals)?;
         match error_of(&self.fetch()?) {
             None => Ok(()),
             Some((_, text)) => Err(AdapterError::Rejected(format!(

@@ -6,6 +6,7 @@ use std::path::Path;
 use serde::Deserialize;
 
 use super::protocol::{SERVOS, TURN};
+use super::{DOF, SPEC};
 
 /// The joints and the gripper, as LeRobot calls them.
 pub const NAMES: [&str; SERVOS] =
@@ -15,6 +16,14 @@ const DATA_SHEET: [(f64, f64); SERVOS] =
     [(-1.920, 1.920), (-1.745, 1.745), (-1.690, 1.690), (-1.658, 1.658), (-2.744, 2.841), (-0.175, 1.745)];
 /// The middle of a turn [counts]: zero of the data sheet.
 const MIDDLE: f64 = 2048.0;
+/// Distance that goals of the joints keep from the seam of the encoder [counts]: a joint that rests beside its goal stays
+/// on its side of the seam. A servo drives round the whole turn to a goal on the other side.
+pub const SEAM_MARGIN: i32 = {
+    let (sag, degree) = (2.0 * SPEC.accuracy + SPEC.droop, TAU / 360.0);
+    ((if sag > degree { sag } else { degree }) * TURN / TAU) as i32 + 1
+};
+/// Highest position of a turn [counts].
+pub const LAST: i32 = TURN as i32 - 1;
 
 /// A servo in LeRobot's file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize)]
@@ -53,10 +62,12 @@ pub fn file(servos: &[Servo; SERVOS]) -> String {
 /// Range and zero of a servo.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Range {
-    /// Lowest and highest position [counts].
+    /// Lowest goal [counts].
     pub low: i32,
-    /// Highest.
+    /// Highest goal.
     pub high: i32,
+    /// The range in the servo: lowest and highest position [counts].
+    pub registers: (i32, i32),
     /// Position of zero [counts].
     zero: f64,
     /// The offset that the servo must have; `None`: any.
@@ -89,7 +100,8 @@ impl Default for Calibration {
     fn default() -> Self {
         Self(DATA_SHEET.map(|(low, high)| {
             let counts = |angle: f64| angle * TURN / TAU + MIDDLE;
-            Range { low: counts(low).ceil() as i32, high: counts(high).floor() as i32, zero: MIDDLE, offset: None }
+            let (low, high) = (counts(low).ceil() as i32, counts(high).floor() as i32);
+            Range { low, high, registers: (low, high), zero: MIDDLE, offset: None }
         }))
     }
 }
@@ -112,13 +124,24 @@ impl Calibration {
     }
 
     fn of(servos: &[Servo; SERVOS]) -> Self {
-        Self(servos.map(|servo| Range {
-            low: servo.range_min,
-            high: servo.range_max,
-            zero: 0.5 * f64::from(servo.range_min + servo.range_max),
-            offset: Some(servo.homing_offset),
+        let mut joint = 0;
+        Self(servos.map(|servo| {
+            joint += 1;
+            let (low, high) = if joint <= DOF { clear_of_seam(&servo) } else { (servo.range_min, servo.range_max) };
+            Range {
+                low,
+                high,
+                registers: (servo.range_min, servo.range_max),
+                zero: 0.5 * f64::from(servo.range_min + servo.range_max),
+                offset: Some(servo.homing_offset),
+            }
         }))
     }
+}
+
+/// Returns the lowest and the highest goal of a joint: its range without the parts beside the seam.
+fn clear_of_seam(servo: &Servo) -> (i32, i32) {
+    (servo.range_min.max(SEAM_MARGIN), servo.range_max.min(LAST - SEAM_MARGIN))
 }
 
 fn entries(text: &str) -> Result<[Servo; SERVOS], String> {
@@ -136,6 +159,10 @@ fn entries(text: &str) -> Result<[Servo; SERVOS], String> {
         }
         if !(-2047..=2047).contains(&offset) {
             return Err(format!("{name}: {offset} is not an offset within -2047 to 2047"));
+        }
+        let (lowest, highest) = clear_of_seam(entry);
+        if lowest >= highest {
+            return Err(format!("{name}: {low} to {high} is beside the seam of its encoder (0 and 4095)"));
         }
         *servo = *entry;
     }
@@ -166,6 +193,18 @@ mod tests {
     }
 
     #[test]
+    fn goals_keep_clear_of_the_seam_and_zero_stays_where_it_is() {
+        let Calibration([pan, .., roll, gripper]) = Calibration::parse(FILE).unwrap();
+        assert_eq!((pan.low, pan.high), pan.registers);
+        assert_eq!((roll.low, roll.high, roll.registers), (SEAM_MARGIN, 4095 - SEAM_MARGIN, (0, 4095)));
+        assert!(SEAM_MARGIN == 92 && (roll.angles().1 - 2.9999).abs() < 1e-3, "0.14 rad: {:?}", roll.angles());
+        assert!(roll.angle(2048) > 0.0 && roll.angle(2047) < 0.0);
+        let at_the_end = FILE.replace("2000, \"range_max\": 3500", "0, \"range_max\": 3500");
+        assert_eq!(Calibration::parse(&at_the_end).unwrap().0[5].low, 0, "the gripper has an end stop");
+        assert_eq!(gripper.registers, (2000, 3500));
+    }
+
+    #[test]
     fn a_file_that_was_written_is_read_as_it_was() {
         let servos = entries(FILE).unwrap();
         let text = file(&servos);
@@ -181,6 +220,9 @@ mod tests {
         assert_eq!(wrong(r#""id": 3"#, r#""id": 4"#), "elbow_flex is servo 4, expected 3");
         assert_eq!(wrong("-50", "2048"), "shoulder_pan: 2048 is not an offset within -2047 to 2047");
         assert_eq!(wrong("3420", "4096"), "shoulder_pan: 758 to 4096 is not a range within 0 to 4095");
+        let beside = FILE.replace("758, \"range_max\": 3420", "0, \"range_max\": 90");
+        let error = Calibration::parse(&beside).unwrap_err();
+        assert_eq!(error, "shoulder_pan: 0 to 90 is beside the seam of its encoder (0 and 4095)");
         assert!(wrong("range_max", "max").starts_with("this is no calibration of LeRobot"));
         let error = Calibration::load(Path::new("/no/such/file")).unwrap_err();
         assert!(error.starts_with("cannot read /no/such/file: "), "{error}");

@@ -18,7 +18,7 @@ impl So101Adapter {
             let offset = signed(u16::from_le_bytes(self.bus.read::<2>(id, register::OFFSET)?), 11);
             self.offsets.get_mut(i).into_iter().for_each(|to| *to = offset);
             let range = self.range(i);
-            let same = found == (range.low as u16, range.high as u16);
+            let same = (found.0.into(), found.1.into()) == range.registers;
             if range.offset.is_some_and(|expected| !same || offset != expected) {
                 return Err(AdapterError::Rejected(format!(
                     "so101 at {at}: {} has the range {} to {} and the offset {offset}, not those of the calibration \

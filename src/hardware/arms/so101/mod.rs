@@ -1,9 +1,11 @@
 //! SO-101 (and SO-100): five joints and a gripper of Feetech STS3215 servos on one half-duplex serial line.
 //!
 //! `protocol.rs` has the bytes, `bus.rs` the line, `calibration.rs` what counts mean, `servos.rs` the state of all
-//! servos and writes to them, `connect.rs` the checks when connecting, `adapter.rs` the lifecycle, `parts.rs` gripper
-//! and joint status, `service.rs` and `settings.rs` the work outside a run, `emulator/` the servos' side of the line.
+//! servos and writes to them, `connect.rs` the checks when connecting, `adapter.rs` the lifecycle, `activation.rs` where
+//! the motors come on, `turns.rs` and `seam.rs` the seam of the encoders, `parts.rs` gripper and joint status,
+//! `service.rs` and `settings.rs` the work outside a run, `emulator/` the servos' side of the line.
 
+mod activation;
 pub mod adapter;
 mod bus;
 pub mod calibration;
@@ -11,13 +13,19 @@ mod connect;
 pub mod emulator;
 mod parts;
 pub mod protocol;
+pub mod seam;
 mod service;
 mod servos;
 mod settings;
 #[cfg(test)]
 mod tests;
 #[cfg(test)]
+mod tests_seam;
+#[cfg(test)]
 mod tests_service;
+#[cfg(test)]
+mod tests_wrong_readings;
+mod turns;
 
 use std::path::PathBuf;
 use std::time::Duration;

@@ -60,7 +60,7 @@ impl Gripper for So101Adapter {
         self.gripper_goal = Some(goal);
         let mut goals = servos.map(|servo| servo.goal);
         goals.iter_mut().skip(DOF).for_each(|to| *to = goal);
-        self.write_goals(goals)
+        self.write_goals_of_enabled(&servos, goals)
     }
 
     fn get_gripper_range(&mut self) -> Option<(f64, f64)> {

@@ -31,6 +31,8 @@ pub mod register {
     pub const RATE: u8 = 6;
     /// Lowest position, two bytes; the highest follows it.
     pub const RANGE: u8 = 9;
+    /// Highest torque [0.1 %], two bytes; the torque limit has its value after power-up.
+    pub const MAX_TORQUE: u8 = 16;
     /// Homing offset, two bytes with the sign in bit 11.
     pub const OFFSET: u8 = 31;
     /// Control mode: 0 is position. In another mode goals mean something else.
@@ -41,8 +43,10 @@ pub mod register {
     pub const ACCELERATION: u8 = 41;
     /// Goal position, two bytes.
     pub const GOAL: u8 = 42;
-    /// Velocity of the goal, two bytes: in position mode the top speed, 0 = none.
+    /// Velocity of the goal, two bytes: in position mode the top speed, 0 = none. The torque limit [0.1 %] follows it.
     pub const TOP_SPEED: u8 = 46;
+    /// Torque limit [0.1 %], two bytes.
+    pub const TORQUE_LIMIT: u8 = 48;
     /// Lock: while it is 1, writes to the EEPROM are lost at power-off.
     pub const LOCK: u8 = 55;
     /// Position, two bytes.
@@ -169,6 +173,8 @@ pub struct Servo {
     pub goal: i32,
     /// Top speed [counts/s]; 0 = none.
     pub top_speed: u16,
+    /// Torque limit [0.1 %].
+    pub torque_limit: u16,
     /// Position [counts].
     pub position: i32,
     /// Velocity [counts/s].
@@ -196,7 +202,8 @@ impl Servo {
         Some(Self {
             on: byte(40) == 1,
             goal: signed(word(42), 15),
-            top_speed: word(46),
+            top_speed: word(register::TOP_SPEED),
+            torque_limit: word(register::TORQUE_LIMIT),
             position: signed(word(56), 15),
             velocity: signed(word(58), 15),
             voltage: byte(62),

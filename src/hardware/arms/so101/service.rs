@@ -30,7 +30,7 @@ const PING: Retry = Retry::once(Duration::from_millis(150));
 /// A servo writes its EEPROM, and changes its rate, in this time.
 const SETTLE: Duration = Duration::from_millis(50);
 
-/// The motors: the wrist turns without end stops.
+/// The motors: the wrist may turn without end stops.
 const MOTORS: [Motor; SERVOS] = {
     let mut motors = [Motor { name: "", id: 0, range: None }; SERVOS];
     let mut i = 0;
@@ -40,6 +40,16 @@ const MOTORS: [Motor; SERVOS] = {
     }
     motors
 };
+
+/// Returns the offset that puts the middle of a range at [`MIDDLE`], and the range then: the seam of the encoder is
+/// opposite, outside the travel where there is room.
+fn centred(offset: i32, (low, high): (i32, i32)) -> (i32, i32, i32) {
+    let by = if (low, high) == (0, TURN - 1) { 0 } else { (low + high) / 2 - MIDDLE };
+    // Half a turn is no offset: one count beside it is as good.
+    let centred = (offset + by + MAX_OFFSET).rem_euclid(TURN) - MAX_OFFSET;
+    let by = by - i32::from(centred > MAX_OFFSET);
+    (centred.min(MAX_OFFSET), low - by, high - by)
+}
 
 /// The servos' line.
 struct Servos {
@@ -170,8 +180,9 @@ impl Service for Servos {
     fn calibration(&self, ranges: &[(i32, i32)]) -> AdapterResult<String> {
         let offsets = self.offsets.ok_or_else(|| AdapterError::Rejected("no middle pose was taken".into()))?;
         let mut servos = [Servo::default(); SERVOS];
-        for (((servo, motor), offset), (low, high)) in servos.iter_mut().zip(MOTORS).zip(offsets).zip(ranges) {
-            *servo = Servo { id: motor.id, drive_mode: 0, homing_offset: offset, range_min: *low, range_max: *high };
+        for (((servo, motor), offset), range) in servos.iter_mut().zip(MOTORS).zip(offsets).zip(ranges) {
+            let (homing_offset, range_min, range_max) = centred(offset, *range);
+            *servo = Servo { id: motor.id, drive_mode: 0, homing_offset, range_min, range_max };
         }
         let text = file(&servos);
         // What the adapter would not read is not saved.
@@ -246,6 +257,26 @@ impl Service for Servos {
         match self.ping()?.as_slice() {
             [id] if *id == new => Ok(()),
             found => Err(AdapterError::Protocol(format!("servo {new} was set up, but {found:?} answer"))),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_middle_of_the_travel_is_the_middle_of_the_turn() {
+        assert_eq!(centred(0, (600, 3200)), (-147, 747, 3347));
+        assert_eq!(centred(10, (0, 4095)), (10, 0, 4095), "no end stops");
+        for offset in -2047..=2047 {
+            for (low, high) in [(0, 1000), (3000, 4095), (40, 4000), (2046, 2050)] {
+                let (to, least, most) = centred(offset, (low, high));
+                assert!((-2047..=2047).contains(&to) && ((least + most) / 2 - MIDDLE).abs() <= 1, "{offset} {low}");
+                // The same places of the encoder.
+                assert_eq!((least + to - low - offset).rem_euclid(TURN), 0);
+                assert_eq!(most - least, high - low);
+            }
         }
     }
 }

@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use super::DOF;
+use super::SPEC;
 use super::adapter::So101Adapter;
 use super::calibration::NAMES;
 use super::protocol::{self, Instruction, MAX_DATA, MAX_INSTRUCTION, SERVOS, STATE, Servo, TURN, register};
@@ -17,10 +17,8 @@ const CYCLE: Retry = Retry { each: Duration::from_millis(30), times: 3 };
 const STATE_AGE: Duration = Duration::from_millis(5);
 /// How often torque and goals are written until the servos show them: nothing acknowledges a write to all.
 const WRITES: u32 = 4;
-/// A goal this far from the joint is that joint's position [counts]: encoders flicker.
-const SAME: i32 = 3;
-/// A joint at rest further than this from its goal has not started yet, or is blocked [counts]; nearer, it droops.
-const DROOP: i32 = 40;
+/// Furthest that a goal is taken back to end an overload [counts].
+const RELIEF: i32 = (SPEC.relief * TURN / std::f64::consts::TAU) as i32;
 
 impl So101Adapter {
     /// Writes the same registers of all servos.
@@ -55,6 +53,7 @@ impl So101Adapter {
         }
         result?;
         let servos = servos.map(Option::unwrap_or_default);
+        self.seams.take(&servos, asked);
         self.state = Some((servos, asked));
         Ok(servos)
     }
@@ -114,24 +113,31 @@ impl So101Adapter {
         Err(AdapterError::Protocol(format!("so101: not all motors can be switched {what}")))
     }
 
-    /// Returns where each servo is, inside its range. A servo goes to its goal when its motor comes on, and some when a
-    /// goal is written.
-    pub(super) fn hold_goals(&self, servos: &[Servo; SERVOS]) -> AdapterResult<[i32; SERVOS]> {
-        let mut goals = servos.map(|servo| servo.position);
-        for (j, goal) in goals.iter_mut().enumerate() {
-            let (range, position) = (self.range(j), *goal);
-            *goal = position.max(range.low).min(range.high);
-            if (*goal - position).abs() > SAME && j < DOF {
-                let degrees = |counts: i32| f64::from(counts) * 360.0 / TURN;
-                return Err(AdapterError::Rejected(format!(
-                    "joint {} ({}) is {:.1}° outside its range\nhint: move it inside by hand, or calibrate the arm",
-                    j + 1,
-                    NAMES.get(j).copied().unwrap_or_default(),
-                    degrees((*goal - position).abs())
-                )));
+    /// Writes goals of the servos whose motors are on; the others might come on.
+    pub(super) fn write_goals_of_enabled(
+        &mut self,
+        servos: &[Servo; SERVOS],
+        goals: [i32; SERVOS],
+    ) -> AdapterResult<()> {
+        if servos.iter().all(|servo| servo.on) {
+            return self.write_goals(goals);
+        }
+        self.state = None;
+        let each = (1..).zip(servos.iter().zip(goals)).filter(|(_, (servo, _))| servo.on);
+        { each }.try_for_each(|(id, (_, goal))| self.bus.write(id, register::GOAL, &(goal.max(0) as u16).to_le_bytes()))
+    }
+
+    /// Returns the goals with those of overloaded servos taken back towards the joint: by at most [`RELIEF`] from what
+    /// was commanded, however often this is asked for. A wrong reading moves a joint no further than that.
+    pub(super) fn relieved_goals(&mut self, servos: &[Servo; SERVOS]) -> [i32; SERVOS] {
+        let mut goals = servos.map(|servo| servo.goal);
+        for ((goal, servo), commanded) in goals.iter_mut().zip(servos).zip(&mut self.relieved) {
+            if servo.on && servo.error != 0 {
+                let from = *commanded.get_or_insert(servo.goal);
+                *goal = servo.position.max(from - RELIEF).min(from + RELIEF).max(0);
             }
         }
-        Ok(goals)
+        goals
     }
 }
 
@@ -140,11 +146,4 @@ pub(super) fn error_of(servos: &[Servo; SERVOS]) -> Option<(i32, String)> {
     let (i, servo) = servos.iter().enumerate().find(|(_, servo)| servo.error != 0)?;
     let (name, text) = (NAMES.get(i).copied().unwrap_or_default(), protocol::error_text(servo.error));
     Some((servo.error.into(), format!("servo {} ({name}): {text}", i + 1)))
-}
-
-/// Returns whether a stop makes the position of servo `j` its goal: if it moves, or is a joint far from its goal.
-/// Joints that droop and a gripper on a workpiece rest away from their goals: with a goal at its position, the joint
-/// would sink further, and the gripper lose its grip. The device thread holds a gripper that starts after this.
-pub(super) fn must_stop(j: usize, servo: &Servo) -> bool {
-    servo.moving || j < DOF && (!servo.on || (servo.goal - servo.position).abs() > DROOP)
 }

@@ -5,9 +5,8 @@ use std::ops::Range;
 use std::time::Duration;
 
 use super::{DEGREE, FirstMotion, FirstMotionEnd, JointMotion, MAX_STRAY, REACH, SPEED};
-use crate::arm::StopPoint;
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::conformance::context::{farthest, when_there_is_room};
+use crate::hardware::conformance::context::{farthest, rest_point, when_there_is_room};
 use crate::hardware::conformance::lag::Trace;
 use crate::joint::ControlMode;
 
@@ -233,7 +232,8 @@ impl FirstMotion<'_> {
             let positions = it.read()?.0;
             Ok(it.check_motion(0, 0.0, REACH, &positions, Observed::default())?.moved > REACH / 4.0)
         })?;
-        self.adapter.write_stop(&StopPoint::default())?;
+        let rest = rest_point(self.adapter);
+        self.adapter.write_stop(&rest)?;
         let at = self.read()?.0;
         let rest = self.wait_for_standstill()?;
         self.motion.stopped = Some(farthest(&rest, &at));

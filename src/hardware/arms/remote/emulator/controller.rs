@@ -97,6 +97,7 @@ impl Controller {
             "holds_when_disabled": SPEC.holds_when_disabled,
             "limits": lists(&self.limits, dof),
             "gripper_range": [0.0, GRIPPER.0],
+            "stop_point": true,
             "parts": ["read_gripper_position"],
         })
     }

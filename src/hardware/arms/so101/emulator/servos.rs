@@ -55,6 +55,10 @@ pub struct Servos {
     wrong_model: bool,
     /// Which servos have a worn-out EEPROM, which keeps its values.
     worn: [bool; SERVOS],
+    /// How far the encoder of a servo is off [counts], for how many readings.
+    misread: [(i32, u32); SERVOS],
+    /// Turns of the servos when their goals were last looked at: behind the end of a turn a goal is somewhere else.
+    turns: [i32; SERVOS],
     /// Instructions since the start.
     instructions: u64,
 }
@@ -97,6 +101,8 @@ impl Servos {
             voltage: (options.voltage * 10.0).round() as u8,
             wrong_model: false,
             worn: [false; SERVOS],
+            misread: [(0, 0); SERVOS],
+            turns: [0; SERVOS],
             instructions: 0,
         };
         for (servo, id) in options.ids.iter().take(SERVOS).enumerate() {
@@ -104,6 +110,11 @@ impl Servos {
         }
         servos.power_up();
         Ok(servos)
+    }
+
+    /// The encoder of a servo (index from 0) is off by this many counts, for so many readings of its position.
+    pub fn misread(&mut self, servo: usize, by: i32, readings: u32) {
+        self.misread.get_mut(servo).into_iter().for_each(|to| *to = (by, readings));
     }
 
     /// Puts a servo (index from 0) with this number on the line; 0 takes it off.
@@ -190,7 +201,10 @@ impl Servos {
             set(MODEL, &2825u16.to_le_bytes());
         }
         set(TORQUE, &[u8::from(self.arm.motor(servo))]);
-        set(56, &with_sign(self.position(servo).0).to_le_bytes());
+        let (by, readings) = self.misread.get(servo).copied().unwrap_or_default();
+        let position = self.position(servo).0;
+        let shown = if readings > 0 { (position + by).rem_euclid(TURN) } else { position };
+        set(56, &with_sign(shown).to_le_bytes());
         let speed = velocity * f64::from(TURN) / TAU;
         set(58, &with_sign(speed.round() as i32).to_le_bytes());
         set(
@@ -206,6 +220,15 @@ impl Servos {
         );
         set(66, &[u8::from(speed.abs() > 3.0)]);
         (address..address + length).map(|i| all.get(i).copied().unwrap_or_default()).collect()
+    }
+
+    /// What a servo answers to a request for registers.
+    fn answer(&mut self, servo: usize, address: usize, length: usize) -> Vec<u8> {
+        let data = self.read(servo, address, length);
+        if (address..address + length).contains(&56) {
+            self.misread.get_mut(servo).into_iter().for_each(|(_, readings)| *readings = readings.saturating_sub(1));
+        }
+        data
     }
 
     /// Writes registers of a servo, as far as they can be written.
@@ -237,6 +260,9 @@ impl Servos {
         let touches = |register: usize| (address..address + values.len()).contains(&register);
         if touches(TORQUE) {
             let on = self.byte(servo, TORQUE) == 1;
+            if !on && self.error(servo) != 0 {
+                let _ = self.arm.clear_error();
+            }
             if on != self.arm.motor(servo) {
                 self.arm.enable_joint(servo, on);
                 if !on {
@@ -246,7 +272,8 @@ impl Servos {
         }
     }
 
-    /// Sends the joints to the goals in the registers. A servo whose goal is where it is has no overload.
+    /// Sends the joints to the goals in the registers. A servo whose goal is where it is has no overload, nor has one that
+    /// is switched off.
     fn go(&mut self) {
         let mut goals = [0.0; SERVOS];
         let (positions, velocities) = self.arm.joints();
@@ -292,7 +319,7 @@ impl Servos {
             }
             (0x02, [address, length]) => {
                 if let Some(servo) = listed(id) {
-                    let data = self.read(servo, (*address).into(), (*length).into());
+                    let data = self.answer(servo, (*address).into(), (*length).into());
                     status(answer, id, self.error(servo), &data);
                 }
             }
@@ -323,7 +350,7 @@ impl Servos {
             }
             (0x82, [address, length, ids @ ..]) => {
                 for (id, servo) in ids.iter().filter_map(|id| Some((*id, listed(*id)?))) {
-                    let data = self.read(servo, (*address).into(), (*length).into());
+                    let data = self.answer(servo, (*address).into(), (*length).into());
                     status(answer, id, self.error(servo), &data);
                 }
             }
@@ -380,6 +407,10 @@ impl Controller for Servos {
         };
         self.arm.client_came();
         self.arm.advance(now);
+        let turns = std::array::from_fn(|servo| self.position(servo).1);
+        if turns != std::mem::replace(&mut self.turns, turns) {
+            self.go();
+        }
         if self.arm.take_fault(FaultKind::WrongModel).is_some() {
             self.wrong_model = true;
         }
