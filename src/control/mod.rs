@@ -14,6 +14,7 @@ pub mod estimate;
 pub mod failsafe;
 pub mod feedback;
 pub mod guard;
+pub mod interruptions;
 pub mod limit;
 pub mod pace;
 pub mod path_clock;

@@ -45,6 +45,8 @@ pub struct Task {
     pub claims: Vec<Claim>,
     /// Whether all claims of the last tick were commanded.
     pub granted: bool,
+    /// The client of its latest target.
+    pub client: u64,
     leader: Vec<LeaderJoint>,
     /// When the gripper of its leader was read last.
     gripper_at: Mono,
@@ -68,6 +70,7 @@ impl Task {
             demand: Demand::Nothing,
             claims: Vec::with_capacity(config.joints.len()),
             granted: false,
+            client: 0,
             leader: config.kind.leader.clone(),
             gripper_at: Mono::ZERO,
             index,

@@ -111,7 +111,7 @@ impl Handle {
 
     /// Enables an arm's motors and makes it ready for motion, without moving it.
     pub fn enable(&self, arm: &str) -> Result<ArmReply, RpcError> {
-        self.call(ArmEnable { arm: arm.to_owned() })
+        self.call(ArmEnable::new(arm.to_owned()))
     }
 
     /// Decelerates an arm to rest and disables its motors; an error if it still moves. An arm without brakes drops.

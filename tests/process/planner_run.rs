@@ -305,7 +305,7 @@ fn a_planned_motion_is_cancelled_and_stopped_like_any_other() {
     home.dimos("execute").with(1).says(&["ARM_LATCHED", "hint: "]);
     let mut client = home.client();
     client.call(ArmReset { arm: "arm".into() }).unwrap();
-    client.call(ArmEnable { arm: "arm".into() }).unwrap();
+    client.call(ArmEnable::new("arm")).unwrap();
     home.dimos("execute").with(0);
     is_at(&home, "arm", &HOME);
 }

@@ -175,7 +175,7 @@ impl Rig {
     pub fn send(&mut self, request: Request) -> u64 {
         let id = self.next_id;
         self.next_id += 1;
-        self.inbox.push_back(Envelope { id, request });
+        self.inbox.push_back(Envelope { id, origin: None, request });
         id
     }
 
@@ -210,7 +210,7 @@ impl Rig {
     pub fn make_ready(&mut self) {
         self.run(2);
         for i in 0..self.arms.len() {
-            assert_eq!(self.ask(Request::Enabled { arm: i as u16 }), Outcome::Accepted);
+            assert_eq!(self.ask(Request::Enabled { arm: i as u16, outside: false }), Outcome::Accepted);
         }
         self.run_for(0.3);
         assert!((0..self.arms.len()).all(|i| self.phase(i) == Phase::Ready));

@@ -193,7 +193,7 @@ impl<'r> Runner<'r, '_> {
                 }
                 self.client.call(ArmReset { arm: arm() })?;
             }
-            Act::Enable => drop(self.client.call(ArmEnable { arm: arm() })?),
+            Act::Enable => drop(self.client.call(ArmEnable::new(arm()))?),
             Act::Repeat { .. } => {}
         }
         Ok(())

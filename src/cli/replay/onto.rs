@@ -141,7 +141,7 @@ impl Driver<'_> {
         let grips = self.possible_grips(&state);
         for (arm, wanted) in self.blueprint.arms.iter().zip(wanted) {
             if *wanted || self.plan.approaches.iter().any(|a| a.arm == arm.hardware_id) {
-                self.run.call(ArmEnable { arm: arm.hardware_id.clone() })?;
+                self.run.call(ArmEnable::new(arm.hardware_id.clone()))?;
             }
         }
         for approach in &self.plan.approaches {

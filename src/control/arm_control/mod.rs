@@ -54,6 +54,8 @@ pub struct ArmControl {
     holds_written: bool,
     /// Measured positions when the arm was enabled [rad].
     enabled_at: Joints,
+    /// Whether it was enabled although it may rest outside its position limits.
+    pub outside_allowed: bool,
     /// While the first setpoint after a start is not written: the number of its first command.
     starting: Option<u64>,
     /// While there is a gap in what is written: the number of the first command made from what had been written.
@@ -116,6 +118,7 @@ impl ArmControl {
             command: ArmCommand::default(),
             holds_written: false,
             enabled_at: [0.0; MAX_DOF],
+            outside_allowed: false,
             starting: None,
             gap_since: None,
             returning: false,
@@ -249,11 +252,14 @@ impl ArmControl {
     }
 
     /// The arm was enabled: starts to hold it. An arm that still decelerates continues to do so. `arm`: the arm's
-    /// index, for the outcome.
-    pub fn activate(&mut self, arm: u16, now: Mono) -> Outcome {
+    /// index, for the outcome; `outside`: it may rest outside its position limits.
+    pub fn activate(&mut self, arm: u16, outside: bool, now: Mono) -> Outcome {
         let before = self.failsafe.phase();
         let outcome = self.failsafe.on_enabled(arm, self.feedback.state(), self.feedback.freshness(), now);
         let begins = outcome == Outcome::Accepted && !matches!(before, Phase::Activating | Phase::Ready);
+        if begins {
+            self.outside_allowed = outside;
+        }
         if begins && self.command.mode.is_none() {
             self.start();
             self.enabled_at = self.feedback.state().position;

@@ -7,12 +7,13 @@ use crate::control::arm_control::ArmControl;
 use crate::control::request::{Envelope, Motion, Request};
 use crate::control::speed_override::SpeedOverride;
 use crate::control::task::{Task, Tick};
-use crate::control::task_body::Target;
-use crate::telemetry::{Cause, Event, LedBy, Outcome, Reason, TaskState};
+use crate::control::task_body::{Target, TargetKind};
+use crate::telemetry::{Cause, Event, Interruption, LedBy, Origin, Outcome, Reason, TaskState};
 
 impl Coordinator {
     /// Handles a request and reports its outcome.
     pub(super) fn handle(&mut self, now: Mono, envelope: Envelope) {
+        let origin = envelope.origin;
         let outcome = match envelope.request {
             Request::Shutdown => {
                 self.shutting_down = true;
@@ -34,34 +35,38 @@ impl Coordinator {
                 Outcome::ShuttingDown
             }
             _ if self.shutting_down => Outcome::ShuttingDown,
-            Request::Execute { task, motion } => self.execute(now, task, motion),
-            Request::Servo { task, target } => self.offer(now, task, &Target::Positions(target)),
-            Request::Velocity { task, target } => self.offer(now, task, &Target::Velocities(target)),
+            Request::Execute { task, motion } => self.execute(now, task, motion, origin),
+            Request::Servo { task, target } => self.offer(now, task, &Target::Positions(target), origin),
+            Request::Velocity { task, target } => self.offer(now, task, &Target::Velocities(target), origin),
             Request::Chunk { task, start, motion } => {
-                let outcome = self.offer(now, task, &Target::Chunk(&motion, start));
+                let outcome = self.offer(now, task, &Target::Chunk(&motion, start), origin);
                 self.output.retired.push(motion);
                 outcome
             }
-            Request::CartesianTarget { task, goal } => self.offer(now, task, &Target::EndEffector(goal)),
-            Request::Start { task } => self.offer(now, task, &Target::Start),
+            Request::CartesianTarget { task, goal } => self.offer(now, task, &Target::EndEffector(goal), origin),
+            Request::Start { task } => self.offer(now, task, &Target::Start, origin),
             Request::Tool { task, tool } => match self.tasks.get_mut(task as usize) {
                 Some(t) => t.set_tool(&tool).err().unwrap_or(Outcome::Accepted),
                 None => Outcome::WrongTask(task),
             },
             Request::Reset { arm } => self.with_arm(arm, |a| a.reset(arm, now)),
-            Request::Enabled { arm } => self.with_arm(arm, |a| a.activate(arm, now)),
+            Request::Enabled { arm, outside } => self.with_arm(arm, |a| a.activate(arm, outside, now)),
             Request::PrepareDisable { arm } => {
                 let outcome = self.with_arm(arm, |a| {
                     a.prepare_disable(now);
                     Outcome::Accepted
                 });
+                self.interrupt(arm.into(), Interruption::Disabled);
                 self.end_tasks_of_held_arms();
                 outcome
             }
             Request::Lead { by: LedBy::Controller, .. } if self.speed.paused => Outcome::Paused,
             Request::Lead { arm, by } => match self.task_of_arm(arm) {
                 Some(task) => Outcome::AlreadyExecuting(task),
-                None => self.with_arm(arm, |a| a.lead(by, arm, now)),
+                None => match self.still_valid(arm, origin) {
+                    Ok(()) => self.with_arm(arm, |a| a.lead(by, arm, now)),
+                    Err(superseded) => superseded,
+                },
             },
             Request::Speed { fraction } => self.change_speed(|speed| speed.set(fraction)),
             Request::EndNative { arm } => self.end_native(arm, now),
@@ -72,7 +77,12 @@ impl Coordinator {
                 }
                 self.change_speed(|speed| speed.paused = on)
             }
-            Request::Gripper { arm, opening, force, speed } => self.gripper(arm, opening, force, speed),
+            Request::Gripper { arm, opening, force, speed } => self.gripper(arm, (opening, force, speed), origin),
+            Request::LeaseTaken { arm, client } => {
+                self.interrupt(arm.into(), Interruption::LeaseTaken(client));
+                Outcome::Accepted
+            }
+            Request::LeaseEnded { arm, client } => self.lease_ended(arm, client),
         };
         self.output.report(Event::Request(envelope.id, outcome));
     }
@@ -112,6 +122,19 @@ impl Coordinator {
                 a.stop_again();
             }
             self.hold(i, Cause::Operator, now);
+            self.interrupt(i, Interruption::Stopped);
+        }
+        Outcome::Accepted
+    }
+
+    /// Ends the chunks that a client has sent, also one that waits for its start.
+    fn lease_ended(&mut self, arm: u16, client: u64) -> Outcome {
+        self.interrupt(arm.into(), Interruption::LeaseEnded(client));
+        let chunks_of = |task: &Task| task.takes(TargetKind::Chunk) && task.client == client;
+        for t in 0..self.tasks.len() {
+            if self.tasks.get(t).is_some_and(|task| task.is_active() && chunks_of(task) && self.moves(task, arm)) {
+                self.end_task(t, TaskState::Aborted, Reason::LeaseEnded(arm));
+            }
         }
         Outcome::Accepted
     }
@@ -165,8 +188,8 @@ impl Coordinator {
         outcome
     }
 
-    fn execute(&mut self, now: Mono, task: u16, motion: Box<Motion>) -> Outcome {
-        let outcome = self.offer(now, task, &Target::Trajectory(&motion));
+    fn execute(&mut self, now: Mono, task: u16, motion: Box<Motion>, origin: Option<Origin>) -> Outcome {
+        let outcome = self.offer(now, task, &Target::Trajectory(&motion), origin);
         let done = match self.tasks.get_mut(task as usize) {
             Some(t) if outcome == Outcome::Accepted => t.keep(motion),
             _ => Some(motion),
@@ -176,30 +199,34 @@ impl Coordinator {
     }
 
     /// Offers a target to a task.
-    pub(super) fn offer(&mut self, now: Mono, task: u16, target: &Target<'_>) -> Outcome {
-        self.try_offer(now, task, target).err().unwrap_or(Outcome::Accepted)
+    pub(super) fn offer(&mut self, now: Mono, task: u16, target: &Target<'_>, origin: Option<Origin>) -> Outcome {
+        self.try_offer(now, task, target, origin).err().unwrap_or(Outcome::Accepted)
     }
 
-    fn try_offer(&mut self, now: Mono, task: u16, target: &Target<'_>) -> Result<(), Outcome> {
+    fn try_offer(&mut self, now: Mono, task: u16, target: &Target<'_>, origin: Option<Origin>) -> Result<(), Outcome> {
         let t = self.tasks.get(task as usize).ok_or(Outcome::WrongTask(task))?;
         t.check(target)?;
-        self.admit(match target {
+        let joints = match target {
             Target::Trajectory(motion) => &motion.joints,
             _ => &t.joints,
-        })?;
+        };
+        self.admit(joints, origin)?;
         let tick = Tick { now, dt: self.period, speed: self.speed, views: &self.joints };
         let t = self.tasks.get_mut(task as usize).ok_or(Outcome::WrongTask(task))?;
-        if t.accept(&tick, target)? {
+        let begins = t.accept(&tick, target)?;
+        t.client = origin.unwrap_or_default().client;
+        if begins {
             self.output.report(Event::Task(task, TaskState::Executing, Reason::None));
         }
         Ok(())
     }
 
-    fn admit(&self, joints: &[u16]) -> Result<(), Outcome> {
+    fn admit(&self, joints: &[u16], origin: Option<Origin>) -> Result<(), Outcome> {
         for &joint in joints {
             let arm = self.arm_of.get(joint as usize).copied().unwrap_or(u16::MAX);
             let Some(a) = self.arms.get(arm as usize) else { return Err(Outcome::StartStateUnavailable(arm)) };
             a.failsafe.admits(arm)?;
+            self.still_valid(arm, origin)?;
             if !a.freshness().fresh {
                 return Err(Outcome::StartStateUnavailable(arm));
             }
@@ -207,7 +234,13 @@ impl Coordinator {
         Ok(())
     }
 
-    fn gripper(&mut self, arm: u16, opening: f64, force: Option<f64>, speed: Option<f64>) -> Outcome {
+    fn gripper(
+        &mut self,
+        arm: u16,
+        (opening, force, speed): (f64, Option<f64>, Option<f64>),
+        origin: Option<Origin>,
+    ) -> Outcome {
+        let valid = self.still_valid(arm, origin);
         let Some(a) = self.arms.get_mut(arm as usize) else { return Outcome::StartStateUnavailable(arm) };
         if !a.config().gripper {
             return Outcome::NoGripper(arm);
@@ -226,7 +259,7 @@ impl Coordinator {
         if speed.is_some_and(|speed| !(info.has_speed && speed > 0.0 && speed <= 1.0)) {
             return Outcome::NoGripperSpeed(arm);
         }
-        match a.failsafe.admits(arm) {
+        match a.failsafe.admits(arm).and(valid) {
             Ok(()) => {
                 a.set_gripper(opening, force, speed);
                 Outcome::Accepted
