@@ -152,12 +152,13 @@ impl Failsafe {
         }
     }
 
-    /// Clears the latch, unless its cause persists.
+    /// Clears the latch, unless its cause persists. An arm that is connected needs no accepted state for that: a reset
+    /// moves nothing, and `ready` requires one.
     pub fn reset(&mut self, arm: u16, state: &ArmState, fresh: Freshness, now: Mono) -> Outcome {
         if self.phase != Phase::Held {
             return Outcome::Accepted;
         }
-        match trouble(state, fresh).filter(|c| *c != Cause::HeartbeatLost) {
+        match trouble(state, fresh).filter(|c| !matches!(c, Cause::HeartbeatLost | Cause::Stale(_))) {
             Some(cause) => Outcome::StillFaulted(arm, cause),
             None => {
                 let phase = if state.enabled { Phase::Standby } else { Phase::Disabled };

@@ -1,7 +1,7 @@
 //! Leases: only one connection at a time can command an arm.
 //!
 //! A connection takes the lease of an arm with its first accepted motion request, or with `lease`, and holds it until
-//! `release` or its end. The run is told when one is taken and when it ends: then its chunks end, and what was
+//! `release` or its end. The run learns when one is taken and when it ends: then its chunks end, and what was
 //! requested but has not begun does not begin. A stream of targets times out, and a trajectory that has begun
 //! continues.
 

@@ -12,14 +12,14 @@ use crate::sync::lock;
 pub(super) type UnsentEnds = Mutex<Vec<(u16, u64)>>;
 
 impl Service {
-    /// Tells the tick that a connection commands an arm from now on, before its first request.
+    /// Reports to the tick that a connection commands an arm from now on, before its first request.
     pub(super) fn note_lease_taken(&self, arm: &str, client: u64) -> Result<(), RpcError> {
         let request = Request::LeaseTaken { arm: self.arm_index(arm)?, client };
         let log = log_of(&request);
         self.parts.dispatcher.send(request, log).map(drop).map_err(|e| self.not_sent(e))
     }
 
-    /// Tells the tick that a connection no longer commands an arm, and ends what is being planned for it again.
+    /// Reports to the tick that a connection no longer commands an arm, and ends what is being planned for it again.
     pub(super) fn note_lease_ended(&self, arm: &str, client: u64) {
         let Ok(arm) = self.arm_index(arm) else { return };
         let joints = self.joints_of_arm(arm);
