@@ -140,7 +140,7 @@ pub enum Request {
         /// Whether they are to pause.
         on: bool,
     },
-    /// A client took the lease of an arm: what others have requested before does not move it.
+    /// A client took the lease of an arm without a motion: what others have requested before does not move it.
     LeaseTaken {
         /// The arm.
         arm: u16,

@@ -145,6 +145,13 @@ impl Task {
         }
     }
 
+    /// Rejects a trajectory that does not begin where the arm is.
+    pub fn check_start(&mut self, tick: &Tick<'_>, target: &Target<'_>) -> Result<(), Outcome> {
+        let Target::Trajectory(motion) = target else { return Ok(()) };
+        let (cx, body, _) = self.parts(tick);
+        body.check_start(&cx, motion)
+    }
+
     /// Passes a target to the body. Returns whether the task becomes active with it.
     pub fn accept(&mut self, tick: &Tick<'_>, target: &Target<'_>) -> Result<bool, Outcome> {
         if !self.takes(target.kind()) {

@@ -59,10 +59,14 @@ pub trait Backend: Send + Sync + 'static {
     fn epoch(&self) -> u64 {
         0
     }
-    /// Called before the first request of a connection that has taken the lease of an arm.
+    /// Called when a connection takes the lease of an arm with `lease`, not with a request.
     fn lease_taken(&self, arm: &str, client: u64) -> Result<(), RpcError> {
         let _ = (arm, client);
         Ok(())
+    }
+    /// Waits until the run has handled what was passed to it before.
+    fn handled(&self) -> BoxFuture<'_, ()> {
+        Box::pin(std::future::ready(()))
     }
     /// Called before another connection can take the lease of an arm that was released.
     fn lease_ended(&self, arm: &str, client: u64) {

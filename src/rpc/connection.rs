@@ -236,7 +236,7 @@ impl Connection {
                 self.reply(&id, result).await
             }
             Lease::NAME => {
-                let result = self.lease(params);
+                let result = self.lease(params).await;
                 self.reply(&id, result).await
             }
             Release::NAME => {
@@ -364,9 +364,11 @@ impl Connection {
         Ok(Done {})
     }
 
-    fn lease(&self, params: Value) -> Result<LeaseReply, RpcError> {
+    async fn lease(&self, params: Value) -> Result<LeaseReply, RpcError> {
         let arms = self.arms(read_params::<Lease>(params)?.arm)?;
         self.lessee.take(&arms)?;
+        // What a client requests after a release of this lease is younger than it.
+        self.backend.handled().await;
         Ok(LeaseReply { arms })
     }
 

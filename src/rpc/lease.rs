@@ -280,13 +280,14 @@ impl Lessee {
     fn claim(&self, arms: &[String], kept: bool) -> Result<(), RpcError> {
         let mut held = self.leases.lock();
         self.check(arms, &held)?;
+        // The tick learns of a lease that a request takes with that request, if it accepts it.
+        if let Some(run) = self.leases.run.as_ref().filter(|_| kept) {
+            arms.iter().try_for_each(|arm| run.lease_taken(arm, self.connection))?;
+        }
         for arm in arms {
             match held.get_mut(arm) {
                 Some(holder) => holder.kept |= kept,
                 None => {
-                    if let Some(run) = &self.leases.run {
-                        run.lease_taken(arm, self.connection)?;
-                    }
                     let (connection, pid, since) = (self.connection, self.pid, Instant::now());
                     let program = self.client.clone().unwrap_or_else(|| program(pid));
                     held.insert(arm.clone(), Holder { connection, pid, program, since, kept });

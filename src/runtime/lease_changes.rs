@@ -12,24 +12,16 @@ use crate::sync::lock;
 pub(super) type UnsentEnds = Mutex<Vec<(u16, u64)>>;
 
 impl Service {
-    /// Reports to the tick that a connection commands an arm from now on, before its first request.
+    /// Reports to the tick that a connection commands an arm from now on.
     pub(super) fn note_lease_taken(&self, arm: &str, client: u64) -> Result<(), RpcError> {
         let request = Request::LeaseTaken { arm: self.arm_index(arm)?, client };
         let log = log_of(&request);
         self.parts.dispatcher.send(request, log).map(drop).map_err(|e| self.not_sent(e))
     }
 
-    /// Reports to the tick that a connection no longer commands an arm, and ends what is being planned for it again.
+    /// Reports to the tick that a connection no longer commands an arm.
     pub(super) fn note_lease_ended(&self, arm: &str, client: u64) {
         let Ok(arm) = self.arm_index(arm) else { return };
-        let joints = self.joints_of_arm(arm);
-        lock(&self.motions).end_replanning(
-            "the client that requested it has disconnected or released the arm",
-            |motion| {
-                motion.plan.as_ref().is_some_and(|plan| plan.origin.client == client)
-                    && motion.joints.iter().any(|joint| joints.contains(joint))
-            },
-        );
         lock(&self.unsent_ends).push((arm, client));
         self.send_lease_ends();
     }

@@ -167,9 +167,11 @@ impl Motions {
         }
     }
 
-    /// Sets the result of planning a motion again.
+    /// Sets the result of planning a motion again. If that was ended, its reason stays.
     pub fn went_on(&mut self, number: u64, next: Result<u64, String>) {
-        if let Some((planned, _)) = self.0.get_mut(&number) {
+        if let Some((planned, _)) = self.0.get_mut(&number)
+            && (next.is_ok() || !matches!(planned.next, Some(Next::None(_))))
+        {
             planned.next = Some(next.map_or_else(Next::None, Next::Motion));
         }
     }

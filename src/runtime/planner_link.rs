@@ -118,9 +118,10 @@ impl Service {
         match call {
             Call::ExecutePlan(execute) => {
                 let released = planner.release(&execute, self.moment(0)).await?;
-                let unknown = || RpcError::new(Code::UnknownPlan, "the request of this plan is no longer known");
-                let planned = lock(&self.plan_requests).get(&released.plan).map(|(_, planned)| planned.epoch);
-                let epoch = origin.epoch.min(planned.ok_or_else(unknown)?);
+                // A planner may release a plan that this run has not requested.
+                let plan = execute.plan.unwrap_or(released.plan);
+                let planned = lock(&self.plan_requests).get(&plan).map(|(_, planned)| planned.epoch);
+                let epoch = planned.map_or(origin.epoch, |planned| planned.min(origin.epoch));
                 let origin = Origin { epoch, ..origin };
                 self.end_streams(&self.joints_named(&released.trajectory.joint_names)?).await?;
                 let replan = execute.replan.then_some(execute.presence);

@@ -458,6 +458,10 @@ impl Backend for Service {
         self.note_lease_taken(arm, client)
     }
 
+    fn handled(&self) -> BoxFuture<'_, ()> {
+        Box::pin(self.next_tick())
+    }
+
     fn lease_ended(&self, arm: &str, client: u64) {
         self.note_lease_ended(arm, client);
     }

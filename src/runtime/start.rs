@@ -216,7 +216,7 @@ impl Connected<'_> {
             recorder: Some(recorder),
             view: None,
             server: None,
-            handle: Handle { service },
+            handle: Handle::new(service),
             endings: (endings, ended),
             faulted: AtomicBool::new(false),
             manager,

@@ -157,13 +157,30 @@ fn a_client_may_take_the_lease_with_what_it_requests_and_moves_nothing_after_it_
     let mut rig = Rig::one_arm(tasks());
     let origin = rig.origin(A);
     rig.ask(Request::LeaseTaken { arm: 0, client: A });
-    let execute = |id| Request::Execute { task: 0, motion: sweep(id, 0..6, 0.0, 0.05, 1.0) };
-    assert_eq!(rig.ask_from(origin, execute(1)), Outcome::Accepted);
+    let execute = |id, from| Request::Execute { task: 0, motion: sweep(id, 0..6, from, 0.05, 1.0) };
+    assert_eq!(rig.ask_from(origin, execute(1, 0.0)), Outcome::Accepted);
     rig.ask(Request::LeaseEnded { arm: 0, client: A });
     rig.run(20);
     assert_eq!(rig.tasks[0].state, TaskState::Executing, "a trajectory that has begun continues");
     rig.run_until(2.0, |rig| rig.tasks[0].state == TaskState::Completed);
-    assert_eq!(rig.ask_from(origin, execute(2)), Outcome::Superseded(0, Interruption::LeaseEnded(A)));
+    assert_eq!(rig.ask_from(origin, execute(2, 0.05)), Outcome::Superseded(0, Interruption::LeaseEnded(A)));
+}
+
+#[test]
+fn the_accepted_motion_of_a_client_supersedes_what_others_have_requested_and_a_refused_one_does_not() {
+    let mut rig = Rig::one_arm(tasks());
+    let (a, b) = (rig.origin(A), rig.origin(B));
+    let refused = Request::Execute { task: 0, motion: sweep(1, 0..6, 0.5, 0.6, 1.0) };
+    assert!(matches!(rig.ask_from(b, refused), Outcome::StartStateMismatch(..)));
+    let gripper = |opening| Request::Gripper { arm: 0, opening, force: None, speed: None };
+    assert_eq!(rig.ask_from(a, gripper(0.02)), Outcome::Accepted);
+    assert_eq!(rig.ask_from(b, gripper(0.03)), Outcome::Superseded(0, Interruption::LeaseTaken(A)));
+    let b = rig.origin(B);
+    assert_eq!(rig.ask_from(b, gripper(0.03)), Outcome::Accepted);
+    let execute = |id, from| Request::Execute { task: 0, motion: sweep(id, 0..6, from, 0.1, 1.0) };
+    assert_eq!(rig.ask_from(a, execute(2, 0.0)), Outcome::Superseded(0, Interruption::LeaseTaken(B)));
+    let elsewhere = rig.ask_from(a, execute(3, 0.3));
+    assert!(matches!(elsewhere, Outcome::StartStateMismatch(..)), "that says more: {elsewhere:?}");
 }
 
 #[test]

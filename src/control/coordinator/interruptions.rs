@@ -4,12 +4,16 @@ use super::Coordinator;
 use crate::arm::Link;
 use crate::control::arm_control::ArmControl;
 use crate::control::interruptions::Interruptions;
-use crate::telemetry::{Cause, Interruption, Origin, Outcome, Phase};
+use crate::control::task::Task;
+use crate::control::task_body::TargetKind;
+use crate::telemetry::{Cause, Interruption, Origin, Outcome, Phase, Reason, TaskState};
 
 /// One arm's interruptions, and what they are noticed by.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Watched {
     known: Interruptions,
+    /// The client that commands it, 0 for none.
+    commander: u64,
     held: bool,
     connected: bool,
     powered: bool,
@@ -52,6 +56,31 @@ impl Coordinator {
             self.epoch += 1;
             watched.known.add(self.epoch, interruption);
         }
+    }
+
+    /// Takes the client that commands an arm. What others have requested before no longer moves the arm.
+    pub(super) fn commanded_by(&mut self, arm: u16, client: u64) {
+        let Some(watched) = self.watched.get_mut(usize::from(arm)) else { return };
+        // The program that has started the run takes no leases.
+        if client != 0 && watched.commander != client {
+            watched.commander = client;
+            self.interrupt(arm.into(), Interruption::LeaseTaken(client));
+        }
+    }
+
+    /// A client no longer commands an arm: ends the chunks that it has sent, also one that waits for its start.
+    pub(super) fn lease_ended(&mut self, arm: u16, client: u64) -> Outcome {
+        if let Some(watched) = self.watched.get_mut(usize::from(arm)).filter(|watched| watched.commander == client) {
+            watched.commander = 0;
+        }
+        self.interrupt(arm.into(), Interruption::LeaseEnded(client));
+        let chunks_of = |task: &Task| task.takes(TargetKind::Chunk) && task.client == client;
+        for t in 0..self.tasks.len() {
+            if self.tasks.get(t).is_some_and(|task| task.is_active() && chunks_of(task) && self.moves(task, arm)) {
+                self.end_task(t, TaskState::Aborted, Reason::LeaseEnded(arm));
+            }
+        }
+        Outcome::Accepted
     }
 
     /// Returns an error if an arm was interrupted since a motion of it was requested.

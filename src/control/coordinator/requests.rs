@@ -7,7 +7,7 @@ use crate::control::arm_control::ArmControl;
 use crate::control::request::{Envelope, Motion, Request};
 use crate::control::speed_override::SpeedOverride;
 use crate::control::task::{Task, Tick};
-use crate::control::task_body::{Target, TargetKind};
+use crate::control::task_body::Target;
 use crate::telemetry::{Cause, Event, Interruption, LedBy, Origin, Outcome, Reason, TaskState};
 
 impl Coordinator {
@@ -64,7 +64,13 @@ impl Coordinator {
             Request::Lead { arm, by } => match self.task_of_arm(arm) {
                 Some(task) => Outcome::AlreadyExecuting(task),
                 None => match self.still_valid(arm, origin) {
-                    Ok(()) => self.with_arm(arm, |a| a.lead(by, arm, now)),
+                    Ok(()) => {
+                        let outcome = self.with_arm(arm, |a| a.lead(by, arm, now));
+                        if outcome == Outcome::Accepted {
+                            self.commanded_by(arm, origin.unwrap_or_default().client);
+                        }
+                        outcome
+                    }
                     Err(superseded) => superseded,
                 },
             },
@@ -79,7 +85,7 @@ impl Coordinator {
             }
             Request::Gripper { arm, opening, force, speed } => self.gripper(arm, (opening, force, speed), origin),
             Request::LeaseTaken { arm, client } => {
-                self.interrupt(arm.into(), Interruption::LeaseTaken(client));
+                self.commanded_by(arm, client);
                 Outcome::Accepted
             }
             Request::LeaseEnded { arm, client } => self.lease_ended(arm, client),
@@ -104,7 +110,7 @@ impl Coordinator {
     }
 
     /// Returns whether a task moves a joint of an arm.
-    fn moves(&self, task: &Task, arm: u16) -> bool {
+    pub(super) fn moves(&self, task: &Task, arm: u16) -> bool {
         task.moving_joints().iter().any(|joint| self.arm_of.get(usize::from(*joint)) == Some(&arm))
     }
 
@@ -123,18 +129,6 @@ impl Coordinator {
             }
             self.hold(i, Cause::Operator, now);
             self.interrupt(i, Interruption::Stopped);
-        }
-        Outcome::Accepted
-    }
-
-    /// Ends the chunks that a client has sent, also one that waits for its start.
-    fn lease_ended(&mut self, arm: u16, client: u64) -> Outcome {
-        self.interrupt(arm.into(), Interruption::LeaseEnded(client));
-        let chunks_of = |task: &Task| task.takes(TargetKind::Chunk) && task.client == client;
-        for t in 0..self.tasks.len() {
-            if self.tasks.get(t).is_some_and(|task| task.is_active() && chunks_of(task) && self.moves(task, arm)) {
-                self.end_task(t, TaskState::Aborted, Reason::LeaseEnded(arm));
-            }
         }
         Outcome::Accepted
     }
@@ -210,23 +204,40 @@ impl Coordinator {
             Target::Trajectory(motion) => &motion.joints,
             _ => &t.joints,
         };
-        self.admit(joints, origin)?;
+        self.admit(joints)?;
+        let valid = joints.iter().try_for_each(|joint| match self.arm_of.get(usize::from(*joint)) {
+            Some(arm) => self.still_valid(*arm, origin),
+            None => Ok(()),
+        });
         let tick = Tick { now, dt: self.period, speed: self.speed, views: &self.joints };
         let t = self.tasks.get_mut(task as usize).ok_or(Outcome::WrongTask(task))?;
+        // That the arm is elsewhere says more.
+        t.check_start(&tick, target)?;
+        valid?;
         let begins = t.accept(&tick, target)?;
-        t.client = origin.unwrap_or_default().client;
+        let client = origin.unwrap_or_default().client;
+        t.client = client;
         if begins {
             self.output.report(Event::Task(task, TaskState::Executing, Reason::None));
+        }
+        for arm in 0..self.arms.len() as u16 {
+            let of_arm = |joint: &u16| self.arm_of.get(usize::from(*joint)) == Some(&arm);
+            let moved = match target {
+                Target::Trajectory(motion) => motion.joints.iter().any(of_arm),
+                _ => self.tasks.get(usize::from(task)).is_some_and(|task| task.joints.iter().any(of_arm)),
+            };
+            if moved {
+                self.commanded_by(arm, client);
+            }
         }
         Ok(())
     }
 
-    fn admit(&self, joints: &[u16], origin: Option<Origin>) -> Result<(), Outcome> {
+    fn admit(&self, joints: &[u16]) -> Result<(), Outcome> {
         for &joint in joints {
             let arm = self.arm_of.get(joint as usize).copied().unwrap_or(u16::MAX);
             let Some(a) = self.arms.get(arm as usize) else { return Err(Outcome::StartStateUnavailable(arm)) };
             a.failsafe.admits(arm)?;
-            self.still_valid(arm, origin)?;
             if !a.freshness().fresh {
                 return Err(Outcome::StartStateUnavailable(arm));
             }
@@ -262,6 +273,7 @@ impl Coordinator {
         match a.failsafe.admits(arm).and(valid) {
             Ok(()) => {
                 a.set_gripper(opening, force, speed);
+                self.commanded_by(arm, origin.unwrap_or_default().client);
                 Outcome::Accepted
             }
             Err(outcome) => outcome,
