@@ -48,7 +48,7 @@ fn record(dof: usize, ticks: u64, log: &std::path::Path) {
     let names = make_joints("arm", dof);
     let (mut from, mut to) = (vec![0.0; dof], vec![0.7; dof]);
     run.step();
-    run.ask(Request::Enabled { arm: 0 });
+    run.ask(Request::Enabled { arm: 0, outside: false });
     while run.tick < ticks {
         if run.tick > 100 && run.tasks[0].state != TaskState::Executing {
             let motion = point_to_point(&names, &from, &to, &limits, 0.7).expect("a valid motion");

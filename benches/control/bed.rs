@@ -107,7 +107,7 @@ impl Bed {
     pub fn requests(&mut self, tick: u64, tasks: &[TaskView], queue: &mut VecDeque<Envelope>) {
         if tick == 10 {
             for arm in 0..self.config.arms.len() {
-                self.send(Request::Enabled { arm: arm as u16 }, queue);
+                self.send(Request::Enabled { arm: arm as u16, outside: false }, queue);
             }
         }
         // The arms are ready by then.
@@ -133,7 +133,7 @@ impl Bed {
 
     fn send(&mut self, request: Request, queue: &mut VecDeque<Envelope>) {
         self.sent += 1;
-        queue.push_back(Envelope { id: self.sent, request });
+        queue.push_back(Envelope { id: self.sent, origin: None, request });
     }
 
     /// Returns whether all tasks are active.

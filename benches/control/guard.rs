@@ -105,7 +105,9 @@ fn measure(guarded: bool, streams: Streams, number: usize) -> (Ticks, usize) {
     for tick in 0u64.. {
         let now: Mono = start.after(config.period() * tick as u32);
         if tick == 5 {
-            (0..2).for_each(|arm| queue.push_back(Envelope { id: 0, request: Request::Enabled { arm } }));
+            (0..2).for_each(|arm| {
+                queue.push_back(Envelope { id: 0, origin: None, request: Request::Enabled { arm, outside: false } })
+            });
         }
         if tick >= SETTLED {
             for (arm, (target, goal)) in targets.iter_mut().zip(&mut goals).enumerate() {
@@ -118,7 +120,7 @@ fn measure(guarded: bool, streams: Streams, number: usize) -> (Ticks, usize) {
                     *at += (to - *at).clamp(-0.1, 0.1);
                 }
                 let request = Request::Servo { task: arm as u16, target: joints_of(target) };
-                queue.push_back(Envelope { id: tick, request });
+                queue.push_back(Envelope { id: tick, origin: None, request });
             }
         }
         let time = TickTime { now, next: now.after(config.period()), skipped: 0, late_ns: 0, woke_late_ns: 0 };

@@ -90,7 +90,7 @@ fn make_ready(client: &mut Client) -> Result<(), String> {
     let limit = Instant::now() + Duration::from_secs(20);
     loop {
         let reset = client.call(ArmReset { arm: "arm".into() });
-        match reset.and_then(|_| client.call(ArmEnable { arm: "arm".into() })) {
+        match reset.and_then(|_| client.call(ArmEnable::new("arm"))) {
             Ok(_) => return Ok(()),
             Err(e) if Instant::now() > limit => return Err(format!("the arm is not ready in time: {e}")),
             Err(_) => std::thread::sleep(Duration::from_millis(20)),

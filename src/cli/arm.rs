@@ -34,7 +34,13 @@ pub struct Args {
 #[derive(Debug, Subcommand)]
 enum Action {
     /// Enable the motors at the current position and make the arm ready for motion
-    Enable(ArmArgs),
+    Enable {
+        #[command(flatten)]
+        which: ArmArgs,
+        /// Hold an arm that rests outside its position limits, to lead or move it inward
+        #[arg(long)]
+        outside: bool,
+    },
     /// Decelerate the arm to rest and disable the motors; an arm without brakes (`list-adapters`: HOLDS = no) drops
     /// unless supported
     Disable {
@@ -113,7 +119,9 @@ struct GripperArgs {
 /// Runs the verb.
 pub fn run(args: &Args, registry: &Registry) -> Result {
     match &args.action {
-        Action::Enable(which) => phase(which, ArmEnable { arm: which.arm.clone() }).map(|_| Exit::Ok),
+        Action::Enable { which, outside } => {
+            phase(which, ArmEnable { arm: which.arm.clone(), outside: *outside }).map(|_| Exit::Ok)
+        }
         Action::Disable { which, now } => {
             phase(which, ArmDisable { arm: which.arm.clone(), now: *now }).map(|_| Exit::Ok)
         }

@@ -169,7 +169,8 @@ impl Failsafe {
         }
     }
 
-    /// Clears the latch, unless its cause persists.
+    /// Clears the latch, unless its cause persists. An arm that is connected needs no accepted state for that: a reset
+    /// moves nothing, and `ready` requires one.
     pub fn reset(&mut self, arm: u16, state: &ArmState, fresh: Freshness, now: Mono) -> Outcome {
         if self.phase != Phase::Held {
             return Outcome::Accepted;

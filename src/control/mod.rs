@@ -12,6 +12,7 @@ pub mod conformance;
 pub mod coordinator;
 pub mod failsafe;
 pub mod guard;
+pub mod interruptions;
 pub mod limit;
 pub mod pace;
 pub mod path_clock;

@@ -4,7 +4,7 @@
 use super::task_robot::FramePose;
 use crate::clock::Mono;
 use crate::joint::Joints;
-use crate::telemetry::LedBy;
+use crate::telemetry::{LedBy, Origin};
 use crate::trajectory::Spline;
 
 /// A request with its id. `Event::Request` with the same id has the outcome.
@@ -12,6 +12,8 @@ use crate::trajectory::Spline;
 pub struct Envelope {
     /// Chosen by the sender; increases.
     pub id: u64,
+    /// When and by whom it was requested; `None`: what interrupted an arm since is not compared.
+    pub origin: Option<Origin>,
     /// The request.
     pub request: Request,
 }
@@ -97,6 +99,8 @@ pub enum Request {
     Enabled {
         /// The arm.
         arm: u16,
+        /// Whether it may rest outside its position limits.
+        outside: bool,
     },
     /// The arm will be disabled: decelerate it to rest and refuse motion. A led arm gets its own stop.
     PrepareDisable {
@@ -135,6 +139,21 @@ pub enum Request {
     Pause {
         /// Whether they are to pause.
         on: bool,
+    },
+    /// A client took the lease of an arm without a motion: what others have requested before does not move it.
+    LeaseTaken {
+        /// The arm.
+        arm: u16,
+        /// The client's connection.
+        client: u64,
+    },
+    /// A client released the lease of an arm, or disconnected: its chunks end, and what it has requested before does
+    /// not move the arm.
+    LeaseEnded {
+        /// The arm.
+        arm: u16,
+        /// The client's connection.
+        client: u64,
     },
     /// The run shuts down: decelerate all arms to rest and refuse further requests.
     Shutdown,

@@ -45,6 +45,8 @@ pub struct Task {
     pub claims: Vec<Claim>,
     /// Whether all claims of the last tick were commanded.
     pub granted: bool,
+    /// The client of its latest target.
+    pub client: u64,
     leader: Vec<LeaderJoint>,
     /// When the gripper of its leader was read last.
     gripper_at: Mono,
@@ -70,6 +72,7 @@ impl Task {
             demand: Demand::Nothing,
             claims: Vec::with_capacity(config.joints.len()),
             granted: false,
+            client: 0,
             leader: config.kind.leader.clone(),
             gripper_at: Mono::ZERO,
             index,
@@ -143,6 +146,13 @@ impl Task {
             Target::Chunk(motion, _) if motion.joints != self.joints => Err(Outcome::WrongTask(self.index)),
             Target::Chunk(..) | Target::EndEffector(_) | Target::Start => Ok(()),
         }
+    }
+
+    /// Rejects a trajectory that does not begin where the arm is.
+    pub fn check_start(&mut self, tick: &Tick<'_>, target: &Target<'_>) -> Result<(), Outcome> {
+        let Target::Trajectory(motion) = target else { return Ok(()) };
+        let (cx, body, _) = self.parts(tick);
+        body.check_start(&cx, motion)
     }
 
     /// Passes a target to the body. Returns whether the task becomes active with it.

@@ -202,6 +202,12 @@ pub trait TaskBody: std::fmt::Debug + Send {
     /// only.
     fn accept(&mut self, cx: &Context<'_>, target: &Target<'_>) -> Result<(), Outcome>;
 
+    /// Rejects a trajectory that does not begin where the joints are. Takes nothing.
+    fn check_start(&self, cx: &Context<'_>, motion: &Motion) -> Result<(), Outcome> {
+        let _ = (cx, motion);
+        Ok(())
+    }
+
     /// Claims joints of the task for this tick, each at most once. Called while the task is active.
     fn compute(&mut self, cx: &Context<'_>, claims: &mut Vec<Claim>) -> Step;
 

@@ -39,6 +39,8 @@ pub struct Pulse {
     pub speed: AtomicU64,
     /// Whether all motions are paused.
     pub paused: AtomicBool,
+    /// Number of interruptions of all arms so far.
+    pub epoch: AtomicU64,
     /// Whether the thread runs with SCHED_FIFO.
     pub fifo: AtomicBool,
     /// Whether no command moves an arm.
@@ -190,6 +192,7 @@ pub fn run(
         }
         pulse.speed.store(output.speed.fraction.to_bits(), Ordering::Relaxed);
         pulse.paused.store(output.speed.paused, Ordering::Relaxed);
+        pulse.epoch.store(output.epoch, Ordering::Release);
         // After the views: they show the effect of a request when its client gets the outcome.
         let mut replied = false;
         for event in &output.events {

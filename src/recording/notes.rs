@@ -10,6 +10,7 @@ use super::robots::LoggedRobots;
 use crate::arm::{IoInfo, IoState, JointStatus, Load};
 use crate::clock::Mono;
 use crate::joint::MAX_DOF;
+use crate::telemetry::Origin;
 use crate::telemetry::describe::Severity;
 use crate::trajectory::JointTrajectory;
 
@@ -27,6 +28,8 @@ pub enum Note {
         id: u64,
         /// Time of arrival.
         stamp: Mono,
+        /// When and by whom it was requested, if the tick compares that.
+        origin: Option<Origin>,
         /// The request as passed to the tick.
         json: String,
     },
@@ -37,6 +40,8 @@ pub enum Note {
         id: u64,
         /// Time of arrival.
         stamp: Mono,
+        /// As for other requests.
+        origin: Option<Origin>,
         /// Index of the task.
         task: u16,
         /// Id of the motion.

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use serde_json::json;
 
 use crate::clock::Mono;
+use crate::telemetry::Origin;
 use crate::trajectory::JointTrajectory;
 
 /// Maximum number of pending requests. The tick answers within a period; an older one has lost its answer.
@@ -18,6 +19,7 @@ const REJECTED_POINTS: usize = 2;
 #[derive(Debug)]
 pub(super) struct Execute {
     pub stamp: Mono,
+    pub origin: Option<Origin>,
     pub task: u16,
     pub motion: u64,
     pub trajectory: Arc<JointTrajectory>,

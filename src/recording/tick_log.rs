@@ -21,7 +21,7 @@ use crate::clock::{Mono, WallOffset};
 use crate::joint::{ControlMode, Joints};
 use crate::sync::lock;
 use crate::telemetry::describe::{Described, Names, Severity};
-use crate::telemetry::{ArmSample, Cause, Phase, TickSample};
+use crate::telemetry::{ArmSample, Cause, Origin, Phase, TickSample};
 
 /// Maximum time between two messages on `/arm_status/<arm>`.
 const STATUS_EVERY: Duration = Duration::from_millis(100);
@@ -154,11 +154,19 @@ impl TickLog {
     }
 
     /// Logs a request as passed to the tick.
-    pub fn request<W: Write + Seek>(&self, log: &mut LogWriter<W>, id: u64, stamp: Mono, json: &str) -> McapResult<()> {
+    pub fn request<W: Write + Seek>(
+        &self,
+        log: &mut LogWriter<W>,
+        (id, stamp, origin): (u64, Mono, Option<Origin>),
+        json: &str,
+    ) -> McapResult<()> {
         // A request that is not JSON is logged as text rather than lost.
         let request = serde_json::from_str(json).unwrap_or_else(|_| serde_json::Value::from(json));
-        let data = serde_json::json!({ "id": id, "request": request }).to_string();
-        log.publish("/dimos/requests", self.wall.wall(stamp), &Text { data })
+        let mut message = serde_json::json!({ "id": id, "request": request });
+        if let Some(origin) = origin {
+            message["origin"] = serde_json::json!(origin);
+        }
+        log.publish("/dimos/requests", self.wall.wall(stamp), &Text { data: message.to_string() })
     }
 
     /// Logs a line of text.

@@ -285,10 +285,12 @@ where
         self.know(&note);
         let Some(log) = &mut self.log else { return Ok(()) };
         match note {
-            Note::Request { id, stamp, json } => self.ticks.request(log, id, stamp, &json),
-            Note::Execute { id, stamp, task, motion, trajectory } => {
-                match self.executes.asked(id, Execute { stamp, task, motion, trajectory }) {
-                    Some((id, execute)) => self.ticks.request(log, id, execute.stamp, &execute.whole()),
+            Note::Request { id, stamp, origin, json } => self.ticks.request(log, (id, stamp, origin), &json),
+            Note::Execute { id, stamp, origin, task, motion, trajectory } => {
+                match self.executes.asked(id, Execute { stamp, origin, task, motion, trajectory }) {
+                    Some((id, execute)) => {
+                        self.ticks.request(log, (id, execute.stamp, execute.origin), &execute.whole())
+                    }
                     None => Ok(()),
                 }
             }
@@ -313,7 +315,7 @@ where
         let Some((log, execute)) = self.log.as_mut().zip(self.executes.answered(id)) else { return Ok(()) };
         let taken_on = matches!(outcome, Outcome::Accepted);
         let json = if taken_on { execute.whole() } else { execute.refused() };
-        self.ticks.request(log, id, execute.stamp, &json)?;
+        self.ticks.request(log, (id, execute.stamp, execute.origin), &json)?;
         if taken_on {
             self.ticks.motion(log, execute.stamp, execute.task, &execute.trajectory)?;
         }
@@ -354,7 +356,7 @@ where
         self.step(now);
         for (id, execute) in std::mem::take(&mut self.executes).into_unanswered() {
             if let Some(log) = &mut self.log
-                && let Err(e) = self.ticks.request(log, id, execute.stamp, &execute.whole())
+                && let Err(e) = self.ticks.request(log, (id, execute.stamp, execute.origin), &execute.whole())
             {
                 self.stop_log(write_error(&self.path, &e));
             }

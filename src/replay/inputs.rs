@@ -13,8 +13,8 @@ use crate::joint::{ControlMode, Joints, MAX_DOF};
 use crate::recording::cdr::{CdrError, Decoder, Encoder};
 use crate::recording::messages::{ArmInput, ArmOutput, Event, JointState, Text, Tick};
 use crate::recording::wire::{Field, Message};
-use crate::telemetry::Guarded;
 use crate::telemetry::describe::Names;
+use crate::telemetry::{Guarded, Origin};
 
 /// Length of the header before every message [bytes].
 const HEADER: usize = 4;
@@ -120,7 +120,7 @@ pub(super) struct Assembler {
     names: Vec<u8>,
     /// Joint values read, until the tick is closed.
     states: JointState,
-    waiting: BTreeMap<u64, Result<Request, String>>,
+    waiting: BTreeMap<u64, Result<(Option<Origin>, Request), String>>,
 }
 
 impl Assembler {
@@ -248,11 +248,11 @@ impl Assembler {
         out.clear();
         // The tick answers its own starts with id 0.
         for id in self.logged.events.iter().flat_map(|e| &e.request).copied().filter(|id| *id != 0) {
-            let request = match self.waiting.remove(&id) {
+            let (origin, request) = match self.waiting.remove(&id) {
                 Some(request) => request.map_err(|e| format!("request {id} cannot be read: {e}"))?,
                 None => return Err(format!("request {id} is missing")),
             };
-            out.push(Envelope { id, request });
+            out.push(Envelope { id, origin, request });
         }
         Ok(())
     }

@@ -32,8 +32,9 @@ pub enum RecordedError {
     /// another form.
     #[error(
         "the log {path} was written by {writer} with config version {found}; this program (dimos {}) verifies config \
-         version {CONFIG_VERSION}\nhint: verify it with the program that wrote it; `dimos replay` without --verify plays it",
-        crate::VERSION
+         version {CONFIG_VERSION}{}\nhint: verify it with the program that wrote it; `dimos replay` without --verify plays it",
+        crate::VERSION,
+        changed_since(*found)
     )]
     Version {
         /// The log.
@@ -142,6 +143,17 @@ fn config_version(metadata: &BTreeMap<String, String>, json: &[u8]) -> u32 {
     let in_configuration = || serde_json::from_slice::<Versioned>(json).ok()?.version;
     let version = metadata.get(CONFIG_VERSION_KEY).and_then(|version| version.parse().ok());
     version.or_else(in_configuration).unwrap_or(FIRST_CONFIG_VERSION)
+}
+
+/// Returns the rules of the tick that have changed since a config version, as part of a sentence.
+fn changed_since(version: u32) -> &'static str {
+    match version {
+        6 => {
+            "; changed since: a task with auto_start does not start after a stop, a hold or a loss, and a reset needs no \
+             accepted state"
+        }
+        _ => "",
+    }
 }
 
 fn version_error(path: PathBuf, found: u32, info: &LogInfo) -> RecordedError {

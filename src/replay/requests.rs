@@ -6,13 +6,16 @@ use crate::clock::Mono;
 use crate::control::request::{Goal, Motion, Request};
 use crate::control::task_robot::FramePose;
 use crate::joint::{Joints, joints_of};
-use crate::telemetry::LedBy;
+use crate::telemetry::{LedBy, Origin};
 use crate::trajectory::{JointTrajectory, Spline};
 
 /// A message of `/dimos/requests`.
 #[derive(Debug, Deserialize)]
 struct RequestMessage {
     id: u64,
+    /// Missing in logs of earlier versions, and for requests that move nothing.
+    #[serde(default)]
+    origin: Option<Origin>,
     request: LoggedRequest,
 }
 
@@ -72,6 +75,8 @@ enum LoggedRequest {
     },
     Ready {
         arm: u16,
+        #[serde(default)]
+        outside: bool,
     },
     Park {
         arm: u16,
@@ -97,6 +102,14 @@ enum LoggedRequest {
     Pause {
         on: bool,
     },
+    LeaseTaken {
+        arm: u16,
+        client: u64,
+    },
+    LeaseEnded {
+        arm: u16,
+        client: u64,
+    },
     Shutdown {},
 }
 
@@ -111,11 +124,11 @@ struct Id {
     id: u64,
 }
 
-/// Reads a request. `joints` are the names of all joints, arm by arm. The inner result fails if only the contents are
-/// unreadable.
-pub fn read(json: &str, joints: &[String]) -> Result<(u64, Result<Request, String>), String> {
+/// Reads a request with its id and its origin. `joints` are the names of all joints, arm by arm. The inner result fails
+/// if only the contents are unreadable.
+pub fn read(json: &str, joints: &[String]) -> Result<(u64, Result<(Option<Origin>, Request), String>), String> {
     match serde_json::from_str::<RequestMessage>(json) {
-        Ok(line) => Ok((line.id, request(line.request, joints))),
+        Ok(line) => Ok((line.id, request(line.request, joints).map(|request| (line.origin, request)))),
         Err(e) => match serde_json::from_str::<Id>(json) {
             Ok(Id { id }) => Ok((id, Err(e.to_string()))),
             Err(e) => Err(e.to_string()),
@@ -150,7 +163,7 @@ fn request(logged: LoggedRequest, joints: &[String]) -> Result<Request, String> 
         LoggedRequest::Start { task } => Request::Start { task },
         LoggedRequest::Stop { arm } => Request::Stop { arm },
         LoggedRequest::Reset { arm } => Request::Reset { arm },
-        LoggedRequest::Ready { arm } => Request::Enabled { arm },
+        LoggedRequest::Ready { arm, outside } => Request::Enabled { arm, outside },
         LoggedRequest::Park { arm } => Request::PrepareDisable { arm },
         LoggedRequest::EndNative { arm } => Request::EndNative { arm },
         LoggedRequest::Lead { arm, by } => Request::Lead { arm, by },
@@ -159,6 +172,8 @@ fn request(logged: LoggedRequest, joints: &[String]) -> Result<Request, String> 
         }
         LoggedRequest::Speed { fraction } => Request::Speed { fraction: fraction.unwrap_or(f64::NAN) },
         LoggedRequest::Pause { on } => Request::Pause { on },
+        LoggedRequest::LeaseTaken { arm, client } => Request::LeaseTaken { arm, client },
+        LoggedRequest::LeaseEnded { arm, client } => Request::LeaseEnded { arm, client },
         LoggedRequest::Shutdown {} => Request::Shutdown,
     })
 }
@@ -215,7 +230,8 @@ mod tests {
             Request::Stop { arm: None },
             Request::Stop { arm: Some(1) },
             Request::Reset { arm: 1 },
-            Request::Enabled { arm: 0 },
+            Request::Enabled { arm: 0, outside: false },
+            Request::Enabled { arm: 1, outside: true },
             Request::PrepareDisable { arm: 2 },
             Request::EndNative { arm: 1 },
             Request::Lead { arm: 1, by: LedBy::HandMotorsOff },
@@ -224,13 +240,18 @@ mod tests {
             Request::Gripper { arm: 0, opening: 0.04, force: Some(f64::NAN), speed: Some(0.1 + 0.2) },
             Request::Speed { fraction: 0.1 + 0.2 },
             Request::Pause { on: true },
+            Request::LeaseTaken { arm: 1, client: 7 },
+            Request::LeaseEnded { arm: 1, client: 7 },
             Request::Shutdown,
         ] {
             let logged = log_of(&request);
-            let line = json!({"id": 7, "request": logged}).to_string();
+            let origin = Origin { epoch: 3, client: 5 };
+            let line = json!({"id": 7, "origin": origin, "request": logged}).to_string();
             let (id, again) = read(&line, &[]).unwrap();
+            let (from, again) = again.unwrap();
+            assert_eq!((id, from), (7, Some(origin)));
             // Debug output shows every bit of a number, and the sign of zero.
-            assert_eq!((id, format!("{:?}", again.unwrap())), (7, format!("{request:?}")));
+            assert_eq!(format!("{again:?}"), format!("{request:?}"));
         }
     }
 
@@ -247,11 +268,11 @@ mod tests {
         let logged = json!({"id": 9, "request": {"execute": {"task": 1, "motion": 5, "trajectory": trajectory}}});
         let names = ["a".to_owned(), "b".to_owned()];
         let (_, request) = read(&logged.to_string(), &names).unwrap();
-        let Ok(Request::Execute { task: 1, motion }) = request else { panic!("{request:?}") };
+        let Ok((None, Request::Execute { task: 1, motion })) = request else { panic!("{request:?}") };
         assert_eq!(*motion, Motion { id: 5, joints: vec![1, 0], spline: Spline::new(&trajectory).unwrap() });
         let chunk = json!({"id": 9, "request": {"chunk": {"task": 1, "start": 7, "trajectory": trajectory}}});
         let (_, request) = read(&chunk.to_string(), &names).unwrap();
-        let Ok(Request::Chunk { task: 1, start: Mono(7), motion }) = request else { panic!("{request:?}") };
+        let Ok((None, Request::Chunk { task: 1, start: Mono(7), motion })) = request else { panic!("{request:?}") };
         assert_eq!(*motion, Motion { id: 0, joints: vec![1, 0], spline: Spline::new(&trajectory).unwrap() });
         let (_, unknown) = read(&logged.to_string(), &names[..1]).unwrap();
         assert!(unknown.unwrap_err().contains("joint"));

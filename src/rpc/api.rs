@@ -29,6 +29,7 @@ use super::schema::MethodSchema;
 use super::streams::Streams;
 pub use super::text_api::*;
 pub use super::world_api::*;
+use crate::telemetry::Origin;
 
 /// Maximum length of a request line, including its newline [bytes].
 pub const MAX_LINE: usize = 256 * 1024;
@@ -49,6 +50,28 @@ pub trait Backend: Send + Sync + 'static {
     /// Answers one request. Called concurrently from the server's threads. Must not block its thread: a stop may wait
     /// for it. Dropped after [`server::CALL_TIMEOUT`](super::server::CALL_TIMEOUT).
     fn call(&self, request: Request) -> BoxFuture<'_, Result<Reply, RpcError>>;
+    /// Same, for a request of this origin.
+    fn call_from(&self, request: Request, origin: Origin) -> BoxFuture<'_, Result<Reply, RpcError>> {
+        let _ = origin;
+        self.call(request)
+    }
+    /// Returns the number of interruptions of all arms so far.
+    fn epoch(&self) -> u64 {
+        0
+    }
+    /// Called when a connection takes the lease of an arm with `lease`, not with a request.
+    fn lease_taken(&self, arm: &str, client: u64) -> Result<(), RpcError> {
+        let _ = (arm, client);
+        Ok(())
+    }
+    /// Waits until the run has handled what was passed to it before.
+    fn handled(&self) -> BoxFuture<'_, ()> {
+        Box::pin(std::future::ready(()))
+    }
+    /// Called before another connection can take the lease of an arm that was released.
+    fn lease_ended(&self, arm: &str, client: u64) {
+        let _ = (arm, client);
+    }
     /// Returns the arms of `subject` by `hardware_id`, for leases; empty if it names something unknown.
     fn arms_of(&self, subject: Subject<'_>) -> Vec<String>;
     /// Returns the number of a plan (`None`: the newest one), and the coordinator's joints that it moves.

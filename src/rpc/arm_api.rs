@@ -57,11 +57,21 @@ pub struct ArmReset {
 }
 
 /// Parameters of `arm_enable`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ArmEnable {
     /// The arm's `hardware_id`.
     pub arm: String,
+    /// Whether the arm may rest outside its position limits: it is held there, to be led or moved inward.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub outside: bool,
+}
+
+impl ArmEnable {
+    /// Creates a request for an arm inside its limits.
+    pub fn new(arm: impl Into<String>) -> Self {
+        Self { arm: arm.into(), outside: false }
+    }
 }
 
 /// Parameters of `arm_teach`.

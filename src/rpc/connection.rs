@@ -35,6 +35,7 @@ use super::streams::{Subscribe, SubscribeReply, Unsubscribe};
 use super::subscription::{RateLimit, Subscription};
 use super::urgent::Transfer;
 use super::wire;
+use crate::telemetry::Origin;
 
 /// Maximum number of lines queued for the client.
 const QUEUE: usize = 64;
@@ -56,6 +57,7 @@ pub(super) async fn serve(transfer: Transfer, backend: Arc<dyn Backend>) -> Opti
     let mut writer = tokio::spawn(write(to_client, waiting));
     let mut from_client = BufReader::new(std::io::Cursor::new(read).chain(from_client));
     let connection = Connection {
+        epoch: backend.epoch(),
         backend,
         lessee,
         permit,
@@ -115,6 +117,8 @@ struct Connection {
     behalf: Option<(bool, Commanded)>,
     /// Whether the run's gateway registered on it.
     is_gateway: bool,
+    /// The run's epoch when the connection last waited for a line. Lines that were there already may be as old.
+    epoch: u64,
 }
 
 /// A registered planner; closed when dropped.
@@ -156,7 +160,7 @@ impl Connection {
     async fn is_silent(&mut self, from: &mut (impl AsyncBufRead + Unpin)) -> bool {
         let mut line = Vec::new();
         loop {
-            let max_line = self.max_line();
+            let (max_line, mut waited) = (self.max_line(), false);
             if self.pending.is_empty() {
                 self.permit.set_pinned(!self.subscriptions.is_empty() || self.planner.is_some() || self.is_gateway);
                 self.permit.set_idle();
@@ -180,8 +184,12 @@ impl Connection {
                     }
                     continue;
                 }
-                read = read_line(from, &mut line, max_line), if self.pending.len() < MAX_PENDING => read,
+                read = noting_a_wait(read_line(from, &mut line, max_line), &mut waited),
+                    if self.pending.len() < MAX_PENDING => read,
             };
+            if waited {
+                self.epoch = self.backend.epoch();
+            }
             match read {
                 Line::Complete => self.permit.set_busy(),
                 Line::End => {
@@ -228,7 +236,7 @@ impl Connection {
                 self.reply(&id, result).await
             }
             Lease::NAME => {
-                let result = self.lease(params);
+                let result = self.lease(params).await;
                 self.reply(&id, result).await
             }
             Release::NAME => {
@@ -291,7 +299,8 @@ impl Connection {
 
     fn call(&self, method: String, request: Request) -> Answer {
         let (backend, leases) = (self.backend.clone(), self.lessee.leases().clone());
-        Box::pin(async move { answer(&method, backend.call(request), &leases).await })
+        let origin = Origin { epoch: self.epoch, client: self.lessee.connection() };
+        Box::pin(async move { answer(&method, backend.call_from(request, origin), &leases).await })
     }
 
     /// Waits for the answers to all pending targets and sends them.
@@ -355,9 +364,11 @@ impl Connection {
         Ok(Done {})
     }
 
-    fn lease(&self, params: Value) -> Result<LeaseReply, RpcError> {
+    async fn lease(&self, params: Value) -> Result<LeaseReply, RpcError> {
         let arms = self.arms(read_params::<Lease>(params)?.arm)?;
         self.lessee.take(&arms)?;
+        // What a client requests after a release of this lease is younger than it.
+        self.backend.handled().await;
         Ok(LeaseReply { arms })
     }
 
@@ -410,6 +421,17 @@ impl Connection {
     async fn send(&mut self, line: String) -> Result<(), Disconnected> {
         self.queue.send(line).await.map_err(|_| Disconnected)
     }
+}
+
+/// Waits for a future, and notes whether it was not ready at once.
+async fn noting_a_wait<T>(future: impl Future<Output = T>, waited: &mut bool) -> T {
+    let mut future = std::pin::pin!(future);
+    poll_fn(|cx| {
+        let poll = future.as_mut().poll(cx);
+        *waited |= poll.is_pending();
+        poll
+    })
+    .await
 }
 
 /// Returns whether a request may take effect: it was accepted, or not answered in time.

@@ -93,6 +93,9 @@ pub enum Code {
     OutOfLimits,
     /// The arm has no gripper.
     NoGripper,
+    /// The arm was stopped, held, disabled or disconnected, or another client took its lease, after the motion had been
+    /// requested; the message says which.
+    Superseded,
     /// The arm or the run lacks this feature.
     Unsupported,
     /// The arm's controller refused; the message has its text.
@@ -132,6 +135,7 @@ impl Code {
             }
             Outcome::NoGripperForce(_) | Outcome::NoGripperSpeed(_) => Some(Self::Unsupported),
             Outcome::NoGripper(_) => Some(Self::NoGripper),
+            Outcome::Superseded(..) => Some(Self::Superseded),
             Outcome::ShuttingDown => Some(Self::ShuttingDown),
         }
     }

@@ -1,10 +1,12 @@
 //! Leases: only one connection at a time can command an arm.
 //!
 //! A connection takes the lease of an arm with its first accepted motion request, or with `lease`, and holds it until
-//! `release` or its end. Leases exist in the rpc server only: when a connection ends, its stream of targets times out,
-//! and a trajectory that has begun continues.
+//! `release` or its end. The run learns when one is taken and when it ends: then its chunks end, and what was
+//! requested but has not begun does not begin. A stream of targets times out, and a trajectory that has begun
+//! continues.
 
 use std::collections::BTreeMap;
+use std::fmt::{self, Debug, Formatter};
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Instant;
 
@@ -99,10 +101,18 @@ impl Holder {
 }
 
 /// The leases of a run, by arm, and its gateway.
-#[derive(Debug, Default)]
+#[derive(Default)]
 pub(super) struct Leases {
     holders: Mutex<BTreeMap<String, Holder>>,
     gateway: Mutex<Option<Gateway>>,
+    /// The run; `None` in tests.
+    run: Option<Arc<dyn Backend>>,
+}
+
+impl Debug for Leases {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Leases").field("holders", &self.holders).field("gateway", &self.gateway).finish_non_exhaustive()
+    }
 }
 
 /// The gateway of a run.
@@ -116,6 +126,17 @@ struct Gateway {
 }
 
 impl Leases {
+    /// Creates the leases of a run, all free.
+    pub fn new(run: Arc<dyn Backend>) -> Self {
+        Self { run: Some(run), ..Self::default() }
+    }
+
+    fn ended(&self, arm: &str, connection: u64) {
+        if let Some(run) = &self.run {
+            run.lease_ended(arm, connection);
+        }
+    }
+
     fn lock(&self) -> MutexGuard<'_, BTreeMap<String, Holder>> {
         lock(&self.holders)
     }
@@ -156,6 +177,11 @@ impl Lessee {
     /// Creates a lessee without leases. `connection` is unique within the run; `pid` is the client's process.
     pub fn new(leases: Arc<Leases>, connection: u64, pid: Option<i32>) -> Self {
         Self { leases, connection, pid, client: None, alive: Arc::default() }
+    }
+
+    /// Returns the connection's number.
+    pub fn connection(&self) -> u64 {
+        self.connection
     }
 
     /// Returns the client's process, if the system reports it.
@@ -254,6 +280,10 @@ impl Lessee {
     fn claim(&self, arms: &[String], kept: bool) -> Result<(), RpcError> {
         let mut held = self.leases.lock();
         self.check(arms, &held)?;
+        // The tick learns of a lease that a request takes with that request, if it accepts it.
+        if let Some(run) = self.leases.run.as_ref().filter(|_| kept) {
+            arms.iter().try_for_each(|arm| run.lease_taken(arm, self.connection))?;
+        }
         for arm in arms {
             match held.get_mut(arm) {
                 Some(holder) => holder.kept |= kept,
@@ -273,6 +303,7 @@ impl Lessee {
         let mine = |arm: &&String| held.get(*arm).is_some_and(|h| h.connection == self.connection);
         let released: Vec<String> = arms.iter().filter(mine).cloned().collect();
         for arm in &released {
+            self.leases.ended(arm, self.connection);
             held.remove(arm);
         }
         released
@@ -294,7 +325,13 @@ impl Lessee {
 
 impl Drop for Lessee {
     fn drop(&mut self) {
-        self.leases.lock().retain(|_, holder| holder.connection != self.connection);
+        self.leases.lock().retain(|arm, holder| {
+            let mine = holder.connection == self.connection;
+            if mine {
+                self.leases.ended(arm, self.connection);
+            }
+            !mine
+        });
         lock(&self.leases.gateway).take_if(|gateway| gateway.connection == self.connection);
     }
 }

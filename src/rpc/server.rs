@@ -115,7 +115,7 @@ async fn accept(
         Ok(listener) => listener,
         Err(e) => return tracing::error!("rpc: the socket cannot be served: {e}"),
     };
-    let leases = Arc::new(Leases::default());
+    let leases = Arc::new(Leases::new(backend.clone()));
     let limit = ConnectionLimit::new(leases.clone());
     loop {
         let accepted = tokio::select! {

@@ -15,6 +15,7 @@ use crate::joint::STANDSTILL;
 use crate::message::Message;
 use crate::rpc::api::{self, Reply};
 use crate::rpc::{Code, RpcError};
+use crate::sync::lock;
 use crate::telemetry::describe::cause_text;
 use crate::telemetry::{ArmSample, Outcome, Phase};
 
@@ -42,6 +43,10 @@ impl Service {
         for (_, count) in stopped {
             count.fetch_add(1, Ordering::Relaxed);
         }
+        // The tick refuses it in any case: no client waits for the planner in vain.
+        let concerns = |joint| self.locate(joint).is_some_and(|(i, _)| arm.is_none_or(|a| usize::from(a) == i));
+        lock(&self.motions)
+            .end_replanning("stopped by an operator", |motion| motion.joints.iter().any(|joint| concerns(*joint)));
         self.ask(Request::Stop { arm }).await?;
         let limit = Instant::now() + STOP_LIMIT;
         let mut arms = BTreeMap::new();
@@ -115,7 +120,7 @@ impl Service {
         Ok(Reply::ArmReset(reply))
     }
 
-    pub(super) async fn enable(&self, id: String) -> Result<Reply, RpcError> {
+    pub(super) async fn enable(&self, id: String, outside: bool) -> Result<Reply, RpcError> {
         let arm = self.arm_index(&id)?;
         let view = self.arm_view(arm as usize).ok_or_else(internal)?;
         match view.phase {
@@ -134,7 +139,7 @@ impl Service {
                     self.wait_for_rest(&id, arm, Instant::now()).await?;
                 }
                 order(self.device(arm)?.activate()).await.map_err(|e| refused(&id, "was not enabled", &e))?;
-                self.ask(Request::Enabled { arm }).await?;
+                self.ask(Request::Enabled { arm, outside }).await?;
             }
         }
         self.until_ready(id, arm).await
@@ -168,7 +173,7 @@ impl Service {
                 if !matches!(self.phase(arm), Phase::Activating | Phase::Ready | Phase::Held) {
                     // The arm's phase shows whether it was accepted. On a busy host its state may be stale for a
                     // moment.
-                    let ready = Request::Enabled { arm: arm as u16 };
+                    let ready = Request::Enabled { arm: arm as u16, outside: false };
                     let log = log_of(&ready);
                     let _ = self.parts.dispatcher.send(ready, log);
                 }

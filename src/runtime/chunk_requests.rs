@@ -11,7 +11,7 @@ use crate::control::tasks::chunk::curve;
 use crate::joint::JointLimits;
 use crate::rpc::api;
 use crate::rpc::{Code, RpcError};
-use crate::telemetry::Outcome;
+use crate::telemetry::{Origin, Outcome};
 use crate::trajectory::Spline;
 
 /// Chunks that begin this far from now are mistaken about the clock [s].
@@ -19,7 +19,7 @@ const MAX_DISTANCE: f64 = 600.0;
 
 impl Service {
     /// Sends the next chunk of a chunk task.
-    pub(super) async fn chunk(&self, mut call: api::Chunk) -> Result<api::ChunkReply, RpcError> {
+    pub(super) async fn chunk(&self, mut call: api::Chunk, origin: Origin) -> Result<api::ChunkReply, RpcError> {
         let task = self.task_index(&call.task)?;
         let config = &self.parts.config.tasks[task as usize];
         let takes = self.parts.blueprint.tasks.get(task as usize).is_some_and(|t| t.spec.takes(TargetKind::Chunk));
@@ -55,11 +55,12 @@ impl Service {
         self.check_limits(&config.joints, &spline)?;
         let log = json!({"chunk": {"task": task, "start": start.0, "trajectory": trajectory}});
         let motion = Box::new(Motion { id: 0, joints: config.joints.clone(), spline });
-        self.outcome(self.parts.dispatcher.ask(Request::Chunk { task, start, motion }, log).await)?;
+        let sent = self.parts.dispatcher.ask(Request::Chunk { task, start, motion }, Some(origin), log);
+        self.outcome(sent.await)?;
         self.streams_to(task);
         count(late);
         if let (Some(arm), Some(targets)) = (arm, &call.gripper) {
-            self.take_gripper_targets(task, arm, start, call.period, targets);
+            self.take_gripper_targets((task, origin), arm, start, call.period, targets);
         }
         Ok(api::ChunkReply { actions, late })
     }

@@ -17,8 +17,8 @@ use crate::recording::notes::{Note, Notes};
 use crate::rt::host;
 use crate::rt::wake::Wake;
 use crate::sync::lock;
-use crate::telemetry::Outcome;
 use crate::telemetry::describe::Severity;
+use crate::telemetry::{Origin, Outcome};
 use crate::trajectory::JointTrajectory;
 
 /// Capacity of the ring of requests.
@@ -62,7 +62,18 @@ impl Dispatcher {
 
     /// Sends a request; the answer comes with the tick that handles it. `log` is its log entry.
     pub fn send(&self, request: Request, log: Value) -> Result<oneshot::Receiver<Outcome>, SendError> {
-        self.push(request, |id, stamp| Note::Request { id, stamp, json: log.to_string() })
+        self.send_from(request, None, log)
+    }
+
+    /// Sends a request that a client made, when and by whom; `None`: it moves nothing, or later than it was requested
+    /// on purpose.
+    pub fn send_from(
+        &self,
+        request: Request,
+        origin: Option<Origin>,
+        log: Value,
+    ) -> Result<oneshot::Receiver<Outcome>, SendError> {
+        self.push(request, origin, |id, stamp| Note::Request { id, stamp, origin, json: log.to_string() })
     }
 
     /// Sends a motion along a trajectory to a task, and waits for its outcome.
@@ -70,16 +81,18 @@ impl Dispatcher {
         &self,
         task: u16,
         motion: Box<Motion>,
+        origin: Option<Origin>,
         trajectory: Arc<JointTrajectory>,
     ) -> Result<Outcome, SendError> {
         let number = motion.id;
-        let note = |id, stamp| Note::Execute { id, stamp, task, motion: number, trajectory };
-        answer(self.push(Request::Execute { task, motion }, note)?).await
+        let note = |id, stamp| Note::Execute { id, stamp, origin, task, motion: number, trajectory };
+        answer(self.push(Request::Execute { task, motion }, origin, note)?).await
     }
 
     fn push(
         &self,
         request: Request,
+        origin: Option<Origin>,
         note: impl FnOnce(u64, Mono) -> Note,
     ) -> Result<oneshot::Receiver<Outcome>, SendError> {
         let ends_motion = matches!(
@@ -88,6 +101,7 @@ impl Dispatcher {
                 | Request::Cancel { .. }
                 | Request::WayBlocked { .. }
                 | Request::EndNative { .. }
+                | Request::LeaseEnded { .. }
                 | Request::Pause { on: true }
                 | Request::Shutdown
         );
@@ -102,7 +116,7 @@ impl Dispatcher {
         lock(&self.waiting).insert(id, sender);
         // The recorder counts notes that do not fit; without a recorder the run is shutting down.
         let _ = self.notes.send(note);
-        if ring.push(Envelope { id, request }).is_err() {
+        if ring.push(Envelope { id, origin, request }).is_err() {
             lock(&self.waiting).remove(&id);
             return Err(SendError::Full);
         }
@@ -110,8 +124,8 @@ impl Dispatcher {
     }
 
     /// Sends a request and waits for its outcome.
-    pub async fn ask(&self, request: Request, log: Value) -> Result<Outcome, SendError> {
-        answer(self.send(request, log)?).await
+    pub async fn ask(&self, request: Request, origin: Option<Origin>, log: Value) -> Result<Outcome, SendError> {
+        answer(self.send_from(request, origin, log)?).await
     }
 
     /// Puts a line of text into the log.
@@ -163,7 +177,9 @@ pub fn log_of(request: &Request) -> Value {
         Request::Start { task } => json!({"start": {"task": task}}),
         Request::Stop { arm } => json!({"stop": {"arm": arm}}),
         Request::Reset { arm } => json!({"reset": {"arm": arm}}),
-        Request::Enabled { arm } => json!({"ready": {"arm": arm}}),
+        // Logs of earlier versions lack `outside`.
+        Request::Enabled { arm, outside: false } => json!({"ready": {"arm": arm}}),
+        Request::Enabled { arm, outside } => json!({"ready": {"arm": arm, "outside": outside}}),
         Request::PrepareDisable { arm } => json!({"park": {"arm": arm}}),
         Request::EndNative { arm } => json!({"end_native": {"arm": arm}}),
         Request::Lead { arm, by } => json!({"lead": {"arm": arm, "by": by}}),
@@ -178,6 +194,8 @@ pub fn log_of(request: &Request) -> Value {
         }
         Request::Speed { fraction } => json!({"speed": {"fraction": fraction}}),
         Request::Pause { on } => json!({"pause": {"on": on}}),
+        Request::LeaseTaken { arm, client } => json!({"lease_taken": {"arm": arm, "client": client}}),
+        Request::LeaseEnded { arm, client } => json!({"lease_ended": {"arm": arm, "client": client}}),
         Request::Shutdown => json!({"shutdown": {}}),
     }
 }

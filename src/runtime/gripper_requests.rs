@@ -15,7 +15,7 @@ use crate::rpc::api::{self, GripReport, Reply};
 use crate::rpc::{Code, RpcError};
 use crate::sync::lock;
 use crate::telemetry::describe::cause_text;
-use crate::telemetry::{ArmSample, Outcome, Phase};
+use crate::telemetry::{ArmSample, Origin, Outcome, Phase};
 
 /// Default time for an outcome [s].
 const TIMEOUT: f64 = 20.0;
@@ -30,7 +30,7 @@ pub struct LatestGrip {
 
 impl Service {
     /// Commands a gripper, and waits for the arm's answer to this order.
-    pub(super) async fn gripper(&self, call: api::Gripper) -> Result<Reply, RpcError> {
+    pub(super) async fn gripper(&self, call: api::Gripper, origin: Origin) -> Result<Reply, RpcError> {
         let arm = self.arm_index(&call.arm)?;
         let from = self.arm_view(arm as usize).map(|view| view.state.gripper);
         let Some(from) = from.unwrap_or(Some(call.position)) else {
@@ -42,7 +42,7 @@ impl Service {
         let _turn = self.grippers.get(arm as usize).ok_or_else(internal)?.lock().await;
         let now = self.now();
         let request = Request::Gripper { arm, opening: call.position, force: call.force, speed: call.speed };
-        self.ask(request).await?;
+        self.ask_from(request, Some(origin)).await?;
         let order = self.arm_view(arm as usize).ok_or_else(internal)?.command.gripper_seq;
         let gone = |view: &ArmSample| matches!(view.state.link, Link::Down | Link::Faulted);
         let gone = || self.seen(arm, gone).map(|()| Err(AdapterError::NotConnected));

@@ -13,7 +13,7 @@ use crate::control::request::Request;
 use crate::rpc::report::StreamCounts;
 use crate::rpc::{Code, RpcError};
 use crate::sync::lock;
-use crate::telemetry::{Outcome, TaskState};
+use crate::telemetry::{Origin, Outcome, TaskState};
 
 /// Least time between two commands to a gripper.
 const PERIOD: Duration = Duration::from_millis(50);
@@ -27,6 +27,7 @@ const BEGINS: Duration = Duration::from_millis(500);
 pub struct GripperTargets {
     /// The task whose stream they are of, and when it sent the latest.
     task: u16,
+    origin: Origin,
     sent: Mono,
     /// Time and position [m or rad], in order of time.
     ahead: VecDeque<(Mono, f64)>,
@@ -129,7 +130,14 @@ impl Service {
 
     /// Takes gripper targets of a stream, `period` apart from `start` on; those whose time is over are dropped. They
     /// replace what is pending from the first of them on. Returns how many were dropped.
-    pub(super) fn take_gripper_targets(&self, task: u16, arm: u16, start: Mono, period: f64, targets: &[f64]) -> usize {
+    pub(super) fn take_gripper_targets(
+        &self,
+        (task, origin): (u16, Origin),
+        arm: u16,
+        start: Mono,
+        period: f64,
+        targets: &[f64],
+    ) -> usize {
         let now = self.now();
         let at = |k: usize| start.after(Duration::from_secs_f64(k as f64 * period));
         // A single target is for now.
@@ -142,7 +150,7 @@ impl Service {
         let Some(pending) = self.gripper_targets.get(arm as usize) else { return late };
         let mut pending = lock(pending);
         let was = pending.is_pending();
-        (pending.task, pending.sent) = (task, now);
+        (pending.task, pending.origin, pending.sent) = (task, origin, now);
         pending.splice(targets.iter().enumerate().skip(late).map(|(k, target)| (at(k), *target)));
         // While any is pending, every tick wakes the thread that commands them.
         if pending.is_pending() && !was {
@@ -171,7 +179,7 @@ impl Service {
                 let request = Request::Gripper { arm, opening, force: None, speed: None };
                 let log = log_of(&request);
                 // A refusal is in the log; the next target tries again.
-                if self.parts.dispatcher.send(request, log).is_err() {
+                if self.parts.dispatcher.send_from(request, Some(pending.origin), log).is_err() {
                     pending.commanded = None;
                 }
             }

@@ -6,8 +6,8 @@ use std::time::Duration;
 use super::service::Service;
 use super::{in_process, watchdog};
 use crate::rpc::api::{
-    ArmDisable, ArmEnable, ArmReply, ArmReset, Cancel, CancelReply, Execute, ExecuteReply, Grip, GripReport, Gripper,
-    Method, Move, MoveReply, Servo, Stop, StopReply, Trajectory, Velocity,
+    ArmDisable, ArmEnable, ArmReply, ArmReset, Backend, Cancel, CancelReply, Execute, ExecuteReply, Grip, GripReport,
+    Gripper, Method, Move, MoveReply, Servo, Stop, StopReply, Trajectory, Velocity,
 };
 use crate::rpc::report::{MotionReport, StateReport, StatusReport};
 use crate::rpc::{Code, RpcError};
@@ -23,9 +23,21 @@ const POLL_PERIOD: Duration = Duration::from_millis(10);
 #[derive(Clone)]
 pub struct Handle {
     pub(super) service: Arc<Service>,
+    /// The epoch of its requests; `None`: that in which each is made.
+    epoch: Option<u64>,
 }
 
 impl Handle {
+    pub(super) fn new(service: Arc<Service>) -> Self {
+        Self { service, epoch: None }
+    }
+
+    /// Returns a handle for a motion in several parts: it no longer moves an arm that is stopped, held, disabled or lost
+    /// from now on, not even after that was enabled again. Its requests are then refused with [`Code::Superseded`].
+    pub fn until_interrupted(&self) -> Self {
+        Self { service: self.service.clone(), epoch: Some(self.service.epoch()) }
+    }
+
     /// Returns the run's name.
     pub fn name(&self) -> &str {
         &self.service.parts.run
@@ -111,7 +123,7 @@ impl Handle {
 
     /// Enables an arm's motors and makes it ready for motion, without moving it.
     pub fn enable(&self, arm: &str) -> Result<ArmReply, RpcError> {
-        self.call(ArmEnable { arm: arm.to_owned() })
+        self.call(ArmEnable::new(arm.to_owned()))
     }
 
     /// Decelerates an arm to rest and disables its motors; an error if it still moves. An arm without brakes drops.
@@ -167,6 +179,6 @@ impl Handle {
 
     /// Calls a method several times at once: the requests usually reach the same tick.
     pub fn call_together<M: Method>(&self, requests: &[M]) -> Vec<Result<M::Reply, RpcError>> {
-        in_process::call(&self.service, requests)
+        in_process::call(&self.service, self.epoch, requests)
     }
 }

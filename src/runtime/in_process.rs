@@ -10,16 +10,20 @@ use super::service::Service;
 use crate::rpc::api::{Backend, METHODS, Method, Reply, Request};
 use crate::rpc::server::CALL_TIMEOUT;
 use crate::rpc::{Code, RpcError};
+use crate::telemetry::Origin;
 
 /// The runtime of all calls in this process. It has no threads: each call runs on the calling thread.
 static RUNTIME: LazyLock<std::io::Result<Runtime>> =
     LazyLock::new(|| Builder::new_current_thread().enable_time().build());
 
-/// Sends all requests at once and waits for all replies. Returns them in the order of the requests.
-pub fn call<M: Method>(service: &Arc<Service>, requests: &[M]) -> Vec<Result<M::Reply, RpcError>> {
+/// Sends all requests at once and waits for all replies. Returns them in the order of the requests. `epoch`: that of
+/// the requests; `None`: the present one.
+pub fn call<M: Method>(service: &Arc<Service>, epoch: Option<u64>, requests: &[M]) -> Vec<Result<M::Reply, RpcError>> {
     let requests: Vec<_> = requests.iter().map(typed).collect();
     let failed: Vec<_> = requests.iter().map(|_| Err(defect("no answer"))).collect();
-    let answers = wait_for(ask(service, requests)).unwrap_or(failed);
+    let answers =
+        wait_for(ask(service, Origin { epoch: epoch.unwrap_or_else(|| service.epoch()), client: 0 }, requests))
+            .unwrap_or(failed);
     answers.into_iter().map(|answer| answer.and_then(reply::<M>)).collect()
 }
 
@@ -33,9 +37,13 @@ pub fn wait_for<T: Send>(something: impl Future<Output = T> + Send) -> Option<T>
     std::thread::scope(|scope| scope.spawn(|| runtime.block_on(something)).join().ok())
 }
 
-async fn ask(service: &Arc<Service>, requests: Vec<Result<Request, RpcError>>) -> Vec<Result<Reply, RpcError>> {
+async fn ask(
+    service: &Arc<Service>,
+    origin: Origin,
+    requests: Vec<Result<Request, RpcError>>,
+) -> Vec<Result<Reply, RpcError>> {
     let begin = |request: Result<Request, RpcError>| async move {
-        tokio::time::timeout(CALL_TIMEOUT, service.call(request?)).await.unwrap_or_else(late)
+        tokio::time::timeout(CALL_TIMEOUT, service.call_from(request?, origin)).await.unwrap_or_else(late)
     };
     let mut begun: Vec<_> = requests.into_iter().map(|request| (Box::pin(begin(request)), None)).collect();
     poll_fn(|context| {

@@ -25,7 +25,7 @@ use crate::rpc::report::{LED_BY_CONTROLLER, end_of_lead};
 use crate::rpc::{Code, RpcError};
 use crate::sync::lock;
 use crate::telemetry::describe::Severity;
-use crate::telemetry::{LedBy, Outcome, Phase, Reason, TaskState};
+use crate::telemetry::{LedBy, Origin, Outcome, Phase, Reason, TaskState};
 
 /// Largest distance between the controller's own pose and the tool centre point [m]: more means different base frames.
 const LARGEST_TOOL: f64 = 0.35;
@@ -45,11 +45,12 @@ struct Native {
     target: Pose,
     /// Fraction of the controller's top speed.
     speed: f64,
+    origin: Origin,
 }
 
 impl Service {
     /// Lets an arm be led by hand, as its adapter's row says.
-    pub(super) async fn teach(&self, call: api::ArmTeach) -> Result<Reply, RpcError> {
+    pub(super) async fn teach(&self, call: api::ArmTeach, origin: Origin) -> Result<Reply, RpcError> {
         let arm = self.arm_index(&call.arm)?;
         let name = &call.arm;
         let (by, note) = match self.parts.blueprint.arms.get(arm as usize).ok_or_else(internal)?.adapter.teach {
@@ -66,7 +67,7 @@ impl Service {
             Teach::HandGuiding => (LedBy::Hand, "led by hand, motors on: the controller compensates gravity"),
         };
         self.end_streams(&self.joints_of_arm(arm).collect::<Vec<_>>()).await?;
-        let lead = self.lead(arm, by).await?;
+        let lead = self.lead(arm, by, origin).await?;
         let device = self.device(arm)?;
         let begun = order(if by == LedBy::Hand { device.lead(Way::Hand, lead) } else { device.disable() }).await;
         if let Err(error) = begun {
@@ -92,15 +93,15 @@ impl Service {
             let what = format!("{id} is not led, or no longer: it is {}", phase.name());
             return Err(RpcError::new(Code::Unsupported, what).hint("`dimos status` shows the cause"));
         }
-        match self.enable(id).await? {
+        match self.enable(id, false).await? {
             Reply::ArmEnable(reply) => Ok(Reply::ArmTakeOver(reply)),
             _ => Err(internal()),
         }
     }
 
     /// Lets the tick pass an arm on. Returns the number of this lead.
-    async fn lead(&self, arm: u16, by: LedBy) -> Result<u32, RpcError> {
-        self.ask(Request::Lead { arm, by }).await?;
+    async fn lead(&self, arm: u16, by: LedBy, origin: Origin) -> Result<u32, RpcError> {
+        self.ask_from(Request::Lead { arm, by }, Some(origin)).await?;
         Ok(self.arm_view(arm as usize).ok_or_else(internal)?.command.lead_seq)
     }
 
@@ -108,7 +109,7 @@ impl Service {
     async fn take_over(&self, name: &str, arm: u16) -> Result<(), RpcError> {
         self.end_lead(name, arm).await?;
         order(self.device(arm)?.take_over()).await.map_err(|e| refused(name, "was not taken over", &e))?;
-        self.ask(Request::Enabled { arm }).await?;
+        self.ask(Request::Enabled { arm, outside: false }).await?;
         self.until_ready(name.to_owned(), arm).await.map(|_| ())
     }
 
@@ -135,7 +136,7 @@ impl Service {
 
     /// Lets an arm's own controller move it to a pose. Replies when the motion begins; a separate thread watches the
     /// motion to its end, also without its client.
-    pub(super) async fn move_native(&self, call: api::MoveNative) -> Result<Reply, RpcError> {
+    pub(super) async fn move_native(&self, call: api::MoveNative, origin: Origin) -> Result<Reply, RpcError> {
         let arm = self.arm_index(&call.arm)?;
         if !call.direct {
             self.needs_no_plan(&call.arm)?;
@@ -156,7 +157,8 @@ impl Service {
             began: None,
         };
         lock(&self.motions).plan(motion, planned);
-        let native = Native { name: call.arm, arm, motion, target, speed: call.speed * self.speed_override().fraction };
+        let speed = call.speed * self.speed_override().fraction;
+        let native = Native { name: call.arm, arm, motion, target, speed, origin };
         let reply = api::NativeReply { motion, speed: native.speed, tool };
         let (begun, answer) = oneshot::channel();
         let me = self.me.upgrade().ok_or_else(internal)?;
@@ -177,7 +179,7 @@ impl Service {
     /// Begins a native motion, sends the result to `begun`, and takes the arm over at its end.
     async fn run_native(self: Arc<Self>, native: &Native, begun: oneshot::Sender<Result<(), RpcError>>) {
         let arm = native.arm;
-        let lead = match self.lead(arm, LedBy::Controller).await {
+        let lead = match self.lead(arm, LedBy::Controller, native.origin).await {
             Ok(lead) => lead,
             Err(error) => return drop(begun.send(Err(error))),
         };

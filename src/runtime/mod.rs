@@ -24,6 +24,7 @@ mod handle;
 mod in_process;
 mod late_stops;
 mod lead_requests;
+mod lease_changes;
 mod log_file;
 mod log_throttle;
 mod logged_scene;

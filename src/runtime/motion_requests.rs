@@ -19,7 +19,7 @@ use crate::planning::topp::JointBound;
 use crate::rpc::api::{self, Reply};
 use crate::rpc::{Code, RpcError};
 use crate::sync::lock;
-use crate::telemetry::Outcome;
+use crate::telemetry::{Origin, Outcome};
 use crate::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
 
 /// Trajectories may exceed a velocity or acceleration limit by this factor, for rounding in files.
@@ -44,13 +44,13 @@ impl Service {
         }
     }
 
-    pub(super) async fn move_arm(&self, call: api::Move) -> Result<Reply, RpcError> {
+    pub(super) async fn move_arm(&self, call: api::Move, origin: Origin) -> Result<Reply, RpcError> {
         let arm = self.arm_index(&call.arm)?;
         if !call.direct {
             self.needs_no_plan(&call.arm)?;
         }
         self.end_streams(&self.joints_of_arm(arm).collect::<Vec<_>>()).await?;
-        self.move_within(call, Duration::MAX).await
+        self.move_within(call, Duration::MAX, origin).await
     }
 
     /// Refuses a motion that is not collision-checked if the run has a planner, also one that has disconnected.
@@ -64,7 +64,12 @@ impl Service {
     }
 
     /// Moves an arm, if that takes at most `longest`.
-    pub(super) async fn move_within(&self, call: api::Move, longest: Duration) -> Result<Reply, RpcError> {
+    pub(super) async fn move_within(
+        &self,
+        call: api::Move,
+        longest: Duration,
+        origin: Origin,
+    ) -> Result<Reply, RpcError> {
         let arm = self.arm_index(&call.arm)?;
         let joints: Vec<u16> = self.joints_of_arm(arm).collect();
         let config = &self.parts.config.arms[arm as usize];
@@ -106,7 +111,7 @@ impl Service {
             let what = format!("the motion would take {duration:.1} s (limit {} s)", longest.as_secs());
             return Err(RpcError::new(Code::OutOfLimits, what));
         }
-        let number = self.begin(task, joints, motion, None).await?;
+        let number = self.begin(task, joints, motion, origin, None).await?;
         Ok(Reply::Move(api::MoveReply {
             motion: number,
             task: self.parts.names.task(task),
@@ -118,10 +123,10 @@ impl Service {
         }))
     }
 
-    pub(super) async fn execute(&self, call: api::Execute) -> Result<Reply, RpcError> {
+    pub(super) async fn execute(&self, call: api::Execute, origin: Origin) -> Result<Reply, RpcError> {
         self.end_streams(&self.joints_named(&call.trajectory.joint_names)?).await?;
         let to = call.retraces_to;
-        let begun = self.execute_as(call, None).await?;
+        let begun = self.execute_as(call, origin, None).await?;
         lock(&self.motions).retraces(begun.motion, to);
         Ok(Reply::Execute(begun))
     }
@@ -140,6 +145,7 @@ impl Service {
     pub(super) async fn execute_as(
         &self,
         call: api::Execute,
+        origin: Origin,
         plan: Option<Carries>,
     ) -> Result<api::ExecuteReply, RpcError> {
         let trajectory = trajectory_of(call.trajectory);
@@ -149,7 +155,7 @@ impl Service {
             None => self.trajectory_task(&joints)?,
         };
         let duration = trajectory.duration();
-        let number = self.begin(task, joints, trajectory, plan).await?;
+        let number = self.begin(task, joints, trajectory, origin, plan).await?;
         Ok(api::ExecuteReply { motion: number, task: self.parts.names.task(task), duration })
     }
 
@@ -159,6 +165,7 @@ impl Service {
         task: u16,
         joints: Vec<u16>,
         trajectory: JointTrajectory,
+        origin: Origin,
         plan: Option<Carries>,
     ) -> Result<u64, RpcError> {
         let spline = Spline::new(&trajectory).map_err(|e| RpcError::new(Code::InvalidTrajectory, e.to_string()))?;
@@ -166,7 +173,7 @@ impl Service {
         self.check_limits(&joints, &spline)?;
         let number = self.parts.dispatcher.next_id();
         let goal = (0..joints.len()).map(|k| spline.goal(k)).collect();
-        let plan = plan.map(|(plan, replan)| Carried { plan, spline: Arc::new(spline.clone()), replan });
+        let plan = plan.map(|(plan, replan)| Carried { plan, spline: Arc::new(spline.clone()), replan, origin });
         let planned = Planned {
             task,
             joints: joints.clone(),
@@ -180,7 +187,8 @@ impl Service {
         };
         lock(&self.motions).plan(number, planned);
         let motion = Box::new(Motion { id: number, joints, spline });
-        let result = self.outcome(self.parts.dispatcher.execute(task, motion, Arc::new(trajectory)).await);
+        let sent = self.parts.dispatcher.execute(task, motion, Some(origin), Arc::new(trajectory));
+        let result = self.outcome(sent.await);
         if result.is_err() {
             lock(&self.motions).forget(number);
         }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use crate::rpc::api::Presence;
-use crate::telemetry::{Reason, TaskState};
+use crate::telemetry::{Origin, Reason, TaskState};
 use crate::trajectory::Spline;
 
 /// The task of a native motion: none, the arm's own controller executes it.
@@ -44,6 +44,8 @@ pub struct Carried {
     pub spline: Arc<Spline>,
     /// If it is planned again when blocked: the connection that requested this, if any.
     pub replan: Option<Option<Presence>>,
+    /// When and by whom it was requested, also if it is planned again.
+    pub origin: Origin,
 }
 
 /// What follows a blocked motion.
@@ -72,6 +74,8 @@ pub struct UnderWay {
     pub spline: Arc<Spline>,
     /// As [`Carried::replan`].
     pub replan: Option<Option<Presence>>,
+    /// As [`Carried::origin`].
+    pub origin: Origin,
 }
 
 /// How a motion ended.
@@ -140,9 +144,9 @@ impl Motions {
     pub fn under_way(&self) -> Vec<UnderWay> {
         let going = self.0.iter().filter(|(_, (_, end))| end.is_none());
         let planned = going.filter_map(|(number, (planned, _))| {
-            let Carried { plan, spline, replan } = planned.plan.clone()?;
+            let Carried { plan, spline, replan, origin } = planned.plan.clone()?;
             let (number, task, joints) = (*number, planned.task, planned.joints.clone());
-            Some(UnderWay { number, task, joints, plan, spline, replan })
+            Some(UnderWay { number, task, joints, plan, spline, replan, origin })
         });
         planned.collect()
     }
@@ -163,9 +167,11 @@ impl Motions {
         }
     }
 
-    /// Sets the result of planning a motion again.
+    /// Sets the result of planning a motion again. If that was ended, its reason stays.
     pub fn went_on(&mut self, number: u64, next: Result<u64, String>) {
-        if let Some((planned, _)) = self.0.get_mut(&number) {
+        if let Some((planned, _)) = self.0.get_mut(&number)
+            && (next.is_ok() || !matches!(planned.next, Some(Next::None(_))))
+        {
             planned.next = Some(next.map_or_else(Next::None, Next::Motion));
         }
     }
@@ -175,14 +181,14 @@ impl Motions {
         self.0.get(&number).is_some_and(|(planned, _)| planned.next == Some(Next::Planning))
     }
 
-    /// Stops planning the motions of a task again.
-    pub fn end_replanning(&mut self, task: u16) {
-        for (planned, _) in self.0.values_mut().filter(|(planned, _)| planned.task == task) {
+    /// Stops planning motions again, for this reason.
+    pub fn end_replanning(&mut self, why: &str, is_meant: impl Fn(&Planned) -> bool) {
+        for (planned, _) in self.0.values_mut().filter(|(planned, _)| is_meant(planned)) {
             if let Some(carried) = &mut planned.plan {
                 carried.replan = None;
             }
             if planned.next == Some(Next::Planning) {
-                planned.next = Some(Next::None("cancelled".to_owned()));
+                planned.next = Some(Next::None(why.to_owned()));
             }
         }
     }

@@ -10,8 +10,8 @@ use std::time::{Duration, Instant};
 use super::{Ended, Ending, Run, in_process};
 use crate::blueprint::OnExit;
 use crate::control::request::Request;
-use crate::rpc::api::{Move, Reply};
-use crate::telemetry::Phase;
+use crate::rpc::api::{Backend, Move, Reply};
+use crate::telemetry::{Origin, Phase};
 
 /// Fraction of the velocity limits of the motion to the park pose.
 const SPEED: f64 = 0.3;
@@ -118,7 +118,8 @@ impl Run {
         }
         let target = service.parts.blueprint.arms.get(arm).map(|arm| arm.park_pose.clone()).unwrap_or_default();
         let call = Move::new(self.name_of(arm), target, SPEED);
-        match in_process::wait_for(service.move_within(call, LONGEST)) {
+        let origin = Origin { epoch: service.epoch(), client: 0 };
+        match in_process::wait_for(service.move_within(call, LONGEST, origin)) {
             Some(Ok(Reply::Move(reply))) => Ok(Parking { arm, motion: reply.motion, duration: reply.duration }),
             Some(Err(error)) => Err(error.message),
             _ => Err("there was no answer".to_owned()),

@@ -95,7 +95,7 @@ impl Service {
             self.rests(arm)?;
             actual = order(device.set_payload(*load)).await;
         }
-        let ready = if again { self.enable(name.clone()).await.map(drop) } else { Ok(()) };
+        let ready = if again { self.enable(name.clone(), false).await.map(drop) } else { Ok(()) };
         let actual = actual.map_err(|e| refused(&name, "did not take the payload", &e))?;
         let [x, y, z] = load.center;
         self.parts

@@ -22,6 +22,7 @@ use crate::rpc::planner_proxy::{PlannerProxy, gone};
 use crate::rpc::report::{AttachedReport, PlannerStatus};
 use crate::rpc::{Code, RpcError};
 use crate::sync::lock;
+use crate::telemetry::Origin;
 use crate::telemetry::describe::Names;
 
 /// Maximum age of a state to plan from.
@@ -104,16 +105,27 @@ impl Service {
         }
     }
 
-    /// Answers the planner's methods.
+    /// Answers those of the planner's methods that neither make nor execute a plan.
     pub(super) async fn planner_call(&self, call: Call) -> Result<Reply, RpcError> {
+        self.planner_call_from(call, Origin::default()).await
+    }
+
+    /// Answers the planner's methods. A plan is executed only if nothing has interrupted its arms since it was
+    /// requested.
+    pub(super) async fn planner_call_from(&self, call: Call, origin: Origin) -> Result<Reply, RpcError> {
         let planner = self.planner()?;
         let limit = if matches!(call, Call::WorldAdd(_)) { SLOW_QUERY_TIMEOUT } else { QUERY_TIMEOUT };
         match call {
             Call::ExecutePlan(execute) => {
                 let released = planner.release(&execute, self.moment(0)).await?;
+                // A planner may release a plan that this run has not requested.
+                let plan = execute.plan.unwrap_or(released.plan);
+                let planned = lock(&self.plan_requests).get(&plan).map(|(_, planned)| planned.epoch);
+                let epoch = planned.map_or(origin.epoch, |planned| planned.min(origin.epoch));
+                let origin = Origin { epoch, ..origin };
                 self.end_streams(&self.joints_named(&released.trajectory.joint_names)?).await?;
                 let replan = execute.replan.then_some(execute.presence);
-                let begun = self.execute_released(&planner, released, replan).await?;
+                let begun = self.execute_released(&planner, released, origin, replan).await?;
                 lock(&self.motions).retraces(begun.motion, execute.retraces_to);
                 Ok(Reply::ExecutePlan(begun))
             }
@@ -122,7 +134,7 @@ impl Service {
                 let plan = self.with_saved_poses(plan).await?;
                 let number = self.parts.dispatcher.next_id();
                 let begun = planner.answer(Call::Plan(plan.clone()), self.moment(number), limit).await?;
-                self.remember_request(number, plan);
+                self.remember_request(number, plan, origin);
                 Ok(begun)
             }
             Call::WorldAdd(_) | Call::WorldMove(_) | Call::WorldRemove(_) | Call::Attach(_) | Call::Detach(_) => {
@@ -145,13 +157,14 @@ impl Service {
         &self,
         planner: &Planner<'_>,
         released: ReleasedPlan,
+        origin: Origin,
         replan: Option<Option<api::Presence>>,
     ) -> Result<api::ExecuteReply, RpcError> {
         let ReleasedPlan { plan, trajectory, task } = released;
         // Data from another process is checked like that of any client.
         let execute = api::Execute { trajectory, task, retraces_to: None };
         api::Method::check(&execute).map_err(|what| RpcError::new(Code::InvalidTrajectory, what))?;
-        let begun = self.execute_as(execute, Some((plan, replan))).await?;
+        let begun = self.execute_as(execute, origin, Some((plan, replan))).await?;
         *lock(&self.executed) = Some((plan, begun.motion));
         // The world may have changed since the plan was checked.
         let under_way = lock(&self.motions).under_way().into_iter().find(|motion| motion.number == begun.motion);

@@ -9,7 +9,7 @@ use crate::joint::STANDSTILL;
 use crate::rpc::api::{ExecutePlan, Plan, PlanGoal, PlanLevel, Planner, Planning, Reply, Request as Call};
 use crate::rpc::{Code, RpcError};
 use crate::sync::lock;
-use crate::telemetry::{Phase, TaskState};
+use crate::telemetry::{Origin, Phase, TaskState};
 
 /// Timeout for the arm to decelerate to rest.
 const REST_TIMEOUT: Duration = Duration::from_secs(10);
@@ -25,13 +25,13 @@ fn is_relative(goal: &PlanGoal) -> bool {
 }
 
 impl Service {
-    /// Keeps the request of a plan.
-    pub(super) fn remember_request(&self, plan: u64, request: Plan) {
+    /// Keeps the request of a plan, and its origin.
+    pub(super) fn remember_request(&self, plan: u64, request: Plan, origin: Origin) {
         let mut requests = lock(&self.plan_requests);
         while requests.len() >= REMEMBERED {
             requests.pop_first();
         }
-        requests.insert(plan, request);
+        requests.insert(plan, (request, origin));
     }
 
     /// Begins to plan a blocked motion again.
@@ -57,17 +57,19 @@ impl Service {
     async fn plan_again(&self, motion: &UnderWay) -> Result<u64, RpcError> {
         self.rested(motion).await?;
         let unknown = || RpcError::new(Code::UnknownPlan, "the request of this plan is no longer known");
-        let mut request = lock(&self.plan_requests).get(&motion.plan).cloned().ok_or_else(unknown)?;
+        let (mut request, _) = lock(&self.plan_requests).get(&motion.plan).cloned().ok_or_else(unknown)?;
         if request.goals.iter().any(|goal| goal.path.is_some()) {
             let what = "a path is followed as it is, not planned around what is in its way";
             return Err(RpcError::new(Code::NoPlan, what));
         }
         if request.goals.iter().any(is_relative) {
-            self.resolve(&mut request, motion.plan).await?;
+            self.resolve(&mut request, motion).await?;
         }
         request.by_number = true;
         let unproven = request.level == PlanLevel::Fast; // Its motion was executed.
-        let Reply::Plan(begun) = self.planner_call(Call::Plan(request)).await? else { return Err(internal()) };
+        let Reply::Plan(begun) = self.planner_call_from(Call::Plan(request), motion.origin).await? else {
+            return Err(internal());
+        };
         loop {
             if let Err(ended) = self.may_go_on(motion) {
                 self.cancel_planning(Some(begun.plan)).await;
@@ -85,18 +87,19 @@ impl Service {
         let presence = motion.replan.clone().flatten();
         let execute =
             ExecutePlan { plan: Some(begun.plan), replan: true, unproven, presence, ..ExecutePlan::default() };
-        match self.planner_call(Call::ExecutePlan(execute)).await? {
+        match self.planner_call_from(Call::ExecutePlan(execute), motion.origin).await? {
             Reply::ExecutePlan(begun) => Ok(begun.motion),
             _ => Err(internal()),
         }
     }
 
     /// Replaces goals that depend on where the arm was by the joint positions that their plan found.
-    async fn resolve(&self, request: &mut Plan, plan: u64) -> Result<(), RpcError> {
+    async fn resolve(&self, request: &mut Plan, motion: &UnderWay) -> Result<(), RpcError> {
         let Reply::Planner(planner) = self.planner_call(Call::Planner(Planner {})).await? else {
             return Err(internal());
         };
-        let Reply::Planning(report) = self.planner_call(Call::Planning(Planning { plan })).await? else {
+        let plan = Call::Planning(Planning { plan: motion.plan });
+        let Reply::Planning(report) = self.planner_call(plan).await? else {
             return Err(internal());
         };
         let found = report.summary.ok_or_else(internal)?;

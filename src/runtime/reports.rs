@@ -323,6 +323,7 @@ impl Service {
             Outcome::StillFaulted(a, _) => {
                 error.hint(format!("remove the cause, then repeat `dimos arm reset {}`", arm(a)))
             }
+            Outcome::Superseded(..) => error.hint("request it again if it is still wanted; a plan must be planned again"),
             Outcome::OutOfLimits(joint, by) => error
                 .hint(match self.range(*joint) {
                     Some([lower, upper]) => format!(

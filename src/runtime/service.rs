@@ -15,6 +15,7 @@ use super::gripper_requests::LatestGrip;
 use super::gripper_targets::{Counters, GripperTargets};
 use super::guard_worlds::GuardWorlds;
 use super::late_stops::LateStops;
+use super::lease_changes::UnsentEnds;
 use super::log_throttle::LogThrottle;
 use super::logged_scene::{Described, LoggedWorld};
 use super::motions::Motions;
@@ -44,7 +45,7 @@ use crate::rt::host::{self, Grant};
 use crate::rt::slot::SlotReader;
 use crate::sync::lock;
 use crate::telemetry::describe::{ArmNames, Names};
-use crate::telemetry::{ArmSample, Event, Outcome, Phase, TaskView};
+use crate::telemetry::{ArmSample, Event, Origin, Outcome, Phase, TaskView};
 
 /// Parts of a service.
 pub struct ServiceParts {
@@ -88,6 +89,7 @@ pub struct Service {
     pub(super) logged_world: Mutex<LoggedWorld>,
     pub(super) log_throttle: LogThrottle,
     pub(super) late_stops: LateStops,
+    pub(super) unsent_ends: UnsentEnds,
     /// Per arm, the number of stops that clients have ordered.
     pub(super) stops: Vec<AtomicU64>,
     pub(super) progress: Progress,
@@ -116,7 +118,7 @@ pub struct Service {
     /// Per task, whether a client has sent it a target since its stream was last ended for a motion.
     pub(super) streamed: Vec<AtomicBool>,
     /// Requests of plans, by the plans' numbers.
-    pub(super) plan_requests: Mutex<BTreeMap<u64, api::Plan>>,
+    pub(super) plan_requests: Mutex<BTreeMap<u64, (api::Plan, Origin)>>,
     pub(super) me: Weak<Self>,
     closed: AtomicBool,
     /// Whether the tick still runs: stops are accepted although the run is closed.
@@ -151,6 +153,7 @@ impl Service {
             logged_world: Mutex::default(),
             log_throttle: LogThrottle::default(),
             late_stops: LateStops::default(),
+            unsent_ends: UnsentEnds::default(),
             published: AtomicU64::new(0),
             attached: Mutex::default(),
             executed: Mutex::default(),
@@ -280,20 +283,30 @@ impl Service {
         first..first + dofs().nth(arm as usize).unwrap_or(0)
     }
 
+    /// Asks something that moves no arm.
     pub(super) async fn ask(&self, request: Request) -> Result<Outcome, RpcError> {
+        self.ask_from(request, None).await
+    }
+
+    /// Asks something that a client requested, when and by whom.
+    pub(super) async fn ask_from(&self, request: Request, origin: Option<Origin>) -> Result<Outcome, RpcError> {
         let log = log_of(&request);
-        self.outcome(self.parts.dispatcher.ask(request, log).await)
+        self.outcome(self.parts.dispatcher.ask(request, origin, log).await)
     }
 
     /// Returns the outcome of a request, or an error if there is none.
     pub(super) fn outcome(&self, answer: Result<Outcome, SendError>) -> Result<Outcome, RpcError> {
-        let outcome = answer.map_err(|e| match e {
-            SendError::Full => RpcError::new(Code::NoAnswer, e.to_string()).hint("send fewer requests at once"),
-            SendError::NoAnswer => {
-                RpcError::new(Code::NoAnswer, e.to_string()).hint("`dimos status` shows whether the run is alive")
-            }
-        })?;
+        let outcome = answer.map_err(|e| self.not_sent(e))?;
         self.refusal(&outcome).map_or(Ok(outcome), Err)
+    }
+
+    /// Returns why a request got no outcome as an error.
+    pub(super) fn not_sent(&self, error: SendError) -> RpcError {
+        let hint = match error {
+            SendError::Full => "send fewer requests at once",
+            SendError::NoAnswer => "`dimos status` shows whether the run is alive",
+        };
+        RpcError::new(Code::NoAnswer, error.to_string()).hint(hint)
     }
 
     /// Returns the arm of a joint, and the joint's index in the arm.
@@ -319,7 +332,7 @@ impl Service {
         let mut tasks = BTreeMap::new();
         for (i, config) in self.parts.config.tasks.iter().enumerate() {
             if task.is_none_or(|t| t as usize == i) && moves(&config.joints) {
-                lock(&self.motions).end_replanning(i as u16);
+                lock(&self.motions).end_replanning("cancelled", |planned| usize::from(planned.task) == i);
                 let outcome = self.ask(Request::Cancel { task: Some(i as u16) }).await?;
                 tasks.insert(config.name.clone(), outcome.name().to_owned());
             }
@@ -343,7 +356,7 @@ impl Service {
         Ok(self.speed_override())
     }
 
-    async fn answer(&self, call: Call) -> Result<Reply, RpcError> {
+    async fn answer(&self, call: Call, origin: Origin) -> Result<Reply, RpcError> {
         let reads =
             matches!(call, Call::Status(_) | Call::State(_) | Call::TextLog(_) | Call::Motion(_) | Call::Grip(_));
         if !reads && self.is_closed() {
@@ -363,8 +376,8 @@ impl Service {
             }
             Call::State(_) => Ok(Reply::State(self.state())),
             Call::Motion(m) => self.motion(m.motion).map(Reply::Motion),
-            Call::Move(m) => self.move_arm(m).await,
-            Call::Execute(e) => self.execute(e).await,
+            Call::Move(m) => self.move_arm(m, origin).await,
+            Call::Execute(e) => self.execute(e, origin).await,
             Call::Plan(_)
             | Call::Planning(_)
             | Call::Preview(_)
@@ -374,19 +387,19 @@ impl Service {
             | Call::World(_)
             | Call::WorldAdd(_)
             | Call::WorldMove(_)
-            | Call::WorldRemove(_) => self.planner_call(call).await,
+            | Call::WorldRemove(_) => self.planner_call_from(call, origin).await,
             Call::Attach(attach) => self.attach(attach).await,
             Call::Detach(detach) => self.detach(detach).await,
             Call::Cancel(c) => self.cancel(c).await,
             Call::Speed(speed) => self.set_speed(speed).await.map(Reply::Speed),
             Call::Stop(s) => self.stop(s).await,
             Call::ArmReset(a) => self.reset(a.arm).await,
-            Call::ArmEnable(a) => self.enable(a.arm).await,
+            Call::ArmEnable(a) => self.enable(a.arm, a.outside).await,
             Call::ArmTakeOver(a) => self.take_over_led(a.arm).await,
-            Call::ArmTeach(a) => self.teach(a).await,
-            Call::MoveNative(m) => self.move_native(m).await,
+            Call::ArmTeach(a) => self.teach(a, origin).await,
+            Call::MoveNative(m) => self.move_native(m, origin).await,
             Call::ArmDisable(a) => self.disable(a.arm, a.now).await,
-            Call::Gripper(g) => self.gripper(g).await,
+            Call::Gripper(g) => self.gripper(g, origin).await,
             Call::Grip(g) => self.grip(&g).map(Reply::Grip),
             Call::ArmPayload(p) => self.payload(&p.arm).await.map(Reply::ArmPayload),
             Call::ArmPayloadSet(p) => self.set_payload(p).await,
@@ -400,14 +413,16 @@ impl Service {
             Call::Poses(_) => self.poses().await.map(Reply::Poses),
             Call::PoseSave(save) => self.save_pose(save).await.map(Reply::PoseSave),
             Call::PoseRemove(remove) => self.remove_pose(remove).await.map(|()| Reply::PoseRemove(Done {})),
-            Call::Servo(s) => self.stream(s.task, s.positions, true, s.gripper).await.map(|()| Reply::Servo(Done {})),
-            Call::Velocity(v) => {
-                self.stream(v.task, v.velocities, false, None).await.map(|()| Reply::Velocity(Done {}))
+            Call::Servo(s) => {
+                self.stream(s.task, (s.positions, true), s.gripper, origin).await.map(|()| Reply::Servo(Done {}))
             }
-            Call::Chunk(chunk) => self.chunk(chunk).await.map(Reply::Chunk),
-            Call::Twist(twist) => self.twist(&twist).await.map(Reply::Twist),
-            Call::Start(start) => self.start_task(&start.task).await.map(Reply::Start),
-            Call::Pose(pose) => self.pose(&pose).await.map(Reply::Pose),
+            Call::Velocity(v) => {
+                self.stream(v.task, (v.velocities, false), None, origin).await.map(|()| Reply::Velocity(Done {}))
+            }
+            Call::Chunk(chunk) => self.chunk(chunk, origin).await.map(Reply::Chunk),
+            Call::Twist(twist) => self.twist(&twist, origin).await.map(Reply::Twist),
+            Call::Start(start) => self.start_task(&start.task, origin).await.map(Reply::Start),
+            Call::Pose(pose) => self.pose(&pose, origin).await.map(Reply::Pose),
             Call::Shutdown(_) => {
                 let _ = self.parts.endings.send(Ending::Asked);
                 Ok(Reply::Shutdown(Done {}))
@@ -428,7 +443,27 @@ impl Backend for Service {
     }
 
     fn call(&self, request: Call) -> BoxFuture<'_, Result<Reply, RpcError>> {
-        Box::pin(self.answer(request))
+        self.call_from(request, Origin { epoch: self.epoch(), client: 0 })
+    }
+
+    fn call_from(&self, request: Call, origin: Origin) -> BoxFuture<'_, Result<Reply, RpcError>> {
+        Box::pin(self.answer(request, origin))
+    }
+
+    fn epoch(&self) -> u64 {
+        self.parts.pulse.epoch.load(Ordering::Acquire)
+    }
+
+    fn lease_taken(&self, arm: &str, client: u64) -> Result<(), RpcError> {
+        self.note_lease_taken(arm, client)
+    }
+
+    fn handled(&self) -> BoxFuture<'_, ()> {
+        Box::pin(self.next_tick())
+    }
+
+    fn lease_ended(&self, arm: &str, client: u64) {
+        self.note_lease_ended(arm, client);
     }
 
     fn arms_of(&self, subject: Subject<'_>) -> Vec<String> {

@@ -216,7 +216,7 @@ impl Connected<'_> {
             recorder: Some(recorder),
             view: None,
             server: None,
-            handle: Handle { service },
+            handle: Handle::new(service),
             endings: (endings, ended),
             faulted: AtomicBool::new(false),
             manager,
@@ -266,6 +266,7 @@ fn publisher(service: Arc<Service>, wall: WallOffset) -> impl FnMut(bool) + Send
     move |woken| {
         service.progress.made();
         service.publish(woken);
+        service.send_lease_ends();
         service.command_gripper_targets();
         service.judge_grips();
         if Instant::now() >= details_due {

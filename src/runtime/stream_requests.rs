@@ -10,14 +10,15 @@ use crate::control::request::{Goal, Request};
 use crate::joint::joints_of;
 use crate::rpc::api::{self, Done};
 use crate::rpc::{Code, RpcError};
+use crate::telemetry::Origin;
 
 /// Commanded velocities below this are at rest [rad/s].
 const AT_REST: f64 = 1e-6;
 
 impl Service {
     /// Sends a target to a task, and remembers that a client streams to it.
-    async fn target(&self, task: u16, request: Request) -> Result<(), RpcError> {
-        self.ask(request).await?;
+    async fn target(&self, task: u16, request: Request, origin: Origin) -> Result<(), RpcError> {
+        self.ask_from(request, Some(origin)).await?;
         self.streams_to(task);
         Ok(())
     }
@@ -77,9 +78,9 @@ impl Service {
     pub(super) async fn stream(
         &self,
         task: String,
-        values: Vec<f64>,
-        positions: bool,
+        (values, positions): (Vec<f64>, bool),
         gripper: Option<f64>,
+        origin: Origin,
     ) -> Result<(), RpcError> {
         let index = self.task_index(&task)?;
         let width = self.parts.config.tasks[index as usize].joints.len();
@@ -93,35 +94,35 @@ impl Service {
             false => Request::Velocity { task: index, target },
         };
         let arm = gripper.map(|gripper| self.check_gripper_targets(index, &[gripper])).transpose()?;
-        self.target(index, request).await?;
+        self.target(index, request, origin).await?;
         if let (Some(arm), Some(gripper)) = (arm, gripper) {
-            self.take_gripper_targets(index, arm, self.now(), 0.0, &[gripper]);
+            self.take_gripper_targets((index, origin), arm, self.now(), 0.0, &[gripper]);
         }
         Ok(())
     }
 
     /// Sends the next target of an `eef_twist` task.
-    pub(super) async fn twist(&self, call: &api::Twist) -> Result<Done, RpcError> {
+    pub(super) async fn twist(&self, call: &api::Twist, origin: Origin) -> Result<Done, RpcError> {
         let tool = call.frame == api::TwistFrame::Tool;
-        self.steer(&call.task, Goal::Twist { linear: call.linear, angular: call.angular, tool }).await
+        self.steer(&call.task, Goal::Twist { linear: call.linear, angular: call.angular, tool }, origin).await
     }
 
     /// Sends the next target of a `cartesian_ik` task.
-    pub(super) async fn pose(&self, call: &api::Pose) -> Result<Done, RpcError> {
+    pub(super) async fn pose(&self, call: &api::Pose, origin: Origin) -> Result<Done, RpcError> {
         let turn = isometry(&call.spec()).rotation;
-        self.steer(&call.task, Goal::Pose { position: call.xyz, orientation: turn.coords.into() }).await
+        self.steer(&call.task, Goal::Pose { position: call.xyz, orientation: turn.coords.into() }, origin).await
     }
 
     /// Starts a task that takes no targets.
-    pub(super) async fn start_task(&self, task: &str) -> Result<Done, RpcError> {
+    pub(super) async fn start_task(&self, task: &str, origin: Origin) -> Result<Done, RpcError> {
         let task = self.task_index(task)?;
-        self.target(task, Request::Start { task }).await?;
+        self.target(task, Request::Start { task }, origin).await?;
         Ok(Done {})
     }
 
-    async fn steer(&self, task: &str, goal: Goal) -> Result<Done, RpcError> {
+    async fn steer(&self, task: &str, goal: Goal, origin: Origin) -> Result<Done, RpcError> {
         let task = self.task_index(task)?;
-        self.target(task, Request::CartesianTarget { task, goal }).await?;
+        self.target(task, Request::CartesianTarget { task, goal }, origin).await?;
         Ok(Done {})
     }
 }

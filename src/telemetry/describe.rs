@@ -4,7 +4,7 @@
 
 use serde::Serialize;
 
-use super::{Age, Bound, Cause, Event, Guarded, LimitKind, Outcome, Phase, Reason, TaskState};
+use super::{Age, Bound, Cause, Event, Guarded, Interruption, LimitKind, Outcome, Phase, Reason, TaskState};
 use crate::named::named;
 
 /// The names behind the tick's indices, in the order of the blueprint.
@@ -178,7 +178,8 @@ fn request(id: u64, outcome: Outcome, names: &Names) -> Described {
         | Outcome::ArmMoving(arm)
         | Outcome::NoGripper(arm)
         | Outcome::NoGripperForce(arm)
-        | Outcome::NoGripperSpeed(arm) => {
+        | Outcome::NoGripperSpeed(arm)
+        | Outcome::Superseded(arm, _) => {
             d.arm = Some(names.arm(arm));
         }
         Outcome::ArmNotReady(arm, _, cause) | Outcome::ArmLatched(arm, cause) | Outcome::StillFaulted(arm, cause) => {
@@ -231,7 +232,23 @@ pub fn outcome_text(outcome: &Outcome, names: &Names) -> String {
             format!("the target of task {} is not finite, or its orientation is invalid", names.task(task))
         }
         Outcome::NoGripper(arm) => format!("{} has no gripper", names.arm(arm)),
+        Outcome::Superseded(arm, by) => {
+            format!("{} after this motion was requested", interruption_text(by, &names.arm(arm)))
+        }
         Outcome::ShuttingDown => "the run is shutting down".into(),
+    }
+}
+
+/// Returns what interrupted an arm as text.
+fn interruption_text(interruption: Interruption, arm: &str) -> String {
+    match interruption {
+        Interruption::Stopped => format!("{arm} was stopped by an operator"),
+        Interruption::Held(cause) => format!("{arm} was held{}", because(cause)),
+        Interruption::Disabled => format!("{arm} was disabled"),
+        Interruption::LinkLost => format!("the connection to {arm} was lost"),
+        Interruption::PowerLost => format!("the motors of {arm} were switched off"),
+        Interruption::LeaseTaken(_) => format!("another client took the lease of {arm}"),
+        Interruption::LeaseEnded(_) => format!("the lease of {arm} was released"),
     }
 }
 
@@ -240,7 +257,7 @@ fn task_changed(task: u16, state: TaskState, reason: Reason, names: &Names) -> D
         (_, Reason::None | Reason::Cancelled | Reason::StreamEnded) => Severity::Info,
         (_, Reason::Approaching | Reason::InStep) => Severity::Info,
         (_, Reason::ArmHeld(_, Cause::Operator | Cause::StopInput | Cause::Shutdown)) => Severity::Warn,
-        (_, Reason::WayBlocked) => Severity::Warn,
+        (_, Reason::WayBlocked | Reason::LeaseEnded(_)) => Severity::Warn,
         (TaskState::Aborted | TaskState::Fault, _) => Severity::Error,
         _ => Severity::Warn,
     };
@@ -262,7 +279,7 @@ fn task_changed(task: u16, state: TaskState, reason: Reason, names: &Names) -> D
             d.values = vec![value];
         }
         Reason::Preempted(_, joint) | Reason::NonFinite(joint) => d.joint = Some(names.joint(joint)),
-        Reason::Guarded(arm) => d.arm = Some(names.arm(arm)),
+        Reason::Guarded(arm) | Reason::LeaseEnded(arm) => d.arm = Some(names.arm(arm)),
         Reason::ArmHeld(arm, cause) | Reason::LeaderLost(arm, cause) => {
             d.arm = Some(names.arm(arm));
             d.values = code(cause);
@@ -299,6 +316,9 @@ pub fn reason_text(reason: &Reason, names: &Names) -> String {
         Reason::Guarded(arm) => format!("the collision guard stopped {}", names.arm(arm)),
         Reason::Gap(joint, by) => {
             format!("after a gap in the setpoints {} came to rest {} from the path", names.joint(joint), angle(by))
+        }
+        Reason::LeaseEnded(arm) => {
+            format!("the client that sent it has disconnected, or released {}", names.arm(arm))
         }
     }
 }

@@ -2,6 +2,7 @@
 //! passes events on to rpc and the text log. Nothing here allocates.
 
 pub mod describe;
+mod interruption;
 mod label;
 
 use serde::{Deserialize, Serialize};
@@ -10,6 +11,7 @@ use crate::arm::{ArmCommand, ArmState};
 use crate::clock::Mono;
 use crate::named::named;
 
+pub use interruption::{Interruption, Origin};
 pub use label::Label;
 
 /// One entry of the ring.
@@ -282,6 +284,8 @@ pub enum Reason {
     Guarded(u16),
     /// After a gap in the setpoints a joint rested too far from the path to continue: joint, distance [rad].
     Gap(u16, f64),
+    /// The client that sent its targets released the lease of the arm, or disconnected: the arm.
+    LeaseEnded(u16),
 }
 
 /// Two things that the collision guard keeps apart.
@@ -397,6 +401,8 @@ pub enum Outcome {
     InvalidTarget(u16),
     /// The arm has no gripper: the arm.
     NoGripper(u16),
+    /// The arm was interrupted after the motion had been requested: the arm, by what first.
+    Superseded(u16, Interruption),
     /// The run is shutting down.
     ShuttingDown,
 }
@@ -422,6 +428,7 @@ impl Outcome {
             Self::NoGripperForce(_) | Self::NoGripperSpeed(_) => "UNSUPPORTED",
             Self::InvalidTarget(_) => "INVALID_TARGET",
             Self::NoGripper(_) => "NO_GRIPPER",
+            Self::Superseded(..) => "SUPERSEDED",
             Self::ShuttingDown => "SHUTTING_DOWN",
         }
     }

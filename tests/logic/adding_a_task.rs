@@ -123,7 +123,7 @@ fn its_log_comes_out_the_same_again_and_is_refused_without_its_row() {
     config.tasks.push(task());
     let mut run = VirtualRun::start_with(&table, &config, &log);
     run.step();
-    run.ask(Request::Enabled { arm: 0 });
+    run.ask(Request::Enabled { arm: 0, outside: false });
     (0..40).for_each(|_| run.step());
     for k in 0..120u32 {
         if k % 2 == 0 && k < 60 {

@@ -38,12 +38,15 @@ fn a_led_arm_gets_no_setpoint_and_is_taken_over_where_it_is() {
         let id = rig.send(Request::Execute { task: 0, motion: sweep(1, 0..6, here, 1.0, 1.0) });
         rig.tick();
         assert_eq!(rig.outcome(id), Outcome::ArmNotReady(0, Phase::Led, Cause::None));
-        assert_eq!(rig.ask(Request::Enabled { arm: 0 }), Outcome::ArmNotReady(0, Phase::Led, Cause::None));
+        assert_eq!(
+            rig.ask(Request::Enabled { arm: 0, outside: false }),
+            Outcome::ArmNotReady(0, Phase::Led, Cause::None)
+        );
         // Taken over: its own stop first, then it is enabled. The rig checks each setpoint.
         assert_eq!(rig.ask(Request::PrepareDisable { arm: 0 }), Outcome::Accepted);
         rig.run(3);
         assert_eq!((rig.phase(0), rig.arms[0].stops), (Phase::Standby, 1), "{by:?}");
-        assert_eq!(rig.ask(Request::Enabled { arm: 0 }), Outcome::Accepted);
+        assert_eq!(rig.ask(Request::Enabled { arm: 0, outside: false }), Outcome::Accepted);
         rig.run_for(0.5);
         assert_eq!(rig.phase(0), Phase::Ready);
         assert!((rig.arms[0].q[0] - here).abs() < 1e-9 && (rig.commanded(0)[0] - here).abs() < 1e-9, "{by:?}");
@@ -127,14 +130,14 @@ fn a_controller_that_is_too_fast_or_out_of_range_is_stopped_and_latched_and_a_ha
     slow.arms[0].q[0] = 1.0;
     slow.run(10);
     assert_eq!(slow.ask(Request::Reset { arm: 0 }), Outcome::Accepted);
-    assert_eq!(slow.ask(Request::Enabled { arm: 0 }), Outcome::Accepted);
+    assert_eq!(slow.ask(Request::Enabled { arm: 0, outside: false }), Outcome::Accepted);
 
     let mut hand = led(LedBy::Hand);
     lead(&mut hand, 0.5, (RANGE + 0.05) / 0.5);
     assert_eq!(hand.phase(0), Phase::Led);
     hand.ask(Request::PrepareDisable { arm: 0 });
     hand.run(3);
-    hand.ask(Request::Enabled { arm: 0 });
+    hand.ask(Request::Enabled { arm: 0, outside: false });
     hand.run_for(0.5);
     let outside = hand.ask(Request::Lead { arm: 0, by: LedBy::Controller });
     assert!(matches!(outside, Outcome::OutOfLimits(0, by) if by > 0.04), "{outside:?}");
@@ -152,7 +155,7 @@ fn the_joint_that_keeps_a_controller_from_starting_is_named_over_all_arms() {
     }
     rig.ask(Request::PrepareDisable { arm: 1 });
     rig.run(3);
-    rig.ask(Request::Enabled { arm: 1 });
+    rig.ask(Request::Enabled { arm: 1, outside: false });
     rig.run_for(0.5);
     let outside = rig.ask(Request::Lead { arm: 1, by: LedBy::Controller });
     assert!(matches!(outside, Outcome::OutOfLimits(8, by) if by > 0.04), "{outside:?}");
@@ -166,7 +169,7 @@ fn each_lead_has_a_number_of_its_own_and_a_refused_one_has_none() {
     let lead = || Request::Lead { arm: 0, by: LedBy::Controller };
     assert_eq!(rig.ask(lead()), Outcome::ArmLatched(0, Cause::Operator));
     rig.ask(Request::Reset { arm: 0 });
-    rig.ask(Request::Enabled { arm: 0 });
+    rig.ask(Request::Enabled { arm: 0, outside: false });
     rig.run_for(0.5);
     assert_eq!(rig.commands[0].lead_seq, first);
     assert_eq!(rig.ask(lead()), Outcome::Accepted);
@@ -230,7 +233,7 @@ fn stops_faults_and_the_end_of_the_run_reach_a_led_arm() {
     lost.run_for(0.1);
     assert_eq!((lost.phase(0), lost.samples[0].cause), (Phase::Held, Cause::LinkLost));
     let owed = lost.arms[0].stops;
-    assert_eq!(lost.ask(Request::Enabled { arm: 0 }), Outcome::ArmLatched(0, Cause::LinkLost));
+    assert_eq!(lost.ask(Request::Enabled { arm: 0, outside: false }), Outcome::ArmLatched(0, Cause::LinkLost));
     lost.arms[0].link = dimos::arm::Link::Up;
     lost.run(2);
     assert_eq!(lost.arms[0].stops, owed + 1, "as soon as it can be reached");

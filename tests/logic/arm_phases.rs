@@ -36,7 +36,7 @@ fn stop_reset_and_enable_are_three_acts_and_none_moves_the_arm() {
         let id = rig.send(Request::Execute { task: 0, motion: sweep(2, 0..6, rest, 1.2, 1.0) });
         rig.tick();
         assert_eq!(rig.outcome(id), Outcome::ArmLatched(0, Cause::Operator));
-        assert_eq!(rig.ask(Request::Enabled { arm: 0 }), Outcome::ArmLatched(0, Cause::Operator));
+        assert_eq!(rig.ask(Request::Enabled { arm: 0, outside: false }), Outcome::ArmLatched(0, Cause::Operator));
         assert_eq!(rig.ask(Request::Reset { arm: 0 }), Outcome::Accepted);
         assert_eq!(rig.phase(0), Phase::Standby);
         rig.run_for(0.5);
@@ -44,7 +44,7 @@ fn stop_reset_and_enable_are_three_acts_and_none_moves_the_arm() {
         let id = rig.send(Request::Execute { task: 0, motion: sweep(3, 0..6, rest, 1.2, 1.0) });
         rig.tick();
         assert_eq!(rig.outcome(id).name(), "ARM_NOT_READY");
-        assert_eq!(rig.ask(Request::Enabled { arm: 0 }), Outcome::Accepted);
+        assert_eq!(rig.ask(Request::Enabled { arm: 0, outside: false }), Outcome::Accepted);
         let before = rig.events.len();
         for _ in 0..100 {
             rig.tick();
@@ -63,7 +63,11 @@ fn an_arm_that_is_being_disabled_or_enabled_may_be_silent_meanwhile() {
     rig.arms[0].silent = true; // its device thread waits for the motors
     rig.run_for(0.5);
     assert_eq!((rig.phase(0), rig.commands[0].mode), (Phase::Standby, None), "no fault, and nothing is sent");
-    assert_eq!(rig.ask(Request::Enabled { arm: 0 }), Outcome::StartStateUnavailable(0), "not on an old state");
+    assert_eq!(
+        rig.ask(Request::Enabled { arm: 0, outside: false }),
+        Outcome::StartStateUnavailable(0),
+        "not on an old state"
+    );
     (rig.arms[0].silent, rig.arms[0].enabled) = (false, false);
     rig.run(3);
     assert_eq!(rig.phase(0), Phase::Disabled);
@@ -85,11 +89,11 @@ fn a_stop_while_an_arm_is_being_enabled_is_not_lost() {
     assert_eq!(rig.ask(Request::Stop { arm: None }), Outcome::Accepted);
     rig.arms[0].enabled = true; // the motors were on their way
     rig.run(3);
-    assert_eq!(rig.ask(Request::Enabled { arm: 0 }), Outcome::ArmLatched(0, Cause::Operator));
+    assert_eq!(rig.ask(Request::Enabled { arm: 0, outside: false }), Outcome::ArmLatched(0, Cause::Operator));
     rig.run_for(0.5);
     assert_eq!((rig.phase(0), rig.commands[0].mode, rig.arms[0].stops), (Phase::Held, None, 1));
     assert_eq!(rig.ask(Request::Reset { arm: 0 }), Outcome::Accepted);
-    assert_eq!(rig.ask(Request::Enabled { arm: 0 }), Outcome::Accepted);
+    assert_eq!(rig.ask(Request::Enabled { arm: 0, outside: false }), Outcome::Accepted);
 }
 
 #[test]
@@ -117,7 +121,7 @@ fn an_open_stop_input_latches_a_hold_in_every_phase_and_is_reset_only_when_close
         assert_eq!((rig.commands[0].mode, rig.arms[0].stops), (None, u32::from(enabled)));
         let rest = rig.arms[0].q[0];
         assert_eq!(rig.ask(Request::Reset { arm: 0 }), Outcome::StillFaulted(0, Cause::StopInput));
-        assert_eq!(rig.ask(Request::Enabled { arm: 0 }), Outcome::ArmLatched(0, Cause::StopInput));
+        assert_eq!(rig.ask(Request::Enabled { arm: 0, outside: false }), Outcome::ArmLatched(0, Cause::StopInput));
         rig.arms[0].state.stop_input_open = false;
         rig.run_for(0.5);
         assert_eq!((rig.phase(0), rig.commands[0].mode), (Phase::Held, None), "closing it moves nothing");
@@ -142,7 +146,7 @@ fn activating_again_and_again_does_not_sink() {
         rig.ask(Request::Stop { arm: Some(0) });
         rig.run_for(1.0);
         rig.ask(Request::Reset { arm: 0 });
-        rig.ask(Request::Enabled { arm: 0 });
+        rig.ask(Request::Enabled { arm: 0, outside: false });
         rig.run_for(0.5);
     }
     assert_eq!(rig.phase(0), Phase::Ready);
@@ -170,7 +174,7 @@ fn an_arm_that_was_carried_away_while_off_is_held_where_it_is() {
         rig.run(3);
         rig.arms[0].enabled = true;
         rig.run(3);
-        assert_eq!(rig.ask(Request::Enabled { arm: 0 }), Outcome::Accepted);
+        assert_eq!(rig.ask(Request::Enabled { arm: 0, outside: false }), Outcome::Accepted);
         rig.run_for(0.5);
         assert!((rig.arms[0].q[0] - there).abs() < 0.005, "{} from {there}", rig.arms[0].q[0]);
         if !off {
@@ -201,7 +205,7 @@ fn an_arm_that_lost_its_connection_is_held_where_it_came_to_rest() {
     rig.arms[0].link = Link::Up;
     rig.run(3);
     assert_eq!(rig.ask(Request::Reset { arm: 0 }), Outcome::Accepted);
-    assert_eq!(rig.ask(Request::Enabled { arm: 0 }), Outcome::Accepted);
+    assert_eq!(rig.ask(Request::Enabled { arm: 0, outside: false }), Outcome::Accepted);
     rig.run_for(0.5);
     assert_eq!((rig.phase(0), rig.arms[0].q[0]), (Phase::Ready, there), "not where it was sent last");
 }
@@ -217,7 +221,7 @@ fn the_first_command_after_activation_holds() {
     rig.run(2);
     assert_eq!((rig.phase(0), rig.commands[0].mode), (Phase::Standby, None), "nothing is sent before `enable`");
     assert_eq!(rig.execute(0, sweep(1, 0..6, 0.0, 0.1, 1.0)), Outcome::ArmNotReady(0, Phase::Standby, Cause::None));
-    rig.ask(Request::Enabled { arm: 0 });
+    rig.ask(Request::Enabled { arm: 0, outside: false });
     assert_eq!(rig.phase(0), Phase::Activating);
     let ready_after = rig.run_until(1.0, |r| r.phase(0) == Phase::Ready);
     assert!(ready_after >= 0.2, "{ready_after}");
@@ -233,7 +237,7 @@ fn an_arm_is_not_taken_up_without_a_fresh_state() {
     rig.run(2);
     rig.arms[0].silent = true;
     rig.run(10);
-    assert_ne!(rig.ask(Request::Enabled { arm: 0 }), Outcome::Accepted);
+    assert_ne!(rig.ask(Request::Enabled { arm: 0, outside: false }), Outcome::Accepted);
     assert_eq!(rig.commands[0].mode, None);
 }
 

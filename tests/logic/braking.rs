@@ -82,7 +82,7 @@ impl Virtual {
         let task = (TaskState::Idle, 0.0);
         let mut run = Self { coordinator, arm, now: Mono(1_000_000_000), inbox: VecDeque::new(), task };
         run.step();
-        run.ask(Request::Enabled { arm: 0 });
+        run.ask(Request::Enabled { arm: 0, outside: false });
         (0..30).for_each(|_| run.step());
         let joints = (0..DOF as u16).collect();
         let motion = Box::new(Motion { id: 7, joints, spline: Spline::new(&found.trajectory).unwrap() });
@@ -93,7 +93,7 @@ impl Virtual {
     }
 
     fn ask(&mut self, request: Request) {
-        self.inbox.push_back(Envelope { id: 7, request });
+        self.inbox.push_back(Envelope { id: 7, origin: None, request });
     }
 
     fn step(&mut self) {

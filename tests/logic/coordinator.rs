@@ -385,7 +385,9 @@ fn requests_for_what_does_not_exist_are_refused() {
     assert_eq!(rig.execute(0, sweep(1, 3..9, 0.0, 0.1, 1.0)), Outcome::WrongTask(0));
     assert_eq!(rig.ask(Request::Servo { task: 0, target: [0.0; 16] }), Outcome::WrongTask(0));
     assert_eq!(rig.ask(Request::Velocity { task: 4, target: [0.0; 16] }), Outcome::WrongTask(4));
-    for request in [Request::Stop { arm: Some(5) }, Request::Reset { arm: 5 }, Request::Enabled { arm: 5 }] {
+    for request in
+        [Request::Stop { arm: Some(5) }, Request::Reset { arm: 5 }, Request::Enabled { arm: 5, outside: false }]
+    {
         assert_ne!(rig.ask(request), Outcome::Accepted);
     }
     assert_eq!(rig.ask(Request::Cancel { task: Some(5) }), Outcome::WrongTask(5));

@@ -38,7 +38,7 @@ fn rig_of(leader: ArmConfig, task: TaskConfig) -> Rig {
     let mut rig = Rig::new(100.0, vec![leader, arm("follower", 6)], vec![task]);
     rig.arms[LEADER].enabled = false;
     rig.run(2);
-    assert_eq!(rig.ask(Request::Enabled { arm: 1 }), Outcome::Accepted);
+    assert_eq!(rig.ask(Request::Enabled { arm: 1, outside: false }), Outcome::Accepted);
     rig.run_for(0.3);
     assert_eq!((rig.phase(LEADER), rig.phase(FOLLOWER)), (Phase::Disabled, Phase::Ready));
     rig.events.clear();
@@ -446,7 +446,7 @@ fn with_auto_start_it_begins_when_its_arm_is_ready_whatever_the_leaders_motors_d
     rig.arms[LEADER].enabled = false;
     rig.run(5);
     assert_eq!(rig.tasks[0].state, TaskState::Idle);
-    rig.ask(Request::Enabled { arm: 1 });
+    rig.ask(Request::Enabled { arm: 1, outside: false });
     rig.run_for(0.5);
     assert_eq!(rig.tasks[0].state, TaskState::Executing, "{:?}", rig.events);
 
@@ -459,14 +459,14 @@ fn with_auto_start_it_begins_when_its_arm_is_ready_whatever_the_leaders_motors_d
         rig.arms[LEADER].silent = other == LEADER;
         rig.run(5);
         for arm in if other == 2 { vec![1] } else { vec![1, 2] } {
-            rig.ask(Request::Enabled { arm });
+            rig.ask(Request::Enabled { arm, outside: false });
         }
         rig.run_for(0.5);
         assert_eq!(rig.tasks[0].state, TaskState::Idle, "{other}");
         (rig.arms[LEADER].silent, rig.arms[2].enabled) = (false, true);
         rig.run(5);
         if other == 2 {
-            rig.ask(Request::Enabled { arm: 2 });
+            rig.ask(Request::Enabled { arm: 2, outside: false });
         }
         rig.run_for(0.5);
         assert_eq!(rig.tasks[0].state, TaskState::Executing, "{other}: {:?}", rig.events);

@@ -309,7 +309,7 @@ fn an_arm_that_was_never_read_is_in_nothings_way() {
         cell.rig.arms[1].silent = !known;
         cell.rig.arms[1].enabled = false;
         cell.rig.run(2);
-        assert_eq!(cell.rig.ask(Request::Enabled { arm: 0 }), Outcome::Accepted);
+        assert_eq!(cell.rig.ask(Request::Enabled { arm: 0, outside: false }), Outcome::Accepted);
         cell.rig.run_for(0.3);
         cell.take_world(|_| {});
         let mut target = HOME.to_vec();
@@ -341,7 +341,7 @@ fn a_guarded_run_replays_bit_for_bit() {
     let own = OwnMargins::of(&world.snapshot(), MARGINS.1);
     run.coordinator.set_guard(Some(prepared(&world.snapshot(), &own, &HOME)));
     run.step();
-    run.ask(Request::Enabled { arm: 0 });
+    run.ask(Request::Enabled { arm: 0, outside: false });
     (0..40).for_each(|_| run.step());
     let mut target = HOME;
     for k in 0..700 {

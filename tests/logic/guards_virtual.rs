@@ -390,7 +390,10 @@ fn a_wrong_reading_is_not_believed_and_three_that_agree_are_a_jump() {
     rig.run_for(0.5);
     let setpoint = rig.arms[0].setpoint.clone().unwrap()[0];
     assert!(setpoint.abs() < 0.02, "no setpoint is made from a position that jumped: {setpoint}");
-    assert_eq!(rig.ask(Request::Enabled { arm: 0 }), Outcome::ArmLatched(0, Cause::PositionJump(0, by)));
+    assert_eq!(
+        rig.ask(Request::Enabled { arm: 0, outside: false }),
+        Outcome::ArmLatched(0, Cause::PositionJump(0, by))
+    );
     assert_eq!(rig.ask(Request::Reset { arm: 0 }), Outcome::Accepted);
 }
 
@@ -398,7 +401,7 @@ fn a_wrong_reading_is_not_believed_and_three_that_agree_are_a_jump() {
 fn an_arm_that_moves_while_it_is_enabled_is_held() {
     let mut rig = Rig::new(100.0, vec![figured(0.05, 0.005)], one(servo()));
     rig.run(2);
-    assert_eq!(rig.ask(Request::Enabled { arm: 0 }), Outcome::Accepted);
+    assert_eq!(rig.ask(Request::Enabled { arm: 0, outside: false }), Outcome::Accepted);
     for _ in 0..10 {
         rig.arms[0].q.iter_mut().for_each(|q| *q += 0.0043);
         rig.arms[0].setpoint = None;

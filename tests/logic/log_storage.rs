@@ -52,7 +52,7 @@ fn begin(log: Option<&Path>, storage: Storage) -> VirtualRun {
     note(Note::Markers { stamp, markers: MarkerArray { markers: vec![object("box", 2)] } });
     note(Note::Payload { arm: 0, stamp, load: Default::default() });
     run.step();
-    run.ask(Request::Enabled { arm: 0 });
+    run.ask(Request::Enabled { arm: 0, outside: false });
     run
 }
 

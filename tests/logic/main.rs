@@ -33,6 +33,7 @@ mod guard;
 mod guards_virtual;
 mod help;
 mod host_stalls;
+mod interruptions;
 mod kinematics;
 mod layering;
 mod lies;

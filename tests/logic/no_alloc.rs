@@ -95,7 +95,7 @@ fn ticks_with_every_task_type_do_not_allocate() {
             970 => {
                 for arm in 0..3 {
                     rig.send(Request::Reset { arm });
-                    rig.send(Request::Enabled { arm });
+                    rig.send(Request::Enabled { arm, outside: false });
                 }
             }
             975 => (0..200).for_each(|_| _ = rig.servo(3, &[left; 7])),
@@ -224,7 +224,7 @@ fn the_tick_loop_does_not_allocate() {
         states.write(&state);
         let mut ask = |request| {
             id += 1;
-            let _ = requests.push(Envelope { id, request });
+            let _ = requests.push(Envelope { id, origin: None, request });
         };
         match arm_reader.read().phase {
             Phase::Ready if round % 40 == 0 => {
@@ -233,7 +233,7 @@ fn the_tick_loop_does_not_allocate() {
             Phase::Ready if round % 40 == 30 => ask(Request::Velocity { task: 1, target: joints_of(&[0.1]) }),
             Phase::Ready => {}
             Phase::Held => ask(Request::Reset { arm: 0 }),
-            _ => ask(Request::Enabled { arm: 0 }),
+            _ => ask(Request::Enabled { arm: 0, outside: false }),
         }
         round += 1;
         while reply_consumer.pop().is_ok() {}

@@ -155,7 +155,7 @@ impl Scenario {
         for arm in 0..2 {
             self.rig.send(Request::Reset { arm });
             self.rig.arms[arm as usize].enabled = true;
-            self.rig.send(Request::Enabled { arm });
+            self.rig.send(Request::Enabled { arm, outside: false });
         }
     }
 

@@ -57,7 +57,7 @@ fn eventful(folder: &Path) -> (PathBuf, u64) {
     };
     let steps = |run: &mut VirtualRun, n: usize| (0..n).for_each(|_| run.step());
     run.step();
-    run.ask(Request::Enabled { arm: 0 });
+    run.ask(Request::Enabled { arm: 0, outside: false });
     steps(&mut run, 120); // the servo task starts automatically, and times out
     go(&mut run, 0.5);
     go(&mut run, 0.6); // refused: it is executing already
@@ -80,7 +80,7 @@ fn eventful(folder: &Path) -> (PathBuf, u64) {
         }
         run.step();
     }
-    for request in [Request::Reset { arm: 0 }, Request::Enabled { arm: 0 }] {
+    for request in [Request::Reset { arm: 0 }, Request::Enabled { arm: 0, outside: false }] {
         run.ask(request);
         steps(&mut run, 40);
     }
@@ -99,7 +99,7 @@ fn eventful(folder: &Path) -> (PathBuf, u64) {
     steps(&mut run, 10);
     run.overrun(15); // more than an arm may lose: it holds
     steps(&mut run, 20);
-    for request in [Request::Reset { arm: 0 }, Request::Enabled { arm: 0 }] {
+    for request in [Request::Reset { arm: 0 }, Request::Enabled { arm: 0, outside: false }] {
         run.ask(request);
         steps(&mut run, 40);
     }
@@ -114,7 +114,7 @@ fn eventful(folder: &Path) -> (PathBuf, u64) {
     run.ask(Request::Reset { arm: 0 }); // refused: the stop input is open
     steps(&mut run, 2);
     run.states[0].stop_input_open = false;
-    for request in [Request::Reset { arm: 0 }, Request::Enabled { arm: 0 }] {
+    for request in [Request::Reset { arm: 0 }, Request::Enabled { arm: 0, outside: false }] {
         run.ask(request);
         steps(&mut run, 40);
     }
@@ -168,7 +168,7 @@ fn motions_of_an_end_effector_come_out_the_same_again() {
     let mut run = VirtualRun::start(&config, &log);
     run.states[0].position = joints_of(&[0.1, -0.3, 0.6, 0.0, 0.8, 0.2]);
     run.step();
-    run.ask(Request::Enabled { arm: 0 });
+    run.ask(Request::Enabled { arm: 0, outside: false });
     (0..40).for_each(|_| run.step());
     for k in 0..400u32 {
         let (turn, t) = (0.1 * f64::from(k), f64::from(k) * 0.01);
@@ -211,7 +211,7 @@ fn an_arm_that_follows_another_does_the_same_again() {
     let mut run = VirtualRun::start(&config, &log);
     (run.states[0].position, run.states[1].enabled) = (joints_of(&[0.1; 6]), false);
     run.step();
-    run.ask(Request::Enabled { arm: 0 });
+    run.ask(Request::Enabled { arm: 0, outside: false });
     (0..40).for_each(|_| run.step());
     for k in 0..2000u32 {
         let t = f64::from(k) * 0.01;
@@ -358,7 +358,7 @@ fn damaged_messages_break_nothing() {
     let (log, copy) = (folder.path().join("short.mcap"), folder.path().join("copy.mcap"));
     let mut run = VirtualRun::start(&one_arm(2), &log);
     run.step();
-    run.ask(Request::Enabled { arm: 0 });
+    run.ask(Request::Enabled { arm: 0, outside: false });
     (0..30).for_each(|_| run.step());
     let limits = JointLimits::uniform(2, 3.0, 2.0).with_defaults();
     run.execute(0, &point_to_point(&make_joints("arm", 2), &[0.0; 2], &[0.05; 2], &limits, 1.0).unwrap());

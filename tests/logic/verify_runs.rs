@@ -70,7 +70,7 @@ fn exercise(name: &str, dof: usize) {
     begin(&mut client, vec![0.25; dof]);
     client.call(api::Stop { arm: None }).unwrap();
     let _ = client.call(api::ArmReset { arm: "arm".into() });
-    let _ = client.call(api::ArmEnable { arm: "arm".into() });
+    let _ = client.call(api::ArmEnable::new("arm"));
     begin(&mut client, goal).map(|motion| wait_for_end(&mut client, motion));
     // The run ends in mid-motion.
     begin(&mut client, vec![0.0; dof]);

@@ -42,7 +42,7 @@ fn a_motion_that_cannot_rest_in_time_holds_the_arms_that_it_moves() {
         rig.run_for(1.0);
         for arm in 0..2 {
             rig.ask(Request::Reset { arm });
-            rig.ask(Request::Enabled { arm });
+            rig.ask(Request::Enabled { arm, outside: false });
         }
         rig.run_for(1.0);
     }

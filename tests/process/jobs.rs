@@ -179,7 +179,7 @@ impl Cell {
         eventually("the arm is ready again, and at home", || {
             if self.phase().0 != "ready" {
                 let _ = client.call(ArmReset { arm: arm() });
-                let _ = client.call(ArmEnable { arm: arm() });
+                let _ = client.call(ArmEnable::new(arm()));
             }
             self.home.start("move arm --named home --speed 1").wait().code == Some(0) && self.at(HOME)
         });

@@ -149,3 +149,19 @@ tasks:
     let refused = dimos::replay::verify::verify(&log, &TaskTable::builtin()).unwrap_err().to_string();
     assert!(refused.contains("no task type `joystick`"), "{refused}");
 }
+
+#[test]
+fn a_motion_in_several_parts_ends_with_the_first_stop() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = mock(folder.path()).start().unwrap();
+    let parts = run.until_interrupted();
+    let first = parts.move_arm("arm", &[0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], 1.0).unwrap();
+    assert_eq!(run.wait(first.motion).unwrap().state, "COMPLETED");
+    run.stop_arms().unwrap();
+    run.reset("arm").unwrap();
+    run.enable("arm").unwrap();
+    let refused = parts.move_arm("arm", &[0.0; 7], 1.0).unwrap_err();
+    assert_eq!(refused.code, Code::Superseded, "{refused}");
+    assert!(refused.message.contains("stopped by an operator"), "{refused}");
+    run.move_arm("arm", &[0.0; 7], 1.0).unwrap();
+}

@@ -61,6 +61,7 @@ mod so101_service;
 mod start_stages;
 mod stop_input;
 mod stops;
+mod superseded;
 mod teach;
 mod ur_runs;
 #[cfg(feature = "view")]

@@ -107,7 +107,7 @@ impl Home {
         let config = one_arm(6);
         let mut run = VirtualRun::start(&config, &log);
         run.step();
-        run.ask(Request::Enabled { arm: 0 });
+        run.ask(Request::Enabled { arm: 0, outside: false });
         (0..40).for_each(|_| run.step());
         let mut from = [0.0; 6];
         for target in [GOAL, [0.1; 6], GOAL] {

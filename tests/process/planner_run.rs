@@ -212,9 +212,9 @@ fn execute_takes_what_plan_made_and_no_plan_of_a_move() {
     home.dimos("execute").with(1).says(&["NO_PLAN", "the plan of a `move`", "hint: `dimos plan` makes one"]);
     home.dimos("preview").with(1).says(&["NO_PLAN"]);
     // A move that begins and is not executed: another program has the arm.
-    home.dimos("plan arm 0.4 -0.3 0.6 0 0.8 0").with(0);
     let mut holder = home.client();
     holder.call(Lease { arm: Some("arm".into()) }).unwrap();
+    home.dimos("plan arm 0.4 -0.3 0.6 0 0.8 0").with(0);
     home.dimos("move arm -0.4 -0.3 0.6 0 0.8 0").with(1).says(&["LEASE_HELD"]);
     drop(holder);
     eventually("the lease is free", || home.dimos("execute --plan 4711").err.contains("UNKNOWN_PLAN"));
@@ -305,7 +305,7 @@ fn a_planned_motion_is_cancelled_and_stopped_like_any_other() {
     home.dimos("execute").with(1).says(&["ARM_LATCHED", "hint: "]);
     let mut client = home.client();
     client.call(ArmReset { arm: "arm".into() }).unwrap();
-    client.call(ArmEnable { arm: "arm".into() }).unwrap();
+    client.call(ArmEnable::new("arm")).unwrap();
     home.dimos("execute").with(0);
     is_at(&home, "arm", &HOME);
 }

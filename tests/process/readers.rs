@@ -50,7 +50,7 @@ fn record(path: &Path) {
     let (mut ring, consumer) = rtrb::RingBuffer::new(4096);
     let (notes, receiver) = channel();
     let stamp = Mono(5_000_000_000);
-    notes.send(Note::Request { id: 1, stamp, json: r#"{"method":"move","arm":"left"}"#.into() }).unwrap();
+    notes.send(Note::Request { id: 1, stamp, origin: None, json: r#"{"method":"move","arm":"left"}"#.into() }).unwrap();
     notes.send(Note::Log { severity: Severity::Warn, stamp, text: "Größe: 1 µm".into() }).unwrap();
     notes.send(Note::ArmText { arm: 1, text: "joint 2: überhitzt".into() }).unwrap();
     let robots = Arc::new(LoggedRobots::new(vec![logged_right_arm()]));
@@ -63,7 +63,9 @@ fn record(path: &Path) {
         ..TrajectoryPoint::default()
     };
     let trajectory = JointTrajectory { joint_names: make_joints("right", 6), points: vec![point(0.0), point(1.25)] };
-    notes.send(Note::Execute { id: 2, stamp, task: 0, motion: 3, trajectory: Arc::new(trajectory) }).unwrap();
+    notes
+        .send(Note::Execute { id: 2, stamp, origin: None, task: 0, motion: 3, trajectory: Arc::new(trajectory) })
+        .unwrap();
     for tick in 0..200 {
         sample(tick).into_iter().for_each(|s| ring.push(s).unwrap());
     }

@@ -160,7 +160,7 @@ impl Stage {
         let held = arm.cause.is_some_and(|cause| cause.name != "operator_stop");
         if held {
             self.watcher.call(ArmReset { arm: arm.hardware_id.clone() }).unwrap();
-            self.watcher.call(ArmEnable { arm: arm.hardware_id }).unwrap();
+            self.watcher.call(ArmEnable::new(arm.hardware_id)).unwrap();
         }
         held
     }

@@ -63,7 +63,7 @@ fn make_ready(client: &mut Client) {
     eventually("the arm is ready again", || {
         let ready = |c: &mut Client| -> Result<bool, ClientError> {
             c.call(ArmReset { arm: "arm".into() })?;
-            Ok(c.call(ArmEnable { arm: "arm".into() })?.phase == "ready")
+            Ok(c.call(ArmEnable::new("arm"))?.phase == "ready")
         };
         ready(client).unwrap_or(false)
     });
@@ -347,7 +347,7 @@ fn an_enable_that_a_stop_overtakes_is_an_error() {
     for _ in 0..20 {
         let enable = std::thread::spawn({
             let mut client = home.client();
-            move || client.call(ArmEnable { arm: "arm".into() })
+            move || client.call(ArmEnable::new("arm"))
         });
         eventually("it is being enabled", || {
             one.call(Status {}).unwrap().arms[0].phase == "activating" || enable.is_finished()

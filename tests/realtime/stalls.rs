@@ -64,7 +64,7 @@ impl Three {
             if !ready {
                 // It is this client that has the arm.
                 let _ = self.client.call(ArmReset { arm: "arm".into() });
-                let _ = self.client.call(ArmEnable { arm: "arm".into() });
+                let _ = self.client.call(ArmEnable::new("arm"));
             }
             ready
         });

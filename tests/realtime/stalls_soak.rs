@@ -132,7 +132,7 @@ impl Soaked {
             let arm = arm["hardware_id"].as_str().unwrap();
             // A refusal shows as the next hold.
             let _ = client.call(ArmReset { arm: arm.into() });
-            let _ = client.call(ArmEnable { arm: arm.into() });
+            let _ = client.call(ArmEnable::new(arm));
         }
     }
 

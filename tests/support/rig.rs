@@ -14,7 +14,7 @@ use dimos::control::coordinator::{Coordinator, TickTime};
 use dimos::control::request::{Envelope, Motion, Request};
 use dimos::control::task_spec::TaskTable;
 use dimos::joint::{ControlMode, JointLimits, joints_of};
-use dimos::telemetry::{ArmSample, Event, Outcome, Phase, TaskView};
+use dimos::telemetry::{ArmSample, Event, Origin, Outcome, Phase, TaskView};
 use dimos::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
 
 pub use super::sim_arm::SimArm;
@@ -38,6 +38,8 @@ pub struct Rig {
     pub commands: Vec<ArmCommand>,
     pub samples: Vec<ArmSample>,
     pub tasks: Vec<TaskView>,
+    /// Number of interruptions of all arms.
+    pub epoch: u64,
     /// Ids of the motions that were given back.
     pub retired: Vec<u64>,
     /// Called with `true` before and `false` after the coordinator's tick.
@@ -144,6 +146,7 @@ impl Rig {
             commands: vec![ArmCommand::default(); config.arms.len()],
             samples: Vec::new(),
             tasks: Vec::new(),
+            epoch: 0,
             retired: Vec::new(),
             around: |_| {},
             late: Duration::ZERO,
@@ -173,10 +176,27 @@ impl Rig {
     }
 
     pub fn send(&mut self, request: Request) -> u64 {
+        self.send_from(None, request)
+    }
+
+    /// Sends a request that a client made.
+    pub fn send_from(&mut self, origin: Option<Origin>, request: Request) -> u64 {
         let id = self.next_id;
         self.next_id += 1;
-        self.inbox.push_back(Envelope { id, request });
+        self.inbox.push_back(Envelope { id, origin, request });
         id
+    }
+
+    /// The origin of a request that a client makes now.
+    pub fn origin(&self, client: u64) -> Option<Origin> {
+        Some(Origin { epoch: self.epoch, client })
+    }
+
+    /// Sends a request that a client made, makes one tick, and returns its outcome.
+    pub fn ask_from(&mut self, origin: Option<Origin>, request: Request) -> Outcome {
+        let id = self.send_from(origin, request);
+        self.tick();
+        self.outcome(id)
     }
 
     /// Sends a request, makes one tick, and returns its outcome.
@@ -210,7 +230,7 @@ impl Rig {
     pub fn make_ready(&mut self) {
         self.run(2);
         for i in 0..self.arms.len() {
-            assert_eq!(self.ask(Request::Enabled { arm: i as u16 }), Outcome::Accepted);
+            assert_eq!(self.ask(Request::Enabled { arm: i as u16, outside: false }), Outcome::Accepted);
         }
         self.run_for(0.3);
         assert!((0..self.arms.len()).all(|i| self.phase(i) == Phase::Ready));
@@ -257,6 +277,7 @@ impl Rig {
         self.commands.clone_from(&output.commands);
         self.samples.clone_from(&output.arms);
         self.tasks.clone_from(&output.tasks);
+        self.epoch = output.epoch;
         self.retired.extend(output.retired.drain(..).map(|m| m.id));
         if self.checked {
             self.check_wire(skipped);

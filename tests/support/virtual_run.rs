@@ -19,7 +19,7 @@ use dimos::recording::storage::Storage;
 use dimos::recording::tcp_log::TcpChains;
 use dimos::runtime::log_of;
 use dimos::telemetry::describe::{ArmNames, Names};
-use dimos::telemetry::{Sample, TaskView, TickSample};
+use dimos::telemetry::{Origin, Sample, TaskView, TickSample};
 use dimos::trajectory::{JointTrajectory, Spline};
 use serde_json::json;
 
@@ -142,8 +142,13 @@ impl VirtualRun {
 
     /// Asks something of the next tick.
     pub fn ask(&mut self, request: Request) {
+        self.ask_from(request, None);
+    }
+
+    /// Asks something that a client requested.
+    pub fn ask_from(&mut self, request: Request, origin: Option<Origin>) {
         let logged = log_of(&request);
-        self.send_logged(request, logged);
+        self.send_logged(request, origin, logged);
     }
 
     /// Asks for a trajectory.
@@ -153,14 +158,14 @@ impl VirtualRun {
         let joints = trajectory.joint_names.iter().map(index).collect();
         let motion = Motion { id: self.next_id, joints, spline: Spline::new(trajectory).unwrap() };
         let logged = json!({"execute": {"task": task, "motion": motion.id, "trajectory": trajectory}});
-        self.send_logged(Request::Execute { task, motion: Box::new(motion) }, logged);
+        self.send_logged(Request::Execute { task, motion: Box::new(motion) }, None, logged);
     }
 
-    fn send_logged(&mut self, request: Request, logged: serde_json::Value) {
+    fn send_logged(&mut self, request: Request, origin: Option<Origin>, logged: serde_json::Value) {
         let (id, stamp) = (self.next_id, self.now);
         self.next_id += 1;
-        self.notes.send(Note::Request { id, stamp, json: logged.to_string() }).unwrap();
-        self.inbox.push_back(Envelope { id, request });
+        self.notes.send(Note::Request { id, stamp, origin, json: logged.to_string() }).unwrap();
+        self.inbox.push_back(Envelope { id, origin, request });
     }
 
     /// One tick.

@@ -57,7 +57,9 @@ impl From<Failure> for End {
 impl From<ClientError> for End {
     fn from(error: ClientError) -> Self {
         match &error {
-            ClientError::Refused(refusal) if refusal.code != Code::LeaseHeld => Self::Fault(error.into()),
+            ClientError::Refused(refusal) if !matches!(refusal.code, Code::LeaseHeld | Code::Superseded) => {
+                Self::Fault(error.into())
+            }
             _ => Self::Stopped(error.into()),
         }
     }
@@ -193,7 +195,7 @@ impl<'r> Runner<'r, '_> {
                 }
                 self.client.call(ArmReset { arm: arm() })?;
             }
-            Act::Enable => drop(self.client.call(ArmEnable { arm: arm() })?),
+            Act::Enable => drop(self.client.call(ArmEnable::new(arm()))?),
             Act::Repeat { .. } => {}
         }
         Ok(())

@@ -291,7 +291,7 @@ impl ControlledArm for RunArm {
             // A run switches all motors at once.
             (Some(_), _) => Err(Refusal::NotNow),
             (None, true) if self.view.ready && self.changed.is_none() => Ok(()),
-            (None, true) => self.change(&ArmEnable { arm }),
+            (None, true) => self.change(&ArmEnable::new(arm)),
             (None, false) if !self.view.enabled && self.changed.is_none() => Ok(()),
             (None, false) => self.change(&ArmDisable { arm, now: false }),
         }

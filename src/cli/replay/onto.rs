@@ -141,13 +141,15 @@ impl Driver<'_> {
         let grips = self.possible_grips(&state);
         for (arm, wanted) in self.blueprint.arms.iter().zip(wanted) {
             if *wanted || self.plan.approaches.iter().any(|a| a.arm == arm.hardware_id) {
-                self.run.call(ArmEnable { arm: arm.hardware_id.clone() })?;
+                self.run.call(ArmEnable::new(arm.hardware_id.clone()))?;
             }
         }
+        // The approaches and the motion are one request of the user's.
+        let run = self.run.until_interrupted();
         for approach in &self.plan.approaches {
             let target = target(approach, &state);
             let go = Move::direct(approach.arm.clone(), target, APPROACH_SPEED);
-            let begun = self.run.call(go)?;
+            let begun = run.call(go)?;
             let (arm, duration) = (&approach.arm, begun.duration);
             self.show.note(format_args!("approach: {arm} moves to the start of the motion, {duration:.1} s, directly"));
             self.follow(&[begun.motion], "approach", &[])?;
@@ -158,7 +160,7 @@ impl Driver<'_> {
             .collect();
         let mut motions = Vec::new();
         let mut refused = None;
-        for begun in self.run.call_together(&requests) {
+        for begun in run.call_together(&requests) {
             match begun {
                 Ok(begun) => motions.push(begun.motion),
                 Err(e) => refused = Some(e),

@@ -320,11 +320,14 @@ impl ArmControl {
     }
 
     /// The arm was enabled: starts to hold it. An arm that still decelerates continues to do so. `arm`: the arm's
-    /// index, for the outcome.
-    pub fn activate(&mut self, arm: u16, now: Mono) -> Outcome {
+    /// index, for the outcome; `outside`: it may rest outside its position limits.
+    pub fn activate(&mut self, arm: u16, outside: bool, now: Mono) -> Outcome {
         let before = self.failsafe.phase();
         let outcome = self.failsafe.on_enabled(arm, self.feedback.state(), self.feedback.freshness(), now);
         let begins = outcome == Outcome::Accepted && !matches!(before, Phase::Activating | Phase::Ready);
+        if begins {
+            self.rest.outside = outside;
+        }
         if begins && self.command.mode.is_none() {
             let velocity = self.config.modes.first().copied().unwrap_or_default();
             self.start(self.config.position_mode().unwrap_or(velocity), now);

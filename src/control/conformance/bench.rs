@@ -121,7 +121,7 @@ impl Bench {
         // The leader, if there is one, too: a task may follow no arm that a person has stopped.
         self.ask(Request::Reset { arm: 1 });
         self.ask(Request::Reset { arm: 0 });
-        self.ask(Request::Enabled { arm: 0 });
+        self.ask(Request::Enabled { arm: 0, outside: false });
         self.run(0.5);
         if self.phase == Phase::Ready { Ok(()) } else { Err(format!("the simulated arm is {:?}", self.phase)) }
     }
@@ -173,7 +173,7 @@ impl Bench {
     fn send(&mut self, request: Request) -> u64 {
         let id = self.next_id;
         self.next_id += 1;
-        self.inbox.push_back(Envelope { id, request });
+        self.inbox.push_back(Envelope { id, origin: None, request });
         id
     }
 

@@ -3,6 +3,7 @@
 //! commands, bit for bit.
 
 mod guarding;
+mod interruptions;
 mod requests;
 mod tick_output;
 
@@ -21,8 +22,9 @@ use super::task_body::JointView;
 use super::task_leader::gripper_target;
 use crate::arm::ArmState;
 use crate::clock::Mono;
-use crate::telemetry::{ArmSample, Bound, Cause, Event, Phase, Reason, TaskState};
+use crate::telemetry::{ArmSample, Bound, Cause, Event, Origin, Phase, Reason, TaskState};
 
+use interruptions::Watched;
 pub use tick_output::{TickOutput, TickTime};
 
 /// Maximum number of requests handled in one tick: the capacity of the ring, so that a flood of targets never delays a
@@ -54,6 +56,9 @@ pub struct Coordinator {
     shutting_down: bool,
     started: bool,
     guard: Guard,
+    /// Number of interruptions of all arms.
+    epoch: u64,
+    watched: Vec<Watched>,
     output: TickOutput,
 }
 
@@ -77,6 +82,8 @@ impl Coordinator {
             arbiter: Arbiter::new(&priorities, arm_of.clone(), arms.len()),
             joints: vec![JointView::default(); arm_of.len()],
             guard: Guard::new(arms.len()),
+            epoch: 0,
+            watched: vec![Watched::default(); arms.len()],
             output: TickOutput::new(arms.len(), tasks.len(), arm_of.len()),
             arms,
             tasks,
@@ -115,6 +122,7 @@ impl Coordinator {
         self.step = self.time_covered(time);
         self.read(time, states);
         self.account_for_lost_time(time);
+        self.notice_interruptions();
         for _ in 0..REQUESTS_PER_TICK {
             let Some(envelope) = inbox() else { break };
             self.handle(time.now, envelope);
@@ -259,7 +267,8 @@ impl Coordinator {
         self.started = true;
         for t in 0..self.tasks.len() {
             let Some(target) = self.tasks.get(t).and_then(Task::first_target) else { continue };
-            let outcome = self.offer(now, t as u16, &target);
+            // The blueprint requested it when the run began.
+            let outcome = self.offer(now, t as u16, &target, Some(Origin::default()));
             self.output.report(Event::Request(0, outcome));
         }
     }
@@ -366,6 +375,8 @@ impl Coordinator {
     }
 
     fn publish(&mut self) {
+        self.notice_interruptions();
+        self.output.epoch = self.epoch;
         self.output.speed = self.speed;
         for (i, arm) in self.arms.iter().enumerate() {
             if let Some(command) = self.output.commands.get_mut(i) {

@@ -8,11 +8,12 @@ use crate::control::request::{Envelope, Motion, Request};
 use crate::control::speed_override::SpeedOverride;
 use crate::control::task::{Task, Tick};
 use crate::control::task_body::Target;
-use crate::telemetry::{Cause, Event, LedBy, Outcome, Reason, TaskState};
+use crate::telemetry::{Cause, Event, Interruption, LedBy, Origin, Outcome, Reason, TaskState};
 
 impl Coordinator {
     /// Handles a request and reports its outcome.
     pub(super) fn handle(&mut self, now: Mono, envelope: Envelope) {
+        let origin = envelope.origin;
         let outcome = match envelope.request {
             Request::Shutdown => {
                 self.shutting_down = true;
@@ -34,34 +35,44 @@ impl Coordinator {
                 Outcome::ShuttingDown
             }
             _ if self.shutting_down => Outcome::ShuttingDown,
-            Request::Execute { task, motion } => self.execute(now, task, motion),
-            Request::Servo { task, target } => self.offer(now, task, &Target::Positions(target)),
-            Request::Velocity { task, target } => self.offer(now, task, &Target::Velocities(target)),
+            Request::Execute { task, motion } => self.execute(now, task, motion, origin),
+            Request::Servo { task, target } => self.offer(now, task, &Target::Positions(target), origin),
+            Request::Velocity { task, target } => self.offer(now, task, &Target::Velocities(target), origin),
             Request::Chunk { task, start, motion } => {
-                let outcome = self.offer(now, task, &Target::Chunk(&motion, start));
+                let outcome = self.offer(now, task, &Target::Chunk(&motion, start), origin);
                 self.output.retired.push(motion);
                 outcome
             }
-            Request::CartesianTarget { task, goal } => self.offer(now, task, &Target::EndEffector(goal)),
-            Request::Start { task } => self.offer(now, task, &Target::Start),
+            Request::CartesianTarget { task, goal } => self.offer(now, task, &Target::EndEffector(goal), origin),
+            Request::Start { task } => self.offer(now, task, &Target::Start, origin),
             Request::Tool { task, tool } => match self.tasks.get_mut(task as usize) {
                 Some(t) => t.set_tool(&tool).err().unwrap_or(Outcome::Accepted),
                 None => Outcome::WrongTask(task),
             },
             Request::Reset { arm } => self.with_arm(arm, |a| a.reset(arm, now)),
-            Request::Enabled { arm } => self.with_arm(arm, |a| a.activate(arm, now)),
+            Request::Enabled { arm, outside } => self.with_arm(arm, |a| a.activate(arm, outside, now)),
             Request::PrepareDisable { arm } => {
                 let outcome = self.with_arm(arm, |a| {
                     a.prepare_disable(now);
                     Outcome::Accepted
                 });
+                self.interrupt(arm.into(), Interruption::Disabled);
                 self.end_tasks_of_held_arms();
                 outcome
             }
             Request::Lead { by: LedBy::Controller, .. } if self.speed.paused => Outcome::Paused,
             Request::Lead { arm, by } => match self.task_of_arm(arm) {
                 Some(task) => Outcome::AlreadyExecuting(task),
-                None => self.with_arm(arm, |a| a.lead(by, arm, now)),
+                None => match self.still_valid(arm, origin) {
+                    Ok(()) => {
+                        let outcome = self.with_arm(arm, |a| a.lead(by, arm, now));
+                        if outcome == Outcome::Accepted {
+                            self.commanded_by(arm, origin.unwrap_or_default().client);
+                        }
+                        outcome
+                    }
+                    Err(superseded) => superseded,
+                },
             },
             Request::Speed { fraction } => self.change_speed(|speed| speed.set(fraction)),
             Request::EndNative { arm } => self.end_native(arm, now),
@@ -72,7 +83,12 @@ impl Coordinator {
                 }
                 self.change_speed(|speed| speed.paused = on)
             }
-            Request::Gripper { arm, opening, force, speed } => self.gripper(arm, opening, force, speed),
+            Request::Gripper { arm, opening, force, speed } => self.gripper(arm, (opening, force, speed), origin),
+            Request::LeaseTaken { arm, client } => {
+                self.commanded_by(arm, client);
+                Outcome::Accepted
+            }
+            Request::LeaseEnded { arm, client } => self.lease_ended(arm, client),
         };
         self.output.report(Event::Request(envelope.id, outcome));
     }
@@ -94,7 +110,7 @@ impl Coordinator {
     }
 
     /// Returns whether a task moves a joint of an arm.
-    fn moves(&self, task: &Task, arm: u16) -> bool {
+    pub(super) fn moves(&self, task: &Task, arm: u16) -> bool {
         task.moving_joints().iter().any(|joint| self.arm_of.get(usize::from(*joint)) == Some(&arm))
     }
 
@@ -112,6 +128,7 @@ impl Coordinator {
                 a.stop_again();
             }
             self.hold(i, Cause::Operator, now);
+            self.interrupt(i, Interruption::Stopped);
         }
         Outcome::Accepted
     }
@@ -165,8 +182,8 @@ impl Coordinator {
         outcome
     }
 
-    fn execute(&mut self, now: Mono, task: u16, motion: Box<Motion>) -> Outcome {
-        let outcome = self.offer(now, task, &Target::Trajectory(&motion));
+    fn execute(&mut self, now: Mono, task: u16, motion: Box<Motion>, origin: Option<Origin>) -> Outcome {
+        let outcome = self.offer(now, task, &Target::Trajectory(&motion), origin);
         let done = match self.tasks.get_mut(task as usize) {
             Some(t) if outcome == Outcome::Accepted => t.keep(motion),
             _ => Some(motion),
@@ -176,21 +193,42 @@ impl Coordinator {
     }
 
     /// Offers a target to a task.
-    pub(super) fn offer(&mut self, now: Mono, task: u16, target: &Target<'_>) -> Outcome {
-        self.try_offer(now, task, target).err().unwrap_or(Outcome::Accepted)
+    pub(super) fn offer(&mut self, now: Mono, task: u16, target: &Target<'_>, origin: Option<Origin>) -> Outcome {
+        self.try_offer(now, task, target, origin).err().unwrap_or(Outcome::Accepted)
     }
 
-    fn try_offer(&mut self, now: Mono, task: u16, target: &Target<'_>) -> Result<(), Outcome> {
+    fn try_offer(&mut self, now: Mono, task: u16, target: &Target<'_>, origin: Option<Origin>) -> Result<(), Outcome> {
         let t = self.tasks.get(task as usize).ok_or(Outcome::WrongTask(task))?;
         t.check(target)?;
-        self.admit(match target {
+        let joints = match target {
             Target::Trajectory(motion) => &motion.joints,
             _ => &t.joints,
-        })?;
+        };
+        self.admit(joints)?;
+        let valid = joints.iter().try_for_each(|joint| match self.arm_of.get(usize::from(*joint)) {
+            Some(arm) => self.still_valid(*arm, origin),
+            None => Ok(()),
+        });
         let tick = Tick { now, dt: self.step, speed: self.speed, views: &self.joints };
         let t = self.tasks.get_mut(task as usize).ok_or(Outcome::WrongTask(task))?;
-        if t.accept(&tick, target)? {
+        // That the arm is elsewhere says more.
+        t.check_start(&tick, target)?;
+        valid?;
+        let begins = t.accept(&tick, target)?;
+        let client = origin.unwrap_or_default().client;
+        t.client = client;
+        if begins {
             self.output.report(Event::Task(task, TaskState::Executing, Reason::None));
+        }
+        for arm in 0..self.arms.len() as u16 {
+            let of_arm = |joint: &u16| self.arm_of.get(usize::from(*joint)) == Some(&arm);
+            let moved = match target {
+                Target::Trajectory(motion) => motion.joints.iter().any(of_arm),
+                _ => self.tasks.get(usize::from(task)).is_some_and(|task| task.joints.iter().any(of_arm)),
+            };
+            if moved {
+                self.commanded_by(arm, client);
+            }
         }
         Ok(())
     }
@@ -207,7 +245,13 @@ impl Coordinator {
         Ok(())
     }
 
-    fn gripper(&mut self, arm: u16, opening: f64, force: Option<f64>, speed: Option<f64>) -> Outcome {
+    fn gripper(
+        &mut self,
+        arm: u16,
+        (opening, force, speed): (f64, Option<f64>, Option<f64>),
+        origin: Option<Origin>,
+    ) -> Outcome {
+        let valid = self.still_valid(arm, origin);
         let Some(a) = self.arms.get_mut(arm as usize) else { return Outcome::StartStateUnavailable(arm) };
         if !a.config().gripper {
             return Outcome::NoGripper(arm);
@@ -226,9 +270,10 @@ impl Coordinator {
         if speed.is_some_and(|speed| !(info.has_speed && speed > 0.0 && speed <= 1.0)) {
             return Outcome::NoGripperSpeed(arm);
         }
-        match a.failsafe.admits(arm) {
+        match a.failsafe.admits(arm).and(valid) {
             Ok(()) => {
                 a.set_gripper(opening, force, speed);
+                self.commanded_by(arm, origin.unwrap_or_default().client);
                 Outcome::Accepted
             }
             Err(outcome) => outcome,

@@ -33,6 +33,8 @@ pub struct TickOutput {
     pub tasks: Vec<TaskView>,
     /// The speed override.
     pub speed: SpeedOverride,
+    /// Number of interruptions of all arms so far.
+    pub epoch: u64,
     /// Events of the tick.
     pub events: Vec<Event>,
     /// Motions that ended, to be freed on another thread.
@@ -53,6 +55,7 @@ impl TickOutput {
             arms: Vec::with_capacity(arms),
             tasks: vec![TaskView::default(); tasks],
             speed: SpeedOverride::default(),
+            epoch: 0,
             events: Vec::with_capacity(events),
             retired: Vec::with_capacity(motions),
             events_lost: 0,

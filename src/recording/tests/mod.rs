@@ -271,7 +271,7 @@ fn a_request_precedes_its_answer_and_events_have_text() {
     let notices = Notices::default();
     let (recorder, mut ring, notes) = start(&path, &notices);
     notes.send(Note::ArmText { arm: 0, text: "joint 2 is too hot".into() }).unwrap();
-    notes.send(Note::Request { id: 7, stamp: deadline(7), json: r#"{"method":"stop"}"#.into() }).unwrap();
+    notes.send(Note::Request { id: 7, stamp: deadline(7), origin: None, json: r#"{"method":"stop"}"#.into() }).unwrap();
     notes.send(Note::Log { severity: Severity::Info, stamp: deadline(7), text: "hello".into() }).unwrap();
     ring.push(arm_sample(0, 7)).unwrap();
     ring.push(arm_sample(1, 7)).unwrap();

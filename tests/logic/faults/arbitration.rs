@@ -106,7 +106,7 @@ proptest! {
                 5 => { rig.send(Request::Stop { arm: None }); }
                 _ => {
                     rig.send(Request::Reset { arm: 0 });
-                    rig.send(Request::Enabled { arm: 0 });
+                    rig.send(Request::Enabled { arm: 0, outside: false });
                 }
             }
             for _ in 0..ticks {
@@ -215,7 +215,7 @@ fn scenario(seed: u64, ticks: u64) -> Vec<u64> {
             30..=33 => {
                 for arm in 0..2 {
                     rig.send(Request::Reset { arm });
-                    rig.send(Request::Enabled { arm });
+                    rig.send(Request::Enabled { arm, outside: false });
                 }
             }
             34 => rig.arms[0].silent = random.below(2) == 0,

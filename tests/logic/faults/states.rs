@@ -129,7 +129,7 @@ fn f07_measurements_that_are_not_finite_reach_no_command() {
         }
         rig.arms[0].q = q;
         assert_eq!(rig.samples[0].cause.name(), "stale");
-        assert_eq!(rig.ask(Request::Enabled { arm: 0 }).name(), "ARM_LATCHED");
+        assert_eq!(rig.ask(Request::Enabled { arm: 0, outside: false }).name(), "ARM_LATCHED");
     }
 }
 

@@ -144,11 +144,14 @@ impl TrajectoryTask {
 impl TaskBody for TrajectoryTask {
     fn accept(&mut self, cx: &Context<'_>, target: &Target<'_>) -> Result<(), Outcome> {
         let Target::Trajectory(motion) = target else { return Err(Outcome::WrongTask(cx.task)) };
-        if let Some((joint, error)) = self.away_from_start(cx, motion) {
-            return Err(Outcome::StartStateMismatch(joint, error.abs()));
-        }
+        self.check_start(cx, motion)?;
         self.start(cx, motion);
         Ok(())
+    }
+
+    fn check_start(&self, cx: &Context<'_>, motion: &Motion) -> Result<(), Outcome> {
+        let away = self.away_from_start(cx, motion);
+        away.map_or(Ok(()), |(joint, error)| Err(Outcome::StartStateMismatch(joint, error.abs())))
     }
 
     fn compute(&mut self, cx: &Context<'_>, claims: &mut Vec<Claim>) -> Step {
