@@ -364,7 +364,7 @@ impl Connection {
         Ok(Done {})
     }
 
-    async fn lease(&self, params: Value) -> Result<LeaseReply, RpcError> {
+    async fn lease(&mut self, params: Value) -> Result<LeaseReply, RpcError> {
         let arms = self.arms(read_params::<Lease>(params)?.arm)?;
         self.lessee.take(&arms)?;
         // What a client requests after a release of this lease is younger than it.
