@@ -162,7 +162,7 @@ fn pattern(seed: u64) -> f64 {
     (0..9).for_each(|_| _ = dice.part());
     let model = [Model::Ur5e, Model::Ur3e, Model::Ur20, Model::Ur10][dice.below(4)];
     let deceleration = [8.0, 8.0, 2.0, 5.5, 20.0][dice.below(5)];
-    let range = [1.0, 6.2, 6.28][dice.below(3)];
+    let range = [1.0, 6.2, 6.27][dice.below(3)];
     let start: [f64; 6] = std::array::from_fn(|_| if dice.below(3) == 0 { range } else { dice.within(range) });
     let mut judge = Judge::new(model, deceleration, start);
     // What the client makes its setpoints from.
