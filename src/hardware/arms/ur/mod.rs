@@ -1,8 +1,8 @@
 //! Universal Robots: CB3, e-Series, UR20 and UR30.
 //!
 //! `protocol/` has the bytes, `rtde`, `primary` and `dashboard` the connections, `control.script` the program that runs
-//! on the controller, `session` and `safety` the state of the arm, `power` and `motion` what is ordered of it,
-//! `adapter` the adapter trait, `emulator/` the controller's side.
+//! on the controller and `script/` its language, `session` and `safety` the state of the arm, `power` and `motion` what
+//! is ordered of it, `adapter` the adapter trait, `emulator/` the controller's side.
 
 pub mod adapter;
 pub mod address;

@@ -21,6 +21,8 @@ const BRAKE_TIME: Duration = Duration::from_secs(4);
 const LEFTOVER_LIMIT: Duration = Duration::from_millis(1200);
 /// How long the motors may take to go off.
 const OFF_LIMIT: Duration = Duration::from_secs(3);
+/// How long the arm may take to come to rest before the program starts, or its motors go off.
+const REST_LIMIT: Duration = Duration::from_millis(1500);
 /// How long the program may take to start.
 const START_LIMIT: Duration = Duration::from_millis(1500);
 /// A protective stop is released this long after it was seen at the earliest, as the controller demands, too.
@@ -125,6 +127,12 @@ impl Session {
         let number = (MonotonicClock.now().0 >> 10) as i32 & i32::MAX;
         // What the registers hold from before is not an order for the new program.
         self.order(Order::Hold)?;
+        // It would take joints that move for ones at rest. An earlier one decelerates them, as ordered.
+        if self.wait(REST_LIMIT, |session| Ok(session.at_rest().then_some(())))?.is_none() {
+            return Err(AdapterError::Rejected(format!(
+                "the arm still moves after {REST_LIMIT:?}\nhint: enable it at rest"
+            )));
+        }
         let text = program::control(number, options, &self.device.limits);
         self.run_program(&text)?;
         let started = self.wait(START_LIMIT, |session| {
@@ -153,6 +161,8 @@ impl Session {
         }
         if self.program_exists() {
             self.stop()?;
+            // A stop is confirmed when it begins; brakes are for joints at rest.
+            self.wait(REST_LIMIT, |session| Ok(session.at_rest().then_some(())))?;
         }
         (self.ready, self.ended) = (None, None);
         self.dashboard()?.order("power off", "powering off")?;

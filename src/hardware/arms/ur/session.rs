@@ -144,9 +144,9 @@ impl Session {
         (major, minor) >= (5, 10)
     }
 
-    /// Returns whether all joints are at rest.
+    /// Returns whether all joints are at rest, and commanded to be.
     pub(super) fn at_rest(&self) -> bool {
-        self.state.velocity.iter().all(|v| v.abs() < REST)
+        self.state.velocity.iter().chain(&self.state.target_velocity).all(|v| v.abs() < REST)
     }
 
     /// Connects to the dashboard.

@@ -117,15 +117,21 @@ fn cut(end: impl FnOnce(&mut UrAdapter)) -> (f64, f64) {
     });
     let change = largest_change(&emulator, 0.002);
     assert!(change <= 1.1 * 8.0 * 0.002, "{change:.4} rad/s within a step");
+    let points = emulator.servoj();
+    let last = points[points.len() - 1].1[0] - points[points.len() - 2].1[0];
+    assert!(last.abs() < 0.0176 * 0.002, "the last points are {last} rad apart: no deceleration to rest");
     (positions(&mut adapter)[0] - start[0], goal[0] - start[0])
 }
 
 #[test]
 fn the_end_of_a_stream_in_motion_is_a_deceleration() {
-    // Silence; the end of the mode; a stop. The arm goes beyond the last setpoint: by 63 mm at 1 rad/s and 8 rad/s².
+    // Silence; the end of the mode; enabling; disabling; a stop. The arm goes beyond the last setpoint: by 63 mm at 1 rad/s and 8 rad/s².
     let (rest, last) = cut(|_| ());
     assert!(rest > last + 0.03 && rest < last + 0.2, "{rest} and {last} rad");
     cut(|adapter| drop(adapter.set_control_mode(ControlMode::Velocity)));
+    // Enabling replaces the program: not in motion.
+    cut(|adapter| adapter.activate().unwrap());
+    cut(|adapter| adapter.write_enable(false).unwrap());
     cut(|adapter| assert_eq!(adapter.write_stop(&StopPoint::default()), Ok(Stop::Confirmed)));
 }
 

@@ -108,6 +108,10 @@ fn what_the_language_does_not_have_is_refused() {
         (&["a = p[0, 0, 0]"], "a pose has six numbers"),
         (&["a = sync()"], "this function returns nothing"),
         (&["def f():", "  return 1", "end", "x = 0.5", "x = f()"], "x is Float, and cannot become Int"),
+        (
+            &["def f(a):", "  if a:", "    return 1", "  end", "  return 0.5", "end", "x = f(True)"],
+            "the function returns Int, and cannot return Float",
+        ),
         (&["def f(a):", "  a = a - 0.5", "  return a", "end", "x = f(1)"], "a is Int, and cannot become Float"),
         // Names and numbers of arguments.
         (&["a = abs(1.0)"], "there is no function abs"),

@@ -6,33 +6,33 @@ use crate::hardware::arms::ur::model::Model;
 use crate::hardware::arms::ur::{Options, program};
 use crate::joint::JointLimits;
 
-const HOLD: i32 = 0;
-const SERVO: i32 = 1;
-const SPEED: i32 = 2;
-const STOP: i32 = 3;
+pub(super) const HOLD: i32 = 0;
+pub(super) const SERVO: i32 = 1;
+pub(super) const SPEED: i32 = 2;
+pub(super) const STOP: i32 = 3;
 
 /// A controller that carries out a program and judges its points.
-struct Judge {
-    machine: Machine,
-    panel: Panel,
+pub(super) struct Judge {
+    pub machine: Machine,
+    pub panel: Panel,
     limits: JointLimits,
     deceleration: f64,
     /// Last point, and the velocity that led to it.
-    velocity: [f64; 6],
+    pub velocity: [f64; 6],
     /// Steps with a point so far, and all.
     steps: usize,
-    ended: bool,
+    pub ended: bool,
     /// Largest change of velocity, as a part of the deceleration.
     worst: f64,
 }
 
 /// The registers of a controller, and what the program did last.
-struct Panel {
+pub(super) struct Panel {
     step: f64,
     start: [f64; 6],
     order: (i32, i32, [f64; 6]),
-    out: [i32; 3],
-    point: Option<[f64; 6]>,
+    pub out: [i32; 3],
+    pub point: Option<[f64; 6]>,
     stopped: bool,
 }
 
@@ -67,7 +67,7 @@ impl Controller for Panel {
 }
 
 impl Judge {
-    fn new(model: Model, deceleration: f64, start: [f64; 6]) -> Self {
+    pub fn new(model: Model, deceleration: f64, start: [f64; 6]) -> Self {
         let options = Options { stop_deceleration: deceleration, ..Options::default() };
         let (limits, step) = (model.limits(), 1.0 / model.rate());
         let machine = Machine::new(&program::control(7, &options, &limits), "dimos_control").unwrap();
@@ -75,24 +75,24 @@ impl Judge {
         Self { machine, panel, limits, deceleration, velocity: [0.0; 6], steps: 0, ended: false, worst: 0.0 }
     }
 
-    fn at(&self) -> [f64; 6] {
+    pub fn at(&self) -> [f64; 6] {
         self.panel.target()
     }
 
-    fn state(&self) -> i32 {
+    pub fn state(&self) -> i32 {
         self.panel.out[1]
     }
 
-    fn order(&mut self, order: i32, values: [f64; 6]) {
+    pub fn order(&mut self, order: i32, values: [f64; 6]) {
         self.panel.order = (self.panel.order.0.wrapping_add(1), order, values);
     }
 
-    fn fastest(&self) -> f64 {
+    pub fn fastest(&self) -> f64 {
         self.velocity.iter().fold(0.0, |fastest: f64, v| fastest.max(v.abs()))
     }
 
     /// Makes a step, and judges it.
-    fn step(&mut self) {
+    pub fn step(&mut self) {
         let (before, step) = (self.at(), self.panel.step);
         if self.ended {
             return;
@@ -118,12 +118,12 @@ impl Judge {
         }
     }
 
-    fn steps(&mut self, seconds: f64) {
+    pub fn steps(&mut self, seconds: f64) {
         (0..(seconds / self.panel.step).round() as usize).for_each(|_| self.step());
     }
 
     /// Sends positions along `velocity`, every `period` steps.
-    fn stream(&mut self, velocity: [f64; 6], seconds: f64, period: usize) {
+    pub fn stream(&mut self, velocity: [f64; 6], seconds: f64, period: usize) {
         let start = self.at();
         for k in 0..(seconds / self.panel.step).round() as usize {
             if k % period == 0 {
@@ -133,144 +133,6 @@ impl Judge {
             self.step();
         }
     }
-}
-
-/// One that follows a steady stream.
-fn following(velocity: [f64; 6]) -> Judge {
-    let mut judge = Judge::new(Model::Ur5e, 8.0, [0.0; 6]);
-    judge.stream(velocity, 1.0, 2);
-    let near = judge.velocity.iter().zip(velocity).all(|(v, wanted)| (v - wanted).abs() < 0.01);
-    assert!(near, "a steady stream is as fast as it is commanded: {:?}", judge.velocity);
-    judge
-}
-
-#[test]
-fn a_gap_is_bridged_then_all_joints_decelerate_together() {
-    let mut judge = following([1.5, -0.75, 0.3, 0.0, 0.0, 0.0]);
-    // The last order was one step ago.
-    for _ in 0..9 {
-        judge.step();
-        assert!((judge.velocity[0] - 1.5).abs() < 0.01 && judge.state() == 2, "{:?}", judge.velocity);
-    }
-    for k in 1..=150 {
-        judge.step();
-        let expected = (1.5 - 8.0 * 0.002 * f64::from(k)).max(0.0);
-        assert!((judge.velocity[0] - expected).abs() < 0.02, "step {k}: {} rad/s", judge.velocity[0]);
-        assert!((judge.velocity[1] + 0.5 * judge.velocity[0]).abs() < 0.01, "along the motion: {:?}", judge.velocity);
-        assert_eq!(judge.state(), 4, "decelerates because no setpoint came in time");
-    }
-    assert!(judge.fastest() < 1e-9 && !judge.ended, "at rest, and waiting");
-    judge.steps(0.8);
-    assert_eq!((judge.state(), judge.ended), (11, true));
-}
-
-#[test]
-fn a_gap_within_the_tolerance_changes_nothing() {
-    let mut judge = following([1.5, 0.0, 0.0, 0.0, 0.0, 0.0]);
-    judge.steps(0.016);
-    // The stream goes on where it would be.
-    for k in 508..600 {
-        if k % 2 == 0 {
-            judge.order(SERVO, [1.5 * 0.002 * f64::from(k), 0.0, 0.0, 0.0, 0.0, 0.0]);
-        }
-        judge.step();
-        assert!((judge.velocity[0] - 1.5).abs() < 0.01 && judge.state() == 2, "{} rad/s", judge.velocity[0]);
-    }
-}
-
-#[test]
-fn setpoints_are_met_again_after_a_gap() {
-    for gap in [0.03, 0.1, 0.25] {
-        let mut judge = following([1.5, 0.0, 0.0, 0.0, 0.0, 0.0]);
-        let start = judge.at();
-        judge.steps(gap);
-        for k in 0..600 {
-            let way = 1.5 * (gap + 0.002 * f64::from(k));
-            judge.order(SERVO, [start[0] + way, 0.0, 0.0, 0.0, 0.0, 0.0]);
-            judge.step();
-        }
-        let error = start[0] + 1.5 * (gap + 1.2) - judge.at()[0];
-        assert!(error.abs() < 0.005 && judge.state() == 2, "{gap} s: {error} rad behind");
-    }
-}
-
-#[test]
-fn holds_stops_and_far_setpoints_decelerate() {
-    for (order, values, state, ends) in
-        [(HOLD, [0.0; 6], 1, false), (STOP, [0.0; 6], 10, true), (SERVO, [6.0; 6], 12, true), (9, [0.0; 6], 1, false)]
-    {
-        for speed in [false, true] {
-            let mut judge = Judge::new(Model::Ur5e, 8.0, [0.0; 6]);
-            let velocity = [1.5, 1.0, 0.0, 0.0, 0.0, 0.0];
-            if speed {
-                (0..300).for_each(|_| {
-                    judge.order(SPEED, velocity);
-                    judge.step();
-                });
-                assert_eq!((judge.state(), (judge.velocity[0] - 1.5).abs() < 1e-6), (3, true));
-            } else {
-                judge.stream(velocity, 1.0, 2);
-            }
-            let from = judge.at()[0];
-            judge.order(order, values);
-            judge.steps(0.25);
-            assert_eq!((judge.state(), judge.ended), (state, ends), "order {order}");
-            assert!(judge.fastest() < 1e-6, "order {order}: {:?}", judge.velocity);
-            let way = judge.at()[0] - from;
-            assert!((way - 1.5 * 1.5 / 16.0).abs() < 0.01, "order {order}: {way} rad");
-        }
-    }
-}
-
-#[test]
-fn what_is_extrapolated_ends_before_a_limit() {
-    for (room, period) in [(0.02, 1), (0.1, 2), (0.141, 5), (0.16, 2)] {
-        // Joint 2 is slower, and nearer to its limit.
-        let top = std::f64::consts::TAU;
-        let mut judge = Judge::new(Model::Ur5e, 8.0, [top - 1.5 - room, 0.75 - top + room, 0.0, 0.0, 0.0, 0.0]);
-        judge.stream([1.5, -0.75, 0.0, 0.0, 0.0, 0.0], 1.0, period);
-        judge.steps(0.9);
-        assert!(judge.fastest() < 1e-6 && judge.state() == 4, "{room} rad: {:?}", judge.velocity);
-    }
-    // An arm outside its limits comes back, and goes no further.
-    let mut judge = Judge::new(Model::Ur5e, 8.0, [6.3, 0.0, 0.0, 0.0, 0.0, 0.0]);
-    judge.stream([0.5, 0.0, 0.0, 0.0, 0.0, 0.0], 0.1, 2);
-    judge.stream([-0.5, 0.0, 0.0, 0.0, 0.0, 0.0], 1.0, 2);
-    assert!(judge.at()[0] < 6.0, "{} rad", judge.at()[0]);
-}
-
-#[test]
-fn a_registers_change_while_they_are_read_is_no_order() {
-    struct Torn(Panel, std::cell::Cell<i32>);
-    impl Controller for Torn {
-        fn step_time(&self) -> f64 {
-            self.0.step_time()
-        }
-        fn target(&self) -> [f64; 6] {
-            self.0.target()
-        }
-        fn read_integer(&self, register: usize) -> i32 {
-            // The count differs at each read.
-            self.1.set(self.1.get() + 1);
-            if register == 24 { self.1.get() } else { SERVO }
-        }
-        fn read_float(&self, _register: usize) -> f64 {
-            1.0
-        }
-        fn write_integer(&mut self, register: usize, value: i32) {
-            self.0.write_integer(register, value);
-        }
-        fn servoj(&mut self, point: &[f64; 6]) {
-            self.0.servoj(point);
-        }
-        fn stopj(&mut self, deceleration: f64) {
-            self.0.stopj(deceleration);
-        }
-    }
-    let Judge { mut machine, panel, .. } = Judge::new(Model::Ur5e, 8.0, [0.0; 6]);
-    let mut torn = Torn(panel, 0.into());
-    assert!((0..100).all(|_| machine.step(&mut torn)));
-    assert_eq!((torn.0.point, torn.0.out[1]), (None, 1));
 }
 
 /// Random numbers.
@@ -300,7 +162,7 @@ fn pattern(seed: u64) -> f64 {
     (0..9).for_each(|_| _ = dice.part());
     let model = [Model::Ur5e, Model::Ur3e, Model::Ur20, Model::Ur10][dice.below(4)];
     let deceleration = [8.0, 8.0, 2.0, 5.5, 20.0][dice.below(5)];
-    let range = [1.0, 6.2, 6.28][dice.below(3)];
+    let range = [1.0, 6.2, 6.27][dice.below(3)];
     let start: [f64; 6] = std::array::from_fn(|_| if dice.below(3) == 0 { range } else { dice.within(range) });
     let mut judge = Judge::new(model, deceleration, start);
     // What the client makes its setpoints from.

@@ -140,7 +140,12 @@ impl<'a> Checker<'a> {
             }
             Action::Return(value) => {
                 let new = value.as_ref().map_or(Ok(Nothing), |value| self.value(value, scope))?;
-                scope.returns = Some(scope.returns.map_or(new, |old| if old == new { old } else { Any }));
+                let old = scope.returns.unwrap_or(new);
+                // One that returns nothing in some cases: what it returns elsewhere is checked where it is used.
+                let Some(kept) = (if new == Nothing { Some(old) } else { old.assigned(new) }) else {
+                    return Refused::new(line, format!("the function returns {old:?}, and cannot return {new:?}"));
+                };
+                scope.returns = Some(kept);
             }
             Action::Thread(thread) => {
                 if !matches!(self.value(thread, scope)?, Int | Any) {
