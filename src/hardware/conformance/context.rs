@@ -45,7 +45,7 @@ pub fn pause(adapter: &mut dyn ManipulatorAdapter, time: Duration) {
 /// Acceleration of arms whose limits have none [rad/s²].
 const BRAKING: f64 = 5.0;
 
-/// Returns where the arm comes to rest by braking: of its own readings, since the checks are its caller and write no
+/// Returns where the arm is at rest after braking: of its own readings, since the checks are its caller and write no
 /// stream of setpoints. None while it cannot be read.
 pub fn rest_point(adapter: &mut dyn ManipulatorAdapter) -> StopPoint {
     let (mut reading, limits) = (JointReading::default(), adapter.get_limits().unwrap_or_default());

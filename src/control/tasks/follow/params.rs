@@ -35,8 +35,8 @@ pub struct FollowParams {
     #[schemars(extend("exclusiveMinimum" = 0.0, "maximum" = MAX_APPROACH_SPEED))]
     pub approach_speed: f64,
     /// A joint that is further than this from the leader's is not moved to it: the task refuses to start, or ends
-    /// [rad], above 0. Half a turn, unless a larger value is written here: a leader whose encoder lost a turn would take
-    /// the arm with it.
+    /// [rad], above 0. Half a turn, unless a larger value is written here: a leader whose encoder lost a turn would
+    /// take the arm with it.
     #[serde(deserialize_with = "positive")]
     #[schemars(extend("exclusiveMinimum" = 0.0))]
     pub max_approach: f64,

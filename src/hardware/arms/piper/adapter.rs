@@ -256,7 +256,8 @@ impl ManipulatorAdapter for PiperAdapter {
         }
     }
 
-    /// Holds the arm at the point of rest. Confirmed when the feedback shows that every joint decelerates or is at rest.
+    /// Holds the arm at the point of rest. Confirmed when the feedback shows that every joint decelerates or is at
+    /// rest.
     fn write_stop(&mut self, rest: &StopPoint) -> AdapterResult<Stop> {
         self.arm.refresh()?; // nothing goes out to an arm that is silent
         let before = self.arm.feedback.motors.map(|motor| i32::from(motor.speed).abs());
@@ -304,7 +305,7 @@ impl ManipulatorAdapter for PiperAdapter {
         self.arm.send(&[protocol::clear_errors()])?;
         if let Some(gripper) = self.arm.feedback.gripper.filter(|_| self.arm.feedback.gripper_errors().next().is_some())
         {
-            // The frame has a target: its last one. Only a gripper that this run never commanded is told where it is.
+            // The frame has a target: its last one. Only a gripper that this run never commanded gets where it is.
             let stroke = self.gripper_target.unwrap_or(gripper.stroke);
             let frame = protocol::clear_gripper(stroke, self.gripper_torque, gripper.enabled());
             self.arm.send(&[frame])?;

@@ -1,5 +1,5 @@
-//! The pose at which the arm holds: after a stop the point that the caller gives, when its motors come on where it is. Only
-//! then is a target made of measured positions.
+//! The pose at which the arm holds: after a stop the point that the caller gives, when its motors come on where it is.
+//! Only then is a target made of measured positions.
 
 use std::time::Duration;
 
@@ -40,8 +40,9 @@ pub const BEYOND: u8 = 4;
 /// Minimum and maximum target of each joint [0.001°].
 pub type WireRanges = [(i32, i32); DOF];
 
-/// Returns the target with which the motors come on [0.001°]: where the arm is, or what it was commanded last. Inside the
-/// limits; for a joint outside, at most as far outside as measured. `strict`: the controller refuses targets outside.
+/// Returns the target with which the motors come on [0.001°]: where the arm is, or what it was commanded last. Inside
+/// the limits; for a joint outside, at most as far outside as measured. `strict`: the controller refuses targets
+/// outside.
 fn target(measured: &WireJoints, written: Option<&WireJoints>, ranges: &WireRanges, strict: bool) -> WireJoints {
     let mut target = *measured;
     for (i, (target, range)) in target.iter_mut().zip(ranges).enumerate() {
@@ -99,8 +100,8 @@ pub fn too_far_outside(measured: &WireJoints, ranges: &WireRanges) -> Option<(us
 }
 
 impl Session {
-    /// Holds the arm at the point where it is to rest. An arm that another program commands has no such point: it is held
-    /// where it is, if its positions agree.
+    /// Holds the arm at the point where it is to rest. An arm that another program commands has no such point: it is
+    /// held where it is, if its positions agree.
     pub fn stop(&mut self, rest: &StopPoint, follow: Follow) -> AdapterResult<()> {
         let target = match rest.position {
             Some(position) if self.ours().is_ok() => self.reachable(position),
@@ -175,8 +176,8 @@ impl Session {
         }
     }
 
-    /// Sets the target with which the motors come on. For an arm slightly outside its limits, that is its position if the
-    /// controller accepts that; otherwise the limit. Returns it.
+    /// Sets the target with which the motors come on. For an arm slightly outside its limits, that is its position if
+    /// the controller accepts that; otherwise the limit. Returns it.
     pub fn take_up_hold(&mut self, measured: &WireJoints, follow: Follow) -> AdapterResult<WireJoints> {
         loop {
             if let (true, Some((joint, by))) = (self.strict, too_far_outside(measured, &self.ranges)) {

@@ -62,7 +62,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     relief: 0.04,
     // Gravity parks J2 and J3 at -1.999° and +1.971°, 0.035 rad outside their ranges (recorded on an arm).
     outside: 0.06,
-    // MOVE J goes on to the last goal; two periods of setpoints at 100 Hz.
+    // MOVE J continues to the last goal; two periods of setpoints at 100 Hz.
     gap_tolerance: Duration::from_millis(20),
     after_gap: AfterGap::RestsAtSetpoint,
     topology: Topology::MultiTurn,

@@ -37,8 +37,8 @@ pub enum Act {
     Enable(bool),
     /// `set_control_mode`
     Mode(ControlMode),
-    /// `write_stop`, with the joint positions at which the arm is to rest [rad]; none if nothing was commanded since the
-    /// motors came on.
+    /// `write_stop`, with the joint positions at which the arm is to rest [rad]; none if nothing was commanded since
+    /// the motors came on.
     Stop(Vec<f64>),
     /// `write_clear_errors`
     ClearErrors,

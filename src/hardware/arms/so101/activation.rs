@@ -53,8 +53,8 @@ impl So101Adapter {
         self.write_torque(true)
     }
 
-    /// Reads until all positions of the servos whose motors are off are accepted for a while: what moves is explained by
-    /// its velocity, as of an arm that falls. Returns the last state, and these positions.
+    /// Reads until all positions of the servos whose motors are off are accepted for a while: what moves is explained
+    /// by its velocity, as of an arm that falls. Returns the last state, and these positions.
     fn agreed(&mut self) -> AdapterResult<([Servo; SERVOS], [i32; SERVOS])> {
         let end = MonotonicClock.now().after(TIMEOUT);
         let (mut since, mut odd) = (None, None);

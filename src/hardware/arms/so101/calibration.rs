@@ -16,8 +16,8 @@ const DATA_SHEET: [(f64, f64); SERVOS] =
     [(-1.920, 1.920), (-1.745, 1.745), (-1.690, 1.690), (-1.658, 1.658), (-2.744, 2.841), (-0.175, 1.745)];
 /// The middle of a turn [counts]: zero of the data sheet.
 const MIDDLE: f64 = 2048.0;
-/// Distance that goals of the joints keep from the seam of the encoder [counts]: a joint that rests beside its goal stays
-/// on its side of the seam. A servo drives round the whole turn to a goal on the other side.
+/// Distance that goals of the joints keep from the seam of the encoder [counts]: a joint that rests beside its goal
+/// stays on its side of the seam. A servo drives round the whole turn to a goal on the other side.
 pub const SEAM_MARGIN: i32 = {
     let (sag, degree) = (2.0 * SPEC.accuracy + SPEC.droop, TAU / 360.0);
     ((if sag > degree { sag } else { degree }) * TURN / TAU) as i32 + 1

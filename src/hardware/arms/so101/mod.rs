@@ -1,8 +1,8 @@
 //! SO-101 (and SO-100): five joints and a gripper of Feetech STS3215 servos on one half-duplex serial line.
 //!
 //! `protocol.rs` has the bytes, `bus.rs` the line, `calibration.rs` what counts mean, `servos.rs` the state of all
-//! servos and writes to them, `connect.rs` the checks when connecting, `adapter.rs` the lifecycle, `activation.rs` where
-//! the motors come on, `turns.rs` and `seam.rs` the seam of the encoders, `parts.rs` gripper and joint status,
+//! servos and writes to them, `connect.rs` the checks when connecting, `adapter.rs` the lifecycle, `activation.rs`
+//! where the motors come on, `turns.rs` and `seam.rs` the seam of the encoders, `parts.rs` gripper and joint status,
 //! `service.rs` and `settings.rs` the work outside a run, `emulator/` the servos' side of the line.
 
 mod activation;
@@ -75,7 +75,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     relief: 0.04,
     // Leaders and followers rest against their end stops, a few counts outside of what was calibrated.
     outside: 0.05,
-    // A servo goes on to its goal; two periods of setpoints at 100 Hz.
+    // A servo continues to its goal; two periods of setpoints at 100 Hz.
     gap_tolerance: Duration::from_millis(20),
     after_gap: AfterGap::RestsAtSetpoint,
     // STS3215: the encoder counts one turn, 0 to 4095.

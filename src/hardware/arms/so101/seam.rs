@@ -1,8 +1,8 @@
 //! What a joint does that was pushed over the seam of its encoder while its motor is on.
 //!
 //! The goal of a servo is a position of one turn, and it never takes the short way over 4095 and 0. A joint behind the
-//! seam would drive round the whole turn to a goal on the other side. So its goal becomes the end of its range on its own
-//! side, at once, and its torque is low until it is back.
+//! seam would drive round the whole turn to a goal on the other side. So its goal becomes the end of its range on its
+//! own side, at once, and its torque is low until it is back.
 
 use super::DOF;
 use super::adapter::So101Adapter;

@@ -202,7 +202,7 @@ fn a_stop_leaves_the_gripper_its_grip_and_joints_that_droop_their_goals() {
     let at = |joints: [f64; DOF]| StopPoint { position: Some(joints_of(&joints)) };
     assert_eq!(adapter.write_stop(&at([0.2, -0.3, 0.4, -0.1, 0.5])), Ok(Stop::Confirmed));
     assert_eq!(goals(&servos), held, "at rest");
-    // The same while a joint moves: it comes to rest where its braking ends.
+    // The same while a joint moves: it stops where its braking ends.
     let start = positions(&mut adapter);
     adapter.write_joint_positions(&[-1.5, -0.3, 0.4, -0.1, 0.5], 0.3).unwrap();
     until(|| (positions(&mut adapter)[0] - start[0]).abs() > 0.1);

@@ -1,5 +1,6 @@
-//! The seam of the encoders: leaders that are turned over it, arms that are enabled beside it, and joints that are pushed
-//! over it under power. Ten thousand random states and pushes against a model of one servo, the rest against the emulator.
+//! The seam of the encoders: leaders that are turned over it, arms that are enabled beside it, and joints that are
+//! pushed over it under power. Ten thousand random states and pushes against a model of one servo, the rest against the
+//! emulator.
 
 use std::time::Duration;
 
@@ -103,7 +104,7 @@ impl Watch {
         order
     }
 
-    /// Lets so many periods pass. Returns the last order.
+    /// Lets this number of periods pass. Returns the last order.
     fn pass(&mut self, model: &mut Model, hand: Option<f64>, periods: u32, random: &mut Random) -> Option<Order> {
         let mut last = None;
         for _ in 0..periods {
@@ -154,7 +155,8 @@ fn no_goal_moves_at_a_seam_in_ten_thousand_states_and_pushes() {
         let back = push.abs() + 2.0 * f64::from(SEAM_MARGIN) + 60.0;
         assert!(moved <= back, "{n}: let go at {before}, it went to {} ({range:?}, goal {goal})", model.at);
         if watch.seams.is_crossed(WRIST) {
-            // Turned back by hand, and let go: it goes to the end on the side on which it was held, weakly, then holds it.
+            // Turned back by hand, and let go: it goes to the end on the side on which it was held, weakly, then holds
+            // it.
             let home = f64::from(goal) - droop;
             watch.pass(&mut model, Some(home), 60, &mut random);
             watch.pass(&mut model, None, 400, &mut random);
@@ -231,7 +233,7 @@ fn a_leader_is_read_over_its_seam() {
     let steps = read.windows(2).map(|pair| (pair[1] - pair[0]).abs()).fold(0.0, f64::max);
     assert!(steps < 0.1 && (read[59] - start + 0.6).abs() < 0.03, "{start}: {read:?}");
     assert_eq!(adapter.read_error(), Ok((0, String::new())), "its motors are off");
-    // There it cannot be enabled: behind its seam, one turn away from its range.
+    // There it cannot be enabled: behind its seam, a whole turn from its range.
     let refused = adapter.activate().unwrap_err().to_string();
     assert!(refused.contains("joint 5 (wrist_roll) is "), "{refused}");
     assert!(refused.contains("beside the seam of its encoder\nhint: turn it by "), "{refused}");

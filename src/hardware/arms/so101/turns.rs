@@ -1,8 +1,8 @@
 //! Positions of a servo counted over the seam of its encoder, and what of them is believed.
 //!
 //! The encoder counts one turn, 0 to 4095. A reading is the position nearest to the last accepted one. It is accepted
-//! when the velocities of the servo explain the way to it, or when readings agree on it for a while: that is a leap, which
-//! the joint has not been seen to make.
+//! when the velocities of the servo explain the way to it, or when readings agree on it for a while: that is a leap,
+//! which the joint has not been seen to make.
 
 use super::protocol::{Servo, TURN};
 use crate::clock::Mono;
@@ -114,9 +114,9 @@ impl Turns {
         self.at.div_euclid(COUNTS)
     }
 
-    /// Returns whether the joint has crossed the seam: two readings say so, and it was seen to move there. Behind a leap
-    /// it was seen to go on, away from its goal: a servo that has crossed drives on round the turn, one whose readings
-    /// are wrong rests at its goal.
+    /// Returns whether the joint has crossed the seam: two readings say so, and it was seen to move there. Behind a
+    /// leap it was seen to continue, away from its goal: a servo that has crossed drives on round the turn, one whose
+    /// readings are wrong rests at its goal.
     pub fn crossed(&self) -> bool {
         let went_on = self.free * f64::from(self.turn().signum()) >= LEFT;
         self.outside >= 2 && (self.leapt == 0 || went_on)

@@ -57,7 +57,7 @@ pub struct Servos {
     worn: [bool; SERVOS],
     /// How far the encoder of a servo is off [counts], for how many readings.
     misread: [(i32, u32); SERVOS],
-    /// Turns of the servos when their goals were last looked at: behind the end of a turn a goal is somewhere else.
+    /// Turns of the servos at the last check of their goals: behind the end of a turn a goal is somewhere else.
     turns: [i32; SERVOS],
     /// Instructions since the start.
     instructions: u64,
@@ -112,7 +112,7 @@ impl Servos {
         Ok(servos)
     }
 
-    /// The encoder of a servo (index from 0) is off by this many counts, for so many readings of its position.
+    /// The encoder of a servo (index from 0) is off by this many counts, for this number of readings of its position.
     pub fn misread(&mut self, servo: usize, by: i32, readings: u32) {
         self.misread.get_mut(servo).into_iter().for_each(|to| *to = (by, readings));
     }
@@ -272,8 +272,8 @@ impl Servos {
         }
     }
 
-    /// Sends the joints to the goals in the registers. A servo whose goal is where it is has no overload, nor has one that
-    /// is switched off.
+    /// Sends the joints to the goals in the registers. A servo whose goal is where it is has no overload, nor has one
+    /// that is switched off.
     fn go(&mut self) {
         let mut goals = [0.0; SERVOS];
         let (positions, velocities) = self.arm.joints();
