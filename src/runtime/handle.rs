@@ -33,7 +33,8 @@ impl Handle {
     }
 
     /// Returns a handle for a motion in several parts: it no longer moves an arm that is stopped, held, disabled or
-    /// lost from now on, not even after that was enabled again. Its requests are then refused with [`Code::Superseded`].
+    /// lost from now on, not even after that was enabled again. Its requests are then refused with
+    /// [`Code::Superseded`].
     pub fn until_interrupted(&self) -> Self {
         Self { service: self.service.clone(), epoch: Some(self.service.epoch()) }
     }
