@@ -32,8 +32,9 @@ impl Handle {
         Self { service, epoch: None }
     }
 
-    /// Returns a handle for a motion in several parts: it no longer moves an arm that is stopped, held, disabled or lost
-    /// from now on, not even after that was enabled again. Its requests are then refused with [`Code::Superseded`].
+    /// Returns a handle for a motion in several parts: it no longer moves an arm that is stopped, held, disabled or
+    /// lost from now on, not even after that was enabled again. Its requests are then refused with
+    /// [`Code::Superseded`].
     pub fn until_interrupted(&self) -> Self {
         Self { service: self.service.clone(), epoch: Some(self.service.epoch()) }
     }
