@@ -181,7 +181,7 @@ fn an_arm_that_was_carried_away_while_off_is_held_where_it_is() {
             // Under power nothing explains that: an operator looks first.
             assert_eq!((rig.phase(0), rig.samples[0].cause.name()), (Phase::Held, "start_mismatch"));
             assert_eq!(rig.ask(Request::Reset { arm: 0 }), Outcome::Accepted);
-            assert_eq!(rig.ask(Request::Enabled { arm: 0 }), Outcome::Accepted);
+            assert_eq!(rig.ask(Request::Enabled { arm: 0, outside: false }), Outcome::Accepted);
             rig.run_for(0.5);
             assert!((rig.arms[0].q[0] - there).abs() < 0.005, "{} from {there}", rig.arms[0].q[0]);
         }

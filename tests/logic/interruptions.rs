@@ -232,7 +232,7 @@ fn a_task_that_the_blueprint_starts_does_not_start_after_a_stop() {
 /// A right arm that follows a left one from the start.
 fn follower() -> Rig {
     let params = FollowParams { leader: Some("left".to_owned()), ..FollowParams::default() };
-    let led = |joint| LeaderJoint { joint, scale: 1.0, offset: 0.0 };
+    let led = |joint| LeaderJoint { joint, scale: 1.0, offset: 0.0, endless: false };
     let mut follow = task("follow", TaskKind::new("follow", &params).led_by((0..6).map(led).collect()), 6..12, 10);
     follow.auto_start = true;
     Rig::new(100.0, vec![arm("left", 6), arm("right", 6)], vec![follow])

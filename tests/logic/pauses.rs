@@ -46,7 +46,7 @@ fn play(seed: u64, verbose: bool) -> (String, Broken) {
     run.verbose = verbose;
     let what = format!("{} at {rate} Hz, {gap:?}", run.row.name);
     (0..3).for_each(|_| run.tick(0, (false, false)));
-    run.ask(Request::Enabled { arm: 0 });
+    run.ask(Request::Enabled { arm: 0, outside: false });
     (0..(0.3 * rate) as u64).for_each(|_| run.tick(0, (false, false)));
     // As fast as the limits allow.
     let l = &run.row.arm.limits;

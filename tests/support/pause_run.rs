@@ -245,7 +245,7 @@ impl Run {
     }
 
     pub fn ask(&mut self, request: Request) {
-        self.inbox.push(Envelope { id: 1, request });
+        self.inbox.push(Envelope { id: 1, origin: None, request });
         self.tick(0, (false, false));
     }
 }

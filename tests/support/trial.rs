@@ -94,7 +94,7 @@ impl Trial {
             let now = self.seconds();
             self.judges[0].stop_asked(now + 1.0 / self.rate, self.arms[0].enabled);
         }
-        self.inbox.push_back(Envelope { id, request });
+        self.inbox.push_back(Envelope { id, origin: None, request });
         id
     }
 

@@ -123,7 +123,7 @@ impl Trial {
             self.begin_lie();
             self.some_ticks(4);
         }
-        let outcome = self.ask(Request::Enabled { arm: 0 });
+        let outcome = self.ask(Request::Enabled { arm: 0, outside: false });
         self.run_until(0.5, |trial| trial.phase() == Phase::Ready);
         self.run_for(0.05);
         self.is_ready(&format!("enabled ({outcome:?})"));

@@ -114,7 +114,7 @@ impl Trial {
             }
             Act::Follow => {
                 let params = FollowParams { leader: Some("leader".to_owned()), ..FollowParams::default() };
-                let led = |joint| LeaderJoint { joint, scale: 1.0, offset: 0.0 };
+                let led = |joint| LeaderJoint { joint, scale: 1.0, offset: 0.0, endless: false };
                 TaskKind::new("follow", &params).led_by((dof..2 * dof).map(led).collect())
             }
         };
