@@ -16,7 +16,7 @@ fn the_vendors_programs_are_read() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/protocols/ur_script");
     for name in ["external_control_5.20.0.script", "external_control_10.12.1.script"] {
         let Ok(text) = std::fs::read_to_string(folder.join(name)) else {
-            println!("SKIPPED: ../shared/protocols/ur_script (make test-tools)");
+            println!("SKIPPED: ../shared (make test-tools)");
             assert_ne!(std::env::var("DIMOS_NO_SKIP").as_deref(), Ok("1"), "{name} is missing");
             return;
         };
