@@ -162,9 +162,10 @@ fn at_most_two_set_points_wait_in_the_kernel() {
     let taken = taken.count();
     assert!((1..=2).contains(&taken), "{taken} setpoints wait");
     arm.discard_pending();
-    assert!(arm.write_stop(&StopPoint::default()).is_err() && arm.is_connected(), "they must be out first");
+    let rest = StopPoint { position: Some(dimos::joint::joints_of(&target)) };
+    assert!(arm.write_stop(&rest).is_err() && arm.is_connected(), "they must be out first");
     sh("tc qdisc change dev can0 root plug release_indefinite");
-    until("a stop", || arm.write_stop(&StopPoint::default()).is_ok());
+    until("a stop", || arm.write_stop(&rest).is_ok());
     until("the stop at the arm", || emulator.trace().iter().filter(|(_, f)| f.id == 0x157).count() == taken + 1);
     let ids: Vec<u16> = emulator.trace().iter().map(|(_, frame)| frame.id).collect();
     assert!(ids.len() <= 12, "{ids:x?}");

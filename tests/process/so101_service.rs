@@ -76,11 +76,12 @@ fn an_arm_is_calibrated_by_hand_with_its_motors_off() {
 
     let path = home.path().join("mine/arm.json");
     let [pan, .., roll, gripper] = Calibration::read(&path).unwrap();
-    assert_eq!((pan.homing_offset, pan.range_min, pan.range_max), (66, 730, 3234));
-    assert_eq!((roll.range_min, roll.range_max), (0, 4095), "it has no end stops");
-    assert_eq!((gripper.id, gripper.range_min, gripper.range_max), (6, 1672, 2924));
+    // The middle of the travel is that of the turn.
+    assert_eq!((pan.homing_offset, pan.range_min, pan.range_max), (1, 795, 3299));
+    assert_eq!((roll.range_min, roll.range_max), (0, 4095), "it was not led");
+    assert_eq!((gripper.id, gripper.range_min, gripper.range_max), (6, 1421, 2673));
     let registers = servos.with(|servos, _| [31, 9, 10, 11, 12, 55].map(|address| servos.byte(0, address)));
-    assert_eq!(registers, [66, 730u16.to_le_bytes()[0], 730u16.to_le_bytes()[1], 3234u16.to_le_bytes()[0], 12, 1]);
+    assert_eq!(registers, [1, 795u16.to_le_bytes()[0], 795u16.to_le_bytes()[1], 3299u16.to_le_bytes()[0], 12, 1]);
     assert!(!servos.with(|servos, _| servos.arm().enabled()), "no motor was switched on");
     home.dimos(&line).with(2).says(&["mine/arm.json exists", "--force"]);
 

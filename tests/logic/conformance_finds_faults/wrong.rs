@@ -173,8 +173,8 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
         if MISTAKE == MOVES_ON_ACTIVATION { self.inner.write_joint_positions(&[0.1; 6], 0.5) } else { Ok(()) }
     }
 
-    fn deactivate(&mut self, _rest: &StopPoint) -> AdapterResult<()> {
-        self.inner.deactivate(&StopPoint::default())?;
+    fn deactivate(&mut self, rest: &StopPoint) -> AdapterResult<()> {
+        self.inner.deactivate(rest)?;
         if MISTAKE == DROPS_POWER_ON_LEAVING { self.inner.write_enable(false) } else { Ok(()) }
     }
 
@@ -293,12 +293,12 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
         if MISTAKE == MOVES_WITHOUT_POWER { Ok(()) } else { result }
     }
 
-    fn write_stop(&mut self, _rest: &StopPoint) -> AdapterResult<Stop> {
+    fn write_stop(&mut self, rest: &StopPoint) -> AdapterResult<Stop> {
         self.stopped = true;
         match MISTAKE {
             IGNORES_STOP if self.inner.is_connected() => Ok(Stop::Confirmed),
             CANNOT_STOP_AFTER_RECONNECTING if self.connections > 1 => Ok(Stop::Confirmed),
-            CONFIRMS_ALWAYS => self.inner.write_stop(&StopPoint::default()).or(Ok(Stop::Confirmed)),
+            CONFIRMS_ALWAYS => self.inner.write_stop(rest).or(Ok(Stop::Confirmed)),
             CONFIRMS_UNSEEN => {
                 let mut here = [0.0; 5];
                 self.inner.read_joint_positions(&mut here)?;
@@ -311,11 +311,11 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
             STOP_CLEARS_ERRORS => self.inner.write_clear_errors().map(|()| Stop::Confirmed),
             // The arm's own stop holds the gripper too; this one does not.
             GRIPPER_IGNORES_STOP | STOP_LOCKS_GRIPPER => {
-                let stop = self.inner.write_stop(&StopPoint::default())?;
+                let stop = self.inner.write_stop(rest)?;
                 let gripper = self.inner.gripper().ok_or(AdapterError::Unsupported)?;
                 gripper.write_gripper_position(self.gripper).map(|()| stop)
             }
-            _ => self.inner.write_stop(&StopPoint::default()),
+            _ => self.inner.write_stop(rest),
         }
     }
 
