@@ -312,7 +312,7 @@ pub struct ArmCommand {
     /// Velocities of position setpoints [rad/s].
     #[serde(default)]
     pub velocity: Joints,
-    /// Where the arm comes to rest from this command by braking within its limits [rad]; `None`: nothing was commanded
+    /// Where the arm is at rest after braking from this command within its limits [rad]; `None`: nothing was commanded
     /// since the motors came on.
     #[serde(default)]
     pub rest: Option<Joints>,

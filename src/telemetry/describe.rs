@@ -315,7 +315,7 @@ pub fn reason_text(reason: &Reason, names: &Names) -> String {
         }
         Reason::Guarded(arm) => format!("the collision guard stopped {}", names.arm(arm)),
         Reason::Gap(joint, by) => {
-            format!("after a gap in the setpoints {} came to rest {} from the path", names.joint(joint), angle(by))
+            format!("after a gap in the setpoints {} stopped {} from the path", names.joint(joint), angle(by))
         }
         Reason::LeaseEnded(arm) => {
             format!("the client that sent it has disconnected, or released {}", names.arm(arm))
@@ -398,7 +398,7 @@ pub fn cause_text(cause: Cause) -> String {
             angle(by)
         ),
         Cause::Gap(joint, by) => format!(
-            "after a gap in its setpoints joint {} did not come to rest where its motion could continue: {} away",
+            "after a gap in its setpoints joint {} did not stop where its motion could continue: {} away",
             joint + 1,
             angle(by)
         ),

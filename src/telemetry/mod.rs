@@ -151,7 +151,7 @@ pub enum Cause {
     StartMismatch(u16, f64, f64),
     /// A joint is this far outside its range, beyond what the arm may be enabled at [rad].
     OutsideRange(u16, f64),
-    /// After a gap in its setpoints the arm did not come to rest where its motion could continue: the joint, and how
+    /// After a gap in its setpoints the arm did not stop where its motion could continue: the joint, and how
     /// far it is from there [rad].
     Gap(u16, f64),
     /// The arm's adapter refused a setpoint.

@@ -80,7 +80,7 @@ fn an_arm_is_led_only_from_rest_without_a_task_and_its_motors_as_the_way_needs_t
     off.run(3);
     assert_eq!(off.ask(lead(LedBy::Hand)), Outcome::ArmNotReady(0, Phase::Disabled, Cause::None));
     assert_eq!(off.ask(lead(LedBy::HandMotorsOff)), Outcome::Accepted);
-    off.arms[0].q[1] = 0.2;
+    off.carry(0, &[0.0, 0.2, 0.0, 0.0, 0.0, 0.0]);
     off.run_for(0.3);
     assert_eq!((off.phase(0), off.commands[0].mode), (Phase::Led, None));
     assert_eq!(off.ask(Request::PrepareDisable { arm: 0 }), Outcome::Accepted);

@@ -247,7 +247,7 @@ fn a_reading_that_slips_without_end_does_not_move_a_held_arm() {
             rig.arms[0].reports_velocity = velocity;
             let mut slip = 0.0;
             for k in 0..1500 {
-                // A reading that moves by itself while its velocity says nothing, and then with the arm.
+                // A reading that moves on its own while its velocity says nothing, and then with the arm.
                 slip += if k > 100 && slip < 0.6 { 0.004 } else { 0.0 };
                 let mut states = [rig.arms[0].observe(rig.now.after(rig.config.period()))];
                 states[0].position[0] += slip;

@@ -215,7 +215,8 @@ fn an_arm_that_follows_another_does_the_same_again() {
     (0..40).for_each(|_| run.step());
     for k in 0..2000u32 {
         let t = f64::from(k) * 0.01;
-        run.states[1].position = joints_of(&[0.4 * t.sin() + if k > 1200 { 0.5 } else { 0.0 }; 6]);
+        // It is carried away while nothing is heard of it.
+        run.states[1].position = joints_of(&[0.4 * t.sin() + if k > 930 { 0.5 } else { 0.0 }; 6]);
         run.states[1].gripper = Some(0.05 + 0.04 * t.cos());
         run.states[1].link = if (900..960).contains(&k) { Link::Down } else { Link::Up };
         match k {
@@ -251,12 +252,12 @@ fn one_bit_of_a_command_is_found_at_its_tick_and_joint() {
     let folder = tempfile::tempdir().unwrap();
     let (log, _) = eventful(folder.path());
     let copy = folder.path().join("copy.mcap");
-    // Commands begin with the second tick, when the arm was enabled.
+    // Commands begin with the sixth tick: the arm was enabled in the second one, and has rested for 50 ms.
     let number = 140;
     tamper(&log, &copy, "/joint_commands", number, |m: &mut JointState| ulp(&mut m.position[3]));
     let d = first_difference(&copy);
-    assert_eq!((d.tick, d.what, d.joint.as_deref()), (number as u64 + 1, "position command", Some("arm_joint4")));
-    assert!((d.time - 1.41).abs() < 1e-9, "{}", d.time);
+    assert_eq!((d.tick, d.what, d.joint.as_deref()), (number as u64 + 5, "position command", Some("arm_joint4")));
+    assert!((d.time - 1.45).abs() < 1e-9, "{}", d.time);
     assert_ne!(d.logged, d.rerun);
 }
 

@@ -286,9 +286,11 @@ impl Rig {
 
     /// Carries an arm whose motors are off by hand, as fast as a hand can.
     pub fn carry(&mut self, arm: usize, to: &[f64]) {
+        let mut most = 0.0;
         while self.arms[arm].q != to {
+            most = f64::min(most + 0.03, 0.15);
             for (q, to) in self.arms[arm].q.iter_mut().zip(to) {
-                *q += (to - *q).clamp(-0.15, 0.15);
+                *q += (to - *q).clamp(-most, most);
             }
             self.tick();
         }

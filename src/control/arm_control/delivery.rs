@@ -1,10 +1,10 @@
-//! Starts, and delivery of commands: a start takes its setpoint anew; after a gap in delivery, motion continues from
-//! the last written setpoint, or from where the arm's controller has come to rest.
+//! Starts, and delivery of commands: a start takes its pose from an arm at rest; after a gap in delivery, motion continues from
+//! the last written setpoint, or from where the arm's controller has stopped.
 
 use super::ArmControl;
 use crate::arm::{AfterGap, Link};
 use crate::clock::Mono;
-use crate::control::rest::anew::{self, AGREEMENT, Since};
+use crate::control::rest::start_pose::{self, AGREEMENT, Since};
 use crate::control::rest::written::Issued;
 use crate::control::rest::{Gap, Start, braking};
 use crate::joint::{ControlMode, MAX_DOF};
@@ -43,8 +43,8 @@ impl ArmControl {
         }
     }
 
-    /// Takes the setpoint of a start anew as soon as the arm is known to be at rest, and sees to it that it is written.
-    pub(super) fn take_anew(&mut self, now: Mono) {
+    /// Takes the pose of a start as soon as the arm is known to be at rest, and checks that it is written.
+    pub(super) fn take_start_pose(&mut self, now: Mono) {
         match self.rest.start {
             Start::None => {}
             Start::Writing(first) if self.feedback.state().written >= first => {
@@ -61,7 +61,7 @@ impl ArmControl {
             Start::Taking(since, mode) => {
                 let rests = self.feedback.is_usable() && self.feedback.rest_time() >= AGREEMENT;
                 if !rests {
-                    if now.since(since) > anew::LIMIT {
+                    if now.since(since) > start_pose::LIMIT {
                         let (joint, by) = self.furthest_from_enabling();
                         self.failsafe.hold(Cause::MovedWhileActivating(joint, by), now);
                     }
@@ -74,7 +74,7 @@ impl ArmControl {
                 };
                 let supervision = &self.config.supervision;
                 let is_turn = |joint, by| self.feedback.is_turn(joint, by);
-                match anew::positions(self.feedback.state(), &self.limiters, supervision, since, is_turn) {
+                match start_pose::positions(self.feedback.state(), &self.limiters, supervision, since, is_turn) {
                     Err(cause) => self.failsafe.hold(cause, now),
                     Ok(positions) => {
                         for (limiter, q) in self.limiters.iter_mut().zip(positions) {
@@ -96,7 +96,7 @@ impl ArmControl {
         self.rest.start != Start::None
     }
 
-    /// Finds out whether commands reach the arm, and after a gap, whether it has come to rest where its motion can
+    /// Finds out whether commands reach the arm, and after a gap, whether it is at rest where its motion can
     /// continue. During a gap, the limiters are at the last written setpoint.
     pub(super) fn check_gap(&mut self, now: Mono) {
         self.resumed = None;
@@ -136,7 +136,7 @@ impl ArmControl {
         self.end_gap(gap, waits, down, now);
     }
 
-    /// Ends a gap once the arm has come to rest, or has not in time.
+    /// Ends a gap once the arm is at rest, or is not in time.
     fn end_gap(&mut self, gap: Gap, waits: bool, down: bool, now: Mono) {
         let rested = self.feedback.is_usable()
             && self.feedback.rest_time() >= AGREEMENT
@@ -150,7 +150,7 @@ impl ArmControl {
             self.rest.gap = None;
             (self.resumed, self.rest.acknowledged) = (Some(gap.last), true);
             self.start(gap.mode, now);
-            self.take_anew(now);
+            self.take_start_pose(now);
         } else if rested && !down && by.abs() <= tolerance {
             self.rest.gap = None;
             self.resumed = Some(gap.last);

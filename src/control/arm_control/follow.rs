@@ -33,7 +33,7 @@ impl ArmControl {
             }
             // Each mode has its own start: positions from where the arm rests, velocities from zero.
             self.start(mode, now);
-            self.take_anew(now);
+            self.take_start_pose(now);
             if self.command.mode != Some(mode) {
                 self.hold(present, dt);
                 return Routed::Waiting;

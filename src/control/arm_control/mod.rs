@@ -229,7 +229,7 @@ impl ArmControl {
             self.failsafe.hold(cause, now);
         }
         if self.failsafe.phase() == Phase::Activating || self.is_starting() {
-            self.take_anew(now);
+            self.take_start_pose(now);
             if self.is_starting() {
                 self.failsafe.prolong_ramp(now);
             }

@@ -4,7 +4,7 @@
 use super::{ArmControl, JointRequest, Routed};
 use crate::clock::Mono;
 use crate::control::limit::Limiter;
-use crate::control::rest::anew::AGREEMENT;
+use crate::control::rest::start_pose::AGREEMENT;
 use crate::control::rest::{Relief, SETTLED, SETTLING_TIME, braking};
 use crate::control::task_body::Demand;
 use crate::joint::{ControlMode, TICK_STANDSTILL};

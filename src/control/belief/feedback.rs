@@ -141,7 +141,7 @@ impl Feedback {
     }
 
     fn accept(&mut self, state: &ArmState, range: Option<&Range>) -> Verdict {
-        if matches!(state.link, Link::Down | Link::Faulted) && !state.enabled {
+        if matches!(state.link, Link::Down | Link::Faulted) {
             // A new connection may find the arm anywhere.
             self.plausibility.acknowledge();
         }

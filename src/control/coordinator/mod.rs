@@ -140,7 +140,7 @@ impl Coordinator {
     }
 
     /// Returns the time that this tick covers [s]. What the controllers of all arms bridge passes as if nothing had
-    /// happened: motions go on where they would be.
+    /// happened: motions are where they would be.
     fn time_covered(&self, time: TickTime) -> f64 {
         let covered = self.period * f64::from(time.skipped + 1);
         if self.arms.iter().all(|arm| arm.bridges(covered)) { covered } else { self.period }

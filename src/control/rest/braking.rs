@@ -1,4 +1,4 @@
-//! Braking with all joints together: the arm comes to rest on the straight line of its velocities, as fast as the joint
+//! Braking with all joints together: the arm stops on the straight line of its velocities, as fast as the joint
 //! that needs longest. The collision guard proves this way before the arm takes it.
 
 use crate::control::limit::Limiter;

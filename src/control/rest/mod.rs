@@ -1,9 +1,9 @@
-//! How an arm comes to rest, what happens in gaps, and from where it starts again. Nothing else in the program decides
+//! How an arm stops, what happens in gaps, and from where it starts again. Nothing else in the program decides
 //! that. Setpoints continue from the last one that was written; a reading never is a place to go.
 
-pub mod anew;
 pub mod braking;
 mod relief;
+pub mod start_pose;
 pub mod written;
 
 use std::time::Duration;
@@ -28,7 +28,7 @@ const REST_AFTER_GAP: f64 = 0.6;
 pub enum Start {
     /// None is under way.
     None,
-    /// The setpoint is being taken anew, since then, for this mode.
+    /// Its pose is being taken, since then, for this mode.
     Taking(Mono, ControlMode),
     /// It was taken; its first command has this number, and is not written yet.
     Writing(u64),

@@ -21,7 +21,7 @@ const BRAKE_TIME: Duration = Duration::from_secs(4);
 const LEFTOVER_LIMIT: Duration = Duration::from_millis(1200);
 /// How long the motors may take to go off.
 const OFF_LIMIT: Duration = Duration::from_secs(3);
-/// How long the arm may take to come to rest before the program starts, or its motors go off.
+/// How long the arm may take to stop before the program starts, or its motors go off.
 const REST_LIMIT: Duration = Duration::from_millis(1500);
 /// How long the program may take to start.
 const START_LIMIT: Duration = Duration::from_millis(1500);

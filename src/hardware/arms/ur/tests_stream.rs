@@ -99,7 +99,7 @@ fn orders_may_be_answered_some_ticks_later() {
     assert_eq!((adapter.foreign_change(), emulator.program().as_deref()), (None, Some("dimos_control")));
 }
 
-/// The stream ends in motion; returns where the arm came to rest, and how far the setpoints had come.
+/// The stream ends in motion; returns where the arm stopped, and how far the setpoints had come.
 fn cut(end: impl FnOnce(&mut UrAdapter)) -> (f64, f64) {
     let (mut adapter, emulator) = ready(json!({}));
     let start = positions(&mut adapter);

@@ -18,7 +18,7 @@ pub(super) enum Token {
 const SIGNS: [&str; 20] =
     ["==", "!=", "<=", ">=", "<", ">", "=", "+", "-", "*", "/", "%", "(", ")", "[", "]", ",", ":", ".", ";"];
 
-/// Splits a text into words, each with its line. A line goes on within brackets and after an operator.
+/// Splits a text into words, each with its line. A line continues within brackets and after an operator.
 pub(super) fn tokens(text: &str) -> Result<Vec<(u32, Token)>, Refused> {
     let mut found: Vec<(u32, Token)> = Vec::new();
     let mut depth = 0_u32;

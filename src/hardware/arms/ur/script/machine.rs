@@ -83,7 +83,7 @@ impl Machine {
         Ok(Self { code: compiler.code, at: 0, numbers, lists })
     }
 
-    /// Runs the program up to its next call that takes a step; whether there was one, and the program goes on.
+    /// Runs the program up to its next call that takes a step; whether there was one, and the program continues.
     pub fn step(&mut self, controller: &mut impl Controller) -> bool {
         for _ in 0..MOST {
             let Some(instruction) = self.code.get(self.at) else { return false };

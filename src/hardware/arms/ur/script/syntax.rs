@@ -101,7 +101,7 @@ impl Parser {
         is
     }
 
-    fn expect(&mut self, wanted: &str) -> Result<(), Refused> {
+    fn require(&mut self, wanted: &str) -> Result<(), Refused> {
         if self.takes(wanted) {
             return Ok(());
         }
@@ -147,10 +147,10 @@ impl Parser {
 
     /// A colon, statements, `end`.
     fn body(&mut self) -> Result<Vec<Statement>, Refused> {
-        self.expect(":")?;
+        self.require(":")?;
         self.end_of_line()?;
         let body = self.block(&["end"])?;
-        self.expect("end")?;
+        self.require("end")?;
         Ok(body)
     }
 
@@ -212,7 +212,7 @@ impl Parser {
         let (mut cases, mut otherwise) = (Vec::new(), Vec::new());
         loop {
             let condition = self.expression()?;
-            self.expect(":")?;
+            self.require(":")?;
             self.end_of_line()?;
             cases.push((condition, self.block(&["elif", "else", "end"])?));
             if self.takes("elif") {
@@ -221,7 +221,7 @@ impl Parser {
             if self.takes("else") {
                 otherwise = self.body()?;
             } else {
-                self.expect("end")?;
+                self.require("end")?;
             }
             return Ok(Action::If { cases, otherwise });
         }
@@ -229,13 +229,13 @@ impl Parser {
 
     fn function(&mut self) -> Result<Function, Refused> {
         let (name, mut parameters) = (self.name()?, Vec::new());
-        self.expect("(")?;
+        self.require("(")?;
         while !self.takes(")") {
             let parameter = self.name()?;
             let default = if self.takes("=") { Some(self.expression()?) } else { None };
             parameters.push((parameter, default));
             if !self.is(")") {
-                self.expect(",")?;
+                self.require(",")?;
             }
         }
         Ok(Function { name, parameters, body: self.body()? })
@@ -284,7 +284,7 @@ impl Parser {
             Token::Sign("[") => Kind::List(self.items()?),
             Token::Sign("(") => {
                 let inner = self.expression()?;
-                self.expect(")")?;
+                self.require(")")?;
                 inner.kind
             }
             Token::Name(name) if name == "True" || name == "False" => Kind::Bool(name == "True"),
@@ -299,7 +299,7 @@ impl Parser {
         let mut value = Expression { line, kind };
         while self.takes("[") {
             let index = self.expression()?;
-            self.expect("]")?;
+            self.require("]")?;
             value = Expression { line, kind: Kind::Item(Box::new(value), Box::new(index)) };
         }
         Ok(value)
@@ -310,7 +310,7 @@ impl Parser {
         while !self.takes("]") {
             items.push(self.expression()?);
             if !self.is("]") {
-                self.expect(",")?;
+                self.require(",")?;
             }
         }
         Ok(items)
@@ -326,7 +326,7 @@ impl Parser {
             };
             arguments.push(argument);
             if !self.is(")") {
-                self.expect(",")?;
+                self.require(",")?;
             }
         }
         Ok(arguments)

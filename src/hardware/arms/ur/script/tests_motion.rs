@@ -37,7 +37,7 @@ fn a_gap_is_bridged_then_all_joints_decelerate_together() {
 fn a_gap_within_the_tolerance_changes_nothing() {
     let mut judge = following([1.5, 0.0, 0.0, 0.0, 0.0, 0.0]);
     judge.steps(0.016);
-    // The stream goes on where it would be.
+    // The stream continues where it would be.
     for k in 508..600 {
         if k % 2 == 0 {
             judge.order(SERVO, [1.5 * 0.002 * f64::from(k), 0.0, 0.0, 0.0, 0.0, 0.0]);

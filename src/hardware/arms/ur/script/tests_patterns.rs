@@ -172,7 +172,7 @@ fn pattern(seed: u64) -> f64 {
         let (period, wanted) = (dice.below(6) + 1, [0.2, 1.0, 3.0][dice.below(3)]);
         let goal: [f64; 6] = std::array::from_fn(|_| if dice.below(2) == 0 { dice.within(wanted) } else { 0.0 });
         match kind {
-            // A client that goes on from where it was, or from where the arm is, or elsewhere.
+            // A client that continues from where it was, or from where the arm is, or elsewhere.
             0 => position = std::array::from_fn(|i| position[i] + dice.within(0.7)),
             1..=5 => position = judge.at(),
             _ => {}
@@ -192,7 +192,7 @@ fn pattern(seed: u64) -> f64 {
                 8..=9 if k % period == 0 => judge.order(SPEED, goal),
                 10 if k % period == 0 => judge.order(HOLD, [0.0; 6]),
                 13 if k == 0 && dice.below(3) == 0 => judge.order(STOP, [0.0; 6]),
-                _ => {} // a gap; the client's time goes on
+                _ => {} // a gap; the client's time continues
             }
             judge.step();
         }

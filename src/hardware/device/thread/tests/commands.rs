@@ -108,9 +108,21 @@ fn a_change_of_mode_may_be_refused_for_a_second() {
 }
 
 #[test]
+fn a_refused_setpoint_is_no_fault_of_the_connection_and_the_tick_is_told_of_it() {
+    let mut bench = Bench::enabled();
+    for _ in 0..5 {
+        bench.arm.fail("write_joint_positions", AdapterError::Rejected("too far".into()));
+        let state = bench.hold_at(0.0);
+        assert!(state.link == Link::Up && state.refused > state.written, "{state:?}");
+    }
+    let state = bench.hold_at(0.0);
+    assert!(state.written > state.refused, "{state:?}");
+}
+
+#[test]
 fn three_failed_writes_are_a_faulted_link_and_one_good_one_ends_that() {
     let mut bench = Bench::enabled();
-    let refused = AdapterError::Rejected("no".into());
+    let refused = AdapterError::Protocol("no".into());
     for wanted in [Link::Up, Link::Up, Link::Faulted] {
         bench.arm.fail("write_joint_positions", refused.clone());
         assert_eq!(bench.hold_at(0.0).link, wanted);

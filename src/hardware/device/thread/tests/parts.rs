@@ -88,8 +88,8 @@ impl ManipulatorAdapter for Equipped {
     fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()> {
         self.inner.write_joint_positions(positions, velocity)
     }
-    fn write_stop(&mut self, _rest: &StopPoint) -> AdapterResult<Stop> {
-        self.inner.write_stop(&StopPoint::default())
+    fn write_stop(&mut self, rest: &StopPoint) -> AdapterResult<Stop> {
+        self.inner.write_stop(rest)
     }
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
         self.inner.write_enable(enable)
