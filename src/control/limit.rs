@@ -69,12 +69,14 @@ pub struct Limiter {
     request: Option<f64>,
     /// Filtered velocity of the requests [rad/s].
     request_velocity: f64,
+    /// Time that the last command covered [s]; 0: it began a start.
+    covered: f64,
 }
 
 impl Limiter {
     /// Creates the limiter of a joint at rest at 0; `seed` it before use.
     pub fn new(bounds: Bounds) -> Self {
-        Self { bounds, position: 0.0, velocity: 0.0, request: None, request_velocity: 0.0 }
+        Self { bounds, position: 0.0, velocity: 0.0, request: None, request_velocity: 0.0, covered: 0.0 }
     }
 
     /// Returns its bounds.
@@ -170,7 +172,7 @@ impl Limiter {
         let goal = target.clamp(lower, upper);
         let asked = (goal - self.position) / dt;
         let b = Bounds { velocity: self.velocity_limit() * speed, ..self.bounds };
-        let change = b.acceleration * dt;
+        let change = b.acceleration * self.time_to(dt);
         let possible = asked.abs() <= b.velocity * (1.0 + ROUNDING)
             && (asked - self.velocity).abs() <= change * (1.0 + ROUNDING) + ROUNDING
             && (in_step || (asked - self.request_velocity).abs() <= change)
@@ -211,7 +213,7 @@ impl Limiter {
         }
         self.forget_request();
         let b = Bounds { velocity: self.velocity_limit() * speed, ..self.bounds };
-        let change = b.acceleration * dt;
+        let change = b.acceleration * self.time_to(dt);
         let slowest = self.speeds_inside(b.lower, b.upper, at.0, dt).0;
         let fastest = self.speeds_inside(b.lower, b.upper, at.1, dt).1;
         let capped = target.clamp(-b.velocity, b.velocity);
@@ -232,6 +234,12 @@ impl Limiter {
         Ok(Limited { value: self.velocity, by })
     }
 
+    /// Returns the time from the middle of the last step to that of one of `dt` [s]: velocities are means of a step.
+    fn time_to(&mut self, dt: f64) -> f64 {
+        let last = std::mem::replace(&mut self.covered, dt);
+        if last > 0.0 { 0.5 * (last + dt) } else { dt }
+    }
+
     /// Returns the position to command without a request: decelerates to rest, then holds.
     pub fn hold_position(&mut self, dt: f64) -> f64 {
         self.decelerate(self.bounds.acceleration * dt, dt);
@@ -241,6 +249,7 @@ impl Limiter {
     /// Decelerates to rest by `decrease` [rad/s] per step, then holds.
     pub fn decelerate(&mut self, decrease: f64, dt: f64) {
         self.forget_request();
+        self.covered = dt;
         self.velocity = self.braked(decrease);
         let (lower, upper) = self.range();
         self.position = (self.position + self.velocity * dt).clamp(lower, upper);

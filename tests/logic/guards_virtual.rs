@@ -287,7 +287,7 @@ fn an_arm_that_does_not_come_to_rest_is_stopped_all_the_same() {
         rig.tick();
         rig.arms[0].stops > stops
     });
-    assert!(ticks.is_some_and(|ticks| (46..=54).contains(&ticks)), "51 ticks are 0.4 s: {ticks:?}");
+    assert!(ticks.is_some_and(|ticks| (34..=42).contains(&ticks)), "38 ticks are 0.3 s: {ticks:?}");
 }
 
 #[test]

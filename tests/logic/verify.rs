@@ -266,10 +266,10 @@ fn one_bit_of_a_state_is_found_where_it_first_matters() {
     let folder = tempfile::tempdir().unwrap();
     let (log, _) = eventful(folder.path());
     let copy = folder.path().join("copy.mcap");
-    // The hold begins where the arm is measured when it is enabled, in the second tick.
-    tamper(&log, &copy, "/joint_states", 1, |m: &mut JointState| ulp(&mut m.position[4]));
+    // The hold begins where the arm is measured once it has rested for 50 ms.
+    tamper(&log, &copy, "/joint_states", 5, |m: &mut JointState| ulp(&mut m.position[4]));
     let d = first_difference(&copy);
-    assert_eq!((d.tick, d.what, d.joint.as_deref()), (1, "position command", Some("arm_joint5")));
+    assert_eq!((d.tick, d.what, d.joint.as_deref()), (5, "position command", Some("arm_joint5")));
     // Where velocities are estimated, every position matters.
     let estimated = 540;
     tamper(&log, &copy, "/joint_states", estimated, |m: &mut JointState| m.position[2] += 1e-9);

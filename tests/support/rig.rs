@@ -48,6 +48,8 @@ pub struct Rig {
     pub late: Duration,
     /// Whether every command is checked.
     pub checked: bool,
+    /// Time that the last command covered [s].
+    covered: f64,
     wire: Vec<Wire>,
     next_id: u64,
 }
@@ -151,6 +153,7 @@ impl Rig {
             around: |_| {},
             late: Duration::ZERO,
             checked: true,
+            covered: 1.0 / rate,
             wire: config.arms.iter().map(wire).collect(),
             next_id: 1,
             config,
@@ -338,6 +341,8 @@ impl Rig {
     fn check_wire(&mut self, skipped: u32) {
         // A single lost period is bridged: the command covers both.
         let dt = if skipped == 1 { 2.0 * self.dt() } else { self.dt() };
+        // Velocities are means of a step.
+        let between = 0.5 * (dt + std::mem::replace(&mut self.covered, dt));
         for (i, (wire, command)) in self.wire.iter_mut().zip(&self.commands).enumerate() {
             let (sample, arm, limits) = (&self.samples[i], &self.arms[i], &self.config.arms[i].limits);
             let was = wire.clone();
@@ -389,7 +394,7 @@ impl Rig {
                 };
                 let change = velocity - wire.velocity[j];
                 assert!(velocity.abs() <= limits.velocity_max[j] * (1.0 + 1e-9) + 1e-12, "{}", at("F08 velocity"));
-                let most = limits.acceleration_max[j] * dt * (1.0 + 1e-6) + 1e-8;
+                let most = limits.acceleration_max[j] * between * (1.0 + 1e-6) + 1e-8;
                 assert!(change.abs() <= most, "{} joint {j} by {}", at("F08 acceleration"), change / dt);
                 wire.velocity[j] = velocity;
                 if mode != ControlMode::Velocity {

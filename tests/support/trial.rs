@@ -152,7 +152,8 @@ impl Trial {
             let (v, a) = (truth.traits.v_max[j], l.acceleration_max[j]);
             // It is held as soon as the joint is seen to move.
             let stopped = if self.row.goal_only { f64::INFINITY } else { v * (s.lag + 0.15) + v * v / (2.0 * a) };
-            let off = if hidden { off.min(stopped) + 0.02f64.max(2.0 * s.accuracy) } else { 0.0 };
+            // On its way there it may reach a speed from which it brakes as far again.
+            let off = if hidden { (2.0 * off).min(stopped) + 0.02f64.max(2.0 * s.accuracy) } else { 0.0 };
             off + crept + truth.traits.droop[j].abs()
         };
         self.judges[0].placed(truth, extra);

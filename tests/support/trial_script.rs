@@ -84,7 +84,9 @@ impl Trial {
                     self.stop();
                 }
                 self.wait(0.05, 0.3);
-                let mismatch = matches!(self.phases[0].1, Cause::StartMismatch(..));
+                let seen = self.phases[0].1;
+                let mismatch =
+                    matches!(seen, Cause::StartMismatch(..) | Cause::PositionJump(..) | Cause::ReadingInconsistent(..));
                 self.ask(Request::Reset { arm: 0 });
                 self.wait(0.02, 0.2);
                 if mismatch {

@@ -1,5 +1,5 @@
-//! Starts, and delivery of commands: a start takes its pose from an arm at rest; after a gap in delivery, motion continues from
-//! the last written setpoint, or from where the arm's controller has stopped.
+//! Starts, and delivery of commands: a start takes its pose from an arm at rest; after a gap in delivery, motion
+//! continues from the last written setpoint, or from where the arm's controller has stopped.
 
 use super::ArmControl;
 use crate::arm::{AfterGap, Link};
@@ -69,6 +69,7 @@ impl ArmControl {
                 }
                 let since = Since {
                     written: self.rest.last_written(),
+                    inexact: if self.rest.by_velocity { self.config.supervision.tracking_tolerance } else { 0.0 },
                     acknowledged: self.rest.acknowledged,
                     outside: self.rest.outside,
                 };
@@ -112,8 +113,7 @@ impl ArmControl {
         let late = self.rest.gap.is_some_and(|gap| last.seq < gap.first) && !waits;
         if late || (self.rest.gap.is_none() && self.rest.written.gap(now)) {
             if self.rest.gap.is_none() {
-                let time = |l: &crate::control::limit::Limiter| l.velocity().abs() / l.bounds().acceleration;
-                let longest = self.limiters.iter().map(time).fold(0.0, f64::max);
+                let longest = braking::time(&self.limiters);
                 let first = self.command.seq + 1;
                 self.rest.begin_gap(now, first, mode, longest, self.config.supervision.lag);
             }
@@ -168,6 +168,7 @@ impl ArmControl {
         for ((q, v), limiter) in out.zip(&self.limiters) {
             (*q, *v) = (limiter.position(), limiter.velocity());
         }
+        self.rest.by_velocity = !mode.is_position();
         self.rest.written.issue(issued);
         self.command.velocity = issued.velocity;
         self.command.rest = Some(braking::rest_point(&self.limiters, dt));

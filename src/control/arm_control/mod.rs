@@ -22,7 +22,7 @@ use super::belief::tracking::{Tracking, furthest};
 use super::config::ArmConfig;
 use super::failsafe::{Failsafe, Freshness};
 use super::limit::{Bounds, Limiter, Refusal};
-use super::rest::{Rest, Start};
+use super::rest::{Rest, Start, braking};
 use super::task_body::Demand;
 use crate::arm::{ArmCommand, ArmState, Link, Topology};
 use crate::clock::Mono;
@@ -363,7 +363,8 @@ impl ArmControl {
         self.command.led = phase == Phase::Led;
         // An arm that another program controls gets neither a setpoint nor a stop.
         let foreign = held && self.failsafe.cause().is_foreign();
-        self.rest.enter(held, self.failsafe.cause(), !self.at_rest(), foreign);
+        let braking = if self.at_rest() { 0.0 } else { braking::time(&self.limiters) };
+        self.rest.enter(held, self.failsafe.cause(), braking, foreign);
         self.before.copy_from_slice(&self.limiters);
         match phase {
             Phase::Unknown | Phase::Disabled => {

@@ -28,7 +28,9 @@ impl ArmControl {
             // Without a connection, an arm in velocity mode keeps its last velocity until it is stopped.
             let stuck = self.rest.gap.is_some() && (silent || mode.is_position());
             if !stuck {
-                if demand != Demand::Nothing && self.limiters.iter().any(|limiter| !limiter.at_rest()) {
+                let moving = self.limiters.iter().any(|limiter| !limiter.at_rest());
+                if demand != Demand::Nothing && moving && (self.rest.along_path > 0.0 || !self.rest.moved) {
+                    self.rest.along_path -= dt;
                     let routed = self.follow(demand, ask, dt, now, |_, _, _| {});
                     if routed == Routed::Sent {
                         return routed;

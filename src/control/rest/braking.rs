@@ -4,11 +4,16 @@
 use crate::control::limit::Limiter;
 use crate::joint::{Joints, MAX_DOF};
 
+/// Returns the time that the joint needs which needs longest [s].
+pub fn time(limiters: &[Limiter]) -> f64 {
+    let time = |limiter: &Limiter| limiter.velocity().abs() / limiter.bounds().acceleration;
+    limiters.iter().map(time).fold(0.0, f64::max)
+}
+
 /// Returns by how much the velocity of each joint decreases per step of `dt` [s] [rad/s].
 pub fn decreases(limiters: &[Limiter], dt: f64) -> Joints {
     let mut decreases = [0.0; MAX_DOF];
-    let time = |limiter: &Limiter| limiter.velocity().abs() / limiter.bounds().acceleration;
-    let longest = limiters.iter().map(time).fold(0.0, f64::max);
+    let longest = time(limiters);
     for (decrease, limiter) in decreases.iter_mut().zip(limiters) {
         *decrease = match longest > 0.0 {
             true => limiter.velocity().abs() / longest * dt,

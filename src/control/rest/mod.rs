@@ -17,7 +17,9 @@ pub use relief::{Move, Relief};
 use written::{Issued, Written};
 
 /// Maximum time for a lagging arm to settle at its last command before it is stopped [s].
-pub const SETTLING_TIME: f64 = 0.4;
+pub const SETTLING_TIME: f64 = 0.3;
+/// How long a held motion may decelerate along its path, beside twice the braking time of its joints [s].
+pub const ALONG_PATH: f64 = 0.05;
 /// How long an arm that has settled must have been read at rest.
 pub const SETTLED: Duration = Duration::from_millis(30);
 /// How long an arm may take to be at rest after a gap, beside its lag and twice its braking time [s].
@@ -56,6 +58,8 @@ pub struct Rest {
     pub written: Written,
     /// Whether nothing else has moved the arm since: no hand, no gravity without motors, no other program.
     pub holds_written: bool,
+    /// Whether it was commanded by velocities.
+    pub by_velocity: bool,
     /// Whether an operator has seen a difference to what was written.
     pub acknowledged: bool,
     /// Whether the arm may be enabled farther outside its limits than its row says.
@@ -68,6 +72,8 @@ pub struct Rest {
     pub stop_pending: bool,
     /// Whether setpoints moved since the arm was held.
     pub moved: bool,
+    /// Time left to decelerate along a path [s].
+    pub along_path: f64,
     /// Taking a setpoint back towards a blocked joint.
     pub relief: Relief,
     was_held: bool,
@@ -81,23 +87,26 @@ impl Rest {
         Self {
             written: Written::new(period, config.write_period, config.supervision.gap_tolerance),
             holds_written: false,
+            by_velocity: false,
             acknowledged: false,
             outside: false,
             start: Start::None,
             gap: None,
             stop_pending: false,
             moved: false,
+            along_path: 0.0,
             relief: Relief::None,
             was_held: false,
             still: 0.0,
         }
     }
 
-    /// Takes this tick's phase: a new hold needs a stop. `moving`: whether setpoints move. `foreign`: another program
-    /// controls the arm.
-    pub fn enter(&mut self, held: bool, cause: Cause, moving: bool, foreign: bool) {
+    /// Takes this tick's phase: a new hold needs a stop. `braking`: braking time of the setpoints [s], 0 at rest.
+    /// `foreign`: another program controls the arm.
+    pub fn enter(&mut self, held: bool, cause: Cause, braking: f64, foreign: bool) {
         if held && !self.was_held {
-            (self.start, self.moved) = (Start::None, moving);
+            (self.start, self.moved) = (Start::None, braking > 0.0);
+            self.along_path = 2.0 * braking + ALONG_PATH;
             self.stop_pending |= !foreign;
             self.relief = if matches!(cause, Cause::Tracking(..)) { Relief::Due } else { Relief::None };
         }

@@ -1,5 +1,5 @@
-//! The pose that a start takes where continuity is lost: at enabling, after an arm was led, at a change of mode, after a
-//! gap. Only of an arm at rest, from what its controller commands, else from positions that have agreed with each other
+//! The pose that a start takes where continuity is lost: at enabling, after an arm was led, at a change of mode, after
+//! a gap. Only of an arm at rest, from what its controller commands, else from positions that have agreed with each other
 //! for a while.
 
 use std::time::Duration;
@@ -20,8 +20,9 @@ const COMMANDED_REST: f64 = 2e-3;
 /// braking distance by the acceleration limit that its own braking may take.
 const REACTION: f64 = 0.2;
 const BRAKING: f64 = 2.0;
-/// Joints whose brakes engage settle by this much [rad].
-const SETTLING: f64 = 0.01;
+
+/// A joint that is stopped by its controller once it has settled may be this far from its setpoint [rad].
+const STOPPED_SHORT: f64 = 0.01;
 
 /// What is known of the time since the last written setpoint.
 #[derive(Debug, Clone, Copy)]
@@ -29,6 +30,8 @@ pub struct Since<'a> {
     /// The last written setpoint; `None`: something else has moved the arm since (a hand, gravity, another program), or
     /// nothing was written.
     pub written: Option<&'a Issued>,
+    /// How exactly that is known [rad]: in velocity mode, positions are where velocities have led to.
+    pub inexact: f64,
     /// An operator has seen the difference to it.
     pub acknowledged: bool,
     /// The arm may be farther outside its limits than its row says.
@@ -64,7 +67,8 @@ pub fn positions(
                 *taken = last;
             } else {
                 let braking = BRAKING * v * v / (2.0 * limiter.bounds().acceleration);
-                let explained = droop + SETTLING + supervision.relief + v * (supervision.lag + REACTION) + braking;
+                // The arm's own stop may have met it on the rest of its way to the setpoint.
+                let explained = droop + STOPPED_SHORT + since.inexact + v * (supervision.lag + REACTION) + braking;
                 if is_turn(j, difference) {
                     return Err(Cause::TurnLost(j as u16, difference));
                 }
@@ -100,7 +104,7 @@ mod tests {
     fn take(read: [f64; 2], written: Option<&Issued>, acknowledged: bool) -> Result<[f64; 2], Cause> {
         let supervision = Supervision { accuracy: 0.01, droop: 0.05, lag: 0.1, ..Supervision::default() };
         let state = ArmState { dof: 2, position: joints_of(&read), ..ArmState::default() };
-        let since = Since { written, acknowledged, outside: false };
+        let since = Since { written, inexact: 0.0, acknowledged, outside: false };
         let is_turn = |_, by: f64| by.abs() > 6.0;
         positions(&state, &limiters(), &supervision, since, is_turn).map(|q| [q[0], q[1]])
     }
@@ -129,7 +133,7 @@ mod tests {
         let own = |q: f64, v: f64| Commanded { position: joints_of(&[q, 0.0]), velocity: joints_of(&[v, 0.0]) };
         let take = |commanded| {
             let state = ArmState { dof: 2, position: joints_of(&[0.5, 0.0]), commanded, ..ArmState::default() };
-            let since = Since { written: None, acknowledged: false, outside: false };
+            let since = Since { written: None, inexact: 0.0, acknowledged: false, outside: false };
             positions(&state, &limiters(), &supervision, since, |_, _| false).map(|q| q[0])
         };
         assert_eq!(take(Some(own(0.51, 0.0))), Ok(0.51));

@@ -103,7 +103,7 @@ pub struct Options {
     /// Gain with which the controller follows setpoints, 100 to 2000: higher is stiffer, and may vibrate.
     #[schemars(range(min = 100, max = 2000))]
     pub gain: f64,
-    /// Deceleration of a stop, of a hold and after a gap, 1 to 40 [rad/s²]. Setpoints are followed with no more than it.
+    /// Deceleration of a stop, of a hold and after a gap, 1 to 40 [rad/s²]. Setpoints are followed with at most this.
     #[schemars(range(min = 1, max = 40))]
     pub stop_deceleration: f64,
     /// Whether to read force and torque at the TCP. An e-Series arm measures them; a CB3 arm estimates them from its

@@ -125,7 +125,8 @@ fn cut(end: impl FnOnce(&mut UrAdapter)) -> (f64, f64) {
 
 #[test]
 fn the_end_of_a_stream_in_motion_is_a_deceleration() {
-    // Silence; the end of the mode; enabling; disabling; a stop. The arm goes beyond the last setpoint: by 63 mm at 1 rad/s and 8 rad/s².
+    // Silence; the end of the mode; enabling; disabling; a stop. The arm goes beyond the last setpoint: by 63 mm at
+    // 1 rad/s and 8 rad/s².
     let (rest, last) = cut(|_| ());
     assert!(rest > last + 0.03 && rest < last + 0.2, "{rest} and {last} rad");
     cut(|adapter| drop(adapter.set_control_mode(ControlMode::Velocity)));

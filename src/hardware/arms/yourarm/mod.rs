@@ -54,8 +54,8 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     accuracy: 0.002,
     lag: 0.03,
     stale_after: Duration::from_millis(50),
-    // yourarm-protocol.md: setpoints up to two periods apart are interpolated, then the arm returns to the last one; its
-    // stop rests where it is.
+    // yourarm-protocol.md: setpoints up to two periods apart are interpolated, then the arm returns to the last one;
+    // its stop rests where it is.
     droop: 0.0,
     relief: 0.0,
     outside: 0.02,

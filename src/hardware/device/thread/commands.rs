@@ -134,7 +134,7 @@ impl Worker {
         now.since(*self.mode_refused_since.get_or_insert(now)) > MODE_TIMEOUT
     }
 
-    /// Returns where the arm is to rest: where braking from the newest command ends, or from the last one that had a mode.
+    /// Returns where the arm is to rest: where braking from the newest command ends that had a mode.
     pub(super) fn stop_point(&self) -> StopPoint {
         StopPoint { position: self.last.rest }
     }

@@ -1,8 +1,8 @@
 //! The emulator of a controller with its arm, for `address: sim`, for tests, and for other clients such as `ur_rtde`.
 //!
 //! Written from the protocol, and shares no code with the adapter besides the models' dimensions: two sides that share
-//! an encoder share its mistakes. The text of the adapter's program is carried out (`super::script`), that of `ur_rtde` is
-//! recognized by its name, and any other one starts and ends.
+//! an encoder share its mistakes. The text of the adapter's program is carried out (`super::script`), that of `ur_rtde`
+//! is recognized by its name, and any other one starts and ends.
 
 mod controller;
 mod dashboard;

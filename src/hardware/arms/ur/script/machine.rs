@@ -1,5 +1,5 @@
-//! Runs a program step by step: numbers, lists of six numbers, conditions, loops, and calls of what a controller has. The
-//! reader has checked its types, so numbers, truth values and integers are all `f64` here.
+//! Runs a program step by step: numbers, lists of six numbers, conditions, loops, and calls of what a controller has.
+//! The reader has checked its types, so numbers, truth values and integers are all `f64` here.
 
 use std::collections::BTreeMap;
 

@@ -1,6 +1,6 @@
-//! The language of the programs on a controller, URScript, as far as the programs use it that dimos and the vendor send:
-//! a reader that refuses what a controller would refuse (`syntax`, `types`, `names`), and the execution of a program
-//! that defines no functions (`machine`). The emulator runs the text of `control.script` with it.
+//! The language of the programs on a controller, URScript, as far as the programs use it that dimos and the vendor
+//! send: a reader that refuses what a controller would refuse (`syntax`, `types`, `names`), and the execution of a
+//! program that defines no functions (`machine`). The emulator runs the text of `control.script` with it.
 
 mod lexer;
 pub mod machine;
