@@ -249,7 +249,7 @@ impl Limiter {
     /// Decelerates to rest by `decrease` [rad/s] per step, then holds.
     pub fn decelerate(&mut self, decrease: f64, dt: f64) {
         self.forget_request();
-        self.covered = dt;
+        let decrease = decrease * (self.time_to(dt) / dt);
         self.velocity = self.braked(decrease);
         let (lower, upper) = self.range();
         self.position = (self.position + self.velocity * dt).clamp(lower, upper);

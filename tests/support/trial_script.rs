@@ -90,9 +90,15 @@ impl Trial {
                 self.ask(Request::Reset { arm: 0 });
                 self.wait(0.02, 0.2);
                 if mismatch {
-                    // An operator has seen both poses, and takes the one that is read.
-                    for (j, q) in self.said[0].position.into_iter().enumerate().take(self.row.arm.dof) {
-                        self.judges[0].request(j, q, self.row.arm.limits.velocity_max[j]);
+                    // An operator has seen both poses, and takes the one that is read. The arm is held once it is seen
+                    // to move, and brakes from the speed that it has by then.
+                    for j in 0..self.row.arm.dof {
+                        let (said, truth) = (self.said[0].position[j], self.arms[0].q[j]);
+                        let v = self.row.arm.limits.velocity_max[j];
+                        for past in [-1.0, 1.0] {
+                            let to = said + past * ((said - truth).abs() + 0.02);
+                            self.judges[0].request(j, to, v);
+                        }
                     }
                 }
                 self.enable(false);

@@ -22,7 +22,7 @@ use super::belief::tracking::{Tracking, furthest};
 use super::config::ArmConfig;
 use super::failsafe::{Failsafe, Freshness};
 use super::limit::{Bounds, Limiter, Refusal};
-use super::rest::{Rest, Start, braking};
+use super::rest::{Rest, SETTLED, Start, braking};
 use super::task_body::Demand;
 use crate::arm::{ArmCommand, ArmState, Link, Topology};
 use crate::clock::Mono;
@@ -254,8 +254,11 @@ impl ArmControl {
             let fastest = self.limiters.iter().fold(0.0, |most: f64, limiter| most.max(limiter.velocity().abs()));
             self.correction = (self.correction + DRIFT * fastest * dt).min(MAX_CORRECTION);
             let (mut used, most) = (0.0f64, self.correction);
-            for (j, limiter) in self.limiters.iter_mut().enumerate() {
-                let by = self.tracking.error(j).max(-most).min(most);
+            let rests = self.at_rest() && self.feedback.rest_time() >= SETTLED;
+            let read = self.feedback.state().position;
+            for (j, (limiter, q)) in self.limiters.iter_mut().zip(read).enumerate() {
+                let off = if rests { q - limiter.position() } else { self.tracking.error(j) };
+                let by = off.max(-most).min(most);
                 used = used.max(by.abs());
                 limiter.correct(by);
             }

@@ -1,6 +1,6 @@
 //! The pose that a start takes where continuity is lost: at enabling, after an arm was led, at a change of mode, after
-//! a gap. Only of an arm at rest, from what its controller commands, else from positions that have agreed with each other
-//! for a while.
+//! a gap. Only of an arm at rest, from what its controller commands, else from positions that have agreed with each
+//! other for a while.
 
 use std::time::Duration;
 

@@ -146,7 +146,8 @@ fn while_streaming(context: &mut Context) -> Result<(), String> {
     let here = reconnect(context)?;
     let off = farthest(&here, &point);
     require(off < 0.02, || format!("it is {off:.4} rad from its last setpoint"))?;
-    context.stays(&here, 0.005)
+    // 0.1 rad/s for as long as its controller bridges a gap.
+    context.stays(&here, 0.005 + 0.1 * context.row.gap_tolerance.as_secs_f64())
 }
 
 fn in_error(context: &mut Context) -> Result<(), String> {
