@@ -128,8 +128,8 @@ impl ArmControl {
         let age = f64::from(age.age_us + age.own_us) * 1e-6;
         let time = self.config.supervision.lag + age + dt;
         let mut out = [(0.0, 0.0); MAX_DOF];
-        for (j, (out, (q, limiter))) in out.iter_mut().zip(state.position.iter().zip(&self.limiters)).enumerate() {
-            let led = limiter.position();
+        for (j, (out, (q, before))) in out.iter_mut().zip(state.position.iter().zip(&self.before)).enumerate() {
+            let led = before.position();
             *out = ((q + range.low(j).min(0.0) * time).min(led), (q + range.high(j).max(0.0) * time).max(led));
         }
         Some(out)

@@ -15,6 +15,8 @@ const NOISE: f64 = 0.02;
 /// Fastest that a hand moves a joint whose motor is off [rad/s], and highest acceleration of that [rad/s²].
 const HAND_SPEED: f64 = 20.0;
 const HAND_ACCELERATION: f64 = 400.0;
+/// Highest acceleration of a joint under power that is pushed off its setpoints [rad/s²].
+const PUSH_ACCELERATION: f64 = 100.0;
 /// Longest time between two readings that counts: the arm may have moved meanwhile [s].
 const LONGEST_GAP: f64 = 0.5;
 /// Number of consecutive, consistent rejected readings that are a jump.
@@ -179,8 +181,12 @@ impl Plausibility {
                 None => (*a, *a),
             };
             let beyond = (low - b).max(b - high).max(0.0);
-            let by_hand = self.velocity.get(j).map_or(0.0, |v| v.abs()) + HAND_ACCELERATION * dt;
-            let reach = if powered { SPEED_MARGIN * speed } else { by_hand.min(HAND_SPEED) } * dt + NOISE;
+            let (top, acceleration) = match powered {
+                true => (SPEED_MARGIN * speed, PUSH_ACCELERATION),
+                false => (HAND_SPEED, HAND_ACCELERATION),
+            };
+            let before = self.velocity.get(j).map_or(0.0, |v| v.abs());
+            let reach = (before + acceleration * dt).min(top) * dt + NOISE;
             let excess = beyond - reach;
             if excess > 0.0 && worst.is_none_or(|(_, _, by)| excess > by) {
                 worst = Some((j, b - a, excess));
