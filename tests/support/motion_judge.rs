@@ -99,8 +99,8 @@ pub struct Judge {
     resting: bool,
     ended: f64,
     at_rest_since: Option<f64>,
-    /// Velocities were commanded beside a lie: where the joints are is known to the tracking tolerance only.
-    blind: bool,
+    /// Velocities were commanded beside a lie: where the joints are is known to this only [rad], 0: exactly.
+    blind: f64,
     wire: Option<Wire>,
     /// How far out the setpoints of this start may be.
     bounds: [(f64, f64); MAX_DOF],
@@ -127,7 +127,7 @@ impl Judge {
             resting: true,
             ended: 0.0,
             at_rest_since: None,
-            blind: false,
+            blind: 0.0,
             wire: None,
             bounds: [(0.0, 0.0); MAX_DOF],
             stop: None,
@@ -158,13 +158,13 @@ impl Judge {
             (self.low[j], self.high[j]) = (truth.q[j] - extra(j), truth.q[j] + extra(j));
         }
         self.speed.fill(0.0);
-        self.blind = false;
+        self.blind = 0.0;
         (self.resting, self.wire, self.at_rest_since) = (true, None, None);
     }
 
-    /// Velocities are commanded while what is read is not true.
-    pub fn blind(&mut self) {
-        self.blind = true;
+    /// Velocities are commanded while what is read is off by this [rad].
+    pub fn blind(&mut self, off: f64) {
+        self.blind = self.blind.max(self.s.tracking_tolerance + 0.05).max(off + 0.05);
     }
 
     /// It may move by this much more: a step that looks like noise [rad].
@@ -185,7 +185,7 @@ impl Judge {
             let rested = self.at_rest_since.is_some_and(|since| now - since.max(self.ended) > RESTED);
             let braking = (0..self.dof).map(|j| self.speed[j] / self.limits.acceleration_max[j]).fold(0.0, f64::max);
             if rested || now - self.ended > braking + 3.0 * self.s.lag + 0.8 {
-                let unknown = if self.blind { self.s.tracking_tolerance + 0.05 } else { 0.0 };
+                let unknown = self.blind;
                 for j in 0..self.dof {
                     (self.low[j], self.high[j]) = (truth.q[j] - unknown, truth.q[j] + unknown);
                 }

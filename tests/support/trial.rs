@@ -153,7 +153,7 @@ impl Trial {
             // It is held as soon as the joint is seen to move.
             let stopped = if self.row.goal_only { f64::INFINITY } else { v * (s.lag + 0.15) + v * v / (2.0 * a) };
             // On its way there it may reach a speed from which it brakes as far again.
-            let off = if hidden { (2.0 * off).min(stopped) + 0.02f64.max(2.0 * s.accuracy) } else { 0.0 };
+            let off = if hidden { (2.2 * off).min(stopped) + 0.02f64.max(2.0 * s.accuracy) } else { 0.0 };
             off + crept + truth.traits.droop[j].abs()
         };
         self.judges[0].placed(truth, extra);
@@ -218,12 +218,21 @@ impl Trial {
         self.requested(now, dt);
         let active = self.is_active();
         let own = self.arms[0].traits.reports_commanded;
-        let lied = self.lie.as_ref().is_some_and(|(arm, lie)| *arm == 0 && lie.is_told());
+        let lie = self.lie.as_ref().filter(|(arm, lie)| *arm == 0 && lie.is_told());
+        let lied = lie.is_some();
+        let false_own = lie.is_some_and(|(_, lie)| lie.of_adapter && lie.kind.is_constant());
         for (i, arm) in self.arms.iter_mut().enumerate() {
             let command = &self.commands[i];
             arm.take(command, &self.said[i]);
-            if i == 0 && lied && !own && command.mode == Some(ControlMode::Velocity) {
-                self.judges[i].blind();
+            if i == 0 && lied && command.mode == Some(ControlMode::Velocity) {
+                // An adapter whose setpoints are as wrong as its readings cannot say how far off an arm is that
+                // velocities stopped on its way to a false pose.
+                let off = |j: usize| (self.said[i].position[j] - arm.q[j]).abs();
+                match own {
+                    false => self.judges[i].blind(0.0),
+                    true if false_own => self.judges[i].blind((0..arm.dof).map(off).fold(0.0, f64::max)),
+                    true => {}
+                }
             }
             let written = arm.written.is_some_and(|(at, ..)| at == command.at);
             self.judges[i].command(now, command, written, arm);

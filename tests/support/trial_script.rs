@@ -35,6 +35,9 @@ pub fn trial_with(seed: u64, honest: bool, verbose: bool, change: impl FnOnce(&m
     })
 }
 
+/// A joint may rest this far from its setpoint after its arm's own stop [rad].
+const STOPPED_SHORT: f64 = 0.01;
+
 impl Trial {
     fn script(&mut self) {
         let occasion = self.lie.as_ref().map(|(_, lie)| lie.occasion);
@@ -126,10 +129,18 @@ impl Trial {
             self.run_until(0.1, |trial| trial.said[0].enabled);
         }
         if lie {
-            let unseen = 0.02f64.max(2.0 * self.row.arm.supervision.accuracy);
+            let s = &self.row.arm.supervision;
+            let unseen = 0.02f64.max(2.0 * s.accuracy).max(s.accuracy + s.droop);
             self.judges[0].widen(unseen);
             self.begin_lie();
             self.some_ticks(4);
+            // Before the request, a step that looks like motion is where the arm has been moved.
+            let (said, truth) = (&self.said[0].position, &self.arms[0].q);
+            let step = said.iter().zip(truth).fold(0.0, |most: f64, (said, q)| most.max((said - q).abs()));
+            self.judges[0].widen(step.min(0.2));
+        } else if self.lied_at.is_some() {
+            // Its own stop may have met it short of its setpoint: that much looks like a lie.
+            self.judges[0].widen(STOPPED_SHORT);
         }
         let outcome = self.ask(Request::Enabled { arm: 0, outside: false });
         self.run_until(0.5, |trial| trial.phase() == Phase::Ready);

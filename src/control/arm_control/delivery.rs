@@ -69,7 +69,7 @@ impl ArmControl {
                 }
                 let since = Since {
                     written: self.rest.last_written(),
-                    inexact: if self.rest.by_velocity { self.config.supervision.tracking_tolerance } else { 0.0 },
+                    inexact: if self.rest.by_velocity { super::MAX_CORRECTION } else { 0.0 },
                     acknowledged: self.rest.acknowledged,
                     outside: self.rest.outside,
                 };
