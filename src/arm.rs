@@ -95,7 +95,8 @@ pub struct Setpoint {
     pub at: Mono,
 }
 
-/// Where a stop is to bring the arm to rest. Made from setpoints, never from a measurement.
+/// Where a stop is to bring the arm to rest. Made from setpoints; after silence, which of them reached the arm is
+/// measured, within them.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct StopPoint {
     /// Joint positions [rad]: the last setpoint of an arm at rest, the end of the braking of one in motion. `None`:
@@ -316,6 +317,23 @@ pub struct ArmCommand {
     /// since the motors came on.
     #[serde(default)]
     pub rest: Option<Joints>,
+    /// Lowest and highest setpoint that the arm may have followed since it was last heard [rad], after silence: which of
+    /// them reached it is unknown. A stop is then where the arm is within that.
+    #[serde(default)]
+    pub unheard: Option<[Joints; 2]>,
+}
+
+impl ArmCommand {
+    /// Returns the stop point of an arm that is heard again at `position` [rad]: within what it may have followed.
+    pub fn rest_within_unheard(&self, position: &Joints) -> Option<Joints> {
+        let [low, high] = self.unheard?;
+        let mut rest = *position;
+        for (q, (low, high)) in rest.iter_mut().zip(low.iter().zip(&high)) {
+            // `max` and `min` also replace a value that is not a number.
+            *q = q.max(*low).min(*high);
+        }
+        Some(rest)
+    }
 }
 
 impl Default for ArmCommand {
@@ -336,6 +354,7 @@ impl Default for ArmCommand {
             lead_seq: 0,
             velocity: [0.0; MAX_DOF],
             rest: None,
+            unheard: None,
         }
     }
 }

@@ -107,8 +107,7 @@ def serve(arm, listener):
                 for line in lines: client.sendall(arm.reply(line))
                 heard = time.monotonic()
             except Exception as e:  # it disconnected, or uses another protocol
-                client.close()
-                client, data = None, b""
+                client, data = client.close(), b""  # None
                 if arm.commanded: arm.stop(f"the client's connection ended ({e!r})")
         if arm.commanded and time.monotonic() - heard >= SILENCE: arm.stop(f"no request came for {SILENCE} s")
         if listener in ready:

@@ -135,7 +135,7 @@ fn checkout(at: &Path) {
         ),
         (
             "src/lib.rs",
-            "pub use real::{clock, joint};\npub mod hardware {\n    pub mod arms;\n    pub use real::hardware::{adapter, adapter_util, check, \
+            "pub use real::{arm, clock, joint};\npub mod hardware {\n    pub mod arms;\n    pub use real::hardware::{adapter, adapter_util, check, \
              registry, sim, transport};\n}\n"
                 .into(),
         ),

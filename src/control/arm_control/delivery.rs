@@ -2,8 +2,9 @@
 //! continues from the last written setpoint, or from where the arm's controller has stopped.
 
 use super::ArmControl;
-use crate::arm::{AfterGap, Link};
+use crate::arm::{AfterGap, ArmState, Link};
 use crate::clock::Mono;
+use crate::control::belief::setpoints::Range;
 use crate::control::rest::start_pose::{self, AGREEMENT, Since};
 use crate::control::rest::written::Issued;
 use crate::control::rest::{Gap, Start, braking};
@@ -82,7 +83,7 @@ impl ArmControl {
                             limiter.seed(q);
                         }
                         self.command.start_seq = self.command.start_seq.wrapping_add(1);
-                        self.command.mode = Some(mode);
+                        (self.command.mode, self.command.unheard) = (Some(mode), None);
                         (self.rest.start, self.started_at) = (Start::Writing(self.command.seq + 1), now);
                         self.enabled_at = self.feedback.state().position;
                         self.tracking.restart();
@@ -176,5 +177,62 @@ impl ArmControl {
             let velocities = (!mode.is_position()).then_some(&self.command.values);
             self.tracking.push(now, &issued.position, velocities);
         }
+    }
+
+    /// The arm is not commanded any more while setpoints do not reach it: it rests at the last one that did.
+    pub(super) fn rest_where_written(&mut self) {
+        if self.rest.holds_written && !self.rest.by_velocity {
+            self.command.rest = Some(*self.rest.last_position());
+        }
+    }
+
+    /// The arm is not heard: it may have followed any of the setpoints since its last state.
+    fn note_unheard(&mut self) {
+        let Some(range) = self.tracking.range(self.feedback.state()) else { return };
+        let [low, high] = self.command.unheard.get_or_insert([range.low, range.high]);
+        for (bound, value) in low.iter_mut().zip(range.low) {
+            *bound = bound.min(value);
+        }
+        for (bound, value) in high.iter_mut().zip(range.high) {
+            *bound = bound.max(value);
+        }
+    }
+
+    /// The arm is heard again. If it has followed the setpoints, nothing was lost. Otherwise it is stopped where it is
+    /// within them, and that counts as written.
+    pub(super) fn hear_again(&mut self) {
+        let commanded = self.command.mode.is_some_and(ControlMode::is_position);
+        if !self.feedback.freshness().fresh && commanded && !self.is_starting() {
+            self.note_unheard();
+        }
+        if self.command.unheard.is_none() || !self.feedback.is_usable() {
+            return;
+        }
+        let state = *self.feedback.state();
+        if self.failsafe.phase() != Phase::Held {
+            self.command.unheard = None;
+        } else if self.command.mode.is_some() {
+            let s = &self.config.supervision;
+            let most = NEAR + s.accuracy + s.droop;
+            let range = self.tracking.range(&state);
+            let off = |range: Range| (0..self.config.dof).any(|j| self.distance(&range, &state, j) > most);
+            if range.is_some_and(off) {
+                (self.command.mode, self.rest.stop_pending) = (None, true);
+            } else {
+                self.command.unheard = None;
+            }
+        } else if self.feedback.rest_time() >= AGREEMENT
+            && let Some(rest) = self.command.rest_within_unheard(&state.position)
+        {
+            for (limiter, q) in self.limiters.iter_mut().zip(rest) {
+                limiter.rewind(q, 0.0);
+            }
+            self.rest.written.rests_at(&rest);
+            (self.command.rest, self.command.unheard) = (Some(rest), None);
+        }
+    }
+
+    fn distance(&self, range: &Range, state: &ArmState, joint: usize) -> f64 {
+        range.distance(joint, state.position.get(joint).copied().unwrap_or_default()).abs()
     }
 }

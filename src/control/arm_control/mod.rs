@@ -235,6 +235,7 @@ impl ArmControl {
             }
         }
         self.check_gap(now);
+        self.hear_again();
         self.compare(dt);
         if let Some(cause) = self.unexpected_motion(dt) {
             self.failsafe.hold(cause, now);
@@ -387,6 +388,7 @@ impl ArmControl {
             _ if matches!(self.feedback.state().link, Link::Down | Link::Faulted) => {
                 // It may still follow the last command: the device thread sends the stop as soon as it can.
                 if self.command.mode.take().is_some() {
+                    self.rest_where_written();
                     self.stop();
                 }
                 Routed::NotReady

@@ -43,6 +43,9 @@ impl ArmControl {
             }
             self.command.mode = None;
             self.rest.stop_pending = true;
+            if stuck {
+                self.rest_where_written();
+            }
         }
         if self.rest.stop_pending {
             self.stop();

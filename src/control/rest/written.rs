@@ -60,6 +60,11 @@ impl Written {
         }
     }
 
+    /// What was written did not all reach the arm: it was stopped here [rad].
+    pub fn rests_at(&mut self, position: &Joints) {
+        (self.last.position, self.last.velocity) = (*position, [0.0; MAX_DOF]);
+    }
+
     /// Returns whether a time without a setpoint [s] is no gap.
     pub fn bridges(&self, time: f64) -> bool {
         time <= self.limit.as_secs_f64()

@@ -134,15 +134,25 @@ impl Worker {
         now.since(*self.mode_refused_since.get_or_insert(now)) > MODE_TIMEOUT
     }
 
-    /// Returns where the arm is to rest: where braking from the newest command ends that had a mode.
+    /// Returns where the arm is to rest: where braking from the newest command ends that had a mode; after silence, where
+    /// the arm is within what was commanded meanwhile.
     pub(super) fn stop_point(&self) -> StopPoint {
-        StopPoint { position: self.last.rest }
+        let heard = self.config.clock.now().since(self.state.stamp) <= self.config.state_timeout();
+        let within = self.last.rest_within_unheard(&self.state.position).filter(|_| heard);
+        StopPoint { position: within.or(self.last.rest) }
     }
 
     /// Sends the arm's own stop; retried in every cycle until the arm takes it.
     pub(super) fn stop(&mut self, adapter: &mut dyn ManipulatorAdapter) {
         if !self.stop_pending || !self.connected {
             return;
+        }
+        if self.last.unheard.is_some() && self.config.clock.now().since(self.state.stamp) > self.config.state_timeout()
+        {
+            self.read(adapter);
+            if !self.connected {
+                return;
+            }
         }
         let power = self.ordered_power;
         match adapter.write_stop(&self.stop_point()) {
