@@ -188,7 +188,8 @@ fn velocity_case(bed: &Bed, kind: Kind, time: Duration) -> Vec<String> {
         }
         bed.rest();
         streaming.store(false, Ordering::Relaxed);
-        let (held, sent, delivered) = (bed.phase().0 == "held", bed.gate.sent(), bed.gate.delivered());
+        let ((phase, cause), sent, delivered) = (bed.phase(), bed.gate.sent(), bed.gate.delivered());
+        let held = phase == "held";
         let mut verdicts = vec![bed.bounds.neighbours(&sent, began)];
         if kind != Kind::Wire(Stall::Drop) {
             verdicts.push(bed.bounds.neighbours(&delivered, began).map_err(|e| format!("delivered: {e}")));
@@ -200,9 +201,10 @@ fn velocity_case(bed: &Bed, kind: Kind, time: Duration) -> Vec<String> {
             let again = if stall > limit { bed.bounds.stopping(0, limit) } else { 0.0 };
             let delay = limit + bed.arm.stale_after().max(stall.min(limit));
             // The arm's own lag, too.
-            verdicts.push(bed.bounds.went(&from, &bed.truth(), delay, again + 0.1, began));
+            let went = bed.bounds.went(&from, &bed.truth(), delay, again + 0.1, began);
+            verdicts.push(went.map_err(|e| format!("held ({cause}): {e}")));
         } else if must_hold(&bed.arm, kind, time) {
-            verdicts.push(Err(format!("it is {} after {time:?} of silence", bed.phase().0)));
+            verdicts.push(Err(format!("it is {phase} after {time:?} of silence")));
         }
         verdicts.into_iter().filter_map(Result::err).collect()
     })

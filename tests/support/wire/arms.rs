@@ -216,7 +216,12 @@ impl World {
             rounding: arm.rounding,
             stale_after: arm.stale_after(),
             // Its stop is a target: what was written last, within 0.02 rad of what is measured, which is a little old.
-            stopped_within: (arm.name == "piper").then_some(0.025),
+            stopped_within: match arm.name {
+                "piper" => Some(0.025),
+                // Its program decelerates by itself after 20 ms without a setpoint, and begins where it rests.
+                "ur" => Some(0.01),
+                _ => None,
+            },
             time_limit: arm.time_limit,
         };
         Ok(Bed { run, gate: self.gate.clone(), arm, bounds, world: self, _folder: folder })
