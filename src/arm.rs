@@ -317,8 +317,8 @@ pub struct ArmCommand {
     /// since the motors came on.
     #[serde(default)]
     pub rest: Option<Joints>,
-    /// Lowest and highest setpoint that the arm may have followed since it was last heard [rad], after silence: which of
-    /// them reached it is unknown. A stop is then where the arm is within that.
+    /// Lowest and highest setpoint that the arm may have followed since it was last heard [rad], after silence: which
+    /// of them reached it is unknown. A stop is then where the arm is within that.
     #[serde(default)]
     pub unheard: Option<[Joints; 2]>,
 }

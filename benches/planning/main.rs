@@ -13,6 +13,7 @@ mod problems;
 #[allow(dead_code, reason = "shared with other benchmarks")]
 mod machine;
 #[path = "../../tests/support/python.rs"]
+#[allow(dead_code, reason = "shared with tests")]
 mod python;
 #[path = "../../tests/support/skip.rs"]
 #[allow(dead_code, reason = "shared with tests")]

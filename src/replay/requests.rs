@@ -124,9 +124,12 @@ struct Id {
     id: u64,
 }
 
+/// Origin and contents of a request, or why they are unreadable.
+pub type Contents = Result<(Option<Origin>, Request), String>;
+
 /// Reads a request with its id and its origin. `joints` are the names of all joints, arm by arm. The inner result fails
 /// if only the contents are unreadable.
-pub fn read(json: &str, joints: &[String]) -> Result<(u64, Result<(Option<Origin>, Request), String>), String> {
+pub fn read(json: &str, joints: &[String]) -> Result<(u64, Contents), String> {
     match serde_json::from_str::<RequestMessage>(json) {
         Ok(line) => Ok((line.id, request(line.request, joints).map(|request| (line.origin, request)))),
         Err(e) => match serde_json::from_str::<Id>(json) {

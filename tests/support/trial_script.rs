@@ -134,15 +134,18 @@ impl Trial {
             self.judges[0].widen(unseen);
             self.begin_lie();
             self.some_ticks(4);
-            // Before the request, a step that looks like motion is where the arm has been moved.
-            let (said, truth) = (&self.said[0].position, &self.arms[0].q);
-            let step = said.iter().zip(truth).fold(0.0, |most: f64, (said, q)| most.max((said - q).abs()));
-            self.judges[0].widen(step.min(0.2));
         } else if self.lied_at.is_some() {
             // Its own stop may have met it short of its setpoint: that much looks like a lie.
             self.judges[0].widen(STOPPED_SHORT);
         }
         let outcome = self.ask(Request::Enabled { arm: 0, outside: false });
+        if lie {
+            // Until then, a step that looks like motion is where the arm has been moved. On its way there it may reach
+            // a speed from which it brakes as far again.
+            let (said, truth) = (&self.said[0].position, &self.arms[0].q);
+            let step = said.iter().zip(truth).fold(0.0, |most: f64, (said, q)| most.max((said - q).abs()));
+            self.judges[0].widen((2.2 * step).min(0.2));
+        }
         self.run_until(0.5, |trial| trial.phase() == Phase::Ready);
         self.run_for(0.05);
         self.is_ready(&format!("enabled ({outcome:?})"));

@@ -179,7 +179,7 @@ impl ArmControl {
         }
     }
 
-    /// The arm is not commanded any more while setpoints do not reach it: it rests at the last one that did.
+    /// The arm is no longer commanded while setpoints do not reach it: it rests at the last one that did.
     pub(super) fn rest_where_written(&mut self) {
         if self.rest.holds_written && !self.rest.by_velocity {
             self.command.rest = Some(*self.rest.last_position());

@@ -29,8 +29,10 @@ use crate::clock::Mono;
 use crate::joint::{ControlMode, Joints, MAX_DOF};
 use crate::telemetry::{Bound, Cause, LedBy, LimitKind, Outcome, Phase};
 
-/// A joint that moves this far while its arm is being enabled is moved by something else [rad].
-const ENABLING_TOLERANCE: f64 = 0.02;
+/// A joint that moves this far while its arm is being enabled is moved by something else [rad]; so is one with this
+/// many consecutive readings that cannot be true.
+const ENABLING_TOLERANCE: f64 = 0.01;
+const ENABLING_REJECTED: u32 = 2;
 
 /// Part of the way that velocities have led to that measurements may correct, and the most at a time [rad].
 const DRIFT: f64 = 0.05;
@@ -293,6 +295,9 @@ impl ArmControl {
             Phase::Activating => {
                 let s = &self.config.supervision;
                 let limit = ENABLING_TOLERANCE.max(2.0 * s.accuracy).max(s.accuracy + s.droop);
+                if let Some((joint, by)) = self.feedback.rejected_step(ENABLING_REJECTED) {
+                    return Some(Cause::MovedWhileActivating(joint, by));
+                }
                 let (joint, by) = self.furthest_from_enabling();
                 (by.abs() > limit).then_some(Cause::MovedWhileActivating(joint, by))
             }

@@ -9,6 +9,7 @@ use super::plausibility::{JUMP_AFTER, Plausibility, Verdict};
 use super::setpoints::Range;
 use super::stalls::Stalls;
 use super::stillness::Stillness;
+use super::tracking::furthest;
 use crate::arm::{ArmState, Link, VelocitySource};
 use crate::clock::Mono;
 use crate::control::config::ArmConfig;
@@ -74,6 +75,13 @@ impl Feedback {
     /// Returns whether the latest reading was rejected as implausible.
     pub fn is_rejected(&self) -> bool {
         self.plausibility.rejected() > 0
+    }
+
+    /// Returns the joint whose rejected position is furthest from the accepted one, and how far [rad], if at least this
+    /// many consecutive readings were rejected.
+    pub fn rejected_step(&self, readings: u32) -> Option<(u16, f64)> {
+        let rejected = self.rejected.as_ref().filter(|_| self.plausibility.rejected() >= readings)?;
+        furthest(rejected.position.iter().zip(&self.state.position).map(|(now, before)| now - before))
     }
 
     /// Returns whether the state is fresh and plausible.

@@ -127,7 +127,7 @@ impl Plausibility {
         let worst = match absurd {
             Some(joint) => Some((joint, self.step(joint, &reading.0))),
             None if first => None,
-            None => self.worst(&self.accepted.0, &reading.0, range.filter(|_| powered), powered, dt),
+            None => self.worst(&self.accepted.0, &reading.0, range.filter(|_| powered), powered, dt, true),
         };
         let Some((joint, step)) = worst else {
             let pairs = reading.0.iter().zip(&self.accepted.0);
@@ -139,8 +139,9 @@ impl Plausibility {
             return Verdict::Accepted;
         };
         let finite = reading.0.iter().take(self.dof).all(|q| q.is_finite());
-        let agrees =
-            finite && self.rejected > 0 && self.worst(&self.candidate.0, &reading.0, None, powered, dt).is_none();
+        let agrees = finite
+            && self.rejected > 0
+            && self.worst(&self.candidate.0, &reading.0, None, powered, dt, false).is_none();
         self.rejected = if agrees { self.rejected.saturating_add(1) } else { 1 };
         self.candidate = reading;
         if self.rejected < JUMP_AFTER {
@@ -171,8 +172,16 @@ impl Plausibility {
     }
 
     /// Returns the joint that exceeds its possible motion between two readings the most, and its step [rad]. Between
-    /// where it was and its setpoints a joint may be anywhere.
-    fn worst(&self, from: &Joints, to: &Joints, range: Option<&Range>, powered: bool, dt: f64) -> Option<(usize, f64)> {
+    /// where it was and its setpoints a joint may be anywhere. `steady`: it had the velocity of the accepted readings.
+    fn worst(
+        &self,
+        from: &Joints,
+        to: &Joints,
+        range: Option<&Range>,
+        powered: bool,
+        dt: f64,
+        steady: bool,
+    ) -> Option<(usize, f64)> {
         let mut worst: Option<(usize, f64, f64)> = None;
         for j in 0..self.dof {
             let (Some(a), Some(b), Some(speed)) = (from.get(j), to.get(j), self.speed.get(j)) else { continue };
@@ -186,7 +195,8 @@ impl Plausibility {
                 false => (HAND_SPEED, HAND_ACCELERATION),
             };
             let before = self.velocity.get(j).map_or(0.0, |v| v.abs());
-            let reach = (before + acceleration * dt).min(top) * dt + NOISE;
+            let fastest = if steady { (before + acceleration * dt).min(top) } else { top };
+            let reach = fastest * dt + NOISE;
             let excess = beyond - reach;
             if excess > 0.0 && worst.is_none_or(|(_, _, by)| excess > by) {
                 worst = Some((j, b - a, excess));

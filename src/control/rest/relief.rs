@@ -12,6 +12,7 @@ const FOLLOWED: f64 = 0.5;
 
 /// Progress of a relief.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[expect(clippy::large_enum_variant, reason = "one per arm, and the tick does not allocate")]
 pub enum Relief {
     /// None is due, or it is over.
     None,

@@ -123,7 +123,7 @@ mod tests {
         assert_eq!(take([0.8, -0.3], Some(&last), true), Ok([0.8, -0.3]));
         // Braking from 1 rad/s after a lag explains 0.55 rad.
         assert_eq!(take([0.8, -0.3], Some(&written([0.5, -0.3], 1.0)), false), Ok([0.8, -0.3]));
-        let turned = take([0.5 + 6.28, -0.3], Some(&last), true);
+        let turned = take([0.5 + std::f64::consts::TAU, -0.3], Some(&last), true);
         assert!(matches!(turned, Err(Cause::TurnLost(0, _))), "{turned:?}");
     }
 

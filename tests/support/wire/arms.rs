@@ -218,7 +218,7 @@ impl World {
             // Its stop is a target: what was written last, within 0.02 rad of what is measured, which is a little old.
             stopped_within: match arm.name {
                 "piper" => Some(0.025),
-                // Its program decelerates by itself after 20 ms without a setpoint, and begins where it rests.
+                // Its program decelerates on its own after 20 ms without a setpoint, and begins where it rests.
                 "ur" => Some(0.01),
                 _ => None,
             },

@@ -143,7 +143,7 @@ fn no_goal_moves_at_a_seam_in_ten_thousand_states_and_pushes() {
         let to = model.at + push;
         let over = !(-2.0..4097.0).contains(&to);
         let order = watch.pass(&mut model, Some(to), 30, &mut random);
-        if over && (to < -100.0 || to > 4200.0) {
+        if over && !(-100.0..=4200.0).contains(&to) {
             crossings += 1;
             assert!(matches!(order, Some(Order::Yield(_))), "{n}: {to} of {range:?}");
         } else if (2.0..4093.0).contains(&to) {

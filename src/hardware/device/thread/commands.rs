@@ -134,8 +134,8 @@ impl Worker {
         now.since(*self.mode_refused_since.get_or_insert(now)) > MODE_TIMEOUT
     }
 
-    /// Returns where the arm is to rest: where braking from the newest command ends that had a mode; after silence, where
-    /// the arm is within what was commanded meanwhile.
+    /// Returns where the arm is to rest: where braking from the newest command ends that had a mode; after silence,
+    /// where the arm is within what was commanded meanwhile.
     pub(super) fn stop_point(&self) -> StopPoint {
         let heard = self.config.clock.now().since(self.state.stamp) <= self.config.state_timeout();
         let within = self.last.rest_within_unheard(&self.state.position).filter(|_| heard);
