@@ -16,8 +16,10 @@ use crate::support::rig::*;
 const A: u64 = 3;
 const B: u64 = 4;
 
-/// Ways to interrupt a ready arm, and what they are named.
-const WAYS: [(fn(&mut Rig), Interruption); 6] = [
+/// A way to interrupt a ready arm, and what it is named.
+type Way = (fn(&mut Rig), Interruption);
+
+const WAYS: [Way; 6] = [
     (stop, Interruption::Stopped),
     (disable, Interruption::Disabled),
     (lose_the_link, Interruption::LinkLost),
