@@ -199,7 +199,9 @@ fn velocity_case(bed: &Bed, kind: Kind, time: Duration) -> Vec<String> {
             // more.
             let (limit, stall) = (bed.arm.time_limit.unwrap_or_default(), time.as_secs_f64());
             let again = if stall > limit { bed.bounds.stopping(0, limit) } else { 0.0 };
-            let delay = limit + bed.arm.stale_after().max(stall.min(limit));
+            // A tracking error must last.
+            let noticed = if cause == "tracking" { 0.11 } else { 0.0 };
+            let delay = limit + bed.arm.stale_after().max(stall.min(limit)) + noticed;
             // The arm's own lag, too.
             let went = bed.bounds.went(&from, &bed.truth(), delay, again + 0.1, began);
             verdicts.push(went.map_err(|e| format!("held ({cause}): {e}")));

@@ -294,7 +294,7 @@ impl ArmControl {
         match self.failsafe.phase() {
             Phase::Activating => {
                 let s = &self.config.supervision;
-                let limit = ENABLING_TOLERANCE.max(2.0 * s.accuracy).max(s.accuracy + s.droop);
+                let limit = ENABLING_TOLERANCE.max(1.5 * s.accuracy).max(s.accuracy + s.droop);
                 if let Some((joint, by)) = self.feedback.rejected_step(ENABLING_REJECTED) {
                     return Some(Cause::MovedWhileActivating(joint, by));
                 }
