@@ -5,13 +5,13 @@ use rustix::process::Signal;
 
 use crate::support::program::{Home, eventually};
 
-/// A hand moves the second joint of the leader after 5 s.
+/// A hand moves the second joint of the leader after 5 s, in half a second.
 const HAND: &str = "
 name: hand
 include: [leader-follower]
 hardware:
   - hardware_id: leader
-    options: {sim: {faults: [{at: 5, kind: pushed, joint: 2, amount: 0.7}]}}
+    options: {sim: {faults: [{at: 5, duration: 0.5, kind: pushed, joint: 2, amount: 0.7}]}}
 ";
 
 /// The report of the follow task.
