@@ -30,6 +30,8 @@ pub use tick_output::{TickOutput, TickTime};
 /// Maximum number of requests handled in one tick: the capacity of the ring, so that a flood of targets never delays a
 /// stop.
 const REQUESTS_PER_TICK: usize = 256;
+/// Time stamps of a regular tick differ from its period by less than this part of it: they are rounded to ns.
+const CLOCK_ROUNDING: f64 = 1e-3;
 /// Time since the previous tick after which all arms are held [s].
 const LOST_TIME: f64 = 0.1;
 /// Consecutive overruns that are reported as degraded.
@@ -44,6 +46,8 @@ pub struct Coordinator {
     period_ns: u64,
     /// Time that this tick covers [s]: also skipped periods that the arms' controllers bridge.
     step: f64,
+    /// Time of the last tick.
+    ticked_at: Mono,
     arms: Vec<ArmControl>,
     tasks: Vec<Task>,
     arbiter: Arbiter,
@@ -78,6 +82,7 @@ impl Coordinator {
         Self {
             period: 1.0 / config.rate,
             step: 1.0 / config.rate,
+            ticked_at: Mono::ZERO,
             period_ns: Duration::from_secs_f64(1.0 / config.rate).as_nanos().max(1) as u64,
             arbiter: Arbiter::new(&priorities, arm_of.clone(), arms.len()),
             joints: vec![JointView::default(); arm_of.len()],
@@ -140,9 +145,16 @@ impl Coordinator {
     }
 
     /// Returns the time that this tick covers [s]. What the controllers of all arms bridge passes as if nothing had
-    /// happened: motions are where they would be.
-    fn time_covered(&self, time: TickTime) -> f64 {
-        let covered = self.period * f64::from(time.skipped + 1);
+    /// happened: motions are where they would be. Ticks clocked by an arm may follow each other sooner after a pause.
+    fn time_covered(&mut self, time: TickTime) -> f64 {
+        let last = std::mem::replace(&mut self.ticked_at, time.now);
+        let nominal = self.period * f64::from(time.skipped + 1);
+        let passed = time.now.seconds_since(last);
+        let sooner = last != Mono::ZERO && passed > 0.0 && passed < nominal - CLOCK_ROUNDING * self.period;
+        let covered = if sooner { passed } else { nominal };
+        if sooner && passed < self.period {
+            return covered;
+        }
         if self.arms.iter().all(|arm| arm.bridges(covered)) { covered } else { self.period }
     }
 
