@@ -96,6 +96,7 @@ struct Shared {
 /// `mock`.) Clones share everything, so a test keeps one and passes the other on.
 ///
 /// ```
+/// use dimos::arm::StopPoint;
 /// use dimos::hardware::adapter::{AdapterError, ManipulatorAdapter};
 /// use dimos::testing::{Call, MockAdapter};
 ///
