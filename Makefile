@@ -1,5 +1,5 @@
 # run install dist viewer check test test-fast · test-tools test-rerun test-lerobot judge-hiroz deny mutants ·
-# bench bench-quick bench-page bench-share jitter soak lies pauses
+# bench bench-quick bench-page bench-share jitter soak lies lies-wire pauses
 
 PYTHON ?= python3
 # Most tests wait rather than compute. More at a time than this and whole runs no longer keep their time.
@@ -38,7 +38,7 @@ PAGE := viewer/dist/index.html
 PAGE_SOURCES := $(wildcard viewer/*.json viewer/*.mjs) $(shell find viewer/src -type f 2>/dev/null)
 NODE := $(if $(wildcard viewer/package.json),$(shell command -v npm))
 
-.PHONY: run install dist shipped viewer viewer-if-possible check lint spelling licences test test-fast test-tools test-rerun test-lerobot judge-hiroz deny mutants bench bench-quick bench-page bench-share jitter soak lies pauses
+.PHONY: run install dist shipped viewer viewer-if-possible check lint spelling licences test test-fast test-tools test-rerun test-lerobot judge-hiroz deny mutants bench bench-quick bench-page bench-share jitter soak lies lies-wire pauses
 
 # Builds the program to try it, not optimized, and starts the shipped blueprint; its arm is simulated. Ends with Ctrl-C.
 run: viewer-if-possible
@@ -200,6 +200,12 @@ soak: viewer-if-possible
 lies:
 	DIMOS_LIES=1000000 cargo test --release --locked --test logic lies::as_many -- --nocapture
 
-# Pauses and lost messages at full speed in virtual time: every row, rate and length, at 200 moments each.
+# Emulated arms that lie on the wire of every protocol: 1,000 trials each, the arms side by side, in 90 minutes.
+lies-wire:
+	DIMOS_WIRE_LIES=1000 cargo test --locked --test realtime lies_on_the_wire -- --nocapture
+
+# Pauses and lost messages at full speed: in virtual time every row, rate and length, at 200 moments each; on the wire
+# of every protocol 25 of each, beside pylibfranka, in half an hour.
 pauses:
 	DIMOS_PAUSES=200 cargo test --release --locked --test logic pauses:: -- --nocapture
+	DIMOS_WIRE_PAUSES=25 cargo test --locked --test realtime pauses_on_the_wire -- --nocapture

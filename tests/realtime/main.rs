@@ -11,4 +11,6 @@ mod faults;
 mod stalls;
 mod stalls_soak;
 mod wire_first;
+mod wire_lies;
+mod wire_pauses;
 mod wire_stalls;

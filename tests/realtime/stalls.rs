@@ -74,7 +74,7 @@ impl Three {
     fn at_full_speed(&mut self) -> u64 {
         let here = self.home.positions("arm");
         let [near, far] = YOURARM.near_and_far(&here);
-        let go = |target: [f64; 6]| Move::new("arm", target, 1.0);
+        let go = |target: &[f64]| Move::new("arm", target, 1.0);
         if furthest(&near, &here) > 0.2 {
             let motion = self.begin(go(near));
             self.done(motion);

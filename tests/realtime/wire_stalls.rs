@@ -150,7 +150,7 @@ fn position_case(bed: &Bed, kind: Kind, time: Duration) -> Vec<String> {
 }
 
 fn velocity_case(bed: &Bed, kind: Kind, time: Duration) -> Vec<String> {
-    let start = bed.arm.ends[0].map(|q| q * 0.95);
+    let start: Vec<f64> = bed.arm.ends[0].iter().map(|q| q * 0.95).collect();
     // The stream of the case before keeps its joints at zero until it is cancelled; and the arm may be held on its way.
     // Only where the case begins depends on this.
     let at_start = || {

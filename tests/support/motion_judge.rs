@@ -7,8 +7,6 @@ use dimos::arm::{ArmCommand, Supervision};
 use dimos::control::config::ArmConfig;
 use dimos::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
 
-use super::true_arm::TrueArm;
-
 /// Until a wrong motion is noticed [s]: a tracking error lasts 0.1 s, a wrong velocity 0.2 s; and some readings.
 const DETECTION: f64 = 0.25;
 /// Of the arm's model at rest [rad].
@@ -89,6 +87,8 @@ pub struct Judge {
     limits: JointLimits,
     period: f64,
     noise: f64,
+    /// How much later than that a wrong motion may be noticed [s].
+    pub late: f64,
     /// What was requested, and the highest speed of it, per joint.
     low: Vec<f64>,
     high: Vec<f64>,
@@ -112,16 +112,18 @@ pub struct Judge {
 }
 
 impl Judge {
-    pub fn new(arm: usize, config: &ArmConfig, truth: &TrueArm, period: f64) -> Self {
+    /// Of an arm that is at `q` [rad] and whose readings have this noise [rad].
+    pub fn new(arm: usize, config: &ArmConfig, q: &[f64], noise: f64, period: f64) -> Self {
         Self {
             arm,
             dof: config.dof,
             s: config.supervision,
             limits: config.limits.clone(),
             period,
-            noise: truth.traits.noise + truth.traits.resolution,
-            low: truth.q.clone(),
-            high: truth.q.clone(),
+            noise,
+            late: 0.0,
+            low: q.to_vec(),
+            high: q.to_vec(),
             speed: vec![0.0; config.dof],
             active: false,
             resting: true,
@@ -153,9 +155,9 @@ impl Judge {
     }
 
     /// The motors come on, or a person moves the arm while they are off. `extra`: how far a joint may move by that.
-    pub fn placed(&mut self, truth: &TrueArm, extra: impl Fn(usize) -> f64) {
+    pub fn placed(&mut self, q: &[f64], extra: impl Fn(usize) -> f64) {
         for j in 0..self.dof {
-            (self.low[j], self.high[j]) = (truth.q[j] - extra(j), truth.q[j] + extra(j));
+            (self.low[j], self.high[j]) = (q[j] - extra(j), q[j] + extra(j));
         }
         self.speed.fill(0.0);
         self.blind = 0.0;
@@ -173,28 +175,25 @@ impl Judge {
         self.high.iter_mut().for_each(|high| *high += by);
     }
 
-    /// Judges the true joints. `active`: something is requested of the arm.
-    pub fn joints(&mut self, now: f64, truth: &TrueArm, active: bool) {
+    /// Judges the true joints [rad] of an arm whose motors are on. `active`: something is requested of the arm.
+    pub fn joints(&mut self, now: f64, q: &[f64], at_rest: bool, active: bool) {
         if self.active && !active {
             self.ended = now;
         }
         self.active = active;
         self.resting &= !active;
-        self.at_rest_since = truth.at_rest().then(|| self.at_rest_since.unwrap_or(now));
+        self.at_rest_since = at_rest.then(|| self.at_rest_since.unwrap_or(now));
         if !active && !self.resting {
             let rested = self.at_rest_since.is_some_and(|since| now - since.max(self.ended) > RESTED);
             let braking = (0..self.dof).map(|j| self.speed[j] / self.limits.acceleration_max[j]).fold(0.0, f64::max);
             if rested || now - self.ended > braking + 3.0 * self.s.lag + 0.8 {
                 let unknown = self.blind;
                 for j in 0..self.dof {
-                    (self.low[j], self.high[j]) = (truth.q[j] - unknown, truth.q[j] + unknown);
+                    (self.low[j], self.high[j]) = (q[j] - unknown, q[j] + unknown);
                 }
                 self.speed.fill(0.0);
                 self.resting = true;
             }
-        }
-        if !truth.enabled {
-            return;
         }
         let still = self.s.relief + self.s.accuracy + self.noise + SLACK;
         for j in 0..self.dof {
@@ -202,12 +201,16 @@ impl Judge {
             let margin = if self.resting {
                 still
             } else {
-                still + self.s.droop + self.s.tracking_tolerance + v * (self.s.lag + DETECTION) + v * v / (2.0 * a)
+                still
+                    + self.s.droop
+                    + self.s.tracking_tolerance
+                    + v * (self.s.lag + DETECTION + self.late)
+                    + v * v / (2.0 * a)
             };
-            let out = (self.low[j] - truth.q[j]).max(truth.q[j] - self.high[j]);
+            let out = (self.low[j] - q[j]).max(q[j] - self.high[j]);
             let rule = if self.resting { Rule::Unasked } else { Rule::Path };
             if out > margin || out.is_nan() {
-                let (q, low, high) = (truth.q[j], self.low[j], self.high[j]);
+                let (q, low, high) = (q[j], self.low[j], self.high[j]);
                 self.report(rule, now, j, out - margin, || {
                     format!("joint at {q:.4}, requested {low:.4} to {high:.4}, margin {margin:.4} rad")
                 });
@@ -216,7 +219,7 @@ impl Judge {
     }
 
     /// Judges the command of a tick, and what of it was written.
-    pub fn command(&mut self, now: f64, command: &ArmCommand, written: bool, truth: &TrueArm) {
+    pub fn command(&mut self, now: f64, command: &ArmCommand, written: bool, q: &[f64]) {
         let finite = |values: &Joints| values.iter().all(|v| v.is_finite());
         if !finite(&command.values) || !finite(&command.velocity) || !command.rest.is_none_or(|rest| finite(&rest)) {
             self.report(Rule::Sound, now, 0, f64::INFINITY, || format!("not finite: {:?}", command.values));
@@ -239,10 +242,10 @@ impl Judge {
         }
         self.last = *command;
         let Some(mode) = command.mode.filter(|_| written) else { return };
-        self.wire(now, command, mode, truth);
+        self.wire(now, command, mode, q);
     }
 
-    fn wire(&mut self, now: f64, command: &ArmCommand, mode: ControlMode, truth: &TrueArm) {
+    fn wire(&mut self, now: f64, command: &ArmCommand, mode: ControlMode, q: &[f64]) {
         let mut velocity = [0.0; MAX_DOF];
         let velocities = mode == ControlMode::Velocity;
         let last = self.wire.filter(|wire| wire.mode == mode && wire.start == command.start_seq);
@@ -262,8 +265,8 @@ impl Judge {
                 let (lower, upper) = (self.limits.position_lower[j], self.limits.position_upper[j]);
                 let beyond = self.s.outside + self.s.accuracy;
                 let start = command.values[j].clamp(lower - beyond, upper + beyond);
-                let low = if velocities { lower } else { lower.min(truth.q[j]).min(start) };
-                self.bounds[j] = (low, if velocities { upper } else { upper.max(truth.q[j]).max(start) });
+                let low = if velocities { lower } else { lower.min(q[j]).min(start) };
+                self.bounds[j] = (low, if velocities { upper } else { upper.max(q[j]).max(start) });
             }
         }
         let dt = last.map_or(self.period, |wire| now - wire.at);

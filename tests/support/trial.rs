@@ -156,7 +156,7 @@ impl Trial {
             let off = if hidden { (2.2 * off).min(stopped) + 0.02f64.max(2.0 * s.accuracy) } else { 0.0 };
             off + crept + truth.traits.droop[j].abs()
         };
-        self.judges[0].placed(truth, extra);
+        self.judges[0].placed(&truth.q, extra);
     }
 
     /// What counts as the leader's motion from now on.
@@ -235,10 +235,10 @@ impl Trial {
                 }
             }
             let written = arm.written.is_some_and(|(at, ..)| at == command.at);
-            self.judges[i].command(now, command, written, arm);
+            self.judges[i].command(now, command, written, &arm.q);
             arm.advance(dt);
             if arm.enabled {
-                self.judges[i].joints(now, arm, active && i == 0);
+                self.judges[i].joints(now, &arm.q, arm.at_rest(), active && i == 0);
             }
         }
         if self.verbose {

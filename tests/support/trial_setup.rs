@@ -59,7 +59,11 @@ impl Trial {
         if let [follower, leader] = &mut arms[..] {
             leader.q = follower.q.iter().map(|q| q + random.between(-0.1, 0.1)).collect();
         }
-        let judges = arms.iter().enumerate().map(|(i, a)| Judge::new(i, &row.arm, a, 1.0 / rate)).collect();
+        let judges = arms
+            .iter()
+            .enumerate()
+            .map(|(i, a)| Judge::new(i, &row.arm, &a.q, a.traits.noise + a.traits.resolution, 1.0 / rate))
+            .collect();
         let begin = Mono(1_000_000_000);
         Self {
             seed,

@@ -4,6 +4,7 @@
 use std::time::Duration;
 
 pub use super::delivery::Delivery;
+use super::misreading::Memory;
 pub use super::options::{SimOptions, check_pose, check_range};
 use crate::clock::Mono;
 use crate::hardware::adapter::AdapterResult;
@@ -35,6 +36,7 @@ pub const PLAYABLE: &[FaultKind] = &[
     FaultKind::Truncated,
     FaultKind::WrongDof,
     FaultKind::WrongModel,
+    FaultKind::Misread,
     FaultKind::Frozen,
     FaultKind::Sag,
     FaultKind::Blocked,
@@ -145,6 +147,7 @@ pub struct SimArm {
     /// The goal of a servo [rad], and when it arrived.
     goal: Option<(Joints, Mono)>,
     script: FaultScript,
+    misreadings: Memory,
     /// Time zero of the fault script.
     first_client: Option<Mono>,
     powered_up: Mono,
@@ -180,6 +183,7 @@ impl SimArm {
             velocity_until: None,
             goal: None,
             script: FaultScript::new(&options.faults),
+            misreadings: Memory::default(),
             first_client: None,
             powered_up: now,
             advanced_to: now,
@@ -299,7 +303,7 @@ impl SimArm {
         self.dof() + usize::from(self.take_fault(FaultKind::WrongDof).is_some())
     }
 
-    /// Returns the measurements; faults make them NaN or zero.
+    /// Returns the measurements; faults make them NaN, zero or otherwise wrong.
     pub fn measured(&mut self) -> Measured {
         let of = |value: f64| {
             let all = [value; MAX_DOF];
@@ -310,7 +314,8 @@ impl SimArm {
         } else if self.take_fault(FaultKind::ZeroState).is_some() {
             of(0.0)
         } else {
-            let (positions, velocities) = self.joints();
+            let (mut positions, mut velocities) = self.joints();
+            self.misread(&mut positions, &mut velocities);
             Measured { positions, velocities, efforts: self.efforts() }
         }
     }

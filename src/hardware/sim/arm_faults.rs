@@ -45,6 +45,14 @@ impl SimArm {
         self.script.take_if(kind, t, wanted)
     }
 
+    /// Changes true positions [rad] and velocities [rad/s] to what the arm reports instead of them now.
+    pub fn misread(&mut self, positions: &mut [f64], velocities: &mut [f64]) {
+        let (now, dof) = (self.script_time(), self.dof());
+        let faults: Vec<Fault> = self.script.take_all(FaultKind::Misread, now).collect();
+        let (Some(positions), Some(velocities)) = (positions.get_mut(..dof), velocities.get_mut(..dof)) else { return };
+        self.misreadings.apply(&faults, now, positions, velocities);
+    }
+
     /// Returns whether a fault of this kind with a duration is active now. Does not count it as played.
     pub fn fault_lasts(&self, kind: FaultKind) -> bool {
         self.script.lasts(kind, self.script_time())

@@ -33,6 +33,7 @@ pub const PLAYABLE: &[FaultKind] = &[
     FaultKind::Estop,
     FaultKind::PowerLoss,
     FaultKind::ZeroState,
+    FaultKind::Misread,
     FaultKind::Garbage,
     FaultKind::Truncated,
     FaultKind::WrongDof,

@@ -7,6 +7,7 @@ use schemars::{JsonSchema, SchemaGenerator};
 use serde::{Deserialize, Deserializer, Serialize};
 
 use super::events::{self, SimEvent};
+use super::misreading::Misreading;
 use crate::hardware::check::ConfigError;
 
 /// Kinds of faults. Each simulated arm can play some of them.
@@ -48,6 +49,8 @@ pub enum FaultKind {
     WrongDof,
     /// The arm reports another model.
     WrongModel,
+    /// The readings of joint number `joint` are wrong for `duration`, as `misread` says, and do not look it.
+    Misread,
     /// Measurements are frozen for `duration`, time stamps included, while the arm continues to move.
     Frozen,
     /// The arm sinks by `amount` [rad] at its second joint when its motors are enabled.
@@ -116,11 +119,15 @@ pub struct Fault {
     #[serde(default = "default_code")]
     #[schemars(range(min = 1))]
     pub code: u16,
-    /// How far the arm sinks, for `sag`, or a joint is moved, for `pushed` [rad]; width of an `object` [m or rad].
+    /// How far the arm sinks, for `sag`, or a joint is moved, for `pushed` [rad]; width of an `object` [m or rad]; how
+    /// wrong a `misread` is.
     #[serde(default = "default_amount", deserialize_with = "non_negative")]
     pub amount: f64,
-    /// Number of the joint, from 1, for `blocked`, `pushed`, `motor_off`, and `error_code` of an arm whose drives have
-    /// an error each.
+    /// What is wrong with the readings, for `misread`.
+    #[serde(default)]
+    pub misread: Misreading,
+    /// Number of the joint, from 1, for `blocked`, `pushed`, `motor_off`, `misread`, and `error_code` of an arm whose
+    /// drives have an error each.
     #[serde(default = "default_joint")]
     #[schemars(range(min = 1))]
     pub joint: usize,
@@ -167,6 +174,7 @@ impl Fault {
             count: 0,
             code: default_code(),
             amount: default_amount(),
+            misread: Misreading::Offset,
             joint: default_joint(),
             input: 0,
         }
@@ -267,6 +275,15 @@ impl FaultScript {
         entry.played += 1;
         entry.note();
         Some(entry.fault)
+    }
+
+    /// Returns all faults of this kind that are due at `now`, and counts them as played.
+    pub fn take_all(&mut self, kind: FaultKind, now: f64) -> impl Iterator<Item = Fault> {
+        self.entries.iter_mut().filter(move |entry| entry.is(kind, now)).map(|entry| {
+            entry.played += 1;
+            entry.note();
+            entry.fault
+        })
     }
 
     /// Returns whether a fault of this kind with a duration is active at `now`. Does not count it as played.

@@ -31,6 +31,7 @@ pub mod events;
 pub mod faults;
 pub mod gripper;
 pub mod io;
+pub mod misreading;
 pub mod options;
 pub mod plant;
 mod plant_joint;

@@ -30,53 +30,79 @@ pub struct Arm {
     /// Its row, unless it is built-in.
     pub row: Option<&'static AdapterSpec>,
     /// Two poses far apart: from one to the other some joint reaches its top speed [rad].
-    pub ends: [[f64; 6]; 2],
+    pub ends: [&'static [f64]; 2],
     /// What a setpoint is rounded to on the wire [rad].
     pub rounding: f64,
     /// Its controller ends a velocity after this time without a setpoint [s]; `None`: no velocity mode.
     pub time_limit: Option<f64>,
+    /// Options of its adapter, as JSON.
+    pub options: &'static str,
 }
 
 /// The template arm over TCP.
 pub const YOURARM: Arm = Arm {
     name: "yourarm",
     row: None,
-    ends: [[-2.7, -0.8, 0.2, -2.5, 0.2, -4.4], [2.7, 0.4, 1.4, 2.5, 1.4, 4.4]],
+    ends: [&[-2.7, -0.8, 0.2, -2.5, 0.2, -4.4], &[2.7, 0.4, 1.4, 2.5, 1.4, 4.4]],
     rounding: 1e-6,
     time_limit: Some(0.2),
+    options: "{}",
 };
 /// UFACTORY's arm: setpoints without waiting for replies, reports on ports of their own.
 pub const XARM: Arm = Arm {
     name: "xarm",
     row: None,
-    ends: [[-3.6, -0.6, -1.2, -3.6, 0.6, -3.6], [3.6, 0.6, -0.4, 3.6, 1.6, 3.6]],
+    ends: [&[-3.6, -0.6, -1.2, -3.6, 0.6, -3.6], &[3.6, 0.6, -0.4, 3.6, 1.6, 3.6]],
     rounding: 1e-6,
     time_limit: Some(0.2),
+    options: "{}",
 };
 /// AgileX's arm on CAN.
 pub const PIPER: Arm = Arm {
     name: "piper",
     row: None,
-    ends: [[-2.5, 0.6, -1.6, -1.2, -0.8, -1.7], [2.5, 1.6, -0.6, 1.2, 0.8, 1.7]],
+    ends: [&[-2.5, 0.6, -1.6, -1.2, -0.8, -1.7], &[2.5, 1.6, -0.6, 1.2, 0.8, 1.7]],
     rounding: 2e-5,
     time_limit: None,
+    options: "{}",
 };
 /// An arm behind another process; a simple one.
 pub const REMOTE: Arm = Arm {
     name: "remote",
     row: None,
-    ends: [[-2.7, -0.8, 0.2, -2.5, 0.2, -2.7], [2.7, 0.4, 1.4, 2.5, 1.4, 2.7]],
+    ends: [&[-2.7, -0.8, 0.2, -2.5, 0.2, -2.7], &[2.7, 0.4, 1.4, 2.5, 1.4, 2.7]],
     rounding: 1e-9,
     time_limit: Some(0.5),
+    options: "{}",
 };
 
 /// Universal Robots' arm: a program on its controller follows registers.
 pub const UR: Arm = Arm {
     name: "ur",
     row: None,
-    ends: [[-2.7, -1.4, 1.5, -2.5, -1.5, -2.7], [2.7, -1.0, 1.9, 2.5, -1.1, 2.7]],
+    ends: [&[-2.7, -1.4, 1.5, -2.5, -1.5, -2.7], &[2.7, -1.0, 1.9, 2.5, -1.1, 2.7]],
     rounding: 1e-9,
     time_limit: Some(0.2),
+    options: "{}",
+};
+
+/// Franka Robotics' arm, by UDP datagrams: there is no gate in its wire, and its controller refuses what is too fast.
+pub const FRANKA: Arm = Arm {
+    name: "franka",
+    row: None,
+    ends: [&[-2.0, -1.0, -2.0, -2.6, -2.0, 1.0, -2.0], &[2.0, 1.0, 2.0, -0.6, 2.0, 3.6, 2.0]],
+    rounding: 1e-6,
+    time_limit: None,
+    options: r#"{"model": "fr3"}"#,
+};
+/// Bus servos on a serial line: a goal per servo, one turn each.
+pub const SO101: Arm = Arm {
+    name: "so101",
+    row: None,
+    ends: [&[-1.5, -1.3, -1.3, -1.2, -2.2], &[1.5, 1.3, 1.3, 1.2, 2.2]],
+    rounding: 2e-3,
+    time_limit: None,
+    options: "{}",
 };
 
 /// An arm on a serial line (`tests/support/serial_line`).
@@ -84,9 +110,10 @@ pub fn serial(row: &'static AdapterSpec) -> Arm {
     Arm {
         name: "acme",
         row: Some(row),
-        ends: [[-2.7, -0.8, 0.2, -2.5, 0.2, -2.7], [2.7, 0.4, 1.4, 2.5, 1.4, 2.7]],
+        ends: [&[-2.7, -0.8, 0.2, -2.5, 0.2, -2.7], &[2.7, 0.4, 1.4, 2.5, 1.4, 2.7]],
         rounding: 1e-6,
         time_limit: Some(0.2),
+        options: "{}",
     }
 }
 
@@ -101,10 +128,28 @@ impl Arm {
         self.spec().accuracy
     }
 
+    pub fn dof(&self) -> usize {
+        self.ends[0].len()
+    }
+
+    /// Options of its adapter and of its emulator.
+    fn options(&self, setup: &Setup) -> Value {
+        let mut options: Value = serde_json::from_str(self.options).unwrap();
+        let start = if setup.start.is_empty() { self.ends[0].to_vec() } else { setup.start.clone() };
+        options["sim"] = json!({ "initial_positions": self.initial(start), "faults": setup.faults });
+        options
+    }
+
+    /// Servos of a gripper have a position, too.
+    fn initial(&self, mut start: Vec<f64>) -> Vec<f64> {
+        start.extend((self.name == "so101").then_some(0.5));
+        start
+    }
+
     /// The end that is nearer to a pose, and the other.
-    pub fn near_and_far(&self, pose: &[f64]) -> [[f64; 6]; 2] {
+    pub fn near_and_far(&self, pose: &[f64]) -> [&'static [f64]; 2] {
         let [a, b] = self.ends;
-        if furthest(&a, pose) < furthest(&b, pose) { [a, b] } else { [b, a] }
+        if furthest(a, pose) < furthest(b, pose) { [a, b] } else { [b, a] }
     }
 
     fn spec(&self) -> AdapterSpec {
@@ -161,9 +206,8 @@ pub struct Bed {
 
 impl World {
     pub fn new(arm: Arm, setup: &Setup) -> Self {
-        let start = if setup.start.is_empty() { arm.ends[0].to_vec() } else { setup.start.clone() };
-        let options = json!({ "sim": { "initial_positions": start, "faults": setup.faults } });
-        let config = AdapterConfig { hardware_id: "arm".into(), address: "sim".into(), dof: 6, options };
+        let (dof, options) = (arm.dof(), arm.options(setup));
+        let config = AdapterConfig { hardware_id: "arm".into(), address: "sim".into(), dof, options };
         let place = EmulatorAddress::InProcess;
         let program = (arm.name == "ur").then(|| Arc::new(UrEmulator::start(&config, &place).unwrap()));
         let emulator = match &program {
@@ -174,7 +218,7 @@ impl World {
         let emulator = Arc::new(Mutex::new(emulator));
         let watched = emulator.clone();
         let gate = Gate::new(Arc::new(move || {
-            lock(&watched).true_positions().map(|all| all[..6].to_vec()).unwrap_or_default()
+            lock(&watched).true_positions().map(|all| all[..dof].to_vec()).unwrap_or_default()
         }));
         let (proxy, address): (Box<dyn Any>, String) = match arm.name {
             "yourarm" => boxed(Proxy::tcp(&address, &gate, decode::yourarm())),
@@ -185,6 +229,8 @@ impl World {
                 let address = format!("tcp:{}", proxy.address);
                 (Box::new(proxy), address)
             }
+            "franka" => (Box::new(()), address),
+            "so101" => boxed(Proxy::serial(&address, &gate, decode::so101())),
             "piper" => {
                 let proxy = CanProxy::start(&address, &gate);
                 let address = proxy.address.clone();
@@ -193,6 +239,10 @@ impl World {
             _ => boxed(Proxy::serial(&address, &gate, decode::template())),
         };
         Self { arm, gate, address, _proxy: proxy, emulator, program }
+    }
+
+    pub fn inject(&self, fault: Fault) {
+        lock(&self.emulator).inject(fault).unwrap();
     }
 
     /// Starts a run; or hands the world back, and why the run did not start.
@@ -229,7 +279,7 @@ impl World {
 
     /// Where the joints truly are [rad]; nothing where the emulator does not tell.
     pub fn truth(&self) -> Vec<f64> {
-        lock(&self.emulator).true_positions().map(|all| all[..6].to_vec()).unwrap_or_default()
+        lock(&self.emulator).true_positions().map(|all| all[..self.arm.dof()].to_vec()).unwrap_or_default()
     }
 }
 
@@ -257,8 +307,22 @@ impl Bed {
         recent.map(command).collect()
     }
 
+    /// Reports where the joints truly are [rad], and whether all motors are on, from another thread.
+    pub fn eyes(&self) -> impl Fn() -> (Vec<f64>, bool) + Send + use<> {
+        let (emulator, dof) = (self.world.emulator.clone(), self.arm.dof());
+        move || {
+            let truth = lock(&emulator).truth();
+            (truth.positions.unwrap_or_default()[..dof].to_vec(), truth.motors_on.unwrap_or(true))
+        }
+    }
+
+    /// Whether all motors are on.
+    pub fn motors_on(&self) -> bool {
+        self.eyes()().1
+    }
+
     pub fn inject(&self, fault: Fault) {
-        lock(&self.world.emulator).inject(fault).unwrap();
+        self.world.inject(fault);
     }
 
     /// The phase of the arm, and why it is held.
@@ -336,8 +400,8 @@ impl Bed {
     fn try_full_speed(&self) -> Result<(), String> {
         let [near, far] = self.arm.near_and_far(&self.measured());
         let go = |to: &[f64]| self.run.move_arm("arm", to, 1.0).map(|m| m.motion).map_err(|e| e.to_string());
-        if furthest(&near, &self.measured()) > 0.2 {
-            let motion = go(&near)?;
+        if furthest(near, &self.measured()) > 0.2 {
+            let motion = go(near)?;
             let began = Instant::now();
             let there = loop {
                 let report = self.run.motion(motion).map_err(|e| e.to_string())?;
@@ -359,7 +423,7 @@ impl Bed {
             }
         }
         self.gate.forget();
-        go(&far)?;
+        go(far)?;
         self.until("it moves at full speed, or is held", |bed| bed.is_fast() || bed.phase().0 != "ready");
         if self.is_fast() { Ok(()) } else { Err(format!("{:?}", self.phase())) }
     }
@@ -382,6 +446,7 @@ fn boxed(proxy: Proxy) -> (Box<dyn Any>, String) {
 
 fn blueprint(arm: &Arm, address: &str) -> String {
     let row = arm.spec();
+    let options: Value = serde_json::from_str(arm.options).unwrap();
     let velocity = row.modes.contains(&dimos::joint::ControlMode::Velocity);
     let mut tasks = vec![
         json!({ "name": "traj_arm", "type": "trajectory", "joint_names": { "hardware": "arm" } }),
@@ -391,7 +456,8 @@ fn blueprint(arm: &Arm, address: &str) -> String {
         || json!({ "name": "velocity_arm", "type": "velocity", "joint_names": { "hardware": "arm" }, "priority": 15 }),
     ));
     let hardware: Value = json!([{
-        "hardware_id": "arm", "joints": { "prefix": "arm", "count": 6 }, "adapter_type": arm.name, "address": address,
+        "hardware_id": "arm", "joints": { "prefix": "arm", "count": arm.dof() }, "adapter_type": arm.name,
+        "address": address, "options": options,
     }]);
     // JSON is YAML.
     json!({ "name": "wire", "hardware": hardware, "tasks": tasks }).to_string()

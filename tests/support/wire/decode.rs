@@ -186,6 +186,31 @@ pub fn template() -> NewDecoder {
     })
 }
 
+/// Feetech's bus servos: a goal for each servo in one packet to all. Positions begin with the middle of a turn, 4096 to
+/// a turn; homing offsets are zero where a test begins.
+pub fn so101() -> NewDecoder {
+    by(|bytes| {
+        let Some([0xFF, 0xFF, _, length]) = bytes.first_chunk::<4>() else {
+            return if matches!(bytes, [] | [0xFF] | [0xFF, 0xFF, ..]) && bytes.len() < 4 {
+                Front::More
+            } else {
+                Front::Skip(1)
+            };
+        };
+        let Some(body) = bytes.get(4..4 + usize::from(*length)) else { return Front::More };
+        let angle = |b: [u8; 2]| (f64::from(u16::from_le_bytes(b)) - 2048.0) / 4096.0 * std::f64::consts::TAU;
+        let what = match body {
+            [0x83, 42, size, goals @ .., _] => {
+                let each = goals.chunks_exact(usize::from(*size) + 1).take(5);
+                Some(What::Position(each.map(|goal| angle([goal[1], goal[2]])).collect()))
+            }
+            [0x83, 40, 1, torques @ .., _] => Some(What::Enable(torques.get(1) == Some(&1))),
+            _ => None,
+        };
+        Front::Frame(4 + body.len(), what)
+    })
+}
+
 /// A Piper's CAN frames, assembled to setpoints: 0x155 to 0x157 carry two joints each, big-endian in 0.001°.
 pub fn piper() -> impl FnMut(&CanFrame) -> Option<What> + Send {
     let mut joints = [None; 6];

@@ -10,6 +10,7 @@ pub mod arms;
 pub mod can;
 pub mod decode;
 pub mod judge;
+pub mod lying;
 pub mod stream;
 pub mod watch;
 

@@ -21,6 +21,7 @@ pub(super) const PLAYABLE: &[FaultKind] = &[
     FaultKind::Nan,
     FaultKind::ZeroState,
     FaultKind::WrongDof,
+    FaultKind::Misread,
     FaultKind::Frozen,
     FaultKind::Sag,
     FaultKind::Blocked,

@@ -54,6 +54,7 @@ const PLAYABLE: &[FaultKind] = &[
     FaultKind::Corrupt,
     FaultKind::Truncated,
     FaultKind::WrongModel,
+    FaultKind::Misread,
     FaultKind::Frozen,
     FaultKind::Blocked,
     FaultKind::Pushed,

@@ -24,6 +24,7 @@ impl Controller {
         if self.leading {
             return out.extend(wire::leading(positions.map(millidegrees), stroke));
         }
+        self.arm.misread(&mut positions, &mut velocities);
         if zero {
             (positions, velocities) = ([0.0; DOF], [0.0; DOF]);
         }

@@ -38,6 +38,7 @@ pub(super) const PLAYABLE: &[FaultKind] = &[
     FaultKind::Estop,
     FaultKind::PowerLoss,
     FaultKind::ZeroState,
+    FaultKind::Misread,
     FaultKind::Garbage,
     FaultKind::Truncated,
     FaultKind::Sag,

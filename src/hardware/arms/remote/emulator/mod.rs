@@ -28,6 +28,7 @@ pub(super) const PLAYABLE: &[FaultKind] = &[
     FaultKind::Estop,
     FaultKind::Nan,
     FaultKind::WrongDof,
+    FaultKind::Misread,
     FaultKind::Frozen,
     FaultKind::Sag,
     FaultKind::Blocked,

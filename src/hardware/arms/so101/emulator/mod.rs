@@ -31,6 +31,7 @@ const PLAYABLE: &[FaultKind] = &[
     FaultKind::Corrupt,
     FaultKind::Truncated,
     FaultKind::WrongModel,
+    FaultKind::Misread,
     FaultKind::Blocked,
     FaultKind::Pushed,
     FaultKind::MotorOff,

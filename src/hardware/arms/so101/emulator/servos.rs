@@ -11,6 +11,7 @@ use crate::hardware::sim::arm::{Delivery, HasArm, SimArm};
 use crate::hardware::sim::faults::FaultKind;
 use crate::hardware::sim::stream::Controller;
 use crate::hardware::transport::Scan;
+use crate::joint::Joints;
 
 /// Number of registers, and of servos.
 const REGISTERS: usize = 87;
@@ -177,7 +178,11 @@ impl Servos {
 
     /// Position of a servo by its own offset [counts], and the turns that are not in it.
     fn position(&self, servo: usize) -> (i32, i32) {
-        let angle = self.arm.joints().0.get(servo).copied().unwrap_or_default();
+        self.counted(servo, self.arm.joints().0.get(servo).copied().unwrap_or_default())
+    }
+
+    /// As above, for a servo at another angle [rad].
+    fn counted(&self, servo: usize, angle: f64) -> (i32, i32) {
         let counted = counts(angle).round() as i32 - self.offset(servo);
         match self.byte(servo, PHASE) & ALL_TURNS {
             0 => (counted.rem_euclid(TURN), counted.div_euclid(TURN)),
@@ -191,8 +196,11 @@ impl Servos {
     }
 
     /// What is read from registers of a servo.
-    fn read(&self, servo: usize, address: usize, length: usize) -> Vec<u8> {
-        let velocity = self.arm.joints().1.get(servo).copied().unwrap_or_default();
+    fn read(&mut self, servo: usize, address: usize, length: usize) -> Vec<u8> {
+        let (mut angles, mut velocities) = self.arm.joints();
+        self.arm.misread(&mut angles, &mut velocities);
+        let of = |values: &Joints| values.get(servo).copied().unwrap_or_default();
+        let (position, velocity) = (self.counted(servo, of(&angles)).0, of(&velocities));
         let mut all = self.registers.get(servo).copied().unwrap_or([0; REGISTERS]);
         let mut set = |address: usize, bytes: &[u8]| {
             all.iter_mut().skip(address).zip(bytes).for_each(|(register, byte)| *register = *byte);
@@ -202,7 +210,6 @@ impl Servos {
         }
         set(TORQUE, &[u8::from(self.arm.motor(servo))]);
         let (by, readings) = self.misread.get(servo).copied().unwrap_or_default();
-        let position = self.position(servo).0;
         let shown = if readings > 0 { (position + by).rem_euclid(TURN) } else { position };
         set(56, &with_sign(shown).to_le_bytes());
         let speed = velocity * f64::from(TURN) / TAU;

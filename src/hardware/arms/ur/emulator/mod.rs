@@ -48,6 +48,7 @@ const PLAYABLE: &[FaultKind] = &[
     FaultKind::Corrupt,
     FaultKind::Truncated,
     FaultKind::WrongModel,
+    FaultKind::Misread,
     FaultKind::Frozen,
     FaultKind::Sag,
     FaultKind::Blocked,

@@ -119,6 +119,8 @@ pub trait ControlledArm: Send + 'static {
     fn due_fault(&mut self, _kind: FaultKind) -> Option<Fault> {
         None
     }
+    /// Changes true positions [rad] and velocities [rad/s] to what is reported instead of them now.
+    fn misread(&mut self, _positions: &mut [f64; 7], _velocities: &mut [f64; 7]) {}
     /// Returns whether a fault lasts.
     fn lasts(&self, _kind: FaultKind) -> bool {
         false
@@ -222,6 +224,10 @@ impl ControlledArm for SimArm {
 
     fn due_fault(&mut self, kind: FaultKind) -> Option<Fault> {
         self.take_fault(kind)
+    }
+
+    fn misread(&mut self, positions: &mut [f64; 7], velocities: &mut [f64; 7]) {
+        self.misread(positions, velocities);
     }
 
     fn lasts(&self, kind: FaultKind) -> bool {

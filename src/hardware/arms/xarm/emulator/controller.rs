@@ -251,6 +251,14 @@ impl<A: ControlledArm> Controller<A> {
         self.chain.map_or_else(|| self.arm.pose(), |chain| Some(chain.forward(&self.seven())))
     }
 
+    /// The joints and their velocities as they are reported.
+    pub(super) fn reported(&mut self) -> ([f64; 7], [f64; 7]) {
+        let (positions, velocities) = self.arm.joints();
+        let (mut positions, mut velocities) = (first(&positions), first(&velocities));
+        self.arm.misread(&mut positions, &mut velocities);
+        (positions, velocities)
+    }
+
     /// The joints as the wire has them.
     pub(super) fn seven(&self) -> [f64; 7] {
         first(&self.arm.joints().0)

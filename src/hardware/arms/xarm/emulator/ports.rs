@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::controlled_arm::ControlledArm;
-use super::controller::{Controller, Received, first, state};
+use super::controller::{Controller, Received, state};
 use super::kinematics::to_wire;
 use super::report::{Kind, Snapshot};
 use super::wire::{self, Request};
@@ -22,6 +22,7 @@ impl<A: ControlledArm> Controller<A> {
     pub fn snapshot(&mut self, now: Mono) -> Snapshot {
         self.advance(now);
         let (wrench, wrench_raw) = self.wrench();
+        let (positions, velocities) = self.reported();
         self.counter = self.counter.wrapping_add(1);
         let scale = if self.settings.currents { 0.1 } else { 1.0 };
         let mut snapshot = Snapshot {
@@ -29,8 +30,8 @@ impl<A: ControlledArm> Controller<A> {
             state: self.reported_state(),
             mode: self.mode,
             queued: (self.queue.len() + usize::from(self.current.is_some() && self.arm.moving())) as u16,
-            position: self.seven().map(|v| v as f32),
-            velocity: first(&self.arm.joints().1).map(|v| v as f32),
+            position: positions.map(|v| v as f32),
+            velocity: velocities.map(|v| v as f32),
             torque: self.torques().map(|v| v * scale),
             pose: self.pose().as_ref().map_or([f32::NAN; 6], to_wire),
             enabled: self.motors(),

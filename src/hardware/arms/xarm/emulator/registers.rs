@@ -95,14 +95,12 @@ impl<A: ControlledArm> Controller<A> {
             (18 | 39 | 40 | 254, _) => {}
             (253, _) => out.push(0),
             (41, _) => put_numbers(out, to_wire(&self.pose().ok_or(NotNow)?)),
-            (42, [wanted @ 1..=3, ..]) => {
-                put_numbers(out, self.seven().map(|v| v as f32));
-                let (_, velocity) = self.arm.joints();
-                let velocity = velocity.iter().take(7).map(|v| *v as f32);
-                (*wanted > 1).then(|| put_numbers(out, velocity));
-                (*wanted > 2).then(|| put_numbers(out, self.torques()));
+            (42, _) => {
+                let (wanted, (positions, velocities)) = (data.first().copied().unwrap_or_default(), self.reported());
+                put_numbers(out, positions.map(|v| v as f32));
+                matches!(wanted, 2 | 3).then(|| put_numbers(out, velocities.map(|v| v as f32)));
+                (wanted == 3).then(|| put_numbers(out, self.torques()));
             }
-            (42, _) => put_numbers(out, self.seven().map(|v| v as f32)),
             (43, _) => {
                 let goal = from_wire(numbers(data).ok_or(Warning(BAD_PARAMETER))?);
                 let joints = self.chain.ok_or(NotNow)?.inverse(&goal, &self.seven()).ok_or(Warning(NO_SOLUTION))?;

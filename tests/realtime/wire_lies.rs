@@ -1,0 +1,62 @@
+//! Arms that report what is not so, on the wire of every protocol: what no true joint, no setpoint and no stop may do.
+//! `make lies-wire` plays 1,000 for each; `DIMOS_WIRE_LIES=50` this many. `DIMOS_WIRE_ARM=xarm` plays only those of
+//! that arm, `DIMOS_WIRE_LIE=123` only that one.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::time::Instant;
+
+use crate::serial;
+use crate::support::wire;
+use crate::support::wire::arms::{Arm, FRANKA, PIPER, REMOTE, SO101, UR, XARM, YOURARM};
+use crate::support::wire::lying::trial;
+use crate::support::wire::watch::Watch;
+
+/// Of each arm.
+const TRIALS: u64 = 30;
+/// Repetitions of a case in which this computer was stalled for longer than [`SPOILT`] [s].
+const REPETITIONS: usize = 4;
+const SPOILT: f64 = 0.02;
+
+fn number(variable: &str) -> Option<u64> {
+    std::env::var(variable).ok().and_then(|n| n.parse().ok())
+}
+
+/// Plays trials of an arm. Returns what they broke.
+fn play(arm: Arm, seeds: impl Iterator<Item = u64>) -> Vec<String> {
+    let watch = Watch::of_programs();
+    let mut broken = Vec::new();
+    for seed in seeds {
+        let (mut what, mut found) = (String::new(), Vec::new());
+        for _ in 0..REPETITIONS {
+            let began = Instant::now();
+            (what, found) = catch_unwind(AssertUnwindSafe(|| trial(arm, seed))).unwrap_or_else(|panic| {
+                let text = panic.downcast_ref::<String>().cloned();
+                (String::new(), vec![text.unwrap_or_else(|| "panicked".to_owned())])
+            });
+            if found.is_empty() || watch.longest_since(began).as_secs_f64() < SPOILT {
+                break;
+            }
+        }
+        if !found.is_empty() || number("DIMOS_WIRE_LIE").is_some() {
+            println!("{} {seed} {what}: {found:#?}", arm.name);
+        }
+        broken.extend(found.into_iter().map(|f| format!("{} {seed} ({what}): {f}", arm.name)));
+    }
+    broken
+}
+
+#[test]
+fn lies_on_the_wire_move_no_arm() {
+    let all = [YOURARM, XARM, PIPER, REMOTE, UR, FRANKA, SO101, wire::arms::serial(&serial::SPEC)];
+    let only = std::env::var("DIMOS_WIRE_ARM").ok();
+    let arms: Vec<Arm> = all.into_iter().filter(|arm| only.as_ref().is_none_or(|only| only == arm.name)).collect();
+    let trials = number("DIMOS_WIRE_LIES").unwrap_or(TRIALS);
+    let seeds = number("DIMOS_WIRE_LIE").map_or(0..trials, |seed| seed..seed + 1);
+    let broken: Vec<String> = std::thread::scope(|scope| {
+        let play = |arm: Arm| (arm, seeds.clone());
+        let threads: Vec<_> =
+            arms.into_iter().map(play).map(|(arm, seeds)| scope.spawn(move || self::play(arm, seeds))).collect();
+        threads.into_iter().flat_map(|thread| thread.join().unwrap()).collect()
+    });
+    assert!(broken.is_empty(), "{} rules broken:\n{}", broken.len(), broken.join("\n"));
+}
