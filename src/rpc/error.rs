@@ -129,7 +129,7 @@ impl Code {
             Outcome::StillFaulted(..) => Some(Self::StillFaulted),
             Outcome::WrongTask(_) => Some(Self::WrongTask),
             Outcome::NonFinite(_) => Some(Self::NonFinite),
-            Outcome::InvalidTarget(_) => Some(Self::InvalidParams),
+            Outcome::InvalidTarget(_) | Outcome::OutOfReach(..) => Some(Self::InvalidParams),
             Outcome::OutOfLimits(..) | Outcome::GripperOutOfLimits(..) | Outcome::GripperForceOutOfLimits(..) => {
                 Some(Self::OutOfLimits)
             }

@@ -166,7 +166,7 @@ fn request(id: u64, outcome: Outcome, names: &Names) -> Described {
             d.task = Some(names.task(task));
         }
         Outcome::NonFinite(joint) => d.joint = Some(names.joint(joint)),
-        Outcome::StartStateMismatch(joint, by) | Outcome::OutOfLimits(joint, by) => {
+        Outcome::StartStateMismatch(joint, by) | Outcome::OutOfLimits(joint, by) | Outcome::OutOfReach(joint, by) => {
             d.joint = Some(names.joint(joint));
             d.values = vec![by];
         }
@@ -220,6 +220,11 @@ pub fn outcome_text(outcome: &Outcome, names: &Names) -> String {
         Outcome::OutOfLimits(joint, by) => {
             format!("the target of {} is outside its limits by {}", names.joint(joint), angle(by))
         }
+        Outcome::OutOfReach(joint, by) => format!(
+            "the target of {} is {} from the one before, further than the joint gets in that time: it is left out",
+            names.joint(joint),
+            angle(by)
+        ),
         Outcome::GripperOutOfLimits(arm, opening) => {
             format!("the gripper of {} cannot go to {opening:.4} m: an opening must be 0 m or more", names.arm(arm))
         }
@@ -271,6 +276,7 @@ fn task_changed(task: u16, state: TaskState, reason: Reason, names: &Names) -> D
         Reason::Approaching | Reason::InStep => {}
         Reason::PathTolerance(joint, value)
         | Reason::GoalTolerance(joint, value)
+        | Reason::GoalVelocity(joint, value)
         | Reason::TrackingError(joint, value)
         | Reason::LeaderAway(joint, value)
         | Reason::Gap(joint, value)
@@ -298,6 +304,9 @@ pub fn reason_text(reason: &Reason, names: &Names) -> String {
         Reason::StreamEnded => "its stream was ended".into(),
         Reason::PathTolerance(joint, by) => format!("{} was {} from the path", names.joint(joint), angle(by)),
         Reason::GoalTolerance(joint, by) => format!("{} ended {} from the goal", names.joint(joint), angle(by)),
+        Reason::GoalVelocity(joint, v) => {
+            format!("{} was at the goal and still moved at {v:.3} rad/s", names.joint(joint))
+        }
         Reason::Preempted(task, joint) => format!("task {} took {}", names.task(task), names.joint(joint)),
         Reason::ArmHeld(arm, cause) => format!("{} is held{}", names.arm(arm), because(cause)),
         Reason::NonFinite(joint) => format!("the command of {} was not a finite number", names.joint(joint)),

@@ -262,6 +262,8 @@ pub enum Reason {
     PathTolerance(u16, f64),
     /// A joint did not arrive within the goal time: joint, error [rad].
     GoalTolerance(u16, f64),
+    /// A joint was at its goal and still moved after the goal time: joint, velocity [rad/s].
+    GoalVelocity(u16, f64),
     /// Another task took a joint: the other task, the joint.
     Preempted(u16, u16),
     /// The arm is held: arm, cause.
@@ -389,6 +391,8 @@ pub enum Outcome {
     NonFinite(u16),
     /// A target is outside the joint's limits: joint, by how much [rad or rad/s].
     OutOfLimits(u16, f64),
+    /// A target of a stream is further from the one before than the joint gets in that time: joint, step [rad].
+    OutOfReach(u16, f64),
     /// A gripper position is not finite, or an opening negative: the arm, the position [m or rad].
     GripperOutOfLimits(u16, f64),
     /// A gripper force is outside its range: the arm, the force [N or Nm].
@@ -426,6 +430,7 @@ impl Outcome {
             Self::NonFinite(_) => "NON_FINITE",
             Self::OutOfLimits(..) | Self::GripperOutOfLimits(..) | Self::GripperForceOutOfLimits(..) => "OUT_OF_LIMITS",
             Self::NoGripperForce(_) | Self::NoGripperSpeed(_) => "UNSUPPORTED",
+            Self::OutOfReach(..) => "OUT_OF_REACH",
             Self::InvalidTarget(_) => "INVALID_TARGET",
             Self::NoGripper(_) => "NO_GRIPPER",
             Self::Superseded(..) => "SUPERSEDED",

@@ -49,6 +49,7 @@ mod planned_paths;
 mod planning;
 mod planning_timing;
 mod poses;
+mod recorded_streams;
 mod robot_models;
 mod rpc;
 mod speed_override;

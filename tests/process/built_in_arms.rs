@@ -245,6 +245,39 @@ fn what_is_wrong_with_an_xarm_is_one_line_and_exit_3() {
     home.dimos(&format!("run model.yaml {simulated}")).with(3).says(&said);
 }
 
+/// A recorded SO-101's shoulder rests up to 0.108 rad below its goal, and follows 0.13 s late.
+#[test]
+fn an_so101_that_droops_like_a_recorded_one_works() {
+    let home = Home::new();
+    let sim = "hardware.arm.options.sim";
+    let run = home.run(&format!("coordinator-so101 --sim --no-record --set {sim}.droop=0.11 --set {sim}.lag=0.13"));
+    for target in ["0.3 -0.4 0.5 0.2 -0.3", "-0.2 0.3 -0.4 -0.1 0.4", "0 0 0 0 0"] {
+        let moved = home.dimos(&format!("move arm {target} --speed 0.5")).with(0);
+        assert!(moved.out.contains("COMPLETED"), "{}\n{}", moved.out, moved.err);
+    }
+    grip(&home, "arm", 0.8);
+    home.dimos("jog arm 2 0.1").with(0);
+    home.dimos("stop").with(0);
+    home.dimos("arm reset arm").with(0);
+    // Once more from where it hangs.
+    assert_eq!(home.dimos("arm enable arm").with(0).out, "arm: ready\n");
+    home.dimos("arm disable arm --now --yes").with(0);
+    run.end(Signal::INT).with(130);
+}
+
+/// Gravity parks a Piper's joints 2 and 3 at -1.999° and +1.971°, outside of their ranges (recorded on an arm).
+#[test]
+fn a_piper_that_gravity_has_parked_is_enabled_and_moves() {
+    let home = Home::new();
+    let parked = "[0.0,-0.034889,0.0344,0.0,-0.0349,0.0388]";
+    let run = home
+        .run(&format!("coordinator-piper --sim --no-record --set hardware.arm.options.sim.initial_positions={parked}"));
+    assert_eq!(home.status()["arms"][0]["phase"], "ready", "{}", run.err());
+    let moved = home.dimos("move arm 0.1 0.5 -0.5 0.1 0.2 0.1").with(0);
+    assert!(moved.out.contains("COMPLETED"), "{}", moved.out);
+    run.end(Signal::INT).with(130);
+}
+
 #[test]
 fn an_xarm_that_is_disabled_is_not_at_fault() {
     let home = Home::new();

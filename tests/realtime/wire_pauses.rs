@@ -19,13 +19,15 @@ use dimos::rpc::report::MotionReport;
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::{Value, json};
 
+use crate::support::arm_rows::{Row, rows};
 use crate::support::loopback::own_address;
 use crate::support::program::{Home, Started, eventually};
 use crate::support::python::python_with;
 use crate::support::wire::arms::furthest;
 use crate::support::wire::watch::Watch;
 
-/// Off the line at a reach of 1 m [rad], and back along it [rad]; besides what a motion without a pause does.
+/// Off the line at the flange [m], where a robot is built in, else at a reach of 1 m [rad]; and back along it [rad].
+/// Besides what a motion without a pause does.
 const OFF: f64 = 0.002;
 const BACK: f64 = 0.0005;
 /// A pause during which this computer was stalled for longer is repeated, at most this many times.
@@ -105,6 +107,11 @@ enum Gap {
 
 type Emulated = Arc<Mutex<Box<dyn Emulator>>>;
 
+/// The row for a coordinator, with the built-in robot.
+fn model(name: &str) -> &'static Row {
+    rows().iter().find(|row| row.name == name).unwrap()
+}
+
 fn emulator(row: &AdapterSpec, case: &Case, place: &EmulatorAddress, sim: Value) -> Emulated {
     let mut options: Value = serde_json::from_str(case.options).unwrap();
     options["sim"] = sim;
@@ -124,14 +131,15 @@ struct Track {
     done: Arc<AtomicBool>,
 }
 
-/// How far from the straight line, and how far back along it, a motion went [rad].
+/// How far from the straight line a motion went at the flange [m, or rad without a model], and how far back along it
+/// [rad].
 #[derive(Debug, Clone, Copy, Default)]
 struct Way {
     off: f64,
     back: f64,
 }
 
-fn way(points: &[Vec<f64>], from: &[f64], to: &[f64]) -> Way {
+fn way(row: &Row, points: &[Vec<f64>], from: &[f64], to: &[f64]) -> Way {
     let whole: f64 = from.iter().zip(to).map(|(a, b)| (b - a) * (b - a)).sum();
     let longest = furthest(from, to);
     let (mut way, mut best) = (Way::default(), f64::NEG_INFINITY);
@@ -139,10 +147,21 @@ fn way(points: &[Vec<f64>], from: &[f64], to: &[f64]) -> Way {
         let part = q.iter().zip(from).zip(to).map(|((q, a), b)| (q - a) * (b - a)).sum::<f64>() / whole;
         let line: Vec<f64> = from.iter().zip(to).map(|(a, b)| a + part * (b - a)).collect();
         best = part.max(best);
-        way.off = way.off.max(furthest(q, &line));
+        way.off = way.off.max(apart(row, q, &line));
         way.back = way.back.max((best - part) * longest);
     }
     way
+}
+
+/// Distance of two poses at the flange [m], or of their furthest joints [rad].
+fn apart(row: &Row, a: &[f64], b: &[f64]) -> f64 {
+    let Some(robot) = &row.robot else { return furthest(a, b) };
+    let flange = |q: &[f64]| {
+        let mut frames = robot.kinematics.frames();
+        robot.kinematics.forward(q, &mut frames);
+        robot.kinematics.link_frame(robot.link, &frames).translation
+    };
+    (flange(a) - flange(b)).length()
 }
 
 impl Track {
@@ -158,9 +177,9 @@ impl Track {
         }
     }
 
-    fn way(&self, from: &[f64], to: &[f64]) -> Way {
+    fn way(&self, row: &Row, from: &[f64], to: &[f64]) -> Way {
         self.done.store(true, Ordering::Relaxed);
-        way(&self.points.lock().unwrap(), from, to)
+        way(row, &self.points.lock().unwrap(), from, to)
     }
 }
 
@@ -190,6 +209,7 @@ struct Figures {
 struct Bed<'a> {
     case: &'a Case,
     row: AdapterSpec,
+    model: &'static Row,
     emulator: Emulated,
     home: Home,
     run: Started,
@@ -225,7 +245,16 @@ impl<'a> Bed<'a> {
         home.write("pauses.yaml", &blueprint.to_string());
         let run = home.run("./pauses.yaml --no-record");
         let client = home.client();
-        Self { case, row, emulator, home, run, client, random: Random::new(case.rate.to_bits()) }
+        Self {
+            case,
+            row,
+            model: model(case.name),
+            emulator,
+            home,
+            run,
+            client,
+            random: Random::new(case.rate.to_bits()),
+        }
     }
 
     fn arm(&self) -> Value {
@@ -324,7 +353,7 @@ impl<'a> Bed<'a> {
             arm["phase"].as_str().unwrap_or_default(),
             arm["cause"]["name"].as_str().unwrap_or_default()
         );
-        (report, track.way(from, to), cause)
+        (report, track.way(self.model, from, to), cause)
     }
 
     /// Loses commands of CAN and servos, and servos' replies, at a share of those that come in 3 ms.
@@ -340,7 +369,9 @@ impl<'a> Bed<'a> {
     /// Plays motions there and back with the same kind of gap, and judges each.
     fn play(&mut self, gap: Gap, times: usize, failures: &mut Vec<String>) -> Figures {
         let [a, b] = self.case.ends;
-        let watch = Watch::of_emulators();
+        // The kernel passes on the bytes of a pseudo-terminal in an ordinary thread.
+        let serial = matches!(self.row.transport, "can" | "serial");
+        let watch = if serial { Watch::of_programs() } else { Watch::of_emulators() };
         let mut figures = Figures::default();
         let (seconds, braking) = self.seconds_and_braking();
         self.return_to(a);
@@ -407,7 +438,11 @@ impl<'a> Bed<'a> {
             let by_itself = if bridged || gap == Gap::None || self.case.name == "ur" { 0.0 } else { braking };
             let most = (clean.off + OFF + by_itself, clean.back + BACK + by_itself);
             if way.off > most.0 {
-                found.push(format!("{:.2} mrad off its line (without a pause {:.2})", 1e3 * way.off, 1e3 * clean.off));
+                found.push(format!(
+                    "{:.2} mm (mrad) off its line (without a pause {:.2})",
+                    1e3 * way.off,
+                    1e3 * clean.off
+                ));
             }
             if way.back > most.1 {
                 found.push(format!("{:.2} mrad back (without a pause {:.2})", 1e3 * way.back, 1e3 * clean.back));
@@ -464,7 +499,7 @@ impl Peer {
             track.done.store(true, Ordering::Relaxed);
             ended
         });
-        (ended == "done", track.way(&from, to))
+        (ended == "done", track.way(model("franka"), &from, to))
     }
 
     fn play(&mut self, time: Duration, times: usize) -> Figures {
@@ -554,7 +589,7 @@ fn pauses_on_the_wire_leave_arms_on_their_lines() {
         }
     }
     println!(
-        "| arm | gap | completed | off its line [mrad] | back [mrad] | of its planned time |\n|---|---|---|---|---|---|"
+        "| arm | gap | completed | off its line [mm, mrad] | back [mrad] | of its planned time |\n|---|---|---|---|---|---|"
     );
     table.iter().for_each(|row| println!("{row}"));
     assert!(failures.is_empty(), "{} failures:\n{}", failures.len(), failures.join("\n"));

@@ -220,6 +220,11 @@ impl SimArm {
         self.plant.falls(speed, rest);
     }
 
+    /// Lets only the first joints droop: a gripper after them carries no load.
+    pub fn load(&mut self, joints: usize) {
+        self.plant.load(joints);
+    }
+
     // --- Time, power and clients ---
 
     /// Advances the joints to `now` and plays the arm's faults that are due. Call it before anything else.

@@ -14,7 +14,7 @@ const LAG: f64 = 0.01;
 /// Largest lag that an emulator can have [s].
 const MAX_LAG: f64 = 0.5;
 /// Largest droop that an emulator can have [rad].
-const MAX_DROOP: f64 = 0.1;
+const MAX_DROOP: f64 = 0.2;
 
 /// Settings of an emulator: the `sim` part of an arm's options. Arms with more settings there have these too.
 // Arms with more settings repeat these fields instead of using serde's `flatten`, which would lose the position of a
@@ -27,8 +27,8 @@ pub struct SimOptions {
     /// Lag of the joints behind their servo setpoints, 0 to 0.5 [s].
     #[schemars(range(min = 0, max = 0.5))]
     pub lag: f64,
-    /// Droop of the joints below their targets at rest under load, 0 to 0.1 [rad].
-    #[schemars(range(min = 0, max = 0.1))]
+    /// Droop of the joints below their targets at rest under load, 0 to 0.2 [rad].
+    #[schemars(range(min = 0, max = 0.2))]
     pub droop: f64,
     /// Faults, and when they begin (seconds after the first connection).
     pub faults: Vec<Fault>,

@@ -56,6 +56,8 @@ pub struct Plant {
     delayed: DelayLine,
     /// How far below its target a joint rests under load [rad].
     droop: f64,
+    /// How many joints carry a load, from the base: the others do not droop.
+    loaded: usize,
     /// Fraction of the top speed in drive `Position` (0–1].
     speed: f64,
     /// Speed at which joints without power fall to their rest positions [rad/s]; 0 = brakes hold.
@@ -92,6 +94,7 @@ impl Plant {
             tracking,
             delayed: DelayLine::new(0.0),
             droop: 0.0,
+            loaded: MAX_DOF,
             speed: 1.0,
             fall,
             sag: 0.0,
@@ -115,6 +118,11 @@ impl Plant {
     /// target. An arm that is repeatedly commanded to its measured position sinks.
     pub fn drooping(self, droop: f64) -> Self {
         Self { droop, ..self }
+    }
+
+    /// Lets only the first joints droop: those after them carry no load.
+    pub fn load(&mut self, joints: usize) {
+        self.loaded = joints;
     }
 
     /// Returns the joint positions [rad].
@@ -318,12 +326,12 @@ impl Plant {
             return false;
         }
         self.drive = drive;
-        let droop = self.droop;
+        let (droop, loaded) = (self.droop, self.loaded);
         for (i, joint) in self.active_mut().iter_mut().enumerate() {
             let value = target.get(i).copied().unwrap_or(f64::NAN);
             let (low, high, below, stay) = match drive {
                 Drive::Velocity => (-joint.velocity_max, joint.velocity_max, 0.0, 0.0),
-                _ => (joint.lower, joint.upper, droop, joint.position),
+                _ => (joint.lower, joint.upper, if i < loaded { droop } else { 0.0 }, joint.position),
             };
             joint.target = if value.is_finite() { (value - below).clamp(low, high) } else { stay };
         }

@@ -9,19 +9,32 @@ use proptest::prelude::*;
 
 use crate::support::rig::*;
 
+/// Sends the same target at this many ticks' distance until the arm is held, for at most 1 s. Returns the outcomes.
+fn insist(rig: &mut Rig, target: &[f64], every: u64) -> Vec<Outcome> {
+    let mut outcomes = Vec::new();
+    while rig.phase(0) == Phase::Ready && (outcomes.len() as u64) < 100 / every {
+        let id = rig.servo(0, target);
+        rig.run(every);
+        outcomes.push(rig.outcome(id));
+    }
+    outcomes
+}
+
 #[test]
-fn f08_a_jump_is_refused_and_holds() {
+fn f08_targets_out_of_reach_are_refused_and_hold_after_a_while() {
     let mut rig = Rig::one_arm(vec![task("s", servo(), 0..6, 10)]);
-    for (first, jump) in [(0.0, 0.201), (0.0, -0.3), (0.1, 3.0)] {
+    for (first, jump) in [(0.0, 0.9), (0.0, -1.2), (0.1, 3.0)] {
         rig.servo(0, &[first; 6]);
-        rig.run(45);
+        rig.run(10);
         let mut target = [first; 6];
         target[2] += jump;
-        rig.servo(0, &target);
         let before = rig.commanded(0)[2];
-        rig.tick();
+        let outcomes = insist(&mut rig, &target, 1);
         assert_eq!(rig.phase(0), Phase::Held, "{jump}: {:?}", rig.tasks);
         assert_eq!(rig.samples[0].cause, Cause::Jump);
+        assert!((10..=22).contains(&outcomes.len()), "held after {} targets in as many 10 ms", outcomes.len());
+        let refused = |o: &Outcome| matches!(o, Outcome::OutOfReach(2, by) if (by - jump).abs() < 1e-9);
+        assert!(outcomes[..outcomes.len() - 1].iter().all(refused), "{outcomes:?}");
         assert!(matches!(rig.tasks[0].reason, Reason::Jump(2, by) if (by - jump).abs() < 1e-9), "{:?}", rig.tasks[0]);
         assert_eq!(rig.tasks[0].state, TaskState::Fault);
         rig.run_for(0.5);
@@ -39,6 +52,25 @@ fn f08_a_jump_is_refused_and_holds() {
     assert_eq!(rig.phase(0), Phase::Ready);
 }
 
+/// A joystick, a network or a policy makes one wrong target now and then: the stream goes on without it.
+#[test]
+fn f08_single_targets_out_of_reach_are_left_out() {
+    for (every, jump) in [(1, 0.25), (3, -0.6), (5, 0.9), (10, 1.8)] {
+        let mut rig = Rig::one_arm(vec![task("s", servo(), 0..6, 10)]);
+        let mut refused = 0;
+        for k in 0..60u32 {
+            let smooth = 0.3 * (0.1 * f64::from(k)).sin();
+            let target = if k % 7 == 5 { smooth + jump } else { smooth };
+            let id = rig.servo(0, &[target, smooth, smooth, smooth, smooth, smooth]);
+            rig.run(every);
+            refused += u32::from(matches!(rig.outcome(id), Outcome::OutOfReach(0, _)));
+            assert_eq!(rig.phase(0), Phase::Ready, "{:?}", rig.tasks);
+            assert!((rig.commanded(0)[0] - rig.commanded(0)[1]).abs() < 0.08, "{jump}: {:?}", rig.commanded(0));
+        }
+        assert_eq!(refused, 8, "a jump of {jump} rad in a stream of {} Hz", 100 / every);
+    }
+}
+
 /// Interpolation between the targets of a slow stream must not hide a jump.
 #[test]
 fn f08_a_jump_in_a_slow_stream_is_refused_too() {
@@ -48,10 +80,29 @@ fn f08_a_jump_in_a_slow_stream_is_refused_too() {
             rig.servo(0, &[1e-3 * k as f64; 6]);
             rig.run(every);
         }
-        rig.servo(0, &[jump; 6]);
-        rig.tick();
-        assert_eq!(rig.phase(0), Phase::Held, "a jump of {jump} rad in a stream of {} Hz", 100 / every);
-        assert!(rig.arms[0].q[0] < 0.03);
+        // As long as the joint cannot be there since the last target that counts.
+        let outcomes = insist(&mut rig, &[jump; 6], every);
+        assert!(matches!(outcomes[0], Outcome::OutOfReach(..)), "{outcomes:?}");
+        assert!(rig.arms[0].q[0] < 0.25 || rig.phase(0) == Phase::Ready, "{jump}: {:?}", rig.arms[0].q);
+    }
+}
+
+/// A network loses some targets of a stream at speed: the arm goes on to the next one within its limits.
+#[test]
+fn f08_after_lost_targets_the_stream_goes_on_within_limits() {
+    for lost in [1, 2, 3, 4, 6] {
+        let mut rig = Rig::one_arm(vec![task("s", servo(), 0..1, 10)]);
+        let at = |k: u32| 0.6 * (1.0 - (2.0 * f64::from(k) / 30.0).cos());
+        for k in (0..95).filter(|k| !(18..18 + lost).contains(&(k % 30))) {
+            // 30 Hz on a tick of 100 Hz.
+            let id = rig.servo(0, &[at(k)]);
+            let next = (k + 1..).find(|k| !(18..18 + lost).contains(&(k % 30))).unwrap();
+            rig.run(u64::from(next * 10 / 3 - k * 10 / 3));
+            assert_eq!(rig.outcome(id), Outcome::Accepted, "{lost} lost, target {k}");
+            assert_eq!(rig.phase(0), Phase::Ready, "{lost} lost: {:?}", rig.tasks);
+        }
+        rig.run(30);
+        assert!((rig.commanded(0)[0] - at(94)).abs() < 0.01, "{lost} lost: {:?}", rig.commanded(0));
     }
 }
 

@@ -1,6 +1,7 @@
 //! Follows a stream of joint positions. If targets arrive less often than the tick, commands are interpolated linearly
-//! over the period of the stream, so that a slow stream gives a smooth motion. When the stream stops, the joints
-//! decelerate to rest.
+//! over the period of the stream, so that a slow stream gives a smooth motion. A target that no joint can reach in its
+//! time is refused, and the stream goes on; when such targets have come for a while, the arm is held. When the stream
+//! stops, the joints decelerate to rest.
 
 use super::params::ServoParams;
 use crate::clock::Mono;
@@ -11,12 +12,18 @@ use crate::telemetry::{Outcome, Reason, TaskState};
 
 /// Maximum period of a stream; a longer pause starts a new one [s].
 const LONGEST_PERIOD: f64 = 0.1;
+/// A step between two targets may take this much of the joint's velocity limit.
+const REACH: f64 = 1.5;
+/// A teleoperated arm's stream has single wrong targets. After this time of nothing else the arm is held [s].
+const WRONG_FOR: f64 = 0.2;
 
 /// State of a servo task.
 #[derive(Debug)]
 pub struct ServoTask {
     params: ServoParams,
     target: Option<Setpoint>,
+    /// The first of the targets that were refused since then.
+    wrong_since: Option<Mono>,
     /// Joints lost to a task of higher priority, until the next target.
     muted: [bool; MAX_DOF],
 }
@@ -52,7 +59,18 @@ impl Setpoint {
 impl ServoTask {
     /// Creates a task without a target.
     pub fn new(params: ServoParams) -> Self {
-        Self { params, target: None, muted: [false; MAX_DOF] }
+        Self { params, target: None, wrong_since: None, muted: [false; MAX_DOF] }
+    }
+
+    /// Returns the first joint that cannot be at its target in the time since the last one, and its step [rad].
+    fn out_of_reach(&self, cx: &Context<'_>, to: &Joints) -> Option<(u16, f64)> {
+        let last = self.target.as_ref()?;
+        let pause = cx.now.seconds_since(last.at);
+        cx.joints.iter().zip(to).zip(&last.to).find_map(|((&joint, to), last)| {
+            let step = to - last;
+            let most = JUMP.max(cx.joint(joint).velocity_limit * pause * REACH);
+            (step.is_nan() || step.abs() > most).then_some((joint, step))
+        })
     }
 
     /// Sets a new target [rad], in the order of the task's joints.
@@ -69,13 +87,13 @@ impl ServoTask {
                 };
                 let before = Context { now: cx.now.before(std::time::Duration::from_secs_f64(cx.dt)), ..*cx };
                 let from = last.reached(&before);
-                // A step that no joint can make in that time is a jump: not interpolated, so that it is refused.
-                let reachable = |(k, joint): (usize, &u16)| {
-                    let step = to.get(k).zip(last.to.get(k)).map_or(0.0, |(to, last)| (to - last).abs());
-                    step <= JUMP.max(cx.joint(*joint).velocity_limit * pause * 1.5)
+                // After lost targets the way may be long: it takes the time that the joints need.
+                let time = |(k, &joint): (usize, &u16)| {
+                    let way = to.get(k).zip(from.get(k)).map_or(0.0, |(to, from)| (to - from).abs());
+                    if way > JUMP { way / cx.joint(joint).velocity_limit } else { 0.0 }
                 };
-                let possible = cx.joints.iter().enumerate().all(reachable);
-                (from, if possible { period } else { 0.0 })
+                let needed = cx.joints.iter().enumerate().map(time).fold(0.0, f64::max);
+                (from, period.max(needed))
             }
         };
         self.target = Some(Setpoint { from, to: *to, at: cx.now, period });
@@ -86,7 +104,7 @@ impl TaskBody for ServoTask {
     fn accept(&mut self, cx: &Context<'_>, target: &Target<'_>) -> Result<(), Outcome> {
         let Target::Positions(positions) = target else { return Err(Outcome::WrongTask(cx.task)) };
         if !cx.active {
-            // A stream begins at the arm's position; later a jump is a fault.
+            // A stream begins at the arm's position.
             for (&joint, value) in cx.joints.iter().zip(positions) {
                 let step = value - cx.joint(joint).commanded;
                 if step.abs() > JUMP {
@@ -94,6 +112,15 @@ impl TaskBody for ServoTask {
                 }
             }
         }
+        if let Some((joint, step)) = self.out_of_reach(cx, positions).filter(|_| cx.active) {
+            let since = *self.wrong_since.get_or_insert(cx.now);
+            if cx.now.seconds_since(since) < WRONG_FOR {
+                return Err(Outcome::OutOfReach(joint, step));
+            }
+            // It is requested as it is: a jump holds the arm.
+            self.target = None;
+        }
+        self.wrong_since = None;
         self.set_target(cx, positions);
         Ok(())
     }
@@ -114,7 +141,7 @@ impl TaskBody for ServoTask {
     }
 
     fn end(&mut self) {
-        self.target = None;
+        (self.target, self.wrong_since) = (None, None);
     }
 
     fn lose(&mut self, joints: &[u16], joint: u16) -> OnLoss {

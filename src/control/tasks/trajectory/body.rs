@@ -129,14 +129,16 @@ impl TrajectoryTask {
         errors.find(|(_, e)| e.abs() > tolerance).map(|(j, e)| Reason::PathTolerance(j, e))
     }
 
-    /// Returns the first joint that has not arrived, and its error [rad].
-    fn away_from_goal(&self, cx: &Context<'_>, motion: &Motion) -> Option<(u16, f64)> {
+    /// Returns why the arm has not arrived: of the first joint that is not at its goal, or still moves.
+    fn away_from_goal(&self, cx: &Context<'_>, motion: &Motion) -> Option<Reason> {
         motion.joints.iter().zip(&self.samples).find_map(|(&joint, sample)| {
             let view = cx.joint(joint);
             let error = view.position - sample.position;
-            let near = error.abs() <= self.params.goal_tolerance.max(view.droop);
-            let arrived = near && view.velocity.abs() <= TICK_STANDSTILL;
-            (!arrived).then_some((joint, error))
+            if error.is_nan() || error.abs() > self.params.goal_tolerance.max(view.droop) {
+                return Some(Reason::GoalTolerance(joint, error));
+            }
+            let moves = view.velocity.abs() > TICK_STANDSTILL;
+            moves.then_some(Reason::GoalVelocity(joint, view.velocity))
         })
     }
 }
@@ -195,8 +197,8 @@ impl TaskBody for TrajectoryTask {
             self.settling += cx.dt;
             match self.away_from_goal(cx, motion) {
                 None => return Step::End(TaskState::Completed, Reason::None),
-                Some((joint, error)) if self.settling > self.params.goal_time => {
-                    return Step::End(TaskState::Aborted, Reason::GoalTolerance(joint, error));
+                Some(reason) if self.settling > self.params.goal_time => {
+                    return Step::End(TaskState::Aborted, reason);
                 }
                 Some(_) => {}
             }

@@ -75,8 +75,8 @@ pub struct SimOptions {
     /// Lag of the joints behind the commands, 0 to 0.5 [s].
     #[schemars(range(min = 0, max = 0.5))]
     pub lag: f64,
-    /// How far below its target a joint rests under load, 0 to 0.1 [rad].
-    #[schemars(range(min = 0, max = 0.1))]
+    /// How far below its target a joint rests under load, 0 to 0.2 [rad].
+    #[schemars(range(min = 0, max = 0.2))]
     pub droop: f64,
     /// Share of the states, and of the commands, that the network loses, 0 to 1.
     #[schemars(range(min = 0, max = 1))]

@@ -52,8 +52,8 @@ pub struct SimOptions {
     /// Lag of the servos behind their goals, 0 to 0.5 [s].
     #[schemars(range(min = 0, max = 0.5))]
     pub lag: f64,
-    /// How far a joint rests below its goal under load, 0 to 0.1 [rad].
-    #[schemars(range(min = 0, max = 0.1))]
+    /// How far a joint rests below its goal under load, 0 to 0.2 [rad].
+    #[schemars(range(min = 0, max = 0.2))]
     pub droop: f64,
     /// Whether the line returns what is sent on it.
     pub echo: bool,

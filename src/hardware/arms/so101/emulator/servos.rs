@@ -68,7 +68,8 @@ impl Servos {
     /// Creates servos that were just switched on.
     pub fn new(options: &SimOptions, now: Mono) -> AdapterResult<Self> {
         let limits = limits();
-        let arm = SimArm::new("so101", &limits, &options.common(), PLAYABLE, now)?.without_modes();
+        let mut arm = SimArm::new("so101", &limits, &options.common(), PLAYABLE, now)?.without_modes();
+        arm.load(SERVOS - 1);
         let mut registers = [[0; REGISTERS]; SERVOS];
         for ((servo, id), (low, high)) in
             registers.iter_mut().zip(1u8..).zip(limits.position_lower.iter().zip(&limits.position_upper))

@@ -79,8 +79,8 @@ pub struct SimOptions {
     /// Lag of the joints behind the servo setpoints of a program, 0 to 0.5 [s].
     #[schemars(range(min = 0, max = 0.5))]
     pub lag: f64,
-    /// How far below its target a joint rests under load, 0 to 0.1 [rad].
-    #[schemars(range(min = 0, max = 0.1))]
+    /// How far below its target a joint rests under load, 0 to 0.2 [rad].
+    #[schemars(range(min = 0, max = 0.2))]
     pub droop: f64,
     /// How long power-on and the release of the brakes take, each, 0 to 60 [s].
     #[schemars(range(min = 0, max = 60))]

@@ -68,8 +68,8 @@ pub struct SimOptions {
     /// How far joints are behind their servo setpoints, 0 to 0.5 [s].
     #[schemars(range(min = 0, max = 0.5))]
     pub lag: f64,
-    /// How far below their targets joints rest under load, 0 to 0.1 [rad].
-    #[schemars(range(min = 0, max = 0.1))]
+    /// How far below their targets joints rest under load, 0 to 0.2 [rad].
+    #[schemars(range(min = 0, max = 0.2))]
     pub droop: f64,
     /// What goes wrong, and when (seconds after the first connection).
     pub faults: Vec<Fault>,
