@@ -108,6 +108,25 @@ mod tests {
         assert_eq!(arm.step(2, false, DT), JointStep::at(0.0), "no such joint");
     }
 
+    /// A joint that moves slowly would rest sooner by itself, beside the line on which the way was proven free.
+    #[test]
+    fn the_braking_that_is_executed_is_the_one_that_was_proven() {
+        let mut arm = arm(ControlMode::ServoPosition, (0.5, 0.4), (0.506, 0.42));
+        arm.before[1].rewind(0.5, -0.1);
+        for tick in 0..12 {
+            let proven = [0, 1].map(|joint| arm.step(joint, true, DT));
+            arm.brake(DT);
+            for (joint, proven) in proven.iter().enumerate() {
+                let executed = &arm.limiters[joint];
+                assert!((executed.position() - proven.to).abs() < 1e-12, "{joint} in tick {tick}: {proven:?}");
+                assert!((executed.velocity() - proven.velocity).abs() < 1e-12, "{joint} in tick {tick}: {proven:?}");
+                assert_eq!(arm.command.values[joint], executed.position());
+            }
+            arm.before.copy_from_slice(&arm.limiters);
+        }
+        assert!(arm.was_at_rest());
+    }
+
     #[test]
     fn with_velocities_the_step_begins_where_the_joint_may_be() {
         let mut arm = arm(ControlMode::Velocity, (0.0, 0.4), (0.0, 0.42));
