@@ -29,18 +29,25 @@ struct Recording {
 }
 
 impl Recording {
-    /// It begins at rest: with constant acceleration up to the speed of its first rows.
+    /// It begins at rest: the arm with constant acceleration up to the speed of its first rows, its target from there
+    /// to the first one.
     fn from_rest(mut self) -> Self {
-        for rows in [&mut self.targets, &mut self.measured] {
-            let v: Vec<f64> = rows[0].iter().zip(&rows[1]).map(|(a, b)| (b - a) / self.period).collect();
-            let count = (LEAD_IN / self.period).round() as usize;
-            let row = |k: usize| -> Vec<f64> {
-                let (t, whole) = (k as f64 * self.period, count as f64 * self.period);
-                rows[0].iter().zip(&v).map(|(q, v)| q - v * whole / 2.0 + v * t * t / (2.0 * whole)).collect()
-            };
-            let before: Vec<Vec<f64>> = (0..count).map(row).collect();
-            rows.splice(0..0, before);
-        }
+        let (q, next) = (self.measured[0].clone(), self.measured[1].clone());
+        let count = (LEAD_IN / self.period).round() as usize;
+        let whole = count as f64 * self.period;
+        let lead = |k: usize| -> Vec<f64> {
+            let t = k as f64 * self.period;
+            let v = |j: usize| (next[j] - q[j]) / self.period;
+            (0..q.len()).map(|j| q[j] - v(j) * whole / 2.0 + v(j) * t * t / (2.0 * whole)).collect()
+        };
+        let before: Vec<Vec<f64>> = (0..count).map(lead).collect();
+        let ahead: Vec<f64> = self.targets[0].iter().zip(&q).map(|(to, q)| to - q).collect();
+        let towards = |(k, row): (usize, &Vec<f64>)| -> Vec<f64> {
+            row.iter().zip(&ahead).map(|(q, ahead)| q + ahead * k as f64 / count as f64).collect()
+        };
+        let targets: Vec<Vec<f64>> = before.iter().enumerate().map(towards).collect();
+        self.targets.splice(0..0, targets);
+        self.measured.splice(0..0, before);
         self
     }
 
@@ -121,7 +128,7 @@ fn judge(name: &str, recordings: &[Recording]) {
     }
 }
 
-/// A LeRobot data set at 30 Hz: 100 is the end of a joint's range, and of the servo's, 1.75 rad from its middle.
+/// A LeRobot data set at 30 Hz: -100 and 100 are the ends of a joint's range.
 #[test]
 fn an_so101_is_streamed_to_as_it_was_recorded() {
     let Some(folder) = shared("recordings") else { return };
@@ -131,9 +138,14 @@ fn an_so101_is_streamed_to_as_it_was_recorded() {
     let Some(answer) = ask_python("parquet_rows.py", "pyarrow", &question) else { return };
     let rows = |column: usize| -> Vec<Vec<f64>> { serde_json::from_value(answer[column].clone()).unwrap() };
     let episodes: Vec<u64> = serde_json::from_value(answer[2].clone()).unwrap();
+    let l = &self::rows().iter().find(|row| row.name == "so101").unwrap().arm.limits;
+    let angle = |j: usize, value: f64| {
+        let (lower, upper) = (l.position_lower[j], l.position_upper[j]);
+        0.5 * (lower + upper) + 0.005 * value * (upper - lower)
+    };
     let of = |rows: &[Vec<f64>], episode: u64| -> Vec<Vec<f64>> {
         let own = rows.iter().zip(&episodes).filter(|(_, e)| **e == episode);
-        own.map(|(row, _)| row[..5].iter().map(|value| value * 0.0175).collect()).collect()
+        own.map(|(row, _)| row[..5].iter().enumerate().map(|(j, value)| angle(j, *value)).collect()).collect()
     };
     let (targets, measured) = (rows(0), rows(1));
     // An episode begins in motion: a stream begins where the arm is near its target.

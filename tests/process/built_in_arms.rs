@@ -255,13 +255,12 @@ fn an_so101_that_droops_like_a_recorded_one_works() {
         let moved = home.dimos(&format!("move arm {target} --speed 0.5")).with(0);
         assert!(moved.out.contains("COMPLETED"), "{}\n{}", moved.out, moved.err);
     }
-    grip(&home, "arm", 0.8);
-    home.dimos("jog arm 2 0.1").with(0);
+    grip(&home, "arm", 1.92);
     home.dimos("stop").with(0);
     home.dimos("arm reset arm").with(0);
     // Once more from where it hangs.
     assert_eq!(home.dimos("arm enable arm").with(0).out, "arm: ready\n");
-    home.dimos("arm disable arm --now --yes").with(0);
+    home.dimos("arm disable arm --now").with(0);
     run.end(Signal::INT).with(130);
 }
 

@@ -281,10 +281,16 @@ impl ArmControl {
         }
     }
 
-    /// Returns the joint that is furthest from where it was when the arm was enabled, and how far [rad].
+    /// Returns the joint that is furthest from where it was when the arm was enabled, and how far [rad]. The way back
+    /// to its range does not count: a controller that takes no target outside moves a joint in that lies there.
     fn furthest_from_enabling(&self) -> (u16, f64) {
-        let moved = self.feedback.state().position.iter().zip(&self.enabled_at).take(self.config.dof);
-        furthest(moved.map(|(q, before)| q - before)).unwrap_or_default()
+        let (state, limits) = (self.feedback.state(), &self.config.limits);
+        let ranges = limits.position_lower.iter().zip(&limits.position_upper);
+        let moved = state.position.iter().zip(&self.enabled_at).zip(ranges).map(|((q, before), (lower, upper))| {
+            let moved = q - before;
+            moved - moved.max((upper - before).min(0.0)).min((lower - before).max(0.0))
+        });
+        furthest(moved).unwrap_or_default()
     }
 
     /// Returns the cause for a hold if the arm moves without a command.

@@ -87,9 +87,9 @@ fn joints_droop_and_sink_when_commanded_to_their_measured_positions() {
     arm.move_to(&positions(&arm), 1.0).unwrap();
     arm.advance(at(4.0));
     assert!((positions(&arm)[0] - (0.8 - 0.02)).abs() < 1e-12);
-    let much = SimOptions { droop: 0.2, ..SimOptions::default() };
+    let much = SimOptions { droop: 0.3, ..SimOptions::default() };
     let error = much.check("acme", &JointLimits::uniform(3, 2.0, 1.0), PLAYABLE).unwrap_err();
-    assert_eq!((error.option.as_str(), error.what.as_str()), ("sim.droop", "droop must be 0 to 0.1 rad, not 0.2 rad"));
+    assert_eq!((error.option.as_str(), error.what.as_str()), ("sim.droop", "droop must be 0 to 0.2 rad, not 0.3 rad"));
 }
 
 #[test]

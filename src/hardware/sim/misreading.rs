@@ -143,8 +143,8 @@ mod tests {
     #[test]
     fn what_is_late_was_true_before_and_what_is_frozen_stays() {
         let mut memory = Memory::default();
-        let mut late = |now: f64| told(&mut memory, Misreading::Late, 0.1, now, (now, 1.0))[0];
-        assert_eq!([1.0, 1.05, 1.1, 1.15, 1.2].map(&mut late), [1.0, 1.0, 1.0, 1.05, 1.1]);
+        let mut late = |now: f64| told(&mut memory, Misreading::Late, 0.125, now, (now, 1.0))[0];
+        assert_eq!([1.0, 1.0625, 1.125, 1.1875, 1.25].map(&mut late), [1.0, 1.0, 1.0, 1.0625, 1.125]);
         let mut memory = Memory::default();
         let mut frozen = |q: f64| told(&mut memory, Misreading::Frozen, 0.0, 1.0 + q, (q, q));
         assert_eq!([frozen(0.1)[0], frozen(0.2)[0], frozen(0.3)[2]], [0.1, 0.1, 0.3]);

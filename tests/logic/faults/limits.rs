@@ -24,8 +24,10 @@ fn insist(rig: &mut Rig, target: &[f64], every: u64) -> Vec<Outcome> {
 fn f08_targets_out_of_reach_are_refused_and_hold_after_a_while() {
     let mut rig = Rig::one_arm(vec![task("s", servo(), 0..6, 10)]);
     for (first, jump) in [(0.0, 0.9), (0.0, -1.2), (0.1, 3.0)] {
-        rig.servo(0, &[first; 6]);
-        rig.run(10);
+        (0..45).for_each(|_| {
+            rig.servo(0, &[first; 6]);
+            rig.tick();
+        });
         let mut target = [first; 6];
         target[2] += jump;
         let before = rig.commanded(0)[2];
@@ -52,7 +54,7 @@ fn f08_targets_out_of_reach_are_refused_and_hold_after_a_while() {
     assert_eq!(rig.phase(0), Phase::Ready);
 }
 
-/// A joystick, a network or a policy makes one wrong target now and then: the stream goes on without it.
+/// A joystick, a network or a policy makes one wrong target now and then: the stream continues without it.
 #[test]
 fn f08_single_targets_out_of_reach_are_left_out() {
     for (every, jump) in [(1, 0.25), (3, -0.6), (5, 0.9), (10, 1.8)] {
@@ -87,7 +89,7 @@ fn f08_a_jump_in_a_slow_stream_is_refused_too() {
     }
 }
 
-/// A network loses some targets of a stream at speed: the arm goes on to the next one within its limits.
+/// A network loses some targets of a stream at speed: the arm continues to the next one within its limits.
 #[test]
 fn f08_after_lost_targets_the_stream_goes_on_within_limits() {
     for lost in [1, 2, 3, 4, 6] {

@@ -1,6 +1,6 @@
 //! Follows a stream of joint positions. If targets arrive less often than the tick, commands are interpolated linearly
 //! over the period of the stream, so that a slow stream gives a smooth motion. A target that no joint can reach in its
-//! time is refused, and the stream goes on; when such targets have come for a while, the arm is held. When the stream
+//! time is refused, and the stream continues; when such targets have come for a while, the arm is held. When the stream
 //! stops, the joints decelerate to rest.
 
 use super::params::ServoParams;

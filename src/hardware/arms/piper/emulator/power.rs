@@ -12,7 +12,7 @@ use crate::hardware::sim::faults::FaultKind;
 /// Speed at which the arm falls when its motors go off [rad/s], and the joint positions at which it rests. Before the
 /// motors are on for the first time the arm is supported.
 const FALL: f64 = 0.3;
-const FOLDED: [Option<f64>; DOF] = [None, Some(-0.03489), Some(0.0344), None, Some(0.0), None];
+const FOLDED: [Option<f64>; DOF] = [None, Some(0.0), Some(0.0), None, Some(0.0), None];
 /// How long the motors take to come on, one after the other.
 const MOTOR_START: Duration = Duration::from_millis(40);
 const NEXT_MOTOR: Duration = Duration::from_millis(5);
