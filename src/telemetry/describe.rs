@@ -496,6 +496,13 @@ mod tests {
     }
 
     #[test]
+    fn a_start_that_is_refused_says_where_the_joint_was_commanded_and_where_it_is_read() {
+        let d = describe(&Event::Arm(0, Phase::Held, Cause::StartMismatch(1, 0.5, -0.25)), &names());
+        assert!(d.text.contains("joint 2 is commanded at 0.5000 rad and read at -0.2500 rad"), "{}", d.text);
+        assert_eq!(d.values, [0.5, -0.25]);
+    }
+
+    #[test]
     fn a_held_arm_says_why() {
         let d = describe(&Event::Arm(1, Phase::Held, Cause::Fault(31)), &names());
         assert_eq!(d.text, "right is held (the arm reports error 31)");

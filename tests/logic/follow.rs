@@ -249,6 +249,17 @@ fn a_leader_that_jumps_is_not_followed() {
 }
 
 #[test]
+fn a_leader_that_a_hand_moves_far_while_it_is_not_read_is_approached_again() {
+    let mut rig = in_step(task_of(follow(|_| {})));
+    rig.arms[LEADER].silent = true;
+    led(&mut rig, 0.02, |t| [12.0 * t; 6]);
+    rig.arms[LEADER].silent = false;
+    let (speed, _) = led(&mut rig, 2.0, |_| [0.3; 6]);
+    assert_eq!(rig.phase(LEADER), Phase::Disabled, "as fast as a hand may be");
+    assert!(speed <= APPROACH + 1e-9 && speed > 0.2, "{speed} rad/s");
+}
+
+#[test]
 fn a_leader_outside_the_range_is_refused_or_followed_to_the_limit() {
     let mut rig = rig(task_of(follow(|_| {})));
     rig.carry(LEADER, &[0.0, 0.0, 0.0, RANGE + 0.3, 0.0, 0.0]);

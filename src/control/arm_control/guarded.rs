@@ -108,6 +108,25 @@ mod tests {
         assert_eq!(arm.step(2, false, DT), JointStep::at(0.0), "no such joint");
     }
 
+    /// A joint that moves slowly would rest sooner by itself, beside the line on which the way was proven free.
+    #[test]
+    fn the_braking_that_is_executed_is_the_one_that_was_proven() {
+        let mut arm = arm(ControlMode::ServoPosition, (0.5, 0.4), (0.506, 0.42));
+        arm.before[1].rewind(0.5, -0.1);
+        for tick in 0..12 {
+            let proven = [0, 1].map(|joint| arm.step(joint, true, DT));
+            arm.brake(DT);
+            for (joint, proven) in proven.iter().enumerate() {
+                let executed = &arm.limiters[joint];
+                assert!((executed.position() - proven.to).abs() < 1e-12, "{joint} in tick {tick}: {proven:?}");
+                assert!((executed.velocity() - proven.velocity).abs() < 1e-12, "{joint} in tick {tick}: {proven:?}");
+                assert_eq!(arm.command.values[joint], executed.position());
+            }
+            arm.before.copy_from_slice(&arm.limiters);
+        }
+        assert!(arm.was_at_rest());
+    }
+
     #[test]
     fn with_velocities_the_step_begins_where_the_joint_may_be() {
         let mut arm = arm(ControlMode::Velocity, (0.0, 0.4), (0.0, 0.42));
@@ -132,5 +151,17 @@ mod tests {
             assert!((step.from - 0.5 * velocity * time).abs() < 1e-12, "{step:?}");
             assert!((step.spread - 0.5 * f64::abs(velocity) * time).abs() < 1e-12, "{step:?}");
         }
+    }
+
+    /// A reading alone does not say where it is: it may be false, and velocities have led the joint elsewhere.
+    #[test]
+    fn with_velocities_a_joint_may_be_anywhere_between_its_reading_and_where_they_have_led_it() {
+        let mut arm = arm(ControlMode::Velocity, (0.6, 0.0), (0.6, 0.0));
+        see(&mut arm, 1, [0.2, 0.9]);
+        arm.tracking.push(Mono(1_010_000_000), &joints_of(&[]), Some(&joints_of(&[0.0, 0.0])));
+        let between = JointStep { from: 0.4, to: 0.4, spread: 0.2, ..arm.step(0, false, DT) };
+        assert!(close(arm.step(0, false, DT), between), "{:?}", arm.step(0, false, DT));
+        let between = JointStep { from: 0.75, to: 0.75, spread: 0.15, ..arm.step(1, false, DT) };
+        assert!(close(arm.step(1, false, DT), between), "{:?}", arm.step(1, false, DT));
     }
 }

@@ -21,6 +21,8 @@ pub mod shaping;
 mod smoothing;
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod tests_commanded;
 
 use std::time::Duration;
 

@@ -120,6 +120,15 @@ fn a_refused_setpoint_is_no_fault_of_the_connection_and_the_tick_is_told_of_it()
 }
 
 #[test]
+fn the_tick_is_told_of_a_step_that_the_last_check_withholds() {
+    let mut bench = Bench::enabled();
+    bench.hold_at(0.0);
+    let state = bench.hold_at(0.5);
+    assert!(state.refused > state.written, "{state:?}");
+    assert!(bench.hold_at(0.0).written > state.refused);
+}
+
+#[test]
 fn three_failed_writes_are_a_faulted_link_and_one_good_one_ends_that() {
     let mut bench = Bench::enabled();
     let refused = AdapterError::Protocol("no".into());
