@@ -78,6 +78,23 @@ fn a_first_setpoint_that_is_not_written_is_taken_again() {
 }
 
 #[test]
+fn far_outside_its_limits_an_arm_is_enabled_only_if_its_operator_says_so() {
+    let mut rig = Rig::one_arm(one(trajectory()));
+    rig.arms[0].enabled = false;
+    rig.run(3);
+    rig.carry(0, &[RANGE + 0.1, 0.0, 0.0, 0.0, 0.0, 0.0]);
+    rig.arms[0].setpoint = None;
+    rig.arms[0].enabled = true;
+    rig.run(3);
+    rig.ask(Request::Reset { arm: 0 });
+    assert_eq!(enable(&mut rig), (Phase::Held, "outside_range"));
+    assert_eq!(rig.ask(Request::Reset { arm: 0 }), Outcome::Accepted);
+    assert_eq!(rig.ask(Request::Enabled { arm: 0, outside: true }), Outcome::Accepted);
+    rig.run_for(0.5);
+    assert_eq!((rig.phase(0), rig.commanded(0)[0]), (Phase::Ready, RANGE + 0.1));
+}
+
+#[test]
 fn a_reset_does_not_make_a_lost_turn_a_position() {
     let mut rig = Rig::one_arm(one(trajectory()));
     rig.arms[0].blocked = true;

@@ -152,4 +152,16 @@ mod tests {
             assert!((step.spread - 0.5 * f64::abs(velocity) * time).abs() < 1e-12, "{step:?}");
         }
     }
+
+    /// A reading alone does not say where it is: it may be false, and velocities have led the joint elsewhere.
+    #[test]
+    fn with_velocities_a_joint_may_be_anywhere_between_its_reading_and_where_they_have_led_it() {
+        let mut arm = arm(ControlMode::Velocity, (0.6, 0.0), (0.6, 0.0));
+        see(&mut arm, 1, [0.2, 0.9]);
+        arm.tracking.push(Mono(1_010_000_000), &joints_of(&[]), Some(&joints_of(&[0.0, 0.0])));
+        let between = JointStep { from: 0.4, to: 0.4, spread: 0.2, ..arm.step(0, false, DT) };
+        assert!(close(arm.step(0, false, DT), between), "{:?}", arm.step(0, false, DT));
+        let between = JointStep { from: 0.75, to: 0.75, spread: 0.15, ..arm.step(1, false, DT) };
+        assert!(close(arm.step(1, false, DT), between), "{:?}", arm.step(1, false, DT));
+    }
 }

@@ -129,3 +129,16 @@ fn rejected_readings_keep_a_state_fresh_until_a_jump_could_be_confirmed() {
         assert_eq!(feedback.freshness().fresh, 10 * seq <= 10 + 50 + 30, "reading {seq}");
     }
 }
+
+#[test]
+fn a_velocity_without_motion_is_a_contradiction_where_setpoints_are_all_that_moves_the_arm() {
+    for driven in [true, false] {
+        let mut feedback = Feedback::new(&config());
+        let found = (1..60).any(|k| {
+            let state = ArmState { velocity: joints_of(&[0.8, 0.0]), ..reading(k, 0.1) };
+            let verdict = feedback.read(&state, None, driven, state.stamp, &Stalls::default());
+            matches!(verdict, Verdict::Inconsistent(0, _))
+        });
+        assert_eq!((found, feedback.is_usable()), (driven, !driven));
+    }
+}

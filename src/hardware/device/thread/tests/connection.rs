@@ -5,6 +5,7 @@ use std::sync::atomic::Ordering::Relaxed;
 use super::*;
 use crate::arm::{Interference, Link};
 use crate::hardware::adapter::AdapterError;
+use crate::joint::joints_of;
 
 #[test]
 fn an_arm_with_another_number_of_joints_is_refused_and_released() {
@@ -236,4 +237,14 @@ fn an_arm_that_is_lost_with_its_first_reading_counts_as_no_reconnect() {
     assert_eq!((bench.count("connect"), bench.worker.connected), (1, false));
     assert_eq!(bench.worker.health.reconnects.load(Relaxed), 0);
     assert!(!bench.notes().iter().any(|note| note.starts_with("over")));
+}
+
+#[test]
+fn a_stop_is_given_the_point_of_rest_and_after_silence_where_the_arm_is_within_what_it_may_have_followed() {
+    let mut bench = Bench::enabled();
+    let rest = joints_of(&[0.3, 0.0, 0.0]);
+    bench.tick(|command| command.rest = Some(rest));
+    assert_eq!(bench.worker.stop_point().position, Some(rest), "not where it is read");
+    bench.tick(|command| command.unheard = Some([joints_of(&[0.1, -0.1, 0.0]), joints_of(&[0.2, 0.1, 0.0])]));
+    assert_eq!(bench.worker.stop_point().position, Some(joints_of(&[0.1, 0.0, 0.0])));
 }
