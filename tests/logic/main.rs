@@ -50,10 +50,7 @@ mod planned_paths;
 mod planning;
 mod planning_timing;
 mod poses;
-<<<<<<< HEAD
 mod recorded_streams;
-=======
->>>>>>> 4200c7cbc31bd670dbacabb93de7d1083117c4a9
 mod relief;
 mod robot_models;
 mod rpc;

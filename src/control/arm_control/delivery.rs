@@ -103,7 +103,9 @@ impl ArmControl {
     pub(super) fn check_gap(&mut self, now: Mono) {
         self.resumed = None;
         let Some(mode) = self.command.mode.or(self.rest.gap.map(|gap| gap.mode)) else { return };
-        if self.is_starting() || !matches!(self.failsafe.phase(), Phase::Ready | Phase::Activating | Phase::Held) {
+        if self.is_starting()
+            || !matches!(self.failsafe.phase(), Phase::Ready | Phase::Activating | Phase::Held | Phase::Standby)
+        {
             self.rest.gap = None;
             return;
         }

@@ -250,3 +250,11 @@ fn a_long_random_scenario_is_repeated_bit_for_bit() {
     println!("DIMOS_TEST_SEED={seed}");
     assert!(scenario(seed, 10_000) == scenario(seed, 10_000), "DIMOS_TEST_SEED={seed}");
 }
+
+/// 2, 8010: a gap while an arm in standby still brakes; 4, 6: a gap that begins in the tick in which another one ends.
+#[test]
+fn scenarios_with_gaps_keep_all_rules() {
+    for seed in [2, 4, 6, 8010] {
+        scenario(seed, 10_000);
+    }
+}
