@@ -78,7 +78,11 @@ pub fn run(args: &Args) -> Result {
         arms: arms(&job),
         ready,
     };
-    let ended = runner.run();
+    let begun = runner.begin_epoch().map_err(|end| job.steps.first().map(|step| (step, end)));
+    let ended = match begun {
+        Err(Some(end)) => Err(end),
+        _ => runner.run(),
+    };
     let mut after = None;
     let mut late_signal = None;
     if let Err((_, End::Fault(_))) = &ended {

@@ -128,6 +128,8 @@ pub struct Client {
     line: Vec<u8>,
     timeout: Duration,
     next: u64,
+    /// The epoch of the requests; `None`: that in which each arrives.
+    epoch: Option<u64>,
     buffered: VecDeque<Message>,
 }
 
@@ -180,7 +182,13 @@ impl Client {
     fn over(stream: UnixStream, run: &str, timeout: Duration) -> io::Result<Self> {
         stream.set_write_timeout(Some(timeout))?;
         let (run, from) = (run.to_owned(), BufReader::new(stream));
-        Ok(Self { run, from, line: Vec::new(), timeout, next: 1, buffered: VecDeque::new() })
+        Ok(Self { run, from, line: Vec::new(), timeout, next: 1, epoch: None, buffered: VecDeque::new() })
+    }
+
+    /// Requests from now on are of this epoch ([`StatusReport::epoch`](super::report::StatusReport::epoch)): they move no
+    /// arm that was stopped, held, disabled or lost since.
+    pub fn since(&mut self, epoch: u64) {
+        self.epoch = Some(epoch);
     }
 
     /// Returns the run's name.
@@ -193,7 +201,7 @@ impl Client {
     pub fn call<M: Method>(&mut self, params: M) -> Result<M::Reply, ClientError> {
         let id = self.next;
         self.next += 1;
-        let line = request(id, &params)?;
+        let line = request(id, self.epoch, &params)?;
         let deadline = Instant::now() + self.timeout;
         if let Err(error) = self.from.get_mut().write_all(line.as_bytes()) {
             // A run that refuses the connection sends the reason before it closes it.
@@ -334,7 +342,7 @@ impl Sender {
     pub fn send<M: Method>(&mut self, params: &M) -> Result<u64, ClientError> {
         let id = self.next;
         self.next += 1;
-        let line = request(id, params)?;
+        let line = request(id, None, params)?;
         let sent = self.to.write_all(line.as_bytes());
         sent.map(|()| id).map_err(|error| ClientError::Io { run: self.run.clone(), error })
     }
@@ -346,8 +354,12 @@ impl Sender {
 }
 
 /// Encodes a request as a line.
-fn request<M: Method>(id: u64, params: &M) -> Result<String, ClientError> {
-    let line = json!({"id": id, "method": M::NAME, "params": params}).to_string() + "\n";
+fn request<M: Method>(id: u64, epoch: Option<u64>, params: &M) -> Result<String, ClientError> {
+    let mut line = json!({"id": id, "method": M::NAME, "params": params});
+    if let Some(epoch) = epoch {
+        line["epoch"] = epoch.into();
+    }
+    let line = line.to_string() + "\n";
     if line.len() > MAX_LINE {
         let text = format!("the request has {} bytes (limit {MAX_LINE})", line.len());
         return Err(RpcError::new(Code::TooLarge, text).hint("send fewer points at once").into());

@@ -58,6 +58,7 @@ pub(super) async fn serve(transfer: Transfer, backend: Arc<dyn Backend>) -> Opti
     let mut from_client = BufReader::new(std::io::Cursor::new(read).chain(from_client));
     let connection = Connection {
         epoch: backend.epoch(),
+        wanted: 0,
         backend,
         lessee,
         permit,
@@ -119,6 +120,8 @@ struct Connection {
     is_gateway: bool,
     /// The run's epoch when the connection last waited for a line. Lines that were there already may be as old.
     epoch: u64,
+    /// The epoch of the request that is answered.
+    wanted: u64,
 }
 
 /// A registered planner; closed when dropped.
@@ -217,10 +220,12 @@ impl Connection {
     }
 
     async fn answer(&mut self, line: &[u8]) -> Result<(), Disconnected> {
-        let wire::Envelope { id, method, params } = match wire::read(line) {
+        let wire::Envelope { id, method, params, epoch } = match wire::read(line) {
             Ok(envelope) => envelope,
             Err((id, error)) => return self.reply::<Done>(&id, Err(error)).await,
         };
+        // A client may want what it wanted longer ago, never later.
+        self.wanted = epoch.map_or(self.epoch, |epoch| epoch.min(self.epoch));
         match method.as_str() {
             Subscribe::NAME => match self.subscribe(params) {
                 Ok((reply, subscription)) => {
@@ -299,7 +304,7 @@ impl Connection {
 
     fn call(&self, method: String, request: Request) -> Answer {
         let (backend, leases) = (self.backend.clone(), self.lessee.leases().clone());
-        let origin = Origin { epoch: self.epoch, client: self.lessee.connection() };
+        let origin = Origin { epoch: self.wanted, client: self.lessee.connection() };
         Box::pin(async move { answer(&method, backend.call_from(request, origin), &leases).await })
     }
 

@@ -29,6 +29,9 @@ pub struct StatusReport {
     pub started: String,
     /// Time since the start [s].
     pub uptime: f64,
+    /// Counts the stops, holds, disables, losses and changes of the lease of all arms.
+    #[serde(default)]
+    pub epoch: u64,
     /// Ticks per second [Hz].
     pub tick_rate: f64,
     /// Whether any of the arms is an emulator, or an ideal arm in memory.

@@ -98,7 +98,7 @@ fn urgent(line: &[u8]) -> Option<(Value, Request)> {
     if line.len() > MAX_URGENT {
         return None;
     }
-    let wire::Envelope { id, method, params } = wire::read(line).ok()?;
+    let wire::Envelope { id, method, params, .. } = wire::read(line).ok()?;
     match method.as_str() {
         Stop::NAME | Cancel::NAME | Status::NAME | Shutdown::NAME => Some((id, Request::read(&method, params).ok()?)),
         _ => None,

@@ -18,6 +18,9 @@ pub(super) struct Envelope {
     pub method: String,
     #[serde(default)]
     pub params: Value,
+    /// The epoch (`status`) in which the client wanted it, if that was earlier.
+    #[serde(default)]
+    pub epoch: Option<u64>,
 }
 
 /// Parses a request line. An error has the id, or null if that could not be read.

@@ -1,6 +1,6 @@
 //! Reports of a run: status, state, motions, streams.
 
-use std::sync::atomic::Ordering::Relaxed;
+use std::sync::atomic::Ordering::{Acquire, Relaxed};
 use std::time::Instant;
 
 use super::motions::{End, NATIVE, Next};
@@ -33,6 +33,7 @@ impl Service {
             blueprint: parts.blueprint.name.clone(),
             started: rfc3339(started),
             uptime: self.started.elapsed().as_secs_f64(),
+            epoch: pulse.epoch.load(Acquire),
             tick_rate: parts.config.rate,
             simulated: parts.blueprint.arms.iter().any(|arm| !arm.is_real()),
             log: parts.log.as_ref().map(|p| p.display().to_string()),

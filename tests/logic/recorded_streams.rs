@@ -31,7 +31,7 @@ struct Recording {
 impl Recording {
     /// It begins at rest: the arm with constant acceleration up to the speed of its first rows, its target from there
     /// to the first one.
-    fn from_rest(mut self) -> Self {
+    fn begun_at_rest(mut self) -> Self {
         let (q, next) = (self.measured[0].clone(), self.measured[1].clone());
         let count = (LEAD_IN / self.period).round() as usize;
         let whole = count as f64 * self.period;
@@ -155,7 +155,7 @@ fn an_so101_is_streamed_to_as_it_was_recorded() {
         let first = targets.iter().zip(&measured).position(near).unwrap();
         Recording { period: 1.0 / 30.0, targets: targets[first..].to_vec(), measured: measured[first..].to_vec() }
     };
-    let recordings: Vec<Recording> = (0..=*episodes.last().unwrap()).map(|e| begin(e).from_rest()).collect();
+    let recordings: Vec<Recording> = (0..=*episodes.last().unwrap()).map(|e| begin(e).begun_at_rest()).collect();
     assert_eq!(recordings.len(), 4);
     judge("so101", &recordings);
 }
@@ -163,7 +163,7 @@ fn an_so101_is_streamed_to_as_it_was_recorded() {
 #[test]
 fn a_ur3e_is_streamed_to_as_it_was_recorded() {
     let Some(folder) = shared("recordings") else { return };
-    judge("ur", &[ur3e(&folder).from_rest()]);
+    judge("ur", &[ur3e(&folder).begun_at_rest()]);
 }
 
 fn ur3e(folder: &Path) -> Recording {

@@ -422,3 +422,30 @@ fn the_recipes_of_the_page_work() {
     home.dimos("down").with(0);
     home.dimos("do --check names.yaml").with(0).says(&["were not checked"]);
 }
+
+/// Stopped, reset and enabled again by another client while the job waits for its gripper: nothing of it moves the arm
+/// afterwards.
+#[test]
+fn a_stop_that_was_reset_during_a_step_ends_the_job() {
+    let home = Home::new();
+    let run = home.run("yourarm-planner --sim --no-record");
+    let mut steps = String::from("arm: arm\nsteps:\n  - move: home\n");
+    (0..12).for_each(|_| steps += "  - gripper: 0.06\n  - gripper: {to: close}\n");
+    home.write("grips.yaml", &(steps + "  - move: {joints: [0.3, -0.3, 0.6, 0, 0.8, 0]}\n"));
+    home.dimos("move arm 0 -0.3 0.6 0 0.8 0 --direct").with(0);
+    let job = home.start("do grips.yaml");
+    let mut client = home.client();
+    let moves = |client: &mut Client| client.call(State {}).unwrap().arms[0].gripper.unwrap_or_default() > 0.03;
+    eventually("it grips", || moves(&mut client));
+    client.call(Stop::default()).unwrap();
+    client.call(ArmReset { arm: "arm".into() }).unwrap();
+    // The lease is the job's: the motors may be enabled by whoever has stopped them.
+    let enabled = client.call(ArmEnable::new("arm"));
+    let before = home.positions("arm");
+    let ended = job.wait().with(1);
+    assert!(ended.err.contains("stopped") || ended.err.contains("held"), "{} {enabled:?}", ended.err);
+    std::thread::sleep(Duration::from_millis(300));
+    let moved = home.positions("arm").iter().zip(&before).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+    assert!(moved < 1e-3, "it went {moved} rad after the stop: {}", ended.err);
+    run.end(Signal::INT);
+}

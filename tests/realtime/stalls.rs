@@ -75,7 +75,7 @@ impl Three {
         let here = self.home.positions("arm");
         let [near, far] = YOURARM.near_and_far(&here);
         let go = |target: &[f64]| Move::new("arm", target, 1.0);
-        if furthest(&near, &here) > 0.2 {
+        if furthest(near, &here) > 0.2 {
             let motion = self.begin(go(near));
             self.done(motion);
             self.ready();

@@ -167,6 +167,7 @@ pub fn start(folder: &Path, run: &str, backend: FakeBackend) -> (Server, Arc<Fak
 pub fn status() -> StatusReport {
     let figures = Percentiles { p50: 4.1, p99: 11.0, p99_9: 22.25, max: 103.0 };
     StatusReport {
+        epoch: 0,
         share: None,
         run: "test".into(),
         pid: std::process::id(),

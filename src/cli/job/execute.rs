@@ -116,6 +116,7 @@ impl<'r> Runner<'r, '_> {
             return Err((format!("not run: {}", not_ready(arm)), None));
         }
         self.ready.retain(|(_, now)| !now);
+        self.client.since(status.epoch);
         self.steps(steps).map(|()| "done".to_owned()).map_err(|(step, end)| match end {
             End::Signal(signal) => ("interrupted".to_owned(), Some(signal)),
             End::Stopped(failure) | End::Fault(failure) => (format!("failed at line {}: {failure}", step.line), None),
@@ -152,7 +153,17 @@ impl<'r> Runner<'r, '_> {
         if let Act::Repeat { times, steps } = &step.act {
             return (0..*times).try_for_each(|_| self.steps(steps));
         }
-        self.act(step).map_err(|end| (step, end))
+        self.act(step).map_err(|end| (step, end))?;
+        // These may interrupt the arm themselves.
+        let own = matches!(step.act, Act::Reset | Act::Enable | Act::Attach(_) | Act::Detach(_) | Act::Output(_));
+        if own { self.begin_epoch().map_err(|end| (step, end)) } else { Ok(()) }
+    }
+
+    /// What interrupted the arms before is known: what does so from now on ends the job.
+    pub fn begin_epoch(&mut self) -> Outcome {
+        let epoch = self.client.call(Status {})?.epoch;
+        self.client.since(epoch);
+        Ok(())
     }
 
     fn act(&mut self, step: &Step) -> Outcome {
