@@ -11,6 +11,7 @@ mod refusals;
 mod replies;
 mod run_arm;
 mod run_link;
+mod tool_line;
 
 use std::net::IpAddr;
 use std::thread::sleep;

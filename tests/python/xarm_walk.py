@@ -333,7 +333,8 @@ def absolute_aa(arm):
 def raw(answer):
     """What a frame's state byte says of an unknown register."""
     code, frame = answer
-    return code or (10 if int(str(frame[7]), 16) & 0x08 else 0)
+    state = frame[7] if isinstance(frame[7], int) else int(frame[7], 16)
+    return code or (10 if state & 0x08 else 0)
 
 
 def data(answer, expected):

@@ -8,9 +8,9 @@ use nalgebra::Isometry3;
 use super::refusals::Refusals;
 use super::replies::{Commands, Target, refusal};
 use super::run_link::{RunLink, View, code};
+use super::tool_line;
 use crate::clock::Mono;
-use crate::hardware::arms::xarm::emulator::{ControlledArm, Frame, Line, Links, MoveRequest, Refusal, Target as Place};
-use crate::hardware::sim::reach::Chain;
+use crate::hardware::arms::xarm::emulator::{ControlledArm, Line, Links, MoveRequest, Refusal};
 use crate::joint::{Joints, STANDSTILL};
 use crate::rpc::Code;
 use crate::rpc::api::{
@@ -27,8 +27,6 @@ const REPEAT_PERIOD: Duration = Duration::from_millis(50);
 const MAX_AGE: Duration = Duration::from_millis(500);
 /// Smallest fraction of a gripper's top speed.
 const SLOWEST_GRIPPER: f64 = 0.01;
-/// Longest distance of a tool's centre point from the flange [m].
-const LONGEST_TOOL: f64 = 0.6;
 /// Time after which the status shows that a stream has begun.
 const BEGIN_TIME: Duration = Duration::from_millis(200);
 
@@ -400,17 +398,8 @@ impl ControlledArm for RunArm {
         }
     }
 
-    /// A move of the tool by a distance, for an xArm whose pose is known. The tool's centre point is where the device
-    /// has it, as for the program.
     fn line(&self, from: &[f64; 7], request: &MoveRequest) -> Option<Line> {
-        let Place::Pose(values, frame @ Frame::Start, orientation) = request.target else { return None };
-        let (links, pose) = (self.info.links?, self.view.pose?);
-        let tool = links.forward(self.view.position.first_chunk::<7>()?).inverse() * pose;
-        if tool.translation.vector.norm() > LONGEST_TOOL {
-            return None; // the box has another base frame
-        }
-        let goal = frame.goal(&(links.forward(from) * tool), values, orientation)?;
-        Line::new(links, &tool, from, &goal)
+        tool_line::of(self.info.links?, &self.view, from, request)
     }
 
     fn note_refused(&mut self, register: u8, data: &[u8], mode: u8, state: u8) {
