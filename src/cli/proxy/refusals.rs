@@ -2,10 +2,10 @@
 
 use std::time::{Duration, Instant};
 
-/// A program that repeats a refused request is told once in this time.
+/// Minimum time between two lines about the same request.
 const REPEATED_AFTER: Duration = Duration::from_secs(1);
 
-/// The refusal that was last told.
+/// The refusal that was last reported.
 #[derive(Debug, Default)]
 pub struct Refusals {
     last: Option<(u8, Instant)>,
@@ -80,7 +80,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_would_move_or_set_is_told_once_and_queries_are_not() {
+    fn what_would_move_or_set_is_reported_once_and_queries_are_not() {
         let mut refusals = Refusals::default();
         let line = refusals.line(21, &[], 0, 2).unwrap();
         assert!(line.starts_with("set_position, set_tool_position or set_position_aa (register 21) refused (code 10)"));

@@ -26,7 +26,7 @@ const LATE: f64 = 0.1;
 const SLACK: f64 = 1.05;
 /// A joint this far from its goal is to move [rad].
 const FAR: f64 = 0.02;
-/// Time after which a joint that does not move is taken for a collision [s]: about 2 s in servo mode, where the box
+/// Time after which a joint that does not move counts as a collision [s]: about 2 s in servo mode, where the box
 /// does not know the planned torques (xArm-Python-SDK #128); shorter in others (our choice).
 const BLOCKED_SERVO: f64 = 2.0;
 const BLOCKED_PLANNED: f64 = 0.3;
