@@ -7,9 +7,11 @@
 //! The proxy is a client of the run: it holds the lease while the program moves the arm, and every command passes the
 //! run's limits and guards.
 
+mod refusals;
 mod replies;
 mod run_arm;
 mod run_link;
+mod tool_line;
 
 use std::net::IpAddr;
 use std::thread::sleep;
@@ -21,7 +23,7 @@ use super::arguments::Target;
 use super::exit::{Exit, Failure, Result};
 use super::follow::Signals;
 use super::output;
-use crate::hardware::arms::xarm::emulator::{ControlBox, ControlledArm};
+use crate::hardware::arms::xarm::emulator::{ControlBox, ControlledArm, Links};
 use crate::hardware::arms::xarm::model::Model;
 use crate::hardware::arms::xarm::protocol::gripper::GripperKind;
 use crate::hardware::sim::events::{self, SimEvent};
@@ -85,8 +87,9 @@ pub fn run(args: &Args) -> Result {
     let mut client = Target { run: args.run.clone(), json: false }.connect()?;
     let status = client.call(Status {})?;
     let arm = choose(&status, args.arm.as_deref())?;
-    let info = info(&mut client, &status, arm)?;
+    let mut info = info(&mut client, &status, arm)?;
     let model = model_of(args.model, &info)?;
+    info.links = (arm.adapter == "xarm").then(|| Links::of(model));
     let gripper = if info.gripper_range.is_some() { GripperKind::Xarm } else { GripperKind::None };
     let streams = [&info.servo, &info.velocity].map(|task| task.as_ref().map(|task| task.name.clone()));
     let link = RunLink::open(&status.run, &info.arm, streams)?;
@@ -157,6 +160,7 @@ fn info(client: &mut Client, status: &StatusReport, arm: &ArmReport) -> Result<A
     let trajectory = status.tasks.iter().filter(covers).min_by_key(|task| task.joints.len());
     Ok(ArmInfo {
         arm: arm.hardware_id.clone(),
+        links: None,
         limits: arm.position_limits.clone(),
         // The SDK's gripper opens by a width.
         gripper_range: arm.gripper_range.filter(|_| arm.gripper_unit.as_deref() == Some("m")),

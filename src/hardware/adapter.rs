@@ -154,6 +154,11 @@ pub trait ManipulatorAdapter: Send {
 
     /// Returns vendor, model, dof, versions, rate, modes.
     fn get_info(&self) -> ManipulatorInfo;
+    /// Returns what a user must know of the arm that is connected, such as a guard that its reports make useless. The
+    /// run logs it as a warning, once.
+    fn connection_warning(&self) -> Option<&'static str> {
+        None
+    }
     /// Returns the number of joints.
     fn get_dof(&self) -> usize;
     /// Returns the joint limits, known or read from the device.

@@ -14,3 +14,4 @@ mod ur_rtde;
 mod viewer;
 mod xarm_proxy;
 mod xarm_sdk;
+mod xarm_walk;

@@ -29,17 +29,17 @@ tasks:
 ";
 
 /// A run of an arm on its emulator, the proxy, and the vendor's client.
-struct Cell {
-    home: Home,
+pub struct Cell {
+    pub home: Home,
     run: Started,
-    proxy: Started,
-    host: String,
-    python: std::path::PathBuf,
+    pub proxy: Started,
+    pub host: String,
+    pub python: std::path::PathBuf,
 }
 
 impl Cell {
     /// Starts a run of `included` with stream tasks, and the proxy; `None` where the client or port 502 is missing.
-    fn start(included: &str, more: &str) -> Option<Self> {
+    pub fn start(included: &str, more: &str) -> Option<Self> {
         Self::of(&format!("include: [{included}]{STREAMS}"), more)
     }
 

@@ -16,7 +16,7 @@ use crate::support::python::python_with;
 use crate::support::skip::skip_port_502;
 
 /// An emulator at the arm's own ports of a loopback address; `None` where port 502 cannot be had.
-fn emulator(last: u8, dof: usize, options: serde_json::Value) -> Option<(XArmEmulator, String)> {
+pub fn emulator(last: u8, dof: usize, options: serde_json::Value) -> Option<(XArmEmulator, String)> {
     let ip = IpAddr::V4(Ipv4Addr::new(127, 0, 6, last));
     let config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof, options };
     match XArmEmulator::start(&config, &EmulatorAddress::Bind(ip)) {

@@ -146,6 +146,25 @@ fn what_it_says_fits_the_model() {
 }
 
 #[test]
+fn the_printed_run_reaches_an_arm_with_a_gripper_and_without() {
+    let (home, address) = (Home::new(), own_address());
+    if std::net::TcpListener::bind((address, 502)).is_err_and(|e| e.kind() == std::io::ErrorKind::PermissionDenied) {
+        return skip_port_502();
+    }
+    for option in ["", " --option gripper=xarm", " --option gripper=xarm_g2"] {
+        let emulator = emulate(&home, &format!("xarm --model xarm6 --bind {address}{option}"));
+        let said = emulator.out();
+        let line = said.lines().find_map(|line| line.trim().strip_prefix("reach it   dimos run ")).unwrap();
+        let run = home.run(&format!("{line} --no-record"));
+        assert_eq!(home.status()["arms"][0]["link"], "up", "{line}");
+        run.end(Signal::TERM).with(143);
+        let line = said.lines().find_map(|line| line.trim().strip_prefix("check it   dimos ")).unwrap();
+        assert!(line.ends_with(&format!("--model xarm6{option}")), "{line}");
+        emulator.end(Signal::INT).with(130);
+    }
+}
+
+#[test]
 fn a_program_finds_the_address_and_an_end() {
     let (home, address) = (Home::new(), own_address());
     let started =

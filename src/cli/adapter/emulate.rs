@@ -23,6 +23,10 @@ use crate::hardware::sim::faults::{Fault, FaultKind};
 /// How often the joints are shown.
 const LOOK: Duration = Duration::from_millis(100);
 
+/// The option of a gripper, and its value for an arm without one.
+const GRIPPER: &str = "gripper";
+const NONE: &str = "none";
+
 /// Arguments of `adapter emulate`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
@@ -223,8 +227,8 @@ fn announce(args: &Args, row: &AdapterSpec, dof: usize, address: &str, registry:
         _ => address.to_owned(),
     };
     let program = program();
-    let command =
-        runnable(args, row, dof, &given, registry).map(|name| format!("{program} run {name} --address arm={given}"));
+    let command = runnable(args, row, dof, &given, registry)
+        .map(|(name, set)| format!("{program} run {name} --address arm={given}{set}"));
     if args.json {
         output::json(&json!({
             "event": "started",
@@ -242,10 +246,15 @@ fn announce(args: &Args, row: &AdapterSpec, dof: usize, address: &str, registry:
         output::line(format_args!("  reach it   {command}"));
     }
     let joints = if row.dof.0 == row.dof.1 { String::new() } else { format!(" --dof {dof}") };
-    let model = args.choice.model.as_ref();
-    let (flag, option) =
-        (model.map(|model| format!(" --model {model}")), model.map(|model| format!(", options: {{model: {model}}}")));
-    let (flag, option) = (flag.unwrap_or_default(), option.unwrap_or_default());
+    let flag: String = client_options(args)
+        .map(
+            |(key, value)| {
+                if key == "model" { format!(" --model {value}") } else { format!(" --option {key}={value}") }
+            },
+        )
+        .collect();
+    let options: Vec<String> = client_options(args).map(|(key, value)| format!("{key}: {value}")).collect();
+    let option = if options.is_empty() { String::new() } else { format!(", options: {{{}}}", options.join(", ")) };
     output::line(format_args!("  check it   {program} adapter test {} --address {given}{joints}{flag}", row.name));
     output::line(format_args!("  blueprint  adapter_type: {}, address: \"{given}\"{option}", row.name));
     output::note("Ctrl-C ends it");
@@ -257,25 +266,48 @@ fn program() -> String {
     Path::new(&path).file_name().and_then(|name| name.to_str()).unwrap_or("dimos").to_owned()
 }
 
-/// A blueprint by a likely name that runs this arm and no other.
-fn runnable(args: &Args, row: &AdapterSpec, dof: usize, address: &str, registry: &Registry) -> Option<String> {
+/// The options that a client needs as well: its model and what is at the arm, not how the emulator behaves.
+fn client_options(args: &Args) -> impl Iterator<Item = (&str, &str)> {
+    let model = args.choice.model.iter().map(|model| ("model", model.as_str()));
+    let others = args.choice.options.iter().map(|(key, value)| (key.as_str(), value.as_str()));
+    model.chain(others.filter(|(key, _)| !key.contains('.')))
+}
+
+/// A blueprint by a likely name that runs this arm and no other, and the arguments that it needs for this emulator.
+fn runnable(
+    args: &Args,
+    row: &AdapterSpec,
+    dof: usize,
+    address: &str,
+    registry: &Registry,
+) -> Option<(String, String)> {
     let (name, model) = (row.name, args.choice.model.as_deref().unwrap_or(row.name));
     let kebab = format!("coordinator-{}", name.replace('_', "-"));
     let names =
         [format!("coordinator-{model}"), format!("coordinator-{name}{dof}"), format!("coordinator-{name}"), kebab];
-    names.into_iter().find(|name| {
-        let Ok(found) = blueprint::find(name) else { return false };
+    names.into_iter().find_map(|name| {
+        let found = blueprint::find(&name).ok()?;
         let set = vec![format!("hardware.arm.address={address}")];
-        let loaded = blueprint::load(&found, &blueprint::Overrides { set, ..Default::default() }, registry);
-        let model = |arm: &blueprint::Arm| arm.options.get("model").and_then(Value::as_str).map(str::to_owned);
-        let fits = |arm: &blueprint::Arm| {
-            arm.adapter_type == row.name
-                && arm.joints.len() == dof
-                && args.choice.model.as_ref().is_none_or(|wanted| {
-                    model(arm).map_or(*name == format!("coordinator-{wanted}"), |model| model == *wanted)
-                })
-        };
-        loaded.blueprint.is_some_and(|blueprint| blueprint.arms.len() == 1 && blueprint.arms.iter().all(fits))
+        let loaded = blueprint::load(&found, &blueprint::Overrides { set, ..Default::default() }, registry).blueprint?;
+        let [arm] = &loaded.arms[..] else { return None };
+        let option = |key: &str| arm.options.get(key).and_then(Value::as_str).map(str::to_owned);
+        let fits = arm.adapter_type == row.name
+            && arm.joints.len() == dof
+            && args.choice.model.as_ref().is_none_or(|wanted| {
+                option("model").map_or(name == format!("coordinator-{wanted}"), |model| model == *wanted)
+            });
+        // What the emulator has otherwise than the blueprint; the gripper is the one part that blueprints add.
+        let mut different: Vec<(String, String)> = client_options(args)
+            .filter(|(key, value)| *key != "model" && option(key).as_deref() != Some(value))
+            .map(|(key, value)| (key.to_owned(), value.to_owned()))
+            .collect();
+        if option(GRIPPER).is_some_and(|gripper| gripper != NONE)
+            && !client_options(args).any(|(key, _)| key == GRIPPER)
+        {
+            different.push((GRIPPER.to_owned(), NONE.to_owned()));
+        }
+        let set = different.iter().map(|(key, value)| format!(" --set hardware.arm.options.{key}={value}"));
+        fits.then(|| (name, set.collect()))
     })
 }
 

@@ -5,14 +5,17 @@ use std::time::{Duration, Instant};
 
 use nalgebra::Isometry3;
 
+use super::refusals::Refusals;
 use super::replies::{Commands, Target, refusal};
 use super::run_link::{RunLink, View, code};
+use super::tool_line;
 use crate::clock::Mono;
-use crate::hardware::arms::xarm::emulator::{ControlledArm, Refusal};
+use crate::hardware::arms::xarm::emulator::{ControlledArm, Line, Links, MoveRequest, Refusal};
 use crate::joint::{Joints, STANDSTILL};
 use crate::rpc::Code;
 use crate::rpc::api::{
-    ArmDisable, ArmEnable, ArmPayloadSet, ArmReset, Cancel, Gripper, Lease, Method, Move, Release, Servo, Velocity,
+    ArmDisable, ArmEnable, ArmPayloadSet, ArmReset, Cancel, Gripper, JointPath, Lease, Method, Move, PATH_TOLERANCE,
+    Release, Servo, Velocity,
 };
 use crate::sync::lock;
 
@@ -22,6 +25,8 @@ const ROUNDING: f64 = 2e-5;
 const REPEAT_PERIOD: Duration = Duration::from_millis(50);
 /// Age of the joints from which the arm counts as not ready.
 const MAX_AGE: Duration = Duration::from_millis(500);
+/// Smallest fraction of a gripper's top speed.
+const SLOWEST_GRIPPER: f64 = 0.01;
 /// Time after which the status shows that a stream has begun.
 const BEGIN_TIME: Duration = Duration::from_millis(200);
 
@@ -39,6 +44,8 @@ pub struct StreamTask {
 pub struct ArmInfo {
     /// Its `hardware_id`.
     pub arm: String,
+    /// Its kinematics, if it is an xArm.
+    pub links: Option<Links>,
     /// Limits of its joints [rad].
     pub limits: Vec<[f64; 2]>,
     /// Closed and open position of its gripper [m].
@@ -85,6 +92,7 @@ pub struct RunArm {
     /// No client is connected that could stop what moves.
     orphaned: bool,
     gripper_ordered: Option<Instant>,
+    refusals: Refusals,
     /// When a change of the arm was accepted whose effect the status does not show yet.
     changed: Option<Instant>,
 }
@@ -108,6 +116,7 @@ impl RunArm {
             leased: false,
             orphaned: false,
             gripper_ordered: None,
+            refusals: Refusals::default(),
             changed: None,
         }
     }
@@ -351,12 +360,16 @@ impl ControlledArm for RunArm {
         }
     }
 
-    fn go(&mut self, target: &[f64; 7], speed: f64, acceleration: f64) -> Result<(), Refusal> {
-        let target: Vec<f64> = target.iter().take(self.info.limits.len()).copied().collect();
+    fn go(&mut self, way: &[[f64; 7]], speed: f64, acceleration: f64) -> Result<(), Refusal> {
+        let joints = |point: &[f64; 7]| point.iter().take(self.info.limits.len()).copied().collect::<Vec<f64>>();
+        let (target, path) = match way {
+            [target] => (joints(target), None),
+            _ => (Vec::new(), Some(JointPath { points: way.iter().map(joints).collect(), tolerance: PATH_TOLERANCE })),
+        };
         let caps = (Some(speed).filter(|v| *v > 0.0), Some(acceleration).filter(|a| *a > 0.0));
         let (max_velocity, max_acceleration) = caps;
         let arm = self.info.arm.clone();
-        let reply = self.ask(&Move { max_velocity, max_acceleration, ..Move::direct(arm, target, 1.0) })?;
+        let reply = self.ask(&Move { path, max_velocity, max_acceleration, ..Move::direct(arm, target, 1.0) })?;
         self.leased = true;
         self.motion = Some(reply.motion);
         self.link.shared.view().motion = Some(reply.motion);
@@ -385,6 +398,16 @@ impl ControlledArm for RunArm {
         }
     }
 
+    fn line(&self, from: &[f64; 7], request: &MoveRequest) -> Option<Line> {
+        tool_line::of(self.info.links?, &self.view, from, request)
+    }
+
+    fn note_refused(&mut self, register: u8, data: &[u8], mode: u8, state: u8) {
+        if let Some(line) = self.refusals.line(register, data, mode, state) {
+            self.link.shared.note(line);
+        }
+    }
+
     fn pose(&self) -> Option<Isometry3<f64>> {
         self.view.pose
     }
@@ -397,11 +420,12 @@ impl ControlledArm for RunArm {
         self.view.gripper_motion(self.gripper_ordered)
     }
 
-    fn move_gripper(&mut self, opening: f64) {
+    fn move_gripper(&mut self, opening: f64, speed: Option<f64>) {
         let Some([closed, open]) = self.info.gripper_range else { return };
         let position = opening.max(closed.min(open)).min(closed.max(open));
         self.gripper_ordered = Some(Instant::now());
-        self.send(&Gripper { arm: self.info.arm.clone(), position, ..Gripper::default() });
+        let speed = speed.map(|speed| speed.clamp(SLOWEST_GRIPPER, 1.0));
+        self.send(&Gripper { arm: self.info.arm.clone(), position, speed, ..Gripper::default() });
     }
 
     fn set_load(&mut self, [mass, x, y, z]: [f32; 4]) -> Result<(), Refusal> {

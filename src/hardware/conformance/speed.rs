@@ -114,17 +114,32 @@ fn fast_stream(context: &mut Context) -> Result<(), String> {
         })
         .collect();
     // A busy machine may keep the emulator from moving; an arm that is too slow fails every time.
-    let mut result = stream_fast(context, &home, &away, time);
+    let mut result = stream_in_turn(context, &home, &away, time);
     for _ in 0..2 {
         if result.is_err() {
             let here = context.standstill()?;
             if context.stream(&here, &home).is_err() {
                 return result;
             }
-            result = stream_fast(context, &home, &away, time);
+            result = stream_in_turn(context, &home, &away, time);
         }
     }
     result
+}
+
+/// Streams one joint after another, from the base on: together they would make the tool faster than some controllers
+/// allow.
+fn stream_in_turn(context: &mut Context, home: &[f64], away: &[f64], time: f64) -> Result<(), String> {
+    let mut from = home.to_vec();
+    for joint in 0..home.len() {
+        let mut to = from.clone();
+        if let (Some(to), Some(away)) = (to.get_mut(joint), away.get(joint)) {
+            *to = *away;
+        }
+        stream_fast(context, &from, &to, time)?;
+        from = to;
+    }
+    Ok(())
 }
 
 fn stream_fast(context: &mut Context, from: &[f64], to: &[f64], time: f64) -> Result<(), String> {

@@ -76,6 +76,8 @@ pub(super) struct Worker {
     turn: u8,
     read_errors: u32,
     write_errors: u32,
+    /// The adapter's warning of its connection was logged.
+    warned: bool,
     plausible: Plausible,
     /// Velocity limit of the fastest joint [rad/s].
     speed: f64,
@@ -148,6 +150,7 @@ impl Worker {
             turn: 0,
             read_errors: 0,
             write_errors: 0,
+            warned: false,
             plausible: Plausible::default(),
             slow: slow_readings::Slow::default(),
             lead: lead::Lead::default(),

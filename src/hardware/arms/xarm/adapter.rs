@@ -118,6 +118,10 @@ impl XArmAdapter {
     }
 }
 
+/// What a run logs of a controller whose reports hide what the joints do.
+const COMMANDED_POSITIONS: &str = "its controller reports commanded positions, not measured ones (firmware before 2.4.0 \
+     at port 30003): tracking supervision is off, only the controller's own collision detection sees a blocked joint";
+
 impl ManipulatorAdapter for XArmAdapter {
     // --- Lifecycle ---
 
@@ -170,6 +174,11 @@ impl ManipulatorAdapter for XArmAdapter {
             holds_when_disabled: HOLDS_WHEN_DISABLED,
             whole_state_at_once: true,
         }
+    }
+
+    fn connection_warning(&self) -> Option<&'static str> {
+        let blind = self.session.as_ref().is_some_and(Session::reports_commanded);
+        blind.then_some(COMMANDED_POSITIONS)
     }
 
     fn get_dof(&self) -> usize {

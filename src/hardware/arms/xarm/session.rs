@@ -14,7 +14,7 @@ use super::model::{Model, VELOCITY};
 use super::protocol::commands::{Command, QUICK, SLOW};
 use super::protocol::frame::Response;
 use super::protocol::identity::Firmware;
-use super::protocol::report::{Health, Motion};
+use super::protocol::report::{Health, Kind, Motion};
 use super::stream::Stream;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
@@ -147,6 +147,11 @@ impl Session {
     /// Returns the rate of the reports [Hz].
     pub fn rate(&self) -> f64 {
         self.reports.kind().rate()
+    }
+
+    /// Returns whether the reported joint positions are the commanded ones: port 30003 with firmware before 2.4.0.
+    pub fn reports_commanded(&self) -> bool {
+        self.reports.kind() == Kind::Real && !self.device.firmware.at_least(2, 4, 0)
     }
 
     /// Returns the controller's condition.

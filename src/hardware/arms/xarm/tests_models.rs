@@ -3,7 +3,7 @@
 use serde_json::json;
 
 use super::emulator::Withhold;
-use super::tests::{config, pair, read, ready, sent, set};
+use super::tests::{config, pair, read, ready, sent, set, six};
 use super::{MODES_WITHOUT_VELOCITY, SPEC};
 use crate::hardware::adapter::ManipulatorAdapter;
 use crate::hardware::conformance::{Outcome, Subject, checks, run_all};
@@ -50,6 +50,35 @@ fn old_firmware_has_no_velocity_mode_because_it_would_not_end_a_velocity() {
     let (_emulator, mut arm) = ready(json!({"sim": {"firmware": "1.8.0"}}), ControlMode::Velocity);
     assert!(arm.get_info().modes.contains(&ControlMode::Velocity));
     arm.write_joint_velocities(&[0.0; 6]).unwrap();
+}
+
+/// Firmware before 2.4.0 reports commanded positions at port 30003: a blocked joint does not show.
+#[test]
+fn reports_of_commanded_positions_are_warned_of() {
+    for (firmware, withhold, blind) in [
+        ("1.12.10", Withhold::No, true),
+        ("2.2.0", Withhold::Close, true),
+        ("2.2.0", Withhold::No, false),
+        ("2.5.1", Withhold::Close, false),
+    ] {
+        let (emulator, mut arm) = pair(6, json!({"sim": {"firmware": firmware}}));
+        emulator.withhold_full_reports(withhold);
+        arm.connect().unwrap();
+        let warning = arm.connection_warning().unwrap_or_default();
+        assert_eq!(warning.contains("tracking supervision is off"), blind, "{firmware} {withhold:?}: {warning}");
+    }
+    let (emulator, mut arm) = ready(json!({"sim": {"firmware": "1.12.10"}}), ControlMode::ServoPosition);
+    emulator.inject(Fault::new(FaultKind::Blocked).lasting(10.0)).unwrap();
+    let start = six(&mut arm);
+    let mut target = start;
+    for _ in 0..10 {
+        target[0] += 0.02;
+        arm.write_joint_positions(&target, 1.0).unwrap();
+        std::thread::sleep(std::time::Duration::from_millis(20));
+    }
+    std::thread::sleep(std::time::Duration::from_millis(100));
+    let (shown, truth) = (six(&mut arm)[0], emulator.joints().0[0]);
+    assert!((shown - target[0]).abs() < 1e-3 && (truth - start[0]).abs() < 1e-3, "{shown}, in truth {truth}");
 }
 
 #[test]

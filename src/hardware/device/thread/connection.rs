@@ -7,7 +7,7 @@ use super::commands::MAX_IN_FLIGHT;
 use super::{BACK_OFF, MAX_FAILURES, TURNS, Worker, slow_readings};
 use crate::arm::{Interference, Link};
 use crate::hardware::adapter::{AdapterError, AdapterResult, ManipulatorAdapter};
-use crate::hardware::device::Connected;
+use crate::hardware::device::{Connected, Note};
 use crate::joint::{JointLimits, STANDSTILL};
 
 /// How long `activate` waits for plausible states, and again for the motors to come on.
@@ -44,6 +44,10 @@ impl Worker {
         self.in_flight = 0;
         if self.speed == 0.0 {
             self.set_limits(&limits);
+        }
+        if let Some(text) = adapter.connection_warning().filter(|_| !self.warned) {
+            self.warned = true;
+            (self.config.notes)(Note::Began(text.to_owned()));
         }
         self.skip_command();
         self.read(adapter);

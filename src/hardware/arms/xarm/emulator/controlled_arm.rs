@@ -5,6 +5,8 @@ use std::time::Duration;
 use nalgebra::Isometry3;
 
 use super::super::model::VELOCITY;
+use super::line::Line;
+use super::move_request::MoveRequest;
 use crate::clock::Mono;
 use crate::hardware::registry::Truth;
 use crate::hardware::sim::arm::{self, Delivery, HasArm, SimArm};
@@ -76,16 +78,24 @@ pub trait ControlledArm: Send + 'static {
     }
     /// The controller is no longer ready, until the next [`ControlledArm::begin`].
     fn end(&mut self) {}
-    /// Moves to a target [rad] with at most this speed [rad/s] and acceleration [rad/s²].
-    fn go(&mut self, target: &[f64; 7], speed: f64, acceleration: f64) -> Result<(), Refusal>;
+    /// Moves along joint positions [rad] to the last of them, with at most this speed [rad/s] and acceleration
+    /// [rad/s²].
+    fn go(&mut self, way: &[[f64; 7]], speed: f64, acceleration: f64) -> Result<(), Refusal>;
     /// Follows a setpoint [rad].
     fn follow(&mut self, target: &[f64; 7]) -> Result<(), Refusal>;
     /// Keeps velocities [rad/s] for a time, or until the next command.
     fn keep_velocity(&mut self, velocities: &[f64; 7], duration: Option<Duration>) -> Result<(), Refusal>;
-    /// Returns whether commands of a mode can be executed.
-    fn has_mode(&self, _mode: u8) -> bool {
-        true
+    /// Returns the straight line of the tool that a request asks for, from joints [rad] on, if the arm itself can
+    /// follow one.
+    fn line(&self, _from: &[f64; 7], _request: &MoveRequest) -> Option<Line> {
+        None
     }
+    /// Returns whether commands of a mode can be executed.
+    fn has_mode(&self, mode: u8) -> bool {
+        matches!(mode, 0 | 1 | 2 | 4)
+    }
+    /// Takes note of a request that was not executed in this mode and state.
+    fn note_refused(&mut self, _register: u8, _data: &[u8], _mode: u8, _state: u8) {}
 
     /// Returns the tool's measured pose, if the arm itself knows it.
     fn pose(&self) -> Option<Isometry3<f64>> {
@@ -99,13 +109,14 @@ pub trait ControlledArm: Send + 'static {
     fn gripper(&self) -> Option<(f64, bool)> {
         None
     }
-    /// Moves the gripper of the arm itself [m].
-    fn move_gripper(&mut self, _opening: f64) {}
+    /// Moves the gripper of the arm itself [m], with a fraction of its top speed if the client has set one.
+    fn move_gripper(&mut self, _opening: f64, _speed: Option<f64>) {}
     /// Sets the load: mass [kg], centre [mm].
     fn set_load(&mut self, _load: [f32; 4]) -> Result<(), Refusal> {
         Ok(())
     }
-    /// Returns whether the controller's settings (tool offset, sensitivities, sensor) apply to it.
+    /// Returns whether the controller is that of the arm: its settings (tool offset, sensitivities, sensor) apply, and
+    /// it has the habits of a real one.
     fn takes_settings(&self) -> bool {
         true
     }
@@ -206,7 +217,8 @@ impl ControlledArm for SimArm {
         self.guide().map_err(not_now)
     }
 
-    fn go(&mut self, target: &[f64; 7], speed: f64, _acceleration: f64) -> Result<(), Refusal> {
+    fn go(&mut self, way: &[[f64; 7]], speed: f64, _acceleration: f64) -> Result<(), Refusal> {
+        let target = way.last().ok_or(Refusal::NotNow)?;
         self.move_to(target, (speed / VELOCITY).clamp(0.0, 1.0)).map_err(not_now)
     }
 

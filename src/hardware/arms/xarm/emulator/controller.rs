@@ -9,7 +9,11 @@ use nalgebra::Isometry3;
 use super::super::model::{Identity, Model};
 use super::super::protocol::gripper::GripperKind;
 use super::controlled_arm::{ControlledArm, Refusal};
+use super::judge::Judge;
 use super::kinematics::Links;
+use super::motion::is_motion;
+use super::queue::{Goal, Move};
+use super::settings::Settings;
 use super::tool::Tool;
 use super::{PLAYABLE, SimOptions, SlowReply, Withhold};
 use crate::clock::Mono;
@@ -23,8 +27,8 @@ use crate::joint::Joints;
 const ACCELERATION: f64 = 12.0;
 /// Longest stretch that is advanced at once, so that queued moves follow one another.
 const SLICE: Duration = Duration::from_millis(20);
-/// Most moves in the queue.
-pub(super) const QUEUE: usize = 256;
+/// The mode that executes setpoints.
+pub(super) const SERVO: u8 = 1;
 /// Positions this close to a limit count as inside [rad]: the vendor's client allows as much.
 const TOLERANCE: f64 = 0.00175;
 /// What the force/torque sensor feels of the tool [N, Nm].
@@ -59,18 +63,8 @@ pub struct Received {
 impl Received {
     /// Whether it asks the arm or its gripper to move.
     pub fn moves(&self) -> bool {
-        matches!(self.register, 21..=30 | 81..=83) || (self.register == 124 && self.payload.get(2) == Some(&16))
+        is_motion(self.register) || (self.register == 124 && self.payload.get(2) == Some(&16))
     }
-}
-
-/// A planned move.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Move {
-    pub target: [f64; 7],
-    /// Highest speed [rad/s] and acceleration [rad/s²] of a joint.
-    pub speed: f64,
-    /// See `speed`.
-    pub acceleration: f64,
 }
 
 /// The controller's memory, and the arm behind it.
@@ -86,7 +80,15 @@ pub struct Controller<A> {
     pub(super) warning: u8,
     pub(super) queue: VecDeque<Move>,
     pub(super) current: Option<Move>,
+    /// End of the pause that is under way.
+    pub(super) pauses_until: Option<Mono>,
     pub(super) settings: Settings,
+    /// The settings that survive a loss of power.
+    pub(super) saved: Settings,
+    /// Watches over servo mode.
+    pub(super) judge: Judge,
+    /// Goal of a request whose outcome is not known yet, with its payload and when it was last made.
+    pub(super) unanswered: Option<(Vec<u8>, Goal, Mono)>,
     /// It answers to a change of mode, and stays in the mode that it is in.
     pub keeps_mode: bool,
     /// Suppresses the reports of the condition; all others continue.
@@ -97,18 +99,6 @@ pub struct Controller<A> {
     pub(super) counter: u32,
     /// Requests that came over the wire.
     pub trace: Trace<Received>,
-}
-
-/// What clients can set.
-#[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Settings {
-    pub offset: [f32; 6],
-    pub load: [f32; 4],
-    pub sensitivity: [u8; 2],
-    /// Reports hold currents in the place of torques.
-    pub currents: bool,
-    pub wrench_on: bool,
-    pub wrench_zero: [f32; 6],
 }
 
 impl Controller<SimArm> {
@@ -151,7 +141,11 @@ impl<A: ControlledArm> Controller<A> {
             warning: 0,
             queue: VecDeque::new(),
             current: None,
-            settings: Settings { sensitivity: [3, 3], ..Settings::default() },
+            pauses_until: None,
+            settings: Settings::default(),
+            saved: Settings::default(),
+            judge: Judge::default(),
+            unanswered: None,
             keeps_mode: false,
             condition_muted: false,
             withhold: Withhold::No,
@@ -173,29 +167,11 @@ impl<A: ControlledArm> Controller<A> {
                     self.tool.advance(self.arm.now().seconds_since(before));
                 }
             }
+            self.watch();
             self.next_move();
         }
         if self.arm.has_stopped() {
             self.halt(state::STOPPED);
-        }
-    }
-
-    /// Begins the next planned move when the one before it is done.
-    fn next_move(&mut self) {
-        if self.arm.moving() {
-            return;
-        }
-        if self.state == state::STOPPING {
-            self.state = state::STOPPED;
-        }
-        if self.state == state::STANDING {
-            self.current = None;
-            let Some(next) = self.queue.front().copied() else { return };
-            match self.arm.go(&next.target, next.speed, next.acceleration) {
-                Err(Refusal::Pending) => {}
-                Err(Refusal::Error(code)) => self.fail(code),
-                Ok(()) | Err(Refusal::NotNow | Refusal::Warning(_)) => self.current = self.queue.pop_front(),
-            }
         }
     }
 
@@ -219,18 +195,15 @@ impl<A: ControlledArm> Controller<A> {
     pub(super) fn halt(&mut self, state: u8) {
         self.state = state;
         self.queue.clear();
-        self.current = None;
+        (self.current, self.pauses_until, self.unanswered) = (None, None, None);
+        self.judge.forget();
         self.arm.stop();
         self.arm.end();
     }
 
     pub(super) fn clear_error(&mut self) -> Result<(), Refusal> {
-        match self.arm.clear() {
-            Ok(()) => self.halt(if self.arm.enabled() { state::CHANGED } else { state::STOPPED }),
-            // The cause is still there, and so is the error.
-            Err(Refusal::NotNow) => {}
-            Err(refusal) => return Err(refusal),
-        }
+        self.arm.clear()?;
+        self.halt(if self.arm.enabled() { state::CHANGED } else { state::STOPPED });
         Ok(())
     }
 
@@ -242,13 +215,13 @@ impl<A: ControlledArm> Controller<A> {
 
     /// The state as it is reported.
     pub(super) fn reported_state(&self) -> u8 {
-        let moving = self.arm.moving() || !self.queue.is_empty();
+        let moving = self.is_busy() || !self.queue.is_empty();
         if self.state == state::STANDING && moving { state::MOVING } else { self.state }
     }
 
     /// The tool's pose, if it is known.
     pub(super) fn pose(&self) -> Option<Isometry3<f64>> {
-        self.chain.map_or_else(|| self.arm.pose(), |chain| Some(chain.forward(&self.seven())))
+        self.chain.map_or_else(|| self.arm.pose(), |chain| Some(chain.forward(&self.seven()) * self.tool_offset()))
     }
 
     /// The joints and their velocities as they are reported.

@@ -3,7 +3,7 @@
 
 use std::f64::consts::{FRAC_PI_2, PI};
 
-use nalgebra::{Isometry3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 
 use super::super::model::Model;
 use crate::hardware::sim::reach::Chain;
@@ -87,6 +87,20 @@ impl Chain for Links {
 pub fn to_wire(pose: &Isometry3<f64>) -> [f32; 6] {
     let ([x, y, z], [roll, pitch, yaw]) = to_xyz_rpy(pose);
     [x * 1000.0, y * 1000.0, z * 1000.0, roll, pitch, yaw].map(|value| value as f32)
+}
+
+/// x, y, z [mm] and the rotation vector [rad] of a pose.
+pub fn to_wire_axis_angle(pose: &Isometry3<f64>) -> [f32; 6] {
+    let [x, y, z]: [f64; 3] = pose.translation.vector.into();
+    let turn = pose.rotation.scaled_axis();
+    [x * 1000.0, y * 1000.0, z * 1000.0, turn.x, turn.y, turn.z].map(|value| value as f32)
+}
+
+/// The pose of x, y, z [mm] and a rotation vector [rad].
+pub fn from_wire_axis_angle(values: [f32; 6]) -> Isometry3<f64> {
+    let [x, y, z, a, b, c] = values.map(f64::from);
+    let place = Translation3::new(x / 1000.0, y / 1000.0, z / 1000.0);
+    Isometry3::from_parts(place, UnitQuaternion::from_scaled_axis(Vector3::new(a, b, c)))
 }
 
 /// The pose of x, y, z [mm], roll, pitch, yaw [rad].

@@ -7,12 +7,21 @@
 
 mod controlled_arm;
 mod controller;
+mod judge;
 mod kinematics;
+mod line;
+mod modbus;
+mod motion;
+mod move_request;
 mod ports;
+mod queue;
 mod registers;
 mod report;
+mod settings;
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod tests_moves;
 mod tool;
 mod wire;
 
@@ -39,6 +48,9 @@ use crate::joint::{JointLimits, Joints};
 pub use controlled_arm::{ControlledArm, JOINT_LIMIT, Refusal};
 pub use controller::Received;
 use controller::{Controller, introduce};
+pub use kinematics::Links;
+pub use line::Line;
+pub use move_request::{Frame, MoveRequest, Target};
 use report::Kind;
 
 /// The faults that it can play.

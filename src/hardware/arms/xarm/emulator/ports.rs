@@ -5,6 +5,7 @@ use std::time::Duration;
 use super::controlled_arm::ControlledArm;
 use super::controller::{Controller, Received, state};
 use super::kinematics::to_wire;
+use super::modbus;
 use super::report::{Kind, Snapshot};
 use super::wire::{self, Request};
 use super::{SECOND, Withhold};
@@ -43,6 +44,7 @@ impl<A: ControlledArm> Controller<A> {
             offset: self.settings.offset,
             load: self.settings.load,
             sensitivity: self.settings.sensitivity,
+            motion: self.settings.motion,
             wrench,
             wrench_raw,
             counter: self.counter,
@@ -90,7 +92,7 @@ impl<A: ControlledArm> Controller<A> {
         match delivery {
             Delivery::PowerLoss(_) => {
                 self.halt(state::STOPPED);
-                (self.mode, self.warning) = (0, 0);
+                (self.mode, self.warning, self.settings) = (0, 0, self.saved);
             }
             Delivery::Send if self.arm.due_fault(FaultKind::Frozen).is_some() => return Delivery::Frozen,
             _ => {}
@@ -108,6 +110,9 @@ impl<A: ControlledArm> stream::Controller for Controller<A> {
         match wire::scan(bytes) {
             Scan::More => Scan::More,
             Scan::Skip(n) => Scan::Skip(n),
+            Scan::Take(n, ()) if bytes.get(..n).is_some_and(|frame| modbus::refuse(frame, answer)) => {
+                Scan::Take(n, Delivery::Send)
+            }
             Scan::Take(n, ()) => match bytes.get(..n).and_then(wire::parts) {
                 Some(request) => Scan::Take(n, self.handle(&request, port == SECOND, now, answer)),
                 None => Scan::Skip(n),
@@ -136,7 +141,15 @@ impl<A: ControlledArm> stream::Controller for Controller<A> {
             (Kind::Full, Withhold::Silence) => return Some(Delivery::Silent),
             _ => {}
         }
-        kind.write(&self.snapshot(now), packet);
+        let mut snapshot = self.snapshot(now);
+        // Older firmware reports there what it commands, not what the joints do.
+        if kind == Kind::Real
+            && self.firmware < [2, 4, 0]
+            && let Some(setpoint) = self.judge.last_setpoint()
+        {
+            snapshot.position = setpoint.map(|v| v as f32);
+        }
+        kind.write(&snapshot, packet);
         // Faults of reports affect the ports with joint positions.
         Some(if matches!(kind, Kind::Full | Kind::Real) { self.delivery() } else { self.lasting() })
     }

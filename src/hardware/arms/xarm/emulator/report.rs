@@ -39,6 +39,8 @@ pub struct Snapshot {
     pub load: [f32; 4],
     /// Sensitivities for collisions and for guiding by hand.
     pub sensitivity: [u8; 2],
+    /// Jerk and largest acceleration of the tool [mm/s³, mm/s²], then of the joints [rad/s³, rad/s²].
+    pub motion: [f32; 4],
     /// Force and torque, without and with what the tool weighs [N, Nm].
     pub wrench: [f32; 6],
     /// See `wrench`.
@@ -157,8 +159,9 @@ fn rich(s: &Snapshot, out: &mut Vec<u8>) {
     packet.bytes(145, &[s.kind, s.axes, 0xAA, 0x55]);
     let [major, minor, revision] = s.firmware;
     packet.bytes(151, format!("v{major}.{minor}.{revision}").as_bytes());
-    packet.floats(181, &[10_000.0, 1.0, 50_000.0, 0.1, 1000.0]);
-    packet.floats(201, &[20.0, 0.01, 20.0, 1e-4, std::f32::consts::PI]);
+    let [tool_jerk, tool_acceleration, jerk, acceleration] = s.motion;
+    packet.floats(181, &[tool_jerk, 1.0, tool_acceleration, 0.1, 1000.0]);
+    packet.floats(201, &[jerk, 0.01, acceleration, 1e-4, std::f32::consts::PI]);
     packet.floats(221, &[100.0, 40.0]);
     packet.bytes(245, &std::array::from_fn::<u8, 7, _>(|joint| SimArm::temperature(joint) as u8));
     (0..7).for_each(|joint| packet.bytes(341 + 2 * joint, &4800_u16.to_be_bytes()));

@@ -8,7 +8,7 @@ use crate::clock::Mono;
 use crate::hardware::arms::xarm::golden::{self, DEGREES, POSE, TORQUES, VELOCITIES, WRENCH, bytes};
 use crate::hardware::transport::tcp::Scan;
 
-fn controller() -> Controller<SimArm> {
+pub(super) fn controller() -> Controller<SimArm> {
     Controller::new(Model::Xarm6, [2, 5, 1], GripperKind::Xarm, &SimOptions::default(), Mono(1)).unwrap()
 }
 
@@ -22,14 +22,14 @@ fn answer(controller: &mut Controller<SimArm>, request: &[u8], at: f64) -> Vec<u
 }
 
 /// A request to a register.
-fn ask(controller: &mut Controller<SimArm>, register: u8, payload: &[u8], at: f64) -> (u8, Vec<u8>) {
+pub(super) fn ask(controller: &mut Controller<SimArm>, register: u8, payload: &[u8], at: f64) -> (u8, Vec<u8>) {
     let request = [&[0, 1, 0, 3, 0, payload.len() as u8 + 1, register], payload].concat();
     let reply = answer(controller, &request, at);
     (reply[7], reply[8..].to_vec())
 }
 
 /// Motors on, ready in a mode.
-fn ready(controller: &mut Controller<SimArm>, mode: u8) {
+pub(super) fn ready(controller: &mut Controller<SimArm>, mode: u8) {
     ask(controller, 11, &[8, 1], 0.0);
     ask(controller, 19, &[mode, 0], 0.0);
     ask(controller, 12, &[0], 0.0);
@@ -37,7 +37,10 @@ fn ready(controller: &mut Controller<SimArm>, mode: u8) {
 
 #[test]
 fn golden_requests_get_golden_responses() {
-    let mut arm = controller();
+    // Near the golden setpoint: a jump to it would be too fast.
+    let near = DEGREES.iter().take(6).map(|degrees| (degrees + 1.0).to_radians()).collect();
+    let options = SimOptions { initial_positions: near, ..SimOptions::default() };
+    let mut arm = Controller::new(Model::Xarm6, [2, 5, 1], GripperKind::Xarm, &options, Mono(1)).unwrap();
     assert_eq!(answer(&mut arm, &bytes(golden::VERSION), 0.0), bytes(golden::VERSION_REPLY));
     answer(&mut arm, &bytes(golden::ENABLE), 0.0);
     assert!(arm.arm.enabled());
@@ -76,6 +79,7 @@ fn reports_are_the_golden_bytes() {
         error: 31,
         warning: 11,
         sensitivity: [3, 4],
+        motion: [10_000.0, 50_000.0, 20.0, 20.0],
         wrench: WRENCH.map(|v| v as f32),
         ..Snapshot::default()
     };
@@ -159,15 +163,17 @@ fn queued_moves_follow_one_another_pause_and_end() {
 fn wrong_requests_raise_what_the_sheet_says() {
     let mut arm = controller();
     ready(&mut arm, 0);
-    assert_eq!(ask(&mut arm, 250, &[], 0.0).0, 0x20);
+    assert_eq!(ask(&mut arm, 250, &[], 0.0).0, 0x28, "no success for the vendor's client");
     assert_eq!(ask(&mut arm, 15, &[], 0.0).1, [0, 13], "unknown register");
-    assert_eq!(ask(&mut arm, 23, &[1, 2, 3], 0.0).0, 0x20);
+    assert_eq!(ask(&mut arm, 23, &[1, 2, 3], 0.0).0, 0x28);
     assert_eq!(ask(&mut arm, 15, &[], 0.0).1, [0, 12], "bad parameter");
-    let far: Vec<u8> = [5000_f32, 0.0, 0.0, 0.0, 0.0, 0.0, 100.0].iter().flat_map(|v| v.to_le_bytes()).collect();
+    let far: Vec<u8> =
+        [5000_f32, 0.0, 0.0, 0.0, 0.0, 0.0, 100.0, 2000.0, 0.0].iter().flat_map(|v| v.to_le_bytes()).collect();
     ask(&mut arm, 21, &far, 0.0);
     assert_eq!(ask(&mut arm, 15, &[], 0.0).1, [0, 14], "no solution");
     ask(&mut arm, 17, &[], 0.0);
-    let beyond: Vec<u8> = [9_f32, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0].iter().flat_map(|v| v.to_le_bytes()).collect();
+    let beyond: Vec<u8> =
+        [9_f32, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 10.0, 0.0].iter().flat_map(|v| v.to_le_bytes()).collect();
     assert_eq!(ask(&mut arm, 23, &beyond, 0.0).0, 0x50);
     assert_eq!(ask(&mut arm, 15, &[], 0.0).1, [23, 0], "beyond a limit");
     ask(&mut arm, 16, &[], 0.0);

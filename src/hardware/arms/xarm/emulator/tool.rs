@@ -11,6 +11,13 @@ const TWO_MBIT: i32 = 11;
 const TOP_SPEED: f64 = 0.25;
 const FASTEST_G1: f64 = 5000.0;
 const FASTEST_G2: f64 = 3765.0;
+/// Register of the baud rate, and of the restart.
+const BAUD: u16 = 0x0A0B;
+const REBOOT: u16 = 0x0607;
+/// The gripper's number on the bus.
+const SLAVE: u8 = 8;
+/// How far beyond its range a target may be [mm]: the vendor's range is -10 to 850 pulses.
+const MARGIN: f64 = 1.0;
 /// The gripper's version.
 const VERSION: [u16; 3] = [3, 4, 3];
 
@@ -21,8 +28,10 @@ pub struct Tool {
     baud: i32,
     enabled: bool,
     speed: u16,
-    /// Opening that a telegram has just ordered [m].
-    order: Option<f64>,
+    /// Whether a client has set the speed.
+    speed_set: bool,
+    /// Opening that a telegram has just ordered [m], and the fraction of the top speed that was set.
+    order: Option<(f64, Option<f64>)>,
     /// The gripper's error.
     pub error: u16,
 }
@@ -31,7 +40,7 @@ impl Tool {
     /// A flange with this gripper, half open.
     pub fn new(kind: GripperKind) -> Self {
         let gripper = Gripper::new(kind.widest().unwrap_or(0.0), TOP_SPEED);
-        Self { kind, gripper, baud: TWO_MBIT, enabled: false, speed: 1500, order: None, error: 0 }
+        Self { kind, gripper, baud: TWO_MBIT, enabled: false, speed: 1500, speed_set: false, order: None, error: 0 }
     }
 
     /// Plays the faults of the gripper that are due.
@@ -52,8 +61,8 @@ impl Tool {
         }
     }
 
-    /// Takes the opening that a telegram has ordered [m].
-    pub fn take_order(&mut self) -> Option<f64> {
+    /// Takes the opening that a telegram has ordered [m], and the fraction of the top speed if one was set.
+    pub fn take_order(&mut self) -> Option<(f64, Option<f64>)> {
         self.order.take()
     }
 
@@ -67,32 +76,46 @@ impl Tool {
         (self.kind == GripperKind::XarmG2).then_some(self.gripper.max_force)
     }
 
-    /// Reads a register of the tool board.
-    pub fn read(&self, register: u16) -> i32 {
-        if register & 0x0FFF == 0x0A0B { self.baud } else { 0 }
-    }
-
-    /// Writes a register of the tool board.
-    pub fn write(&mut self, register: u16, value: f32) {
-        if register & 0x0FFF == 0x0A0B {
-            self.baud = value as i32;
+    /// Reads a register of the tool board: the baud rate, and inputs and outputs without a signal; `None` for another.
+    pub fn read(&self, register: u16) -> Option<i32> {
+        match register & 0x0FFF {
+            BAUD => Some(self.baud),
+            0x0A12..=0x0A17 => Some(0),
+            _ => None,
         }
     }
 
-    /// Returns the answer to a telegram; `None` if no device answers.
+    /// Writes a register of the tool board. `None` if nothing was written; `settable`: the baud rate can be changed.
+    pub fn write(&mut self, register: u16, value: f32, settable: bool) -> Option<()> {
+        match register & 0x0FFF {
+            BAUD if settable => self.baud = value as i32,
+            BAUD if value as i32 == self.baud => {}
+            // Its restart changes nothing here.
+            REBOOT if settable && value == 1.0 => {}
+            _ => return None,
+        }
+        Some(())
+    }
+
+    /// Returns whether a device answers telegrams like this one.
+    pub fn hears(&self, telegram: &[u8]) -> bool {
+        self.kind != GripperKind::None && self.baud == TWO_MBIT && telegram.first() == Some(&SLAVE)
+    }
+
+    /// Returns the answer to a telegram; `None` for one that the gripper does not know or execute.
     pub fn telegram(&mut self, telegram: &[u8]) -> Option<Vec<u8>> {
-        if self.kind == GripperKind::None || self.baud != TWO_MBIT {
+        if !self.hears(telegram) {
             return None;
         }
         match *telegram {
-            [8, 3, a0, a1, _, count] if count <= 16 => {
+            [SLAVE, 3, a0, a1, _, count] if count <= 16 => {
                 let first = u16::from_be_bytes([a0, a1]);
                 let registers = (0..u16::from(count)).flat_map(|i| self.holding(first.wrapping_add(i)).to_be_bytes());
-                Some([8, 3, 2 * count].into_iter().chain(registers).collect())
+                Some([SLAVE, 3, 2 * count].into_iter().chain(registers).collect())
             }
-            [8, 16, a0, a1, c0, c1, _, ref data @ ..] => {
-                self.set(u16::from_be_bytes([a0, a1]), data);
-                Some(vec![8, 16, a0, a1, c0, c1])
+            [SLAVE, 16, a0, a1, c0, c1, _, ref data @ ..] => {
+                self.set(u16::from_be_bytes([a0, a1]), data)?;
+                Some(vec![SLAVE, 16, a0, a1, c0, c1])
             }
             _ => None,
         }
@@ -121,35 +144,45 @@ impl Tool {
         }
     }
 
-    fn set(&mut self, register: u16, data: &[u8]) {
-        match (register, data) {
-            (0x0100, [_, on]) => self.enabled = *on == 1,
-            (0x0303, [high, low]) => self.speed = u16::from_be_bytes([*high, *low]),
-            (0x0109, _) => self.error = 0,
-            (0x0700, [a, b, c, d]) => {
-                self.go(i32::from_be_bytes([*a, *b, *c, *d]), f64::from(self.speed) / FASTEST_G1);
+    /// Writes a register. `None` if nothing came of it: vendors' clients take any answer for a success.
+    fn set(&mut self, register: u16, data: &[u8]) -> Option<()> {
+        match (register, self.kind, data) {
+            (0x0100, _, [_, on @ 0..=1]) => self.enabled = *on == 1,
+            (0x0101, _, [0, 0]) => {} // the position mode: it has no other
+            (0x0303, GripperKind::Xarm, [high, low]) => {
+                (self.speed, self.speed_set) = (u16::from_be_bytes([*high, *low]), true);
             }
-            (0x0C00, [_, on, s0, s1, f0, f1, a, b, c, d]) => {
+            (0x0109, ..) => self.error = 0,
+            (0x0700, GripperKind::Xarm, [a, b, c, d]) => {
+                self.go(i32::from_be_bytes([*a, *b, *c, *d]), f64::from(self.speed) / FASTEST_G1)?;
+            }
+            (0x0C00, GripperKind::XarmG2, [_, on, s0, s1, f0, f1, a, b, c, d]) => {
                 self.enabled |= *on == 1;
                 let speed = f64::from(u16::from_be_bytes([*s0, *s1])) / FASTEST_G2;
                 self.gripper.max_force = u16::from_be_bytes([*f0, *f1]).into();
-                self.go(i32::from_be_bytes([*a, *b, *c, *d]), speed);
+                self.go(i32::from_be_bytes([*a, *b, *c, *d]), speed)?;
             }
-            _ => {}
+            _ => return None,
         }
+        Some(())
     }
 
-    fn go(&mut self, pulses: i32, speed: f64) {
-        if !self.enabled || self.error != 0 {
-            return;
+    fn go(&mut self, pulses: i32, speed: f64) -> Option<()> {
+        if self.error != 0 {
+            return Some(()); // the client reads the error next
         }
         let millimetres = match self.kind {
             GripperKind::XarmG2 => (f64::from(pulses) / 18.28 - 8.33).to_radians().sin() * 110.0 + 16.0,
             _ => f64::from(pulses) / 10.0,
         };
+        let widest = self.kind.widest()? * 1000.0;
+        if !self.enabled || !(-MARGIN..=widest + MARGIN).contains(&millimetres) {
+            return None;
+        }
         self.gripper.set_speed(speed);
-        self.order = Some(millimetres / 1000.0);
+        self.order = Some((millimetres / 1000.0, self.speed_set.then_some(speed)));
         self.gripper.move_to(millimetres / 1000.0);
+        Some(())
     }
 }
 

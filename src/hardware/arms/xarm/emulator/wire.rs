@@ -16,8 +16,8 @@ pub struct Request<'a> {
     pub payload: &'a [u8],
 }
 
-/// Length of the request at the front of what has arrived; skips what is none. A sign of life of old clients
-/// (protocol 1) and standard Modbus (protocol 0) are not answered.
+/// Length of the request at the front of what has arrived; skips what is none. A sign of life of old clients (protocol
+/// 1) is not answered, nor a Modbus request (protocol 0) without a function.
 pub fn scan(bytes: &[u8]) -> Scan<()> {
     let &[_, _, high, protocol, l0, l1, ..] = bytes else { return Scan::More };
     let length = usize::from(l0) << 8 | usize::from(l1);
@@ -26,7 +26,7 @@ pub fn scan(bytes: &[u8]) -> Scan<()> {
     }
     match bytes.len() >= 6 + length {
         false => Scan::More,
-        true if protocol < 2 => Scan::Skip(6 + length),
+        true if protocol == 1 || (protocol == 0 && length < 2) => Scan::Skip(6 + length),
         true => Scan::Take(6 + length, ()),
     }
 }
