@@ -279,7 +279,7 @@ fn task_changed(task: u16, state: TaskState, reason: Reason, names: &Names) -> D
         | Reason::GoalVelocity(joint, value)
         | Reason::TrackingError(joint, value)
         | Reason::LeaderAway(joint, value)
-        | Reason::Gap(joint, value)
+        | Reason::Gap(joint, value, _)
         | Reason::Jump(joint, value) => {
             d.joint = Some(names.joint(joint));
             d.values = vec![value];
@@ -323,9 +323,11 @@ pub fn reason_text(reason: &Reason, names: &Names) -> String {
             format!("{} was {} from its leader, more than `max_approach`", names.joint(joint), angle(by))
         }
         Reason::Guarded(arm) => format!("the collision guard stopped {}", names.arm(arm)),
-        Reason::Gap(joint, by) => {
-            format!("after a gap in the setpoints {} stopped {} from the path", names.joint(joint), angle(by))
-        }
+        Reason::Gap(joint, by, time) => format!(
+            "after a gap in the setpoints {} stopped {} from the path, {time:.2} s after the last one",
+            names.joint(joint),
+            angle(by)
+        ),
         Reason::LeaseEnded(arm) => {
             format!("the client that sent it has disconnected, or released {}", names.arm(arm))
         }
@@ -406,8 +408,9 @@ pub fn cause_text(cause: Cause) -> String {
             joint + 1,
             angle(by)
         ),
-        Cause::Gap(joint, by) => format!(
-            "after a gap in its setpoints joint {} did not stop where its motion could continue: {} away",
+        Cause::Gap(joint, by, time) => format!(
+            "after a gap in its setpoints, {time:.2} s since the last one, joint {} did not stop where its motion could \
+             continue: {} away",
             joint + 1,
             angle(by)
         ),
@@ -462,7 +465,7 @@ fn code(cause: Cause) -> Vec<f64> {
         | Cause::ReadingInconsistent(_, by)
         | Cause::ReadingFollows(_, by)
         | Cause::OutsideRange(_, by)
-        | Cause::Gap(_, by) => vec![by],
+        | Cause::Gap(_, by, _) => vec![by],
         Cause::StartMismatch(_, written, read) => vec![written, read],
         _ => Vec::new(),
     }

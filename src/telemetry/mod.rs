@@ -151,9 +151,9 @@ pub enum Cause {
     StartMismatch(u16, f64, f64),
     /// A joint is this far outside its range, beyond what the arm may be enabled at [rad].
     OutsideRange(u16, f64),
-    /// After a gap in its setpoints the arm did not stop where its motion could continue: the joint, and how
-    /// far it is from there [rad].
-    Gap(u16, f64),
+    /// After a gap in its setpoints the arm did not stop where its motion could continue: the joint, how far it is
+    /// from there [rad], and the time since the last setpoint [s].
+    Gap(u16, f64, f64),
     /// The arm's adapter refused a setpoint.
     SetpointRefused,
     /// A joint of the arm moved this far while the arm was being enabled [rad].
@@ -284,8 +284,9 @@ pub enum Reason {
     LeaderAway(u16, f64),
     /// The collision guard stopped the arm: the arm.
     Guarded(u16),
-    /// After a gap in the setpoints a joint rested too far from the path to continue: joint, distance [rad].
-    Gap(u16, f64),
+    /// After a gap in the setpoints a joint rested too far from the path to continue: joint, distance [rad], time since
+    /// the last setpoint [s].
+    Gap(u16, f64, f64),
     /// The client that sent its targets released the lease of the arm, or disconnected: the arm.
     LeaseEnded(u16),
 }

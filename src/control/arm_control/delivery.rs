@@ -159,7 +159,7 @@ impl ArmControl {
             self.resumed = Some(gap.last);
             self.tracking.restart();
         } else if now >= gap.until && self.failsafe.phase() == Phase::Ready {
-            self.failsafe.hold(Cause::Gap(joint, by), now);
+            self.failsafe.hold(Cause::Gap(joint, by, now.seconds_since(gap.last)), now);
         }
     }
 

@@ -203,7 +203,7 @@ impl Coordinator {
                     continue;
                 }
                 if let Err((joint, by)) = task.rejoin(&tick, at, tolerance) {
-                    self.end_task(t, TaskState::Aborted, Reason::Gap(joint, by));
+                    self.end_task(t, TaskState::Aborted, Reason::Gap(joint, by, now.seconds_since(at)));
                     break;
                 }
             }
