@@ -185,8 +185,8 @@ impl Client {
         Ok(Self { run, from, line: Vec::new(), timeout, next: 1, epoch: None, buffered: VecDeque::new() })
     }
 
-    /// Requests from now on are of this epoch ([`StatusReport::epoch`](super::report::StatusReport::epoch)): they move no
-    /// arm that was stopped, held, disabled or lost since.
+    /// Requests from now on are of this epoch ([`StatusReport::epoch`](super::report::StatusReport::epoch)): they move
+    /// no arm that was stopped, held, disabled or lost since.
     pub fn since(&mut self, epoch: u64) {
         self.epoch = Some(epoch);
     }

@@ -85,8 +85,9 @@ fn ticks_with_every_task_type_do_not_allocate() {
             500..=540 => _ = rig.send(Request::CartesianTarget { task: 6, goal: pose }),
             541..=590 => _ = rig.send(Request::CartesianTarget { task: 7, goal: twist }),
             595 => _ = rig.send(Request::CartesianTarget { task: 6, goal: nowhere }),
-            900 => _ = rig.servo(3, &[left + 0.01; 7]),
-            901 => _ = rig.servo(3, &[left + 0.7; 7]),
+            // Out of reach, until the arm is held.
+            885 => _ = rig.servo(3, &[left + 0.01; 7]),
+            886..=909 => _ = rig.servo(3, &[left + 1.2; 7]),
             910 => _ = rig.send(Request::Gripper { arm: 0, opening: 0.03, force: None, speed: None }),
             920 => _ = rig.send(Request::Stop { arm: None }),
             940 => rig.arms[1].error = 3,

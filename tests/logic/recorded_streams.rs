@@ -174,7 +174,7 @@ fn ur3e(folder: &Path) -> Recording {
         (0..6).map(|j| names.iter().position(|n| *n == format!("{what}_q_{j}")).unwrap()).collect()
     };
     let (target, actual) = (columns("target"), columns("actual"));
-    // Its wrist 3 turns without end; here it stands two turns back.
+    // Its wrist 3 turns without end; here it is two turns back.
     let row = |line: &str, columns: &[usize]| -> Vec<f64> {
         let all: Vec<f64> = line.split(',').map(|n| n.parse().unwrap_or(0.0)).collect();
         let turned = |(j, c): (usize, &usize)| all[*c] - if j == 5 { 2.0 * std::f64::consts::TAU } else { 0.0 };

@@ -101,7 +101,7 @@ fn a_reset_does_not_make_a_lost_turn_a_position() {
     rig.arms[0].q[2] += TAU;
     rig.run(10);
     assert_eq!((rig.phase(0), rig.samples[0].cause.name()), (Phase::Held, "turn_lost"));
-    // Without its motors nothing of what was written holds any more.
+    // Without its motors nothing of what was written still holds.
     rig.arms[0].enabled = false;
     rig.run(10);
     assert_eq!(rig.ask(Request::Reset { arm: 0 }), Outcome::Accepted);

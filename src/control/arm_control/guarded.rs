@@ -108,7 +108,7 @@ mod tests {
         assert_eq!(arm.step(2, false, DT), JointStep::at(0.0), "no such joint");
     }
 
-    /// A joint that moves slowly would rest sooner by itself, beside the line on which the way was proven free.
+    /// A joint that moves slowly would rest sooner on its own, beside the line on which the way was proven free.
     #[test]
     fn the_braking_that_is_executed_is_the_one_that_was_proven() {
         let mut arm = arm(ControlMode::ServoPosition, (0.5, 0.4), (0.506, 0.42));
