@@ -63,7 +63,7 @@ const CASES: [Case; 7] = [
         name: "xarm",
         rate: 100.0,
         ends: [&[-1.5, -0.6, -1.2, -1.5, 0.6, -1.5], &[1.5, 0.4, -0.4, 1.5, 1.6, 1.5]],
-        options: "{}",
+        options: r#"{"sim": {"tool_speed_factor": 10}}"#,
         loses: false,
     },
     Case {
@@ -114,7 +114,9 @@ fn model(name: &str) -> &'static Row {
 
 fn emulator(row: &AdapterSpec, case: &Case, place: &EmulatorAddress, sim: Value) -> Emulated {
     let mut options: Value = serde_json::from_str(case.options).unwrap();
-    options["sim"] = sim;
+    for (key, value) in sim.as_object().unwrap() {
+        options["sim"][key] = value.clone();
+    }
     let dof = case.ends[0].len();
     let config = AdapterConfig { hardware_id: "arm".into(), address: "sim".into(), dof, options };
     Arc::new(Mutex::new(row.emulate.unwrap()(&config, place).unwrap()))

@@ -55,7 +55,8 @@ pub const XARM: Arm = Arm {
     ends: [&[-3.6, -0.6, -1.2, -3.6, 0.6, -3.6], &[3.6, 0.6, -0.4, 3.6, 1.6, 3.6]],
     rounding: 1e-6,
     time_limit: Some(0.2),
-    options: "{}",
+    // Joints at their top speed: the tool is faster than a box allows by default.
+    options: r#"{"sim": {"tool_speed_factor": 10}}"#,
 };
 /// AgileX's arm on CAN.
 pub const PIPER: Arm = Arm {
@@ -136,7 +137,11 @@ impl Arm {
     fn options(&self, setup: &Setup) -> Value {
         let mut options: Value = serde_json::from_str(self.options).unwrap();
         let start = if setup.start.is_empty() { self.ends[0].to_vec() } else { setup.start.clone() };
-        options["sim"] = json!({ "initial_positions": self.initial(start), "faults": setup.faults });
+        if options["sim"].is_null() {
+            options["sim"] = json!({});
+        }
+        (options["sim"]["initial_positions"], options["sim"]["faults"]) =
+            (json!(self.initial(start)), json!(setup.faults));
         options
     }
 

@@ -120,7 +120,7 @@ impl XArmAdapter {
 
 /// What a run logs of a controller whose reports hide what the joints do.
 const COMMANDED_POSITIONS: &str = "its controller reports commanded positions, not measured ones (firmware before 2.4.0 \
-     at port 30003): tracking supervision is off, only the controller's own collision detection sees a blocked joint";
+     at port 30003): tracking supervision sees no difference, only the controller's own collision detection sees a blocked joint";
 
 impl ManipulatorAdapter for XArmAdapter {
     // --- Lifecycle ---

@@ -117,7 +117,9 @@ impl Controller<SimArm> {
         // Its modes are its own.
         let arm = arm.without_modes().with_tolerance(TOLERANCE);
         let slow = options.slow_replies.clone();
-        Ok(Self { chain: Some(Links::of(model)), slow, ..Self::around(identity, firmware, gripper, arm) })
+        let settings = Settings { limit_factor: options.tool_speed_factor, ..Settings::default() };
+        let controller = Self::around(identity, firmware, gripper, arm);
+        Ok(Self { chain: Some(Links::of(model)), slow, settings, saved: settings, ..controller })
     }
 
     /// Pushes the E-stop button: error, motors off.

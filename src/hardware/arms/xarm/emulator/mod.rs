@@ -77,6 +77,10 @@ pub struct SimOptions {
     pub port_503: bool,
     /// Registers whose replies take time, as those of a real box do.
     pub slow_replies: Vec<SlowReply>,
+    /// Limit of the tool's speed in servo mode, as a multiple of its top speed: what `set_linear_spd_limit_factor` sets
+    /// and the controller saves. Above it, it stops with error 60.
+    #[schemars(range(min = 0.1, max = 100))]
+    pub tool_speed_factor: f32,
     /// How far joints are behind their servo setpoints, 0 to 0.5 [s].
     #[schemars(range(min = 0, max = 0.5))]
     pub lag: f64,
@@ -94,6 +98,7 @@ impl Default for SimOptions {
             firmware: "2.5.1".into(),
             port_503: true,
             slow_replies: Vec::new(),
+            tool_speed_factor: judge::LIMIT_FACTOR,
             lag: 0.01,
             droop: 0.0,
             faults: Vec::new(),
@@ -120,6 +125,9 @@ impl SimOptions {
         self.common().check("xarm", limits, PLAYABLE)?;
         if let Some(i) = self.slow_replies.iter().position(|slow| !(0.0..=3600.0).contains(&slow.delay)) {
             return Err(ConfigError::new(format!("sim.slow_replies.{i}.delay"), "a delay is between 0 and 3600 s"));
+        }
+        if !(0.1..=100.0).contains(&self.tool_speed_factor) {
+            return Err(ConfigError::new("sim.tool_speed_factor", "it is between 0.1 and 100"));
         }
         self.firmware().map(drop)
     }
