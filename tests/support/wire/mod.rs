@@ -11,6 +11,10 @@ pub mod can;
 pub mod decode;
 pub mod judge;
 pub mod lying;
+mod lying_script;
+pub mod paused;
+pub mod paused_peer;
+pub mod paused_run;
 pub mod stream;
 pub mod watch;
 
