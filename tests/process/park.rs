@@ -5,7 +5,7 @@ use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::arm::HasArm;
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use dimos::hardware::sim::serial_server::SerialServer;
-use dimos::rpc::api::Shutdown;
+use dimos::rpc::api::{Move, Shutdown, Stop};
 use rustix::process::Signal;
 use serde_json::json;
 
@@ -158,11 +158,14 @@ fn a_stop_and_a_second_signal_end_the_way_to_the_park_pose() {
 
     let rig = Rig::new();
     let run = rig.home.run("parked.yaml --no-record");
+    // Connected before: the way takes less time than some programs to start on a busy computer.
+    let mut client = rig.home.client();
     run.signal(Signal::TERM);
     rig.leaves();
-    rig.home.dimos("move arm 0 0 0 0 0").with(1).says(&["SHUTTING_DOWN"]);
-    rig.home.client().call(Shutdown {}).expect("it does shut down");
-    rig.home.dimos("stop").with(0);
+    let refused = format!("{:?}", client.call(Move::new("arm", &[0.0; 5], 0.5)).unwrap_err());
+    assert!(refused.contains("ShuttingDown"), "{refused}");
+    client.call(Shutdown {}).expect("it does shut down");
+    client.call(Stop::default()).unwrap();
     rig.not_parked(run, 143, "arm is held (stopped by an operator)");
 }
 
