@@ -434,11 +434,11 @@ fn a_request_of_before_a_stop_is_superseded() {
     home.dimos("stop").with(0);
     home.dimos("arm reset arm").with(0);
     home.dimos("arm enable arm").with(0);
-    let refused = client.call(Move::new("arm", &HOME, 0.5)).unwrap_err().to_string();
+    let refused = client.call(Move::new("arm", HOME, 0.5)).unwrap_err().to_string();
     assert!(refused.contains("SUPERSEDED") || refused.contains("stopped"), "{refused}");
     let now = client.call(Status {}).unwrap().epoch;
     assert!(now > epoch, "{epoch} to {now}");
     client.since(now);
-    client.call(Move::new("arm", &HOME, 0.5)).unwrap();
+    client.call(Move::new("arm", HOME, 0.5)).unwrap();
     run.end(Signal::INT).with(130);
 }

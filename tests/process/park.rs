@@ -162,7 +162,7 @@ fn a_stop_and_a_second_signal_end_the_way_to_the_park_pose() {
     let mut client = rig.home.client();
     run.signal(Signal::TERM);
     rig.leaves();
-    let refused = format!("{:?}", client.call(Move::new("arm", &[0.0; 5], 0.5)).unwrap_err());
+    let refused = format!("{:?}", client.call(Move::new("arm", [0.0; 5], 0.5)).unwrap_err());
     assert!(refused.contains("ShuttingDown"), "{refused}");
     client.call(Shutdown {}).expect("it does shut down");
     client.call(Stop::default()).unwrap();
