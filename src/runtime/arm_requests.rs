@@ -64,6 +64,11 @@ impl Service {
         Ok(Reply::Stop(api::StopReply { arms }))
     }
 
+    /// Returns whether the stop of each held arm was sent, or cannot be.
+    pub(super) fn stops_are_sent(&self) -> bool {
+        (0..self.parts.config.arms.len()).all(|arm| self.phase(arm) != Phase::Held || self.confirmation(arm).is_some())
+    }
+
     /// Returns the progress of an arm's stop; `None`: not known yet.
     pub(super) fn confirmation(&self, arm: usize) -> Option<api::Confirmation> {
         let (view, device) = (self.arm_view(arm)?, self.parts.devices.get(arm)?);

@@ -367,7 +367,9 @@ impl Run {
         let look = || {
             taken = taken || is_taken();
             // Commands at rest are not enough: an arm that lags, or whose motors are off, may still move.
-            if !(taken && pulse.at_rest.load(Ordering::Acquire) && service.at_standstill()) {
+            let rests = pulse.at_rest.load(Ordering::Acquire) && service.at_standstill();
+            // A client that has stopped an arm is answered before the run ends.
+            if !(taken && rests && service.stops_are_sent()) {
                 still_since = Instant::now();
             }
             let rests = still_since.elapsed() >= STILL_FOR.max(2 * service.period());

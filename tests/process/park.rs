@@ -165,7 +165,7 @@ fn a_stop_and_a_second_signal_end_the_way_to_the_park_pose() {
     let refused = format!("{:?}", client.call(Move::new("arm", [0.0; 5], 0.5)).unwrap_err());
     assert!(refused.contains("ShuttingDown"), "{refused}");
     client.call(Shutdown {}).expect("it does shut down");
-    client.call(Stop::default()).unwrap();
+    client.call(Stop::default()).unwrap_or_else(|e| panic!("{e}: {}", run.err()));
     rig.not_parked(run, 143, "arm is held (stopped by an operator)");
 }
 

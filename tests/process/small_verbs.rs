@@ -178,7 +178,7 @@ fn targets_are_streamed_from_a_file() {
     home.write("far.txt", "1.5 0\n");
     home.dimos("task stream servo_arm far.txt").with(1).says(&["[START_STATE_MISMATCH]"]);
     home.write("jump.txt", "0.2 -0.1\n0.2 -0.1\n0.9 -0.1\n");
-    // Nothing goes on the wire that the joint does not reach in its time.
+    // A target that the joint does not reach in its time is not written.
     home.dimos("task stream servo_arm jump.txt").with(2).says(&["0.7000 rad", "from the one before", "it is left out"]);
 }
 
