@@ -284,6 +284,7 @@ fn exchange(mock: &mut MockArm, reading: &mut JointReading, state: &mut ArmState
         mock.write_joint_positions(&command.values[..DOF], 1.0).expect("a command that it takes");
     }
     mock.read_joints(reading).expect("a state");
+    (state.mode, state.written) = (mock.get_control_mode(), command.seq);
     state.seq += 1;
     state.stamp = reading.stamp.unwrap_or(state.stamp);
     state.position = reading.position;
