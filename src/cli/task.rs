@@ -11,7 +11,7 @@ use super::follow::Signals;
 use super::targets::{Source, Width};
 use super::{output, status};
 use crate::rpc::api::{Cancel, Pose, Servo, Start, Status, Twist, TwistFrame, Velocity};
-use crate::rpc::client::Client;
+use crate::rpc::client::{Client, ClientError};
 use crate::rpc::report::TaskReport;
 use crate::rpc::{Code, RpcError};
 
@@ -124,7 +124,7 @@ fn find(client: &mut Client, name: &str) -> Result<TaskReport> {
 }
 
 fn refusal(error: RpcError) -> Failure {
-    crate::rpc::client::ClientError::Refused(error).into()
+    ClientError::Refused(error).into()
 }
 
 fn invoke(task: &str, method: Method, target_run: &Target) -> Result {
@@ -194,7 +194,7 @@ fn stream(
 ) -> Result {
     let signals = Signals::watch();
     let period = rate.map(|rate| Duration::from_secs_f64(1.0 / rate));
-    let (began, mut sent, mut beat) = (Instant::now(), 0_u64, Instant::now());
+    let (began, mut sent, mut left_out, mut beat) = (Instant::now(), 0_u64, 0_u64, Instant::now());
     let ended = loop {
         if let Some(signal) = signals.last() {
             break Some(signal);
@@ -213,8 +213,14 @@ fn stream(
                 return Err(mistake);
             }
         };
-        send(client, task, targets, target)?;
         sent += 1;
+        match send(client, task, targets, target) {
+            Err(ClientError::Refused(refusal)) if refusal.code == Code::OutOfReach => {
+                left_out += 1;
+                output::note(format_args!("target {sent}: {refusal}"));
+            }
+            result => result?,
+        }
         if let Some(period) = period {
             beat = (beat + period).max(Instant::now() - period);
         }
@@ -230,15 +236,24 @@ fn stream(
     }
     let seconds = began.elapsed().as_secs_f64();
     if json {
-        output::json(&serde_json::json!({"task": task.name, "targets": sent, "seconds": seconds}));
+        let report = serde_json::json!({"task": task.name, "targets": sent, "left_out": left_out, "seconds": seconds});
+        output::json(&report);
     } else {
         output::line(format_args!("{}: {sent} targets in {seconds:.2} s", task.name));
+    }
+    if left_out > 0 && ended.is_none() {
+        return Err(Failure::new(Exit::Failed, format!("{}: {left_out} of {sent} targets were left out", task.name)));
     }
     Ok(ended.map_or(Exit::Ok, Exit::by_signal))
 }
 
 /// Sends a target in the form of the stream.
-fn send(client: &mut Client, task: &TaskReport, targets: Targets, target: Vec<f64>) -> Result<()> {
+fn send(
+    client: &mut Client,
+    task: &TaskReport,
+    targets: Targets,
+    target: Vec<f64>,
+) -> std::result::Result<(), ClientError> {
     let name = task.name.clone();
     let three = |from: usize| std::array::from_fn(|i| target.get(from + i).copied().unwrap_or_default());
     match targets {

@@ -91,6 +91,9 @@ pub enum Code {
     NonFinite,
     /// A target is outside the joint's limits.
     OutOfLimits,
+    /// A target of a stream is further from the one before than the joint gets in that time: it is left out, and the
+    /// stream continues.
+    OutOfReach,
     /// The arm has no gripper.
     NoGripper,
     /// The arm was stopped, held, disabled or disconnected, or another client took its lease, after the motion had been
@@ -129,7 +132,8 @@ impl Code {
             Outcome::StillFaulted(..) => Some(Self::StillFaulted),
             Outcome::WrongTask(_) => Some(Self::WrongTask),
             Outcome::NonFinite(_) => Some(Self::NonFinite),
-            Outcome::InvalidTarget(_) | Outcome::OutOfReach(..) => Some(Self::InvalidParams),
+            Outcome::InvalidTarget(_) => Some(Self::InvalidParams),
+            Outcome::OutOfReach(..) => Some(Self::OutOfReach),
             Outcome::OutOfLimits(..) | Outcome::GripperOutOfLimits(..) | Outcome::GripperForceOutOfLimits(..) => {
                 Some(Self::OutOfLimits)
             }

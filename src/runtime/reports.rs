@@ -325,6 +325,9 @@ impl Service {
                 error.hint(format!("remove the cause, then repeat `dimos arm reset {}`", arm(a)))
             }
             Outcome::Superseded(..) => error.hint("request it again if it is still wanted; a plan must be planned again"),
+            Outcome::OutOfReach(joint, by) => {
+                error.data(serde_json::json!({"joint": names.joint(*joint), "by": by}))
+            }
             Outcome::OutOfLimits(joint, by) => error
                 .hint(match self.range(*joint) {
                     Some([lower, upper]) => format!(

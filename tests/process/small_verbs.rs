@@ -177,9 +177,14 @@ fn targets_are_streamed_from_a_file() {
     eventually("the stream is stale", idle);
     home.write("far.txt", "1.5 0\n");
     home.dimos("task stream servo_arm far.txt").with(1).says(&["[START_STATE_MISMATCH]"]);
-    home.write("jump.txt", "0.2 -0.1\n0.2 -0.1\n0.9 -0.1\n");
-    // A target that the joint does not reach in its time is not written.
-    home.dimos("task stream servo_arm jump.txt").with(2).says(&["0.7000 rad", "from the one before", "it is left out"]);
+    let jump = "0.2 -0.1\n0.2 -0.1\n0.9 -0.1\n".to_owned();
+    home.write("jump.txt", &(jump.clone() + "0.2 -0.1\n"));
+    // A target that the joint does not reach in its time is not written, and the stream continues.
+    let said = ["target 3: ", "0.7000 rad", "from the one before", "servo_arm: 1 of 4 targets were left out"];
+    home.dimos("task stream servo_arm jump.txt").with(1).says(&said);
+    // The arm is held when nothing else comes.
+    home.write("far.txt", &(jump.clone() + &"2.5 -0.1\n".repeat(40)));
+    home.dimos("task stream servo_arm far.txt").with(1).says(&["servo_arm: FAULT after", "hint: "]);
 }
 
 #[test]

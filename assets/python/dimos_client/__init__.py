@@ -14,11 +14,11 @@ at a time may move an arm: LeaseHeld names the other one. Everything that waits 
 
 from .client import Client
 from .connection import KEPT, MAX_LINE, runs
-from .errors import (ArmNotReady, ConnectionLost, DimosError, LeaseHeld, MotionFailed, NoRun, OutOfLimits,
+from .errors import (ArmNotReady, ConnectionLost, DimosError, LeaseHeld, MotionFailed, NoRun, OutOfLimits, OutOfReach,
                      PlanningFailed, Refused)
 from .records import ArmState, ChunkReport, Goal, Grip, JointState, LoopReport, Plan, Pose, Waypoint
 from .streams import IN_FLIGHT, Policy
 
 __all__ = ["ArmNotReady", "ArmState", "ChunkReport", "Client", "ConnectionLost", "DimosError", "Goal", "Grip",
            "IN_FLIGHT", "JointState", "KEPT", "LeaseHeld", "LoopReport", "MAX_LINE", "MotionFailed", "NoRun",
-           "OutOfLimits", "Plan", "PlanningFailed", "Policy", "Pose", "Refused", "Waypoint", "runs"]
+           "OutOfLimits", "OutOfReach", "Plan", "PlanningFailed", "Policy", "Pose", "Refused", "Waypoint", "runs"]

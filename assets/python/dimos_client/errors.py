@@ -36,6 +36,11 @@ class OutOfLimits(Refused):
     """A target or the way there leaves a limit; `data` has `joint` and `by`."""
 
 
+class OutOfReach(Refused):
+    """A streamed target is further from the one before than the joint gets in that time. It is left out, and the stream
+    continues; `data` has `joint` and `by`."""
+
+
 class PlanningFailed(DimosError):
     """There is no plan; `data` is the reply to `planning`."""
 
@@ -45,7 +50,7 @@ class MotionFailed(DimosError):
 
 
 _REFUSALS: Dict[str, Type[Refused]] = {
-    "LEASE_HELD": LeaseHeld, "OUT_OF_LIMITS": OutOfLimits, "ARM_LATCHED": ArmNotReady, "ARM_NOT_READY": ArmNotReady,
+    "LEASE_HELD": LeaseHeld, "OUT_OF_LIMITS": OutOfLimits, "OUT_OF_REACH": OutOfReach, "ARM_LATCHED": ArmNotReady, "ARM_NOT_READY": ArmNotReady,
     "STILL_FAULTED": ArmNotReady}
 
 

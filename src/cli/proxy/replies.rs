@@ -160,7 +160,7 @@ impl Commands {
 pub fn refusal(error: &RpcError) -> Refusal {
     match error.code {
         Code::OutOfLimits => Refusal::Error(JOINT_LIMIT),
-        Code::StartStateMismatch => Refusal::Error(code::SPEED),
+        Code::StartStateMismatch | Code::OutOfReach => Refusal::Error(code::SPEED),
         Code::ArmLatched => Refusal::Error(code::STOP_INPUT),
         Code::NoTrajectoryTask => Refusal::Error(code::PLANNING),
         Code::ArmNotReady | Code::StillFaulted | Code::ShuttingDown => Refusal::NotNow,
