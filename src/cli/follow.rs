@@ -13,7 +13,7 @@ use super::output::{self, Table, Tone, fixed, signed, toned};
 use crate::rpc::api::{Cancel, Motion, Status};
 use crate::rpc::client::Client;
 use crate::rpc::report::{Deviation, MotionReport};
-use crate::telemetry::describe::percent;
+use crate::telemetry::texts::percent;
 
 /// Poll period.
 const POLL_PERIOD: Duration = Duration::from_millis(20);

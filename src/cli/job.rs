@@ -77,12 +77,9 @@ pub fn run(args: &Args) -> Result {
         quiet,
         arms: arms(&job),
         ready,
+        epoch: 0,
     };
-    let begun = runner.begin_epoch().map_err(|end| job.steps.first().map(|step| (step, end)));
-    let ended = match begun {
-        Err(Some(end)) => Err(end),
-        _ => runner.run(),
-    };
+    let ended = runner.run();
     let mut after = None;
     let mut late_signal = None;
     if let Err((_, End::Fault(_))) = &ended {

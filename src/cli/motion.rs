@@ -12,7 +12,7 @@ use crate::rpc::api::{
     Cancel, ExecutePlan, Move, MoveNative, MoveReply, Plan, PlanLevel, Planner, Poses, State, Status, World,
 };
 use crate::rpc::client::Client;
-use crate::telemetry::describe::percent;
+use crate::telemetry::texts::percent;
 
 /// Arguments of `move`.
 #[derive(Debug, clap::Args)]

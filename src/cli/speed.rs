@@ -4,7 +4,7 @@ use super::arguments::{self, Target};
 use super::exit::{Exit, Result};
 use super::output;
 use crate::rpc::api::{Speed, SpeedReport};
-use crate::telemetry::describe::percent;
+use crate::telemetry::texts::percent;
 
 /// Arguments of `speed`.
 #[derive(Debug, clap::Args)]

@@ -3,7 +3,7 @@
 use super::messages::{self, ArmInput, ArmIo, ArmOutput, ArmStatus, Header, Inertia, InertiaStamped, Vector3};
 use crate::arm::{AnalogUnit, ArmCommand, ArmState, Commanded, IoInfo, IoState, JointStatus, Load};
 use crate::joint::{ControlMode, Joints};
-use crate::telemetry::describe::cause_text;
+use crate::telemetry::texts::cause_text;
 use crate::telemetry::{ArmSample, TickSample};
 
 /// Returns whether two states differ in the fields of `ArmInput`. NaN differs from itself: a superfluous message is

@@ -19,7 +19,8 @@ use super::tick_log::{ArmLog, TickLog};
 use crate::arm::Link;
 use crate::clock::Mono;
 use crate::sync::lock;
-use crate::telemetry::describe::{ArmNames, cause_text};
+use crate::telemetry::describe::ArmNames;
+use crate::telemetry::texts::cause_text;
 use crate::telemetry::{ArmSample, Cause, Phase, TickSample};
 use crate::trajectory::{Cursor, JointTrajectory, Sample, Spline};
 

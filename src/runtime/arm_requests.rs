@@ -16,7 +16,7 @@ use crate::message::Message;
 use crate::rpc::api::{self, Reply};
 use crate::rpc::{Code, RpcError};
 use crate::sync::lock;
-use crate::telemetry::describe::cause_text;
+use crate::telemetry::texts::cause_text;
 use crate::telemetry::{ArmSample, Outcome, Phase};
 
 /// Timeout for a stopped arm to decelerate to rest and confirm.

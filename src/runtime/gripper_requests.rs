@@ -14,7 +14,7 @@ use crate::message::Message;
 use crate::rpc::api::{self, GripReport, Reply};
 use crate::rpc::{Code, RpcError};
 use crate::sync::lock;
-use crate::telemetry::describe::cause_text;
+use crate::telemetry::texts::cause_text;
 use crate::telemetry::{ArmSample, Origin, Outcome, Phase};
 
 /// Default time for an outcome [s].

@@ -16,7 +16,8 @@ use crate::rpc::streams::{EventReport, JointState, Level};
 use crate::rpc::{Code, RpcError};
 use crate::rt::histogram::Figures;
 use crate::sync::lock;
-use crate::telemetry::describe::{Described, Severity, bound_text, cause_text, outcome_text, reason_text};
+use crate::telemetry::describe::{Described, Severity};
+use crate::telemetry::texts::{bound_text, cause_text, outcome_text, reason_text};
 use crate::telemetry::{Cause, Outcome, Phase, Reason, TaskState};
 
 impl Service {

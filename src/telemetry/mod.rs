@@ -4,6 +4,7 @@
 pub mod describe;
 mod interruption;
 mod label;
+pub mod texts;
 
 use serde::{Deserialize, Serialize};
 

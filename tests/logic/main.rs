@@ -28,6 +28,7 @@ mod device_streams;
 mod english;
 mod faults;
 mod follow;
+mod follow_ends;
 mod gaps;
 mod guard;
 mod guards_virtual;

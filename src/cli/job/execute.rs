@@ -85,6 +85,8 @@ pub struct Runner<'r, 'c> {
     pub arms: BTreeSet<String>,
     /// Arms that were ready since the job began; `true`: since its last fault.
     pub ready: BTreeSet<(String, bool)>,
+    /// The epoch of its requests: an arm that was interrupted since is not moved.
+    pub epoch: u64,
 }
 
 type Outcome<T = (), E = End> = Result<T, E>;
@@ -92,6 +94,9 @@ type Outcome<T = (), E = End> = Result<T, E>;
 impl<'r> Runner<'r, '_> {
     /// Runs all cycles. The error has the step at which the job ended.
     pub fn run(&mut self) -> Outcome<(), (&'r Step, End)> {
+        if let Some(first) = self.job.steps.first() {
+            self.begin_epoch().map_err(|end| (first, end))?;
+        }
         while self.job.repeat.is_none_or(|cycles| self.cycles.count() < cycles) {
             let began = Instant::now();
             self.steps(&self.job.steps)?;
@@ -116,7 +121,7 @@ impl<'r> Runner<'r, '_> {
             return Err((format!("not run: {}", not_ready(arm)), None));
         }
         self.ready.retain(|(_, now)| !now);
-        self.client.since(status.epoch);
+        self.begin_epoch_at(status.epoch);
         self.steps(steps).map(|()| "done".to_owned()).map_err(|(step, end)| match end {
             End::Signal(signal) => ("interrupted".to_owned(), Some(signal)),
             End::Stopped(failure) | End::Fault(failure) => (format!("failed at line {}: {failure}", step.line), None),
@@ -153,17 +158,27 @@ impl<'r> Runner<'r, '_> {
         if let Act::Repeat { times, steps } = &step.act {
             return (0..*times).try_for_each(|_| self.steps(steps));
         }
-        self.act(step).map_err(|end| (step, end))?;
-        // These may interrupt the arm themselves.
-        let own = matches!(step.act, Act::Reset | Act::Enable | Act::Attach(_) | Act::Detach(_) | Act::Output(_));
-        if own { self.begin_epoch().map_err(|end| (step, end)) } else { Ok(()) }
+        self.perform(step).map_err(|end| (step, end))
     }
 
-    /// What interrupted the arms before is known: what does so from now on ends the job.
-    pub fn begin_epoch(&mut self) -> Outcome {
+    /// Performs a step. A payload that it sets may disable the arm for a moment: that is no interruption by others.
+    fn perform(&mut self, step: &Step) -> Outcome {
+        let sets_payload = matches!(step.act, Act::Attach(_) | Act::Detach(_));
+        let undisturbed = sets_payload && self.client.call(Status {})?.epoch == self.epoch;
+        self.act(step)?;
+        if undisturbed { self.begin_epoch() } else { Ok(()) }
+    }
+
+    /// What has interrupted the arms is known: what does so from now on ends the job.
+    fn begin_epoch(&mut self) -> Outcome {
         let epoch = self.client.call(Status {})?.epoch;
-        self.client.since(epoch);
+        self.begin_epoch_at(epoch);
         Ok(())
+    }
+
+    fn begin_epoch_at(&mut self, epoch: u64) {
+        self.epoch = epoch;
+        self.client.since(epoch);
     }
 
     fn act(&mut self, step: &Step) -> Outcome {
