@@ -1,4 +1,4 @@
-# run install dist viewer check test test-fast · test-tools test-rerun test-lerobot judge-hiroz deny mutants ·
+# run install dist viewer check test test-fast verified · test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants ·
 # bench bench-quick bench-page bench-share jitter soak lies lies-wire pauses
 
 PYTHON ?= python3
@@ -38,7 +38,7 @@ PAGE := viewer/dist/index.html
 PAGE_SOURCES := $(wildcard viewer/*.json viewer/*.mjs) $(shell find viewer/src -type f 2>/dev/null)
 NODE := $(if $(wildcard viewer/package.json),$(shell command -v npm))
 
-.PHONY: run install dist shipped viewer viewer-if-possible check lint spelling licences test test-fast test-tools test-rerun test-lerobot judge-hiroz deny mutants bench bench-quick bench-page bench-share jitter soak lies lies-wire pauses
+.PHONY: run install dist shipped viewer viewer-if-possible check lint spelling licences test test-fast verified test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants bench bench-quick bench-page bench-share jitter soak lies lies-wire pauses
 
 # Builds the program to try it, not optimized, and starts the shipped blueprint; its arm is simulated. Ends with Ctrl-C.
 run: viewer-if-possible
@@ -113,6 +113,10 @@ test-fast:
 	else cargo test --locked --lib; \
 	fi
 
+# Writes docs/verified.md from the reports in docs/reports.
+verified:
+	DIMOS_REGENERATE=1 cargo test --locked --test logic verified::the_page
+
 # What tests compare with and run in: other people's readers of logs; as root, also cyclictest, a browser, and a guest
 # kernel that has CAN, with the tools for its interfaces.
 test-tools: .venv/readers-installed $(READERS)/node_modules/.package-lock.json viewer/node_modules/.package-lock.json
@@ -140,6 +144,16 @@ test-rerun: .venv/readers-installed
 judge-hiroz: .venv/readers-installed
 	cargo build --manifest-path tests/hiroz/Cargo.toml --target-dir $(TARGET)/hiroz
 	DIMOS_HIROZ=$(abspath $(TARGET))/hiroz/debug/judge-hiroz cargo test --locked --features share --test process hiroz
+
+# 50 motions at half and at full speed, judged by franka-sim: five minutes.
+judge-franka: .venv/readers-installed
+	DIMOS_FRANKA_SIM=50 cargo test --locked --test peers franka_sim -- --nocapture
+
+# The first day at a simulator that others wrote, and its report: ARM=ur, xarm (containers of the vendors) or franka.
+# docs/first-day.md says what of it has been run.
+vendor-sim:
+	cargo build --locked --bin dimos
+	DIMOS=$(abspath $(TARGET))/debug/dimos tests/vendor_sim.sh
 
 # LeRobot with all that it asks for is large (torch), so it has a venv of its own.
 test-lerobot:

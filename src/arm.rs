@@ -1,10 +1,14 @@
 //! Data between an arm's device thread and the tick: the latest state one way, the latest command the other. Plain
 //! data of fixed size, so that neither side ever allocates or waits.
 
+mod controller_pose;
+mod factory_kinematics;
 mod gripper;
 mod io;
 mod joint_status;
 mod load;
+#[cfg(test)]
+pub(crate) mod test_dh;
 
 use std::time::Duration;
 
@@ -14,6 +18,8 @@ use crate::clock::Mono;
 use crate::joint::{ControlMode, Joints, MAX_DOF};
 use crate::named::named;
 
+pub use controller_pose::ControllerPose;
+pub use factory_kinematics::{Dh, FactoryKinematics};
 pub use gripper::{ForceUnit, GripperInfo, GripperUnit};
 pub use io::{AnalogUnit, IoInfo, IoState, MAX_ANALOG, MAX_DIGITAL, OutputValue, StopInput, channel};
 pub use joint_status::JointStatus;
@@ -52,6 +58,15 @@ pub struct Supervision {
     /// How the reading of each joint counts turns.
     #[serde(default)]
     pub topology: [Topology; MAX_DOF],
+}
+
+/// What an arm's controller makes of a gap in its setpoints.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Bridging {
+    /// Longest time without a setpoint that it bridges.
+    pub tolerance: Duration,
+    /// What it does beyond it.
+    pub after: AfterGap,
 }
 
 named! {
@@ -155,6 +170,8 @@ named! {
         Power = "power",
         /// The arm was stopped, paused or reset.
         Stop = "stop",
+        /// Another arm than the one of the run answers.
+        Identity = "identity",
     }
 }
 
@@ -188,7 +205,7 @@ named! {
     }
 }
 
-/// An end-effector pose in the arm's base frame, as the arm's controller states it.
+/// Position and orientation of a frame in another one.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Pose {
     /// x, y, z [m].
@@ -218,8 +235,8 @@ pub struct ArmState {
     pub gripper: Option<f64>,
     /// Measured force of the gripper, in its force unit, where it measures one.
     pub gripper_force: Option<f64>,
-    /// End-effector pose, where the arm reports it.
-    pub pose: Option<Pose>,
+    /// Pose of the arm's end by its controller, where it states one.
+    pub pose: Option<ControllerPose>,
     /// Force and torque at the sensor [N, N, N, Nm, Nm, Nm], where there is one.
     pub wrench: Option<[f64; 6]>,
     /// The mode the arm is in.
@@ -242,6 +259,10 @@ pub struct ArmState {
     pub stop_input_open: bool,
     /// The device's own time of the measurement, on its own clock [ns], where it reports one.
     pub device_ns: Option<u64>,
+    /// Fraction of its speed at which the arm's controller runs motions at present (a slider, a safety function), 0 to
+    /// 1, where it reports that. All times of its motion are longer by it: the path stays the same.
+    #[serde(default)]
+    pub speed_fraction: Option<f64>,
     /// What the arm's controller itself commands, where it reports that.
     #[serde(default)]
     pub commanded: Option<Commanded>,
@@ -274,6 +295,7 @@ impl Default for ArmState {
             own_delay_ns: 0,
             stop_input_open: false,
             device_ns: None,
+            speed_fraction: None,
             commanded: None,
             refused: 0,
         }

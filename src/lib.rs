@@ -33,6 +33,7 @@
 pub const VERSION: &str = env!("DIMOS_VERSION");
 
 pub mod arm;
+mod bounded;
 pub mod clock;
 pub mod joint;
 pub mod message;

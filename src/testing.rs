@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard};
 
-use crate::arm::{Pose, StopPoint};
+use crate::arm::{ControllerPose, Pose, StopPoint};
 use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
 };
@@ -86,6 +86,7 @@ struct Shared {
     pose: Option<Pose>,
     gripper: Option<f64>,
     wrench: Option<[f64; 6]>,
+    serial: Option<String>,
     failures: VecDeque<(&'static str, AdapterError)>,
     calls: Vec<Call>,
 }
@@ -133,6 +134,7 @@ impl MockAdapter {
             pose: None,
             gripper: None,
             wrench: None,
+            serial: None,
             failures: VecDeque::new(),
             calls: Vec::new(),
         })))
@@ -141,6 +143,12 @@ impl MockAdapter {
     /// Answers of `read_joint_positions` [rad].
     pub fn positions(self, positions: &[f64]) -> Self {
         self.lock().positions = positions.to_vec();
+        self
+    }
+
+    /// Its serial number, from the next `connect` on.
+    pub fn serial(self, serial: &str) -> Self {
+        self.lock().serial = Some(serial.to_owned());
         self
     }
 
@@ -267,7 +275,7 @@ impl ManipulatorAdapter for MockAdapter {
             model: "test double".into(),
             dof: self.get_dof(),
             firmware_version: None,
-            serial_number: None,
+            serial_number: self.lock().serial.clone(),
             native_rate: 1000.0,
             modes: ControlMode::ALL,
             holds_when_disabled: true,
@@ -387,8 +395,8 @@ impl ForceTorque for MockAdapter {
 }
 
 impl Cartesian for MockAdapter {
-    fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>> {
-        Ok(self.asked("read_cartesian_position")?.pose)
+    fn read_cartesian_position(&mut self) -> AdapterResult<Option<ControllerPose>> {
+        Ok(self.asked("read_cartesian_position")?.pose.map(ControllerPose::of_flange))
     }
 
     fn write_cartesian_position(&mut self, pose: &Pose, velocity: f64) -> AdapterResult<()> {

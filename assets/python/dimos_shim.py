@@ -4,7 +4,7 @@ import argparse, contextlib, ctypes, enum, errno, importlib, itertools, json, ma
 import signal, socket, struct, sys, time
 SILENCE, LONGEST = 0.5, 16384  # a commanded arm is stopped after this time without a request [s]; bytes of a line
 FEEDBACK = ["read_joint_velocities", "read_joint_efforts"]
-EXTRAS = ["modes", "gripper_range", "gripper_unit", "holds_when_disabled"]
+EXTRAS = ["modes", "gripper_range", "gripper_unit", "holds_when_disabled", "gap_tolerance", "after_gap"]
 READS = ["read_error", "read_enabled", "get_control_mode", "read_state", "read_gripper_position",
          "read_cartesian_position", "read_force_torque", *FEEDBACK]
 ACTS = ["activate", "deactivate", "write_enable", "set_control_mode", "write_stop", "write_clear_errors"]
@@ -31,8 +31,7 @@ class Arm:  # the adapter, called from one thread only
         self.dof, began = dof or adapter.get_dof(), time.monotonic()
         self.read(*READS)
         self.quick = time.monotonic() - began < 0.5 / hz  # else one read besides the positions per cycle, in turn
-    def lost(self):
-        return hasattr(self.adapter, "is_connected") and not self.adapter.is_connected()
+    def lost(self): return hasattr(self.adapter, "is_connected") and not self.adapter.is_connected()
     def read(self, *names):  # only zeros since the start: the guide's sign for "not measured"
         for name, answer in [(name, getattr(self.adapter, name)()) for name in names if hasattr(self.adapter, name)]:
             if name.startswith("read_joint_") and answer is not None:
@@ -75,8 +74,7 @@ class Arm:  # the adapter, called from one thread only
             planned, self.commanded = [command["velocity"]] if command["mode"] != "velocity" else [], True
             try:
                 self.call("write_joint_positions" if planned else "write_joint_velocities", command["values"], *planned)
-            except Exception as e:
-                refused = str(e) or repr(e)
+            except Exception as e: refused = str(e) or repr(e)
         time.sleep(0.0 if command else max(0.0, self.due - time.monotonic()))  # asked early: wait for a new state
         if time.monotonic() >= self.due:
             self.read("read_joint_positions")
@@ -114,9 +112,14 @@ def serve(arm, listener):
             with contextlib.suppress(OSError):  # the client may have disconnected already
                 another = listener.accept()[0]
                 another.settimeout(1.0)
-                if client: another.sendall(b'{"id":1,"error":"rejected","text":"it serves another client already"}\n')
-                client = client or another
-
+                if listener.family == socket.AF_INET and not is_ours(another): another.close()
+                elif client: another.sendall(b'{"id":1,"error":"rejected","text":"it serves another client already"}\n')
+                else: client = another
+def is_ours(client):  # any user can connect to a port; the system lists whose an open connection's other end is
+    at = lambda ip, port: f"{int.from_bytes(socket.inet_aton(ip), sys.byteorder):08X}:{port:04X}"
+    ends = [at(*client.getpeername()), at(*client.getsockname()), "01"]
+    rows = map(str.split, pathlib.Path("/proc/net/tcp").read_text().splitlines())
+    return any(row[1:4] == ends and row[9] != "0" and int(row[7]) in (0, os.geteuid()) for row in rows)
 def listen(at):
     if not at.startswith("unix:"):
         host, _, port = at.replace("tcp:", "", 1).rpartition(":")
@@ -127,7 +130,6 @@ def listen(at):
     before = os.umask(0o177)  # the socket is for this user only; files and folders of the adapter are as usual
     try: return socket.create_server(at[5:], family=socket.AF_UNIX)
     finally: os.umask(before)
-
 def ask_for_short_slices():  # since Linux 6.12 a thread that asks for them runs sooner beside busy programs
     number = {"x86_64": 314, "aarch64": 274}.get(platform.machine())  # of the system call sched_setattr
     if number and sys.platform == "linux":  # size, ordinary class, flags, nice, priority, slice of 0.1 ms
@@ -141,8 +143,7 @@ if __name__ == "__main__":
     parser.add_argument("--address", default=argparse.SUPPRESS, help="given to the adapter")
     parser.add_argument("--dof", type=int, default=argparse.SUPPRESS, help="given to the adapter")
     parser.add_argument("--hz", type=float, default=100.0, help="how often the arm has a new state (100)")
-    given = vars(parser.parse_args())
-    adapter, at, hz = given.pop("adapter"), given.pop("at"), given.pop("hz")
+    adapter, at, hz = map((given := vars(parser.parse_args())).pop, ("adapter", "at", "hz"))
     for end in signal.SIGINT, signal.SIGTERM, signal.SIGHUP: signal.signal(end, lambda *_: sys.exit(0))
     sys.path.insert(0, os.getcwd())
     ask_for_short_slices()
@@ -153,8 +154,7 @@ if __name__ == "__main__":
         hint = "\nhint: give MODULE:CLASS, a class in a file here or on PYTHONPATH" if type(e) in MISSING else ""
         sys.exit(f"error: {adapter} --at {at}: {str(e) or repr(e)}{hint}")
     print(f"serving {adapter} at {at}; Ctrl-C ends it", flush=True)
-    try:
-        serve(arm, listener)
+    try: serve(arm, listener)
     finally:  # a signal, or an error in this file
         if arm.commanded: arm.stop("the shim exits")
         arm.adapter.disconnect()

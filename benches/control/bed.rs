@@ -53,6 +53,7 @@ impl Bed {
     pub fn new(arms: usize, load: Load) -> Self {
         let limits = JointLimits::uniform(DOF, 3.0, 3.0).with_defaults();
         let arm = |i| ArmConfig {
+            tool: None,
             name: format!("arm{i}"),
             dof: DOF,
             limits: limits.clone(),

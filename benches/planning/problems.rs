@@ -134,6 +134,7 @@ impl Arm {
             solids: self.solids.clone(),
             base: DAffine3::IDENTITY,
             padding: 0.0,
+            apart: 0.0,
             allowed: self.allowed.clone(),
         }
     }

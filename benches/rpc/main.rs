@@ -174,7 +174,7 @@ fn python(effort: Effort) -> Result<(), String> {
     let seconds = effort.of("2", "60");
     let output = Command::new("python3")
         .args([script, "servo_arm", "--rate", "100", "--seconds", seconds])
-        .env("XDG_RUNTIME_DIR", run.folder())
+        .env("DIMOS_WORLD", run.folder())
         .env("PYTHONDONTWRITEBYTECODE", "1")
         .output()
         .map_err(|e| format!("python3: {e} (make test-tools)"))?;

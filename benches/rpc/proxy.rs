@@ -115,11 +115,11 @@ fn ask(port: &mut TcpStream, register: u8, payload: &[u8]) -> std::io::Result<u8
 pub fn measure(effort: Effort) -> Result<(), String> {
     let text = |e: std::io::Error| e.to_string();
     let folder = tempfile::tempdir().map_err(text)?;
-    let claim = RunDir::at(folder.path().join("dimos")).claim("bench").map_err(|e| e.to_string())?;
+    let claim = RunDir::closed(folder.path().join("dimos")).claim("bench").map_err(|e| e.to_string())?;
     let run = Arc::new(Run::default());
     let _server = Server::start(claim, run.clone()).map_err(text)?;
     let mut command = Command::new(env!("CARGO_BIN_EXE_dimos"));
-    command.args(["proxy", "xarm", "--listen", HOST]).env("XDG_RUNTIME_DIR", folder.path());
+    command.args(["proxy", "xarm", "--listen", HOST]).env("DIMOS_WORLD", folder.path());
     let mut proxy = Proxy(command.stdout(Stdio::piped()).stderr(Stdio::inherit()).spawn().map_err(text)?);
     let mut line = String::new();
     BufReader::new(proxy.0.stdout.take().ok_or("no stdout")?).read_line(&mut line).map_err(text)?;

@@ -50,7 +50,7 @@ impl LiveRun {
     ) -> std::io::Result<Self> {
         let mut command = Command::new(env!("CARGO_BIN_EXE_dimos"));
         command.args(["run", blueprint, "--name", name]).args(recording).args(arguments);
-        command.env("XDG_RUNTIME_DIR", home.path()).env("XDG_STATE_HOME", home.path());
+        command.env("DIMOS_WORLD", home.path()).env("XDG_STATE_HOME", home.path());
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
         let started = Instant::now();
         let child = command.spawn()?;
@@ -74,7 +74,7 @@ impl LiveRun {
 
     /// Connects to it as soon as it is up.
     pub fn client(&mut self) -> Result<Client, String> {
-        let folder = RunDir::at(self.home.path().join("dimos"));
+        let folder = RunDir::closed(self.home.path().join("dimos"));
         loop {
             if let Some(status) = self.child.try_wait().map_err(|e| e.to_string())? {
                 return Err(format!("the run ended during startup: {status}"));

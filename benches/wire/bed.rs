@@ -15,7 +15,7 @@ use dimos::rt::host;
 use dimos::rt::slot::{SlotReader, SlotWriter, slot};
 use dimos::rt::wake::Wake;
 
-use crate::timed::{Delays, Timed, moment};
+use crate::timed::{Delays, Timed};
 
 /// Timeout for the arm.
 const TIMEOUT: Duration = Duration::from_secs(5);
@@ -62,7 +62,8 @@ impl Arm {
             notes: Box::new(|_| {}),
         };
         let device = Device::spawn(config, adapter, state_writer, command_reader).map_err(|e| e.to_string())?;
-        device.connect().wait(TIMEOUT).map_err(text)?;
+        let connected = device.connect().wait(TIMEOUT).map_err(text)?;
+        drop(device.set_limits(connected.limits));
         device.activate().wait(TIMEOUT).map_err(text)?;
         Ok(Self { wake: device.wake(), device, commands, states, sent, arrived, _world: world })
     }
@@ -93,18 +94,18 @@ pub struct Periods {
 }
 
 /// Does the work of the tick for this many periods: reads all states, writes all commands, then wakes all device
-/// threads.
-pub fn tick(arms: &mut [Arm], period: Duration, periods: u64, beat: &Heartbeat) -> Periods {
+/// threads. Without a mode nothing is commanded.
+pub fn tick(arms: &mut [Arm], period: Duration, periods: u64, beat: &Heartbeat, mode: Option<ControlMode>) -> Periods {
     let (_, _latency) = host::prepare_process(true);
     let mut counted = Periods::default();
     std::thread::scope(|scope| {
-        let thread = scope.spawn(|| run(arms, period, periods, beat));
+        let thread = scope.spawn(|| run(arms, period, periods, beat, mode));
         counted = thread.join().unwrap_or_default();
     });
     counted
 }
 
-fn run(arms: &mut [Arm], period: Duration, periods: u64, beat: &Heartbeat) -> Periods {
+fn run(arms: &mut [Arm], period: Duration, periods: u64, beat: &Heartbeat, mode: Option<ControlMode>) -> Periods {
     host::enter_realtime(host::TICK_PRIORITY);
     let mut counted = Periods::default();
     let hold: Vec<[f64; MAX_DOF]> = arms.iter_mut().map(|arm| arm.states.read().position).collect();
@@ -119,10 +120,15 @@ fn run(arms: &mut [Arm], period: Duration, periods: u64, beat: &Heartbeat) -> Pe
         counted.skipped += u64::from(skipped);
         for (arm, hold) in arms.iter_mut().zip(&hold) {
             let _ = arm.states.read();
-            let mut values = *hold;
-            values[0] = moment();
-            let mode = Some(ControlMode::ServoPosition);
-            let command = ArmCommand { seq: counted.ticked, mode, values, next_tick: next, ..ArmCommand::default() };
+            let command = ArmCommand {
+                seq: counted.ticked,
+                mode,
+                values: *hold,
+                next_tick: next,
+                at: MonotonicClock.now(),
+                start_seq: 1,
+                ..ArmCommand::default()
+            };
             counted.overwritten += u64::from(arm.commands.write(&command));
         }
         for arm in arms.iter() {

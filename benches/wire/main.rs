@@ -21,6 +21,7 @@ use std::time::Duration;
 use bed::{Arm, tick};
 use dimos::hardware::arms::xarm;
 use dimos::hardware::registry::{self, AdapterConfig, EmulatorAddress};
+use dimos::joint::ControlMode;
 use dimos::rt::heartbeat::Heartbeat;
 use support::measure::{Goal, Measure, print, quantile};
 use support::{Effort, machine};
@@ -30,6 +31,8 @@ const SETPOINT: u8 = 29;
 
 /// A part of the benchmark, by name.
 type Part = (&'static str, fn(Effort) -> Result<(), String>);
+
+const SERVO: Option<ControlMode> = Some(ControlMode::ServoPosition);
 
 fn main() -> ExitCode {
     let effort = Effort::from_environment();
@@ -77,7 +80,7 @@ fn commands(effort: Effort) -> Result<(), String> {
             let arms: Result<Vec<Arm>, String> =
                 (0..count).map(|_| arm("xarm", 7, period, &beat, 2 * periods as usize)).collect();
             let mut arms = arms?;
-            tick(&mut arms, period, periods, &beat);
+            tick(&mut arms, period, periods, &beat, SERVO);
             let delays: Vec<f64> = arms.iter().flat_map(|arm| arm.sent.lock().unwrap().clone()).collect();
             arms.into_iter().try_for_each(Arm::finish)?;
             p50.push(quantile(&delays, 0.5));
@@ -101,7 +104,8 @@ fn states(effort: Effort) -> Result<(), String> {
         let address = relay::start(&emulator.address())?;
         let adapter = registry::create("xarm", &address, 7).map_err(|e| e.to_string())?;
         let mut arms = [Arm::new(adapter, Box::new(emulator), period, &beat, 3 * periods as usize)?];
-        tick(&mut arms, period, periods, &beat);
+        // Times pose as the positions of a joint, so nothing may be commanded.
+        tick(&mut arms, period, periods, &beat, None);
         let delays = arms[0].arrived.lock().unwrap().clone();
         arms.into_iter().try_for_each(Arm::finish)?;
         p50.push(quantile(&delays, 0.5));
@@ -159,7 +163,7 @@ fn stream(
     let (arm, points) = make(period, &beat, 2 * periods as usize)?;
     let mut arms = [arm];
     let before = points();
-    let counted = tick(&mut arms, period, periods, &beat);
+    let counted = tick(&mut arms, period, periods, &beat, SERVO);
     let delivered = points() - before;
     arms.into_iter().try_for_each(Arm::finish)?;
     let unaccounted = counted.ticked.abs_diff(delivered + counted.overwritten);

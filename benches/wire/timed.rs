@@ -2,6 +2,7 @@
 
 use std::sync::{Arc, Mutex};
 
+use dimos::arm::Setpoint;
 use dimos::clock::{Clock, MonotonicClock};
 use dimos::hardware::adapter::{
     AdapterResult, Cartesian, ForceTorque, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
@@ -27,17 +28,17 @@ pub type Delays = Arc<Mutex<Vec<f64>>>;
 /// The wrapped adapter.
 pub struct Timed {
     pub inner: Box<dyn ManipulatorAdapter>,
-    /// From the time stamp in a command's first joint until it was written.
+    /// From the time of a setpoint until it was written.
     pub sent: Delays,
     /// From the time stamp in a state's first joint (a microradian each, as in a report) until it was read.
     pub arrived: Delays,
 }
 
-fn note(delays: &Delays, moment: f64) {
+fn note(delays: &Delays, delay: f64) {
     if let Ok(mut delays) = delays.lock()
         && delays.len() < delays.capacity()
     {
-        delays.push(since(moment));
+        delays.push(delay);
     }
 }
 
@@ -45,13 +46,13 @@ impl ManipulatorAdapter for Timed {
     delegate!(
         inner: connect, disconnect, is_connected, activate, deactivate, get_info, get_dof, get_limits,
         set_control_mode, get_control_mode, state_fd, read_joint_positions, read_state, read_error, read_enabled,
-        gripper, force_torque, cartesian, write_stop, write_enable, write_clear_errors
+        gripper, force_torque, cartesian, write_joint_positions, write_stop, write_enable, write_clear_errors
     );
 
-    fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()> {
-        let result = self.inner.write_joint_positions(positions, velocity);
-        if let (Ok(()), Some(then)) = (&result, positions.first()) {
-            note(&self.sent, *then);
+    fn write_setpoint(&mut self, setpoint: &Setpoint) -> AdapterResult<()> {
+        let result = self.inner.write_setpoint(setpoint);
+        if result.is_ok() {
+            note(&self.sent, MonotonicClock.now().seconds_since(setpoint.at) * 1e6);
         }
         result
     }
@@ -60,7 +61,7 @@ impl ManipulatorAdapter for Timed {
         let before = reading.stamp;
         let result = self.inner.read_joints(reading);
         if result.is_ok() && reading.stamp != before {
-            note(&self.arrived, reading.position[0] * 1e-3);
+            note(&self.arrived, since(reading.position[0] * 1e-3));
         }
         result
     }

@@ -15,6 +15,17 @@ named! {
         /// Angle of a rotary gripper's jaw [rad].
         #[serde(rename = "rad")]
         Radians = "rad",
+        /// One that only opens and closes: 0 closed, or suction on; 1 open, or suction off. Nothing measures its
+        /// fingers: its position is the order, as the device confirms it.
+        #[serde(rename = "on_off")]
+        OnOff = "on_off",
+    }
+}
+
+impl GripperUnit {
+    /// Returns whether there is such a position in this unit: one that only opens and closes has two.
+    pub fn has(self, position: f64) -> bool {
+        self != Self::OnOff || position == 0.0 || position == 1.0
     }
 }
 

@@ -68,6 +68,29 @@ impl Load {
         Self { mass, center, inertia }
     }
 
+    /// Returns the rest of this load beside a part of it; `None` if that is no part of it. Unknown inertia stays so.
+    pub fn without(&self, part: &Self) -> Option<Self> {
+        let mass = self.mass - part.mass;
+        if mass < -TOLERANCE.0 {
+            return None;
+        }
+        if mass <= TOLERANCE.0 {
+            return Some(Self::default());
+        }
+        let mut center = [0.0; 3];
+        for ((c, all), of_part) in center.iter_mut().zip(self.center).zip(part.center) {
+            *c = (self.mass * all - part.mass * of_part) / mass;
+        }
+        let mut rest = Self { mass, center, inertia: [0.0; 6] };
+        if self.inertia.iter().any(|v| *v != 0.0) {
+            // Without inertia of its own, the rest adds what its distance does.
+            let bare = part.plus(&rest).inertia;
+            rest.inertia =
+                std::array::from_fn(|i| self.inertia.get(i).zip(bare.get(i)).map_or(0.0, |(all, bare)| all - bare));
+        }
+        rest.check().is_ok().then_some(rest)
+    }
+
     /// Returns whether a controller that was set to this load may report `other`: rounded, and without the inertia or
     /// with the centre of no mass.
     pub fn agrees_with(&self, other: &Self) -> bool {
@@ -99,6 +122,21 @@ mod tests {
         let diagonal = Load { mass: 1.0, center: [0.2, 0.2, 0.0], inertia: [0.0; 6] };
         let xy = diagonal.plus(&Load { mass: 1.0, ..Load::default() }).inertia[1];
         assert!((xy + 2.0 * 0.01).abs() < 1e-12, "{xy}");
+    }
+
+    #[test]
+    fn the_rest_of_a_load_and_its_part_are_the_load() {
+        let tool = Load { mass: 0.73, center: [-0.01, 0.0, 0.03], inertia: [1e-3, 0.0, 0.0, 2.5e-3, 0.0, 1.7e-3] };
+        let part = Load { mass: 0.5, center: [0.0, 0.02, 0.12], inertia: [1e-3, 1e-4, 0.0, 1e-3, 0.0, 2e-3] };
+        let both = tool.plus(&part);
+        let rest = both.without(&tool).unwrap();
+        assert!(part.agrees_with(&rest) && (rest.inertia[1] - 1e-4).abs() < 1e-9, "{rest:?}");
+        assert_eq!(tool.without(&tool), Some(Load::default()));
+        assert_eq!(part.without(&tool), None, "less than its part");
+        let unknown = Load { inertia: [0.0; 6], ..both };
+        assert_eq!(unknown.without(&tool).unwrap().inertia, [0.0; 6]);
+        let thin = Load { inertia: [1e-4; 6], ..both };
+        assert_eq!(thin.without(&tool), None, "what remains is no body");
     }
 
     #[test]

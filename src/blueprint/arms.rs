@@ -33,6 +33,8 @@ pub(super) struct Entry {
     pub(super) joints: Vec<String>,
     /// The row of its adapter; `None` if the adapter is unknown.
     pub(super) adapter: Option<AdapterSpec>,
+    /// Its complete address and the position of that; `None` if it has none, or is simulated.
+    place: Option<(String, NodeId)>,
 }
 
 pub(super) fn resolve(checker: &mut Checker<'_>, hardware: &[Located<HardwareEntry>]) -> Hardware {
@@ -58,7 +60,8 @@ pub(super) fn resolve(checker: &mut Checker<'_>, hardware: &[Located<HardwareEnt
             None if joints_known => drop(limits::resolve(checker, &entry.limits, &joints, None)),
             None => {}
         }
-        found.entries.push(Entry { id, at: entry.hardware_id.at, joints, adapter });
+        let place = adapter.as_ref().and_then(|row| place(checker, entry, row, &found.entries));
+        found.entries.push(Entry { id, at: entry.hardware_id.at, joints, adapter, place });
     }
     found
 }
@@ -77,6 +80,26 @@ fn id(checker: &mut Checker<'_>, entry: &Located<HardwareEntry>, others: &[Entry
         checker.error(id.at, diag.also(also).hint("give each arm its own name"));
     }
     (id.value.clone(), duplicate.is_some())
+}
+
+/// Returns an arm's complete address; reports one that an earlier arm has.
+fn place(
+    checker: &mut Checker<'_>,
+    entry: &Located<HardwareEntry>,
+    row: &AdapterSpec,
+    others: &[Entry],
+) -> Option<(String, NodeId)> {
+    let given = entry.address.as_ref().filter(|given| given.value != SIM && row.transport != "memory")?;
+    let full = (row.address.check)(given).ok().filter(|full| !full.is_empty())?;
+    // Names of hosts and interfaces in any case; those of files as they are.
+    let full = if full.contains('/') { full } else { full.to_ascii_lowercase() };
+    let first = others.iter().find_map(|other| other.place.as_ref().filter(|(place, _)| *place == full));
+    if let Some((_, first)) = first {
+        let also = checker.tree.label(*first).with_text("first used here");
+        let diag = Diag::error(format!("two arms have the address {}", quote(given)));
+        checker.error(given.at, diag.also(also).hint("give each arm the address of its own controller"));
+    }
+    Some((full, given.at))
 }
 
 /// Checks the settings that depend on the adapter, and builds the arm.
@@ -131,6 +154,9 @@ fn arm(
         options,
         own_limits: own.unwrap_or_default(),
         limits,
+        tool: checked.tool,
+        tcp_velocity: None,
+        tool_robot: None,
     }
 }
 

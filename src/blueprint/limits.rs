@@ -22,6 +22,9 @@ pub struct LimitsEntry {
     pub acceleration: Option<Located<PerJoint>>,
     /// Highest jerk [rad/s³], in the same forms. Default: the arm's own, else 20.
     pub jerk: Option<Located<PerJoint>>,
+    /// Highest speed of tool centre point and flange [m/s]. Default: the vendor's, in the arm's page.
+    #[schemars(extend("exclusiveMinimum" = 0))]
+    pub tcp_velocity: Option<Located<f64>>,
 }
 
 /// Position limits: one pair for all joints, or pairs by joint name.

@@ -40,12 +40,18 @@ impl Loaded {
 
     /// Returns the number of errors.
     pub fn errors(&self) -> usize {
-        self.diags.iter().filter(|d| d.severity == Severity::Error).count() + self.tree.unlisted()
+        self.tree.errors()
     }
 
     /// Returns the number of warnings.
     pub fn warnings(&self) -> usize {
-        self.diags.iter().filter(|d| d.severity == Severity::Warning).count()
+        self.tree.warnings()
+    }
+
+    /// Adds a diagnostic that a later check found, without a position in the blueprint.
+    pub fn report(&mut self, diag: Diag) {
+        self.tree.report(diag);
+        self.diags = in_order(&self.tree);
     }
 
     /// Returns all diagnostics as text, with the numbers of errors and warnings in the last line; empty if there are
@@ -57,7 +63,8 @@ impl Loaded {
             out.push_str("\n\n");
         }
         if self.tree.unlisted() > 0 {
-            out.push_str("Not all mistakes are listed; fix these first.\n");
+            let what = if self.errors() > 0 { "mistakes" } else { "warnings" };
+            out.push_str(&format!("Not all {what} are listed; fix these first.\n"));
         }
         let count = |n: usize, what: &str| match n {
             0 => None,
@@ -119,10 +126,16 @@ pub fn load_from<'a>(
 ) -> Loaded {
     let mut tree = Tree::new();
     let blueprint = read_blueprint(&mut tree, search, found, overrides, catalog.into());
-    let mut diags = tree.diags().to_vec();
-    // The main file is the first source, arguments are the last; diagnostics without a position come first.
-    diags.sort_by_key(|d| d.at.as_ref().map(|at| (at.source, at.range.start)));
+    let diags = in_order(&tree);
     Loaded { blueprint, tree, diags }
+}
+
+/// Returns the diagnostics in the order of the text. The main file is the first source, arguments are the last;
+/// diagnostics without a position come first.
+fn in_order(tree: &Tree) -> Vec<Diag> {
+    let mut diags = tree.diags().to_vec();
+    diags.sort_by_key(|d| d.at.as_ref().map(|at| (at.source, at.range.start)));
+    diags
 }
 
 fn read_blueprint(

@@ -31,6 +31,7 @@ mod task_pos;
 mod task_robots;
 mod tasks;
 mod tick_clock;
+mod tool_speed;
 
 pub use catalog::Catalog;
 pub use json_schema::{full_schema, json_schema};
@@ -42,3 +43,4 @@ pub use resolve::{Arm, Blueprint, Task, TaskRobot, UsedAsset};
 pub use schema::{Compression, CoordinatorConfig, GuardConfig, OnExit, RecordingConfig, RpcConfig};
 pub use summary::{ArmSummary, JointSummary, Limit, Origin, Summary, TaskSummary};
 pub use tick_clock::TickClock;
+pub use tool_speed::ToolRobot;

@@ -84,17 +84,25 @@ pub struct RobotEntry {
     #[serde(default)]
     pub tool: Option<Located<PoseEntry>>,
     /// The link whose frame is that of the arm's flange, in which the controller takes the centre of a load. Needed for
-    /// `attach` with a mass.
+    /// `attach` with a mass, and to compare the model with the arm.
     #[serde(default)]
     pub flange_link: Option<Located<String>>,
+    /// What happens if the arm's controller has its flange more than 30 mm or 5° from where the model has it: planned
+    /// motions are refused (`refuse`), or made with that distance as additional padding (`allow`).
+    #[serde(default)]
+    pub model_mismatch: ModelMismatch,
     /// The planned joints by their names in the model, from the base; or `{group: NAME}`: a `group` of the SRDF.
     pub joint_names: Located<RobotJoints>,
     /// Shorthand for `joint_name_mapping`: the coordinator's joint `{joint_prefix}{joint}` is the model's `{joint}`.
     #[serde(default)]
     pub joint_prefix: Option<Located<String>>,
-    /// The coordinator's joint names and the model's: `{arm_joint1: joint1}`. Default: they are the same.
+    /// The coordinator's joint names and the model's: `{arm_joint1: joint1}`, also of joints that are not planned but
+    /// measured by another arm of the run. Default: they are the same, or those that `joint_prefix` makes.
     #[serde(default)]
     pub joint_name_mapping: Keyed<Located<String>>,
+    /// Positions of joints that nothing plans or measures, by the model's names: `{yaw: 0.3}` [rad or m].
+    #[serde(default)]
+    pub fixed_joints: Keyed<Located<f64>>,
     /// The joint of the model that the arm's gripper drives: `{joint: finger, closed: 0, open: 0.04}`. Without it,
     /// plans assume a fully open gripper.
     #[serde(default)]
@@ -129,6 +137,17 @@ pub struct RobotEntry {
     /// Named poses: one position for each of `joint_names` [rad].
     #[serde(default)]
     pub named_poses: Keyed<Located<Vec<f64>>>,
+}
+
+/// What happens if a model does not fit its arm.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum ModelMismatch {
+    /// Planned motions are refused.
+    #[default]
+    Refuse,
+    /// Motions are planned with additional padding.
+    Allow,
 }
 
 /// The joint of a model that a gripper drives; other joints may follow by `mimic`.

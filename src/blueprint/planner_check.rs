@@ -2,10 +2,12 @@
 
 use crate::blueprint::arms::Hardware;
 use crate::blueprint::planner::{ObjectEntry, PlannerEntry, PoseEntry, RobotEntry, ShapeEntry, ViewConfig};
+use crate::blueprint::planner_files;
 use crate::blueprint::planner_models::Described;
 use crate::blueprint::resolve::Checker;
 use crate::blueprint::schema::{JointNames, TaskEntry};
 use crate::control::task_body::TargetKind;
+use crate::planning::config::MAX_OBJECTS;
 use crate::yaml::{Diag, Located, did_you_mean, quote};
 
 pub(super) fn check(
@@ -40,6 +42,10 @@ pub(super) fn check(
     }
     for (name, entry) in &planner.world.0 {
         object(checker, name, entry);
+    }
+    if let Some((beyond, _)) = planner.world.0.get(MAX_OBJECTS) {
+        let diag = Diag::error(format!("the world has {} objects (limit {MAX_OBJECTS})", planner.world.0.len()));
+        checker.error(beyond.at, diag.hint("describe several by one mesh or point cloud"));
     }
 }
 
@@ -118,30 +124,35 @@ fn joints(
         let diag = Diag::error("the robot has no joints");
         checker.error(robot.joint_names.at, diag.hint("list the planned joints by their names in the model"));
     }
-    if let (Some(prefix), Some((first, _))) = (&robot.joint_prefix, mapping.0.first()) {
-        let also = checker.tree.label(first.at).with_text("given here too");
-        let diag = Diag::error("`joint_prefix` and `joint_name_mapping` both map the joints' names").also(also);
-        checker.error(prefix.at, diag.hint("remove one of the two"));
+    let is_planned = |name: &str| model.iter().any(|joint| joint.value == name);
+    for (number, (_, theirs)) in mapping.0.iter().enumerate() {
+        if good && !is_planned(theirs) && !described.may_have(theirs) {
+            let diag = Diag::error(format!("the model has no independent joint {}", quote(theirs)));
+            checker.error(theirs.at, diag.maybe_hint(did_you_mean(theirs, described.names(), "its joints")));
+        }
+        if let Some((_, other)) = mapping.0.iter().take(number).find(|(_, other)| other.value == theirs.value) {
+            let also = checker.tree.label(other.at).with_text("first mapped here");
+            let diag = Diag::error(format!("the joint {} is mapped twice", quote(theirs))).also(also);
+            checker.error(theirs.at, diag.hint("one joint of the run is one joint of the model"));
+        }
+    }
+    if !good || ["joint_name_mapping", "joint_prefix"].into_iter().any(|key| !checker.has(robot.at, key)) {
         return;
     }
-    // Names of the coordinator's joints, each with its node.
-    let mut wanted: Vec<Located<String>> = Vec::new();
+    // Names of the coordinator's joints, each with its node, and whether it is planned.
+    let mut wanted: Vec<(Located<String>, bool)> = Vec::new();
     for (ours, theirs) in &mapping.0 {
-        wanted.push(ours.clone());
-        if good && !model.iter().any(|j| j.value == theirs.value) {
-            let diag = Diag::error(format!("the robot has no joint {}", quote(theirs)));
-            let hint = did_you_mean(theirs, model.iter().map(|j| j.as_str()), "its joint_names");
-            checker.error(theirs.at, diag.maybe_hint(hint));
-        }
+        wanted.push((ours.clone(), is_planned(theirs)));
     }
-    if mapping.0.is_empty() && good && checker.has(robot.at, "joint_name_mapping") {
-        if !checker.has(robot.at, "joint_prefix") {
-            return;
-        }
-        let prefix = robot.joint_prefix.as_ref();
-        for joint in model {
-            let name = format!("{}{}", prefix.map_or("", |p| p.as_str()), joint.value);
-            wanted.push(Located { at: prefix.map_or(joint.at, |p| p.at), value: name });
+    for joint in model.iter().filter(|joint| !mapping.0.iter().any(|(_, theirs)| theirs.value == joint.value)) {
+        let at = robot.joint_prefix.as_ref().map_or(joint.at, |prefix| prefix.at);
+        wanted.push((Located { at, value: planner_files::coordinator_name(robot, joint) }, true));
+    }
+    for (number, (name, _)) in wanted.iter().enumerate() {
+        if let Some((other, _)) = wanted.iter().take(number).find(|(other, _)| other.value == name.value) {
+            let also = checker.tree.label(other.at).with_text("first used here");
+            let diag = Diag::error(format!("{} is two joints of the model", quote(name))).also(also);
+            checker.error(name.at, diag.hint("one joint of the run is one joint of the model"));
         }
     }
     if !hardware.joints_known {
@@ -156,7 +167,7 @@ fn joints(
         }
     });
     let mut reported = Vec::new();
-    for name in &wanted {
+    for (name, planned) in &wanted {
         if reported.contains(&name.at) {
             continue;
         }
@@ -170,6 +181,7 @@ fn joints(
             };
             checker.error(name.at, diag.maybe_hint(hint));
         } else if let (Some(task), Some(joints)) = (task, &of_task)
+            && *planned
             && !joints.is_empty()
             && !joints.contains(&name.value)
         {

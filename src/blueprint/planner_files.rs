@@ -6,21 +6,27 @@ use std::time::Duration;
 
 use nalgebra::Isometry3;
 
-use crate::blueprint::planner::{ObjectEntry, PlannerEntry, PoseEntry, RobotEntry, ShapeEntry};
+use crate::blueprint::arms::Hardware;
+use crate::blueprint::planner::{ModelMismatch, ObjectEntry, PlannerEntry, PoseEntry, RobotEntry, ShapeEntry};
 use crate::blueprint::planner_models::Described;
 use crate::blueprint::resolve::Checker;
-use crate::planning::config::{GripperJoint, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
+use crate::planning::config::{GripperJoint, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig, Unplanned};
 use crate::pose;
 use crate::robot::Source;
 use crate::yaml::{Located, NodeId};
 
 /// Returns the configuration of the planner; only valid if nothing was reported.
-pub(super) fn resolve(checker: &Checker<'_>, typed: &PlannerEntry, described: &[Described]) -> PlannerConfig {
+pub(super) fn resolve(
+    checker: &Checker<'_>,
+    typed: &PlannerEntry,
+    described: &[Described],
+    hardware: &Hardware,
+) -> PlannerConfig {
     let robots = typed.robots.iter().zip(described);
     PlannerConfig {
         timeout: Duration::from_secs_f64(typed.planning_timeout.clamp(0.0, 86_400.0)),
         padding: typed.padding,
-        robots: robots.map(|(robot, described)| self::robot(checker, robot, described)).collect(),
+        robots: robots.map(|(robot, described)| self::robot(checker, robot, described, hardware)).collect(),
         objects: typed.world.0.iter().map(|(name, entry)| object(checker, &name.value, entry)).collect(),
     }
 }
@@ -38,14 +44,48 @@ pub(super) fn source(checker: &Checker<'_>, typed: &Located<RobotEntry>) -> Sour
     }
 }
 
-fn robot(checker: &Checker<'_>, typed: &Located<RobotEntry>, described: &Described) -> RobotConfig {
-    let joints: Vec<String> = described.joints.iter().flatten().map(|name| name.value.clone()).collect();
-    let source = source(checker, typed);
-    let ours = |model: &String| {
-        let mapped = typed.joint_name_mapping.0.iter().find(|(_, theirs)| theirs.value == *model);
-        let prefix = typed.joint_prefix.as_ref().map_or("", |prefix| prefix.as_str());
-        mapped.map_or_else(|| format!("{prefix}{model}"), |(ours, _)| ours.value.clone())
+/// Returns the coordinator's name of a joint of the model, as the robot's entry maps it.
+pub(super) fn coordinator_name(typed: &RobotEntry, model: &str) -> String {
+    let mapped = typed.joint_name_mapping.0.iter().find(|(_, theirs)| theirs.value == model);
+    let prefix = typed.joint_prefix.as_ref().map_or("", |prefix| prefix.as_str());
+    mapped.map_or_else(|| format!("{prefix}{model}"), |(ours, _)| ours.value.clone())
+}
+
+/// Returns where the joints are that are not planned: as an arm of the run measures them, or fixed.
+fn unplanned(typed: &RobotEntry, described: &Described, hardware: &Hardware) -> BTreeMap<String, Unplanned> {
+    let gripper = typed.gripper_joint.as_ref().map(|gripper| gripper.joint.as_str());
+    let has = |name: &String| hardware.entries.iter().any(|arm| arm.joints.contains(name));
+    // A joint of the run is one joint of the model.
+    let is_free = |name: &String, joint: &str| {
+        let planned = described.joints.iter().flatten().any(|own| coordinator_name(typed, own) == *name);
+        let mapped = typed.joint_name_mapping.0.iter().find(|(ours, _)| ours.value == *name);
+        !planned && mapped.is_none_or(|(_, theirs)| theirs.value == joint)
     };
+    let of = |joint: String| {
+        let fixed = || typed.fixed_joints.0.iter().find(|(name, _)| name.value == joint).map(|(_, at)| at.value);
+        let names = [coordinator_name(typed, &joint), joint.clone()].into_iter();
+        let measured = { names }.find(|name| has(name) && is_free(name, &joint));
+        Some((joint.clone(), measured.map(Unplanned::Measured).or_else(|| fixed().map(Unplanned::Fixed))?))
+    };
+    described.unplanned().into_iter().filter(|joint| gripper != Some(joint.as_str())).filter_map(of).collect()
+}
+
+fn robot(
+    checker: &Checker<'_>,
+    typed: &Located<RobotEntry>,
+    described: &Described,
+    hardware: &Hardware,
+) -> RobotConfig {
+    let mut joints: Vec<(usize, String)> =
+        described.joints.iter().flatten().map(|name| &name.value).cloned().enumerate().collect();
+    // Everywhere in the order of the arm: one list of positions means the same to `move`, with and without a plan.
+    let all: Vec<&String> = hardware.entries.iter().flat_map(|arm| &arm.joints).collect();
+    joints.sort_by_key(|(_, model)| {
+        let ours = coordinator_name(typed, model);
+        all.iter().position(|joint| **joint == ours).unwrap_or(usize::MAX)
+    });
+    let (order, joints): (Vec<usize>, Vec<String>) = joints.into_iter().unzip();
+    let source = source(checker, typed);
     RobotConfig {
         name: typed.name.value.clone(),
         model_path: source.path,
@@ -53,6 +93,7 @@ fn robot(checker: &Checker<'_>, typed: &Located<RobotEntry>, described: &Describ
         xacro_args: source.xacro_args,
         srdf: source.srdf,
         joint_limits: source.joint_limits,
+        places: source.places,
         shapes: typed.collision_shapes.0.iter().map(|(link, mode)| (link.value.clone(), mode.value)).collect(),
         convert_meshes: typed.auto_convert_meshes,
         base_pose: isometry(&typed.base_pose),
@@ -60,9 +101,11 @@ fn robot(checker: &Checker<'_>, typed: &Located<RobotEntry>, described: &Describ
         end_effector_link: typed.end_effector_link.value.clone(),
         tool: typed.tool.as_ref().map(|tool| isometry(tool)),
         flange_link: typed.flange_link.as_ref().map(|link| link.value.clone()),
-        coordinator_joints: joints.iter().map(ours).collect(),
+        controller_base: None,
+        allows_mismatch: typed.model_mismatch == ModelMismatch::Allow,
+        coordinator_joints: joints.iter().map(|joint| coordinator_name(typed, joint)).collect(),
         joints,
-        joint_prefix: typed.joint_prefix.as_ref().map_or_else(String::new, |prefix| prefix.value.clone()),
+        unplanned: unplanned(typed, described, hardware),
         gripper_joint: typed.gripper_joint.as_ref().map(|gripper| GripperJoint {
             joint: gripper.joint.value.clone(),
             closed: gripper.closed,
@@ -77,7 +120,7 @@ fn robot(checker: &Checker<'_>, typed: &Located<RobotEntry>, described: &Describ
             .named_poses
             .0
             .iter()
-            .map(|(n, p)| (n.value.clone(), p.value.clone()))
+            .map(|(n, p)| (n.value.clone(), order.iter().filter_map(|at| p.get(*at)).copied().collect()))
             .collect::<BTreeMap<_, _>>(),
     }
 }

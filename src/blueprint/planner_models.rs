@@ -4,17 +4,19 @@
 
 use std::path::Path;
 
+use crate::blueprint::arms::Hardware;
 use crate::blueprint::planner::{PlannerEntry, RobotEntry, RobotJoints, ShapeEntry};
 use crate::blueprint::planner_files;
 use crate::blueprint::resolve::Checker;
-use crate::planning::config::{ObjectShape, PlannerConfig};
-use crate::robot::model::RobotModel;
+use crate::planning::config::{ObjectShape, PlannerConfig, RobotConfig, Unplanned};
+use crate::robot::model::{Joint, RobotModel};
 use crate::robot::srdf::Semantics;
+use crate::robot::urdf::VISUAL_NOT_FOUND;
 use crate::robot::{Source, load};
 use crate::yaml::{Diag, Located, NodeId, Report, Severity, did_you_mean, quote};
 
-/// Maximum number of warnings shown per description; `dimos model check` shows all.
-const WARNINGS: usize = 5;
+/// Maximum number of missing visual meshes shown per description; `dimos model check` shows all.
+const NOT_SHOWN: usize = 5;
 
 /// The readable part of a robot's description.
 pub(super) struct Described {
@@ -22,6 +24,27 @@ pub(super) struct Described {
     semantics: Semantics,
     /// The planned joints, each with its node; `None` if they are not known.
     pub(super) joints: Option<Vec<Located<String>>>,
+}
+
+impl Described {
+    /// Returns the names of the independent joints that are not planned; none if they are not known.
+    pub(super) fn unplanned(&self) -> Vec<String> {
+        let (Some(model), Some(planned)) = (&self.model, &self.joints) else { return Vec::new() };
+        let own = model.independent_joints().into_iter().filter_map(|joint| model.joints.get(joint));
+        let is_planned = |name: &String| planned.iter().any(|joint| joint.value == *name);
+        own.map(|joint| joint.name.clone()).filter(|name| !is_planned(name)).collect()
+    }
+
+    /// Returns whether the model may have an independent joint of this name; yes if it is not known.
+    pub(super) fn may_have(&self, name: &str) -> bool {
+        let Some(model) = &self.model else { return true };
+        model.joint_index(name).and_then(|joint| model.joints.get(joint)).is_some_and(Joint::is_independent)
+    }
+
+    /// Returns the names of the model's joints.
+    pub(super) fn names(&self) -> impl Iterator<Item = &str> {
+        self.model.iter().flat_map(|model| &model.joints).map(|joint| joint.name.as_str())
+    }
 }
 
 /// Reads the descriptions of all robots, and resolves groups of joints.
@@ -35,8 +58,14 @@ pub(super) fn read(checker: &mut Checker<'_>, typed: &PlannerEntry) -> Vec<Descr
 }
 
 /// Checks robots and objects against their files.
-pub(super) fn check(checker: &mut Checker<'_>, typed: &PlannerEntry, described: &[Described], config: &PlannerConfig) {
-    for (robot, described) in typed.robots.iter().zip(described) {
+pub(super) fn check(
+    checker: &mut Checker<'_>,
+    typed: &PlannerEntry,
+    described: &[Described],
+    config: &PlannerConfig,
+    hardware: &Hardware,
+) {
+    for ((robot, described), resolved) in typed.robots.iter().zip(described).zip(&config.robots) {
         if let Some(model) = &described.model {
             names(checker, robot, described, model);
             exclusions(checker, robot, model);
@@ -44,6 +73,10 @@ pub(super) fn check(checker: &mut Checker<'_>, typed: &PlannerEntry, described: 
             meshes(checker, robot, model);
             named_poses(checker, robot, described, model);
             gripper_joint(checker, robot, described, model);
+            fixed_joints(checker, robot, described, model, resolved);
+            if hardware.joints_known && described.joints.is_some() {
+                moved_by_nothing(checker, robot, model, resolved);
+            }
         }
     }
     for ((_, entry), object) in typed.world.0.iter().zip(&config.objects) {
@@ -85,12 +118,17 @@ fn description(checker: &mut Checker<'_>, robot: &Located<RobotEntry>) -> (Optio
         let more = format!("`{check}` shows all mistakes in it");
         checker.error(at, diag.hint(first.hint.clone().unwrap_or(more)));
     }
-    for report in warnings.iter().take(WARNINGS) {
-        let (at, what) = report_position(robot, &source, report);
-        checker.error(at, Diag::warning(what).maybe_hint(report.hint.clone()));
+    // Of a description without its package all are missing; every other warning is shown.
+    let mut missing = 0;
+    for report in warnings {
+        missing += usize::from(report.message.starts_with(VISUAL_NOT_FOUND));
+        if missing <= NOT_SHOWN || !report.message.starts_with(VISUAL_NOT_FOUND) {
+            let (at, what) = report_position(robot, &source, report);
+            checker.error(at, Diag::warning(what).maybe_hint(report.hint.clone()));
+        }
     }
-    if let Some(more) = warnings.len().checked_sub(WARNINGS).filter(|more| *more > 0) {
-        let diag = Diag::warning(format!("{more} more warnings about the robot's description"));
+    if let Some(more) = missing.checked_sub(NOT_SHOWN).filter(|more| *more > 0) {
+        let diag = Diag::warning(format!("{more} more visual meshes of the robot were not found"));
         checker.error(robot.model_path.at, diag.hint(format!("`{check}` shows them all")));
     }
     (loaded.model, loaded.semantics)
@@ -113,10 +151,7 @@ fn command(source: &Source) -> String {
 
 /// Returns the key of the file with a mistake, and the mistake with its position in that file.
 fn report_position(robot: &RobotEntry, source: &Source, report: &Report) -> (NodeId, String) {
-    let what = match (&report.file, report.line, report.column) {
-        (Some(file), Some(line), Some(column)) => format!("{file}:{line}:{column}: {}", report.message),
-        _ => report.message.clone(),
-    };
+    let what = report.placed();
     let named = |path: &&Path| what.starts_with(&format!("{}:", path.display()));
     let others = [(&robot.srdf_path, &source.srdf), (&robot.joint_limits_path, &source.joint_limits)];
     let found = others.into_iter().find(|(_, path)| path.as_deref().as_ref().is_some_and(named));
@@ -204,33 +239,91 @@ fn link(checker: &mut Checker<'_>, at: NodeId, name: &str, model: &RobotModel) {
 /// Checks the gripper's joint: independent, not planned, and its positions within the limits.
 fn gripper_joint(checker: &mut Checker<'_>, robot: &RobotEntry, described: &Described, model: &RobotModel) {
     let Some(gripper) = &robot.gripper_joint else { return };
-    let name = &gripper.joint;
-    let planned = described.joints.iter().flatten().any(|joint| joint.value == name.value);
-    let diag = match model.joint_index(name).and_then(|index| model.joints.get(index)) {
+    let found = own_joint(described, model, &gripper.joint, "name the joint that the gripper drives");
+    let found = found.and_then(|joint| within(joint, &[gripper.closed, gripper.open]));
+    if let Err(diag) = found {
+        checker.error(gripper.joint.at, *diag);
+    }
+}
+
+/// Checks the joints that are said to stay where they are.
+fn fixed_joints(
+    checker: &mut Checker<'_>,
+    robot: &RobotEntry,
+    described: &Described,
+    model: &RobotModel,
+    config: &RobotConfig,
+) {
+    for (name, at) in &robot.fixed_joints.0 {
+        let of_gripper = robot.gripper_joint.as_ref().is_some_and(|gripper| gripper.joint.value == name.value);
+        let found = own_joint(described, model, name, "remove it here").and_then(|joint| within(joint, &[at.value]));
+        let diag = match (found, config.unplanned.get(&name.value)) {
+            (Err(diag), _) => *diag,
+            (Ok(()), Some(Unplanned::Measured(ours))) => {
+                let what = format!("the joint {} is measured: it is {} of the run", quote(name), quote(ours));
+                Diag::error(what).hint("remove it here")
+            }
+            (Ok(()), _) if of_gripper => {
+                Diag::error(format!("the joint {} is the gripper's", quote(name))).hint("remove it here")
+            }
+            (Ok(()), _) => continue,
+        };
+        checker.error(name.at, diag);
+    }
+}
+
+/// Reports a joint between base and tool that nothing plans, measures or fixes: no pose of the tool is known.
+fn moved_by_nothing(checker: &mut Checker<'_>, robot: &RobotEntry, model: &RobotModel, config: &RobotConfig) {
+    let links = (model.link_index(&robot.base_link), model.link_index(&robot.end_effector_link));
+    let (Some(base), Some(tip)) = links else { return };
+    let gripper = robot.gripper_joint.as_ref().map(|gripper| &gripper.joint.value);
+    let between = model.independent_of(&model.path(base, tip)).into_iter().filter_map(|joint| model.joints.get(joint));
+    let known = |name: &String| {
+        config.joints.contains(name) || config.unplanned.contains_key(name) || gripper.is_some_and(|own| own == name)
+    };
+    for joint in between.filter(|joint| !known(&joint.name)) {
+        let (name, tip) = (&joint.name, &robot.end_effector_link.value);
+        let inside = 0.0_f64.max(joint.limits.lower).min(joint.limits.upper);
+        let what = format!("the joint {} moves {}, and nothing plans or measures it", quote(name), quote(tip));
+        checker.error(
+            robot.end_effector_link.at,
+            Diag::error(what).hint(format!(
+                "`joint_name_mapping: {{JOINT: {name}}}` with the joint of the run that measures it, or \
+             `fixed_joints: {{{name}: {inside}}}` with its position"
+            )),
+        );
+    }
+}
+
+/// Returns a joint of the model that is independent and not planned.
+fn own_joint<'m>(described: &Described, model: &'m RobotModel, name: &str, hint: &str) -> Result<&'m Joint, Box<Diag>> {
+    let planned = described.joints.iter().flatten().any(|joint| joint.value == name);
+    match model.joint_index(name).and_then(|index| model.joints.get(index)) {
         None => {
-            let names = model.joints.iter().map(|joint| joint.name.as_str());
-            Diag::error(format!("the model has no joint {}", quote(name))).maybe_hint(did_you_mean(
-                name,
-                names,
-                "its joints",
-            ))
+            let what = Diag::error(format!("the model has no joint {}", quote(name)));
+            Err(what.maybe_hint(did_you_mean(name, described.names(), "its joints")).into())
         }
-        Some(_) if planned => Diag::error(format!("the joint {} is a planned joint", quote(name)))
-            .hint("name the joint that the gripper drives; it is not one of `joint_names`"),
+        Some(_) if planned => Err(Diag::error(format!("the joint {} is a planned joint", quote(name)))
+            .hint(format!("{hint}; it is not one of `joint_names`"))
+            .into()),
         Some(joint) if !joint.is_independent() => {
             let why = if joint.is_movable() { "mimics another joint" } else { "is fixed" };
-            Diag::error(format!("the joint {} {why}", quote(name))).hint("name the joint that the others mimic")
+            let what = Diag::error(format!("the joint {} {why}", quote(name)));
+            Err(what.hint("name the joint that the others mimic").into())
         }
-        Some(joint) => {
-            let limits = joint.limits;
-            let outside = |q: &f64| !(limits.lower - 1e-9..=limits.upper + 1e-9).contains(q);
-            let Some(at) = [gripper.closed, gripper.open].into_iter().find(outside) else { return };
-            let (lower, upper, unit) = (limits.lower, limits.upper, joint.kind.unit());
-            Diag::error(format!("{} at {at} {unit} is outside the model's limits", quote(name)))
-                .hint(format!("its range is {lower:.4} to {upper:.4} {unit}"))
-        }
-    };
-    checker.error(name.at, diag);
+        Some(joint) => Ok(joint),
+    }
+}
+
+/// Checks that positions are within a joint's limits.
+pub(super) fn within(joint: &Joint, positions: &[f64]) -> Result<(), Box<Diag>> {
+    let limits = joint.limits;
+    let outside = |q: &&f64| !(limits.lower - 1e-9..=limits.upper + 1e-9).contains(*q);
+    let Some(at) = positions.iter().find(outside) else { return Ok(()) };
+    let (lower, upper, unit) = (limits.lower, limits.upper, joint.kind.unit());
+    Err(Diag::error(format!("{} at {at} {unit} is outside the model's limits", quote(&joint.name)))
+        .hint(format!("its range is {lower:.4} to {upper:.4} {unit}"))
+        .into())
 }
 
 fn exclusions(checker: &mut Checker<'_>, robot: &Located<RobotEntry>, model: &RobotModel) {

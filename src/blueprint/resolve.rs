@@ -1,5 +1,7 @@
 //! The resolved blueprint: checked, with indices instead of names.
 
+use std::collections::BTreeMap;
+
 use serde_json::Value;
 
 use crate::arm::Supervision;
@@ -12,11 +14,14 @@ use crate::blueprint::schema::{
     BlueprintFile, CoordinatorConfig, GuardConfig, HardwareType, OnExit, RecordingConfig, RpcConfig,
 };
 use crate::blueprint::task_robots::{self, Base};
+use crate::blueprint::tool_speed::ToolRobot;
 use crate::blueprint::{
     arms, assets, park, planner_check, planner_files, planner_models, share, task_leaders, tasks, tick_clock,
+    tool_speed,
 };
 use crate::control::task_leader::LeaderJoint;
 use crate::control::task_spec::TaskSpec;
+use crate::hardware::check::ToolFacts;
 use crate::hardware::device::Setup;
 use crate::hardware::registry::AdapterSpec;
 use crate::joint::{JointLimits, LONGEST_NAME, may_be_in_name};
@@ -114,6 +119,12 @@ pub struct Arm {
     pub own_limits: JointLimits,
     /// Limits narrower than the arm's own, one entry for each joint.
     pub limits: Vec<JointOverride>,
+    /// What is known of its tool.
+    pub tool: ToolFacts,
+    /// Highest speed of its tool [m/s]: the blueprint's, else the vendor's.
+    pub tcp_velocity: Option<f64>,
+    /// What the speed of its tool is computed with, if a model is known.
+    pub tool_robot: Option<ToolRobot>,
 }
 
 impl Arm {
@@ -159,6 +170,8 @@ pub struct TaskRobot {
     pub tool: Option<nalgebra::Isometry3<f64>>,
     /// Its base pose if it is a robot of the planner; otherwise everything is in the frame of the model's root.
     pub base: Option<Base>,
+    /// Positions of joints that the task does not move, by the model's names [rad or m].
+    pub fixed: BTreeMap<String, f64>,
 }
 
 /// Context of all checks: the tree, the nodes that could not be read, and the catalog.
@@ -224,7 +237,7 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
         let at = if name.at == NOWHERE { root } else { name.at };
         checker.check_name(&Located { at, value: name.value.clone() }, "blueprint's name");
     }
-    let hardware = arms::resolve(&mut checker, &file.hardware);
+    let mut hardware = arms::resolve(&mut checker, &file.hardware);
     let mut tasks = tasks::resolve(&mut checker, &file.tasks, &hardware);
     tick_clock::check(&mut checker, &file.coordinator.clock, &hardware);
     park::check_tasks(&mut checker, &file.hardware, &tasks, &hardware);
@@ -233,12 +246,13 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
     let planner = file.planner.as_ref().map(|planner| {
         let described = planner_models::read(&mut checker, planner);
         planner_check::check(&mut checker, planner, &described, file.view.as_ref(), &file.tasks, &hardware);
-        let config = planner_files::resolve(&checker, planner, &described);
-        planner_models::check(&mut checker, planner, &described, &config);
+        let config = planner_files::resolve(&checker, planner, &described, &hardware);
+        planner_models::check(&mut checker, planner, &described, &config, &hardware);
         config
     });
     let guard = guard(&mut checker, file.guard.as_ref(), planner.is_some());
     task_robots::resolve(&mut checker, &file.tasks, &mut tasks, planner.as_ref(), &hardware);
+    tool_speed::resolve(&mut checker, &file.hardware, &mut hardware, &tasks, planner.as_ref());
     task_leaders::resolve(&mut checker, &file.tasks, &mut tasks, &hardware);
     let assets = assets::resolved(&checker, &file.tasks, file.planner.as_ref());
     let view = file.view.or_else(|| file.planner.and_then(|p| p.value.visualization));

@@ -50,7 +50,7 @@ pub struct ShareEntry {
     /// Whether operators may make arms ready again from another computer, where they may not see them: `arm reset`,
     /// `arm enable`, `arm teach`, `arm take-over`.
     pub remote_enable: bool,
-    /// Maximum number of clients.
+    /// Maximum number of clients of each user.
     #[schemars(range(min = 1, max = 48))]
     pub max_clients: Located<usize>,
     /// The run as the coordinator of Python dimos.
@@ -215,7 +215,7 @@ pub struct ShareConfig {
     pub observers_stop: bool,
     /// Whether operators may reset and enable arms.
     pub remote_enable: bool,
-    /// Maximum number of clients.
+    /// Maximum number of clients of each user.
     pub max_clients: usize,
     /// The run as the coordinator of Python dimos.
     #[serde(default)]
@@ -321,7 +321,8 @@ pub(super) fn resolve(checker: &mut Checker<'_>, entry: &Located<ShareEntry>, jo
     };
     if !(1..=MOST_CLIENTS).contains(&config.max_clients) {
         let diag = Diag::error(format!("max_clients is {} (limit {MOST_CLIENTS})", config.max_clients));
-        checker.error(entry.max_clients.at, diag.hint("a run has 128 connections, and each client takes two"));
+        checker
+            .error(entry.max_clients.at, diag.hint("a run has 128 connections, which the clients of all users share"));
     }
     // Where a key could not be read, what follows from its absence is no mistake.
     let whole = |list| {

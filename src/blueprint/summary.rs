@@ -72,6 +72,10 @@ pub struct ArmSummary {
     pub park_pose: Vec<f64>,
     /// Whether the arm keeps its pose when its motors are disabled.
     pub holds_when_disabled: bool,
+    /// Highest speed of its tool [m/s]; absent if neither its manual nor the blueprint limits that.
+    pub tcp_velocity: Option<Limit>,
+    /// Whether a model of the arm is known, so that this limit is kept.
+    pub tcp_velocity_is_kept: bool,
     /// Its joints.
     pub joints: Vec<JointSummary>,
 }
@@ -153,6 +157,11 @@ fn arm(arm: &Arm) -> ArmSummary {
         on_exit_from: if arm.on_exit_given { Origin::Blueprint } else { Origin::Default },
         park_pose: arm.park_pose.clone(),
         holds_when_disabled: arm.adapter.holds_when_disabled,
+        tcp_velocity: arm.tcp_velocity.map(|value| Limit {
+            value,
+            from: if arm.tool.velocity == Some(value) { Origin::Adapter } else { Origin::Blueprint },
+        }),
+        tcp_velocity_is_kept: matches!(arm.tool_limit(), Ok(Some(_))),
         joints: (0..arm.joints.len()).map(|joint| joint_summary(arm, joint)).collect(),
     }
 }

@@ -1,7 +1,7 @@
 //! Finds the robot of each Cartesian task, in its own parameters or among the planner's robots, and checks it against
 //! its description.
 
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use nalgebra::Isometry3;
@@ -9,13 +9,14 @@ use serde::Deserialize;
 
 use crate::blueprint::arms::Hardware;
 use crate::blueprint::planner_files::file;
+use crate::blueprint::planner_models::within;
 use crate::blueprint::resolve::{Checker, Task, TaskRobot};
 use crate::blueprint::schema::TaskEntry;
 use crate::blueprint::task_pos::TaskPos;
 use crate::control::task_robot::{FramePose, RobotParams, TaskKinematics};
 use crate::planning::config::{PlannerConfig, RobotConfig};
 use crate::robot::kinematics::Kinematics;
-use crate::robot::model::{JointKind, RobotModel};
+use crate::robot::model::{Joint, JointKind, RobotModel};
 use crate::robot::{Source, load};
 use crate::yaml::{Diag, Located, Severity, did_you_mean, quote};
 
@@ -64,6 +65,7 @@ fn robot(
             link: String::new(),
             tool: None,
             base: None,
+            fixed: BTreeMap::new(),
         },
         (None, Some(planned)) => of_planner(planned, joints, mapped),
         (None, None) => {
@@ -74,6 +76,7 @@ fn robot(
             return None;
         }
     };
+    robot.fixed.extend(params.fixed_joints.clone());
     match &params.end_effector_link {
         Some(link) => robot.link.clone_from(link),
         None if params.model_path.is_some() => {
@@ -86,12 +89,12 @@ fn robot(
     }
     // The tool is on a link: a task with another link moves that link.
     robot.tool = planned.filter(|planned| planned.end_effector_link == robot.link).and_then(|planned| planned.tool);
-    check(checker, pos, &robot, joints);
+    check(checker, pos, &robot, joints, planned.filter(|_| params.model_path.is_none()));
     Some(robot)
 }
 
 /// Returns a planning robot as the robot of a task.
-fn of_planner(planned: &RobotConfig, joints: &[String], mapped: Option<Vec<String>>) -> TaskRobot {
+pub(super) fn of_planner(planned: &RobotConfig, joints: &[String], mapped: Option<Vec<String>>) -> TaskRobot {
     let model_name = |ours: &String| {
         let at = planned.coordinator_joints.iter().position(|j| j == ours);
         at.and_then(|at| planned.joints.get(at)).unwrap_or(ours).clone()
@@ -107,14 +110,11 @@ fn of_planner(planned: &RobotConfig, joints: &[String], mapped: Option<Vec<Strin
         link: planned.end_effector_link.clone(),
         tool: None,
         base: Some((planned.base_link.clone(), planned.base_pose)),
+        fixed: planned.fixed_joints().map(|(name, at)| (name.to_owned(), at)).collect(),
     }
 }
 
-fn packages(
-    checker: &Checker<'_>,
-    pos: &TaskPos<'_>,
-    params: &RobotParams,
-) -> std::collections::BTreeMap<String, PathBuf> {
+fn packages(checker: &Checker<'_>, pos: &TaskPos<'_>, params: &RobotParams) -> BTreeMap<String, PathBuf> {
     let at = pos.of(checker, "package_paths");
     params.package_paths.iter().map(|(name, path)| (name.clone(), file(checker, at, path))).collect()
 }
@@ -127,39 +127,38 @@ fn mapping(
     joints: &[String],
 ) -> Option<Option<Vec<String>>> {
     let (prefix, mapping) = (&params.joint_prefix, &params.joint_name_mapping);
-    match prefix {
-        Some(_) if !mapping.is_empty() => {
-            let at = pos.of(checker, "joint_prefix");
-            let diag = Diag::error("`joint_prefix` and `joint_name_mapping` both map the joints' names");
-            checker.error(at, diag.hint("remove one of the two"));
+    if prefix.is_none() && mapping.is_empty() {
+        return Some(None);
+    }
+    if let Some(odd) = mapping.keys().find(|ours| !joints.contains(ours)) {
+        let diag = Diag::error(format!("the task has no joint {}", quote(odd)));
+        let hint = did_you_mean(odd, joints.iter().map(String::as_str), "its joints");
+        checker.error(pos.of(checker, "joint_name_mapping"), diag.maybe_hint(hint));
+        return None;
+    }
+    // A joint that is not mapped has the prefix.
+    let prefix = prefix.as_deref().unwrap_or_default();
+    let name = |ours: &String| mapping.get(ours).cloned().or_else(|| Some(ours.strip_prefix(prefix)?.to_owned()));
+    let named: Result<Vec<String>, &String> = joints.iter().map(|ours| name(ours).ok_or(ours)).collect();
+    match named {
+        Ok(named) => Some(Some(named)),
+        Err(odd) => {
+            let diag = Diag::error(format!("the joint {} does not begin with {}", quote(odd), quote(prefix)));
+            let hint = "`joint_prefix` and the model's name make the coordinator's joint name";
+            checker.error(pos.of(checker, "joint_prefix"), diag.hint(hint));
             None
-        }
-        None if mapping.is_empty() => Some(None),
-        Some(prefix) => {
-            let odd = joints.iter().find(|joint| !joint.starts_with(prefix.as_str()));
-            if let Some(odd) = odd {
-                let at = pos.of(checker, "joint_prefix");
-                let diag = Diag::error(format!("the joint {} does not begin with {}", quote(odd), quote(prefix)));
-                checker.error(at, diag.hint("`joint_prefix` and the model's name make the coordinator's joint name"));
-                return None;
-            }
-            Some(Some(joints.iter().map(|j| j.strip_prefix(prefix.as_str()).unwrap_or(j).to_owned()).collect()))
-        }
-        None => {
-            let at = pos.of(checker, "joint_name_mapping");
-            if let Some(odd) = mapping.keys().find(|ours| !joints.contains(ours)) {
-                let diag = Diag::error(format!("the task has no joint {}", quote(odd)));
-                let hint = did_you_mean(odd, joints.iter().map(String::as_str), "its joints");
-                checker.error(at, diag.maybe_hint(hint));
-                return None;
-            }
-            Some(Some(joints.iter().map(|ours| mapping.get(ours).unwrap_or(ours).clone()).collect()))
         }
     }
 }
 
 /// Checks a task's robot against its description.
-fn check(checker: &mut Checker<'_>, pos: &TaskPos<'_>, robot: &TaskRobot, ours: &[String]) {
+fn check(
+    checker: &mut Checker<'_>,
+    pos: &TaskPos<'_>,
+    robot: &TaskRobot,
+    ours: &[String],
+    planned: Option<&RobotConfig>,
+) {
     if checker.assets.source_awaited(&robot.source) {
         return;
     }
@@ -197,24 +196,52 @@ fn check(checker: &mut Checker<'_>, pos: &TaskPos<'_>, robot: &TaskRobot, ours: 
         return checker.error(pos.of(checker, "end_effector_link"), diag.maybe_hint(hint));
     };
     if good {
-        check_chain(checker, pos, robot, &model, link);
+        check_chain(checker, pos, robot, (&model, link), planned);
     }
 }
 
-/// Checks that the task's joints move the end effector.
-fn check_chain(checker: &mut Checker<'_>, pos: &TaskPos<'_>, robot: &TaskRobot, model: &RobotModel, link: usize) {
-    let chain = model.chain(0, link).unwrap_or_default();
-    let names: Vec<&str> = chain.iter().filter_map(|j| model.joints.get(*j)).map(|j| j.name.as_str()).collect();
-    if !robot.joints.iter().any(|j| names.contains(&j.as_str())) {
+/// Checks that the task's joints move the end effector, and that all others on the way to it stay where they are known
+/// to be: a task does not follow them.
+fn check_chain(
+    checker: &mut Checker<'_>,
+    pos: &TaskPos<'_>,
+    robot: &TaskRobot,
+    (model, link): (&RobotModel, usize),
+    planned: Option<&RobotConfig>,
+) {
+    let base = robot.base.as_ref().and_then(|(base, _)| model.link_index(base)).unwrap_or(0);
+    let between = model.independent_of(&model.path(base, link));
+    let between: Vec<&Joint> = between.into_iter().filter_map(|joint| model.joints.get(joint)).collect();
+    if !between.iter().any(|joint| robot.joints.contains(&joint.name)) {
         let diag = Diag::error(format!("no joint of the task moves the link {}", quote(&robot.link)));
         let at = pos.of(checker, "end_effector_link");
         return checker.error(at, diag.hint("name a link below the task's joints"));
     }
-    let independent = chain.iter().filter_map(|j| model.joints.get(*j)).filter(|j| j.is_independent());
-    if let Some(other) = { independent }.find(|j| !robot.joints.contains(&j.name)) {
-        let what = format!("the joint {} moves the end effector but is not a joint of the task", quote(&other.name));
-        let diag = Diag::warning(what).note("the task assumes that it is fixed at 0");
-        checker.error(pos.entry.joint_names.at, diag.hint("add it to the task's joints, if the coordinator has it"));
+    let known = |name: &String| robot.joints.contains(name) || robot.fixed.contains_key(name);
+    if let Some(other) = between.iter().find(|joint| !known(&joint.name)) {
+        let name = &other.name;
+        let what = format!("the joint {} moves the end effector but is not a joint of the task", quote(name));
+        let gripper = planned.and_then(|planned| planned.gripper_joint.as_ref());
+        let follows = gripper.is_some_and(|own| own.joint == *name)
+            || planned.is_some_and(|planned| planned.unplanned.contains_key(name));
+        let hint = format!("`params: {{fixed_joints: {{{name}: POSITION}}}}` with where it is while the task runs");
+        let diag = match follows {
+            true => Diag::error(what).note("the planner follows it where it is measured; a task does not").hint(hint),
+            false => Diag::error(what).hint(format!("add it to the task's joints, or {hint}")),
+        };
+        checker.error(pos.entry.joint_names.at, diag);
+    }
+    for (name, at) in &robot.fixed {
+        let joint = model.joint_index(name).and_then(|joint| model.joints.get(joint));
+        let wrong = match joint.filter(|joint| joint.is_independent() && !robot.joints.contains(name)) {
+            None => Diag::error(format!("the model has no joint {} that stays where it is", quote(name)))
+                .hint("name an independent joint that the task does not move"),
+            Some(joint) => match within(joint, &[*at]) {
+                Ok(()) => continue,
+                Err(diag) => *diag,
+            },
+        };
+        checker.error(pos.of(checker, "fixed_joints"), wrong);
     }
 }
 
@@ -228,11 +255,12 @@ impl TaskRobot {
         let link = |name: &str| model.link_index(name).ok_or_else(|| format!("the model has no link {name:?}"));
         let joint = |name: &String| model.joint_index(name).ok_or_else(|| format!("the model has no joint {name:?}"));
         let joints = self.joints.iter().map(joint).collect::<Result<Vec<_>, _>>()?;
-        let kinematics = Kinematics::new(&model, &joints, &[]).map_err(|e| e.to_string())?;
+        let fixed = self.fixed.iter().map(|(name, at)| (name.clone(), *at)).collect();
+        let rest = model.positions(&fixed);
+        let kinematics = Kinematics::new(&model, &joints, &rest).map_err(|e| e.to_string())?;
         let mut robot = TaskKinematics::new(kinematics, link(&self.link)?);
         robot.tool = self.tool.as_ref().map_or(FramePose::SAME, FramePose::from);
         if let Some((base_link, base_pose)) = &self.base {
-            let rest = model.positions(&HashMap::new());
             let base = model.link_poses(&rest).get(link(base_link)?).copied().unwrap_or_default();
             robot.root = FramePose::from(&(base_pose * base.inverse()));
             robot.base = base.rotation.coords.into();

@@ -6,6 +6,7 @@ mod bus;
 mod calibrate;
 mod configure;
 mod find_port;
+mod kinematics;
 mod live_table;
 pub(super) mod parts;
 mod setup_motors;
@@ -54,6 +55,8 @@ enum Action {
     Reset(ArmArgs),
     /// Lead the arm by hand, and record the motion
     Teach(teach::Args),
+    /// Let `move` and `execute` move an arm at full speed: until then, one that you have not driven yet moves at 25 %
+    FullSpeed(ArmArgs),
     /// Open or close the gripper, and wait for the outcome: open, closed, holding an object, blocked
     #[command(after_help = "\
 Exit code 0: the fingers are where they were sent, or hold an object. 1: blocked, or no outcome within --timeout.
@@ -68,6 +71,8 @@ Exit code 0: the fingers are where they were sent, or hold an object. 1: blocked
     SetupMotors(setup_motors::Args),
     /// Record the middle pose and the range of each joint by hand; motors off, no run needed
     Calibrate(calibrate::Args),
+    /// Show an arm's dimensions, as its maker measured them and its controller has them
+    Kinematics(kinematics::Args),
     /// Compare the motors' stored settings with those the adapter wants, and write them; no run needed
     Configure(configure::Args),
     /// Show the digital and analogue inputs and outputs, or set outputs
@@ -132,11 +137,13 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
             }
             Ok(Exit::Ok)
         }
+        Action::FullSpeed(which) => super::full_speed::run(which),
         Action::Gripper(args) => gripper(args),
         Action::Teach(args) => teach::run(args),
         Action::Io(args) => parts::io(args),
         Action::Payload(args) => parts::payload(args),
         Action::Tool(args) => tool::run(args),
+        Action::Kinematics(args) => kinematics::run(args, registry),
         Action::FindPort(args) => find_port::run(args, registry),
         Action::SetupMotors(args) => setup_motors::run(args, registry),
         Action::Calibrate(args) => calibrate::run(args, registry),

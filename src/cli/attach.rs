@@ -20,6 +20,7 @@ use crate::rpc::api::{State, Status};
 use crate::rpc::client::{self, Client, ClientError};
 use crate::rpc::report::{ArmReport, StatusReport};
 use crate::rpc::run_dir::{Claim, LiveRun, RunDir};
+use crate::runtime::kinematics::use_kept;
 use crate::runtime::{AttachedPlanner, Ending, LinkEvent};
 use crate::share::Relay;
 use crate::view::{self, Shown, View};
@@ -186,6 +187,10 @@ impl Attached {
         let name = args.name.clone().unwrap_or_else(|| blueprint.name.clone());
         let claim = RunDir::standard().planners().claim(&name);
         let claim = claim.map_err(|e| Failure::new(Exit::Failed, e.to_string()).hint(e.hint()))?;
+        // The arms are connected in the run: their dimensions are those that were kept.
+        let mut blueprint = blueprint.clone();
+        use_kept(&mut blueprint).iter().for_each(|line| terminal.note(format!("  model      {line}")));
+        let blueprint = &blueprint;
         let config = blueprint.planner.clone().unwrap_or_default();
         let (terminal, json) = (terminal.clone(), args.json);
         let on_event = {
@@ -210,7 +215,7 @@ impl Attached {
             .and_then(|mut client| Ok((client.call(Status {})?, client.call(State {})?)));
         let view = reports.as_ref().ok().filter(|_| !args.no_view).and_then(|(status, state)| {
             let (config, shown) = (view::config_of(blueprint)?, Shown::of_attached(blueprint, status, state));
-            let served = View::start(&config, shown, &run.socket, claim.socket());
+            let served = View::start(&config, shown, &run.socket, &claim.files());
             served.inspect_err(|why| tracing::warn!("no live view: {why}")).ok()
         });
         let arms = reports.map(|(status, _)| status.arms).unwrap_or_default();

@@ -17,6 +17,7 @@ use crate::planning::topp::JointBound;
 use crate::recording::replay::LogReader;
 use crate::replay::motion::{RecordedMotion, tcp_path};
 use crate::replay::recorded::Recorded;
+use crate::replay::recorded::RecordedError;
 use crate::replay::retrace::{Back, ON_PATH, Retrace, RetraceError, retrace};
 use crate::rpc::api::{
     Execute, ExecutePlan, MAX_LINE, Motion, Plan, PlanGoal, Planner, Point, State, Status, Trajectory,
@@ -198,7 +199,9 @@ fn way_back(
         for window in WINDOWS {
             let since = ((from.unwrap_or(stamp).min(stamp) - window).max(0.0) * 1e9) as u64;
             let motion = RecordedMotion::measured(log, &joints, since, u64::MAX);
-            let motion = motion.map_err(|e| Failure::of(Exit::Failed, e))?;
+            let exit =
+                |e: &RecordedError| if matches!(e, RecordedError::Lacks { .. }) { Exit::Log } else { Exit::Failed };
+            let motion = motion.map_err(|e| Failure::of(exit(&e), e))?;
             let tcp = args.distance.map(|_| tcp_path(log, arm, since, u64::MAX)).transpose();
             let tcp = tcp.map_err(|e| Failure::of(Exit::Failed, e))?.unwrap_or_default();
             let back = match (args.distance, args.time) {

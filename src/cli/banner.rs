@@ -5,8 +5,13 @@ use std::path::Path;
 use serde::Serialize;
 
 use super::text_log::Terminal;
+use crate::control::arm_control::effective;
 use crate::rpc::report::{ArmReport, RealtimeReport, StatusReport};
 use crate::runtime::Ended;
+use crate::telemetry::texts::percent;
+
+/// Fractions from here on are shown as full speed.
+const FULL: f64 = 0.9995;
 
 /// Last line of the banner of a run with a terminal.
 pub const IN_A_TERMINAL: &str = "Press Ctrl-C for a controlled stop. In a second terminal: dimos status";
@@ -51,6 +56,7 @@ pub fn text(report: &StatusReport, socket: &Path, url: Option<&str>, end: &str) 
         if let Some(cause) = cause(arm) {
             row("", format!("{}: {cause}", arm.phase));
         }
+        arm.model_notes.iter().for_each(|note| row("", format!("model: {note}")));
         row("", format!("at exit: {}", at_exit(arm)));
     }
     let clock = Some(&report.ticks.clock).filter(|clock| clock.starts_with("device"));
@@ -92,6 +98,17 @@ pub fn cause(arm: &ArmReport) -> Option<String> {
     let cause = &arm.cause.as_ref()?.text;
     let error = arm.error.as_ref().filter(|error| cause.ends_with(&format!("error {}", error.code)));
     Some(error.map_or_else(|| cause.clone(), |error| format!("{cause}: {}", error.text)))
+}
+
+/// Returns that an arm's controller slows its motions, or stops them on their paths; `None` if it does not.
+pub fn slowed(arm: &str, fraction: Option<f64>) -> Option<String> {
+    match effective(fraction) {
+        0.0 => Some(format!("{arm} is stopped by its controller (0 % of the speed): motions wait on their paths")),
+        fraction if fraction < FULL => {
+            Some(format!("{arm} is slowed by its controller to {} of the speed", percent(fraction)))
+        }
+        _ => None,
+    }
 }
 
 /// Describes the motors after the end of the run.

@@ -2,10 +2,11 @@
 
 use std::time::Duration;
 
-use super::arguments::Target;
+use super::arguments::{Target, connect};
 use super::exit::{Exit, Result};
 use super::output;
 use crate::rpc::api::{Cancel, Status};
+use crate::rpc::client::Client;
 use crate::rpc::report::TaskReport;
 
 /// Time in which a client that streams sends its next targets.
@@ -26,8 +27,8 @@ pub struct Args {
 
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
-    let mut client = args.target_run.connect()?;
-    let reply = client.call(Cancel { arm: args.arm.clone(), task: args.task.clone(), plan: None })?;
+    let cancel = Cancel { arm: args.arm.clone(), task: args.task.clone(), plan: None };
+    let (mut client, reply) = Client::urgent(None, || connect(args.target_run.run.as_deref()), &cancel)?;
     if args.target_run.json {
         output::json(&reply);
         return Ok(Exit::Ok);

@@ -9,7 +9,12 @@ use super::exit::{Exit, Failure, Result};
 use super::output::{self, Table};
 use super::{banner, fetch};
 use crate::blueprint::{self, Catalog, Limit, Loaded, OnExit, Overrides, Summary};
+use crate::message::Message;
+use crate::rpc::RpcError;
+use crate::rpc::run_dir;
+use crate::runtime::device_lock;
 use crate::share;
+use crate::yaml::Diag;
 
 /// Arguments of `check`.
 #[derive(Debug, clap::Args)]
@@ -65,45 +70,55 @@ pub fn print_warnings(loaded: &Loaded) {
 
 /// Checks a blueprint and prints the result.
 pub fn report(name: &str, overrides: &Overrides, catalog: Catalog<'_>, as_json: bool) -> Result {
-    let loaded = load(name, overrides, catalog)?;
-    let summary = loaded.blueprint.as_ref().map(Summary::of);
-    let robots = loaded.blueprint.as_ref().map(robots::of).unwrap_or_else(|| Ok(Vec::new()));
-    let shared = loaded.blueprint.as_ref().and_then(|blueprint| blueprint.share.as_ref());
-    let certificates = shared.map_or(Ok(None), share::check_gateway);
+    let mut loaded = load(name, overrides, catalog)?;
+    let (summary, mut robots, mut soon) = (loaded.blueprint.as_ref().map(Summary::of), Vec::new(), None);
+    if let Some(blueprint) = loaded.blueprint.take() {
+        robots::judge(&blueprint).into_iter().for_each(|diag| loaded.report(diag));
+        match robots::of(&blueprint) {
+            Ok(found) => robots = found,
+            Err(what) => loaded.report(error(what.into())),
+        }
+        match blueprint.share.as_ref().map_or(Ok(None), share::check_gateway) {
+            Ok(found) => soon = found,
+            Err(RpcError { message: what, hint, .. }) => loaded.report(error(Message { what, hint })),
+        }
+        if let Some(text) = &soon {
+            loaded.report(Diag::warning(text).hint("make a new certificate: docs/many-machines.md"));
+        }
+        loaded.blueprint = Some(blueprint);
+    }
     if as_json {
         let mut document = loaded.to_json();
         document["blueprint"] = json!(summary);
-        match &robots {
-            Ok(robots) => document["robots"] = json!(robots),
-            Err(what) => document["valid"] = robots::refuse(&mut document["problems"], what),
-        }
-        match &certificates {
-            Ok(soon) => document["certificates"] = json!(soon),
-            Err(error) => {
-                robots::refuse(&mut document["diagnostics"], &error.message);
-                (document["ok"], document["errors"]) = (json!(false), json!(loaded.errors() + 1));
-            }
-        }
+        document["robots"] = json!(robots);
+        document["certificates"] = json!(soon);
         output::json(&document);
-        let valid = summary.is_some() && robots.is_ok() && certificates.is_ok();
-        return Ok(if valid { Exit::Ok } else { Exit::Usage });
+        return Ok(if loaded.errors() == 0 { Exit::Ok } else { Exit::Usage });
     }
-    let Some(summary) = summary else { return Err(mistakes(&loaded)) };
+    let Some(summary) = summary.filter(|_| loaded.errors() == 0) else { return Err(mistakes(&loaded)) };
     print_warnings(&loaded);
-    let robots = robots.map_err(Failure::usage)?;
-    let soon = certificates.map_err(|error| Failure::usage(error.message).maybe_hint(error.hint))?;
     print(&summary);
     robots.iter().for_each(robots::print);
     let awaited = loaded.blueprint.iter().flat_map(|blueprint| blueprint.awaited_assets());
     for asset in awaited {
         output::note(format_args!("{} is not downloaded yet: its contents were not checked", asset.name));
     }
-    if let Some(text) = soon {
-        output::note(format_args!("warning: {text}\nhint: make a new certificate: docs/many-machines.md"));
+    if std::env::var_os(run_dir::WORLD).is_some() {
+        let arms = summary.arms.iter().filter(|arm| !arm.simulated && !arm.address.is_empty());
+        for arm in arms.filter(|arm| !device_lock::is_this_computer(&arm.address)) {
+            let (id, address) = (&arm.hardware_id, &arm.address);
+            let what = "is outside of DIMOS_WORLD: a run would refuse it";
+            output::note(format_args!("warning: arm {id} at {address} {what}\nhint: unset DIMOS_WORLD"));
+        }
     }
     output::line("");
-    output::line("no mistakes");
+    output::line(output::no_mistakes(loaded.warnings()));
     Ok(Exit::Ok)
+}
+
+/// Returns the error that a run would end with.
+fn error(Message { what, hint }: Message) -> Diag {
+    Diag::error(what).maybe_hint(hint)
 }
 
 fn print(summary: &Summary) {
@@ -139,6 +154,10 @@ fn print(summary: &Summary) {
             table.row(cells);
         }
         table.print();
+        if let Some(Limit { value, from }) = arm.tcp_velocity {
+            let kept = if arm.tcp_velocity_is_kept { from.name() } else { "not kept: no model of the arm is known" };
+            output::wrapped(format_args!("  tool: at most {value:.3} m/s ({kept})"));
+        }
     }
     output::line("");
     let mut table = Table::new(&["TASK", "TYPE", ">PRIORITY", "~JOINTS"]);

@@ -59,8 +59,8 @@ pub fn run(args: &Args) -> Result {
             };
         }
     };
-    let mut client = Client::connect(&found.name, &found.socket)?;
-    client.call(Shutdown {})?;
+    let connect = || Client::connect(&found.name, &found.socket);
+    let (mut client, _) = Client::urgent(None, connect, &Shutdown {})?;
     let requested = Instant::now();
     // Afterwards, and over the same connection: a slow report delays no shutdown, and is that of the run that ends. One
     // that has ended already reports nothing.
@@ -70,7 +70,8 @@ pub fn run(args: &Args) -> Result {
     // The name is free before the process has written its last lines.
     let recorded = || RunRecord::of(&found.name).filter(|record| record.pid == found.pid);
     let is_live = || recorded().is_some_and(|record| record.state() == RunState::Live);
-    while folder.runs().map_err(ClientError::from)?.contains(&found) || is_live() {
+    let is_found = |run: &LiveRun| run.name == found.name && run.pid == found.pid;
+    while folder.runs().map_err(ClientError::from)?.iter().any(is_found) || is_live() {
         if requested.elapsed() > timeout {
             let what = format!("{} is still shutting down: pid {} has not exited", found.name, found.pid);
             return Err(Failure::new(Exit::Failed, what).hint("its terminal or `dimos logs` shows the reason"));
@@ -164,7 +165,7 @@ fn only_planners(planners: &[LiveRun]) -> Failure {
 /// Returns the selected run; for one that has ended, its failure.
 fn find(folder: &RunDir, name: Option<&str>) -> Result<LiveRun> {
     client::find(folder, name).map_err(|error| {
-        let dead = name.and_then(RunRecord::of).and_then(|record| record.failure());
+        let dead = name.and_then(RunRecord::failure_of);
         dead.unwrap_or_else(|| error.into())
     })
 }

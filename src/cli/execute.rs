@@ -5,8 +5,9 @@ use std::path::PathBuf;
 use super::arguments::Target;
 use super::exit::{Exit, Failure, Result};
 use super::follow::{Signals, follow};
-use super::{output, trajectory_file};
-use crate::rpc::api::{Execute, ExecutePlan};
+use super::{full_speed, output, trajectory_file};
+use crate::rpc::api::{Execute, ExecutePlan, Planner, Planning, Trajectory};
+use crate::rpc::client::Client;
 
 /// Arguments of `execute`.
 #[derive(Debug, clap::Args)]
@@ -49,7 +50,9 @@ pub fn run(args: &Args) -> Result {
     let mut client = args.target_run.connect()?;
     let signals = (!args.no_wait).then(Signals::watch);
     let begun = match trajectory {
-        Some(trajectory) => {
+        Some(mut trajectory) => {
+            let joints = trajectory.joint_names.clone();
+            stretch(&mut trajectory, full_speed::limit_of(&mut client, |_| Ok(joints))?);
             let points = trajectory.points.len();
             let begun = client.call(Execute { trajectory, task: args.task.clone(), retraces_to: None })?;
             output::note(format_args!(
@@ -59,10 +62,12 @@ pub fn run(args: &Args) -> Result {
             begun
         }
         None => {
+            let max_speed = full_speed::limit_of(&mut client, |client| joints_of(client, args.plan))?;
             let begun = client.call(ExecutePlan {
                 plan: args.plan,
                 replan: args.replan,
                 unproven: args.unproven,
+                max_speed: Some(max_speed).filter(|speed| *speed < 1.0),
                 ..ExecutePlan::default()
             })?;
             let (motion, task) = (begun.motion, &begun.task);
@@ -80,4 +85,23 @@ pub fn run(args: &Args) -> Result {
             Ok(Exit::Ok)
         }
     }
+}
+
+/// Slows a trajectory to this fraction of its speed.
+fn stretch(trajectory: &mut Trajectory, speed: f64) {
+    for point in &mut trajectory.points {
+        point.time_from_start /= speed;
+        point.velocities.iter_mut().flatten().for_each(|v| *v *= speed);
+        point.accelerations.iter_mut().flatten().for_each(|a| *a *= speed * speed);
+    }
+}
+
+/// Returns the joints that a plan moves; none without a plan: `execute_plan` says why.
+fn joints_of(client: &mut Client, plan: Option<u64>) -> Result<Vec<String>> {
+    let plan = match plan {
+        Some(plan) => Some(plan),
+        None => client.call(Planner {})?.plan,
+    };
+    let report = plan.map(|plan| client.call(Planning { plan })).transpose()?;
+    Ok(report.and_then(|report| report.summary).map(|summary| summary.joints).unwrap_or_default())
 }

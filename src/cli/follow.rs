@@ -84,7 +84,9 @@ pub fn watch(
             continue;
         }
         bar.set_position((report.progress.clamp(0.0, 1.0) * 1000.0) as u64);
-        let left = format!("{:.1} s left", report.remaining.max(0.0));
+        let slowed =
+            report.speed_fraction.map_or_else(String::new, |at| format!(", its controller at {}", percent(at)));
+        let left = format!("{:.1} s left{slowed}", report.remaining.max(0.0));
         // A script or a log has no progress bar that shows why nothing moves.
         let pauses = report.speed.as_ref().is_some_and(|speed| speed.paused);
         if pauses && !std::mem::replace(&mut paused, pauses) && bar.is_hidden() {

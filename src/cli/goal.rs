@@ -52,9 +52,10 @@ pub struct Goal {
     /// left=by:x,y,z moves by a distance; @FRAME after a pose gives its frame: left=by:0,0,0.05@tool
     #[arg(long = "goal", value_name = "ARM=GOAL", value_parser = arm_goal, conflicts_with_all = ["joints", "tcp", "named"], group = "goal")]
     pub several: Vec<PlanGoal>,
-    /// One motion through these waypoints; the last is the goal. Each is a named pose, joints as 0.1,-0.3,0.6,0,0.8,0,
-    /// or pose:x,y,z,r,p,y (also with x,y,z or a quaternion, and @FRAME); line:… is reached on a straight
-    /// line. With `move` also gripper:open, gripper:close or gripper:0.03, where the arm waits for the outcome
+    /// One motion through these waypoints; the last is the goal. Each is a named pose (named:1 if its name is a
+    /// number), joints as 0.1,-0.3,0.6,0,0.8,0, or pose:x,y,z,r,p,y (also with x,y,z or a quaternion, and @FRAME);
+    /// line:… is reached on a straight line. With `move` also gripper:open, gripper:close or gripper:0.03, where the
+    /// arm waits for the outcome
     #[arg(long, value_name = "WAYPOINT", num_args = 2.., value_parser = waypoint, allow_negative_numbers = true, conflicts_with_all = ["joints", "tcp", "named", "several"], group = "goal")]
     pub through: Vec<Waypoint>,
     /// Follow the path of a motion that was led or recorded: .csv or .json as for `execute`, or a log (.mcap). Its
@@ -136,7 +137,8 @@ fn waypoint(text: &str) -> std::result::Result<Waypoint, String> {
         Some(_) => {
             return Err("must be a name, joints as 0.1,-0.3,…, pose:x,y,z,…, line:x,y,z,… or gripper:close".into());
         }
-        None if text.contains(',') => planned.joints = Some(numbers(text)?),
+        // Of an arm with one joint.
+        None if text.contains(',') || finite(text).is_ok() => planned.joints = Some(numbers(text)?),
         None => planned.named = Some(text.to_owned()),
     }
     Ok(Waypoint::Goal(planned))
@@ -267,9 +269,13 @@ impl Goal {
     pub fn plan(&self, client: &mut Client, robot: Option<&str>, search: &Search) -> Result<Plan> {
         let path = match (&self.path, robot) {
             (Some(file), Some(name)) => {
-                let robots = client.call(Planner {})?.robots.into_iter().map(|robot| (robot.name, robot.joints));
+                let robots = client.call(Planner {})?.robots;
+                let limits = robots.iter().find(|robot| robot.name == name).map(|robot| robot.limits.as_slice());
+                // Continuous joints have no limits.
+                let turns: Vec<bool> = limits.unwrap_or_default().iter().map(|l| *l == [None, None]).collect();
+                let robots = robots.into_iter().map(|robot| (robot.name, robot.joints));
                 let joints = recorded_path::joints_of(name, Code::UnknownRobot, robots.collect())?;
-                Some(recorded_path::read(file, &joints, self.tolerance)?)
+                Some(recorded_path::read(file, &joints, &turns, self.tolerance)?)
             }
             _ => None,
         };
@@ -369,8 +375,14 @@ pub fn show(planned: &Planned) {
         (Some(depth), Some([a, b])) if depth < 0.0 => {
             output::line(format_args!("  begins in contact: {a} and {b}, {} m deep", fixed(-depth, 4)));
         }
+        (Some(clearance), Some([a, b])) if clearance < 1e-6 => {
+            output::line(format_args!("  proven free of contact; {a} comes within 1 mm of {b}"));
+        }
         (Some(clearance), Some([a, b])) => {
-            output::line(format_args!("  proven clearance {} m, least between {a} and {b}", fixed(clearance, 4)));
+            output::line(format_args!(
+                "  proven clearance {} m, least between {a} and {b}",
+                fixed(clearance, if clearance < 1e-3 { 6 } else { 4 })
+            ));
         }
         (Some(clearance), None) => {
             output::line(format_args!("  proven clearance {} m or more", fixed(clearance, 4)));
@@ -392,5 +404,27 @@ pub fn show(planned: &Planned) {
         let (link, other, distance) = (&given_up.link, &given_up.other, fixed(given_up.distance, 4));
         let padding = fixed(s.padding, 4);
         output::line(format_args!("  less than {padding} m {where_}: {link} is {distance} m from {other} there"));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_number_is_the_position_of_one_joint() {
+        let goal = |text: &str| match waypoint(text) {
+            Ok(Waypoint::Goal(goal)) => (goal.joints, goal.named),
+            other => panic!("{other:?}"),
+        };
+        for (text, position) in [("0.5", 0.5), ("-0.5", -0.5), ("1e-3", 1e-3), ("2", 2.0)] {
+            assert_eq!(goal(text), (Some(vec![position]), None), "{text}");
+        }
+        for (text, name) in
+            [("home", "home"), ("named:2", "2"), ("2nd", "2nd"), ("-", "-"), ("nan", "nan"), ("inf", "inf")]
+        {
+            assert_eq!(goal(text), (None, Some(name.to_owned())), "{text}");
+        }
+        assert_eq!(goal("0.5,-0.5"), (Some(vec![0.5, -0.5]), None));
     }
 }

@@ -10,9 +10,10 @@ use super::arguments::finite;
 use super::exit::{Exit, Failure, Result};
 use super::follow::Signals;
 use super::output;
+use crate::arm::GripperUnit;
 use crate::rpc::api::{
-    Attach, Detach, GRASP_REACH, Grip, GripOutcome, GripReport, Gripper, GripperReply, Planner, Status, World,
-    WorldObject,
+    Attach, Detach, GRASP_REACH, Grip, GripOutcome, GripReport, Gripper, GripperReply, Planner, RobotReport, State,
+    Status, World, WorldObject,
 };
 use crate::rpc::client::Client;
 use crate::rpc::report::ArmReport;
@@ -82,6 +83,10 @@ pub fn impossible(arm: &ArmReport, to: Opening, force: Option<f64>) -> Option<(S
                 format!("the gripper of {name} reports no range"),
                 Some(format!("give its position in {unit}")),
             );
+        }
+        (Opening::Position(at), _) if GripperUnit::of_name(unit).is_some_and(|unit| !unit.has(at)) => {
+            let hint = Some("closed is 0, open 1".to_owned());
+            return say(format!("the gripper of {name} only closes and opens: it cannot go to {at}"), hint);
         }
         (Opening::Position(at), Some([closed, open]))
             if at < closed.min(open) - SAME_POSITION || at > closed.max(open) + SAME_POSITION =>
@@ -184,11 +189,11 @@ impl GripAction {
                 let what = format!("{arm}: {}, on the way to {:.4} {}", report.text(), report.target, report.unit);
                 return Err(failed(what, "remove what is in the way of the fingers, or command a larger --force"));
             }
-            (Some(GripOutcome::Holding), Some((true, names))) => {
+            (Some(GripOutcome::Holding), Some((Some(robot), names))) => {
                 for name in &names {
                     let attach = Attach {
                         name: name.clone(),
-                        robot: arm.to_owned(),
+                        robot: robot.clone(),
                         within: Some(GRASP_REACH),
                         ..Attach::default()
                     };
@@ -196,11 +201,15 @@ impl GripAction {
                 }
                 done("attached", &names);
             }
-            (Some(_), Some((true, names))) => {
+            (Some(GripOutcome::Ordered), Some((Some(_), names))) => {
+                let what = format!("{arm}: {}: {} is not attached", report.text(), names.join(", "));
+                return Err(failed(what, "attach what it holds with `dimos world attach`"));
+            }
+            (Some(_), Some((Some(_), names))) => {
                 let what = format!("{arm}: {}: it holds nothing, {} is not attached", report.text(), names.join(", "));
                 return Err(failed(what, "move the fingers around the object first"));
             }
-            (Some(_), Some((false, names))) => {
+            (Some(_), Some((None, names))) => {
                 for name in &names {
                     client.call(Detach { name: name.clone() })?;
                 }
@@ -211,41 +220,64 @@ impl GripAction {
         Ok(())
     }
 
-    /// Returns the objects to attach (`true`) or detach, checked before anything moves.
-    fn objects(&self, client: &mut Client, arm: &str) -> Result<Option<(bool, Vec<String>)>> {
+    /// Returns the objects to attach, with the robot of the planner, or to detach; checked before anything moves.
+    fn objects(&self, client: &mut Client, arm: &str) -> Result<Option<(Option<String>, Vec<String>)>> {
         if self.objects == Objects::Keep {
             return Ok(None);
         }
         let robots = client.call(Planner {})?.robots;
-        if !robots.iter().any(|robot| robot.name == arm) {
+        let joints = joints_of(client, arm)?;
+        let is_of = |robot: &&RobotReport| robot.name == arm || robot.joints.iter().any(|joint| joints.contains(joint));
+        let Some(robot) = robots.iter().find(is_of).map(|robot| robot.name.clone()) else {
             let names: Vec<&str> = robots.iter().map(|robot| robot.name.as_str()).collect();
             let what = format!("the planner has no robot {arm}, only {}", names.join(", "));
             return Err(Failure::usage(what).hint("objects are attached to the robots of `planner.robots`"));
-        }
+        };
         let world = client.call(World {})?.objects;
-        let ours = |object: &WorldObject| object.held_by.as_ref().is_some_and(|[robot, _]| robot == arm);
+        let ours = |object: &WorldObject| object.held_by.as_ref().is_some_and(|[by, _]| *by == robot);
         let (Objects::Attach(name) | Objects::Either(name)) = &self.objects else {
             let held: Vec<String> = world.iter().filter(|object| ours(object)).map(|o| o.name.clone()).collect();
             return match held.is_empty() {
                 true => Err(Failure::new(Exit::Failed, format!("{arm} holds no object: there is none to detach"))
                     .hint("`dimos world list` shows what is held")),
-                false => Ok(Some((false, held))),
+                false => Ok(Some((None, held))),
             };
         };
         match world.iter().find(|object| object.name == *name) {
             Some(object) if ours(object) && matches!(self.objects, Objects::Either(_)) => {
-                Ok(Some((false, vec![name.clone()])))
+                Ok(Some((None, vec![name.clone()])))
             }
             Some(object) => match &object.held_by {
                 Some([robot, link]) => {
                     Err(Failure::new(Exit::Failed, format!("{name} is held already, by {robot} at {link}"))
                         .hint(format!("dimos world detach {name}")))
                 }
-                None => Ok(Some((true, vec![name.clone()]))),
+                None => Ok(Some((Some(robot), vec![name.clone()]))),
             },
             None => Err(unknown_object(name, &world)),
         }
     }
+}
+
+/// Returns the names of an arm's joints; none of an unknown arm.
+fn joints_of(client: &mut Client, arm: &str) -> Result<Vec<String>> {
+    let own = client.call(State {})?.arms.into_iter().find(|own| own.hardware_id == arm);
+    Ok(own.map(|own| own.joints.into_iter().map(|joint| joint.name).collect()).unwrap_or_default())
+}
+
+/// Returns the arm whose gripper a robot of the planner has: of that name, or one of several that it spans.
+pub fn arm_of(client: &mut Client, robot: Option<&RobotReport>, name: &str) -> Result<String> {
+    let arms = client.call(Status {})?.arms;
+    if arms.iter().any(|arm| arm.hardware_id == name) {
+        return Ok(name.to_owned());
+    }
+    for arm in arms.into_iter().filter(|arm| arm.gripper_unit.is_some()) {
+        let joints = joints_of(client, &arm.hardware_id)?;
+        if robot.is_some_and(|robot| robot.joints.iter().any(|joint| joints.contains(joint))) {
+            return Ok(arm.hardware_id);
+        }
+    }
+    Err(Failure::usage(format!("{name} has no gripper: nothing has moved")))
 }
 
 /// Waits for the outcome of a command. A signal ends the wait; the fingers continue.

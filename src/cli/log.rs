@@ -21,8 +21,12 @@ use super::exit::{Exit, Failure, Result};
 use super::replay;
 use crate::blueprint::Catalog;
 use crate::recording::files;
-use crate::recording::replay::{LogReader, ReplayError};
-use crate::recording::scan::Scan;
+use crate::recording::messages::JointState;
+use crate::recording::replay::{LogInfo, LogReader, ReplayError};
+use crate::recording::wire::Message;
+
+/// Topic of joint states.
+pub(super) const STATES: &str = "/joint_states";
 
 /// Arguments of `log`.
 #[derive(Debug, clap::Args)]
@@ -100,7 +104,7 @@ unknown.")]
     /// Export joint states and commands, or one topic, as CSV; or as Parquet, rosbag2 or LeRobot data set
     #[command(after_help = "\
 A row has the time [s], and of each joint its position, velocity, effort and commanded value. Values that are unknown \
-are empty. With --topic a row is a message, with the columns of the first one.")]
+are empty. With --topic a row is a message, with the columns of all of them.")]
     Export {
         #[command(flatten)]
         log: Log,
@@ -225,7 +229,7 @@ pub(super) fn kept() -> Vec<String> {
 pub(super) fn found(path: &Path) -> PathBuf {
     let listed = files::log_folder().map(|folder| folder.join(path));
     let listed = listed.filter(|listed| !path.exists() && listed.exists());
-    files::log_at(&listed.unwrap_or_else(|| path.to_owned()))
+    listed.unwrap_or_else(|| path.to_owned())
 }
 
 impl Part {
@@ -261,31 +265,27 @@ fn whole_or_nothing(to: &Path, write: impl FnOnce() -> Result) -> Result {
     result
 }
 
-/// Returns what is missing in the part of a log that was read; `None` if nothing is, or if the run is live.
-fn loss(scan: &Scan) -> Option<String> {
-    let damaged = scan.damage.first().map(|(at, why)| {
-        let more = scan.damage.len() - 1;
-        format!(
-            "damaged at byte {at}: {why}{}",
-            if more > 0 { format!(" ({more} more chunks)") } else { String::new() }
-        )
-    });
-    let ended_early = || {
-        let lacks = !scan.complete && !scan.is_live() && scan.part_reaches_end();
-        lacks.then(|| scan.cut.clone().unwrap_or_else(|| "it was not closed".to_owned()))
-    };
-    damaged.or_else(ended_early)
-}
-
-/// Returns the exit code for a log, and prints what it lacks.
-fn ended(scan: &Scan) -> Exit {
-    match loss(scan) {
+/// Prints what the part of a log that was read lacks; returns the exit code.
+fn ended(loss: Option<&str>) -> Exit {
+    match loss {
         None => Exit::Ok,
         Some(loss) => {
             super::output::note(format_args!("warning: the log is not whole: {loss}"));
             Exit::Log
         }
     }
+}
+
+/// Returns the failure of a log without joint states where they are looked for; names where they are.
+pub(super) fn no_states(path: &Path, info: &LogInfo) -> Failure {
+    let states = info.topics.iter().filter(|(topic, schema)| *schema == JointState::SCHEMA && *topic != STATES);
+    let elsewhere: Vec<&str> = states.map(|(topic, _)| topic.as_str()).collect();
+    let at = match elsewhere.is_empty() {
+        true => String::new(),
+        false => format!("; joint states are on {}", elsewhere.join(", ")),
+    };
+    let failure = Failure::usage(format!("{}: the log has no {STATES} in this part{at}", path.display()));
+    failure.hint("`dimos log info` shows its topics")
 }
 
 /// Writes text; `false` if the reader has closed the pipe.

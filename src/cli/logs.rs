@@ -9,6 +9,7 @@ use std::time::Duration;
 use anyhow::Context;
 
 use super::arguments::{connect, place};
+use super::escapes::safe;
 use super::exit::{Exit, Failure, Result};
 use super::run_record::{RunRecord, RunState};
 use super::{lasting, output};
@@ -16,6 +17,8 @@ use crate::rpc::api::TextLog;
 use crate::rpc::client::ClientError;
 use crate::rpc::run_dir::RunDir;
 
+/// Longest line that is printed whole [bytes].
+const MAX_LINE: usize = 1 << 20;
 /// Poll period of --follow.
 const POLL_PERIOD: Duration = Duration::from_millis(100);
 
@@ -86,7 +89,7 @@ fn elsewhere(args: &Args, name: Option<&str>) -> Result {
         if report.lost > 0 && after > 0 {
             output::note(format_args!("({} lines are missing: the run keeps the latest 1000)", report.lost));
         }
-        if !report.lines.iter().all(|line| output::data(format!("{line}\n").as_bytes())) {
+        if !report.lines.iter().all(|line| text(&format!("{line}\n"))) {
             return Ok(Exit::Ok);
         }
         after = report.last;
@@ -128,10 +131,15 @@ impl RunRecord {
     }
 }
 
+/// Prints text as a terminal may get it; returns whether it still can be written.
+fn text(text: &str) -> bool {
+    output::data(safe(text, output::colour(&io::stdout())).as_bytes())
+}
+
 /// Prints a file, and what is appended while it is expected to grow.
 fn show(path: &Path, grows: impl Fn() -> bool) -> io::Result<()> {
     let mut file = File::open(path)?;
-    let mut buffer = vec![0; 64 * 1024];
+    let (mut buffer, mut lines) = (vec![0; 64 * 1024], Vec::new());
     loop {
         // Check before reading, so that everything written before the end is read.
         let goes_on = grows();
@@ -140,11 +148,16 @@ fn show(path: &Path, grows: impl Fn() -> bool) -> io::Result<()> {
             if read == 0 {
                 break;
             }
-            if !output::data(buffer.get(..read).unwrap_or_default()) {
+            lines.extend_from_slice(buffer.get(..read).unwrap_or_default());
+            // Whole lines: a character or a colour may be cut.
+            let end = lines.iter().rposition(|byte| *byte == b'\n').map_or(0, |at| at + 1);
+            let whole: Vec<u8> = lines.drain(..if lines.len() > MAX_LINE { lines.len() } else { end }).collect();
+            if !text(&String::from_utf8_lossy(&whole)) {
                 return Ok(());
             }
         }
         if !goes_on {
+            text(&String::from_utf8_lossy(&lines));
             return Ok(());
         }
         std::thread::sleep(POLL_PERIOD);

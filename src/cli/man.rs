@@ -56,6 +56,10 @@ const ENVIRONMENT: &[(&str, &str)] = &[
     ("DIMOS_BLUEPRINT_PATH", "further folders with blueprints, separated by colons"),
     ("DIMOS_LOG", "level of the text log: error, warn (default), info, debug"),
     ("NO_COLOR", "if set and not empty: no colours"),
+    (
+        "DIMOS_WORLD",
+        "folder of a closed world of runs, for tests: it takes only arms at sim, loopback and pseudo-terminals",
+    ),
     ("XDG_RUNTIME_DIR, XDG_STATE_HOME, XDG_CACHE_HOME, XDG_CONFIG_HOME", "folders, see FILES"),
 ];
 

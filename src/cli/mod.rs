@@ -14,10 +14,12 @@ pub mod completions;
 pub mod daemon;
 pub mod doctor;
 pub mod down;
+mod escapes;
 pub mod execute;
 pub mod exit;
 mod fetch;
 mod follow;
+mod full_speed;
 mod goal;
 mod grip;
 pub mod job;
@@ -312,7 +314,7 @@ fn command_line(catalog: Catalog<'_>) -> ExitCode {
     let exit = result.unwrap_or_else(|failure| {
         match json {
             // Not on stdout, which may have data already: a motion that was aborted has its report there.
-            true => output::note(failure.to_json()),
+            true => output::note(escapes::in_json(&failure.to_json().to_string())),
             false => output::failure(&failure),
         }
         failure.exit

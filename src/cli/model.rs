@@ -7,7 +7,6 @@ mod collide;
 mod fk;
 mod ik;
 mod info;
-mod meshes;
 
 use std::path::{Path, PathBuf};
 
@@ -98,6 +97,7 @@ impl With {
             srdf: self.srdf.clone(),
             joint_limits: self.joint_limits.clone(),
             meshes,
+            ..Source::default()
         }
     }
 }

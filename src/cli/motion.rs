@@ -6,7 +6,7 @@ use super::exit::{Exit, Failure, Result};
 use super::follow::{Signals, follow, follow_until};
 use super::goal::{Goal, Leg, Search, checked, has_planner, plan, show};
 use super::grip::{self, Objects};
-use super::{output, recorded_path};
+use super::{full_speed, output, recorded_path};
 use crate::rpc::Code;
 use crate::rpc::api::{
     Cancel, ExecutePlan, Move, MoveNative, MoveReply, Plan, PlanLevel, Planner, Poses, State, Status, World,
@@ -109,9 +109,9 @@ fn move_native(args: &Args, client: &mut Client, signals: &Signals) -> Result {
         Some("controller") => true,
         Some(other) => return Err(Failure::usage(format!("--native takes --frame map or controller, not {other}"))),
     };
+    let speed = args.search.speed.min(full_speed::limit(client, std::slice::from_ref(arm))?);
     signals.check()?;
-    let request =
-        MoveNative { arm: arm.clone(), pose, controller_frame, speed: args.search.speed, direct: args.direct };
+    let request = MoveNative { arm: arm.clone(), pose, controller_frame, speed, direct: args.direct };
     let begun = client.call(request)?;
     let (motion, speed) = (begun.motion, percent(begun.speed));
     output::note(format_args!(
@@ -146,7 +146,8 @@ fn run_legs(args: &Args, arm: &str, client: &mut Client, signals: &Signals) -> R
             .hint("`dimos pose list` lists the poses"));
     }
     let legs = args.goal.legs(arm, &args.search);
-    check_grips(arm, client, &legs)?;
+    let own = grip::arm_of(client, robot, arm)?;
+    check_grips(&own, client, &legs)?;
     for leg in legs {
         match leg {
             Leg::Motion(request) => {
@@ -156,7 +157,7 @@ fn run_legs(args: &Args, arm: &str, client: &mut Client, signals: &Signals) -> R
                     exit => return Ok(exit),
                 }
             }
-            Leg::Grip(action) => action.run(client, arm, signals, args.target_run.json).map_err(|failure| {
+            Leg::Grip(action) => action.run(client, &own, signals, args.target_run.json).map_err(|failure| {
                 let what = format!("{}: the motion ends here", failure.what);
                 Failure { what, ..failure }
             })?,
@@ -188,7 +189,9 @@ type Begun = (u64, String, serde_json::Value);
 
 fn plan_and_begin(args: &Args, request: Plan, client: &mut Client, signals: &Signals) -> Result<Begun> {
     // The plan of a move is this move's own: `dimos execute` passes it over.
-    let request = Plan { by_number: true, ..request };
+    let robots: Vec<String> = request.goals.iter().map(|goal| goal.robot.clone()).collect();
+    let speed = request.speed.min(full_speed::limit(client, &robots)?);
+    let request = Plan { by_number: true, speed, ..request };
     let planned = plan(client, request, signals)?;
     if !args.target_run.json {
         show(&planned);
@@ -211,9 +214,10 @@ fn begin_direct(args: &Args, client: &mut Client, signals: &Signals) -> Result<B
         let arms = client.call(State {})?.arms.into_iter();
         let arms = arms.map(|a| (a.hardware_id, a.joints.into_iter().map(|joint| joint.name).collect()));
         let joints = recorded_path::joints_of(arm, Code::UnknownArm, arms.collect())?;
-        let path = Some(recorded_path::read(file, &joints, args.goal.tolerance)?);
+        let path = Some(recorded_path::read(file, &joints, &[], args.goal.tolerance)?);
+        let speed = args.search.speed.min(full_speed::limit(client, std::slice::from_ref(arm))?);
         signals.check()?;
-        let begun = client.call(Move { direct: args.direct, path, ..Move::new(arm, [], args.search.speed) })?;
+        let begun = client.call(Move { direct: args.direct, path, ..Move::new(arm, [], speed) })?;
         return Ok(direct(begun, "direct to its first point and along the path"));
     }
     let target = match (&args.arm, args.goal.joints(), &args.goal.named) {
@@ -230,7 +234,9 @@ fn begin_direct(args: &Args, client: &mut Client, signals: &Signals) -> Result<B
         return Err(failure.hint("run a planner blueprint, such as yourarm-planner, or give joint positions"));
     };
     signals.check()?;
-    let request = Move { direct: args.direct, ..Move::new(arm.clone(), target, args.search.speed) };
+    let speed = args.search.speed.min(full_speed::limit(client, std::slice::from_ref(arm))?);
+    signals.check()?;
+    let request = Move { direct: args.direct, ..Move::new(arm.clone(), target, speed) };
     Ok(direct(client.call(request)?, "direct"))
 }
 

@@ -2,12 +2,12 @@
 
 use std::fmt;
 use std::os::unix::fs::MetadataExt;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-/// The kernel's list of sockets.
-const SOCKETS: &str = "/proc/net/unix";
-/// Flag of a listening socket in that list.
-const LISTENING: &str = "00010000";
+use super::arguments::place;
+use super::output;
+use crate::rpc::run_dir::{RunDir, check_name};
+use crate::rt::socket_list;
 
 /// A live run of another user.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -24,13 +24,37 @@ impl fmt::Display for OtherRun {
     }
 }
 
-/// Returns the live runs of all other users; empty if the system does not show them.
+/// Prints where runs of this user may be that this process cannot see.
+pub fn note_unseen(found_none: bool) {
+    let Ok(seen) = RunDir::standard().seen() else { return };
+    if place().is_some() {
+        return;
+    }
+    if !seen.unseen.is_empty() {
+        let pids: Vec<String> = seen.unseen.iter().map(ToString::to_string).collect();
+        let pids = pids.join(", ");
+        output::note(format_args!("note: runs in namespaces of other processes (pid {pids}) cannot be seen"));
+    }
+    // In a container that has the runs, this would be noise.
+    if !seen.is_whole && found_none {
+        output::note("note: runs outside of this container are not seen");
+    }
+}
+
+/// Returns the live runs of all other users; empty if the system does not show them, and in a closed world.
 pub fn runs() -> Vec<OtherRun> {
+    if RunDir::standard().is_closed() || place().is_some() {
+        return Vec::new();
+    }
     let us = rustix::process::geteuid().as_raw();
-    let sockets = std::fs::read_to_string(SOCKETS).unwrap_or_default();
-    let others = sockets.lines().filter_map(listening).filter_map(|path| {
-        let name = run_of(&path)?;
-        let user = owner(&path).filter(|user| *user != us)?;
+    let sockets = socket_list::of("self").unwrap_or_default();
+    let others = socket_list::listening(&sockets).filter_map(|socket| {
+        let path = Path::new(socket.path);
+        if let Some((user, name)) = marked(path) {
+            return (user != us).then(|| OtherRun { name, user: user_name(user) });
+        }
+        let name = run_of(path)?;
+        let user = owner(path).filter(|user| *user != us)?;
         Some(OtherRun { name, user: user_name(user) })
     });
     let mut others: Vec<OtherRun> = others.collect();
@@ -39,13 +63,11 @@ pub fn runs() -> Vec<OtherRun> {
     others
 }
 
-/// Returns the path of a listening socket, from a line of the list.
-fn listening(line: &str) -> Option<PathBuf> {
-    // Num RefCount Protocol Flags Type St Inode Path
-    let mut columns = line.split_ascii_whitespace();
-    let flags = columns.nth(3)?;
-    let path = columns.nth(3)?;
-    (flags == LISTENING && path.starts_with('/')).then(|| PathBuf::from(path))
+/// Returns user and name of a run, if a socket is its mark. The user is the one that the mark claims.
+fn marked(path: &Path) -> Option<(u32, String)> {
+    let (user, name) = path.to_str()?.strip_prefix("@dimos/run/")?.split_once('/')?;
+    check_name(name).ok()?;
+    Some((user.parse().ok()?, name.to_owned()))
 }
 
 /// Returns the run's name, if a socket belongs to a run.
@@ -77,16 +99,15 @@ mod tests {
 
     #[test]
     fn sockets_of_runs_are_recognized() {
-        let line =
-            |flags: &str, path: &str| format!("0000000000000000: 00000002 00000000 {flags} 0001 01 47110 {path}");
-        let run = |path: &str| listening(&line(LISTENING, path)).and_then(|path| run_of(&path));
+        let run = |path: &str| run_of(Path::new(path));
         assert_eq!(run("/run/user/1001/dimos/cell-2.sock").as_deref(), Some("cell-2"));
         assert_eq!(run("/tmp/dimos-1001/cell.sock").as_deref(), Some("cell"));
         assert_eq!(run("/tmp/dimos-x/cell.sock"), None);
         assert_eq!(run("/run/user/1001/bus"), None);
-        assert_eq!(run("@dimos/device/yourarm/10.0.0.1:9760"), None);
-        assert_eq!(listening(&line("00000000", "/run/user/1001/dimos/cell.sock")), None);
-        assert_eq!(listening("Num RefCount Protocol Flags Type St Inode Path"), None);
+        assert_eq!(run("@dimos/device/10.0.0.1:9760"), None);
+        let mark = |path: &str| marked(Path::new(path));
+        assert_eq!(mark("@dimos/run/1001/cell"), Some((1001, "cell".to_owned())));
+        assert_eq!(mark("@dimos/run/1001@00000000000000ab/cell"), None, "a closed world");
         assert_eq!(user_name(0), "root");
     }
 }

@@ -11,6 +11,7 @@ use comfy_table::presets::NOTHING;
 use comfy_table::{Attribute, Cell, CellAlignment, Color, ColumnConstraint, ContentArrangement, Width};
 use serde::Serialize;
 
+use super::escapes::{in_json, safe};
 use super::exit::{Exit, Failure};
 use crate::rpc::run_dir::LiveRun;
 
@@ -25,9 +26,10 @@ const TEXT: ColumnConstraint = ColumnConstraint::LowerBoundary(Width::Fixed(MIN_
 /// The first failed write to stdout.
 static FAILED_WRITE: OnceLock<String> = OnceLock::new();
 
-/// Prints a line of data to stdout. [`finish`] reports a write that failed.
+/// Prints a line of data to stdout, as a terminal may get it. [`finish`] reports a write that failed.
 pub fn line(text: impl Display) {
-    written(writeln!(io::stdout().lock(), "{text}"));
+    let out = io::stdout();
+    written(writeln!(out.lock(), "{}", safe(&text.to_string(), colour(&out))));
 }
 
 /// Prints a sentence to stdout; a terminal that is narrower gets it in several lines, indented below the first.
@@ -88,13 +90,19 @@ pub fn done(what: impl Display, data: serde_json::Value, as_json: bool) {
 
 /// Prints a value to stdout as one line of JSON.
 pub fn json(value: &impl Serialize) {
-    // The types printed have string keys only, so encoding cannot fail.
-    line(serde_json::to_string(value).unwrap_or_default());
+    line(encoded(value));
 }
 
-/// Prints a line of diagnostics to stderr.
+/// Returns a value as one line of JSON, as a terminal may get it.
+pub fn encoded(value: &impl Serialize) -> String {
+    // The types printed have string keys only, so encoding cannot fail.
+    in_json(&serde_json::to_string(value).unwrap_or_default()).into_owned()
+}
+
+/// Prints a line of diagnostics to stderr, as a terminal may get it.
 pub fn note(text: impl Display) {
-    let _ = writeln!(io::stderr().lock(), "{text}");
+    let out = io::stderr();
+    let _ = writeln!(out.lock(), "{}", safe(&text.to_string(), colour(&out)));
 }
 
 /// Prints a note if a run has not answered after a second, unless the result was dropped by then: `advice`, what the
@@ -209,6 +217,15 @@ impl Table {
     /// Prints it to stdout.
     pub fn print(&self) {
         self.lines().iter().for_each(line);
+    }
+}
+
+/// Returns the last line of a check without errors.
+pub fn no_mistakes(warnings: usize) -> String {
+    match warnings {
+        0 => "no mistakes".to_owned(),
+        1 => "no mistakes, 1 warning".to_owned(),
+        more => format!("no mistakes, {more} warnings"),
     }
 }
 

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 
 use super::arguments::{Target, finite};
+use super::escapes::safe;
 use super::exit::{Exit, Result};
 use super::goal::{Planned, show};
 use super::output::{self, Table, fixed, number};
@@ -43,7 +44,7 @@ pub fn run(args: &Args) -> Result {
         return Ok(Exit::Ok);
     }
     if args.hz.is_some() {
-        output::data(csv(&reply).as_bytes());
+        output::data(safe(&csv(&reply), false).as_bytes());
         return Ok(Exit::Ok);
     }
     let elapsed = reply.summary.times.values().sum();

@@ -106,6 +106,7 @@ pub fn run(args: &Args) -> Result {
                 SimEvent::Connected => output::note("a client connected"),
                 SimEvent::Disconnected => output::note("a client disconnected"),
                 SimEvent::Rejected => output::note("a client was rejected: too many are connected"),
+                SimEvent::Foreign => output::note("a program of another user was disconnected"),
                 SimEvent::Fault(_) => {}
             }
         }

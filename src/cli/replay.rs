@@ -17,6 +17,7 @@ use thiserror::Error;
 
 use super::arguments::{Changes, duration, time};
 use super::exit::{Exit, Failure, Result};
+use super::output;
 use crate::blueprint::Catalog;
 use crate::control::task_spec::TaskTable;
 use crate::recording::files;
@@ -185,7 +186,7 @@ fn try_run(args: &ReplayArgs, catalog: Catalog<'_>) -> anyhow::Result<Exit> {
     let mut view: Box<dyn View> = if args.json {
         Box::new(JsonLines::new(out.lock()))
     } else {
-        eprintln!("{}", headline(&path, log.info()));
+        output::note(headline(&path, log.info()));
         let joints = joints(log.info());
         if tty {
             Box::new(Live::new(out.lock(), &part, joints))
@@ -199,19 +200,17 @@ fn try_run(args: &ReplayArgs, catalog: Catalog<'_>) -> anyhow::Result<Exit> {
     }
     let end = play(&mut log, &part, Pace::new(args.rate, args.start_paused), view.as_mut(), time.as_mut())?;
     drop((view, time));
-    if let Some(cut) = &end.cut {
-        eprintln!("warning: {cut}");
+    if let Some(loss) = &end.loss {
+        output::note(format_args!("warning: the log is not whole: {loss}"));
     }
     if end.lost > 0 {
-        eprintln!("warning: {} samples are missing in this log: the recorder fell behind", end.lost);
-    }
-    if end.damaged > 0 {
-        eprintln!("warning: {} messages do not match their schema", end.damaged);
+        let lost = end.lost;
+        output::note(format_args!("warning: {lost} samples are missing in this log: the recorder fell behind"));
     }
     if end.interrupted {
         return Ok(Exit::Interrupted);
     }
-    Ok(if end.cut.is_some() || end.lost > 0 || end.damaged > 0 { Exit::DATA_LOST } else { Exit::Ok })
+    Ok(if end.loss.is_some() || end.lost > 0 { Exit::DATA_LOST } else { Exit::Ok })
 }
 
 fn log_path(args: &ReplayArgs) -> anyhow::Result<PathBuf> {

@@ -1,8 +1,11 @@
 //! Record of the latest run of a name: `<run>.json` beside the logs, written when the run is up and again when it has
 //! ended. A record without an end whose process is gone belongs to a crashed run.
 
-use std::io;
+use std::fs::{File, OpenOptions};
+use std::io::{self, Read, Seek, SeekFrom};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -13,6 +16,10 @@ use crate::rpc::report::StatusReport;
 
 /// Size of the tail of a text log that is searched for its last lines [bytes].
 const TAIL: u64 = 8192;
+/// Maximum size of a record [bytes].
+const MAX_RECORD: u64 = 1 << 20;
+/// Maximum time from the release of a run's name to the record of its end.
+const LAST_LINES_LIMIT: Duration = Duration::from_secs(2);
 /// Maximum number of last lines.
 const LAST_LINES: usize = 6;
 
@@ -151,6 +158,19 @@ impl RunRecord {
         self.text_log.as_deref().map(last_lines).unwrap_or_default()
     }
 
+    /// Returns why a verb does not find a run of this name; `None` if no end of one is recorded. The name is free
+    /// before the process has written its last lines: waits for them, at most [`LAST_LINES_LIMIT`].
+    pub fn failure_of(run: &str) -> Option<Failure> {
+        let deadline = Instant::now() + LAST_LINES_LIMIT;
+        loop {
+            let record = Self::of(run)?;
+            if record.state() != RunState::Live || Instant::now() > deadline {
+                return record.failure();
+            }
+            std::thread::sleep(Duration::from_millis(10));
+        }
+    }
+
     /// Returns why a verb cannot reach it; `None` if it is live.
     pub fn failure(&self) -> Option<Failure> {
         let mut what = format!("no live run is named {}: {}", self.run, self.describe_end()?);
@@ -184,14 +204,25 @@ fn path_in(folder: &Path, run: &str) -> PathBuf {
 /// Reads a record; `None` if there is none or it is not valid.
 fn read(path: &Path) -> Option<RunRecord> {
     path.extension().filter(|ending| *ending == "json")?;
-    serde_json::from_slice(&std::fs::read(path).ok()?).ok()
+    let mut bytes = Vec::new();
+    open(path).ok()?.take(MAX_RECORD).read_to_end(&mut bytes).ok()?;
+    serde_json::from_slice(&bytes).ok()
+}
+
+/// Opens a file to read it; fails for what is none, which might block.
+fn open(path: &Path) -> io::Result<File> {
+    let flags = rustix::fs::OFlags::NONBLOCK.bits() as i32;
+    let file = OpenOptions::new().read(true).custom_flags(flags).open(path)?;
+    match file.metadata()?.is_file() {
+        true => Ok(file),
+        false => Err(io::Error::new(io::ErrorKind::InvalidInput, "not a file")),
+    }
 }
 
 /// Returns the last lines of a text file; empty if it cannot be read.
 pub fn last_lines(path: &Path) -> Vec<String> {
-    use std::io::{Read, Seek, SeekFrom};
     let tail = || {
-        let mut file = std::fs::File::open(path)?;
+        let mut file = open(path)?;
         let length = file.metadata()?.len();
         file.seek(SeekFrom::Start(length.saturating_sub(TAIL)))?;
         let mut bytes = Vec::new();

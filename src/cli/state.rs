@@ -5,14 +5,19 @@ use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use super::arguments::{Target, hertz, place};
+use super::banner;
+use super::escapes::safe;
 use super::exit::{Exit, Result};
 use super::lasting;
 use super::output::{self, Table, fixed, number};
-use crate::rpc::api::State;
+use crate::rpc::api::{State, gripper_text};
 use crate::rpc::client::{self, ClientError};
 use crate::rpc::error::{Code, RpcError};
 use crate::rpc::report::{ArmStateReport, JointReport, PoseReport, StateReport};
 use crate::rpc::run_dir::RunDir;
+
+/// Marks poses of the arm's own controller.
+const DEVICE: &str = " (device)";
 
 /// Arguments of `state`.
 #[derive(Debug, clap::Args)]
@@ -50,7 +55,7 @@ pub fn run(args: &Args) -> Result {
             report => report?,
         };
         let lines = match args.target_run.json {
-            true => vec![serde_json::to_string(&report).unwrap_or_default()],
+            true => vec![output::encoded(&report)],
             false => table(&report),
         };
         if !output::written(screen.show(&lines)) || !args.watch {
@@ -91,11 +96,14 @@ impl Screen {
             true => format!("\x1b[{}A\x1b[J", self.drawn.iter().map(rows).sum::<usize>()),
             false => String::new(),
         };
+        let colour = output::colour(&io::stdout());
+        self.drawn.clear();
         for line in lines {
-            text.push_str(line);
+            let line = safe(line, colour);
+            text.push_str(&line);
             text.push('\n');
+            self.drawn.push(columns(&line));
         }
-        self.drawn = lines.iter().map(|line| columns(line)).collect();
         let mut out = io::stdout().lock();
         out.write_all(text.as_bytes())?;
         out.flush()
@@ -144,10 +152,14 @@ fn of_arm(arm: &ArmStateReport) -> Vec<String> {
     lines.extend(table.lines());
     if let Some(gripper) = arm.gripper {
         let unit = arm.gripper_unit.as_deref().unwrap_or("m");
-        lines.push(format!("gripper  {gripper:.4} {unit}{}", force(arm)));
+        lines.push(format!("gripper  {}{}", gripper_text(gripper, unit), force(arm)));
     }
-    let poses = [(&arm.pose, ""), (&arm.device_pose, " (device)")];
+    lines.extend(banner::slowed(&arm.hardware_id, arm.speed_fraction));
+    let poses = [(&arm.pose, ""), (&arm.device_pose, DEVICE), (&arm.device_tool_pose, DEVICE)];
     lines.extend(poses.iter().filter_map(|(pose, whose)| Some(pose_lines(pose.as_ref()?, whose))).flatten());
+    if let Some(missing) = &arm.device_pose_missing {
+        lines.push(format!("pose     flange{DEVICE} not known: the controller does not report its {missing}"));
+    }
     if let Some([fx, fy, fz, tx, ty, tz]) = arm.wrench {
         lines.push(format!("wrench   force {fx:.2} {fy:.2} {fz:.2} N, torque {tx:.3} {ty:.3} {tz:.3} Nm"));
     }

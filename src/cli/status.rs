@@ -3,11 +3,12 @@
 use serde::Serialize;
 
 use super::arguments::{Target, connect_to, place};
-use super::arm::parts::{io_lines, joint_lines, payload_text};
+use super::arm::parts::{gripper_line, io_lines, joint_lines, payload_text};
 use super::arm::tool::tcp_text;
 use super::attach;
 use super::banner::{self, at_exit};
 use super::exit::{Exit, Result};
+use super::other_users;
 use super::output::{self, Table, Tone, number, span, toned};
 use super::run_record::{RunRecord, RunState};
 use super::speed::describe;
@@ -82,24 +83,36 @@ struct FailedRun {
 pub fn run(args: &Args) -> Result {
     let target = Target { run: args.name.clone().or(args.target_run.run.clone()), ..args.target_run };
     let mut runs = target.named_or_all().map_err(|failure| {
-        let dead = target.run.as_deref().and_then(RunRecord::of).and_then(|record| record.failure());
+        let dead = target.run.as_deref().and_then(RunRecord::failure_of);
         dead.unwrap_or(failure)
     })?;
     if target.run.is_some() || (runs.len() == 1 && !target.json) {
         let Some(run) = runs.pop() else { return Ok(Exit::Ok) };
-        let report = request_status(&run)?;
-        if target.json {
-            output::json(&report);
-            return Ok(Exit::Ok);
+        let report = request_status(&run);
+        match &report {
+            Ok(report) if target.json => output::json(report),
+            Ok(report) => print(report, args.verbose),
+            Err(_) => {}
         }
-        print(&report, args.verbose);
         if target.run.is_none() {
             failed_runs(&[run]).iter().for_each(print_failed);
+            note_others(false);
         }
+        report?;
     } else {
+        let found_none = runs.is_empty();
         overview(runs, target.json);
+        note_others(found_none);
     }
     Ok(Exit::Ok)
+}
+
+/// Says which runs of this computer are not shown.
+fn note_others(found_none: bool) {
+    for other in other_users::runs() {
+        output::note(format_args!("note: run {other} is live; only that user sees its status"));
+    }
+    other_users::note_unseen(found_none);
 }
 
 /// Returns the runs that failed and have not been started again.
@@ -157,7 +170,7 @@ fn overview(runs: Vec<LiveRun>, json: bool) {
         return output::json(&found);
     }
     if found.is_empty() {
-        return output::note("no run is live\nhint: start one: dimos run coordinator-yourarm");
+        return output::note("no run of this user is live\nhint: start one: dimos run coordinator-yourarm");
     }
     let mut table = Table::new(&["RUN", ">PID", "UP", "BLUEPRINT", "~ARMS"]);
     let mut logs: Vec<(&str, String)> = Vec::new();
@@ -285,6 +298,7 @@ fn attention(r: &StatusReport) -> Vec<String> {
             lines.push(format!("{name}: its connection is {}", arm.link));
         }
     }
+    lines.extend(r.arms.iter().filter_map(|arm| banner::slowed(&arm.hardware_id, arm.speed_fraction)));
     if r.speed.paused {
         lines.push("all motions are paused: nothing moves until `dimos resume`".to_owned());
     }
@@ -368,6 +382,14 @@ fn print_arms(arms: &[ArmReport], verbose: bool) {
         if let Some(tcp) = &arm.tcp {
             output::wrapped(format_args!("  {name}: poses in map are those of {}", tcp_text(tcp)));
         }
+        if !arm.simulated && arm.identity.is_none() {
+            output::wrapped(format_args!(
+                "  {name}: identity unknown: the arm has no serial number that this program reads"
+            ));
+        }
+        for note in &arm.model_notes {
+            output::wrapped(format_args!("  {name}: model: {note}"));
+        }
         if let Some(load) = &arm.payload {
             output::wrapped(format_args!("  {name}: payload {}", payload_text(load)));
         }
@@ -394,17 +416,6 @@ fn print_arms(arms: &[ArmReport], verbose: bool) {
             output::wrapped(format_args!("  {name} counted {}", counted.join(", ")));
         }
     }
-}
-
-/// Returns ranges and measured force of an arm's gripper; `None` without one, or if nothing is known of it.
-fn gripper_line(arm: &ArmReport) -> Option<String> {
-    let (unit, force_unit) = (arm.gripper_unit.as_deref()?, arm.gripper_force_unit.as_deref().unwrap_or_default());
-    let range = arm.gripper_range.map(|[closed, open]| format!("{closed:.4} {unit} closed, {open:.4} {unit} open"));
-    let commands = arm.gripper_force_range.map(|[least, most]| format!("force {least} to {most} {force_unit}"));
-    let measured = arm.gripper_force.map(|force| format!("measured force {force:.2} {force_unit}"));
-    let speed = arm.gripper_has_speed.then(|| "speed control".to_owned());
-    let parts: Vec<String> = [range, commands, speed, measured].into_iter().flatten().collect();
-    (!parts.is_empty()).then(|| format!("gripper {}", parts.join("; ")))
 }
 
 /// Prints the tasks as a table.

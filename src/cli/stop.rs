@@ -1,13 +1,14 @@
 //! `dimos stop`: a latched hold at once. An operational stop, not a safety function.
 
 use std::collections::BTreeMap;
+use std::io::ErrorKind;
 
 use super::arguments::{self, Target, connect_to};
 use super::exit::{Exit, Failure};
 use super::other_users;
 use super::output::{self, Table, Tone, toned};
 use crate::rpc::api::{Confirmation, Stop, StopReply};
-use crate::rpc::client::{ClientError, find};
+use crate::rpc::client::{self, Client, ClientError, find};
 use crate::rpc::run_dir::{LiveRun, RunDir};
 use crate::rpc::{Code, RpcError};
 
@@ -47,6 +48,7 @@ pub fn run(args: &Args) -> Result {
         for other in other_users::runs() {
             output::note(format_args!("not stopped: run {other}; only that user can stop it"));
         }
+        other_users::note_unseen(runs.is_empty());
     }
     if runs.is_empty() {
         return Err(unreached.unwrap_or_else(|| ClientError::NoRun.into()));
@@ -69,9 +71,14 @@ fn runs(args: &Args) -> Result<(Vec<LiveRun>, Option<Failure>)> {
         return Ok((args.target_run.named_or_all()?, None));
     }
     let folder = RunDir::standard();
-    let mut runs = match &args.target_run.run {
-        Some(name) => find(&folder, Some(name)).into_iter().collect(),
-        None => folder.runs().map_err(ClientError::from)?,
+    let here = match &args.target_run.run {
+        Some(name) => Ok(find(&folder, Some(name)).into_iter().collect()),
+        None => folder.runs(),
+    };
+    let mut runs: Vec<LiveRun> = match here {
+        Ok(runs) => runs,
+        // The runs of the place are stopped all the same.
+        Err(error) => return Ok((args.target_run.named_or_all()?, Some(ClientError::from(error).into()))),
     };
     match args.target_run.named_or_all() {
         Ok(remote) => {
@@ -91,8 +98,8 @@ fn result(replies: Replies<'_>) -> Result {
     let stopped_any = stopped().next().is_some();
     // A run without the arm is not a failure as long as another one has it.
     let is_elsewhere = |e: &ClientError| matches!(e, ClientError::Refused(e) if e.code == Code::UnknownArm);
-    let failures = replies.into_iter().filter_map(|(_, reply)| reply.err());
-    let mut failures = failures.filter(|e| !(stopped_any && is_elsewhere(e))).map(Failure::from);
+    let failures = replies.into_iter().filter_map(|(run, reply)| Some((run, reply.err()?)));
+    let mut failures = failures.filter(|(_, e)| !(stopped_any && is_elsewhere(e))).map(|(run, e)| not_stopped(run, e));
     if let Some(first) = failures.next() {
         failures.filter(|failure| *failure != first).for_each(|failure| output::failure(&failure));
         return Err(first);
@@ -102,6 +109,31 @@ fn result(replies: Replies<'_>) -> Result {
         return Err(Failure::new(Exit::Failed, what).hint("watch the arm; `dimos state` shows whether it is moving"));
     }
     Ok(Exit::Ok)
+}
+
+/// Returns the failure of a run that may not be stopped, with what ends it otherwise.
+fn not_stopped(run: &LiveRun, error: ClientError) -> Failure {
+    let why = match &error {
+        // The run itself refuses, or it is on another computer.
+        ClientError::Refused(_) => return error.into(),
+        _ if run.at.is_some() => return error.into(),
+        ClientError::Io { error, .. } if serves_none(run, error) => "it serves no clients".to_owned(),
+        ClientError::Io { error, .. } => client::io_text(error),
+        ClientError::Protocol { what, .. } => format!("invalid reply: {what}"),
+        other => other.to_string(),
+    };
+    let (name, own) = (&run.name, "its own stop");
+    let (pid, hint) = match run.pid {
+        0 => ("unknown".to_owned(), own.to_owned()),
+        pid => (pid.to_string(), format!("{own}, or kill -INT {pid}: its arms decelerate to rest")),
+    };
+    Failure::new(Exit::Failed, format!("run {name} (pid {pid}) is not stopped: {why}")).hint(hint)
+}
+
+/// Returns whether a run closes each connection: it has no socket (`rpc.enabled: false`), or starts or ends.
+fn serves_none(run: &LiveRun, error: &std::io::Error) -> bool {
+    run.socket.as_os_str().as_encoded_bytes().starts_with(b"@")
+        && matches!(error.kind(), ErrorKind::UnexpectedEof | ErrorKind::BrokenPipe | ErrorKind::ConnectionReset)
 }
 
 /// Calls `stop` for every run and returns every result. The calls are concurrent: a run that does not answer must not
@@ -121,7 +153,7 @@ fn of_each(runs: &[LiveRun], stop: impl Fn(&LiveRun) -> Result<StopReply, Client
 
 fn stop(run: &LiveRun, args: &Args) -> Result<StopReply, ClientError> {
     let _slow = output::note_if_slow(run, "its arms may still move; use their own stop");
-    connect_to(run)?.call(Stop { arm: args.arm.clone() })
+    Client::urgent(None, || connect_to(run), &Stop { arm: args.arm.clone() }).map(|(_, reply)| reply)
 }
 
 fn print(done: &BTreeMap<&str, &StopReply>) {

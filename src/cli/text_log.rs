@@ -15,6 +15,8 @@ use tracing_subscriber::fmt::MakeWriter;
 use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::{Layer, Registry};
 
+use super::escapes::safe;
+use super::output;
 use crate::rpc::api::TextLines;
 
 /// Capacity of the queue [lines].
@@ -54,9 +56,7 @@ impl Terminal {
         let level = asked.as_ref().and_then(|level| level.parse::<LevelFilter>().ok());
         if let (Some(asked), None) = (&asked, level) {
             let levels = "error, warn, info or debug";
-            super::output::note(format_args!(
-                "warning: DIMOS_LOG={asked} is no level\nhint: {levels}; warn is used now"
-            ));
+            output::note(format_args!("warning: DIMOS_LOG={asked} is no level\nhint: {levels}; warn is used now"));
         }
         let (items, received) = sync_channel(QUEUE);
         let dropped = Arc::new(AtomicU64::new(0));
@@ -65,7 +65,7 @@ impl Terminal {
         std::thread::Builder::new().name("terminal".into()).spawn(move || write(&received, &lost, &keep))?;
         let terminal = Self { items, dropped, kept };
         let layer = tracing_subscriber::fmt::layer()
-            .with_ansi(super::output::colour(&io::stderr()))
+            .with_ansi(output::colour(&io::stderr()))
             .with_target(false)
             .with_writer(terminal.clone());
         let level = level.unwrap_or(LevelFilter::WARN);
@@ -95,10 +95,7 @@ impl Terminal {
 
     /// Prints a line of JSON, to stdout.
     pub fn json(&self, value: &impl Serialize) {
-        // The types printed have string keys only, so encoding cannot fail.
-        let mut line = serde_json::to_vec(value).unwrap_or_default();
-        line.push(b'\n');
-        self.send(Item::Data(line));
+        self.send(Item::Data((output::encoded(value) + "\n").into_bytes()));
     }
 
     /// Waits until all lines are written, at most [`FLUSH_TIMEOUT`].
@@ -118,15 +115,21 @@ impl Terminal {
 }
 
 fn write(items: &Receiver<Item>, lost: &AtomicU64, kept: &TextLines) {
+    let colour = output::colour(&io::stderr());
     for item in items {
         match item {
             // A closed pipe is not an error.
             Item::Note(line) => {
-                kept.push(&String::from_utf8_lossy(&line));
-                let _ = io::stderr().write_all(&line);
+                let line = String::from_utf8_lossy(&line);
+                let line = safe(&line, colour);
+                kept.push(&line);
+                let _ = io::stderr().write_all(line.as_bytes());
             }
-            Item::Private(line) => drop(io::stderr().write_all(&line)),
-            Item::Data(line) => drop(super::output::data(&line)),
+            Item::Private(line) => {
+                let line = String::from_utf8_lossy(&line);
+                let _ = io::stderr().write_all(safe(&line, colour).as_bytes());
+            }
+            Item::Data(line) => drop(output::data(&line)),
             Item::Flush(done) => drop(done.send(())),
         }
         let missing = lost.swap(0, Ordering::Relaxed);

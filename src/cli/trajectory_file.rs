@@ -5,6 +5,8 @@ use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
+use serde_json::Value;
+
 use super::exit::{Failure, Result};
 use crate::rpc::api::{Point, Trajectory};
 use crate::trajectory::MAX_DURATION;
@@ -28,7 +30,12 @@ pub fn read(path: &Path) -> Result<Trajectory> {
         Some("csv") => csv(&text),
         _ => return Err(unreadable(&"neither .json nor .csv").hint("the extension decides the format")),
     };
-    let trajectory = parsed.map_err(|e| unreadable_at(path, &e))?;
+    let mut trajectory = parsed.map_err(|e| unreadable_at(path, &e))?;
+    // An empty list is none.
+    for point in &mut trajectory.points {
+        let given = |list: Option<Vec<f64>>| list.filter(|list| !list.is_empty());
+        (point.velocities, point.accelerations) = (given(point.velocities.take()), given(point.accelerations.take()));
+    }
     if trajectory.points.len() < 2 {
         return Err(unreadable(&"a trajectory needs at least two points"));
     }
@@ -49,7 +56,7 @@ fn unreadable_at(path: &Path, mistake: &Mistake) -> Failure {
 }
 
 fn json(text: &str) -> std::result::Result<Trajectory, Mistake> {
-    serde_json::from_str(text).map_err(|e| {
+    serde_json::from_str(text).or_else(|e| as_of_ros(text).ok_or(e)).map_err(|e| {
         let what = e.to_string();
         // The position is in front already.
         let what = what.rsplit_once(" at line ").map_or(what.as_str(), |(what, _)| what).to_owned();
@@ -57,7 +64,29 @@ fn json(text: &str) -> std::result::Result<Trajectory, Mistake> {
     })
 }
 
+/// Reads the form of the ROS message: with a header, times as seconds and nanoseconds, and empty lists for what is not
+/// given. `None` if it is not that either.
+fn as_of_ros(text: &str) -> Option<Trajectory> {
+    let mut value: Value = serde_json::from_str(text).ok()?;
+    let trajectory = value.as_object_mut()?;
+    trajectory.remove("header");
+    for point in trajectory.get_mut("points")?.as_array_mut()? {
+        let point = point.as_object_mut()?;
+        point.retain(|_, value| value.as_array().is_none_or(|list| !list.is_empty()));
+        if let Some(time) = point.get_mut("time_from_start").filter(|time| time.is_object()) {
+            let part = |key: &str| time.get(key).map_or(Some(0.0), Value::as_f64);
+            *time = (part("sec")? + part("nanosec")? * 1e-9).into();
+        }
+    }
+    serde_json::from_value(value).ok()
+}
+
 fn csv(text: &str) -> std::result::Result<Trajectory, Mistake> {
+    // What spreadsheets write: a mark of the encoding; with semicolons between cells a comma is the decimal point.
+    let text = text.trim_start_matches('\u{feff}');
+    let heading = text.lines().find(|line| !line.trim().is_empty()).unwrap_or_default();
+    let semicolons = heading.contains(';') && !heading.contains(',');
+    let text = if semicolons { text.replace(',', ".").replace(';', ",") } else { text.to_owned() };
     let mut lines = text.lines().enumerate().map(|(i, text)| (i + 1, text)).filter(|(_, t)| !t.trim().is_empty());
     let Some((line, header)) = lines.next() else {
         return Err(Mistake { line: 1, column: 1, what: "the file is empty".into() });

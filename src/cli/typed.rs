@@ -4,7 +4,12 @@ use std::ffi::OsString;
 
 /// Returns the words for the parser.
 pub fn as_parsed(typed: impl Iterator<Item = OsString>) -> Vec<OsString> {
-    place_first(separated(typed).into_iter().map(spelled_out).collect())
+    let mut waypoints = false;
+    let spelled = separated(typed).into_iter().map(|word| {
+        waypoints = word == "--through" || waypoints && !is_option(&word);
+        spelled_out(word, waypoints)
+    });
+    place_first(spelled.collect())
 }
 
 /// Options whose numbers may also be separated by commas, as those of `--goal`.
@@ -43,10 +48,22 @@ fn place_first(mut words: Vec<OsString>) -> Vec<OsString> {
     words
 }
 
-/// Negative numbers in plain decimals: of `-0.5`, `-.5` and `-5e-1` the parser takes only the first for a number.
-fn spelled_out(argument: OsString) -> OsString {
-    match argument.to_str().filter(|text| text.starts_with('-')).and_then(|text| text.parse::<f64>().ok()) {
-        Some(number) if number.is_finite() => number.to_string().into(),
+/// Returns whether a word is the name of an option: a dash, and no number behind it.
+fn is_option(word: &OsString) -> bool {
+    word.to_str()
+        .and_then(|text| text.strip_prefix('-'))
+        .is_some_and(|rest| !rest.starts_with(|c: char| c == '.' || c.is_ascii_digit()))
+}
+
+/// Negative numbers in plain decimals: of `-0.5`, `-.5` and `-5e-1` the parser takes only the first for a number. A
+/// waypoint that begins with a minus gets a space: it would be an option.
+fn spelled_out(argument: OsString, waypoint: bool) -> OsString {
+    let Some(text) = argument.to_str().filter(|text| text.starts_with('-')) else { return argument };
+    match text.parse::<f64>() {
+        Ok(number) if number.is_finite() => number.to_string().into(),
+        Err(_) if waypoint && text.split(',').all(|part| part.trim().parse::<f64>().is_ok()) => {
+            format!(" {text}").into()
+        }
         _ => argument,
     }
 }
@@ -87,10 +104,15 @@ mod tests {
     #[test]
     fn negative_numbers_are_spelled_out() {
         for (typed, meant) in [("-.5", "-0.5"), ("-1e-3", "-0.001"), ("-0.30000000000000004", "-0.30000000000000004")] {
-            assert_eq!(spelled_out(typed.into()), meant);
+            assert_eq!(spelled_out(typed.into(), false), meant);
         }
-        for same in ["-0.5", "-0", "-x", "-.", "--", ".5", "1e-3", "-inf", "-nan"] {
-            assert_eq!(spelled_out(same.into()), same);
+        assert_eq!(spelled_out("-0.5,-.1,1e-3".into(), true), " -0.5,-.1,1e-3");
+        let read = |line: &str| as_parsed(line.split(' ').map(OsString::from)).join(&OsString::from("|"));
+        assert_eq!(read("dimos plan a --through -1,2 home -3,4"), "dimos|plan|a|--through| -1,2|home| -3,4");
+        assert_eq!(read("dimos plan a --through -1,2 --seed -3,4"), "dimos|plan|a|--through| -1,2|--seed|-3,4");
+        assert_eq!(read("dimos move a -1,2"), "dimos|move|a|-1,2");
+        for same in ["-a,b", "-0.5,", "0.5,-1", "-0.5", "-0", "-x", "-.", "--", ".5", "1e-3", "-inf", "-nan"] {
+            assert_eq!(spelled_out(same.into(), true), same);
         }
     }
 }

@@ -9,6 +9,8 @@ use super::arguments::{Target, angle, finite};
 use super::arm::parts::payload_text;
 use super::exit::{Exit, Failure, Result};
 use super::output::{self, Table, done, fixed};
+use crate::bounded;
+use crate::robot::mesh::Size;
 use crate::rpc::api::{
     Attach, Detach, PoseSpec, ShapeSpec, World, WorldAdd, WorldEntry, WorldMove, WorldObject, WorldRemove,
 };
@@ -186,7 +188,8 @@ pub fn run(args: &Args) -> Result {
             };
             let mut client = a.target_run.connect()?;
             let replaced = replaced(&mut client, &[&a.name])?;
-            client.call(WorldAdd(object))?;
+            client.call(WorldAdd(object.clone()))?;
+            note_doubts([&object]);
             let how = if replaced.is_empty() { "added" } else { "replaced" };
             done(format_args!("{} {how}", a.name), json!({how: [a.name]}), a.target_run.json);
         }
@@ -208,6 +211,7 @@ pub fn run(args: &Args) -> Result {
             for object in &objects {
                 client.call(WorldAdd(object.clone()))?;
             }
+            note_doubts(&objects);
             let added: Vec<&str> = names.iter().filter(|name| !replaced.iter().any(|r| r == *name)).copied().collect();
             let objects = if added.len() == 1 { "object" } else { "objects" };
             let text = format!("{} {objects} added, {} replaced", added.len(), replaced.len());
@@ -237,6 +241,18 @@ pub fn run(args: &Args) -> Result {
     Ok(Exit::Ok)
 }
 
+/// Warns of meshes with a doubtful unit.
+fn note_doubts<'a>(objects: impl IntoIterator<Item = &'a WorldObject>) {
+    for object in objects {
+        let ShapeSpec::Mesh(path) = &object.shape else { continue };
+        let size = Size::read(Path::new(path)).ok();
+        if let Some(doubt) = size.and_then(|size| size.doubt_of_object(&object.name, Path::new(path))) {
+            let hint = doubt.hint.map(|hint| format!("\nhint: {hint}")).unwrap_or_default();
+            output::note(format_args!("warning: {}{hint}", doubt.message));
+        }
+    }
+}
+
 /// Returns those of these names that objects in the world have.
 fn replaced(client: &mut Client, names: &[&str]) -> Result<Vec<String>> {
     let there = client.call(World {})?.objects.into_iter().map(|object| object.name);
@@ -263,7 +279,7 @@ fn full_path(file: &Path) -> Result<String> {
 /// Returns the objects of a file. Paths in it are relative to its folder.
 fn load(file: &Path) -> Result<Vec<WorldObject>> {
     let wrong = |what: String| Failure::usage(format!("{}: {what}", file.display()));
-    let text = std::fs::read_to_string(file).map_err(|e| wrong(e.to_string()))?;
+    let text = bounded::read_text(file, bounded::SMALL).map_err(|e| wrong(e.to_string()))?;
     let folder = file.parent().unwrap_or(Path::new(""));
     // Converted to JSON: a shape is written as in a blueprint, `shape: {box: […]}`.
     let typed: BTreeMap<String, Value> = serde_yaml::from_str(&text).map_err(|e| match e.location() {

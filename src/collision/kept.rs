@@ -1,6 +1,6 @@
 //! The distance that motions are proven to keep: between their samples, too.
 
-use super::checker::{CollisionChecker, Stop};
+use super::checker::{CollisionChecker, Resolution, Stop};
 use super::exact::ExactChecker;
 use super::report::Pair;
 
@@ -12,9 +12,14 @@ const PART: f64 = 0.1;
 const COARSE: f64 = 5e-4;
 /// Below this distance [m], what covers miss is much of it: solids are checked.
 const NEAR: f64 = 0.005;
+/// Below this distance [m], a number of metres says little: it is found to a part of it, down to the finest.
+const FINE: f64 = 1e-3;
+const FINEST: f64 = 1e-6;
 
 /// Number of exact checks of configurations for a distance that need not be kept.
 const EXACT_CHECKS: u64 = 24;
+/// The same for a small distance: what slides along something needs most.
+const FINE_CHECKS: u64 = 65_536;
 
 /// A motion: straight from one configuration to another [rad or m].
 pub type Motion = [Vec<f64>; 2];
@@ -37,20 +42,39 @@ enum By {
     Limited,
     /// With solids, however long it takes.
     Solids,
+    /// With solids, and pieces of a motion that are small beside the distance.
+    Fine,
 }
 
 impl ExactChecker {
     /// Returns the distance that motions keep, regardless of the padding; they must be proven free. It may be some
-    /// millimetres less than the true one, 0.5 mm if `exact`; at most 0.2 m. `None` if nothing can collide, or if
-    /// stopped.
+    /// millimetres less than the true one, 0.5 mm if `exact`, a part of it if below 1 mm; at most 0.2 m. `None` if
+    /// nothing can collide, or if stopped.
     pub fn kept_on(&mut self, motions: &[Motion], exact: bool, stop: &Stop) -> Option<Kept> {
         if self.pairs.is_empty() {
             return None;
         }
-        let (pads, most_pad) = (self.pads.clone(), self.most_pad);
-        let kept = self.search_kept(motions, exact, stop);
-        (self.pads, self.most_pad) = (pads, most_pad);
+        let (pads, most_pad, resolution) = (self.pads.clone(), self.most_pad, self.resolution);
+        let mut kept = self.search_kept(motions, exact, stop);
+        if let Some(coarse) = kept.as_mut().filter(|kept| kept.distance < FINE)
+            && let Some(fine) = self.refined(motions, coarse, stop)
+        {
+            *coarse = fine;
+        }
+        (self.pads, self.most_pad, self.resolution) = (pads, most_pad, resolution);
         kept
+    }
+
+    /// Returns a small distance in its own measure; all motions keep the coarse one. `None` if stopped.
+    fn refined(&mut self, motions: &[Motion], coarse: &Kept, stop: &Stop) -> Option<Kept> {
+        let mut kept = Kept { distance: 2.0 * NEAR, pair: coarse.pair.clone() };
+        for motion in motions {
+            if !self.keeps_on(motion, kept.distance, By::Fine, stop) {
+                let (distance, pair) = self.kept_on_one(motion, (coarse.distance, kept.distance), By::Fine, stop);
+                kept = Kept { distance, pair: pair.and_then(|pair| self.names(pair)) };
+            }
+        }
+        (!stop.is_over()).then_some(kept)
     }
 
     fn search_kept(&mut self, motions: &[Motion], exact: bool, stop: &Stop) -> Option<Kept> {
@@ -97,7 +121,12 @@ impl ExactChecker {
             }
             low = tried;
         }
-        while high - low > if by == By::Solids { COARSE } else { COARSE.max(PART * high) } {
+        let width = |low: f64, high: f64| match by {
+            By::Fine if low < FINE => FINEST.max(PART * high),
+            By::Solids | By::Fine => COARSE,
+            By::Covers | By::Limited => COARSE.max(PART * high),
+        };
+        while high - low > width(low, high) {
             let middle = 0.5 * (low + high);
             if self.keeps_on(motion, middle, by, stop) {
                 low = middle;
@@ -115,6 +144,11 @@ impl ExactChecker {
             By::Covers => self.is_free_by_covers(from, to, stop),
             By::Limited => self.is_free_within(EXACT_CHECKS, (from, to), false, stop),
             By::Solids => self.motion_is_free(from, to, stop),
+            By::Fine => {
+                // Never coarser than what all proofs use.
+                self.resolution.motion = Resolution::default().motion.min(PART * distance);
+                self.is_free_within(FINE_CHECKS, (from, to), false, stop)
+            }
         }
     }
 

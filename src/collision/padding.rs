@@ -4,17 +4,21 @@ use super::exact::{ExactChecker, Gap};
 use super::report::{Contact, Pair};
 
 impl ExactChecker {
-    /// Sets the padding [m] of moving links to obstacles and to the links of other robots. Pairs of links of one robot
+    /// Sets the padding [m] of moving links to obstacles and to the links of other robots; robots that may be off their
+    /// models add that distance. Pairs of links of one robot
     /// have none: they are close to each other by design.
     pub fn with_padding(mut self, padding: f64) -> Self {
+        let apart = |link| self.scene.apart(link);
         for (pad, pair) in self.pads.iter_mut().zip(&self.pairs) {
             *pad = match *pair {
-                Pair::Obstacle(..) => padding,
-                Pair::Links(a, b) if self.scene.links[a].robot != self.scene.links[b].robot => padding,
+                Pair::Obstacle(link, _) => padding + apart(link),
+                Pair::Links(a, b) if self.scene.links[a].robot != self.scene.links[b].robot => {
+                    padding + apart(a) + apart(b)
+                }
                 Pair::Links(..) => 0.0,
             };
         }
-        self.most_pad = padding.max(0.0);
+        self.most_pad = self.pads.iter().copied().fold(0.0, f64::max);
         self
     }
 

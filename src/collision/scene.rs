@@ -84,6 +84,8 @@ pub struct SceneRobot {
     pub kinematics: Arc<Kinematics>,
     /// Pose of its root in the world.
     pub base: DAffine3,
+    /// Distance from its links that padding adds [m].
+    pub(super) apart: f64,
     /// Index of its first joint in a configuration.
     pub first_joint: usize,
     pub(super) first_frame: usize,
@@ -121,6 +123,7 @@ impl Scene {
                 model: robot.model.clone(),
                 kinematics: robot.kinematics.clone(),
                 base: robot.base,
+                apart: robot.apart,
                 first_joint: scene.limits.len(),
                 first_frame: scene.frames,
             });
@@ -145,6 +148,12 @@ impl Scene {
         scene.make_pairs(world, &origins);
         scene.obstacles = world.obstacles().iter().map(place).collect();
         scene
+    }
+
+    /// Returns how far the robot of a link may be from its model [m].
+    pub(super) fn apart(&self, link: usize) -> f64 {
+        let robot = self.links.get(link).and_then(|link| self.robots.get(link.robot));
+        robot.map_or(0.0, |robot| robot.apart)
     }
 
     #[allow(clippy::too_many_arguments, reason = "one caller per kind of link")]

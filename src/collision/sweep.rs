@@ -97,6 +97,16 @@ impl Sweep {
         matches!(self.pairs.get(pair), Some(Pair::Links(a, b)) if robot(*a) == robot(*b))
     }
 
+    /// Returns the distance that the members of a pair keep besides a margin: how far their robots may be from their
+    /// models [m].
+    pub fn apart(&self, pair: usize) -> f64 {
+        match self.pairs.get(pair) {
+            Some(Pair::Links(a, b)) => self.scene.apart(*a) + self.scene.apart(*b),
+            Some(Pair::Obstacle(link, _)) => self.scene.apart(*link),
+            None => 0.0,
+        }
+    }
+
     /// Returns the joints that move the members of a pair relative to each other, and how far they move any of their
     /// points at most [m/rad or m/m].
     pub fn levers(&self, pair: usize) -> &[(u32, f32)] {

@@ -36,6 +36,7 @@ fn arm(name: &str, base: DVec3) -> Robot {
         model: Arc::new(model),
         base: DAffine3::from_translation(base),
         padding: 0.0,
+        apart: 0.0,
         allowed: vec![],
     }
 }
@@ -86,6 +87,18 @@ fn padding_and_snapshots_hold() {
     world.move_to("post", DAffine3::from_translation(DVec3::new(0.3, 0.0, 0.1))).unwrap();
     assert!(!checker(&world).is_free(&[0.0; 3]));
     assert!(world.put(Obstacle { padding: f64::NAN, ..post }).is_err());
+}
+
+#[test]
+fn a_robot_that_may_be_off_its_model_keeps_that_distance() {
+    let mut world = World::new();
+    world.add_robot(Robot { apart: 0.02, ..arm("", DVec3::ZERO) }).unwrap();
+    world.add(ball("post", DVec3::new(0.95, 0.11, 0.1), 0.05)).unwrap();
+    assert!(checker(&world).is_free(&[0.0; 3]), "contact is contact");
+    assert!(!checker(&world).with_padding(0.0).is_free(&[0.0; 3]));
+    let folded = [0.0, 2.6, 2.6];
+    let is_free = checker(&world).is_free(&folded);
+    assert_eq!(checker(&world).with_padding(0.0).is_free(&folded), is_free, "its own links are where they are");
 }
 
 #[test]

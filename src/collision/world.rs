@@ -26,6 +26,9 @@ pub struct Robot {
     pub base: DAffine3,
     /// Additional padding of its links [m].
     pub padding: f64,
+    /// Distance that a checker with padding keeps from its links to obstacles and other robots besides: how far the arm
+    /// may be from its model [m].
+    pub apart: f64,
     /// Allowed collision pairs, by link name: exclusion pairs and those of the SRDF.
     pub allowed: Vec<(String, String)>,
 }

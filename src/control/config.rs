@@ -16,6 +16,7 @@ pub use super::tasks::follow::FollowParams;
 pub use super::tasks::servo::ServoParams;
 pub use super::tasks::trajectory::TrajectoryParams;
 pub use super::tasks::velocity::VelocityParams;
+pub use super::tool_limit::ToolLimit;
 
 /// A step of a command further than this from the one before it is refused [rad].
 pub const JUMP: f64 = 0.2;
@@ -26,7 +27,7 @@ pub const ACTIVATION_RAMP: Duration = Duration::from_millis(200);
 
 /// Config version: of the form of [`CoordinatorConfig`] and of the rules of the tick. The same configuration, states
 /// and requests give the same commands only under the same version. Increase it with every change of either.
-pub const CONFIG_VERSION: u32 = 7;
+pub const CONFIG_VERSION: u32 = 8;
 
 /// Config version of logs that have none.
 pub const FIRST_CONFIG_VERSION: u32 = 1;
@@ -84,6 +85,9 @@ pub struct ArmConfig {
     /// Figures with which its measurements and its motion are checked.
     #[serde(default)]
     pub supervision: Supervision,
+    /// The speed limit of its tool, if it has one and a model of the arm is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tool: Option<Box<ToolLimit>>,
 }
 
 impl ArmConfig {
@@ -102,6 +106,7 @@ impl ArmConfig {
             read_period: period,
             write_period: period,
             supervision: Supervision::default(),
+            tool: None,
         }
     }
 

@@ -46,6 +46,7 @@ pub fn trouble(state: &ArmState, freshness: Freshness) -> Option<Cause> {
         Link::Stale => Some(Cause::Stale(freshness.age)),
         Link::Up if !freshness.fresh => Some(Cause::Stale(freshness.age)),
         Link::Up if state.stop_input_open => Some(Cause::StopInput),
+        Link::Up if state.interference == Interference::Identity => Some(Cause::IdentityChanged),
         Link::Up if state.interference == Interference::Mode => Some(Cause::ModeChanged),
         Link::Up if state.interference == Interference::Power => Some(Cause::PowerChanged),
         Link::Up if state.interference == Interference::Stop => Some(Cause::StoppedElsewhere),
@@ -83,6 +84,17 @@ impl Failsafe {
             Phase::Unknown => self.enter(Phase::Disabled, Cause::None, now),
             Phase::Disabled if state.interference == Interference::Power => {
                 self.enter(Phase::Held, Cause::PowerChanged, now);
+            }
+            Phase::Disabled if state.interference == Interference::Identity => {
+                self.enter(Phase::Held, Cause::IdentityChanged, now);
+            }
+            // The connection is back: whatever it was held for before was about another arm.
+            Phase::Held
+                if state.interference == Interference::Identity
+                    && state.link == Link::Up
+                    && self.cause != Cause::IdentityChanged =>
+            {
+                self.enter(Phase::Held, Cause::IdentityChanged, now);
             }
             // It may be about to be enabled.
             Phase::Disabled if state.link == Link::Up && state.stop_input_open => {

@@ -24,6 +24,7 @@ fn troubles() -> Vec<(ArmState, Freshness, Cause)> {
         (healthy(), OLD, Cause::Stale(OLD.age)),
         (ArmState { interference: Interference::Mode, ..healthy() }, FRESH, Cause::ModeChanged),
         (ArmState { interference: Interference::Power, ..healthy() }, FRESH, Cause::PowerChanged),
+        (ArmState { interference: Interference::Identity, ..healthy() }, FRESH, Cause::IdentityChanged),
         (ArmState { interference: Interference::Stop, ..healthy() }, FRESH, Cause::StoppedElsewhere),
         (ArmState { self_held: true, ..healthy() }, FRESH, Cause::HeartbeatLost),
     ]
@@ -77,11 +78,11 @@ fn the_first_state_decides_between_standby_and_disabled() {
 }
 
 #[test]
-fn only_motors_that_someone_else_enabled_hold_a_disabled_arm() {
+fn only_another_arm_and_motors_that_someone_else_enabled_hold_a_disabled_arm() {
     for (state, fresh, cause) in troubles() {
         let mut arm = in_phase(Phase::Disabled);
         let changed = arm.update(&ArmState { enabled: false, ..state }, fresh, at(10));
-        assert_eq!(changed, cause == Cause::PowerChanged, "{cause:?}");
+        assert_eq!(changed, matches!(cause, Cause::PowerChanged | Cause::IdentityChanged), "{cause:?}");
         assert_eq!(arm.phase(), if changed { Phase::Held } else { Phase::Disabled });
     }
 }

@@ -99,6 +99,43 @@ impl Limiter {
         *self = Self { position, ..Self::new(self.bounds) };
     }
 
+    /// Slows the command that follows `before` down to this velocity [rad/s], as far as the acceleration limit lets it.
+    pub fn slow_to(&mut self, velocity: f64, before: &Self) {
+        let change = self.bounds.acceleration * between(before.covered, self.covered);
+        self.velocity = velocity.clamp(before.velocity - change, before.velocity + change);
+        self.position = before.position + self.velocity * self.covered;
+    }
+
+    /// Brakes more than that, where the joint would otherwise leave its range: a joint that brakes together with slower
+    /// ones may be too fast for what is left of it.
+    pub fn keep_inside(&mut self, before: &Self) {
+        let change = self.bounds.acceleration * between(before.covered, self.covered);
+        let (lower, upper) = before.range();
+        let (slowest, fastest) = before.speeds_inside(lower, upper, before.position, self.covered);
+        let inside = self.velocity.clamp(slowest, fastest);
+        if inside != self.velocity {
+            self.velocity = inside.clamp(before.velocity - change, before.velocity + change);
+            self.position = (before.position + self.velocity * self.covered).clamp(lower, upper);
+        }
+    }
+
+    /// Returns the time that the last command covered, of the arm's own time [s]; 0: it began a start, or the arm's
+    /// controller had stopped.
+    pub fn covered(&self) -> f64 {
+        self.covered
+    }
+
+    /// Commands the same for another `dt` [s].
+    pub fn repeat(&mut self, dt: f64) {
+        self.covered = dt;
+    }
+
+    /// Lets the velocity decrease by `decrease` [rad/s] per step; the position stays.
+    pub fn brake_in_place(&mut self, decrease: f64, dt: f64) {
+        let decrease = decrease * (self.time_to(dt) / dt);
+        self.velocity = self.braked(decrease);
+    }
+
     /// Goes back to the last written command: later ones did not reach the arm. Requests continue.
     pub fn rewind(&mut self, position: f64, velocity: f64) {
         (self.position, self.velocity) = (position, velocity);
@@ -125,10 +162,10 @@ impl Limiter {
         }
     }
 
-    /// Sets the command of a relief, which keeps the joint's limits itself [rad, rad/s].
-    pub fn relieve(&mut self, position: f64, velocity: f64) {
+    /// Sets the command of a relief, which keeps the joint's limits itself [rad, rad/s], `dt` [s] after the last one.
+    pub fn relieve(&mut self, position: f64, velocity: f64, dt: f64) {
         self.forget_request();
-        (self.position, self.velocity) = (position, velocity);
+        (self.position, self.velocity, self.covered) = (position, velocity, dt);
     }
 
     /// Corrects the position that velocities have led to by a measurement [rad].
@@ -236,8 +273,7 @@ impl Limiter {
 
     /// Returns the time from the middle of the last step to that of one of `dt` [s]: velocities are means of a step.
     fn time_to(&mut self, dt: f64) -> f64 {
-        let last = std::mem::replace(&mut self.covered, dt);
-        if last > 0.0 { 0.5 * (last + dt) } else { dt }
+        between(std::mem::replace(&mut self.covered, dt), dt)
     }
 
     /// Returns the position to command without a request: decelerates to rest, then holds.
@@ -290,6 +326,11 @@ impl Limiter {
     fn braking_speed(&self, distance: f64, dt: f64) -> f64 {
         braking_speed(distance, self.bounds.acceleration, dt)
     }
+}
+
+/// Returns the time between the middles of two steps [s]; of the second alone if it is the first of a start.
+fn between(last: f64, dt: f64) -> f64 {
+    if last > 0.0 { 0.5 * (last + dt) } else { dt }
 }
 
 #[cfg(test)]

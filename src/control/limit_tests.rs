@@ -52,6 +52,31 @@ fn a_range_loses_its_margin_or_a_tenth_at_each_end() {
     }
 }
 
+/// A third of the deceleration that it needs, and it is still inside at rest, without more than it may brake.
+#[test]
+fn a_joint_that_brakes_together_with_others_keeps_its_range() {
+    let mut l = limiter();
+    let (upper, acceleration) = (l.bounds.upper, l.bounds.acceleration);
+    let speed = 1.2;
+    l.rewind(upper - way(speed, acceleration), speed);
+    let mut kept = l;
+    for _ in 0..400 {
+        let before = kept;
+        kept.decelerate_from(&before, acceleration * DT / 3.0, DT);
+        kept.keep_inside(&before);
+        assert!(kept.position() <= upper, "{}", kept.position());
+        assert!((kept.velocity() - before.velocity()).abs() <= acceleration * DT * (1.0 + 1e-9));
+        // The step is what the velocity says: none is cut off at the end of the range.
+        assert!((kept.position() - before.position() - kept.velocity() * DT).abs() < 1e-6);
+    }
+    assert!(kept.at_rest() && upper - kept.position() < 0.01, "{}", kept.position());
+}
+
+/// The way of a joint from this speed to rest, with room for a step [rad].
+fn way(speed: f64, acceleration: f64) -> f64 {
+    speed * speed / (2.0 * acceleration) + speed * DT
+}
+
 #[test]
 fn a_step_of_exactly_the_largest_one_is_no_jump() {
     let l = limiter();

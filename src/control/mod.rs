@@ -29,3 +29,4 @@ pub mod task_robot;
 pub mod task_spec;
 pub mod tasks;
 pub mod tick_loop;
+pub mod tool_limit;

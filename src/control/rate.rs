@@ -35,7 +35,7 @@ impl Rate {
 
     /// Changes it towards `target` over a step of `dt` [s].
     pub fn approach(&mut self, target: f64, limits: RateLimits, dt: f64) {
-        if self.value == target {
+        if self.value == target || dt <= 0.0 {
             return;
         }
         let (first, second) = (SHARE * limits.first, SHARE * limits.second);

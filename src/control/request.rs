@@ -85,6 +85,13 @@ pub enum Request {
         /// Pose of the tool centre point in the frame of the task's link.
         tool: FramePose,
     },
+    /// Another tool at an arm whose tool has a speed limit.
+    ArmTool {
+        /// The arm.
+        arm: u16,
+        /// Pose of the tool centre point in the frame of the link that carries it.
+        tool: FramePose,
+    },
     /// Latch the hold of an arm, or of all.
     Stop {
         /// The arm; `None`: all.

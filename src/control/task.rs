@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use super::arm_control::effective;
 use super::config::TaskConfig;
 use super::request::Motion;
 use super::speed_override::SpeedOverride;
@@ -45,6 +46,8 @@ pub struct Task {
     pub claims: Vec<Claim>,
     /// Whether all claims of the last tick were commanded.
     pub granted: bool,
+    /// Its path moves arms of which one is slowed by its controller more than another: all keep the same time.
+    pub shares_time: bool,
     /// The client of its latest target.
     pub client: u64,
     leader: Vec<LeaderJoint>,
@@ -72,6 +75,7 @@ impl Task {
             demand: Demand::Nothing,
             claims: Vec::with_capacity(config.joints.len()),
             granted: false,
+            shares_time: false,
             client: 0,
             leader: config.kind.leader.clone(),
             gripper_at: Mono::ZERO,
@@ -177,12 +181,25 @@ impl Task {
         self.motion.replace(motion)
     }
 
+    /// Returns the smallest and the largest fraction of their speeds at which the controllers of its arms run motions.
+    fn own_speeds(&self, views: &[JointView]) -> (f64, f64) {
+        let of = |joint: &u16| effective(views.get(usize::from(*joint)).and_then(|view| view.speed_fraction));
+        let mut speeds = self.moving_joints().iter().map(of);
+        let first = speeds.next().unwrap_or(1.0);
+        speeds.fold((first, first), |(low, high), speed| (low.min(speed), high.max(speed)))
+    }
+
     fn parts<'a>(&'a mut self, tick: &Tick<'a>) -> (Context<'a>, &'a mut dyn TaskBody, &'a mut Vec<Claim>) {
+        let (slowest, fastest) = self.own_speeds(tick.views);
+        let on_path = self.takes(TargetKind::Trajectory);
+        // One clock for all arms of a path: that of the slowest, approached within the limits of the others.
+        self.shares_time = on_path && slowest != fastest;
+        let alone = on_path && !self.shares_time;
         let cx = Context {
             now: tick.now,
-            dt: tick.dt,
-            speed: tick.speed.target(),
-            pace: tick.speed.of_streams(),
+            dt: if alone { tick.dt * slowest } else { tick.dt },
+            speed: if alone && slowest > 0.0 { tick.speed.target() } else { tick.speed.target() * slowest },
+            pace: tick.speed.of_streams() * slowest,
             task: self.index,
             joints: &self.joints,
             active: self.braking || matches!(self.state, TaskState::Executing | TaskState::Cancelling),

@@ -18,7 +18,7 @@ pub struct JointView {
     pub velocity: f64,
     /// Last commanded position [rad].
     pub commanded: f64,
-    /// Last commanded velocity [rad/s].
+    /// Last commanded velocity [rad/s], in the time that passes here: a controller that slows its arm has its own.
     pub commanded_velocity: f64,
     /// Lowest commanded position [rad].
     pub lower: f64,
@@ -34,6 +34,8 @@ pub struct JointView {
     pub tracking_error: f64,
     /// How far a joint that droops may be read from its setpoint at rest [rad]; 0 for one that does not.
     pub droop: f64,
+    /// Fraction of its speed at which the arm's controller runs motions, if it reports one.
+    pub speed_fraction: Option<f64>,
     /// Index of its arm.
     pub arm: u16,
     /// When position and velocity were measured.
@@ -48,7 +50,7 @@ pub struct JointView {
 pub struct Context<'a> {
     /// The tick's time.
     pub now: Mono,
-    /// Length of the control step [s].
+    /// Length of the control step [s]; along a path in the arm's own time, which its controller may slow.
     pub dt: f64,
     /// Speed override: the fraction of its speed that a motion is to have, 0 while paused. A task that
     /// [applies it](TaskBody::applies_speed) changes to it within its limits.

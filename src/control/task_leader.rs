@@ -5,7 +5,7 @@ use std::f64::consts::TAU;
 
 use serde::{Deserialize, Serialize};
 
-use crate::arm::GripperInfo;
+use crate::arm::{GripperInfo, GripperUnit};
 
 /// The parameters that name a task's leader, read from among all its parameters. A type that has a key `leader` has the
 /// others, too.
@@ -55,15 +55,27 @@ impl LeaderJoint {
 
 /// A gripper is commanded again when its target has changed by this share of its range.
 const GRIPPER_STEP: f64 = 0.01;
+/// Share of a leader's range up to which a gripper that only opens and closes closes, and from which it opens.
+const CLOSES: f64 = 0.4;
+const OPENS: f64 = 0.6;
 
 /// Returns the position to which a gripper follows that of its leader: the same share of its range, or the same
 /// position where a range is not known. `None`: it is there already (`last` was commanded), or the units differ.
 pub fn gripper_target(position: f64, of: &GripperInfo, own: &GripperInfo, last: Option<f64>) -> Option<f64> {
     let span = |range: (f64, f64)| range.1 - range.0;
+    let unit = own.unit;
     let ranges = of.range.zip(own.range).filter(|(of, own)| span(*of) != 0.0 && span(*own) != 0.0);
     let (target, step) = match ranges {
         Some((of, own)) => {
-            let share = ((position - of.0) / span(of)).clamp(0.0, 1.0);
+            let mut share = ((position - of.0) / span(of)).clamp(0.0, 1.0);
+            // In the middle of a leader's way one that only opens and closes stays as it is.
+            if unit == GripperUnit::OnOff {
+                share = match share {
+                    ..=CLOSES => 0.0,
+                    OPENS.. => 1.0,
+                    _ => return None,
+                };
+            }
             (own.0 + share * span(own), GRIPPER_STEP * span(own).abs())
         }
         None if of.unit == own.unit => (position, 1e-3),
@@ -76,7 +88,6 @@ pub fn gripper_target(position: f64, of: &GripperInfo, own: &GripperInfo, last: 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::arm::GripperUnit;
 
     #[test]
     fn only_a_joint_without_end_takes_the_shorter_way_round() {
@@ -94,6 +105,9 @@ mod tests {
         assert!((gripper_target(0.95, &jaw, &fingers, None).unwrap() - 0.04).abs() < 1e-12);
         assert_eq!(gripper_target(2.5, &jaw, &fingers, None), Some(0.08));
         assert_eq!(gripper_target(0.95, &jaw, &fingers, Some(0.0405)), None, "less than a step");
+        let valve = GripperInfo { unit: GripperUnit::OnOff, range: Some((0.0, 1.0)), ..Default::default() };
+        let switched = [0.0, 0.7, 0.9, 1.0, 1.2, 1.9].map(|angle| gripper_target(angle, &jaw, &valve, None));
+        assert_eq!(switched, [Some(0.0), Some(0.0), None, None, Some(1.0), Some(1.0)], "it only opens and closes");
         let unknown = GripperInfo::default();
         assert_eq!(gripper_target(0.03, &fingers, &unknown, None), Some(0.03));
         assert_eq!(gripper_target(0.95, &jaw, &unknown, None), None, "an angle is no opening");

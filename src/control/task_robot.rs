@@ -26,6 +26,8 @@ pub struct RobotParams {
     pub joint_prefix: Option<String>,
     /// The coordinator's joint names and the model's.
     pub joint_name_mapping: BTreeMap<String, String>,
+    /// Positions of joints that the task does not move, by the model's names [rad or m].
+    pub fixed_joints: BTreeMap<String, f64>,
 }
 
 /// The kinematics of the robot whose end effector a task moves.

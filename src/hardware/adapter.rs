@@ -17,7 +17,10 @@ mod payload;
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
-use crate::arm::{Commanded, ForceUnit, GripperInfo, GripperUnit, Pose, Setpoint, StopPoint};
+use crate::arm::{
+    Bridging, Commanded, ControllerPose, FactoryKinematics, ForceUnit, GripperInfo, GripperUnit, Pose, Setpoint,
+    StopPoint,
+};
 use crate::clock::Mono;
 use crate::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
 
@@ -108,6 +111,9 @@ pub struct JointReading {
     /// What the controller itself commands its joints, if it reports that: measured or estimated values do not belong
     /// here.
     pub commanded: Option<Commanded>,
+    /// Fraction of its speed at which the controller runs motions at present, 0 to 1, if it reports that: setpoints are
+    /// then sent so much slower. Not a fraction that this run has set.
+    pub speed_fraction: Option<f64>,
 }
 
 /// The device's own state codes.
@@ -163,6 +169,22 @@ pub trait ManipulatorAdapter: Send {
     fn get_dof(&self) -> usize;
     /// Returns the joint limits, known or read from the device.
     fn get_limits(&mut self) -> AdapterResult<JointLimits>;
+    /// Takes the limits of commands: those of `get_limits`, narrowed by the blueprint. An adapter that makes commands
+    /// of its own between setpoints, for example to catch up with them, keeps to these. Called after the first
+    /// `connect`; they outlive connections.
+    fn set_limits(&mut self, _limits: &JointLimits) {}
+
+    /// Returns the arm's dimensions by its data sheet, and its own ones as its maker measured them; `None` for an arm
+    /// whose controller has none. Known once connected.
+    fn factory_kinematics(&self) -> Option<FactoryKinematics> {
+        None
+    }
+
+    /// Returns what the arm itself says of gaps in its setpoints; `None`: the figures of its row hold. Known once
+    /// connected.
+    fn bridging(&self) -> Option<Bridging> {
+        None
+    }
 
     // --- Mode ---
 
@@ -341,6 +363,7 @@ pub trait Gripper {
         match self.get_gripper_unit() {
             GripperUnit::Meters => ForceUnit::Newtons,
             GripperUnit::Radians => ForceUnit::NewtonMeters,
+            GripperUnit::OnOff => ForceUnit::Percent,
         }
     }
     /// Returns the smallest and the largest force that can be commanded [their unit]; `None` without force control.
@@ -404,9 +427,12 @@ pub trait ForceTorque {
 
 /// The device's own kinematics.
 pub trait Cartesian {
-    /// Returns the end-effector pose; `None` while it is unknown. Must not allocate.
-    fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>>;
-    /// Commands an end-effector pose; the device plans the motion. `velocity` as in
+    /// Returns the pose of the device's tool centre point with the offsets that make it that of the flange; `None`
+    /// while it is unknown. A device that has no tool of its own states its flange: [`ControllerPose::of_flange`]. An
+    /// offset that it does not report is `None`, never zero. Must not allocate.
+    fn read_cartesian_position(&mut self) -> AdapterResult<Option<ControllerPose>>;
+    /// Commands a pose of the device's tool centre point in its reference frame, as
+    /// [`ControllerPose::tcp_at`] returns it; the device plans the motion. `velocity` as in
     /// [`ManipulatorAdapter::write_joint_positions`]. Called in mode [`ControlMode::Position`]; no setpoint follows
     /// until the arm is activated again.
     fn write_cartesian_position(&mut self, _pose: &Pose, _velocity: f64) -> AdapterResult<()> {

@@ -24,6 +24,21 @@ pub struct Checked {
     pub max_payload: Option<f64>,
     /// How each joint's reading counts turns; empty: all as in the row.
     pub topology: Vec<Topology>,
+    /// What limits the speed of the tool.
+    pub tool: ToolFacts,
+}
+
+/// What is known of an arm's tool without the arm.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct ToolFacts {
+    /// Highest speed of the tool that the controller takes, by its manual [m/s].
+    pub velocity: Option<f64>,
+    /// Whether that is a setting of the controller, so that a blueprint may also raise it.
+    pub is_setting: bool,
+    /// A built-in model of the arm, and its flange.
+    pub model: Option<(&'static str, &'static str)>,
+    /// Links besides flange and tool whose speed is limited, by the names that models give them.
+    pub also: &'static [&'static str],
 }
 
 impl Checked {
@@ -40,6 +55,11 @@ impl Checked {
     /// Says that the controller takes loads up to this mass [kg]; 0: none.
     pub fn max_payload(self, mass: f64) -> Self {
         Self { max_payload: Some(mass), ..self }
+    }
+
+    /// Says what limits the speed of the tool.
+    pub fn tool(self, tool: ToolFacts) -> Self {
+        Self { tool, ..self }
     }
 
     /// Says how each joint's reading counts turns.

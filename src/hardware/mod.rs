@@ -10,3 +10,4 @@ pub mod registry;
 pub mod service;
 pub mod sim;
 pub mod transport;
+pub mod wire;

@@ -11,6 +11,7 @@ use crate::hardware::adapter::{AdapterError, AdapterResult, ManipulatorAdapter};
 use crate::hardware::check::{Checked, ConfigError};
 use crate::hardware::service::OpenService;
 use crate::hardware::sim::faults::Fault;
+use crate::hardware::wire::Wire;
 use crate::joint::{ControlMode, Joints};
 use crate::named::named;
 use crate::yaml;
@@ -128,6 +129,15 @@ pub enum EmulatorAddress {
 }
 
 impl EmulatorAddress {
+    /// Returns a number for the serial number of an emulated arm, another one at each address. `None`: it has the usual
+    /// one, as all have that listen for this program only or at 127.0.0.1.
+    pub fn number(&self) -> Option<u32> {
+        match self {
+            Self::Bind(IpAddr::V4(ip)) => Some(ip.to_bits() & 0x00FF_FFFF).filter(|number| *number != 1),
+            _ => None,
+        }
+    }
+
     /// Returns the TCP address of an emulator whose arm has its server at `port`.
     pub fn tcp(&self, port: u16) -> AdapterResult<SocketAddr> {
         match self {
@@ -202,6 +212,8 @@ pub struct AdapterSpec {
     pub emulate: Option<Emulate>,
     /// Opens the arm's bus for work outside a run, such as calibration; `None` if there is none.
     pub service: Option<OpenService>,
+    /// How captures of its protocol are read; `None` if nothing goes over a wire.
+    pub wire: Option<Wire>,
 }
 
 /// An adapter that this build lacks: of another operating system, or of a disabled cargo feature.

@@ -9,6 +9,10 @@ use nalgebra::Isometry3;
 use crate::collision::body::MeshMode;
 use crate::pose::tcp_name;
 use crate::robot::Source;
+use crate::robot::calibrated::Places;
+
+/// Maximum number of objects in the world: each one costs time in every plan and check.
+pub const MAX_OBJECTS: usize = 1000;
 
 /// A planner.
 #[derive(Debug, Clone, Default)]
@@ -38,6 +42,8 @@ pub struct RobotConfig {
     pub srdf: Option<PathBuf>,
     /// `joint_limits.yaml` file.
     pub joint_limits: Option<PathBuf>,
+    /// Frames of joints that replace those of the description: of an arm whose own dimensions are known.
+    pub places: Places,
     /// Collision geometry per link name; convex hulls for links not listed.
     pub shapes: BTreeMap<String, MeshMode>,
     /// Whether Collada collision meshes are accepted; they are converted to triangles when read.
@@ -52,12 +58,18 @@ pub struct RobotConfig {
     pub tool: Option<Isometry3<f64>>,
     /// The link of the arm's flange, where a load is measured from.
     pub flange_link: Option<String>,
+    /// The base in whose frame the arm's controller states poses: a link, and the base's pose in the link's frame;
+    /// `None`: `base_link`.
+    pub controller_base: Option<(String, Isometry3<f64>)>,
+    /// Whether motions are planned although the model does not fit the arm.
+    pub allows_mismatch: bool,
     /// Planned joints by their names in the model, from the base.
     pub joints: Vec<String>,
     /// Names of the same joints in the coordinator.
     pub coordinator_joints: Vec<String>,
-    /// Prefix that turns a model's joint name into the coordinator's, for joints that are not planned.
-    pub joint_prefix: String,
+    /// Where the joints are that are not planned, by their names in the model. Nothing is known of those not listed:
+    /// they count at their widest pose.
+    pub unplanned: BTreeMap<String, Unplanned>,
     /// The joint of the model that the arm's gripper drives.
     pub gripper_joint: Option<GripperJoint>,
     /// The trajectory task that executes its motions.
@@ -72,6 +84,15 @@ pub struct RobotConfig {
     pub max_jerk: Option<f64>,
     /// Named poses: one position for each of `joints` [rad].
     pub named_poses: BTreeMap<String, Vec<f64>>,
+}
+
+/// Where a joint is that is not planned.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Unplanned {
+    /// Where the run measures this joint of the coordinator.
+    Measured(String),
+    /// Always here [rad or m].
+    Fixed(f64),
 }
 
 /// The joint of a model that a gripper drives; other joints may follow by `mimic`.
@@ -91,6 +112,14 @@ impl RobotConfig {
         tcp_name(&self.end_effector_link, self.tool.is_some())
     }
 
+    /// Returns the joints that stay where they are, with their positions [rad or m].
+    pub fn fixed_joints(&self) -> impl Iterator<Item = (&str, f64)> {
+        self.unplanned.iter().filter_map(|(name, unplanned)| match unplanned {
+            Unplanned::Fixed(at) => Some((name.as_str(), *at)),
+            Unplanned::Measured(_) => None,
+        })
+    }
+
     /// Returns the files of its description.
     pub fn source(&self) -> Source {
         Source {
@@ -99,6 +128,7 @@ impl RobotConfig {
             xacro_args: self.xacro_args.clone(),
             srdf: self.srdf.clone(),
             joint_limits: self.joint_limits.clone(),
+            places: self.places.clone(),
             ..Source::default()
         }
     }
@@ -116,6 +146,7 @@ impl RobotConfig {
             xacro_args: BTreeMap::new(),
             srdf: None,
             joint_limits: None,
+            places: Places::new(),
             shapes: BTreeMap::new(),
             convert_meshes: true,
             base_pose: Isometry3::identity(),
@@ -123,9 +154,11 @@ impl RobotConfig {
             end_effector_link: "flange".into(),
             tool: None,
             flange_link: Some("flange".into()),
+            controller_base: None,
+            allows_mismatch: false,
             coordinator_joints: joints.iter().map(|joint| format!("arm_{joint}")).collect(),
             joints,
-            joint_prefix: String::new(),
+            unplanned: BTreeMap::new(),
             gripper_joint: None,
             task: None,
             exclusions: Vec::new(),
@@ -148,6 +181,8 @@ pub struct JointBounds {
     pub acceleration: f64,
     /// Maximum jerk [rad/s³].
     pub jerk: f64,
+    /// Maximum speed of the arm's tool [m/s]; `None`: no limit.
+    pub tcp_velocity: Option<f64>,
 }
 
 /// An object in the world.

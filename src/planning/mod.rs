@@ -42,6 +42,7 @@ mod stage_cache;
 pub mod start_contact;
 pub mod thin;
 pub mod timing;
+pub mod tool_timing;
 pub mod topp;
 pub mod unplanned_joints;
 pub mod verify;

@@ -168,6 +168,9 @@ pub enum PlanError {
         /// What encloses it; of several goals, the nearest.
         enclosed: Enclosed,
     },
+    /// Covers touch at the start, or at every goal: only a proof can say whether solids do.
+    #[error("nothing looks free at the start or at every goal")]
+    Covered,
     /// The timeout was reached.
     #[error("no path found in time, after {} samples and {} nodes", .0.samples, .0.nodes)]
     Timeout(SearchCount),
@@ -231,10 +234,12 @@ pub fn plan<C: CollisionChecker>(
         None => {
             // Where covers touch already, no edge would look free.
             let mut looks_free = |q: &Vec<f64>| checker.motion_looks_free(q, q);
+            let covered = settings.level != Level::Exact
+                && !stop.is_over()
+                && (!looks_free(&from) || !goals.iter().any(looks_free));
             let level = match settings.level {
-                Level::Certified if !stop.is_over() && (!looks_free(&from) || !goals.iter().any(looks_free)) => {
-                    Level::Exact
-                }
+                Level::Fast if covered => return Err(PlanError::Covered),
+                Level::Certified if covered => Level::Exact,
                 level => level,
             };
             let mut searches = Portfolio::new(&from, &goals, &settings.search, level, settings.seed);
@@ -244,7 +249,7 @@ pub fn plan<C: CollisionChecker>(
                 let found = match found {
                     Ok(found) => found,
                     Err(Halt::TookLong) => {
-                        not_enclosed(checker, &from, &goals, settings, stop)?;
+                        not_enclosed(checker, &from, &goals, (settings.seed, level.proves()), stop)?;
                         continue;
                     }
                     Err(Halt::Stopped) if stop.is_cancelled() => return Err(PlanError::Cancelled),
@@ -292,10 +297,9 @@ fn not_enclosed<C: CollisionChecker>(
     checker: &mut C,
     start: &[f64],
     goals: &[Vec<f64>],
-    settings: &PlanSettings,
+    how: (u64, bool),
     stop: &Stop,
 ) -> Result<(), PlanError> {
-    let how = (settings.seed, settings.level.proves());
     let to = [start.to_vec()];
     let mut nearest = None;
     // What both say of a wall between them is plainer of the goal: the start has most of the space as a rule.

@@ -17,7 +17,8 @@ use super::path_planner::{PlanError, digits_outside};
 use super::planning_scene::{PlannedRobot, PlanningScene};
 use super::stage_cache::Key;
 use super::start_contact::{EscapePath, passes};
-use super::timing::{bounds, time_within};
+use super::timing::{TimingError, bounds, time_within};
+use super::tool_timing::Tools;
 use super::topp::JointBound;
 use crate::collision::kept::Kept;
 use crate::collision::report::Pair;
@@ -119,12 +120,14 @@ pub struct PlanFailure {
     pub hint: Option<String>,
     /// Whether the request was cancelled.
     pub cancelled: bool,
+    /// Whether samples and covers only are in the way: a proof may find that nothing is.
+    pub unproven: bool,
 }
 
 impl PlanFailure {
     /// Creates a failure without a hint.
     pub fn new(what: impl Into<String>) -> Self {
-        Self { what: what.into(), hint: None, cancelled: false }
+        Self { what: what.into(), hint: None, cancelled: false, unproven: false }
     }
 
     /// Creates the failure of a cancelled request.
@@ -158,8 +161,23 @@ pub(super) struct Stage<'a> {
 /// Duration of each stage [s], by its name.
 pub(super) type StageTimes = BTreeMap<String, f64>;
 
-/// Plans a motion. The same scene, world and request give the same motion unless the timeout is reached.
+/// Plans a motion. The same scene, world and request give the same motion unless the timeout is reached. What samples
+/// have in the way may be free: if the level `fast` finds none, proofs are asked.
 pub fn solve(
+    setup: &PlanningScene,
+    world: &World,
+    request: &PlanRequest,
+    stop: &Stop,
+) -> Result<PlannedMotion, PlanFailure> {
+    match attempt(setup, world, request, stop) {
+        Err(failure) if request.level == Level::Fast && failure.unproven && !stop.is_over() => {
+            attempt(setup, world, &PlanRequest { level: Level::Certified, ..request.clone() }, stop)
+        }
+        found => found,
+    }
+}
+
+fn attempt(
     setup: &PlanningScene,
     world: &World,
     request: &PlanRequest,
@@ -294,7 +312,7 @@ pub(super) fn failure_for(stage: &Stage<'_>, error: &PlanError) -> PlanFailure {
         let unit = { kinds }.nth(joint).map_or("rad", |kind| kind.unit());
         (stage.joints.get(joint).map_or("a joint", String::as_str), unit)
     };
-    match error {
+    let failure = match error {
         PlanError::Outside { which, joint, position, lower, upper } => {
             let (name, unit) = name_and_unit(*joint);
             let digits = digits_outside(*position, *lower, *upper);
@@ -322,7 +340,9 @@ pub(super) fn failure_for(stage: &Stage<'_>, error: &PlanError) -> PlanFailure {
         PlanError::Timeout(_) => PlanFailure::new(error.to_string()).hint("increase --timeout, or try another --seed"),
         PlanError::Cancelled => PlanFailure::cancelled(),
         _ => PlanFailure::new(error.to_string()),
-    }
+    };
+    let unproven = matches!(error, PlanError::Covered | PlanError::Enclosed { .. } | PlanError::Exhausted(_));
+    PlanFailure { unproven, ..failure }
 }
 
 /// Returns the trajectory of robots that are already at the goal: a short rest.
@@ -355,7 +375,24 @@ fn timed(
     let checker = &mut stage.checker;
     let free = |a: &[f64], b: &[f64]| passes(checker, request.level, escape_path, (a, b), stop);
     let timed = time_within(&stage.joints, path, &bounds, deviation, 1.0, free);
-    timed.map(|timed| timed.trajectory).map_err(|e| late(stop).unwrap_or_else(|| PlanFailure::new(e.to_string())))
+    let timed = timed.map_err(|error| {
+        let unproven = matches!(error, TimingError::NotFree(..));
+        late(stop).unwrap_or_else(|| PlanFailure { unproven, ..PlanFailure::new(error.to_string()) })
+    })?;
+    Ok(tools(stage).slowed(&timed.trajectory, &bounds, request.speed).unwrap_or(timed.trajectory))
+}
+
+/// Returns the tools of the moving robots whose speed is limited.
+fn tools(stage: &Stage<'_>) -> Tools {
+    let (mut tools, mut first) = (Tools::default(), 0);
+    for robot in &stage.robots {
+        let joints = first..first + robot.joints.len();
+        first = joints.end;
+        if let Some((speed, limit)) = robot.tool_speed() {
+            tools.push(joints, speed, limit);
+        }
+    }
+    tools
 }
 
 /// Returns the bounds of the joints at a part of their speed: half the speed means half the velocity and half the

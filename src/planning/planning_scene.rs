@@ -17,6 +17,7 @@ use crate::collision::cloud::Cloud;
 use crate::collision::world::{Obstacle, Robot, World};
 use crate::collision::{Solid, ply};
 use crate::joint::DEFAULT_ACCELERATION;
+use crate::robot::kinematics::tool_speed::ToolSpeed;
 use crate::robot::kinematics::{Kinematics, KinematicsError, frame};
 use crate::robot::load;
 use crate::robot::mesh::Mesh;
@@ -43,6 +44,8 @@ pub struct PlannedRobot {
     pub end_effector: usize,
     /// Limits of the planned joints.
     pub limits: Vec<Limits>,
+    /// Highest speed of its tool and its flange [m/s].
+    pub tcp_velocity: Option<f64>,
     /// Positions of the joints that are not planned, among those of all joints of the model [rad or m].
     pub rest: Vec<f64>,
     /// Its collision geometry at its base pose, with all planned joints.
@@ -152,6 +155,7 @@ pub fn whole(model: RobotModel, allowed: Vec<(String, String)>) -> Result<Robot,
         model: Arc::new(model),
         base: DAffine3::IDENTITY,
         padding: 0.0,
+        apart: 0.0,
         allowed,
     })
 }
@@ -186,7 +190,7 @@ impl PlannedRobot {
         config.flange_link.as_deref().map(link).transpose()?;
         let shape = |link: &str| config.shapes.get(link).copied().unwrap_or_default();
         let solids = solids_of(&model, shape).map_err(|e| e.to_string())?;
-        let idle = idle(config, &model, &joints, &Measured::default());
+        let idle = idle(config, &model, &joints, &Measured::default(), &[]);
         let posed = model.positions(&idle);
         let tool = tool_frame(config.tool.as_ref());
         let kinematics = compiled(&model, &joints, &posed, end_effector, &tool).map_err(|e| e.to_string())?;
@@ -200,6 +204,7 @@ impl PlannedRobot {
             solids,
             base: frame(&(config.base_pose * base_in_model.inverse())),
             padding: 0.0,
+            apart: 0.0,
             allowed: config.exclusions.iter().cloned().chain(semantics.disabled_pairs()).collect(),
         };
         let outside = |pose: &[f64]| pose.iter().zip(&limits).position(|(q, l)| !(l.lower..=l.upper).contains(q));
@@ -214,13 +219,14 @@ impl PlannedRobot {
             config.named_poses.entry(name.to_owned()).or_insert(pose);
         }
         let disabled = { semantics.disabled }.into_iter().map(|pair| ([pair.a, pair.b], pair.reason)).collect();
-        Ok(Self { config, model, joints, end_effector, limits, rest: posed, body, disabled })
+        Ok(Self { config, model, joints, end_effector, limits, tcp_velocity: None, rest: posed, body, disabled })
     }
 
     fn narrow(&mut self, bounds: &BTreeMap<String, JointBounds>) -> Result<(), String> {
         let mut model = (*self.model).clone();
         for (&index, name) in self.joints.iter().zip(&self.config.coordinator_joints) {
             let (Some(joint), Some(b)) = (model.joints.get_mut(index), bounds.get(name)) else { continue };
+            self.tcp_velocity = b.tcp_velocity.into_iter().chain(self.tcp_velocity).reduce(f64::min);
             let (own, [lower, upper]) = (joint.limits, b.position);
             if own.upper.min(upper) <= own.lower.max(lower) {
                 return Err(format!(
@@ -246,6 +252,14 @@ impl PlannedRobot {
     /// the robot. Without a tool it coincides with the end-effector link.
     pub fn tcp(&self) -> usize {
         self.model.links.len()
+    }
+
+    /// Returns what measures the speed of its tool and its flange, and their limit [m/s]; `None` without one.
+    pub fn tool_speed(&self) -> Option<(ToolSpeed, f64)> {
+        let limit = self.tcp_velocity?;
+        let flange = self.config.flange_link.as_ref().and_then(|link| self.model.link_index(link));
+        let links = flange.into_iter().chain([self.tcp()]).collect();
+        Some((ToolSpeed::new((*self.body.kinematics).clone(), links), limit))
     }
 
     /// Returns the pose of the tool centre point in the frame `map` at these positions of the planned joints [rad].

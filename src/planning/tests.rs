@@ -349,6 +349,7 @@ fn pointer(lower: f64, upper: f64) -> Robot {
         model,
         base: DAffine3::IDENTITY,
         padding: 0.0,
+        apart: 0.0,
         allowed: vec![],
     }
 }

@@ -49,6 +49,7 @@ fn checker(posts: &[(f64, f64)]) -> ExactChecker {
         model,
         base: DAffine3::IDENTITY,
         padding: 0.0,
+        apart: 0.0,
         allowed: vec![("l1".into(), "l3".into())],
     };
     world.add_robot(robot).unwrap();

@@ -1,6 +1,6 @@
 //! Decoded messages of a log, and their channels.
 
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::collections::{BTreeMap, HashMap};
 
 use mcap::parse_record;
 use mcap::records::{Channel, MessageHeader, Record, op};
@@ -98,12 +98,18 @@ pub(super) fn message(opcode: u8, body: &[u8]) -> Option<(MessageHeader, &[u8])>
     Some((header, body.get(22..)?))
 }
 
-/// The channels of a log read so far.
+/// Name of a schema, the number of its fields that are known here, and otherwise the schema.
+type KnownSchema = (String, Option<usize>, Option<Schema>);
+
+/// The channels of a log read so far, by file and id.
 #[derive(Default)]
 pub(super) struct Channels {
-    /// Name of each schema, the number of its fields that are known here, and otherwise the schema.
-    schemas: HashMap<u16, (String, Option<usize>, Option<Schema>)>,
-    channels: HashMap<u16, KnownChannel>,
+    schemas: HashMap<(usize, u16), KnownSchema>,
+    channels: HashMap<(usize, u16), KnownChannel>,
+    /// Samples that the recorder lost, in the messages taken.
+    pub lost: u64,
+    /// Messages of channels that are not described.
+    pub unknown: u64,
 }
 
 struct KnownChannel {
@@ -117,7 +123,7 @@ struct KnownChannel {
 
 impl Channels {
     /// Takes schema and channel records. Skips invalid ones, and with them their messages.
-    pub(super) fn learn(&mut self, opcode: u8, body: &[u8]) {
+    pub(super) fn learn(&mut self, file: usize, opcode: u8, body: &[u8]) {
         match opcode {
             op::SCHEMA => {
                 if let Ok(Record::Schema { header, data }) = parse_record(opcode, body)
@@ -127,53 +133,52 @@ impl Channels {
                     let fields = text.and_then(|text| known_fields(&header.name, text));
                     let other =
                         text.filter(|_| fields.is_none()).and_then(|text| Schema::parse(&header.name, text).ok());
-                    self.schemas.insert(header.id, (header.name, fields, other));
+                    self.schemas.insert((file, header.id), (header.name, fields, other));
                 }
             }
             op::CHANNEL => {
                 if let Ok(Record::Channel(channel)) = parse_record(opcode, body)
                     && channel.topic.len() <= MAX_NAME
                 {
-                    self.add(channel);
+                    self.add(file, channel);
                 }
             }
             _ => {}
         }
     }
 
-    fn add(&mut self, channel: Channel) {
-        let (schema, fields, other) = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
+    fn add(&mut self, file: usize, channel: Channel) {
+        let (schema, fields, other) = self.schemas.get(&(file, channel.schema_id)).cloned().unwrap_or_default();
         let is_cdr = channel.message_encoding == "cdr";
         let (fields, other) = (fields.filter(|_| is_cdr), other.filter(|_| is_cdr));
-        self.channels.insert(channel.id, KnownChannel { topic: channel.topic, schema, fields, other });
+        self.channels.insert((file, channel.id), KnownChannel { topic: channel.topic, schema, fields, other });
     }
 
-    /// Takes a record; queues its message if it is selected.
-    pub(super) fn take(
-        &mut self,
-        opcode: u8,
-        body: &[u8],
-        wanted: &Selection,
-        ready: &mut VecDeque<Entry>,
-        lost: &mut u64,
-    ) {
-        self.learn(opcode, body);
-        let Some((header, bytes)) = message(opcode, body) else { return };
-        let Some(channel) = self.channels.get(&header.channel_id) else { return };
+    /// Returns whether all these channels of a file are described.
+    pub(super) fn know(&self, file: usize, ids: &[u16]) -> bool {
+        ids.iter().all(|id| self.channels.contains_key(&(file, *id)))
+    }
+
+    /// Takes a record; returns its message if it is selected.
+    pub(super) fn take(&mut self, file: usize, opcode: u8, body: &[u8], wanted: &Selection) -> Option<Entry> {
+        self.learn(file, opcode, body);
+        let (header, bytes) = message(opcode, body)?;
+        let Some(channel) = self.channels.get(&(file, header.channel_id)) else {
+            self.unknown += 1;
+            return None;
+        };
         if header.log_time < wanted.from || header.log_time > wanted.to {
-            return;
+            return None;
         }
         let chosen = wanted.topics.is_empty() || wanted.topics.contains(&channel.topic);
         if !chosen && channel.schema != Tick::SCHEMA {
-            return;
+            return None;
         }
         let data = decode(channel, bytes);
         if let Payload::Tick(tick) = &data {
-            *lost += u64::from(tick.dropped);
+            self.lost += u64::from(tick.dropped);
         }
-        if chosen {
-            ready.push_back(Entry { topic: channel.topic.clone(), log_time: header.log_time, data });
-        }
+        chosen.then(|| Entry { topic: channel.topic.clone(), log_time: header.log_time, data })
     }
 
     /// Returns the topics and their schemas.

@@ -62,18 +62,22 @@ pub fn further_parts(first: &Path) -> impl Iterator<Item = PathBuf> {
     (1..).map(|number| part(first, number)).take_while(|path| path.exists())
 }
 
-/// Returns the size of all files of a log [bytes].
+/// Returns the size of all files of a log, or in its folder [bytes].
 pub fn size(first: &Path) -> u64 {
     let size = |path: &Path| std::fs::metadata(path).map_or(0, |about| about.len());
+    if first.is_dir() {
+        return logs_in(first).iter().map(|path| size(path)).sum();
+    }
     size(first) + further_parts(first).map(|path| size(&path)).sum::<u64>()
 }
 
-/// Returns the log in a folder that holds one: its first file. Returns other paths unchanged.
-pub fn log_at(path: &Path) -> PathBuf {
-    let Ok(entries) = std::fs::read_dir(path) else { return path.to_owned() };
-    let logs = entries.flatten().map(|entry| entry.path()).filter(|path| path.extension().is_some_and(|e| e == LOG));
+/// Returns the MCAP files in a folder, the first file of a log before its further ones.
+pub fn logs_in(folder: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+    let mut logs: Vec<PathBuf> = entries.filter(|path| path.extension().is_some_and(|e| e == LOG)).collect();
     // `_` sorts after `.`, but a log of one file may have any name.
-    logs.min_by_key(|path| path.file_stem().map(std::ffi::OsStr::to_owned)).unwrap_or_else(|| path.to_owned())
+    logs.sort_by_key(|path| path.file_stem().map(std::ffi::OsStr::to_owned));
+    logs
 }
 
 /// Returns the newest log in `folder`, by the time in its name.
@@ -220,7 +224,7 @@ mod tests {
         parts.iter().for_each(|path| std::fs::write(path, b"").unwrap());
         assert_eq!(all(folder.path()).unwrap(), std::slice::from_ref(&first));
         assert_eq!(further_parts(&first).collect::<Vec<_>>(), parts);
-        assert_eq!(log_at(folder.path()), first);
+        assert_eq!(logs_in(folder.path()).first(), Some(&first));
         let writing = File::open(&parts[1]).unwrap();
         mark_as_being_written(&writing);
         assert_eq!(retain(folder.path(), 0).unwrap(), <[PathBuf; 0]>::default());

@@ -321,6 +321,8 @@ message! {
         commanded_velocity: Vec<f64>,
         /// Number of the newest setpoint that was refused; 0: none.
         refused: u64,
+        /// Fraction of its speed at which the arm's controller runs motions, 0 to 1; empty if not reported.
+        speed_fraction: Vec<f64>,
     }
 }
 

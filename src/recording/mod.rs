@@ -8,14 +8,18 @@
 //! Contents of a log and guarantees for readers: `docs/log-format.md`.
 
 mod arm_messages;
+pub mod attachment;
 pub mod cdr;
+pub mod chunk;
 pub mod disk_space;
 mod disk_sync;
 pub mod display_messages;
 mod entries;
 mod fault_ring;
 pub mod files;
+pub mod joints;
 pub mod log_writer;
+pub mod loss;
 pub mod messages;
 pub mod notes;
 mod packed_samples;
@@ -29,6 +33,8 @@ pub mod robots;
 pub mod ros2msg;
 pub mod scan;
 mod scene_log;
+pub mod source;
+pub mod source_files;
 pub mod storage;
 pub mod tcp_log;
 mod tick_log;

@@ -1,19 +1,21 @@
-//! Reads the records of an MCAP file in order and in bounded memory: at most [`LIMIT`] bytes at a time, whatever the
-//! file contains; a truncated file is read up to the cut, that of a live run up to its newest chunk.
+//! Reads the records of an MCAP file in order, or only their heads; a truncated file is read up to the cut, that of a
+//! live run up to its newest chunk.
 
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
-use mcap::records::{ChunkHeader, Record, op};
+use mcap::records::op;
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
-use mcap::{MAGIC, McapError, parse_record};
+use mcap::{MAGIC, McapError};
 use thiserror::Error;
 
 use super::files;
 
-/// Maximum length of a record, and of a chunk's contents [bytes]. Attachments may be longer.
-pub const LIMIT: usize = 16 * 1024 * 1024;
+/// At most this much of a file is checked at a time [bytes].
+const PIECE: usize = 1024 * 1024;
+/// Bytes of a [`Head`] at most: the times of a message, and what precedes the data of a chunk.
+const HEAD: u64 = 40;
 /// Opcode and length before each record.
 const PREFIX: usize = 9;
 /// Footer record and closing magic at the end of every complete file.
@@ -48,6 +50,42 @@ pub enum ReplayError {
         /// The problem.
         reason: String,
     },
+    /// A part of it is damaged. Reading continues after it.
+    #[error("the log {path} is {damage}\nhint: `dimos log doctor` checks all of it", path = damage.path.display())]
+    Damaged {
+        /// The damage.
+        damage: Damage,
+    },
+    /// The files of a folder are not one log.
+    #[error("{path} holds {what}\nhint: name one of its files")]
+    NotOneLog {
+        /// The folder.
+        path: PathBuf,
+        /// What it holds.
+        what: String,
+    },
+}
+
+/// Damage of a file.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Damage {
+    /// The file.
+    pub path: PathBuf,
+    /// Start of the damaged record [bytes from the start].
+    pub at: u64,
+    /// Unix times of the first and last message in it [ns], where they are known.
+    pub span: Option<(u64, u64)>,
+    /// What is wrong.
+    pub reason: String,
+    /// Whether its messages were read all the same.
+    pub kept: bool,
+}
+
+impl std::fmt::Display for Damage {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let end = if self.kept { "its messages are kept, and may be wrong" } else { "its messages are left out" };
+        write!(f, "damaged at byte {}: {}; {end}", self.at, self.reason)
+    }
 }
 
 /// A record: kind and contents. Contents of kinds that are not used are empty.
@@ -58,6 +96,30 @@ pub struct RawRecord {
     pub at: u64,
     /// Contents.
     pub body: Vec<u8>,
+}
+
+/// The head of a record.
+pub struct Head {
+    /// Kind: one of `mcap::records::op`.
+    pub opcode: u8,
+    /// Position of its start [bytes from the start of the file].
+    pub at: u64,
+    /// Position of its end.
+    pub end: u64,
+    /// The first bytes of its contents.
+    pub first: Vec<u8>,
+}
+
+impl Head {
+    /// Returns the Unix times of a message, or of the first and last one of a chunk [ns].
+    pub fn span(&self) -> Option<(u64, u64)> {
+        let number = |at: usize| self.first.get(at..at + 8)?.try_into().ok().map(u64::from_le_bytes);
+        match self.opcode {
+            op::MESSAGE => number(6).map(|time| (time, time)),
+            op::CHUNK => Some((number(0)?, number(8)?)),
+            _ => None,
+        }
+    }
 }
 
 /// Reads an MCAP file record by record.
@@ -97,6 +159,11 @@ impl RecordReader {
         Ok(records)
     }
 
+    /// Returns the path of the file.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
     /// Returns whether a live run was writing the file when it was opened.
     pub fn is_live(&self) -> bool {
         self.live
@@ -107,7 +174,7 @@ impl RecordReader {
         (self.at, self.length)
     }
 
-    /// Also reads attachments, up to [`LIMIT`]; by default they are skipped.
+    /// Also reads attachments; by default they are skipped.
     pub fn with_attachments(mut self) -> Self {
         self.attachments = true;
         self
@@ -151,15 +218,50 @@ impl RecordReader {
         record
     }
 
-    /// Returns the end of a file that is too short: a live one continues there.
-    fn too_short(&mut self, at: u64, reason: &str) -> Result<Option<RawRecord>, ReplayError> {
-        if self.live { Ok(None) } else { Err(self.cut(at, reason)) }
+    /// Returns the cut of a file that is too short; a live one continues there.
+    fn too_short(&mut self, at: u64, reason: &str) -> Result<(), ReplayError> {
+        if self.live { Ok(()) } else { Err(self.cut(at, reason)) }
     }
 
     fn read_record(&mut self) -> Result<Option<RawRecord>, ReplayError> {
+        let Some((opcode, at)) = self.begin()? else { return Ok(None) };
+        let length = self.at - at - PREFIX as u64;
+        let body = match opcode {
+            op::ATTACHMENT if self.attachments => self.body(length)?,
+            op::ATTACHMENT | op::MESSAGE_INDEX | op::ATTACHMENT_INDEX | op::METADATA_INDEX | op::SUMMARY_OFFSET => {
+                self.skip(length)?;
+                Vec::new()
+            }
+            _ => self.body(length)?,
+        };
+        Ok(self.finish(opcode, at)?.then_some(RawRecord { opcode, at, body }))
+    }
+
+    /// Returns the head of the next record, and skips the rest of it; ends as [`Self::next_record`] does.
+    pub fn next_head(&mut self) -> Result<Option<Head>, ReplayError> {
+        if self.ended {
+            return Ok(None);
+        }
+        let head = self.read_head();
+        self.ended = head.as_ref().map_or(true, |h| h.as_ref().is_none_or(|h| h.opcode == op::FOOTER));
+        head
+    }
+
+    fn read_head(&mut self) -> Result<Option<Head>, ReplayError> {
+        let Some((opcode, at)) = self.begin()? else { return Ok(None) };
+        let length = self.at - at - PREFIX as u64;
+        let kept = length.min(HEAD);
+        let first = self.body(kept)?;
+        self.skip(length - kept)?;
+        Ok(self.finish(opcode, at)?.then_some(Head { opcode, at, end: self.at, first }))
+    }
+
+    /// Reads the prefix of a record, and moves `at` to its end. Returns its kind and its start.
+    fn begin(&mut self) -> Result<Option<(u8, u64)>, ReplayError> {
         let at = self.at;
         if self.length - at < PREFIX as u64 {
-            return self.too_short(at, "no valid footer");
+            self.too_short(at, "no valid footer")?;
+            return Ok(None);
         }
         let prefix: [u8; PREFIX] = self.read()?;
         let [opcode, length @ ..] = prefix;
@@ -168,32 +270,38 @@ impl RecordReader {
             return Err(self.cut(at, "no record at this position"));
         }
         if length > self.length - at - PREFIX as u64 {
-            return self.too_short(at, "the file ends inside a record");
+            self.too_short(at, "the file ends inside a record")?;
+            return Ok(None);
         }
         self.at = at + PREFIX as u64 + length;
-        let body = match opcode {
-            op::ATTACHMENT if self.attachments && length <= LIMIT as u64 => self.body(length)?,
-            op::ATTACHMENT | op::MESSAGE_INDEX | op::ATTACHMENT_INDEX | op::METADATA_INDEX | op::SUMMARY_OFFSET => {
-                self.file.seek_relative(length as i64).map_err(|e| self.io(e))?;
-                Vec::new()
-            }
-            _ if length > LIMIT as u64 => return Err(self.cut(at, "a record exceeds 16 MiB")),
-            _ => self.body(length)?,
-        };
+        Ok(Some((opcode, at)))
+    }
+
+    /// Checks the end of a file after its footer; `false` where a live one continues.
+    fn finish(&mut self, opcode: u8, at: u64) -> Result<bool, ReplayError> {
         if opcode == op::FOOTER {
             if self.length - self.at < MAGIC.len() as u64 {
-                return self.too_short(at, "no valid footer");
+                self.too_short(at, "no valid footer")?;
+                return Ok(false);
             }
             if self.read::<{ MAGIC.len() }>()? != *MAGIC {
                 return Err(self.cut(at, "no valid footer"));
             }
         }
-        Ok(Some(RawRecord { opcode, at, body }))
+        Ok(true)
+    }
+
+    fn skip(&mut self, length: u64) -> Result<(), ReplayError> {
+        self.file.seek_relative(length as i64).map_err(|e| self.io(e))
     }
 
     fn body(&mut self, length: u64) -> Result<Vec<u8>, ReplayError> {
-        let mut body = vec![0; length as usize];
-        self.file.read_exact(&mut body).map_err(|e| self.io(e))?;
+        // Grows with what is read: the length is that of the file at most.
+        let mut body = Vec::new();
+        let read = self.file.by_ref().take(length).read_to_end(&mut body).map_err(|e| self.io(e))?;
+        if (read as u64) < length {
+            return Err(self.io(std::io::ErrorKind::UnexpectedEof.into()));
+        }
         Ok(body)
     }
 
@@ -230,7 +338,7 @@ pub fn check_sections(path: &Path) -> Result<Option<McapError>, ReplayError> {
     while let Some(event) = reader.next_event() {
         match event {
             Ok(LinearReadEvent::ReadRequest(wanted)) => {
-                let read = file.read(reader.insert(wanted.min(LIMIT))).map_err(io)?;
+                let read = file.read(reader.insert(wanted.min(PIECE))).map_err(io)?;
                 reader.notify_read(read);
             }
             Ok(LinearReadEvent::Record { .. }) => {}
@@ -240,59 +348,4 @@ pub fn check_sections(path: &Path) -> Result<Option<McapError>, ReplayError> {
         }
     }
     Ok(None)
-}
-
-/// Returns the header of a chunk record: time range, sizes, compression.
-pub fn chunk_header(body: &[u8]) -> Result<ChunkHeader, McapError> {
-    match parse_record(op::CHUNK, body)? {
-        Record::Chunk { header, .. } => Ok(header),
-        _ => Err(McapError::UnexpectedEoc),
-    }
-}
-
-/// Unpacks a chunk record and passes its records on in order. Verifies its checksum first.
-pub fn unpack_chunk(body: &[u8], mut each: impl FnMut(u8, &[u8])) -> Result<(), McapError> {
-    let Record::Chunk { header, data } = parse_record(op::CHUNK, body)? else { return Err(McapError::UnexpectedEoc) };
-    if header.uncompressed_size > LIMIT as u64 {
-        return Err(McapError::ChunkTooLarge(header.uncompressed_size));
-    }
-    match header.compression.as_str() {
-        "" => walk(&data, each),
-        "zstd" => {
-            // The library's reader unpacks the chunk as a file with a single record.
-            let mut reader = LinearReader::new_with_options(
-                LinearReaderOptions::default()
-                    .with_skip_start_magic(true)
-                    .with_skip_end_magic(true)
-                    .with_prevalidate_chunk_crcs(true)
-                    .with_record_length_limit(LIMIT),
-            );
-            let prefix = [&[op::CHUNK], &(body.len() as u64).to_le_bytes()[..]].concat();
-            let mut rest = prefix.chain(body);
-            while let Some(event) = reader.next_event() {
-                match event? {
-                    LinearReadEvent::ReadRequest(wanted) => {
-                        let wanted = wanted.min(PREFIX + body.len());
-                        let read = rest.read(reader.insert(wanted))?;
-                        reader.notify_read(read);
-                    }
-                    LinearReadEvent::Record { data, opcode } => each(opcode, data),
-                }
-            }
-            Ok(())
-        }
-        other => Err(McapError::UnsupportedCompression(other.to_owned())),
-    }
-}
-
-/// Passes on the records of an uncompressed chunk.
-fn walk(mut rest: &[u8], mut each: impl FnMut(u8, &[u8])) -> Result<(), McapError> {
-    while let Some((&opcode, after)) = rest.split_first() {
-        let (length, after) = after.split_first_chunk().ok_or(McapError::UnexpectedEoc)?;
-        let length = usize::try_from(u64::from_le_bytes(*length)).unwrap_or(usize::MAX);
-        let (body, after) = after.split_at_checked(length).ok_or(McapError::UnexpectedEoc)?;
-        each(opcode, body);
-        rest = after;
-    }
-    Ok(())
 }

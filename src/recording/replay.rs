@@ -1,4 +1,4 @@
-//! Reads a log: its decoded messages in order of time, up to a cut.
+//! Reads a log: its decoded messages in order of time.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
@@ -6,9 +6,12 @@ use std::path::{Path, PathBuf};
 use mcap::parse_record;
 use mcap::records::{Record, op};
 
-use super::entries::{Channels, message};
-use super::records::{RawRecord, RecordReader, chunk_header, unpack_chunk};
-use super::{PART, files};
+use super::attachment;
+use super::entries::Channels;
+use super::loss::Loss;
+use super::records::{Damage, RawRecord, RecordReader};
+use super::source::{Block, Source};
+use super::source_files;
 
 pub use super::entries::{Entry, Payload};
 pub use super::records::ReplayError;
@@ -45,27 +48,29 @@ pub struct LogInfo {
     pub topics: BTreeMap<String, String>,
 }
 
-/// A log opened for reading: of one in several files all of them, if it is opened by the first.
+/// Order of messages: their time, then the file and position of their block.
+type Key = (u64, (usize, u64));
+
+/// A log opened for reading: of one in several files all of them, if it is opened by the first or their folder.
 pub struct LogReader {
-    /// Files after the first, with their first and last times.
-    parts: Vec<(PathBuf, (u64, u64))>,
-    first: PathBuf,
-    /// The file that is read; 0 is the first.
-    part: usize,
-    topics: Option<Vec<String>>,
-    records: RecordReader,
+    source: Source,
     selection: Selection,
     info: LogInfo,
     channels: Channels,
-    /// Latest time and position of each chunk of a closed log.
-    index: Vec<(u64, u64)>,
-    ready: VecDeque<Entry>,
-    failed: Option<ReplayError>,
-    lost: u64,
+    /// Blocks to read.
+    queue: VecDeque<usize>,
+    /// Messages that were read, in order of time.
+    ready: VecDeque<(Key, Entry)>,
+    /// Damage to report after what is ready.
+    failed: VecDeque<ReplayError>,
+    found: Loss,
+    ended: bool,
+    /// Whether all channels were looked for when it was opened: others belong to no message.
+    knows_all: bool,
 }
 
 impl LogReader {
-    /// Opens a log. Uses the summary of a closed log; scans a truncated one to find its end.
+    /// Opens a log. Of one whose summary does not describe all channels it reads everything once.
     pub fn open(path: &Path) -> Result<Self, ReplayError> {
         Self::open_with(path, None)
     }
@@ -77,50 +82,62 @@ impl LogReader {
     }
 
     fn open_with(path: &Path, topics: Option<&[&str]>) -> Result<Self, ReplayError> {
-        let mut log = Self::open_one(path, topics)?;
-        for (part, number) in further_files(path, &log.info).into_iter().zip(1u32..) {
-            let next = Self::open_one(&part, topics)?.info;
-            if !continues(&log.info, &next, number) {
+        let mut source = Source::open(path)?;
+        let mut channels = Channels::default();
+        for (file, opcode, body) in std::mem::take(&mut source.outside) {
+            channels.learn(file, opcode, &body);
+        }
+        let enough = |channels: &Channels| {
+            topics.is_some_and(|topics| topics.iter().all(|topic| channels.topics().contains_key(*topic)))
+        };
+        if !enough(&channels) {
+            let described = |block: &Block, channels: &Channels| {
+                block.channels.as_deref().is_some_and(|ids| channels.know(block.file, ids))
+            };
+            let known: Vec<(usize, u64)> = source
+                .blocks
+                .iter()
+                .filter(|block| described(block, &channels))
+                .map(|block| (block.file, block.at))
+                .collect();
+            source.learn(
+                |file, opcode, body| {
+                    channels.learn(file, opcode, body);
+                    opcode == op::CHANNEL && enough(&channels)
+                },
+                |block| known.binary_search(&(block.file, block.at)).is_ok(),
+            )?;
+        }
+        let mut info = LogInfo {
+            span: source.span(),
+            complete: source.is_complete(),
+            live: source.is_live(),
+            topics: channels.topics(),
+            metadata: BTreeMap::new(),
+        };
+        for other in source.others.clone().into_iter().filter(|(_, _, opcode)| *opcode == op::METADATA) {
+            let Some(record) = source.other(other)? else { continue };
+            if let Ok(Record::Metadata(found)) = parse_record(record.opcode, &record.body)
+                && found.name == "dimos"
+            {
+                info.metadata = found.metadata;
                 break;
             }
-            (log.info.complete, log.info.live) = (next.complete, next.live);
-            log.info.topics.extend(next.topics);
-            // One without messages has nothing to read.
-            let times = next.span.or(log.info.span.map(|(_, end)| (end, end))).unwrap_or_default();
-            if let (Some(span), Some((_, end))) = (&mut log.info.span, next.span) {
-                span.1 = span.1.max(end);
-            }
-            log.parts.push((part, times));
         }
-        Ok(log)
-    }
-
-    fn open_one(path: &Path, topics: Option<&[&str]>) -> Result<Self, ReplayError> {
-        let mut records = RecordReader::open(path)?;
-        let (mut channels, mut index) = (Channels::default(), Vec::new());
-        let mut info = match records.summary_start()? {
-            Some(start) => summary(&mut records, start, &mut channels, &mut index)?,
-            None => None,
-        }
-        .map_or_else(|| scan(&mut records, &mut channels, topics), Ok)?;
-        info.live = records.is_live();
-        info.topics = channels.topics();
-        info.metadata = metadata(&mut records)?;
-        records.rewind()?;
-        Ok(Self {
-            parts: Vec::new(),
-            first: path.to_owned(),
-            part: 0,
-            topics: topics.map(|topics| topics.iter().map(|topic| (*topic).to_owned()).collect()),
-            records,
+        let mut log = Self {
+            source,
             selection: Selection::default(),
             info,
             channels,
-            index,
+            queue: VecDeque::new(),
             ready: VecDeque::new(),
-            failed: None,
-            lost: 0,
-        })
+            failed: VecDeque::new(),
+            found: Loss::default(),
+            ended: false,
+            knows_all: topics.is_none(),
+        };
+        log.select(Selection::default())?;
+        Ok(log)
     }
 
     /// Returns information about the log.
@@ -130,220 +147,107 @@ impl LogReader {
 
     /// Restarts with the messages of a selection.
     pub fn select(&mut self, selection: Selection) -> Result<(), ReplayError> {
-        self.selection = selection;
         self.ready.clear();
-        self.failed = None;
-        self.lost = 0;
-        let from = self.selection.from;
-        // The first file that has anything of the part; those before it end earlier.
-        let part = self.parts.iter().rposition(|(_, (start, _))| *start <= from).map_or(0, |at| at + 1);
-        if part != self.part {
-            self.turn_to(part)?;
-        }
-        // A late part of a long log begins at its first chunk. Everything else that is read comes before the chunks.
-        let (from, later) = (self.selection.from, self.info.span.is_some_and(|(start, _)| self.selection.from > start));
-        match self.index.iter().filter(|(end, _)| *end >= from).map(|(_, at)| *at).min().filter(|_| later) {
-            Some(at) => self.records.go_to(at),
-            None => self.records.rewind(),
-        }
+        self.ended = false;
+        self.found = Loss { began: self.info.span.map_or(0, |(start, _)| start), ..Loss::default() };
+        (self.channels.lost, self.channels.unknown) = (0, 0);
+        let inside = |start: u64, end: u64| end >= selection.from && start <= selection.to;
+        let blocks = self.source.blocks.iter().enumerate();
+        self.queue = blocks.filter(|(_, block)| inside(block.start, block.end)).map(|(index, _)| index).collect();
+        let damage = self.source.damage.iter();
+        let damage = damage.filter(|damage| damage.span.is_none_or(|(start, end)| inside(start, end)));
+        self.failed = damage.map(|damage| ReplayError::Damaged { damage: damage.clone() }).collect();
+        self.selection = selection;
+        Ok(())
     }
 
     /// Returns the next message; `None` at the end of a closed log, and at the newest chunk of a live one. Returns
-    /// `ReplayError::Cut` once, where a truncated or damaged log ends.
+    /// `ReplayError::Damaged` once for each part that is damaged, and continues after it; `ReplayError::Cut` once,
+    /// where a truncated log ends.
     pub fn next_entry(&mut self) -> Result<Option<Entry>, ReplayError> {
         loop {
-            if let Some(entry) = self.ready.pop_front() {
+            // Later blocks may have messages as old as that.
+            let later = self.queue.front().and_then(|next| self.source.blocks.get(*next));
+            let until = later.map_or(u64::MAX, |block| block.start);
+            if let Some((_, entry)) = self.ready.pop_front_if(|((time, _), _)| *time <= until) {
+                if matches!(entry.data, Payload::Damaged { .. } | Payload::Unknown { .. }) {
+                    self.found.undecoded += 1;
+                }
                 return Ok(Some(entry));
             }
-            if let Some(e) = self.failed.take() {
-                return Err(e);
-            }
-            let Some(record) = self.records.next_record()? else {
-                let next = self.parts.get(self.part).filter(|(_, (start, _))| *start <= self.selection.to);
-                if next.is_none() {
-                    return Ok(None);
+            if let Some(damaged) = self.failed.pop_front() {
+                if let ReplayError::Damaged { damage } = &damaged {
+                    self.found.damage.push(damage.clone());
                 }
-                self.turn_to(self.part + 1)?;
-                continue;
+                return Err(damaged);
+            }
+            let Some(next) = self.queue.pop_front() else {
+                let cut = self.source.cut.as_ref().filter(|_| !std::mem::replace(&mut self.ended, true));
+                let Some((path, at, reason)) = cut else { return Ok(None) };
+                self.found.cut = Some(format!("it ends at byte {at}: {reason}"));
+                return Err(ReplayError::Cut { path: path.to_path_buf(), at: *at, reason: reason.clone() });
             };
-            // Messages before the damage come first.
-            self.failed = self.take(&record).err();
+            let Self { source, channels, selection, ready, .. } = self;
+            let Some(place) = source.blocks.get(next).map(|block| (block.file, block.at)) else { continue };
+            let damage = source.read(next, |file, opcode, body| {
+                if let Some(entry) = channels.take(file, opcode, body, selection) {
+                    ready.push_back(((entry.log_time, place), entry));
+                }
+            })?;
+            self.failed.extend(damage.map(|damage| ReplayError::Damaged { damage }));
+            self.ready.make_contiguous().sort_by_key(|(key, _)| *key);
         }
     }
 
-    /// Opens another file of the log.
-    fn turn_to(&mut self, part: usize) -> Result<(), ReplayError> {
-        let path = part.checked_sub(1).and_then(|at| self.parts.get(at)).map_or(&self.first, |(path, _)| path);
-        let topics: Option<Vec<&str>> = self.topics.as_ref().map(|topics| topics.iter().map(String::as_str).collect());
-        let one = Self::open_one(path, topics.as_deref())?;
-        (self.records, self.channels, self.index, self.part) = (one.records, one.channels, one.index, part);
-        Ok(())
+    /// Returns what was found missing in the selection so far; a cut counts only if the selection reaches to it.
+    pub fn loss(&self) -> Loss {
+        let mut loss = self.found.clone();
+        loss.unknown = if self.knows_all { self.channels.unknown } else { 0 };
+        if self.info.span.is_some_and(|(_, end)| self.selection.to < end) {
+            loss.cut = None;
+        }
+        loss
     }
 
     /// Returns the number of samples lost by the recorder so far, whether or not `/dimos/tick` is selected.
     pub fn lost(&self) -> u64 {
-        self.lost
-    }
-
-    fn take(&mut self, record: &RawRecord) -> Result<(), ReplayError> {
-        match record.opcode {
-            op::CHUNK => {
-                let Self { channels, selection, ready, lost, .. } = self;
-                let mut take = || {
-                    let header = chunk_header(&record.body)?;
-                    if header.message_end_time >= selection.from && header.message_start_time <= selection.to {
-                        unpack_chunk(&record.body, |opcode, body| channels.take(opcode, body, selection, ready, lost))?;
-                    }
-                    Ok::<(), mcap::McapError>(())
-                };
-                take().map_err(|e| self.records.cut(record.at, e))?;
-                self.ready.make_contiguous().sort_by_key(|entry| entry.log_time);
-            }
-            opcode => self.channels.take(opcode, &record.body, &self.selection, &mut self.ready, &mut self.lost),
-        }
-        Ok(())
+        self.channels.lost
     }
 }
 
-/// Returns the files that may continue a log.
-fn further_files(path: &Path, info: &LogInfo) -> Vec<PathBuf> {
-    if info.metadata.contains_key(PART) { Vec::new() } else { files::further_parts(path).collect() }
-}
-
-/// Returns whether a file continues a log: it is of the same run, and has this number.
-fn continues(log: &LogInfo, next: &LogInfo, number: u32) -> bool {
-    let same = |key| log.metadata.get(key) == next.metadata.get(key);
-    next.metadata.get(PART) == Some(&number.to_string()) && same("wall_offset_ns") && same("run")
-}
-
-/// Returns the files of a log in order: of one in several files all of them, if this is the first.
+/// Returns the files of a log in order: of one in several files all of them, if this is the first or their folder.
 pub fn parts(path: &Path) -> Result<Vec<PathBuf>, ReplayError> {
-    if !files::part(path, 1).exists() {
-        return Ok(vec![path.to_owned()]);
-    }
-    let log = LogReader::open(path)?;
-    Ok(std::iter::once(log.first).chain(log.parts.into_iter().map(|(path, _)| path)).collect())
+    Ok(source_files::of(path)?.files)
 }
 
-/// Returns an attachment by name; `None` if there is none before the first message.
+/// Returns an attachment by name; `None` if there is none.
 pub fn attachment(path: &Path, name: &str) -> Result<Option<Vec<u8>>, ReplayError> {
-    let mut records = RecordReader::open(path)?.with_attachments();
-    loop {
-        let record = match records.next_record() {
-            Ok(Some(record)) if !matches!(record.opcode, op::CHUNK | op::MESSAGE) => record,
-            Ok(_) | Err(ReplayError::Cut { .. }) => return Ok(None),
-            Err(e) => return Err(e),
-        };
-        if let Ok(Record::Attachment { header, data, .. }) = parse_record(record.opcode, &record.body)
-            && header.name == name
-        {
-            return Ok(Some(data.into_owned()));
-        }
-    }
-}
-
-/// Reads time span and channels from the summary of a closed log; `None` if it lacks them.
-fn summary(
-    records: &mut RecordReader,
-    start: u64,
-    channels: &mut Channels,
-    index: &mut Vec<(u64, u64)>,
-) -> Result<Option<LogInfo>, ReplayError> {
-    records.go_to(start)?;
-    let mut info = None;
-    loop {
-        match records.next_record() {
-            Ok(Some(record)) => {
-                channels.learn(record.opcode, &record.body);
-                if record.opcode == op::CHUNK_INDEX
-                    && let Ok(Record::ChunkIndex(chunk)) = parse_record(record.opcode, &record.body)
-                {
-                    index.push((chunk.message_end_time, chunk.chunk_start_offset));
-                }
-                if record.opcode == op::STATISTICS
-                    && let Ok(Record::Statistics(s)) = parse_record(record.opcode, &record.body)
-                {
-                    let span = (s.message_count > 0).then_some((s.message_start_time, s.message_end_time));
-                    info = Some(LogInfo { span, complete: true, ..LogInfo::default() });
-                }
-            }
-            Ok(None) => return Ok(info),
-            // An unreadable summary counts as absent.
-            Err(ReplayError::Cut { .. }) => return Ok(None),
-            Err(e) => return Err(e),
-        }
-    }
-}
-
-/// Reads time span and channels of a log without a summary, from the whole file; with `topics`, channels only until
-/// these are known.
-fn scan(records: &mut RecordReader, channels: &mut Channels, topics: Option<&[&str]>) -> Result<LogInfo, ReplayError> {
-    let knows = |channels: &Channels| {
-        topics.is_some_and(|topics| topics.iter().all(|topic| channels.topics().contains_key(*topic)))
+    let named = |record: &RawRecord, path: &Path| {
+        let is_one = record.opcode == op::ATTACHMENT;
+        let found = attachment::of(&record.body).filter(|found| is_one && found.header.name == name)?;
+        Some(found.damage.map_or(Ok(Some(found.data)), |reason| {
+            let (path, reason) = (path.to_owned(), format!("{name}: {reason}"));
+            Err(ReplayError::Damaged { damage: Damage { path, at: record.at, span: None, reason, kept: false } })
+        }))
     };
-    let mut known = knows(channels);
-    records.rewind()?;
-    let mut info = LogInfo::default();
-    let mut seen = |from: u64, to: u64| {
-        let (start, end) = info.span.unwrap_or((from, to));
-        info.span = Some((start.min(from), end.max(to)));
-    };
-    loop {
-        match records.next_record() {
-            Ok(Some(record)) if record.opcode == op::CHUNK => {
-                // One without messages has no times.
-                let mut any = known && chunk_header(&record.body).is_ok_and(|header| header.message_end_time > 0);
-                let each = |opcode, body: &[u8]| {
-                    any |= opcode == op::MESSAGE;
-                    channels.learn(opcode, body);
-                };
-                if !known && unpack_chunk(&record.body, each).is_err() {
-                    return Ok(info);
-                }
-                known = known || knows(channels);
-                if let (true, Ok(header)) = (any, chunk_header(&record.body)) {
-                    seen(header.message_start_time, header.message_end_time);
-                }
+    // Most are before the first message: a long log is not read for them.
+    if let Some(part) = parts(path)?.first() {
+        let mut records = RecordReader::open(part)?.with_attachments();
+        while let Ok(Some(record)) = records.next_record() {
+            if let Some(found) = named(&record, part) {
+                return found;
             }
-            Ok(Some(record)) => {
-                channels.learn(record.opcode, &record.body);
-                if let Some((header, _)) = message(record.opcode, &record.body) {
-                    seen(header.log_time, header.log_time);
-                }
+            if matches!(record.opcode, op::CHUNK | op::MESSAGE) {
+                break;
             }
-            Ok(None) => {
-                info.complete = !records.is_live();
-                return Ok(info);
-            }
-            Err(ReplayError::Cut { .. }) => return Ok(info),
-            Err(e) => return Err(e),
         }
     }
-}
-
-/// Reads the run's metadata, stored before the first message.
-fn metadata(records: &mut RecordReader) -> Result<BTreeMap<String, String>, ReplayError> {
-    records.rewind()?;
-    loop {
-        let record = match records.next_record() {
-            Ok(Some(record)) => record,
-            Ok(None) | Err(ReplayError::Cut { .. }) => return Ok(BTreeMap::new()),
-            Err(e) => return Err(e),
-        };
-        match parse_metadata(&record) {
-            Some(found) => return Ok(found),
-            None if matches!(record.opcode, op::CHUNK | op::MESSAGE) => return Ok(BTreeMap::new()),
-            None => {}
+    let mut source = Source::open(path)?;
+    for other in source.others.clone() {
+        let Some(record) = source.other(other)? else { continue };
+        if let Some(found) = named(&record, source.path(other.0)) {
+            return found;
         }
     }
-}
-
-fn parse_metadata(record: &RawRecord) -> Option<BTreeMap<String, String>> {
-    if record.opcode != op::METADATA {
-        return None;
-    }
-    match parse_record(record.opcode, &record.body) {
-        Ok(Record::Metadata(m)) if m.name == "dimos" => Some(m.metadata),
-        _ => None,
-    }
+    Ok(None)
 }

@@ -1,18 +1,21 @@
 //! Copies what can be read of a log to a new one: a part of a log, or what a crash left.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{BufWriter, Error};
 use std::path::Path;
 
-use mcap::records::{MessageHeader, Metadata, Record};
+use mcap::records::{AttachmentHeader, MessageHeader, Metadata, Record, op};
 use mcap::{Attachment, McapError, WriteOptions, Writer, parse_record};
 
-use super::records::ReplayError;
+use super::attachment;
+use super::records::{RawRecord, ReplayError};
 use super::scan::{Item, LogChannel, RawMessage, Scan};
 
 /// Key in the metadata of a part of a log: the log that it was cut out of.
 pub const PART_OF: &str = "part_of";
+/// Name of the metadata of a copy that has what was damaged: attachments, and what is wrong with them.
+pub const DAMAGED: &str = "damaged";
 /// Topics whose messages are moments, not states: they are not repeated at the beginning of a part.
 const MOMENTS: [&str; 5] = ["/dimos/tick", "/dimos/events", "/dimos/requests", "/rosout", "/joint_trajectory"];
 /// A topic whose messages add to each other.
@@ -64,38 +67,26 @@ pub fn copy(
         e => RewriteError::Write { path: to.display().to_string(), reason: e.to_string(), exists: false },
     };
     let file = File::create_new(to).map_err(failed)?;
-    let options = WriteOptions::new().profile("ros2").library(concat!("dimos/", env!("CARGO_PKG_VERSION")));
+    let options = WriteOptions::new().profile(scan.profile()).library(concat!("dimos/", env!("CARGO_PKG_VERSION")));
     let options = options.compression_level(1).compression_threads(0).disable_seeking(true);
     let mut copy = Copy {
         writer: options.create(BufWriter::new(file)).map_err(refused)?,
         ids: BTreeMap::new(),
         before: BTreeMap::new(),
         added: Vec::new(),
+        others: BTreeSet::new(),
         written: Written::default(),
     };
-    let (from, until) = scan.part;
-    let mut in_part = false;
+    let (from, until) = scan.part();
+    let (mut in_part, mut damaged) = (false, BTreeMap::new());
     while let Some(item) = scan.next_item()? {
         match item {
-            Item::Other(record) => match parse_record(record.opcode, &record.body) {
-                Ok(Record::Attachment { header, data, .. }) => copy
-                    .writer
-                    .attach(&Attachment {
-                        log_time: header.log_time,
-                        create_time: header.create_time,
-                        name: header.name,
-                        media_type: header.media_type,
-                        data,
-                    })
-                    .map_err(refused)?,
-                Ok(Record::Metadata(Metadata { name, mut metadata })) => {
-                    if let Some(whole) = part_of.filter(|_| name == "dimos") {
-                        metadata.insert(PART_OF.to_owned(), whole.to_owned());
-                    }
-                    copy.writer.write_metadata(&Metadata { name, metadata }).map_err(refused)?;
+            Item::Other(record) => {
+                if let Some((name, why)) = copy.other(&record, part_of).map_err(refused)? {
+                    scan.lacks(format!("{name} at byte {}: {why}", record.at));
+                    damaged.insert(name, why);
                 }
-                _ => {}
-            },
+            }
             Item::Messages => {
                 for (message, channel, bytes) in scan.messages() {
                     if message.time < from {
@@ -114,6 +105,13 @@ pub fn copy(
             }
         }
     }
+    // Channels without messages are part of a log, too.
+    for (id, channel) in &scan.channels {
+        copy.id(*id, channel).map_err(refused)?;
+    }
+    if !damaged.is_empty() {
+        copy.writer.write_metadata(&Metadata { name: DAMAGED.to_owned(), metadata: damaged }).map_err(refused)?;
+    }
     copy.writer.finish().map_err(refused)?;
     let file = copy.writer.into_inner().into_inner().map_err(|e| failed(e.into_error()))?;
     file.sync_all().map_err(failed)?;
@@ -127,10 +125,41 @@ struct Copy {
     /// The latest message of each channel before the part.
     before: BTreeMap<u16, (RawMessage, LogChannel, Vec<u8>)>,
     added: Vec<(RawMessage, LogChannel, Vec<u8>)>,
+    /// Names, lengths and checksums of the attachments and metadata that were copied.
+    others: BTreeSet<(String, usize, u32)>,
     written: Written,
 }
 
 impl Copy {
+    /// Copies an attachment or metadata, once. Returns its name and what is wrong with it.
+    fn other(&mut self, record: &RawRecord, part_of: Option<&str>) -> Result<Option<(String, String)>, McapError> {
+        if record.opcode == op::ATTACHMENT {
+            let Some(found) = attachment::of(&record.body) else {
+                return Ok(Some(("an attachment".to_owned(), "it cannot be read, and is left out".to_owned())));
+            };
+            let AttachmentHeader { log_time, create_time, name, media_type } = found.header;
+            // Every file of a split log has the same.
+            if !self.others.insert((name.clone(), found.data.len(), crc32fast::hash(&found.data))) {
+                return Ok(None);
+            }
+            let data = found.data.into();
+            let kept = Attachment { log_time, create_time, name: name.clone(), media_type, data };
+            self.writer.attach(&kept)?;
+            return Ok(found.damage.map(|why| (name, format!("{why}; its bytes are kept, and may be wrong"))));
+        }
+        let Ok(Record::Metadata(Metadata { name, mut metadata })) = parse_record(record.opcode, &record.body) else {
+            return Ok(Some(("metadata".to_owned(), "they cannot be read, and are left out".to_owned())));
+        };
+        if !self.others.insert((name.clone(), 0, if name == "dimos" { 0 } else { crc32fast::hash(&record.body) })) {
+            return Ok(None);
+        }
+        if let Some(whole) = part_of.filter(|_| name == "dimos") {
+            metadata.insert(PART_OF.to_owned(), whole.to_owned());
+        }
+        self.writer.write_metadata(&Metadata { name, metadata })?;
+        Ok(None)
+    }
+
     fn keep(&mut self, message: RawMessage, channel: &LogChannel, bytes: &[u8]) {
         let topic = channel.topic.as_str();
         if topic == ADDED && self.added.len() < MAX_ADDED {
@@ -149,22 +178,27 @@ impl Copy {
     fn repeat(&mut self, time: u64) -> Result<(), McapError> {
         let mut kept: Vec<_> = std::mem::take(&mut self.before).into_values().chain(self.added.drain(..)).collect();
         kept.sort_by_key(|(message, ..)| message.time);
-        kept.iter().try_for_each(|(message, channel, bytes)| self.put(RawMessage { time, ..*message }, channel, bytes))
+        let put = |(message, channel, bytes): &(RawMessage, LogChannel, Vec<u8>)| {
+            self.put(RawMessage { time, published: time, ..*message }, channel, bytes)
+        };
+        kept.iter().try_for_each(put)
     }
 
     fn put(&mut self, message: RawMessage, channel: &LogChannel, bytes: &[u8]) -> Result<(), McapError> {
-        let id = match self.ids.get(&message.channel) {
-            Some(id) => *id,
-            None => {
-                let (name, encoding, text) = &channel.schema;
-                let schema = if name.is_empty() { 0 } else { self.writer.add_schema(name, encoding, text)? };
-                let id = self.writer.add_channel(schema, &channel.topic, &channel.encoding, &channel.metadata)?;
-                self.ids.insert(message.channel, id);
-                id
-            }
-        };
-        let (time, sequence) = (message.time, message.sequence);
-        let header = MessageHeader { channel_id: id, sequence, log_time: time, publish_time: time };
-        self.writer.write_to_known_channel(&header, bytes)
+        let channel_id = self.id(message.channel, channel)?;
+        let RawMessage { time: log_time, published: publish_time, sequence, .. } = message;
+        self.writer.write_to_known_channel(&MessageHeader { channel_id, sequence, log_time, publish_time }, bytes)
+    }
+
+    /// Returns the id of a channel in the new file, which has it from then on.
+    fn id(&mut self, channel_id: u16, channel: &LogChannel) -> Result<u16, McapError> {
+        if let Some(id) = self.ids.get(&channel_id) {
+            return Ok(*id);
+        }
+        let (name, encoding, text) = &channel.schema;
+        let schema = if name.is_empty() { 0 } else { self.writer.add_schema(name, encoding, text)? };
+        let id = self.writer.add_channel(schema, &channel.topic, &channel.encoding, &channel.metadata)?;
+        self.ids.insert(channel_id, id);
+        Ok(id)
     }
 }

@@ -10,8 +10,8 @@ use super::arm_messages::{input, input_differs, output, output_differs, status};
 use super::display_messages::DiagnosticArray;
 use super::log_writer::LogWriter;
 use super::messages::{
-    ArmInput, ArmOutput, ArmStatus, Event, Header, JointState, Log, PoseStamped, Text, Tick, Time, Vector3, Wrench,
-    WrenchStamped,
+    ArmInput, ArmOutput, ArmStatus, Event, Header, JointState, Log, PoseStamped, Quaternion, Text, Tick, Time, Vector3,
+    Wrench, WrenchStamped,
 };
 use super::scene_log::SceneLog;
 use super::tcp_log::{TCP_EVERY, TcpChains};
@@ -56,6 +56,8 @@ pub(super) struct ArmLog {
     status: Option<StatusKey>,
     status_at: Mono,
     tcp_at: Option<Mono>,
+    /// Orientation of the latest tool centre point.
+    tcp_turn: Option<Quaternion>,
     error_text: String,
     /// A new file begins with everything that is known of it.
     pub(super) fresh: bool,
@@ -336,7 +338,13 @@ impl TickLog {
             let chains = lock(&self.tcps);
             let pose = chains.get(index).and_then(|chain| chain.as_ref()?.pose(&self.states.position));
             drop(chains);
-            if let Some(pose) = pose {
+            if let Some(mut pose) = pose {
+                let (now, last) = (&mut pose.orientation, &arm.tcp_turn);
+                // Of two quaternions of one orientation the one near the last: readers interpolate between them.
+                if last.as_ref().is_some_and(|q| q.x * now.x + q.y * now.y + q.z * now.z + q.w * now.w < 0.0) {
+                    *now = Quaternion { x: -now.x, y: -now.y, z: -now.z, w: -now.w };
+                }
+                arm.tcp_turn = Some(now.clone());
                 let header = Header { frame_id: "map".to_owned(), ..header.clone() };
                 log.publish(&format!("/tcp/{id}"), time, &PoseStamped { header, pose })?;
                 arm.tcp_at = Some(tick.deadline);

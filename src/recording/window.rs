@@ -2,126 +2,47 @@
 //! messages of each topic. Only the chunks that are shown are read.
 
 use std::collections::HashMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use mcap::parse_record;
-use mcap::records::{Record, op};
-
-use super::entries::message;
-use super::records::{RecordReader, ReplayError, chunk_header, unpack_chunk};
+use super::records::ReplayError;
 use super::scan::{Item, LogChannel, RawMessage, Scan};
 
 /// A log, with the index of its chunks in memory.
 pub struct LogWindows {
-    path: PathBuf,
     scan: Scan,
-    /// In order of their first message.
-    chunks: Vec<Chunk>,
-    /// Where the part without an index that was not read yet begins [bytes]; `None`: the file has an index.
-    next: Option<u64>,
-    cut: Option<String>,
-}
-
-struct Chunk {
-    start: u64,
-    end: u64,
-    at: u64,
-    channels: Box<[u16]>,
 }
 
 impl LogWindows {
     /// Opens a log. Uses the index of a closed one; of another one it reads everything once, up to a cut.
     pub fn open(path: &Path) -> Result<Self, ReplayError> {
         let mut scan = Scan::open(path)?;
-        let mut chunks = Vec::new();
-        if let Some(start) = scan.records.summary_start()? {
-            scan.records.go_to(start)?;
-            while let Ok(Some(record)) = scan.records.next_record() {
-                scan.learn(record.opcode, &record.body);
-                if let Ok(Record::ChunkIndex(index)) = parse_record(record.opcode, &record.body) {
-                    let channels: Box<[u16]> = index.message_index_offsets.keys().copied().collect();
-                    let (start, end) = (index.message_start_time, index.message_end_time);
-                    chunks.push(Chunk { start, end, at: index.chunk_start_offset, channels });
-                }
-            }
-        }
-        let mut log = Self { path: path.to_owned(), scan, chunks, next: None, cut: None };
-        if log.chunks.is_empty() || log.chunks.iter().any(|chunk| chunk.channels.is_empty() && chunk.end > 0) {
-            log.chunks.clear();
-            log.scan.records.rewind()?;
-            log.index()?;
-        }
-        log.sort();
-        Ok(log)
+        scan.learn_all()?;
+        Ok(Self { scan })
     }
 
     /// Takes note of what a live run has written since then; returns whether it was live.
     pub fn refresh(&mut self) -> Result<bool, ReplayError> {
-        let (Some(next), true) = (self.next, self.scan.is_live()) else { return Ok(false) };
-        self.scan.records = RecordReader::open(&self.path)?.with_attachments();
-        self.scan.records.go_to(next)?;
-        self.index()?;
-        self.sort();
-        Ok(true)
-    }
-
-    fn sort(&mut self) {
-        // One without messages has no times.
-        self.chunks.retain(|chunk| !chunk.channels.is_empty());
-        self.chunks.sort_by_key(|chunk| chunk.start);
-    }
-
-    /// Reads on to the end of the file, and notes the chunks.
-    fn index(&mut self) -> Result<(), ReplayError> {
-        self.cut = None;
-        loop {
-            let record = match self.scan.records.next_record() {
-                Ok(Some(record)) => record,
-                Ok(None) => break,
-                Err(ReplayError::Cut { at, reason, .. }) => {
-                    self.cut = Some(format!("it ends at byte {at}: {reason}"));
-                    break;
-                }
-                Err(e) => return Err(e),
-            };
-            if record.opcode != op::CHUNK {
-                self.scan.learn(record.opcode, &record.body);
-                continue;
-            }
-            let mut channels = Vec::new();
-            let scan = &mut self.scan;
-            let unpacked = unpack_chunk(&record.body, |opcode, body| match message(opcode, body) {
-                Some((header, _)) if !channels.contains(&header.channel_id) => channels.push(header.channel_id),
-                Some(_) => {}
-                None => scan.learn(opcode, body),
-            });
-            match chunk_header(&record.body) {
-                Ok(header) if unpacked.is_ok() => self.chunks.push(Chunk {
-                    start: header.message_start_time,
-                    end: header.message_end_time,
-                    at: record.at,
-                    channels: channels.into(),
-                }),
-                _ => self.cut = Some(format!("it is damaged at byte {}", record.at)),
-            }
+        let was_live = self.scan.source.refresh()?;
+        if was_live {
+            self.scan.describe()?;
+            self.scan.learn_all()?;
         }
-        self.next = Some(self.scan.position().0);
-        Ok(())
+        Ok(was_live)
     }
 
     /// Returns the Unix times of its first and last message [ns]; `None` without messages.
     pub fn span(&self) -> Option<(u64, u64)> {
-        Some((self.chunks.first()?.start, self.chunks.iter().map(|chunk| chunk.end).max()?))
+        self.scan.source.span()
     }
 
     /// Returns whether a live run was writing it when it was read last.
     pub fn is_live(&self) -> bool {
-        self.next.is_some() && self.scan.is_live()
+        self.scan.is_live()
     }
 
-    /// Returns what it lacks; `None` if it is whole or live.
-    pub fn loss(&self) -> Option<&str> {
-        self.cut.as_deref().filter(|_| !self.scan.is_live())
+    /// Returns what it lacks, as far as it was read; `None` if it is whole or live.
+    pub fn loss(&self) -> Option<String> {
+        self.scan.loss_of((0, u64::MAX)).text()
     }
 
     /// Returns its topics.
@@ -142,32 +63,29 @@ impl LogWindows {
         let wanted = self.scan.channels.iter().filter(|(_, channel)| topics.contains(&channel.topic.as_str()));
         // When the next message of each channel is due.
         let mut due: HashMap<u16, u64> = wanted.map(|(id, _)| (*id, from)).collect();
-        self.scan.part = (from, to);
-        self.scan.damage.clear();
-        for chunk in &self.chunks {
-            let any = chunk.channels.iter().any(|id| due.get(id).is_some_and(|due| *due <= chunk.end));
-            if !any || chunk.start > to {
-                continue;
-            }
-            // One that is damaged has no messages.
-            self.scan.chunks = Some([chunk.at].into());
-            while let Some(item) = self.scan.next_item()? {
-                let Item::Messages = item else { continue };
-                for (message, channel, bytes) in self.scan.messages() {
-                    let Some(due) = due.get_mut(&message.channel).filter(|due| **due <= message.time) else { continue };
-                    if message.time > to {
-                        continue;
-                    }
-                    if let Some(passed) = (message.time - from).checked_div(step) {
-                        *due = from.saturating_add((passed + 1).saturating_mul(step));
-                    }
-                    if !take(message, channel, bytes) {
-                        return Ok(());
-                    }
+        self.scan.restart((from, to));
+        loop {
+            self.scan.skip(|scan, block| {
+                let channels = block.channels.as_deref().unwrap_or_default().iter();
+                let mut ids = channels.filter_map(|id| Some(scan.channel_of(block.file, *id)?.0));
+                !ids.any(|id| due.get(&id).is_some_and(|due| *due <= block.end))
+            });
+            // What is damaged is noted, and read as far as possible.
+            let Some(item) = self.scan.next_item()? else { return Ok(()) };
+            let Item::Messages = item else { continue };
+            for (message, channel, bytes) in self.scan.messages() {
+                let Some(due) = due.get_mut(&message.channel).filter(|due| **due <= message.time) else { continue };
+                if message.time > to {
+                    continue;
+                }
+                if let Some(passed) = (message.time - from).checked_div(step) {
+                    *due = from.saturating_add((passed + 1).saturating_mul(step));
+                }
+                if !take(message, channel, bytes) {
+                    return Ok(());
                 }
             }
         }
-        Ok(())
     }
 }
 
@@ -237,7 +155,7 @@ mod tests {
         write(&path).finish().unwrap();
         let mut log = LogWindows::open(&path).unwrap();
         check(&mut log);
-        assert!(log.next.is_none() && log.chunks.len() > 100, "the index of the file is used");
+        assert!(log.scan.source.blocks.len() > 100, "{}", log.scan.source.blocks.len());
         assert!(log.loss().is_none() && !log.is_live());
     }
 

@@ -23,22 +23,25 @@ pub struct RecordedGrip {
 }
 
 /// Reads the gripper commands of these arms within ticks, in order of time. Of those before, the last one of each arm
-/// counts for the start: the gripper is then where the motion begins with it.
+/// counts for the start: the gripper is then where the motion begins with it. The log must be whole up
+/// to `to` [ns].
 pub fn read(
     path: &Path,
     arms: &[String],
     ticks: RangeInclusive<u64>,
     period: f64,
+    to: u64,
 ) -> Result<Vec<RecordedGrip>, RecordedError> {
     let mut log = LogReader::open(path)?;
     let topics = arms.iter().map(|arm| format!("/dimos/outputs/{arm}")).collect();
-    log.select(Selection { topics, ..Selection::default() })?;
+    log.select(Selection { topics, to, ..Selection::default() })?;
     let (mut counts, mut before, mut grips) = (BTreeMap::new(), BTreeMap::new(), Vec::new());
     loop {
         let entry = match log.next_entry() {
             Ok(Some(entry)) => entry,
-            // The part before a cut is usable.
-            Ok(None) | Err(ReplayError::Cut { .. }) => break,
+            Ok(None) => break,
+            // It is in the loss.
+            Err(ReplayError::Cut { .. } | ReplayError::Damaged { .. }) => continue,
             Err(e) => return Err(e.into()),
         };
         let (Payload::ArmOutput(output), Some(arm)) = (&entry.data, entry.topic.strip_prefix("/dimos/outputs/")) else {
@@ -60,5 +63,6 @@ pub fn read(
             grips.push(grip);
         }
     }
+    RecordedError::unless_whole(path, &log)?;
     Ok(before.into_values().chain(grips).collect())
 }

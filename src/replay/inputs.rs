@@ -292,6 +292,7 @@ fn read_input(input: &ArmInput, state: &mut ArmState) -> Result<(), String> {
             velocity: crate::joint::joints_of(&input.commanded_velocity),
         }),
         refused: input.refused,
+        speed_fraction: input.speed_fraction.first().copied(),
         ..ArmState::default()
     };
     Ok(())

@@ -8,6 +8,7 @@ use std::path::Path;
 
 use super::grips::{self, RecordedGrip};
 use super::recorded::{Recorded, RecordedError};
+use crate::recording::joints::Places;
 use crate::recording::messages::JointState;
 use crate::recording::replay::{LogReader, Payload, ReplayError, Selection};
 use crate::trajectory::smooth_step;
@@ -20,7 +21,7 @@ const FADE_TIME: f64 = 1.0;
 /// Measured joints, commanded joints, ticks.
 const TOPICS: [&str; 3] = ["/joint_states", "/joint_commands", "/dimos/tick"];
 /// Maximum gap bridged by a straight line [s].
-const MAX_GAP: f64 = 1.0;
+pub const MAX_GAP: f64 = 1.0;
 
 /// Motion of a log's joints.
 #[derive(Debug, Clone, PartialEq)]
@@ -48,12 +49,12 @@ struct Row {
 }
 
 impl RecordedMotion {
-    /// Reads the motion between two Unix times [ns]. If there are position commands, it begins and ends with the first
-    /// and last of them.
+    /// Reads the whole motion between two Unix times [ns]. If there are position commands, it begins and ends with
+    /// the first and last of them.
     pub fn read(path: &Path, from: u64, to: u64) -> Result<Self, RecordedError> {
         let recorded = Recorded::open(path)?;
         let names = recorded.joints();
-        let rows = rows(LogReader::open(path)?, &TOPICS, names.len(), (from, to))?;
+        let rows = rows(path, LogReader::open(path)?, &TOPICS, &names, (from, to))?;
         let is_commanded = |row: &Row| row.commanded.iter().any(|q| q.is_finite());
         let whole = (0, rows.len().saturating_sub(1));
         let first = rows.iter().position(is_commanded).unwrap_or(whole.0);
@@ -74,7 +75,8 @@ impl RecordedMotion {
         let length = columns.first().map_or(0, Vec::len);
         let ends = rows.first().zip(rows.last()).map(|(first, last)| first.tick..=last.tick);
         let arms: Vec<String> = recorded.names.arms.iter().map(|arm| arm.hardware_id.clone()).collect();
-        let grips = ends.map(|ticks| grips::read(path, &arms, ticks, period)).transpose()?.unwrap_or_default();
+        let grips = ends.map(|ticks| grips::read(path, &arms, ticks, period, to)).transpose()?;
+        let grips = grips.unwrap_or_default();
         let last = rows.last().map_or(0, |row| row.time);
         Ok(Self { joints, period, rows: (0..length).map(at).collect(), last, lost: ticks, grips })
     }
@@ -91,7 +93,7 @@ impl RecordedMotion {
         let names = recorded.joints();
         let index = |joint: &String| names.iter().position(|name| name == joint);
         let columns: Vec<usize> = joints.iter().map(index).collect::<Option<_>>().unwrap_or_default();
-        let rows = rows(log, &[measured, tick], names.len(), (from, to))?;
+        let rows = rows(path, log, &[measured, tick], &names, (from, to))?;
         let period = 1.0 / recorded.config.rate;
         let is_known = |row: &Row| columns.iter().all(|j| row.measured[*j].is_finite());
         let is_gap = |w: &[Row]| w[1].tick.saturating_sub(w[0].tick) as f64 * period > MAX_GAP + period;
@@ -128,25 +130,33 @@ pub fn tcp_path(path: &Path, arm: &str, from: u64, to: u64) -> Result<Vec<(u64, 
                     found.push((entry.log_time, [p.x, p.y, p.z]));
                 }
             }
-            Ok(None) | Err(ReplayError::Cut { .. }) => return Ok(found),
+            Ok(None) => return Ok(found),
+            Err(ReplayError::Cut { .. } | ReplayError::Damaged { .. }) => {}
             Err(e) => return Err(e.into()),
         }
     }
 }
 
-fn rows(mut log: LogReader, topics: &[&str], joints: usize, (from, to): (u64, u64)) -> Result<Vec<Row>, RecordedError> {
+/// Reads the ticks of a part that lacks nothing, by the names of the joints.
+fn rows(
+    path: &Path,
+    mut log: LogReader,
+    topics: &[&str],
+    joints: &[String],
+    (from, to): (u64, u64),
+) -> Result<Vec<Row>, RecordedError> {
     let topics = topics.iter().map(|topic| (*topic).to_owned()).collect();
     log.select(Selection { topics, from, to })?;
-    let nothing = || vec![f64::NAN; joints];
-    // Grippers follow the joints.
-    let positions = |m: &JointState| m.position.get(..joints).map_or_else(nothing, <[f64]>::to_vec);
+    let nothing = || vec![f64::NAN; joints.len()];
+    let mut places = [Places::new(joints), Places::new(joints)];
+    let mut positions = |m: &JointState, of: usize| places[of].pick(&m.name, &m.position).collect::<Vec<f64>>();
     let (mut measured, mut commanded) = (nothing(), nothing());
     let mut rows: Vec<Row> = Vec::new();
     loop {
         match log.next_entry() {
             Ok(Some(entry)) => match &entry.data {
-                Payload::JointState(m) if entry.topic == TOPICS[0] => measured = positions(m),
-                Payload::JointState(m) => commanded = positions(m),
+                Payload::JointState(m) if entry.topic == TOPICS[0] => measured = positions(m, 0),
+                Payload::JointState(m) => commanded = positions(m, 1),
                 Payload::Tick(t) if rows.last().is_none_or(|row| t.tick > row.tick) => {
                     let now =
                         (std::mem::replace(&mut measured, nothing()), std::mem::replace(&mut commanded, nothing()));
@@ -154,8 +164,9 @@ fn rows(mut log: LogReader, topics: &[&str], joints: usize, (from, to): (u64, u6
                 }
                 _ => {}
             },
-            // The part before a cut is usable.
-            Ok(None) | Err(ReplayError::Cut { .. }) => return Ok(rows),
+            Ok(None) => return RecordedError::unless_whole(path, &log).map(|()| rows),
+            // It is in the loss.
+            Err(ReplayError::Cut { .. } | ReplayError::Damaged { .. }) => {}
             Err(e) => return Err(e.into()),
         }
     }

@@ -28,6 +28,27 @@ pub enum RecordedError {
         /// The log.
         path: PathBuf,
     },
+    /// The coordinator's configuration is damaged.
+    #[error(
+        "the log {path} cannot be replayed: its {COORDINATOR} is damaged (byte {at})\nhint: `dimos log doctor` checks all of it"
+    )]
+    Damaged {
+        /// The log.
+        path: PathBuf,
+        /// Where the attachment is in its file [bytes].
+        at: u64,
+    },
+    /// A part of it is missing or wrong: a motion of it would be half of one.
+    #[error(
+        "{path}: a part of the motion is missing or wrong: {loss}; nothing has moved\n\
+         hint: choose a part before with --duration, or save one: dimos log cut {path} --to TIME -o part.mcap"
+    )]
+    Lacks {
+        /// The log.
+        path: PathBuf,
+        /// What it lacks.
+        loss: String,
+    },
     /// Another version of the program wrote it: the same inputs give other commands now, or its configuration has
     /// another form.
     #[error(
@@ -72,6 +93,13 @@ pub enum RecordedError {
     },
 }
 
+impl RecordedError {
+    /// Returns an error if the selection of a log that was read lacks anything.
+    pub(super) fn unless_whole(path: &Path, log: &LogReader) -> Result<(), Self> {
+        log.loss().text().map_or(Ok(()), |loss| Err(Self::Lacks { path: path.to_owned(), loss }))
+    }
+}
+
 /// The run of a log.
 #[derive(Debug, Clone)]
 pub struct Recorded {
@@ -96,7 +124,13 @@ impl Recorded {
     /// Reads the run of a log that was opened already.
     pub fn of(path: &Path, info: LogInfo) -> Result<Self, RecordedError> {
         let path = path.to_owned();
-        let Some(json) = attachment(&path, COORDINATOR)? else { return Err(RecordedError::NoCoordinator { path }) };
+        let damaged = |e| match e {
+            ReplayError::Damaged { damage } => RecordedError::Damaged { path: path.clone(), at: damage.at },
+            e => e.into(),
+        };
+        let Some(json) = attachment(&path, COORDINATOR).map_err(damaged)? else {
+            return Err(RecordedError::NoCoordinator { path });
+        };
         let version = config_version(&info.metadata, &json);
         let read = serde_json::from_slice(&json).map_err(|e| format!("{COORDINATOR}: {e}"));
         let names = read.and_then(|config| Ok((names(&config, &info.metadata)?, config)));

@@ -64,6 +64,11 @@ enum LoggedRequest {
         position: [Option<f64>; 3],
         orientation: [Option<f64>; 4],
     },
+    ArmTool {
+        arm: u16,
+        position: [Option<f64>; 3],
+        orientation: [Option<f64>; 4],
+    },
     Start {
         task: u16,
     },
@@ -163,6 +168,10 @@ fn request(logged: LoggedRequest, joints: &[String]) -> Result<Request, String> 
             let tool = FramePose { position: numbers(position), orientation: numbers(orientation) };
             Request::Tool { task, tool }
         }
+        LoggedRequest::ArmTool { arm, position, orientation } => {
+            let tool = FramePose { position: numbers(position), orientation: numbers(orientation) };
+            Request::ArmTool { arm, tool }
+        }
         LoggedRequest::Start { task } => Request::Start { task },
         LoggedRequest::Stop { arm } => Request::Stop { arm },
         LoggedRequest::Reset { arm } => Request::Reset { arm },
@@ -228,6 +237,10 @@ mod tests {
             },
             Request::Tool {
                 task: 5,
+                tool: FramePose { position: [0.1 + 0.2, -0.0, 0.12], orientation: [0.0, f64::NAN, 0.6, 0.8] },
+            },
+            Request::ArmTool {
+                arm: 1,
                 tool: FramePose { position: [0.1 + 0.2, -0.0, 0.12], orientation: [0.0, f64::NAN, 0.6, 0.8] },
             },
             Request::Stop { arm: None },

@@ -16,7 +16,8 @@ use crate::control::coordinator::{Coordinator, TickOutput};
 use crate::control::request::Envelope;
 use crate::control::task::Task;
 use crate::control::task_spec::TaskTable;
-use crate::recording::records::{RawRecord, RecordReader, unpack_chunk};
+use crate::recording::chunk;
+use crate::recording::records::{RawRecord, RecordReader};
 use crate::recording::replay::{ReplayError, parts};
 
 /// Result of a verification.
@@ -158,9 +159,9 @@ impl<'a> Rerun<'a> {
         Ok(None)
     }
 
-    fn record(&mut self, record: &RawRecord) -> Result<(), mcap::McapError> {
+    fn record(&mut self, record: &RawRecord) -> Result<(), String> {
         match record.opcode {
-            op::CHUNK => unpack_chunk(&record.body, |opcode, body| self.contents(opcode, body)),
+            op::CHUNK => chunk::each_checked(&record.body, |opcode, body| self.contents(opcode, body)),
             opcode => {
                 self.contents(opcode, &record.body);
                 Ok(())

@@ -1,26 +1,13 @@
 //! Reads the text of a description: guards against files that are none, and decodes the encodings that XML files
 //! declare.
 
-use std::fs::{self, File};
-use std::io::Read;
 use std::path::Path;
+
+use crate::bounded;
 
 /// Reads a text file of at most `max` bytes. The error names no file; it may end with a hint.
 pub fn read(path: &Path, max: u64) -> Result<String, String> {
-    let about = fs::metadata(path).map_err(|e| e.to_string())?;
-    if about.is_dir() {
-        return Err("this is a folder, not a file".to_owned());
-    }
-    // A pipe would be waited for without end, and a device read without end.
-    if !about.is_file() {
-        return Err("not a regular file\nhint: write the output of a command to a file first".to_owned());
-    }
-    let mut bytes = Vec::new();
-    let file = File::open(path).map_err(|e| e.to_string())?;
-    file.take(max + 1).read_to_end(&mut bytes).map_err(|e| e.to_string())?;
-    if bytes.len() as u64 > max {
-        return Err(format!("the file is larger than {} MiB", max >> 20));
-    }
+    let bytes = bounded::read(path, max).map_err(|e| e.to_string())?;
     decode(bytes)
 }
 
@@ -92,7 +79,7 @@ mod tests {
     fn only_regular_files_of_a_limited_size_are_read() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("f");
-        fs::write(&file, [b'x'; 100]).unwrap();
+        std::fs::write(&file, [b'x'; 100]).unwrap();
         assert_eq!(read(&file, 100).unwrap().len(), 100);
         assert!(read(&file, 99).unwrap_err().contains("is larger than"));
         assert!(read(folder.path(), 99).unwrap_err().contains("folder"));

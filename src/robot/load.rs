@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use serde_json::json;
 
 use crate::message::Message;
+use crate::robot::calibrated::{self, Places};
 use crate::robot::model::RobotModel;
 use crate::robot::packages::{Packages, absolute};
 use crate::robot::srdf::{self, Semantics};
@@ -15,7 +16,7 @@ use crate::robot::{builtin, encoding, joint_limits, xacro};
 use crate::yaml::{Diag, Label, Report, Severity, Tree, render};
 
 /// A description and how to read it.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Source {
     /// A URDF or xacro file, or `builtin:NAME`.
     pub path: PathBuf,
@@ -29,6 +30,8 @@ pub struct Source {
     pub joint_limits: Option<PathBuf>,
     /// Whether to look for mesh files.
     pub meshes: Meshes,
+    /// Frames of joints that replace those of the description: of an arm whose own dimensions are known.
+    pub places: Places,
 }
 
 impl Source {
@@ -55,7 +58,9 @@ pub struct Loaded {
 impl Loaded {
     /// Returns all diagnostics as text.
     pub fn render(&self, colour: bool) -> String {
-        self.tree.diags().iter().map(|diag| render(&self.tree, diag, colour) + "\n").collect()
+        let listed = self.tree.diags().iter().map(|diag| render(&self.tree, diag, colour) + "\n");
+        let rest = (self.tree.unlisted() > 0).then(|| format!("{} more are not listed\n", self.tree.unlisted()));
+        listed.chain(rest).collect()
     }
 
     /// Returns all diagnostics as data.
@@ -65,7 +70,7 @@ impl Loaded {
 
     /// Returns the number of warnings.
     pub fn warnings(&self) -> usize {
-        self.tree.diags().iter().filter(|d| d.severity == Severity::Warning).count()
+        self.tree.warnings()
     }
 
     /// Returns whether there are errors.
@@ -105,10 +110,13 @@ impl Loaded {
 pub fn load(source: &Source) -> Loaded {
     let mut loaded = Loaded::default();
     let packages = Packages::named(source.packages.clone()).with_environment();
-    let Some((document, calls)) = expanded(&source.path, source, &packages, true, &mut loaded) else { return loaded };
+    let Some((mut document, calls)) = expanded(&source.path, source, &packages, true, &mut loaded) else {
+        return loaded;
+    };
     let folder = absolute(&source.path).parent().map(Path::to_owned).unwrap_or_default();
     let resolve = |uri: &str| packages.resolve(uri, &folder);
     let mut model = urdf::read(&document.root, &mut loaded.tree, &calls, source.meshes, &resolve);
+    calibrated::put(&source.places, model.as_mut(), &mut document);
     loaded.document = Some(document);
     if let Some(robot) = &mut model {
         if let Some(path) = &source.srdf

@@ -1,16 +1,20 @@
 //! Triangle meshes from STL, OBJ and Collada files: vertices merged, finite, in metres.
 
 mod collada;
+mod obj;
+mod sizes;
+mod stl;
 mod stored_as;
 
 use std::collections::HashMap;
 use std::fs;
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 
 use nalgebra::{Point3, Vector3};
 
 use crate::robot::model::MeshFile;
+
+pub use sizes::{MeshSizes, Size};
 
 /// Maximum file size [bytes].
 pub const MAX_BYTES: u64 = 64 << 20;
@@ -58,17 +62,8 @@ impl Mesh {
         let ending = name.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
         let corners = match ending.as_str() {
             "dae" => collada::read(bytes)?,
-            "stl" => {
-                stored_as::check_stl(bytes)?;
-                foreign(|| mesh_loader::stl::from_slice(bytes))?
-            }
-            "obj" => foreign(|| {
-                // Materials are not needed: no other file is opened.
-                mesh_loader::obj::from_slice(bytes, None::<&Path>, |_: &Path| -> std::io::Result<Vec<u8>> {
-                    Ok(Vec::new())
-                })
-            })
-            .map_err(stored_as::obj_error)?,
+            "stl" => stl::read(bytes)?,
+            "obj" => obj::read(bytes)?,
             other => {
                 let what = format!("meshes of type `{other}` cannot be read\nhint: convert it to STL, OBJ or DAE");
                 return Err(what);
@@ -121,26 +116,6 @@ impl Mesh {
         let start = self.vertices.first().copied().unwrap_or_default();
         self.vertices.iter().fold((start, start), |(low, high), v| (low.inf(v), high.sup(v)))
     }
-}
-
-/// Reads triangles with the mesh library, which may panic on malformed files; a panic becomes an error.
-fn foreign(read: impl FnOnce() -> std::io::Result<mesh_loader::Scene>) -> Result<Vec<[Point3<f64>; 3]>, String> {
-    let scene = catch_unwind(AssertUnwindSafe(read)).map_err(|_| "the file is damaged".to_owned())?;
-    let scene = scene.map_err(|e| e.to_string())?;
-    let mut corners = Vec::new();
-    for mesh in &scene.meshes {
-        let corner = |i: u32| {
-            let [x, y, z] = mesh.vertices.get(i as usize)?;
-            Some(Point3::new(f64::from(*x), f64::from(*y), f64::from(*z)))
-        };
-        for [a, b, c] in &mesh.faces {
-            let (Some(a), Some(b), Some(c)) = (corner(*a), corner(*b), corner(*c)) else {
-                return Err("a triangle refers to a missing vertex".to_owned());
-            };
-            corners.push([a, b, c]);
-        }
-    }
-    Ok(corners)
 }
 
 #[cfg(test)]

@@ -8,9 +8,11 @@
 //! Every element keeps its position in the source, through includes and macros, so that diagnostics point at it.
 
 pub mod builtin;
+pub mod calibrated;
 mod encoding;
 pub mod interchange;
 mod joint_limits;
+mod judge;
 pub mod kinematics;
 mod load;
 pub mod mesh;
@@ -22,6 +24,7 @@ pub mod urdf;
 pub mod xacro;
 pub mod xml;
 
+pub use judge::judge;
 pub use load::{Loaded, Source, load};
 pub use model::{Geometry, Inertial, Joint, JointKind, Limits, Link, MeshFile, Mimic, RobotModel, Shape};
 

@@ -86,7 +86,8 @@ impl Packages {
         let path = if let Some(rest) = uri.strip_prefix("package://").or_else(|| uri.strip_prefix("model://")) {
             let (package, inside) = rest.split_once('/').unwrap_or((rest, ""));
             let root = self.find(package, beside)?;
-            let path = plain(&root.join(decoded(inside)));
+            // A second slash would make the rest a path from the root of the file system.
+            let path = plain(&root.join(decoded(inside).trim_start_matches('/')));
             if !path.starts_with(&root) {
                 return Err(format!("`{uri}` points outside its package"));
             }
@@ -276,6 +277,8 @@ mod tests {
             ("package://g/a.stl", "given/a.stl"),
             ("package://p/./x/../b.stl", "ros/p/b.stl"),
             ("package://q/c.stl", "ament/share/q/c.stl"),
+            ("package://g//a.stl", "given/a.stl"),
+            ("package://q/%2Fc.stl", "ament/share/q/c.stl"),
             ("package://own/urdf/d%20e.stl", "own_repo/urdf/d e.stl"),
             ("package://own_repo/urdf/d e.stl", "own_repo/urdf/d e.stl"),
             ("d e.stl", "own_repo/urdf/d e.stl"),
@@ -296,6 +299,8 @@ mod tests {
             ("package://zz/a.stl", "--package zz=FOLDER"),
             ("package://g/../ros/p/b.stl", "points outside its package"),
             ("package://g/%2e%2e/ros/p/b.stl", "points outside its package"),
+            ("package://g//../ros/p/b.stl", "points outside its package"),
+            ("package://g/%2F%2e%2e%2Fros/p/b.stl", "points outside its package"),
             ("package://../given/a.stl", "is not a package name"),
             ("package://g/none.stl", "file not found"),
             ("https://x/a.stl", "`https://` is not supported"),

@@ -3,9 +3,11 @@
 //!
 //! Uses our own XML tree rather than a URDF crate, so that mistakes have positions: docs/decisions/0023.
 
+mod limits;
 mod numbers;
 mod shapes;
 mod tree;
+mod version;
 
 use std::collections::{HashMap, HashSet};
 use std::path::PathBuf;
@@ -15,6 +17,9 @@ use nalgebra::{Unit, Vector3};
 use crate::robot::model::{Joint, JointKind, Limits, Link, Mimic, RobotModel};
 use crate::robot::xml::{Calls, Element, SourcePos};
 use crate::yaml::{Diag, Tree, did_you_mean, quote};
+
+pub use shapes::VISUAL_NOT_FOUND;
+pub use version::version;
 
 /// Maximum number of links.
 pub const MAX_LINKS: usize = 512;
@@ -42,8 +47,18 @@ pub fn read(
     meshes: Meshes,
     resolve: &Resolve<'_>,
 ) -> Option<RobotModel> {
-    let mut reader =
-        Reader { tree, calls, meshes, resolve, materials: HashMap::new(), carried: HashSet::new(), errors: 0 };
+    let mut reader = Reader {
+        tree,
+        calls,
+        meshes,
+        resolve,
+        version: 0,
+        materials: HashMap::new(),
+        carried: HashSet::new(),
+        narrowed: Vec::new(),
+        quaternions: Vec::new(),
+        errors: 0,
+    };
     let model = reader.robot(root);
     model.filter(|_| reader.errors == 0)
 }
@@ -65,10 +80,16 @@ struct Reader<'t> {
     calls: &'t Calls,
     meshes: Meshes,
     resolve: &'t Resolve<'t>,
+    /// Minor number of the description's version, 1.0 to 1.2.
+    version: u32,
     /// Colours by material name.
     materials: HashMap<String, [f64; 4]>,
     /// Links that a joint carries.
     carried: HashSet<String>,
+    /// Joints with soft limits that are narrower than their limits: where these are, and the range that is left.
+    narrowed: Vec<(SourcePos, String)>,
+    /// Quaternions that do not count in this version.
+    quaternions: Vec<SourcePos>,
     errors: usize,
 }
 
@@ -126,6 +147,13 @@ impl Reader<'_> {
             return None;
         }
         let name = self.needed(root, "name").map(|(name, _)| name.to_owned());
+        match version(root) {
+            Ok(minor) => self.version = minor,
+            Err(what) => {
+                let diag = Diag::error(what).hint("the versions are 1.0, 1.1 and 1.2; without one it is 1.0");
+                self.report(root.attribute("version").map_or(root.at, |a| a.at), diag);
+            }
+        }
         self.collect_materials(root);
         let children = root.named("joint").filter_map(|joint| joint.child("child")?.attribute("link"));
         self.carried = children.map(|link| link.value.clone()).collect();
@@ -146,6 +174,7 @@ impl Reader<'_> {
                 _ => {}
             }
         }
+        self.report_what_differs();
         if links.is_empty() {
             self.error(root.at, "the robot has no links");
             return None;
@@ -232,67 +261,6 @@ impl Reader<'_> {
             self.report(at, Diag::error("this axis is zero").hint("an axis is a direction, such as 0 0 1"));
         }
         axis
-    }
-
-    fn limits(&mut self, element: &Element, kind: JointKind) -> Option<Limits> {
-        let bounded = matches!(kind, JointKind::Revolute | JointKind::Prismatic);
-        let Some(limit) = element.child("limit").filter(|_| kind != JointKind::Fixed) else {
-            if !bounded {
-                return Some(Limits::NONE);
-            }
-            let hint = "add <limit lower=\"…\" upper=\"…\" velocity=\"…\" effort=\"…\"/>, or make it continuous";
-            let diag = Diag::error(format!("this {} joint has no `limit`", kind.name()));
-            self.report(element.at, diag.hint(hint));
-            return None;
-        };
-        let mut limits = Limits::NONE;
-        let mut fine = true;
-        if bounded {
-            if limit.attribute("lower").is_none() && limit.attribute("upper").is_none() {
-                self.error(limit.at, "this limit has neither `lower` nor `upper`");
-                fine = false;
-            }
-            // URDF: an omitted end is zero.
-            let lower = self.number_or(limit, "lower", 0.0);
-            let upper = self.number_or(limit, "upper", 0.0);
-            match (lower, upper) {
-                (Some(lower), Some(upper)) if lower > upper => {
-                    let diag = Diag::error(format!("the lower limit {lower} is above the upper limit {upper}"));
-                    let at = limit.attribute("lower").map_or(limit.at, |a| a.at);
-                    self.report(at, diag.hint("are they swapped?"));
-                    fine = false;
-                }
-                (Some(lower), Some(upper)) => (limits.lower, limits.upper) = (lower, upper),
-                _ => fine = false,
-            }
-        }
-        let missing = limit.attribute("velocity").is_none();
-        if bounded && missing {
-            self.error(limit.at, "this limit has no `velocity`");
-        }
-        limits.velocity = self.rate(limit, "velocity")?;
-        limits.effort = self.rate(limit, "effort")?;
-        limits.acceleration = self.rate(limit, "acceleration").filter(|v| v.is_finite());
-        limits.jerk = self.rate(limit, "jerk").filter(|v| v.is_finite());
-        (fine && !(bounded && missing)).then_some(limits)
-    }
-
-    /// Returns a positive limit; infinite if omitted. Exporters write zero for an unknown limit.
-    fn rate(&mut self, limit: &Element, name: &str) -> Option<f64> {
-        let value = self.number_or(limit, name, f64::INFINITY)?;
-        let at = limit.attribute(name).map_or(limit.at, |a| a.at);
-        if value < 0.0 {
-            self.error(at, format!("the {name} limit {value} is negative"));
-            return None;
-        }
-        if value == 0.0 {
-            if name == "velocity" {
-                let what = "a velocity limit of 0 counts as not given";
-                self.report(at, Diag::warning(what).hint("give the joint's actual limit"));
-            }
-            return Some(f64::INFINITY);
-        }
-        Some(value)
     }
 
     fn mimic(&mut self, element: &Element) -> Option<RawMimic> {

@@ -266,7 +266,7 @@ methods! {
     /// A plan in full: the trajectory, and the paths of the end effectors.
     "preview" Preview -> PreviewReply, check Preview::valid;
     /// Executes a plan. Replies when the motion begins.
-    "execute_plan" ExecutePlan -> ExecuteReply;
+    "execute_plan" ExecutePlan -> ExecuteReply, check ExecutePlan::valid;
     /// The planner's state and robots.
     "planner" Planner -> PlannerReport;
     /// Inverse kinematics: joint positions for a pose of a robot, and what touches there. Moves nothing.

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::api::{Method, finite};
 use super::motion_api::{default_speed, valid_speed};
 use super::planner_api::PoseSpec;
+use crate::arm::GripperUnit;
 
 /// Parameters of `stop`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
@@ -268,22 +269,39 @@ pub enum GripOutcome {
     Holding,
     /// Stopped before the commanded position, without an object in its grip.
     Blocked,
+    /// The device confirms the order. Nothing measures the fingers, nor whether they hold something.
+    Ordered,
+}
+
+/// Returns a gripper's position in its unit as text.
+pub fn gripper_text(position: f64, unit: &str) -> String {
+    match unit == GripperUnit::OnOff.name() {
+        true if position == 0.0 => "closed (as ordered)".to_owned(),
+        true => "open (as ordered)".to_owned(),
+        false => format!("{position:.4} {unit}"),
+    }
 }
 
 impl GripReport {
     /// Returns the outcome with its figures as text.
     pub fn text(&self) -> String {
-        let unit = &self.unit;
+        let on_off = self.unit == GripperUnit::OnOff.name();
         let outcome = match self.outcome {
             Some(GripOutcome::Open) => "open at",
             Some(GripOutcome::Closed) => "closed at",
             Some(GripOutcome::Reached) => "reached",
             Some(GripOutcome::Holding) => "holding an object at",
             Some(GripOutcome::Blocked) => "blocked at",
+            Some(GripOutcome::Ordered) if self.target == 0.0 => "ordered to close, which nothing measures",
+            Some(GripOutcome::Ordered) => "ordered to open, which nothing measures",
             None => "without an outcome at",
         };
         let force = self.force.map_or_else(String::new, |force| format!(", force {force:.2} {}", self.force_unit));
-        format!("gripper {outcome} {:.4} {unit}{force}, after {:.2} s", self.position, self.elapsed)
+        let place = match on_off {
+            true => outcome.trim_end_matches(" at").to_owned(),
+            false => format!("{outcome} {:.4} {}", self.position, self.unit),
+        };
+        format!("gripper {place}{force}, after {:.2} s", self.elapsed)
     }
 }
 

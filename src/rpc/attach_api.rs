@@ -57,6 +57,24 @@ pub struct RegisteredModel {
     pub root: PoseSpec,
     /// Its tool centre point.
     pub tcp: TcpReport,
+    /// Its flange; absent if the model does not name it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub flange: Option<RegisteredFlange>,
+    /// Whether planned motions are made although the model does not fit the arm.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub allows_mismatch: bool,
+}
+
+/// Where the flange and the base of the arm's controller are in a model.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct RegisteredFlange {
+    /// Index of the flange's link in the kinematics.
+    pub link: usize,
+    /// Index of the link that carries the controller's base.
+    pub base_link: usize,
+    /// Pose of that base in the link's frame.
+    pub base: PoseSpec,
 }
 
 /// Reply to `register_planner`.
@@ -79,6 +97,9 @@ pub struct CommandLimits {
     pub acceleration: f64,
     /// Highest jerk [rad/s³].
     pub jerk: f64,
+    /// Highest speed of the tool of the joint's arm [m/s]; absent without a limit.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tcp_velocity: Option<f64>,
 }
 
 /// A request to an attached planner: `data` of a message of the stream `planner_requests`.
@@ -107,6 +128,10 @@ pub struct Moment {
     /// Opening of the gripper (0–1), listed for each joint of its arm.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub grippers: BTreeMap<String, f64>,
+    /// Distance that plans keep beyond the padding, because an arm is that far from its model; listed for each joint of
+    /// the arm [m].
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub paddings: BTreeMap<String, f64>,
 }
 
 /// Parameters of `planner_answer`: one of `result` and `error`.

@@ -10,13 +10,14 @@ use serde_json::{Value, json};
 
 use super::api::{MAX_LINE, Method, Status};
 use super::error::{Code, RpcError};
+use super::reach::{self, Unreached};
 use super::run_dir::{self, LiveRun, RunDir, RunDirError};
 use super::server::CALL_TIMEOUT;
 use super::wire::Incoming;
 use crate::yaml::{did_you_mean, quote};
 
 /// Timeout for a reply: a little longer than the run's own.
-const REPLY_TIMEOUT: Duration = CALL_TIMEOUT.saturating_add(Duration::from_secs(2));
+pub(super) const REPLY_TIMEOUT: Duration = CALL_TIMEOUT.saturating_add(Duration::from_secs(2));
 /// Minimum time for one read, so that what has arrived already is read after the deadline too.
 const MIN_READ_TIMEOUT: Duration = Duration::from_millis(1);
 /// Stream messages buffered while waiting for a reply; older ones are dropped and counted.
@@ -26,8 +27,16 @@ const MAX_BUFFERED: usize = 1024;
 #[derive(Debug, thiserror::Error)]
 pub enum ClientError {
     /// No run is live.
-    #[error("no run is live")]
+    #[error("no run of this user is live")]
     NoRun,
+    /// Another user listens at the run's socket.
+    #[error("run {run:?} belongs to another user (uid {uid})")]
+    NotOurs {
+        /// The run's name.
+        run: String,
+        /// The user.
+        uid: u32,
+    },
     /// Several runs are live, and none was selected.
     #[error("several runs are live: {}", names(.0))]
     SeveralRuns(Vec<LiveRun>),
@@ -76,6 +85,7 @@ impl ClientError {
             Self::SeveralRuns(_) => Some("select one with --run NAME".into()),
             Self::UnknownRun { live, .. } if live.is_empty() => Self::NoRun.hint(),
             Self::UnknownRun { name, live } => did_you_mean(name, live.iter().map(|r| r.name.as_str()), "live"),
+            Self::NotOurs { .. } => Some("only that user, or root, can use it".into()),
             Self::RunDir(error) => Some(error.hint().into()),
             Self::Io { .. } if self.is_timeout() => {
                 Some("the process is live but does not answer; its log may say why".into())
@@ -88,7 +98,7 @@ impl ClientError {
 }
 
 /// Describes an error of the socket: what matters is that the run is gone, not at which call that shows.
-fn io_text(error: &io::Error) -> String {
+pub fn io_text(error: &io::Error) -> String {
     match error.kind() {
         io::ErrorKind::BrokenPipe | io::ErrorKind::ConnectionReset | io::ErrorKind::UnexpectedEof => {
             "the run closed the connection".into()
@@ -126,7 +136,7 @@ pub struct Client {
     from: BufReader<UnixStream>,
     /// Beginning of a line whose end has not arrived yet.
     line: Vec<u8>,
-    timeout: Duration,
+    pub(super) timeout: Duration,
     next: u64,
     /// The epoch of the requests; `None`: that in which each arrives.
     epoch: Option<u64>,
@@ -154,10 +164,9 @@ pub fn view_url(run: &str, socket: &Path) -> Option<String> {
         let name = status.planner?.attached?.name;
         run_dir::check_name(&name).ok()?;
         let planners = RunDir::at(socket.parent()?).planners();
-        std::fs::read_to_string(planners.path().join(format!("{name}.view"))).ok()
+        run_dir::url_in(&planners.path().join(format!("{name}.view")))
     };
-    let text = of_planner().or_else(|| std::fs::read_to_string(run_dir::view_file(socket)).ok())?;
-    Some(text.trim().to_owned())
+    of_planner().or_else(|| run_dir::url_in(&run_dir::view_file(socket)))
 }
 
 impl Client {
@@ -169,9 +178,12 @@ impl Client {
 
     /// Connects to a socket; `run` is the name used in errors.
     pub fn connect(run: &str, socket: &Path) -> Result<Self, ClientError> {
-        UnixStream::connect(socket)
-            .and_then(|stream| Self::over(stream, run, REPLY_TIMEOUT))
-            .map_err(|error| ClientError::Io { run: run.to_owned(), error })
+        let failed = |error| ClientError::Io { run: run.to_owned(), error };
+        let stream = reach::wait_for(socket).map_err(|unreached| match unreached {
+            Unreached::Io(error) => failed(error),
+            Unreached::OtherUser(uid) => ClientError::NotOurs { run: run.to_owned(), uid },
+        })?;
+        Self::over(stream, run, REPLY_TIMEOUT).map_err(failed)
     }
 
     /// Talks over a stream that leads to the run's socket; `run` is the name used in errors.
@@ -179,7 +191,7 @@ impl Client {
         Self::over(stream, run, REPLY_TIMEOUT)
     }
 
-    fn over(stream: UnixStream, run: &str, timeout: Duration) -> io::Result<Self> {
+    pub(super) fn over(stream: UnixStream, run: &str, timeout: Duration) -> io::Result<Self> {
         stream.set_write_timeout(Some(timeout))?;
         let (run, from) = (run.to_owned(), BufReader::new(stream));
         Ok(Self { run, from, line: Vec::new(), timeout, next: 1, epoch: None, buffered: VecDeque::new() })

@@ -84,6 +84,11 @@ impl ConnectionLimit {
         Ok(Permit { number, limit: self.clone(), shared })
     }
 
+    /// Frees the place of a connection.
+    pub fn end_connection(&self, number: u64) {
+        lock(&self.open).connections.remove(&number);
+    }
+
     /// Starts closing the connection that has been idle for the longest time, among the reserved or the other ones.
     /// Returns `false` if there is none; pinned connections and lease holders do not count as idle.
     fn evict_idle(&self, open: &Open, reserved: bool) -> bool {
@@ -166,7 +171,7 @@ impl Permit {
 
 impl Drop for Permit {
     fn drop(&mut self) {
-        lock(&self.limit.open).connections.remove(&self.number);
+        self.limit.end_connection(self.number);
     }
 }
 

@@ -61,6 +61,8 @@ pub enum Code {
     NoPlan,
     /// The world has changed since the plan was made, and now blocks it.
     PlanOutdated,
+    /// The model of the arm has its flange elsewhere than the arm's controller: nothing is planned with it.
+    ModelMismatch,
     /// The plan is not proven to be free of contact, and the request does not say that this is wanted.
     PlanUnproven,
     /// No such object in the world.

@@ -146,6 +146,18 @@ impl Leases {
         self.lock().values().any(|holder| holder.connection == connection)
     }
 
+    /// Releases the leases of a connection that has ended.
+    pub fn end_connection(&self, connection: u64) {
+        self.lock().retain(|arm, holder| {
+            let ends = holder.connection == connection;
+            if ends {
+                self.ended(arm, connection);
+            }
+            !ends
+        });
+        lock(&self.gateway).take_if(|gateway| gateway.connection == connection);
+    }
+
     /// Adds the lease holders and the gateway to a `status` reply.
     pub fn complete(&self, mut reply: Reply) -> Reply {
         if let Reply::Status(status) = &mut reply {
@@ -325,14 +337,7 @@ impl Lessee {
 
 impl Drop for Lessee {
     fn drop(&mut self) {
-        self.leases.lock().retain(|arm, holder| {
-            let mine = holder.connection == self.connection;
-            if mine {
-                self.leases.ended(arm, self.connection);
-            }
-            !mine
-        });
-        lock(&self.leases.gateway).take_if(|gateway| gateway.connection == self.connection);
+        self.leases.end_connection(self.connection);
     }
 }
 

@@ -400,12 +400,21 @@ pub struct ExecutePlan {
     /// Required for a plan of the level `fast`: it is not proven to be free.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub unproven: bool,
+    /// A plan that was made for a larger fraction of the limits is stretched in time to this one, 0.01–1.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub max_speed: Option<f64>,
     /// If the motion retraces the log: time in it of the goal [s since 1970]. `motion` reports it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub retraces_to: Option<f64>,
     /// The requesting connection, if any; after its end nothing is planned again.
     #[serde(skip)]
     pub presence: Option<Presence>,
+}
+
+impl ExecutePlan {
+    pub(super) fn valid(&self) -> Result<(), String> {
+        self.max_speed.map_or(Ok(()), valid_speed)
+    }
 }
 
 /// Observes whether a connection is open.

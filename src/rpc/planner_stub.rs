@@ -18,6 +18,7 @@ use tokio::time::timeout;
 
 use super::api::{Method, PLANNER_REQUESTS, PlannerAnswer, PlannerRequest, RegisterPlanner, Registered};
 use super::error::RpcError;
+use super::reach::open;
 use super::wire::Incoming;
 
 /// Maximum time for a run to answer a registration.
@@ -55,7 +56,7 @@ impl PlannerStub {
     }
 
     async fn try_register(socket: &Path, planner: &RegisterPlanner) -> Result<Self, RegisterError> {
-        let (from, mut to) = UnixStream::connect(socket).await?.into_split();
+        let (from, mut to) = UnixStream::from_std(open(socket)?)?.into_split();
         let mut from = BufReader::new(from);
         let line = json!({"id": 1, "method": RegisterPlanner::NAME, "params": planner}).to_string() + "\n";
         to.write_all(line.as_bytes()).await?;

@@ -2,22 +2,27 @@
 //!
 //! A run holds a lock on `<run>.lock`, which contains its pid, beside its socket `<run>.sock`; `<run>.view` has the URL
 //! of its live view, with the token. The kernel releases the lock when the process ends, so files without a lock are
-//! stale; any process that finds them removes them.
+//! stale: the next run of that name removes them, readers remove nothing. A run also has a mark in the kernel, so that
+//! its name is unique and it is found wherever its directory is, or was.
 
-use std::fs::{self, DirBuilder, File, OpenOptions, Permissions, TryLockError};
-use std::io::{self, Read, Write};
-use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt};
+use std::fs::{self, TryLockError};
+use std::io;
+use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+pub use super::claim::{Claim, RunFiles, UrlFile};
+use super::mark::Mark;
+use super::run_files::{FOLDERS, is_ours, open_lock, pid_in, prepare};
+use super::{live_runs, run_files};
+use crate::rt::abstract_name::Taken;
+
+/// Environment variable of the directory of a closed world of runs.
+pub const WORLD: &str = "DIMOS_WORLD";
 /// Maximum length of a run name [bytes].
 const MAX_NAME: usize = 64;
 /// Maximum length of a socket's path in Linux [bytes].
 const MAX_SOCKET_PATH: usize = 107;
-/// Attempts to claim a name whose lock is held: a process that lists the runs holds each lock briefly.
-const ATTEMPTS: u32 = 20;
-/// Attempts while the lock file has no pid: its holder is about to write it, or is listing the runs.
-const ATTEMPTS_UNNAMED: u32 = 400;
 /// For a run to release its name after its connections: 10 s.
 const ATTEMPTS_RELEASED: u32 = 2000;
 /// Pause between attempts.
@@ -30,7 +35,7 @@ pub enum RunDirError {
     #[error("{0:?} cannot be the name of a run")]
     BadName(String),
     /// A live run has this name.
-    #[error("a run named {run:?} is live already (pid {pid})")]
+    #[error("a run named {run:?} is live already (pid {})", pid_text(*.pid))]
     Taken {
         /// The name.
         run: String,
@@ -40,6 +45,12 @@ pub enum RunDirError {
     /// The directory belongs to another user, or is not a directory.
     #[error("{} is not a directory of this user", .0.display())]
     NotOurs(PathBuf),
+    /// Something else is where a run's file would be, or in a directory that others may enter.
+    #[error("{} was not made by a run", .0.display())]
+    OtherFiles(PathBuf),
+    /// `DIMOS_WORLD` names no directory of this user.
+    #[error("DIMOS_WORLD={} is not a directory of this user", .0.display())]
+    World(PathBuf),
     /// The path of the socket is too long for Linux.
     #[error("the path of the socket is too long: {}", .0.display())]
     PathTooLong(PathBuf),
@@ -60,15 +71,44 @@ impl RunDirError {
             Self::BadName(_) => "use 1 to 64 letters, digits, '-', '_' and '.', without a leading '.'",
             Self::Taken { .. } => "choose another name with `--name`, or end that run with `dimos down`",
             Self::NotOurs(_) => "remove it, or set XDG_RUNTIME_DIR to a directory of this user",
+            Self::OtherFiles(_) => "move it away, or set XDG_RUNTIME_DIR to another directory",
+            Self::World(_) => "make the directory, or unset DIMOS_WORLD",
             Self::PathTooLong(_) => "set XDG_RUNTIME_DIR to a directory with a shorter path, or use a shorter name",
             Self::Io { .. } => "make the directory writable, or set XDG_RUNTIME_DIR to another one",
         }
     }
 }
 
+fn pid_text(pid: u32) -> String {
+    if pid == 0 { "unknown".into() } else { pid.to_string() }
+}
+
+/// Which runs see each other.
+#[derive(Debug, Clone, PartialEq, Eq)]
+enum World {
+    /// All runs of this user that the kernel lists.
+    Open,
+    /// Those with the same directory, identified by this number.
+    Closed(u64),
+    /// `DIMOS_WORLD` names no directory of this user: no runs.
+    Wrong,
+}
+
+/// What is claimed in a directory.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    Run,
+    Planner,
+    Relay,
+}
+
 /// The directory of sockets and locks.
 #[derive(Debug, Clone)]
-pub struct RunDir(PathBuf);
+pub struct RunDir {
+    path: PathBuf,
+    world: World,
+    kind: Kind,
+}
 
 /// A live run.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -77,142 +117,219 @@ pub struct LiveRun {
     pub name: String,
     /// Process id; 0 while unknown.
     pub pid: u32,
-    /// Its socket; missing while the run starts. Empty if it is on another computer.
+    /// Its socket; missing while the run starts. `@NAME`: an abstract one. Empty if it is on another computer.
     pub socket: PathBuf,
     /// Where it is, if it is on another computer.
     pub at: Option<String>,
 }
 
-/// A claimed run name. Dropping it removes the socket and releases the name.
-#[derive(Debug)]
-pub struct Claim {
-    run: String,
-    socket: PathBuf,
-    lock_path: PathBuf,
-    _lock: File,
+/// The live runs, and where others may be.
+#[derive(Debug, Default)]
+pub struct Seen {
+    /// The runs, sorted by name.
+    pub runs: Vec<LiveRun>,
+    /// Processes of this user whose namespace cannot be searched.
+    pub unseen: Vec<u32>,
+    /// Whether this process sees all processes of this computer.
+    pub is_whole: bool,
 }
 
 impl RunDir {
-    /// Returns the default directory: `$XDG_RUNTIME_DIR/dimos`, or `<tmp>/dimos-<uid>` if that variable is unset or
-    /// names no directory.
+    /// Returns the default directory: `$DIMOS_WORLD/dimos`, a closed world, if that variable is set; else
+    /// `$XDG_RUNTIME_DIR/dimos`, or `<tmp>/dimos-<uid>` if that variable is unset or names no directory.
     pub fn standard() -> Self {
+        if let Some(folder) = std::env::var_os(WORLD).map(PathBuf::from) {
+            return match fs::canonicalize(&folder).ok().filter(|real| matches!(is_ours(real), Ok(true))) {
+                Some(real) => Self::closed(real.join("dimos")),
+                None => Self { path: folder, world: World::Wrong, kind: Kind::Run },
+            };
+        }
         let runtime = std::env::var_os("XDG_RUNTIME_DIR").map(PathBuf::from).filter(|dir| dir.is_dir());
-        Self(match runtime {
+        Self::at(match runtime {
             Some(dir) => dir.join("dimos"),
             None => std::env::temp_dir().join(format!("dimos-{}", rustix::process::geteuid().as_raw())),
         })
     }
 
-    /// Returns a run directory at this path, for tests and programs that contain a run.
+    /// Returns a run directory at this path, for programs that contain a run.
     pub fn at(path: impl Into<PathBuf>) -> Self {
-        Self(path.into())
+        Self { path: path.into(), world: World::Open, kind: Kind::Run }
+    }
+
+    /// Returns a run directory at this path that is a world for itself, for tests: its runs are found by nothing else,
+    /// find nothing else, and may have names that other runs have. That of `DIMOS_WORLD=DIR` is `DIR/dimos`.
+    pub fn closed(path: impl Into<PathBuf>) -> Self {
+        let path = path.into();
+        let real = path.parent().and_then(|parent| Some(fs::canonicalize(parent).ok()?.join(path.file_name()?)));
+        // FNV-1a: other programs compute it, too.
+        let number = real.as_ref().unwrap_or(&path).as_os_str().as_bytes().iter();
+        let number = number
+            .fold(0xcbf2_9ce4_8422_2325_u64, |n, byte| (n ^ u64::from(*byte)).wrapping_mul(0x0000_0100_0000_01b3));
+        Self { path, world: World::Closed(number), kind: Kind::Run }
     }
 
     /// Returns the directory for attached planners: they have a lock, but no socket.
     pub fn planners(&self) -> Self {
-        Self(self.0.join("planners"))
+        self.within(FOLDERS[0], Kind::Planner)
     }
 
     /// Returns the directory for sockets that lead to runs on other computers.
     pub fn relays(&self) -> Self {
-        Self(self.0.join("relays"))
+        self.within(FOLDERS[1], Kind::Relay)
+    }
+
+    fn within(&self, folder: &str, kind: Kind) -> Self {
+        Self { path: self.path.join(folder), world: self.world.clone(), kind }
     }
 
     /// Returns its path.
     pub fn path(&self) -> &Path {
-        &self.0
+        &self.path
     }
 
-    /// Claims a run name, removing stale files of that name. Fails if a live run has it. May block for 2 s.
+    /// Returns whether its world is closed: only arms of this computer belong to it.
+    pub fn is_closed(&self) -> bool {
+        self.world != World::Open
+    }
+
+    /// Claims a run name, removing stale files of that name. Fails if a live run of this user has it, whatever its
+    /// directory. May block for 2 s.
     pub fn claim(&self, run: &str) -> Result<Claim, RunDirError> {
+        self.check_world()?;
         check_name(run)?;
-        let socket = self.0.join(format!("{run}.sock"));
+        let socket = self.path.join(format!("{run}.sock"));
         if socket.as_os_str().len() > MAX_SOCKET_PATH {
             return Err(RunDirError::PathTooLong(socket));
         }
-        self.prepare()?;
-        let lock_path = self.0.join(format!("{run}.lock"));
-        let in_lock = |error| RunDirError::Io { path: lock_path.clone(), error };
-        let mut pid = 0;
-        let mut attempts = 0;
-        while attempts < if pid == 0 { ATTEMPTS_UNNAMED } else { ATTEMPTS } {
-            attempts += 1;
-            let mut file = OpenOptions::new()
-                .read(true)
-                .write(true)
-                .create(true)
-                .truncate(false)
-                .mode(0o600)
-                .open(&lock_path)
-                .map_err(in_lock)?;
-            match file.try_lock() {
-                Ok(()) if is_same_file(&file, &lock_path) => {
-                    file.set_len(0).map_err(in_lock)?;
-                    write!(file, "{}", std::process::id()).map_err(in_lock)?;
-                    remove_files(&socket)?;
-                    return Ok(Claim { run: run.to_owned(), socket, lock_path, _lock: file });
-                }
-                Ok(()) => {} // Its previous holder removed the file after we opened it.
-                Err(TryLockError::WouldBlock) => {
-                    pid = read_pid(&mut file);
-                    std::thread::sleep(PAUSE);
-                }
-                Err(TryLockError::Error(error)) => return Err(in_lock(error)),
-            }
-        }
-        Err(RunDirError::Taken { run: run.to_owned(), pid })
-    }
-
-    /// Returns the live runs, sorted by name. Removes stale files.
-    pub fn runs(&self) -> Result<Vec<LiveRun>, RunDirError> {
-        let in_folder = |error| RunDirError::Io { path: self.0.clone(), error };
-        let entries = match fs::read_dir(&self.0) {
-            Ok(entries) => entries,
-            Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
-            Err(e) => return Err(in_folder(e)),
+        let taken = |pid| RunDirError::Taken { run: run.to_owned(), pid };
+        let mark = match self.marks() {
+            Some(prefix) => Some(Mark::take(format!("{prefix}{run}")).map_err(|refused| match refused {
+                Taken::By(peer) => taken(peer.map_or(0, |peer| peer.pid)),
+                Taken::Io(error) => RunDirError::Io { path: socket.clone(), error },
+            })?),
+            None => None,
         };
-        let mut runs = Vec::new();
-        for entry in entries {
-            let path = entry.map_err(in_folder)?.path();
-            let name = path.file_stem().and_then(|n| n.to_str()).unwrap_or_default().to_owned();
-            match path.extension().and_then(|e| e.to_str()) {
-                Some("lock") => {}
-                Some("sock" | "view") if !path.with_extension("lock").exists() => {
-                    remove(&path)?;
-                    continue;
-                }
-                _ => continue,
-            }
-            let socket = path.with_extension("sock");
-            let Ok(mut file) = File::open(&path) else { continue };
-            match file.try_lock() {
-                Ok(()) if is_same_file(&file, &path) => {
-                    remove_files(&socket)?;
-                    remove(&path)?;
-                }
-                Err(TryLockError::WouldBlock) => {
-                    runs.push(LiveRun { name, pid: read_pid(&mut file), socket, at: None })
-                }
-                _ => {}
-            }
+        // A name in another network namespace does not show as taken.
+        if let Some(prefix) = self.marks().filter(|_| self.world == World::Open)
+            && let Some(other) = live_runs::elsewhere(&prefix).runs.into_iter().find(|other| other.name == run)
+        {
+            return Err(taken(other.pid));
         }
-        runs.sort_by(|a, b| a.name.cmp(&b.name));
-        Ok(runs)
+        prepare(&self.path)?;
+        Claim::new(&self.path, run, mark)
     }
 
-    /// Creates the directory, accessible to this user only.
-    fn prepare(&self) -> Result<(), RunDirError> {
-        let failed = |error| RunDirError::Io { path: self.0.clone(), error };
-        DirBuilder::new().recursive(true).mode(0o700).create(&self.0).map_err(failed)?;
-        // Any user can create directories in <tmp>. The owner of this one could replace our socket.
-        let found = fs::symlink_metadata(&self.0).map_err(failed)?;
-        if !found.is_dir() || found.uid() != rustix::process::geteuid().as_raw() {
-            return Err(RunDirError::NotOurs(self.0.clone()));
+    /// Returns the live runs, sorted by name.
+    pub fn runs(&self) -> Result<Vec<LiveRun>, RunDirError> {
+        Ok(self.seen()?.runs)
+    }
+
+    /// Returns the live runs: with a lock in this directory, or with a mark in the kernel. Removes nothing.
+    pub fn seen(&self) -> Result<Seen, RunDirError> {
+        self.check_world()?;
+        let here = self.locked();
+        let Some(prefix) = self.marks() else { return Ok(Seen { runs: here?, ..Seen::default() }) };
+        let mut seen = Seen::default();
+        let locked = match live_runs::here(&prefix) {
+            Ok(marked) => {
+                seen.runs = marked;
+                // A folder that cannot be read hides none: the kernel lists them.
+                here.unwrap_or_default()
+            }
+            // Then the folder alone must do.
+            Err(error) => {
+                tracing::debug!("/proc/net/unix: {error}");
+                here?
+            }
+        };
+        // A lock knows the socket, the mark the process.
+        for run in locked {
+            match seen.runs.iter_mut().find(|marked| marked.name == run.name) {
+                Some(marked) if marked.socket.as_os_str().as_bytes().starts_with(b"@") && run.socket.exists() => {
+                    marked.socket = run.socket;
+                }
+                Some(_) => {}
+                None if live_runs::is_of_other_world(&prefix, &run) => {}
+                None => seen.runs.push(run),
+            }
         }
-        if found.mode() & 0o777 != 0o700 {
-            fs::set_permissions(&self.0, Permissions::from_mode(0o700)).map_err(failed)?;
+        if self.world == World::Open {
+            let elsewhere = live_runs::elsewhere(&prefix);
+            let is_new = |run: &LiveRun| !seen.runs.iter().any(|known| known.name == run.name && known.pid == run.pid);
+            let new: Vec<LiveRun> = elsewhere.runs.into_iter().filter(is_new).collect();
+            seen.runs.extend(new);
+            (seen.unseen, seen.is_whole) = (elsewhere.unseen, elsewhere.is_whole);
+        } else {
+            seen.is_whole = true;
+        }
+        seen.runs.sort_by(|a, b| a.name.cmp(&b.name));
+        Ok(seen)
+    }
+
+    fn check_world(&self) -> Result<(), RunDirError> {
+        match self.world {
+            World::Wrong => {
+                let given = std::env::var_os(WORLD).map_or_else(|| self.path.clone(), PathBuf::from);
+                Err(RunDirError::World(given))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Returns the beginning of the marks; what is claimed here may have none.
+    fn marks(&self) -> Option<String> {
+        let kind = match self.kind {
+            Kind::Run => "run",
+            Kind::Planner => "planner",
+            Kind::Relay => return None,
+        };
+        let user = rustix::process::geteuid().as_raw();
+        Some(match self.world {
+            World::Closed(number) => format!("dimos/{kind}/{user}@{number:016x}/"),
+            _ => format!("dimos/{kind}/{user}/"),
+        })
+    }
+
+    /// Removes what dead holders of names left here.
+    pub fn tidy(&self) -> Result<(), RunDirError> {
+        if !is_ours(&self.path)? {
+            return Ok(());
+        }
+        let failed = |error| RunDirError::Io { path: self.path.clone(), error };
+        for entry in fs::read_dir(&self.path).map_err(failed)? {
+            let path = entry.map_err(failed)?.path();
+            let Some(lock) = path.extension().filter(|e| *e == "lock").and_then(|_| open_lock(&path, false).ok())
+            else {
+                continue;
+            };
+            if lock.try_lock().is_ok() && run_files::is_at(&lock, &path) {
+                run_files::remove_left(&path.with_extension("sock"))?;
+                fs::remove_file(&path).map_err(failed)?;
+            }
         }
         Ok(())
+    }
+
+    /// Returns the runs with a lock in this directory; none if it belongs to another user.
+    fn locked(&self) -> Result<Vec<LiveRun>, RunDirError> {
+        if !matches!(is_ours(&self.path), Ok(true)) {
+            return Ok(Vec::new());
+        }
+        let in_folder = |error| RunDirError::Io { path: self.path.clone(), error };
+        let mut runs = Vec::new();
+        for entry in fs::read_dir(&self.path).map_err(in_folder)? {
+            let path = entry.map_err(in_folder)?.path();
+            let name = path.file_stem().and_then(|n| n.to_str()).unwrap_or_default();
+            if path.extension().is_none_or(|ending| ending != "lock") || check_name(name).is_err() {
+                continue;
+            }
+            let Ok(file) = open_lock(&path, false) else { continue };
+            if matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock)) {
+                let (name, socket) = (name.to_owned(), path.with_extension("sock"));
+                runs.push(LiveRun { name, pid: pid_in(&file), socket, at: None });
+            }
+        }
+        Ok(runs)
     }
 }
 
@@ -222,11 +339,11 @@ pub fn has_ended_in_order(socket: &Path) -> bool {
     let lock = socket.with_extension("lock");
     for _ in 0..ATTEMPTS_RELEASED {
         // Asked first: the socket is removed before the name is released.
-        let is_held = File::open(&lock).is_ok_and(|file| matches!(file.try_lock(), Err(TryLockError::WouldBlock)));
+        let held = open_lock(&lock, false).map(|file| matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock)));
         if !socket.exists() {
             return true;
         }
-        if !is_held {
+        if !held.unwrap_or(false) {
             return false;
         }
         std::thread::sleep(PAUSE);
@@ -234,24 +351,9 @@ pub fn has_ended_in_order(socket: &Path) -> bool {
     true
 }
 
-impl Claim {
-    /// Returns the run's name.
-    pub fn run(&self) -> &str {
-        &self.run
-    }
-
-    /// Returns the path for its socket.
-    pub fn socket(&self) -> &Path {
-        &self.socket
-    }
-}
-
-impl Drop for Claim {
-    fn drop(&mut self) {
-        // Still locked, so these are not another run's files. After a failure the next run removes them.
-        let _ = remove_files(&self.socket);
-        let _ = remove(&self.lock_path);
-    }
+/// Returns the URL in the file of a run's live view; `None` if there is none, or it is not of this user.
+pub fn url_in(view_file: &Path) -> Option<String> {
+    run_files::read_text(view_file).map(|text| text.trim().to_owned())
 }
 
 /// Checks that a run name is valid as part of a file name.
@@ -266,30 +368,4 @@ pub fn check_name(run: &str) -> Result<(), RunDirError> {
 /// Returns the file with the URL of a run's live view, beside its socket.
 pub fn view_file(socket: &Path) -> PathBuf {
     socket.with_extension("view")
-}
-
-/// Removes what a run has beside its lock.
-fn remove_files(socket: &Path) -> Result<(), RunDirError> {
-    remove(socket)?;
-    remove(&view_file(socket))
-}
-
-fn remove(path: &Path) -> Result<(), RunDirError> {
-    match fs::remove_file(path) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(RunDirError::Io { path: path.to_owned(), error }),
-        _ => Ok(()),
-    }
-}
-
-fn is_same_file(file: &File, path: &Path) -> bool {
-    match (file.metadata(), fs::metadata(path)) {
-        (Ok(a), Ok(b)) => a.ino() == b.ino() && a.dev() == b.dev(),
-        _ => false,
-    }
-}
-
-fn read_pid(file: &mut File) -> u32 {
-    let mut text = String::new();
-    let _ = file.take(32).read_to_string(&mut text);
-    text.trim().parse().unwrap_or(0)
 }

@@ -1,6 +1,6 @@
 //! The requests that always get through: `stop`, `cancel`, `status`, `shutdown`. The thread that accepts connections
 //! answers them, as long as a connection sends nothing else. So they never wait for another client's request, and may
-//! use the reserved connections.
+//! use the reserved connections; the first `stop`, `cancel` or `shutdown` of a new connection needs none.
 
 use std::sync::Arc;
 use std::sync::mpsc::Sender;
@@ -9,17 +9,22 @@ use std::time::Duration;
 use serde_json::Value;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::UnixStream;
+use tokio::sync::oneshot;
 use tokio::time::timeout;
 
-use super::api::{Backend, Cancel, Method, Reply, Request, Shutdown, Status, Stop};
+use super::api::{Cancel, Method, Reply, Request, Shutdown, Status, Stop};
 use super::connection::answer;
 use super::connection_limit::Permit;
 use super::error::RpcError;
 use super::lease::Lessee;
+use super::server::refuse;
+use super::stop_thread::{Reception, Turn};
 use super::wire;
 
 /// Maximum length of an urgent request [bytes].
 const MAX_URGENT: usize = 1024;
+/// Time for a new connection to send a line before it needs a permit.
+const FIRST_LINE_TIMEOUT: Duration = Duration::from_millis(250);
 /// Maximum silence of a reserved connection.
 const IDLE_TIMEOUT: Duration = Duration::from_secs(2);
 /// Maximum time for a client to take a reply.
@@ -39,9 +44,65 @@ pub(super) struct Transfer {
     pub permit: Permit,
 }
 
-/// Serves a connection until it ends or sends another request; then passes it to `others`.
-pub(super) async fn serve(transfer: Transfer, backend: Arc<dyn Backend>, others: Sender<Transfer>) {
+/// Serves a new connection. A stop, cancel or shutdown needs no permit: other connections do not get in its way. What
+/// sends anything else, or nothing for [`FIRST_LINE_TIMEOUT`], or must make room for newer ones (`out`), needs one.
+pub(super) async fn receive(
+    mut stream: UnixStream,
+    mut out: oneshot::Receiver<()>,
+    reception: Arc<Reception>,
+    turn: Arc<Turn>,
+) {
+    let mut read = Vec::new();
+    loop {
+        let filled = tokio::select! {
+            filled = timeout(FIRST_LINE_TIMEOUT, fill(&mut stream, &mut read)) => filled,
+            _ = &mut out => break,
+        };
+        match filled {
+            Ok(true) => {}
+            Ok(false) => return,
+            Err(_) => break,
+        }
+        let Some(line) = next_line(&mut read) else { if read.len() > MAX_URGENT { break } else { continue } };
+        let ends = urgent(&line).filter(|(_, request)| !matches!(request, Request::Status(_)));
+        let (Some((id, request)), Ok(_held)) = (ends, reception.unbound.try_acquire()) else {
+            read.splice(..0, line);
+            break;
+        };
+        let (name, result) = (request.written().0, reception.backend.call(request));
+        let result = answer(name, result, &reception.leases).await;
+        if !send::<Reply>(&mut stream, &id, result).await {
+            return;
+        }
+    }
+    let permit = match reception.limit.acquire() {
+        Ok(permit) => permit,
+        Err(error) => return refuse(&stream, error),
+    };
+    let pid = stream.peer_cred().ok().and_then(|peer| peer.pid());
+    let lessee = Lessee::new(reception.leases.clone(), permit.number(), pid);
+    if let Ok(stream) = stream.into_std() {
+        serve(Transfer { stream, read, lessee, permit }, reception, turn).await;
+    }
+}
+
+/// Reads until a line is complete or longer than an urgent request; returns `false` if the connection ends before.
+async fn fill(stream: &mut UnixStream, read: &mut Vec<u8>) -> bool {
+    let mut chunk = [0; MAX_URGENT];
+    while !read.contains(&b'\n') && read.len() <= MAX_URGENT {
+        match stream.read(&mut chunk).await {
+            Ok(length @ 1..) => read.extend(chunk.iter().take(length)),
+            _ => return false,
+        }
+    }
+    true
+}
+
+/// Serves a connection until it ends or sends another request; then passes it on.
+pub(super) async fn serve(transfer: Transfer, reception: Arc<Reception>, turn: Arc<Turn>) {
     let Transfer { stream, mut read, lessee, permit } = transfer;
+    let _served = turn.serves(permit.number(), &stream);
+    let (backend, others) = (&reception.backend, &reception.others);
     let Ok(mut stream) = UnixStream::from_std(stream) else { return };
     let mut statuses = 0;
     loop {
@@ -50,7 +111,7 @@ pub(super) async fn serve(transfer: Transfer, backend: Arc<dyn Backend>, others:
             statuses += u32::from(matches!(urgent, Some((_, Request::Status(_)))));
             let Some((id, request)) = urgent.filter(|_| statuses <= MAX_STATUS || permit.is_reserved()) else {
                 read.splice(..0, line);
-                return pass_on(stream, read, lessee, permit, &others).await;
+                return pass_on(stream, read, lessee, permit, others).await;
             };
             permit.set_busy();
             let (name, result) = (request.written().0, backend.call(request));
@@ -62,7 +123,7 @@ pub(super) async fn serve(transfer: Transfer, backend: Arc<dyn Backend>, others:
             tokio::task::yield_now().await;
         }
         if read.len() > MAX_URGENT {
-            return pass_on(stream, read, lessee, permit, &others).await;
+            return pass_on(stream, read, lessee, permit, others).await;
         }
         permit.set_idle();
         let max_silence = if permit.is_reserved() { IDLE_TIMEOUT } else { Duration::MAX };

@@ -14,12 +14,15 @@ pub struct Heartbeat {
     due: Due,
     /// Processor clock of the thread; 0: unknown.
     cpu_clock: AtomicI32,
+    /// Id of the thread; 0: unknown.
+    thread: AtomicI32,
 }
 
 impl Heartbeat {
     /// Makes the processor time of the calling thread known: it is the one that beats.
     pub fn adopt_thread(&self) {
         self.cpu_clock.store(host::cpu_clock().unwrap_or(0), Ordering::Release);
+        self.thread.store(rustix::thread::gettid().as_raw_nonzero().get(), Ordering::Release);
     }
 
     /// Returns the processor time of the thread that beats; `None` if it is unknown or the thread has ended.
@@ -28,6 +31,21 @@ impl Heartbeat {
             0 => None,
             clock => host::cpu_time_of(clock),
         }
+    }
+
+    /// Returns whether the thread wants to run and got less than a third of a processor in the time `passed`, since its
+    /// processor time was `used_before`. A thread that waits, also for a lock, or that a debugger has stopped, is not
+    /// starved; nor is one in an endless loop, unless others keep it from the processor. Reads a file of /proc.
+    pub fn is_starved(&self, used_before: Option<Duration>, passed: Duration) -> bool {
+        let used = self.cpu_time().zip(used_before).map(|(now, before)| now.saturating_sub(before));
+        used.is_some_and(|used| used < passed / 3) && self.is_runnable()
+    }
+
+    fn is_runnable(&self) -> bool {
+        let file = format!("/proc/self/task/{}/stat", self.thread.load(Ordering::Acquire));
+        let stat = std::fs::read_to_string(file).unwrap_or_default();
+        // The name before it may have blanks and parentheses.
+        stat.rsplit_once(')').is_some_and(|(_, rest)| rest.trim_start().starts_with('R'))
     }
 
     /// Records a beat.

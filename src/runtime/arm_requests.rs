@@ -94,6 +94,7 @@ impl Service {
     pub(super) async fn reset(&self, id: String) -> Result<Reply, RpcError> {
         let arm = self.arm_index(&id)?;
         let device = self.device(arm)?;
+        self.accept_identity(&id, arm)?;
         let count = || self.stops.get(usize::from(arm)).map_or(0, |count| count.load(Ordering::Relaxed));
         let stops = count();
         let view = self.arm_view(arm as usize);
@@ -123,6 +124,37 @@ impl Service {
         // The state is read once more before the arm is enabled.
         reply.note = cause.map(|cause| format!("was held: {cause}"));
         Ok(Reply::ArmReset(reply))
+    }
+
+    /// Accepts another arm at the second reset; the first one shows both. Arms of the run that changed places are never
+    /// accepted.
+    fn accept_identity(&self, id: &str, arm: u16) -> Result<(), RpcError> {
+        let health = |device: &Arc<Device>| device.health().identity();
+        let Some(device) = self.parts.devices.get(usize::from(arm)) else { return Ok(()) };
+        let Some(found) = health(device).other else { return Ok(()) };
+        let others = self.parts.devices.iter().enumerate().filter(|(index, _)| *index != usize::from(arm));
+        if let Some((_, other)) = { others }.find(|(_, other)| health(other).accepted.as_ref() == Some(&found)) {
+            let what =
+                format!("{found} answers at the address of {id}, and is the arm {} of this run", other.hardware_id());
+            return Err(RpcError::new(Code::ArmLatched, what).hint(
+                "their cables or addresses are interchanged: change them back, or end the run and start it again",
+            ));
+        }
+        let known = self.parts.blueprint.arms.get(usize::from(arm)).zip(self.parts.connected.get(usize::from(arm)));
+        if let Some(((config, about), serial)) = known.zip(found.strip_prefix("serial ")) {
+            let taken = self.parts.serials.take(usize::from(arm), config, &about.info, serial);
+            taken.map_err(|holder| {
+                let (what, hint) = holder.describe(id, &self.parts.blueprint.arms, serial);
+                RpcError::new(Code::ArmLatched, what).hint(hint)
+            })?;
+        }
+        device.health().with_identity(|identity| identity.accept()).map_err(|(accepted, found)| {
+            let what = format!("another arm answers as {id}: the run began with {accepted}, this is {found}");
+            RpcError::new(Code::ArmLatched, what).hint(format!(
+                "if it is meant: `dimos arm reset {id}` again; its limits and its model stay those of the arm before until \
+                 a new run"
+            ))
+        })
     }
 
     pub(super) async fn enable(&self, id: String, outside: bool) -> Result<Reply, RpcError> {

@@ -4,7 +4,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::StartError;
-use super::device_lock::{self, DeviceLock};
+use super::device_lock::{self, DeviceLock, DeviceLockError};
+use super::serial_locks::SerialLocks;
 use crate::arm::{ArmCommand, ArmState};
 use crate::blueprint::{Arm, Blueprint, JointOverride, OnExit, TickClock};
 use crate::clock::MonotonicClock;
@@ -34,6 +35,8 @@ pub struct Arms {
     // Dropped after the device threads; the locks last.
     _emulators: Vec<Box<dyn Emulator>>,
     _locks: Vec<DeviceLock>,
+    /// Their serial numbers.
+    pub serials: Arc<SerialLocks>,
 }
 
 /// The tick's ends of the slots.
@@ -55,18 +58,26 @@ pub struct BroughtUp {
     pub connected: Vec<(Connected, JointLimits)>,
 }
 
-/// Connects all arms in parallel. If one fails, the others are released again.
+/// Connects all arms in parallel. If one fails, the others are released again. In a closed world of runs they may share
+/// serial numbers.
 pub fn bring_up(
     blueprint: &Blueprint,
+    is_closed: bool,
     beat: &Arc<Heartbeat>,
     note: impl Fn(usize, Note) + Clone + Send + 'static,
 ) -> Result<BroughtUp, StartError> {
     let period = Duration::from_secs_f64(1.0 / blueprint.coordinator.tick_rate);
-    let mut arms =
-        Arms { devices: Vec::new(), pace: None, disable: Vec::new(), _emulators: Vec::new(), _locks: Vec::new() };
+    let mut arms = Arms {
+        devices: Vec::new(),
+        pace: None,
+        disable: Vec::new(),
+        _emulators: Vec::new(),
+        _locks: Vec::new(),
+        serials: Arc::new(SerialLocks::new(is_closed)),
+    };
     let mut slots = Slots::default();
     for (index, arm) in blueprint.arms.iter().enumerate() {
-        let config = configure(arm, &mut arms)?;
+        let config = configure(&blueprint.arms, index, &mut arms)?;
         let adapter = (arm.adapter.create)(&config).map_err(|e| unfit(arm, &e))?;
         let (state_writer, state_reader) = slot(ArmState::default());
         let (command_writer, command_reader) = slot(ArmCommand::default());
@@ -117,11 +128,21 @@ pub fn bring_up(
             Err(error) => return Err(error),
         }
     }
+    for (index, (arm, (about, _))) in blueprint.arms.iter().zip(&connected).enumerate() {
+        let Some(serial) = &about.info.serial_number else { continue };
+        arms.serials.take(index, arm, &about.info, serial).map_err(|holder| {
+            let (what, hint) = holder.describe(&arm.hardware_id, &blueprint.arms, serial);
+            StartError::Hardware { arm: arm.hardware_id.clone(), what, hint: hint.to_owned() }
+        })?;
+    }
     Ok(BroughtUp { arms, slots, connected })
 }
 
 /// Locks the device or starts its emulator. Returns the adapter's configuration.
-fn configure(arm: &Arm, arms: &mut Arms) -> Result<AdapterConfig, StartError> {
+fn configure(all: &[Arm], index: usize, arms: &mut Arms) -> Result<AdapterConfig, StartError> {
+    let Some((arm, before)) = all.get(index).zip(all.get(..index)) else {
+        return Err(StartError::other("no such arm", "this is a defect of the program"));
+    };
     let mut config = AdapterConfig {
         hardware_id: arm.hardware_id.clone(),
         address: arm.address.clone(),
@@ -137,11 +158,21 @@ fn configure(arm: &Arm, arms: &mut Arms) -> Result<AdapterConfig, StartError> {
         _ if arm.address.is_empty() || arm.address == SIM => {}
         _ => {
             // The blueprint was checked: an address that cannot be completed stays as it is.
-            let address = (arm.adapter.address.check)(&arm.address).unwrap_or_else(|_| arm.address.clone());
-            let lock = device_lock::take(&arm.adapter_type, &address).map_err(|e| StartError::Hardware {
-                arm: arm.hardware_id.clone(),
-                what: e.to_string(),
-                hint: "end the other run first: `dimos status` shows it, `dimos down` ends it".to_owned(),
+            let full = |arm: &Arm| (arm.adapter.address.check)(&arm.address).unwrap_or_else(|_| arm.address.clone());
+            let address = full(arm);
+            let lock = device_lock::take(&arm.adapter_type, &address).map_err(|e| {
+                let has_lock = |other: &&Arm| !other.address.is_empty() && other.address != SIM;
+                let mut others = before.iter().filter(has_lock);
+                let same = others.find(|other| device_lock::is_same_place(&full(other), &address));
+                let (what, hint) = match same.filter(|_| matches!(e, DeviceLockError::By { .. })) {
+                    Some(same) => {
+                        let what =
+                            format!("{} at {address} is the arm {} of this run", arm.adapter_type, same.hardware_id);
+                        (what, "give each arm its own address")
+                    }
+                    None => (e.to_string(), e.hint()),
+                };
+                StartError::Hardware { arm: arm.hardware_id.clone(), what, hint: hint.to_owned() }
             })?;
             arms._locks.push(lock);
         }

@@ -1,7 +1,7 @@
 //! The coordinator's configuration: names and limits of a blueprint, and what its arms report.
 
 use crate::blueprint::Blueprint;
-use crate::control::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, TaskConfig, TaskKind};
+use crate::control::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, TaskConfig, TaskKind, ToolLimit};
 use crate::control::task::Task;
 use crate::control::task_spec::{TaskSpec, TaskTable};
 use crate::hardware::device;
@@ -44,18 +44,34 @@ pub(super) fn tasks(blueprint: &Blueprint) -> Result<(Vec<TaskConfig>, Vec<Task>
     Ok((configs, tasks))
 }
 
+/// Returns the speed limits of the arms' tools. An arm whose limit cannot be kept is named in the text log.
+pub(super) fn tools(blueprint: &Blueprint) -> Result<Vec<Option<ToolLimit>>, String> {
+    let limit = |arm: &crate::blueprint::Arm| {
+        let limit = arm.tool_limit().map_err(|what| format!("{}: {what}", arm.hardware_id))?;
+        if let (Some(velocity), None) = (arm.tcp_velocity, &limit) {
+            let id = &arm.hardware_id;
+            tracing::warn!(
+                "{id}: no model of it is known, so the {velocity} m/s that its controller allows the tool are not kept"
+            );
+        }
+        Ok(limit)
+    };
+    blueprint.arms.iter().map(limit).collect()
+}
+
 /// Returns the configuration of arms with their effective limits, and of tasks.
 pub(super) fn coordinator_config(
     blueprint: &Blueprint,
     connected: &[(device::Connected, JointLimits)],
     tasks: Vec<TaskConfig>,
+    tools: Vec<Option<ToolLimit>>,
 ) -> CoordinatorConfig {
-    let arms = blueprint.arms.iter().zip(connected);
+    let arms = blueprint.arms.iter().zip(connected).zip(tools);
     CoordinatorConfig {
         version: CONFIG_VERSION,
         rate: blueprint.coordinator.tick_rate,
         arms: arms
-            .map(|(arm, (said, limits))| ArmConfig {
+            .map(|((arm, (said, limits)), tool)| ArmConfig {
                 name: arm.hardware_id.clone(),
                 dof: arm.joints.len().min(MAX_DOF),
                 limits: limits.clone(),
@@ -66,6 +82,7 @@ pub(super) fn coordinator_config(
                 read_period: said.read_period,
                 write_period: said.write_period,
                 supervision: arm.supervision,
+                tool: tool.map(Box::new),
             })
             .collect(),
         tasks,

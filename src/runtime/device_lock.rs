@@ -4,21 +4,16 @@
 use std::collections::BTreeSet;
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr as SocketIp, ToSocketAddrs};
-use std::os::fd::AsFd;
-use std::os::linux::net::SocketAddrExt;
-use std::os::unix::net::{SocketAddr, UnixListener};
+use std::os::unix::net::UnixListener;
 use std::sync::mpsc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use rustix::io::Errno;
-use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, connect, socket_with, sockopt};
+use crate::hardware::registry::SIM;
+use crate::rpc::run_dir::WORLD;
+use crate::rt::abstract_name::{self, Taken, fit};
 
-/// Longest name of a socket in the kernel, without its leading zero [bytes].
-const MAX_NAME: usize = 107;
 /// Timeout for the lookup of a host name.
 const LOOK_UP_LIMIT: Duration = Duration::from_secs(3);
-/// How long a process that takes a name may need from binding its socket to listening.
-const HOLDER_LIMIT: Duration = Duration::from_millis(500);
 
 /// A lock on devices, held for the lifetime of this value.
 #[derive(Debug)]
@@ -37,6 +32,14 @@ pub enum DeviceLockError {
         /// The process.
         pid: String,
     },
+    /// It is not of this computer, and the world of runs is closed.
+    #[error("{adapter} at {address} is outside of DIMOS_WORLD, which has arms of this computer only")]
+    OtherWorld {
+        /// The adapter.
+        adapter: String,
+        /// The device's address.
+        address: String,
+    },
     /// The name cannot be bound.
     #[error("cannot lock {adapter} at {address}: {error}")]
     Io {
@@ -49,53 +52,55 @@ pub enum DeviceLockError {
     },
 }
 
-/// Locks the device at a complete address; the error names the process that holds it. Resolves host names.
+impl DeviceLockError {
+    /// Returns what the user can do about it.
+    pub fn hint(&self) -> &'static str {
+        match self {
+            Self::OtherWorld { .. } => "unset DIMOS_WORLD",
+            _ => "end the run or verb that uses it first: `dimos status` shows runs, `dimos down` ends one",
+        }
+    }
+}
+
+/// Locks the device at a complete address; the error names the process that holds it. Resolves host names. In a closed
+/// world of runs it refuses a device that is not of this computer.
 pub fn take(adapter: &str, address: &str) -> Result<DeviceLock, DeviceLockError> {
-    let names = canonical_addresses(address).into_iter().map(|place| name(adapter, &place));
+    if std::env::var_os(WORLD).is_some() && !is_this_computer(address) {
+        return Err(DeviceLockError::OtherWorld { adapter: adapter.to_owned(), address: address.to_owned() });
+    }
+    // Without the adapter: no two of them can use one place.
+    let names = canonical_addresses(address).into_iter().map(|place| fit(format!("dimos/device/{place}")));
     let mut taken = Vec::new();
     for name in names {
         let (adapter, address) = (adapter.to_owned(), address.to_owned());
-        taken.push(take_name(&name).map_err(|refused| match refused {
-            Refused::Taken(pid) => {
-                let pid = pid.map_or_else(|| "unknown".to_owned(), |pid| pid.to_string());
+        taken.push(abstract_name::take(&name).map_err(|refused| match refused {
+            Taken::By(peer) => {
+                let pid = peer.map_or_else(|| "unknown".to_owned(), |peer| peer.pid.to_string());
                 DeviceLockError::By { adapter, address, pid }
             }
-            Refused::Io(error) => DeviceLockError::Io { adapter, address, error },
+            Taken::Io(error) => DeviceLockError::Io { adapter, address, error },
         })?);
     }
     Ok(DeviceLock(taken))
 }
 
-/// Why a name cannot be taken.
-enum Refused {
-    /// A process has it; its pid where the kernel knows it.
-    Taken(Option<i32>),
-    /// The kernel refused.
-    Io(io::Error),
+/// Returns whether two complete addresses lead to one place.
+pub fn is_same_place(one: &str, other: &str) -> bool {
+    !canonical_addresses(one).is_disjoint(&canonical_addresses(other))
 }
 
-/// Takes the name, or returns who has it.
-fn take_name(name: &str) -> Result<UnixListener, Refused> {
-    let at = SocketAddr::from_abstract_name(name).map_err(Refused::Io)?;
-    let deadline = Instant::now() + HOLDER_LIMIT;
-    loop {
-        match UnixListener::bind_addr(&at) {
-            Err(error) if error.kind() == io::ErrorKind::AddrInUse => match holder(name) {
-                // The holder has bound its socket and does not listen yet, or has just ended: the next try shows which.
-                Err(Errno::CONNREFUSED) if Instant::now() < deadline => std::thread::sleep(Duration::from_millis(1)),
-                pid => return Err(Refused::Taken(pid.ok())),
-            },
-            bound => return bound.map_err(Refused::Io),
-        }
-    }
-}
-
-/// Returns the pid that holds the name, taken from the socket's peer credentials. Never blocks.
-fn holder(name: &str) -> Result<i32, Errno> {
-    let flags = SocketFlags::NONBLOCK | SocketFlags::CLOEXEC;
-    let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None)?;
-    connect(socket.as_fd(), &SocketAddrUnix::new_abstract_name(name.as_bytes())?)?;
-    Ok(sockopt::socket_peercred(&socket)?.pid.as_raw_nonzero().get())
+/// Returns whether only a program on this computer can be at a complete address: `sim`, a loopback address, a
+/// pseudo-terminal or a socket. Resolves host names, and links.
+pub fn is_this_computer(address: &str) -> bool {
+    let text = address.trim();
+    let is_local = |place: &String| match place.parse::<SocketIp>() {
+        Ok(at) => at.ip().is_loopback(),
+        Err(_) => place.starts_with("/dev/pts/"),
+    };
+    // `0.0.0.0` leads to this computer, too.
+    text == SIM
+        || ["memory:", "unix:"].iter().any(|kind| text.starts_with(kind))
+        || canonical_addresses(text).iter().all(is_local)
 }
 
 /// Returns canonical addresses of a device, the same for every spelling: the addresses of its host, each with the first
@@ -110,8 +115,9 @@ fn canonical_addresses(address: &str) -> BTreeSet<String> {
     if text.starts_with('/') {
         return BTreeSet::from([device_file(text)]);
     }
-    if let Some((kind, path)) = text.split_once(':').filter(|(_, path)| path.starts_with('/')) {
-        return BTreeSet::from([format!("{}:{}", kind.to_ascii_lowercase(), device_file(path))]);
+    // The kind is not part of the place: `slcan:/dev/ttyACM0`.
+    if let Some((_, path)) = text.split_once(':').filter(|(_, path)| path.starts_with('/')) {
+        return BTreeSet::from([device_file(path)]);
     }
     let text = text.to_ascii_lowercase();
     let Some((host, port)) = host_and_port(text.strip_prefix("tcp:").unwrap_or(&text)) else {
@@ -165,19 +171,6 @@ fn look_up(host: &str, port: u16) -> Vec<IpAddr> {
     asked.ok().and_then(|_| found.recv_timeout(LOOK_UP_LIMIT).ok()).unwrap_or_default()
 }
 
-/// Returns the socket name.
-fn name(adapter: &str, place: &str) -> String {
-    let name = format!("dimos/device/{adapter}/{place}");
-    // Longer names are cut in the middle: hosts differ at the beginning, ports at the end.
-    match name.char_indices().nth(MAX_NAME / 2) {
-        Some((half, _)) if name.len() > MAX_NAME => {
-            let tail = name.char_indices().rev().nth(MAX_NAME / 4).map_or(half, |(at, _)| at);
-            format!("{}{}", &name[..half], &name[tail..]).chars().filter(char::is_ascii).collect()
-        }
-        _ => name,
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -193,34 +186,46 @@ mod tests {
             assert!(refused.contains(&format!("process {port}")) || refused.contains("unknown"), "{refused}");
         }
         assert!(take("test", &at("127.0.0.2")).is_ok());
-        assert!(take("other", &at("127.0.0.1")).is_ok());
+        assert!(take("other", &at("127.0.0.1")).is_err(), "whatever the adapter");
         drop(held);
         assert!(take("test", &at("127.0.0.1")).is_ok());
     }
 
     #[test]
-    fn a_holder_that_does_not_listen_yet_is_named() {
-        let (port, name) = (std::process::id(), name("starting", &format!("127.0.0.1:{}", std::process::id())));
-        let flags = SocketFlags::CLOEXEC;
-        let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None).unwrap();
-        rustix::net::bind(&socket, &SocketAddrUnix::new_abstract_name(name.as_bytes()).unwrap()).unwrap();
-        let late = std::thread::spawn(move || {
-            std::thread::sleep(Duration::from_millis(50));
-            rustix::net::listen(&socket, 8).map(|()| socket).unwrap()
-        });
-        let refused = take("starting", &format!("127.0.0.1:{port}")).unwrap_err().to_string();
-        assert!(refused.contains(&format!("in use by process {port}")), "{refused}");
-        drop(late.join().unwrap());
-        assert!(take("starting", &format!("127.0.0.1:{port}")).is_ok(), "the holder has ended");
-    }
-
-    #[test]
-    fn names_fit_and_differ_by_host_and_port() {
-        let all = |address: &str| canonical_addresses(address).iter().map(|place| name("a", place)).collect::<Vec<_>>();
-        let long = |end: &str| name("adapter", &format!("{}{end}", "h".repeat(300)));
-        assert!(long(":1").len() <= MAX_NAME && long("ä").len() <= MAX_NAME);
-        assert_ne!(long(":1"), long(":2"));
-        assert_eq!(all("Host.invalid:1"), all(" host.invalid:1"));
+    fn only_loopback_pseudo_terminals_and_sockets_are_this_computer() {
+        for here in [
+            "sim",
+            "127.0.0.9:502",
+            "[::1]:502",
+            "0.0.0.0:9760",
+            "localhost:1",
+            "tcp:127.1.2.3:7",
+            "unix:/x",
+            "memory:1",
+        ] {
+            assert!(is_this_computer(here), "{here}");
+        }
+        let elsewhere = [
+            "192.168.1.5:502",
+            "can0",
+            "/dev/ttyUSB0@1000000",
+            "slcan:/dev/ttyACM0",
+            "host.invalid:1",
+            "",
+            "[fe80::1]:1",
+        ];
+        for elsewhere in elsewhere {
+            assert!(!is_this_computer(elsewhere), "{elsewhere}");
+        }
+        let (pty, folder) =
+            (rustix::pty::openpt(rustix::pty::OpenptFlags::RDWR).unwrap(), tempfile::tempdir().unwrap());
+        rustix::pty::grantpt(&pty).and_then(|()| rustix::pty::unlockpt(&pty)).unwrap();
+        let name = rustix::pty::ptsname(&pty, Vec::new()).unwrap().into_string().unwrap();
+        let link = folder.path().join("arm");
+        std::os::unix::fs::symlink(&name, &link).unwrap();
+        for pty in [format!("{name}@1000000"), format!("slcan:{name}"), link.display().to_string()] {
+            assert!(is_this_computer(&pty), "{pty}");
+        }
     }
 
     #[test]

@@ -174,6 +174,9 @@ pub fn log_of(request: &Request) -> Value {
         Request::Tool { task, tool: FramePose { position, orientation } } => {
             json!({"tool": {"task": task, "position": position, "orientation": orientation}})
         }
+        Request::ArmTool { arm, tool: FramePose { position, orientation } } => {
+            json!({"arm_tool": {"arm": arm, "position": position, "orientation": orientation}})
+        }
         Request::Start { task } => json!({"start": {"task": task}}),
         Request::Stop { arm } => json!({"stop": {"arm": arm}}),
         Request::Reset { arm } => json!({"reset": {"arm": arm}}),

@@ -54,6 +54,11 @@ impl GripJudge {
         Self { info, target, force, closing, begin: now, last: from, since: now, has_moved: false }
     }
 
+    /// Returns whether nothing measures the fingers.
+    pub fn is_unmeasured(&self) -> bool {
+        self.info.unit == GripperUnit::OnOff
+    }
+
     /// Takes a measurement. Returns the outcome once the fingers are at rest.
     pub fn observe(&mut self, reading: &Reading, now: Mono) -> Option<GripOutcome> {
         if (reading.position - self.last).abs() > self.same() / 4.0 {
@@ -61,7 +66,9 @@ impl GripJudge {
         }
         // A device reports an object somewhat later than its fingers stop.
         let doubtful = self.closing && reading.holds == Some(false);
-        let settles = if self.is_at(reading, self.target) || (self.has_moved && !doubtful) { SETTLES } else { STARTS };
+        // Where nothing measures the fingers, to be there means only that the order was confirmed.
+        let there = self.is_at(reading, self.target) && !(doubtful && self.is_unmeasured());
+        let settles = if there || (self.has_moved && !doubtful) { SETTLES } else { STARTS };
         (now.since(self.since) >= settles).then(|| self.outcome(reading))
     }
 
@@ -80,6 +87,7 @@ impl GripJudge {
         let arrived = self.is_at(reading, self.target);
         match reading.holds {
             Some(true) if self.closing => GripOutcome::Holding,
+            None if arrived && self.is_unmeasured() => GripOutcome::Ordered,
             _ if arrived && (self.target - closed).abs() <= self.same() => GripOutcome::Closed,
             _ if arrived && (self.target - open).abs() <= self.same() => GripOutcome::Open,
             _ if arrived => GripOutcome::Reached,
@@ -105,6 +113,7 @@ impl GripJudge {
             (Some((closed, open)), _) => SAME * (open - closed).abs(),
             (None, GripperUnit::Meters) => SAME_METERS,
             (None, GripperUnit::Radians) => SAME_RADIANS,
+            (None, GripperUnit::OnOff) => SAME,
         }
     }
 }
@@ -174,6 +183,23 @@ mod tests {
         assert_eq!(closing(0.03, Some(0.2), None), GripOutcome::Blocked, "stopped, but presses on nothing");
         assert_eq!(closing(0.03, Some(0.2), Some(true)), GripOutcome::Holding);
         assert_eq!(play(info(), 0.03, 0.08, 0.05, (None, Some(true))).0, GripOutcome::Blocked, "it opens");
+    }
+
+    #[test]
+    fn where_nothing_measures_the_fingers_an_order_is_no_grip() {
+        let on_off = GripperInfo { unit: GripperUnit::OnOff, range: Some((0.0, 1.0)), ..info() };
+        let after = |target, holds: fn(u64) -> Option<bool>| {
+            let mut judge = GripJudge::new(on_off, target, None, 1.0 - target, Mono(0));
+            (1..200).find_map(|tick| {
+                let reading = Reading { position: target, force: None, holds: holds(tick * 10) };
+                judge.observe(&reading, Mono(tick * 10_000_000)).map(|outcome| (outcome, tick * 10))
+            })
+        };
+        assert_eq!(after(0.0, |_| None), Some((GripOutcome::Ordered, 310)));
+        assert_eq!(after(1.0, |_| None), Some((GripOutcome::Ordered, 310)));
+        assert_eq!(after(0.0, |ms| Some(ms > 700)), Some((GripOutcome::Holding, 710)), "suction takes its time");
+        assert_eq!(after(0.0, |_| Some(false)), Some((GripOutcome::Closed, 1010)));
+        assert_eq!(after(1.0, |_| Some(false)), Some((GripOutcome::Open, 310)));
     }
 
     #[test]

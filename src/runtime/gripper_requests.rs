@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use super::arm_requests::ORDER_LIMIT;
 use super::grip_judge::{GripJudge, Reading};
 use super::service::{Service, internal};
-use crate::arm::Link;
+use crate::arm::{GripperUnit, Link};
 use crate::clock::Mono;
 use crate::control::request::Request;
 use crate::hardware::adapter::AdapterError;
@@ -33,11 +33,14 @@ impl Service {
     pub(super) async fn gripper(&self, call: api::Gripper, origin: Origin) -> Result<Reply, RpcError> {
         let arm = self.arm_index(&call.arm)?;
         let from = self.arm_view(arm as usize).map(|view| view.state.gripper);
-        let Some(from) = from.unwrap_or(Some(call.position)) else {
+        let info = self.gripper_info(arm.into()).unwrap_or_default();
+        // One that nothing measures has no position before its first order: it is taken to be at the other end.
+        let other = info.range.filter(|_| info.unit == GripperUnit::OnOff);
+        let other = other.map(|(closed, open)| if call.position == closed { open } else { closed });
+        let Some(from) = from.unwrap_or(Some(call.position)).or(other) else {
             return self.refusal(&Outcome::NoGripper(arm)).map_or_else(|| Err(internal()), Err);
         };
         let device = self.device(arm)?;
-        let info = self.gripper_info(arm.into()).unwrap_or_default();
         let unit = info.unit.name();
         let _turn = self.grippers.get(arm as usize).ok_or_else(internal)?.lock().await;
         let now = self.now();
@@ -129,7 +132,10 @@ impl Service {
                 report.elapsed = judge.elapsed().as_secs_f64();
             } else if report.error.is_none() && now >= *deadline {
                 let after = deadline.since(*begin).as_secs_f64();
-                report.error = Some(format!("its fingers still move after {after} s"));
+                report.error = Some(match judge.is_unmeasured() {
+                    true => format!("the order is not confirmed after {after} s"),
+                    false => format!("its fingers still move after {after} s"),
+                });
             }
             if report.outcome.is_some() || report.error.is_some() {
                 report.done = true;
@@ -163,6 +169,7 @@ impl Service {
                 Ok(judge.observe(&Reading { position, force: state.gripper_force, holds }, self.now()))
             }
             (Link::Down | Link::Faulted, _) => Err("the connection to the arm was lost".into()),
+            (Link::Up, None) if judge.is_unmeasured() => Ok(None), // not confirmed yet
             (Link::Up, None) => Err("the arm no longer reports its gripper".into()),
             (Link::Stale, _) => {
                 judge.miss(self.now());

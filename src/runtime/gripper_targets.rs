@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use super::dispatch::log_of;
 use super::service::{Service, internal};
+use crate::arm::GripperUnit;
 use crate::clock::Mono;
 use crate::control::request::Request;
 use crate::rpc::report::StreamCounts;
@@ -118,10 +119,13 @@ impl Service {
         };
         let (closed, open) = info.range.unwrap_or((f64::NEG_INFINITY, f64::INFINITY));
         let range = closed.min(open)..=closed.max(open);
-        match targets.iter().find(|target| !range.contains(target)) {
+        match targets.iter().find(|target| !(range.contains(target) && info.unit.has(**target))) {
             Some(wrong) => {
                 let (unit, name) = (info.unit.name(), self.parts.names.arm(arm));
-                let what = format!("the gripper of {name} goes from {closed} to {open} {unit}, not to {wrong} {unit}");
+                let what = match info.unit {
+                    GripperUnit::OnOff => format!("the gripper of {name} only closes (0) and opens (1), not {wrong}"),
+                    _ => format!("the gripper of {name} goes from {closed} to {open} {unit}, not to {wrong} {unit}"),
+                };
                 Err(RpcError::new(Code::OutOfLimits, what).hint("`dimos status` shows its range"))
             }
             None => Ok(arm),

@@ -77,7 +77,8 @@ impl Handle {
     /// After replanning around an obstacle, returns the report of the motion that continued. An error if the run shuts
     /// down or its tick hangs.
     pub fn wait(&self, motion: u64) -> Result<MotionReport, RpcError> {
-        let (mut motion, mut last_beat, mut silent_for) = (motion, None, Duration::ZERO);
+        let (mut motion, mut last_beat, mut silent_for, mut used) = (motion, None, Duration::ZERO, None);
+        let pulse = &self.service.parts.pulse.beat;
         let limit = 2 * watchdog::tick_timeout(self.service.period());
         loop {
             let report = self.motion(motion)?;
@@ -90,8 +91,12 @@ impl Handle {
                 return Err(RpcError::new(Code::ShuttingDown, format!("the run ends during motion {motion}")));
             }
             // Counts only the time in which this thread could run: a stall of the host also stops the tick.
-            let beat = self.service.parts.pulse.beat.last();
-            silent_for = if beat == last_beat { silent_for + POLL_PERIOD } else { Duration::ZERO };
+            let (beat, used_before) = (pulse.last(), std::mem::replace(&mut used, pulse.cpu_time()));
+            if beat != last_beat {
+                silent_for = Duration::ZERO;
+            } else if !pulse.is_starved(used_before, POLL_PERIOD) {
+                silent_for += POLL_PERIOD;
+            }
             last_beat = beat;
             if silent_for > limit {
                 let what = format!("no tick for {} ms during motion {motion}", silent_for.as_millis());

@@ -12,13 +12,13 @@ use super::arm_requests::{order, refused};
 use super::motions::{NATIVE, Planned};
 use super::planner_port::isometry;
 use super::service::{Service, internal};
-use crate::arm::Pose;
+use crate::arm::{ControllerPose, Pose};
 use crate::control::request::Request;
 use crate::hardware::adapter::AdapterError;
 use crate::hardware::device::Way;
 use crate::hardware::registry::Teach;
 use crate::joint::STANDSTILL;
-use crate::pose::{from_xyz_rpy, to_xyz_rpy};
+use crate::pose::from_xyz_rpy;
 use crate::robot::kinematics::pose as to_isometry;
 use crate::rpc::api::{self, Reply};
 use crate::rpc::report::{LED_BY_CONTROLLER, end_of_lead};
@@ -258,28 +258,28 @@ impl Service {
             RpcError::new(Code::Unsupported, what)
                 .hint("a run with a planner moves to poses: `dimos move` without --native")
         })?;
-        let now = from_xyz_rpy(own.xyz, own.rpy);
         let model = self.tcp_models().into_iter().nth(arm as usize).flatten();
         let measured = self.tcp_poses().into_iter().nth(arm as usize).flatten();
         let (target, tool) = match (model, measured) {
             (Some(model), Some(tcp)) if !call.controller_frame => {
+                let flange = own.flange().ok_or_else(|| no_flange(&name, &own))?.isometry();
                 let (root, tcp) = (to_isometry(&model.root), from_xyz_rpy(tcp.xyz, tcp.rpy));
-                let tool = (root * now).inverse() * tcp;
+                let tool = (root * flange).inverse() * tcp;
                 let distance = tool.translation.vector.norm();
                 if distance > LARGEST_TOOL {
                     let what = format!(
-                        "the pose that {name} reports is {distance:.3} m from the tool centre point of its model: their \
+                        "the flange by the controller of {name} is {distance:.3} m from the tool centre point of its model: their \
                          base frames differ"
                     );
                     return Err(RpcError::new(Code::Unsupported, what)
                         .hint("give the pose in the controller's own frame: --frame controller"));
                 }
-                (root.inverse() * goal(call, &tcp) * tool.inverse(), Some(distance))
+                let goal = root.inverse() * goal(call, &tcp) * tool.inverse();
+                (own.tcp_at(&goal).ok_or_else(|| no_flange(&name, &own))?, Some(distance))
             }
-            _ => (goal(call, &now), None),
+            _ => (goal(call, &own.tcp.isometry()), None),
         };
-        let (xyz, rpy) = to_xyz_rpy(&target);
-        Ok((Pose { xyz, rpy }, tool))
+        Ok((Pose::from(&target), tool))
     }
 
     fn set_native(&self, arm: u16, runs: bool) {
@@ -310,17 +310,26 @@ impl Service {
     /// Returns how far the pose that an arm reports is from another one [m, rad].
     fn off_by(&self, arm: u16, target: &Isometry3<f64>) -> Option<(f64, f64)> {
         let own = self.arm_view(arm as usize)?.state.pose?;
-        let off = from_xyz_rpy(own.xyz, own.rpy).inverse() * target;
+        let off = own.tcp.isometry().inverse() * target;
         Some((off.translation.vector.norm(), off.rotation.angle()))
     }
 }
 
-/// Returns the requested pose; without an orientation, that of the present one.
 fn no_native_motions(arm: &str) -> RpcError {
     RpcError::new(Code::Unsupported, format!("the controller of {arm} takes no poses"))
         .hint("a run with a planner moves to poses: `dimos move` without --native")
 }
 
+fn no_flange(arm: &str, own: &ControllerPose) -> RpcError {
+    let what = own.missing().unwrap_or("pose");
+    RpcError::new(
+        Code::Unsupported,
+        format!("the controller of {arm} does not report its {what}: where its flange is, is not known"),
+    )
+    .hint("give the pose in the controller's own frame: --frame controller")
+}
+
+/// Returns the requested pose; without an orientation, that of the present one.
 fn goal(call: &api::MoveNative, now: &Isometry3<f64>) -> Isometry3<f64> {
     let turned = call.pose.rpy.is_some() || call.pose.quat.is_some();
     let rotation = if turned { isometry(&call.pose).rotation } else { now.rotation };

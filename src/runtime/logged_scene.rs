@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use super::planner_port::isometry;
 use super::service::Service;
+use crate::bounded;
 use crate::clock::{Clock, MonotonicClock};
 use crate::planning::planning_scene::PlannedRobot;
 use crate::recording::display_messages::{ColorRGBA, Marker, MarkerArray};
@@ -193,8 +194,7 @@ fn meshes(all: &RobotModel) -> Vec<LogAttachment> {
     }
     let (mut room, mut left_out, mut attached) = (MAX_MESHES, 0, Vec::new());
     for (uri, path) in files {
-        let fits = |path: &&std::path::Path| std::fs::metadata(path).is_ok_and(|about| about.len() <= room as u64);
-        let Some(data) = path.filter(fits).and_then(|path| std::fs::read(path).ok()).filter(|d| d.len() <= room) else {
+        let Some(data) = path.and_then(|path| bounded::read(path, room as u64).ok()) else {
             left_out += 1;
             continue;
         };

@@ -106,6 +106,7 @@ impl Service {
                 RpcError::new(Code::OutOfLimits, e.to_string()).hint("try another speed, or a slightly different target")
             }
         })?;
+        let motion = self.within_tool_speed(&joints, motion, call.speed).await?;
         let duration = motion.duration();
         if duration > longest.as_secs_f64() {
             let what = format!("the motion would take {duration:.1} s (limit {} s)", longest.as_secs());
@@ -154,6 +155,7 @@ impl Service {
             Some(name) => self.task_index(name)?,
             None => self.trajectory_task(&joints)?,
         };
+        let trajectory = self.within_tool_speed(&joints, trajectory, 1.0).await?;
         let duration = trajectory.duration();
         let number = self.begin(task, joints, trajectory, origin, plan).await?;
         Ok(api::ExecuteReply { motion: number, task: self.parts.names.task(task), duration })

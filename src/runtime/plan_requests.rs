@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use glamx::DAffine3;
 use nalgebra::Isometry3;
 
-use super::planner_port::{PlannerPort, isometry, positions_of, robot_index, run_blocking};
+use super::planner_port::{PlannerPort, isometry, no_state, positions_of, robot_index, run_blocking};
 use super::service::internal;
 use super::tcp::TcpModel;
 use crate::collision::Stop;
@@ -162,6 +162,13 @@ impl PlannerPort {
         let tasks: Vec<_> = found.robots.iter().filter_map(|&r| setup.robots.get(r)?.config.task.as_ref()).collect();
         let task = tasks.first().filter(|task| tasks.len() == found.robots.len() && tasks.iter().all(|t| t == *task));
         let task = task.map(|task| (*task).clone());
+        let found = match call.max_speed.filter(|most| *most < job.request.speed) {
+            Some(most) => {
+                let trajectory = found.trajectory.scaled(most / job.request.speed);
+                Arc::new(PlannedMotion { trajectory, ..(*found).clone() })
+            }
+            None => found,
+        };
         self.measured(moment);
         let version = self.thread.version();
         self.still_free(&job, &found, moment).await?;
@@ -215,10 +222,16 @@ impl PlannerPort {
     }
 }
 
-/// Returns the positions of every robot [rad], in the order of the scene.
+/// Returns the positions of every robot [rad], in the order of the scene. Joints that others move must be known, too:
+/// a plan would be about a robot that is elsewhere.
 pub(super) fn all_positions(setup: &PlanningScene, moment: &Moment) -> Result<Vec<Vec<f64>>, RpcError> {
-    let configs = setup.robots.iter().map(|robot| &robot.config);
-    configs.map(|robot| positions_of(&robot.name, &robot.coordinator_joints, moment)).collect()
+    let positions = |robot: &PlannedRobot| {
+        if let Some((_, lost)) = robot.moved_by_others().find(|(_, ours)| !moment.positions.contains_key(*ours)) {
+            return Err(no_state(&format!("{lost}, which moves {}", robot.config.name)));
+        }
+        positions_of(&robot.config.name, &robot.config.coordinator_joints, moment)
+    };
+    setup.robots.iter().map(positions).collect()
 }
 
 pub(super) fn job(port: &PlannerPort, plan: Option<u64>) -> Result<Job, RpcError> {

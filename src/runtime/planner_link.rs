@@ -10,6 +10,7 @@ use serde_json::Value;
 use super::planner_port::{PlannerPort, run_blocking};
 use super::service::{Service, internal};
 use super::tcp::TcpModel;
+use crate::blueprint::Arm;
 use crate::control::config::CoordinatorConfig;
 use crate::control::limit::Bounds;
 use crate::control::task_body::TargetKind;
@@ -118,9 +119,14 @@ impl Service {
         match call {
             Call::ExecutePlan(execute) => {
                 let released = planner.release(&execute, self.moment(0)).await?;
+                self.refuse_mismatch(&released.trajectory.joint_names)?;
                 // A planner may release a plan that this run has not requested.
                 let plan = execute.plan.unwrap_or(released.plan);
-                let planned = lock(&self.plan_requests).get(&plan).map(|(_, planned)| planned.epoch);
+                let planned = lock(&self.plan_requests).get_mut(&plan).map(|(request, planned)| {
+                    // If it is planned again, it stays as slow.
+                    request.speed = execute.max_speed.map_or(request.speed, |most| request.speed.min(most));
+                    planned.epoch
+                });
                 let epoch = planned.map_or(origin.epoch, |planned| planned.min(origin.epoch));
                 let origin = Origin { epoch, ..origin };
                 self.end_streams(&self.joints_named(&released.trajectory.joint_names)?).await?;
@@ -132,6 +138,7 @@ impl Service {
             Call::Planner(_) => self.planner_report(&planner, limit).await.map(Reply::Planner),
             Call::Plan(plan) => {
                 let plan = self.with_saved_poses(plan).await?;
+                self.refuse_mismatch(&self.joints_of_plan(&plan))?;
                 let number = self.parts.dispatcher.next_id();
                 let begun = planner.answer(Call::Plan(plan.clone()), self.moment(number), limit).await?;
                 self.remember_request(number, plan, origin);
@@ -267,7 +274,7 @@ impl Service {
             models.extend(TcpModel::registered(robot).map_err(|what| RpcError::new(Code::InvalidParams, what))?);
         }
         let joints = planner.robots.iter().flat_map(|robot| &robot.joints);
-        let mut limits = command_limits(&self.parts.names, &self.parts.config);
+        let mut limits = command_limits(&self.parts.names, &self.parts.config, &self.parts.blueprint.arms);
         limits.retain(|joint, _| joints.clone().any(|j| j == joint));
         let mut attached = lock(&self.attached);
         if let Some(other) = attached.as_ref().filter(|other| !other.line.is_closed()) {
@@ -322,14 +329,18 @@ impl Service {
                 grippers.extend(arm.joints.iter().map(|joint| (joint.clone(), part)));
             }
         }
-        Moment { plan, positions, grippers }
+        Moment { plan, positions, grippers, paddings: self.paddings() }
     }
 }
 
-/// Returns the position, velocity, acceleration and jerk limits of each joint, as [`Service::begin`] checks them.
-pub(super) fn command_limits(names: &Names, config: &CoordinatorConfig) -> BTreeMap<String, CommandLimits> {
+/// Returns the limits of each joint and of the speed of its arm's tool, as [`Service::begin`] checks them.
+pub(super) fn command_limits(
+    names: &Names,
+    config: &CoordinatorConfig,
+    arms: &[Arm],
+) -> BTreeMap<String, CommandLimits> {
     let mut all = BTreeMap::new();
-    for (arm, named) in config.arms.iter().zip(&names.arms) {
+    for ((arm, named), described) in config.arms.iter().zip(&names.arms).zip(arms) {
         let l = &arm.limits;
         for (j, joint) in named.joints.iter().enumerate() {
             let of = |limits: &[f64]| limits.get(j).copied();
@@ -337,7 +348,13 @@ pub(super) fn command_limits(names: &Names, config: &CoordinatorConfig) -> BTree
             let (Some(velocity), Some(acceleration)) = (of(&l.velocity_max), of(&l.acceleration_max)) else { continue };
             let b = Bounds::inside(lower, upper, velocity, acceleration);
             let jerk = of(&l.jerk_max).unwrap_or(DEFAULT_JERK);
-            let limits = CommandLimits { position: [b.lower, b.upper], velocity, acceleration, jerk };
+            let limits = CommandLimits {
+                position: [b.lower, b.upper],
+                velocity,
+                acceleration,
+                jerk,
+                tcp_velocity: described.tcp_velocity,
+            };
             all.insert(joint.clone(), limits);
         }
     }

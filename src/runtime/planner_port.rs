@@ -47,6 +47,7 @@ impl PlannerPort {
             velocity: l.velocity,
             acceleration: l.acceleration,
             jerk: l.jerk,
+            tcp_velocity: l.tcp_velocity,
         };
         let setup = setup.within(&limits.iter().map(|(joint, l)| (joint.clone(), bound(l))).collect())?;
         let objects = config.objects.iter().map(|object| (object.name.clone(), typed(object))).collect();
@@ -57,8 +58,8 @@ impl PlannerPort {
 
     /// Takes the positions of the joints that are not planned.
     pub(super) fn measured(&self, moment: &Moment) {
-        let (positions, grippers) = (moment.positions.clone(), moment.grippers.clone());
-        self.thread.measured(&Measured { positions, grippers });
+        let Moment { positions, grippers, paddings, .. } = moment.clone();
+        self.thread.measured(&Measured { positions, grippers, paddings });
     }
 
     /// Answers one of the planner's methods, except `execute_plan`: see [`release`](Self::release).
@@ -111,10 +112,13 @@ pub fn registered(setup: &PlanningScene) -> Vec<RegisteredRobot> {
 /// Returns the positions of a robot's joints [rad].
 pub(super) fn positions_of(robot: &str, joints: &[String], moment: &Moment) -> Result<Vec<f64>, RpcError> {
     let position = |joint| moment.positions.get(joint).copied();
-    joints.iter().map(position).collect::<Option<_>>().ok_or_else(|| {
-        RpcError::new(Code::StartStateUnavailable, format!("{robot}: no state that is younger than 1 s"))
-            .hint("`dimos status` shows what the arm waits for")
-    })
+    joints.iter().map(position).collect::<Option<_>>().ok_or_else(|| no_state(robot))
+}
+
+/// Returns the error of a request that needs a newer state than there is.
+pub(super) fn no_state(of: &str) -> RpcError {
+    RpcError::new(Code::StartStateUnavailable, format!("{of}: no state that is younger than 1 s"))
+        .hint("`dimos status` shows what the arm waits for")
 }
 
 /// Runs work of the planner on another thread: neither reading files nor a panic may delay other requests, above all

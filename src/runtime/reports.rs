@@ -6,8 +6,9 @@ use std::time::Instant;
 use super::motions::{End, NATIVE, Next};
 use super::service::Service;
 use super::tcp::TcpModel;
-use crate::arm::{ArmState, VelocitySource};
+use crate::arm::{ArmState, Pose, VelocitySource};
 use crate::clock::WallOffset;
+use crate::control::arm_control::effective;
 use crate::hardware::device::Connected;
 use crate::hardware::registry::Teach;
 use crate::rpc::api::{LoadReport, SpeedReport, TextLog, TextLogReport};
@@ -124,6 +125,7 @@ impl Service {
             stop_pending: self.late_stops.is_waiting(index),
             enabled: view.state.enabled,
             mode: view.state.mode.name().to_owned(),
+            speed_fraction: view.state.speed_fraction,
             device_state: health.codes().map(|codes| DeviceState { state: codes.state, mode: codes.mode }),
             error: (view.state.error != 0).then(|| DeviceError { code: view.state.error, text: health.error_text() }),
             state_age_ms: self.age_ms(&view.state),
@@ -141,11 +143,19 @@ impl Service {
             joints: self.joint_status(index, &health.details()),
             payload: health.details().payload.map(LoadReport::from),
             tcp: tcp.map(TcpModel::report),
+            identity: self.parts.devices.get(index).and_then(|device| device.health().identity().accepted),
+            model_notes: self.model_notes(index),
             position_limits: self.position_limits(index),
             on_exit: arm.on_exit.name().to_owned(),
             holds_when_disabled: info.holds_when_disabled,
             counters: counters.into_iter().map(|(name, n)| (name.to_owned(), n.load(Relaxed))).collect(),
         })
+    }
+
+    /// Returns what is to be said of how an arm's model fits it.
+    fn model_notes(&self, arm: usize) -> Vec<String> {
+        let kinematics = self.parts.kinematics.get(arm).cloned().flatten();
+        kinematics.into_iter().chain(self.model_note(arm)).collect()
     }
 
     /// Returns the lowest and highest position of an arm's joints [rad].
@@ -201,19 +211,16 @@ impl Service {
                 hardware_id: arm.hardware_id.clone(),
                 simulated: !arm.is_real(),
                 age_ms: self.age_ms(s),
+                speed_fraction: s.speed_fraction,
                 joints: joints.collect(),
                 gripper: s.gripper,
                 gripper_unit: gripper.map(|gripper| gripper.unit.name().to_owned()),
                 gripper_force: s.gripper_force,
                 gripper_force_unit: gripper.map(|gripper| gripper.force_unit.name().to_owned()),
                 pose: poses.get_mut(i).and_then(Option::take),
-                device_pose: s.pose.map(|p| PoseReport {
-                    link: "flange".to_owned(),
-                    tool: None,
-                    frame: "base".to_owned(),
-                    xyz: p.xyz,
-                    rpy: p.rpy,
-                }),
+                device_pose: s.pose.and_then(|pose| Some(device_pose("flange", "base", pose.flange()?))),
+                device_tool_pose: s.pose.map(|pose| device_pose("tool", "controller", pose.tcp)),
+                device_pose_missing: s.pose.and_then(|pose| pose.missing()).map(str::to_owned),
                 wrench: s.wrench,
             })
         });
@@ -265,6 +272,8 @@ impl Service {
         let Some(end) = end else {
             let speed = self.speed_override();
             report.remaining /= speed.fraction;
+            report.speed_fraction = self.slowest(&planned.joints);
+            report.remaining /= report.speed_fraction.filter(|fraction| *fraction > 0.0).unwrap_or(1.0);
             report.speed = Some(speed).filter(|speed| *speed != SpeedReport::default());
             let state = if view.motion == number { view.state } else { TaskState::Executing };
             report.state = state.name().to_owned();
@@ -293,6 +302,12 @@ impl Service {
         });
         report.deviation = Some(deviation.collect());
         Ok(report)
+    }
+
+    /// Returns the smallest fraction of the speed at which a controller of these joints runs motions, if below 1.
+    fn slowest(&self, joints: &[u16]) -> Option<f64> {
+        let of = |joint: &u16| Some(effective(self.arm_view(self.locate(*joint)?.0)?.state.speed_fraction));
+        joints.iter().filter_map(of).min_by(f64::total_cmp).filter(|fraction| *fraction < 1.0)
     }
 
     /// Returns the limits of a joint [rad].
@@ -434,4 +449,9 @@ fn rfc3339(wall_ns: i64) -> String {
     let time = jiff::Timestamp::from_nanosecond(i128::from(wall_ns)).unwrap_or_default();
     // Whole seconds suffice for display.
     jiff::Timestamp::from_second(time.as_second()).unwrap_or_default().to_string()
+}
+
+/// Returns a pose of the arm's own controller.
+fn device_pose(link: &str, frame: &str, pose: Pose) -> PoseReport {
+    PoseReport { link: link.to_owned(), tool: None, frame: frame.to_owned(), xyz: pose.xyz, rpy: pose.rpy }
 }

@@ -18,10 +18,12 @@ use super::late_stops::LateStops;
 use super::lease_changes::UnsentEnds;
 use super::log_throttle::LogThrottle;
 use super::logged_scene::{Described, LoggedWorld};
+use super::model_check::Checked;
 use super::motions::Motions;
 use super::payloads::HeldLoads;
 use super::planner_link::Attached;
 use super::planner_port::PlannerPort;
+use super::serial_locks::SerialLocks;
 use super::waiting::Progress;
 use crate::arm::{ArmState, Link};
 use crate::blueprint::Blueprint;
@@ -54,7 +56,10 @@ pub struct ServiceParts {
     pub config: CoordinatorConfig,
     pub names: Names,
     pub connected: Vec<Connected>,
+    /// Per arm, what is to be said of its factory kinematics.
+    pub kinematics: Vec<Option<String>>,
     pub devices: Vec<Arc<Device>>,
+    pub serials: Arc<SerialLocks>,
     pub dispatcher: Arc<Dispatcher>,
     pub pulse: Arc<Pulse>,
     pub streams: Streams,
@@ -109,6 +114,8 @@ pub struct Service {
     pub(super) held_loads: Vec<tokio::sync::Mutex<HeldLoads>>,
     /// Number of ticks when the joint state was last published.
     pub(super) published: AtomicU64,
+    /// Per arm, where model and controller have the flange.
+    pub(super) checks: Mutex<Vec<Checked>>,
     /// The attached planner, also after it disconnected.
     pub(super) attached: Mutex<Option<Arc<Attached>>>,
     /// The last executed plan, and its motion.
@@ -140,6 +147,7 @@ impl Service {
             counters: parts.config.tasks.iter().map(|_| Counters::default()).collect(),
             details_logged: Mutex::new(vec![Details::default(); parts.devices.len()]),
             task_tools: Mutex::new(parts.blueprint.tasks.iter().map(|task| task.robot.as_ref()?.tool).collect()),
+            checks: Mutex::new(vec![Checked::default(); parts.devices.len()]),
             held_loads: parts.devices.iter().map(|_| tokio::sync::Mutex::default()).collect(),
             streamed: parts.config.tasks.iter().map(|_| AtomicBool::default()).collect(),
             parts,

@@ -15,9 +15,10 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use super::arms::{self, Arms, BroughtUp, Slots};
-use super::control_config::{coordinator_config, names_of, tasks};
+use super::control_config::{coordinator_config, names_of, tasks, tools};
 use super::dispatch::{Dispatcher, OutcomeThread};
 use super::guard_worlds::{GuardEnds, GuardWorlds};
+use super::kinematics::{self, Known};
 use super::log_file::{attachments, log_device_note, log_path, metadata, no_log, retain, storage};
 use super::planner_link::command_limits;
 use super::planner_port::PlannerPort;
@@ -34,10 +35,13 @@ use crate::control::config::{CoordinatorConfig, TaskConfig};
 use crate::control::task::Task;
 use crate::control::tick_loop::Pulse;
 use crate::hardware::device;
+use crate::joint::JointLimits;
 use crate::planning::config::PlannerConfig;
 use crate::planning::planning_scene::PlanningScene;
+use crate::recording::files;
 use crate::recording::notes::{self, NoteReceiver, Notes};
 use crate::recording::recorder::{Notice, Recorder, RecorderConfig};
+use crate::robot::calibrated::Places;
 use crate::rpc::report::StatusReport;
 use crate::rpc::run_dir::Claim;
 use crate::rpc::server::Server;
@@ -57,6 +61,7 @@ impl Run {
         // If a later stage fails, the run ends before its name is released.
         let (claim, mut run) = Prepared::new(blueprint, options)?.connect()?.start()?;
         run.enable(blueprint)?;
+        run.handle.service.check_models();
         if blueprint.rpc.enabled {
             let server = Server::start(claim, run.handle.service.clone()).map_err(|e| {
                 let hint = "see the folder's rights, or set rpc.enabled: false";
@@ -64,7 +69,7 @@ impl Run {
             })?;
             run.server = Some(server);
             if view {
-                run.serve_view(blueprint);
+                run.serve_view();
             }
         } else {
             run.handle.service.keep(claim);
@@ -76,10 +81,13 @@ impl Run {
     }
 
     /// Serves the live view, if the blueprint has one.
-    fn serve_view(&mut self, blueprint: &Blueprint) {
-        let Some((config, socket)) = view::config_of(blueprint).zip(self.socket()) else { return };
+    fn serve_view(&mut self) {
+        let service = self.handle.service.clone();
+        let blueprint = &service.parts.blueprint;
+        let claim = self.server.as_ref().map(Server::claim);
+        let Some((config, claim)) = view::config_of(blueprint).zip(claim) else { return };
         let shown = Shown::of_run(self.name(), blueprint, self.config());
-        match View::start(&config, shown, socket, socket) {
+        match View::start(&config, shown, &claim.far_socket(), &claim.files()) {
             Ok(view) => {
                 let _ = self.handle.service.view.set(view.address().to_owned());
                 self.view = Some(view);
@@ -97,8 +105,8 @@ impl Run {
 }
 
 /// A run with its name claimed and its blueprint checked. No arm was contacted.
-struct Prepared<'a> {
-    blueprint: &'a Blueprint,
+struct Prepared {
+    blueprint: Blueprint,
     options: Options,
     name: String,
     names: Names,
@@ -112,30 +120,41 @@ struct Prepared<'a> {
     claim: Claim,
 }
 
-impl<'a> Prepared<'a> {
-    fn new(blueprint: &'a Blueprint, options: Options) -> Result<Self, StartError> {
+impl Prepared {
+    fn new(blueprint: &Blueprint, options: Options) -> Result<Self, StartError> {
         let name = options.name.clone().unwrap_or_else(|| blueprint.name.clone());
         let claim = options.folder.claim(&name).map_err(|e| StartError::other(&e, e.hint()))?;
+        let claim = claim.or_in(files::log_folder().map(|folder| folder.join("run")));
         let (grants, latency) = host::prepare_process(options.hold_latency);
         let wall = WallOffset::take(&MonotonicClock);
         let log = log_path(blueprint, &options, &name, wall)?;
         let robots = blueprint.planner.as_ref().map(robots).transpose()?;
         let (task_configs, tasks) = tasks(blueprint).map_err(wrong_model)?;
         let names = names_of(blueprint);
+        let blueprint = blueprint.clone();
         Ok(Self { blueprint, options, name, names, log, wall, robots, task_configs, tasks, grants, latency, claim })
     }
 
-    fn connect(mut self) -> Result<Connected<'a>, StartError> {
+    fn connect(mut self) -> Result<Connected, StartError> {
         let pulse = Arc::new(Pulse::default());
         let (notes, noted) = notes::channel();
         let device_notes = {
             let (notes, names) = (notes.clone(), self.names.clone());
             move |arm: usize, note: device::Note| log_device_note(&notes, &names, arm, note)
         };
-        let BroughtUp { arms, slots, connected } = arms::bring_up(self.blueprint, &pulse.beat, device_notes)?;
-        let config = coordinator_config(self.blueprint, &connected, std::mem::take(&mut self.task_configs));
+        let BroughtUp { arms, slots, connected } =
+            arms::bring_up(&self.blueprint, self.options.folder.is_closed(), &pulse.beat, device_notes)?;
+        for (arm, (said, _)) in self.blueprint.arms.iter_mut().zip(&connected) {
+            if let Some(bridging) = said.bridging {
+                arm.supervision.gap_tolerance = bridging.tolerance;
+                arm.supervision.after_gap = bridging.after;
+            }
+        }
+        let kinematics = self.calibrate(&connected)?;
+        let tools = tools(&self.blueprint).map_err(wrong_model)?;
+        let config = coordinator_config(&self.blueprint, &connected, std::mem::take(&mut self.task_configs), tools);
         let planner = self.blueprint.planner.as_ref().zip(self.robots.take()).map(|(planner, setup)| {
-            let limits = command_limits(&self.names, &config);
+            let limits = command_limits(&self.names, &config, &self.blueprint.arms);
             PlannerPort::start(planner, setup, &limits, self.options.solver.take()).map_err(|what| {
                 let hint = "the model's limits, the arm's, and `limits` in the blueprint must overlap";
                 StartError::other(what, hint)
@@ -143,29 +162,51 @@ impl<'a> Prepared<'a> {
         });
         let planner = planner.transpose()?;
         let connected = connected.into_iter().map(|(connected, _)| connected).collect();
-        Ok(Connected { arms, slots, connected, config, planner, pulse, notes, noted, prepared: self })
+        Ok(Connected { arms, slots, connected, kinematics, config, planner, pulse, notes, noted, prepared: self })
+    }
+
+    /// Puts the dimensions of the connected arms into the models. Returns what is to be said of each.
+    fn calibrate(&mut self, connected: &[(device::Connected, JointLimits)]) -> Result<Vec<Option<String>>, StartError> {
+        let about = self.blueprint.arms.iter().zip(connected);
+        let known: Vec<_> = about.map(|(arm, (about, _))| Known::connected(arm, about)).collect();
+        let before = self.blueprint.clone();
+        let notes = kinematics::correct(&mut self.blueprint, &known);
+        let robots_of = |blueprint: &Blueprint| {
+            let planned = blueprint.planner.iter().flat_map(|planner| &planner.robots);
+            planned.map(|robot| (robot.places.clone(), robot.controller_base.clone())).collect::<Vec<_>>()
+        };
+        let tasks_of = |blueprint: &Blueprint| -> Vec<Places> {
+            blueprint.tasks.iter().filter_map(|task| Some(task.robot.as_ref()?.source.places.clone())).collect()
+        };
+        // Models are read again only where they have changed.
+        if robots_of(&before) != robots_of(&self.blueprint) || tasks_of(&before) != tasks_of(&self.blueprint) {
+            self.robots = self.blueprint.planner.as_ref().map(robots).transpose()?;
+            (self.task_configs, self.tasks) = tasks(&self.blueprint).map_err(wrong_model)?;
+        }
+        Ok(notes)
     }
 }
 
 /// A run with connected arms. Fields are dropped in this order: the arms before the name.
-struct Connected<'a> {
+struct Connected {
     arms: Arms,
     slots: Slots,
     connected: Vec<device::Connected>,
+    kinematics: Vec<Option<String>>,
     config: CoordinatorConfig,
     planner: Option<PlannerPort>,
     pulse: Arc<Pulse>,
     notes: Notes,
     noted: NoteReceiver,
-    prepared: Prepared<'a>,
+    prepared: Prepared,
 }
 
-impl Connected<'_> {
+impl Connected {
     /// Starts the threads. If one cannot be started, the previous ones end.
     fn start(self) -> Result<(Claim, Run), StartError> {
         // Dropped in reverse order: the arms before the name.
-        let Self { prepared, mut arms, slots, connected, config, planner, pulse, notes, noted } = self;
-        let source = source(prepared.blueprint, &mut arms, &connected)?;
+        let Self { prepared, mut arms, slots, connected, kinematics, config, planner, pulse, notes, noted } = self;
+        let source = source(&prepared.blueprint, &mut arms, &connected)?;
         let margin = prepared.blueprint.guard.filter(|_| planner.is_some());
         let (ports, ends) = wires(&config, slots, &arms, source, pulse.clone(), margin.is_some())?;
         let guard = match (&planner, margin, ends.guard) {
@@ -180,7 +221,9 @@ impl Connected<'_> {
             config: config.clone(),
             names: prepared.names.clone(),
             connected,
+            kinematics,
             devices: arms.devices.clone(),
+            serials: arms.serials.clone(),
             dispatcher: dispatcher.clone(),
             pulse: pulse.clone(),
             streams: Streams::default(),
@@ -227,13 +270,13 @@ impl Connected<'_> {
 }
 
 fn start_recorder(
-    prepared: &Prepared<'_>,
+    prepared: &Prepared,
     config: &CoordinatorConfig,
     samples: rtrb::Consumer<Sample>,
     noted: NoteReceiver,
     service: &Arc<Service>,
 ) -> Result<Recorder, StartError> {
-    let (blueprint, wall) = (prepared.blueprint, prepared.wall);
+    let (blueprint, wall) = (&prepared.blueprint, prepared.wall);
     service.log_tcps();
     let mut attachments = attachments(blueprint, config);
     let storage = storage(blueprint, &prepared.options);
@@ -272,6 +315,7 @@ fn publisher(service: Arc<Service>, wall: WallOffset) -> impl FnMut(bool) + Send
         if Instant::now() >= details_due {
             service.log_details();
             service.log_tcps();
+            service.check_models();
             service.log_world();
             details_due = Instant::now() + DETAILS_PERIOD;
         }

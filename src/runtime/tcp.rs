@@ -13,7 +13,7 @@ use super::service::Service;
 use crate::planning::planning_scene::PlannedRobot;
 use crate::recording::tcp_log::TcpChain;
 use crate::robot::kinematics::{Kinematics, frame, pose};
-use crate::rpc::api::{RegisteredModel, RegisteredRobot};
+use crate::rpc::api::{RegisteredFlange, RegisteredModel, RegisteredRobot};
 use crate::rpc::report::{PoseReport, TcpReport, ToolReport};
 use crate::sync::lock;
 
@@ -36,6 +36,21 @@ pub(super) struct TcpModel {
     pub link: String,
     /// Pose of the tool centre point in the link's frame.
     pub tool: Option<Isometry3<f64>>,
+    /// The flange, and the controller's base; `None` if the model does not name its flange.
+    pub(super) flange: Option<Flange>,
+    /// Whether planned motions are made although the model does not fit the arm.
+    pub(super) allows_mismatch: bool,
+}
+
+/// Where the flange and the base of an arm's controller are in its model.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Flange {
+    /// Index of the flange's link in the kinematics.
+    link: usize,
+    /// Index of the link that carries the controller's base.
+    base_link: usize,
+    /// Pose of the controller's base in that link's frame.
+    base: Isometry3<f64>,
 }
 
 impl TcpModel {
@@ -49,16 +64,37 @@ impl TcpModel {
             root: robot.body.base,
             link: robot.config.end_effector_link.clone(),
             tool: robot.config.tool,
+            flange: Self::flange_of(robot),
+            allows_mismatch: robot.config.allows_mismatch,
         }
+    }
+
+    fn flange_of(robot: &PlannedRobot) -> Option<Flange> {
+        let link = robot.model.link_index(robot.config.flange_link.as_ref()?)?;
+        let own = || Some((robot.model.link_index(&robot.config.base_link)?, Isometry3::identity()));
+        let (base_link, base) = match &robot.config.controller_base {
+            Some((name, base)) => (robot.model.link_index(name)?, *base),
+            None => own()?,
+        };
+        Some(Flange { link, base_link, base })
     }
 
     /// Returns the model of an attached planner's robot, if it registered one. The error names what is wrong with it.
     pub fn registered(robot: &RegisteredRobot) -> Result<Option<Self>, String> {
-        let Some(RegisteredModel { kinematics, index, root, tcp }) = &robot.model else { return Ok(None) };
+        let Some(RegisteredModel { kinematics, index, root, tcp, flange, allows_mismatch }) = &robot.model else {
+            return Ok(None);
+        };
         let read = serde_json::from_value::<Kinematics>(kinematics.clone());
         let kinematics = read.map_err(|e| format!("the kinematics of {}: {e}", robot.name))?;
         if kinematics.dof() != robot.joints.len() || *index >= kinematics.links() {
             return Err(format!("the kinematics of {} have other joints or links than the robot", robot.name));
+        }
+        let flange = flange.as_ref().map(|flange| {
+            let RegisteredFlange { link, base_link, base } = flange;
+            Flange { link: *link, base_link: *base_link, base: isometry(base) }
+        });
+        if flange.is_some_and(|flange| flange.link.max(flange.base_link) >= kinematics.links()) {
+            return Err(format!("the kinematics of {} have no such flange", robot.name));
         }
         Ok(Some(Self {
             robot: Some(robot.name.clone()),
@@ -68,13 +104,21 @@ impl TcpModel {
             root: frame(&isometry(root)),
             link: tcp.link.clone(),
             tool: tcp.tool.map(|tool| crate::pose::from_xyz_rpy(tool.xyz, tool.rpy)),
+            flange,
+            allows_mismatch: *allows_mismatch,
         }))
     }
 
     /// Returns it for the registration of an attached planner.
     pub fn to_register(&self) -> RegisteredModel {
         let (kinematics, root) = (serde_json::to_value(&*self.kinematics).unwrap_or_default(), spec(&pose(&self.root)));
-        RegisteredModel { kinematics, index: self.index, root, tcp: self.report() }
+        let flange = self.flange.map(|flange| RegisteredFlange {
+            link: flange.link,
+            base_link: flange.base_link,
+            base: spec(&flange.base),
+        });
+        let allows_mismatch = self.allows_mismatch;
+        RegisteredModel { kinematics, index: self.index, root, tcp: self.report(), flange, allows_mismatch }
     }
 
     /// Returns the point's report.
@@ -82,9 +126,24 @@ impl TcpModel {
         TcpReport { link: self.link.clone(), tool: self.tool.as_ref().map(ToolReport::from) }
     }
 
+    /// Returns the number of its joints.
+    pub fn dof(&self) -> usize {
+        self.joints.len()
+    }
+
     /// Returns whether the robot has one of these joints.
     pub fn moves(&self, joints: &[String]) -> bool {
         self.joints.iter().any(|joint| joints.contains(joint))
+    }
+
+    /// Returns the pose of the flange in the frame of the controller's base, at positions of the arm's joints [rad],
+    /// which must be those of the model; `None` if the model does not name its flange, or has other joints.
+    pub(super) fn flange_in_controller(&self, positions: &[f64]) -> Option<Isometry3<f64>> {
+        let flange = self.flange.filter(|_| positions.len() == self.joints.len())?;
+        let mut frames = self.kinematics.frames();
+        self.kinematics.forward_from(&self.root, positions, &mut frames);
+        let link = |index: usize| pose(&self.kinematics.link_frame(index, &frames));
+        Some((link(flange.base_link) * flange.base).inverse() * link(flange.link))
     }
 
     /// Returns the point's pose in `map` at these positions [rad]; `None` if one is missing.
@@ -140,6 +199,8 @@ impl Service {
                 root: robot.root.frame(),
                 link: about.link.clone(),
                 tool: *tool,
+                flange: None,
+                allows_mismatch: false,
             };
             model.moves(joints).then_some(model)
         })

@@ -28,7 +28,11 @@ impl Service {
         self.rests(arm)?;
         self.set_planner_tool(&model, tool).await?;
         let tasks = self.tasks_of(arm, &model.link);
-        if let Err(error) = self.set_task_tools(&tasks, tool).await {
+        let set = match self.set_task_tools(&tasks, tool).await {
+            Ok(()) => self.limit_tool(arm, &model.link, tool).await,
+            Err(error) => Err(error),
+        };
+        if let Err(error) = set {
             let _ = self.set_task_tools(&tasks, model.tool).await;
             let _ = self.set_planner_tool(&model, model.tool).await;
             return Err(error);

@@ -12,7 +12,7 @@ use super::service::internal;
 use crate::collision::pairs;
 use crate::collision::shape::Placed;
 use crate::collision::world::{Attached, Obstacle, World};
-use crate::planning::config::{ObjectConfig, ObjectShape};
+use crate::planning::config::{MAX_OBJECTS, ObjectConfig, ObjectShape};
 use crate::planning::planning_scene::{PlannedRobot, obstacle};
 use crate::robot::kinematics::{frame, pose};
 use crate::rpc::api::{self, AttachReply, Done, LoadReport, Moment, ShapeSpec, WorldObject};
@@ -119,6 +119,10 @@ impl PlannerPort {
         let objects = &mut *lock(&self.objects);
         // Another client may have attached it meanwhile.
         not_held(objects, &object.name)?;
+        if objects.len() >= MAX_OBJECTS && !objects.contains_key(&object.name) {
+            let error = RpcError::new(Code::TooLarge, format!("the world has {MAX_OBJECTS} objects already"));
+            return Err(error.hint("remove some with `dimos world remove`, or describe several by one mesh"));
+        }
         self.thread.world(|world| world.put(made)).map_err(|e| wrong(e.to_string()))?;
         objects.insert(object.name.clone(), object);
         Ok(Done {})
@@ -266,8 +270,12 @@ mod tests {
         let config = PlannerConfig { timeout, padding: 0.0, robots, objects: vec![ball] };
         let setup = PlanningScene::load(&config).unwrap();
         let joints = setup.robots[0].config.coordinator_joints.iter();
-        let moment =
-            Moment { plan: 1, positions: joints.map(|j| (j.clone(), 0.0)).collect(), grippers: BTreeMap::new() };
+        let moment = Moment {
+            plan: 1,
+            positions: joints.map(|j| (j.clone(), 0.0)).collect(),
+            grippers: BTreeMap::new(),
+            ..Moment::default()
+        };
         (PlannerPort::start(&config, setup, &BTreeMap::new(), None).unwrap(), moment)
     }
 

@@ -1,36 +1,39 @@
 //! The gateway: a client of a run's socket that gives it to other computers.
 //!
 //! ```text
-//!  client ─ zenoh ─▶ queryable: key, role, form ─▶ Remote: a connection per client, one more for stop, cancel ─▶ run
+//!  client ─ zenoh ─▶ queryable: key, role, form ─▶ Remote: a connection per client; per user for stop, cancel ─▶ run
 //!         ◀─ streams that everyone may read, read once ────────────────────────────────────────────────────── run
 //! ```
 //!
 //! The run sees clients of its socket and nothing else: their leases are those of their connections, which this process
 //! closes when a client is lost. It decides nothing that the run decides.
 
+mod clients;
+
 use std::collections::{BTreeMap, VecDeque};
 use std::io::{self, BufRead, BufReader, Write};
 use std::os::unix::net::UnixStream;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, SyncSender, channel, sync_channel};
 use std::sync::{Arc, Mutex, Weak};
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
+use zenoh::bytes::ZBytes;
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::query::Query;
-use zenoh::sample::{Sample, SampleKind};
 use zenoh::{Session, Wait};
 
 use super::class::{Class, PAGE, permit};
 use super::keys::{self, Who};
 use super::page::Pages;
-use super::remote::{Closed, Remote, Request, Ways, ended, refuse};
+use super::remote::{Closed, Remote, Request, refuse};
 use super::{certificates, python_dimos, ros, settings, streams};
-use crate::blueprint::share::{OnLost, ShareConfig};
-use crate::rpc::api::{FaceReport, Lease, MAX_ANSWER, MAX_LINE, METHODS, Method, PlannerAnswer, RegisterGateway};
+use crate::blueprint::share::ShareConfig;
+use crate::rpc::api::{FaceReport, MAX_ANSWER, MAX_LINE, METHODS, Method, PlannerAnswer, RegisterGateway};
 use crate::rpc::error::{Code, RpcError};
+use crate::rpc::reach;
 use crate::rpc::run_dir::has_ended_in_order;
 use crate::sync::lock;
 
@@ -46,6 +49,8 @@ const LAST_ANSWERS: Duration = Duration::from_millis(200);
 const END_LEAD: Duration = Duration::from_millis(50);
 /// Refusals that may wait to be sent.
 const MAX_REFUSED: usize = 1024;
+/// Length of the attachment of requests and beats [bytes].
+pub(super) const PROOF: usize = 16;
 /// Room for the rest of a line beside the params [bytes].
 const ENVELOPE: usize = 256;
 
@@ -79,6 +84,8 @@ struct Shared {
     session: Session,
     news: Sender<News>,
     clients: Mutex<BTreeMap<Who, Arc<Remote>>>,
+    /// The connection for what ends motion, by user: it needs no place among the clients.
+    ends: Mutex<BTreeMap<String, Arc<Remote>>>,
     /// Set with the lock of `clients`: there are no new ones.
     run_ended: AtomicBool,
     /// Commanders whose leases ended because they were silent.
@@ -96,7 +103,7 @@ impl Gateway {
         if let Some(soon) = certificates::check_gateway(&config)? {
             tracing::warn!("share: {soon}");
         }
-        let mut control = UnixStream::connect(&socket).map_err(|e| failed(format!("run {run}: {e}")))?;
+        let mut control = connect(&socket).map_err(|e| failed(format!("run {run}: {e}")))?;
         let endpoints = config.listen.iter().chain(&config.connect).map(ToString::to_string).collect();
         register(&mut control, &RegisterGateway { endpoints, starting: true, ..RegisterGateway::default() })
             .map_err(|e| failed(e.to_string()))?;
@@ -124,6 +131,7 @@ impl Gateway {
             session,
             news: news.clone(),
             clients: Mutex::default(),
+            ends: Mutex::default(),
             run_ended: AtomicBool::new(false),
             lost: Mutex::default(),
             pages,
@@ -228,7 +236,7 @@ impl Gateway {
         let clients: Vec<Arc<Remote>> = {
             let clients = lock(&shared.clients);
             shared.run_ended.store(true, Ordering::Release);
-            clients.values().cloned().collect()
+            clients.values().chain(lock(&shared.ends).values()).cloned().collect()
         };
         clients.iter().for_each(|remote| remote.close(Closed::RunEnded));
         let end = shared.session.put(keys::end(&shared.run), "").priority(Priority::RealTime);
@@ -300,12 +308,21 @@ impl Shared {
                     self.refuse(query, error);
                 }
             }
-            Ok((who, class, method, params, bytes)) => match self.client(&who) {
+            Ok((who, Class::End, method, params, bytes)) => {
+                let name = lock(&self.clients).get(&who).map_or_else(|| who.short(), |known| lock(&known.name).clone());
+                tracing::warn!("share: {method} by {}", who.title(&name));
+                match self.end(&who.user) {
+                    Ok(remote) => {
+                        if let Some(query) = remote.queue(Request { query, class: Class::End, method, params, bytes }) {
+                            self.refuse(query, remote.over(&self.run));
+                        }
+                    }
+                    Err(error) => self.refuse(query, error),
+                }
+            }
+            Ok((who, class, method, params, bytes)) => match self.proved_client(&who, &query) {
                 Ok(remote) => {
                     remote.is_alive();
-                    if class == Class::End {
-                        tracing::warn!("share: {method} by {}", remote.title());
-                    }
                     if let Some(query) = remote.queue(Request { query, class, method, params, bytes }) {
                         self.refuse(query, remote.over(&self.run));
                     }
@@ -336,8 +353,10 @@ impl Shared {
             }
             Some(_) => permit(&who.user, method, class, &self.config)?,
         }
-        if query.attachment().is_some() || !query.parameters().is_empty() {
-            return Err(RpcError::new(Code::Malformed, "a request has no attachment and no parameters in its key"));
+        let proof = query.attachment().map_or(0, ZBytes::len);
+        if ![0, PROOF].contains(&proof) || !query.parameters().is_empty() {
+            let text = format!("a request has an attachment of {PROOF} bytes or none, and no parameters in its key");
+            return Err(RpcError::new(Code::Malformed, text));
         }
         let bytes = query.payload().map_or(0, |payload| payload.len());
         let limit = if method == PlannerAnswer::NAME { MAX_ANSWER } else { MAX_LINE } - ENVELOPE;
@@ -357,110 +376,15 @@ impl Shared {
         self.still_commands(&who, method, class)?;
         Ok((who, class, method.to_owned(), params, bytes))
     }
-
-    /// Fails for a commander that was lost, until it takes its lease again.
-    fn still_commands(&self, who: &Who, method: &str, class: Class) -> Result<(), RpcError> {
-        let mut lost = lock(&self.lost);
-        if !lost.contains(who) || !matches!(class, Class::Move | Class::Enable) {
-            return Ok(());
-        }
-        if method == Lease::NAME {
-            lost.retain(|other| other != who);
-            return Ok(());
-        }
-        let timeout = self.config.client_timeout;
-        let text = format!("the lease has ended: this client was silent for more than {timeout} s");
-        Err(RpcError::new(Code::Lost, text).hint("take the lease again with `lease`, or start the program again"))
-    }
-
-    /// Returns a client; a new one gets its connections.
-    fn client(&self, who: &Who) -> Result<Arc<Remote>, RpcError> {
-        let mut clients = lock(&self.clients);
-        if self.run_ended.load(Ordering::Acquire) {
-            return Err(ended(&self.run));
-        }
-        clients.retain(|_, remote| !remote.is_closed());
-        if let Some(remote) = clients.get(who) {
-            return Ok(remote.clone());
-        }
-        let limit = self.config.max_clients;
-        if clients.len() >= limit {
-            let error = RpcError::new(Code::TooManyConnections, format!("{limit} clients are connected already"));
-            return Err(error.hint("`dimos status` names them; the limit is `share.max_clients`"));
-        }
-        let ways = Ways {
-            session: &self.session,
-            run: &self.run,
-            socket: &self.socket,
-            cancel_at_end: self.config.on_lost == OnLost::Cancel,
-        };
-        let remote = Remote::start(who.clone(), &ways).map_err(|e| failed(format!("no thread for a client: {e}")))?;
-        clients.insert(who.clone(), remote.clone());
-        let _ = self.news.send(News::Clients);
-        Ok(remote)
-    }
-
-    fn see_token(&self, sample: &Sample) {
-        let Some(who) = Who::of_token(sample.key_expr().as_str(), &self.run) else { return };
-        match sample.kind() {
-            SampleKind::Put => {
-                if let Ok(remote) = self.client(&who) {
-                    remote.has_token.store(true, Ordering::Release);
-                    remote.is_alive();
-                }
-            }
-            SampleKind::Delete => self.lose(&who, "it has closed its connection"),
-        }
-    }
-
-    fn see_beat(&self, sample: &Sample) {
-        let Some(who) = Who::of_token(sample.key_expr().as_str(), &self.run) else { return };
-        let Some(remote) = lock(&self.clients).get(&who).cloned() else { return };
-        remote.is_alive();
-        let name = sample.payload().to_bytes();
-        if let Ok(name) = std::str::from_utf8(&name)
-            && !name.is_empty()
-        {
-            let name: String = name.chars().filter(|c| !c.is_control()).take(40).collect();
-            if *lock(&remote.name) != name {
-                *lock(&remote.name) = name;
-                let _ = self.news.send(News::Clients);
-            }
-        }
-    }
-
-    /// Ends the connections of commanders that are silent, and of clients that never had a token.
-    fn look_after_clients(&self) {
-        let timeout = Duration::from_secs_f64(self.config.client_timeout);
-        let silent = |remote: &&Arc<Remote>| {
-            let silence = remote.silence();
-            (remote.commands.load(Ordering::Acquire) && silence > timeout)
-                || (!remote.has_token.load(Ordering::Acquire) && silence > FORGET_AFTER)
-        };
-        let silent: Vec<Who> = lock(&self.clients).values().filter(silent).map(|remote| remote.who.clone()).collect();
-        for who in silent {
-            self.lose(&who, "it has been silent");
-        }
-    }
-
-    /// Closes the connections of a client: the run frees its leases, and cancels its motions if it is to.
-    fn lose(&self, who: &Who, why: &str) {
-        let Some(remote) = lock(&self.clients).remove(who) else { return };
-        if remote.commands.load(Ordering::Acquire) {
-            tracing::warn!("share: the commander {} is lost: {why}", remote.title());
-            let mut lost = lock(&self.lost);
-            if lost.len() == MAX_LOST {
-                lost.pop_front();
-            }
-            lost.push_back(who.clone());
-        }
-        remote.close(Closed::Lost);
-        let _ = self.news.send(News::Clients);
-    }
 }
 
 fn failed(text: String) -> RpcError {
     RpcError::new(Code::Internal, text)
+}
+
+fn connect(socket: &Path) -> io::Result<UnixStream> {
+    let stream = reach::open(socket)?;
+    stream.set_nonblocking(false).map(|()| stream)
 }
 
 /// Sends what the gateway says of itself.

@@ -10,6 +10,7 @@
 //! ```
 
 use super::class::Class;
+use crate::blueprint::share::ANYONE;
 
 /// First part of all keys.
 const ROOT: &str = "dimos";
@@ -85,6 +86,21 @@ impl Who {
             ["by", user, class, id, method] => Some((Self::of(user, id)?, Class::of_name(class)?, method)),
             _ => None,
         }
+    }
+
+    /// Returns what the client is called until it says its name.
+    pub fn short(&self) -> String {
+        format!("client {}", self.id.get(..8).unwrap_or(&self.id))
+    }
+
+    /// Returns the client as people know it, with its name.
+    pub fn title(&self, name: &str) -> String {
+        format!("{} ({name})", self.title_of_user())
+    }
+
+    /// Returns the user as people know it.
+    pub fn title_of_user(&self) -> &str {
+        if self.user == ANYONE { "someone" } else { &self.user }
     }
 
     fn of(user: &str, id: &str) -> Option<Self> {

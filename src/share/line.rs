@@ -8,7 +8,7 @@
 //! So every verb works over it unchanged, and a client that does not read delays neither the network nor the gateway.
 
 use std::collections::BTreeMap;
-use std::io::{self, BufRead, BufReader, Write};
+use std::io::{self, BufRead, BufReader, Read, Write};
 use std::net::{Shutdown, TcpStream, ToSocketAddrs};
 use std::os::unix::net::UnixStream;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -24,6 +24,7 @@ use zenoh::sample::SampleKind;
 use zenoh::{Session, Wait};
 
 use super::class::Class;
+use super::gateway::PROOF;
 use super::place::Place;
 use super::{certificates, keys, settings};
 use crate::rpc::api::{METHODS, Method};
@@ -121,6 +122,8 @@ struct Line {
     run: String,
     user: String,
     id: String,
+    /// Goes with every request and beat: another program of the same user cannot speak for this one.
+    proof: [u8; PROOF],
     /// Lines to the client.
     out: SyncSender<String>,
     /// Whether the gateway is live.
@@ -132,6 +135,7 @@ impl Line {
         let (out, lines) = sync_channel(QUEUE);
         let line = Arc::new(Self {
             id: session.zid().to_string(),
+            proof: random()?,
             session,
             place: place.name.clone(),
             run: run.to_owned(),
@@ -196,7 +200,7 @@ impl Line {
     fn beat(&self) {
         let name = program_and_host();
         let sent = self.session.put(keys::beat(&self.run, &self.user, &self.id), name);
-        let _ = sent.congestion_control(CongestionControl::Block).express(true).wait();
+        let _ = sent.attachment(self.proof).congestion_control(CongestionControl::Block).express(true).wait();
     }
 
     fn subscribe_to(
@@ -243,6 +247,7 @@ impl Line {
             Pending { line: self.clone(), id, method, sent: Instant::now(), answered: AtomicBool::new(false) };
         let key = keys::request(&self.run, &self.user, class, &self.id, &pending.method);
         let asked = self.session.get(key).payload(params.to_string()).timeout(REPLY_TIMEOUT);
+        let asked = asked.attachment(self.proof);
         let asked =
             asked.congestion_control(CongestionControl::Block).express(true).consolidation(ConsolidationMode::None);
         // If it fails, the callback is dropped, and with it what is pending.
@@ -290,6 +295,13 @@ impl Line {
         let text = format!("the connection to {} is lost", self.place);
         self.over(Code::Lost, text);
     }
+}
+
+/// Returns random bytes.
+fn random() -> io::Result<[u8; PROOF]> {
+    let mut bytes = [0; PROOF];
+    std::fs::File::open("/dev/urandom")?.read_exact(&mut bytes)?;
+    Ok(bytes)
 }
 
 /// Beats until the connection ends.

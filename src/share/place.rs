@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 
 use crate::blueprint::share::{ANYONE, Endpoint, Identity, is_user};
+use crate::bounded;
 use crate::yaml::{did_you_mean, quote};
 
 /// Where a run, or a router of runs, is reached, and as whom.
@@ -48,7 +49,7 @@ impl Place {
 
     /// Returns the names in `places.yaml`; none if it cannot be read.
     pub fn names() -> Vec<String> {
-        let written = std::fs::read_to_string(settings().join("places.yaml")).unwrap_or_default();
+        let written = bounded::read_text(&settings().join("places.yaml"), bounded::SMALL).unwrap_or_default();
         let places: BTreeMap<String, serde_yaml::Value> = serde_yaml::from_str(&written).unwrap_or_default();
         places.into_keys().collect()
     }
@@ -61,7 +62,7 @@ impl Place {
         }
         let file = settings.join("places.yaml");
         let shown = file.display();
-        let written = match std::fs::read_to_string(&file) {
+        let written = match bounded::read_text(&file, bounded::SMALL) {
             Ok(written) => written,
             Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
                 let hint = "hint: give an endpoint, tls/HOST:PORT, or name places in that file: docs/many-machines.md";

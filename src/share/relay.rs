@@ -4,7 +4,7 @@
 use std::io::{Read, Write};
 use std::os::unix::fs::PermissionsExt;
 use std::os::unix::net::{UnixListener, UnixStream};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::thread::JoinHandle;
@@ -24,7 +24,8 @@ const REFUSAL: Duration = Duration::from_secs(1);
 /// The socket. Closed and removed when dropped; connections continue.
 #[derive(Debug)]
 pub struct Relay {
-    claim: Claim,
+    socket: PathBuf,
+    _claim: Claim,
     ended: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
@@ -35,8 +36,7 @@ impl Relay {
         static NUMBER: AtomicU32 = AtomicU32::new(0);
         let place = remote_runs::find(place)?;
         let folder = RunDir::standard().relays();
-        // Removes those of processes that were killed.
-        folder.runs()?;
+        folder.tidy()?;
         let claim = folder.claim(&format!("{}-{}", std::process::id(), NUMBER.fetch_add(1, Ordering::Relaxed)))?;
         let failed = |error| ClientError::Io { run: run.to_owned(), error };
         let listener = UnixListener::bind(claim.socket()).map_err(failed)?;
@@ -48,12 +48,12 @@ impl Relay {
             .name("relay".into())
             .spawn(move || accept(&listener, &place, &run_name, &end))
             .map_err(failed)?;
-        Ok(Self { claim, ended, thread: Some(thread) })
+        Ok(Self { socket: claim.socket(), _claim: claim, ended, thread: Some(thread) })
     }
 
     /// Returns the path of the socket.
     pub fn socket(&self) -> &Path {
-        self.claim.socket()
+        &self.socket
     }
 }
 
@@ -61,7 +61,7 @@ impl Drop for Relay {
     fn drop(&mut self) {
         self.ended.store(true, Ordering::Release);
         // Wakes the thread.
-        let _ = UnixStream::connect(self.claim.socket());
+        let _ = UnixStream::connect(&self.socket);
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
         }

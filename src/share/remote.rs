@@ -1,11 +1,11 @@
-//! One client on another computer: two connections to the run's socket, each with its own thread and queue. Requests
-//! that end motion have the second one, so that a `stop` never waits behind a slow request of the same client.
+//! A client on another computer: a connection to the run's socket, with its own thread and queue. Requests that end
+//! motion have one for all clients of a user, so that a `stop` waits behind no slow request and needs no free place.
 
 use std::collections::BTreeMap;
 use std::io;
 use std::path::Path;
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, OnceLock};
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
@@ -24,6 +24,7 @@ use super::class::Class;
 use super::keys::{self, Who};
 use crate::rpc::api::{Method, OnBehalfOf, PLANNER_REQUESTS, RegisterPlanner, Release};
 use crate::rpc::error::{Code, RpcError};
+use crate::rpc::reach;
 use crate::sync::lock;
 
 /// Requests of a client that may wait for their replies; more are refused.
@@ -61,8 +62,10 @@ pub(super) struct Remote {
     pub has_token: AtomicBool,
     /// Whether it may hold a lease, or is the planner: then silence matters.
     pub commands: AtomicBool,
-    ordered: Queue,
-    urgent: Queue,
+    /// Attachment of its requests and beats, set by its first request: a program with the same id and another one is
+    /// not this client.
+    pub proof: OnceLock<Vec<u8>>,
+    queue: Queue,
     end: watch::Sender<Option<Closed>>,
 }
 
@@ -90,39 +93,40 @@ pub(super) struct Ways<'a> {
 }
 
 impl Remote {
-    /// Starts the threads of a client.
-    pub fn start(who: Who, ways: &Ways<'_>) -> io::Result<std::sync::Arc<Self>> {
-        let ((ordered, from_ordered), (urgent, from_urgent)) = (channel(QUEUE), channel(QUEUE));
-        let queue = |to| Queue { to, waiting: AtomicUsize::new(0) };
-        let remote = std::sync::Arc::new(Self {
-            name: Mutex::new(format!("client {}", who.id.get(..8).unwrap_or(&who.id))),
+    /// Starts the thread of a client; of the requests that end motion, with `ends`.
+    pub fn start(who: Who, ends: bool, ways: &Ways<'_>) -> io::Result<Arc<Self>> {
+        let (to, requests) = channel(QUEUE);
+        let remote = Arc::new(Self {
+            name: Mutex::new(who.short()),
             who,
             seen: Mutex::new(Instant::now()),
             has_token: AtomicBool::new(false),
             commands: AtomicBool::new(false),
-            ordered: queue(ordered),
-            urgent: queue(urgent),
+            proof: OnceLock::new(),
+            queue: Queue { to, waiting: AtomicUsize::new(0) },
             end: watch::Sender::new(None),
         });
-        for (name, from, urgent) in [("client", from_ordered, false), ("client-stop", from_urgent, true)] {
-            let (remote, session, run) = (remote.clone(), ways.session.clone(), ways.run.to_owned());
-            let (socket, cancel_at_end) = (ways.socket.to_owned(), ways.cancel_at_end);
-            std::thread::Builder::new().name(name.into()).spawn(move || {
-                let line = Line { remote, session, run, pending: BTreeMap::new(), next: BEHALF + 1 };
-                let runtime = tokio::runtime::Builder::new_current_thread().enable_io().enable_time().build();
-                let served = runtime.map(|runtime| runtime.block_on(line.serve(from, &socket, urgent, cancel_at_end)));
-                if let Err(e) = served {
-                    tracing::warn!("share: cannot serve a client: {e}");
-                }
-            })?;
-        }
+        let line = Line {
+            remote: remote.clone(),
+            session: ways.session.clone(),
+            run: ways.run.to_owned(),
+            pending: BTreeMap::new(),
+            next: BEHALF + 1,
+        };
+        let (socket, behalf) = (ways.socket.to_owned(), (!ends).then_some(ways.cancel_at_end));
+        std::thread::Builder::new().name(if ends { "client-stop" } else { "client" }.into()).spawn(move || {
+            let runtime = tokio::runtime::Builder::new_current_thread().enable_io().enable_time().build();
+            let served = runtime.map(|runtime| runtime.block_on(line.serve(requests, &socket, behalf)));
+            if let Err(e) = served {
+                tracing::warn!("share: cannot serve a client: {e}");
+            }
+        })?;
         Ok(remote)
     }
 
     /// Returns the client as people know it: `alice (dimos jog on laptop)`.
     pub fn title(&self) -> String {
-        let user = if self.who.user == crate::blueprint::share::ANYONE { "someone" } else { &self.who.user };
-        format!("{user} ({})", lock(&self.name))
+        self.who.title(&lock(&self.name))
     }
 
     /// Notes a sign of life.
@@ -138,8 +142,7 @@ impl Remote {
     /// Queues a request. Drops it if too much waits: nothing here waits for the client or the run. Returns a request
     /// that comes after the end of the connections.
     pub fn queue(&self, request: Request) -> Option<Query> {
-        let queue = if request.class == Class::End { &self.urgent } else { &self.ordered };
-        let bytes = request.bytes;
+        let (queue, bytes) = (&self.queue, request.bytes);
         let waiting = queue.waiting.fetch_add(bytes, Ordering::AcqRel) + bytes;
         let sent = if waiting > MAX_QUEUED { Err(TrySendError::Full(request)) } else { queue.to.try_send(request) };
         let Err(unsent) = sent else { return None };
@@ -190,7 +193,7 @@ pub(super) fn refuse(query: &Query, error: &RpcError) {
 
 /// One connection to the run.
 struct Line {
-    remote: std::sync::Arc<Remote>,
+    remote: Arc<Remote>,
     session: Session,
     run: String,
     /// Requests without a reply, by number, with their methods.
@@ -200,12 +203,12 @@ struct Line {
 
 impl Line {
     /// Serves until the connection ends, and refuses what is without a reply then.
-    async fn serve(mut self, mut requests: Receiver<Request>, socket: &Path, urgent: bool, cancel_at_end: bool) {
+    async fn serve(mut self, mut requests: Receiver<Request>, socket: &Path, behalf: Option<bool>) {
         let mut end = self.remote.end.subscribe();
-        let connected = UnixStream::connect(socket).await;
+        let connected = reach::open(socket).and_then(UnixStream::from_std);
         let refused = connected.as_ref().err().map(ToString::to_string);
         if let Ok(stream) = connected {
-            self.exchange(stream, &mut requests, &mut end, urgent, cancel_at_end).await;
+            self.exchange(stream, &mut requests, &mut end, behalf).await;
         }
         // A run that ends closes all connections: this one perhaps first.
         let is_closed = tokio::time::timeout(END_TIMEOUT, end.wait_for(Option::is_some)).await.is_ok();
@@ -224,21 +227,19 @@ impl Line {
         }
     }
 
-    /// Passes requests and replies on until either side ends the connection.
+    /// Passes requests and replies on until either side ends the connection. `behalf`: whether motions are cancelled
+    /// with it, to be said before the first request.
     async fn exchange(
         &mut self,
         stream: UnixStream,
         requests: &mut Receiver<Request>,
         end: &mut watch::Receiver<Option<Closed>>,
-        urgent: bool,
-        cancel_at_end: bool,
+        mut behalf: Option<bool>,
     ) {
         let (from, to) = stream.into_split();
         let mut from = BufReader::new(from).lines();
         let (lines, waiting) = channel(2 * MAX_PENDING);
         let writer = tokio::spawn(write(to, waiting));
-        // Before the first request: a client says its name before it asks.
-        let mut behalf = (!urgent).then_some(cancel_at_end);
         loop {
             tokio::select! {
                 biased;
@@ -248,8 +249,8 @@ impl Line {
                     None => break,
                 },
                 Some(request) = requests.recv() => {
-                    let queue = if urgent { &self.remote.urgent } else { &self.remote.ordered };
-                    queue.waiting.fetch_sub(request.bytes, Ordering::AcqRel);
+                    self.remote.queue.waiting.fetch_sub(request.bytes, Ordering::AcqRel);
+                    // A client says its name before it asks.
                     if let Some(cancel_at_end) = behalf.take() {
                         let behalf = OnBehalfOf { client: self.remote.title(), cancel_at_end };
                         let line = json!({"id": BEHALF, "method": OnBehalfOf::NAME, "params": behalf});

@@ -84,7 +84,7 @@ fn gateway_values(run: &str, config: &ShareConfig) -> Value {
         "mode": "peer",
         "listen": {"endpoints": endpoints(&config.listen), "exit_on_failure": true},
         "connect": {"endpoints": endpoints(&config.connect), "exit_on_failure": false, "timeout_ms": -1},
-        "transport": {"unicast": {"max_sessions": config.max_clients + MORE_SESSIONS}},
+        "transport": {"unicast": {"max_sessions": config.max_clients * (config.users.len() + 1) + MORE_SESSIONS}},
     });
     if config.listen.iter().chain(&config.connect).any(|endpoint| endpoint.tls)
         && let Some(identity) = &config.identity

@@ -258,6 +258,7 @@ fn unit(kind: LimitKind) -> &'static str {
         LimitKind::Position => "rad",
         LimitKind::Velocity => "rad/s",
         LimitKind::Acceleration => "rad/s²",
+        LimitKind::Tool => "m/s",
     }
 }
 

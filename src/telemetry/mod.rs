@@ -169,6 +169,8 @@ pub enum Cause {
     PowerChanged,
     /// The arm was stopped, paused or reset, and not by this run.
     StoppedElsewhere,
+    /// Another arm than the one of the run answers.
+    IdentityChanged,
     /// The arm's stop input is open.
     StopInput,
     /// Something appeared in the way of its motion, and it could not rest before it.
@@ -217,6 +219,7 @@ impl Cause {
             Self::LedOutOfRange(..) => "led_out_of_range",
             Self::ModeChanged => "mode_changed",
             Self::PowerChanged => "power_changed",
+            Self::IdentityChanged => "identity_changed",
             Self::StoppedElsewhere => "stopped_elsewhere",
             Self::StopInput => "stop_input",
             Self::WayBlocked => "way_blocked",
@@ -321,6 +324,8 @@ pub enum Bound {
     Invalid,
     /// The collision guard.
     Guard(Guarded),
+    /// The speed limit of the tool.
+    Tool,
 }
 
 named! {
@@ -333,6 +338,8 @@ named! {
         Velocity = "velocity",
         /// Acceleration reduced.
         Acceleration = "acceleration",
+        /// Velocity of all joints reduced: the tool would be too fast.
+        Tool = "tool speed",
     }
 }
 

@@ -123,6 +123,7 @@ pub fn bound_text(bound: Bound, names: &Names) -> String {
         Bound::Position(joint) => format!("the position limit of {}", names.joint(joint)),
         Bound::Acceleration(joint) => format!("the acceleration limit of {}", names.joint(joint)),
         Bound::Singularity => "a singularity nearby".into(),
+        Bound::Tool => "the speed limit of the tool".into(),
         Bound::Invalid => "a target that is not finite".into(),
         Bound::Guard(pair) => format!("the collision guard: {}", apart(&pair)),
     }
@@ -196,6 +197,7 @@ pub fn cause_text(cause: Cause) -> String {
         }
         Cause::ModeChanged => "the panel, hand guiding or another program changed the control mode".into(),
         Cause::StoppedElsewhere => "the panel or another program stopped the arm".into(),
+        Cause::IdentityChanged => "another arm answers than the one with which the run began".into(),
         Cause::PowerChanged => "the panel or another program enabled the motors".into(),
         Cause::StopInput => "the stop input is open".into(),
         Cause::WayBlocked => "it could not rest before what is in its way".into(),

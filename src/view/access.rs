@@ -1,13 +1,9 @@
 //! Who may use the page: those with the token, from a page of this server. Another page in the same browser has
 //! neither: its `Origin` differs, and a name that it resolves to this computer is not an accepted `Host`.
 
-use std::fs::{self, File, OpenOptions};
-use std::io::{self, Read, Write};
+use std::fs::File;
+use std::io::{self, Read};
 use std::net::{IpAddr, SocketAddr};
-use std::os::unix::fs::OpenOptionsExt;
-use std::path::{Path, PathBuf};
-
-use crate::rpc::run_dir;
 
 /// What gives access to the page of one run.
 #[derive(Debug)]
@@ -65,26 +61,6 @@ impl Access {
             Err(_) => name.eq_ignore_ascii_case("localhost"),
         };
         known && port.parse() == Ok(self.at.port())
-    }
-}
-
-/// The file with the URL of a run's page, for its user only. Removed when dropped.
-#[derive(Debug)]
-pub struct UrlFile(PathBuf);
-
-impl UrlFile {
-    /// Writes the file beside a socket.
-    pub fn write(socket: &Path, url: &str) -> io::Result<Self> {
-        let path = run_dir::view_file(socket);
-        let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&path)?;
-        writeln!(file, "{url}").map(|()| Self(path))
-    }
-}
-
-impl Drop for UrlFile {
-    fn drop(&mut self) {
-        // If that fails, the next run of this name removes it.
-        let _ = fs::remove_file(&self.0);
     }
 }
 

@@ -7,6 +7,7 @@
 
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use futures_util::stream::{SplitSink, SplitStream};
@@ -25,6 +26,7 @@ use tokio_tungstenite::tungstenite::{Error, Message};
 
 use super::access::Access;
 use super::http::Request;
+use crate::rpc::reach;
 
 /// Maximum length of a message of the page [bytes].
 const MAX_MESSAGE: usize = 64 << 10;
@@ -53,13 +55,13 @@ pub fn key(request: &Request) -> Option<&str> {
     request.header("sec-websocket-key").filter(|_| upgrades && request.header("sec-websocket-version") == Some("13"))
 }
 
-/// Serves a page until it or the run ends. `pages` counts those with the token.
+/// Serves a page until it or the run ends. `pages` counts those with the token; `is_known` is set for one of them.
 pub async fn serve(
     mut stream: TcpStream,
     request: Request,
     access: &Access,
     run: &Path,
-    pages: &Arc<Semaphore>,
+    (pages, is_known): (&Arc<Semaphore>, &AtomicBool),
     ended: watch::Receiver<bool>,
 ) {
     let Some(key) = key(&request) else { return };
@@ -80,10 +82,13 @@ pub async fn serve(
     if !token.is_ok_and(|message| matches!(message, Some(Ok(Message::Text(text))) if has_token(access, &text))) {
         return close(&mut page, WRONG_TOKEN, "wrong token: `dimos view` prints the URL").await;
     }
+    is_known.store(true, Ordering::Relaxed);
     let Ok(_page) = pages.try_acquire() else {
         return close(&mut page, TOO_MANY, "too many pages are open").await;
     };
-    let Ok(run) = UnixStream::connect(run).await else { return close(&mut page, NO_RUN, "the run is gone").await };
+    let Ok(run) = reach::open(run).and_then(UnixStream::from_std) else {
+        return close(&mut page, NO_RUN, "the run is gone").await;
+    };
     if page.send(Message::text(r#"{"ok":true}"#)).await.is_err() {
         return;
     }

@@ -17,6 +17,8 @@ mod bridge;
 #[cfg(feature = "view")]
 mod http;
 #[cfg(feature = "view")]
+mod page_urdf;
+#[cfg(feature = "view")]
 mod scene;
 #[cfg(feature = "view")]
 mod server;

@@ -8,7 +8,8 @@ use std::path::PathBuf;
 use nalgebra::Isometry3;
 use serde::{Serialize, Serializer};
 
-use super::{Shown, ShownArm, ShownRobot};
+use super::{Shown, ShownArm, ShownRobot, page_urdf};
+use crate::bounded;
 use crate::robot;
 use crate::robot::urdf::Meshes;
 use crate::robot::xml::{Element, Node};
@@ -40,7 +41,7 @@ impl MeshFile {
     /// Returns the address of the mesh with this number.
     pub fn address(&self, number: usize) -> String {
         let hash = match self {
-            Self::At(path) => std::fs::read(path).ok().map(|bytes| hash(&bytes)),
+            Self::At(path) => bounded::read(path, bounded::LARGE).ok().map(|bytes| hash(&bytes)),
             Self::Inside(_, bytes) => Some(hash(bytes)),
             Self::Missing(_) => None,
         };
@@ -171,6 +172,7 @@ fn read<'a>(robot: &'a ShownRobot, shown: &Shown, meshes: &mut Vec<MeshFile>) ->
         });
     }
     number_meshes(&mut document.root, &numbers);
+    page_urdf::simplify(&mut document.root);
     let base_in_model = robot.base_link.as_deref().and_then(|link| model.link_index(link)).and_then(|link| {
         let poses = model.link_poses(&model.positions(&HashMap::new()));
         poses.get(link).copied()

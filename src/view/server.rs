@@ -1,24 +1,27 @@
 //! The server of the live view: its thread, its connections.
 
 use std::borrow::Cow;
+use std::collections::VecDeque;
 use std::io;
 use std::net::{SocketAddr, TcpListener as StdListener};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{OnceCell, Semaphore, watch};
-use tokio::task::{JoinSet, spawn_blocking};
+use tokio::task::{AbortHandle, JoinSet, spawn_blocking};
 
-use super::access::{Access, UrlFile};
+use super::access::Access;
 use super::http::{self, Reply, Request};
 use super::scene::{self, Scene};
 use super::subject::{Live, Subject};
 use super::{Shown, bridge, stl};
 use crate::blueprint::planner::ViewConfig;
+use crate::rpc::run_dir::{RunFiles, UrlFile};
 
 /// The page, compressed by the build.
 static PAGE: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/page.html.gz"));
@@ -31,7 +34,7 @@ base-uri 'none'; form-action 'none'; frame-ancestors 'none'\r\n";
 const PORTS: u16 = 100;
 /// Maximum number of WebSockets: two per page, one of them for stops only.
 const MAX_SOCKETS: usize = 16;
-/// Maximum number of connections; further ones wait.
+/// Maximum number of connections; a further one ends the oldest without the token.
 const MAX_CONNECTIONS: usize = 64;
 /// Size of the kernel's buffer to a page [bytes]: a page that takes nothing is noticed when it is full.
 const SEND_BUFFER: usize = 128 << 10;
@@ -61,9 +64,9 @@ struct Site {
 }
 
 impl View {
-    /// Starts serving the page of the run with this socket. The URL is also in the file that belongs to `claim`: the
-    /// socket's path of the run itself, or of the planner that serves the page.
-    pub fn start(config: &ViewConfig, shown: Shown, socket: &Path, claim: &Path) -> Result<Self, String> {
+    /// Starts serving the page of the run with this socket. The URL is also in a file of the claimed name: of the run
+    /// itself, or of the planner that serves the page.
+    pub fn start(config: &ViewConfig, shown: Shown, socket: &Path, claim: &RunFiles) -> Result<Self, String> {
         let live = Live { shown, socket: socket.to_owned() };
         Self::serve(config, Arc::new(live), Some(socket.to_owned()), Some(claim))
     }
@@ -82,15 +85,14 @@ impl View {
         config: &ViewConfig,
         subject: Arc<dyn Subject>,
         run: Option<PathBuf>,
-        claim: Option<&Path>,
+        claim: Option<&RunFiles>,
     ) -> Result<Self, String> {
         let listener = bind(config)?;
         let failed = |what: &'static str| move |error: io::Error| format!("{what}: {error}");
         let at = listener.local_addr().map_err(failed("its port"))?;
         let access = Access::new(at).map_err(failed("no random numbers for its token"))?;
         let (address, url) = (access.address(), access.url());
-        let file =
-            claim.map(|claim| UrlFile::write(claim, &url)).transpose().map_err(failed("the file with its URL"))?;
+        let file = claim.map(|claim| claim.write_url(&url)).transpose().map_err(failed("the file with its URL"))?;
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_io()
             .enable_time()
@@ -155,16 +157,28 @@ fn prepare(listener: &StdListener) -> io::Result<()> {
     listener.set_nonblocking(true)
 }
 
+/// A connection, and whether its page has sent the token.
+type Stranger = (AbortHandle, Arc<AtomicBool>);
+
 /// Accepts connections until the end.
 async fn serve(listener: StdListener, site: Arc<Site>, mut ended: watch::Receiver<bool>) -> io::Result<()> {
     let listener = TcpListener::from_std(listener)?;
-    let (mut connections, for_pages) = (JoinSet::new(), ended.clone());
+    let (mut connections, for_pages, mut strangers) = (JoinSet::new(), ended.clone(), VecDeque::<Stranger>::new());
     loop {
         tokio::select! {
             _ = ended.wait_for(|ended| *ended) => break,
             Some(_) = connections.join_next() => {}
-            accepted = listener.accept(), if connections.len() < MAX_CONNECTIONS => match accepted {
-                Ok((stream, _)) => drop(connections.spawn(connection(stream, site.clone(), for_pages.clone()))),
+            accepted = listener.accept() => match accepted {
+                Ok((stream, _)) => {
+                    strangers.retain(|(task, is_known)| !task.is_finished() && !is_known.load(Ordering::Relaxed));
+                    if connections.len() >= MAX_CONNECTIONS {
+                        let Some((oldest, _)) = strangers.pop_front() else { continue };
+                        oldest.abort();
+                    }
+                    let is_known = Arc::new(AtomicBool::new(false));
+                    let serving = connection(stream, site.clone(), is_known.clone(), for_pages.clone());
+                    strangers.push_back((connections.spawn(serving), is_known));
+                }
                 Err(_) => tokio::time::sleep(ACCEPT_PAUSE).await,
             },
         }
@@ -173,13 +187,13 @@ async fn serve(listener: StdListener, site: Arc<Site>, mut ended: watch::Receive
     Ok(())
 }
 
-async fn connection(mut stream: TcpStream, site: Arc<Site>, ended: watch::Receiver<bool>) {
+async fn connection(mut stream: TcpStream, site: Arc<Site>, is_known: Arc<AtomicBool>, ended: watch::Receiver<bool>) {
     let _ = stream.set_nodelay(true);
     let reply = match http::read(&mut stream).await {
         Ok(None) => return,
         Ok(Some(request)) => match &site.run {
             Some(run) if request.path == "/rpc" && bridge::key(&request).is_some() && is_own(&site, &request) => {
-                return bridge::serve(stream, request, &site.access, run, &site.pages, ended).await;
+                return bridge::serve(stream, request, &site.access, run, (&site.pages, &is_known), ended).await;
             }
             _ => answer(&site, &request).await,
         },

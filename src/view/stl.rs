@@ -7,6 +7,7 @@ use std::path::Path;
 use nalgebra::Vector3;
 
 use super::scene::MeshFile;
+use crate::bounded;
 use crate::collision::ply;
 use crate::robot::mesh::Mesh;
 use crate::rpc::api::ShapeSpec;
@@ -41,7 +42,7 @@ pub fn of_object(shape: &ShapeSpec) -> Result<Vec<u8>, String> {
     match shape {
         ShapeSpec::Mesh(path) => from_file(Path::new(path)),
         ShapeSpec::Cloud(path) => {
-            let data = std::fs::read(path).map_err(|e| format!("{path}: {e}"))?;
+            let data = bounded::read(Path::new(path), bounded::LARGE).map_err(|e| format!("{path}: {e}"))?;
             let points = ply::read(&data).map_err(|e| format!("{path}: {e}"))?;
             let every = points.len().div_ceil(MAX_POINTS).max(1);
             let finite = points.into_iter().step_by(every).filter(|point| point.is_finite());

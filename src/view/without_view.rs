@@ -4,6 +4,7 @@ use std::path::Path;
 
 use super::Shown;
 use crate::blueprint::planner::ViewConfig;
+use crate::rpc::run_dir::RunFiles;
 
 /// No view.
 #[derive(Debug)]
@@ -11,7 +12,7 @@ pub enum View {}
 
 impl View {
     /// Fails: this build has none.
-    pub fn start(_: &ViewConfig, _: Shown, _: &Path, _: &Path) -> Result<Self, String> {
+    pub fn start(_: &ViewConfig, _: Shown, _: &Path, _: &RunFiles) -> Result<Self, String> {
         Err("this build has none (cargo feature `view`)".to_owned())
     }
 

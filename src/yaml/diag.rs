@@ -147,3 +147,13 @@ pub struct Report {
     /// How to fix it.
     pub hint: Option<String>,
 }
+
+impl Report {
+    /// Returns what is wrong, after the position if there is one.
+    pub fn placed(&self) -> String {
+        match (&self.file, self.line, self.column) {
+            (Some(file), Some(line), Some(column)) => format!("{file}:{line}:{column}: {}", self.message),
+            _ => self.message.clone(),
+        }
+    }
+}

@@ -1,5 +1,7 @@
-//! Merges one tree over another, for includes: groups key by key, named lists by id, everything else replaced.
+//! Merges one tree over another, for includes: groups key by key, named lists by id, everything else replaced. And
+//! YAML's own merge keys, for files of other programs; a blueprint has none.
 
+use crate::yaml::diag::Diag;
 use crate::yaml::tree::{Kind, NodeId, Tree};
 
 /// Merge rules. Paths are keys joined by dots.
@@ -65,4 +67,35 @@ fn merge_at(tree: &mut Tree, base: NodeId, over: NodeId, rules: &MergeRules, pat
     // The result has the position of the later text.
     tree.set_kind(over, merged);
     over
+}
+
+impl Tree {
+    /// Returns the entries of a group with those of its merge key (`<<`: a group or a list of groups) as YAML 1.1
+    /// defines it: own keys win, then those of the earlier group. Reports a merge key with another value.
+    pub fn flattened(&mut self, map: NodeId) -> Vec<(NodeId, NodeId)> {
+        let is_merge = |tree: &Self, key| {
+            let kind = tree.node(key).map(|node| &node.kind);
+            matches!(kind, Some(Kind::Scalar { text, plain: true }) if text == "<<")
+        };
+        let all = self.entries(map).to_vec();
+        let (merges, mut entries): (Vec<_>, Vec<_>) = all.into_iter().partition(|(key, _)| is_merge(self, *key));
+        for (_, value) in merges {
+            let groups = match self.node(value).map(|n| &n.kind) {
+                Some(Kind::Seq(groups)) => groups.clone(),
+                _ => vec![value],
+            };
+            for group in groups {
+                if !matches!(self.node(group).map(|n| &n.kind), Some(Kind::Map(_))) {
+                    let diag = Diag::error("`<<` takes a group or a list of groups").at(self.label(group));
+                    self.report(diag);
+                }
+                for (key, value) in self.flattened(group) {
+                    if !entries.iter().any(|(known, _)| self.text(*known) == self.text(key)) {
+                        entries.push((key, value));
+                    }
+                }
+            }
+        }
+        entries
+    }
 }

@@ -90,7 +90,7 @@ pub fn read<T: DeserializeOwned>(tree: &mut Tree, root: NodeId, missing: Missing
             }
         }
     }
-    tree.unlisted += 1;
+    tree.unlisted[0] += 1;
     recovery.lost.note(&[root]);
     (None, recovery.lost)
 }

@@ -11,7 +11,7 @@ pub const MAX_BYTES: usize = 1 << 20;
 pub const MAX_DEPTH: usize = 32;
 /// Maximum number of values, aliases expanded.
 pub const MAX_NODES: usize = 200_000;
-/// Maximum number of listed diagnostics.
+/// Maximum number of listed errors, and of listed warnings.
 const MAX_DIAGS: usize = 100;
 
 /// A node of a [`Tree`].
@@ -67,8 +67,8 @@ pub struct Tree {
     pub(super) damaged: HashSet<NodeId>,
     /// Looks up the group of a misplaced key.
     homes: Option<fn(&str) -> Option<String>>,
-    /// Number of diagnostics that are not listed.
-    pub(super) unlisted: usize,
+    /// Number of errors and of warnings that are not listed.
+    pub(super) unlisted: [usize; 2],
 }
 
 impl Tree {
@@ -270,15 +270,32 @@ impl Tree {
         if self.diags.contains(&diag) {
             return;
         }
-        match self.diags.len() < MAX_DIAGS {
-            true => self.diags.push(diag),
-            false => self.unlisted += 1,
+        let listed = self.diags.iter().filter(|other| other.severity == diag.severity).count();
+        let [errors, warnings] = &mut self.unlisted;
+        match diag.severity {
+            _ if listed < MAX_DIAGS => self.diags.push(diag),
+            Severity::Error => *errors += 1,
+            Severity::Warning => *warnings += 1,
         }
+    }
+
+    /// Returns the number of errors, also of those that are not listed.
+    pub fn errors(&self) -> usize {
+        self.count(Severity::Error) + self.unlisted[0]
+    }
+
+    /// Returns the number of warnings, also of those that are not listed.
+    pub fn warnings(&self) -> usize {
+        self.count(Severity::Warning) + self.unlisted[1]
+    }
+
+    fn count(&self, severity: Severity) -> usize {
+        self.diags.iter().filter(|diag| diag.severity == severity).count()
     }
 
     /// Returns the number of diagnostics that are not listed.
     pub fn unlisted(&self) -> usize {
-        self.unlisted
+        self.unlisted.iter().sum()
     }
 
     /// Returns whether there is a diagnostic at exactly this node.
@@ -289,7 +306,7 @@ impl Tree {
 
     /// Returns whether there are errors.
     pub fn has_errors(&self) -> bool {
-        self.unlisted > 0 || self.diags.iter().any(|d| d.severity == Severity::Error)
+        self.errors() > 0
     }
 
     /// Returns the diagnostics, in order of detection.

@@ -34,6 +34,7 @@ const JERK: f64 = 100.0;
 fn config() -> CoordinatorConfig {
     let limits = JointLimits { acceleration_max: vec![ACCELERATION; DOF], ..JointLimits::uniform(DOF, 3.2, 1.0) };
     let arm = ArmConfig {
+        tool: None,
         name: "arm".into(),
         dof: DOF,
         limits: limits.with_defaults(),
@@ -187,7 +188,13 @@ fn too_close(judge: &ExactChecker, q: &[f64]) -> Option<f64> {
 fn setup() -> PlanningScene {
     let loaded = Run::from_name("yourarm-planner").unwrap().check();
     let setup = PlanningScene::load(loaded.blueprint.unwrap().planner.as_ref().unwrap()).unwrap();
-    let bounds = JointBounds { position: [-3.0, 3.0], velocity: 3.0, acceleration: ACCELERATION, jerk: JERK };
+    let bounds = JointBounds {
+        position: [-3.0, 3.0],
+        velocity: 3.0,
+        acceleration: ACCELERATION,
+        jerk: JERK,
+        tcp_velocity: None,
+    };
     setup.within(&(1..=DOF).map(|j| (format!("arm_joint{j}"), bounds)).collect()).unwrap()
 }
 

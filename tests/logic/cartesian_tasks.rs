@@ -432,3 +432,25 @@ fn a_tool_is_what_moves_and_is_replaced_only_at_rest() {
     let (distance, angle) = between(&before, &tip(&rig));
     assert!(distance < 1e-3 && angle > 0.1, "its centre point stays: {distance} m, {angle} rad");
 }
+
+/// Its limiter keeps the time that passes at the controller, the task that which passes here.
+#[test]
+fn a_slowed_arm_is_steered_no_faster_than_asked_and_rests_at_the_end() {
+    for fraction in [0.5, 0.3, 0.1] {
+        let mut rig = rig();
+        rig.checked = false;
+        rig.arms[0].state.speed_fraction = Some(fraction);
+        let (mut last, mut fastest) = (commanded(&rig).translation, 0.0f64);
+        let mut watch = |rig: &Rig| {
+            let now = commanded(rig).translation;
+            fastest = fastest.max(now.distance(std::mem::replace(&mut last, now)) / 0.01);
+        };
+        stream(&mut rig, TWISTS, twist([0.1, 0.0, 0.0], [0.0; 3]), 1.5, &mut watch);
+        stream(&mut rig, TWISTS, twist([0.0; 3], [0.0; 3]), 2.0, &mut watch);
+        assert!((0.1 * fraction..0.102).contains(&fastest), "{fastest} m/s at {fraction}");
+        let rests = commanded(&rig).translation;
+        stream(&mut rig, TWISTS, twist([0.0; 3], [0.0; 3]), 0.2, |_| ());
+        assert!(commanded(&rig).translation.distance(rests) < 1e-6, "it moves on at {fraction}");
+        assert_eq!(rig.phase(0), Phase::Ready, "{:?}", rig.events);
+    }
+}

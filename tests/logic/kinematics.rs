@@ -247,13 +247,13 @@ fn fr3_and_fer_have_the_controllers_kinematics_and_limits() {
         let model = from_text(name, dimos::robot::builtin::text(name).unwrap()).unwrap();
         let limits = arm.limits(false);
         for (i, joint) in model.joints.iter().filter(|joint| joint.is_independent()).enumerate() {
+            // The adapter of an FER keeps 10 mrad from the ends, and 5 % of the speed, for what it makes up.
             let found = (joint.limits.lower, joint.limits.upper, joint.limits.velocity);
             let expected = (limits.position_lower[i], limits.position_upper[i], limits.velocity_max[i]);
-            assert!(
-                (found.0 - expected.0).abs() + (found.1 - expected.1).abs() < 1e-9,
-                "{name} {found:?} {expected:?}"
-            );
-            assert!((found.2 - expected.2).abs() < 1e-4, "{name} {found:?} {expected:?}");
+            let inside = [expected.0 - found.0, found.1 - expected.1];
+            let (margin, share) = if arm == Model::Fer { (0.01, 0.95) } else { (0.0, 1.0) };
+            assert!(inside.iter().all(|by| (by - margin).abs() < 1e-9), "{name} {found:?} {expected:?}");
+            assert!((expected.2 / found.2 - share).abs() < 1e-9, "{name} {found:?} {expected:?}");
         }
     }
 }

@@ -6,9 +6,22 @@ use std::path::{Path, PathBuf};
 
 /// Every module of `src/`, with the modules that it may use besides itself. `ALL`: everything above it.
 const ALL: &[&str] = &["*"];
-const VOCABULARY: &[&str] =
-    &["message", "named", "packed", "sync", "joint", "arm", "trajectory", "pose", "clock", "telemetry", "yaml"];
+const VOCABULARY: &[&str] = &[
+    "bounded",
+    "message",
+    "named",
+    "packed",
+    "sync",
+    "joint",
+    "arm",
+    "trajectory",
+    "pose",
+    "clock",
+    "telemetry",
+    "yaml",
+];
 const LAYERS: &[(&str, &[&str])] = &[
+    ("bounded", &[]),
     ("message", &[]),
     ("named", &[]),
     ("packed", &[]),
@@ -29,7 +42,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("testing", &["hardware"]),
     ("control", &["rt", "robot", "collision"]),
     ("planning", &["robot", "collision"]),
-    ("rpc", &[]),
+    ("rpc", &["rt"]),
     ("recording", &[]),
     ("blueprint", &["robot", "assets", "collision", "hardware"]),
     ("view", &["robot", "rpc", "blueprint"]),

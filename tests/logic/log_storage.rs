@@ -12,7 +12,7 @@ use dimos::joint::{JointLimits, make_joints};
 use dimos::recording::display_messages::{Marker, MarkerArray};
 use dimos::recording::files;
 use dimos::recording::notes::Note;
-use dimos::recording::records::{RecordReader, check_sections, chunk_header};
+use dimos::recording::records::{RecordReader, check_sections};
 use dimos::recording::replay::{LogReader, Payload, Selection};
 use dimos::recording::scan::{Item, Scan};
 use dimos::recording::storage::{FaultLog, Storage};
@@ -68,8 +68,8 @@ fn messages(path: &Path) -> u64 {
     while let Some(item) = scan.next_item().unwrap() {
         count += if let Item::Messages = item { scan.messages().count() as u64 } else { 0 };
     }
-    assert!(scan.complete && scan.damage.is_empty() && scan.cut.is_none());
-    assert_eq!(scan.counted(), Some(count));
+    assert!(scan.is_complete() && scan.loss().text().is_none());
+    assert_eq!(scan.statistics().map(|(counted, _)| counted), Some(count));
     count
 }
 
@@ -163,7 +163,11 @@ fn a_log_is_split_by_size_and_stored_without_compression() {
         let mut records = RecordReader::open(part).unwrap();
         let all = std::iter::from_fn(|| records.next_record().unwrap());
         let chunks = all.filter(|record| record.opcode == mcap::records::op::CHUNK);
-        let kinds: Vec<String> = chunks.map(|chunk| chunk_header(&chunk.body).unwrap().compression).collect();
+        let compression = |body: &[u8]| match mcap::parse_record(mcap::records::op::CHUNK, body).unwrap() {
+            mcap::records::Record::Chunk { header, .. } => header.compression,
+            other => panic!("{other:?}"),
+        };
+        let kinds: Vec<String> = chunks.map(|chunk| compression(&chunk.body)).collect();
         assert!(!kinds.is_empty() && kinds.iter().all(String::is_empty), "{kinds:?}");
     }
     assert_eq!(reproducible(&log).ticks, 6001);
@@ -316,7 +320,8 @@ fn a_long_log_starts_at_its_end_without_reading_the_rest() {
     let mut records = RecordReader::open(&log).unwrap();
     let chunks = std::iter::from_fn(|| records.next_record().unwrap());
     let chunks: Vec<_> = chunks.filter(|record| record.opcode == mcap::records::op::CHUNK).collect();
-    let is_late = |chunk: &[u8]| chunk_header(chunk).unwrap().message_end_time >= end - 10_000_000;
+    let latest = |chunk: &[u8]| u64::from_le_bytes(chunk[8..16].try_into().unwrap());
+    let is_late = |chunk: &[u8]| latest(chunk) >= end - 10_000_000;
     for chunk in chunks.iter().filter(|chunk| !is_late(&chunk.body)) {
         bytes[chunk.at as usize + 9 + chunk.body.len() - 3] ^= 0xff;
     }

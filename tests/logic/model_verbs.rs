@@ -119,6 +119,15 @@ fn check_reports_everything_at_once() {
     std::fs::write(&file, &fine).unwrap();
     let found = dimos(&["check", path]);
     assert!(found.code == 2 && found.err.contains("unusable mesh"), "{}", found.err);
+    // Soft limits are said once, with the ranges that are left.
+    let soft = fine.replace("</joint>", "<safety_controller k_velocity='1' soft_upper_limit='0.5'/></joint>");
+    std::fs::write(&file, soft.replace("gone.stl", "fine.stl")).unwrap();
+    std::fs::write(folder.path().join("fine.stl"), tetrahedron(0.25)).unwrap();
+    let found = dimos(&["check", path]);
+    assert!(found.code == 0 && found.err.contains("narrow j to -1 … 0.5 rad"), "{}", found.err);
+    assert!(found.out.contains("no mistakes, 2 warnings"), "{}", found.out);
+    let shown = dimos(&["info", path]);
+    assert!(shown.out.contains("-1.000…0.500"), "{}", shown.out);
     assert_eq!(dimos(&["check", "no/such/file.urdf"]).code, 2);
     assert_eq!(dimos(&["check", "builtin:lite6"]).code, 0);
 }

@@ -153,6 +153,7 @@ fn world_of(arms: &[(&str, f64)]) -> World {
             solids: solids(&model, MeshMode::Hull).unwrap(),
             base: DAffine3::from_translation(DVec3::Y * *y),
             padding: 0.0,
+            apart: 0.0,
             allowed: vec![],
         };
         world.add_robot(robot).unwrap();

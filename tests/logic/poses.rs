@@ -152,6 +152,7 @@ fn a_printed_pose_at_a_limit_moves_the_arm_just_inside() {
         let (joint, limits) = (&robot.config.coordinator_joints[1], &robot.limits[1]);
         let (rate, wide) = (limits.velocity.min(3.0), 20.0);
         let bounds = JointBounds {
+            tcp_velocity: None,
             position: [start[1] + 0.008, limits.upper],
             velocity: rate,
             acceleration: wide,

@@ -119,7 +119,11 @@ fn check_shows_what_files_add_to_a_robot() {
         "the SRDF's pose `beyond` cannot be used: `rail` at 0.9 m is outside the model's limits",
         "3 warnings",
     ]);
-    assert!(shown.out.contains("named poses: home, ready") && shown.out.ends_with("no mistakes\n"), "{}", shown.out);
+    assert!(
+        shown.out.contains("named poses: home, ready") && shown.out.ends_with("no mistakes, 3 warnings\n"),
+        "{}",
+        shown.out
+    );
     let document = home.dimos("check lab.yaml --json").with(0).json();
     let robot = &document["robots"][0];
     let joint = |i: usize, key: &str| robot["joints"][i][key].clone();

@@ -342,13 +342,13 @@ fn a_folder_that_is_a_link_is_refused() {
     let (real, link) = (folder.path().join("real"), folder.path().join("link"));
     std::fs::create_dir(&real).unwrap();
     std::os::unix::fs::symlink(&real, &link).unwrap();
-    assert!(matches!(RunDir::at(&link).claim("test"), Err(RunDirError::NotOurs(_))));
+    assert!(matches!(RunDir::closed(&link).claim("test"), Err(RunDirError::NotOurs(_))));
 }
 
 #[test]
 fn a_name_is_taken_once_and_given_back_at_the_end() {
     let folder = tempfile::tempdir().unwrap();
-    let place = RunDir::at(folder.path());
+    let place = RunDir::closed(folder.path());
     let (server, _) = start(folder.path(), "test", FakeBackend::default());
     match place.claim("test") {
         Err(RunDirError::Taken { run, pid }) => assert_eq!((run.as_str(), pid), ("test", std::process::id())),
@@ -371,9 +371,10 @@ fn a_name_is_taken_once_and_given_back_at_the_end() {
 }
 
 #[test]
-fn what_dead_runs_left_is_removed() {
+fn what_dead_runs_left_is_removed_by_the_next_run_of_that_name() {
     let folder = tempfile::tempdir().unwrap();
-    let place = RunDir::at(folder.path());
+    std::fs::set_permissions(folder.path(), PermissionsExt::from_mode(0o700)).unwrap();
+    let place = RunDir::closed(folder.path());
     // As after `kill -9`: the socket and the lock file stay, no process holds the lock.
     let leave = |name: &str, lock: bool| {
         drop(UnixListener::bind(folder.path().join(format!("{name}.sock"))).unwrap());
@@ -385,19 +386,32 @@ fn what_dead_runs_left_is_removed() {
     leave("orphan", false);
     std::fs::write(folder.path().join("note.txt"), "").unwrap();
     assert_eq!(place.runs().unwrap(), []);
-    let left: Vec<_> = std::fs::read_dir(folder.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
-    assert_eq!(left, ["note.txt"], "what is not ours stays");
+    let files = || {
+        let all = std::fs::read_dir(folder.path()).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap());
+        all.collect::<std::collections::BTreeSet<_>>()
+    };
+    let left = files();
+    assert_eq!(
+        left,
+        ["dead.lock", "dead.sock", "note.txt", "orphan.sock"].map(str::to_owned).into(),
+        "readers remove none"
+    );
 
     leave("again", true);
-    let (_server, _) = start(folder.path(), "again", FakeBackend::default());
+    let (server, _) = start(folder.path(), "again", FakeBackend::default());
     assert_eq!(Client::find(&place, Some("again")).unwrap().call(Status {}).unwrap().run, "test");
+    for name in ["dead", "orphan"] {
+        drop(start(folder.path(), name, FakeBackend::default()));
+    }
+    drop(server);
+    assert_eq!(files(), ["note.txt".to_owned()].into(), "nothing is left behind, and what is not ours stays");
 }
 
 #[test]
 fn one_of_many_that_want_a_name_gets_it() {
     let folder = tempfile::tempdir().unwrap();
     for _ in 0..10 {
-        let place = &RunDir::at(folder.path());
+        let place = &RunDir::closed(folder.path());
         let won = std::thread::scope(|scope| {
             let claims: Vec<_> = (0..8).map(|_| scope.spawn(|| place.claim("test").ok())).collect();
             let listing = scope.spawn(|| place.runs().unwrap());

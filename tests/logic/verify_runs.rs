@@ -26,7 +26,7 @@ fn blueprint(name: &str, set: &[&str]) -> Blueprint {
 fn start(folder: &Path, blueprint: &Blueprint, probe: Option<dimos::control::tick_loop::Probe>) -> (Run, Client) {
     let options = Options {
         record: Record::To(folder.join("real.mcap")),
-        folder: RunDir::at(folder),
+        folder: RunDir::closed(folder.join("runs")),
         probe,
         hold_latency: false,
         ..Options::default()
@@ -109,8 +109,12 @@ fn a_fault_of_a_run_that_is_not_recorded_is_logged() {
     std::fs::write(&path, STREAMED).unwrap();
     let directory = format!("recording.directory={}", logs.display());
     let blueprint = blueprint(path.to_str().unwrap(), &[&directory]);
-    let options =
-        |record| Options { record, folder: RunDir::at(folder.path()), hold_latency: false, ..Options::default() };
+    let options = |record| Options {
+        record,
+        folder: RunDir::closed(folder.path().join("runs")),
+        hold_latency: false,
+        ..Options::default()
+    };
     let run = Run::start(&blueprint, options(Record::Faults)).unwrap();
     for _ in 0..500 {
         if !files::all(&logs).unwrap().is_empty() {

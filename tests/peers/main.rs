@@ -6,6 +6,7 @@ mod support;
 mod can_kernel;
 mod feetech_sdk;
 mod franka;
+mod franka_sim;
 mod lerobot_bus;
 mod piper_kernel;
 mod piper_sdk;

@@ -32,6 +32,13 @@ fn ur_rtde_commands_the_emulated_arm() {
     assert!(said.ends_with("all is as it says\n"), "{said}");
 }
 
+/// Four clients end without disconnecting; what the emulated controller does not do is no success.
+#[test]
+fn clients_that_vanish_and_commands_that_are_not_emulated() {
+    let Some(said) = client("again", "127.48.17.8") else { return };
+    assert!(said.ends_with("all is as it says\n"), "{said}");
+}
+
 #[test]
 fn the_adapters_requests_are_those_of_ur_rtde() {
     let Some(theirs) = client("bytes", "127.48.17.6") else { return };

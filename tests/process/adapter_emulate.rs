@@ -151,7 +151,7 @@ fn the_printed_run_reaches_an_arm_with_a_gripper_and_without() {
     if std::net::TcpListener::bind((address, 502)).is_err_and(|e| e.kind() == std::io::ErrorKind::PermissionDenied) {
         return skip_port_502();
     }
-    for option in ["", " --option gripper=xarm", " --option gripper=xarm_g2"] {
+    for option in ["", " --option gripper=xarm", " --option gripper=xarm_g2", " --option gripper=lite6"] {
         let emulator = emulate(&home, &format!("xarm --model xarm6 --bind {address}{option}"));
         let said = emulator.out();
         let line = said.lines().find_map(|line| line.trim().strip_prefix("reach it   dimos run ")).unwrap();

@@ -305,7 +305,7 @@ fn mistakes_are_reported_with_their_exit_code() {
     let (emulator, address) = arm(&SimOptions::default());
     let run = home.run(&format!("coordinator-yourarm --no-record --set hardware.arm.address={address}"));
     let taken = dimos(&format!("adapter test yourarm --address {address}")).with(3);
-    taken.says(&["is in use by process", "hint: end the run first"]);
+    taken.says(&["is in use by process", "hint: end the run or verb"]);
     run.end(Signal::TERM);
     dimos(&format!("adapter test yourarm --address {address} --only row")).with(0);
     // When the arm has been reached and its state was watched, another one answers.

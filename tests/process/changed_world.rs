@@ -31,7 +31,7 @@ fn up() -> Cell {
         Run::from_name("yourarm-planner").unwrap().set("hardware.arm.address", arm.address()).record(Record::Off)
     };
     let setup = PlanningScene::load(blueprint().check().blueprint.unwrap().planner.as_ref().unwrap()).unwrap();
-    let run = blueprint().folder(RunDir::at(folder.path())).start().unwrap();
+    let run = blueprint().folder(RunDir::closed(folder.path())).start().unwrap();
     let cell = Cell { run, arm, setup, _folder: folder };
     let begun = cell.run.call(Move { direct: true, ..Move::new("arm", HOME, 1.0) }).unwrap();
     assert_eq!(cell.run.wait(begun.motion).unwrap().state, "COMPLETED");

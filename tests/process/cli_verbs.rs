@@ -11,7 +11,7 @@ use serde_json::Value;
 use crate::support::fake_run::{FakeBackend, PLAN, start};
 use crate::support::program::eventually;
 
-/// A folder for `XDG_RUNTIME_DIR`; the runs in it are the only ones that the binary sees.
+/// A world of runs; those in it are the only ones that the binary sees.
 struct Home(tempfile::TempDir);
 
 impl Home {
@@ -25,7 +25,7 @@ impl Home {
 
     fn command(&self, arguments: &str) -> Command {
         let mut command = Command::new(env!("CARGO_BIN_EXE_dimos"));
-        command.args(arguments.split_whitespace()).env("XDG_RUNTIME_DIR", self.0.path());
+        command.args(arguments.split_whitespace()).env("DIMOS_WORLD", self.0.path());
         command.env("XDG_STATE_HOME", self.0.path()).current_dir(self.0.path());
         command
     }
@@ -82,7 +82,11 @@ fn without_a_run_every_verb_says_how_to_start_one() {
     let home = Home::new();
     for verb in ["state", "move arm 0", "cancel", "stop", "stop --all", "arm reset arm", "down"] {
         let ended = home.run(verb).with(1);
-        assert!(ended.err.starts_with("error: no run is live\nhint: start one: dimos run "), "{verb}: {}", ended.err);
+        assert!(
+            ended.err.starts_with("error: no run of this user is live\nhint: start one: dimos run "),
+            "{verb}: {}",
+            ended.err
+        );
         assert_eq!(ended.out, "");
     }
     let overview = home.run("status").with(0);
@@ -143,7 +147,7 @@ fn move_takes_negative_numbers_waits_and_prints_the_deviation() {
     assert!(ended.out.contains("+0.1000"), "{}", ended.out);
     // First it asks for a planner.
     match run.asked().as_slice() {
-        [Request::Planner(_), Request::Move(m), ..] => {
+        [Request::Planner(_), Request::Status(_), Request::Move(m), ..] => {
             assert_eq!((m.target.as_slice(), m.speed), ([0.3, -0.2].as_slice(), 0.25));
         }
         other => panic!("{other:?}"),
@@ -295,6 +299,42 @@ fn execute_reads_json_and_csv() {
     assert_eq!(csv.trajectory, json.trajectory);
     assert_eq!(csv.trajectory.points[1].velocities, Some(vec![0.0, 0.0]));
     assert_eq!(json.task.as_deref(), Some("traj_arm"));
+}
+
+/// The first motions with an arm are slow until its user says otherwise.
+#[test]
+fn an_arm_that_is_new_to_its_user_moves_at_25_percent_until_full_speed_is_asked_for() {
+    let home = Home::new();
+    let csv = "time,arm_joint1,arm_joint2,arm_joint1_vel,arm_joint2_vel\n0,0,0,0,0\n1.5,0.1,-0.2,0.4,0\n";
+    write(home.0.path(), "a.csv", csv);
+    let new = |address| start(&home.runs(), "test", FakeBackend { address: Some(address), ..Default::default() });
+    let moved = |run: &FakeBackend, line: &str| {
+        run.asked.lock().unwrap().clear();
+        let ended = home.run(line).with(0);
+        let speed = run.asked().into_iter().find_map(|request| match request {
+            Request::Move(call) => Some(call.speed),
+            Request::Execute(call) => Some(1.5 / call.trajectory.points[1].time_from_start),
+            _ => None,
+        });
+        (
+            speed.unwrap(),
+            ended.err.contains("arm is new to you: at most 25 % of its speed until `dimos arm full-speed arm`"),
+        )
+    };
+    let (server, run) = new("10.0.0.1:502");
+    assert_eq!(moved(&run, "move arm 0.3 -0.2"), (0.25, true));
+    assert_eq!(moved(&run, "move arm 0.3 -0.2 --direct --speed 0.1"), (0.1, true));
+    assert_eq!(moved(&run, "execute a.csv"), (0.25, true));
+    home.run("arm full-speed amr").with(2);
+    assert_eq!(moved(&run, "move arm 0 0").0, 0.25);
+    assert!(home.run("arm full-speed arm").with(0).out.contains("yourarm at 10.0.0.1:502"));
+    assert_eq!(moved(&run, "move arm 0.3 -0.2 --speed 1"), (1.0, false));
+    assert_eq!(moved(&run, "execute a.csv"), (1.0, false));
+    drop(server);
+    for (address, speed) in [("10.0.0.2:502", 0.25), ("/dev/ttyACM0", 0.25), ("can0", 0.25), ("127.0.0.1:502", 1.0)] {
+        let (_server, run) = new(address);
+        assert_eq!(moved(&run, "move arm 0 0 --speed 1").0, speed, "{address}");
+    }
 }
 
 #[test]

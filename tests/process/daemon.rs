@@ -145,9 +145,13 @@ fn it_ends_when_its_starter_has_exited() {
 #[test]
 fn logs_shows_and_follows_the_text_of_the_living_and_the_dead() {
     let home = Home::new();
-    home.dimos("logs").with(1).says(&["no run is live"]);
+    home.dimos("logs").with(1).says(&["no run of this user is live"]);
     home.dimos("logs missing").with(2).says(&["no record of a run named missing"]);
     let daemon = Daemon::start(&home, RUN);
+    // The file is written after what it says.
+    eventually("it is in the file", || {
+        text(&daemon.text_log()).contains("Press Ctrl-C") || text(&daemon.text_log()).contains("dimos down")
+    });
     assert_eq!(home.dimos("logs").with(0).out, text(&daemon.text_log()));
     let following = home.start("logs -f");
     following.until("run coordinator-mock");

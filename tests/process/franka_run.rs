@@ -2,6 +2,7 @@
 
 use dimos::hardware::arms::franka::emulator::FrankaEmulator;
 use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
+use dimos::hardware::sim::faults::{Fault, FaultKind};
 use rustix::process::Signal;
 
 use crate::support::program::Home;
@@ -36,4 +37,14 @@ fn runs_at_any_rate_move_an_arm_that_wants_a_command_every_millisecond() {
         let lost = lost_at(tick_rate);
         assert!(lost < 0.2, "{lost} at {tick_rate} Hz");
     }
+}
+
+#[test]
+fn zeros_without_a_pose_inside_the_range_are_not_enabled() {
+    let (home, emulator) = (Home::new(), emulator());
+    emulator.inject(Fault::new(FaultKind::ZeroState).lasting(60.0)).unwrap();
+    let options = format!("--set hardware.arm.address={} --no-record", emulator.address());
+    let ended = home.start(&format!("run coordinator-fr3 {options}")).wait();
+    assert!(ended.code != Some(0) && ended.err.contains("every joint reads exactly 0"), "{}", ended.err);
+    assert_eq!(emulator.figures().moved, 0, "nothing is written");
 }

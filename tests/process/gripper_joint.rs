@@ -82,7 +82,11 @@ fn fingers_follow(home: &Home) {
 fn a_gripper_that_nothing_is_known_of_is_planned_for_wide_open_and_check_says_so() {
     let home = home("max_velocity: 1.0");
     let shown = home.dimos("check tongs.yaml").with(0).out;
-    assert!(shown.contains("left_finger is assumed fully open") && shown.contains("hint: gripper_joint"), "{shown}");
+    assert!(
+        shown.contains("left_finger is assumed at its widest, 1.2000")
+            && shown.contains("fixed_joints: {left_finger: 1.2000}"),
+        "{shown}"
+    );
     let _run = home.run("tongs.yaml --no-record");
     home.dimos("arm gripper arm close").with(0);
     let (distance, closest) = clearance(&home);
@@ -99,4 +103,33 @@ fn a_gripper_joint_that_cannot_be_one_is_refused() {
     ] {
         home(&format!("gripper_joint: {gripper}")).dimos("check tongs.yaml").with(2).says(&words);
     }
+}
+
+/// A robot that spans two arms has the gripper of the one that carries the fingers.
+#[test]
+fn of_several_arms_the_one_that_carries_the_fingers_drives_them() {
+    let home = Home::new();
+    let turn = r#"<joint name="turn" type="revolute"><parent link="base_link"/>"#;
+    let foot = r#"<link name="foot"/><joint name="foot" type="revolute"><parent link="base_link"/><child link="foot"/>
+        <axis xyz="0 0 1"/><limit lower="-2" upper="2" velocity="1" effort="1"/></joint>"#;
+    let spanning = URDF.replace(turn, &format!("{foot}{}", turn.replace("base_link", "foot")));
+    assert!(spanning != URDF);
+    home.write("tongs.urdf", &spanning);
+    let blueprint = BLUEPRINT
+        .replace("tasks:", "  - {hardware_id: foot, joints: [arm_foot], adapter_type: mock}\ntasks:")
+        .replace("joint_names: {hardware: arm}", "joint_names: [arm_foot, arm_turn]")
+        .replace("joint_names: [turn]", "joint_names: [foot, turn]")
+        .replace("name: arm\n", "name: both\n")
+        .replace("GRIPPER", FINGER);
+    // The foot is the first arm.
+    let arms: Vec<&str> = blueprint.lines().filter(|line| line.contains("hardware_id")).collect();
+    home.write("tongs.yaml", &blueprint.replace(&arms.join("\n"), &format!("{}\n{}", arms[1], arms[0])));
+    let _run = home.run("tongs.yaml --no-record");
+    let clearance = || home.dimos("plan both 0 0.01 --json").with(0).json()["summary"]["clearance"].as_f64().unwrap();
+    home.dimos("arm gripper foot close").with(0);
+    home.dimos("arm gripper arm open").with(0);
+    eventually("the fingers of the arm are open", || clearance() < 0.12);
+    home.dimos("arm gripper foot open").with(0);
+    home.dimos("arm gripper arm close").with(0);
+    eventually("the fingers of the arm are closed", || clearance() > 0.15);
 }

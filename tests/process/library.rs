@@ -13,7 +13,7 @@ use dimos::rpc::streams::{Stream, Subscribe};
 use dimos::runtime::{Builder, Ending, Options, Record, Run, StartError};
 
 fn mock(folder: &Path) -> Builder {
-    Run::from_name("coordinator-mock").unwrap().record(Record::Off).folder(RunDir::at(folder))
+    Run::from_name("coordinator-mock").unwrap().record(Record::Off).folder(RunDir::closed(folder))
 }
 
 #[test]
@@ -24,7 +24,7 @@ fn a_run_that_is_dropped_is_stopped() {
     let handle = run.handle();
     let motion = handle.move_arm("arm", &[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], 0.1).unwrap().motion;
     drop(run);
-    assert!(RunDir::at(folder.path()).runs().unwrap().is_empty());
+    assert!(RunDir::closed(folder.path()).runs().unwrap().is_empty());
     // Who still has a handle is refused, and does not wait for ever.
     assert_eq!(handle.move_arm("arm", &[0.0; 7], 0.5).unwrap_err().code, Code::ShuttingDown);
     assert!(handle.wait(motion).map_or_else(|e| e.code == Code::ShuttingDown, |report| report.state == "ABORTED"));
@@ -128,7 +128,7 @@ hardware:
 tasks:
   - {name: stick, type: joystick, joint_names: {hardware: arm}, params: {timeout: 0.5}}
 ";
-    let of = |name: &str| Run::from_yaml(name, blueprint).folder(RunDir::at(folder.path()));
+    let of = |name: &str| Run::from_yaml(name, blueprint).folder(RunDir::closed(folder.path()));
     match of("without").record(Record::Off).start() {
         Err(StartError::Blueprint { what, .. }) => assert!(what.contains("no task type `joystick`"), "{what}"),
         other => panic!("{:?}", other.map(|_| ()).err()),

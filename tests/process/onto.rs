@@ -53,7 +53,7 @@ impl Home {
     fn command(&self, arguments: &str) -> Command {
         let mut command = Command::new(env!("CARGO_BIN_EXE_dimos"));
         command.args(arguments.split_whitespace()).current_dir(self.0.path()).stdin(Stdio::null());
-        command.env("XDG_RUNTIME_DIR", self.0.path()).env("XDG_STATE_HOME", self.0.path());
+        command.env("DIMOS_WORLD", self.0.path()).env("XDG_STATE_HOME", self.0.path());
         command
     }
 
@@ -87,7 +87,7 @@ impl Home {
         Watch::of_processors().unless_stalled(|| {
             let _ = std::fs::remove_file(&log);
             let record = Record::To(log.clone());
-            let folder = RunDir::at(self.path("runs"));
+            let folder = RunDir::closed(self.path("runs"));
             let run = Run::start(&blueprint, Options { record, folder, hold_latency: false, ..Options::default() });
             let run = run.unwrap();
             let poses = [(GOAL, 0.02), ([0.1; 6], 0.07), (GOAL, 0.05)];

@@ -25,7 +25,7 @@ tasks: [{name: traj_arm, type: trajectory, joint_names: {hardware: arm}}]
 
 fn start(row: AdapterSpec, folder: &tempfile::TempDir) -> Run {
     let run = Run::from_yaml("orders", BLUEPRINT).adapters(&[row]).record(Record::Off);
-    run.folder(RunDir::at(folder.path())).start().unwrap()
+    run.folder(RunDir::closed(folder.path())).start().unwrap()
 }
 
 #[test]
@@ -85,7 +85,7 @@ tasks: [{name: traj_arm, type: trajectory, joint_names: {hardware: arm}}]
 ";
     let folder = tempfile::tempdir().unwrap();
     let run =
-        Run::from_yaml("braking", blueprint).record(Record::Off).folder(RunDir::at(folder.path())).start().unwrap();
+        Run::from_yaml("braking", blueprint).record(Record::Off).folder(RunDir::closed(folder.path())).start().unwrap();
     let speed = || run.state().arms[0].joints[0].velocity.unwrap().abs();
     let position = || run.state().arms[0].joints[0].position.unwrap();
     run.move_arm("arm", &[2.0], 1.0).unwrap();

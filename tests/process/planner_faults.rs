@@ -61,7 +61,7 @@ fn f23_a_planner_that_panics_or_never_ends_costs_that_request_only() {
             _ => solve(setup, world, request, stop),
         }
     };
-    let run = Run::from_yaml("f23", BLUEPRINT).record(Record::Off).folder(RunDir::at(folder.path()));
+    let run = Run::from_yaml("f23", BLUEPRINT).record(Record::Off).folder(RunDir::closed(folder.path()));
     let run = run.solver(Arc::new(solver)).start().unwrap();
     // A motion that takes as long as all of this does, and is not disturbed by any of it.
     let host = Watch::of_processors();

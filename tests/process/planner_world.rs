@@ -1,5 +1,9 @@
 //! The planner's world in a run: obstacles that are added, moved and removed, and objects that an arm holds.
 
+use dimos::rpc::Code;
+use dimos::rpc::api::{PoseSpec, ShapeSpec, WorldAdd, WorldObject};
+use dimos::rpc::client::{Client, ClientError};
+
 use super::planner_run::up;
 
 #[test]
@@ -97,4 +101,29 @@ fn what_an_arm_holds_goes_with_it() {
     let world = home.dimos("world list --json").with(0).json();
     assert_eq!(&world["objects"][0], rod);
     home.dimos("world remove rod").with(0);
+}
+
+#[test]
+fn the_world_has_at_most_a_thousand_objects() {
+    let (home, _run) = up();
+    let mut client = home.client();
+    let add = |client: &mut Client, name: String| {
+        let (shape, pose) = (ShapeSpec::Sphere(0.01), PoseSpec { xyz: [5.0, 0.0, 5.0], ..PoseSpec::default() });
+        client.call(WorldAdd(WorldObject { name, shape, pose, padding: 0.0, held_by: None }))
+    };
+    let before = client.call(dimos::rpc::api::World {}).unwrap().objects.len();
+    for n in before..1000 {
+        add(&mut client, format!("ball{n}")).unwrap();
+    }
+    match add(&mut client, "one_more".into()) {
+        Err(ClientError::Refused(error)) => assert_eq!(error.code, Code::TooLarge, "{error}"),
+        other => panic!("{other:?}"),
+    }
+    // One of them is replaced, and a place is free after a removal.
+    add(&mut client, "ball999".into()).unwrap();
+    home.dimos("world remove ball999").with(0);
+    add(&mut client, "one_more".into()).unwrap();
+    let world: String = (0..1001).map(|n| format!("    ball{n}: {{shape: {{sphere: 0.01}}}}\n")).collect();
+    home.write("full.yaml", &format!("include: [lab.yaml]\nplanner:\n  world:\n{world}"));
+    home.dimos("check full.yaml").with(2).says(&["(limit 1000)", "full.yaml:1003", "hint: "]);
 }

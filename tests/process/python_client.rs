@@ -62,7 +62,7 @@ fn the_example_follows_its_policy() {
     home.write("scripts.yaml", BLUEPRINT);
     let example = file("assets/python/example_policy.py");
     let Some(alone) = python(&home, &[&example, "servo_arm"]) else { return };
-    alone.with(1).says(&["error: no run is live [NO_RUN]\nhint: start one: dimos run"]);
+    alone.with(1).says(&["error: no run of this user is live [NO_RUN]\nhint: start one: dimos run"]);
     let _run = home.run("scripts.yaml --no-record");
     let Some(ended) = python(&home, &[&example, "servo_arm", "--seconds", "1"]) else { return };
     assert!(ended.with(0).out.contains(" targets in 1."), "it says how it kept its time");

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::{Arc, Mutex};
 
-use dimos::arm::{ArmCommand, ArmState, Link, Pose, VelocitySource};
+use dimos::arm::{ArmCommand, ArmState, ControllerPose, Link, Pose, VelocitySource};
 use dimos::blueprint::{Overrides, find, load};
 use dimos::clock::{Mono, WallOffset};
 use dimos::hardware::registry::Registry;
@@ -204,7 +204,9 @@ fn sample(tick: u64) -> Vec<Sample> {
             velocity_source: if tick < 40 { VelocitySource::Absent } else { VelocitySource::Estimated },
             effort: (arm == 0 && tick % 50 > 25).then(|| joints_of(&[x; 7])),
             gripper: (arm == 0).then_some(x * 1e-3),
-            pose: tick.is_multiple_of(2).then_some(Pose { xyz: [x, 0.2, 0.3], rpy: [0.0, -1.0, x] }),
+            pose: tick
+                .is_multiple_of(2)
+                .then_some(ControllerPose::of_flange(Pose { xyz: [x, 0.2, 0.3], rpy: [0.0, -1.0, x] })),
             wrench: (arm == 1).then_some([1.0, 2.0, x, 4.0, 5.0, 6.0]),
             mode: ControlMode::ServoPosition,
             enabled: tick > 2,

@@ -4,6 +4,8 @@ use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::time::Duration;
 
+use dimos::recording::replay::attachment;
+
 use super::remote_shim::BLUEPRINT;
 use crate::support::program::Home;
 
@@ -40,6 +42,14 @@ fn peers_that_are_something_else_end_the_start_with_one_clear_line() {
         (&[&DESCRIPTION.replace("\"dof\":6", "\"dof\":7").replace("1]", "1,1]")], "expected 6 joints, the arm says 7"),
         (&[&DESCRIPTION.replace("\"V\"", "null")], "its description"),
         (&[&DESCRIPTION.replace("[-1,-1,-1,-1,-1,-1]", "[]")], "limits must have 6 values each"),
+        (
+            &[&DESCRIPTION.replace("\"native_rate\":100", "\"native_rate\":100,\"gap_tolerance\":2")],
+            "gap_tolerance must be 0 to 1 s",
+        ),
+        (
+            &[&DESCRIPTION.replace("\"native_rate\":100", "\"native_rate\":100,\"after_gap\":\"waits\"")],
+            "its description",
+        ),
         (&[r#"{"id":1,"error":"io","text":"no arm there"}"#], "no arm there"),
         (&[], "accepts the connection, but does not say what it is"),
         (&[DESCRIPTION], "did not answer within"),
@@ -62,4 +72,28 @@ fn peers_that_are_something_else_end_the_start_with_one_clear_line() {
     home.dimos("run remote.yaml").with(3).says(&["there is no such socket", "hint: start the process that serves"]);
     home.write("remote.yaml", &BLUEPRINT.replace("ADDRESS", "10.0.0.1:7450"));
     home.dimos("run remote.yaml").with(2).says(&["no authentication", "ssh -L 7450:127.0.0.1:7450 10.0.0.1"]);
+}
+
+/// A gap in its commands is bridged as the arm itself says, not as the row of a remote arm, of which nothing is known.
+#[test]
+fn an_arm_says_itself_what_gaps_it_bridges() {
+    for (option, expected) in [
+        ("options: {sim: {controller: {gap_tolerance: 0.04}}}", (40_000_000, "decelerates")),
+        ("options: {}", (0, "rests_at_setpoint")),
+    ] {
+        let home = Home::new();
+        let blueprint = BLUEPRINT
+            .replace("'ADDRESS'", "sim")
+            .replace("accept_zero_pose: true", &format!("accept_zero_pose: true, {option}"));
+        home.write("remote.yaml", &blueprint);
+        let run = home.run("remote.yaml");
+        home.dimos("down").with(0);
+        run.wait().with(0);
+        let log = home.logs().pop().unwrap();
+        let coordinator = attachment(&log, "coordinator.json").unwrap().unwrap();
+        let coordinator: serde_json::Value = serde_json::from_slice(&coordinator).unwrap();
+        let supervision = &coordinator["arms"][0]["supervision"];
+        assert_eq!(supervision["gap_tolerance"]["nanos"], expected.0, "{supervision:#}");
+        assert_eq!(supervision["after_gap"], expected.1, "{supervision:#}");
+    }
 }

@@ -198,6 +198,44 @@ fn n08_a_flood_of_requests_is_bounded_and_delays_no_stop() {
 }
 
 #[test]
+fn n18_an_id_belongs_to_the_program_that_used_it_first() {
+    if !is_built() {
+        return;
+    }
+    let shared = Shared::start(", users: {'-': operator}, client_timeout: 0.5");
+    let Some(mut owner) = Judge::open(&shared.at, "-", Value::Null) else { return };
+    let Some(mut thief) = Judge::open(&shared.at, "-", Value::Null) else { return };
+    let id = owner.opened["id"].clone();
+    let target = json!({"task": "velocity_arm", "velocities": [0.2, 0, 0, 0, 0, 0]});
+    for (own, others) in
+        [(Some("0123456789abcdef"), [None, Some("fedcba9876543210")]), (None, [Some("0123456789abcdef"); 2])]
+    {
+        let prove = |judge: &mut Judge, attachment: Option<&str>| {
+            judge.does("prove", json!({"attachment": attachment.unwrap_or_default(), "id": id}))
+        };
+        // The second time as a program that knows nothing of attachments.
+        prove(&mut owner, own);
+        owner.does("announce", json!({}));
+        owner.does("beat", json!({}));
+        assert_eq!(owner.asks("move", "lease", json!({}))["result"], json!({"arms": ["arm"]}));
+        let began = Instant::now();
+        for other in others {
+            prove(&mut thief, other);
+            let refused = thief.asks("move", "velocity", target.clone());
+            assert_eq!(refused["error"]["code"], "FORBIDDEN", "{refused}");
+            assert!(refused["error"]["message"].as_str().unwrap().contains("another program has the id"), "{refused}");
+            assert_eq!(thief.asks("end", "stop", json!({}))["result"]["arms"]["arm"], "confirmed");
+        }
+        // Beats of another program do not hide that its owner is silent.
+        while began.elapsed() < Duration::from_secs(1) {
+            thief.does("beat", json!({}));
+            std::thread::sleep(Duration::from_millis(50));
+        }
+        assert!(shared.commander().is_none(), "{:?}", shared.commander());
+    }
+}
+
+#[test]
 fn n11_what_names_no_client_exactly_reaches_no_run() {
     if !is_built() {
         return;

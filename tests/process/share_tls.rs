@@ -124,6 +124,27 @@ fn n11_no_user_speaks_as_another() {
 }
 
 #[test]
+fn n17_an_observer_that_takes_all_its_places_takes_none_of_an_operator() {
+    if !is_built() {
+        return;
+    }
+    let Some(cell) = Cell::start() else { return };
+    let Some(mut bob) = cell.judge("bob", "bob") else { return };
+    let ask = |bob: &mut Judge, class: &str, n: u32, method: &str| {
+        let key = format!("dimos/cell/by/bob/{class}/f{n}/{method}");
+        bob.does("raw", json!({"key": key, "payload": "{}", "timeout": 5.0}))
+    };
+    let answers: Vec<Value> = (0..40).map(|n| ask(&mut bob, "read", n, "state")).collect();
+    let refused = answers.iter().filter(|answer| answer["error"]["code"] == "TOO_MANY_CONNECTIONS").count();
+    assert_eq!(refused, 8, "{answers:?}");
+    cell.as_user("alice", "move arm 0.2 0 0 0 0 0").with(0);
+    cell.as_user("alice", "stop").with(0).shows(&["confirmed"]);
+    // Without a place of its own too.
+    let stop = ask(&mut bob, "end", 99, "stop");
+    assert_eq!(stop["result"]["arms"]["arm"], "confirmed", "{stop}");
+}
+
+#[test]
 fn n09_a_certificate_that_cannot_be_used_is_refused_at_once_with_the_reason() {
     if !is_built() {
         return;

@@ -82,7 +82,7 @@ planner:
     }
 
     fn place(&self) -> RunDir {
-        RunDir::at(self.path("runs"))
+        RunDir::closed(self.path("runs"))
     }
 
     /// The start fails with these words, and nothing is left of it: the same run can be started at once.
@@ -150,7 +150,7 @@ fn a_device_that_another_run_has() {
     let other = other.replace("PID", &std::process::id().to_string());
     let other = Run::from_yaml("other", &other).adapters(&[SPEC]).record(Record::Off);
     let folder = tempfile::tempdir().unwrap();
-    let other = other.folder(RunDir::at(folder.path())).start().unwrap();
+    let other = other.folder(RunDir::closed(folder.path())).start().unwrap();
     let start = || {
         let failed = bench.run("log.mcap").start();
         other.stop();
@@ -190,8 +190,15 @@ fn an_arm_that_is_not_enabled() {
 #[test]
 fn a_socket_that_cannot_be_opened() {
     let bench = Bench::new();
-    *APPEARS.lock().unwrap() = Some(bench.path("runs").join("stages.sock"));
-    bench.fails(|| bench.run("log.mcap").start(), "the socket cannot be opened");
+    let file = bench.path("runs").join("stages.sock");
+    *APPEARS.lock().unwrap() = Some(file.clone());
+    let start = || {
+        let failed = bench.run("log.mcap").start();
+        // No run made it, so none removes it.
+        fs::remove_file(&file).unwrap();
+        failed
+    };
+    bench.fails(start, "the socket cannot be opened");
 }
 
 #[test]

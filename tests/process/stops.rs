@@ -160,14 +160,14 @@ impl Flood {
         let execute =
             json!({"id": 1, "method": "execute", "params": {"trajectory": elsewhere(2000)}}).to_string() + "\n";
         let socket = home.path().join("run/dimos/streams.sock");
-        let threads = (0..18).map(|i| {
+        let threads = (0..24).map(|i| {
             let (stop, socket, execute) = (stop.clone(), socket.clone(), execute.clone());
             std::thread::spawn(move || {
                 while !stop.load(Ordering::Relaxed) {
                     let Ok(stream) = UnixStream::connect(&socket) else { return };
                     let _ = stream.set_read_timeout(Some(Duration::from_secs(1)));
                     let _ = stream.set_write_timeout(Some(Duration::from_millis(100)));
-                    flood(i % 6, stream, &execute, &stop);
+                    flood(i % 8, stream, &execute, &stop);
                 }
             })
         });
@@ -175,7 +175,13 @@ impl Flood {
     }
 }
 
-/// One client of the flood, of one of six kinds.
+/// Leaves a connection open for a while.
+fn waits() -> bool {
+    std::thread::sleep(Duration::from_millis(50));
+    true
+}
+
+/// One client of the flood, of one of eight kinds.
 fn flood(kind: usize, stream: UnixStream, execute: &str, stop: &AtomicBool) {
     let mut replies = BufReader::new(stream.try_clone().unwrap());
     let mut ask = |line: &[u8]| {
@@ -196,6 +202,10 @@ fn flood(kind: usize, stream: UnixStream, execute: &str, stop: &AtomicBool) {
                     true
                 }
             }
+            // Half a stop.
+            5 => (&stream).write_all(b"{\"id\":1,\"method\":\"stop\",\"params\":{").is_ok() && waits(),
+            // Nothing.
+            6 => waits(),
             // A line that is too long.
             _ => ask(&vec![b' '; 300 * 1024]),
         };
@@ -274,9 +284,12 @@ fn runs_of_other_users_are_named_as_not_stopped() {
     if let Err(error) = std::os::unix::fs::chown(&socket, Some(65534), None) {
         return skip_privileged(&format!("a socket of another user: {error}"), CapabilitySet::CHOWN);
     }
-    let stopped = home.dimos("stop").with(0).says(&["not stopped: run their-cell of user "]);
-    assert!(stopped.out.contains("confirmed") && !stopped.out.contains("their-cell"), "{}", stopped.out);
-    assert!(!home.dimos("stop --run streams").with(0).err.contains("their-cell"));
+    // In the open world. No run there has such an arm, so none is stopped.
+    let open = |arguments: &str| Started::of(home.command(arguments).env_remove("DIMOS_WORLD")).wait();
+    let stopped = open("stop arm-of-no-run").says(&["not stopped: run their-cell of user "]);
+    assert!(!stopped.out.contains("their-cell"), "{}", stopped.out);
+    open("status").says(&["note: run their-cell of user "]);
+    assert!(!home.dimos("stop").with(0).err.contains("their-cell"), "the world of this test is closed");
 }
 
 #[test]
@@ -431,7 +444,7 @@ fn an_arm_that_does_not_come_to_rest_keeps_its_motors_unless_now_is_said() {
     let mut row = *Registry::builtin().get("mock").unwrap();
     row.create = |_| Ok(Box::new(RUNAWAY.clone()));
     let folder = tempfile::tempdir().unwrap();
-    let run = Run::from_name("coordinator-mock").unwrap().record(Record::Off).folder(RunDir::at(folder.path()));
+    let run = Run::from_name("coordinator-mock").unwrap().record(Record::Off).folder(RunDir::closed(folder.path()));
     let run = run.adapters(&[row]).start().unwrap();
     let _moving = RUNAWAY.clone().velocities(Some(&[0.0, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0]));
     eventually("it moves", || run.state().arms[0].joints[1].velocity.is_some_and(|v| v > 0.2));

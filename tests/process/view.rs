@@ -143,7 +143,7 @@ fn unpacked(content: &[u8]) -> String {
 #[test]
 fn a_page_with_the_token_sees_and_commands_the_run_and_no_other_does() {
     let home = Home::new();
-    home.dimos("view").with(1).says(&["no run is live"]);
+    home.dimos("view").with(1).says(&["no run of this user is live"]);
     for (name, text) in [("cell.urdf", URDF), ("part.obj", PART), ("cell.yaml", BLUEPRINT)] {
         home.write(name, text);
     }
@@ -299,7 +299,7 @@ fn pages_are_bounded_and_one_that_takes_nothing_is_dropped() {
     let taken = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = taken.local_addr().unwrap().port();
     let run = Run::from_name("yourarm-planner").unwrap().name("bounded").record(Record::Off);
-    let run = run.view().set("view.port", port).folder(RunDir::at(folder.path())).start().unwrap();
+    let run = run.view().set("view.port", port).folder(RunDir::closed(folder.path())).start().unwrap();
     let page = Page::of(run.view_url().unwrap());
     assert_ne!(page.host, format!("127.0.0.1:{port}"), "the next free port");
 
@@ -330,4 +330,24 @@ fn pages_are_bounded_and_one_that_takes_nothing_is_dropped() {
     assert!(run.stop().troubles.is_empty(), "with pages open");
     let last = std::iter::repeat_with(|| pages[0].read().unwrap()).find(Message::is_close);
     assert_eq!(closed_with(last.unwrap()), Some(1001));
+}
+
+#[test]
+fn connections_that_say_nothing_keep_no_page_from_its_user() {
+    let home = Home::new();
+    for (name, text) in [("cell.urdf", URDF), ("part.obj", PART), ("cell.yaml", BLUEPRINT)] {
+        home.write(name, text);
+    }
+    let run = Started::of(home.as_typed("run --no-record cell.yaml").stdin(Stdio::null()));
+    run.until("Press Ctrl-C");
+    let page = Page::of(home.dimos("view").with(0).out.trim());
+    let mut watching = page.accepted();
+    let silent: Vec<TcpStream> = (0..200).map(|_| page.connect()).collect();
+    let began = std::time::Instant::now();
+    assert_eq!(page.get("/scene.json").0, 200);
+    assert!(began.elapsed() < Duration::from_secs(2), "{:?}", began.elapsed());
+    // A page with the token stays.
+    watching.send(Message::text(json!({"id": 1, "method": "status", "params": {}}).to_string())).unwrap();
+    assert!(watching.read().is_ok());
+    drop(silent);
 }

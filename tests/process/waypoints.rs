@@ -54,6 +54,7 @@ fn one_motion_passes_several_waypoints() {
     home.dimos(&format!("plan arm {through} 1,2")).with(2).says(&["6 joints, the goal 2 values"]);
     home.dimos("plan arm --through home 0.1,0.2,0,0,0,9 home").with(1).says(&["waypoint 2: "]);
     home.dimos("plan arm --through home").with(2);
+    home.dimos("plan arm --through home -0.2,-.3,0.6,0,0.8,0 --speed 1").with(0);
 }
 
 /// A path as a hand leads it, at 100 Hz: from aside of home, to and fro, to its end.

@@ -8,6 +8,7 @@ use std::time::Duration;
 use dimos::hardware::arms::xarm::emulator::{Received, XArmEmulator};
 use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::faults::{Fault, FaultKind};
+use rustix::process::Signal;
 use serde_json::{Value, json};
 
 use crate::support::program;
@@ -79,7 +80,7 @@ fn an_arm_that_another_client_takes_over_is_left_to_it() {
         eventually("the client's goal", there);
         eventually("the hold", || phase(&home) == ("held".into(), "mode_changed".into()));
         // A requested stop goes to the arm; the end of the run alone sends nothing.
-        run.end(rustix::process::Signal::INT);
+        run.end(Signal::INT);
         let ours = ours(&emulator);
         assert!(there() && emulator.enabled() && only_refused_set_points(&ours), "{spacing} ms: {ours:?}");
     }
@@ -99,7 +100,7 @@ fn a_stop_by_another_client_is_named_and_reset_and_enable_take_the_arm_back() {
     home.dimos("arm reset arm").with(0);
     home.dimos("arm enable arm").with(0);
     eventually("ready", || phase(&home).0 == "ready");
-    run.end(rustix::process::Signal::INT).with(130);
+    run.end(Signal::INT).with(130);
 }
 
 #[test]
@@ -116,7 +117,7 @@ fn a_box_that_takes_its_time_is_enabled_stopped_and_reset() {
         home.dimos("arm reset arm").with(0);
         home.dimos("arm enable arm").with(0);
         eventually("ready", || phase(&home).0 == "ready");
-        run.end(rustix::process::Signal::INT).with(130);
+        run.end(Signal::INT).with(130);
         assert!(!emulator.enabled());
     }
 }
@@ -127,10 +128,27 @@ fn an_arm_at_zero_is_enabled_and_one_that_has_not_measured_is_not() {
     let (home, at_zero) = (Home::new(), emulator(zero));
     let started = run(&home, &at_zero, NO_GRIPPER);
     up(&home, &started);
-    started.end(rustix::process::Signal::INT).with(130);
+    started.end(Signal::INT).with(130);
     let (home, unmeasured) = (Home::new(), emulator(json!({})));
     unmeasured.inject(Fault::new(FaultKind::ZeroState).lasting(60.0)).unwrap();
     let ended = run(&home, &unmeasured, NO_GRIPPER).wait();
     assert!(ended.err.contains("not measured yet"), "{}", ended.err);
     assert!(!unmeasured.enabled());
+}
+
+/// What is said of a Lite 6's gripper is what its outputs are, and never that it holds something.
+#[test]
+fn a_gripper_that_only_opens_and_closes_is_ordered_and_not_measured() {
+    let home = Home::new();
+    let run = home.run("coordinator-lite6 --sim --no-record --set hardware.arm.options.gripper=lite6");
+    assert!(!home.dimos("state").with(0).out.contains("gripper"), "nothing is known before the first order");
+    home.dimos("status").with(0).shows(&["gripper only opens (1) and closes (0); nothing measures its fingers"]);
+    let closed = home.dimos("arm gripper arm close --json").with(0).json();
+    assert_eq!((&closed["outcome"], &closed["unit"]), (&json!("ordered"), &json!("on_off")), "{closed}");
+    home.dimos("state").with(0).shows(&["gripper  closed (as ordered)"]);
+    home.dimos("arm gripper arm open").with(0).shows(&["gripper ordered to open, which nothing measures"]);
+    home.dimos("arm gripper arm 0.5").with(1).says(&["only closes (0) and opens (1)", "hint: "]);
+    home.dimos("arm gripper arm close --force 10").with(1).says(&["has no force control"]);
+    home.dimos("state").with(0).shows(&["gripper  open (as ordered)"]);
+    run.end(Signal::INT).with(130);
 }

@@ -222,3 +222,17 @@ class RotaryGripperAdapter(SimArmAdapter):
     def write_gripper_position(self, position: float) -> bool:
         self.angle = position
         return True
+
+
+class HostileAdapter(SimArmAdapter):
+    """An arm whose texts a terminal would execute."""
+
+    HOSTILE = "\x1b]0;owned\x07\x1b[2J\u202eevil\x7f\x9b5m"
+
+    def get_info(self) -> ManipulatorInfo:
+        return ManipulatorInfo(vendor=self.HOSTILE, model=self.HOSTILE, dof=self._dof, firmware_version=self.HOSTILE,
+                               serial_number=self.HOSTILE)
+
+    def read_error(self) -> tuple[int, str]:
+        code, _ = super().read_error()
+        return code, self.HOSTILE if code else ""

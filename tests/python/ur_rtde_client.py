@@ -95,6 +95,50 @@ def use(address):
     print("all is as it says")
 
 
+def again(address):
+    """Clients that end without a word leave their program behind; the next ones replace it. Commands that the emulated
+    controller does not carry out fail."""
+    import os
+
+    import rtde_control
+    import rtde_receive
+
+    power_on(address)
+    receive = rtde_receive.RTDEReceiveInterface(address)
+    for turn in range(4):
+        child = os.fork()
+        if child == 0:
+            os._exit(0 if tried(lambda: rtde_control.RTDEControlInterface(address).isProgramRunning()) else 1)
+        check(f"client {turn}", os.waitpid(child, 0)[1] == 0)
+    control = rtde_control.RTDEControlInterface(address)
+    here = receive.getActualQ()
+    goal = [here[0] + 0.05] + here[1:]
+    check("moveJ after them", control.moveJ(goal, 1.0, 2.0) and near(receive.getActualQ(), goal))
+
+    commands = [
+        ("setTcp", lambda control: control.setTcp([0, 0, 0.1, 0, 0, 0])),
+        ("zeroFtSensor", lambda control: control.zeroFtSensor()),
+        ("a pose out of reach", lambda control: control.moveL([3, 0, 0, 0, 0, 0], 0.2, 0.5)),
+        ("positions out of range", lambda control: control.moveJ([9] * 6, 1.0, 2.0)),
+    ]
+    for name, act in commands:
+        check(f"its program runs before {name}", control.isProgramRunning())
+        check(f"{name} fails", not tried(lambda: act(control)))
+        # A new client clears the command that is left in the register.
+        control.disconnect()
+        control = rtde_control.RTDEControlInterface(address)
+    check("moveJ after those", control.moveJ(here, 1.0, 2.0) and near(receive.getActualQ(), here))
+    print("all is as it says")
+
+
+def tried(act):
+    """Whether it says that it was done."""
+    try:
+        return act()
+    except Exception:
+        return False
+
+
 def serve(address, sent):
     """Passes a connection on, and keeps what its client sends."""
     server = socket.create_server((PROXY, 30004))
@@ -150,4 +194,4 @@ def packets(address):
         data = data[length:]
 
 
-use(sys.argv[2]) if sys.argv[1] == "use" else packets(sys.argv[2])
+{"use": use, "bytes": packets, "again": again}[sys.argv[1]](sys.argv[2])

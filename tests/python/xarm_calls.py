@@ -106,6 +106,11 @@ def rests(arm, before):
     return near(a, joints(), 0.01)
 
 
+def outputs(*levels):
+    """Whether the first outputs of the tool board are at these levels."""
+    return shows(lambda arm: arm.get_tgpio_output_digital()[1][:len(levels)] == list(levels))
+
+
 def gripped(*pulses):
     """Whether the gripper is at one of these positions."""
     at = lambda opening: opening is not None and any(abs(opening - p / 1e4) < 1e-3 for p in pulses)
@@ -186,6 +191,9 @@ CHANGES = {
     "set_tcp_offset": (
         lambda a, p: a.set_tcp_offset([0, 0, 100, 0, 0, 0]), 0,
         lambda arm, before: near(arm.tcp_offset, [0, 0, 100, 0, 0, 0]) and moved(arm, before["pose"], [0, 0, -100])),
+    "set_world_offset": (
+        lambda a, p: a.set_world_offset([0, 0, 100, 0, 0, 0]), 0,
+        lambda arm, before: near(arm.world_offset, [0, 0, 100, 0, 0, 0]) and moved(arm, before["pose"], [0, 0, 100])),
     "set_tcp_jerk": (lambda a, p: a.set_tcp_jerk(8000), 0, shows(lambda arm: abs(arm.tcp_jerk - 8000) < 1)),
     "set_tcp_maxacc": (lambda a, p: a.set_tcp_maxacc(9000), 0, shows(lambda arm: abs(arm.tcp_acc_limit[1] - 9000) < 1)),
     "set_joint_jerk": (lambda a, p: a.set_joint_jerk(800), 0, shows(lambda arm: abs(arm.joint_jerk - 800) < 1)),
@@ -223,6 +231,12 @@ CHANGES = {
     before: arm.get_tgpio_modbus_baudrate() == (0, 2000000)),
     "set_rs485_baudrate": (
         lambda a, p: a.set_rs485_baudrate(2000000), 0, lambda arm, before: arm.get_rs485_baudrate() == (0, 2000000)),
+    # Outputs of the tool board, and the grippers that they open and close.
+    "set_tgpio_digital": (lambda a, p: a.set_tgpio_digital(4, 1), 0, outputs(0, 0, 0, 0, 1)),
+    "open_lite6_gripper": (lambda a, p: a.open_lite6_gripper(), 0, outputs(1, 0)),
+    "close_lite6_gripper": (lambda a, p: a.close_lite6_gripper(), 0, outputs(0, 1)),
+    "stop_lite6_gripper": (lambda a, p: a.stop_lite6_gripper(), 0, outputs(0, 0)),
+    "set_vacuum_gripper": (lambda a, p: a.set_vacuum_gripper(True, wait=False), 0, outputs(1, 0)),
     # They ask the gripper for its error: its answer is right.
     "getset_tgpio_modbus_data": (
         lambda a, p: data(a.getset_tgpio_modbus_data([8, 3, 0, 15, 0, 1]), [8, 3, 2, 0, 0]), 0, rests),
@@ -243,8 +257,7 @@ REFUSED = {
     "calibrate_tcp_coordinate_offset": ([X] * 4,), "calibrate_tcp_orientation_offset": ([0] * 3, [0] * 3),
     "calibrate_user_coordinate_offset": ([0] * 3, [0] * 3), "calibrate_user_orientation_offset": ([X] * 3,),
     "check_verification": (), "clean_bio_gripper_error": (), "clean_linear_motor_error": (),
-    "close_lite6_gripper": (), "open_lite6_gripper": (),
-    "stop_lite6_gripper": (), "config_cgpio_reset_when_stop": (True,), "config_tgpio_reset_when_stop": (True,),
+    "config_cgpio_reset_when_stop": (True,), "config_tgpio_reset_when_stop": (True,),
     "iden_ft_sensor_load_offset": (), "iden_joint_friction": ("XI130500000000",), "iden_tcp_load": (),
     "load_trajectory": ("a", False), "playback_trajectory": (1, None, False), "save_record_trajectory": ("a", False),
     "start_record_trajectory": (), "stop_record_trajectory": (), "mask_write_holding_register": (0, 1, 1),
@@ -279,9 +292,9 @@ REFUSED = {
     "set_reduced_max_joint_speed": (10,),
     "set_reduced_max_tcp_speed": (100,), "set_reduced_mode": (True,), "set_reduced_tcp_boundary": ([1, -1] * 3,),
     "set_rh56_finger_position": (1, 100), "set_rs485_timeout": (10,), "set_self_collision_detection": (True,),
-    "set_simulation_robot": (True,), "set_tgpio_digital": (0, 1), "set_tgpio_digital_with_xyz": (0, 1, [0] * 3, 1),
-    "set_tgpio_modbus_timeout": (10,), "set_tgpio_monitor_params": (1, 1), "set_vacuum_gripper": (True,),
-    "set_world_offset": (X,), "set_xarm7_ik_redundancy": ([0.0] * 7, 1), "system_control": (1,),
+    "set_simulation_robot": (True,), "set_tgpio_digital_with_xyz": (0, 1, [0] * 3, 1),
+    "set_tgpio_modbus_timeout": (10,), "set_tgpio_monitor_params": (1, 1),
+    "set_xarm7_ik_redundancy": ([0.0] * 7, 1), "system_control": (1,),
 }
 
 # Queries, and what their values must be if they return 0.
@@ -317,7 +330,7 @@ QUERIES = {
     "get_tool_digital_input": lambda a, v: not any(v),
     "get_tgpio_output_digital": lambda a, v: not any(v),
     "get_tgpio_analog": lambda a, v: near(v, [0, 0], 0.01),
-    "get_vacuum_gripper": lambda a, v: v == 0,
+    "get_vacuum_gripper": lambda a, v: v == -1,  # off
     # The client's own: what it has last seen.
     "get_bio_gripper_error": None, "get_linear_motor_registers": None,
     # Of the G1, whose telegrams they share.

@@ -23,11 +23,14 @@ WORKS += ["set_servo_angle relative", "set_servo_angle all relative", "set_posit
     "set_pause_time"]
 WORKS_EMULATED = ["set_position", "set_position y only", "set_tool_position", "set_position_aa absolute",
     "set_position_aa tool",
-    "set_servo_cartesian", "set_servo_cartesian_aa", "move_gohome", "set_tcp_offset", "get_inverse_kinematics",
-    "get_forward_kinematics", "set_collision_sensitivity", "set_tcp_jerk", "only_check_type 1"]
+    "set_servo_cartesian", "set_servo_cartesian_aa", "move_gohome", "set_tcp_offset",
+    "set_world_offset", "get_inverse_kinematics",
+    "get_forward_kinematics", "set_collision_sensitivity", "set_tcp_jerk", "only_check_type 1", "set_tgpio_digital",
+    "open_lite6_gripper", "close_lite6_gripper", "set_vacuum_gripper"]
 # In the proxy, what would move, switch or simulate and is not on its page returns 10.
 REFUSED_10 = ["set_position", "set_position y only", "set_tool_position", "set_position_aa absolute", "move_circle",
     "set_servo_cartesian", "set_servo_cartesian_aa", "vc_set_cartesian_velocity", "set_mode 5", "set_tcp_offset",
+    "set_world_offset",
     "set_tgpio_digital", "set_cgpio_digital", "set_collision_sensitivity", "set_simulation_robot", "set_servo_detach"]
 
 
@@ -92,6 +95,8 @@ def main():
             failures.append(f"{name} returns {code} and has moved the arm")
         if "tcp_offset" in name and EMULATED:
             arm.set_tcp_offset([0] * 6)
+        if name == "set_world_offset" and EMULATED:
+            arm.set_world_offset([0] * 6)
     for name in WORKS + (WORKS_EMULATED if EMULATED else []):
         if codes.get(name) != 0:
             failures.append(f"{name} should work: {codes.get(name)}")

@@ -82,6 +82,7 @@ class Client:
         self.own = f"dimos/{run}/by/{user}"
         self.root = f"dimos/{run}"
         self.token = None
+        self.more = {}
         self.seen = []
         self.subscribers = []
 
@@ -89,8 +90,14 @@ class Client:
         self.token = self.session.liveliness().declare_token(key or f"{self.own}/client/{self.id}")
         return {}
 
+    def prove(self, attachment, id=None):
+        """Sends this with every request and beat from now on, and speaks for the client of another id."""
+        self.more = {"attachment": attachment.encode()} if attachment else {}
+        self.id = id or self.id
+        return {}
+
     def beat(self, key=None, name="judge"):
-        self.session.put(key or f"{self.own}/client/{self.id}/beat", name)
+        self.session.put(key or f"{self.own}/client/{self.id}/beat", name, **self.more)
         return {}
 
     def ask(self, method=None, params=None, cls=None, key=None, size=None, timeout=12.0):
@@ -100,7 +107,7 @@ class Client:
 
     def raw(self, key, payload, timeout=12.0):
         began = time.monotonic()
-        answers = list(self.session.get(key, payload=payload, timeout=timeout))
+        answers = list(self.session.get(key, payload=payload, timeout=timeout, **self.more))
         took = time.monotonic() - began
         if not answers:
             return {"answers": 0, "took": took}

@@ -30,7 +30,7 @@ static CASES: [Case; 7] = [
         name: "xarm",
         rate: 100.0,
         ends: [&[-1.5, -0.6, -1.2, -1.5, 0.6, -1.5], &[1.5, 0.4, -0.4, 1.5, 1.6, 1.5]],
-        options: r#"{"sim": {"tool_speed_factor": 10}}"#,
+        options: "{}",
         loses: false,
     },
     Case {

@@ -168,11 +168,13 @@ fn velocity_case(bed: &Bed, kind: Kind, time: Duration) -> Vec<String> {
     bed.gate.forget();
     let handle = bed.run.handle();
     let streaming = AtomicBool::new(true);
+    // Where the tool's speed is limited, a joint that does not move the tool: the last one.
+    let joint = if matches!(bed.arm.name, "xarm" | "ur") { 5 } else { 0 };
     std::thread::scope(|scope| {
-        let (streaming, top) = (&streaming, bed.bounds.velocity[0]);
+        let (streaming, top) = (&streaming, bed.bounds.velocity[joint]);
         scope.spawn(move || {
             let mut target = vec![0.0; 6];
-            target[0] = top;
+            target[joint] = top;
             let began = Instant::now();
             // Refused once it is held.
             while streaming.load(Ordering::Relaxed) && began.elapsed() < Duration::from_millis(900) {
@@ -198,7 +200,7 @@ fn velocity_case(bed: &Bed, kind: Kind, time: Duration) -> Vec<String> {
             // What was on its way may come late: it counts from then, and sets an arm that has stopped in motion once
             // more.
             let (limit, stall) = (bed.arm.time_limit.unwrap_or_default(), time.as_secs_f64());
-            let again = if stall > limit { bed.bounds.stopping(0, limit) } else { 0.0 };
+            let again = if stall > limit { bed.bounds.stopping(joint, limit) } else { 0.0 };
             // A tracking error must last.
             let noticed = if cause == "tracking" { 0.11 } else { 0.0 };
             let delay = limit + bed.arm.stale_after().max(stall.min(limit)) + noticed;

@@ -71,6 +71,7 @@ pub const YOURARM: AdapterSpec = AdapterSpec {
     create: |_| Err(AdapterError::Rejected(NOT_HERE.to_owned())),
     emulate: Some(|_, _| Err(AdapterError::Rejected(NOT_HERE.to_owned()))),
     service: None,
+    wire: None,
 };
 
 /// An arm in memory that needs no address.
@@ -83,6 +84,7 @@ pub const MOCK: AdapterSpec = AdapterSpec {
     options: OptionsSpec::of::<NoOptions>(),
     emulate: None,
     service: None,
+    wire: None,
     ..YOURARM
 };
 
@@ -105,6 +107,7 @@ pub const SERVOBOT: AdapterSpec = AdapterSpec {
     options: OptionsSpec::of::<NoOptions>(),
     emulate: None,
     service: None,
+    wire: None,
     ..YOURARM
 };
 

@@ -28,6 +28,8 @@ pub struct FakeBackend {
     pub unconfirmed: bool,
     /// When set, the run has a planner, and planning does not end until it is cancelled.
     pub plans: bool,
+    /// When set, the arm is real, at this address.
+    pub address: Option<&'static str>,
     /// While set, `planner` is not answered.
     pub holds_planner: AtomicBool,
 }
@@ -59,6 +61,7 @@ impl FakeBackend {
             elapsed: 0.4,
             remaining: 0.1,
             speed: None,
+            speed_fraction: None,
             error: (state == "ABORTED").then(|| "arm_joint1 was 0.2000 rad off the path".into()),
             replanning: false,
             next: None,
@@ -91,7 +94,13 @@ impl Backend for FakeBackend {
                 tokio::time::sleep(Duration::from_millis(5)).await;
             }
             Ok(match request {
-                Request::Status(_) => Reply::Status(status()),
+                Request::Status(_) => {
+                    let mut status = status();
+                    if let Some(address) = self.address {
+                        (status.arms[0].address, status.arms[0].simulated) = (address.to_owned(), false);
+                    }
+                    Reply::Status(status)
+                }
                 Request::State(_) => Reply::State(state()),
                 Request::Move(m) if m.arm != "arm" => {
                     return Err(RpcError::unknown(Code::UnknownArm, "arm", &m.arm, &["arm"]));
@@ -160,7 +169,7 @@ impl Backend for FakeBackend {
 /// Starts a run of that name; it ends when the server is dropped.
 pub fn start(folder: &Path, run: &str, backend: FakeBackend) -> (Server, Arc<FakeBackend>) {
     let backend = Arc::new(backend);
-    let claim = RunDir::at(folder).claim(run).expect("the name is free");
+    let claim = RunDir::closed(folder).claim(run).expect("the name is free");
     (Server::start(claim, backend.clone()).expect("the socket opens"), backend)
 }
 
@@ -242,6 +251,7 @@ pub fn state() -> StateReport {
             hardware_id: "arm".into(),
             simulated: true,
             age_ms: Some(2.5),
+            speed_fraction: None,
             joints: vec![joint(1, 1.5, "measured"), joint(2, -0.25, "estimated")],
             gripper: Some(0.04),
             gripper_unit: Some("m".into()),
@@ -254,6 +264,8 @@ pub fn state() -> StateReport {
                 ..PoseReport::default()
             }),
             device_pose: None,
+            device_tool_pose: None,
+            device_pose_missing: None,
             wrench: None,
         }],
     }

@@ -28,7 +28,7 @@ fn place() -> PathBuf {
     if is_realtime && memory.is_dir() { memory.to_owned() } else { std::env::temp_dir() }
 }
 
-/// A user's folders: sockets, logs, settings. Runs of other users are not visible.
+/// A user's folders: sockets, logs, settings. They are a world for themselves: other runs are not visible.
 pub struct Home(tempfile::TempDir);
 
 impl Home {
@@ -47,6 +47,7 @@ impl Home {
         command
             .env("HOME", self.path())
             .env("XDG_RUNTIME_DIR", self.path().join("run"))
+            .env("DIMOS_WORLD", self.path().join("run"))
             .env("XDG_STATE_HOME", self.path().join("state"))
             .env("XDG_CACHE_HOME", self.path().join("cache"))
             .env("XDG_CONFIG_HOME", self.path().join("config"))
@@ -95,7 +96,7 @@ impl Home {
     }
 
     pub fn runs(&self) -> RunDir {
-        RunDir::at(self.path().join("run/dimos"))
+        RunDir::closed(self.path().join("run/dimos"))
     }
 
     /// A connection to the only run.

@@ -69,6 +69,7 @@ pub fn arm(name: &str, dof: usize) -> ArmConfig {
     let mut limits = JointLimits::uniform(dof, RANGE, V_MAX).with_defaults();
     limits.acceleration_max = vec![A_MAX; dof];
     ArmConfig {
+        tool: None,
         name: name.to_owned(),
         dof,
         limits,

@@ -139,6 +139,7 @@ impl SimArm {
                 _ if self.blocked || !self.enabled => self.q[j],
                 (_, None) => self.q[j],
                 (ControlMode::Velocity, Some(v)) => {
+                    let v = v * self.state.speed_fraction.unwrap_or(1.0);
                     let v = self.v[j] + share * (v - self.v[j]);
                     self.q[j] + v * dt
                 }

@@ -38,6 +38,9 @@ pub struct Hand {
     pub phase: f64,
 }
 
+/// A jump that an operator accepts, with a look at the arm [rad].
+pub(super) const ACCEPTED: f64 = 0.05;
+
 pub struct Trial {
     pub seed: u64,
     pub row: Row,
@@ -47,6 +50,8 @@ pub struct Trial {
     /// The lie, and the arm that it is about: 0, or 1 for the leader.
     pub lie: Option<(usize, Lie)>,
     pub lied_at: Option<(f64, String)>,
+    /// Number of the last written setpoint when the motors came on.
+    pub(super) written_before: u64,
     pub random: Random,
     /// For noise, so that the requests are the same with and without it.
     pub(super) noise: Random,
@@ -130,9 +135,19 @@ impl Trial {
     /// The motors of the arm are switched.
     pub fn switch(&mut self, on: bool) {
         self.arms[0].switch(on);
-        if !on {
-            return;
+        if on {
+            self.written_before = self.said[0].written;
+            self.place();
         }
+    }
+
+    /// Whether nothing was written since the motors came on: where the arm is, only its readings say.
+    pub fn is_unplaced(&self) -> bool {
+        self.arms[0].enabled && self.said[0].written == self.written_before
+    }
+
+    /// The arm is enabled where its readings say that it is.
+    pub fn place(&mut self) {
         let (said, truth) = (self.said[0], &self.arms[0]);
         let (s, l) = (&self.row.arm.supervision, &self.row.arm.limits);
         // What was wrong before the motors came on cannot be seen, unless the controller itself says where it is.
@@ -152,8 +167,15 @@ impl Trial {
             let (v, a) = (truth.traits.v_max[j], l.acceleration_max[j]);
             // It is held as soon as the joint is seen to move.
             let stopped = if self.row.goal_only { f64::INFINITY } else { v * (s.lag + 0.15) + v * v / (2.0 * a) };
-            // On its way there it may reach a speed from which it brakes as far again.
-            let off = if hidden { (2.2 * off).min(stopped) + 0.02f64.max(2.0 * s.accuracy) } else { 0.0 };
+            // On its way there it may reach a speed from which it brakes as far again, and farther where it brakes less
+            // hard than it follows a step.
+            let again = 2.2f64.max(1.2 + 20.0 / a);
+            let off = match hidden {
+                true => (again * off).min(stopped) + 0.02f64.max(2.0 * s.accuracy),
+                // An operator has seen a jump, and has accepted a small one.
+                false if lie.is_some() => (again * off.min(ACCEPTED)).min(stopped),
+                false => 0.0,
+            };
             off + crept + truth.traits.droop[j].abs()
         };
         self.judges[0].placed(&truth.q, extra);

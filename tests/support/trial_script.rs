@@ -13,7 +13,7 @@ use glamx::{DAffine3, DQuat};
 use super::lies::Occasion;
 use super::motion_judge::{Rule, Violation};
 use super::rig::motion;
-use super::trial::{Act, Hand, Trial};
+use super::trial::{ACCEPTED, Act, Hand, Trial};
 
 /// Runs the trial of a seed and returns the rules that it broke.
 pub fn trial(seed: u64, honest: bool, verbose: bool) -> Vec<Violation> {
@@ -127,6 +127,8 @@ impl Trial {
             self.switch(true);
             self.wait(0.02, 0.08);
             self.run_until(0.1, |trial| trial.said[0].enabled);
+        } else if self.is_unplaced() {
+            self.place();
         }
         if lie {
             let s = &self.row.arm.supervision;
@@ -136,7 +138,11 @@ impl Trial {
             self.some_ticks(4);
         } else if self.lied_at.is_some() {
             // Its own stop may have met it short of its setpoint: that much looks like a lie.
-            self.judges[0].widen(STOPPED_SHORT);
+            let (said, truth) = (&self.said[0].position, &self.arms[0].q);
+            let off = said.iter().zip(truth).fold(0.0, |most: f64, (said, q)| most.max((said - q).abs()));
+            // Or an operator has seen that much at a reset, and has accepted it.
+            let seen = if off <= ACCEPTED { 2.2 * off } else { 0.0 };
+            self.judges[0].widen(STOPPED_SHORT.max(seen));
         }
         let outcome = self.ask(Request::Enabled { arm: 0, outside: false });
         if lie {

@@ -71,6 +71,7 @@ impl Trial {
             act,
             lie: (!honest).then_some((usize::from(leader), lie)),
             lied_at: None,
+            written_before: 0,
             noise: Random::new(random.bits()),
             random,
             coordinator: Coordinator::new(&config, TaskTable::builtin().build(&config.tasks).unwrap()),

@@ -2,6 +2,7 @@
 import 'uplot/dist/uPlot.min.css';
 import './style.css';
 import './acts.css';
+import './strip.css';
 import {Context} from './context';
 import {button, el} from './dom';
 import {logPage} from './log/page';
@@ -19,7 +20,7 @@ import {jointsPanel} from './panels/joints';
 import {movePanel} from './panels/move';
 import {notice} from './panels/notice';
 import {plotsPanel} from './panels/plots';
-import {ledNote} from './panels/teach';
+import {strip} from './panels/strip';
 import {timeline} from './panels/timeline';
 import {toolbar} from './panels/toolbar';
 import {worldPanel} from './panels/world';
@@ -94,7 +95,6 @@ function layout(context: Context, canvas: HTMLElement): void {
     canvas,
     toolbar(context),
     offline,
-    ledNote(context),
     notice(context),
     timeline(context),
   );
@@ -130,11 +130,12 @@ function layout(context: Context, canvas: HTMLElement): void {
     class: 'quiet',
   });
   top.element.append(top.stop);
+  const bar = el('div', {class: 'topbar'}, top.element, strip(context));
   left.append(el('footer', {}, el('span', {id: 'version'}), licences));
   context.run.onStatus.on(({version}) => {
     document.getElementById('version')!.textContent = `dimos ${version}`;
   });
-  app.replaceChildren(top.element, left, centre, plotsPanel(context), el('aside', {class: 'right'}, tabs, panels));
+  app.replaceChildren(bar, left, centre, plotsPanel(context), el('aside', {class: 'right'}, tabs, panels));
   choose('move');
 }
 

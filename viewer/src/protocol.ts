@@ -112,10 +112,14 @@ export interface ArmStatus {
   cause: {name: string; text: string} | null;
   enabled: boolean;
   mode: string;
+  /** Fraction of its speed at which its controller runs motions. */
+  speed_fraction?: number | null;
   error: {code: number; text: string} | null;
   state_age_ms: number | null;
   measured_rate_hz: number | null;
   faults: {since: number; over: boolean; count: number; text: string}[];
+  /** How its model fits the arm, in words; absent where there is nothing to say. */
+  model_notes?: string[];
   commander: {program: string; pid: number | null; held_for: number} | null;
   gripper_range?: [number, number] | null;
   gripper_unit?: string | null;

@@ -153,7 +153,7 @@ test('an arm is led by hand, its pose is saved, and it is held again; with motor
   await page.waitForSelector('#support', {state: 'hidden'});
   await page.click('#teach');
   await text(page, '#teach-report', /guided: led by hand, motors on/);
-  await text(page, '#led', /guided is led by hand, motors on/);
+  await text(page, '#strip', /guided is led by hand, motors on/);
   assert.equal(run.arm('guided').phase, 'led');
   await page.fill('.teach input[placeholder]', 'shown');
   await page.click('.teach .save button');
@@ -161,7 +161,7 @@ test('an arm is led by hand, its pose is saved, and it is held again; with motor
   await page.click('#teach-end');
   await text(page, '#teach-report', /guided: ready, held where it is/);
   assert.equal(run.arm('guided').phase, 'ready');
-  await page.waitForSelector('#led', {state: 'hidden'});
+  await text(page, '#strip', /guided ready/);
 
   await page.click('[data-arm=soft] .card-head');
   await page.waitForSelector('#support:visible');

@@ -125,7 +125,7 @@ test('a log that was cut is shown up to the cut', async () => {
   writeFileSync(join(run.home, 'cut.mcap'), bytes.subarray(0, bytes.length * 0.7));
   const {url} = await view('cut.mcap');
   const page = await open(browser, url);
-  await text(page, '#about', /cut: it ends at byte/);
+  await text(page, '#about', /not whole: it ends at byte/);
   await until('joint2 as at the start', async () => near(await joint(page, 2), -0.3));
   await page.context().close();
 });

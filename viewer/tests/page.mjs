@@ -124,6 +124,41 @@ test('Stop holds the moving arm and says so; Reset and Enable are separate acts'
   assert.ok(near(run.positions(), held, 1e-3), 'neither moves the arm');
 });
 
+/** What of an element a person can see and touch: its rectangle inside the window, if nothing lies over its middle. */
+const seen = (page, selector) =>
+  page.evaluate((selector) => {
+    const element = document.querySelector(selector);
+    const {left, top, right, bottom, width, height} = element.getBoundingClientRect();
+    const inside = left >= 0 && top >= 0 && right <= innerWidth && bottom <= innerHeight && width > 0 && height > 0;
+    const over = document.elementFromPoint((left + right) / 2, (top + bottom) / 2);
+    return inside && (element.contains(over) || over?.contains(element)) ? {left, top, right, bottom} : null;
+  }, selector);
+
+test('what keeps an arm from moving is seen on every screen and tab, and Stop is within reach', async () => {
+  run.dimos('stop');
+  run.dimos('speed', '30%');
+  await text(page, '#strip', /speed 30 %/);
+  assert.match(await text(page, '#strip', /held/), /arm held: stopped by an operator/);
+  for (const [width, height] of [[390, 844], [844, 390], [600, 960], [960, 600], [1024, 768], [768, 1024], [1920, 1080]]) {
+    await page.setViewportSize({width, height});
+    for (const tab of ['move', 'jog', 'world', 'events', ...(width <= 960 ? ['arms', 'plots'] : [])]) {
+      const where = `${width} x ${height}, ${tab}`;
+      await click(`[data-tab=${tab}]`);
+      assert.ok(await seen(page, '#strip .bad'), `the held arm: ${where}`);
+      assert.ok(await seen(page, '#strip .warn'), `the speed: ${where}`);
+      assert.ok(await seen(page, '#stop'), `Stop: ${where}`);
+      if (tab === 'jog') assert.ok(await seen(page, '#jog-rows .hold'), `a jog button: ${where}`);
+    }
+    if (process.env.DIMOS_PICTURES) await page.screenshot({path: `${process.env.DIMOS_PICTURES}/${width}x${height}.png`});
+  }
+  await page.setViewportSize({width: 1200, height: 760});
+  await click('[data-tab=move]');
+  run.dimos('speed', '100%');
+  run.dimos('arm', 'reset', 'arm');
+  run.dimos('arm', 'enable', 'arm');
+  await text(page, '#strip', /^arm ready$/);
+});
+
 test('a page that is opened later shows how it came about', async () => {
   const later = await open(browser, run.url);
   const opened = Date.now() / 1000;

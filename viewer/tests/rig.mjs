@@ -158,6 +158,7 @@ export function environment(home) {
     PATH: process.env.PATH,
     HOME: home,
     XDG_RUNTIME_DIR: join(home, 'run'),
+    DIMOS_WORLD: join(home, 'run'),
     XDG_STATE_HOME: join(home, 'state'),
     XDG_CONFIG_HOME: join(home, 'config'),
     XDG_CACHE_HOME: join(home, 'cache'),

@@ -13,9 +13,10 @@ at a time may move an arm: LeaseHeld names the other one. Everything that waits 
 """
 
 from .client import Client
-from .connection import KEPT, MAX_LINE, runs
+from .connection import KEPT, MAX_LINE
 from .errors import (ArmNotReady, ConnectionLost, DimosError, LeaseHeld, MotionFailed, NoRun, OutOfLimits, OutOfReach,
                      PlanningFailed, Refused)
+from .live_runs import runs
 from .records import ArmState, ChunkReport, Goal, Grip, JointState, LoopReport, Plan, Pose, Waypoint
 from .streams import IN_FLIGHT, Policy
 

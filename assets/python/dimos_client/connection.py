@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import socket
-import tempfile
 import time
 from collections import deque
 from pathlib import Path
@@ -14,26 +12,11 @@ from types import TracebackType
 from typing import Any, Callable, Deque, Dict, Iterator, Optional, Type, TypeVar, Union
 
 from .errors import ConnectionLost, NoRun, Refused, refusal
+from .live_runs import _address, _peer, runs
 
 MAX_LINE = 256 * 1024  # bytes of a request
 KEPT = 256  # messages of a subscription that wait to be read; older ones are lost and counted
 _Self = TypeVar("_Self", bound="Connection")
-
-
-def runs() -> Dict[str, Path]:
-    """The sockets of the live runs, by name, where the command line looks for them."""
-    base = os.environ.get("XDG_RUNTIME_DIR", "")
-    folder = Path(base, "dimos") if os.path.isdir(base) else Path(tempfile.gettempdir(), f"dimos-{os.geteuid()}")
-    live = {}
-    for lock in sorted(folder.glob("*.lock")):
-        try:
-            with open(lock) as file:
-                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # what is not locked is what a dead run left
-        except BlockingIOError:
-            live[lock.stem] = lock.with_suffix(".sock")
-        except OSError:
-            pass
-    return live
 
 
 class Connection:
@@ -49,7 +32,10 @@ class Connection:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._socket.settimeout(timeout)
         try:
-            self._socket.connect(str(path))
+            self._socket.connect(_address(path))
+            user = _peer(self._socket)[1]
+            if os.geteuid() not in (0, user):
+                raise PermissionError(f"it belongs to user {user}")
         except OSError as error:
             self._socket.close()
             raise ConnectionLost("NO_CONNECTION", f"{path}: {error}", "see `dimos status`") from None
@@ -61,7 +47,7 @@ class Connection:
         if run is None and len(live) > 1:
             raise NoRun("SEVERAL_RUNS", f"several runs are live: {', '.join(live)}", "say which")
         if not live or run not in (None, *live):
-            raise NoRun("NO_RUN", f"no run is live{f' by the name of {run}' if run else ''}", "start one: dimos run")
+            raise NoRun("NO_RUN", f"no run of this user is live{f' by the name of {run}' if run else ''}", "start one: dimos run")
         return cls(live[run or next(iter(live))], timeout)
 
     @classmethod

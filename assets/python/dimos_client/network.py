@@ -89,6 +89,7 @@ class _Line:
         self.zenoh, self.session, self.line, self.place = zenoh, session, line, f"run {run}"
         self.root, self.id = f"dimos/{run}", str(session.zid())
         self.own = f"{self.root}/by/{user}"
+        self.proof = os.urandom(16)  # another program of the same user cannot speak for this one
         self.lock, self.ended = threading.Lock(), threading.Event()
         self.subscribers: List[Any] = []
         self.alive = session.liveliness().declare_subscriber(f"{self.root}/alive", self._gateway)
@@ -120,7 +121,7 @@ class _Line:
     def _beats(self) -> None:
         name = f"{Path(sys.argv[0]).name or 'python'} on {socket.gethostname()}"
         while not self.ended.is_set():
-            self.session.put(f"{self.own}/client/{self.id}/beat", name)
+            self.session.put(f"{self.own}/client/{self.id}/beat", name, attachment=self.proof)
             self.ended.wait(BEAT)
 
     def _requests(self) -> None:
@@ -142,7 +143,7 @@ class _Line:
             self.subscribers[params["subscription"] - OWN].undeclare()
             return self._say({"id": number, "result": {}})
         key = f"{self.own}/{CLASS_OF.get(method, 'read')}/{self.id}/{method}"
-        replies = self.session.get(key, payload=json.dumps(params), timeout=ANSWERED)
+        replies = self.session.get(key, payload=json.dumps(params), timeout=ANSWERED, attachment=self.proof)
         threading.Thread(target=self._answer, args=(number, method, replies), daemon=True).start()
 
     def _answer(self, number: int, method: str, replies: Any) -> None:

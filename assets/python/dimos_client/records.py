@@ -117,8 +117,10 @@ class Plan:
 class Grip:
     """A gripper after a command."""
     position: float  # in `unit`
-    unit: str  # "m" or "rad"
-    outcome: str  # "open", "closed" or "reached"; "holding" (stopped while closing), "blocked" (opening); "moving"
+    unit: str  # "m", "rad" or "on_off" (0 closed, 1 open)
+    # "open", "closed" or "reached"; "holding" (stopped while closing), "blocked" (opening); "ordered" (nothing measures
+    # the fingers); "moving"
+    outcome: str
     force: Optional[float] = None  # measured, in `force_unit`
     force_unit: Optional[str] = None  # "N", "Nm" or "%"
     elapsed: float = 0.0  # s from the command to the last motion of the fingers

@@ -320,7 +320,8 @@ impl ManipulatorAdapter for AcmeAdapter {
             velocity: Some(from_wire(&state.velocities)),
             effort: None, // YOUR ARM: its torques [Nm], if it measures them; then write `read_joint_efforts` too
             valid: None,
-            commanded: None, // YOUR ARM: what the controller itself commands, if it reports that
+            commanded: None,      // YOUR ARM: what the controller itself commands, if it reports that
+            speed_fraction: None, // YOUR ARM: at which part of its speed the controller runs motions, if it reports that
         };
         Ok(())
     }

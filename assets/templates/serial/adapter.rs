@@ -284,7 +284,8 @@ impl ManipulatorAdapter for AcmeAdapter {
             velocity: Some(self.of_joints(&servos, velocity)),
             effort: None,
             valid: Some(true),
-            commanded: None, // YOUR ARM: what the controller itself commands, if it reports that
+            commanded: None,      // YOUR ARM: what the controller itself commands, if it reports that
+            speed_fraction: None, // YOUR ARM: at which part of its speed the controller runs motions, if it reports that
         };
         Ok(())
     }

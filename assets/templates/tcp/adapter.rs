@@ -255,7 +255,8 @@ impl ManipulatorAdapter for AcmeAdapter {
             velocity: Some(from_wire(&state.velocities)),
             effort: Some(joints_of(&state.torques)),
             valid: None,
-            commanded: None, // YOUR ARM: what the controller itself commands, if it reports that
+            commanded: None,      // YOUR ARM: what the controller itself commands, if it reports that
+            speed_fraction: None, // YOUR ARM: at which part of its speed the controller runs motions, if it reports that
         };
         Ok(())
     }

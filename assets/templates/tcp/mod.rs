@@ -62,6 +62,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     create: |config| Ok(Box::new(adapter::AcmeAdapter::new(config)?)),
     emulate: Some(emulator::start),
     service: None,
+    wire: None, // YOUR ARM: how a captured protocol is read, for `adapter replay`: hardware::wire
 };
 
 /// Checks the number of joints and the options, and returns the joint limits; `dimos check` calls it.

@@ -15,6 +15,7 @@ use super::super::follow::Signals;
 use super::super::output::{self, Table};
 use super::choice::{Choice, not_started};
 use crate::blueprint;
+use crate::bounded;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::registry::{AdapterSpec, Emulator, EmulatorAddress, Registry};
 use crate::hardware::sim::events::{self, SimEvent};
@@ -145,6 +146,7 @@ fn tell(bar: &ProgressBar, zero: Mono) {
             SimEvent::Connected => "a client connected".to_owned(),
             SimEvent::Disconnected => "the client is gone".to_owned(),
             SimEvent::Rejected => "another client was rejected".to_owned(),
+            SimEvent::Foreign => "a client of another user was disconnected".to_owned(),
             SimEvent::Fault(kind) => format!("the fault {} begins", kind.name()),
         };
         bar.suspend(|| output::note(format_args!("{:8.3} s  {what}", at.seconds_since(zero))));
@@ -205,7 +207,8 @@ fn script(text: &str) -> Result<Vec<Fault>> {
     let wrong = |what: String| Failure::usage(format!("--fault {text}: {what}"));
     if !text.contains('=') || Path::new(text).is_file() {
         let hint = "one fault, like at=2,kind=stall,duration=0.5, or a YAML or JSON file with a list of such";
-        let content = std::fs::read_to_string(text).map_err(|e| wrong(format!("no file: {e}")).hint(hint))?;
+        let content = bounded::read_text(Path::new(text), bounded::SMALL)
+            .map_err(|e| wrong(format!("no file: {e}")).hint(hint))?;
         return serde_yaml::from_str(&content).map_err(|e| wrong(e.to_string()));
     }
     let mut fault = serde_json::Map::new();

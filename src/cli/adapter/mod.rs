@@ -1,8 +1,10 @@
-//! `dimos adapter new|test|emulate`: the integration kit.
+//! `dimos adapter new|test|replay|emulate`: the integration kit.
 
 pub(super) mod choice;
 pub mod emulate;
+mod first_day;
 pub mod new;
+pub mod replay;
 mod report;
 pub mod test;
 
@@ -24,6 +26,8 @@ enum Action {
     New(new::Args),
     /// Check an adapter on a real arm, without motion unless allowed, or on its emulator
     Test(test::Args),
+    /// Play the report of a first day: what the arm sent through the decoder, what was sent to it to the emulator
+    Replay(replay::Args),
     /// Run an arm's emulator in its own process, until Ctrl-C
     Emulate(emulate::Args),
 }
@@ -33,6 +37,7 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
     match &args.action {
         Action::New(args) => new::run(args, registry),
         Action::Test(args) => test::run(args, registry),
+        Action::Replay(args) => replay::run(args, registry),
         Action::Emulate(args) => emulate::run(args, registry),
     }
 }

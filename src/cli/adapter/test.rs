@@ -13,6 +13,7 @@ use super::super::exit::{Exit, Failure, Result};
 use super::super::follow::Signals;
 use super::super::output;
 use super::choice::{Choice, not_started};
+use super::first_day;
 use super::report::{Arm, Limits, Report, Row};
 use crate::hardware::adapter::{AdapterError, ManipulatorAdapter, ManipulatorInfo};
 use crate::hardware::conformance::lag::Lag;
@@ -30,6 +31,8 @@ const WATCH: Duration = Duration::from_secs(2);
 Without --allow-motion nothing is enabled and nothing moves. With it, and only when no check failed, after a question, \
 each joint goes 2° to either side and back, one after the other, at 5 % of its top speed; whatever is odd, and Ctrl-C, ends that by a stop.
 With --lag this motion is streamed as setpoints, and the lag is measured: the time from a setpoint to the motion that follows it.
+With --first-day ten minutes of steps measure what only the arm can tell, slow to fast: each is asked for (y, n ends, s skips), Ctrl-C \
+stops the arm and keeps what was measured. --report then writes the file for `dimos adapter replay`, without serial number.
 Stay within reach of the arm's own E-stop button.
 
 Exit codes: 0 all passed, 1 something failed, 2 usage, 3 the arm cannot be reached.")]
@@ -41,18 +44,21 @@ pub struct Args {
     #[arg(long)]
     pub address: Option<String>,
     /// Move each joint a little, slowly
-    #[arg(long)]
+    #[arg(long, group = "motion")]
     pub allow_motion: bool,
     /// Measure the lag by a small slow motion of each joint; a real arm needs --allow-motion too
     #[arg(long)]
     pub lag: bool,
-    /// Do not ask before the motion
-    #[arg(long, requires = "allow_motion")]
+    /// Measure what only the arm can tell, in steps, slow to fast; each is asked for
+    #[arg(long, group = "motion", conflicts_with = "lag")]
+    pub first_day: bool,
+    /// Do not ask before the motion, or before the steps
+    #[arg(long, requires = "motion")]
     pub yes: bool,
-    /// Make only the checks with this in their names
+    /// Make only the checks, or the steps, with this in their names
     #[arg(long, value_name = "TEXT")]
     pub only: Option<String>,
-    /// Write the report as Markdown
+    /// Write the report: as Markdown, or of a first day the file for `adapter replay`
     #[arg(long, value_name = "FILE")]
     pub report: Option<PathBuf>,
     /// Print JSON
@@ -61,17 +67,20 @@ pub struct Args {
 }
 
 /// An arm to test: what its adapter is made from, and what must live as long as the test.
-struct Bench {
-    subject: Subject,
+pub(super) struct Bench {
+    pub(super) subject: Subject,
     /// The address in full.
-    address: String,
-    _emulator: Option<Box<dyn Emulator>>,
+    pub(super) address: String,
+    pub(super) emulator: Option<Box<dyn Emulator>>,
     _lock: Option<DeviceLock>,
 }
 
 /// Runs the verb.
 pub fn run(args: &Args, registry: &Registry) -> Result {
     let row = args.choice.row(registry)?;
+    if args.first_day {
+        return first_day::run(args, &row);
+    }
     let chosen: Vec<&'static Check> =
         checks().filter(|check| args.only.as_ref().is_none_or(|text| check.name.contains(text))).collect();
     if chosen.is_empty() {
@@ -99,7 +108,7 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
     let mut report = Report {
         adapter: row.name.to_owned(),
         address: bench.address.clone(),
-        simulated: bench._emulator.is_some(),
+        simulated: bench.emulator.is_some(),
         when: jiff::Timestamp::from_second(jiff::Timestamp::now().as_second()).unwrap_or_default().to_string(),
         dimos: crate::VERSION,
         arm: arm(&row, info.clone()),
@@ -134,13 +143,13 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
 
 impl Args {
     /// Finds the arm, or starts its emulator.
-    fn bench(&self, row: &AdapterSpec) -> Result<Bench> {
+    pub(super) fn bench(&self, row: &AdapterSpec) -> Result<Bench> {
         let subject = |config: AdapterConfig, real| Subject { config, real, ..Subject::emulated(row) };
         match self.address.as_deref().map(str::trim) {
             Some(SIM) if row.emulate.is_some() => {
                 let (emulator, config) = self.emulate(row)?;
                 let address = config.address.clone();
-                Ok(Bench { subject: subject(config, false), address, _emulator: Some(emulator), _lock: None })
+                Ok(Bench { subject: subject(config, false), address, emulator: Some(emulator), _lock: None })
             }
             None | Some("") if row.address.required => {
                 let failure = Failure::usage(format!("where is the arm? {} needs --address", row.name));
@@ -152,17 +161,15 @@ impl Args {
             }
             None | Some("" | SIM) => {
                 let config = self.made(row, "")?;
-                Ok(Bench { subject: subject(config, false), address: String::new(), _emulator: None, _lock: None })
+                Ok(Bench { subject: subject(config, false), address: String::new(), emulator: None, _lock: None })
             }
             Some(address) => {
                 let full = (row.address.check)(address)
                     .map_err(|e| Failure::usage(format!("--address {address}: {e}")).hint(row.address.form))?;
                 let config = self.made(row, &full)?;
-                let lock = device_lock::take(row.name, &full).map_err(|e| {
-                    let hint = "end the run first: `dimos status` shows it, `dimos down` ends it";
-                    Failure::new(Exit::Hardware, e.to_string()).hint(hint)
-                })?;
-                Ok(Bench { subject: subject(config, true), address: full, _emulator: None, _lock: Some(lock) })
+                let lock = device_lock::take(row.name, &full)
+                    .map_err(|e| Failure::new(Exit::Hardware, e.to_string()).hint(e.hint()))?;
+                Ok(Bench { subject: subject(config, true), address: full, emulator: None, _lock: Some(lock) })
             }
         }
     }

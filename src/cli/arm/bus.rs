@@ -43,10 +43,7 @@ impl fmt::Display for BusArgs {
 
 /// Locks a device against runs and other verbs. `address` is complete.
 pub fn lock(row: &AdapterSpec, address: &str) -> Result<DeviceLock> {
-    device_lock::take(row.name, address).map_err(|e| {
-        let hint = "end the run or verb that uses it first: `dimos status` shows runs, `dimos down` ends one";
-        Failure::new(Exit::Hardware, e.to_string()).hint(hint)
-    })
+    device_lock::take(row.name, address).map_err(|e| Failure::new(Exit::Hardware, e.to_string()).hint(e.hint()))
 }
 
 /// Returns the row of an adapter with work to do outside a run, and its service.

@@ -2,6 +2,7 @@
 
 use std::io::{self, IsTerminal, Write};
 
+use super::super::escapes::safe;
 use super::super::output::Table;
 use crate::hardware::service::Motor;
 
@@ -62,7 +63,7 @@ impl Place {
             return;
         }
         let up = if self.drawn > 0 { format!("\x1b[{}A", self.drawn) } else { String::new() };
-        let text: String = lines.iter().map(|line| format!("\r{line}\x1b[K\n")).collect();
+        let text: String = lines.iter().map(|line| format!("\r{}\x1b[K\n", safe(line, true))).collect();
         self.drawn = lines.len();
         let _ = out.lock().write_all(format!("{up}{text}").as_bytes());
     }

@@ -6,8 +6,9 @@ use super::super::arguments::finite;
 use super::super::exit::{Exit, Result};
 use super::super::output;
 use super::ArmArgs;
+use crate::arm::GripperUnit;
 use crate::rpc::api::{AnalogReport, ArmIo, ArmIoSet, ArmPayload, ArmPayloadSet, IoReport, LoadReport};
-use crate::rpc::report::JointStatusReport;
+use crate::rpc::report::{ArmReport, JointStatusReport};
 
 /// Arguments of `arm io`.
 #[derive(Debug, clap::Args)]
@@ -127,4 +128,18 @@ pub fn io_lines(report: &IoReport) -> Vec<String> {
         lines.push(format!("stop input {}: {state}", stop.input));
     }
     lines
+}
+
+/// Returns ranges and measured force of an arm's gripper; `None` without one, or if nothing is known of it.
+pub fn gripper_line(arm: &ArmReport) -> Option<String> {
+    let (unit, force_unit) = (arm.gripper_unit.as_deref()?, arm.gripper_force_unit.as_deref().unwrap_or_default());
+    let range = arm.gripper_range.map(|[closed, open]| match unit == GripperUnit::OnOff.name() {
+        true => format!("only opens ({open}) and closes ({closed}); nothing measures its fingers"),
+        false => format!("{closed:.4} {unit} closed, {open:.4} {unit} open"),
+    });
+    let commands = arm.gripper_force_range.map(|[least, most]| format!("force {least} to {most} {force_unit}"));
+    let measured = arm.gripper_force.map(|force| format!("measured force {force:.2} {force_unit}"));
+    let speed = arm.gripper_has_speed.then(|| "speed control".to_owned());
+    let parts: Vec<String> = [range, commands, speed, measured].into_iter().flatten().collect();
+    (!parts.is_empty()).then(|| format!("gripper {}", parts.join("; ")))
 }

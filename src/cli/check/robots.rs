@@ -3,12 +3,14 @@
 use std::collections::BTreeMap;
 
 use serde::Serialize;
-use serde_json::{Value, json};
 
 use crate::blueprint::{Blueprint, JointSummary, Summary};
 use crate::cli::output::{self, Table};
-use crate::planning::config::JointBounds;
+use crate::planning::config::{JointBounds, ObjectConfig, ObjectShape};
 use crate::planning::planning_scene::{PlannedRobot, PlanningScene};
+use crate::robot::mesh::Size;
+use crate::robot::{self, Source};
+use crate::yaml::{Diag, Severity};
 
 /// A planned robot.
 #[derive(Debug, Serialize)]
@@ -18,8 +20,10 @@ pub(super) struct Robot {
     end_effector_link: String,
     joints: Vec<Joint>,
     named_poses: Vec<String>,
-    /// Gripper joints without a measurement: assumed fully open.
-    taken_as_open: Vec<String>,
+    /// Joints of the model that joints of other arms move, with the coordinator's names.
+    moved_by_others: BTreeMap<String, String>,
+    /// Joints that nothing is known of, with the widest position, which is assumed [rad or m].
+    assumed: BTreeMap<String, f64>,
     /// Pairs of links that touch in every configuration.
     always_touching: Vec<[String; 2]>,
 }
@@ -34,6 +38,46 @@ struct Joint {
     velocity: Option<f64>,
     acceleration: Option<f64>,
     jerk: Option<f64>,
+}
+
+/// Returns what is doubtful in the files of a blueprint's robots and objects: the warnings of `model check` that need
+/// them. What is wrong with them is an error of [`of`].
+pub(super) fn judge(blueprint: &Blueprint) -> Vec<Diag> {
+    if !blueprint.awaited_assets().is_empty() {
+        return Vec::new();
+    }
+    let planner = blueprint.planner.as_ref();
+    let planned = planner.iter().flat_map(|planner| &planner.robots).map(|robot| (robot.source(), false));
+    // The warnings of their descriptions themselves are not among those of the blueprint.
+    let moved = blueprint.tasks.iter().filter_map(|task| task.robot.as_ref()).filter(|robot| robot.base.is_none());
+    let mut sources: Vec<(Source, bool)> = Vec::new();
+    for (source, whole) in planned.chain(moved.map(|robot| (robot.source.clone(), true))) {
+        if !sources.iter().any(|(known, _)| *known == source) {
+            sources.push((source, whole));
+        }
+    }
+    let mut diags: Vec<Diag> = Vec::new();
+    for (source, whole) in sources {
+        let mut loaded = robot::load(&source);
+        let Some(model) = loaded.model.take() else { continue };
+        let known = if whole { 0 } else { loaded.reports().len() };
+        robot::judge(&mut loaded, &model);
+        let reports = loaded.reports();
+        let listed = reports.iter().filter(|report| report.severity == Severity::Warning).count();
+        let more = loaded.warnings() - listed;
+        for report in reports.into_iter().skip(known).filter(|report| report.severity == Severity::Warning) {
+            diags.push(Diag::warning(report.placed()).maybe_hint(report.hint));
+        }
+        if more > 0 {
+            diags.push(Diag::warning(format!("{more} more warnings about {}", source.path.display())));
+        }
+    }
+    let objects = planner.iter().flat_map(|planner| &planner.objects);
+    diags.extend(objects.filter_map(|object: &ObjectConfig| match &object.shape {
+        ObjectShape::Mesh(path) => Size::read(path).ok()?.doubt_of_object(&object.name, path),
+        _ => None,
+    }));
+    diags
 }
 
 /// Returns the robots of a blueprint, none while assets are missing; the error is the one that a run would report.
@@ -53,7 +97,13 @@ pub(in crate::cli) fn commanded(summary: &Summary) -> BTreeMap<String, JointBoun
         // Position ranges are shown as in the model, beside those of the arm.
         let position = [f64::NEG_INFINITY, f64::INFINITY];
         let velocity = joint.velocity.map_or(f64::INFINITY, |limit| limit.value);
-        JointBounds { position, velocity, acceleration: joint.acceleration.value, jerk: joint.jerk.value }
+        JointBounds {
+            position,
+            velocity,
+            acceleration: joint.acceleration.value,
+            jerk: joint.jerk.value,
+            tcp_velocity: None,
+        }
     };
     summary.arms.iter().flat_map(|arm| &arm.joints).map(|joint| (joint.name.clone(), bounds(joint))).collect()
 }
@@ -77,17 +127,10 @@ fn robot(planned: &PlannedRobot, setup: &PlanningScene) -> Robot {
         end_effector_link: config.end_effector_link.clone(),
         joints: joints.collect(),
         named_poses: config.named_poses.keys().cloned().collect(),
-        taken_as_open: planned.taken_as_open().into_iter().map(|(name, _)| name).collect(),
+        moved_by_others: planned.moved_by_others().map(|(model, ours)| (model.to_owned(), ours.to_owned())).collect(),
+        assumed: planned.assumed().into_iter().collect(),
         always_touching: touching.map(|(_, pair)| pair.clone()).collect(),
     }
-}
-
-/// Adds a run's start-up error to the problems; returns whether the blueprint is still valid.
-pub(super) fn refuse(problems: &mut Value, what: &str) -> Value {
-    if let Some(problems) = problems.as_array_mut() {
-        problems.push(json!({"severity": "error", "message": what}));
-    }
-    json!(false)
 }
 
 pub(super) fn print(robot: &Robot) {
@@ -104,9 +147,14 @@ pub(super) fn print(robot: &Robot) {
     if !robot.named_poses.is_empty() {
         output::line(format_args!("  named poses: {}", robot.named_poses.join(", ")));
     }
-    for joint in &robot.taken_as_open {
-        output::line(format_args!("  {joint} is assumed fully open: its position is not measured"));
-        output::line("  hint: gripper_joint: {joint: …, closed: …, open: …} lets it follow the gripper");
+    for (model, ours) in &robot.moved_by_others {
+        output::line(format_args!("  {model} is where {ours} is measured"));
+    }
+    for (joint, position) in &robot.assumed {
+        output::line(format_args!("  {joint} is assumed at its widest, {position:.4}: nothing measures it"));
+        output::line(format_args!(
+            "  hint: fixed_joints: {{{joint}: {position:.4}}} if it stays there, gripper_joint if a gripper drives it"
+        ));
     }
     for [a, b] in &robot.always_touching {
         output::line(format_args!(

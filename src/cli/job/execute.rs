@@ -23,13 +23,14 @@ use crate::rpc::report::ArmReport;
 const POLL_PERIOD: Duration = Duration::from_millis(50);
 /// Causes of a hold by a person or another program, or by what somebody has put in the way: a job neither clears them
 /// nor continues after them.
-const BY_OTHERS: [&str; 8] = [
+const BY_OTHERS: [&str; 9] = [
     "operator_stop",
     "stop_input",
     "stopped_elsewhere",
     "mode_changed",
     "power_changed",
     "power_lost",
+    "identity_changed",
     "way_blocked",
     "shutdown",
 ];
@@ -310,6 +311,7 @@ impl<'r> Runner<'r, '_> {
                 return Err(Failure::new(Exit::Failed, what).into());
             }
             (Some(GripOutcome::Blocked), _) => "did not get there",
+            (Some(GripOutcome::Ordered), Some(_)) => "cannot tell whether it holds something",
             (Some(_), Some(true)) if !holds => "holds nothing",
             (Some(_), Some(false)) if holds => "holds something",
             _ => return Ok(()),

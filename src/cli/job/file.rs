@@ -7,6 +7,7 @@ use std::time::Duration;
 use super::keys::{self, Group};
 use super::step::{Act, Job, Motion, Step};
 use crate::arm::channel;
+use crate::bounded;
 use crate::cli::arguments::{duration, finite, is_angle, speed, time};
 use crate::cli::exit::{Failure, Result};
 use crate::cli::grip::opening;
@@ -25,7 +26,9 @@ impl Job {
     /// Reads a job. Prints all mistakes.
     pub fn read(path: &Path) -> Result<Self> {
         let file = path.display().to_string();
-        let bytes = std::fs::read(path).map_err(|e| Failure::usage(format!("{file}: {e}")))?;
+        // Also a pipe, as of `do <(command)`.
+        let bytes = std::fs::File::open(path).and_then(|opened| bounded::take(opened, bounded::SMALL));
+        let bytes = bytes.map_err(|e| Failure::usage(format!("{file}: {e}")))?;
         let job = Self::parse(file, &bytes);
         job.verdict().map(|()| job)
     }

@@ -3,6 +3,7 @@
 use std::time::{Duration, Instant};
 
 use super::watch::ArmSnapshot;
+use crate::arm::GripperUnit;
 
 /// Step of a tap, as a part of the range.
 const TAP: f64 = 0.025;
@@ -24,15 +25,18 @@ impl Fingers {
     /// Handles a key that opens or closes. Returns the position to command [m or rad], or why there is none; `Ok(None)`
     /// if the next command is not due yet.
     pub fn step(&mut self, open: bool, seen: &ArmSnapshot, now: Instant) -> Result<Option<f64>, String> {
-        let position = seen.state.as_ref().and_then(|state| state.gripper);
+        let unit = seen.arm.as_ref().and_then(|arm| arm.gripper_unit.as_deref());
+        let on_off = unit == Some(GripperUnit::OnOff.name());
+        let position = seen.state.as_ref().and_then(|state| state.gripper).or(on_off.then_some(0.0));
         let Some(position) = position else { return Err("the arm has no gripper".into()) };
         let range = seen.arm.as_ref().and_then(|arm| arm.gripper_range);
         let Some([closed, opened]) = range else { return Err("the range of the gripper is unknown".into()) };
-        let (mut part, mut sent) = (TAP, None);
+        // One that only opens and closes goes all the way.
+        let (mut part, mut sent) = (if on_off { 1.0 } else { TAP }, None);
         if let Some((before, key, command)) = self.last.filter(|(before, ..)| *before == open)
             && now.saturating_duration_since(key) < HELD
         {
-            (part, sent) = (LEAD, Some(command));
+            (part, sent) = (part.max(LEAD), Some(command));
             self.last = Some((before, now, command));
         }
         if sent.is_some_and(|sent| now.saturating_duration_since(sent) < PERIOD) {
@@ -71,6 +75,18 @@ mod tests {
         near(fingers.step(true, &at(0.075), ms(590)), 0.08);
         near(fingers.step(false, &at(0.04), ms(600)), 0.038);
         near(fingers.step(false, &at(0.04), ms(1400)), 0.038);
-        assert!(fingers.step(true, &ArmSnapshot::default(), ms(1500)).unwrap_err().contains("no gripper"));
+        let valve = |gripper| ArmSnapshot {
+            state: Some(ArmStateReport { gripper, ..Default::default() }),
+            arm: Some(ArmReport {
+                gripper_range: Some([0.0, 1.0]),
+                gripper_unit: Some("on_off".to_owned()),
+                ..Default::default()
+            }),
+            ..ArmSnapshot::default()
+        };
+        let orders = [(true, None), (false, Some(1.0)), (false, Some(0.0)), (true, Some(0.0))];
+        let orders = (0..).zip(orders).map(|(k, (open, now))| fingers.step(open, &valve(now), ms(3000 + 1500 * k)));
+        assert_eq!(orders.collect::<Vec<_>>(), [1.0, 0.0, 0.0, 1.0].map(|to| Ok(Some(to))), "it only opens and closes");
+        assert!(fingers.step(true, &ArmSnapshot::default(), ms(11_500)).unwrap_err().contains("no gripper"));
     }
 }

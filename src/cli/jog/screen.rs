@@ -6,6 +6,7 @@ use super::keys::AXES;
 use super::terminal::{Line, Look};
 use super::watch::ArmSnapshot;
 use crate::cli::output::fixed;
+use crate::rpc::api::gripper_text;
 use crate::rpc::report::{ArmReport, ArmStateReport, JointReport, TaskReport};
 
 /// Age at which a state is highlighted.
@@ -172,7 +173,7 @@ fn pose(state: Option<&ArmStateReport>) -> Vec<Line> {
         let unit = state.gripper_unit.as_deref().unwrap_or("m");
         let force = state.gripper_force.zip(state.gripper_force_unit.as_deref());
         let force = force.map_or_else(String::new, |(force, unit)| format!("  force {force:.2} {unit}"));
-        lines.push(Line::default().and(format!("gripper {gripper:.4} {unit}{force}")));
+        lines.push(Line::default().and(format!("gripper {}{force}", gripper_text(gripper, unit))));
     }
     lines
 }

@@ -12,6 +12,7 @@ use super::link::{self, Link};
 use super::screen::{self, View};
 use super::terminal::Terminal;
 use super::watch::{ArmSnapshot, Watch};
+use crate::cli::arguments::connect;
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::follow::Signals;
 use crate::rpc::api::{Gripper, Lease, Release, State, Stop, TwistFrame};
@@ -229,7 +230,14 @@ impl Session {
         self.held.clear();
         (self.stream, self.resting) = (None, None);
         let arm = self.setting.arm.clone();
-        let text = match self.client.call(Stop { arm: Some(arm.clone()) }) {
+        let stop = Stop { arm: Some(arm.clone()) };
+        let reply = match self.client.call(stop.clone()) {
+            Err(error) if error.is_passing() => {
+                Client::urgent(None, || connect(Some(&self.setting.run)), &stop).map(|(_, reply)| reply)
+            }
+            reply => reply,
+        };
+        let text = match reply {
             Ok(reply) => {
                 let result = reply.arms.get(&arm).map_or("unknown", |confirmation| confirmation.text());
                 format!("stop of {arm}: {result}; next: `dimos arm reset {arm}`, `dimos arm enable {arm}`")

@@ -16,6 +16,7 @@ use crossterm::terminal::{
 };
 use crossterm::{execute, queue};
 
+use crate::cli::escapes::is_hidden;
 use crate::cli::output;
 
 /// Whether it must be restored.
@@ -130,7 +131,7 @@ impl Terminal {
             queue!(out, MoveTo(0, row as u16))?;
             let mut room = columns;
             for (text, look) in new.map_or(&[][..], |line| &line.0) {
-                let text: String = text.chars().filter(|c| !c.is_control()).take(room).collect();
+                let text: String = text.chars().filter(|c| !is_hidden(*c)).take(room).collect();
                 room -= text.chars().count();
                 self.look(&mut out, *look)?;
                 queue!(out, Print(text), SetAttribute(Attribute::Reset), ResetColor)?;

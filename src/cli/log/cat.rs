@@ -4,7 +4,10 @@ use std::fmt::Write as _;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
+use serde_json::Value;
+
 use super::{Part, ended, progress, unreadable, written};
+use crate::cli::escapes::{in_json, safe};
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output;
 use crate::recording::replay::LogReader;
@@ -32,8 +35,10 @@ pub fn run(path: &Path, part: &Part, topics: &[String], json: bool) -> Result {
             line.clear();
             let (time, topic) = (message.time, &channel.topic);
             let _ = match json {
-                true => write!(line, "{{\"topic\":\"{topic}\",\"log_time\":{time},\"data\":"),
-                false => write!(line, "{:10.3}  {topic}  ", time.saturating_sub(began) as f64 * 1e-9),
+                true => write!(line, "{{\"topic\":{},\"log_time\":{time},\"data\":", Value::from(topic.as_str())),
+                false => {
+                    write!(line, "{:10.3}  {}  ", time.saturating_sub(began) as f64 * 1e-9, safe(topic, false))
+                }
             };
             let start = line.len();
             if channel.json(bytes, &mut line).is_err() {
@@ -42,7 +47,7 @@ pub fn run(path: &Path, part: &Part, topics: &[String], json: bool) -> Result {
                 unknown += 1;
             }
             line.push_str(if json { "}\n" } else { "\n" });
-            if !written(&mut out, &line)? {
+            if !written(&mut out, &in_json(&line))? {
                 return Ok(Exit::Ok);
             }
         }
@@ -50,9 +55,6 @@ pub fn run(path: &Path, part: &Part, topics: &[String], json: bool) -> Result {
     if !written(&mut out, "")? || !output::written(out.flush()) {
         return Ok(Exit::Ok);
     }
-    if unknown > 0 {
-        output::note(format_args!("warning: {unknown} messages cannot be decoded by their schema"));
-        return Ok(Exit::Log);
-    }
-    Ok(ended(&scan))
+    scan.not_decoded(unknown);
+    Ok(ended(scan.loss().text().as_deref()))
 }

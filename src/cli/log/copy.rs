@@ -4,7 +4,7 @@ use std::path::Path;
 
 use serde_json::json;
 
-use super::{Part, loss, progress, unreadable};
+use super::{Part, ended, progress, unreadable};
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output;
 use crate::recording::rewrite::{RewriteError, Written, copy};
@@ -13,13 +13,10 @@ use crate::recording::scan::Scan;
 /// Writes a part of a log.
 pub fn cut(path: &Path, part: &Part, to: &Path, json: bool) -> Result {
     let part = part.of(path)?;
-    let mut scan = Scan::open(path).map_err(unreadable)?;
-    scan.part = part;
+    let mut scan = Scan::open_part(path, &[], part).map_err(unreadable)?.with_earlier();
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     let written = copy(&mut scan, to, Some(&name), progress::of_scan(false)).map_err(|e| failure(e, to))?;
-    let loss = loss(&scan);
-    print("cut", loss.as_deref(), &written, to, json);
-    Ok(if loss.is_some() { Exit::Log } else { Exit::Ok })
+    Ok(print("cut", scan.loss().text().as_deref(), &written, to, json))
 }
 
 /// Writes what can be read of a log.
@@ -32,9 +29,7 @@ pub fn recover(path: &Path, to: Option<&Path>, json: bool) -> Result {
     let beside = path.with_file_name(format!("{}-recovered.mcap", path.file_stem().unwrap_or_default().display()));
     let to = to.unwrap_or(&beside);
     let written = copy(&mut scan, to, None, progress::of_scan(false)).map_err(|e| failure(e, to))?;
-    let loss = loss(&scan);
-    print("recovered", loss.as_deref(), &written, to, json);
-    Ok(if loss.is_some() { Exit::Log } else { Exit::Ok })
+    Ok(print("recovered", scan.loss().text().as_deref(), &written, to, json))
 }
 
 /// Returns the failure of a copy; removes what there is of the new file.
@@ -47,15 +42,13 @@ pub fn failure(error: RewriteError, to: &Path) -> Failure {
     Failure::of(exit, error)
 }
 
-fn print(done: &str, loss: Option<&str>, written: &Written, to: &Path, as_json: bool) {
+fn print(done: &str, loss: Option<&str>, written: &Written, to: &Path, as_json: bool) -> Exit {
     let length = written.span.map_or(0.0, |(start, end)| (end - start) as f64 * 1e-9);
     let messages = written.messages;
     if as_json {
         output::json(&json!({"file": to, "messages": messages, "length": length, "loss": loss}));
-        return;
+    } else {
+        output::line(format_args!("{done}: {messages} messages, {length:.3} s: {}", to.display()));
     }
-    output::line(format_args!("{done}: {messages} messages, {length:.3} s: {}", to.display()));
-    if let Some(loss) = loss {
-        output::note(format_args!("warning: the log was not whole: {loss}"));
-    }
+    ended(loss)
 }

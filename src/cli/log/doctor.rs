@@ -5,7 +5,8 @@ use std::path::Path;
 
 use serde_json::{Value, json};
 
-use super::{loss, progress, unreadable};
+use super::info::check_other;
+use super::{progress, unreadable};
 use crate::cli::exit::{Exit, Result};
 use crate::cli::output;
 use crate::recording::messages::Tick;
@@ -21,22 +22,17 @@ pub fn run(path: &Path, json: bool) -> Result {
     while let Some(item) = scan.next_item().map_err(unreadable)? {
         match item {
             Item::Messages => found.batch(&scan),
-            // Of an attachment that is too long for memory there are no contents.
-            Item::Other(record) if record.body.is_empty() => {}
-            Item::Other(record) => {
-                if let Err(e) = mcap::parse_record(record.opcode, &record.body) {
-                    found.problems.push(format!("an attachment at byte {}: {e}", record.at));
-                }
-            }
+            Item::Other(record) => drop(check_other(&mut scan, &record)),
         }
         bar(&scan);
     }
-    found.problems.extend(loss(&scan));
-    let counted = scan.counted().filter(|count| *count != found.messages);
-    if let Some(counted) = counted.filter(|_| scan.damage.is_empty()) {
+    let loss = scan.loss();
+    let counted = scan.statistics().map(|(count, _)| count).filter(|count| *count < found.messages);
+    found.problems.extend(loss.text());
+    if let Some(counted) = counted.filter(|_| scan.is_complete()) {
         found.problems.push(format!("the summary counts {counted} messages, the log has {}", found.messages));
     }
-    if scan.complete && scan.damage.is_empty() {
+    if scan.is_complete() && loss.damage.is_empty() {
         for part in parts(path).map_err(unreadable)? {
             let wrong = check_sections(&part).map_err(unreadable)?;
             found.problems.extend(wrong.map(|wrong| format!("{}: {wrong}", part.display())));
@@ -80,8 +76,8 @@ struct Findings {
     lost: u64,
     undecoded: u64,
     unordered: u64,
-    /// Latest time on each channel.
-    times: BTreeMap<u16, u64>,
+    /// Where the latest message of each channel was written.
+    times: BTreeMap<u16, (usize, u64)>,
     problems: Vec<String>,
     text: String,
 }
@@ -94,11 +90,11 @@ impl Findings {
             // Only schemas that are understood can be checked.
             let wrong = channel.decoder.is_some() && channel.json(bytes, &mut self.text).is_err();
             self.undecoded += u64::from(wrong);
-            let last = self.times.insert(message.channel, message.time);
+            let last = self.times.insert(message.channel, message.place);
             // Notes of other threads have their own times.
             let of_ticks =
                 !matches!(channel.topic.as_str(), "/rosout" | "/dimos/requests" | "/markers" | "/joint_trajectory");
-            self.unordered += u64::from(of_ticks && last.is_some_and(|last| message.time < last));
+            self.unordered += u64::from(of_ticks && last.is_some_and(|last| message.place < last));
             if channel.topic == "/dimos/tick" {
                 self.tick(bytes);
             }

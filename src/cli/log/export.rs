@@ -1,14 +1,17 @@
 //! `dimos log export`: joint values as CSV or Parquet, or the messages of a topic as CSV.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
 use serde_json::{Value, json};
 
-use super::{Part, ended, progress, unreadable, written};
+use super::{Part, STATES, ended, no_states, progress, unreadable, written};
+use crate::cli::escapes::safe;
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output;
+use crate::recording::joints::Places;
 use crate::recording::messages::JointState;
 use crate::recording::parquet::{Column, ParquetWriter};
 use crate::recording::replay::{Entry, LogReader, Payload, ReplayError, Selection};
@@ -23,7 +26,7 @@ pub fn csv(path: &Path, part: &Part, topic: Option<&str>, to: Option<&Path>, jso
         Some(to) => Box::new(new_file(to)?),
     };
     let mut rows = Rows { out: &mut *out, began, count: 0, prints: to.is_none() };
-    let exit = match topic {
+    let loss = match topic {
         Some(topic) => rows.topic(path, topic, (from, until))?,
         None => rows.joints(path, (from, until))?,
     };
@@ -34,9 +37,13 @@ pub fn csv(path: &Path, part: &Part, topic: Option<&str>, to: Option<&Path>, jso
         return Err(Failure::new(Exit::Failed, format!("cannot write: {e}")));
     }
     if let Some(to) = to {
-        output::done(format_args!("{count} rows: {}", to.display()), json!({"file": to, "rows": count}), json);
+        output::done(
+            format_args!("{count} rows: {}", to.display()),
+            json!({"file": to, "rows": count, "loss": loss}),
+            json,
+        );
     }
-    Ok(exit)
+    Ok(ended(loss.as_deref()))
 }
 
 /// Exports joint states and commands as a Parquet file, with the columns of the text; unknown values are NaN.
@@ -50,10 +57,10 @@ pub fn parquet(path: &Path, part: &Part, to: &Path, json: bool) -> Result {
     columns.extend(columns_of(&names).map(|name| (name, numbers())));
     let failed = |e| cannot_write(to, e);
     let mut file = ParquetWriter::new(out, columns).map_err(failed)?;
-    let exit = joint_rows(path, part_of_log, names.len(), false, |time, values| {
+    let loss = joint_rows(path, part_of_log, &names, false, |time, values| {
         for (column, value) in file.columns.iter_mut().skip(2).zip(values) {
             if let Column::Numbers(list) = column {
-                list.push(value.unwrap_or(f64::NAN));
+                list.push(*value);
             }
         }
         if let [Column::Numbers(seconds), Column::Integers(times), ..] = &mut file.columns[..] {
@@ -63,8 +70,8 @@ pub fn parquet(path: &Path, part: &Part, to: &Path, json: bool) -> Result {
         file.row_added().map_err(failed).map(|()| true)
     })?;
     let rows = file.finish(&[]).map_err(failed)?;
-    output::done(format_args!("{rows} rows: {}", to.display()), json!({"file": to, "rows": rows}), json);
-    Ok(exit)
+    output::done(format_args!("{rows} rows: {}", to.display()), json!({"file": to, "rows": rows, "loss": loss}), json);
+    Ok(ended(loss.as_deref()))
 }
 
 /// Creates a file that must not exist yet.
@@ -77,22 +84,26 @@ pub fn cannot_write(to: &Path, e: io::Error) -> Failure {
     Failure::new(Exit::Failed, format!("cannot write {}: {e}", to.display())).hint("choose another file")
 }
 
-const STATES: &str = "/joint_states";
 const COMMANDS: &str = "/joint_commands";
 
-/// Returns the names in joint states; a gripper gets its name when it is first measured.
+/// Returns all names in joint states, in the order in which they appear: a gripper gets its name when it is first
+/// measured.
 fn joint_names(path: &Path, (from, to): (u64, u64), prints: bool) -> Result<Vec<String>> {
     let mut names: Vec<String> = Vec::new();
     let mut log = LogReader::open(path).map_err(unreadable)?;
     let states = Selection { topics: vec![STATES.to_owned()], from, to };
-    each(&mut log, states, progress::bar(prints), |entry| {
-        if let Payload::JointState(state) = entry.data
-            && state.name.len() > names.len()
-        {
-            names = state.name;
+    let loss = each(&mut log, states, progress::bar(prints), |entry| {
+        let Payload::JointState(state) = entry.data else { return Ok(true) };
+        if names != state.name {
+            let new: Vec<String> = state.name.into_iter().filter(|name| !names.contains(name)).collect();
+            names.extend(new);
         }
         Ok(true)
     })?;
+    // What is damaged may have had them.
+    if names.is_empty() && loss.is_none() {
+        return Err(no_states(path, log.info()));
+    }
     Ok(names)
 }
 
@@ -102,31 +113,41 @@ fn columns_of(names: &[String]) -> impl Iterator<Item = String> {
     names.iter().flat_map(move |name| columns.map(|column| format!("{name}.{column}")))
 }
 
-/// Passes on time [ns] and values of each joint state and the commands with it, until `row` returns `false`.
+/// Passes on time [ns] and values of each joint state and the commands with it, by the names of the joints; NaN where
+/// the message has none. Ends when `row` returns `false`. Returns what the log lacks.
 fn joint_rows(
     path: &Path,
     (from, to): (u64, u64),
-    joints: usize,
+    names: &[String],
     prints: bool,
-    mut row: impl FnMut(u64, &[Option<f64>]) -> Result<bool>,
-) -> Result {
+    mut row: impl FnMut(u64, &[f64]) -> Result<bool>,
+) -> Result<Option<String>> {
     let mut log = LogReader::open(path).map_err(unreadable)?;
     let mut waiting: Option<(u64, JointState)> = None;
-    let mut commands = JointState::default();
-    let mut write = |time: u64, state: &JointState, commands: &JointState| {
-        let lists = [&commands.position, &commands.velocity, &commands.effort];
-        // One of them has a value: an arm has one mode at a time.
-        let command = |i: usize| lists.iter().filter_map(|list| list.get(i)).copied().find(|v| !v.is_nan());
-        let of = |list: &[f64], i: usize| list.get(i).copied();
-        let values = |i| [of(&state.position, i), of(&state.velocity, i), of(&state.effort, i), command(i)];
-        let values: Vec<Option<f64>> = (0..joints).flat_map(values).collect();
+    let mut commands = BTreeMap::<String, f64>::new();
+    let mut places = Places::new(names);
+    let mut write = |time: u64, state: &JointState, commands: &BTreeMap<String, f64>| {
+        let mut values = vec![f64::NAN; 4 * names.len()];
+        for (column, list) in [&state.position, &state.velocity, &state.effort].into_iter().enumerate() {
+            let cells = values.iter_mut().skip(column).step_by(4);
+            cells.zip(places.pick(&state.name, list)).for_each(|(cell, value)| *cell = value);
+        }
+        for (cell, name) in values.iter_mut().skip(3).step_by(4).zip(names) {
+            *cell = commands.get(name).copied().unwrap_or(f64::NAN);
+        }
         row(time, &values)
     };
     let both = Selection { topics: vec![STATES.to_owned(), COMMANDS.to_owned()], from, to };
-    let cut = each(&mut log, both, progress::bar(prints), |entry| {
+    let loss = each(&mut log, both, progress::bar(prints), |entry| {
         let Payload::JointState(values) = entry.data else { return Ok(true) };
         if entry.topic == COMMANDS {
-            commands = values;
+            let JointState { name, position, velocity, effort, .. } = values;
+            for (i, name) in name.into_iter().enumerate() {
+                // One of them has a value: an arm has one mode at a time.
+                let lists = [&position, &velocity, &effort].into_iter();
+                let command = lists.filter_map(|list| list.get(i)).copied().find(|v| !v.is_nan());
+                commands.extend(command.map(|command| (name, command)));
+            }
             return Ok(true);
         }
         let last = waiting.replace((entry.log_time, values));
@@ -136,13 +157,7 @@ fn joint_rows(
     if let Some((time, state)) = waiting {
         write(time, &state, &commands)?;
     }
-    match cut.filter(|_| !log.info().live) {
-        Some(cut) => {
-            output::note(format_args!("warning: {cut}"));
-            Ok(Exit::Log)
-        }
-        None => Ok(Exit::Ok),
-    }
+    Ok(loss)
 }
 
 struct Rows<'a> {
@@ -164,68 +179,91 @@ impl Rows<'_> {
             line.push_str(&cell);
         });
         line.push('\n');
-        written(self.out, &line)
+        self.write(&line)
+    }
+
+    /// Writes to the file as it is, and to stdout as a terminal may get it.
+    fn write(&mut self, text: &str) -> Result<bool> {
+        written(self.out, &if self.prints { safe(text, false) } else { text.into() })
     }
 
     fn heading(&mut self, names: impl Iterator<Item = String>) -> Result<bool> {
         let names: String = names.map(|name| format!(",{}", quoted(&name))).collect();
-        written(self.out, &format!("time{names}\n"))
+        self.write(&format!("time{names}\n"))
     }
 
     /// Writes joint states and commands, a row for each state.
-    fn joints(&mut self, path: &Path, part: (u64, u64)) -> Result {
+    fn joints(&mut self, path: &Path, part: (u64, u64)) -> Result<Option<String>> {
         let names = joint_names(path, part, self.prints)?;
         self.heading(columns_of(&names))?;
-        joint_rows(path, part, names.len(), self.prints, |time, values| {
-            self.row(time, values.iter().copied().map(cell))
-        })
+        joint_rows(path, part, &names, self.prints, |time, values| self.row(time, values.iter().copied().map(cell)))
     }
 
-    /// Writes the messages of a topic, with the columns of the first one.
-    fn topic(&mut self, path: &Path, topic: &str, part: (u64, u64)) -> Result {
-        let mut scan = Scan::open_part(path, &[topic.to_owned()], part).map_err(unreadable)?;
-        let (mut columns, mut text, mut bar) = (Vec::<String>::new(), String::new(), progress::of_scan(self.prints));
-        while let Some(item) = scan.next_item().map_err(unreadable)? {
-            bar(&scan);
-            let Item::Messages = item else { continue };
-            for (message, channel, bytes) in scan.messages() {
-                if channel.topic != topic || !(part.0..=part.1).contains(&message.time) {
-                    continue;
-                }
-                text.clear();
-                let Ok(()) = channel.json(bytes, &mut text) else { continue };
-                let mut cells = Vec::new();
-                flatten(String::new(), &serde_json::from_str(&text).unwrap_or_default(), &mut cells);
-                if columns.is_empty() {
-                    columns = cells.iter().map(|(name, _)| name.clone()).collect();
-                    self.heading(columns.iter().cloned())?;
-                }
-                let of = |column: &String| cells.iter().find(|(name, _)| name == column);
-                let row = columns.iter().map(|column| of(column).map_or_else(String::new, |(_, value)| value.clone()));
-                if !self.row(message.time, row)? {
-                    return Ok(Exit::Ok);
-                }
-            }
-        }
-        if columns.is_empty() {
-            let topics: Vec<&str> = scan.channels.values().map(|channel| channel.topic.as_str()).collect();
+    /// Writes the messages of a topic, with the columns of all of them in the order in which they appear.
+    fn topic(&mut self, path: &Path, topic: &str, part: (u64, u64)) -> Result<Option<String>> {
+        let (mut columns, mut seen) = (Vec::new(), BTreeSet::new());
+        let (loss, topics) = messages(path, topic, part, self.prints, |_, cells| {
+            let new = cells.iter().filter(|(name, _)| seen.insert(name.clone()));
+            columns.extend(new.map(|(name, _)| name.clone()));
+            Ok(true)
+        })?;
+        if columns.is_empty() && loss.is_none() {
             let what = format!("there is no message on {topic} in this part of the log");
-            return Err(Failure::usage(what).hint(format!("topics: {}", topics.join(", "))));
+            return Err(Failure::usage(what).hint(format!("topics: {topics}")));
         }
-        Ok(ended(&scan))
+        self.heading(columns.iter().cloned())?;
+        messages(path, topic, part, self.prints, |time, cells| {
+            let cells: BTreeMap<String, String> = cells.into_iter().collect();
+            self.row(time, columns.iter().map(|column| cells.get(column).cloned().unwrap_or_default()))
+        })?;
+        Ok(loss)
     }
 }
 
-/// Reads the selected messages of a log until `take` returns `false`; returns the cut, if they reach to it. `progress`
-/// gets how much of how much time is read [ns].
+/// Passes on the time [ns] and the values of each message of a topic until `each` returns `false`. Returns what the log
+/// lacks, and all topics.
+fn messages(
+    path: &Path,
+    topic: &str,
+    part: (u64, u64),
+    prints: bool,
+    mut each: impl FnMut(u64, Vec<(String, String)>) -> Result<bool>,
+) -> Result<(Option<String>, String)> {
+    let mut scan = Scan::open_part(path, &[topic.to_owned()], part).map_err(unreadable)?;
+    let (mut text, mut wrong, mut bar) = (String::new(), 0, progress::of_scan(prints));
+    while let Some(item) = scan.next_item().map_err(unreadable)? {
+        bar(&scan);
+        let Item::Messages = item else { continue };
+        for (message, channel, bytes) in scan.messages() {
+            if channel.topic != topic || !(part.0..=part.1).contains(&message.time) {
+                continue;
+            }
+            text.clear();
+            let Ok(()) = channel.json(bytes, &mut text) else {
+                wrong += 1;
+                continue;
+            };
+            let mut cells = Vec::new();
+            flatten(String::new(), &serde_json::from_str(&text).unwrap_or_default(), &mut cells);
+            if !each(message.time, cells)? {
+                return Ok((None, String::new()));
+            }
+        }
+    }
+    scan.not_decoded(wrong);
+    let topics: Vec<&str> = scan.channels.values().map(|channel| channel.topic.as_str()).collect();
+    Ok((scan.loss().text(), topics.join(", ")))
+}
+
+/// Reads the selected messages of a log until `take` returns `false`, also after damage; returns what the part lacks.
+/// `progress` gets how much of how much time is read [ns].
 pub fn each(
     log: &mut LogReader,
     selection: Selection,
     mut progress: impl FnMut(u64, u64),
     mut take: impl FnMut(Entry) -> Result<bool>,
-) -> Result<Option<ReplayError>> {
+) -> Result<Option<String>> {
     let (from, length) = (selection.from, selection.to.saturating_sub(selection.from));
-    let reaches_end = log.info().span.is_none_or(|(_, end)| selection.to >= end);
     log.select(selection).map_err(unreadable)?;
     loop {
         match log.next_entry() {
@@ -235,15 +273,16 @@ pub fn each(
                     return Ok(None);
                 }
             }
-            Ok(None) => return Ok(None),
-            Err(cut @ ReplayError::Cut { .. }) => return Ok(Some(cut).filter(|_| reaches_end)),
+            Ok(None) => return Ok(log.loss().text()),
+            // It is in the loss.
+            Err(ReplayError::Cut { .. } | ReplayError::Damaged { .. }) => {}
             Err(e) => return Err(unreadable(e)),
         }
     }
 }
 
-fn cell(value: Option<f64>) -> String {
-    value.filter(|v| v.is_finite()).map_or_else(String::new, |v| format!("{v:?}"))
+fn cell(value: f64) -> String {
+    if value.is_finite() { format!("{value:?}") } else { String::new() }
 }
 
 /// Adds the values of a message with their names: `header.stamp.sec`, `position[0]`.

@@ -3,14 +3,18 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use mcap::records::{Record, op};
 use serde_json::{Value, json};
 
-use super::{progress, unreadable};
-use crate::cli::exit::{Exit, Result};
+use super::{ended, progress, unreadable};
+use crate::cli::exit::Result;
 use crate::cli::output::{self, Table, fixed};
+use crate::recording::attachment::{self, LoggedAttachment};
 use crate::recording::disk_space::Megabytes;
 use crate::recording::files;
+use crate::recording::records::RawRecord;
 use crate::recording::replay::{LogInfo, LogReader, ReplayError};
+use crate::recording::rewrite::DAMAGED;
 use crate::recording::scan::{Item, Scan};
 
 /// Prints what is in a log.
@@ -25,16 +29,15 @@ pub fn run(path: &Path, json: bool) -> Result {
                 scan.messages().for_each(|(message, ..)| *counts.entry(message.channel).or_default() += 1);
             }
             Item::Other(record) => {
-                if let Ok(mcap::records::Record::Attachment { header, data, .. }) =
-                    mcap::parse_record(record.opcode, &record.body)
-                {
-                    attachments.push(json!({"name": header.name, "size": data.len()}));
-                }
+                let found = check_other(&mut scan, &record);
+                attachments.extend(found.map(|found| json!({"name": found.header.name, "size": found.data.len()})));
             }
         }
         bar(&scan);
     }
     let faults = faults(path, info).map_err(unreadable)?;
+    let loss = scan.loss().text();
+    let state = if loss.is_some() && info.complete { "damaged" } else { state(info) };
     let length = length(info);
     let mut topics: Vec<_> = scan.channels.iter().collect();
     topics.sort_by_key(|(_, channel)| &channel.topic);
@@ -48,17 +51,17 @@ pub fn run(path: &Path, json: bool) -> Result {
         });
         let mut data = json!({
             "path": path, "size": size, "length": length, "start": info.span.map(|(start, _)| start),
-            "state": state(info), "metadata": info.metadata, "topics": topics.collect::<Vec<_>>(),
+            "state": state, "loss": loss, "metadata": info.metadata, "topics": topics.collect::<Vec<_>>(),
             "attachments": attachments, "faults": faults,
         });
         if let Some(arms) = arms(info) {
             data["arms"] = json!(arms);
         }
         output::json(&data);
-        return Ok(exit(info, &scan));
+        return Ok(ended(loss.as_deref()));
     }
     let text = |key: &str| info.metadata.get(key).map_or("-", String::as_str);
-    output::line(format_args!("{}: {}", path.display(), state(info)));
+    output::line(format_args!("{}: {state}", path.display()));
     output::line(format_args!("run {}, started {}, {length:.3} s, {}", text("run"), started(info), Megabytes(size)));
     let (version, config) = (text("dimos_version"), text("config_version"));
     output::line(format_args!("dimos {version}, config version {config}, tick rate {} Hz", text("tick_rate")));
@@ -75,11 +78,31 @@ pub fn run(path: &Path, json: bool) -> Result {
         let time = fault["time"].as_f64().unwrap_or(0.0);
         output::line(format_args!("{time:10.3} s  {}", fault["text"].as_str().unwrap_or_default()));
     }
-    Ok(exit(info, &scan))
+    Ok(ended(loss.as_deref()))
 }
 
-fn exit(info: &LogInfo, scan: &Scan) -> Exit {
-    if (info.complete || info.live) && scan.damage.is_empty() { Exit::Ok } else { Exit::Log }
+/// Checks an attachment or metadata, and adds its damage to what the log lacks. Returns the attachment.
+pub fn check_other(scan: &mut Scan, record: &RawRecord) -> Option<LoggedAttachment> {
+    if record.opcode == op::ATTACHMENT {
+        let found = attachment::of(&record.body);
+        let (name, damage) = match &found {
+            None => ("an attachment", Some("it cannot be read")),
+            Some(found) => (found.header.name.as_str(), found.damage.as_deref()),
+        };
+        if let Some(why) = damage {
+            scan.lacks(format!("{name} at byte {}: {why}", record.at));
+        }
+        return found;
+    }
+    match mcap::parse_record(record.opcode, &record.body) {
+        // What was damaged already in the log that this one is a copy of.
+        Ok(Record::Metadata(found)) if found.name == DAMAGED => {
+            found.metadata.iter().for_each(|(name, why)| scan.lacks(format!("{name}: {why}")));
+        }
+        Ok(_) => {}
+        Err(e) => scan.lacks(format!("metadata at byte {}: {e}", record.at)),
+    }
+    None
 }
 
 /// Returns the length of a log [s].

@@ -7,9 +7,10 @@ use std::path::Path;
 use serde_json::{Value, json};
 
 use super::export::{cannot_write, each, new_file};
-use super::{Part, progress, unreadable};
-use crate::cli::exit::{Exit, Failure, Result};
+use super::{Part, ended, progress, unreadable};
+use crate::cli::exit::{Failure, Result};
 use crate::cli::output;
+use crate::recording::joints::Places;
 use crate::recording::parquet::{Column, ParquetWriter};
 use crate::recording::replay::{LogReader, Payload, Selection};
 
@@ -50,7 +51,7 @@ pub fn run(path: &Path, part: &Part, folder: &Path, fps: Option<u32>, task: Opti
     ];
     let columns = columns.map(|(name, column)| (name.to_owned(), column)).into();
     frames.file = Some(ParquetWriter::new(new_file(&folder.join(DATA))?, columns).map_err(failed)?);
-    let cut = frames.read(&mut log, (from, to), &arms, &failed)?;
+    let loss = frames.read(&mut log, (from, to), &arms, &failed)?;
     let Frames { names, file, figures, .. } = frames;
     let rows = file.map_or(Ok(0), |file| file.finish(&[])).map_err(failed)?;
     if rows == 0 {
@@ -76,19 +77,13 @@ pub fn run(path: &Path, part: &Part, folder: &Path, fps: Option<u32>, task: Opti
     }
     write_tasks(folder, task, rows).map_err(failed)?;
     let seconds = rows as f64 / rate;
-    let data = json!({"folder": folder, "frames": rows, "fps": rate, "length": seconds});
+    let data = json!({"folder": folder, "frames": rows, "fps": rate, "length": seconds, "loss": loss});
     output::done(
         format_args!("1 episode, {rows} frames ({seconds:.3} s at {rate} Hz): {}", folder.display()),
         data,
         json,
     );
-    Ok(match cut {
-        Some(cut) => {
-            output::note(format_args!("warning: {cut}"));
-            Exit::Log
-        }
-        None => Exit::Ok,
-    })
+    Ok(ended(loss.as_deref()))
 }
 
 /// Writes what the episode is, and what its task is.
@@ -178,11 +173,11 @@ impl Frames {
             Selection { topics: vec!["/joint_states".to_owned()], from, to },
             |_, _| (),
             |entry| {
-                if let Payload::JointState(state) = entry.data {
-                    // Joint states have the order of the arms, and then grippers, which may be joints of a model.
-                    joints = arms.values().map(Vec::len).sum::<usize>().min(state.name.len());
-                    names = state.name.into_iter().take(joints).collect();
-                }
+                let Payload::JointState(state) = entry.data else { return Ok(true) };
+                // Grippers are among them as joints of a model.
+                let of_arms = |name: &String| arms.values().flatten().any(|joint| joint == name);
+                names = state.name.into_iter().filter(of_arms).collect();
+                joints = names.len();
                 Ok(false)
             },
         )?;
@@ -201,7 +196,8 @@ impl Frames {
     ) -> Result<Option<String>> {
         let mut topics = vec!["/joint_states".to_owned(), "/joint_commands".to_owned()];
         topics.extend(arms.keys().flat_map(|arm| [format!("/gripper/{arm}"), format!("/dimos/outputs/{arm}")]));
-        let cut = each(log, Selection { topics, from, to }, progress::bar(false), |entry| {
+        let mut places = Places::new(&self.names[..self.joints]);
+        let loss = each(log, Selection { topics, from, to }, progress::bar(false), |entry| {
             if entry.log_time != self.at {
                 self.frames_before(entry.log_time).map_err(failed)?;
                 self.at = entry.log_time;
@@ -210,14 +206,17 @@ impl Frames {
                 |arm: &str| self.names.iter().skip(self.joints).position(|name| *name == format!("{arm}_gripper"));
             match entry.data {
                 Payload::JointState(values) if entry.topic == "/joint_states" => {
-                    let joints = self.joints;
-                    self.state.iter_mut().zip(&values.position).take(joints).for_each(|(own, now)| *own = *now);
-                    // Without a command of a position an arm is to stay where it is.
-                    self.action.iter_mut().zip(&values.position).take(joints).for_each(|(own, now)| *own = *now);
+                    let known = places.pick(&values.name, &values.position);
+                    for ((state, action), now) in self.state.iter_mut().zip(&mut self.action).zip(known) {
+                        // Without a command of a position an arm is to stay where it is.
+                        if now.is_finite() {
+                            (*state, *action) = (now, now);
+                        }
+                    }
                 }
                 Payload::JointState(values) if entry.topic == "/joint_commands" => {
-                    let known = self.action.iter_mut().zip(&values.position).take(self.joints);
-                    known.filter(|(_, now)| now.is_finite()).for_each(|(own, now)| *own = *now);
+                    let known = self.action.iter_mut().zip(places.pick(&values.name, &values.position));
+                    known.filter(|(_, now)| now.is_finite()).for_each(|(own, now)| *own = now);
                 }
                 Payload::JointState(values) => {
                     let at = entry.topic.strip_prefix("/gripper/").and_then(index).map(|at| at + self.joints);
@@ -238,7 +237,7 @@ impl Frames {
             Ok(true)
         })?;
         self.frames_before(self.at.saturating_add((0.25e9 / self.rate) as u64)).map_err(failed)?;
-        Ok(cut.filter(|_| !log.info().live).map(|cut| cut.to_string()))
+        Ok(loss)
     }
 
     /// Adds the frames before a time [ns].

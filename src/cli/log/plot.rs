@@ -6,7 +6,7 @@ use std::path::Path;
 use serde_json::json;
 
 use super::export::each;
-use super::{Part, progress, unreadable};
+use super::{Part, ended, no_states, progress, unreadable};
 use crate::arm::GripperUnit;
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output;
@@ -40,7 +40,7 @@ pub fn run(path: &Path, part: &Part, joints: &[String], to: &Path, json: bool) -
     let mut log = LogReader::open(path).map_err(unreadable)?;
     let (mut names, mut curves) = (Vec::<String>::new(), Vec::<[Curve; 2]>::new());
     let topics = vec!["/joint_states".to_owned(), "/joint_commands".to_owned()];
-    let cut = each(&mut log, Selection { topics, from, to: until }, progress::bar(false), |entry| {
+    let loss = each(&mut log, Selection { topics, from, to: until }, progress::bar(false), |entry| {
         let Payload::JointState(values) = entry.data else { return Ok(true) };
         let time = entry.log_time.saturating_sub(began) as f64 * 1e-9;
         let kind = usize::from(entry.topic == "/joint_commands");
@@ -56,6 +56,9 @@ pub fn run(path: &Path, part: &Part, joints: &[String], to: &Path, json: bool) -
         }
         Ok(true)
     })?;
+    if names.is_empty() && loss.is_none() {
+        return Err(no_states(path, log.info()));
+    }
     if let Some(unknown) = joints.iter().find(|joint| !names.contains(joint)) {
         let what = format!("the log has no position of a joint {unknown}");
         return Err(Failure::usage(what).hint(format!("joints: {}", names.join(", "))));
@@ -86,16 +89,10 @@ pub fn run(path: &Path, part: &Part, joints: &[String], to: &Path, json: bool) -
     let count = drawn.len();
     output::done(
         format_args!("{count} {}: {}", if count == 1 { "joint" } else { "joints" }, to.display()),
-        json!({"file": to, "joints": count}),
+        json!({"file": to, "joints": count, "loss": loss}),
         json,
     );
-    Ok(match cut.filter(|_| !log.info().live) {
-        Some(cut) => {
-            output::note(format_args!("warning: {cut}"));
-            Exit::Log
-        }
-        None => Exit::Ok,
-    })
+    Ok(ended(loss.as_deref()))
 }
 
 /// Returns the position limits of a joint [rad]; `None` for a gripper.

@@ -7,8 +7,8 @@ use serde_json::json;
 
 use super::copy::failure;
 use super::export::cannot_write;
-use super::{Part, loss, progress, unreadable};
-use crate::cli::exit::{Exit, Result};
+use super::{Part, ended, progress, unreadable};
+use crate::cli::exit::Result;
 use crate::cli::output;
 use crate::recording::rewrite::copy;
 use crate::recording::scan::Scan;
@@ -19,18 +19,14 @@ pub fn run(path: &Path, part: &Part, folder: &Path, json: bool) -> Result {
     std::fs::create_dir(folder).map_err(|e| cannot_write(folder, e))?;
     let name = format!("{}_0.mcap", folder.file_name().unwrap_or_default().display());
     let to = folder.join(&name);
-    let mut scan = Scan::open(path).map_err(unreadable)?;
-    scan.part = part;
+    let mut scan = Scan::open_part(path, &[], part).map_err(unreadable)?.with_earlier();
     copy(&mut scan, &to, None, progress::of_scan(false)).map_err(|e| failure(e, &to))?;
     let metadata = metadata(&to, &name).map_err(unreadable)?;
     let file = folder.join("metadata.yaml");
     std::fs::write(&file, metadata).map_err(|e| cannot_write(&file, e))?;
-    let lost = loss(&scan);
+    let lost = scan.loss().text();
     output::done(format_args!("{}", folder.display()), json!({"folder": folder, "loss": lost}), json);
-    if let Some(lost) = &lost {
-        output::note(format_args!("warning: the log was not whole: {lost}"));
-    }
-    Ok(if lost.is_some() { Exit::Log } else { Exit::Ok })
+    Ok(ended(lost.as_deref()))
 }
 
 /// Returns the description of a complete file, in version 5 of rosbag2's form: that of ROS 2 Humble, which later ones
@@ -38,18 +34,19 @@ pub fn run(path: &Path, part: &Part, folder: &Path, json: bool) -> Result {
 fn metadata(path: &Path, name: &str) -> std::result::Result<String, crate::recording::replay::ReplayError> {
     // Nothing of the file but its summary.
     let scan = Scan::open_part(path, &[], (0, 0))?;
-    let figures = scan.statistics.clone().unwrap_or_default();
+    let figures = scan.statistics().map(|(_, figures)| figures.clone()).unwrap_or_default();
     let (start, messages) = (figures.message_start_time, figures.message_count);
     let duration = figures.message_end_time.saturating_sub(start);
     let mut topics = String::new();
     for (id, channel) in &scan.channels {
         let qos = channel.metadata.get("offered_qos_profiles").map_or("", String::as_str);
         // JSON texts are YAML texts.
-        let [topic, schema, qos] = [&*channel.topic, &*channel.schema.0, qos].map(|text| json!(text));
+        let texts = [&*channel.topic, &*channel.schema.0, qos, &*channel.encoding];
+        let [topic, schema, qos, encoding] = texts.map(|text| json!(text));
         let count = figures.channel_message_counts.get(id).unwrap_or(&0);
         let _ = writeln!(
             topics,
-            "    - topic_metadata:\n        name: {topic}\n        type: {schema}\n        serialization_format: cdr\n        \
+            "    - topic_metadata:\n        name: {topic}\n        type: {schema}\n        serialization_format: {encoding}\n        \
              offered_qos_profiles: {qos}\n      message_count: {count}"
         );
     }

@@ -1,27 +1,19 @@
 //! `dimos model check`: every mistake of a description, its meshes, its SRDF and its limits.
 
-use super::meshes::MeshSizes;
 use super::{File, has_mistakes};
 use crate::cli::exit::{Exit, Result};
 use crate::cli::output;
 use crate::planning::planning_scene::{always_touch, whole};
-use crate::robot::model::Inertial;
 use crate::robot::urdf::Meshes;
-use crate::robot::{Loaded, RobotModel};
-use crate::yaml::{Diag, Label, quote};
-
-/// Part of the largest moment of inertia that rounded moments may miss the triangle inequality by.
-const ROUNDING: f64 = 1e-3;
+use crate::robot::{Loaded, RobotModel, judge};
+use crate::yaml::{Diag, quote};
 
 /// Runs the verb.
 pub(super) fn run(file: &File) -> Result {
     let mut loaded = file.load(Meshes::Find);
     let summary = loaded.model.take().map(|robot| {
-        let mut meshes = MeshSizes::default();
-        let mistakes = meshes.mistakes(&robot, loaded.document.as_ref());
-        mistakes.into_iter().for_each(|diag| loaded.report(diag));
+        let meshes = judge(&mut loaded, &robot);
         poses_outside_limits(&robot, &mut loaded);
-        impossible_inertias(&robot, &mut loaded);
         let (links, independent) = (robot.links.len(), robot.independent_joints().len());
         let triangles = meshes.triangles();
         let summary = format!("{}: {links} links, {independent} independent joints, {triangles} triangles", robot.name);
@@ -39,11 +31,7 @@ pub(super) fn run(file: &File) -> Result {
         output::note(text.trim_end());
     }
     output::line(summary);
-    output::line(match loaded.warnings() {
-        0 => "no mistakes".to_owned(),
-        1 => "no mistakes, 1 warning".to_owned(),
-        more => format!("no mistakes, {more} warnings"),
-    });
+    output::line(output::no_mistakes(loaded.warnings()));
     Ok(Exit::Ok)
 }
 
@@ -75,34 +63,4 @@ fn poses_outside_limits(robot: &RobotModel, loaded: &mut Loaded) {
         }
         loaded.semantics.poses.push(pose);
     }
-}
-
-/// Warns of inertias that no body has: simulators and dynamics libraries reject them.
-fn impossible_inertias(robot: &RobotModel, loaded: &mut Loaded) {
-    for link in &robot.links {
-        let Some(what) = link.inertial.as_ref().and_then(impossible) else { continue };
-        let diag = Diag::warning(format!("the inertia of the link {} is impossible: {what}", quote(&link.name)));
-        let at = place_of_inertia(loaded, &link.name);
-        loaded.report(at.into_iter().fold(diag, Diag::at));
-    }
-}
-
-/// Returns what makes an inertia impossible: a negative principal moment, or one above the sum of the others.
-fn impossible(inertial: &Inertial) -> Option<String> {
-    let mut moments = inertial.inertia.symmetric_eigenvalues();
-    moments.as_mut_slice().sort_by(f64::total_cmp);
-    let [small, middle, large] = [moments.x, moments.y, moments.z];
-    let rounding = ROUNDING * large.abs().max(small.abs());
-    if small < -rounding {
-        return Some(format!("a principal moment is {small:.3e} kg·m²"));
-    }
-    (small + middle < large - rounding).then(|| {
-        format!("its principal moment {large:.3e} kg·m² is above the sum of the others, {:.3e}", small + middle)
-    })
-}
-
-fn place_of_inertia(loaded: &Loaded, link: &str) -> Option<Label> {
-    let root = &loaded.document.as_ref()?.root;
-    let mut links = root.named("link").filter(|element| element.attribute("name").is_some_and(|a| a.value == link));
-    Some(links.next()?.child("inertial")?.child("inertia")?.at.label())
 }

@@ -3,10 +3,10 @@
 use serde_json::{Value, json};
 
 use super::File;
-use super::meshes::MeshSizes;
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output::{self, Table};
 use crate::pose::to_xyz_rpy;
+use crate::robot::mesh::MeshSizes;
 use crate::robot::srdf::Semantics;
 use crate::robot::urdf::Meshes;
 use crate::robot::{Geometry, Joint, RobotModel, Shape};

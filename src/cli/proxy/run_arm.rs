@@ -182,7 +182,7 @@ impl RunArm {
     }
 
     fn cancel(&self, task: String) {
-        self.link.send_urgent(&Cancel { task: Some(task), ..Cancel::default() });
+        self.link.cancel(Cancel { task: Some(task), ..Cancel::default() });
     }
 
     /// Takes why the run has refused a target.

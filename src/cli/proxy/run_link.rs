@@ -2,11 +2,12 @@
 //!
 //! ```text
 //!  RunArm ──▶ commands  lease, move, targets; a thread takes the replies
-//!         ──▶ urgent    stop and cancel, which always get through; a thread takes the replies
+//!         ──▶ urgent    stop and cancel, which always get through; a thread sends them
 //!  View   ◀── state     a thread reads joints, pose, gripper, the motion's progress, and the status
 //! ```
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
@@ -19,8 +20,8 @@ use crate::cli::arguments;
 use crate::cli::exit::Result;
 use crate::joint::Joints;
 use crate::pose::from_xyz_rpy;
-use crate::rpc::api::{Method, Motion, State, Status, Stop};
-use crate::rpc::client::{Client, ClientError, Sender};
+use crate::rpc::api::{Cancel, Motion, State, Status, Stop};
+use crate::rpc::client::{Client, ClientError};
 use crate::rpc::report::{ArmReport, ArmStateReport, StatusReport};
 use crate::sync::lock;
 
@@ -120,8 +121,9 @@ impl View {
                 }
             }
         }
-        // As the vendor's program expects it: in the arm's base.
-        self.pose = arm.device_pose.as_ref().map(|pose| from_xyz_rpy(pose.xyz, pose.rpy));
+        // As the vendor's program expects it: of the tool that is set at the controller, in the controller's frame.
+        let own = arm.device_tool_pose.as_ref().or(arm.device_pose.as_ref());
+        self.pose = own.map(|pose| from_xyz_rpy(pose.xyz, pose.rpy));
         self.wrench = arm.wrench.map(|values| values.map(|value| value as f32));
         self.gripper = arm.gripper.map(|opening| match self.gripper {
             Some((before, at)) if (before - opening).abs() < 1e-4 => (before, at),
@@ -222,7 +224,16 @@ impl Shared {
 pub struct RunLink {
     pub shared: Arc<Shared>,
     pub commands: Arc<Mutex<Commands>>,
-    urgent: Arc<Mutex<Sender>>,
+    urgent: Sender<Urgent>,
+    /// Number of the latest stop.
+    stops: AtomicU64,
+}
+
+/// A request that always gets through.
+enum Urgent {
+    /// The stop with this number.
+    Stop(u64),
+    Cancel(Cancel),
 }
 
 impl RunLink {
@@ -230,13 +241,13 @@ impl RunLink {
     pub fn open(run: &str, arm: &str, streams: [Option<String>; 2]) -> Result<Self> {
         let connect = || arguments::connect(Some(run));
         let shared = Arc::new(Shared::new(arm, streams));
-        let (mut state, mut urgent, mut replies) = (connect()?, connect()?, connect()?);
+        let (mut state, urgent, mut replies) = (connect()?, connect()?, connect()?);
         read_state(&mut state, &shared)?;
         shared.keep_status(&state.call(Status {})?, Instant::now());
-        let to_urgent = Arc::new(Mutex::new(urgent.sender()?));
         let commands = Arc::new(Mutex::new(Commands::new(replies.sender()?)));
         start("proxy-state", &shared, move |shared| watch_state(&mut state, shared))?;
-        start("proxy-stops", &shared, move |shared| take_urgent_replies(&mut urgent, shared))?;
+        let (to_urgent, requests) = channel();
+        start("proxy-stops", &shared, move |shared| send_urgent_requests(&requests, urgent, shared))?;
         let taker = commands.clone();
         start("proxy-replies", &shared, move |shared| {
             loop {
@@ -245,30 +256,27 @@ impl RunLink {
                 }
             }
         })?;
-        Ok(Self { shared, commands, urgent: to_urgent })
+        Ok(Self { shared, commands, urgent: to_urgent, stops: AtomicU64::new(0) })
     }
 
     /// Stops the arm. Until the run answers, it counts as held.
     pub fn stop(&self) {
         let mut view = self.shared.view();
-        match lock(&self.urgent).send(&Stop { arm: Some(self.shared.arm.clone()) }) {
-            Ok(id) => (view.ready, view.held, view.stopping) = (false, true, Some(id)),
-            Err(error) => self.shared.lose(error),
-        }
+        let number = self.stops.fetch_add(1, Ordering::Relaxed);
+        (view.ready, view.held, view.stopping) = (false, true, Some(number));
+        // Fails only once the run is lost.
+        let _ = self.urgent.send(Urgent::Stop(number));
     }
 
-    /// Sends a request that always gets through.
-    pub fn send_urgent<M: Method>(&self, params: &M) {
-        if let Err(error) = lock(&self.urgent).send(params) {
-            self.shared.lose(error);
-        }
+    /// Cancels motions, also beside clients that occupy all connections of the run.
+    pub fn cancel(&self, cancel: Cancel) {
+        let _ = self.urgent.send(Urgent::Cancel(cancel));
     }
 }
 
 impl Drop for RunLink {
     fn drop(&mut self) {
         self.shared.ending.store(true, Ordering::Relaxed);
-        lock(&self.urgent).close();
         lock(&self.commands).close();
     }
 }
@@ -332,16 +340,30 @@ fn watch_state(client: &mut Client, shared: &Shared) -> std::result::Result<(), 
     Ok(())
 }
 
-fn take_urgent_replies(client: &mut Client, shared: &Shared) -> std::result::Result<(), ClientError> {
-    while !shared.is_ending() {
-        let Some((id, result)) = client.reply()? else { continue };
-        let mut view = shared.view();
-        if view.stopping == Some(id) {
-            (view.stopping, view.not_before) = (None, Instant::now());
+/// Sends the requests that always get through, over `open` and, where the run closes it, over new connections.
+fn send_urgent_requests(
+    requests: &Receiver<Urgent>,
+    open: Client,
+    shared: &Shared,
+) -> std::result::Result<(), ClientError> {
+    let run = open.run().to_owned();
+    let (connect, mut open) = (|| arguments::connect(Some(&run)), Some(open));
+    for request in requests {
+        let answered = match &request {
+            Urgent::Stop(_) => {
+                let stop = Stop { arm: Some(shared.arm.clone()) };
+                Client::urgent(open.take(), connect, &stop).map(|(client, _)| client)
+            }
+            Urgent::Cancel(cancel) => Client::urgent(open.take(), connect, cancel).map(|(client, _)| client),
+        };
+        match answered {
+            Ok(client) => open = Some(client),
+            Err(ClientError::Refused(refusal)) => shared.note(refusal.to_string()),
+            Err(error) => return Err(error),
         }
-        drop(view);
-        if let Err(error) = result {
-            shared.note(error.to_string());
+        let mut view = shared.view();
+        if matches!(request, Urgent::Stop(number) if view.stopping == Some(number)) {
+            (view.stopping, view.not_before) = (None, Instant::now());
         }
     }
     Ok(())

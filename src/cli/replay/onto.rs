@@ -20,6 +20,7 @@ use crate::replay::fit::fit;
 use crate::replay::grips::RecordedGrip;
 use crate::replay::motion::RecordedMotion;
 use crate::replay::onto::{Approach, Plan, check as check_limits, is_real, plan};
+use crate::replay::recorded::RecordedError;
 use crate::rpc::RpcError;
 use crate::rpc::api::{self, ArmEnable, Cancel, Execute, Gripper, Move, Point, State, Trajectory};
 use crate::rpc::report::{Deviation, MotionReport, StateReport};
@@ -40,7 +41,10 @@ pub fn run(args: &ReplayArgs, onto: &str, log: &Path, span: &Span, catalog: Cata
     let loaded = check::load_to_run(onto, &args.onto.changes.overrides(), catalog)?;
     let Some(mut blueprint) = loaded.blueprint.clone() else { return Err(check::refuse(&loaded)) };
     check::print_warnings(&loaded);
-    let motion = RecordedMotion::read(log, span.from, span.to).map_err(split)?;
+    let motion = RecordedMotion::read(log, span.from, span.to).map_err(|e| match e {
+        RecordedError::Lacks { .. } => Failure::of(Exit::Log, e),
+        e => split(e),
+    })?;
     if motion.lost > 0 {
         output::note(format_args!("warning: {} ticks are missing in the log: straight lines bridge them", motion.lost));
     }
@@ -215,7 +219,7 @@ impl Driver<'_> {
 
     /// Returns the recorded gripper commands for arms with a gripper, and prints how many others are left out.
     fn possible_grips(&self, state: &StateReport) -> Vec<&RecordedGrip> {
-        let grips = |arm: &str| state.arms.iter().any(|a| a.hardware_id == arm && a.gripper.is_some());
+        let grips = |arm: &str| state.arms.iter().any(|a| a.hardware_id == arm && a.gripper_unit.is_some());
         let possible: Vec<_> = self.grips.iter().filter(|grip| grips(&grip.arm)).collect();
         let others = self.grips.len() - possible.len();
         if others > 0 {

@@ -5,7 +5,10 @@ use std::time::Duration;
 
 use super::view::View;
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::recording::replay::{LogReader, Payload, ReplayError, Selection};
+use crate::recording::replay::{LogReader, ReplayError, Selection};
+
+/// A longer gap between two messages is not waited for: a clock was set [ns].
+const MAX_WAIT: u64 = 3600 * 1_000_000_000;
 
 /// Part of a log to play, and how.
 #[derive(Debug, Clone, PartialEq)]
@@ -23,12 +26,10 @@ pub struct Part {
 /// How it ended.
 #[derive(Debug, Default)]
 pub struct End {
-    /// The cut, if the log is truncated.
-    pub cut: Option<ReplayError>,
+    /// What the part of the log lacks.
+    pub loss: Option<String>,
     /// Samples lost by the recorder.
     pub lost: u64,
-    /// Messages that do not match their schema.
-    pub damaged: u64,
     /// Whether Ctrl-C ended it.
     pub interrupted: bool,
 }
@@ -144,8 +145,6 @@ pub fn play(
     view: &mut dyn View,
     time: &mut dyn Waiting,
 ) -> anyhow::Result<End> {
-    // A cut after the selected part does not matter.
-    let reaches_end = log.info().span.is_none_or(|(_, end)| part.to >= end);
     view.pace(&pace)?;
     loop {
         let mut end = End::default();
@@ -156,25 +155,27 @@ pub fn play(
         loop {
             match log.next_entry() {
                 Ok(Some(entry)) => {
+                    if let Some(last) = shown.filter(|last| entry.log_time.saturating_sub(*last) > MAX_WAIT) {
+                        let hours = (entry.log_time - last) as f64 / 3.6e12;
+                        eprintln!("note: the log has nothing for {hours:.0} h: that is not waited for");
+                        pace.from = (time.time(), entry.log_time);
+                    }
                     if shown != Some(entry.log_time)
                         && let Some(interrupted) = pace.wait(entry.log_time, view, time)?
                     {
                         view.end()?;
                         return Ok(End { interrupted, ..End::default() });
                     }
-                    end.damaged += u64::from(matches!(entry.data, Payload::Damaged { .. }));
                     view.show(&entry, time.time())?;
                     shown = Some(entry.log_time);
                 }
                 Ok(None) => break,
-                Err(cut @ ReplayError::Cut { .. }) => {
-                    end.cut = Some(cut).filter(|_| reaches_end);
-                    break;
-                }
+                // It is in the loss.
+                Err(ReplayError::Cut { .. } | ReplayError::Damaged { .. }) => {}
                 Err(e) => return Err(e.into()),
             }
         }
-        end.lost = log.lost();
+        (end.lost, end.loss) = (log.lost(), log.loss().text());
         view.end()?;
         if !(part.looping && shown.is_some()) {
             return Ok(end);
@@ -192,7 +193,7 @@ mod tests {
     use crate::clock::VirtualClock;
     use crate::recording::log_writer::LogWriter;
     use crate::recording::messages::Text;
-    use crate::recording::replay::Entry;
+    use crate::recording::replay::{Entry, Payload};
     use std::collections::BTreeMap;
 
     impl Waiting for VirtualClock {
@@ -261,7 +262,7 @@ mod tests {
             let mut notes = Notes { seen: Vec::new(), room: 99 };
             let end =
                 play(&mut log, &part(0, to), Pace::new(1.0, false), &mut notes, &mut VirtualClock::default()).unwrap();
-            assert_eq!(end.cut.is_some(), cut, "up to {to} ms");
+            assert_eq!(end.loss.is_some(), cut, "up to {to} ms");
             assert_eq!(notes.seen.len() as u64, to / 100 + 1);
         }
     }

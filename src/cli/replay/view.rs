@@ -7,6 +7,7 @@ use std::time::Duration;
 use comfy_table::{Cell, CellAlignment, Table, presets};
 
 use super::player::{Pace, Part};
+use crate::cli::escapes::{in_json, safe};
 use crate::cli::output;
 use crate::clock::Mono;
 use crate::recording::messages::JointState;
@@ -47,9 +48,8 @@ impl<W: Write> JsonLines<W> {
 
 impl<W: Write> View for JsonLines<W> {
     fn show(&mut self, entry: &Entry, _now: Mono) -> io::Result<()> {
-        let mut line = serde_json::to_vec(entry)?;
-        line.push(b'\n');
-        self.0.write_all(&line)
+        let line = serde_json::to_string(entry)?;
+        writeln!(self.0, "{}", in_json(&line))
     }
     fn end(&mut self) -> io::Result<()> {
         self.0.flush()
@@ -91,14 +91,15 @@ impl<W: Write> View for Plain<W> {
                     for (i, name) in joints.name.iter().take(self.joints).enumerate() {
                         line.push_str(&format!("  {name} {} rad", number(&joints.position, i, 4)));
                     }
-                    writeln!(self.out, "{line}")?;
+                    writeln!(self.out, "{}", safe(&line, false))?;
                 }
             }
             Payload::Log(log) => {
                 let answer = log.msg.strip_prefix("request ").and_then(|answer| answer.split_once(':'));
                 let asked = answer.and_then(|(id, text)| Some((self.asked.iter().find(|asked| asked.0 == id)?, text)));
                 let text = asked.map(|((id, kind), text)| format!("request {id} ({kind}):{text}"));
-                writeln!(self.out, "{at:10.3} s  {}: {}", level(log.level), text.as_ref().unwrap_or(&log.msg))?;
+                let text = safe(text.as_ref().unwrap_or(&log.msg), false);
+                writeln!(self.out, "{at:10.3} s  {}: {text}", level(log.level))?;
             }
             Payload::Text(text) if entry.topic == "/dimos/requests" => {
                 self.asked.extend(request(&text.data));
@@ -117,7 +118,7 @@ impl<W: Write> View for Plain<W> {
     fn end(&mut self) -> io::Result<()> {
         self.next = 0;
         for (topic, count) in std::mem::take(&mut self.others) {
-            writeln!(self.out, "{:10}    {topic}: {count} messages", "")?;
+            writeln!(self.out, "{:10}    {}: {count} messages", "", safe(&topic, false))?;
         }
         self.out.flush()
     }
@@ -218,6 +219,7 @@ impl<W: Write> Live<W> {
 
     fn draw(&mut self) -> io::Result<()> {
         let render = self.render();
+        let render = safe(&render, true);
         // Moves up to the start of the previous frame and clears from there on.
         let up = if self.drawn_lines > 0 { format!("\x1b[{}A\x1b[J", self.drawn_lines) } else { String::new() };
         self.drawn_lines = render.lines().count();

@@ -38,14 +38,14 @@ impl Log {
     /// Opens a log.
     pub fn open(path: &Path) -> Result<Self> {
         let windows = LogWindows::open(path).map_err(|e| Failure::of(Exit::Usage, e))?;
-        let empty = || Failure::usage(format!("the log {} has no messages in chunks", path.display()));
+        let empty = || Failure::usage(format!("the log {} has no messages", path.display()));
         let (start, _) = windows.span().ok_or_else(empty)?;
         Ok(Self { path: path.to_owned(), windows: Mutex::new(windows), start })
     }
 
     /// Returns what it lacks; `None` if it is whole or live.
     pub fn loss(&self) -> Option<String> {
-        lock(&self.windows).loss().map(str::to_owned)
+        lock(&self.windows).loss()
     }
 
     /// Returns the arms with their joints and limits, as far as the log has them.
@@ -102,7 +102,8 @@ impl Log {
         });
         read.map_err(|e| e.to_string())?;
         let (length, live) = (seconds(log.span().map_or(0, |(_, end)| end), self.start), log.is_live());
-        Ok(format!("{{\"length\":{length:.6},\"live\":{live},\"full\":{full},\"messages\":[{out}]}}"))
+        let loss = json!(log.loss());
+        Ok(format!("{{\"length\":{length:.6},\"live\":{live},\"loss\":{loss},\"full\":{full},\"messages\":[{out}]}}"))
     }
 }
 

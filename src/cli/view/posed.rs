@@ -23,6 +23,7 @@ use crate::robot::kinematics::pose;
 use crate::robot::urdf::Meshes;
 use crate::robot::{Source, load};
 use crate::rpc::api::WorldObject;
+use crate::runtime::kinematics::use_kept;
 use crate::runtime::world_object;
 use crate::sync::lock;
 use crate::view::{Scene, Shown, ShownArm, ShownRobot, Subject, robots, value};
@@ -78,6 +79,9 @@ impl Posed {
         let loaded = check::load_to_run(name, &Overrides::default(), catalog)?;
         let Some(blueprint) = &loaded.blueprint else { return Err(check::mistakes(&loaded)) };
         check::print_warnings(&loaded);
+        let mut blueprint = blueprint.clone();
+        use_kept(&mut blueprint).iter().for_each(|line| output::note(format_args!("model: {line}")));
+        let blueprint = &blueprint;
         let shown = robots(blueprint);
         if shown.is_empty() {
             let what = format!("the blueprint {} has no robot model: there is nothing to show", blueprint.name);
@@ -195,7 +199,7 @@ fn planned(blueprint: &Blueprint, shown: &[ShownRobot]) -> Result<PlannerConfig>
 
 /// Returns a robot that no planner has, with its own limits.
 fn alone(robot: &ShownRobot, name: String) -> Result<RobotConfig> {
-    let Source { path, packages, xacro_args, srdf, joint_limits, .. } = robot.source.clone();
+    let Source { path, packages, xacro_args, srdf, joint_limits, places, .. } = robot.source.clone();
     let loaded = load(&Source { meshes: Meshes::Ignore, ..robot.source.clone() });
     let model = loaded.into_model().map_err(Failure::usage)?;
     let (coordinator_joints, joints) = robot.joints.iter().cloned().unzip();
@@ -206,6 +210,7 @@ fn alone(robot: &ShownRobot, name: String) -> Result<RobotConfig> {
         xacro_args,
         srdf,
         joint_limits,
+        places,
         shapes: BTreeMap::new(),
         convert_meshes: true,
         base_pose: robot.base_pose,
@@ -213,9 +218,11 @@ fn alone(robot: &ShownRobot, name: String) -> Result<RobotConfig> {
         end_effector_link: robot.tip.clone(),
         tool: None,
         flange_link: None,
+        controller_base: None,
+        allows_mismatch: false,
         joints,
         coordinator_joints,
-        joint_prefix: String::new(),
+        unplanned: BTreeMap::new(),
         gripper_joint: None,
         task: None,
         exclusions: Vec::new(),

@@ -56,6 +56,7 @@ fn checker(name: &str, text: &str, base: DVec3, random: &mut Random) -> ExactChe
         model: Arc::new(model),
         base: DAffine3::from_translation(base),
         padding: 0.0,
+        apart: 0.0,
         allowed: vec![],
     };
     world.add_robot(robot).unwrap();

@@ -11,6 +11,8 @@ use crate::control::rest::{Gap, Start, braking};
 use crate::joint::{ControlMode, MAX_DOF};
 use crate::telemetry::{Cause, Phase};
 
+/// A slowed arm is waited for after a gap as if it had this fraction of its speed, or more.
+const SLOWEST: f64 = 0.05;
 /// A joint this close to where it is to rest is there, beside its accuracy and droop [rad].
 const NEAR: f64 = 0.01;
 
@@ -116,7 +118,7 @@ impl ArmControl {
         let late = self.rest.gap.is_some_and(|gap| last.seq < gap.first) && !waits;
         if late || (self.rest.gap.is_none() && self.rest.written.gap(now)) {
             if self.rest.gap.is_none() {
-                let longest = braking::time(&self.limiters);
+                let longest = braking::time(&self.limiters) / self.speed_fraction().max(SLOWEST);
                 let first = self.command.seq + 1;
                 self.rest.begin_gap(now, first, mode, longest, self.config.supervision.lag);
             }
@@ -168,16 +170,18 @@ impl ArmControl {
         let Some(mode) = self.command.mode else { return };
         let mut issued = Issued { seq: self.command.seq, at: now, position: [0.0; MAX_DOF], velocity: [0.0; MAX_DOF] };
         let out = issued.position.iter_mut().zip(&mut issued.velocity);
-        for ((q, v), limiter) in out.zip(&self.limiters) {
-            (*q, *v) = (limiter.position(), limiter.velocity());
+        for (((q, v), limiter), pace) in out.zip(&self.limiters).zip(&mut self.pace) {
+            (*q, *v, *pace) = (limiter.position(), limiter.velocity(), limiter.covered() / dt);
         }
         self.rest.by_velocity = !mode.is_position();
         self.rest.written.issue(issued);
-        self.command.velocity = issued.velocity;
+        let speed = self.speed_fraction();
+        self.command.velocity = std::array::from_fn(|j| self.commanded_velocity(j));
         self.command.rest = Some(braking::rest_point(&self.limiters, dt));
         if self.rest.gap.is_none() {
-            let velocities = (!mode.is_position()).then_some(&self.command.values);
-            self.tracking.push(now, &issued.position, velocities);
+            let velocities = (!mode.is_position()).then(|| self.command.values.map(|v| v * speed));
+            self.tracking.pass(now, speed);
+            self.tracking.push(now, &issued.position, velocities.as_ref());
         }
     }
 

@@ -56,18 +56,37 @@ impl ArmControl {
             self.hold(mode, dt);
             return Routed::Refused(j, refusal);
         }
+        let own = self.own_time(dt);
+        if own == 0.0 {
+            self.stays(mode, dt);
+            for (j, limiter) in self.limiters.iter_mut().enumerate().filter(|_| mode.is_position()) {
+                match ask(j) {
+                    // Jumps were refused above.
+                    Some(ask) => {
+                        if ask.new_task {
+                            limiter.forget_request();
+                        }
+                        let _ = limiter.check_request(ask.value);
+                    }
+                    // What ends here does not continue later.
+                    None => limiter.rewind(limiter.position(), 0.0),
+                }
+            }
+            return Routed::Sent;
+        }
         let ahead = if mode == ControlMode::Velocity { self.ahead(dt) } else { None };
-        let decreases = braking::decreases(&self.limiters, dt);
+        let decreases = braking::decreases(&self.limiters, own);
         for (j, limiter) in self.limiters.iter_mut().enumerate() {
             let value = match ask(j) {
                 None => {
-                    limiter.decelerate(decreases.get(j).copied().unwrap_or_default(), dt);
+                    limiter.decelerate(decreases.get(j).copied().unwrap_or_default(), own);
                     if mode == ControlMode::Velocity { limiter.velocity() } else { limiter.position() }
                 }
                 Some(ask) => {
                     if ask.new_task {
                         limiter.forget_request();
                     }
+                    let dt = if ask.shared { dt } else { own };
                     let limited = match mode {
                         ControlMode::Velocity => {
                             let at = limiter.position();
@@ -95,7 +114,24 @@ impl ArmControl {
                 *out = value;
             }
         }
+        if let Some(asked) = self.limit_tool(mode) {
+            report(asked.0, LimitKind::Tool, asked.1);
+        }
         Routed::Sent
+    }
+
+    /// Slows the commands down where the tool would be too fast. Returns the fastest joint and the speed of the tool
+    /// [m/s] where that begins.
+    fn limit_tool(&mut self, mode: ControlMode) -> Option<(usize, f64)> {
+        let asked = self.tool.as_mut()?.limit(&self.before, &mut self.limiters);
+        self.tool_limited = asked.is_some();
+        let began = self.tool_limited && !self.tool_was_limited;
+        for (out, limiter) in self.command.values.iter_mut().zip(&self.limiters).filter(|_| asked.is_some()) {
+            *out = if mode == ControlMode::Velocity { limiter.velocity() } else { limiter.position() };
+        }
+        let speed = |j: usize| self.limiters.get(j).map_or(0.0, |limiter| limiter.velocity().abs());
+        let joint = (0..self.limiters.len()).max_by(|a, b| speed(*a).total_cmp(&speed(*b)))?;
+        asked.filter(|_| began).map(|speed| (joint, speed))
     }
 
     /// Nothing reaches the arm, or it is on its way back: repeats the last written setpoint. Requests are still checked
@@ -106,6 +142,7 @@ impl ArmControl {
             if let (Some(ask), true) = (ask(j), mode.is_position()) {
                 refused = refused.or(limiter.check_request(ask.value).err().map(|refusal| (j, refusal)));
             }
+            limiter.repeat(dt);
             if let Some(out) = self.command.values.get_mut(j) {
                 *out = if mode == ControlMode::Velocity { limiter.velocity() } else { limiter.position() };
             }

@@ -43,6 +43,13 @@ impl ArmControl {
     /// Decelerates instead of following the requests of this tick.
     pub fn brake(&mut self, dt: f64) {
         let velocity = self.command.mode == Some(ControlMode::Velocity);
+        let dt = self.own_time(dt);
+        if dt == 0.0 {
+            self.limiters.copy_from_slice(&self.before);
+            let out = self.limiters.iter().zip(self.command.values.iter_mut());
+            out.for_each(|(limiter, out)| *out = if velocity { limiter.velocity() } else { limiter.position() });
+            return;
+        }
         let decreases = braking::decreases(&self.before, dt);
         let joints = self.limiters.iter_mut().zip(&self.before).zip(decreases);
         for (((limiter, before), decrease), out) in joints.zip(self.command.values.iter_mut()) {

@@ -8,8 +8,8 @@ use crate::telemetry::{Cause, LedBy, Outcome, Phase};
 
 /// A joint that the arm's controller moves may have this much more than its velocity limit.
 const OVERSPEED: f64 = 1.1;
-/// Consecutive readings above that: one velocity may be an estimate from noisy positions.
-const TOO_FAST_READINGS: u8 = 2;
+/// Time above that [s]: one velocity may be an estimate from noisy positions.
+const TOO_FAST_FOR: f64 = 0.008;
 
 impl ArmControl {
     /// The arm will be led. It must be at rest; its own controller may only start from within its range.
@@ -28,7 +28,7 @@ impl ArmControl {
             self.command.lead_seq = self.command.lead_seq.wrapping_add(1);
             self.rest.forget_written();
             self.command.rest = None;
-            self.led_too_fast = (0, 0);
+            self.led_too_fast = None;
         }
         outcome
     }
@@ -81,15 +81,12 @@ impl ArmControl {
         let velocities = self.feedback.state().velocity.iter().zip(&self.limiters).enumerate();
         let too_fast = { velocities }.find(|(_, (v, limiter))| v.abs() > OVERSPEED * limiter.bounds().velocity);
         let Some((joint, (velocity, _))) = too_fast else {
-            self.led_too_fast = (0, 0);
+            self.led_too_fast = None;
             return None;
         };
-        let (readings, counted) = self.led_too_fast;
-        let seq = self.feedback.state().seq;
-        if seq != counted {
-            self.led_too_fast = (readings.saturating_add(1), seq);
-        }
-        (self.led_too_fast.0 >= TOO_FAST_READINGS).then_some(Cause::LedTooFast(joint as u16, *velocity))
+        let stamp = self.feedback.state().stamp;
+        let since = *self.led_too_fast.get_or_insert(stamp);
+        (stamp.seconds_since(since) >= TOO_FAST_FOR).then_some(Cause::LedTooFast(joint as u16, *velocity))
     }
 
     /// Returns the first joint outside its range, its position, and how far outside it is [rad].

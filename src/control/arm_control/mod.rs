@@ -11,6 +11,7 @@ mod delivery;
 mod follow;
 mod guarded;
 mod led;
+mod own_time;
 mod rest;
 
 use std::time::Duration;
@@ -24,19 +25,23 @@ use super::failsafe::{Failsafe, Freshness};
 use super::limit::{Bounds, Limiter, Refusal};
 use super::rest::{Rest, SETTLED, Start, braking};
 use super::task_body::Demand;
+use super::task_robot::FramePose;
+use super::tool_limit::ToolLimiter;
 use crate::arm::{ArmCommand, ArmState, Link, Topology};
 use crate::clock::Mono;
 use crate::joint::{ControlMode, Joints, MAX_DOF};
 use crate::telemetry::{Bound, Cause, LedBy, LimitKind, Outcome, Phase};
 
-/// A joint that moves this far while its arm is being enabled is moved by something else [rad]; so is one with this
-/// many consecutive readings that cannot be true.
+/// A joint that moves this far while its arm is being enabled is moved by something else [rad]; so is one whose
+/// readings agree for this time and cannot be true [s].
 const ENABLING_TOLERANCE: f64 = 0.01;
-const ENABLING_REJECTED: u32 = 2;
+const ENABLING_REJECTED: f64 = 0.008;
 
 /// Part of the way that velocities have led to that measurements may correct, and the most at a time [rad].
 const DRIFT: f64 = 0.05;
 const MAX_CORRECTION: f64 = 0.05;
+
+pub use own_time::effective;
 
 /// One arm inside the tick.
 #[derive(Debug)]
@@ -53,6 +58,12 @@ pub struct ArmControl {
     before: Vec<Limiter>,
     /// The limit that changed the joint's command in the last tick.
     limited: Vec<Option<LimitKind>>,
+    tool: Option<ToolLimiter>,
+    /// Whether the tool's speed limit changed the commands in the last tick, and in the one before.
+    tool_limited: bool,
+    tool_was_limited: bool,
+    /// Per joint, the arm's own time that the last command covered, for each second here.
+    pace: Joints,
     command: ArmCommand,
     /// Measured positions when the setpoint of the last start was taken [rad], and when that was.
     enabled_at: Joints,
@@ -62,8 +73,8 @@ pub struct ArmControl {
     resumed: Option<Mono>,
     /// Positions that velocities may still be corrected by measurements [rad].
     correction: f64,
-    /// Consecutive readings in which the arm's own controller moved a joint too fast, and the number of the last one.
-    led_too_fast: (u8, u64),
+    /// When the first of the readings was measured in which the arm's own controller moves a joint too fast.
+    led_too_fast: Option<Mono>,
 }
 
 /// Request to one joint in this tick.
@@ -75,6 +86,8 @@ pub struct JointRequest {
     pub new_task: bool,
     /// Fraction of the velocity limit that applies, 0 to 1.
     pub speed: f64,
+    /// The request does not slow down with the arm's controller alone: its task moves other arms, too.
+    pub shared: bool,
 }
 
 /// Result of an arm's requests.
@@ -108,6 +121,10 @@ impl ArmControl {
             before: limiters.clone(),
             limiters,
             limited: vec![None; config.dof],
+            tool_limited: false,
+            tool_was_limited: false,
+            pace: [1.0; MAX_DOF],
+            tool: config.tool.as_deref().map(ToolLimiter::new),
             feedback: Feedback::new(&config),
             tracking: Tracking::new(&config, period),
             rest: Rest::new(&config, period),
@@ -119,7 +136,7 @@ impl ArmControl {
             started_at: Mono::ZERO,
             resumed: None,
             correction: 0.0,
-            led_too_fast: (0, 0),
+            led_too_fast: None,
         }
     }
 
@@ -133,13 +150,24 @@ impl ArmControl {
         self.first
     }
 
+    /// Returns the velocity of a joint's last command [rad/s], in the time that passes here.
+    pub fn commanded_velocity(&self, joint: usize) -> f64 {
+        self.limiters.get(joint).map_or(0.0, Limiter::velocity) * self.pace.get(joint).copied().unwrap_or(1.0)
+    }
+
+    /// Replaces the tool whose speed is limited.
+    pub fn set_tool(&mut self, tool: &FramePose) {
+        self.tool.iter_mut().for_each(|limiter| limiter.set_tool(tool));
+    }
+
     /// Returns the limit that changed the command of a joint (index over all arms) in the last tick.
     pub fn limited(&self, joint: usize) -> Option<Bound> {
-        let kind = (*self.limited.get(joint.checked_sub(self.first)?)?)?;
-        Some(match kind {
+        let kind = *self.limited.get(joint.checked_sub(self.first)?)?;
+        Some(match if self.tool_limited { LimitKind::Tool } else { kind? } {
             LimitKind::Position => Bound::Position(joint as u16),
             LimitKind::Velocity => Bound::Velocity(joint as u16),
             LimitKind::Acceleration => Bound::Acceleration(joint as u16),
+            LimitKind::Tool => Bound::Tool,
         })
     }
 
@@ -381,6 +409,7 @@ impl ArmControl {
         let braking = if self.at_rest() { 0.0 } else { braking::time(&self.limiters) };
         self.rest.enter(held, self.failsafe.cause(), braking, foreign);
         self.before.copy_from_slice(&self.limiters);
+        self.tool_was_limited = std::mem::take(&mut self.tool_limited);
         match phase {
             Phase::Unknown | Phase::Disabled => {
                 self.command.mode = None;

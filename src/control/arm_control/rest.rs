@@ -29,14 +29,18 @@ impl ArmControl {
             let stuck = self.rest.gap.is_some() && (silent || mode.is_position());
             if !stuck {
                 let moving = self.limiters.iter().any(|limiter| !limiter.at_rest());
-                if demand != Demand::Nothing && moving && (self.rest.along_path > 0.0 || !self.rest.moved) {
-                    self.rest.along_path -= dt;
+                let in_time = self.rest.along_path > 0.0;
+                self.rest.along_path -= dt;
+                if demand != Demand::Nothing && moving && (in_time || !self.rest.moved) {
                     let routed = self.follow(demand, ask, dt, now, |_, _, _| {});
                     if routed == Routed::Sent {
                         return routed;
                     }
                 }
-                if !self.limiters.iter().all(Limiter::at_rest) || (self.rest.moved && !self.settled(dt)) {
+                // A slowed one decelerates for longer: its controller continues that, along its motion.
+                let slowed = !in_time && self.speed_fraction() < 1.0;
+                let moves = self.limiters.iter().any(|limiter| !limiter.at_rest());
+                if !slowed && (moves || (self.rest.moved && !self.settled(dt))) {
                     self.hold(mode, dt);
                     return Routed::NotReady;
                 }
@@ -103,7 +107,7 @@ impl ArmControl {
         }
         if !usable {
             // The setpoints stay where they are.
-            self.limiters.iter_mut().for_each(|limiter| limiter.relieve(limiter.position(), 0.0));
+            self.limiters.iter_mut().for_each(|limiter| limiter.relieve(limiter.position(), 0.0, dt));
         }
         self.rest.relief = Relief::None;
         (self.command.mode, self.rest.stop_pending) = (None, true);
@@ -128,10 +132,17 @@ impl ArmControl {
 
     /// Commands the next step of the deceleration to rest, then the same values again.
     pub(super) fn hold(&mut self, mode: ControlMode, dt: f64) {
-        let decreases = braking::decreases(&self.limiters, dt);
+        let own = self.own_time(dt);
+        if own == 0.0 {
+            if mode.is_position() {
+                self.limiters.iter_mut().for_each(|limiter| limiter.rewind(limiter.position(), 0.0));
+            }
+            return self.stays(mode, dt);
+        }
+        let decreases = braking::decreases(&self.limiters, own);
         let joints = self.limiters.iter_mut().zip(decreases).zip(self.command.values.iter_mut());
         for ((limiter, decrease), out) in joints {
-            limiter.decelerate(decrease, dt);
+            limiter.decelerate(decrease, own);
             *out = if mode == ControlMode::Velocity { limiter.velocity() } else { limiter.position() };
         }
         if !self.limiters.iter().all(Limiter::at_rest) {

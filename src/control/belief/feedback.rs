@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use super::agreement::Agreement;
 use super::estimate::VelocityEstimator;
-use super::plausibility::{JUMP_AFTER, Plausibility, Verdict};
+use super::plausibility::{CONFIRMED, Plausibility, Verdict};
 use super::setpoints::Range;
 use super::stalls::Stalls;
 use super::stillness::Stillness;
@@ -74,13 +74,13 @@ impl Feedback {
 
     /// Returns whether the latest reading was rejected as implausible.
     pub fn is_rejected(&self) -> bool {
-        self.plausibility.rejected() > 0
+        self.plausibility.rejected_for().is_some()
     }
 
-    /// Returns the joint whose rejected position is furthest from the accepted one, and how far [rad], if at least this
-    /// many consecutive readings were rejected.
-    pub fn rejected_step(&self, readings: u32) -> Option<(u16, f64)> {
-        let rejected = self.rejected.as_ref().filter(|_| self.plausibility.rejected() >= readings)?;
+    /// Returns the joint whose rejected position is furthest from the accepted one, and how far [rad], if readings that
+    /// agree were rejected for this time [s].
+    pub fn rejected_step(&self, time: f64) -> Option<(u16, f64)> {
+        let rejected = self.rejected.as_ref().filter(|_| self.plausibility.rejected_for() >= Some(time))?;
         furthest(rejected.position.iter().zip(&self.state.position).map(|(now, before)| now - before))
     }
 
@@ -180,7 +180,7 @@ impl Feedback {
     fn age(&self, now: Mono, stalls: &Stalls) -> Freshness {
         // An arm whose readings are rejected still answers: its age counts from the latest of them until it had the
         // time to confirm a jump.
-        let confirmation = JUMP_AFTER * self.read_period.max(Duration::from_millis(1));
+        let confirmation = Duration::from_secs_f64(CONFIRMED) + 2 * self.read_period.max(Duration::from_millis(1));
         let finite = self.rejected.as_ref().is_some_and(|read| self.is_finite(&read.position));
         let waits = finite && now.since(self.plausibility.stamp()) <= self.max_age + confirmation;
         let stamp = self.rejected.as_ref().filter(|_| waits).map_or(self.state.stamp, |read| read.stamp);

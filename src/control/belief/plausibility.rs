@@ -1,7 +1,7 @@
 //! Rejects implausible measurements. A joint under power goes where its setpoints go, and no farther than its top speed
 //! takes it between two readings: a reading that implies more is rejected, and the last accepted one stays. The
-//! allowance does not grow while readings are rejected. Three rejected ones that agree with each other are a jump; the
-//! last accepted one still stays, until an operator's reset.
+//! allowance does not grow while readings are rejected. Rejected ones that agree with each other for some time are a
+//! jump; the last accepted one still stays, until an operator's reset.
 
 use super::setpoints::Range;
 use crate::arm::{ArmState, Topology};
@@ -19,8 +19,8 @@ const HAND_ACCELERATION: f64 = 400.0;
 const PUSH_ACCELERATION: f64 = 100.0;
 /// Longest time between two readings that counts: the arm may have moved meanwhile [s].
 const LONGEST_GAP: f64 = 0.5;
-/// Number of consecutive, consistent rejected readings that are a jump.
-pub(super) const JUMP_AFTER: u32 = 3;
+/// Rejected readings that agree for this time are a jump: three of them at 100 Hz, two of a slower arm [s].
+pub(super) const CONFIRMED: f64 = 0.015;
 /// One turn [rad].
 pub const TURN: f64 = std::f64::consts::TAU;
 /// Largest position of an endless joint [rad].
@@ -63,7 +63,8 @@ pub struct Plausibility {
     velocity: Joints,
     /// When the newest reading was measured, accepted or not.
     newest: Mono,
-    rejected: u32,
+    /// When the first of the rejected readings that agree with the newest one was measured; `None`: it was accepted.
+    rejected: Option<Mono>,
     candidate: (Joints, Mono),
 }
 
@@ -90,7 +91,7 @@ impl Plausibility {
             accepted: none,
             velocity: [0.0; MAX_DOF],
             newest: Mono::ZERO,
-            rejected: 0,
+            rejected: None,
             candidate: none,
         }
     }
@@ -100,15 +101,15 @@ impl Plausibility {
         self.accepted.1
     }
 
-    /// Returns the number of readings rejected since then.
-    pub fn rejected(&self) -> u32 {
-        self.rejected
+    /// Returns for how long readings that agree were rejected [s]; `None` if the newest one was accepted.
+    pub fn rejected_for(&self) -> Option<f64> {
+        self.rejected.map(|since| self.newest.seconds_since(since))
     }
 
     /// The next reading is accepted, wherever it is, unless it is no position of the joint at all: an operator has seen
     /// it, or the connection is new.
     pub fn acknowledge(&mut self) {
-        (self.enabled, self.rejected) = (false, 0);
+        (self.enabled, self.rejected) = (false, None);
         self.newest = Mono::ZERO;
     }
 
@@ -135,16 +136,16 @@ impl Plausibility {
                 *v = if first { 0.0 } else { (now - before) / dt };
             }
             self.accepted = reading;
-            self.rejected = 0;
+            self.rejected = None;
             return Verdict::Accepted;
         };
         let finite = reading.0.iter().take(self.dof).all(|q| q.is_finite());
         let agrees = finite
-            && self.rejected > 0
+            && self.rejected.is_some()
             && self.worst(&self.candidate.0, &reading.0, None, powered, dt, false).is_none();
-        self.rejected = if agrees { self.rejected.saturating_add(1) } else { 1 };
-        self.candidate = reading;
-        if self.rejected < JUMP_AFTER {
+        let since = self.rejected.filter(|_| agrees).unwrap_or(state.stamp);
+        (self.rejected, self.candidate) = (Some(since), reading);
+        if state.stamp.seconds_since(since) < CONFIRMED {
             return Verdict::Rejected;
         }
         if absurd.is_none() && self.is_turn(joint, step) {
@@ -230,9 +231,9 @@ mod tests {
         assert_eq!(b.take(&reading(1, 10, [0.5, 0.0]), None), Verdict::Accepted);
         assert_eq!(b.take(&reading(2, 20, [0.0, 0.0]), None), Verdict::Rejected);
         assert_eq!(b.take(&reading(2, 20, [0.0, 0.0]), None), Verdict::Same);
-        assert_eq!((b.accepted.0[0], b.stamp(), b.rejected()), (0.5, Mono(10_000_000), 1));
+        assert_eq!((b.accepted.0[0], b.stamp(), b.rejected_for()), (0.5, Mono(10_000_000), Some(0.0)));
         assert_eq!(b.take(&reading(3, 30, [0.52, 0.0]), None), Verdict::Accepted);
-        assert_eq!(b.rejected(), 0);
+        assert_eq!(b.rejected_for(), None);
     }
 
     #[test]

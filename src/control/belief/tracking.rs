@@ -32,6 +32,8 @@ pub struct Tracking {
     velocities: SetpointWindow,
     /// Distance of each joint from the range of its setpoints of the last `lag` seconds [rad].
     errors: Joints,
+    /// Time that did not pass for the arm, because its controller slowed it [ns], and until when that is counted.
+    behind: (u64, Mono),
     /// How long the tolerances have been exceeded [s]: of positions, of velocities.
     exceeded: (f64, f64),
 }
@@ -48,6 +50,7 @@ impl Tracking {
             positions: SetpointWindow::new(config.dof, span),
             velocities: SetpointWindow::new(config.dof, span),
             errors: [0.0; MAX_DOF],
+            behind: (0, Mono::ZERO),
             exceeded: (0.0, 0.0),
         }
     }
@@ -59,8 +62,23 @@ impl Tracking {
         self.exceeded = (0.0, 0.0);
     }
 
+    /// Notes the fraction of its speed at which the arm's controller runs its motion until `now`: an arm that is slowed
+    /// follows setpoints so much later.
+    pub fn pass(&mut self, now: Mono, speed: f64) {
+        let (behind, since) = self.behind;
+        let lost =
+            if speed < 1.0 && since != Mono::ZERO { now.since(since).mul_f64(1.0 - speed) } else { Duration::ZERO };
+        self.behind = (behind + lost.as_nanos() as u64, now);
+    }
+
+    /// Returns a time on the arm's own clock.
+    fn own(&self, at: Mono) -> Mono {
+        at.before(Duration::from_nanos(self.behind.0))
+    }
+
     /// Adds the setpoints of a tick [rad]; in velocity mode also their velocities [rad/s].
     pub fn push(&mut self, now: Mono, positions: &Joints, velocities: Option<&Joints>) {
+        let now = self.own(now);
         self.positions.push(now, positions);
         if let Some(velocities) = velocities {
             self.velocities.push(now, velocities);
@@ -69,12 +87,12 @@ impl Tracking {
 
     /// Returns the range of the positions that the arm may be following in this state.
     pub fn range(&self, state: &ArmState) -> Option<Range> {
-        self.positions.range(state.stamp.before(self.window))
+        self.positions.range(self.own(state.stamp).before(self.window))
     }
 
     /// Returns the range of the velocities that it may be following; `None` if none were commanded.
     pub fn velocity_range(&self, state: &ArmState) -> Option<Range> {
-        self.velocities.range(state.stamp.before(self.window))
+        self.velocities.range(self.own(state.stamp).before(self.window))
     }
 
     /// Returns the distance of a joint from the range of its setpoints [rad]; 0 inside.

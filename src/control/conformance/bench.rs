@@ -337,6 +337,7 @@ impl Bench {
 
 fn config(spec: &TaskSpec, robot: &TaskKinematics) -> CoordinatorConfig {
     let arm = ArmConfig {
+        tool: None,
         name: "arm".to_owned(),
         dof: DOF,
         limits: JointLimits::uniform(DOF, 2.9, 2.0).with_defaults(),

@@ -173,7 +173,7 @@ impl Coordinator {
                     position: arm.state().position.get(j).copied().unwrap_or_default(),
                     velocity: arm.state().velocity.get(j).copied().unwrap_or_default(),
                     commanded: limiter.position(),
-                    commanded_velocity: limiter.velocity(),
+                    commanded_velocity: arm.commanded_velocity(j),
                     lower: limiter.bounds().lower,
                     upper: limiter.bounds().upper,
                     acceleration: limiter.bounds().acceleration,
@@ -181,6 +181,7 @@ impl Coordinator {
                     jerk: arm.config().limits.jerk_max.get(j).copied().unwrap_or(crate::joint::DEFAULT_JERK),
                     tracking_error: arm.tracking_error(j),
                     droop,
+                    speed_fraction: arm.state().speed_fraction,
                     arm: i as u16,
                     stamp: arm.state().stamp,
                     fault,
@@ -339,9 +340,10 @@ impl Coordinator {
                 arbiter.demand(i),
                 |j| {
                     let (task, value) = arbiter.winner(first + j)?;
-                    let scales = tasks.get(task as usize).is_some_and(|task| !task.applies_speed());
-                    let speed = if scales { pace } else { 1.0 };
-                    Some(JointRequest { value, new_task: arbiter.winner_changed(first + j), speed })
+                    let task = tasks.get(task as usize)?;
+                    let speed = if task.applies_speed() { 1.0 } else { pace };
+                    let new_task = arbiter.winner_changed(first + j);
+                    Some(JointRequest { value, new_task, speed, shared: task.shares_time })
                 },
                 self.step,
                 time.now,

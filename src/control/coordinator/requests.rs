@@ -49,6 +49,10 @@ impl Coordinator {
                 Some(t) => t.set_tool(&tool).err().unwrap_or(Outcome::Accepted),
                 None => Outcome::WrongTask(task),
             },
+            Request::ArmTool { arm, tool } => self.with_arm(arm, |a| {
+                a.set_tool(&tool);
+                Outcome::Accepted
+            }),
             Request::Reset { arm } => self.with_arm(arm, |a| a.reset(arm, now)),
             Request::Enabled { arm, outside } => self.with_arm(arm, |a| a.activate(arm, outside, now)),
             Request::PrepareDisable { arm } => {

@@ -135,7 +135,10 @@ impl GuardWorld {
             let release = if sweep.is_of_one_robot(pair) { OWN_RELEASE } else { RELEASE };
             pairs.push(GuardedPair { arms, names: sweep.names(pair).map(Label::new), release, released: None });
         }
-        let kept = |pair| if sweep.is_of_one_robot(pair) { own.get(sweep.names(pair)) } else { margin as f32 };
+        let kept = |pair| match sweep.is_of_one_robot(pair) {
+            true => own.get(sweep.names(pair)),
+            false => (margin + sweep.apart(pair)) as f32,
+        };
         let margins: Vec<f32> = (0..sweep.pairs()).map(kept).collect();
         let list = || Vec::with_capacity(margins.len());
         let pieces = || Vec::with_capacity(PARTS * Sweep::PIECES * margins.len());

@@ -56,7 +56,7 @@ impl Move {
         for (limiter, to) in limiters.iter_mut().zip(&self.to) {
             let left = to - limiter.position();
             if left == 0.0 {
-                limiter.relieve(*to, 0.0);
+                limiter.relieve(*to, 0.0, dt);
                 continue;
             }
             let acceleration = GENTLY * limiter.bounds().acceleration;
@@ -64,7 +64,7 @@ impl Move {
             let speed = most.min(limiter.velocity().abs() + acceleration * dt);
             let reached = speed * dt >= left.abs() - 1e-12;
             let next = if reached { *to } else { limiter.position() + (speed * dt).copysign(left) };
-            limiter.relieve(next, if reached { 0.0 } else { speed.copysign(left) });
+            limiter.relieve(next, if reached { 0.0 } else { speed.copysign(left) }, dt);
             arrived &= reached;
         }
         arrived

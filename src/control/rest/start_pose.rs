@@ -62,7 +62,8 @@ pub fn positions(
         if let Some(written) = since.written {
             let (last, v) = (of(&written.position), of(&written.velocity).abs());
             let difference = here - last;
-            let near = if resting.is_some() { supervision.accuracy } else { droop };
+            // A joint below its setpoint droops; in velocity mode there was none.
+            let near = if resting.is_some() || since.inexact > 0.0 { supervision.accuracy } else { droop };
             if difference.abs() <= near {
                 *taken = last;
             } else {

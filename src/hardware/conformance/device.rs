@@ -154,7 +154,7 @@ fn optional_parts(context: &mut Context) -> Result<(), String> {
         sensor.read_force_torque().map_err(|e| format!("read_force_torque: {e}"))?;
     }
     let pose = adapter.cartesian().map_or(Ok(None), |poses| poses.read_cartesian_position());
-    if let Some(pose) = pose.map_err(|e| format!("read_cartesian_position: {e}"))? {
+    if let Some(pose) = pose.map_err(|e| format!("read_cartesian_position: {e}"))?.map(|stated| stated.tcp) {
         // A pose at 20 m or 7 rad is in millimetres or degrees.
         require(pose.xyz.iter().all(|v| v.abs() < 20.0), || format!("{:?} is not in metres", pose.xyz))?;
         require(pose.rpy.iter().all(|v| v.abs() < 7.0), || format!("{:?} is not in rad", pose.rpy))?;

@@ -34,7 +34,7 @@ const MOTORS_TIMEOUT: Duration = Duration::from_secs(5);
 /// How long the arm may refuse a change of mode after a motion.
 const MODE_TIMEOUT: Duration = Duration::from_secs(2);
 /// How long the arm is monitored after the motors came on.
-const HOLD_TIME: Duration = Duration::from_millis(500);
+pub(super) const HOLD_TIME: Duration = Duration::from_millis(500);
 /// Attempts to measure the lag of a joint while this program runs unevenly.
 const LAG_ATTEMPTS: u32 = 3;
 

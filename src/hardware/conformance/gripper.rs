@@ -27,20 +27,28 @@ pub fn in_unit(unit: GripperUnit, metres: f64) -> f64 {
     match unit {
         GripperUnit::Meters => metres,
         GripperUnit::Radians => metres * RADIANS_PER_METRE,
+        GripperUnit::OnOff => f64::from(metres > 0.0),
     }
 }
 
 /// Makes the arm ready; returns what is known of its gripper and its position, `None` without a gripper.
 fn ready(context: &mut Context) -> Result<Option<(GripperInfo, f64)>, String> {
     context.ready(context.first_mode())?;
-    let Some(position) = context.gripper()? else { return Ok(None) };
-    let info = context.adapter.gripper().map(|gripper| gripper.info());
-    Ok(info.map(|info| (info, position)))
+    let Some(info) = context.adapter.gripper().map(|gripper| gripper.info()) else { return Ok(None) };
+    if let (GripperUnit::OnOff, Some((closed, _)), None) = (info.unit, info.range, context.gripper()?) {
+        // Its position is the order: nothing is known of it before the first one.
+        context.command_gripper(closed)?;
+        arrives(context, info.unit, closed)?;
+    }
+    Ok(context.gripper()?.map(|position| (info, position)))
 }
 
 /// A target that differs from `from` and is within the range.
 fn target(info: &GripperInfo, from: f64) -> f64 {
     let (closed, open) = info.range.unwrap_or((0.0, in_unit(info.unit, 0.04)));
+    if info.unit == GripperUnit::OnOff {
+        return if from == closed { open } else { closed };
+    }
     let middle = (closed + open) / 2.0;
     // From the middle, a quarter of the range towards open.
     if (from - middle).abs() > (open - closed).abs() / 8.0 { middle } else { middle + (open - closed) / 4.0 }
@@ -77,6 +85,7 @@ fn unit(context: &mut Context) -> Result<(), String> {
     let plausible = match info.unit {
         GripperUnit::Meters => -0.01..0.5,
         GripperUnit::Radians => -6.3..6.3,
+        GripperUnit::OnOff => 0.0..1.5,
     };
     let named = info.unit.name();
     require(plausible.contains(&start), || format!("a position of {start} {named}"))?;

@@ -8,6 +8,7 @@ mod device;
 mod disconnects;
 mod faults;
 pub mod figures;
+pub mod first_day;
 pub mod first_motion;
 mod gripper;
 mod identity;

@@ -148,10 +148,13 @@ fn stop_is_no_fault(context: &mut Context) -> Result<(), String> {
 /// Holds the gripper as the device thread does after a stop that does not affect it.
 fn stop_holds_gripper(context: &mut Context) -> Result<(), String> {
     context.ready(context.first_mode())?;
+    let info = context.adapter.gripper().map(|gripper| gripper.info()).unwrap_or_default();
+    if info.unit == GripperUnit::OnOff {
+        return context.skip("its gripper only opens and closes");
+    }
     if context.gripper()?.is_none() {
         return context.skip("it has no gripper");
     }
-    let info = context.adapter.gripper().map(|gripper| gripper.info()).unwrap_or_default();
     let Some((closed, open)) = info.range else { return context.skip("the range of its gripper is unknown") };
     // On a busy machine the gripper may arrive before the stop: then the check is repeated in the other direction.
     for target in [open, closed, open, closed, open] {

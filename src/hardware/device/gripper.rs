@@ -49,6 +49,7 @@ impl GripperStop {
         let smallest = match unit {
             GripperUnit::Meters => STEP,
             GripperUnit::Radians => ROTARY_STEP,
+            GripperUnit::OnOff => f64::INFINITY,
         };
         self.until = self.until.filter(|until| now < *until);
         self.until?;

@@ -1,10 +1,11 @@
 //! Counters and texts of a device thread, for status and log. The tick does not read them.
 
 use std::collections::VecDeque;
-use std::sync::atomic::{AtomicU8, AtomicU32, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Mutex, OnceLock};
 
 use super::Details;
+use super::identity::Identity;
 use crate::clock::Mono;
 use crate::hardware::adapter::{AdapterError, AdapterResult, RobotState};
 use crate::rt::wake::Wake;
@@ -63,6 +64,9 @@ pub struct Health {
     /// Moving average of the time between states [ns]. An average of rates would give short intervals too much weight.
     interval_ns: AtomicU64,
     text: Mutex<Text>,
+    identity: Mutex<Identity>,
+    /// Whether another arm answers than the one of the run.
+    is_other: AtomicBool,
     codes: Mutex<Option<RobotState>>,
     details: Mutex<Details>,
     /// `ArmCommand::gripper_seq` of the last gripper command that was answered, and the answer.
@@ -82,6 +86,24 @@ struct Text {
 }
 
 impl Health {
+    /// Returns which arm this is.
+    pub fn identity(&self) -> Identity {
+        lock(&self.identity).clone()
+    }
+
+    /// Changes which arm this is: at a connection, and when an operator accepts another one.
+    pub fn with_identity<T>(&self, act: impl FnOnce(&mut Identity) -> T) -> T {
+        let mut identity = lock(&self.identity);
+        let result = act(&mut identity);
+        self.is_other.store(identity.other.is_some(), Ordering::Release);
+        result
+    }
+
+    /// Returns whether another arm answers than the one of the run. Never blocks.
+    pub(super) fn is_other_arm(&self) -> bool {
+        self.is_other.load(Ordering::Acquire)
+    }
+
     /// Returns the rate of new states [Hz].
     pub fn rate(&self) -> f64 {
         match self.interval_ns.load(Ordering::Relaxed) {

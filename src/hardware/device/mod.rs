@@ -10,6 +10,7 @@
 mod details;
 pub mod gripper;
 mod health;
+mod identity;
 mod plausible;
 mod thread;
 mod wire_guard;
@@ -21,9 +22,13 @@ use std::time::Duration;
 
 pub use details::Details;
 pub use health::{Episode, Health, Note};
+pub use identity::Identity;
 pub use thread::Way;
 
-use crate::arm::{ArmCommand, ArmState, GripperInfo, IoInfo, IoState, Load, OutputValue, StopInput, Supervision};
+use crate::arm::{
+    ArmCommand, ArmState, Bridging, FactoryKinematics, GripperInfo, IoInfo, IoState, Load, OutputValue, StopInput,
+    Supervision,
+};
 use crate::clock::Clock;
 use crate::hardware::adapter::{AdapterError, AdapterResult, ManipulatorAdapter, ManipulatorInfo};
 use crate::joint::{JointLimits, Joints};
@@ -108,8 +113,14 @@ pub struct Connected {
     pub gripper: Option<GripperInfo>,
     /// Its digital and analogue inputs and outputs, if it has any.
     pub io: Option<IoInfo>,
+    /// Which arm it is: its serial number, or the offsets that its drives keep; `None` if it does not say.
+    pub identity: Option<String>,
     /// Calibration offsets of its joints [rad], if it reports them.
     pub calibration_offsets: Option<Joints>,
+    /// Its dimensions, if its controller has them.
+    pub kinematics: Option<FactoryKinematics>,
+    /// What it makes of gaps in its setpoints, if it says so itself.
+    pub bridging: Option<Bridging>,
     /// Whether it streams its state.
     pub streams: bool,
     /// Whether its controller takes the load at the flange.

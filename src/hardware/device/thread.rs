@@ -270,6 +270,7 @@ impl Worker {
             }
             Order::SetLimits(limits, reply) => {
                 self.set_limits(&limits);
+                adapter.set_limits(&limits);
                 let _ = reply.send(Ok(()));
             }
             Order::ReadIo(reply) => {

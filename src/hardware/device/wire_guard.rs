@@ -52,6 +52,11 @@ impl WireGuard {
         self.period = period;
     }
 
+    /// Sets the longest time without a setpoint that the arm bridges.
+    pub fn set_gap_tolerance(&mut self, tolerance: Duration) {
+        self.supervision.gap_tolerance = tolerance;
+    }
+
     /// Sets the limits of commands.
     pub fn set_limits(&mut self, limits: &JointLimits) {
         let limits = limits.clone().with_defaults();

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 pub use super::delivery::Delivery;
 use super::misreading::Memory;
-pub use super::options::{SimOptions, check_pose, check_range};
+pub use super::options::{ControllerOptions, SimOptions, check_pose, check_range};
 use crate::clock::Mono;
 use crate::hardware::adapter::AdapterResult;
 use crate::hardware::registry::Truth;
@@ -41,6 +41,7 @@ pub const PLAYABLE: &[FaultKind] = &[
     FaultKind::Sag,
     FaultKind::Blocked,
     FaultKind::Pushed,
+    FaultKind::Nudged,
     FaultKind::MotorOff,
 ];
 
@@ -148,6 +149,8 @@ pub struct SimArm {
     goal: Option<(Joints, Mono)>,
     script: FaultScript,
     misreadings: Memory,
+    /// Whether setpoints are reported instead of measurements.
+    reports_commanded: bool,
     /// Time zero of the fault script.
     first_client: Option<Mono>,
     powered_up: Mono,
@@ -169,7 +172,9 @@ impl SimArm {
         Ok(Self {
             name,
             playable,
-            plant: Plant::lagging(limits, &options.initial_positions, options.lag).drooping(options.droop),
+            plant: Plant::lagging(limits, &options.initial_positions, options.lag)
+                .drooping(options.droop)
+                .as_controlled(options.controller.deceleration, options.controller.gap_tolerance),
             limits: limits.clone(),
             tolerance: ROUNDING,
             mode: ControlMode::Position,
@@ -184,6 +189,7 @@ impl SimArm {
             goal: None,
             script: FaultScript::new(&options.faults),
             misreadings: Memory::default(),
+            reports_commanded: options.controller.reports_commanded,
             first_client: None,
             powered_up: now,
             advanced_to: now,

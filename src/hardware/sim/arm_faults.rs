@@ -19,6 +19,8 @@ impl SimArm {
         if let Some((joint, fault)) = pushed.filter(|(_, fault)| fault.duration == 0.0) {
             self.plant.push(joint, fault.amount);
         }
+        let nudged = self.take_fault(FaultKind::Nudged).map(|fault| (fault.joint.saturating_sub(1), fault.amount));
+        self.plant.nudge(nudged);
         if let Some(fault) = self.take_fault(FaultKind::MotorOff) {
             self.switch(fault.joint.saturating_sub(1), false);
         }
@@ -45,11 +47,15 @@ impl SimArm {
         self.script.take_if(kind, t, wanted)
     }
 
-    /// Changes true positions [rad] and velocities [rad/s] to what the arm reports instead of them now.
+    /// Changes true positions [rad] and velocities [rad/s] to what the arm reports instead of them now: its setpoints
+    /// if it reports those, and what faults make of them.
     pub fn misread(&mut self, positions: &mut [f64], velocities: &mut [f64]) {
         let (now, dof) = (self.script_time(), self.dof());
         let faults: Vec<Fault> = self.script.take_all(FaultKind::Misread, now).collect();
         let (Some(positions), Some(velocities)) = (positions.get_mut(..dof), velocities.get_mut(..dof)) else { return };
+        if self.reports_commanded {
+            positions.iter_mut().zip(self.plant.commanded()).for_each(|(said, commanded)| *said = commanded);
+        }
         self.misreadings.apply(&faults, now, positions, velocities);
     }
 

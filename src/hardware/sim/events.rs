@@ -21,6 +21,8 @@ pub enum SimEvent {
     Disconnected,
     /// Another client was rejected.
     Rejected,
+    /// A client of another user was disconnected.
+    Foreign,
     /// A fault of the script began.
     Fault(FaultKind),
 }

@@ -60,6 +60,9 @@ pub enum FaultKind {
     /// Joint number `joint` is moved by `amount` [rad], as by hand: at once, or evenly during `duration`. A joint whose
     /// motor is on does not give way, unless the arm is guided by hand.
     Pushed,
+    /// A hand pushes joint number `joint` against its motor for `duration`: it yields by `amount` [rad], and springs
+    /// back.
+    Nudged,
     /// The motor of joint number `joint` loses its power; the other motors keep theirs.
     MotorOff,
     /// Digital input number `input` is low for `duration`; without a duration it stays low.
@@ -119,15 +122,15 @@ pub struct Fault {
     #[serde(default = "default_code")]
     #[schemars(range(min = 1))]
     pub code: u16,
-    /// How far the arm sinks, for `sag`, or a joint is moved, for `pushed` [rad]; width of an `object` [m or rad]; how
-    /// wrong a `misread` is.
+    /// How far the arm sinks, for `sag`, or a joint is moved, for `pushed` and `nudged` [rad]; width of an `object` [m
+    /// or rad]; how wrong a `misread` is.
     #[serde(default = "default_amount", deserialize_with = "non_negative")]
     pub amount: f64,
     /// What is wrong with the readings, for `misread`.
     #[serde(default)]
     pub misread: Misreading,
-    /// Number of the joint, from 1, for `blocked`, `pushed`, `motor_off`, `misread`, and `error_code` of an arm whose
-    /// drives have an error each.
+    /// Number of the joint, from 1, for `blocked`, `pushed`, `nudged`, `motor_off`, `misread`, and `error_code` of an
+    /// arm whose drives have an error each.
     #[serde(default = "default_joint")]
     #[schemars(range(min = 1))]
     pub joint: usize,

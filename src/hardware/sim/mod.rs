@@ -11,6 +11,7 @@
 //! | [`faults`] | fault script: what goes wrong, when, how often, for how long |
 //! | [`delivery`] | delivery of responses and reports: late, lost, damaged, cut off, without power |
 //! | [`tcp_server`] | one port for requests, or several ports with requests, reports or both |
+//! | [`peer`] | the user at the other end of a connection within this computer |
 //! | [`serial_server`] | a pseudo-terminal; requests as over TCP ([`stream`]) |
 //! | [`can_server`] | a bus in memory, a CAN interface, or a serial CAN adapter; the arm streams its state |
 //! | [`trace`] | received bytes, for tests |
@@ -33,6 +34,7 @@ pub mod gripper;
 pub mod io;
 pub mod misreading;
 pub mod options;
+pub mod peer;
 pub mod plant;
 mod plant_joint;
 pub mod reach;

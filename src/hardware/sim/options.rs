@@ -32,11 +32,43 @@ pub struct SimOptions {
     pub droop: f64,
     /// Faults, and when they begin (seconds after the first connection).
     pub faults: Vec<Fault>,
+    /// What the controller does otherwise than its documents say.
+    pub controller: ControllerOptions,
+}
+
+/// Where an emulated controller differs from its documents: what `dimos adapter test --first-day` must find.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct ControllerOptions {
+    /// Deceleration of the joints, 0.1 to 1000 [rad/s²]; 0 for the arm's own.
+    #[schemars(range(min = 0, max = 1000))]
+    pub deceleration: f64,
+    /// How long it continues at the velocity of the last setpoints when none follows, 0 to 1 [s]; then it decelerates.
+    /// 0 for its own behaviour. Only where joints follow setpoints that arrive as such.
+    #[schemars(range(min = 0, max = 1))]
+    pub gap_tolerance: f64,
+    /// Whether it reports its own setpoints as joint positions, instead of measurements.
+    pub reports_commanded: bool,
+}
+
+impl ControllerOptions {
+    fn check(&self) -> Result<(), ConfigError> {
+        if self.deceleration != 0.0 {
+            check_range("controller.deceleration", self.deceleration, 0.1..=1000.0, "rad/s²")?;
+        }
+        check_range("controller.gap_tolerance", self.gap_tolerance, 0.0..=1.0, "s")
+    }
 }
 
 impl Default for SimOptions {
     fn default() -> Self {
-        Self { initial_positions: Vec::new(), lag: LAG, droop: 0.0, faults: Vec::new() }
+        Self {
+            initial_positions: Vec::new(),
+            lag: LAG,
+            droop: 0.0,
+            faults: Vec::new(),
+            controller: ControllerOptions::default(),
+        }
     }
 }
 
@@ -57,6 +89,7 @@ impl SimOptions {
             .map_err(|error| error.within("sim"))
             .and_then(|()| check_range("lag", self.lag, 0.0..=MAX_LAG, "s"))
             .and_then(|()| check_range("droop", self.droop, 0.0..=MAX_DROOP, "rad"))
+            .and_then(|()| self.controller.check())
     }
 }
 

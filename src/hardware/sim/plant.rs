@@ -18,6 +18,8 @@ const FRICTION: f64 = 0.5;
 const HEADROOM: f64 = 2.0;
 /// Largest first-order part of a lag [s]; the rest is dead time.
 const FIRST_ORDER: f64 = 0.02;
+/// Weight of the newest setpoint in the pace at which a reference continues without setpoints.
+const PACE_GAIN: f64 = 0.1;
 
 /// How joints follow servo setpoints and velocities.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -67,8 +69,16 @@ pub struct Plant {
     /// Time since the last servo setpoint, and between the two before it [s].
     since_setpoint: f64,
     interval: f64,
+    /// Average of that time [s].
+    average: f64,
     /// How far the integration is ahead of the present [s]: less than a step.
     ahead: f64,
+    /// Deceleration [rad/s²]; 0: each joint's acceleration.
+    braking: f64,
+    /// How long the reference continues without setpoints [s]; 0: not at all.
+    bridges: f64,
+    /// The joint that a hand pushes against its motor, and how far it yields [rad].
+    nudged: Option<(usize, f64)>,
 }
 
 impl Plant {
@@ -100,7 +110,11 @@ impl Plant {
             sag: 0.0,
             since_setpoint: 0.0,
             interval: 0.0,
+            average: 0.0,
             ahead: 0.0,
+            braking: 0.0,
+            bridges: 0.0,
+            nudged: None,
         }
     }
 
@@ -120,6 +134,33 @@ impl Plant {
         Self { droop, ..self }
     }
 
+    /// Gives all joints this deceleration [rad/s²], and lets their reference continue for `bridges` [s] at the velocity
+    /// of the last setpoints when none follows; then it decelerates. 0 for neither.
+    pub fn as_controlled(mut self, deceleration: f64, bridges: f64) -> Self {
+        (self.braking, self.bridges) = (deceleration, bridges);
+        for joint in self.active_mut().iter_mut().filter(|_| deceleration > 0.0) {
+            // What a joint cannot brake it must not gather.
+            joint.acceleration = joint.acceleration.min(deceleration / HEADROOM);
+        }
+        self
+    }
+
+    /// A hand pushes a joint (index from 0) against its motor: it is `amount` [rad] beside its place. `None`: no hand.
+    pub fn nudge(&mut self, nudged: Option<(usize, f64)>) {
+        self.nudged = nudged;
+    }
+
+    /// Returns where the controller commands the joints to be [rad]: without lag, droop and pushes.
+    pub fn commanded(&self) -> Joints {
+        let following = self.drive == Drive::Servo;
+        let undrooped = |i: usize| if i < self.loaded { self.droop } else { 0.0 };
+        std::array::from_fn(|i| match self.joints.get(i) {
+            Some(joint) if following && joint.on => joint.target + undrooped(i),
+            Some(joint) => joint.position,
+            None => 0.0,
+        })
+    }
+
     /// Lets only the first joints droop: those after them carry no load.
     pub fn load(&mut self, joints: usize) {
         self.loaded = joints;
@@ -130,7 +171,11 @@ impl Plant {
         // Interpolates back from the end of the last step to the present; an ideal servo is at its setpoint.
         let exact = self.drive == Drive::Servo && self.tracking == Tracking::Ideal;
         let back = if exact { 0.0 } else { self.ahead };
-        self.joints.map(|joint| joint.position - joint.velocity * back)
+        let mut positions = self.joints.map(|joint| joint.position - joint.velocity * back);
+        if let Some((at, amount)) = self.nudged.and_then(|(joint, amount)| Some((positions.get_mut(joint)?, amount))) {
+            *at += amount;
+        }
+        positions
     }
 
     /// Returns the joint velocities [rad/s].
@@ -213,15 +258,27 @@ impl Plant {
 
     fn follow_setpoint(&mut self, target: &[f64]) {
         let following = self.drive == Drive::Servo;
-        let before = self.joints.map(|joint| joint.target);
+        let bridges = self.bridges > 0.0;
+        let before = self.joints.map(|joint| if bridges { joint.setpoint } else { joint.target });
         if !self.drive_to(Drive::Servo, target) {
             return;
         }
-        self.interval = (self.since_setpoint - self.ahead).clamp(1e-3, CREDIT);
+        let passed = (self.since_setpoint - self.ahead).clamp(0.0, CREDIT);
+        self.average = (self.average + PACE_GAIN * (passed - self.average)).max(1e-4);
+        self.interval = passed.max(1e-3);
         self.since_setpoint = self.ahead;
-        let (interval, ahead) = (self.interval, self.ahead);
+        let (interval, ahead, average) = (self.interval, self.ahead, self.average);
         for (joint, before) in self.active_mut().iter_mut().zip(before) {
-            joint.pace = if following { (joint.target - before) / interval } else { 0.0 };
+            joint.setpoint = joint.target;
+            let step = if following { joint.target - before } else { 0.0 };
+            joint.pace = step / interval;
+            if bridges {
+                // Setpoints do not arrive evenly: what continues without them continues at their average pace.
+                joint.step = if following { joint.step + PACE_GAIN * (step - joint.step) } else { 0.0 };
+                joint.pace = joint.step / average;
+                // A setpoint holds for a period, and is in the middle of it on average.
+                joint.target -= 0.5 * joint.step;
+            }
         }
         if self.tracking == Tracking::Ideal {
             for joint in self.active_mut().iter_mut().filter(|joint| joint.on && !joint.blocked) {
@@ -342,6 +399,7 @@ impl Plant {
         let fallen = |joint: &Joint| self.fall == 0.0 || joint.fallen();
         let arrived = |joint: &Joint| match self.drive {
             _ if !joint.on => fallen(joint),
+            Drive::Servo if self.bridges > 0.0 && joint.pace != 0.0 => false,
             Drive::Disabled | Drive::Stop | Drive::Guided => true,
             Drive::Position | Drive::Servo => joint.position == joint.target,
             Drive::Velocity => joint.target == 0.0,
@@ -353,6 +411,7 @@ impl Plant {
     fn step(&mut self, h: f64) {
         self.since_setpoint += h;
         let pause = self.since_setpoint > 1.5 * self.interval;
+        let (braking, bridges, since) = (self.braking, self.bridges, self.since_setpoint - 0.5 * self.average);
         let (drive, tracking, speed, fall) = (self.drive, self.tracking, self.speed, self.fall);
         for joint in self.active_mut() {
             if joint.blocked {
@@ -365,8 +424,19 @@ impl Plant {
                     joint.travel(h);
                 }
                 (Drive::Disabled, _) => joint.fall(fall, h),
-                (Drive::Stop | Drive::Guided, _) => joint.accelerate(0.0, joint.acceleration, h),
+                (Drive::Stop | Drive::Guided, _) => {
+                    let deceleration = if braking > 0.0 { braking } else { joint.acceleration };
+                    joint.accelerate(0.0, deceleration, h);
+                }
                 (Drive::Position, _) => joint.approach(joint.velocity_max * speed, 0.0, 0.0, joint.acceleration, h),
+                (Drive::Servo, Tracking::Lag(lag)) if bridges > 0.0 => {
+                    if since > bridges {
+                        let dv = (if braking > 0.0 { braking } else { joint.acceleration }) * h;
+                        joint.pace -= joint.pace.clamp(-dv, dv);
+                    }
+                    joint.target = (joint.target + joint.pace * h).clamp(joint.lower, joint.upper);
+                    joint.approach(joint.velocity_max, lag, joint.pace, HEADROOM * joint.acceleration, h);
+                }
                 (Drive::Servo, Tracking::Lag(lag)) => {
                     let pace = if pause { 0.0 } else { joint.pace };
                     joint.approach(joint.velocity_max, lag, pace, HEADROOM * joint.acceleration, h);

@@ -16,6 +16,10 @@ pub(super) struct Joint {
     pub on: bool,
     /// Target position [rad] or velocity [rad/s].
     pub target: f64,
+    /// The last servo setpoint [rad].
+    pub setpoint: f64,
+    /// Average distance from a setpoint to the next [rad].
+    pub step: f64,
     /// Speed of the setpoints, from the last two [rad/s].
     pub pace: f64,
     pub lower: f64,

@@ -189,3 +189,34 @@ fn a_dead_time_delays_setpoints_and_a_stop_discards_them() {
     plant.advance(1.0);
     assert_eq!(plant.positions()[0], 0.4);
 }
+
+/// What continues without setpoints goes `v·T + v²/2a` past the last one, and lags by its lag before.
+#[test]
+fn a_reference_continues_for_its_time_and_then_decelerates() {
+    let limits = JointLimits { acceleration_max: vec![10.0; 2], ..JointLimits::uniform(2, 3.0, 3.0) };
+    let mut plant = Plant::lagging(&limits, &[0.0, 0.0], 0.06).as_controlled(4.0, 0.04);
+    plant.enable(true);
+    let (speed, period) = (0.2, 0.005);
+    for i in 0..200 {
+        plant.servo(&[speed * period * f64::from(i), 0.0]);
+        plant.advance(period);
+    }
+    let last = speed * period * 199.0;
+    // A setpoint holds for a period, and is in the middle of it on average.
+    let behind = (last + 0.5 * speed * period - plant.positions()[0]) / speed;
+    assert!((behind - 0.06).abs() < 0.003, "{behind}");
+    plant.advance(2.0);
+    let past = plant.positions()[0] - last;
+    assert!((past - (speed * 0.04 + speed * speed / 8.0)).abs() < 2e-4, "{past}");
+    assert_eq!(plant.velocities()[0], 0.0);
+}
+
+#[test]
+fn a_pushed_joint_is_beside_its_place_and_commanded_ones_are_not() {
+    let mut plant = Plant::lagging(&JointLimits::uniform(2, 3.0, 3.0), &[0.5, 0.0], 0.01);
+    plant.enable(true);
+    plant.nudge(Some((0, 0.01)));
+    assert!((plant.positions()[0] - 0.51).abs() < 1e-9 && (plant.commanded()[0] - 0.5).abs() < 1e-9);
+    plant.nudge(None);
+    assert!((plant.positions()[0] - 0.5).abs() < 1e-9);
+}

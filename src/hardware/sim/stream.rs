@@ -2,6 +2,7 @@
 //! ([`super::tcp_server`]) and serial lines ([`super::serial_server`]).
 
 use std::io::{Read, Write};
+use std::net::IpAddr;
 use std::sync::{Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -59,6 +60,9 @@ pub trait Controller: Send + 'static {
     fn report(&mut self, _port: usize, _now: Mono, _packet: &mut Vec<u8>) -> Option<Delivery> {
         None
     }
+
+    /// A client of a port with sessions has connected from this address.
+    fn session_from(&mut self, _port: usize, _client: u64, _address: IpAddr) {}
 
     /// A client has connected to a port with sessions. What is put into `greeting` is sent first.
     fn session_began(&mut self, _port: usize, _client: u64, _now: Mono, _greeting: &mut Vec<u8>) {}

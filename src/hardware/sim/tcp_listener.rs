@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::arm::Delivery;
+use super::events::{self, SimEvent};
 use super::stream::{Controller, Ending};
 use super::tcp_server::{Inner, Port};
 use crate::sync::lock;
@@ -99,6 +100,9 @@ impl<C: Controller> ListenerThread<C> {
     }
 
     fn add_client(&mut self, stream: TcpStream, port: usize) {
+        if !(self.inner.admit)(&stream) {
+            return events::note(SimEvent::Foreign);
+        }
         let _ = stream.set_nodelay(true);
         match self.inner.ports.get(port) {
             Some((_, Port::Requests | Port::Sessions(_))) => {

@@ -64,6 +64,8 @@ pub(super) struct Inner<C> {
     pub ports: Vec<(SocketAddr, Port)>,
     /// Maximum number of clients that send requests.
     max_clients: usize,
+    /// Returns whether a new client is served.
+    pub admit: Admit,
     pub shared: Shared<C, Client>,
     /// All connections were closed, including those of report readers.
     pub ended: AtomicBool,
@@ -71,6 +73,9 @@ pub(super) struct Inner<C> {
     next_client: AtomicU64,
     refused: AtomicU64,
 }
+
+/// Decides on a new client before anything is read from it.
+pub type Admit = fn(&TcpStream) -> bool;
 
 /// A client with requests: its number and its connection.
 type Client = (u64, TcpStream);
@@ -81,22 +86,24 @@ impl<C: Controller> TcpServer<C> {
     pub fn start(name: &str, controller: C, address: SocketAddr) -> AdapterResult<Self> {
         let failed = |e| cannot_listen(&format!("{name} emulator"), address, &e);
         let listener = TcpListener::bind(address).map_err(failed)?;
-        Self::with_ports(name, controller, vec![(listener, Port::Requests)], 1).map_err(failed)
+        Self::with_ports(name, controller, vec![(listener, Port::Requests)], 1, |_| true).map_err(failed)
     }
 
     /// Serves several ports, and at most `max_clients` clients with requests at a time. Ports are numbered in this
-    /// order.
+    /// order. Clients that `admit` refuses are disconnected.
     pub fn with_ports(
         name: &str,
         controller: C,
         ports: Vec<(TcpListener, Port)>,
         max_clients: usize,
+        admit: Admit,
     ) -> io::Result<Self> {
         let addresses = ports.iter().map(|(listener, port)| Ok((listener.local_addr()?, *port)));
         let inner = Arc::new(Inner {
             name: name.to_owned(),
             ports: addresses.collect::<io::Result<_>>()?,
             max_clients,
+            admit,
             shared: Shared::new(controller),
             ended: AtomicBool::new(false),
             wake: Wake::new()?,
@@ -178,6 +185,9 @@ impl<C: Controller> Inner<C> {
         };
         events::note(SimEvent::Connected);
         let session = self.ports.get(port).and_then(|(_, kind)| kind.session());
+        if let Some(address) = stream.peer_addr().ok().filter(|_| session.is_some()) {
+            self.shared.with(|controller, _| controller.session_from(port, number, address.ip()));
+        }
         let ending = match session {
             Some(period) => self.shared.converse((port, number), &mut stream, period),
             None => self.shared.serve(port, &mut stream),

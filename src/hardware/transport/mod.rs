@@ -1,6 +1,7 @@
 //! Transports to devices, shared by the arms.
 
 pub mod can;
+pub mod capture;
 pub mod device_time;
 mod incoming;
 pub mod measured;
@@ -9,5 +10,6 @@ pub mod request_reply;
 pub mod serial;
 pub mod serial_ports;
 pub mod tcp;
+pub mod udp;
 
 pub use incoming::Scan;

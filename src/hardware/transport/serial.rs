@@ -15,6 +15,7 @@ use rustix::termios::{
     ControlModes, OptionalActions, QueueSelector, Termios, ioctl_tiocexcl, isatty, tcflush, tcgetattr, tcsetattr,
 };
 
+use super::capture::Tap;
 use super::incoming::Incoming;
 pub use super::incoming::Scan;
 pub use super::pty::Pty;
@@ -70,6 +71,7 @@ pub struct SerialLink {
     incoming: Incoming,
     /// Timeout of a write.
     timeout: Duration,
+    tap: Tap,
 }
 
 impl SerialLink {
@@ -83,7 +85,8 @@ impl SerialLink {
     /// write. Does not show whether a controller is connected.
     pub fn connect(device: &str, path: &str, baud: u32, timeout: Duration) -> AdapterResult<Self> {
         let line = open_line(device, path, baud)?;
-        Ok(Self { line, peer: format!("{device} at {path}"), incoming: Incoming::new(), timeout })
+        let tap = Tap::open(|| path.to_owned(), false, None);
+        Ok(Self { line, peer: format!("{device} at {path}"), incoming: Incoming::new(), timeout, tap })
     }
 
     /// Returns the device and its path, for messages.
@@ -94,6 +97,7 @@ impl SerialLink {
     /// Passes all of `bytes` to the system, which sends them at the line's rate. `Timeout` if that is too slow; the
     /// line stays usable.
     pub fn send(&mut self, bytes: &[u8]) -> AdapterResult<()> {
+        self.tap.sent(bytes);
         let deadline = Instant::now() + self.timeout;
         let mut rest = bytes;
         while !rest.is_empty() {
@@ -116,10 +120,12 @@ impl SerialLink {
     /// Waits up to `timeout` for a frame. `scan` gets the received bytes from the first one on, until it takes a frame;
     /// it must skip everything else. `Timeout` leaves the line usable; `Io` does not.
     pub fn receive<T>(&mut self, timeout: Duration, scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<T> {
-        let Self { line, peer, incoming, .. } = self;
+        let Self { line, peer, incoming, tap, .. } = self;
         incoming.receive(peer, timeout, scan, |room, left| {
             if wait(&*line, PollFlags::IN, left).map_err(|e| broken(peer, e))? {
-                read_line(line, peer, room)
+                let n = read_line(line, peer, room)?;
+                tap.received(room.get(..n).unwrap_or_default());
+                Ok(n)
             } else {
                 Ok(0)
             }

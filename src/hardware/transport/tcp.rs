@@ -6,6 +6,7 @@ use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
+use super::capture::Tap;
 use super::incoming::Incoming;
 pub use super::incoming::Scan;
 use crate::hardware::adapter::{AdapterError, AdapterResult};
@@ -96,6 +97,7 @@ pub struct TcpLink {
     incoming: Incoming,
     /// Timeout of reads.
     timeout: Duration,
+    tap: Tap,
 }
 
 impl TcpLink {
@@ -123,7 +125,8 @@ impl TcpLink {
         };
         prepare().map_err(|e| failed(reason(&e)))?;
         let peer = format!("{device} at {endpoint}");
-        Ok(Self { stream, peer, incoming: Incoming::new(), timeout })
+        let tap = Tap::open(|| endpoint.to_string(), false, None);
+        Ok(Self { stream, peer, incoming: Incoming::new(), timeout, tap })
     }
 
     /// Returns the device and its address, for messages.
@@ -138,11 +141,13 @@ impl TcpLink {
 
     /// Sends all of `bytes`.
     pub fn send(&mut self, bytes: &[u8]) -> AdapterResult<()> {
+        self.tap.sent(bytes);
         self.stream.write_all(bytes).map_err(|e| broken(&self.peer, &e))
     }
 
     /// Sends as much of `bytes` as possible without blocking. For a last message before [`TcpLink::abort`].
     pub fn send_now(&mut self, bytes: &[u8]) {
+        self.tap.sent(bytes);
         let flags = rustix::net::SendFlags::DONTWAIT | rustix::net::SendFlags::NOSIGNAL;
         let _ = rustix::net::send(&self.stream, bytes, flags);
     }
@@ -157,10 +162,10 @@ impl TcpLink {
     /// Waits up to `timeout` for a frame. `scan` gets the received bytes from the first one on, until it takes a frame;
     /// it must skip everything else. `Timeout` leaves the connection usable; `Io` does not.
     pub fn receive<T>(&mut self, timeout: Duration, scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<T> {
-        let Self { stream, peer, incoming, timeout: set } = self;
+        let Self { stream, peer, incoming, timeout: set, tap } = self;
         incoming.receive(peer, timeout, scan, |room, left| {
             if left.is_zero() {
-                return read_now(stream, peer, room);
+                return read_now(stream, peer, room, *tap);
             }
             if *set != left {
                 stream.set_read_timeout(Some(left)).map_err(|e| broken(peer, &e))?;
@@ -168,7 +173,10 @@ impl TcpLink {
             }
             match stream.read(room) {
                 Ok(0) => Err(AdapterError::Io(format!("{peer} closed the connection"))),
-                Ok(n) => Ok(n),
+                Ok(n) => {
+                    tap.received(room.get(..n).unwrap_or_default());
+                    Ok(n)
+                }
                 Err(e) if matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted) => {
                     Ok(0)
                 }
@@ -182,7 +190,7 @@ impl TcpLink {
         self.incoming.clear();
         let mut room = [0; 1024];
         for _ in 0..MAX_READS {
-            if read_now(&self.stream, &self.peer, &mut room)? == 0 {
+            if read_now(&self.stream, &self.peer, &mut room, self.tap)? == 0 {
                 break;
             }
         }
@@ -192,12 +200,12 @@ impl TcpLink {
     /// Returns the next frame among the received bytes, without waiting; `None` if there is none, or if too much noise
     /// comes before it: the connection is still readable then. `scan` as above.
     pub fn poll<T>(&mut self, mut scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<Option<T>> {
-        let Self { stream, peer, incoming, .. } = self;
+        let Self { stream, peer, incoming, tap, .. } = self;
         for _ in 0..MAX_READS {
             if let Some(frame) = incoming.next(&mut scan) {
                 return Ok(Some(frame));
             }
-            let arrived = incoming.fill(peer, |room| read_now(stream, peer, room))?;
+            let arrived = incoming.fill(peer, |room| read_now(stream, peer, room, *tap))?;
             if arrived == 0 {
                 return Ok(None);
             }
@@ -207,10 +215,13 @@ impl TcpLink {
 }
 
 /// Reads what has arrived; 0 if nothing has.
-fn read_now(stream: &TcpStream, peer: &str, room: &mut [u8]) -> AdapterResult<usize> {
-    match rustix::net::recv(stream, room, rustix::net::RecvFlags::DONTWAIT) {
+fn read_now(stream: &TcpStream, peer: &str, room: &mut [u8], tap: Tap) -> AdapterResult<usize> {
+    match rustix::net::recv(stream, &mut *room, rustix::net::RecvFlags::DONTWAIT) {
         Ok((0, _)) => Err(AdapterError::Io(format!("{peer} closed the connection"))),
-        Ok((n, _)) => Ok(n),
+        Ok((n, _)) => {
+            tap.received(room.get(..n).unwrap_or_default());
+            Ok(n)
+        }
         Err(rustix::io::Errno::AGAIN | rustix::io::Errno::INTR) => Ok(0),
         Err(e) => Err(broken(peer, &e.into())),
     }

@@ -14,7 +14,7 @@ use super::messages::{ArmInput, JointState};
 use super::notes::{Notes, channel};
 use super::recorder::{Note, Notice, Recorder, RecorderConfig};
 use super::replay::{Entry, LogReader, Payload, ReplayError, Selection};
-use crate::arm::{ArmCommand, ArmState, Commanded, Interference, Link, Pose, VelocitySource};
+use crate::arm::{ArmCommand, ArmState, Commanded, ControllerPose, Interference, Link, Pose, VelocitySource};
 use crate::clock::{Mono, WallOffset};
 use crate::joint::{ControlMode, MAX_DOF, joints_of, make_joints};
 use crate::telemetry::describe::{ArmNames, Names, Severity};
@@ -65,7 +65,7 @@ fn state(arm: u16, tick: u64) -> ArmState {
         effort: (arm == 0 && tick % 4 > 1).then(|| joints_of(&[1.5, 2.5, x])),
         gripper: (arm == 0).then_some(0.04 + x * 1e-3),
         gripper_force: (arm == 0).then_some(7.0 + x),
-        pose: (tick % 3 == 1).then_some(Pose { xyz: [x, 0.2, 0.3], rpy: [0.0, -1.0, x] }),
+        pose: (tick % 3 == 1).then_some(ControllerPose::of_flange(Pose { xyz: [x, 0.2, 0.3], rpy: [0.0, -1.0, x] })),
         wrench: (arm == 1 && tick > 3).then_some([1.0, 2.0, x, 4.0, 5.0, 6.0]),
         mode: if tick > 5 { ControlMode::ServoPosition } else { ControlMode::Velocity },
         enabled: tick > 2,
@@ -80,6 +80,7 @@ fn state(arm: u16, tick: u64) -> ArmState {
         commanded: (arm == 0 && tick > 2)
             .then(|| Commanded { position: joints_of(&[x, 0.1 + 0.2, -0.0]), velocity: joints_of(&[0.0, x, 1.0]) }),
         refused: tick / 3,
+        speed_fraction: (arm == 0 && tick > 4).then_some(0.25),
     }
 }
 
@@ -177,8 +178,10 @@ fn with_values(input: &ArmInput, states: Option<&JointState>, skip: usize, dof: 
         effort: (input.has_effort && known).then(|| pick(&states.unwrap().effort)),
         gripper: input.gripper.first().copied(),
         gripper_force: input.gripper_force.first().copied(),
-        pose: (!input.pose.is_empty())
-            .then(|| Pose { xyz: input.pose[..3].try_into().unwrap(), rpy: input.pose[3..].try_into().unwrap() }),
+        pose: (!input.pose.is_empty()).then(|| {
+            let (xyz, rpy) = (input.pose[..3].try_into().unwrap(), input.pose[3..].try_into().unwrap());
+            ControllerPose::of_flange(Pose { xyz, rpy })
+        }),
         wrench: (!input.wrench.is_empty()).then(|| input.wrench.clone().try_into().unwrap()),
         mode: modes.into_iter().find(|m| m.name() == input.mode).unwrap(),
         enabled: input.enabled,
@@ -195,6 +198,7 @@ fn with_values(input: &ArmInput, states: Option<&JointState>, skip: usize, dof: 
             velocity: joints_of(&input.commanded_velocity),
         }),
         refused: input.refused,
+        speed_fraction: input.speed_fraction.first().copied(),
     }
 }
 

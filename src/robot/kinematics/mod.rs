@@ -9,6 +9,7 @@
 pub mod jacobian;
 pub mod step;
 mod stored;
+pub mod tool_speed;
 
 use std::f64::consts::TAU;
 

@@ -1,10 +1,7 @@
-//! What a mesh file is, before the mesh library reads it: files of another kind, and binary STL files whose length
-//! does not fit their header. The library takes the number of triangles from the length and ignores the header.
+//! How a mesh file is stored: files of another kind, and the encodings of text.
 
-/// Length of the header of a binary STL file, with the number of triangles [bytes].
-const STL_HEADER: usize = 84;
-/// Length of a triangle in a binary STL file [bytes].
-const STL_TRIANGLE: u64 = 50;
+use std::borrow::Cow;
+
 /// Length of the start of a file in which text formats are recognized [bytes].
 const START: usize = 512;
 
@@ -22,43 +19,17 @@ pub(super) fn refuse_other_files(bytes: &[u8]) -> Result<(), String> {
     Ok(())
 }
 
-/// Checks that an STL file is text, or binary of the length that its header states: a truncated or padded file would
-/// be read as another, smaller or larger mesh.
-pub(super) fn check_stl(bytes: &[u8]) -> Result<(), String> {
-    let length = bytes.len() as u64;
-    let declared = bytes.get(80..STL_HEADER).and_then(|count| <[u8; 4]>::try_from(count).ok()).map(u32::from_le_bytes);
-    let expected = declared.map(|count| STL_HEADER as u64 + STL_TRIANGLE * u64::from(count));
-    // Some exporters end the file with a line break.
-    if expected.is_some_and(|expected| {
-        let rest = usize::try_from(expected).ok().and_then(|expected| bytes.get(expected..));
-        rest.is_some_and(|rest| matches!(rest, b"" | b"\n" | b"\r\n"))
-    }) {
-        return Ok(());
-    }
-    if is_text(bytes) {
-        return Ok(());
-    }
-    let (Some(declared), Some(expected)) = (declared, expected) else {
-        return Err(format!("the file is truncated: {length} bytes are less than the header of an STL file"));
+/// Returns the text of a file: UTF-8, or UTF-16 with a byte order mark; other bytes, such as those of a name in ISO
+/// 8859-1, are replaced. The numbers of a mesh are ASCII.
+pub(super) fn text(bytes: &[u8]) -> Cow<'_, str> {
+    let utf16 = |read: fn([u8; 2]) -> u16| {
+        let units: Vec<u16> = bytes.chunks_exact(2).skip(1).map(|pair| read([pair[0], pair[1]])).collect();
+        Cow::Owned(String::from_utf16_lossy(&units))
     };
-    let what = if length < expected { "truncated or not STL" } else { "damaged" };
-    Err(format!(
-        "the file is {what}: its header declares {declared} triangles ({expected} bytes), it has {length} bytes"
-    ))
-}
-
-/// Returns whether an STL file is text: it begins with `solid`, and its start has no bytes that text does not have.
-fn is_text(bytes: &[u8]) -> bool {
-    let after = bytes.trim_ascii_start().strip_prefix(b"solid");
-    let begins = after.is_some_and(|after| after.first().is_some_and(u8::is_ascii_whitespace));
-    let start = bytes.get(..bytes.len().min(START)).unwrap_or_default();
-    begins && start.iter().all(|byte| *byte >= b' ' || byte.is_ascii_whitespace())
-}
-
-/// Returns an error of the OBJ reader in terms of the file: indices count from 1, the reader's from 0.
-pub(super) fn obj_error(what: String) -> String {
-    if what.contains("out of bounds (4294967295)") {
-        return "a face refers to vertex 0: the vertices of an OBJ file count from 1".to_owned();
+    match bytes {
+        [0xff, 0xfe, ..] => utf16(u16::from_le_bytes),
+        [0xfe, 0xff, ..] => utf16(u16::from_be_bytes),
+        [0xef, 0xbb, 0xbf, rest @ ..] => String::from_utf8_lossy(rest),
+        _ => String::from_utf8_lossy(bytes),
     }
-    what
 }

@@ -63,11 +63,17 @@ fn volume(mesh: &Mesh) -> f64 {
 #[test]
 fn every_format_gives_the_same_mesh() {
     let plain = "<node id='n'><instance_geometry url='#g'/></node>";
+    let faces_first = obj();
+    let (points, faces) = faces_first.split_once("usemtl none\n").unwrap();
+    let faces_first = format!("{faces}{points}");
     for (name, bytes) in [
         ("a.stl", binary_stl(b"binary")),
         ("a.STL", binary_stl(b"solid but binary all the same")),
         ("a.stl", ascii_stl().into_bytes()),
+        ("a.stl", ascii_stl().replace('\n', " \r").into_bytes()),
         ("a.obj", obj().into_bytes()),
+        ("a.obj", obj().replace("v 1 0 0", "v 2 0 0 2").into_bytes()),
+        ("a.obj", faces_first.into_bytes()),
         ("a.dae", dae("1", "Z_UP", plain).into_bytes()),
         ("a.dae", dae("1", "Y_UP", plain).into_bytes()),
     ] {
@@ -135,6 +141,8 @@ fn unusable_files_are_rejected() {
     // Cut between two triangles, and with one too many: the length alone looks like that of a whole file.
     let mut cut = binary_stl(b"solid t");
     cut.truncate(84 + 2 * 50);
+    let whole = ascii_stl();
+    let cut_text = whole.as_bytes().get(..whole.len() / 2).unwrap();
     let padded = [binary_stl(b""), vec![7; 50]].concat();
     let mut bogus = binary_stl(b"");
     bogus[80..84].copy_from_slice(&4_000_000_000_u32.to_le_bytes());
@@ -148,13 +156,27 @@ fn unusable_files_are_rejected() {
         ("a.stl", padded, "the file is damaged: its header declares 4 triangles (284 bytes), it has 334 bytes"),
         ("a.stl", bogus, "declares 4000000000 triangles (200000000084 bytes)"),
         ("a.stl", b"shorter than a header".to_vec(), "truncated: 21 bytes"),
+        ("a.stl", ascii_stl().replace("endsolid t", "").into_bytes(), "truncated: it has no `endsolid`"),
+        ("a.stl", cut_text.to_vec(), "truncated: it has no `endsolid`"),
+        ("a.stl", ascii_stl().replacen("vertex", "vertx", 1).into_bytes(), "line 8: a facet with 2 vertices, not 3"),
+        ("a.stl", ascii_stl().replacen("endloop", "vertex 1 2 3", 1).into_bytes(), "line 8: a facet with 4 vertices"),
+        ("a.stl", ascii_stl().replacen("endfacet", "", 1).into_bytes(), "line 9: a facet without `endfacet`"),
+        ("a.stl", ascii_stl().replacen("vertex 0 0 0", "vertex 0 0", 1).into_bytes(), "line 4: a vertex takes three"),
+        ("a.stl", ascii_stl().replacen("vertex 0 0 0", "vertex 0 0 x", 1).into_bytes(), "line 4: a vertex takes three"),
+        ("a.stl", ascii_stl().replacen("vertex 0 0 0", "vertex 0 0 nan", 1).into_bytes(), "a vertex at 0 0 NaN"),
+        ("a.stl", ascii_stl().replacen("solid t", "solidity", 1).into_bytes(), "truncated or not STL"),
         ("a.stl", pointer.clone(), "this is a Git LFS pointer"),
         ("a.dae", pointer, "run `git lfs pull`"),
         ("a.obj", page, "this is a web page"),
         ("a.obj", b"v 1 2 3\nv 1 2 4\nv 1 3 4\nf 0 1 2\n".to_vec(), "count from 1"),
         ("a.stl", Vec::new(), ""),
         ("a.ply", Vec::new(), "meshes of type `ply` cannot be read"),
-        ("a.obj", b"v 1 2 3\nf 1 2 9\n".to_vec(), ""),
+        ("a.obj", b"v 1 2 3\nf 1 2 9\n".to_vec(), "a face refers to vertex 2 of 1"),
+        ("a.obj", obj().replace("f 1 3 2", "f -1 -2 -5").into_bytes(), "a face refers to vertex -5 of 4"),
+        ("a.obj", obj().replace("f 1 3 2", "f 1 3 /2").into_bytes(), "unusable line"),
+        ("a.obj", obj().replacen("v 0 0 0", "v 0 0", 1).into_bytes(), "unusable line \"v 0 0\""),
+        ("a.obj", obj().replacen("v 0 0 0", "v 0 0 0 0", 1).into_bytes(), "unusable line"),
+        ("a.obj", obj().replacen("v 0 0 0", "v 0 0 inf", 1).into_bytes(), "a vertex at 0 0 inf"),
         ("a.obj", b"v 1 2 3\n".to_vec(), "no triangles"),
         ("a.dae", b"<COLLADA/>".to_vec(), "no triangles"),
         ("a.dae", dae("-1", "Z_UP", "").into_bytes(), "the unit of -1 metres"),

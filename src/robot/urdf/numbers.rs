@@ -5,7 +5,7 @@ use nalgebra::{Isometry3, Quaternion, UnitQuaternion};
 use super::Reader;
 use crate::pose::from_xyz_rpy;
 use crate::robot::xml::{Attribute, Element};
-use crate::yaml::quote;
+use crate::yaml::{Diag, quote};
 
 impl Reader<'_> {
     /// Returns `N` finite numbers from an attribute.
@@ -51,7 +51,7 @@ impl Reader<'_> {
         }
     }
 
-    /// Returns the pose of an `origin` child; identity without one.
+    /// Returns the pose of an `origin` child; identity without one. Quaternions count from version 1.1 on.
     pub(super) fn origin(&mut self, element: &Element) -> Option<Isometry3<f64>> {
         let Some(origin) = element.child("origin") else { return Some(Isometry3::identity()) };
         let three = |reader: &mut Self, name: &str| match origin.attribute(name) {
@@ -59,7 +59,15 @@ impl Reader<'_> {
             None => Some([0.0; 3]),
         };
         let xyz = three(self, "xyz");
-        if let Some(quaternion) = origin.attribute("quat_xyzw") {
+        let quaternion = origin.attribute("quat_xyzw");
+        if let Some(quaternion) = quaternion.filter(|_| self.version < 1) {
+            self.quaternions.push(quaternion.at);
+        } else if let Some(quaternion) = quaternion {
+            if let Some(rpy) = origin.attribute("rpy") {
+                let diag = Diag::error("an origin has either `rpy` or `quat_xyzw`, not both");
+                self.report(quaternion.at, diag.also(rpy.at.label()));
+                return None;
+            }
             let [x, y, z, w] = self.numbers::<4>(quaternion)?;
             let Some(rotation) = UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-9) else {
                 self.error(quaternion.at, "this quaternion is zero");

@@ -9,6 +9,9 @@ use crate::robot::model::{Geometry, Inertial, MeshFile, Shape};
 use crate::robot::xml::{Element, SourcePos};
 use crate::yaml::{Diag, quote};
 
+/// Start of the warning of a missing visual mesh, which a description may have many of.
+pub const VISUAL_NOT_FOUND: &str = "visual mesh not found";
+
 impl Reader<'_> {
     /// Returns a shape; `None` if it is not usable, which is reported.
     pub(super) fn shape(&mut self, element: &Element, collides: bool) -> Option<Shape> {
@@ -95,7 +98,7 @@ impl Reader<'_> {
                             Diag::warning(format!("collision mesh not found: {what}"))
                         }
                         true => Diag::error(format!("collision mesh not found: {what}")),
-                        false => Diag::warning(format!("visual mesh not found, it is not shown: {what}")),
+                        false => Diag::warning(format!("{VISUAL_NOT_FOUND}, it is not shown: {what}")),
                     };
                     self.report(at, diag.maybe_hint(hint));
                 }

@@ -20,6 +20,23 @@ fn joint(kind: &str, inside: &str) -> String {
 
 const LIMIT: &str = "<limit lower='-1' upper='2' velocity='3' effort='4'/>";
 
+/// A limit from -1 to 2 with soft limits.
+fn soft(inside: &str) -> String {
+    format!("{LIMIT}<safety_controller k_velocity='1' {inside}/>")
+}
+
+/// Reads a robot without mistakes; its warnings with their hints.
+fn warned(text: &str) -> (RobotModel, Vec<String>) {
+    let mut tree = Tree::new();
+    let source = tree.add_source("t.urdf", text);
+    let document = crate::robot::xml::parse(&mut tree, source).unwrap();
+    let refuse: &Resolve<'_> = &|uri| Err(uri.to_owned());
+    let model = read(&document.root, &mut tree, &Calls::default(), Meshes::Ignore, refuse);
+    let all = tree.diags().iter();
+    let all = all.map(|d| format!("{} {}", d.message, d.hint.as_deref().unwrap_or_default()));
+    (model.unwrap_or_else(|| panic!("{:?}", tree.diags())), all.collect())
+}
+
 #[test]
 fn a_tree_is_put_in_order() {
     let text = robot(
@@ -56,6 +73,7 @@ fn a_tree_is_put_in_order() {
 #[test]
 fn mistakes_are_reported_with_their_position() {
     let limits = |l: &str| joint("revolute", l);
+    let new = |text: String| text.replace("name=\"t\"", "name='t' version='1.2'");
     let long = robot(&(0..600).map(|i| format!("<link name='l{i}'/>")).collect::<String>());
     for (text, what, place) in [
         ("<robt name='x'/>".to_owned(), "the root element is `robt`", "t.urdf:1:2"),
@@ -77,7 +95,16 @@ fn mistakes_are_reported_with_their_position() {
         ),
         (joint("spherical", ""), "joints of type `spherical` are not supported", ""),
         (joint("revolute", ""), "this revolute joint has no `limit`", ""),
-        (limits("<limit velocity='1' effort='1'/>"), "neither `lower` nor `upper`", ""),
+        (joint("fixed", "").replace("name=\"t\"", "name='t' version='1.3'"), "unknown version `1.3`", "t.urdf:1:26"),
+        (new(limits("<limit upper='1' velocity='1'/>")), "this limit has no `lower`: version 1.2 needs it", ""),
+        (new(limits("<limit lower='-1' velocity='1'/>")), "this limit has no `upper`: version 1.2 needs it", ""),
+        (new(limits("<limit lower='-1' upper='1' deceleration='-1'/>")), "the deceleration limit -1 is negative", ""),
+        (new(limits(&format!("{LIMIT}<origin quat_xyzw='0 0 0 0'/>"))), "this quaternion is zero", ""),
+        (new(limits(&format!("{LIMIT}<origin quat_xyzw='0 0 1'/>"))), "`quat_xyzw` takes 4 numbers, found 3", ""),
+        (new(limits(&format!("{LIMIT}<origin rpy='0 0 0' quat_xyzw='0 0 0 1'/>"))), "not both", ""),
+        (limits(&soft("soft_lower_limit='3'")), "no position is left for the joint `j`: 3 to 2", "t.urdf:1"),
+        (limits(&soft("soft_upper_limit='-1.5'")), "no position is left for the joint `j`: -1 to -1.5", ""),
+        (limits(&soft("soft_upper_limit='x'")), "`soft_upper_limit`: `x` is not a number", ""),
         (limits("<limit lower='-1' upper='1'/>"), "this limit has no `velocity`", ""),
         (limits("<limit lower='2' upper='-1' velocity='1'/>"), "the lower limit 2 is above the upper limit -1", ""),
         (limits("<limit lower='-1' upper='1' velocity='-3'/>"), "the velocity limit -3 is negative", ""),
@@ -166,13 +193,8 @@ fn a_floating_root_counts_as_fixed_and_shapes_without_extent_are_left_out() {
         (robot(&empty("<sphere radius='0'/>")), "this sphere has no extent"),
         (robot(&empty("<cylinder radius='0' length='0'/>")), "this cylinder has no extent"),
     ] {
-        let mut tree = Tree::new();
-        let source = tree.add_source("t.urdf", text.clone());
-        let document = crate::robot::xml::parse(&mut tree, source).unwrap();
-        let refuse: &Resolve<'_> = &|uri| Err(uri.to_owned());
-        let model = read(&document.root, &mut tree, &Calls::default(), Meshes::Ignore, refuse).expect(what);
-        let found = &tree.diags()[0];
-        assert!(found.message.contains(what) && tree.diags().len() == 1 && found.at.is_some(), "{text}: {found:?}");
+        let (model, found) = warned(&text);
+        assert!(found.len() == 1 && found[0].contains(what), "{text}: {found:?}");
         assert!(model.links[0].collisions.is_empty() && model.independent_joints().is_empty());
     }
     // A plate without thickness is a mistake, not an empty shape.
@@ -193,4 +215,78 @@ fn mimic_chains_are_resolved() {
     let model = from_text("t", &text).unwrap();
     assert_eq!(model.joints[0].mimic, Some(Mimic { leader: 2, multiplier: 4.0, offset: 3.0 }));
     assert_eq!(model.independent_joints(), [2]);
+}
+
+#[test]
+fn soft_limits_narrow_and_are_said_once() {
+    for (kind, inside, range, said) in [
+        ("revolute", "soft_lower_limit='-0.5' soft_upper_limit='1'", [-0.5, 1.0], "j to -0.5 … 1 rad"),
+        ("prismatic", "soft_upper_limit='1'", [-1.0, 1.0], "j to -1 … 1 m"),
+        ("revolute", "soft_lower_limit='0'", [0.0, 2.0], "j to 0 … 2 rad"),
+        ("revolute", "soft_lower_limit='-9' soft_upper_limit='9'", [-1.0, 2.0], ""),
+        ("revolute", "k_position='3'", [-1.0, 2.0], ""),
+        ("continuous", "soft_lower_limit='0' soft_upper_limit='1'", [f64::NEG_INFINITY, f64::INFINITY], ""),
+    ] {
+        let (model, found) = warned(&joint(kind, &soft(inside)));
+        assert_eq!([model.joints[0].limits.lower, model.joints[0].limits.upper], range, "{kind} {inside}");
+        assert_eq!(found.len(), usize::from(!said.is_empty()), "{found:?}");
+        assert!(found.iter().all(|found| found.contains(said)), "{found:?}");
+    }
+    let narrowed = soft("soft_upper_limit='1'");
+    let two = joint("revolute", &narrowed).replace(
+        "</robot>",
+        &format!(
+            "<link name='c'/><joint name='k' type='revolute'><parent link='b'/><child link='c'/>{narrowed}</joint>\
+             </robot>"
+        ),
+    );
+    let (_, found) = warned(&two);
+    assert!(found.len() == 1 && found[0].contains("narrow j to -1 … 1 rad, k to -1 … 1 rad"), "{found:?}");
+}
+
+#[test]
+fn what_a_version_does_not_know_is_said() {
+    let old = joint("revolute", &format!("{LIMIT}<origin rpy='0 0 1' quat_xyzw='x'/>"));
+    let (model, found) = warned(&old);
+    assert!((model.joints[0].origin.rotation.euler_angles().2 - 1.0).abs() < 1e-15);
+    assert!(found.len() == 1 && found[0].contains("counts from version 1.1 on"), "{found:?}");
+    let (model, found) = warned(&joint("revolute", "<limit velocity='3'/>"));
+    assert_eq!((model.joints[0].limits.lower, model.joints[0].limits.upper), (0.0, 0.0));
+    assert!(found.len() == 1 && found[0].contains("cannot move: its range is 0 to 0 rad"), "{found:?}");
+    let new = joint("revolute", "<limit lower='-1' upper='1'/>").replace("name=\"t\"", "name='t' version='1.2'");
+    let (model, found) = warned(&new);
+    assert_eq!(model.joints[0].limits.velocity, f64::INFINITY);
+    assert!(found.len() == 1 && found[0].contains("`max_velocity`"), "{found:?}");
+}
+
+#[test]
+fn the_smaller_of_acceleration_and_deceleration_counts() {
+    for (rates, expected) in [
+        ("acceleration='5' deceleration='2'", Some(2.0)),
+        ("acceleration='2' deceleration='5'", Some(2.0)),
+        ("deceleration='2'", Some(2.0)),
+        ("deceleration='-2'", Some(2.0)),
+        ("acceleration='2' deceleration='0'", Some(2.0)),
+        ("", None),
+    ] {
+        let text = joint("revolute", &LIMIT.replace("/>", &format!(" {rates}/>")));
+        let (model, found) = warned(&text);
+        assert_eq!((model.joints[0].limits.acceleration, found.len()), (expected, 0), "{rates}");
+    }
+}
+
+#[test]
+fn degrees_are_suspected() {
+    let range = |lower: &str, upper: &str| {
+        let limit = LIMIT.replace("-1", lower).replace("upper='2'", &format!("upper='{upper}'"));
+        warned(&joint("revolute", &limit)).1
+    };
+    let found = range("-180", "180");
+    assert!(found.len() == 1 && found[0].contains("is it in degrees?") && found[0].contains("3.1416 rad"), "{found:?}");
+    assert_eq!(range("0", "90").len(), 1);
+    // Two turns to each side, as of many arms.
+    for end in ["6.28318530718", "6.2832"] {
+        assert_eq!(range(&format!("-{end}"), end), [""; 0]);
+    }
+    assert_eq!(warned(&joint("prismatic", &LIMIT.replace("upper='2'", "upper='40'"))).1, [""; 0]);
 }

@@ -39,6 +39,10 @@ pub struct ArmReport {
     pub enabled: bool,
     /// Its control mode.
     pub mode: String,
+    /// Fraction of its speed at which its controller runs motions at present (a speed slider, a safety function), 0–1;
+    /// absent if it reports none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub speed_fraction: Option<f64>,
     /// State and mode codes of the device, as in its manual; absent if it has none.
     #[serde(default)]
     pub device_state: Option<DeviceState>,
@@ -86,6 +90,12 @@ pub struct ArmReport {
     /// The point whose pose `state` reports and pose goals are for; absent if the run has no model of the arm.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tcp: Option<TcpReport>,
+    /// Which arm it is: its serial number, or the offsets that its drives keep; absent if it does not say.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub identity: Option<String>,
+    /// What is known of how its model fits the arm: factory kinematics, and where model and controller have the flange.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub model_notes: Vec<String>,
     /// Lower and upper position limits of its joints [rad], in their order.
     #[serde(default)]
     pub position_limits: Vec<[f64; 2]>,

@@ -74,11 +74,14 @@ pub struct MotionReport {
     pub progress: f64,
     /// Time since its start [s].
     pub elapsed: f64,
-    /// Time until its planned end [s], with the present speed override; of its whole speed while paused.
+    /// Time until its planned end [s], with the present speed override and fraction; of its whole speed while paused.
     pub remaining: f64,
     /// The speed override, if it slows the motion.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub speed: Option<SpeedReport>,
+    /// Fraction of its speed at which the controller of an arm runs it, if that slows the motion.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub speed_fraction: Option<f64>,
     /// Why it did not reach its goal.
     pub error: Option<String>,
     /// Whether an obstacle blocked it and it is being replanned; meanwhile it is not done.

@@ -26,6 +26,10 @@ pub struct ArmStateReport {
     pub simulated: bool,
     /// Age of its latest state [ms]; absent before the first.
     pub age_ms: Option<f64>,
+    /// Fraction of its speed at which its controller runs motions at present (a speed slider, a safety function), 0–1;
+    /// absent if it reports none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub speed_fraction: Option<f64>,
     /// Its joints, in order.
     pub joints: Vec<JointReport>,
     /// Gripper position [`gripper_unit`].
@@ -41,9 +45,17 @@ pub struct ArmStateReport {
     pub gripper_force_unit: Option<String>,
     /// Pose of its tool centre point in `map`, computed from the measured joints; absent if the run has no model of it.
     pub pose: Option<PoseReport>,
-    /// Pose that the device reports: its flange in its base; absent if it reports none.
+    /// Pose of the flange in the arm's base, by the arm's own controller: the tool and base offsets that are set there
+    /// are taken out. Absent if it reports no pose, or not these offsets: see `device_pose_missing`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub device_pose: Option<PoseReport>,
+    /// Pose of the controller's own tool centre point in its own reference frame, as its panel shows it; absent if it
+    /// reports none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub device_tool_pose: Option<PoseReport>,
+    /// The offset that the controller does not report, so that its flange is not known: `tool offset`, `base offset`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub device_pose_missing: Option<String>,
     /// Force and torque [N, N, N, Nm, Nm, Nm].
     pub wrench: Option<[f64; 6]>,
 }
@@ -68,13 +80,13 @@ pub struct JointReport {
 /// A pose: of what, in which frame.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct PoseReport {
-    /// The link of the model; `flange` in a device's own pose.
+    /// The link of the model; in a device's own poses `flange` or `tool`.
     #[serde(default)]
     pub link: String,
     /// Tool on the link, whose centre point has the pose; absent: the link itself has it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tool: Option<ToolReport>,
-    /// Reference frame: `map`, or `base` in a device's own pose.
+    /// Reference frame: `map`; in a device's own poses `base` (the arm's) or `controller` (that of its controller).
     #[serde(default)]
     pub frame: String,
     /// x, y, z [m].

@@ -88,13 +88,12 @@ impl Services {
         })
     }
 
-    fn ended(&self, end: fn(Client) -> Result<TriggerResponse, ClientError>) -> TriggerResponse {
+    fn ended(&self, end: fn(&Self) -> Result<TriggerResponse, ClientError>) -> TriggerResponse {
         if !self.may_end {
             let message = "the run's owner has taken cancel and stop from observers: share.observers_stop".into();
             return TriggerResponse { success: false, message };
         }
-        let ended = client(&self.run, &self.socket).and_then(end);
-        ended.unwrap_or_else(|error| TriggerResponse { success: false, message: error.to_string() })
+        end(self).unwrap_or_else(|error| TriggerResponse { success: false, message: error.to_string() })
     }
 }
 
@@ -103,15 +102,15 @@ fn client(run: &str, socket: &Path) -> Result<Client, ClientError> {
 }
 
 /// Holds all arms; fails if one has not confirmed it.
-fn stop(mut client: Client) -> Result<TriggerResponse, ClientError> {
-    let arms = client.call(Stop::default())?.arms;
+fn stop(at: &Services) -> Result<TriggerResponse, ClientError> {
+    let arms = Client::urgent(None, || client(&at.run, &at.socket), &Stop::default())?.1.arms;
     let said: Vec<String> = arms.iter().map(|(arm, said)| format!("{arm}: {}", said.text())).collect();
     let success = arms.values().all(|said| *said == Confirmation::Confirmed);
     Ok(TriggerResponse { success, message: said.join(", ") })
 }
 
-fn cancel(mut client: Client) -> Result<TriggerResponse, ClientError> {
-    let tasks = client.call(Cancel::default())?.tasks;
+fn cancel(at: &Services) -> Result<TriggerResponse, ClientError> {
+    let tasks = Client::urgent(None, || client(&at.run, &at.socket), &Cancel::default())?.1.tasks;
     let cancelled: Vec<&str> =
         tasks.iter().filter(|(_, result)| *result == "CANCELLED").map(|(task, _)| task.as_str()).collect();
     let message = match cancelled.is_empty() {

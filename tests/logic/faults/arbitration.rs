@@ -251,10 +251,11 @@ fn a_long_random_scenario_is_repeated_bit_for_bit() {
     assert!(scenario(seed, 10_000) == scenario(seed, 10_000), "DIMOS_TEST_SEED={seed}");
 }
 
-/// 2, 8010: a gap while an arm in standby still brakes; 4, 6: a gap that begins in the tick in which another one ends.
+/// 2, 8010: a gap while an arm in standby still brakes; 4, 6: a gap that begins in the tick in which another one ends;
+/// 962, 1110: a gap in velocity mode after a bridged period; 1870: positions after velocities that were not exact.
 #[test]
 fn scenarios_with_gaps_keep_all_rules() {
-    for seed in [2, 4, 6, 8010] {
+    for seed in [2, 4, 6, 962, 1110, 1870, 8010] {
         scenario(seed, 10_000);
     }
 }

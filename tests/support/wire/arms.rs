@@ -55,8 +55,7 @@ pub const XARM: Arm = Arm {
     ends: [&[-3.6, -0.6, -1.2, -3.6, 0.6, -3.6], &[3.6, 0.6, -0.4, 3.6, 1.6, 3.6]],
     rounding: 1e-6,
     time_limit: Some(0.2),
-    // Joints at their top speed: the tool is faster than a box allows by default.
-    options: r#"{"sim": {"tool_speed_factor": 10}}"#,
+    options: "{}",
 };
 /// AgileX's arm on CAN.
 pub const PIPER: Arm = Arm {
@@ -257,7 +256,7 @@ impl World {
         let arm = self.arm;
         let builder = Run::from_yaml("wire", &blueprint(&arm, &self.address))
             .record(Record::Off)
-            .folder(RunDir::at(folder.path()))
+            .folder(RunDir::closed(folder.path()))
             .adapters(arm.row.map(std::slice::from_ref).unwrap_or_default());
         let run = match builder.start() {
             Ok(run) => run,

@@ -32,7 +32,7 @@ export function logPage(scene: Scene, token: string, app: HTMLElement): void {
   player.onTime.on(() => showMotion(context, player, trails));
   const about = el('div', {class: 'about', id: 'about'});
   const describe = () => {
-    const state = source.live ? 'live' : log.log.loss ? `cut: ${log.log.loss}` : 'complete';
+    const state = source.live ? 'live' : source.loss ? `not whole: ${source.loss}` : 'complete';
     const began = new Date(log.log.start * 1000).toLocaleString();
     const known = [log.log.file, began, duration(source.length * 1000), state].join(' · ');
     setText(about, player.trouble || known);

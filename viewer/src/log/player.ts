@@ -167,8 +167,12 @@ export class Player extends Still {
     if (!now) return;
     // Between two messages the arm is between two positions.
     const part = next && next.t > now.t ? Math.min(1, Math.max(0, (time - now.t) / (next.t - now.t))) : 0;
+    const place = (i: number) => {
+      const [name, names] = [now.data.name[i]!, next?.data.name ?? []];
+      return names[i] === name ? i : names.indexOf(name);
+    };
     const position = now.data.position.map((value, i) => {
-      const other = next?.data.position[i];
+      const other = next?.data.position[place(i)];
       return typeof value === 'number' && typeof other === 'number' ? value + part * (other - value) : value;
     });
     const stamp = this.source.scene.log.start + time;

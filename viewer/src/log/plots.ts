@@ -179,7 +179,7 @@ class Plot {
     const rows = (this.context.arm?.joints ?? []).map((joint) => {
       const places = new Map<string, number>();
       const place = ({name}: Joints) => {
-        const key = name.length + name[0]!;
+        const key = name.join('\n');
         if (!places.has(key)) places.set(key, name.indexOf(joint));
         return places.get(key)!;
       };

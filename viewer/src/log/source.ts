@@ -76,12 +76,14 @@ interface Options {
 export class LogSource {
   length: number;
   live: boolean;
+  /** What was found missing so far: damage shows where it is read. */
+  loss: string | null;
 
   constructor(
     readonly scene: LogScene,
     private readonly server: Server,
   ) {
-    ({length: this.length, live: this.live} = scene.log);
+    ({length: this.length, live: this.live, loss: this.loss} = scene.log);
   }
 
   /** The topics of a kind that this log has: `/tcp/` gives one for each arm. */
@@ -102,11 +104,13 @@ export class LogSource {
     interface Reply {
       length: number;
       live: boolean;
+      loss: string | null;
       messages: Message<T>[];
     }
     const reply = await this.server.get<Reply>(`/messages?${query.join('&')}`, signal);
     this.length = reply.length;
     this.live = reply.live;
+    this.loss = reply.loss;
     // Chunks are in the order of their first messages.
     return reply.messages.sort((a, b) => a.t - b.t);
   }

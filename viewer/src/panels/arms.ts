@@ -88,7 +88,13 @@ function notesOf(arm: ArmStatus, tasks: Task[]): HTMLElement[] {
   if (arm.stop_pending) note('bad', 'a stop could not be sent', 'it is delivered when the arm is reachable again');
   if (arm.cause) note('bad', `held: ${arm.cause.text}`, 'when it may move again: Reset, then Enable');
   if (arm.error) note('bad', `error ${arm.error.code}: ${arm.error.text}`, 'remove the cause, then Reset');
+  const speed = arm.speed_fraction ?? 1;
+  if (speed < 1e-4) note('warn', 'stopped by its controller at 0 % of the speed', 'motions wait on their paths');
+  else if (speed < 0.9995) note('warn', `slowed by its controller to ${(100 * speed).toFixed(1)} % of the speed`);
   if (!arm.cause && arm.phase === 'standby') note('warn', 'not ready', 'Enable makes it ready where it is');
+  for (const text of arm.model_notes ?? []) {
+    note(text.includes('refused') ? 'bad' : text.includes('padding') ? 'warn' : 'muted', `model: ${text}`);
+  }
   for (const fault of arm.faults.slice(-3).reverse()) {
     const times = fault.count > 1 ? `, ${fault.count} times` : '';
     note(

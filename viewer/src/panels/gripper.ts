@@ -20,11 +20,13 @@ export function gripperPanel(context: Context): HTMLElement {
   let busy = false;
   let touched = false;
 
+  const onOff = () => run.arm(context.selected)?.gripper_unit === 'on_off';
   const limits = () => run.arm(context.selected)?.gripper_range ?? null;
-  const text = (position: number) =>
-    run.arm(context.selected)?.gripper_unit === 'rad'
-      ? `${figure(position, 3)} rad`
-      : `${figure(position * 1000, 1)} mm`;
+  const text = (position: number) => {
+    if (onOff()) return position ? 'open' : 'closed';
+    const turns = run.arm(context.selected)?.gripper_unit === 'rad';
+    return turns ? `${figure(position, 3)} rad` : `${figure(position * 1000, 1)} mm`;
+  };
   const target = () => {
     const [low, high] = limits() ?? [0, 0];
     return low + (Number(range.value) / 1000) * (high - low);
@@ -59,11 +61,12 @@ export function gripperPanel(context: Context): HTMLElement {
     setText(value, text(target()));
     show();
   });
+  const slider = el('label', {class: 'slider plain'}, el('span', {text: 'position'}), range, value);
   const element = el(
     'fieldset',
     {class: 'acts gripper'},
     el('h2', {text: 'Gripper'}),
-    el('label', {class: 'slider plain'}, el('span', {text: 'position'}), range, value),
+    slider,
     el('div', {class: 'buttons'}, open, close, go),
     outcome,
   );
@@ -72,6 +75,8 @@ export function gripperPanel(context: Context): HTMLElement {
     setClass(element, 'hidden', !has);
     for (const each of [open, close]) each.disabled = busy;
     go.disabled = busy || !touched;
+    // One that only opens and closes has no other position.
+    for (const each of [go, slider]) setClass(each, 'hidden', onOff());
     const position = run.armState(context.selected)?.gripper;
     if (!has || touched || typeof position !== 'number') return;
     range.value = String(Math.round(((position - has[0]) / (has[1] - has[0] || 1)) * 1000));

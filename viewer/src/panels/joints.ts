@@ -85,14 +85,13 @@ export function jointsPanel(context: Context): HTMLElement {
     }
     if (typeof state?.gripper === 'number') {
       const mm = state.gripper_unit === 'm';
+      const ordered = state.gripper ? 'open (as ordered)' : 'closed (as ordered)';
+      const position = mm ? `${figure(state.gripper * 1000, 1)} mm` : `${angleText(state.gripper)} ${angle.label}`;
       const force =
         typeof state.gripper_force === 'number'
           ? `  ${figure(state.gripper_force, 1)} ${state.gripper_force_unit}`
           : '';
-      lines.push([
-        'gripper',
-        `${mm ? figure(state.gripper * 1000, 1) + ' mm' : angleText(state.gripper) + ' ' + angle.label}${force}`,
-      ]);
+      lines.push(['gripper', state.gripper_unit === 'on_off' ? ordered : `${position}${force}`]);
     }
     if (state?.wrench) {
       lines.push([

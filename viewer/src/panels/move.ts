@@ -173,7 +173,7 @@ function showReport(report: HTMLElement, {flow}: Context): void {
     const clearance =
       typeof summary.clearance !== 'number'
         ? ''
-        : ` · clearance ≥ ${figure(summary.clearance * 1000, 1)} mm` +
+        : ` · clearance ≥ ${figure(summary.clearance * 1000, summary.clearance < 1e-3 ? 3 : 1)} mm` +
           (summary.closest ? ` (${summary.closest.join(' – ')})` : '');
     line('', `${figure(summary.duration, 1)} s · ${figure(summary.length, 2)} rad${clearance}`);
     if (typeof summary.fraction === 'number' && summary.fraction < 1) {

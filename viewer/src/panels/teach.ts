@@ -1,8 +1,8 @@
 // Leading an arm by hand: begin, save poses, and hold it where it is. The words and conditions of `dimos arm teach`.
 import {type Context} from '../context';
-import {button, el, setClass, setText} from '../dom';
+import {button, el, setClass} from '../dom';
 import {pause} from '../flow';
-import {type ArmStatus, RpcError} from '../protocol';
+import {RpcError} from '../protocol';
 import {savePose} from './save';
 
 /** Longest wait for a hand to hold the arm still, and time between two attempts to take it over [ms]. */
@@ -98,21 +98,4 @@ export function teachPanel(context: Context): HTMLElement {
   });
   show();
   return element;
-}
-
-/** Says over the view which arms are led, and how. */
-export function ledNote(context: Context): HTMLElement {
-  const element = el('div', {class: 'led-note hidden', id: 'led', attributes: {role: 'status'}});
-  context.run.onStatus.on(({arms}) => {
-    const led = arms.filter((arm) => arm.phase === 'led');
-    setClass(element, 'hidden', !led.length);
-    setText(element, led.map(ledText).join(' · '));
-  });
-  return element;
-}
-
-function ledText(arm: ArmStatus): string {
-  const name = arm.hardware_id;
-  if (arm.led_by === 'controller') return `${name} is moved by its own controller`;
-  return `${name} is led by hand, ${arm.enabled ? 'motors on' : 'motors off: support the arm'}`;
 }

@@ -106,6 +106,7 @@ impl EndEffector {
     /// Advances by one tick towards a twist and claims the joints. `way`: remaining way to a goal, at which it must
     /// stop.
     pub fn advance(&mut self, cx: &Context<'_>, wanted: &Velocity, way: Option<&Velocity>, claims: &mut Vec<Claim>) {
+        self.take_limits(cx);
         let before = self.velocity;
         self.approach(wanted, cx.dt);
         let Velocity { linear, angular } = self.velocity;
@@ -145,6 +146,18 @@ impl EndEffector {
             Bounded::Invalid => Bound::Invalid,
         };
         claims.extend(joints.iter().zip(&self.joints.position).map(|(&joint, &value)| Claim { joint, value }));
+    }
+
+    /// Continues from what was commanded where a limit of the arm changed it: what is behind would be made up for after
+    /// the stream has ended.
+    fn take_limits(&mut self, cx: &Context<'_>) {
+        let motion = self.joints.position.iter_mut().zip(&mut self.joints.velocity);
+        for ((q, v), &joint) in motion.zip(cx.joints) {
+            let view = cx.joint(joint);
+            if *q != view.commanded {
+                (*q, *v) = (view.commanded, view.commanded_velocity);
+            }
+        }
     }
 
     /// Changes the twist towards the requested one, both parts by the same fraction, as fast as their limits allow.

@@ -26,6 +26,8 @@ pub struct CartesianParams {
     pub joint_prefix: Option<String>,
     /// The coordinator's joint names and the model's: `{arm_joint1: joint1}`. Default: they are the same.
     pub joint_name_mapping: BTreeMap<String, String>,
+    /// Positions of joints of the model that the task does not move: `{yaw: 0.3}` [rad or m].
+    pub fixed_joints: BTreeMap<String, f64>,
     /// Without a new target for this long the end effector decelerates to rest, and the task releases its joints [s];
     /// 0 = never.
     #[serde(deserialize_with = "non_negative")]
@@ -63,6 +65,7 @@ impl Default for CartesianParams {
             end_effector_link: None,
             joint_prefix: None,
             joint_name_mapping: BTreeMap::new(),
+            fixed_joints: BTreeMap::new(),
             timeout: 0.3,
             max_linear_velocity: 0.25,
             max_angular_velocity: 1.0,
@@ -84,7 +87,8 @@ mod tests {
     fn the_robot_is_read_from_these_parameters() {
         let typed = json!({
             "model_path": "a.urdf", "package_paths": {"p": "q"}, "xacro_args": {"x": "0.50"},
-            "end_effector_link": "flange", "joint_prefix": "arm_", "joint_name_mapping": {"a": "b"}
+            "end_effector_link": "flange", "joint_prefix": "arm_", "joint_name_mapping": {"a": "b"},
+            "fixed_joints": {"yaw": 0.5}
         });
         let params = serde_json::to_value(CartesianParams::deserialize(&typed).unwrap()).unwrap();
         let robot = RobotParams::deserialize(&params).unwrap();
@@ -96,6 +100,7 @@ mod tests {
             end_effector_link: Some("flange".into()),
             joint_prefix: Some("arm_".into()),
             joint_name_mapping: one("a", "b"),
+            fixed_joints: BTreeMap::from([("yaw".into(), 0.5)]),
         };
         assert_eq!(robot, expected);
     }

@@ -186,7 +186,8 @@ impl TaskBody for TrajectoryTask {
         motion.spline.sample(self.clock.elapsed(), &mut self.cursor, &mut self.samples);
         note_progress(&mut self.last, self.clock.elapsed(), duration);
         if self.slowing {
-            if self.clock.rate() <= 0.0 || self.clock.elapsed() >= duration {
+            // An arm that its controller has stopped on its way needs no deceleration.
+            if self.clock.rate() <= 0.0 || self.clock.elapsed() >= duration || cx.dt == 0.0 {
                 return Step::End(TaskState::Aborted, Reason::Cancelled);
             }
         } else if granted && !self.clock.runs_at(cx.speed) {

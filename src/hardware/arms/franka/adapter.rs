@@ -4,14 +4,15 @@
 
 use std::os::fd::BorrowedFd;
 
-use nalgebra::{Matrix3, Rotation3};
+use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion};
 
+use super::ceiling::UserLimit;
 use super::connect::connect;
 use super::gripper::{FORCES, Hand, RANGE};
 use super::protocol::{DOF, PORT};
 use super::session::{LinkCounts, Session};
 use super::{HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, check};
-use crate::arm::{Commanded, Load, Pose, StopPoint};
+use crate::arm::{Commanded, ControllerPose, Load, Pose, StopPoint};
 use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo,
     Payload, RobotState, Stop,
@@ -21,6 +22,9 @@ use crate::hardware::registry::AdapterConfig;
 use crate::hardware::transport::tcp::Endpoint;
 use crate::joint::{ControlMode, JointLimits, joints_of};
 
+/// How far from orthogonal the axes of a pose may be: single precision has 1e-6.
+const NOT_RIGID: f64 = 1e-3;
+
 /// A Franka arm behind its controller.
 pub struct FrankaAdapter {
     address: Endpoint,
@@ -28,6 +32,8 @@ pub struct FrankaAdapter {
     pub(super) session: Option<Session>,
     hand: Option<Hand>,
     mode: ControlMode,
+    /// Limits of the user.
+    limits: [UserLimit; DOF],
 }
 
 impl FrankaAdapter {
@@ -36,7 +42,8 @@ impl FrankaAdapter {
         config.check(check)?;
         let address = config.parse_address(|text| Endpoint::parse(text, PORT))?;
         let (session, hand) = (None, None);
-        Ok(Self { address, options: config.options()?, session, hand, mode: ControlMode::ServoPosition })
+        let (mode, limits) = (ControlMode::ServoPosition, [UserLimit::NONE; DOF]);
+        Ok(Self { address, options: config.options()?, session, hand, mode, limits })
     }
 
     /// Returns how states and answers fared since `connect`, and the controller's own success rate, 0 to 1: the share
@@ -80,7 +87,8 @@ impl ManipulatorAdapter for FrankaAdapter {
 
     fn connect(&mut self) -> AdapterResult<()> {
         self.disconnect();
-        let session = connect(&self.address, &self.options)?;
+        let mut session = connect(&self.address, &self.options)?;
+        session.shaping.user = self.limits;
         self.hand = if self.options.gripper { Some(Hand::connect(&self.address, &self.options)?) } else { None };
         self.session = Some(session);
         Ok(())
@@ -130,14 +138,29 @@ impl ManipulatorAdapter for FrankaAdapter {
 
     /// Returns the limits of the model, narrowed by those that the robot reports.
     fn get_limits(&mut self) -> AdapterResult<JointLimits> {
-        let mut limits = self.options.model.limits(self.options.full_range);
-        let own = self.session.as_ref().map(|session| session.ranges);
-        let positions = limits.position_lower.iter_mut().zip(&mut limits.position_upper).zip(&mut limits.velocity_max);
-        for (((lower, upper), velocity), range) in positions.zip(own.iter().flatten()) {
-            (*lower, *upper) = (lower.max(range.lower), upper.min(range.upper));
-            *velocity = velocity.min(range.velocity);
-        }
+        let (model, full) = (self.options.model, self.options.full_range);
+        let mut limits = model.limits(full);
+        let Some(session) = &self.session else { return Ok(limits) };
+        let own = model.limits_of(&session.ranges, full);
+        let narrow = |list: &mut Vec<f64>, own: &[f64], to: fn(f64, f64) -> f64| {
+            list.iter_mut().zip(own).for_each(|(value, own)| *value = to(*value, *own));
+        };
+        narrow(&mut limits.position_lower, &own.position_lower, f64::max);
+        narrow(&mut limits.position_upper, &own.position_upper, f64::min);
+        narrow(&mut limits.velocity_max, &own.velocity_max, f64::min);
+        narrow(&mut limits.acceleration_max, &own.acceleration_max, f64::min);
         Ok(limits)
+    }
+
+    fn set_limits(&mut self, limits: &JointLimits) {
+        let of = |list: &[f64], joint: usize| list.get(joint).copied().unwrap_or(f64::INFINITY);
+        self.limits = std::array::from_fn(|i| UserLimit {
+            velocity: of(&limits.velocity_max, i),
+            acceleration: of(&limits.acceleration_max, i),
+        });
+        if let Some(session) = &mut self.session {
+            session.shaping.user = self.limits;
+        }
     }
 
     // --- Mode ---
@@ -202,8 +225,9 @@ impl ManipulatorAdapter for FrankaAdapter {
             position: joints_of(&state.q),
             velocity: Some(joints_of(&state.dq)),
             effort: Some(joints_of(&state.tau)),
-            valid: Some(true),
+            valid: session.positions_are_proven().then_some(true),
             commanded: Some(Commanded { position: joints_of(&state.q_d), velocity: joints_of(&state.dq_d) }),
+            speed_fraction: None,
         };
         Ok(())
     }
@@ -308,20 +332,47 @@ impl ForceTorque for FrankaAdapter {
 }
 
 impl Cartesian for FrankaAdapter {
-    fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>> {
-        let [a, b, c, _, d, e, f, _, g, h, i, _, x, y, z, _] = self.connected()?.state.pose;
-        let turn = Rotation3::from_matrix_unchecked(Matrix3::new(a, d, g, b, e, h, c, f, i));
-        let (roll, pitch, yaw) = turn.euler_angles();
-        Ok(Some(Pose { xyz: [x, y, z], rpy: [roll, pitch, yaw] }))
+    fn read_cartesian_position(&mut self) -> AdapterResult<Option<ControllerPose>> {
+        let state = &self.connected()?.state;
+        let stated = |tcp| ControllerPose { tcp, tool: pose(&state.end_effector), base: Some(Pose::default()) };
+        Ok(pose(&state.pose).map(stated))
     }
+}
+
+/// Returns the pose that a matrix of the wire has, column by column; `None` for one that is no pose: a controller that
+/// has not computed it sends zeros.
+pub(super) fn pose(&[a, b, c, _, d, e, f, _, g, h, i, _, x, y, z, _]: &[f64; 16]) -> Option<Pose> {
+    let matrix = Matrix3::new(a, d, g, b, e, h, c, f, i);
+    let proper = (matrix * matrix.transpose() - Matrix3::identity()).amax() < NOT_RIGID && matrix.determinant() > 0.0;
+    let turn = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(matrix));
+    (proper && [x, y, z].iter().all(|v| v.is_finite()))
+        .then(|| Pose::from(&Isometry3::from_parts(Translation3::new(x, y, z), turn)))
 }
 
 impl Payload for FrankaAdapter {
     fn read_payload(&mut self) -> AdapterResult<Option<Load>> {
-        Ok(Some(self.connected()?.state.load))
+        let state = &self.connected()?.state;
+        Ok(Some(together(&state.tool, &state.load)))
     }
 
     fn write_payload(&mut self, load: &Load) -> AdapterResult<()> {
-        self.with(|session| session.set_load(load))
+        let tool = self.connected()?.state.tool;
+        let rest = load.without(&tool).ok_or_else(|| {
+            AdapterError::Rejected(format!(
+                "the controller already counts {:.3} kg of the end effector that is set up in Desk, and a payload of {:.3} kg \
+                 is to be all of tool and workpiece\nhint: give both together, or set up no end effector in Desk",
+                tool.mass, load.mass
+            ))
+        })?;
+        self.with(|session| session.set_load(&rest))
     }
+}
+
+/// Returns all that the controller carries: the end effector of Desk and the load. Without the inertia of one,
+/// that of both is unknown.
+fn together(tool: &Load, load: &Load) -> Load {
+    let both = tool.plus(load);
+    let unstated = |body: &Load| body.mass > 0.0 && body.inertia.iter().all(|v| *v == 0.0);
+    let unknown = unstated(tool) || unstated(load);
+    if unknown { Load { inertia: [0.0; 6], ..both } } else { both }
 }

@@ -1,10 +1,11 @@
 //! Connecting: identifies the arm and compares it with the blueprint. Enables and moves nothing.
 
-use std::net::{SocketAddr, UdpSocket};
+use std::net::SocketAddr;
 use std::time::Duration;
 
 use super::Options;
 use super::description;
+use super::messages::STATES;
 use super::model::Model;
 use super::protocol::Interface;
 use super::protocol::service::{Reader, Service, connect as connect_values, request};
@@ -14,6 +15,7 @@ use super::shaping::Shaping;
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::transport::tcp::{Endpoint, TcpLink};
+use crate::hardware::transport::udp::UdpLink;
 
 /// Timeouts of the connection, of its answer, and of the first state.
 const CONNECT: Duration = Duration::from_millis(1000);
@@ -27,7 +29,7 @@ pub fn connect(address: &Endpoint, options: &Options) -> AdapterResult<Session> 
     let mut tcp = TcpLink::connect("franka", address, CONNECT)?;
     let io = |e: std::io::Error| AdapterError::Io(format!("franka at {address}: cannot receive states: {e}"));
     let (here, peer) = tcp.addresses().map_err(io)?;
-    let udp = UdpSocket::bind((here.ip(), 0)).map_err(io)?;
+    let udp = UdpLink::bind((here.ip(), 0), STATES).map_err(io)?;
     let port = udp.local_addr().map_err(io)?.port();
     tcp.send(&request(interface, Service::Connect, 1, &connect_values(interface, port)))?;
     agree(&mut tcp, model, address)?;
@@ -65,7 +67,7 @@ fn agree(tcp: &mut TcpLink, model: Model, address: &Endpoint) -> AdapterResult<(
 
 /// Waits for the first state. Returns where it came from, too: answers go there.
 fn first_state(
-    udp: &UdpSocket,
+    udp: &UdpLink,
     interface: Interface,
     peer: SocketAddr,
     address: &Endpoint,

@@ -1,13 +1,14 @@
 //! The hand: its own connection, to the next port.
 
-use std::net::UdpSocket;
 use std::time::Duration;
 
 use super::Options;
+use super::messages::HAND_STATES;
 use super::protocol::gripper::{Request, STATE, VERSION, request, scan, state};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::transport::tcp::{Endpoint, TcpLink};
+use crate::hardware::transport::udp::UdpLink;
 
 /// Timeout of the connection and of its answer.
 const ANSWER: Duration = Duration::from_millis(700);
@@ -25,7 +26,7 @@ pub const RANGE: (f64, f64) = (0.0, 0.08);
 /// A connected hand.
 pub struct Hand {
     tcp: TcpLink,
-    udp: UdpSocket,
+    udp: UdpLink,
     last_id: u32,
     /// Width, largest width [m], and when they came.
     newest: Option<(f64, f64, Mono)>,
@@ -43,7 +44,7 @@ impl Hand {
         let mut tcp = TcpLink::connect("franka gripper", &at, ANSWER)?;
         let io = |e: std::io::Error| AdapterError::Io(format!("franka gripper at {at}: cannot receive states: {e}"));
         let (here, _) = tcp.addresses().map_err(io)?;
-        let udp = UdpSocket::bind((here.ip(), 0)).map_err(io)?;
+        let udp = UdpLink::bind((here.ip(), 0), HAND_STATES).map_err(io)?;
         udp.set_nonblocking(true).map_err(io)?;
         tcp.send(&request(1, Request::Connect(udp.local_addr().map_err(io)?.port())))?;
         match tcp.receive(ANSWER, scan)? {

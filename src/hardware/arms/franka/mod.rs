@@ -6,13 +6,17 @@
 //! each command, `gripper` the hand, `adapter` the adapter trait, `emulator/` the controller's side.
 
 pub mod adapter;
+mod catching_up;
+mod ceiling;
 mod connect;
 mod description;
+mod desired;
 pub mod emulator;
 mod follower;
 #[cfg(test)]
 mod golden;
 mod gripper;
+mod messages;
 pub mod model;
 mod motion;
 pub mod protocol;
@@ -30,7 +34,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::arm::{AfterGap, Topology};
-use crate::hardware::check::{Checked, ConfigError, in_range};
+use crate::hardware::check::{Checked, ConfigError, ToolFacts, in_range};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use crate::hardware::transport::tcp::Endpoint;
 use crate::joint::ControlMode;
@@ -78,6 +82,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     check,
     create: |config| Ok(Box::new(adapter::FrankaAdapter::new(config)?)),
     service: None,
+    wire: Some(messages::WIRE),
     emulate: Some(|config, place| Ok(Box::new(emulator::FrankaEmulator::start(config, place)?))),
 };
 
@@ -160,5 +165,10 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     }
     let limits = options.model.limits(options.full_range);
     options.sim.check(&limits)?;
-    Ok(Checked::new(limits).digital_inputs(0))
+    let tool = ToolFacts {
+        velocity: Some(options.model.tool_speed()),
+        model: Some((options.model.option(), "flange")),
+        ..ToolFacts::default()
+    };
+    Ok(Checked::new(limits).digital_inputs(0).tool(tool))
 }

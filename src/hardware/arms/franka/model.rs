@@ -6,6 +6,7 @@ use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::ceiling::toward;
 use super::protocol::{DOF, Interface};
 use crate::joint::JointLimits;
 
@@ -25,6 +26,12 @@ const SHARE: f64 = 0.7;
 /// Share of the speeds that the vendor suggests for an FR3 which the controller allows everywhere in the suggested
 /// range.
 const EVERYWHERE: f64 = 0.95;
+/// Share of the published speeds that the coordinator uses where it may use a joint's whole range.
+const PLANNED: f64 = 0.95;
+/// How far before the place where an FR3 allows no speed the coordinator's range ends [rad]. The coordinator itself
+/// keeps `MARGIN` more [rad].
+const END: f64 = 0.02;
+const MARGIN: f64 = 0.01;
 /// Jerk limit as a multiple of the acceleration limit [1/s].
 const JERK: f64 = 500.0;
 
@@ -53,9 +60,45 @@ impl JointRange {
         let toward = |room: f64| ((2.0 * deceleration * room).max(0.0).sqrt() - offset).clamp(0.0, self.velocity);
         (-toward(position - self.lower), toward(self.upper - position))
     }
+
+    /// Returns how far from an end of the range the coordinator's range ends [rad]: an FR3 allows no speed close to it.
+    fn dead_end(&self) -> f64 {
+        self.braking.map_or(MARGIN, |(offset, deceleration)| offset * offset / (2.0 * deceleration) + END)
+    }
+
+    /// Returns the acceleration with which a joint that brakes to the end of the coordinator's range stays below the
+    /// speeds that are allowed on the way [rad/s²].
+    fn planned_acceleration(&self) -> f64 {
+        if self.braking.is_none() {
+            return self.acceleration;
+        }
+        let top = PLANNED * self.velocity;
+        // Braking from the speed that is allowed at a distance takes v²/2a: 2 % steps from 0.1 mrad to 5 rad.
+        let ways = (0..550).map(|i| 1e-4 * 1.02_f64.powi(i));
+        ways.fold(self.acceleration, |least, way| {
+            let (allowed, _) = toward(self, way + self.dead_end() + MARGIN, PLANNED);
+            if allowed >= top { least } else { least.min(allowed * allowed / (2.0 * way)) }
+        })
+    }
 }
 
 impl Model {
+    /// Returns the name in a blueprint.
+    pub fn option(self) -> &'static str {
+        match self {
+            Self::Fer => "fer",
+            Self::Fr3 => "fr3",
+        }
+    }
+
+    /// Returns the highest speed of the end effector [m/s]: 97 % of the vendor's limit of Cartesian velocity.
+    pub fn tool_speed(self) -> f64 {
+        0.97 * match self {
+            Self::Fer => 1.7,
+            Self::Fr3 => 3.0,
+        }
+    }
+
     /// Returns the vendor's name.
     pub fn name(self) -> &'static str {
         match self {
@@ -108,22 +151,44 @@ impl Model {
         })
     }
 
-    /// Returns the published limits. With `full`, up to the ends of the joints' ranges: an FR3 then slows down near
-    /// them. Otherwise the range and nearly the speed that the vendor suggests for planners, at which it never does.
+    /// Returns the limits for the coordinator. With `full`, up to the ends of the joints' ranges, with accelerations
+    /// with which an FR3 stays below the speeds that it allows there. Otherwise the range and nearly the speed that the
+    /// vendor suggests for planners.
     pub fn limits(self, full: bool) -> JointLimits {
-        let ranges = self.ranges();
+        self.limits_of(&self.ranges(), full)
+    }
+
+    /// Returns the same for a robot that reports these ranges.
+    pub fn limits_of(self, ranges: &[JointRange; DOF], full: bool) -> JointLimits {
         let of = |value: fn(&JointRange) -> f64| ranges.iter().map(value).collect::<Vec<_>>();
+        let suggested_range = self == Self::Fr3 && !full;
         let mut limits = JointLimits {
-            position_lower: of(|range| range.lower),
-            position_upper: of(|range| range.upper),
-            velocity_max: of(|range| range.velocity),
-            acceleration_max: of(|range| SHARE * range.acceleration),
+            position_lower: of(|range| range.lower + range.dead_end()),
+            position_upper: of(|range| range.upper - range.dead_end()),
+            velocity_max: of(|range| PLANNED * range.velocity),
+            acceleration_max: of(if suggested_range {
+                |range| SHARE * range.acceleration
+            } else {
+                |range| range.planned_acceleration().min(SHARE * range.acceleration)
+            }),
             jerk_max: of(|range| SHARE * range.jerk),
         };
-        if self == Self::Fr3 && !full {
-            limits.position_lower = vec![-2.3476, -1.5454, -2.4937, -2.7714, -2.5100, 0.7773, -2.7045];
-            limits.position_upper = vec![2.3476, 1.5454, 2.4937, -0.4226, 2.5100, 4.2841, 2.7045];
-            limits.velocity_max = [2.0, 1.0, 1.5, 1.25, 3.0, 1.5, 3.0].map(|velocity| EVERYWHERE * velocity).to_vec();
+        if suggested_range {
+            let suggested: [(f64, f64, f64); DOF] = [
+                (-2.3476, 2.3476, 2.0),
+                (-1.5454, 1.5454, 1.0),
+                (-2.4937, 2.4937, 1.5),
+                (-2.7714, -0.4226, 1.25),
+                (-2.5100, 2.5100, 3.0),
+                (0.7773, 4.2841, 1.5),
+                (-2.7045, 2.7045, 3.0),
+            ];
+            let narrow = |list: &mut Vec<f64>, to: fn(f64, (f64, f64, f64)) -> f64| {
+                list.iter_mut().zip(suggested).for_each(|(value, row)| *value = to(*value, row));
+            };
+            narrow(&mut limits.position_lower, |value, row| value.max(row.0));
+            narrow(&mut limits.position_upper, |value, row| value.min(row.1));
+            narrow(&mut limits.velocity_max, |value, row| value.min(EVERYWHERE * row.2));
         }
         limits
     }

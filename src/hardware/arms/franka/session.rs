@@ -1,11 +1,13 @@
 //! A connection to a controller: takes its states, answers them while a motion runs, and asks for services.
 
-use std::net::UdpSocket;
 use std::os::fd::{AsFd, BorrowedFd};
 use std::time::Duration;
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
+use super::adapter::pose;
+use super::catching_up::CatchingUp;
+use super::desired::{Fate, Record};
 use super::follower::Follower;
 use super::model::{JointRange, Model};
 use super::protocol::command::{self, Target};
@@ -17,6 +19,7 @@ use super::shaping::{Pace, Shaping};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::transport::tcp::TcpLink;
+use crate::hardware::transport::udp::UdpLink;
 
 /// Without a state for this time the connection is lost.
 const STATE_TIMEOUT: Duration = Duration::from_millis(500);
@@ -30,6 +33,8 @@ const ANSWER_TIMEOUT: Duration = Duration::from_millis(800);
 const MAX_JUMP: f64 = 0.1;
 /// Joints whose desired speed is lower are at rest [rad/s].
 const REST: f64 = 1e-3;
+/// A joint that rests at an end of its range may be measured this far outside [rad].
+const OUTSIDE: f64 = 0.02;
 /// States that are taken at once: more do not wait in a socket.
 const MOST_STATES: usize = 512;
 
@@ -57,11 +62,13 @@ pub(super) struct Motion {
     pub follower: Follower,
     /// Commands so far.
     sent: u64,
-    /// The state that was answered last, and the positions that were sent.
+    /// The state that was answered last.
     answered: u64,
     /// The newest state: those before it were counted.
     counted: u64,
-    positions: [f64; DOF],
+    /// The controller's desired values in full precision.
+    record: Record,
+    catching_up: CatchingUp,
     /// How fast the answers move before filter and limits.
     pace: Pace,
     /// It is to end: answers hold, and say so.
@@ -76,7 +83,7 @@ pub struct Session {
     reader: Reader,
     answers: Vec<Answer>,
     last_id: u32,
-    pub(super) udp: UdpSocket,
+    pub(super) udp: UdpLink,
     pub(super) ranges: [JointRange; DOF],
     pub(super) shaping: Shaping,
     pub(super) state: State,
@@ -93,7 +100,7 @@ pub struct Session {
 
 impl Session {
     /// Starts with a first state.
-    pub(super) fn new(model: Model, tcp: TcpLink, udp: UdpSocket, first: State, shaping: Shaping) -> Self {
+    pub(super) fn new(model: Model, tcp: TcpLink, udp: UdpLink, first: State, shaping: Shaping) -> Self {
         let now = MonotonicClock.now();
         Self {
             model,
@@ -124,6 +131,14 @@ impl Session {
     /// Returns whether the arm is enabled and could move.
     pub fn enabled(&self) -> bool {
         self.on && matches!(self.state.mode, mode::IDLE | mode::MOVE | mode::REFLEX)
+    }
+
+    /// Returns whether the joint positions are measured: the controller computes a proper pose of them, and they are
+    /// inside the joints' hard limits.
+    pub fn positions_are_proven(&self) -> bool {
+        let within = |(q, range): (&f64, &JointRange)| (range.lower - OUTSIDE..=range.upper + OUTSIDE).contains(q);
+        let inside = self.state.q.iter().zip(&self.ranges).all(within);
+        inside && pose(&self.state.pose).is_some()
     }
 
     pub(super) fn at_rest(&self) -> bool {
@@ -235,10 +250,10 @@ impl Session {
             }
             return;
         }
-        let apart = |(a, b): (&f64, &f64)| (a - b).abs() > 1e-6;
+        let (desired, fate) = motion.record.take(&self.state);
+        (self.state.q_d, self.state.dq_d, self.state.ddq_d) = (desired.q, desired.v, desired.a);
         if motion.answered + 1 == self.state.id {
-            let lost = !motion.velocity && motion.positions.iter().zip(&self.state.q_d).any(apart);
-            self.counts.lost_answers += u64::from(lost && motion.sent > 1);
+            self.counts.lost_answers += u64::from(fate != Fate::Used && motion.sent > 1);
         } else if motion.sent > 0 {
             self.counts.unanswered += self.state.id.saturating_sub(motion.counted.max(motion.answered + 1));
         }
@@ -264,27 +279,41 @@ impl Session {
         if !self.state.is_finite() {
             return;
         }
-        let target = if motion.velocity { Target::Velocities(*values) } else { Target::Positions(*values) };
-        motion.pace.take(values, self.state.id.saturating_sub(motion.answered));
-        let shaped = self.shaping.shape(&target, &self.state, motion.sent == 0, Some(&motion.pace));
+        let cycles = self.state.id.saturating_sub(motion.answered);
+        let values = match motion.velocity || motion.finishing {
+            true => *values,
+            false => motion.catching_up.take(values, cycles, &self.shaping.user),
+        };
+        let target = if motion.velocity { Target::Velocities(values) } else { Target::Positions(values) };
+        motion.pace.take(&values, cycles);
+        let shaping = Shaping { rounded: motion.record.is_uncertain(), ..self.shaping };
+        let shaped = shaping.shape(&target, &self.state, motion.sent == 0, Some(&motion.pace));
         let bytes = command::encode(self.state.id, &shaped, motion.finishing);
         // A datagram that is not sent is lost, as others are.
         let sent = self.udp.send(command::sent(self.interface, &bytes)).is_ok();
         self.counts.answers += u64::from(sent);
         motion.sent += 1;
         motion.answered = self.state.id;
-        motion.positions = match shaped {
-            Target::Positions(positions) => positions,
-            Target::Velocities(_) => self.state.q_d,
-        };
+        motion.record.answered(shaped);
     }
 
     pub(super) fn begin(&mut self, id: u32, velocity: bool) {
         let follower = Follower::new(&self.state, velocity, self.shaping.gain);
-        let State { id: now, q_d: positions, .. } = self.state;
-        let (sent, answered, counted, pace, finishing) = (0, now, now, Pace::default(), false);
-        self.motion =
-            Some(Box::new(Motion { velocity, id, follower, sent, answered, counted, positions, pace, finishing }));
+        let (now, record) = (self.state.id, Record::new(&self.state, velocity));
+        let (sent, answered, counted, finishing) = (0, now, now, false);
+        let (pace, catching_up) = (Pace::default(), CatchingUp::default());
+        self.motion = Some(Box::new(Motion {
+            velocity,
+            id,
+            follower,
+            sent,
+            answered,
+            counted,
+            record,
+            catching_up,
+            pace,
+            finishing,
+        }));
         self.see_motion();
     }
 

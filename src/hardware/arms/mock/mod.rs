@@ -53,6 +53,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     create: |config| Ok(Box::new(MockArm::new(config)?)),
     emulate: None,
     service: None,
+    wire: None,
 };
 
 fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {

@@ -18,7 +18,7 @@ use super::protocol::{self, DOF, WireJoints, millidegrees, radians};
 use super::session::{ESTOP, Session};
 use super::wire::{Wire, WireCounts};
 use super::{Follow, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, check};
-use crate::arm::{ForceUnit, JointStatus, Pose, StopPoint};
+use crate::arm::{ControllerPose, ForceUnit, JointStatus, Pose, StopPoint};
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, Gripper, JointMonitor, JointReading, ManipulatorAdapter, ManipulatorInfo,
@@ -66,7 +66,7 @@ impl PiperAdapter {
         config.check(check)?;
         let address = config.parse_address(CanAddress::parse)?;
         let options: Options = config.options()?;
-        let arm = Session::new(config.hardware_id.clone(), address, options.gripper.stroke().is_some());
+        let arm = Session::new(config.hardware_id.clone(), address, options.model, options.gripper.stroke().is_some());
         let gripper_torque = millinewtonmeters(options.gripper_torque);
         Ok(Self { arm, options, mode: ControlMode::Position, gripper_torque, gripper_target: None })
     }
@@ -133,7 +133,7 @@ impl ManipulatorAdapter for PiperAdapter {
     fn get_info(&self) -> ManipulatorInfo {
         ManipulatorInfo {
             vendor: "AgileX".into(),
-            model: "Piper".into(),
+            model: self.options.model.name().into(),
             dof: DOF,
             firmware_version: self.arm.feedback.firmware().map(|(a, b, c)| format!("S-V{a}.{b}-{c}")),
             serial_number: None,
@@ -209,6 +209,7 @@ impl ManipulatorAdapter for PiperAdapter {
             effort: self.efforts(),
             valid: self.arm.valid(),
             commanded: None,
+            speed_fraction: None,
         };
         Ok(())
     }
@@ -235,7 +236,7 @@ impl ManipulatorAdapter for PiperAdapter {
         let Ok(positions) = <[f64; DOF]>::try_from(positions) else {
             return Err(self.arm.refuse(format!("{DOF} values are needed, one per joint")));
         };
-        for (i, (value, (lower, upper))) in positions.iter().zip(super::RANGES).enumerate() {
+        for (i, (value, (lower, upper))) in positions.iter().zip(self.options.model.ranges()).enumerate() {
             // NaN is not inside either.
             if !(lower - MARGIN..=upper + MARGIN).contains(value) {
                 let joint = i + 1;
@@ -417,11 +418,12 @@ impl Gripper for PiperAdapter {
 }
 
 impl Cartesian for PiperAdapter {
-    fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>> {
-        Ok(self.arm.known()?.pose.map(|[x, y, z, roll, pitch, yaw]| Pose {
+    fn read_cartesian_position(&mut self) -> AdapterResult<Option<ControllerPose>> {
+        let pose = self.arm.known()?.pose.map(|[x, y, z, roll, pitch, yaw]| Pose {
             xyz: [x, y, z].map(|v| f64::from(v) * MICRO),
             rpy: [roll, pitch, yaw].map(radians),
-        }))
+        });
+        Ok(pose.map(ControllerPose::of_flange))
     }
 
     fn write_cartesian_position(&mut self, pose: &Pose, velocity: f64) -> AdapterResult<()> {

@@ -1,6 +1,6 @@
 //! Joint limits: those of the data sheet, narrowed by those of the arm's controller.
 
-use super::limits;
+use super::model::Model;
 use super::protocol::{DOF, MotorLimits};
 use crate::joint::JointLimits;
 
@@ -10,8 +10,8 @@ const MIN_RANGE: f64 = 0.02;
 const LOW_SPEED: f64 = 0.1;
 
 /// Returns the limits, and a log line for each unusual limit of the controller.
-pub fn narrowed(own: &[Option<MotorLimits>; DOF]) -> (JointLimits, Vec<String>) {
-    let mut limits = limits();
+pub fn narrowed(model: Model, own: &[Option<MotorLimits>; DOF]) -> (JointLimits, Vec<String>) {
+    let mut limits = model.limits();
     let mut odd = Vec::new();
     let positions = limits.position_lower.iter_mut().zip(&mut limits.position_upper);
     let all = positions.zip(&mut limits.velocity_max).zip(own).zip(1..);
@@ -54,7 +54,7 @@ mod tests {
     fn with(joint: usize, lower: i16, upper: i16, speed: u16) -> (JointLimits, Vec<String>) {
         let mut own = [None; DOF];
         own[joint - 1] = Some(MotorLimits { lower, upper, speed });
-        narrowed(&own)
+        narrowed(Model::Piper, &own)
     }
 
     #[test]
@@ -62,20 +62,20 @@ mod tests {
         let (narrow, odd) = with(1, -900, 900, 1500);
         let lower = narrow.position_lower[0].to_degrees();
         assert!((lower + 90.0).abs() < 1e-9 && narrow.velocity_max[0] == 1.5 && odd.is_empty());
-        assert_eq!(with(2, -1800, 1800, 9000), (limits(), vec![]), "never wider than the sheet");
-        assert_eq!(narrowed(&[None; DOF]), (limits(), vec![]));
+        assert_eq!(with(2, -1800, 1800, 9000), (Model::Piper.limits(), vec![]), "never wider than the sheet");
+        assert_eq!(narrowed(Model::Piper, &[None; DOF]), (Model::Piper.limits(), vec![]));
     }
 
     #[test]
     fn invalid_limits_are_ignored_with_a_warning() {
         for (lower, upper) in [(-1, -1), (900, -900), (-1800, -10), (0, 10)] {
             let (same, odd) = with(2, lower, upper, 3000);
-            assert_eq!(same, limits());
+            assert_eq!(same, Model::Piper.limits());
             let begin = format!("joint 2: the controller's limits of {} to ", f64::from(lower) / 10.0);
             assert!(odd.len() == 1 && odd[0].starts_with(&begin) && odd[0].ends_with("0.0 to 179.9 deg"), "{odd:?}");
         }
         let (same, odd) = with(3, -1700, 0, 0);
-        assert!(same.velocity_max == limits().velocity_max && odd.len() == 1, "{odd:?}");
+        assert!(same.velocity_max == Model::Piper.limits().velocity_max && odd.len() == 1, "{odd:?}");
     }
 
     #[test]

@@ -9,6 +9,8 @@ mod golden;
 mod guard;
 mod hold;
 mod jump_filter;
+mod messages;
+pub mod model;
 pub mod protocol;
 mod session;
 #[cfg(test)]
@@ -30,10 +32,11 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::arm::{AfterGap, Topology};
 use crate::hardware::adapter_util::{above_zero, fraction};
-use crate::hardware::check::{Checked, ConfigError};
+use crate::hardware::check::{Checked, ConfigError, ToolFacts};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use crate::hardware::transport::can::{self, address::FORMS};
-use crate::joint::{ControlMode, JointLimits};
+use crate::joint::ControlMode;
+use model::{Model, SPEED};
 
 /// The modes of the arm. It has no velocity mode.
 const MODES: &[ControlMode] = &[ControlMode::Position, ControlMode::ServoPosition];
@@ -47,7 +50,7 @@ const HOLDS_WHEN_DISABLED: bool = false;
 /// The Piper's row in the adapter table.
 pub const SPEC: AdapterSpec = AdapterSpec {
     name: "piper",
-    about: "AgileX Piper, 6 joints and gripper",
+    about: "AgileX Piper, Piper-H, -L, -X, 6 joints and gripper",
     level: Level::Emulated,
     transport: "can",
     dof: (protocol::DOF, protocol::DOF),
@@ -75,32 +78,17 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     create: |config| Ok(Box::new(adapter::PiperAdapter::new(config)?)),
     emulate: Some(|config, place| Ok(Box::new(emulator::PiperEmulator::start(config, place)?))),
     service: None,
+    wire: Some(messages::WIRE),
 };
 
-/// Lowest and highest position of each joint [rad].
-#[expect(clippy::approx_constant, reason = "the vendor's figure for joint 2, which is not π")]
-const RANGES: [(f64, f64); protocol::DOF] =
-    [(-2.6179, 2.6179), (0.0, 3.14), (-2.967, 0.0), (-1.745, 1.745), (-1.22, 1.22), (-2.09439, 2.09439)];
-/// Highest speed [rad/s] and acceleration [rad/s²] of every joint.
-const SPEED: f64 = 3.0;
-const ACCELERATION: f64 = 5.0;
-
-/// All arms have the same limits; a connected one may have been given narrower ones.
+/// All arms of a model have the same limits; a connected one may have been given narrower ones.
 fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("piper", SPEC.dof)?;
-    config.options::<Options>()?.sim.check(emulator::PLAYABLE)?;
-    Ok(Checked::new(limits()).digital_inputs(0).max_payload(0.0))
-}
-
-/// The joint limits of the data sheet.
-fn limits() -> JointLimits {
-    JointLimits {
-        position_lower: RANGES.iter().map(|range| range.0).collect(),
-        position_upper: RANGES.iter().map(|range| range.1).collect(),
-        velocity_max: vec![SPEED; protocol::DOF],
-        acceleration_max: vec![ACCELERATION; protocol::DOF],
-        jerk_max: Vec::new(),
-    }
+    let options = config.options::<Options>()?;
+    options.sim.check(options.model, emulator::PLAYABLE)?;
+    let model = (options.model == Model::Piper).then_some(("piper", "link6"));
+    let tool = ToolFacts { model, ..ToolFacts::default() };
+    Ok(Checked::new(options.model.limits()).digital_inputs(0).max_payload(0.0).tool(tool))
 }
 
 /// Which gripper is fitted.
@@ -142,6 +130,8 @@ pub enum Follow {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
+    /// Which arm it is: `piper`, `piper_h`, `piper_l` or `piper_x`. The arm does not say.
+    pub model: Model,
     /// Scales the speed of moves that the controller plans (0–1].
     #[serde(deserialize_with = "fraction")]
     #[schemars(extend("exclusiveMinimum" = 0, "maximum" = 1))]
@@ -161,6 +151,7 @@ pub struct Options {
 impl Default for Options {
     fn default() -> Self {
         Self {
+            model: Model::default(),
             speed_scale: 1.0,
             follow: Follow::default(),
             gripper: GripperKind::default(),

@@ -6,7 +6,7 @@ use std::time::Duration;
 use super::controller_limits;
 use super::feedback::Feedback;
 use super::hold::{self, WireRanges};
-use super::limits;
+use super::model::Model;
 use super::protocol::{self, DOF, Driver, Follow, MoveMode, Status, WireJoints, radians};
 use super::wire::Wire;
 use crate::clock::{Clock, Mono, MonotonicClock};
@@ -38,6 +38,8 @@ pub struct Session {
     /// The arm's `hardware_id`, for messages.
     hardware_id: String,
     address: CanAddress,
+    /// Which arm it is.
+    model: Model,
     /// The open port, while connected.
     pub wire: Option<Wire>,
     /// The arm's feedback.
@@ -56,12 +58,13 @@ pub struct Session {
 
 impl Session {
     /// Creates a session with the arm on the bus at `address`. Does not connect.
-    pub fn new(hardware_id: String, address: CanAddress, gripper_used: bool) -> Self {
+    pub fn new(hardware_id: String, address: CanAddress, model: Model, gripper_used: bool) -> Self {
         let feedback = Feedback::of_arm(gripper_used);
         let ranges = [(0, 0); DOF];
         Self {
             hardware_id,
             address,
+            model,
             wire: None,
             feedback,
             written: None,
@@ -183,7 +186,8 @@ impl Session {
         }
         let (address, silent) = (&self.address, self.feedback.silent_drivers(earliest));
         Err(AdapterError::Timeout(format!(
-            "piper at {address}: the drivers of joints {silent} have said nothing for {} ms",
+            "piper at {address}: the {} said nothing for {} ms",
+            drivers(&silent),
             DRIVERS_STALE_AFTER.as_millis()
         )))
     }
@@ -227,7 +231,7 @@ impl Session {
 
     /// The data sheet's limits, narrowed by those that the controller has been given; and what of these is odd.
     pub fn limits(&self) -> (JointLimits, Vec<String>) {
-        controller_limits::narrowed(&self.feedback.limits)
+        controller_limits::narrowed(self.model, &self.feedback.limits)
     }
 
     /// Why there is no whole state.
@@ -349,7 +353,7 @@ impl Session {
                     .into(),
             ));
         }
-        let limits = limits();
+        let limits = self.model.limits();
         let range = limits.position_lower.iter().zip(&limits.position_upper);
         for (i, (wire, (lower, upper))) in measured.iter().zip(range).enumerate() {
             let value = radians(*wire);
@@ -380,7 +384,7 @@ impl Session {
         let (name, within) = (&self.hardware_id, ENABLE_TIMEOUT.as_millis());
         let silent = self.feedback.silent_drivers(began);
         if !silent.is_empty() {
-            let what = format!("{name}: the drivers of joints {silent} have said nothing for {within} ms");
+            let what = format!("{name}: the {} said nothing for {within} ms", drivers(&silent));
             return Err(AdapterError::Timeout(what));
         }
         let wrong = |(_, driver): &(usize, &Driver)| driver.enabled() != on;
@@ -389,4 +393,10 @@ impl Session {
         let (joints, word) = (joints.join(", "), if on { "on" } else { "off" });
         Err(AdapterError::Timeout(format!("{name}: the motors of joints {joints} do not go {word} within {within} ms")))
     }
+}
+
+/// Returns drivers, such as those of `3, 4`, with their verb.
+fn drivers(joints: &str) -> String {
+    let many = joints.contains(',');
+    if many { format!("drivers of joints {joints} have") } else { format!("driver of joint {joints} has") }
 }

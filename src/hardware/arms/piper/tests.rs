@@ -91,7 +91,7 @@ fn units_go_both_ways_and_the_arm_gets_there() {
     let wire: Vec<i32> = frames[1..4].iter().flat_map(two).collect();
     assert_eq!(wire, target.map(|v: f64| (v.to_degrees() * 1000.0).round() as i32), "0.001 deg on the wire");
     assert_eq!(frames.len(), 4, "nothing else was sent");
-    let pose = arm.read_cartesian_position().unwrap().unwrap();
+    let pose = arm.read_cartesian_position().unwrap().unwrap().tcp;
     assert!(pose.xyz[2] > 0.2 && pose.xyz[2] < 0.6, "metres: {pose:?}");
 }
 
@@ -141,12 +141,12 @@ fn set_points_are_followed_smoothly_or_directly() {
 fn cartesian_targets_are_reached_or_told() {
     let (emulator, mut arm) = connected();
     activate(&emulator, &mut arm);
-    let now = arm.read_cartesian_position().unwrap().unwrap();
+    let now = arm.read_cartesian_position().unwrap().unwrap().tcp;
     let goal = Pose { xyz: [now.xyz[0] + 0.03, now.xyz[1] + 0.04, now.xyz[2] + 0.03], rpy: now.rpy };
     arm.write_cartesian_position(&goal, 1.0).unwrap();
     until("pose", || {
         read(&mut arm).unwrap();
-        farthest(&arm.read_cartesian_position().unwrap().unwrap().xyz, &goal.xyz) < 1e-4
+        farthest(&arm.read_cartesian_position().unwrap().unwrap().tcp.xyz, &goal.xyz) < 1e-4
     });
     arm.write_cartesian_position(&Pose { xyz: [3.0, 0.0, 0.0], rpy: [0.0; 3] }, 1.0).unwrap();
     until("refusal", || {
@@ -335,4 +335,19 @@ fn wrong_configurations_are_refused() {
     assert!(emulate(serde_json::json!({}), &bind).contains("no IP address"));
     let script = SimOptions { faults: vec![Fault::new(FaultKind::Nan)], ..SimOptions::default() };
     assert!(PiperEmulator::with(&script, GripperKind::Small, &EmulatorAddress::InProcess).is_err());
+}
+
+/// A joint of a Piper-H goes where a Piper's may not.
+#[test]
+fn the_models_have_their_ranges() {
+    let limits = |model: &str| {
+        let config = config("can0", serde_json::json!({"model": model}));
+        (SPEC.check)(&config).unwrap().limits
+    };
+    assert!((limits("piper").position_upper[3] - 100f64.to_radians()).abs() < 1e-3);
+    for (model, wrist, tilt) in [("piper_h", 135.0, 89.5), ("piper_l", 127.0, 89.5), ("piper_x", 89.0, 89.0)] {
+        let limits = limits(model);
+        let is = [limits.position_upper[3].to_degrees(), limits.position_upper[4].to_degrees()];
+        assert!((is[0] - wrist).abs() < 0.02 && (is[1] - tilt).abs() < 0.02, "{model}: {is:?}");
+    }
 }

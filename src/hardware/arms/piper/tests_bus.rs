@@ -149,7 +149,7 @@ fn f17_what_nothing_replaces_is_told_when_it_is_lost() {
     no_room(&emulator, 1);
     assert!(matches!(arm.write_clear_errors(), Err(AdapterError::Io(_))));
     arm.write_clear_errors().unwrap();
-    let pose = arm.read_cartesian_position().unwrap().unwrap();
+    let pose = arm.read_cartesian_position().unwrap().unwrap().tcp;
     no_room(&emulator, 3);
     assert!(arm.write_joint_positions(&START, 0.1).is_err(), "a planned move");
     assert!(arm.write_cartesian_position(&pose, 0.1).is_err());

@@ -71,6 +71,8 @@ fn f05_drivers_that_fall_silent_are_named_and_the_arm_can_still_be_stopped() {
     let (emulator, mut arm) = connected();
     activate(&emulator, &mut arm);
     emulator.mute(Some(0x263..=0x264));
+    // Each reports at its own time: both have been silent for long enough then.
+    std::thread::sleep(Duration::from_millis(400));
     let error = failure(&mut arm);
     let AdapterError::Timeout(text) = &error else { panic!("{error:?}") };
     assert!(text.ends_with("the drivers of joints 3, 4 have said nothing for 300 ms"), "{text}");

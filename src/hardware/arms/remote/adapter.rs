@@ -10,7 +10,7 @@ use super::address::Address;
 use super::protocol::{Act, Command, Description, Measured, WirePose};
 use super::session::Session;
 use super::{MODES, NATIVE_RATE, check, limits, same_modes};
-use crate::arm::{GripperUnit, Pose, StopPoint};
+use crate::arm::{Bridging, ControllerPose, GripperUnit, Pose, StopPoint};
 use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo,
     RobotState, Stop,
@@ -158,6 +158,10 @@ impl ManipulatorAdapter for RemoteAdapter {
         Ok(self.last.as_ref().map_or_else(|| limits(self.dof), |d| d.joint_limits()))
     }
 
+    fn bridging(&self) -> Option<Bridging> {
+        self.last.as_ref()?.bridging()
+    }
+
     // --- Mode ---
 
     fn set_control_mode(&mut self, mode: ControlMode) -> AdapterResult<()> {
@@ -215,6 +219,7 @@ impl ManipulatorAdapter for RemoteAdapter {
             effort: state.effort.map(|values| values.joints),
             valid: None,
             commanded: None,
+            speed_fraction: None,
         };
         Ok(())
     }
@@ -334,8 +339,8 @@ impl ForceTorque for RemoteAdapter {
 }
 
 impl Cartesian for RemoteAdapter {
-    fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>> {
-        self.recent(|state| state.pose.map(WirePose::pose))
+    fn read_cartesian_position(&mut self) -> AdapterResult<Option<ControllerPose>> {
+        self.recent(|state| state.pose.map(|pose| ControllerPose::of_flange(pose.pose())))
     }
 
     fn write_cartesian_position(&mut self, pose: &Pose, velocity: f64) -> AdapterResult<()> {

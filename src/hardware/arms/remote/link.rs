@@ -16,6 +16,7 @@ use rustix::net::{
 use super::address::Address;
 use super::protocol::MAX_LINE;
 use crate::hardware::adapter::{AdapterError, AdapterResult};
+use crate::hardware::transport::capture::Tap;
 
 /// Room for a line and the beginning of the next.
 const BUFFER: usize = 2 * MAX_LINE;
@@ -29,6 +30,7 @@ pub struct Link {
     buffer: Vec<u8>,
     filled: Range<usize>,
     reads: u32,
+    tap: Tap,
 }
 
 impl Drop for Link {
@@ -64,7 +66,8 @@ impl Link {
                  python3 dimos_shim.py MODULE:CLASS --at {address}"
             ))
         })?;
-        Ok(Self { socket, peer, buffer: vec![0; BUFFER], filled: 0..0, reads: 0 })
+        let tap = Tap::open(|| address.to_string(), false, None);
+        Ok(Self { socket, peer, buffer: vec![0; BUFFER], filled: 0..0, reads: 0, tap })
     }
 
     /// Who is at the other end, for messages.
@@ -79,6 +82,7 @@ impl Link {
 
     /// Sends a line. A peer that does not take one has stopped reading: that ends the connection.
     pub fn send(&self, line: &[u8]) -> AdapterResult<()> {
+        self.tap.sent(line);
         match send(&self.socket, line, SendFlags::DONTWAIT | SendFlags::NOSIGNAL) {
             Ok(n) if n == line.len() => Ok(()),
             Ok(_) | Err(Errno::AGAIN) => Err(AdapterError::Io(format!("{} has stopped taking requests", self.peer))),
@@ -134,9 +138,10 @@ impl Link {
         self.buffer.copy_within(self.filled.clone(), 0);
         self.filled = 0..self.filled.len();
         let room = self.buffer.get_mut(self.filled.end..).unwrap_or_default();
-        match recv(&self.socket, room, RecvFlags::DONTWAIT) {
+        match recv(&self.socket, &mut *room, RecvFlags::DONTWAIT) {
             Ok((0, _)) => Err(AdapterError::Io(format!("{} closed the connection", self.peer))),
             Ok((n, _)) => {
+                self.tap.received(room.get(..n).unwrap_or_default());
                 self.filled.end += n;
                 Ok(true)
             }

@@ -7,6 +7,7 @@ mod adapter;
 pub mod address;
 pub mod emulator;
 mod link;
+mod messages;
 mod protocol;
 mod session;
 #[cfg(test)]
@@ -65,6 +66,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     create: |config| Ok(Box::new(adapter::RemoteAdapter::new(config)?)),
     emulate: Some(emulator::start),
     service: None,
+    wire: Some(messages::WIRE),
 };
 
 fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {

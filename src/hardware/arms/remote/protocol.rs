@@ -4,11 +4,12 @@
 
 use std::fmt;
 use std::io::Write as _;
+use std::time::Duration;
 
 use serde::de::{Deserializer, Error as _, SeqAccess, Visitor};
 use serde::{Deserialize, Serialize};
 
-use crate::arm::{GripperUnit, Pose};
+use crate::arm::{AfterGap, Bridging, GripperUnit, Pose};
 use crate::hardware::adapter::AdapterError;
 use crate::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
 
@@ -347,6 +348,12 @@ pub struct Description {
     /// Whether `write_stop` takes the positions at which the arm is to rest.
     #[serde(default)]
     pub stop_point: bool,
+    /// Longest time without a command that the arm bridges, 0 to 1 [s]; nothing where it does not say.
+    #[serde(default)]
+    pub gap_tolerance: Option<f64>,
+    /// What it does beyond that; it rests at its last setpoint where it does not say.
+    #[serde(default)]
+    pub after_gap: Option<AfterGap>,
     /// `get_limits` [rad, rad/s, rad/s², rad/s³]
     pub limits: Limits,
     /// Position of its gripper when closed and when open [m or rad].
@@ -393,6 +400,9 @@ impl Description {
         if !(0.1..=10_000.0).contains(&description.native_rate) {
             return Err(format!("its description: a native_rate of {} Hz", description.native_rate));
         }
+        if !(0.0..=1.0).contains(&description.gap_tolerance.unwrap_or_default()) {
+            return Err("its description: gap_tolerance must be 0 to 1 s".to_owned());
+        }
         let unusable = |own: &Vec<ControlMode>| own.is_empty() || own.iter().any(|mode| !modes.contains(mode));
         if description.modes.as_ref().is_some_and(unusable) {
             return Err("its description: modes must be some of position, servo_position, velocity".to_owned());
@@ -403,6 +413,15 @@ impl Description {
             return Err(format!("its description: limits must have {dof} values each"));
         }
         Ok(description)
+    }
+
+    /// What it says of gaps in its commands.
+    pub fn bridging(&self) -> Option<Bridging> {
+        if self.gap_tolerance.is_none() && self.after_gap.is_none() {
+            return None;
+        }
+        let tolerance = Duration::from_secs_f64(self.gap_tolerance.unwrap_or_default());
+        Some(Bridging { tolerance, after: self.after_gap.unwrap_or_default() })
     }
 
     /// The limits in this program's words.

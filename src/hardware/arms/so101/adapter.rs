@@ -214,8 +214,10 @@ impl ManipulatorAdapter for So101Adapter {
             position: self.positions(),
             velocity: Some(self.angles(|j, _| velocity(servos.get(j)))),
             effort: None,
+            // Counts of absolute encoders: 0 rad is the middle of a range, not what a servo sends unmeasured.
             valid: Some(true),
             commanded: on.then(|| Commanded { position: self.angles(goal), ..Commanded::default() }),
+            speed_fraction: None,
         };
         Ok(())
     }

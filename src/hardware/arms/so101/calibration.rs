@@ -7,6 +7,7 @@ use serde::Deserialize;
 
 use super::protocol::{SERVOS, TURN};
 use super::{DOF, SPEC};
+use crate::bounded;
 
 /// The joints and the gripper, as LeRobot calls them.
 pub const NAMES: [&str; SERVOS] =
@@ -114,7 +115,8 @@ impl Calibration {
 
     /// Reads LeRobot's file as it is.
     pub fn read(path: &Path) -> Result<[Servo; SERVOS], String> {
-        let text = std::fs::read_to_string(path).map_err(|e| format!("cannot read {}: {e}", path.display()))?;
+        let text =
+            bounded::read_text(path, bounded::SMALL).map_err(|e| format!("cannot read {}: {e}", path.display()))?;
         entries(&text).map_err(|e| format!("{}: {e}", path.display()))
     }
 

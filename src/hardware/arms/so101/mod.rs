@@ -11,6 +11,7 @@ mod bus;
 pub mod calibration;
 mod connect;
 pub mod emulator;
+mod messages;
 mod parts;
 pub mod protocol;
 pub mod seam;
@@ -94,6 +95,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     create: |config| Ok(Box::new(adapter::So101Adapter::new(config)?)),
     emulate: Some(|config, place| Ok(Box::new(emulator::start(config, place)?))),
     service: Some(service::open),
+    wire: Some(messages::WIRE),
 };
 
 /// Checks the number of joints, the options and the calibration file; returns the joint limits.

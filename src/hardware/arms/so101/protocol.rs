@@ -115,7 +115,8 @@ pub fn encode<'a>(instruction: Instruction<'_>, frame: &'a mut [u8; MAX_INSTRUCT
     frame.get(..=at).unwrap_or_default()
 }
 
-fn sum(bytes: &[u8]) -> u8 {
+/// Returns the sum of the bytes after FF FF, as frames end with it.
+pub(super) fn sum(bytes: &[u8]) -> u8 {
     !bytes.iter().fold(0u8, |sum, byte| sum.wrapping_add(*byte))
 }
 

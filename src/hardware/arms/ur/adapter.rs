@@ -5,7 +5,7 @@
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
-use nalgebra::{Rotation3, Vector3};
+use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 
 use super::address::Address;
 use super::connect::connect;
@@ -13,7 +13,7 @@ use super::protocol::inputs::Order;
 use super::safety::Stopped;
 use super::session::Session;
 use super::{DOF, HOLDS_WHEN_DISABLED, MODES, Options, check};
-use crate::arm::{Commanded, Pose, StopPoint};
+use crate::arm::{Commanded, ControllerPose, FactoryKinematics, Pose, StopPoint};
 use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, ForceTorque, Io, JointMonitor, JointReading, ManipulatorAdapter,
     ManipulatorInfo, Payload, RobotState, Stop,
@@ -120,6 +120,10 @@ impl ManipulatorAdapter for UrAdapter {
         }
     }
 
+    fn connection_warning(&self) -> Option<&'static str> {
+        self.session.as_ref()?.device.warning
+    }
+
     fn get_dof(&self) -> usize {
         DOF
     }
@@ -127,6 +131,10 @@ impl ManipulatorAdapter for UrAdapter {
     fn get_limits(&mut self) -> AdapterResult<JointLimits> {
         let device = self.session.as_ref().map(|session| session.device.limits.clone());
         Ok(device.unwrap_or_else(|| self.options.limits()))
+    }
+
+    fn factory_kinematics(&self) -> Option<FactoryKinematics> {
+        self.session.as_ref().map(|session| session.device.kinematics.clone())
     }
 
     // --- Mode ---
@@ -184,12 +192,11 @@ impl ManipulatorAdapter for UrAdapter {
             velocity: Some(joints_of(&state.velocity)),
             // Motor currents are not torques.
             effort: None,
-            // Before power-on the positions may not be measured yet. Enabling does not use them: the controller itself
-            // holds the arm, and once its motors are on they are measured.
-            valid: Some(true),
+            valid: session.positions_are_proven().then_some(true),
             commanded: session
                 .enabled()
                 .then(|| Commanded { position: joints_of(&state.target), velocity: joints_of(&state.target_velocity) }),
+            speed_fraction: Some(session.speed_fraction()),
         };
         Ok(())
     }
@@ -269,9 +276,16 @@ impl ForceTorque for UrAdapter {
 }
 
 impl Cartesian for UrAdapter {
-    fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>> {
-        let [x, y, z, a, b, c] = self.recent()?.state().0.tcp;
-        let (roll, pitch, yaw) = Rotation3::new(Vector3::new(a, b, c)).euler_angles();
-        Ok(Some(Pose { xyz: [x, y, z], rpy: [roll, pitch, yaw] }))
+    fn read_cartesian_position(&mut self) -> AdapterResult<Option<ControllerPose>> {
+        let session = self.recent()?;
+        let (state, _) = session.state();
+        let tool = session.rtde.has("tcp_offset").then(|| pose(&state.tcp_offset));
+        Ok(Some(ControllerPose { tcp: pose(&state.tcp), tool, base: Some(Pose::default()) }))
     }
+}
+
+/// Returns the pose of a position [m] and a rotation vector [rad].
+fn pose(&[x, y, z, a, b, c]: &[f64; 6]) -> Pose {
+    let turn = UnitQuaternion::from_scaled_axis(Vector3::new(a, b, c));
+    Pose::from(&Isometry3::from_parts(Translation3::new(x, y, z), turn))
 }

@@ -4,8 +4,11 @@ use crate::hardware::transport::tcp::Endpoint;
 
 /// The first of a controller's ports: the dashboard's.
 pub const FIRST_PORT: u16 = 29999;
-/// How many consecutive ports follow from it, the first included. The second one is not used.
+/// How many consecutive ports follow from it, the first included. The second one is that of the Robot API, where the
+/// first one is another: a controller has it at [`API_PORT`].
 pub const PORTS: u16 = 6;
+/// Port of the Robot API of a controller.
+pub const API_PORT: u16 = 80;
 
 /// A port of the controller. The number is its distance from the first one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -13,6 +16,8 @@ pub const PORTS: u16 = 6;
 pub enum Service {
     /// Dashboard: text lines (29999).
     Dashboard = 0,
+    /// Robot API of PolyScope X: HTTP (80).
+    RobotApi = 1,
     /// Primary interface: state, messages, script (30001).
     Primary = 2,
     /// Secondary interface: state, script (30002).
@@ -42,6 +47,9 @@ impl Address {
 
     /// Returns the host and the port of a service.
     pub fn port(&self, service: Service) -> Endpoint {
+        if service == Service::RobotApi && self.first.port == FIRST_PORT {
+            return Endpoint { host: self.first.host.clone(), port: API_PORT };
+        }
         Endpoint { host: self.first.host.clone(), port: self.first.port.saturating_add(service as u16) }
     }
 }
@@ -65,7 +73,8 @@ mod tests {
             assert!(full(bad).is_err(), "{bad:?}");
         }
         let address = Address::parse("ur5e.local").unwrap();
-        let ports = [Service::Primary, Service::Secondary, Service::RealTime, Service::Rtde];
-        assert_eq!(ports.map(|service| address.port(service).port), [30001, 30002, 30003, 30004]);
+        let ports = [Service::Primary, Service::Secondary, Service::RealTime, Service::Rtde, Service::RobotApi];
+        assert_eq!(ports.map(|service| address.port(service).port), [30001, 30002, 30003, 30004, 80]);
+        assert_eq!(Address::parse("127.0.0.1:41000").unwrap().port(Service::RobotApi).port, 41001);
     }
 }

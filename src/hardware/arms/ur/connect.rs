@@ -7,10 +7,11 @@ use super::Options;
 use super::address::Address;
 use super::dashboard::Dashboard;
 use super::model::Model;
-use super::primary::Primary;
-use super::protocol::primary::Configuration;
+use super::primary::{KINEMATICS, Primary};
+use super::protocol::primary::{Configuration, Kinematics};
 use super::rtde::Rtde;
-use super::session::{Device, Session};
+use super::session::{Device, POLYSCOPE_X, Session};
+use crate::arm::FactoryKinematics;
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::joint::JointLimits;
@@ -26,13 +27,20 @@ pub fn connect(address: &Address, options: &Options) -> AdapterResult<Session> {
     let limit = MonotonicClock.now().after(TOTAL_TIMEOUT);
     let named = |error| name(error, address);
     let mut rtde = Rtde::connect(address, limit).map_err(named)?;
-    let (primary, major, configuration) = Primary::connect(address, limit).map_err(named)?;
+    let (primary, major, configuration, kinematics) = Primary::connect(address, limit, KINEMATICS).map_err(named)?;
     verify(address, options.model, configuration.kind, major)?;
     let left = limit.since(MonotonicClock.now());
-    // Without a dashboard the arm is only read.
-    let serial = Dashboard::connect(address, left.min(DASHBOARD)).and_then(|mut board| board.ask("get serial number"));
+    // Without a dashboard the arm does not say its serial number and its family.
+    let dashboard = match rtde.software {
+        [major, ..] if major >= POLYSCOPE_X => None,
+        _ => Dashboard::connect(address, left.min(DASHBOARD)).ok(),
+    };
+    let (serial, family) = match dashboard {
+        Some(mut board) => (board.ask("get serial number").ok(), board.ask("get robot model").ok()),
+        None => (None, None),
+    };
     let digits = |serial: &String| !serial.is_empty() && serial.bytes().all(|byte| byte.is_ascii_digit());
-    let serial = serial.ok().filter(digits);
+    let serial = serial.filter(digits);
     let left = limit.since(MonotonicClock.now());
     let first = rtde.next(left.min(FIRST_STATE)).map_err(named)?;
     let [major, minor, bugfix] = rtde.software;
@@ -40,9 +48,31 @@ pub fn connect(address: &Address, options: &Options) -> AdapterResult<Session> {
         model: options.model,
         software: format!("{major}.{minor}.{bugfix}"),
         serial,
+        kinematics: factory(options.model, kinematics),
+        warning: renamed(options.model, family.as_deref()),
         limits: narrowed(options.model, options.limits(), &configuration),
     };
     Ok(Session::new(device, address.clone(), rtde, primary, first))
+}
+
+/// Returns what to say of an arm that has another name than the blueprint's, and the same joints.
+fn renamed(model: Model, family: Option<&str>) -> Option<&'static str> {
+    match (model, family?) {
+        (Model::Ur5e, "UR7") => Some("the arm is a UR7e, with a payload of 7.5 kg: set `model: ur7e`"),
+        (Model::Ur10e, "UR12") => Some("the arm is a UR12e: set `model: ur12e`"),
+        (Model::Ur7e, "UR5") => Some("the arm is a UR5e, with a payload of 5 kg: set `model: ur5e`"),
+        (Model::Ur12e, "UR10") => Some("the arm is a UR10e: set `model: ur10e`"),
+        _ => None,
+    }
+}
+
+/// Returns the arm's kinematics, beside those of its model.
+fn factory(model: Model, found: Option<Kinematics>) -> FactoryKinematics {
+    FactoryKinematics {
+        nominal: model.dh().to_vec(),
+        actual: found.map(|found| found.joints.to_vec()),
+        checksum: found.map_or_else(String::new, |found| found.checksum.map(|sum| format!("{sum:08x}")).concat()),
+    }
 }
 
 /// Adds the address to an error.
@@ -57,10 +87,10 @@ fn name(error: AdapterError, address: &Address) -> AdapterError {
 
 /// Checks that the arm is the expected one.
 fn verify(address: &Address, model: Model, kind: u32, major: u8) -> AdapterResult<()> {
-    let found = Model::of(kind, major);
-    if found == Some(model) {
+    if model.is(kind, major) {
         return Ok(());
     }
+    let found = Model::of(kind, major);
     let (what, hint) = match found {
         Some(other) => {
             (format!("a {}", other.name()), format!(" Else set the arm's options to {{model: {}}}", other.option()))

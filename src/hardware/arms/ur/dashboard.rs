@@ -4,6 +4,7 @@
 use std::time::Duration;
 
 use super::address::{Address, Service};
+use super::robot_api;
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::transport::Scan;
 use crate::hardware::transport::tcp::TcpLink;
@@ -17,6 +18,41 @@ const LONGEST: usize = 1024;
 /// A connection to the dashboard.
 pub struct Dashboard {
     link: TcpLink,
+}
+
+/// What takes orders besides motion.
+pub enum Panel {
+    /// The dashboard.
+    Dashboard(Dashboard),
+    /// The Robot API of PolyScope X, which has no dashboard.
+    RobotApi(Address, Duration),
+}
+
+impl Panel {
+    /// Sends an order; `Rejected` unless it is taken, as the answer of the dashboard begins then.
+    pub fn order(&mut self, request: &str, expected: &str) -> AdapterResult<()> {
+        match self {
+            Self::Dashboard(dashboard) => dashboard.order(request, expected),
+            Self::RobotApi(address, timeout) => robot_api::order(address, request, *timeout),
+        }
+    }
+
+    /// Closes the message of a safety stop, where it must be closed before the arm is switched on.
+    pub fn close_safety_popup(&mut self) -> AdapterResult<()> {
+        match self {
+            Self::Dashboard(dashboard) => dashboard.ask("close safety popup").map(|_| ()),
+            Self::RobotApi(..) => Ok(()),
+        }
+    }
+
+    /// Returns whether the controller takes orders and programs: not in local control. Series before e have no such
+    /// switch; the Robot API says so with the first order.
+    pub fn is_in_remote_control(&mut self, cb3: bool) -> AdapterResult<bool> {
+        match self {
+            Self::Dashboard(dashboard) => Ok(cb3 || dashboard.ask("is in remote control")? != "false"),
+            Self::RobotApi(..) => Ok(true),
+        }
+    }
 }
 
 /// Scans for a line, without its end.
@@ -56,12 +92,6 @@ impl Dashboard {
         }
         let hint = if answer.contains("not allowed") { "\nhint: select remote control at the pendant" } else { "" };
         Err(AdapterError::Rejected(format!("ur refuses {request:?}: {answer}{hint}")))
-    }
-
-    /// Returns whether the controller takes orders and programs: not in local control. Series before e have no such
-    /// switch.
-    pub fn is_in_remote_control(&mut self, cb3: bool) -> AdapterResult<bool> {
-        Ok(cb3 || self.ask("is in remote control")? != "false")
     }
 }
 

@@ -1,4 +1,4 @@
-//! Universal Robots: CB3, e-Series, UR20 and UR30.
+//! Universal Robots: CB3, e-Series, UR-Series, with PolyScope and PolyScope X.
 //!
 //! `protocol/` has the bytes, `rtde`, `primary` and `dashboard` the connections, `control.script` the program that runs
 //! on the controller and `script/` its language, `session` and `safety` the state of the arm, `power` and `motion` what
@@ -6,12 +6,14 @@
 
 pub mod adapter;
 pub mod address;
+mod condition;
 mod connect;
 mod dashboard;
 pub mod emulator;
 #[cfg(test)]
 mod golden;
 mod io;
+mod messages;
 pub mod model;
 mod motion;
 mod outputs;
@@ -19,6 +21,7 @@ mod power;
 mod primary;
 pub mod program;
 pub mod protocol;
+mod robot_api;
 mod rtde;
 mod safety;
 mod script;
@@ -28,7 +31,11 @@ mod tests;
 #[cfg(test)]
 mod tests_others;
 #[cfg(test)]
+mod tests_poses;
+#[cfg(test)]
 mod tests_power;
+#[cfg(test)]
+mod tests_speed;
 #[cfg(test)]
 mod tests_stream;
 
@@ -38,7 +45,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::arm::{AfterGap, Topology};
-use crate::hardware::check::{Checked, ConfigError, in_range};
+use crate::hardware::check::{Checked, ConfigError, ToolFacts, in_range};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use crate::joint::{ControlMode, JointLimits};
 use address::Address;
@@ -53,10 +60,14 @@ const NATIVE_RATE: f64 = 500.0;
 /// Whether the arm keeps its pose when its motors are off: it has brakes.
 const HOLDS_WHEN_DISABLED: bool = true;
 
+/// Highest speed of tool, flange and elbow [m/s] with the default preset of the safety settings. The controller has no
+/// interface that reports them.
+const TOOL_SPEED: f64 = 1.5;
+
 /// The row in the adapter table.
 pub const SPEC: AdapterSpec = AdapterSpec {
     name: "ur",
-    about: "Universal Robots UR3 to UR30: CB3, e-Series",
+    about: "Universal Robots UR3 to UR30, UR8 Long: CB3, e-Series, UR-Series",
     level: Level::Emulated,
     transport: "tcp",
     dof: (DOF, DOF),
@@ -87,6 +98,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     check,
     create: |config| Ok(Box::new(adapter::UrAdapter::new(config)?)),
     service: None,
+    wire: Some(messages::WIRE),
     emulate: Some(|config, place| Ok(Box::new(emulator::UrEmulator::start(config, place)?))),
 };
 
@@ -94,8 +106,8 @@ pub const SPEC: AdapterSpec = AdapterSpec {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
-    /// Which arm it is: `ur3`, `ur3e`, `ur5`, `ur5e`, `ur10`, `ur10e`, `ur16e`, `ur20` or `ur30`. An arm that is
-    /// another model is refused.
+    /// Which arm it is: `ur3`, `ur3e`, `ur5`, `ur5e`, `ur7e`, `ur8long`, `ur10`, `ur10e`, `ur12e`, `ur15`, `ur16e`,
+    /// `ur18`, `ur20` or `ur30`. An arm that is another model is refused.
     pub model: Model,
     /// Time over which the controller smooths setpoints, 0.03 to 0.2 [s]: longer is smoother and later.
     #[schemars(range(min = 0.03, max = 0.2))]
@@ -149,5 +161,11 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     Ok(Checked::new(limits)
         .digital_inputs(io::DIGITAL)
         .max_payload(io::max_payload(options.model))
-        .topology((0..DOF).map(topology).collect()))
+        .topology((0..DOF).map(topology).collect())
+        .tool(ToolFacts {
+            velocity: Some(TOOL_SPEED),
+            is_setting: true,
+            model: (options.model == Model::Ur5e).then_some(("ur5e", "tool0")),
+            also: &["forearm_link", "link3"],
+        }))
 }

@@ -7,6 +7,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::DOF;
+use crate::arm::Dh;
 use crate::joint::JointLimits;
 
 /// The arms that this adapter knows.
@@ -22,12 +23,22 @@ pub enum Model {
     /// UR5e.
     #[default]
     Ur5e,
+    /// UR7e: a UR5e with a larger payload.
+    Ur7e,
+    /// UR8 Long.
+    Ur8long,
     /// UR10 (CB3).
     Ur10,
     /// UR10e.
     Ur10e,
+    /// UR12e: a UR10e by another name.
+    Ur12e,
+    /// UR15.
+    Ur15,
     /// UR16e.
     Ur16e,
+    /// UR18.
+    Ur18,
     /// UR20.
     Ur20,
     /// UR30.
@@ -53,20 +64,42 @@ struct Sheet {
 
 impl Model {
     /// All models.
-    pub const ALL: [Self; 9] =
-        [Self::Ur3, Self::Ur3e, Self::Ur5, Self::Ur5e, Self::Ur10, Self::Ur10e, Self::Ur16e, Self::Ur20, Self::Ur30];
+    pub const ALL: [Self; 14] = [
+        Self::Ur3,
+        Self::Ur3e,
+        Self::Ur5,
+        Self::Ur5e,
+        Self::Ur7e,
+        Self::Ur8long,
+        Self::Ur10,
+        Self::Ur10e,
+        Self::Ur12e,
+        Self::Ur15,
+        Self::Ur16e,
+        Self::Ur18,
+        Self::Ur20,
+        Self::Ur30,
+    ];
 
     fn sheet(self) -> Sheet {
         let sheet = |name, kind, size, speed, payload| Sheet { name, kind, size, speed, payload };
         let (small, middle) = ([180.0, 180.0, 180.0, 360.0], [180.0; 4]);
         let (large, largest) = ([120.0, 120.0, 180.0, 180.0], [120.0, 120.0, 150.0, 210.0]);
+        // The joints of UR8 Long, UR15 and UR18 are the same; the speeds are those published of the UR18, and the
+        // controller reports the arm's own.
+        let newer = [180.0, 180.0, 240.0, 300.0];
         match self {
             Self::Ur3 => sheet("UR3", 3, [0.1519, -0.24365, -0.21325, 0.11235, 0.08535, 0.0819], small, 3.0),
             Self::Ur3e => sheet("UR3e", 3, [0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921], small, 3.0),
             Self::Ur5 => sheet("UR5", 1, [0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823], middle, 5.0),
             Self::Ur5e => sheet("UR5e", 1, [0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996], middle, 5.0),
+            Self::Ur7e => Sheet { name: "UR7e", payload: 7.5, ..Self::Ur5e.sheet() },
+            Self::Ur8long => sheet("UR8Long", 6, [0.2186, -0.8989, -0.7149, 0.1824, 0.1361, 0.1434], newer, 8.0),
             Self::Ur10 => sheet("UR10", 2, [0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922], large, 10.0),
             Self::Ur10e => sheet("UR10e", 2, [0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655], large, 12.5),
+            Self::Ur12e => Sheet { name: "UR12e", ..Self::Ur10e.sheet() },
+            Self::Ur15 => sheet("UR15", 9, [0.2186, -0.6475, -0.5164, 0.1824, 0.1361, 0.1434], newer, 15.0),
+            Self::Ur18 => sheet("UR18", 5, [0.2186, -0.475, -0.3389, 0.1824, 0.1361, 0.1434], newer, 18.0),
             Self::Ur16e => sheet("UR16e", 4, [0.1807, -0.4784, -0.36, 0.17415, 0.11985, 0.11655], large, 16.0),
             Self::Ur20 => sheet("UR20", 7, [0.2363, -0.862, -0.7287, 0.201, 0.1593, 0.1543], largest, 20.0),
             Self::Ur30 => sheet("UR30", 8, [0.2363, -0.637, -0.5037, 0.201, 0.1593, 0.1543], largest, 30.0),
@@ -76,7 +109,13 @@ impl Model {
     /// Returns the model of a type in the primary interface and of the major version of the controller's software: the
     /// CB3 and the e-Series arm of a size have the same type. `None` for one that this adapter does not know.
     pub fn of(kind: u32, major: u8) -> Option<Self> {
-        Self::ALL.into_iter().find(|model| model.kind() == kind && model.is_cb3() == (major < 5))
+        Self::ALL.into_iter().find(|model| model.is(kind, major))
+    }
+
+    /// Returns whether an arm with this type and software may be this model. A UR7e has the type of a UR5e, and a UR12e
+    /// that of a UR10e.
+    pub fn is(self, kind: u32, major: u8) -> bool {
+        self.kind() == kind && self.is_cb3() == (major < 5)
     }
 
     /// Returns the type in the primary interface.
@@ -127,19 +166,20 @@ impl Model {
         }
     }
 
-    /// Returns the Denavit-Hartenberg parameters a [m], d [m], alpha [rad] of each joint.
-    pub fn dh(self) -> [(f64, f64, f64); DOF] {
+    /// Returns the Denavit-Hartenberg parameters of each joint by the data sheet.
+    pub fn dh(self) -> [Dh; DOF] {
         let [d1, a2, a3, d4, d5, d6] = self.sheet().size;
         let quarter = FRAC_PI_2;
         [(0.0, d1, quarter), (a2, 0.0, 0.0), (a3, 0.0, 0.0), (0.0, d4, quarter), (0.0, d5, -quarter), (0.0, d6, 0.0)]
+            .map(|(a, d, alpha)| Dh { theta: 0.0, a, d, alpha })
     }
 
     /// Returns the transform of one joint at a position [rad].
     pub fn link(self, joint: usize, position: f64) -> Option<Isometry3<f64>> {
-        let (a, d, alpha) = *self.dh().get(joint)?;
+        let Dh { theta, a, d, alpha } = *self.dh().get(joint)?;
         let turn = Isometry3::from_parts(
             Translation3::new(0.0, 0.0, d),
-            UnitQuaternion::from_axis_angle(&Vector3::z_axis(), position),
+            UnitQuaternion::from_axis_angle(&Vector3::z_axis(), theta + position),
         );
         let twist = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), alpha);
         Some(turn * Isometry3::from_parts(Translation3::new(a, 0.0, 0.0), twist))
@@ -158,9 +198,13 @@ mod tests {
             (Model::of(4, 5), Model::of(7, 5), Model::of(8, 5)),
             (Some(Model::Ur16e), Some(Model::Ur20), Some(Model::Ur30))
         );
-        assert_eq!((Model::of(9, 5), Model::of(4, 3)), (None, None));
+        assert_eq!(
+            (Model::of(5, 5), Model::of(6, 5), Model::of(9, 10)),
+            (Some(Model::Ur18), Some(Model::Ur8long), Some(Model::Ur15))
+        );
+        assert_eq!((Model::of(10, 5), Model::of(4, 3)), (None, None));
         for model in Model::ALL {
-            assert_eq!(Model::of(model.kind(), if model.is_cb3() { 3 } else { 5 }), Some(model));
+            assert!(model.is(model.kind(), if model.is_cb3() { 3 } else { 5 }));
             assert_eq!(serde_json::to_value(model).unwrap(), model.option());
         }
     }

@@ -14,7 +14,7 @@ use crate::hardware::adapter::{AdapterError, AdapterResult, Stop};
 /// follows within its tracking tolerance.
 const MAX_UNANSWERED: [Duration; 2] = [Duration::from_millis(20), Duration::from_millis(40)];
 /// How long a stop waits for the program's answer, and for what the dashboard does after that.
-const STOP_LIMIT: Duration = Duration::from_millis(300);
+pub(super) const STOP_LIMIT: Duration = Duration::from_millis(300);
 const DASHBOARD_LIMIT: Duration = Duration::from_millis(700);
 
 impl Session {
@@ -53,6 +53,8 @@ impl Session {
     /// which echoes the order in its registers, or by a later state with the joints at rest and no program that moves
     /// them.
     pub fn stop(&mut self) -> AdapterResult<Stop> {
+        // While the program still runs: after that, nothing is known of what slows it.
+        let limit = if self.crawls() { Duration::ZERO } else { STOP_LIMIT };
         (self.ready, self.ended) = (None, None);
         let sent = MonotonicClock.now();
         if self.rtde.takes_orders() {
@@ -66,14 +68,14 @@ impl Session {
             let still = session.at_rest() && (!session.program_exists() || session.stopped.is_some());
             Ok((echoed || (still && measured > sent)).then_some(()))
         };
-        if self.wait(STOP_LIMIT, done)?.is_some() {
+        if self.wait(limit, done)?.is_some() {
             return Ok(Stop::Confirmed);
         }
         // Another program, or ours does not run as it should.
         // The primary interface takes it at once and does not answer; the dashboard may be slow, or not there.
         let told = |primary: &mut Primary| !primary.read_only() && primary.run("stop program\n").is_ok();
         let told = self.primary.as_mut().is_some_and(told);
-        let asked = self.dashboard().and_then(|mut dashboard| dashboard.order("stop", "stopped"));
+        let asked = self.panel().and_then(|mut panel| panel.order("stop", "stopped"));
         let asked = if told { Ok(()) } else { asked };
         let sent = MonotonicClock.now();
         let done = |session: &mut Self| {

@@ -8,7 +8,7 @@ use super::program;
 use super::protocol::inputs::Order;
 use super::protocol::status::{self, robot, robot_name, safety, safety_text};
 use super::rtde::in_use;
-use super::session::{FULL_SPEED, Session};
+use super::session::Session;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 
@@ -41,13 +41,6 @@ impl Session {
         if !self.rtde.takes_orders() {
             return Err(in_use());
         }
-        if self.state.slider < FULL_SPEED {
-            return Err(AdapterError::Rejected(format!(
-                "the pendant's speed slider is at {:.0} %: the arm would follow its setpoints late\nhint: set the slider to \
-                 100 %, and limits.velocity in the blueprint",
-                100.0 * self.state.slider
-            )));
-        }
         let limit = MonotonicClock.now().after(POWER_LIMIT);
         self.end_leftover()?;
         self.power_on(limit)?;
@@ -75,8 +68,8 @@ impl Session {
     }
 
     fn power_on(&mut self, limit: Mono) -> AdapterResult<()> {
-        let mut dashboard = self.dashboard()?;
-        if !dashboard.is_in_remote_control(self.device.model.is_cb3())? {
+        let mut panel = self.panel()?;
+        if !panel.is_in_remote_control(self.device.model.is_cb3())? {
             return Err(AdapterError::Rejected(
                 "the controller is in local control\nhint: select remote control at the pendant".into(),
             ));
@@ -89,9 +82,9 @@ impl Session {
             return Err(AdapterError::Rejected(format!("the controller is not ready: its robot mode is {name}")));
         }
         let braked = self.state.robot_mode == robot::IDLE;
-        dashboard.ask("close safety popup")?;
+        panel.close_safety_popup()?;
         if !braked {
-            dashboard.order("power on", "powering on")?;
+            panel.order("power on", "powering on")?;
             self.reach(robot::IDLE, limit)?;
         }
         // What is ordered continues after this call, and after the end of the run.
@@ -101,7 +94,7 @@ impl Session {
                     .into(),
             ));
         }
-        dashboard.order("brake release", "brake releasing")?;
+        panel.order("brake release", "brake releasing")?;
         self.reach(robot::RUNNING, limit)
     }
 
@@ -165,7 +158,7 @@ impl Session {
             self.wait(REST_LIMIT, |session| Ok(session.at_rest().then_some(())))?;
         }
         (self.ready, self.ended) = (None, None);
-        self.dashboard()?.order("power off", "powering off")?;
+        self.panel()?.order("power off", "powering off")?;
         let off = self.wait(OFF_LIMIT, |session| Ok((session.state.robot_mode <= robot::POWER_OFF).then_some(())))?;
         off.ok_or_else(|| AdapterError::Timeout(format!("the motors do not go off within {OFF_LIMIT:?}")))
     }
@@ -217,12 +210,12 @@ impl Session {
                 }
             }));
         }
-        let mut dashboard = self.dashboard()?;
+        let mut panel = self.panel()?;
         let answer = if order == "stop" {
-            dashboard.order(order, expected) // the program may end although the dashboard answers otherwise
+            panel.order(order, expected) // the program may end although the dashboard answers otherwise
         } else {
-            dashboard.ask("close safety popup")?;
-            Ok(dashboard.order(order, expected)?)
+            panel.close_safety_popup()?;
+            Ok(panel.order(order, expected)?)
         };
         self.asked = Some((order, MonotonicClock.now(), answer));
         Err(AdapterError::Busy)

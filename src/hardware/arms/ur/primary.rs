@@ -3,13 +3,16 @@
 use std::time::Duration;
 
 use super::address::{Address, Service};
-use super::protocol::primary::{Configuration, Packet, WARNING, scan};
+use super::protocol::primary::{Configuration, Kinematics, Packet, WARNING, scan};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::transport::tcp::TcpLink;
 
 /// Error code of a connection that was opened in local control: it takes no programs.
 const READ_ONLY: i32 = 210;
+
+/// Time for the kinematics to follow the configuration: three states.
+pub const KINEMATICS: Duration = Duration::from_millis(350);
 
 /// A connection, and what was reported on it.
 pub struct Primary {
@@ -23,21 +26,41 @@ pub struct Primary {
 }
 
 impl Primary {
-    /// Connects, and waits for the version and the configuration.
-    pub fn connect(address: &Address, limit: Mono) -> AdapterResult<(Self, u8, Configuration)> {
+    /// Connects, and waits for the version, the configuration, and for this time for the kinematics, which not all
+    /// controllers send.
+    pub fn connect(
+        address: &Address,
+        limit: Mono,
+        patience: Duration,
+    ) -> AdapterResult<(Self, u8, Configuration, Option<Kinematics>)> {
         let left = |most: Duration| limit.since(MonotonicClock.now()).min(most);
         let most = Duration::from_millis(1500);
         let link = TcpLink::connect("the primary interface of ur", &address.port(Service::Primary), left(most))?;
         let mut primary = Self { link, error: None, exception: None, read_only: false };
-        let (mut major, mut configuration) = (None, None);
+        let (mut major, mut configuration, mut kinematics) = (None, None, None);
+        // A controller that sends its kinematics does so within its first states.
+        let mut until = limit;
         loop {
-            match primary.link.receive(left(most), scan)? {
+            let known = major.zip(configuration);
+            let packet = match (primary.link.receive(until.since(MonotonicClock.now()).min(most), scan), known) {
+                (Err(AdapterError::Timeout(_)), Some((major, configuration))) => {
+                    return Ok((primary, major, configuration, kinematics));
+                }
+                (packet, _) => packet?,
+            };
+            match packet {
                 Packet::Version(version, ..) => major = Some(version),
-                Packet::Configuration(found) => configuration = Some(found),
+                Packet::About(about) => {
+                    configuration = about.configuration.or(configuration);
+                    kinematics = about.kinematics.or(kinematics);
+                }
                 _ => {}
             }
-            if let (Some(major), Some(configuration)) = (major, configuration) {
-                return Ok((primary, major, configuration));
+            if let Some((major, configuration)) = major.zip(configuration) {
+                if kinematics.is_some() || patience.is_zero() || MonotonicClock.now() >= until {
+                    return Ok((primary, major, configuration, kinematics));
+                }
+                until = until.min(MonotonicClock.now().after(patience));
             }
         }
     }

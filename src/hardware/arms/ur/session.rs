@@ -6,7 +6,7 @@ use std::time::Duration;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::address::Address;
-use super::dashboard::Dashboard;
+use super::dashboard::{Dashboard, Panel};
 use super::model::Model;
 use super::outputs::Outputs;
 use super::primary::Primary;
@@ -15,6 +15,7 @@ use super::protocol::state::State;
 use super::protocol::status::{self, bits, program, robot};
 use super::rtde::Rtde;
 use super::safety::Stopped;
+use crate::arm::FactoryKinematics;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::transport::measured::Measured;
@@ -34,8 +35,6 @@ const PRIMARY_PERIOD: Duration = Duration::from_millis(20);
 const PRIMARY_CONNECT: Duration = Duration::from_secs(1);
 /// Joints slower than this are at rest [rad/s].
 const REST: f64 = 0.03;
-/// Slider positions from here on are full speed.
-pub(super) const FULL_SPEED: f64 = 0.999;
 
 /// What the arm is.
 pub struct Device {
@@ -45,9 +44,16 @@ pub struct Device {
     pub software: String,
     /// Serial number, if it is known.
     pub serial: Option<String>,
+    /// Dimensions.
+    pub kinematics: FactoryKinematics,
+    /// What a user must know of it.
+    pub warning: Option<&'static str>,
     /// Joint limits.
     pub limits: JointLimits,
 }
+
+/// The first major version of PolyScope X.
+pub(super) const POLYSCOPE_X: u32 = 10;
 
 /// A connected arm.
 pub struct Session {
@@ -149,9 +155,13 @@ impl Session {
         self.state.velocity.iter().chain(&self.state.target_velocity).all(|v| v.abs() < REST)
     }
 
-    /// Connects to the dashboard.
-    pub(super) fn dashboard(&self) -> AdapterResult<Dashboard> {
-        Dashboard::connect(&self.address, Duration::from_millis(800))
+    /// Returns what takes orders besides motion.
+    pub(super) fn panel(&self) -> AdapterResult<Panel> {
+        const TIMEOUT: Duration = Duration::from_millis(800);
+        match self.rtde.software {
+            [major, ..] if major >= POLYSCOPE_X => Ok(Panel::RobotApi(self.address.clone(), TIMEOUT)),
+            _ => Dashboard::connect(&self.address, TIMEOUT).map(Panel::Dashboard),
+        }
     }
 
     /// Processes all that has arrived, without waiting, and keeps the program alive. Does nothing within `age` of the
@@ -208,7 +218,8 @@ impl Session {
     pub(super) fn run_program(&mut self, text: &str) -> AdapterResult<()> {
         if self.primary.as_mut().is_none_or(|primary| primary.update().is_err() || primary.read_only()) {
             let (primary, ..) =
-                Primary::connect(&self.address, MonotonicClock.now().after(PRIMARY_CONNECT)).map_err(refused)?;
+                Primary::connect(&self.address, MonotonicClock.now().after(PRIMARY_CONNECT), Duration::ZERO)
+                    .map_err(refused)?;
             self.primary = Some(primary);
         }
         self.primary.as_mut().map_or(Ok(()), |primary| primary.run(text)).map_err(refused)
@@ -260,7 +271,11 @@ impl Session {
         }
         // Every new echo is an answer. That of the newest order comes later than the next order.
         let echoed = state.count != self.state.count && self.count.wrapping_sub(state.count) >= 0;
+        let passed = Duration::from_secs_f64((state.time - self.state.time).clamp(0.0, STATE_TIMEOUT.as_secs_f64()));
         self.state = state;
+        // A step of servoj takes longer by the fraction: the program answers so much later.
+        let slowed = passed.mul_f64(1.0 - self.speed_fraction());
+        self.unanswered = self.unanswered.map(|since| since.after(slowed));
         if state.count == self.count {
             self.unanswered = None;
         } else if echoed && self.unanswered.is_some() {
@@ -274,9 +289,7 @@ impl Session {
     fn see_program(&mut self) {
         let Some(number) = self.ready else { return };
         let state = &self.state;
-        if state.slider < FULL_SPEED {
-            self.lose_program("the pendant's speed slider was moved: setpoints would be followed late");
-        } else if !self.enabled() {
+        if !self.enabled() {
             self.ready = None; // the motors' state says it
         } else if state.number == number && state.program == program::SILENT {
             self.lose_program(

@@ -7,6 +7,7 @@ use serde_json::json;
 use super::tests::{arm, ready, text, until};
 use crate::arm::{AnalogUnit, IoState, JointStatus, Load};
 use crate::hardware::adapter::ManipulatorAdapter;
+use crate::hardware::sim::faults::{Fault, FaultKind};
 
 #[test]
 fn the_brakes_are_released_only_if_the_time_is_enough() {
@@ -67,4 +68,60 @@ fn inputs_outputs_load_and_joints_are_parts_of_the_arm() {
     let mut joints = [JointStatus::default(); 6];
     adapter.joint_monitor().unwrap().read_joint_status(&mut joints).unwrap();
     assert_eq!((joints[5].temperature, joints[0].voltage, joints[3].error), (Some(36.0), Some(48.0), Some(0)));
+}
+
+/// PolyScope X has no dashboard: power, brakes and the end of a protective stop are ordered by its Robot API.
+#[test]
+fn polyscope_x_is_switched_by_its_robot_api() {
+    let (mut adapter, emulator) = arm(json!({"sim": {"software": "10.11.0"}}));
+    adapter.connect().unwrap();
+    assert_eq!(adapter.get_info().firmware_version.as_deref(), Some("10.11.0"));
+    emulator.set_remote_control(false);
+    let refused = text(adapter.activate().unwrap_err());
+    assert_eq!(refused, "the controller is in local control\nhint: select remote control at the pendant");
+    emulator.set_remote_control(true);
+    adapter.activate().unwrap();
+    assert_eq!(adapter.read_enabled(), Ok(true));
+    crate::hardware::registry::Emulator::inject(&emulator, Fault::new(FaultKind::ErrorCode).code(153)).unwrap();
+    until(&mut adapter, |adapter| adapter.read_error().is_ok_and(|(code, _)| code != 0));
+    until(&mut adapter, |adapter| adapter.write_clear_errors().is_ok());
+    until(&mut adapter, |adapter| adapter.read_error().is_ok_and(|(code, _)| code == 0));
+    adapter.activate().unwrap();
+    adapter.write_enable(false).unwrap();
+    assert_eq!(adapter.read_enabled(), Ok(false));
+}
+
+#[test]
+fn polyscope_x_before_10_11_is_switched_on_at_the_pendant() {
+    let (mut adapter, emulator) = arm(json!({"sim": {"software": "10.8.0"}}));
+    adapter.connect().unwrap();
+    let refused = text(adapter.activate().unwrap_err());
+    assert!(refused.contains("has no \"power on\"") && refused.contains("hint: switch the arm on"), "{refused}");
+    emulator.set_robot_mode(7);
+    until(&mut adapter, |adapter| adapter.read_state().is_ok_and(|state| state.state == 7));
+    adapter.activate().unwrap();
+    assert_eq!(adapter.read_enabled(), Ok(true), "switched on by hand, it takes programs");
+}
+
+#[test]
+fn a_ur7e_is_told_from_a_ur5e() {
+    for (model, others) in [("ur7e", "ur5e"), ("ur12e", "ur10e")] {
+        let (mut adapter, emulator) = arm(json!({"model": model}));
+        adapter.connect().unwrap();
+        assert_eq!(adapter.connection_warning(), None);
+        let config = crate::hardware::registry::AdapterConfig {
+            hardware_id: "arm".into(),
+            address: crate::hardware::registry::Emulator::address(&emulator),
+            dof: 6,
+            options: json!({"model": others}),
+        };
+        let mut other = super::adapter::UrAdapter::new(&config).unwrap();
+        other.connect().unwrap();
+        let warning = other.connection_warning().unwrap();
+        assert!(warning.contains(&format!("set `model: {model}`")), "{warning}");
+    }
+    for model in ["ur15", "ur18", "ur8long"] {
+        let (mut adapter, _emulator) = arm(json!({"model": model}));
+        adapter.connect().unwrap();
+    }
 }

@@ -251,3 +251,28 @@ fn a_program_that_hangs_or_is_refused_is_reported() {
     let refused = text(adapter.activate().unwrap_err());
     assert!(refused.starts_with("the controller refuses the program of dimos: line 1: compile_error"), "{refused}");
 }
+
+/// A program of another client: up to this speed within 0.5 s, along there, then the same point repeatedly.
+fn ends_at_speed(speed: f64) -> String {
+    format!(
+        "def dimos_control():\n  q = get_target_joint_positions()\n  v = 0.0\n  i = 0\n  while i < 500:\n    if i < 250:\n      \
+         v = v + {}\n    elif i > 300:\n      v = 0.0\n    end\n    q[0] = q[0] + v * 0.002\n    servoj(q, 0, 0, 0.002, 0.05, \
+         500)\n    i = i + 1\n  end\n  stopj(8)\nend\n",
+        speed / 250.0
+    )
+}
+
+/// The emulated controller refuses it: no stream of this adapter's may end like that.
+#[test]
+fn points_that_end_at_speed_are_c204a3() {
+    for (speed, stops) in [(1.5, true), (0.8, false)] {
+        let (mut adapter, emulator) = ready(json!({}));
+        let mut primary = std::net::TcpStream::connect(emulator.primary()).unwrap();
+        std::io::Write::write_all(&mut primary, ends_at_speed(speed).as_bytes()).unwrap();
+        let began = Instant::now();
+        let stopped = |adapter: &mut UrAdapter| adapter.read_error().unwrap().0 != 0;
+        until(&mut adapter, |adapter| stopped(adapter) || began.elapsed() > Duration::from_millis(1500));
+        let (code, what) = adapter.read_error().unwrap();
+        assert_eq!((code, what.contains("C204A3")), if stops { (204, true) } else { (0, false) }, "{speed}: {what}");
+    }
+}

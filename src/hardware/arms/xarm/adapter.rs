@@ -7,15 +7,17 @@ use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
 use super::address::Address;
+use super::condition::Condition;
 use super::connect::{connect, ends_velocities};
 pub use super::control::Counts;
 use super::model::{Model, VELOCITY};
 use super::protocol::commands::{Command, WireJoints};
 use super::protocol::gripper::{FORCE_RANGE_G2, GripperKind};
-use super::report_validity::measured;
+use super::protocol::report::Motion;
+use super::report_validity::{MM_PER_M, measured, pose};
 use super::session::Session;
 use super::{HOLDS_WHEN_DISABLED, MODES, MODES_WITHOUT_VELOCITY, Options, check, model_of};
-use crate::arm::{ForceUnit, JointStatus, Load, Pose, StopPoint};
+use crate::arm::{ControllerPose, ForceUnit, GripperUnit, JointStatus, Load, Pose, StopPoint};
 use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, HandGuiding, JointMonitor, JointReading,
     ManipulatorAdapter, ManipulatorInfo, Payload, RobotState, Stop,
@@ -40,8 +42,6 @@ const SLOWEST: (f64, f64) = (1e-4, 0.1);
 const VELOCITY_TIMEOUT: f64 = 0.2;
 /// Planned moves to targets closer than this are the same move [rad].
 const SAME_TARGET: f64 = 1e-6;
-
-const MM_PER_M: f64 = 1000.0;
 
 /// An xArm, Lite 6 or 850 behind its control box.
 pub struct XArmAdapter {
@@ -264,8 +264,9 @@ impl ManipulatorAdapter for XArmAdapter {
             position: self.only(&motion.position),
             velocity: motion.velocity.map(|velocity| self.only(&velocity)),
             effort: session.device.torques.then(|| self.only(&motion.torque)),
-            valid: measured(motion, self.model, session.condition().tool),
+            valid: measured(motion, self.model, &stated(motion, session.condition())),
             commanded: None,
+            speed_fraction: None,
         };
         Ok(())
     }
@@ -419,6 +420,14 @@ impl Gripper for XArmAdapter {
         Ok(self.recent()?.gripper().opening())
     }
 
+    fn get_gripper_unit(&self) -> GripperUnit {
+        if self.options.gripper.is_on_off() { GripperUnit::OnOff } else { GripperUnit::Meters }
+    }
+
+    fn read_gripper_holds(&mut self) -> AdapterResult<Option<bool>> {
+        Ok(self.recent()?.gripper().holds())
+    }
+
     fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
         self.options.gripper.widest().map(|widest| (0.0, widest))
     }
@@ -433,7 +442,7 @@ impl Gripper for XArmAdapter {
     }
 
     fn has_gripper_speed(&self) -> bool {
-        true
+        !self.options.gripper.is_on_off()
     }
 
     fn set_gripper_speed(&mut self, fraction: Option<f64>) {
@@ -459,9 +468,9 @@ impl ForceTorque for XArmAdapter {
 }
 
 impl Cartesian for XArmAdapter {
-    fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>> {
-        let [x, y, z, roll, pitch, yaw] = self.recent()?.motion().0.pose;
-        Ok(Some(Pose { xyz: [x, y, z].map(|v| v / MM_PER_M), rpy: [roll, pitch, yaw] }))
+    fn read_cartesian_position(&mut self) -> AdapterResult<Option<ControllerPose>> {
+        let session = self.recent()?;
+        Ok(Some(stated(session.motion().0, session.condition())))
     }
 
     fn write_cartesian_position(&mut self, pose: &Pose, velocity: f64) -> AdapterResult<()> {
@@ -474,4 +483,10 @@ impl Cartesian for XArmAdapter {
         self.target = None;
         self.with(|session| session.plan(&Command::MoveLine { pose, speed, acceleration: LINE_ACCELERATION }))
     }
+}
+
+/// Returns the pose of a report, with the offsets of the newest one that has them: five times a second.
+fn stated(motion: &Motion, condition: &Condition) -> ControllerPose {
+    let (tool, base) = (condition.tool.as_ref().map(pose), condition.base.as_ref().map(pose));
+    ControllerPose { tcp: pose(&motion.pose), tool, base }
 }

@@ -27,8 +27,10 @@ pub struct Condition {
     pub warning: u8,
     /// Motors that are on, one bit per joint.
     pub enabled: u8,
-    /// Position of the tool relative to the flange: x, y, z [mm].
-    pub tool: [f64; 3],
+    /// Offset of the tool from the flange: x, y, z [mm], roll, pitch, yaw [rad]; `None` before the first report.
+    pub tool: Option<[f64; 6]>,
+    /// Pose of the base in the reference frame of poses, alike, if reported.
+    pub base: Option<[f64; 6]>,
     /// Load at the flange: mass [kg], centre x, y, z [mm].
     pub load: [f64; 4],
     /// Direction of gravity in the base frame, if reported.
@@ -65,7 +67,7 @@ impl Condition {
 
     /// Checks a report.
     pub fn report(&mut self, health: Health) {
-        (self.enabled, self.tool) = (health.enabled, health.tool);
+        (self.enabled, self.tool, self.base) = (health.enabled, Some(health.tool), health.base);
         (self.load, self.gravity, self.motors) = (health.load, health.gravity, health.motors);
         self.changed |= health.error != self.error || health.warning != self.warning;
     }

@@ -7,11 +7,12 @@ use super::Options;
 use super::address::Address;
 use super::condition::Condition;
 use super::control::{Control, Purpose};
-use super::gripper::Gripper;
+use super::gripper::{Gripper, ToolGripper};
 use super::model::{Identity, Model};
+use super::output_gripper::OutputGripper;
 use super::protocol::commands::{Command, QUICK, SLOW};
 use super::protocol::frame::{Response, WATCHED};
-use super::protocol::gripper::{BAUD_INDEX, BAUD_REGISTER, GripperKind, Rtu, decode_position};
+use super::protocol::gripper::{BAUD_INDEX, BAUD_REGISTER, GripperKind, OUTPUTS, Rtu, decode_position};
 use super::protocol::identity::{Firmware, decode_serial, decode_version};
 use super::protocol::report::{Health, Kind, Motion};
 use super::session::{Device, Session};
@@ -65,7 +66,10 @@ pub fn connect(address: &Address, model: Model, options: &Options) -> AdapterRes
 
     let limits = identity.limits().unwrap_or_else(|| model.limits());
     let device = Device { model, firmware, serial, limits, torques: !currents };
-    let gripper = Gripper::new(options.gripper, pulses);
+    let gripper: Box<dyn ToolGripper> = match options.gripper {
+        kind @ (GripperKind::Lite6 | GripperKind::Vacuum) => Box::new(OutputGripper::new(kind)),
+        kind => Box::new(Gripper::new(kind, pulses)),
+    };
     Ok(Session::new(device, (control, bus), motion, first, normal, condition, gripper))
 }
 
@@ -145,8 +149,27 @@ fn find_gripper(
     if kind == GripperKind::None {
         return Ok((None, None));
     }
+    // Another kind of server may be listening at the second port.
+    let first = |control: &mut Control, request: Command| {
+        let second = || {
+            let mut bus = Control::new(TcpLink::connect("xarm", &address.second(), left(until, SECOND))?);
+            let answer = ask(&mut bus, &request, left(until, FIRST_TELEGRAM))?;
+            AdapterResult::Ok((Some(bus), answer))
+        };
+        second().or_else(|_| AdapterResult::Ok((None, ask(control, &request, left(until, SLOW))?)))
+    };
     let rejected =
         |what: &str, hint: &str| Err(AdapterError::Rejected(format!("xarm at {address}: {what}\nhint: {hint}")));
+    if kind.is_on_off() {
+        let (bus, answer) = first(control, Command::ReadToolBoard(OUTPUTS))?;
+        return match answer.status.invalid() || answer.data().len() < 4 {
+            false => Ok((bus, None)),
+            true => rejected(
+                "the tool board does not say what its outputs are, which open and close the gripper",
+                "without a gripper set the arm's options to {gripper: none}",
+            ),
+        };
+    }
     let baud = ask(control, &Command::ReadToolBoard(BAUD_REGISTER), left(until, SLOW))?;
     match baud.data() {
         [_, a, b, c, d, ..] | [a, b, c, d] if i32::from_be_bytes([*a, *b, *c, *d]) == BAUD_INDEX => {}
@@ -158,16 +181,7 @@ fn find_gripper(
         }
     }
     let telegram = Rtu::read_position();
-    // Another kind of server may be listening there.
-    let second = || {
-        let mut bus = Control::new(TcpLink::connect("xarm", &address.second(), left(until, SECOND))?);
-        let answer = ask(&mut bus, &Command::Tool(telegram), left(until, FIRST_TELEGRAM))?;
-        AdapterResult::Ok((Some(bus), answer))
-    };
-    let (bus, answer) = match second() {
-        Ok(found) => found,
-        Err(_) => (None, ask(control, &Command::Tool(telegram), left(until, SLOW))?),
-    };
+    let (bus, answer) = first(control, Command::Tool(telegram))?;
     match telegram.answered(answer.data()).and_then(decode_position) {
         Some(pulses) => Ok((bus, Some(pulses))),
         None => rejected(

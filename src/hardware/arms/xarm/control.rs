@@ -352,7 +352,9 @@ mod tests {
         assert_eq!(control.next().unwrap().map(|_| ()), None);
         assert_eq!(control.counts(), Counts { sent: 3, late: 0, overdue: 1, stray: 1 });
         go.send(()).unwrap();
+        let end = std::time::Instant::now() + Duration::from_secs(10);
         while control.counts().late == 0 {
+            assert!(std::time::Instant::now() < end, "the late one is not counted");
             assert_eq!(control.next().unwrap().map(|_| ()), None, "its request was dropped");
         }
         assert_eq!(control.counts(), Counts { sent: 3, late: 1, overdue: 1, stray: 2 });

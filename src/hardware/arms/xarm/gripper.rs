@@ -7,6 +7,7 @@
 use std::time::Duration;
 
 use super::errors::gripper_text;
+use super::protocol::commands::Command;
 use super::protocol::frame::Response;
 use super::protocol::gripper::{FORCE_G2, FORCE_RANGE_G2, GripperKind, Rtu, decode_error, decode_position};
 use crate::clock::Mono;
@@ -39,6 +40,34 @@ enum Step {
     Go(i32, u16),
     Error,
     Position,
+}
+
+/// A gripper at the tool flange, as the session sees it.
+pub trait ToolGripper: Send {
+    /// Returns its position, if known: opening [m], or 0 closed and 1 open.
+    fn opening(&self) -> Option<f64>;
+    /// Returns whether it reports an object in its grip, if it can tell.
+    fn holds(&self) -> Option<bool> {
+        None
+    }
+    /// Queues a move to a position.
+    fn go_to(&mut self, opening: f64) -> AdapterResult<()>;
+    /// Queues a move to an opening [m] with a largest force [%].
+    fn grip(&mut self, _opening: f64, _force: f64) -> AdapterResult<()> {
+        Err(AdapterError::Unsupported)
+    }
+    /// Sets the speed of the moves that follow, as a fraction of its top speed; `None`: the default.
+    fn set_speed(&mut self, _speed: Option<f64>) {}
+    /// The arm was stopped. An unsent target is dropped.
+    fn stopped(&mut self, now: Mono);
+    /// Queues the clearing of its error.
+    fn clear_error(&mut self) {}
+    /// Its connection was closed.
+    fn unplugged(&mut self);
+    /// Returns the next request, if one is due. `quiet`: requests would delay setpoints, so only urgent ones are sent.
+    fn due(&mut self, now: Mono, quiet: bool) -> Option<Command>;
+    /// Takes the response to the outstanding request.
+    fn take(&mut self, response: &Response);
 }
 
 /// State of the gripper, and its pending commands.
@@ -83,34 +112,9 @@ impl Gripper {
         }
     }
 
-    /// Returns its opening [m], if known.
-    pub fn opening(&self) -> Option<f64> {
-        self.pulses.map(|pulses| self.kind.opening(pulses))
-    }
-
     /// Returns the smallest and the largest force [%]; `None` for a gripper without force control.
     pub fn force_range(&self) -> Option<(f64, f64)> {
         (self.kind == GripperKind::XarmG2).then_some(FORCE_RANGE_G2)
-    }
-
-    /// Queues a move to an opening [m] with a largest force [%].
-    pub fn grip(&mut self, opening: f64, force: f64) -> AdapterResult<()> {
-        let range = self.force_range().ok_or(AdapterError::Unsupported)?;
-        let force = within("gripper force", force, range, "%")?;
-        self.go(opening, force.round() as u16)
-    }
-
-    /// Sets the speed of the moves that follow, as a fraction of its top speed; `None`: the default.
-    pub fn set_speed(&mut self, speed: Option<f64>) {
-        if self.kind == GripperKind::Xarm && self.speed != speed {
-            self.wake.get_or_insert(Step::Speed);
-        }
-        self.speed = speed;
-    }
-
-    /// Queues a move to an opening [m].
-    pub fn go_to(&mut self, opening: f64) -> AdapterResult<()> {
-        self.go(opening, FORCE_G2)
     }
 
     fn go(&mut self, opening: f64, force: u16) -> AdapterResult<()> {
@@ -129,33 +133,77 @@ impl Gripper {
         Ok(())
     }
 
-    /// The arm was stopped. An unsent target is dropped; the next positions show whether the gripper still moves.
-    pub fn stopped(&mut self, now: Mono) {
-        self.wanted = None;
-        self.watched_until = now.after(WATCH);
-    }
-
-    /// Queues the clearing of its error.
-    pub fn clear_error(&mut self) {
-        self.clear |= self.error != 0;
-    }
-
-    /// Its connection was closed.
-    pub fn unplugged(&mut self) {
-        if self.under_way.is_some() {
-            self.failed();
-        }
-    }
-
     /// Returns whether there is nothing to send and nothing to wait for.
     fn rests(&self, now: Mono) -> bool {
         let asked = self.clear || self.wanted.is_some() || now < self.watched_until;
         !asked && self.pulses.is_some() && self.same >= RESTS_AFTER
     }
 
-    /// Returns the next telegram, if one is due. `quiet`: telegrams would delay setpoints, so only urgent ones are
-    /// sent.
-    pub fn due(&mut self, now: Mono, quiet: bool) -> Option<Rtu> {
+    fn choose(&mut self, now: Mono) -> Option<Step> {
+        let silent = self.failures >= SILENT_AFTER;
+        if self.clear && !silent {
+            return Some(Step::Clear);
+        }
+        if let Some((pulses, force)) = self.wanted.filter(|_| !silent) {
+            return Some(self.wake.unwrap_or(Step::Go(pulses, force)));
+        }
+        if now < self.next_poll && (silent || now >= self.watched_until) {
+            return None;
+        }
+        self.next_poll = now.after(if silent { POLL_SILENT } else { POLL });
+        self.polls = self.polls.wrapping_add(1);
+        Some(if self.polls.is_multiple_of(ERROR_EVERY) { Step::Error } else { Step::Position })
+    }
+
+    fn failed(&mut self) {
+        self.under_way = None;
+        self.failures += 1;
+        if self.failures >= SILENT_AFTER {
+            // Its position and target are unknown now.
+            (self.pulses, self.wanted, self.wake, self.clear) = (None, None, Some(Step::Enable), false);
+        }
+    }
+}
+
+impl ToolGripper for Gripper {
+    fn opening(&self) -> Option<f64> {
+        self.pulses.map(|pulses| self.kind.opening(pulses))
+    }
+
+    fn grip(&mut self, opening: f64, force: f64) -> AdapterResult<()> {
+        let range = self.force_range().ok_or(AdapterError::Unsupported)?;
+        let force = within("gripper force", force, range, "%")?;
+        self.go(opening, force.round() as u16)
+    }
+
+    fn set_speed(&mut self, speed: Option<f64>) {
+        if self.kind == GripperKind::Xarm && self.speed != speed {
+            self.wake.get_or_insert(Step::Speed);
+        }
+        self.speed = speed;
+    }
+
+    fn go_to(&mut self, opening: f64) -> AdapterResult<()> {
+        self.go(opening, FORCE_G2)
+    }
+
+    /// The next positions show whether the gripper still moves.
+    fn stopped(&mut self, now: Mono) {
+        self.wanted = None;
+        self.watched_until = now.after(WATCH);
+    }
+
+    fn clear_error(&mut self) {
+        self.clear |= self.error != 0;
+    }
+
+    fn unplugged(&mut self) {
+        if self.under_way.is_some() {
+            self.failed();
+        }
+    }
+
+    fn due(&mut self, now: Mono, quiet: bool) -> Option<Command> {
         if self.kind == GripperKind::None || (quiet && (self.rests(now) || self.failures >= SILENT_AFTER)) {
             return None;
         }
@@ -176,27 +224,10 @@ impl Gripper {
             Step::Position => Rtu::read_position(),
         };
         self.under_way = Some((step, telegram, now));
-        Some(telegram)
+        Some(Command::Tool(telegram))
     }
 
-    fn choose(&mut self, now: Mono) -> Option<Step> {
-        let silent = self.failures >= SILENT_AFTER;
-        if self.clear && !silent {
-            return Some(Step::Clear);
-        }
-        if let Some((pulses, force)) = self.wanted.filter(|_| !silent) {
-            return Some(self.wake.unwrap_or(Step::Go(pulses, force)));
-        }
-        if now < self.next_poll && (silent || now >= self.watched_until) {
-            return None;
-        }
-        self.next_poll = now.after(if silent { POLL_SILENT } else { POLL });
-        self.polls = self.polls.wrapping_add(1);
-        Some(if self.polls.is_multiple_of(ERROR_EVERY) { Step::Error } else { Step::Position })
-    }
-
-    /// Takes the response to the outstanding telegram.
-    pub fn take(&mut self, response: &Response) {
+    fn take(&mut self, response: &Response) {
         let Some((step, telegram, _)) = self.under_way.take() else { return };
         let Some(data) = telegram.answered(response.data()) else { return self.failed() };
         self.failures = 0;
@@ -225,15 +256,6 @@ impl Gripper {
                 self.same = if same { self.same.saturating_add(1) } else { 0 };
                 self.pulses = pulses;
             }
-        }
-    }
-
-    fn failed(&mut self) {
-        self.under_way = None;
-        self.failures += 1;
-        if self.failures >= SILENT_AFTER {
-            // Its position and target are unknown now.
-            (self.pulses, self.wanted, self.wake, self.clear) = (None, None, Some(Step::Enable), false);
         }
     }
 }

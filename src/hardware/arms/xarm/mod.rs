@@ -17,10 +17,12 @@ pub mod errors;
 #[cfg(test)]
 mod golden;
 mod gripper;
+mod messages;
 mod mode;
 pub mod model;
 mod motion_commands;
 mod other_clients;
+mod output_gripper;
 pub mod protocol;
 mod report_validity;
 mod session;
@@ -33,6 +35,8 @@ mod tests_models;
 #[cfg(test)]
 mod tests_other_clients;
 #[cfg(test)]
+mod tests_outputs;
+#[cfg(test)]
 mod tests_slow;
 
 use std::time::Duration;
@@ -42,7 +46,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::arm::{AfterGap, Topology};
 use crate::hardware::adapter_util::fraction;
-use crate::hardware::check::{Checked, ConfigError};
+use crate::hardware::check::{Checked, ConfigError, ToolFacts};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use crate::joint::ControlMode;
 use address::Address;
@@ -97,6 +101,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     create: |config| Ok(Box::new(adapter::XArmAdapter::new(config)?)),
     emulate: Some(|config, place| Ok(Box::new(emulator::XArmEmulator::start(config, place)?))),
     service: None,
+    wire: Some(messages::WIRE),
 };
 
 /// What a blueprint may set of an xArm.
@@ -106,7 +111,7 @@ pub struct Options {
     /// Which arm it is: `xarm5`, `xarm6`, `xarm7`, `lite6` or `xarm850`. By default the xArm with that number of
     /// joints. An arm that is another model is refused.
     pub model: Option<Model>,
-    /// The gripper at the tool flange: `xarm`, `xarm_g2`, or `none`.
+    /// The gripper at the tool flange: `xarm`, `xarm_g2`, `lite6`, `vacuum`, or `none`.
     pub gripper: GripperKind,
     /// Whether to use the force/torque sensor. It is switched on with the motors.
     pub force_torque: bool,
@@ -133,9 +138,15 @@ impl Default for Options {
 /// Returns the limits of the configured model.
 fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     let options: Options = config.options()?;
-    let limits = model_of(&options, config.dof)?.limits();
+    let model = model_of(&options, config.dof)?;
+    let limits = model.limits();
     options.sim.check(&limits)?;
-    Ok(Checked::new(limits).digital_inputs(0))
+    let tool = ToolFacts {
+        velocity: Some(model.tool_speed()),
+        model: Some((model.option(), "link_eef")),
+        ..ToolFacts::default()
+    };
+    Ok(Checked::new(limits).digital_inputs(0).tool(tool))
 }
 
 /// Returns the model of options and number of joints, or why they conflict.

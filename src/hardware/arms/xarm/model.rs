@@ -32,9 +32,11 @@ pub struct Identity {
     pub serial: String,
 }
 
-/// Top speed [rad/s], acceleration [rad/s²] and jerk [rad/s³] of every joint of every model.
+/// Top speed [rad/s], acceleration [rad/s²] and jerk [rad/s³] of every joint of every model. The acceleration is that
+/// of the vendor's own examples, 500°/s²; with the API's maximum, more than twice that, arms report abnormal currents
+/// (error 31).
 pub const VELOCITY: f64 = std::f64::consts::PI;
-const ACCELERATION: f64 = 20.0;
+const ACCELERATION: f64 = 8.726_646;
 const JERK: f64 = 500.0;
 
 /// Ranges [rad] that several models share.
@@ -106,6 +108,15 @@ impl Model {
     /// Returns the article for the name in a sentence.
     pub fn article(self) -> &'static str {
         if self == Self::Lite6 { "a" } else { "an" }
+    }
+
+    /// Returns the highest speed of the tool [m/s]: 5 % below what its manual allows. In servo mode the box of an xArm
+    /// stops above 1.0 to 1.2 m/s, with error 60 or 24 (xArm-Python-SDK #94, #124; xarm_ros2 #112).
+    pub fn tool_speed(self) -> f64 {
+        match self {
+            Self::Lite6 => 0.475,
+            _ => 0.95,
+        }
     }
 
     /// Returns the name in a blueprint.

@@ -4,45 +4,67 @@
 
 use super::model::Model;
 use super::protocol::report::Motion;
+use crate::arm::{ControllerPose, Pose};
 
-/// How far a calibrated arm's tool may be from where the data sheet puts it [mm].
-const TOLERANCE: f64 = 20.0;
+/// How far a calibrated arm's flange may be from where the data sheet puts it [m].
+const TOLERANCE: f64 = 0.02;
+/// Millimetres per metre.
+pub const MM_PER_M: f64 = 1000.0;
 
-/// The report's own sign that its positions are measured. `tool`: where the tool is from the flange [mm].
-pub fn measured(motion: &Motion, model: Model, tool: [f64; 3]) -> Option<bool> {
+/// Returns a pose of the wire: x, y, z [mm], roll, pitch, yaw [rad].
+pub fn pose(&[x, y, z, roll, pitch, yaw]: &[f64; 6]) -> Pose {
+    Pose { xyz: [x, y, z].map(|v| v / MM_PER_M), rpy: [roll, pitch, yaw] }
+}
+
+/// The report's own sign that its positions are measured. `stated`: the pose in it, with the offsets of tool and base.
+pub fn measured(motion: &Motion, model: Model, stated: &ControllerPose) -> Option<bool> {
     let pose = motion.pose.iter().any(|value| *value != 0.0);
     let joints = motion.position.iter().any(|value| *value != 0.0);
     match (joints, pose) {
         (true, true) => Some(true),
         (true, false) => None,
         (false, false) => Some(false),
-        // Elsewhere with all joints at zero: another base frame is set, or the joints are not measured.
-        (false, true) => at_zero(motion, model, tool).then_some(true),
+        // Elsewhere with all joints at zero: the joints are not measured.
+        (false, true) => at_zero(model, stated).then_some(true),
     }
 }
 
-/// Whether the tool is where it is with all joints at zero.
-fn at_zero(motion: &Motion, model: Model, tool: [f64; 3]) -> bool {
-    let ([x, y, z, ..], [right, left, out], (forward, up)) = (motion.pose, tool, model.zero_pose());
-    let off = [x - forward - right, y + left, z - up + out];
-    off.iter().all(|off| off.abs() < TOLERANCE)
+/// Whether the flange is where it is with all joints at zero.
+fn at_zero(model: Model, stated: &ControllerPose) -> bool {
+    let (Some(Pose { xyz: [x, y, z], .. }), (forward, up)) = (stated.flange(), model.zero_pose()) else { return false };
+    [x - forward / MM_PER_M, y, z - up / MM_PER_M].iter().all(|off| off.abs() < TOLERANCE)
 }
 
 #[cfg(test)]
 mod tests {
+    use std::f64::consts::PI;
+
     use super::*;
 
     #[test]
-    fn zeros_are_measured_where_the_tool_agrees() {
-        let report = |position: f64, pose: [f64; 3]| {
-            let [x, y, z] = pose;
-            let motion = Motion { position: [position; 7], pose: [x, y, z, 0.0, 0.0, 0.0], ..Motion::default() };
-            measured(&motion, Model::Xarm6, [10.0, 20.0, 172.0])
+    fn zeros_are_measured_where_the_flange_agrees() {
+        let report = |position: f64, wire: [f64; 6], base: Option<[f64; 6]>| {
+            let motion = Motion { position: [position; 7], pose: wire, ..Motion::default() };
+            let tool = Some(pose(&[10.0, 20.0, 172.0, 0.0, 0.0, 0.0]));
+            measured(
+                &motion,
+                Model::Xarm6,
+                &ControllerPose { tcp: pose(&wire), tool, base: base.map(|base| pose(&base)) },
+            )
         };
-        assert_eq!(report(0.0, [0.0; 3]), Some(false), "nothing is measured yet");
-        assert_eq!(report(0.0, [217.0, -20.0, -60.0]), Some(true), "the zero pose, with a gripper");
-        assert_eq!(report(0.0, [400.0, 0.0, 300.0]), None);
-        assert_eq!(report(0.1, [400.0, 0.0, 300.0]), Some(true));
-        assert_eq!(report(0.1, [0.0; 3]), None);
+        let zero = Some([0.0; 6]);
+        let gripper = [217.0, -20.0, -60.0, PI, 0.0, 0.0];
+        assert_eq!(report(0.0, [0.0; 6], zero), Some(false), "nothing is measured yet");
+        assert_eq!(report(0.0, gripper, zero), Some(true), "the zero pose, with a gripper");
+        assert_eq!(report(0.0, [400.0, 0.0, 300.0, PI, 0.0, 0.0], zero), None);
+        let moved = [1217.0, -20.0, -60.0, PI, 0.0, 0.0];
+        assert_eq!(
+            report(0.0, moved, Some([1000.0, 0.0, 0.0, 0.0, 0.0, 0.0])),
+            Some(true),
+            "with an offset of the base"
+        );
+        assert_eq!(report(0.0, gripper, None), None, "the offset of the base is not known");
+        assert_eq!(report(0.1, [400.0, 0.0, 300.0, 0.0, 0.0, 0.0], zero), Some(true));
+        assert_eq!(report(0.1, [0.0; 6], zero), None);
     }
 }

@@ -8,7 +8,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::condition::Condition;
 use super::control::{Control, Counts, Purpose};
-use super::gripper::Gripper;
+use super::gripper::ToolGripper;
 use super::mode::{ModeChange, is_ready};
 use super::model::{Model, VELOCITY};
 use super::protocol::commands::{Command, QUICK, SLOW};
@@ -48,7 +48,7 @@ pub struct Device {
 /// State other than joints that responses and reports update.
 pub(super) struct Known {
     pub(super) condition: Condition,
-    pub(super) gripper: Gripper,
+    pub(super) gripper: Box<dyn ToolGripper>,
     /// The newest response that a caller waits for.
     pub(super) answer: Option<Response>,
 }
@@ -111,7 +111,7 @@ impl Session {
         first: Motion,
         normal: Stream<Health>,
         condition: Condition,
-        gripper: Gripper,
+        gripper: Box<dyn ToolGripper>,
     ) -> Self {
         let arrived = reports.arrived;
         Self {
@@ -160,8 +160,8 @@ impl Session {
     }
 
     /// The gripper.
-    pub fn gripper(&mut self) -> &mut Gripper {
-        &mut self.known.gripper
+    pub fn gripper(&mut self) -> &mut dyn ToolGripper {
+        &mut *self.known.gripper
     }
 
     /// Returns the counts of requests.
@@ -237,8 +237,8 @@ impl Session {
                 while let Some((_, response)) = bus.next()? {
                     gripper.take(&response);
                 }
-                let telegram = gripper.due(now, false);
-                telegram.map_or(Ok(()), |telegram| bus.post(&Command::Tool(telegram), Purpose::Gripper).map(drop))
+                let request = gripper.due(now, false);
+                request.map_or(Ok(()), |request| bus.post(&request, Purpose::Gripper).map(drop))
             };
             if talk().is_err() {
                 self.bus = None;
@@ -248,7 +248,7 @@ impl Session {
         }
         let streams = now.since(self.streamed_at) < STREAMING_TIME;
         match gripper.due(now, streams) {
-            Some(telegram) => self.control.post(&Command::Tool(telegram), Purpose::Gripper).map(drop),
+            Some(request) => self.control.post(&request, Purpose::Gripper).map(drop),
             None => Ok(()),
         }
     }

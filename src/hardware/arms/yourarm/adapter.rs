@@ -11,7 +11,7 @@ use std::time::Duration;
 use super::frame::{self, MAX_FRAME, Reply, Status};
 use super::protocol::{self, Command, DOF, Hello, Mode, WireJoints};
 use super::{GRIPPER_FORCE, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, check, limits};
-use crate::arm::{AnalogUnit, IoInfo, IoState, JointStatus, Load, Pose, StopPoint};
+use crate::arm::{AnalogUnit, ControllerPose, IoInfo, IoState, JointStatus, Load, Pose, StopPoint};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, Gripper, Io, JointMonitor, JointReading, ManipulatorAdapter,
@@ -270,6 +270,7 @@ impl ManipulatorAdapter for YourArmAdapter {
             effort: Some(joints_of(&self.state.torques)),
             valid: None,
             commanded: None,
+            speed_fraction: None,
         };
         Ok(())
     }
@@ -448,9 +449,10 @@ impl Io for YourArmAdapter {
 }
 
 impl Cartesian for YourArmAdapter {
-    fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>> {
+    fn read_cartesian_position(&mut self) -> AdapterResult<Option<ControllerPose>> {
         let [x, y, z, roll, pitch, yaw] = self.recent()?.pose;
-        Ok(Some(Pose { xyz: [x, y, z].map(|v| v / MM_PER_M), rpy: [roll, pitch, yaw].map(f64::to_radians) }))
+        let flange = Pose { xyz: [x, y, z].map(|v| v / MM_PER_M), rpy: [roll, pitch, yaw].map(f64::to_radians) };
+        Ok(Some(ControllerPose::of_flange(flange)))
     }
 
     fn write_cartesian_position(&mut self, pose: &Pose, velocity: f64) -> AdapterResult<()> {

@@ -16,7 +16,7 @@ const MAX_PAYLOAD: usize = 256;
 /// Longest frame; the size of a frame buffer.
 pub const MAX_FRAME: usize = HEADER + MAX_PAYLOAD + CRC;
 /// Set in the opcode of a reply.
-const REPLY: u8 = 0x80;
+pub const REPLY: u8 = 0x80;
 
 /// CRC-16/CCITT-FALSE: polynomial 0x1021, start value 0xFFFF, not reflected. Of "123456789" it is 0x29B1.
 fn crc16(bytes: &[u8]) -> u16 {
@@ -48,16 +48,26 @@ pub enum Status {
     Refused(u8),
 }
 
-/// Finds the reply to the command with this opcode and sequence number at the front of `bytes`. Noise, damaged
-/// frames and replies to other commands are skipped.
-pub fn scan<'a>(bytes: &'a [u8], opcode: u8, sequence: u16) -> Scan<Reply<'a>> {
+/// A whole frame with a good checksum.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Frame<'a> {
+    /// Opcode; of a reply with [`REPLY`].
+    pub opcode: u8,
+    /// Sequence number.
+    pub sequence: u16,
+    /// What is between header and checksum.
+    pub payload: &'a [u8],
+}
+
+/// Finds the next frame at the front of `bytes`. Noise and damaged frames are skipped.
+pub fn any(bytes: &[u8]) -> Scan<Frame<'_>> {
     // A frame can only begin where the magic is; a lone first byte of it may still become one.
     let begins = |at: &[u8]| at.starts_with(&MAGIC) || at == &MAGIC[..1];
     let noise = (0..bytes.len()).take_while(|i| !bytes.get(*i..).is_some_and(begins)).count();
     if noise > 0 {
         return Scan::Skip(noise);
     }
-    let Some([_, _, version, code, s0, s1, l0, l1]) = bytes.first_chunk::<HEADER>() else { return Scan::More };
+    let Some([_, _, version, opcode, s0, s1, l0, l1]) = bytes.first_chunk::<HEADER>() else { return Scan::More };
     let length = usize::from(u16::from_le_bytes([*l0, *l1]));
     if *version != VERSION || length > MAX_PAYLOAD {
         return Scan::Skip(1);
@@ -67,13 +77,32 @@ pub fn scan<'a>(bytes: &'a [u8], opcode: u8, sequence: u16) -> Scan<Reply<'a>> {
     if crc16(body) != u16::from_le_bytes(*checksum) {
         return Scan::Skip(1);
     }
-    let answers = *code == opcode | REPLY && u16::from_le_bytes([*s0, *s1]) == sequence;
-    match body.get(HEADER..).and_then(<[u8]>::split_first) {
+    let (sequence, payload) = (u16::from_le_bytes([*s0, *s1]), body.get(HEADER..).unwrap_or_default());
+    Scan::Take(frame.len(), Frame { opcode: *opcode, sequence, payload })
+}
+
+/// Finds the reply to the command with this opcode and sequence number at the front of `bytes`. Noise, damaged
+/// frames and replies to other commands are skipped.
+pub fn scan<'a>(bytes: &'a [u8], opcode: u8, sequence: u16) -> Scan<Reply<'a>> {
+    let (length, frame) = match any(bytes) {
+        Scan::Take(length, frame) => (length, frame),
+        Scan::Skip(n) => return Scan::Skip(n),
+        Scan::More => return Scan::More,
+    };
+    let answers = frame.opcode == opcode | REPLY && frame.sequence == sequence;
+    match frame.payload.split_first() {
         Some((status, data)) if answers => {
             let status = if *status == 0 { Status::Ok } else { Status::Refused(*status) };
-            Scan::Take(frame.len(), Reply { status, data })
+            Scan::Take(length, Reply { status, data })
         }
-        _ => Scan::Skip(frame.len()),
+        _ => Scan::Skip(length),
+    }
+}
+
+/// Makes the checksum of a frame right again, after its payload was changed.
+pub fn seal(frame: &mut [u8]) {
+    if let Some((body, checksum)) = frame.split_last_chunk_mut::<CRC>() {
+        *checksum = crc16(body).to_le_bytes();
     }
 }
 

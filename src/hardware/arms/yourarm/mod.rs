@@ -9,6 +9,7 @@ pub mod emulator;
 pub mod frame;
 #[cfg(test)]
 mod golden;
+mod messages;
 pub mod protocol;
 #[cfg(test)]
 mod tests;
@@ -20,7 +21,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::arm::{AfterGap, Topology};
 use crate::hardware::adapter_util::fraction;
-use crate::hardware::check::{Checked, ConfigError};
+use crate::hardware::check::{Checked, ConfigError, ToolFacts};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use crate::hardware::sim::arm::SimOptions;
 use crate::hardware::sim::io::PLAYABLE;
@@ -75,6 +76,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     create: |config| Ok(Box::new(adapter::YourArmAdapter::new(config)?)),
     emulate: Some(|config, place| Ok(Box::new(emulator::YourArmEmulator::start(config, place)?))),
     service: None,
+    wire: Some(messages::WIRE),
 };
 
 /// The data sheet's joint limits: minimum and maximum position [deg], maximum speed [deg/s].
@@ -96,7 +98,8 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("yourarm", SPEC.dof)?;
     let (options, limits) = (config.options::<Options>()?, limits());
     options.sim.check("yourarm", &limits, PLAYABLE)?;
-    Ok(Checked::new(limits).digital_inputs(protocol::DIGITAL))
+    let tool = ToolFacts { model: Some(("yourarm", "flange")), ..ToolFacts::default() };
+    Ok(Checked::new(limits).digital_inputs(protocol::DIGITAL).tool(tool))
 }
 
 /// Returns the joint limits in SI units.

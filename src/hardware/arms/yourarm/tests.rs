@@ -68,7 +68,7 @@ fn units_go_both_ways_and_the_arm_gets_there() {
     let [first, ..] = emulator.trace()[..] else { panic!("nothing recorded") };
     let degrees = target.map(|v: f64| v.to_degrees() as f32);
     assert_eq!(first.request, Request::MoveJoints(50.0, degrees), "deg and % on the wire");
-    let pose = arm.cartesian().unwrap().read_cartesian_position().unwrap().unwrap();
+    let pose = arm.cartesian().unwrap().read_cartesian_position().unwrap().unwrap().tcp;
     assert!(pose.xyz[0] > 0.2 && pose.xyz[0] < 0.6, "metres: {pose:?}");
     arm.gripper().unwrap().write_gripper_position(0.08).unwrap();
     until("gripper", || (arm.gripper().unwrap().read_gripper_position().unwrap().unwrap() - 0.08).abs() < 1e-6);
@@ -78,11 +78,11 @@ fn units_go_both_ways_and_the_arm_gets_there() {
 fn cartesian_targets_are_reached() {
     let (_emulator, mut arm) = connected(&[]);
     arm.activate().unwrap();
-    let now = arm.cartesian().unwrap().read_cartesian_position().unwrap().unwrap();
+    let now = arm.cartesian().unwrap().read_cartesian_position().unwrap().unwrap().tcp;
     let goal = Pose { xyz: [now.xyz[0], now.xyz[1] + 0.05, now.xyz[2] + 0.03], rpy: now.rpy };
     arm.cartesian().unwrap().write_cartesian_position(&goal, 1.0).unwrap();
     until("pose", || {
-        let pose = arm.cartesian().unwrap().read_cartesian_position().unwrap().unwrap();
+        let pose = arm.cartesian().unwrap().read_cartesian_position().unwrap().unwrap().tcp;
         pose.xyz.iter().zip(goal.xyz).all(|(a, b)| (a - b).abs() < 1e-4)
     });
     let far = Pose { xyz: [5.0, 0.0, 0.0], rpy: [0.0; 3] };

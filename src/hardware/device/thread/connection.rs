@@ -6,9 +6,9 @@ use std::time::Duration;
 use super::commands::MAX_IN_FLIGHT;
 use super::{BACK_OFF, MAX_FAILURES, TURNS, Worker, slow_readings};
 use crate::arm::{Interference, Link};
-use crate::hardware::adapter::{AdapterError, AdapterResult, ManipulatorAdapter};
+use crate::hardware::adapter::{AdapterError, AdapterResult, ManipulatorAdapter, ManipulatorInfo};
 use crate::hardware::device::{Connected, Note};
-use crate::joint::{JointLimits, STANDSTILL};
+use crate::joint::{JointLimits, Joints, STANDSTILL};
 
 /// How long `activate` waits for plausible states, and again for the motors to come on.
 const ACTIVATION_TIMEOUT: Duration = Duration::from_secs(1);
@@ -39,7 +39,10 @@ impl Worker {
         self.write_errors = 0;
         self.reconnect.1 = BACK_OFF.0;
         self.plausible.reset();
+        let identity = identity(&info, calibration_offsets.as_ref());
+        self.health.with_identity(|known| known.connected(identity.clone()));
         self.expect_nothing(None);
+        self.compare_identity();
         self.guard.forget();
         self.in_flight = 0;
         if self.speed == 0.0 {
@@ -53,6 +56,10 @@ impl Worker {
         self.read(adapter);
         let write_period = self.config.write_period(adapter.set_point_period());
         self.guard.set_period(write_period);
+        let bridging = adapter.bridging();
+        if let Some(bridging) = bridging {
+            self.guard.set_gap_tolerance(bridging.tolerance);
+        }
         let read_period = self.config.read_period();
         let gripper = adapter.gripper().map(|gripper| gripper.info());
         let io = adapter.io().map(|io| io.get_io());
@@ -63,7 +70,10 @@ impl Worker {
             limits,
             gripper,
             io,
+            identity,
             calibration_offsets,
+            kinematics: adapter.factory_kinematics(),
+            bridging,
             streams: adapter.state_fd().is_some(),
             has_payload,
             payload_resets,
@@ -108,6 +118,11 @@ impl Worker {
     pub(super) fn activate(&mut self, adapter: &mut dyn ManipulatorAdapter) -> AdapterResult<()> {
         if !self.connected {
             return Err(AdapterError::NotConnected);
+        }
+        if self.health.is_other_arm() {
+            let what = "another arm answers than the one with which the run began";
+            let hint = format!("`dimos arm reset {}` shows both", self.config.hardware_id);
+            return Err(AdapterError::Rejected(format!("{what}\nhint: {hint}")));
         }
         let limit = self.config.clock.now().after(ACTIVATION_TIMEOUT);
         while !self.plausible.stable(self.state.stamp) {
@@ -215,4 +230,13 @@ impl Worker {
         }
         self.states.write(&self.state);
     }
+}
+
+/// Returns which arm this is: its serial number, else the calibration that its drives keep.
+fn identity(info: &ManipulatorInfo, offsets: Option<&Joints>) -> Option<String> {
+    let of_drives = |offsets: &Joints| {
+        let offsets = offsets.iter().take(info.dof).map(|offset| format!("{offset:.4}")).collect::<Vec<_>>();
+        format!("servo offsets {} rad", offsets.join(" "))
+    };
+    info.serial_number.clone().map(|serial| format!("serial {serial}")).or_else(|| offsets.map(of_drives))
 }

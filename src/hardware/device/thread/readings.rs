@@ -123,8 +123,18 @@ impl Worker {
         self.trouble(what);
     }
 
-    /// Compares mode and motors with what this run ordered.
+    /// Compares which arm answers with the one of the run: another one gets nothing until it is accepted.
+    pub(super) fn compare_identity(&mut self) {
+        match (self.health.is_other_arm(), self.state.interference) {
+            (true, _) => self.state.interference = Interference::Identity,
+            (false, Interference::Identity) => self.state.interference = Interference::None,
+            _ => {}
+        }
+    }
+
+    /// Compares arm, mode and motors with what this run ordered.
     pub(super) fn compare_with_orders(&mut self) {
+        self.compare_identity();
         if !self.state.enabled {
             self.guard.forget();
         }
@@ -151,6 +161,7 @@ impl Worker {
         self.state.position = self.reading.position;
         self.state.effort = self.reading.effort;
         self.state.commanded = self.reading.commanded;
+        self.state.speed_fraction = self.reading.speed_fraction;
         self.state.velocity = self.reading.velocity.unwrap_or_default();
         self.state.velocity_source =
             if self.reading.velocity.is_some() { VelocitySource::Measured } else { VelocitySource::Absent };

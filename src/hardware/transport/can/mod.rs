@@ -14,6 +14,7 @@ pub mod socket;
 
 use std::os::fd::BorrowedFd;
 
+use super::capture::Tap;
 use crate::hardware::adapter::AdapterResult;
 pub use address::CanAddress;
 pub use bus::Bus;
@@ -120,10 +121,45 @@ pub trait CanPort: Send {
 /// if `filters` accept them, so include the identifiers of setpoints. `device` names the arm in messages. Errors
 /// contain a hint.
 pub fn open(device: &str, address: &CanAddress, filters: &[CanFilter]) -> AdapterResult<Box<dyn CanPort>> {
-    match address {
-        CanAddress::Memory(number) => Ok(Box::new(bus::open(device, *number, filters)?)),
-        CanAddress::Slcan { path, bit_rate } => Ok(Box::new(slcan::open(device, path, *bit_rate, filters)?)),
-        CanAddress::Interface(name) => open_interface(device, name, filters),
+    let port: Box<dyn CanPort> = match address {
+        CanAddress::Memory(number) => Box::new(bus::open(device, *number, filters)?),
+        CanAddress::Slcan { path, bit_rate } => Box::new(slcan::open(device, path, *bit_rate, filters)?),
+        CanAddress::Interface(name) => open_interface(device, name, filters)?,
+    };
+    Ok(Box::new(Captured { port, tap: Tap::open(|| address.to_string(), true, None) }))
+}
+
+/// A port whose frames can be captured.
+struct Captured {
+    port: Box<dyn CanPort>,
+    tap: Tap,
+}
+
+impl CanPort for Captured {
+    fn send(&mut self, frames: &[CanFrame]) -> AdapterResult<usize> {
+        let taken = self.port.send(frames)?;
+        frames.iter().take(taken).for_each(|frame| self.tap.keep(true, &[&frame.id.to_be_bytes(), frame.bytes()]));
+        Ok(taken)
+    }
+
+    fn receive(&mut self) -> AdapterResult<Option<CanEvent>> {
+        let event = self.port.receive()?;
+        if let Some(CanEvent::Frame(frame)) = &event {
+            self.tap.keep(false, &[&frame.id.to_be_bytes(), frame.bytes()]);
+        }
+        Ok(event)
+    }
+
+    fn fd(&self) -> BorrowedFd<'_> {
+        self.port.fd()
+    }
+
+    fn waiting(&self) -> usize {
+        self.port.waiting()
+    }
+
+    fn discard(&mut self) -> AdapterResult<usize> {
+        self.port.discard()
     }
 }
 

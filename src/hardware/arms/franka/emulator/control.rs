@@ -4,6 +4,8 @@ use std::collections::VecDeque;
 use std::net::{IpAddr, SocketAddr};
 use std::time::Duration;
 
+use nalgebra::Isometry3;
+
 use super::hand::Hand;
 use super::wire;
 use super::{PLAYABLE, SimOptions};
@@ -33,6 +35,8 @@ const RECOVERING: u8 = 6;
 const RECOVERY: u32 = 30;
 /// A joint that was moved by hand by more than this has a new desired position [rad].
 const BY_HAND: f64 = 1e-4;
+/// The vendor's hand, as Desk has it: mass [kg], inertia about its centre [kg·m²], centre in the flange frame [m].
+const HAND: [f64; 13] = [0.73, 0.001, 0.0, 0.0, 0.0, 0.0025, 0.0, 0.0, 0.0, 0.0017, -0.01, 0.0, 0.03];
 
 /// A connection: port and number.
 pub(super) type Who = (usize, u64);
@@ -87,8 +91,8 @@ pub struct Control {
     pub(super) id: u64,
     /// Who gets the states, and where.
     pub(super) client: Option<(Who, SocketAddr)>,
-    /// Where clients are: on this computer.
-    pub(super) clients_at: IpAddr,
+    /// From where each connection comes.
+    pub(super) clients_at: Vec<(Who, IpAddr)>,
     pub(super) mode: u8,
     pub(super) generator: u8,
     pub(super) controller: u8,
@@ -108,8 +112,14 @@ pub struct Control {
     pub(super) answers: Vec<(Who, Vec<u8>)>,
     pub(super) lost_in_row: u32,
     pub(super) history: VecDeque<bool>,
+    /// Mass, inertia and centre of the end effector that is set up in Desk.
+    pub(super) tool: [f64; 13],
     /// Mass, centre and inertia of the load.
     pub(super) load: [f64; 13],
+    /// Nominal end effector in the flange's frame, as Desk sets it, and the end effector in that frame, as clients do.
+    pub(super) frames: [Isometry3<f64>; 2],
+    /// The frame of Cartesian stiffness at the end effector.
+    pub(super) stiffness: Isometry3<f64>,
     pub(super) impedance: [f64; DOF],
     /// Lower and upper thresholds of external torques.
     pub(super) thresholds: ([f64; DOF], [f64; DOF]),
@@ -139,7 +149,7 @@ impl Control {
             arm,
             id: 1_000_000,
             client: None,
-            clients_at: IpAddr::from([127, 0, 0, 1]),
+            clients_at: Vec::new(),
             mode: IDLE,
             generator: 0,
             controller: 3,
@@ -156,7 +166,10 @@ impl Control {
             answers: Vec::new(),
             lost_in_row: 0,
             history: VecDeque::with_capacity(100),
+            tool: if options.hand_in_desk { HAND } else { [0.0; 13] },
             load: [0.0; 13],
+            frames: [options.end_effector(), Isometry3::identity()],
+            stiffness: Isometry3::identity(),
             impedance: [3000.0, 3000.0, 3000.0, 2500.0, 2500.0, 2000.0, 2000.0],
             thresholds: ([20.0; DOF], [20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0]),
             external: [0.0; DOF],
@@ -169,18 +182,13 @@ impl Control {
             figures: Figures::default(),
             traffic: Trace::default(),
         };
-        control.q_d = std::array::from_fn(|i| control.kept(positions.get(i).copied().unwrap_or_default()));
+        control.q_d = std::array::from_fn(|i| positions.get(i).copied().unwrap_or_default());
         Ok(control)
     }
 
     /// Whether states have f64: those of an FER.
     pub(super) fn wide(&self) -> bool {
         self.model == Model::Fer
-    }
-
-    /// Returns a value as a state has it: the controller continues from what it has reported.
-    pub(super) fn kept(&self, value: f64) -> f64 {
-        if self.wide() { value } else { f64::from(value as f32) }
     }
 
     /// Makes one cycle. Returns the state to send, and where to.
@@ -213,8 +221,8 @@ impl Control {
         for i in 0..DOF {
             let (Some(q), Some(q_d)) = (positions.get(i), self.q_d.get(i)) else { continue };
             if (q - q_d).abs() > BY_HAND {
-                let kept = self.kept(*q);
-                self.q_d.iter_mut().skip(i).take(1).for_each(|q_d| *q_d = kept);
+                let q = *q;
+                self.q_d.iter_mut().skip(i).take(1).for_each(|q_d| *q_d = q);
             }
         }
     }
@@ -351,21 +359,31 @@ impl Control {
     /// Returns the end-effector pose, column by column.
     pub(super) fn pose(&self, measured: &Measured) -> [f64; 16] {
         let joints = measured.positions.get(..DOF).unwrap_or_default();
-        let pose = Flange.forward(joints).to_homogeneous();
-        std::array::from_fn(|i| pose.get(i).copied().unwrap_or_default())
+        columns(&(Flange.forward(joints) * self.end_effector()))
     }
+
+    /// Returns the end effector in the flange's frame.
+    pub(super) fn end_effector(&self) -> Isometry3<f64> {
+        self.frames[0] * self.frames[1]
+    }
+}
+
+/// Returns a pose as the wire has it, column by column.
+pub(super) fn columns(pose: &Isometry3<f64>) -> [f64; 16] {
+    let matrix = pose.to_homogeneous();
+    std::array::from_fn(|i| matrix.get(i).copied().unwrap_or_default())
 }
 
 /// The kinematic chain up to the flange.
 struct Flange;
 
 impl Chain for Flange {
-    fn link(&self, joint: usize, position: f64) -> Option<nalgebra::Isometry3<f64>> {
+    fn link(&self, joint: usize, position: f64) -> Option<Isometry3<f64>> {
         Model::link(joint, position)
     }
 
-    fn end(&self) -> nalgebra::Isometry3<f64> {
-        nalgebra::Isometry3::translation(0.0, 0.0, Model::FLANGE)
+    fn end(&self) -> Isometry3<f64> {
+        Isometry3::translation(0.0, 0.0, Model::FLANGE)
     }
 }
 

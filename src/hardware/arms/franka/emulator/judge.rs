@@ -1,5 +1,5 @@
 //! What the controller makes of a command, or of none: desired values, judged by backward differences. Nothing is
-//! clamped or smoothed.
+//! clamped or smoothed. Its history is in full precision: a state rounds it, the judgement does not.
 
 use super::control::{CYCLE, Command, Control, DOF, IDLE, REFLEX};
 use super::wire::Ended;
@@ -113,9 +113,9 @@ impl Control {
             return error;
         }
         let before = self.dq_d;
-        self.q_d = std::array::from_fn(|i| self.kept(at(&self.q_d, i) + at(velocities, i) * CYCLE));
-        self.dq_d = velocities.map(|v| self.kept(v));
-        self.ddq_d = std::array::from_fn(|i| self.kept((at(velocities, i) - at(&before, i)) / CYCLE));
+        self.q_d = std::array::from_fn(|i| at(&self.q_d, i) + at(velocities, i) * CYCLE);
+        self.dq_d = *velocities;
+        self.ddq_d = std::array::from_fn(|i| (at(velocities, i) - at(&before, i)) / CYCLE);
         None
     }
 
@@ -130,7 +130,7 @@ impl Control {
             *v -= v.clamp(-step, step);
         }
         self.ddq_d = std::array::from_fn(|i| (at(&self.dq_d, i) - at(&before, i)) / CYCLE);
-        self.q_d = std::array::from_fn(|i| self.kept(at(&self.q_d, i) + at(&self.dq_d, i) * CYCLE));
+        self.q_d = std::array::from_fn(|i| at(&self.q_d, i) + at(&self.dq_d, i) * CYCLE);
         if self.dq_d == [0.0; DOF] {
             (self.braking, self.ddq_d) = (false, [0.0; DOF]);
             if self.mode == super::control::MOVE {

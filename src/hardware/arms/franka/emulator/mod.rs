@@ -22,6 +22,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use nalgebra::Isometry3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -35,6 +36,7 @@ use crate::hardware::sim::arm;
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::sim::tcp_server::{Port, TcpServer, emulator_ports};
 use crate::joint::JointLimits;
+use crate::pose::from_xyz_rpy;
 use crate::rt::histogram::{self, Histogram};
 use clock::{Network, Pace};
 use control::Control;
@@ -58,6 +60,7 @@ const PLAYABLE: &[FaultKind] = &[
     FaultKind::Frozen,
     FaultKind::Blocked,
     FaultKind::Pushed,
+    FaultKind::Nudged,
     FaultKind::Object,
     FaultKind::GripperBlocked,
 ];
@@ -78,6 +81,9 @@ pub struct SimOptions {
     /// How far below its target a joint rests under load, 0 to 0.2 [rad].
     #[schemars(range(min = 0, max = 0.2))]
     pub droop: f64,
+    /// Nominal end effector in the flange's frame, as it is set in the controller's web interface: x, y, z [m], roll,
+    /// pitch, yaw [rad].
+    pub end_effector: [f64; 6],
     /// Share of the states, and of the commands, that the network loses, 0 to 1.
     #[schemars(range(min = 0, max = 1))]
     pub lose: f64,
@@ -94,8 +100,12 @@ pub struct SimOptions {
     /// computer that is too busy for 1 kHz.
     #[schemars(range(min = 0, max = 0.1))]
     pub command_wait: f64,
+    /// Whether the vendor's hand is set up in Desk as the end effector: the controller counts its mass beside the load.
+    pub hand_in_desk: bool,
     /// Faults, and when they begin (seconds after the first connection).
     pub faults: Vec<Fault>,
+    /// What the controller does otherwise than its documents say.
+    pub controller: arm::ControllerOptions,
 }
 
 impl Default for SimOptions {
@@ -104,12 +114,15 @@ impl Default for SimOptions {
             initial_positions: Vec::new(),
             lag: 0.004,
             droop: 0.0,
+            end_effector: [0.0; 6],
             lose: 0.0,
             repeat: 0.0,
             reorder: 0.0,
             drift: 0.0,
             command_wait: 0.0,
+            hand_in_desk: false,
             faults: Vec::new(),
+            controller: arm::ControllerOptions::default(),
         }
     }
 }
@@ -125,9 +138,14 @@ impl SimOptions {
         self.common().check("franka", limits, PLAYABLE)
     }
 
+    fn end_effector(&self) -> Isometry3<f64> {
+        let [x, y, z, roll, pitch, yaw] = self.end_effector;
+        from_xyz_rpy([x, y, z], [roll, pitch, yaw])
+    }
+
     fn common(&self) -> arm::SimOptions {
-        let Self { initial_positions, lag, droop, faults, .. } = self.clone();
-        arm::SimOptions { initial_positions, lag, droop, faults }
+        let Self { initial_positions, lag, droop, faults, controller, .. } = self.clone();
+        arm::SimOptions { initial_positions, lag, droop, faults, controller }
     }
 }
 
@@ -148,14 +166,11 @@ impl FrankaEmulator {
         let (address, listeners) = emulator_ports("franka", place, PORT, 2)?;
         let ip = address.ip();
         let serve = |e: std::io::Error| AdapterError::Io(format!("franka emulator: cannot serve: {e}"));
-        let mut control = Control::new(options.model, &options.sim, MonotonicClock.now())?;
-        if ip.is_ipv6() {
-            control.clients_at = ip;
-        }
+        let control = Control::new(options.model, &options.sim, MonotonicClock.now())?;
         let socket = UdpSocket::bind((ip, 0)).map_err(serve)?;
         socket.set_nonblocking(true).map_err(serve)?;
         let ports = listeners.into_iter().map(|listener| (listener, Port::Sessions(ANSWERS))).collect();
-        let server = Arc::new(TcpServer::with_ports("franka", control, ports, CLIENTS).map_err(serve)?);
+        let server = Arc::new(TcpServer::with_ports("franka", control, ports, CLIENTS, |_| true).map_err(serve)?);
         let ends = Arc::new(AtomicBool::new(false));
         let sim = options.sim;
         let network = Network { lose: sim.lose, repeat: sim.repeat, reorder: sim.reorder };

@@ -1,6 +1,8 @@
 //! What comes and goes at the TCP ports: 0 the arm's, 1 the hand's. Answers are sent with the next look for them,
 //! because some come long after their commands.
 
+use std::net::IpAddr;
+
 use super::control::{Control, Who};
 use crate::clock::Mono;
 use crate::hardware::sim::arm::Delivery;
@@ -23,7 +25,7 @@ impl stream::Controller for Control {
         let who = (port, client);
         let scan = match port {
             0 => self.request(who, bytes),
-            _ => self.hand.request(who, self.clients_at, bytes, &mut self.answers),
+            _ => self.hand.request(who, self.address_of(who), bytes, &mut self.answers),
         };
         if matches!(scan, Scan::Take(_, Delivery::Send | Delivery::HangUp)) {
             self.collect(who, answer);
@@ -32,6 +34,10 @@ impl stream::Controller for Control {
     }
 
     fn client_gone(&mut self, _now: Mono) {}
+
+    fn session_from(&mut self, port: usize, client: u64, address: IpAddr) {
+        self.clients_at.push(((port, client), address));
+    }
 
     fn session_began(&mut self, port: usize, _client: u64, _now: Mono, _greeting: &mut Vec<u8>) {
         if port == 0 {
@@ -53,11 +59,18 @@ impl stream::Controller for Control {
             self.leave();
         }
         self.hand.leave(who);
+        self.clients_at.retain(|(of, _)| *of != who);
         self.answers.retain(|(to, _)| *to != who);
     }
 }
 
 impl Control {
+    /// Returns from where a client has connected: its datagrams go there.
+    pub(super) fn address_of(&self, who: Who) -> IpAddr {
+        let found = self.clients_at.iter().find(|(of, _)| *of == who);
+        found.map_or(IpAddr::from([127, 0, 0, 1]), |(_, address)| *address)
+    }
+
     /// Moves the answers for a connection to `packet`.
     fn collect(&mut self, who: Who, packet: &mut Vec<u8>) {
         self.answers.retain(|(to, bytes)| {

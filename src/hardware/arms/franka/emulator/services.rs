@@ -2,6 +2,8 @@
 
 use std::net::SocketAddr;
 
+use nalgebra::{Isometry3, Matrix4, try_convert};
+
 use super::control::{Control, DOF, Datagram, IDLE, MOVE, Motion, Who};
 use super::urdf;
 use super::wire::{self, Ended};
@@ -19,8 +21,14 @@ enum Asked {
     Collision,
     Impedance,
     Load,
+    /// The end effector in the nominal one's frame.
+    EndEffector,
     Recovery,
     Model,
+    /// The compiled model, which a real controller has for the client's processor.
+    Library,
+    /// The frame in which Cartesian stiffness is meant, at the end effector: kept, without effect.
+    Stiffness,
     /// Another setter: checked for its length and its mode only.
     Other,
     Unknown,
@@ -38,10 +46,12 @@ impl Asked {
             (5, true) | (4, false) => (Self::Impedance, 56),
             (6, true) | (5, false) => (Self::Other, 48),
             (7, true) | (6, false) => (Self::Other, 7),
-            (8 | 9, true) | (7 | 8, false) => (Self::Other, 128),
+            (8, true) | (7, false) => (Self::Stiffness, 128),
+            (9, true) | (8, false) => (Self::EndEffector, 128),
             (10, true) | (9, false) => (Self::Load, 104),
             (11, true) => (Self::Other, 40),
             (12, true) | (10, false) => (Self::Recovery, 0),
+            (13, true) => (Self::Library, 2),
             (11, false) => (Self::Model, 0),
             _ => (Self::Unknown, 0),
         }
@@ -77,6 +87,8 @@ impl Control {
         let status = match asked {
             Asked::Connect => return Some(self.connect(who, values)),
             Asked::Model => return Some((0, urdf::of(self.described(), &self.ranges).into_bytes())),
+            // It is a program of the vendor's.
+            Asked::Library => 1,
             Asked::Move => self.start(who, id, values),
             Asked::Stop => return self.stop(who, id).map(|status| (status, Vec::new())),
             Asked::Recovery => return self.begin_recovery(who, id).map(|status| (status, Vec::new())),
@@ -95,7 +107,7 @@ impl Control {
         let same = version == own;
         if same {
             self.leave();
-            self.client = Some((who, SocketAddr::new(self.clients_at, port)));
+            self.client = Some((who, SocketAddr::new(self.address_of(who), port)));
         }
         (u8::from(!same), own.to_le_bytes().to_vec())
     }
@@ -158,6 +170,14 @@ impl Control {
                 }
             }
             Asked::Load if !values.first().is_some_and(|mass| (0.0..=10.0).contains(mass)) => return 2,
+            Asked::EndEffector => match pose(values) {
+                Some(pose) => self.frames[1] = pose,
+                None => return 2,
+            },
+            Asked::Stiffness => match pose(values) {
+                Some(pose) => self.stiffness = pose,
+                None => return 2,
+            },
             Asked::Load => self.load = values.first_chunk().copied().unwrap_or(self.load),
             _ => {}
         }
@@ -182,4 +202,10 @@ impl Control {
         }
         false
     }
+}
+
+/// Reads a pose, column by column; `None` for a matrix that is none.
+fn pose(values: &[f64]) -> Option<Isometry3<f64>> {
+    let matrix = Matrix4::from_column_slice(values.first_chunk::<16>()?);
+    try_convert(matrix)
 }

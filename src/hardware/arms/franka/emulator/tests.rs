@@ -279,3 +279,41 @@ fn joints_follow_and_rest() {
     assert!(bench.control.q_d.iter().zip(&q).all(|(a, b)| (a - b).abs() < 1e-4), "{:?} {q:?}", bench.control.q_d);
     assert!((q[0] - 0.26).abs() < 1e-3 && dq[..DOF] == [0.0; DOF], "{q:?}");
 }
+
+/// A client need not be at 127.0.0.1: its states go where it connects from. A compiled model is refused at once, and
+/// the connection remains.
+#[test]
+fn states_go_to_where_the_client_connects_from_and_a_compiled_model_is_refused() {
+    use std::io::{Read, Write};
+    use std::net::{Ipv4Addr, SocketAddrV4, TcpStream, UdpSocket};
+    use std::time::Duration;
+
+    use rustix::net::{AddressFamily, SocketType, bind, connect, socket};
+
+    use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
+
+    let options = serde_json::json!({"model": "fer"});
+    let config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: 7, options };
+    let emulator = super::FrankaEmulator::start(&config, &EmulatorAddress::InProcess).unwrap();
+    let server: SocketAddrV4 = emulator.address().parse().unwrap();
+    let here = Ipv4Addr::new(127, 48, 24, 7);
+    let states = UdpSocket::bind((here, 0)).unwrap();
+    states.set_read_timeout(Some(Duration::from_secs(3))).unwrap();
+    let client = socket(AddressFamily::INET, SocketType::STREAM, None).unwrap();
+    bind(&client, &SocketAddrV4::new(here, 0)).unwrap();
+    connect(&client, &server).unwrap();
+    let mut client = TcpStream::from(client);
+    client.set_read_timeout(Some(Duration::from_secs(3))).unwrap();
+    let mut ask = |code: u32, values: &[u8], more: usize| {
+        let head = [code, 1, 12 + values.len() as u32].map(u32::to_le_bytes).concat();
+        client.write_all(&[&head[..], values].concat()).unwrap();
+        let mut answer = vec![0; 13 + more];
+        client.read_exact(&mut answer).unwrap();
+        answer[12]
+    };
+    let port = states.local_addr().unwrap().port();
+    assert_eq!(ask(0, &[5_u16.to_le_bytes(), port.to_le_bytes()].concat(), 2), 0);
+    assert_eq!(states.recv(&mut [0; 4096]).unwrap(), 2373, "a state");
+    assert_eq!(ask(13, &[0, 0], 0), 1, "it has no program of the vendor's");
+    assert_eq!(ask(2, &[], 0), 0, "the connection remains");
+}

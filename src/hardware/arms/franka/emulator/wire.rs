@@ -1,6 +1,6 @@
 //! The controller's side of the bytes: states, commands, answers. Shares nothing with the adapter's side.
 
-use super::control::{Command, Control, DOF};
+use super::control::{Command, Control, DOF, columns};
 use crate::hardware::sim::arm::Measured;
 
 /// Commands by their numbers in interface 10 and in interface 5.
@@ -60,9 +60,6 @@ impl State {
     }
 }
 
-/// A frame that coincides with another one.
-const SAME: [f64; 16] = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
-
 /// The state of a cycle.
 pub(super) fn state(control: &Control, measured: &Measured) -> Vec<u8> {
     let wide = control.wide();
@@ -78,8 +75,10 @@ pub(super) fn state(control: &Control, measured: &Measured) -> Vec<u8> {
     to.bytes.extend(control.id.to_le_bytes());
     to.put(&pose); // O_T_EE
     to.put(&pose); // O_T_EE_d
-    (0..4).for_each(|_| to.put(&SAME)); // F_T_EE, EE_T_K, F_T_NE, NE_T_EE
-    to.zeros(13); // m_ee, I_ee, F_x_Cee
+    to.put(&columns(&control.end_effector())); // F_T_EE
+    to.put(&columns(&control.stiffness)); // EE_T_K
+    control.frames.iter().for_each(|frame| to.put(&columns(frame))); // F_T_NE, NE_T_EE
+    to.put(&control.tool); // m_ee, I_ee, F_x_Cee
     to.put(&[mass]);
     to.put(rest.get(3..).unwrap_or_default()); // I_load
     to.put(rest.get(..3).unwrap_or_default()); // F_x_Cload

@@ -10,9 +10,9 @@ use crate::arm::Load;
 /// Where values begin, as the count of numbers before them.
 mod at {
     pub const POSE: usize = 0;
+    pub const F_T_EE: usize = 32;
+    pub const TOOL_MASS: usize = 96;
     pub const LOAD_MASS: usize = 109;
-    pub const LOAD_INERTIA: usize = 110;
-    pub const LOAD_CENTER: usize = 119;
     pub const TAU: usize = 126;
     pub const Q: usize = 147;
     pub const Q_D: usize = 154;
@@ -55,6 +55,10 @@ pub struct State {
     pub id: u64,
     /// Pose of the end effector in the base frame, column-major [m].
     pub pose: [f64; 16],
+    /// Pose of the end effector in the flange's frame, column-major [m].
+    pub end_effector: [f64; 16],
+    /// End effector that is set up in Desk: the controller counts it beside the load.
+    pub tool: Load,
     /// Load that was set.
     pub load: Load,
     /// Measured joint torques [Nm].
@@ -102,6 +106,12 @@ impl Numbers<'_> {
         }
     }
 
+    /// Mass, inertia (nine numbers), centre.
+    fn body(&self, from: usize) -> Load {
+        let [xx, xy, xz, _, yy, yz, _, _, zz] = self.array(from + 1);
+        Load { mass: self.get(from), center: self.array(from + 10), inertia: [xx, xy, xz, yy, yz, zz] }
+    }
+
     fn array<const N: usize>(&self, from: usize) -> [f64; N] {
         std::array::from_fn(|i| self.get(from + i))
     }
@@ -125,16 +135,12 @@ impl State {
         let (reasons, rest) = rest.split_at_checked(ERRORS)?;
         let [mode, rest @ ..] = rest else { return None };
         let numbers = Numbers { bytes: numbers, wide };
-        let inertia: [f64; 9] = numbers.array(at::LOAD_INERTIA);
-        let [xx, xy, xz, _, yy, yz, _, _, zz] = inertia;
         Some(Self {
             id: u64::from_le_bytes(*id),
             pose: numbers.array(at::POSE),
-            load: Load {
-                mass: numbers.get(at::LOAD_MASS),
-                center: numbers.array(at::LOAD_CENTER),
-                inertia: [xx, xy, xz, yy, yz, zz],
-            },
+            end_effector: numbers.array(at::F_T_EE),
+            tool: numbers.body(at::TOOL_MASS),
+            load: numbers.body(at::LOAD_MASS),
             tau: numbers.array(at::TAU),
             q: numbers.array(at::Q),
             dq: numbers.array(at::DQ),

@@ -7,7 +7,9 @@ use std::f64::consts::TAU;
 use std::ops::RangeInclusive;
 use std::time::Duration;
 
-use super::super::{GripperKind, RANGES, SPEED, protocol::DOF};
+use super::super::model::{Model, SPEED};
+use super::super::{GripperKind, NATIVE_RATE, protocol::DOF};
+use super::feedback::Staircase;
 use super::kinematics::Links;
 use super::wire::{self, Request};
 use super::{SimOptions, stops};
@@ -69,10 +71,16 @@ pub struct Controller {
     pub(super) pose: [[i32; 2]; 3],
     pub(super) joints: [[i32; 2]; 3],
     pub(super) ticks: u64,
+    /// It sends less often than an arm.
+    pub(super) slow: bool,
+    /// What its moving joints show.
+    pub(super) staircases: [Staircase; DOF],
     /// What came over the bus, and when.
     pub trace: Trace<(Mono, CanFrame)>,
     /// How often the motors lost their power under a reset.
     pub power_drops: u64,
+    /// Its dimensions.
+    pub(super) links: Links,
     /// It takes targets outside its limits.
     pub lenient: bool,
     /// Frames that it does not send.
@@ -83,14 +91,14 @@ impl Controller {
     /// A controller that was just switched on, motors off.
     pub fn new(
         options: &SimOptions,
-        gripper: GripperKind,
+        (model, gripper): (Model, GripperKind),
         playable: &'static [FaultKind],
         now: Mono,
     ) -> AdapterResult<Self> {
         let decidegrees = |value: f64| (value.to_degrees() * 10.0).round() as i16;
         let mut firmware = [0; 8];
         firmware.iter_mut().zip(options.firmware.bytes()).for_each(|(to, byte)| *to = byte);
-        let arm = SimArm::new("piper", &stops(), &options.common().starting_at(&INITIAL), playable, now)?;
+        let arm = SimArm::new("piper", &stops(model), &options.common().starting_at(&INITIAL), playable, now)?;
         Ok(Self {
             // Its limits are its own, in units of the wire.
             arm: arm.without_modes().with_tolerance(f64::INFINITY),
@@ -99,7 +107,8 @@ impl Controller {
             gripper_on: false,
             gripper_errors: 0,
             firmware,
-            limits: RANGES.map(|(lower, upper)| (decidegrees(upper), decidegrees(lower), (SPEED * 1e3) as u16)),
+            links: Links(model),
+            limits: model.ranges().map(|(lower, upper)| (decidegrees(upper), decidegrees(lower), (SPEED * 1e3) as u16)),
             control: 0,
             mode: 0,
             speed: 0,
@@ -111,6 +120,8 @@ impl Controller {
             pose: [[0; 2]; 3],
             joints: [[0; 2]; 3],
             ticks: 0,
+            slow: options.feedback_hz < NATIVE_RATE,
+            staircases: [Staircase::default(); DOF],
             trace: Trace::default(),
             power_drops: 0,
             lenient: false,
@@ -223,7 +234,7 @@ impl Controller {
         let [x, y, z] = [x, y, z].map(|v| f64::from(v) * 1e-6);
         let [roll, pitch, yaw] = [roll, pitch, yaw].map(radians);
         let goal = pose::from_xyz_rpy([x, y, z], [roll, pitch, yaw]);
-        let found = Links.inverse(&goal, &self.six()).map(|joints| joints.map(millidegrees));
+        let found = self.links.inverse(&goal, &self.six()).map(|joints| joints.map(millidegrees));
         match found.filter(|joints| self.outside(joints) == 0) {
             None => self.arm.fail(state::NO_SOLUTION),
             Some(joints) => {

@@ -17,7 +17,8 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
-use super::{GripperKind, NATIVE_RATE, Options, limits};
+use super::model::Model;
+use super::{GripperKind, NATIVE_RATE, Options};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::AdapterResult;
 use crate::hardware::check::ConfigError;
@@ -44,6 +45,7 @@ pub(super) const PLAYABLE: &[FaultKind] = &[
     FaultKind::Sag,
     FaultKind::Blocked,
     FaultKind::Pushed,
+    FaultKind::Nudged,
     FaultKind::MotorOff,
     FaultKind::Leader,
     FaultKind::Object,
@@ -77,6 +79,8 @@ pub struct SimOptions {
     pub droop: f64,
     /// What goes wrong, and when (seconds after the first frame to the arm).
     pub faults: Vec<Fault>,
+    /// What the controller does otherwise than its documents say.
+    pub controller: arm::ControllerOptions,
 }
 
 impl Default for SimOptions {
@@ -88,14 +92,15 @@ impl Default for SimOptions {
             lag: 0.02,
             droop: 0.0,
             faults: Vec::new(),
+            controller: arm::ControllerOptions::default(),
         }
     }
 }
 
 impl SimOptions {
     /// Refuses a pose outside the joint limits, an invalid firmware version, and faults that are not among `playable`.
-    pub(super) fn check(&self, playable: &[FaultKind]) -> Result<(), ConfigError> {
-        self.common().check("piper", &stops(), playable)?;
+    pub(super) fn check(&self, model: Model, playable: &[FaultKind]) -> Result<(), ConfigError> {
+        self.common().check("piper", &stops(model), playable)?;
         match self.firmware.len() {
             8 => Ok(()),
             _ => Err(ConfigError::new("sim.firmware", "firmware must have 8 characters, as S-V1.8-5 has")),
@@ -104,15 +109,15 @@ impl SimOptions {
 
     /// What all emulated arms have.
     fn common(&self) -> arm::SimOptions {
-        let Self { initial_positions, lag, droop, faults, .. } = self.clone();
-        arm::SimOptions { initial_positions, lag, droop, faults }
+        let Self { initial_positions, lag, droop, faults, controller, .. } = self.clone();
+        arm::SimOptions { initial_positions, lag, droop, faults, controller }
     }
 }
 
 /// Where the joints meet their mechanical stops: 0.05 rad outside the limits.
-fn stops() -> JointLimits {
+fn stops(model: Model) -> JointLimits {
     const BEYOND: f64 = 0.05;
-    let mut stops = limits();
+    let mut stops = model.limits();
     stops.position_lower.iter_mut().for_each(|lower| *lower -= BEYOND);
     stops.position_upper.iter_mut().for_each(|upper| *upper += BEYOND);
     stops
@@ -136,15 +141,19 @@ impl PiperEmulator {
     /// Starts an emulator at `place`, with the adapter's options.
     pub fn start(config: &AdapterConfig, place: &EmulatorAddress) -> AdapterResult<Self> {
         let options = config.options::<Options>()?;
-        Self::with(&options.sim, options.gripper, place)
+        Self::of(options.model, &options.sim, options.gripper, place)
     }
 
-    /// Starts an emulator at `place`.
+    /// Starts an emulator of a Piper at `place`.
     pub fn with(options: &SimOptions, gripper: GripperKind, place: &EmulatorAddress) -> AdapterResult<Self> {
+        Self::of(Model::Piper, options, gripper, place)
+    }
+
+    fn of(model: Model, options: &SimOptions, gripper: GripperKind, place: &EmulatorAddress) -> AdapterResult<Self> {
         let playable =
             if *place == EmulatorAddress::InProcess { PLAYABLE } else { PLAYABLE.get(..ANYWHERE).unwrap_or_default() };
-        options.check(playable)?;
-        let controller = Controller::new(options, gripper, playable, MonotonicClock.now())?;
+        options.check(model, playable)?;
+        let controller = Controller::new(options, (model, gripper), playable, MonotonicClock.now())?;
         let period = Duration::from_secs_f64(1.0 / options.feedback_hz);
         Ok(Self { server: CanServer::start("piper", controller, place, period)? })
     }

@@ -5,6 +5,7 @@ use serde_json::{Map, Value, json};
 use super::super::{MODES, NATIVE_RATE, SPEC};
 use super::wire::{self, Command, Request};
 use super::{PLAYABLE, SILENCE_TIMEOUT};
+use crate::arm::AfterGap;
 use crate::clock::Mono;
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::registry::Truth;
@@ -25,6 +26,8 @@ const GRIPPER: (f64, f64) = (0.08, 0.1);
 pub struct Controller {
     arm: SimArm,
     limits: JointLimits,
+    /// How long it bridges a gap in its commands before it decelerates; 0: it goes to its last setpoint [s].
+    gap_tolerance: f64,
     gripper: Gripper,
     /// Why commands are refused until the arm is enabled again.
     held: Option<&'static str>,
@@ -47,6 +50,7 @@ impl Controller {
         Ok(Self {
             arm: SimArm::new("remote", &limits, &options, PLAYABLE, now)?,
             limits,
+            gap_tolerance: options.controller.gap_tolerance,
             gripper: Gripper::new(GRIPPER.0, GRIPPER.1),
             held: None,
             commanded: false,
@@ -87,7 +91,7 @@ impl Controller {
     fn hello(&mut self) -> Value {
         self.arm.client_came();
         self.held = Some("it has to be enabled first");
-        let dof = self.arm.claimed_dof();
+        let (dof, gap_tolerance) = (self.arm.claimed_dof(), self.gap_tolerance);
         json!({
             "version": 1,
             "dof": dof,
@@ -98,6 +102,8 @@ impl Controller {
             "limits": lists(&self.limits, dof),
             "gripper_range": [0.0, GRIPPER.0],
             "stop_point": true,
+            "gap_tolerance": gap_tolerance,
+            "after_gap": if gap_tolerance > 0.0 { AfterGap::Decelerates } else { AfterGap::RestsAtSetpoint },
             "parts": ["read_gripper_position"],
         })
     }

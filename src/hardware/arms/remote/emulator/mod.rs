@@ -33,6 +33,7 @@ pub(super) const PLAYABLE: &[FaultKind] = &[
     FaultKind::Sag,
     FaultKind::Blocked,
     FaultKind::Pushed,
+    FaultKind::Nudged,
     FaultKind::MotorOff,
     FaultKind::Object,
     FaultKind::GripperBlocked,

@@ -34,6 +34,7 @@ const PLAYABLE: &[FaultKind] = &[
     FaultKind::Misread,
     FaultKind::Blocked,
     FaultKind::Pushed,
+    FaultKind::Nudged,
     FaultKind::MotorOff,
 ];
 /// Ranges of the joints and of the gripper [rad], and their speed [rad/s] and acceleration [rad/s²].
@@ -66,6 +67,8 @@ pub struct SimOptions {
     pub voltage: f64,
     /// Faults, and when they begin (seconds after the first request).
     pub faults: Vec<Fault>,
+    /// What the controller does otherwise than its documents say.
+    pub controller: arm::ControllerOptions,
 }
 
 impl Default for SimOptions {
@@ -79,14 +82,15 @@ impl Default for SimOptions {
             factory: false,
             voltage: 12.0,
             faults: Vec::new(),
+            controller: arm::ControllerOptions::default(),
         }
     }
 }
 
 impl SimOptions {
     fn common(&self) -> arm::SimOptions {
-        let Self { initial_positions, lag, droop, faults, .. } = self.clone();
-        arm::SimOptions { initial_positions, lag, droop, faults }
+        let Self { initial_positions, lag, droop, faults, controller, .. } = self.clone();
+        arm::SimOptions { initial_positions, lag, droop, faults, controller }
     }
 
     /// Returns an error for values that the emulator cannot have.

@@ -4,7 +4,9 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
-use super::programs::{Program, Reach};
+use super::fields::vector;
+use super::pace::Segment;
+use super::programs::{Build, Program, Reach, pose};
 use super::rtde::Rtde;
 use super::{PLAYABLE, SimOptions, limits};
 use crate::clock::Mono;
@@ -14,7 +16,6 @@ use crate::hardware::arms::ur::model::Model;
 use crate::hardware::sim::arm::{ESTOP, HasArm, SimArm};
 use crate::hardware::sim::faults::FaultKind;
 use crate::hardware::sim::reach::Chain;
-use crate::joint::Joints;
 
 /// Pose at power-up [rad]: upright, and no joint as another one.
 const POSE: [f64; DOF] = [0.3, -1.4, 1.5, -1.7, -1.5, 0.4];
@@ -32,7 +33,7 @@ pub(super) const REGISTERS: usize = 48;
 /// Messages that are kept for clients of the primary interface.
 const KEPT: usize = 64;
 /// Positions of servoj that are kept for tests.
-const SERVOJ_KEPT: usize = 20_000;
+pub(super) const SERVOJ_KEPT: usize = 20_000;
 /// All digital inputs: 8 standard, 8 configurable, 2 of the tool.
 const INPUTS: u64 = (1 << 18) - 1;
 
@@ -84,6 +85,9 @@ pub(super) struct Session {
 /// The controller's memory.
 pub struct Controller {
     pub(super) model: Model,
+    pub(super) software: [u8; 3],
+    pub(super) build: Build,
+    pub(super) serial: String,
     pub(super) arm: SimArm,
     pub(super) mode: i32,
     /// The robot mode that was ordered, and when the next one on the way to it is reached.
@@ -92,6 +96,8 @@ pub struct Controller {
     power_time: Duration,
     /// When the present protective stop began.
     stopped_at: Option<Mono>,
+    /// Argument of its error, where a point of servoj caused it.
+    pub(super) stop_argument: i32,
     /// A safety mode other than those that follow from the arm.
     safety: Option<i32>,
     pub(super) program: Option<Program>,
@@ -112,7 +118,10 @@ pub struct Controller {
     pub(super) commanded: ([f64; DOF], [f64; DOF]),
     /// Positions that a program gave to servoj, and when.
     pub(super) servoj: VecDeque<(Mono, [f64; DOF])>,
+    /// Position of the pendant's speed slider, and how much of that speed the trajectory limiter leaves, 0 to 1.
     pub(super) slider: f64,
+    pub(super) scaling: f64,
+    pub(super) segment: Option<Segment>,
     pub(super) remote: bool,
     pub(super) refuses_programs: bool,
     pub(super) hangs: bool,
@@ -123,7 +132,7 @@ pub struct Controller {
     /// A paused program does not count as running in the status bits.
     pub(super) hides_paused: bool,
     pub(super) wrong_model: bool,
-    /// Joint positions, and the pose of the flange there.
+    /// Joint positions, and the pose of the tool's centre point there.
     pose: ([f64; DOF], [f64; 6]),
     pub(super) sessions: BTreeMap<(usize, u64), Session>,
     /// Messages of the primary interface, and the number of the first one.
@@ -137,12 +146,16 @@ impl Controller {
         let arm = SimArm::new("ur", &limits(model), &common, PLAYABLE, now)?.without_modes();
         Ok(Self {
             model,
+            software: options.software(model),
+            build: Build { model, reach: Reach(options.kinematics(model)), tool: pose(&options.tcp_offset) },
+            serial: options.serial.clone(),
             arm,
             mode: POWER_OFF,
             goal: POWER_OFF,
             next_mode: now,
             power_time: Duration::from_secs_f64(options.power_time),
             stopped_at: None,
+            stop_argument: 0,
             safety: None,
             program: None,
             paused: false,
@@ -156,6 +169,8 @@ impl Controller {
             commanded: ([0.0; DOF], [0.0; DOF]),
             servoj: VecDeque::new(),
             slider: options.speed_slider,
+            scaling: options.speed_scaling,
+            segment: None,
             remote: options.remote_control,
             refuses_programs: false,
             hangs: false,
@@ -212,7 +227,8 @@ impl Controller {
         } else if self.arm.error() != 0 && self.stopped_at.is_none() {
             self.stopped_at = Some(self.arm.now());
             self.paused = self.program.is_some();
-            self.report_error(self.arm.error().into(), 2);
+            let argument = if self.arm.error() == 204 { self.stop_argument } else { 0 };
+            self.report_error(self.arm.error().into(), argument, 2);
         }
     }
 
@@ -334,14 +350,18 @@ impl Controller {
         }
     }
 
-    /// Position [m] and rotation vector [rad] of the flange. Computed only where the joints have moved.
+    /// Position [m] and rotation vector [rad] of the tool's centre point. Computed only where the joints have moved.
     pub(super) fn pose(&mut self, joints: [f64; DOF]) -> [f64; 6] {
         if self.pose.0 != joints {
-            let pose = Reach(self.model).forward(&joints);
-            let (at, turn) = (pose.translation.vector, pose.rotation.scaled_axis());
-            self.pose = (joints, [at.x, at.y, at.z, turn.x, turn.y, turn.z]);
+            let pose = self.build.reach.forward(&joints) * self.build.tool;
+            self.pose = (joints, vector(&pose));
         }
         self.pose.1
+    }
+
+    /// Sets the tool's centre point in the flange's frame: position [m] and rotation vector [rad].
+    pub(super) fn set_tcp(&mut self, offset: [f64; 6]) {
+        (self.build.tool, self.pose.0) = (pose(&offset), [f64::NAN; DOF]);
     }
 
     // --- Program ---
@@ -353,13 +373,13 @@ impl Controller {
     pub(super) fn start_program(&mut self, program: Program) {
         self.stop_program();
         self.announce("PROGRAM_XXX_STARTED", program.name().to_owned());
-        (self.program, self.paused) = (Some(program), false);
+        (self.program, self.paused, self.segment) = (Some(program), false, None);
     }
 
     pub(super) fn stop_program(&mut self) {
         if let Some(program) = self.program.take() {
             self.arm.stop();
-            self.paused = false;
+            (self.paused, self.segment) = (false, None);
             self.announce("PROGRAM_XXX_STOPPED", program.name().to_owned());
         }
     }
@@ -369,27 +389,6 @@ impl Controller {
         if self.program.is_some() {
             self.arm.stop();
             self.paused = true;
-        }
-    }
-
-    fn step_program(&mut self) {
-        let (before, (positions, velocities)) = (self.commanded.0, self.arm.joints());
-        let six = |values: Joints| values.first_chunk().copied().unwrap_or_default();
-        self.commanded = (six(positions), six(velocities));
-        if self.paused || self.hangs || !self.may_move() {
-            return;
-        }
-        let Some(mut program) = self.program.take() else { return };
-        let step = self.step_time();
-        let ended = program.step(&mut self.arm, &mut self.registers, &mut self.payload, step, self.model);
-        if let Some(goal) = program.servoed() {
-            self.commanded = (goal, std::array::from_fn(|i| (goal[i] - before[i]) / step));
-            self.servoj.push_back((self.arm.now(), goal));
-            self.servoj.drain(..self.servoj.len().saturating_sub(SERVOJ_KEPT));
-        }
-        self.program = Some(program);
-        if ended {
-            self.stop_program();
         }
     }
 

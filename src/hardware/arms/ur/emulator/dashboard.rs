@@ -70,7 +70,7 @@ impl Controller {
                 self.restart_safety();
                 "Restarting safety"
             }
-            "stop" if self.program.is_none() => "Failed to execute: stop",
+            // Also without a program: the vendor's examples begin with it.
             "stop" => {
                 self.stop_program();
                 "Stopped"
@@ -97,7 +97,7 @@ impl Controller {
                 return format!("URSoftware {major}.{minor}.{bugfix}.1106628 (Jan 01 2022)");
             }
             "get robot model" => return family(self.model),
-            "get serial number" => "20195500123",
+            "get serial number" => return self.serial.clone(),
             "is in remote control" if !cb3 => return self.remote.to_string(),
             _ => return format!("could not understand: '{request}'"),
         };
@@ -107,5 +107,5 @@ impl Controller {
 
 /// The model without its series.
 fn family(model: Model) -> String {
-    model.name().trim_end_matches('e').to_owned()
+    model.name().trim_end_matches('e').replace("8Long", "8_LONG")
 }

@@ -1,5 +1,7 @@
 //! RTDE values: their names, their types, and where they come from.
 
+use nalgebra::Isometry3;
+
 use super::controller::{Controller, REGISTERS};
 use crate::hardware::sim::arm::Measured;
 
@@ -51,7 +53,7 @@ impl Value {
 pub(super) struct Frame<'a> {
     pub controller: &'a Controller,
     pub measured: Measured,
-    /// Position [m] and rotation vector [rad] of the flange.
+    /// Position [m] and rotation vector [rad] of the tool's centre point.
     pub pose: [f64; 6],
 }
 
@@ -117,6 +119,15 @@ impl Frame<'_> {
 
 type Source = fn(&Frame<'_>) -> Value;
 
+/// Offset of the tool's centre point: software from 3.12.3 and 5.5.1 on has it.
+const TCP_OFFSET: &str = "tcp_offset";
+
+/// Returns position [m] and rotation vector [rad] of a pose.
+pub(super) fn vector(pose: &Isometry3<f64>) -> [f64; 6] {
+    let (at, turn) = (pose.translation.vector, pose.rotation.scaled_axis());
+    [at.x, at.y, at.z, turn.x, turn.y, turn.z]
+}
+
 /// Values other than registers.
 const OUTPUTS: &[(&str, Source)] = &[
     ("timestamp", |f| Value::F64(100.0 + f.controller.arm.uptime().as_secs_f64())),
@@ -143,7 +154,7 @@ const OUTPUTS: &[(&str, Source)] = &[
     ("actual_TCP_force", |_| Value::V6([0.5, -0.25, -4.0, 0.01, 0.02, -0.03])),
     ("ft_raw_wrench", |_| Value::V6([0.5, -0.25, -4.0, 0.01, 0.02, -0.03])),
     ("tcp_force_scalar", |_| Value::F64(4.0)),
-    ("tcp_offset", |_| Value::V6([0.0; 6])),
+    (TCP_OFFSET, |f| Value::V6(vector(&f.controller.build.tool))),
     ("actual_tool_accelerometer", |_| Value::V3([0.0, 0.0, -9.81])),
     ("elbow_position", |_| Value::V3([0.0; 3])),
     ("elbow_velocity", |_| Value::V3([0.0; 3])),
@@ -153,7 +164,7 @@ const OUTPUTS: &[(&str, Source)] = &[
     ("actual_robot_voltage", |f| Value::F64(if f.controller.mode > 3 { 48.0 } else { 0.0 })),
     ("actual_robot_current", |_| Value::F64(0.6)),
     ("io_current", |_| Value::F64(0.02)),
-    ("speed_scaling", |_| Value::F64(1.0)),
+    ("speed_scaling", |f| Value::F64(f.controller.speed_scaling())),
     ("target_speed_fraction", |f| Value::F64(f.controller.slider)),
     ("payload", |f| Value::F64(f.controller.payload.0)),
     ("payload_cog", |f| Value::V3(f.controller.payload.1)),
@@ -201,8 +212,12 @@ pub(super) enum Output {
 }
 
 impl Output {
-    /// Returns the value of a name.
-    pub fn find(name: &str) -> Option<Self> {
+    /// Returns the value of a name, as far as this software has it.
+    pub fn find(name: &str, software: [u8; 3]) -> Option<Self> {
+        let since = if software[0] < 5 { [3, 12, 3] } else { [5, 5, 1] };
+        if name == TCP_OFFSET && software < since {
+            return None;
+        }
         let number = |prefix: &str| name.strip_prefix(prefix)?.parse().ok().filter(|n: &usize| *n < REGISTERS);
         if let Some(n) = number("output_int_register_") {
             return Some(Self::Int(n));

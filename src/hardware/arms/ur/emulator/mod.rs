@@ -8,29 +8,33 @@ mod controller;
 mod dashboard;
 mod fields;
 mod ours;
+mod pace;
+mod points;
 mod ports;
 mod primary;
 mod programs;
+mod robot_api;
 mod rtde;
 mod scripts;
 #[cfg(test)]
 mod tests;
 
-use std::net::SocketAddr;
+use std::net::{SocketAddr, TcpListener};
 use std::time::Duration;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::address::{FIRST_PORT, PORTS, Service};
+use super::address::{API_PORT, FIRST_PORT, PORTS, Service};
 use super::model::Model;
+use crate::arm::Dh;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::check::ConfigError;
 use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, Truth};
 use crate::hardware::sim::arm;
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::sim::tcp_server::{Port, TcpServer, emulator_ports};
+use crate::hardware::sim::tcp_server::{Port, TcpServer, cannot_listen, emulator_ports};
 use crate::joint::JointLimits;
 use controller::Controller;
 
@@ -53,6 +57,7 @@ const PLAYABLE: &[FaultKind] = &[
     FaultKind::Sag,
     FaultKind::Blocked,
     FaultKind::Pushed,
+    FaultKind::Nudged,
     FaultKind::InputLow,
 ];
 /// The ports, in the order of their numbers here.
@@ -82,6 +87,14 @@ pub struct SimOptions {
     /// How far below its target a joint rests under load, 0 to 0.2 [rad].
     #[schemars(range(min = 0, max = 0.2))]
     pub droop: f64,
+    /// Software of the controller, such as 5.4.0; empty: one that has all values.
+    pub software: String,
+    /// Serial number of the arm, digits only.
+    pub serial: String,
+    /// Pose of the tool's centre point in the flange's frame: x, y, z [m], rotation vector [rad].
+    pub tcp_offset: [f64; 6],
+    /// The arm's own Denavit-Hartenberg parameters, one entry per joint; those of the data sheet when empty.
+    pub kinematics: Vec<Dh>,
     /// How long power-on and the release of the brakes take, each, 0 to 60 [s].
     #[schemars(range(min = 0, max = 60))]
     pub power_time: f64,
@@ -90,8 +103,13 @@ pub struct SimOptions {
     /// Position of the pendant's speed slider, 0 to 1.
     #[schemars(range(min = 0, max = 1))]
     pub speed_slider: f64,
+    /// How much of that speed the limits of the controller leave, as in reduced mode, 0 to 1.
+    #[schemars(range(min = 0, max = 1))]
+    pub speed_scaling: f64,
     /// Faults, and when they begin (seconds after the first connection).
     pub faults: Vec<Fault>,
+    /// What the controller does otherwise than its documents say.
+    pub controller: arm::ControllerOptions,
 }
 
 impl Default for SimOptions {
@@ -100,10 +118,16 @@ impl Default for SimOptions {
             initial_positions: Vec::new(),
             lag: 0.05,
             droop: 0.0,
+            software: String::new(),
+            serial: "20195500123".into(),
+            tcp_offset: [0.0; 6],
+            kinematics: Vec::new(),
             power_time: 0.05,
             remote_control: true,
             speed_slider: 1.0,
+            speed_scaling: 1.0,
             faults: Vec::new(),
+            controller: arm::ControllerOptions::default(),
         }
     }
 }
@@ -113,13 +137,40 @@ impl SimOptions {
     pub(super) fn check(&self, limits: &JointLimits) -> Result<(), ConfigError> {
         arm::check_range("power_time", self.power_time, 0.0..=60.0, "s")?;
         arm::check_range("speed_slider", self.speed_slider, 0.0..=1.0, "")?;
+        let wrong = |option: &str, what: &str| Err(ConfigError::new(format!("sim.{option}"), what));
+        if !self.software.is_empty() && parse_software(&self.software).is_none() {
+            return wrong("software", "a version is like 5.11.6");
+        }
+        if !self.serial.bytes().all(|byte| byte.is_ascii_digit()) {
+            return wrong("serial", "a serial number has digits only");
+        }
+        if !self.kinematics.is_empty() && self.kinematics.len() != super::DOF {
+            return wrong("kinematics", "one entry per joint");
+        }
+        arm::check_range("speed_scaling", self.speed_scaling, 0.0..=1.0, "")?;
         self.common().check("ur", limits, PLAYABLE)
     }
 
-    fn common(&self) -> arm::SimOptions {
-        let Self { initial_positions, lag, droop, faults, .. } = self.clone();
-        arm::SimOptions { initial_positions, lag, droop, faults }
+    fn software(&self, model: Model) -> [u8; 3] {
+        let own = if model.is_cb3() { [3, 15, 8] } else { [5, 11, 6] };
+        parse_software(&self.software).unwrap_or(own)
     }
+
+    /// Returns the arm's parameters.
+    fn kinematics(&self, model: Model) -> [Dh; super::DOF] {
+        let nominal = model.dh();
+        self.kinematics.clone().try_into().unwrap_or(nominal)
+    }
+
+    fn common(&self) -> arm::SimOptions {
+        let Self { initial_positions, lag, droop, faults, controller, .. } = self.clone();
+        arm::SimOptions { initial_positions, lag, droop, faults, controller }
+    }
+}
+
+fn parse_software(text: &str) -> Option<[u8; 3]> {
+    let numbers: Vec<u8> = text.split('.').map(|number| number.parse().ok()).collect::<Option<_>>()?;
+    numbers.try_into().ok()
 }
 
 /// A running emulator. Ends when it is dropped.
@@ -135,9 +186,24 @@ impl UrEmulator {
         let options: super::Options = config.options()?;
         let (address, listeners) = emulator_ports("ur", place, FIRST_PORT, PORTS)?;
         let used = SERVICES.map(|service| service as usize);
-        let listeners =
-            listeners.into_iter().enumerate().filter(|(i, _)| used.contains(i)).map(|(_, listener)| listener);
-        let controller = Controller::new(options.model, &options.sim, MonotonicClock.now())?;
+        let mut controller = Controller::new(options.model, &options.sim, MonotonicClock.now())?;
+        if let Some(number) = place.number().filter(|_| options.sim.serial == SimOptions::default().serial) {
+            controller.serial = format!("201{number:08}");
+        }
+        let mut listeners: Vec<_> = listeners.into_iter().map(Some).collect();
+        if controller.is_polyscope_x() {
+            let api = Service::RobotApi as usize;
+            let place = SocketAddr::new(address.ip(), API_PORT);
+            let at_default = address.port() == FIRST_PORT;
+            let own = at_default.then(|| TcpListener::bind(place).map_err(|e| cannot_listen("ur emulator", place, &e)));
+            // It has no dashboard: nothing answers there.
+            listeners.swap(Service::Dashboard as usize, api);
+            if let (Some(own), Some(first)) = (own.transpose()?, listeners.first_mut()) {
+                *first = Some(own);
+            }
+        }
+        let listeners = listeners.into_iter().enumerate().filter(|(i, _)| used.contains(i));
+        let listeners = listeners.filter_map(|(_, listener)| listener);
         let period = Duration::from_secs_f64(1.0 / options.model.rate());
         let ports = listeners.zip(SERVICES).map(|(listener, service)| {
             let period = match service {
@@ -147,7 +213,7 @@ impl UrEmulator {
             };
             (listener, Port::Sessions(period))
         });
-        let server = TcpServer::with_ports("ur", controller, ports.collect(), CLIENTS);
+        let server = TcpServer::with_ports("ur", controller, ports.collect(), CLIENTS, |_| true);
         let server = server.map_err(|e| AdapterError::Io(format!("ur emulator: cannot serve: {e}")))?;
         Ok(Self { server, address })
     }
@@ -168,6 +234,11 @@ impl UrEmulator {
     /// Moves the pendant's speed slider, 0 to 1.
     pub fn set_slider(&self, fraction: f64) {
         self.with(|controller| controller.slider = fraction);
+    }
+
+    /// Sets how much of the slider's speed the limits of the controller leave, 0 to 1.
+    pub fn set_scaling(&self, fraction: f64) {
+        self.with(|controller| controller.scaling = fraction);
     }
 
     /// Changes between remote control and the pendant.
@@ -215,6 +286,11 @@ impl UrEmulator {
         self.with(|controller| controller.mode = mode);
     }
 
+    /// Changes the arm's serial number, as when another arm is connected in its place.
+    pub fn set_serial(&self, serial: &str) {
+        self.with(|controller| serial.clone_into(&mut controller.serial));
+    }
+
     /// Sets the level of a digital input, bits as in RTDE.
     pub fn set_input(&self, number: u8, high: bool) {
         self.with(|controller| controller.set_input(number, high));
@@ -233,6 +309,11 @@ impl UrEmulator {
     /// Returns the positions [rad] that the program gave to servoj, one a step, and when.
     pub fn servoj(&self) -> Vec<(Mono, [f64; super::DOF])> {
         self.with(|controller| controller.servoj.iter().copied().collect())
+    }
+
+    /// Returns the address of the primary interface, which takes programs.
+    pub fn primary(&self) -> SocketAddr {
+        SocketAddr::new(self.address.ip(), self.address.port() + Service::Primary as u16)
     }
 
     /// Returns the name of the running program.

@@ -1,7 +1,8 @@
 //! The adapter's program: its own text, carried out one step of the controller at a time.
 
 use super::controller::Registers;
-use super::programs::{joints, servo};
+use super::points::Points;
+use super::programs::joints;
 use crate::hardware::arms::ur::DOF;
 use crate::hardware::arms::ur::script::Refused;
 use crate::hardware::arms::ur::script::machine::{Controller, Machine};
@@ -14,27 +15,32 @@ pub(super) const NAME: &str = "dimos_control";
 #[derive(Debug, Clone)]
 pub(super) struct Ours {
     machine: Machine,
-    /// The last point of servoj, and whether the last step had one.
-    last: Option<[f64; DOF]>,
+    /// The points of servoj, and whether the last step had one.
+    points: Points,
     servoed: bool,
 }
 
 impl Ours {
     /// Reads the text; an error is one that a controller would report.
     pub fn new(text: &str) -> Result<Self, Refused> {
-        Ok(Self { machine: Machine::new(text, NAME)?, last: None, servoed: false })
+        Ok(Self { machine: Machine::new(text, NAME)?, points: Points::default(), servoed: false })
     }
 
     /// Returns the position that the last step gave to servoj, if it did.
     pub fn servoed(&self) -> Option<[f64; DOF]> {
-        self.last.filter(|_| self.servoed)
+        self.points.last().filter(|_| self.servoed)
+    }
+
+    /// Returns the argument of the last point's error.
+    pub fn argument(&self) -> i32 {
+        self.points.argument
     }
 
     /// Makes one step; whether the program has ended.
     pub fn step(&mut self, arm: &mut SimArm, registers: &mut Registers, step: f64) -> bool {
         self.servoed = false;
-        let Self { machine, last, servoed } = self;
-        !machine.step(&mut Step { arm, registers, step, last, servoed })
+        let Self { machine, points, servoed } = self;
+        !machine.step(&mut Step { arm, registers, step, points, servoed })
     }
 }
 
@@ -43,7 +49,7 @@ struct Step<'a> {
     arm: &'a mut SimArm,
     registers: &'a mut Registers,
     step: f64,
-    last: &'a mut Option<[f64; DOF]>,
+    points: &'a mut Points,
     servoed: &'a mut bool,
 }
 
@@ -53,7 +59,7 @@ impl Controller for Step<'_> {
     }
 
     fn target(&self) -> [f64; DOF] {
-        self.last.unwrap_or_else(|| joints(self.arm))
+        self.points.last().unwrap_or_else(|| joints(self.arm))
     }
 
     fn read_integer(&self, register: usize) -> i32 {
@@ -68,8 +74,8 @@ impl Controller for Step<'_> {
         self.registers.int_out.iter_mut().skip(register).take(1).for_each(|to| *to = value);
     }
 
-    fn servoj(&mut self, point: &[f64; DOF]) {
-        servo(self.arm, self.last, point, self.step);
+    fn servoj(&mut self, point: &[f64; DOF], lookahead: f64) {
+        self.points.take(self.arm, point, self.step, lookahead);
         *self.servoed = true;
     }
 

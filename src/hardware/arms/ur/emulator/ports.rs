@@ -39,6 +39,10 @@ impl stream::Controller for Controller {
         if service == Service::Rtde {
             return self.rtde_request(who, bytes, answer);
         }
+        if service == Service::Dashboard && self.is_polyscope_x() {
+            // A connection for each request.
+            return self.robot_api(bytes, answer).map(|()| Delivery::HangUp);
+        }
         let Some(end) = bytes.iter().position(|byte| *byte == b'\n') else { return Scan::More };
         let line = String::from_utf8_lossy(bytes.get(..end).unwrap_or_default());
         if service != Service::Dashboard {
@@ -75,7 +79,9 @@ impl stream::Controller for Controller {
         self.sessions.insert((port, client), session);
         match service(port) {
             Service::Rtde => self.arm.client_came(),
-            Service::Dashboard if self.lasting() == Delivery::Send => greeting.extend(GREETING),
+            Service::Dashboard if self.lasting() == Delivery::Send && !self.is_polyscope_x() => {
+                greeting.extend(GREETING)
+            }
             Service::Primary | Service::Secondary if self.lasting() == Delivery::Send => {
                 greeting.extend(self.introduction());
             }

@@ -2,6 +2,7 @@
 
 use super::controller::Controller;
 use super::programs::Program;
+use crate::arm::Dh;
 use crate::hardware::arms::ur::model::Model;
 
 /// A packet with its size.
@@ -29,9 +30,10 @@ impl Controller {
         self.said(3, &[b"\x09URControl", &[major, minor][..], &numbers, b"01-01-2022, 00:00:00"].concat())
     }
 
-    /// Reports an error C{code}A0.
-    pub(super) fn report_error(&mut self, code: i32, level: i32) {
-        let message = self.said(6, &[[code, 0, level, 0, 0].map(i32::to_be_bytes).concat(), Vec::new()].concat());
+    /// Reports an error C{code}A{argument}.
+    pub(super) fn report_error(&mut self, code: i32, argument: i32, level: i32) {
+        let message =
+            self.said(6, &[[code, argument, level, 0, 0].map(i32::to_be_bytes).concat(), Vec::new()].concat());
         self.message(message);
     }
 
@@ -56,7 +58,7 @@ impl Controller {
         let mut mode = (self.arm.uptime().as_micros() as u64).to_be_bytes().to_vec();
         mode.extend([true, true, self.mode > 3, estop, stop, running, self.paused].map(u8::from));
         mode.extend([self.mode as u8, 0]);
-        [self.slider, 1.0, 1.0].iter().for_each(|v: &f64| mode.extend(v.to_be_bytes()));
+        [self.slider, self.speed_scaling(), 1.0].iter().for_each(|v: &f64| mode.extend(v.to_be_bytes()));
         mode.push(0);
         part(&mut parts, 0, &mode);
         let mut joints = Vec::new();
@@ -67,8 +69,23 @@ impl Controller {
             joints.push(253);
         }
         part(&mut parts, 1, &joints);
+        part(&mut parts, 5, &self.kinematics());
         part(&mut parts, 6, &self.configuration());
         to.extend(packet(16, &parts));
+    }
+
+    /// Checksums, theta, a, d, alpha of all joints, and that they are calibrated.
+    fn kinematics(&self) -> Vec<u8> {
+        let mut body = Vec::new();
+        let all = self.build.reach.0;
+        let sum =
+            |dh: &Dh| [dh.theta, dh.a, dh.d, dh.alpha].iter().fold(0, |sum, v| sum ^ v.to_bits() ^ v.to_bits() >> 32);
+        all.iter().for_each(|dh| body.extend((sum(dh) as u32).to_be_bytes()));
+        for value in [|dh: &Dh| dh.theta, |dh: &Dh| dh.a, |dh: &Dh| dh.d, |dh: &Dh| dh.alpha] {
+            all.iter().for_each(|dh| body.extend(value(dh).to_be_bytes()));
+        }
+        body.extend(0_u32.to_be_bytes());
+        body
     }
 
     fn configuration(&self) -> Vec<u8> {
@@ -82,9 +99,9 @@ impl Controller {
         limits.velocity_max.iter().for_each(|speed| [*speed, 40.0].map(&mut put).into_iter().collect());
         [1.05, 1.4, 0.25, 1.2, 0.2].into_iter().for_each(&mut put);
         let dh = self.model.dh();
-        dh.iter().for_each(|(a, ..)| put(*a));
-        dh.iter().for_each(|(_, d, _)| put(*d));
-        dh.iter().for_each(|(.., alpha)| put(*alpha));
+        dh.iter().for_each(|dh| put(dh.a));
+        dh.iter().for_each(|dh| put(dh.d));
+        dh.iter().for_each(|dh| put(dh.alpha));
         [0.0; 6].into_iter().for_each(put);
         let kind = match self.wrong_model {
             true if self.model.kind() == Model::Ur10e.kind() => Model::Ur5e.kind(),

@@ -57,7 +57,8 @@ impl Controller {
             b'O' => {
                 let (hertz, list) = content.split_at_checked(8).unwrap_or((&[0; 8], &[]));
                 let hertz = f64::from_be_bytes(hertz.try_into().unwrap_or_default());
-                let outputs: Vec<Option<Output>> = names(list).iter().map(|name| Output::find(name)).collect();
+                let outputs: Vec<Option<Output>> =
+                    names(list).iter().map(|name| Output::find(name, controller_version)).collect();
                 let kinds = outputs.iter().map(|o| o.map_or("NOT_FOUND", |output| output.value(&frame).kind()));
                 let text = kinds.collect::<Vec<_>>().join(",");
                 let known: Option<Vec<Output>> = outputs.into_iter().collect();
@@ -184,6 +185,6 @@ impl Controller {
 
     /// Version of the software.
     pub(super) fn version(&self) -> [u8; 3] {
-        if self.model.is_cb3() { [3, 15, 8] } else { [5, 11, 6] }
+        self.software
     }
 }

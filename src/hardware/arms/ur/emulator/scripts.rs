@@ -25,7 +25,7 @@ impl Controller {
         let local = !self.remote && !self.model.is_cb3();
         let refused = local || self.sessions.get(&who).is_some_and(|session| session.read_only);
         if refused {
-            self.report_error(210, 2);
+            self.report_error(210, 0, 2);
         }
         refused
     }
@@ -61,6 +61,7 @@ impl Controller {
             .collect();
         match (name, &values[..]) {
             ("set_gravity", [x, y, z]) => self.gravity = [*x, *y, *z],
+            ("set_tcp", [x, y, z, a, b, c]) => self.set_tcp([*x, *y, *z, *a, *b, *c]),
             ("set_payload", [mass, x, y, z]) => (self.payload.0, self.payload.1) = (*mass, [*x, *y, *z]),
             ("set_target_payload", [mass, x, y, z, inertia @ ..]) => {
                 (self.payload.0, self.payload.1) = (*mass, [*x, *y, *z]);

@@ -1,11 +1,13 @@
 //! The primary interface: who the controller is, what its errors are, and why a program fails.
 
 use super::Reader;
+use crate::arm::Dh;
 use crate::hardware::transport::Scan;
 
 /// Types of packets, of messages and of parts of the state that are used here.
 const STATE: u8 = 16;
 const MESSAGE: u8 = 20;
+const KINEMATICS: u8 = 5;
 const CONFIGURATION: u8 = 6;
 const VERSION: u8 = 3;
 const ERROR: u8 = 6;
@@ -32,13 +34,45 @@ pub struct Configuration {
     pub kind: u32,
 }
 
+/// The arm's own Denavit-Hartenberg parameters, measured at the factory.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Kinematics {
+    /// Checksum of each joint's parameters.
+    pub checksum: [u32; 6],
+    /// The parameters, from the base.
+    pub joints: [Dh; 6],
+}
+
+impl Kinematics {
+    /// Largest length [m] and angle [rad] that can be true: axes that are almost parallel have their common normal far
+    /// away.
+    const LARGEST: (f64, f64) = (1e6, 10.0);
+
+    fn is_possible(&self) -> bool {
+        let (far, wide) = Self::LARGEST;
+        let is_possible =
+            |dh: &Dh| dh.a.abs() < far && dh.d.abs() < far && dh.theta.abs() < wide && dh.alpha.abs() < wide;
+        self.joints.iter().all(is_possible) && self.joints.iter().any(|dh| dh.a != 0.0 || dh.d != 0.0)
+    }
+}
+
+/// What a state says of the arm. The controller sends these parts on a new connection, and when they change.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct About {
+    /// Limits and type.
+    pub configuration: Option<Configuration>,
+    /// Dimensions.
+    pub kinematics: Option<Kinematics>,
+}
+
 /// A packet that matters here. Only an exception allocates.
+#[allow(clippy::large_enum_variant, reason = "a box would allocate in the cycle of reads")]
 #[derive(Debug, Clone, PartialEq)]
 pub enum Packet {
     /// Version of the controller's software: major, minor, bugfix.
     Version(u8, u8, i32),
-    /// A state with a configuration.
-    Configuration(Configuration),
+    /// A state with a configuration or with kinematics.
+    About(About),
     /// An error.
     Error {
         /// C code.
@@ -77,7 +111,7 @@ pub fn scan(bytes: &[u8]) -> Scan<Packet> {
 
 fn decode(kind: u8, content: &[u8]) -> Packet {
     match kind {
-        STATE => configuration(content).map_or(Packet::Other, Packet::Configuration),
+        STATE => about(content).map_or(Packet::Other, Packet::About),
         MESSAGE => message(&mut Reader::new(content)).unwrap_or(Packet::Other),
         _ => Packet::Other,
     }
@@ -109,24 +143,41 @@ fn message(reader: &mut Reader<'_>) -> Option<Packet> {
     reader.ok.then_some(packet)
 }
 
-/// Finds the configuration among the parts of a state.
-fn configuration(content: &[u8]) -> Option<Configuration> {
-    let mut reader = Reader::new(content);
+/// Finds configuration and kinematics among the parts of a state; `None` without either.
+fn about(content: &[u8]) -> Option<About> {
+    let (mut reader, mut about) = (Reader::new(content), About::default());
     loop {
         let (length, kind) = (reader.u32(), reader.u8());
-        let body = reader.take((length as usize).checked_sub(5)?);
-        if !reader.ok {
-            return None;
+        let body = reader.take((length as usize).saturating_sub(5));
+        if !reader.ok || length < 5 {
+            break;
         }
-        if kind == CONFIGURATION {
-            let mut body = Reader::new(body);
-            let ranges = std::array::from_fn(|_| (body.f64(), body.f64()));
-            let speeds = std::array::from_fn(|_| (body.f64(), body.f64()).0);
-            body.take(5 * 8 + 4 * 6 * 8 + 2 * 4);
-            let found = Configuration { ranges, speeds, kind: body.u32() };
-            return body.ok.then_some(found);
+        let mut body = Reader::new(body);
+        match kind {
+            CONFIGURATION => about.configuration = configuration(&mut body),
+            KINEMATICS => about.kinematics = kinematics(&mut body),
+            _ => {}
         }
     }
+    (about != About::default()).then_some(about)
+}
+
+fn configuration(body: &mut Reader<'_>) -> Option<Configuration> {
+    let ranges = std::array::from_fn(|_| (body.f64(), body.f64()));
+    let speeds = std::array::from_fn(|_| (body.f64(), body.f64()).0);
+    body.take(5 * 8 + 4 * 6 * 8 + 2 * 4);
+    let found = Configuration { ranges, speeds, kind: body.u32() };
+    body.ok.then_some(found)
+}
+
+/// Checksums, then theta, a, d, alpha of all joints.
+fn kinematics(body: &mut Reader<'_>) -> Option<Kinematics> {
+    let checksum = std::array::from_fn(|_| body.u32());
+    let mut list = || -> [f64; 6] { std::array::from_fn(|_| body.f64()) };
+    let (theta, a, d, alpha) = (list(), list(), list(), list());
+    let joints = std::array::from_fn(|i| Dh { theta: theta[i], a: a[i], d: d[i], alpha: alpha[i] });
+    let found = Kinematics { checksum, joints };
+    (body.ok && found.is_possible()).then_some(found)
 }
 
 #[cfg(test)]
@@ -167,10 +218,31 @@ mod tests {
         assert_eq!(body.len() + 5, 445, "the vendor's own size");
         let part = |kind: u8, body: &[u8]| [&(5 + body.len() as u32).to_be_bytes()[..], &[kind], body].concat();
         let state = packet(STATE, &[part(0, &[1; 42]), part(CONFIGURATION, &body), part(7, &[])].concat());
-        let Scan::Take(_, Packet::Configuration(found)) = scan(&state) else { panic!("no configuration") };
+        let Scan::Take(_, Packet::About(about)) = scan(&state) else { panic!("no configuration") };
+        let found = about.configuration.unwrap();
         assert_eq!((found.kind, found.ranges[2], found.speeds[4]), (7, (-2.0, 2.0), 2.0));
         assert_eq!(scan(&packet(STATE, &part(0, &[1; 42]))), Scan::Take(52, Packet::Other));
         assert_eq!(scan(&packet(STATE, &[0, 0, 9, 9, 0])), Scan::Take(10, Packet::Other), "a part that is cut off");
+    }
+
+    #[test]
+    fn kinematics_are_those_of_six_joints() {
+        let mut body: Vec<u8> = (1..=6_u32).flat_map(u32::to_be_bytes).collect();
+        (1..=24).for_each(|i| body.extend(f64::from(i).mul_add(0.25, 0.0).to_be_bytes()));
+        body.extend([0; 4]);
+        let part = |body: &[u8]| [&(5 + body.len() as u32).to_be_bytes()[..], &[KINEMATICS], body].concat();
+        assert_eq!(part(&body).len(), 225, "the vendor's own size");
+        let of = |body: &[u8]| match scan(&packet(STATE, &part(body))) {
+            Scan::Take(_, Packet::About(about)) => about.kinematics,
+            _ => None,
+        };
+        let found = of(&body).unwrap();
+        assert_eq!(found.checksum, [1, 2, 3, 4, 5, 6]);
+        assert_eq!(found.joints[1], Dh { theta: 0.5, a: 2.0, d: 3.5, alpha: 5.0 });
+        assert_eq!(of(&body[..200]), None, "cut off");
+        body[24..32].copy_from_slice(&f64::NAN.to_be_bytes());
+        assert_eq!(of(&body), None);
+        assert_eq!(of(&[0; 220]), None, "an arm has dimensions");
     }
 
     #[test]

@@ -259,6 +259,8 @@ impl State {
             && slow(&self.velocity)
             && slow(&self.target_velocity)
             && (0.0..1e12).contains(&self.time)
+            && self.slider.is_finite()
+            && self.scaling.is_finite()
             && (-1..=20).contains(&self.robot_mode)
             && (0..=40).contains(&self.safety_mode)
             && self.status < 1 << 8
@@ -304,7 +306,14 @@ mod tests {
             wrong[at] ^= byte;
             assert_eq!(recipe.decode(&wrong), None, "byte {at}");
         }
-        bytes[8..16].copy_from_slice(&f64::NAN.to_be_bytes());
-        assert_eq!(recipe.decode(&bytes), None);
+        // Each scales motions or times somewhere.
+        let good = bytes.clone();
+        for name in ["actual_q", "speed_scaling", "target_speed_fraction"] {
+            let before = recipe.fields().take_while(|(_, field)| field.name != name);
+            let at: usize = before.map(|(_, field)| field.kind.length()).sum();
+            bytes.clone_from(&good);
+            bytes[at..at + 8].copy_from_slice(&f64::NAN.to_be_bytes());
+            assert_eq!(recipe.decode(&bytes), None, "{name} at {at}");
+        }
     }
 }

@@ -102,7 +102,7 @@ pub fn safety_text(mode: i32) -> &'static str {
 pub fn code_text(code: i32) -> &'static str {
     match code {
         153 | 157 => "a joint deviates from its commanded motion: collision, or wrong payload",
-        204 => "sudden change of the commanded position",
+        204 => "sudden change of the commanded position or velocity",
         210 => "the connection is read-only: the controller is in local mode",
         _ => "",
     }

@@ -8,6 +8,9 @@ use super::{Action, Expression, Kind, Operator, Refused, Statement};
 /// Instructions that a program may carry out without waiting for the next step of the controller.
 const MOST: u32 = 20_000;
 
+/// Lookahead time of a servoj that gives none [s].
+const LOOKAHEAD: f64 = 0.1;
+
 /// What a program finds on its controller.
 pub trait Controller {
     /// Time of a step [s].
@@ -17,8 +20,8 @@ pub trait Controller {
     fn read_integer(&self, register: usize) -> i32;
     fn read_float(&self, register: usize) -> f64;
     fn write_integer(&mut self, register: usize, value: i32);
-    /// Follows a point for one step.
-    fn servoj(&mut self, point: &[f64; 6]);
+    /// Follows a point for one step; `lookahead`: time over which its trajectory is smoothed [s].
+    fn servoj(&mut self, point: &[f64; 6], lookahead: f64);
     /// Decelerates to rest [rad/s²].
     fn stopj(&mut self, deceleration: f64);
 }
@@ -41,7 +44,7 @@ enum Instruction {
     Jump(usize),
     Unless(Number, usize),
     Write(Number, Number),
-    Servoj(List),
+    Servoj(List, Number),
     Stopj(Number),
     Sync,
 }
@@ -118,8 +121,9 @@ impl Machine {
                     controller.write_integer(register as usize, value as i32);
                 }
                 Instruction::Stopj(deceleration) => controller.stopj(self.number(deceleration, controller)),
-                Instruction::Servoj(point) => {
-                    controller.servoj(&self.list(point, controller));
+                Instruction::Servoj(point, lookahead) => {
+                    let lookahead = self.number(lookahead, controller);
+                    controller.servoj(&self.list(point, controller), lookahead);
                     return true;
                 }
                 Instruction::Sync => return true,
@@ -271,8 +275,13 @@ impl<'a> Compiler<'a> {
     fn call(&self, call: &Expression) -> Result<Instruction, Refused> {
         let Kind::Call(name, arguments) = &call.kind else { return cannot(call.line, "this statement") };
         match (name.as_str(), &arguments[..]) {
-            ("servoj", [(None, point), ..]) => match self.list(point)? {
-                Some(point) => Ok(Instruction::Servoj(point)),
+            ("servoj", [(None, point), rest @ ..]) => match self.list(point)? {
+                Some(point) => {
+                    let named = |(name, _): &&(Option<String>, Expression)| name.as_deref() == Some("lookahead_time");
+                    let given = rest.iter().find(named).or_else(|| rest.get(3).filter(|(name, _)| name.is_none()));
+                    let lookahead = given.map_or(Ok(Number::Constant(LOOKAHEAD)), |(_, value)| self.number(value))?;
+                    Ok(Instruction::Servoj(point, lookahead))
+                }
                 None => cannot(call.line, "servoj to a pose"),
             },
             ("stopj", [(None, deceleration)]) => Ok(Instruction::Stopj(self.number(deceleration)?)),

@@ -129,8 +129,8 @@ fn a_registers_change_while_they_are_read_is_no_order() {
         fn write_integer(&mut self, register: usize, value: i32) {
             self.0.write_integer(register, value);
         }
-        fn servoj(&mut self, point: &[f64; 6]) {
-            self.0.servoj(point);
+        fn servoj(&mut self, point: &[f64; 6], lookahead: f64) {
+            self.0.servoj(point, lookahead);
         }
         fn stopj(&mut self, deceleration: f64) {
             self.0.stopj(deceleration);

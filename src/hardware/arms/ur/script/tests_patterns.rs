@@ -57,7 +57,7 @@ impl Controller for Panel {
         self.out[register - 24] = value;
     }
 
-    fn servoj(&mut self, point: &[f64; 6]) {
+    fn servoj(&mut self, point: &[f64; 6], _lookahead: f64) {
         self.point = Some(*point);
     }
 

@@ -10,7 +10,7 @@ use super::super::model::{Identity, Model};
 use super::super::protocol::gripper::GripperKind;
 use super::controlled_arm::{ControlledArm, Refusal};
 use super::judge::Judge;
-use super::kinematics::Links;
+use super::kinematics::{Links, to_wire};
 use super::motion::is_motion;
 use super::queue::{Goal, Move};
 use super::settings::Settings;
@@ -22,6 +22,7 @@ use crate::hardware::sim::arm::SimArm;
 use crate::hardware::sim::reach::Chain;
 use crate::hardware::sim::trace::Trace;
 use crate::joint::Joints;
+use crate::pose::from_xyz_rpy;
 
 /// Acceleration of the emulated joints [rad/s²]: a real arm does less than its limit.
 const ACCELERATION: f64 = 12.0;
@@ -70,6 +71,8 @@ impl Received {
 /// The controller's memory, and the arm behind it.
 pub struct Controller<A> {
     pub(super) identity: Identity,
+    /// End of its serial number.
+    pub(super) unit: String,
     pub(super) firmware: [u16; 3],
     /// The kinematics; without them, poses are those that the arm itself knows.
     pub(super) chain: Option<Links>,
@@ -117,7 +120,9 @@ impl Controller<SimArm> {
         // Its modes are its own.
         let arm = arm.without_modes().with_tolerance(TOLERANCE);
         let slow = options.slow_replies.clone();
-        let settings = Settings { limit_factor: options.tool_speed_factor, ..Settings::default() };
+        let wire = |[x, y, z, roll, pitch, yaw]: [f64; 6]| to_wire(&from_xyz_rpy([x, y, z], [roll, pitch, yaw]));
+        let (offset, base) = (wire(options.tcp_offset), wire(options.world_offset));
+        let settings = Settings { limit_factor: options.tool_speed_factor, offset, base, ..Settings::default() };
         let controller = Self::around(identity, firmware, gripper, arm);
         Ok(Self { chain: Some(Links::of(model)), slow, settings, saved: settings, ..controller })
     }
@@ -134,6 +139,7 @@ impl<A: ControlledArm> Controller<A> {
     pub fn around(identity: Identity, firmware: [u16; 3], gripper: GripperKind, arm: A) -> Self {
         Self {
             identity,
+            unit: "C07L01".to_owned(),
             firmware,
             chain: None,
             arm,
@@ -223,7 +229,12 @@ impl<A: ControlledArm> Controller<A> {
 
     /// The tool's pose, if it is known.
     pub(super) fn pose(&self) -> Option<Isometry3<f64>> {
-        self.chain.map_or_else(|| self.arm.pose(), |chain| Some(chain.forward(&self.seven()) * self.tool_offset()))
+        self.chain.map_or_else(|| self.arm.pose(), |chain| Some(self.tcp_of(chain, &self.seven())))
+    }
+
+    /// The pose of the tool's centre point in the reference frame, at joints [rad].
+    pub(super) fn tcp_of(&self, chain: Links, joints: &[f64; 7]) -> Isometry3<f64> {
+        self.base() * chain.forward(joints) * self.tool_offset()
     }
 
     /// The joints and their velocities as they are reported.

@@ -43,6 +43,7 @@ use crate::hardware::check::ConfigError;
 use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, Truth};
 use crate::hardware::sim::arm::{self, HasArm, SimArm};
 use crate::hardware::sim::faults::{Fault, FaultKind};
+use crate::hardware::sim::peer;
 use crate::hardware::sim::tcp_server::{ATTEMPTS, Port, TcpServer, cannot_listen, ports_in_a_row};
 use crate::joint::{JointLimits, Joints};
 pub use controlled_arm::{ControlledArm, JOINT_LIMIT, Refusal};
@@ -81,6 +82,10 @@ pub struct SimOptions {
     /// and the controller saves. Above it, it stops with error 60.
     #[schemars(range(min = 0.1, max = 100))]
     pub tool_speed_factor: f32,
+    /// Tool offset that is set at the controller: x, y, z [m], roll, pitch, yaw [rad].
+    pub tcp_offset: [f64; 6],
+    /// Offset of the base that is set at the controller, alike.
+    pub world_offset: [f64; 6],
     /// How far joints are behind their servo setpoints, 0 to 0.5 [s].
     #[schemars(range(min = 0, max = 0.5))]
     pub lag: f64,
@@ -89,6 +94,8 @@ pub struct SimOptions {
     pub droop: f64,
     /// What goes wrong, and when (seconds after the first connection).
     pub faults: Vec<Fault>,
+    /// What the controller does otherwise than its documents say.
+    pub controller: arm::ControllerOptions,
 }
 
 impl Default for SimOptions {
@@ -99,9 +106,12 @@ impl Default for SimOptions {
             port_503: true,
             slow_replies: Vec::new(),
             tool_speed_factor: judge::LIMIT_FACTOR,
+            tcp_offset: [0.0; 6],
+            world_offset: [0.0; 6],
             lag: 0.01,
             droop: 0.0,
             faults: Vec::new(),
+            controller: arm::ControllerOptions::default(),
         }
     }
 }
@@ -134,8 +144,8 @@ impl SimOptions {
 
     /// What all emulated arms have.
     fn common(&self) -> arm::SimOptions {
-        let Self { initial_positions, lag, droop, faults, .. } = self.clone();
-        arm::SimOptions { initial_positions, lag, droop, faults }
+        let Self { initial_positions, lag, droop, faults, controller, .. } = self.clone();
+        arm::SimOptions { initial_positions, lag, droop, faults, controller }
     }
 
     fn firmware(&self) -> Result<[u16; 3], ConfigError> {
@@ -172,8 +182,11 @@ impl XArmEmulator {
         options.check(&model.limits())?;
         let firmware = options.firmware()?;
         let (ports, address) = listen(WHO, ip, in_process, options.port_503)?;
-        let controller = Controller::new(model, firmware, gripper, options, MonotonicClock.now())?;
-        let server = TcpServer::with_ports("xarm", controller, ports, CLIENTS).map_err(cannot_serve)?;
+        let mut controller = Controller::new(model, firmware, gripper, options, MonotonicClock.now())?;
+        if let Some(number) = EmulatorAddress::Bind(ip).number() {
+            controller.unit = format!("C{number:07}");
+        }
+        let server = TcpServer::with_ports("xarm", controller, ports, CLIENTS, |_| true).map_err(cannot_serve)?;
         Ok(Self { server, address })
     }
 
@@ -261,13 +274,14 @@ pub struct ControlBox<A: ControlledArm> {
 
 impl<A: ControlledArm> ControlBox<A> {
     /// Serves `arm` as a `model` with the default firmware, at the arm's own ports of a loopback
-    /// address.
+    /// address, to programs of this user and of root.
     pub fn start(model: Model, gripper: GripperKind, arm: A, ip: IpAddr) -> AdapterResult<Self> {
         let ip = EmulatorAddress::Bind(ip).tcp(CONTROL_PORT)?.ip();
         let (ports, address) = listen("xArm control box", ip, false, true)?;
         let firmware = SimOptions::default().firmware()?;
         let controller = Controller::around(introduce(model), firmware, gripper, arm);
-        let server = TcpServer::with_ports("xarm", controller, ports, CLIENTS).map_err(cannot_serve)?;
+        let server =
+            TcpServer::with_ports("xarm", controller, ports, CLIENTS, peer::is_ours_or_root).map_err(cannot_serve)?;
         Ok(Self { server, address })
     }
 

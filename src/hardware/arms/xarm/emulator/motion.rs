@@ -155,10 +155,9 @@ impl<A: ControlledArm> Controller<A> {
             Target::Pose(values, frame, orientation) => (values, frame, orientation),
         };
         let chain = self.chain.ok_or(NotNow)?;
-        let tool = self.tool_offset();
-        let start = chain.forward(&from) * tool;
+        let start = self.tcp_of(chain, &from);
         let goal = frame.goal(&start, values, orientation).ok_or(Warning(BAD_PARAMETER))?;
-        let goal = goal * tool.inverse();
+        let goal = self.base().inverse() * goal * self.tool_offset().inverse();
         chain.inverse(&goal, &from).ok_or(Warning(NO_SOLUTION))
     }
 

@@ -41,6 +41,7 @@ impl<A: ControlledArm> Controller<A> {
             axes: self.identity.axes as u8,
             kind: self.identity.kind as u8,
             firmware: self.firmware,
+            base: self.settings.base,
             offset: self.settings.offset,
             load: self.settings.load,
             sensitivity: self.settings.sensitivity,
@@ -108,12 +109,13 @@ impl<A: ControlledArm> stream::Controller for Controller<A> {
 
     fn serve_port(&mut self, port: usize, bytes: &[u8], now: Mono, answer: &mut Vec<u8>) -> Scan<Delivery> {
         match wire::scan(bytes) {
-            Scan::More => Scan::More,
-            Scan::Skip(n) => Scan::Skip(n),
-            Scan::Take(n, ()) if bytes.get(..n).is_some_and(|frame| modbus::refuse(frame, answer)) => {
+            None => Scan::Take(bytes.len(), Delivery::HangUp),
+            Some(Scan::More) => Scan::More,
+            Some(Scan::Skip(n)) => Scan::Skip(n),
+            Some(Scan::Take(n, ())) if bytes.get(..n).is_some_and(|frame| modbus::refuse(frame, answer)) => {
                 Scan::Take(n, Delivery::Send)
             }
-            Scan::Take(n, ()) => match bytes.get(..n).and_then(wire::parts) {
+            Some(Scan::Take(n, ())) => match bytes.get(..n).and_then(wire::parts) {
                 Some(request) => Scan::Take(n, self.handle(&request, port == SECOND, now, answer)),
                 None => Scan::Skip(n),
             },

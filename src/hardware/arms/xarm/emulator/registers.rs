@@ -8,7 +8,6 @@ use super::motion::is_motion;
 use super::settings::is_setting;
 use super::wire::{self, Request, number, numbers, put_numbers};
 use crate::hardware::sim::faults::FaultKind;
-use crate::hardware::sim::reach::Chain;
 
 /// The mode of guiding by hand.
 const GUIDED: u8 = 2;
@@ -84,8 +83,8 @@ impl<A: ControlledArm> Controller<A> {
         match (register, data) {
             (1, _) => self.version(out),
             (2, _) => {
-                let serial = &self.identity.serial;
-                out.extend(format!("{serial}C07L01\0AC1305C07L01\n\0").bytes().chain([0; 40]).take(40));
+                let (serial, unit) = (&self.identity.serial, &self.unit);
+                out.extend(format!("{serial}{unit}\0AC1305C07L01\n\0").bytes().chain([0; 40]).take(40));
             }
             (5, _) => out.push(u8::from(self.settings.currents)),
             (11, [joint, on]) => self.switch(*joint, *on == 1)?,
@@ -115,8 +114,7 @@ impl<A: ControlledArm> Controller<A> {
             }
             (44, _) => {
                 let joints = numbers::<7>(data).ok_or(Warning(BAD_PARAMETER))?.map(f64::from);
-                let flange = self.chain.ok_or(NotNow)?.forward(&joints);
-                put_numbers(out, to_wire(&(flange * self.tool_offset())));
+                put_numbers(out, to_wire(&self.tcp_of(self.chain.ok_or(NotNow)?, &joints)));
             }
             (45, _) => {
                 let joints = numbers::<7>(data).ok_or(Warning(BAD_PARAMETER))?.map(f64::from);

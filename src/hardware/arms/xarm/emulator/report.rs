@@ -33,6 +33,8 @@ pub struct Snapshot {
     pub kind: u8,
     /// Firmware.
     pub firmware: [u16; 3],
+    /// Pose of the base in the reference frame of poses [mm, rad].
+    pub base: [f32; 6],
     /// Offset of the tool [mm, rad], its mass and centre [kg, mm].
     pub offset: [f32; 6],
     /// See `offset`.
@@ -168,6 +170,7 @@ fn rich(s: &Snapshot, out: &mut Vec<u8>) {
     packet.floats(355, &s.torque.map(|torque| torque / 10.0));
     packet.floats(256, &s.velocity);
     packet.bytes(284, &s.counter.to_be_bytes());
+    packet.floats(288, &s.base);
     packet.floats(433, &s.wrench);
     packet.floats(457, &s.wrench_raw);
 }

@@ -16,6 +16,8 @@ const LIMIT_FACTOR_NUMBER: u8 = 1;
 /// What clients can set.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Settings {
+    /// Pose of the base in the reference frame of poses [mm, rad].
+    pub base: [f32; 6],
     /// Offset of the tool [mm, rad], its mass and centre [kg, mm].
     pub offset: [f32; 6],
     /// See `offset`.
@@ -37,6 +39,7 @@ pub struct Settings {
 impl Default for Settings {
     fn default() -> Self {
         Self {
+            base: [0.0; 6],
             offset: [0.0; 6],
             load: [0.0; 4],
             sensitivity: [3, 3],
@@ -51,7 +54,7 @@ impl Default for Settings {
 
 /// Returns whether a register belongs to this module.
 pub(super) fn is_setting(register: u8) -> bool {
-    matches!(register, 31..=40 | 70 | 201..=203 | 206 | 232 | 233)
+    matches!(register, 31..=40 | 70 | 73 | 201..=203 | 206 | 232 | 233)
 }
 
 impl<A: ControlledArm> Controller<A> {
@@ -66,7 +69,7 @@ impl<A: ControlledArm> Controller<A> {
                 self.reset_with(|s| s.load = load, out);
             }
             // Settings that the arm does not have are refused, except those that change nothing.
-            (35, _) if !own && data.iter().all(|byte| *byte == 0) => self.put_queue(out),
+            (35 | 73, _) if !own && data.iter().all(|byte| *byte == 0) => self.put_queue(out),
             (70, [0]) | (202, [0]) => {
                 self.settings.currents &= register != 70;
             }
@@ -79,10 +82,10 @@ impl<A: ControlledArm> Controller<A> {
                 }
                 self.put_queue(out);
             }
-            (35, _) => {
+            (35 | 73, _) => {
                 let offset =
                     numbers(data).filter(|values: &[f32; 6]| values.iter().all(|v| v.is_finite())).ok_or(bad)?;
-                self.reset_with(|s| s.offset = offset, out);
+                self.reset_with(|s| *(if register == 35 { &mut s.offset } else { &mut s.base }) = offset, out);
             }
             (37, [level @ 0..=5]) => self.reset_with(|s| s.sensitivity = [*level, s.sensitivity[1]], out),
             (38, [level @ 1..=5]) => self.reset_with(|s| s.sensitivity = [s.sensitivity[0], *level], out),
@@ -114,5 +117,9 @@ impl<A: ControlledArm> Controller<A> {
     /// The tool's centre point in the flange.
     pub(super) fn tool_offset(&self) -> Isometry3<f64> {
         from_wire(self.settings.offset)
+    }
+    /// The base in the reference frame of poses.
+    pub(super) fn base(&self) -> Isometry3<f64> {
+        from_wire(self.settings.base)
     }
 }

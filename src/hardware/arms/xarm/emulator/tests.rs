@@ -6,6 +6,8 @@ use super::wire;
 use super::*;
 use crate::clock::Mono;
 use crate::hardware::arms::xarm::golden::{self, DEGREES, POSE, TORQUES, VELOCITIES, WRENCH, bytes};
+use crate::hardware::sim::arm::Delivery;
+use crate::hardware::sim::stream;
 use crate::hardware::transport::tcp::Scan;
 
 pub(super) fn controller() -> Controller<SimArm> {
@@ -14,8 +16,8 @@ pub(super) fn controller() -> Controller<SimArm> {
 
 /// The response to a golden request, at a time [s].
 fn answer(controller: &mut Controller<SimArm>, request: &[u8], at: f64) -> Vec<u8> {
-    assert_eq!(wire::scan(&request[..request.len() - 1]), Scan::More);
-    assert_eq!(wire::scan(request), Scan::Take(request.len(), ()));
+    assert_eq!(wire::scan(&request[..request.len() - 1]), Some(Scan::More));
+    assert_eq!(wire::scan(request), Some(Scan::Take(request.len(), ())));
     let mut out = Vec::new();
     controller.handle(&wire::parts(request).unwrap(), false, Mono(1).after(Duration::from_secs_f64(at)), &mut out);
     out
@@ -101,10 +103,18 @@ fn reports_are_the_golden_bytes() {
 }
 
 #[test]
-fn a_sign_of_life_and_noise_are_not_answered() {
-    assert_eq!(wire::scan(&bytes("0000000100020000")), Scan::Skip(8), "the heartbeat of old clients");
-    assert_eq!(wire::scan(b"GET / HTTP"), Scan::Skip(1));
-    assert_eq!(wire::scan(&[0, 1, 0]), Scan::More);
+fn a_sign_of_life_is_not_answered_and_what_is_no_request_ends_the_connection() {
+    assert_eq!(wire::scan(&bytes("0000000100020000")), Some(Scan::Skip(8)), "the heartbeat of old clients");
+    assert_eq!(wire::scan(&[0, 1, 0]), Some(Scan::More));
+    for noise in [&b"GET"[..], b"GET / HTTP", &[0, 1, 0, 4], &[0, 1, 0, 2, 0, 0], &[0, 1, 0, 2, 2, 0]] {
+        assert_eq!(wire::scan(noise), None, "{noise:?}");
+    }
+    let mut arm = controller();
+    for port in [0, SECOND] {
+        let answer = &mut Vec::new();
+        let hung_up = stream::Controller::serve_port(&mut arm, port, b"POST", Mono(0), answer);
+        assert_eq!((hung_up, answer.len()), (Scan::Take(4, Delivery::HangUp), 0));
+    }
 }
 
 #[test]

@@ -9,6 +9,8 @@ const TWO_MBIT: i32 = 11;
 /// Nominal speed of the fingers at the largest speed of their motor [m/s], and that speed in the units of each
 /// gripper's telegrams.
 const TOP_SPEED: f64 = 0.25;
+/// Part of its way that a gripper without positions makes in a second.
+const ON_OFF_SPEED: f64 = 3.0;
 const FASTEST_G1: f64 = 5000.0;
 const FASTEST_G2: f64 = 3765.0;
 /// Register of the baud rate, and of the restart.
@@ -20,6 +22,8 @@ const SLAVE: u8 = 8;
 const MARGIN: f64 = 1.0;
 /// The gripper's version.
 const VERSION: [u16; 3] = [3, 4, 3];
+/// The outputs that the tool board has.
+const ALL_OUTPUTS: u16 = 0x001F;
 
 /// The tool flange.
 pub struct Tool {
@@ -32,6 +36,8 @@ pub struct Tool {
     speed_set: bool,
     /// Opening that a telegram has just ordered [m], and the fraction of the top speed that was set.
     order: Option<(f64, Option<f64>)>,
+    /// Levels of the outputs.
+    outputs: u16,
     /// The gripper's error.
     pub error: u16,
 }
@@ -39,8 +45,18 @@ pub struct Tool {
 impl Tool {
     /// A flange with this gripper, half open.
     pub fn new(kind: GripperKind) -> Self {
-        let gripper = Gripper::new(kind.widest().unwrap_or(0.0), TOP_SPEED);
-        Self { kind, gripper, baud: TWO_MBIT, enabled: false, speed: 1500, speed_set: false, order: None, error: 0 }
+        let speed = if kind.is_on_off() { ON_OFF_SPEED } else { TOP_SPEED };
+        Self {
+            kind,
+            gripper: Gripper::new(kind.widest().unwrap_or(0.0), speed),
+            baud: TWO_MBIT,
+            enabled: false,
+            speed: 1500,
+            speed_set: false,
+            order: None,
+            outputs: 0,
+            error: 0,
+        }
     }
 
     /// Plays the faults of the gripper that are due.
@@ -76,10 +92,12 @@ impl Tool {
         (self.kind == GripperKind::XarmG2).then_some(self.gripper.max_force)
     }
 
-    /// Reads a register of the tool board: the baud rate, and inputs and outputs without a signal; `None` for another.
+    /// Reads a register of the tool board: the baud rate, and inputs and outputs; `None` for another.
     pub fn read(&self, register: u16) -> Option<i32> {
         match register & 0x0FFF {
             BAUD => Some(self.baud),
+            0x0A14 => Some((self.kind == GripperKind::Vacuum && self.gripper.gripping()).into()),
+            0x0A18 => Some(self.outputs.into()),
             0x0A12..=0x0A17 => Some(0),
             _ => None,
         }
@@ -90,6 +108,8 @@ impl Tool {
         match register & 0x0FFF {
             BAUD if settable => self.baud = value as i32,
             BAUD if value as i32 == self.baud => {}
+            // The upper byte says which outputs are meant, the lower one their levels.
+            0x0A15 if settable => self.set_outputs(value as u16),
             // Its restart changes nothing here.
             REBOOT if settable && value == 1.0 => {}
             _ => return None,
@@ -97,9 +117,25 @@ impl Tool {
         Some(())
     }
 
+    fn set_outputs(&mut self, value: u16) {
+        let meant = (value >> 8) & ALL_OUTPUTS;
+        self.outputs = (self.outputs & !meant) | (value & meant);
+        // Both off: the Lite 6's fingers rest, and a vacuum gripper does as before.
+        let opens = match (self.kind, self.outputs & 3) {
+            (GripperKind::Lite6, 1) | (GripperKind::Vacuum, 2) => true,
+            (GripperKind::Lite6, 2) | (GripperKind::Vacuum, 1) => false,
+            (GripperKind::Lite6, _) => return self.gripper.stop(),
+            _ => return,
+        };
+        self.gripper.move_to(f64::from(opens));
+    }
+
     /// Returns whether a device answers telegrams like this one.
     pub fn hears(&self, telegram: &[u8]) -> bool {
-        self.kind != GripperKind::None && self.baud == TWO_MBIT && telegram.first() == Some(&SLAVE)
+        self.kind != GripperKind::None
+            && !self.kind.is_on_off()
+            && self.baud == TWO_MBIT
+            && telegram.first() == Some(&SLAVE)
     }
 
     /// Returns the answer to a telegram; `None` for one that the gripper does not know or execute.

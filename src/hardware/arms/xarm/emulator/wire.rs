@@ -16,19 +16,24 @@ pub struct Request<'a> {
     pub payload: &'a [u8],
 }
 
-/// Length of the request at the front of what has arrived; skips what is none. A sign of life of old clients (protocol
-/// 1) is not answered, nor a Modbus request (protocol 0) without a function.
-pub fn scan(bytes: &[u8]) -> Scan<()> {
-    let &[_, _, high, protocol, l0, l1, ..] = bytes else { return Scan::More };
-    let length = usize::from(l0) << 8 | usize::from(l1);
-    if high != 0 || protocol > 3 || length == 0 || length > 400 {
-        return Scan::Skip(1);
+/// Returns the length of the request at the front of what has arrived. A sign of life of old clients (protocol 1) is
+/// not answered, nor a Modbus request (protocol 0) without a function. `None`: this is no request, so the client is not
+/// one of this protocol. What it sends may contain requests, such as the body of a web page's HTTP request.
+pub fn scan(bytes: &[u8]) -> Option<Scan<()>> {
+    let (high, protocol) = (*bytes.get(2).unwrap_or(&0), *bytes.get(3).unwrap_or(&0));
+    if high != 0 || protocol > 3 {
+        return None;
     }
-    match bytes.len() >= 6 + length {
+    let &[_, _, _, _, l0, l1, ..] = bytes else { return Some(Scan::More) };
+    let length = usize::from(l0) << 8 | usize::from(l1);
+    if length == 0 || length > 400 {
+        return None;
+    }
+    Some(match bytes.len() >= 6 + length {
         false => Scan::More,
         true if protocol == 1 || (protocol == 0 && length < 2) => Scan::Skip(6 + length),
         true => Scan::Take(6 + length, ()),
-    }
+    })
 }
 
 /// The parts of a request that [`scan`] found.

@@ -86,6 +86,8 @@ pub enum Command {
     Tool(Rtu),
     /// A register of the tool board.
     ReadToolBoard(u16),
+    /// Sets a register of the tool board.
+    WriteToolBoard(u16, u16),
     /// Load at the flange: mass [kg], centre x, y, z [mm]. Resets the controller: mode 0, not ready.
     SetLoad([f64; 4]),
     /// The force/torque sensor on or off.
@@ -113,6 +115,7 @@ impl Command {
             Self::Velocity { .. } => 81,
             Self::ServoErrors => 106,
             Self::Tool(_) => 124,
+            Self::WriteToolBoard(..) => 127,
             Self::ReadToolBoard(_) => 128,
             Self::EnableForceTorque(_) => 201,
         }
@@ -123,7 +126,8 @@ impl Command {
         match self {
             Self::Enable(_) => MOTORS,
             Self::SetState(_) | Self::SetMode { .. } | Self::ClearError | Self::ClearWarning => SLOW,
-            Self::Tool(_) | Self::ReadToolBoard(_) | Self::EnableForceTorque(_) | Self::SetLoad(_) => SLOW,
+            Self::Tool(_) | Self::ReadToolBoard(_) | Self::WriteToolBoard(..) => SLOW,
+            Self::EnableForceTorque(_) | Self::SetLoad(_) => SLOW,
             _ => QUICK,
         }
     }
@@ -164,6 +168,11 @@ impl Command {
             Self::ReadToolBoard(address) => {
                 out.put(&[TOOL]);
                 out.put(&address.to_be_bytes());
+            }
+            Self::WriteToolBoard(address, value) => {
+                out.put(&[TOOL]);
+                out.put(&address.to_be_bytes());
+                out.floats(&[f64::from(*value)]);
             }
             Self::SetLoad(load) => out.floats(load),
             Self::EnableForceTorque(on) => out.put(&[u8::from(*on)]),

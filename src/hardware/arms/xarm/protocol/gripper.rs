@@ -41,7 +41,19 @@ pub const BAUD_REGISTER: u16 = 0x0A0B;
 /// See [`BAUD_REGISTER`].
 pub const BAUD_INDEX: i32 = 11;
 
-/// The grippers with a position.
+/// Registers of the tool board: its inputs, what sets one of its outputs, and what its outputs are.
+pub const INPUTS: u16 = 0x0A14;
+/// See [`INPUTS`].
+pub const SET_OUTPUTS: u16 = 0x0A15;
+/// See [`INPUTS`].
+pub const OUTPUTS: u16 = 0x0A18;
+
+/// The value that sets output 0 or 1 of the tool board: which one is meant in the upper byte, its level in the lower.
+pub fn set_output(output: u8, high: bool) -> u16 {
+    (0x0100 | u16::from(high)) << output
+}
+
+/// The grippers at the tool flange.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum GripperKind {
@@ -52,13 +64,23 @@ pub enum GripperKind {
     Xarm,
     /// xArm Gripper G2.
     XarmG2,
+    /// The Lite 6's own gripper, which only opens and closes.
+    Lite6,
+    /// The vacuum gripper.
+    Vacuum,
 }
 
 impl GripperKind {
-    /// Widest opening [m]; `None` without gripper.
+    /// Returns whether it only opens and closes, by outputs of the tool board.
+    pub fn is_on_off(self) -> bool {
+        matches!(self, Self::Lite6 | Self::Vacuum)
+    }
+
+    /// Position when it is open [m], or 1 of one that only opens and closes; `None` without gripper.
     pub fn widest(self) -> Option<f64> {
         match self {
             Self::None => None,
+            Self::Lite6 | Self::Vacuum => Some(1.0),
             Self::Xarm => Some(0.085),
             Self::XarmG2 => Some(0.084),
         }

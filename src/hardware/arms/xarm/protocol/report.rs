@@ -117,8 +117,10 @@ pub struct Health {
     pub error: u8,
     /// The warning; 0 = none.
     pub warning: u8,
-    /// Where the tool is from the flange: x, y, z [mm].
-    pub tool: [f64; 3],
+    /// Offset of the tool from the flange: x, y, z [mm], roll, pitch, yaw [rad].
+    pub tool: [f64; 6],
+    /// Pose of the base in the reference frame of poses, alike, if reported.
+    pub base: Option<[f64; 6]>,
     /// Load at the flange: mass [kg], centre x, y, z [mm].
     pub load: [f64; 4],
     /// Direction of gravity in the base frame, if reported.
@@ -161,9 +163,9 @@ impl Health {
         let [collision, teach] = take::bytes(packet, 131)?;
         let [state_mode] = take::bytes(packet, 4)?;
         let (tool, load) = (take::floats(packet, 91)?, take::floats(packet, 115)?);
-        let (gravity, motors) = (take::floats(packet, 133), Motors::decode(packet));
+        let (gravity, motors, base) = (take::floats(packet, 133), Motors::decode(packet), take::floats(packet, 288));
         let valid = collision <= 5 && teach <= 5 && state_mode & 0x0F <= 9;
-        valid.then_some(Self { enabled, error, warning, tool, load, gravity, motors })
+        valid.then_some(Self { enabled, error, warning, tool, base, load, gravity, motors })
     }
 }
 

@@ -53,6 +53,7 @@ pub struct Received {
 
 /// The controller's memory.
 pub struct Controller {
+    pub(super) serial: String,
     pub(super) arm: SimArm,
     pub(super) gripper: Gripper,
     pub(super) io: SimIo,
@@ -71,6 +72,7 @@ impl Controller {
         let options = options.clone().starting_at(&INITIAL);
         let arm = SimArm::new("yourarm", &limits(), &options, PLAYABLE, now)?;
         Ok(Self {
+            serial: "YA6-00042".to_owned(),
             arm: arm.with_velocity_timeout(VELOCITY_TIMEOUT),
             gripper: Gripper::new(GRIPPER_MAX, GRIPPER_SPEED).with_force(POWER_UP_FORCE),
             io: SimIo::default(),
@@ -97,7 +99,7 @@ impl Controller {
                 let dof = self.arm.claimed_dof() as u8;
                 let other = self.arm.take_fault(FaultKind::WrongModel).is_some();
                 let model = if other { "YOURARM-6L" } else { "YOURARM-6" };
-                reply(out, frame, status, |out| put_hello(out, model, dof, [2, 1, 3], "YA6-00042"));
+                reply(out, frame, status, |out| put_hello(out, model, dof, [2, 1, 3], &self.serial));
             }
             (Ok(()), Ok(Request::GetState(with_force))) => {
                 let report = self.report();

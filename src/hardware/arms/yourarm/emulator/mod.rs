@@ -7,8 +7,6 @@ mod controller;
 mod kinematics;
 pub mod wire;
 
-use std::net::SocketAddr;
-
 use super::protocol::PORT;
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::AdapterResult;
@@ -29,16 +27,20 @@ pub struct YourArmEmulator {
 impl YourArmEmulator {
     /// Starts an emulator at `place`, with the `sim` part of an adapter's options.
     pub fn start(config: &AdapterConfig, place: &EmulatorAddress) -> AdapterResult<Self> {
-        Self::listen(&config.options::<super::Options>()?.sim, place.tcp(PORT)?)
+        Self::listen(&config.options::<super::Options>()?.sim, place)
     }
 
     /// Starts an emulator on a free loopback port.
     pub fn with(options: &SimOptions) -> AdapterResult<Self> {
-        Self::listen(options, EmulatorAddress::InProcess.tcp(PORT)?)
+        Self::listen(options, &EmulatorAddress::InProcess)
     }
 
-    fn listen(options: &SimOptions, address: SocketAddr) -> AdapterResult<Self> {
-        let controller = Controller::new(options, MonotonicClock.now())?;
+    fn listen(options: &SimOptions, place: &EmulatorAddress) -> AdapterResult<Self> {
+        let address = place.tcp(PORT)?;
+        let mut controller = Controller::new(options, MonotonicClock.now())?;
+        if let Some(number) = place.number() {
+            controller.serial = format!("YA6-{number:08}");
+        }
         Ok(Self { server: TcpServer::start("yourarm", controller, address)? })
     }
 

@@ -70,6 +70,32 @@ fn after_a_reconnect_the_arm_is_held_and_the_wait_is_short_again() {
 }
 
 #[test]
+fn another_arm_of_the_kind_gets_nothing_until_it_is_accepted() {
+    let mut bench = Bench::enabled_with(MockAdapter::new(DOF).serial("A1"));
+    bench.arm.clone().serial("B2");
+    bench.worker.mark_lost();
+    bench.advance(Duration::from_millis(500));
+    assert_eq!(bench.cycle().interference, Interference::Identity);
+    assert!(bench.worker.health.is_other_arm());
+    bench.settle();
+    let refused = bench.activate().unwrap_err().to_string();
+    assert!(refused.starts_with("another arm answers than the one with which the run began"), "{refused}");
+    bench.hold_at(0.0);
+    assert!(bench.written().is_empty() && bench.count("activate") == 0);
+    let accept = |bench: &Bench| bench.worker.health.with_identity(|identity| identity.accept());
+    assert_eq!(accept(&bench), Err(("serial A1".to_owned(), "serial B2".to_owned())));
+    assert_eq!(bench.cycle().interference, Interference::Identity, "shown, not accepted");
+    assert_eq!(accept(&bench), Ok(()));
+    bench.settle();
+    assert_eq!(bench.cycle().interference, Interference::None);
+    bench.activate().unwrap();
+    // The same arm again is no other one.
+    bench.worker.mark_lost();
+    bench.advance(Duration::from_millis(500));
+    assert_eq!(bench.cycle().interference, Interference::None);
+}
+
+#[test]
 fn another_arm_at_the_address_is_said_once_it_is_found() {
     let mut bench = Bench::enabled();
     bench.worker.mark_lost();

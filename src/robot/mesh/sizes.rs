@@ -1,14 +1,14 @@
-//! Mesh files of a description: each is read once; their sizes, and what is wrong with them.
+//! Sizes of mesh files, and what is wrong with those of a description. Each is read once.
 
 use std::collections::HashMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use nalgebra::Vector3;
 
+use super::Mesh;
 use crate::message::Message;
-use crate::robot::mesh::Mesh;
 use crate::robot::model::MeshFile;
-use crate::robot::xml::Document;
+use crate::robot::xml::{Document, Element};
 use crate::robot::{Geometry, RobotModel, Shape};
 use crate::yaml::{Diag, Label};
 
@@ -19,7 +19,7 @@ const SMALL: f64 = 1e-4;
 
 /// Size of a mesh.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Size {
+pub struct Size {
     /// Number of triangles.
     pub triangles: usize,
     /// Extents along x, y, z, after scaling [m].
@@ -27,16 +27,40 @@ pub(super) struct Size {
 }
 
 impl Size {
-    /// Returns why the unit of the mesh is doubtful, and the likely cause.
-    fn doubt(&self) -> Option<(String, &'static str)> {
-        let most = self.extents.amax();
-        let shown = self.shown();
+    /// Reads the size of a file that is not scaled.
+    pub fn read(path: &Path) -> Result<Self, String> {
+        Mesh::read(path, Vector3::repeat(1.0)).map(|mesh| Self::of(&mesh))
+    }
+
+    fn of(mesh: &Mesh) -> Self {
+        Self { triangles: mesh.triangles.len(), extents: mesh.extents() }
+    }
+
+    /// Returns why the unit of the mesh is doubtful.
+    fn doubt(&self) -> Option<String> {
+        let (most, shown) = (self.extents.amax(), self.shown());
         if most > LARGE {
-            let hint = "a URDF is in metres: if the file is in millimetres, add scale=\"0.001 0.001 0.001\"";
-            return Some((format!("extends over {shown}"), hint));
+            return Some(format!("extends over {shown}"));
         }
-        let hint = "is it scaled twice? a file in metres needs no scale";
-        (most < SMALL).then(|| (format!("extends over only {shown}"), hint))
+        (most < SMALL).then(|| format!("extends over only {shown}"))
+    }
+
+    /// Returns a warning if the unit of the mesh of an object in the world is doubtful: such a mesh has no scale.
+    pub fn doubt_of_object(&self, object: &str, path: &Path) -> Option<Diag> {
+        let what = format!("the mesh of the object `{object}` {}: {}", self.doubt()?, path.display());
+        Some(
+            Diag::warning(what)
+                .hint("a mesh in the world is in metres: convert the file, for example from millimetres"),
+        )
+    }
+
+    /// Returns a warning if the unit of the mesh of a link is doubtful.
+    fn doubt_of_link(&self, link: &str, uri: &str) -> Option<Diag> {
+        let hint = match self.extents.amax() > LARGE {
+            true => "a URDF is in metres: if the file is in millimetres, add scale=\"0.001 0.001 0.001\"",
+            false => "is it scaled twice? a file in metres needs no scale",
+        };
+        Some(Diag::warning(format!("the mesh of the link `{link}` {}: {uri}", self.doubt()?)).hint(hint))
     }
 
     /// Returns the extents as text.
@@ -50,17 +74,14 @@ impl Size {
 
 /// The meshes read so far, by file and scale.
 #[derive(Debug, Default)]
-pub(super) struct MeshSizes(HashMap<(PathBuf, [u64; 3]), Result<Size, String>>);
+pub struct MeshSizes(HashMap<(PathBuf, [u64; 3]), Result<Size, String>>);
 
 impl MeshSizes {
     /// Returns the size of a mesh, or why it cannot be read; `None` if its file was not found.
     pub fn of(&mut self, mesh: &MeshFile) -> Option<&Result<Size, String>> {
         let path = mesh.path.clone()?;
         let scale = [mesh.scale.x, mesh.scale.y, mesh.scale.z].map(f64::to_bits);
-        let read = || {
-            let mesh = Mesh::load(mesh)?;
-            Ok(Size { triangles: mesh.triangles.len(), extents: mesh.extents() })
-        };
+        let read = || Mesh::load(mesh).map(|mesh| Size::of(&mesh));
         Some(self.0.entry((path, scale)).or_insert_with(read))
     }
 
@@ -78,9 +99,7 @@ impl MeshSizes {
             for (shape, collides) in collisions.chain(link.visuals.iter().map(|shape| (shape, false))) {
                 let Shape { geometry: Geometry::Mesh(mesh), .. } = shape else { continue };
                 let diag = match self.of(mesh) {
-                    Some(Ok(size)) => size.doubt().map(|(what, hint)| {
-                        Diag::warning(format!("the mesh of the link `{}` {what}: {}", link.name, mesh.uri)).hint(hint)
-                    }),
+                    Some(Ok(size)) => size.doubt_of_link(&link.name, &mesh.uri),
                     Some(Err(why)) => {
                         let Message { what, hint } = why.clone().into();
                         let what = format!("unusable mesh of the link `{}`: {what}", link.name);
@@ -103,7 +122,7 @@ impl MeshSizes {
 
 /// Returns the position of a mesh's file name in a description.
 fn place(document: &Document, link: &str, uri: &str, collides: bool) -> Option<Label> {
-    let named = |element: &&crate::robot::xml::Element| element.attribute("name").is_some_and(|a| a.value == link);
+    let named = |element: &&Element| element.attribute("name").is_some_and(|a| a.value == link);
     let link = document.root.named("link").find(named)?;
     let shapes = link.named(if collides { "collision" } else { "visual" });
     let files = shapes.filter_map(|shape| shape.child("geometry")?.child("mesh")?.attribute("filename"));
