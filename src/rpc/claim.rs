@@ -82,6 +82,13 @@ impl Claim {
         self.mark.as_ref().map_or_else(|| self.socket(), |mark| PathBuf::from(format!("@{}", mark.name())))
     }
 
+    /// Serves no clients: from now on a connection to its mark is closed at once.
+    pub fn serve_none(&self) {
+        if let Some(way) = self.way() {
+            way.close();
+        }
+    }
+
     /// Returns where connections to its mark go; `None` without a mark.
     pub(super) fn way(&self) -> Option<Way> {
         self.mark.as_ref().map(Mark::way)

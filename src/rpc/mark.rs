@@ -20,8 +20,53 @@ const PAUSE: Duration = Duration::from_millis(100);
 /// Stack size of the thread [bytes].
 const STACK: usize = 1 << 17;
 
-/// Where connections to the mark go.
-pub(super) type Way = Arc<Mutex<Option<UnboundedSender<UnixStream>>>>;
+/// Connections that may wait until the run serves them.
+const MAX_WAITING: usize = 64;
+
+/// Where connections to the mark go. The mark is there before the server: who asks while the run starts waits.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Way(Arc<Mutex<To>>);
+
+#[derive(Debug)]
+enum To {
+    /// The run starts.
+    Waiting(Vec<UnixStream>),
+    /// They are served.
+    Server(UnboundedSender<UnixStream>),
+    /// Nothing serves them: each is closed.
+    Closed,
+}
+
+impl Default for To {
+    fn default() -> Self {
+        Self::Waiting(Vec::new())
+    }
+}
+
+impl Way {
+    /// Leads to a server from now on, in place of the one before. What has waited comes first.
+    pub fn lead_to(&self, server: UnboundedSender<UnixStream>) {
+        let mut to = lock(&self.0);
+        if let To::Waiting(streams) = &mut *to {
+            // Fails only while the server shuts down.
+            streams.drain(..).for_each(|stream| drop(server.send(stream)));
+        }
+        *to = To::Server(server);
+    }
+
+    /// Closes every connection, also those that wait.
+    pub fn close(&self) {
+        *lock(&self.0) = To::Closed;
+    }
+
+    fn pass(&self, stream: UnixStream) {
+        match &mut *lock(&self.0) {
+            To::Waiting(streams) if streams.len() < MAX_WAITING => streams.push(stream),
+            To::Server(server) => drop(server.send(stream)),
+            To::Waiting(_) | To::Closed => {}
+        }
+    }
+}
 
 /// A mark that is held. A thread takes its connections: those of other users are closed at once, so that none of them
 /// fills the queue or delays the thread that serves stops.
@@ -50,7 +95,7 @@ impl Mark {
         &self.name
     }
 
-    /// Returns where its connections go; nowhere at first, and with a receiver that is gone they are closed.
+    /// Returns where its connections go.
     pub fn way(&self) -> Way {
         self.way.clone()
     }
@@ -59,6 +104,7 @@ impl Mark {
 impl Drop for Mark {
     fn drop(&mut self) {
         self.ended.store(true, Ordering::Release);
+        self.way.close();
         // Ends the thread's wait.
         let _ = rustix::net::shutdown(&self.listener, Shutdown::Both);
         if let Some(thread) = self.thread.take() {
@@ -70,11 +116,7 @@ impl Drop for Mark {
 fn accept(listener: &UnixListener, way: &Way, ended: &AtomicBool) {
     while !ended.load(Ordering::Acquire) {
         match listener.accept() {
-            Ok((stream, _)) if is_owner_or_root(&stream) => {
-                if let Some(to) = lock(way).as_ref() {
-                    let _ = to.send(stream);
-                }
-            }
+            Ok((stream, _)) if is_owner_or_root(&stream) => way.pass(stream),
             Ok(_) => {}
             Err(error) if matches!(error.kind(), io::ErrorKind::Interrupted | io::ErrorKind::ConnectionAborted) => {}
             Err(_) => std::thread::sleep(PAUSE),

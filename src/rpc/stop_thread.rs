@@ -195,7 +195,7 @@ fn spawn(reception: &Arc<Reception>) -> io::Result<(Arc<Turn>, JoinHandle<()>)> 
         until_the_end(runtime, shared.ended.clone(), accept((listener, from_far), shared, mine, silent));
     })?;
     if let Some(way) = &reception.way {
-        *lock(way) = Some(far);
+        way.lead_to(far);
     }
     *lock(&reception.current) = (back, turn.clone());
     Ok((turn, thread))

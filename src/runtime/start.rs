@@ -72,6 +72,7 @@ impl Run {
                 run.serve_view();
             }
         } else {
+            claim.serve_none();
             run.handle.service.keep(claim);
         }
         if let Some(manager) = &run.manager {

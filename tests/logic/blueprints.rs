@@ -387,7 +387,6 @@ tasks:
         (own("end_effector_link: base_link, joint_prefix: arm_"), "no joint of the task moves", "base_link"),
         (own("end_effector_link: flange"), "the model has no joint `arm_joint1`", "4:"),
         (own("end_effector_link: flange, joint_prefix: left_"), "does not begin with `left_`", "left_"),
-        (own(&format!("{mapped}, joint_prefix: arm_")), "both map the joints' names", "arm_"),
         (own(mapped), "the model has no joint `arm_joint3`", "4:"),
         (own("end_effector_link: flange, joint_prefix: arm_, timeout: -1"), "out of range", "-1"),
         (own("end_effector_link: flange, joint_prefix: arm_, max_linear_velocity: 0"), "out of range", "0"),

@@ -72,6 +72,18 @@ fn a_run_is_found_from_a_shell_with_other_folders() {
 }
 
 #[test]
+fn who_asks_while_a_run_starts_is_answered() {
+    let home = Home::new();
+    let run = Started::of(&mut home.command("run coordinator-yourarm --name early --no-record"));
+    // It has its name, and no socket yet.
+    eventually("the name", || home.path().join("run/dimos/early.lock").exists());
+    home.dimos("status early").with(0).shows(&["run early", "ready"]);
+    home.dimos("stop").with(0).shows(&["confirmed"]);
+    home.dimos("down").with(0);
+    run.wait().with(0);
+}
+
+#[test]
 fn a_run_whose_folder_is_removed_is_stopped_and_listens_again() {
     let (home, name) = (Home::new(), own_name());
     let run = up(&home, &format!("coordinator-yourarm --name {name}"));
