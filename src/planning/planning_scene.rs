@@ -192,8 +192,8 @@ impl PlannedRobot {
         let solids = solids_of(&model, shape).map_err(|e| e.to_string())?;
         let idle = idle(config, &model, &joints, &Measured::default(), &[]);
         let posed = model.positions(&idle);
-        let tool = tool_frame(config.tool.as_ref());
-        let kinematics = compiled(&model, &joints, &posed, end_effector, &tool).map_err(|e| e.to_string())?;
+        let kinematics = compiled(&model, &joints, &posed, end_effector, config.tool.as_ref());
+        let kinematics = kinematics.map_err(|e| e.to_string())?;
         let limits = kinematics.limits().to_vec();
         let base_in_model = model.link_poses(&posed).get(base).copied().unwrap_or_default();
         let model = Arc::new(model);
@@ -284,7 +284,7 @@ impl PlannedRobot {
 
     /// Compiles the kinematics of the planned joints, with the tool centre point.
     pub(super) fn compiled(&self, model: &RobotModel, rest: &[f64]) -> Result<Kinematics, KinematicsError> {
-        compiled(model, &self.joints, rest, self.end_effector, &tool_frame(self.config.tool.as_ref()))
+        compiled(model, &self.joints, rest, self.end_effector, self.config.tool.as_ref())
     }
 
     /// Builds the robot's collision geometry with all joints fixed at these positions.
@@ -303,15 +303,15 @@ fn tool_frame(tool: Option<&Isometry3<f64>>) -> DAffine3 {
 }
 
 /// Compiles a model for these joints, with the tool centre point as one more link.
-fn compiled(
+pub(super) fn compiled(
     model: &RobotModel,
     joints: &[usize],
     rest: &[f64],
     link: usize,
-    tool: &DAffine3,
+    tool: Option<&Isometry3<f64>>,
 ) -> Result<Kinematics, KinematicsError> {
     let mut kinematics = Kinematics::new(model, joints, rest)?;
-    kinematics.attach_frame(link, tool);
+    kinematics.attach_frame(link, &tool_frame(tool));
     Ok(kinematics)
 }
 

@@ -6,8 +6,9 @@ use std::collections::{BTreeMap, HashMap};
 use std::f64::consts::PI;
 
 use super::config::{RobotConfig, Unplanned};
-use super::planning_scene::{PlannedRobot, PlanningScene};
+use super::planning_scene::{PlannedRobot, PlanningScene, compiled};
 use crate::collision::world::Robot;
+use crate::robot::kinematics::Kinematics;
 use crate::robot::model::{Joint, RobotModel};
 
 /// Changes below this are measurement noise [rad or m].
@@ -65,6 +66,23 @@ impl PlannedRobot {
             Unplanned::Measured(ours) => Some((model.as_str(), ours.as_str())),
             Unplanned::Fixed(_) => None,
         })
+    }
+
+    /// Returns the model with the joints fixed that the blueprint fixes.
+    pub fn model_with_fixed(&self) -> RobotModel {
+        let fixed = self.config.unplanned.iter().filter(|(_, unplanned)| matches!(unplanned, Unplanned::Fixed(_)));
+        let mut model = (*self.model).clone();
+        model.fix(fixed.filter_map(|(name, _)| self.model.joint_index(name)), &self.rest);
+        model
+    }
+
+    /// Returns the kinematics in which the joints that others move move as well, after the planned ones; `None` if
+    /// others move none.
+    pub fn kinematics_with_others(&self) -> Option<Kinematics> {
+        let others: Vec<usize> = self.moved_by_others().filter_map(|(name, _)| self.model.joint_index(name)).collect();
+        let joints = [self.joints.as_slice(), &others].concat();
+        let kinematics = compiled(&self.model, &joints, &self.rest, self.end_effector, self.config.tool.as_ref());
+        kinematics.ok().filter(|_| !others.is_empty())
     }
 
     /// Returns the links that no planned joint moves relative to `link`, such as the fingers on a flange: no plan

@@ -8,7 +8,7 @@ use nalgebra::{Isometry3, Vector3};
 use super::display_messages::{TFMessage, Transform, TransformStamped};
 use super::messages::{self, Header, Quaternion};
 use crate::arm::ArmState;
-use crate::robot::model::{Joint, JointKind, Limits, Link, RobotModel};
+use crate::robot::model::{Joint, JointKind, Limits, Link, Mimic, RobotModel};
 
 /// The frame of all robots.
 const MAP: &str = "map";
@@ -27,6 +27,8 @@ pub struct LoggedRobot {
     pub root: Isometry3<f64>,
     /// Its joints in the run: index in the model, index over all arms' joints, and name in the run.
     pub joints: Vec<(usize, usize, String)>,
+    /// Joints that other arms of the run move, in the same form.
+    pub moved_by_others: Vec<(usize, usize, String)>,
     /// Positions of all joints of the model; those that are measured change [rad or m].
     pub rest: Vec<f64>,
     /// The joint that an arm's gripper drives.
@@ -77,11 +79,14 @@ impl LoggedRobots {
             for own in links.chain(model.joints.iter_mut().map(|joint| &mut joint.name)).filter(|_| prefixed) {
                 *own = format!("{name}_{own}");
             }
-            for (index, _, in_run) in joints {
-                if let Some(joint) = model.joints.get_mut(*index) {
-                    joint.name.clone_from(in_run);
-                }
-            }
+            rename(model, joints.iter());
+        }
+        // One of them has the name; the others follow it in `combined`.
+        let mut named: Vec<usize> = all.iter().flat_map(|robot| robot.joints.iter().map(|(_, own, _)| *own)).collect();
+        for LoggedRobot { model, moved_by_others, .. } in &mut all {
+            let first = moved_by_others.iter().filter(|(_, in_run, _)| !named.contains(in_run));
+            rename(model, first);
+            named.extend(moved_by_others.iter().map(|(_, in_run, _)| *in_run));
         }
         Self { robots: all }
     }
@@ -96,8 +101,10 @@ impl LoggedRobots {
         let name = self.robots.first().map_or("", |robot| &robot.model.name).to_owned();
         let links = vec![Link { name: MAP.to_owned(), ..Link::default() }];
         let mut all = RobotModel { name, links, joints: Vec::new() };
+        let mut moved_by_others = Vec::new();
         for robot in &self.robots {
             let (links, joints) = (all.links.len(), all.joints.len() + 1);
+            moved_by_others.extend(robot.moved_by_others.iter().map(|(index, _, name)| (joints + index, name)));
             all.joints.push(Joint {
                 name: format!("{MAP}_to_{}", robot.name),
                 kind: JointKind::Fixed,
@@ -118,6 +125,17 @@ impl LoggedRobots {
                 }
                 joint
             }));
+        }
+        // Several robots on one lift: a joint has one name, and one place.
+        for (follower, name) in moved_by_others {
+            let Some(leader) = all.joint_index(name).filter(|leader| *leader != follower) else { continue };
+            for (index, joint) in all.joints.iter_mut().enumerate() {
+                match &mut joint.mimic {
+                    Some(mimic) if mimic.leader == follower => mimic.leader = leader,
+                    mimic if index == follower => *mimic = Some(Mimic { leader, multiplier: 1.0, offset: 0.0 }),
+                    _ => {}
+                }
+            }
         }
         all
     }
@@ -151,7 +169,8 @@ impl LoggedRobots {
         for robot in &self.robots {
             let mut q = robot.rest.clone();
             q.resize(robot.model.joints.len(), 0.0);
-            let measured = robot.joints.iter().map(|(joint, index, _)| (*joint, positions.get(*index).copied()));
+            let measured = robot.joints.iter().chain(&robot.moved_by_others);
+            let measured = measured.map(|(joint, index, _)| (*joint, positions.get(*index).copied()));
             let known = measured.clone().all(|(_, position)| position.is_some_and(f64::is_finite));
             let Some((_, first, _)) = robot.joints.first().filter(|_| known) else { continue };
             let driven = robot.gripper.as_ref().and_then(|g| Some((g.joint, g.position(grippers(g.arm)?.gripper?))));
@@ -181,6 +200,13 @@ impl LoggedRobots {
     }
 }
 
+/// Gives joints the names that they have in the run.
+fn rename<'a>(model: &mut RobotModel, joints: impl Iterator<Item = &'a (usize, usize, String)>) {
+    for (index, _, in_run) in joints {
+        model.joints.get_mut(*index).into_iter().for_each(|joint| joint.name.clone_from(in_run));
+    }
+}
+
 impl LoggedRobot {
     fn has(&self, index: usize) -> bool {
         self.joints.iter().any(|(_, own, _)| *own == index)
@@ -206,7 +232,6 @@ fn stamped(stamp: &Header, parent: &str, child: String, at: Isometry3<f64>) -> T
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::robot::model::Mimic;
 
     fn joint(name: &str, kind: JointKind, parent: usize, child: usize, mimic: Option<Mimic>) -> Joint {
         let axis = if kind == JointKind::Prismatic { Vector3::y_axis() } else { Vector3::z_axis() };
@@ -228,6 +253,7 @@ mod tests {
             model: RobotModel { name: "tongs".into(), links, joints },
             root: Isometry3::translation(0.0, arm as f64, 0.0),
             joints: vec![(0, arm, format!("{name}_joint1"))],
+            moved_by_others: Vec::new(),
             rest: vec![0.0, 0.04, -0.04],
             gripper: Some(LoggedGripper { arm, joint: 1, range: [(0.0, 0.08), (0.0, 0.04)] }),
             end_effector: 1,
@@ -256,6 +282,28 @@ mod tests {
         assert_eq!(robots.driven(0, 0.08), Some(("finger", 0.04)));
         let unknown = robots.moved(&Header::default(), &[f64::NAN], |_| None, |_| Isometry3::identity());
         assert!(unknown.transforms.is_empty(), "its joint is not measured yet");
+    }
+
+    #[test]
+    fn robots_on_one_lift_have_one_joint_for_it() {
+        let on_a_lift = |name: &str, arm| {
+            let mut robot = tongs(name, arm);
+            robot.model.joints.push(joint("lift", JointKind::Prismatic, 3, 4, None));
+            robot.model.links.push(Link { name: "top".into(), ..Link::default() });
+            robot.moved_by_others = vec![(3, 2, "height".to_owned())];
+            robot
+        };
+        let robots = LoggedRobots::new(vec![on_a_lift("left", 0), on_a_lift("right", 1)]);
+        let all = robots.combined();
+        let leader = all.joint_index("height").unwrap();
+        let other = &all.joints[all.joint_index("right_lift").unwrap()];
+        assert_eq!(other.mimic, Some(Mimic { leader, multiplier: 1.0, offset: 0.0 }));
+        let moved =
+            |height: f64| robots.moved(&Header::default(), &[0.0, 0.0, height], |_| None, |_| Isometry3::identity());
+        let message = moved(0.3);
+        let tops = frames(&message).into_iter().filter(|(_, child, _)| child.ends_with("top"));
+        assert_eq!(tops.map(|(_, _, at)| at[1]).collect::<Vec<_>>(), [0.3, 0.3]);
+        assert!(moved(f64::NAN).transforms.is_empty(), "the lift is not measured yet");
     }
 
     #[test]

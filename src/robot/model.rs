@@ -307,6 +307,19 @@ impl RobotModel {
         self.joints.iter().map(position).collect()
     }
 
+    /// Makes joints fixed ones where they are, and those that mimic them; `positions` are of all joints (see
+    /// [`RobotModel::positions`]) [rad or m].
+    pub fn fix(&mut self, joints: impl IntoIterator<Item = usize>, positions: &[f64]) {
+        for fixed in joints {
+            for (index, joint) in self.joints.iter_mut().enumerate() {
+                if index == fixed || joint.mimic.is_some_and(|mimic| mimic.leader == fixed) {
+                    joint.origin = joint.transform(positions.get(index).copied().unwrap_or_default());
+                    (joint.kind, joint.mimic) = (JointKind::Fixed, None);
+                }
+            }
+        }
+    }
+
     /// Returns the frame of every link in the root's frame, from positions of all joints (see
     /// [`RobotModel::positions`]).
     pub fn link_poses(&self, positions: &[f64]) -> Vec<Isometry3<f64>> {

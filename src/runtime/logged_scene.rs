@@ -71,7 +71,10 @@ impl Service {
         let modelled = tasks.filter_map(|(config, task)| {
             let (kinematics, robot) = (config.kind.robot.as_ref()?, task.robot.as_ref()?);
             // The blueprint was checked with it: it is known to be readable.
-            let model = load(&robot.source).model?;
+            let mut model = load(&robot.source).model?;
+            let fixed = robot.fixed.iter().map(|(name, position)| (name.clone(), *position)).collect();
+            let rest = model.positions(&fixed);
+            model.fix({ robot.fixed.keys() }.filter_map(|name| model.joint_index(name)).collect::<Vec<_>>(), &rest);
             let names = config.joints.iter().map(|joint| self.parts.names.joint(*joint));
             let joints = robot.joints.iter().zip(&config.joints).zip(names);
             let joints = joints.map(|((own, index), name)| Some((model.joint_index(own)?, usize::from(*index), name)));
@@ -79,7 +82,8 @@ impl Service {
                 name: self.arm_of(usize::from(*config.joints.first()?))?.1,
                 joints: joints.collect::<Option<_>>()?,
                 root: pose(&kinematics.root.frame()),
-                rest: Vec::new(),
+                moved_by_others: Vec::new(),
+                rest,
                 gripper: None,
                 end_effector: model.link_index(&robot.link)?,
                 model,
@@ -90,11 +94,13 @@ impl Service {
 
     fn planned(&self, robot: &PlannedRobot) -> Option<LoggedRobot> {
         let all: Vec<&String> = self.parts.names.arms.iter().flat_map(|arm| &arm.joints).collect();
-        let joints = robot.joints.iter().zip(&robot.config.coordinator_joints);
-        let joints: Option<Vec<_>> = joints
-            .map(|(index, name)| Some((*index, all.iter().position(|own| *own == name)?, name.clone())))
-            .collect();
-        let joints = joints?;
+        let in_run =
+            |(index, name): (usize, &str)| Some((index, all.iter().position(|own| *own == name)?, name.to_owned()));
+        let own = robot.joints.iter().copied().zip(robot.config.coordinator_joints.iter().map(String::as_str));
+        let joints: Vec<_> = own.map(in_run).collect::<Option<_>>()?;
+        let others = robot.moved_by_others();
+        let others = others.map(|(model, name)| in_run((robot.model.joint_index(model)?, name)));
+        let moved_by_others = others.collect::<Option<_>>()?;
         let gripper = robot.config.gripper_joint.as_ref().and_then(|driven| {
             let (arm, _) = self.arm_of(joints.first()?.1)?;
             let range = self.gripper_info(arm)?.range?;
@@ -103,7 +109,8 @@ impl Service {
         });
         Some(LoggedRobot {
             name: robot.config.name.clone(),
-            model: (*robot.model).clone(),
+            model: robot.model_with_fixed(),
+            moved_by_others,
             root: pose(&robot.body.base),
             rest: robot.rest.clone(),
             end_effector: robot.end_effector,

@@ -28,6 +28,8 @@ pub(super) struct TcpModel {
     /// Names of its joints in the coordinator.
     joints: Vec<String>,
     kinematics: Arc<Kinematics>,
+    /// With the joints that other arms move: all joints, and kinematics in which they move, too.
+    with_others: Option<(Vec<String>, Arc<Kinematics>)>,
     /// Index of the end-effector link in the kinematics.
     index: usize,
     /// Pose of the model's root in `map`.
@@ -60,6 +62,10 @@ impl TcpModel {
             robot: Some(robot.config.name.clone()),
             joints: robot.config.coordinator_joints.clone(),
             kinematics: robot.body.kinematics.clone(),
+            with_others: robot.kinematics_with_others().map(|kinematics| {
+                let others = robot.moved_by_others().map(|(_, name)| name.to_owned());
+                (robot.config.coordinator_joints.iter().cloned().chain(others).collect(), Arc::new(kinematics))
+            }),
             index: robot.end_effector,
             root: robot.body.base,
             link: robot.config.end_effector_link.clone(),
@@ -100,6 +106,7 @@ impl TcpModel {
             robot: Some(robot.name.clone()),
             joints: robot.joints.clone(),
             kinematics: Arc::new(kinematics),
+            with_others: None,
             index: *index,
             root: frame(&isometry(root)),
             link: tcp.link.clone(),
@@ -177,8 +184,9 @@ impl Service {
         let all: Vec<&String> = self.parts.names.arms.iter().flat_map(|arm| &arm.joints).collect();
         let index = |joint: &String| all.iter().position(|name| *name == joint);
         let chain = |model: TcpModel| {
-            let joints = model.joints.iter().map(index).collect::<Option<_>>()?;
-            let TcpModel { kinematics, index: link, root, tool, .. } = model;
+            let TcpModel { joints, kinematics, with_others, index: link, root, tool, .. } = model;
+            let (joints, kinematics) = with_others.unwrap_or((joints, kinematics));
+            let joints = joints.iter().map(index).collect::<Option<_>>()?;
             Some(TcpChain { joints, kinematics, link, root, tool })
         };
         let chains = self.tcp_models().into_iter().map(|model| chain(model?)).collect();
@@ -195,6 +203,7 @@ impl Service {
                 robot: None,
                 joints: config.joints.iter().map(|joint| self.parts.names.joint(*joint)).collect(),
                 kinematics: Arc::new(robot.kinematics.clone()),
+                with_others: None,
                 index: robot.link,
                 root: robot.root.frame(),
                 link: about.link.clone(),

@@ -78,6 +78,12 @@ struct Robot<'a> {
     /// The coordinator's joint names and the model's, from the base.
     #[serde(serialize_with = "in_order")]
     joints: &'a [(String, String)],
+    /// Joints that other arms move, in the same form.
+    #[serde(serialize_with = "in_order")]
+    moved_by_others: &'a [(String, String)],
+    /// Positions of joints that stay where they are [rad or m].
+    #[serde(serialize_with = "in_order")]
+    fixed: &'a [(String, f64)],
     groups: BTreeMap<String, Vec<f64>>,
     #[serde(serialize_with = "in_order")]
     limits: Vec<(String, Limits)>,
@@ -174,7 +180,7 @@ fn read<'a>(robot: &'a ShownRobot, shown: &Shown, meshes: &mut Vec<MeshFile>) ->
     number_meshes(&mut document.root, &numbers);
     page_urdf::simplify(&mut document.root);
     let base_in_model = robot.base_link.as_deref().and_then(|link| model.link_index(link)).and_then(|link| {
-        let poses = model.link_poses(&model.positions(&HashMap::new()));
+        let poses = model.link_poses(&model.positions(&robot.fixed.iter().cloned().collect()));
         poses.get(link).copied()
     });
     let base = robot.base_pose * base_in_model.unwrap_or_default().inverse();
@@ -191,6 +197,8 @@ fn read<'a>(robot: &'a ShownRobot, shown: &Shown, meshes: &mut Vec<MeshFile>) ->
         tip: &robot.tip,
         root: model.links.first().map(|link| link.name.clone()).unwrap_or_default(),
         joints: &robot.joints,
+        moved_by_others: &robot.moved_by_others,
+        fixed: &robot.fixed,
         groups,
         limits: limits.collect(),
     })

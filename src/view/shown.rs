@@ -5,7 +5,7 @@ use nalgebra::Isometry3;
 use crate::blueprint::{Blueprint, TaskRobot};
 use crate::control::config::CoordinatorConfig;
 use crate::joint::JointLimits;
-use crate::planning::config::{GripperJoint, RobotConfig};
+use crate::planning::config::{GripperJoint, RobotConfig, Unplanned};
 use crate::robot::Source;
 use crate::rpc::report::{ArmReport, StateReport, StatusReport};
 
@@ -39,6 +39,10 @@ pub struct ShownRobot {
     pub tip: String,
     /// Names of its joints in the coordinator and in the model, from the base.
     pub joints: Vec<(String, String)>,
+    /// Joints that other arms move, in the same form.
+    pub moved_by_others: Vec<(String, String)>,
+    /// Joints that stay where they are, by the model's names [rad or m].
+    pub fixed: Vec<(String, f64)>,
     /// Named poses: one position for each of `joints` [rad]. Those of an SRDF are added when it is read.
     pub poses: Vec<(String, Vec<f64>)>,
     /// The joint of the model that the arm's gripper drives.
@@ -151,6 +155,13 @@ pub(crate) fn robots(blueprint: &Blueprint) -> Vec<ShownRobot> {
 }
 
 fn of_planner(robot: &RobotConfig) -> ShownRobot {
+    let (mut moved_by_others, mut fixed) = (Vec::new(), Vec::new());
+    for (model, unplanned) in &robot.unplanned {
+        match unplanned {
+            Unplanned::Measured(ours) => moved_by_others.push((ours.clone(), model.clone())),
+            Unplanned::Fixed(position) => fixed.push((model.clone(), *position)),
+        }
+    }
     ShownRobot {
         name: robot.name.clone(),
         source: robot.source(),
@@ -158,6 +169,8 @@ fn of_planner(robot: &RobotConfig) -> ShownRobot {
         base_pose: robot.base_pose,
         tip: robot.end_effector_link.clone(),
         joints: robot.coordinator_joints.iter().cloned().zip(robot.joints.iter().cloned()).collect(),
+        moved_by_others,
+        fixed,
         poses: robot.named_poses.clone().into_iter().collect(),
         gripper: robot.gripper_joint.clone(),
     }
@@ -171,6 +184,8 @@ fn of_task(name: &str, robot: &TaskRobot, joints: Vec<String>) -> ShownRobot {
         base_pose: Isometry3::identity(),
         tip: robot.link.clone(),
         joints: joints.into_iter().zip(robot.joints.iter().cloned()).collect(),
+        moved_by_others: Vec::new(),
+        fixed: robot.fixed.clone().into_iter().collect(),
         poses: Vec::new(),
         gripper: None,
     }

@@ -157,6 +157,7 @@ fn log_topics() {
         root: Isometry3::identity(),
         joints: (0..6).map(joint).collect(),
         rest: Vec::new(),
+        moved_by_others: Vec::new(),
         gripper: None,
         end_effector: model.links.len() - 1,
         model,

@@ -1,8 +1,13 @@
 //! Joints that a plan does not move and that carry the arm: measured by another arm, fixed, or not known.
 
-use serde_json::Value;
+use std::path::Path;
+use std::process::{Command, Stdio};
 
-use crate::support::program::{Home, eventually};
+use serde_json::{Value, json};
+
+use crate::support::program::{Home, Started, UP, eventually};
+use crate::support::skip::skip_tool;
+use crate::view::Page;
 
 /// A beam that turns on a column, whose height another arm sets; a cover that nothing measures.
 const URDF: &str = r#"<robot name="cell">
@@ -60,6 +65,46 @@ fn what_another_arm_moves_is_planned_for_where_it_is_measured() {
     home.dimos("plan arm 0.785").with(1).says(&["the goal collides", "post"]);
     let pose = home.dimos("state --json").json()["arms"][1]["pose"]["xyz"].clone();
     assert!((pose[2].as_f64().unwrap() - 0.5).abs() < 1e-3, "{pose}");
+}
+
+/// A page, and what other tools read in a log, have the arm on its lift, and a joint that is fixed where it is.
+#[test]
+fn a_log_and_a_page_show_the_arm_where_its_lift_is() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let python = root.join(".venv/bin/python");
+    if !python.exists() {
+        return skip_tool("the Python readers in .venv");
+    }
+    let home = home(&format!("{MEASURED}\n      fixed_joints: {{hinge: 0.2}}"), "");
+    let run = Started::of(home.as_typed("run cell.yaml").stdin(Stdio::null()));
+    run.until(UP);
+    home.dimos("move arm 0.3 --speed 1").with(0);
+    let page = Page::of(home.dimos("view").with(0).out.trim()).scene();
+    let robot = &page["robots"][0];
+    assert_eq!((&robot["moved_by_others"]["height"], &robot["fixed"]["hinge"]), (&json!("lift"), &json!(0.2)));
+    home.dimos("down").with(0);
+    run.wait().with(0);
+    let urdf = home.path().join("description.urdf");
+    let read = |frame: &str| -> Value {
+        let mut read = Command::new(&python);
+        read.arg(root.join("tests/readers/read_scene.py")).arg(&home.logs()[0]).arg(frame).arg(&urdf);
+        let output = read.output().unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        serde_json::from_slice(&output.stdout).unwrap()
+    };
+    let height = |pose: &Value| pose[2][3].as_f64().unwrap();
+    assert!((height(&read("arm_tcp")["pose"]) - 0.5).abs() < 1e-3, "{}", read("arm_tcp"));
+    let cover = &read("cover")["pose"];
+    assert!((cover[0][2].as_f64().unwrap() - 0.2_f64.sin()).abs() < 1e-6, "{cover}");
+    // The description has the joints of `/joint_states`.
+    let fk = format!("model fk {} --base map --link tip 0.5 0.3 --json", urdf.display());
+    assert!((home.dimos(&fk).with(0).json()["xyz"][2].as_f64().unwrap() - 0.5).abs() < 1e-9);
+    let text = std::fs::read_to_string(&urdf).unwrap();
+    assert!(text.contains("\"height\"") && text.contains("\"arm_turn\""), "{text}");
+    let tcp = home.dimos("log cat --last --topics /tcp/arm --json").with(0).out;
+    let z = tcp.lines().last().map(|line| serde_json::from_str::<Value>(line).unwrap());
+    let z = z.unwrap()["data"]["pose"]["position"]["z"].as_f64();
+    assert!((z.unwrap() - 0.5).abs() < 1e-3, "{z:?}");
 }
 
 /// A lift whose connection is lost is where it was, and not at zero.

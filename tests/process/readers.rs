@@ -101,6 +101,7 @@ fn logged_right_arm() -> LoggedRobot {
         name: "right".into(),
         root: pose(&robot.body.base),
         joints: robot.joints.iter().zip(7..13).zip(names).map(|((own, index), name)| (*own, index, name)).collect(),
+        moved_by_others: Vec::new(),
         rest: robot.rest.clone(),
         gripper: None,
         end_effector: robot.end_effector,

@@ -23,6 +23,10 @@ export interface SceneRobot {
   root: string;
   /** The coordinator's joint → the joint of the URDF. */
   joints: Record<string, string>;
+  /** The same of joints that other arms move. */
+  moved_by_others?: Record<string, string>;
+  /** Positions of joints of the URDF that stay where they are [rad or m]. */
+  fixed?: Record<string, number>;
   /** Named poses, in the order of `joints`. */
   groups?: Record<string, number[]>;
   limits: Record<string, JointLimit>;

@@ -61,6 +61,8 @@ impl Posed {
             base_pose: Isometry3::identity(),
             tip,
             joints: names().zip(names()).collect(),
+            moved_by_others: Vec::new(),
+            fixed: Vec::new(),
             poses: poses.collect(),
             gripper: None,
             source,

@@ -58,6 +58,7 @@ export class Robot {
     };
     this.urdf = loader.parse(withMaterials(model.urdf));
     for (const joint of Object.values(this.urdf.joints)) joint.ignoreLimits = true;
+    for (const [name, value] of Object.entries(model.fixed ?? {})) this.urdf.setJointValue(name, value);
     this.group.position.set(...model.base.xyz);
     this.group.quaternion.set(...model.base.quat);
     this.group.userData.fit = true;
@@ -70,7 +71,7 @@ export class Robot {
   /** Sets joints by the coordinator's names; true if the arm looks different now. */
   setJoints(position: (joint: string) => number | null | undefined): boolean {
     let moved = false;
-    for (const [joint, name] of Object.entries(this.model.joints)) {
+    for (const [joint, name] of this.moving()) {
       const value = position(joint);
       if (value !== null && value !== undefined) moved = this.urdf.setJointValue(name, value) || moved;
     }
@@ -161,7 +162,7 @@ export class Robot {
       this.ghosts.set(kind, ghost);
       this.group.add(ghost);
     }
-    for (const [joint, name] of Object.entries(this.model.joints)) {
+    for (const [joint, name] of this.moving()) {
       const value = position(joint) ?? (this.urdf.joints[name]?.angle as number | undefined) ?? 0;
       ghost.setJointValue(name, value);
     }
@@ -188,6 +189,11 @@ export class Robot {
       }
     }
     this.changed();
+  }
+
+  /** The joints that the run measures: the coordinator's names, and those of the URDF. */
+  private moving(): [string, string][] {
+    return [...Object.entries(this.model.joints), ...Object.entries(this.model.moved_by_others ?? {})];
   }
 
   private get link(): Object3D {
