@@ -4,12 +4,14 @@
 
 use std::collections::{BTreeMap, HashMap};
 use std::io::{Seek, Write};
+use std::path::Path;
 use std::time::Duration;
 
 use mcap::records::{MessageHeader, Metadata};
-use mcap::{Attachment, Compression, McapResult, WriteOptions, Writer};
+use mcap::{Attachment, Compression, McapResult, WriteOptions};
 
 use super::cdr::Encoder;
+use super::long_log::LongLog;
 use super::wire::Message;
 use crate::clock::Mono;
 
@@ -52,7 +54,7 @@ pub struct LogAttachment {
 
 /// An open log. Dropping it closes it like `finish`, but ignores errors.
 pub struct LogWriter<W: Write + Seek> {
-    mcap: Writer<W>,
+    mcap: LongLog<W>,
     channels: HashMap<String, Channel>,
     topics: Topics,
     encoder: Encoder,
@@ -88,7 +90,7 @@ impl<W: Write + Seek> LogWriter<W> {
         metadata: BTreeMap<String, String>,
         compress: bool,
     ) -> McapResult<Self> {
-        let mut mcap = WriteOptions::new()
+        let options = WriteOptions::new()
             .profile("ros2")
             .library(concat!("dimos/", env!("CARGO_PKG_VERSION")))
             .chunk_size(Some(CHUNK_SIZE))
@@ -97,8 +99,8 @@ impl<W: Write + Seek> LogWriter<W> {
             .compression_level(1)
             // Worker threads would compete with the tick; seeking back would leave half a chunk after a crash.
             .compression_threads(0)
-            .disable_seeking(true)
-            .create(sink)?;
+            .disable_seeking(true);
+        let mut mcap = LongLog::create(options, sink)?;
         for a in attachments {
             mcap.attach(&Attachment {
                 log_time: now,
@@ -120,6 +122,11 @@ impl<W: Write + Seek> LogWriter<W> {
         })
     }
 
+    /// Keeps the indexes of a long log in this folder, in a file without a name; otherwise they stay in memory.
+    pub fn keep_indexes_in(&mut self, folder: &Path) {
+        self.mcap.keep_indexes_in(folder);
+    }
+
     /// Declares a topic, so that it is listed even without messages.
     pub fn announce<M: Message>(&mut self, topic: &str) -> McapResult<()> {
         self.add(topic, M::SCHEMA, M::schema_text)
@@ -137,11 +144,11 @@ impl<W: Write + Seek> LogWriter<W> {
 
     fn add(&mut self, topic: &str, name: &'static str, text: fn() -> String) -> McapResult<()> {
         if !self.channels.contains_key(topic) {
-            let schema = self.mcap.add_schema(name, "ros2msg", text().as_bytes())?;
+            let schema = self.mcap.add_schema(name, text().as_bytes())?;
             let durability = if LATCHED.contains(&topic) { "durability: 1" } else { "durability: 2" };
             let qos = QOS.replace("durability: 2", durability);
             let metadata = BTreeMap::from([("offered_qos_profiles".to_owned(), qos)]);
-            let id = self.mcap.add_channel(schema, topic, "cdr", &metadata)?;
+            let id = self.mcap.add_channel(schema, topic, metadata)?;
             self.channels.insert(topic.to_owned(), Channel { id, sequence: 0 });
             self.topics.push((topic.to_owned(), name, text));
         }
@@ -159,7 +166,7 @@ impl<W: Write + Seek> LogWriter<W> {
         // The first message on a topic is flushed at once.
         self.flush.urgent |= channel.sequence == 0;
         channel.sequence = channel.sequence.wrapping_add(1);
-        self.mcap.write_to_known_channel(&header, self.encoder.bytes())?;
+        self.mcap.write(&header, self.encoder.bytes())?;
         self.written += 1;
         self.flush.pending = true;
         Ok(())
@@ -186,11 +193,8 @@ impl<W: Write + Seek> LogWriter<W> {
     }
 
     /// Closes the log: indexes, statistics, summary. Returns the sink.
-    pub fn finish(mut self) -> McapResult<W> {
-        self.mcap.finish()?;
-        let mut sink = self.mcap.into_inner();
-        sink.flush()?;
-        Ok(sink)
+    pub fn finish(self) -> McapResult<W> {
+        self.mcap.finish()
     }
 }
 
@@ -295,6 +299,51 @@ mod tests {
         let times: Vec<_> =
             std::iter::from_fn(|| end.next_entry().map(|e| e.map(|e| e.log_time)).transpose()).collect();
         assert!(matches!(times[..], [Ok(4), Ok(5), Err(ReplayError::Cut { .. })]), "{times:?}");
+    }
+
+    /// One writer after the other in one file: what is read is what one of them would have written.
+    #[test]
+    fn a_long_log_is_indexed_as_a_short_one() {
+        use crate::recording::replay::{LogReader, Selection};
+        const MESSAGES: u64 = 9000;
+        let folder = tempfile::tempdir().unwrap();
+        let files = [None, Some(folder.path())].map(|indexes| {
+            let path = folder.path().join(if indexes.is_some() { "long.mcap" } else { "plain.mcap" });
+            let attachment = LogAttachment { name: "b".into(), media_type: "text/plain".into(), data: b"x".to_vec() };
+            let sink = std::fs::File::create(&path).unwrap();
+            let mut log = LogWriter::create(sink, 7, &[attachment], BTreeMap::new()).unwrap();
+            indexes.into_iter().for_each(|folder| log.keep_indexes_in(folder));
+            for time in 1..=MESSAGES {
+                let topic = if time % 3 == 0 { "/b" } else { "/a" };
+                log.publish(topic, time, &Text { data: time.to_string() }).unwrap();
+                if time == 5000 {
+                    log.announce::<Text>("/later").unwrap();
+                }
+                log.flush_soon();
+                log.flush_if_due(Mono(time)).unwrap();
+            }
+            log.finish().unwrap();
+            path
+        });
+        let [plain, long] = files.each_ref().map(|path| std::fs::read(path).unwrap());
+        let summaries = [&plain, &long].map(|bytes| mcap::Summary::read(bytes).unwrap().unwrap());
+        let [whole, joined] = summaries.each_ref();
+        assert_eq!(joined.stats, whole.stats);
+        assert_eq!((&joined.channels, &joined.schemas), (&whole.channels, &whole.schemas));
+        assert_eq!((joined.chunk_indexes.len(), joined.attachment_indexes.len()), (9000, 1));
+        let found = mcap::read::attachment(&long, &joined.attachment_indexes[0]).unwrap();
+        assert_eq!(found.name, "b");
+        let every = |bytes: &[u8]| {
+            let all = mcap::MessageStream::new(bytes).unwrap().map(Result::unwrap);
+            all.map(|m| (m.channel.topic.clone(), m.sequence, m.log_time, m.data.to_vec())).collect::<Vec<_>>()
+        };
+        assert_eq!(every(&long), every(&plain));
+        for index in &joined.chunk_indexes {
+            assert_eq!(joined.stream_chunk(&long, index).unwrap().filter(Result::is_ok).count(), 1);
+        }
+        let mut log = LogReader::open(&files[1]).unwrap();
+        log.select(Selection { from: 8999, topics: vec!["/a".into()], ..Selection::default() }).unwrap();
+        assert_eq!(log.next_entry().unwrap().map(|entry| entry.log_time), Some(8999));
     }
 
     #[test]

@@ -19,6 +19,7 @@ mod fault_ring;
 pub mod files;
 pub mod joints;
 pub mod log_writer;
+mod long_log;
 pub mod loss;
 pub mod messages;
 pub mod notes;

@@ -128,6 +128,7 @@ where
         let now = self.config.wall.wall(MonotonicClock.now());
         let create = || {
             let mut log = LogWriter::create_with(sink, now, &self.config.attachments, metadata, storage.compress)?;
+            self.path.parent().into_iter().for_each(|folder| log.keep_indexes_in(folder));
             log.announce_all(&self.topics)?;
             self.ticks.announce(&mut log)?;
             self.ticks.renew(&mut log, stamp)?;

@@ -41,6 +41,7 @@ mod kinematics;
 mod layering;
 mod lies;
 mod log_storage;
+mod long_log;
 mod model;
 mod model_forms;
 mod model_verbs;
