@@ -61,12 +61,16 @@ use std::process::ExitCode;
 use std::sync::OnceLock;
 
 use clap::{ArgMatches, CommandFactory, FromArgMatches, Parser, Subcommand};
+use rustix::process::{Resource, getrlimit};
 
 use crate::blueprint::{self, Catalog};
 use crate::control::task_spec::{TaskSpec, TaskTable};
 use crate::hardware::registry::{Absent, AdapterSpec, Registry};
 use crate::robot::builtin;
 
+/// Stack that the command line takes at most, and the stack that it has where that of the process is smaller [bytes].
+const MIN_STACK: u64 = 4 << 20;
+const OWN_STACK: usize = 8 << 20;
 const START_WITH: &str = "\
 Start with:  dimos run coordinator-yourarm
 Then, in a second terminal:  dimos status, dimos state, dimos move arm 0.3 -0.2 0.5 0 0.4 0";
@@ -294,7 +298,24 @@ pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
     command_line(Catalog::from(&Registry::with(adapters)))
 }
 
+/// Runs the command line, on a stack of its own where that of the process may not grow (`ulimit -s 64`).
 fn command_line(catalog: Catalog<'_>) -> ExitCode {
+    if getrlimit(Resource::Stack).current.is_none_or(|most| most >= MIN_STACK) {
+        return answer(catalog);
+    }
+    std::thread::scope(|scope| {
+        let thread = std::thread::Builder::new().name("dimos".into()).stack_size(OWN_STACK);
+        match thread.spawn_scoped(scope, || answer(catalog)).map(std::thread::ScopedJoinHandle::join) {
+            Ok(answered) => answered.unwrap_or_else(|panic| std::panic::resume_unwind(panic)),
+            Err(e) => {
+                output::note(format_args!("error: no thread with a stack of its own: {e}"));
+                ExitCode::from(exit::Exit::Failed as u8)
+            }
+        }
+    })
+}
+
+fn answer(catalog: Catalog<'_>) -> ExitCode {
     // First of all: it changes the environment, and no thread may read that meanwhile.
     complete::answer(catalog);
     set_threads_of_the_network();

@@ -1,13 +1,13 @@
 //! What a new user does, with the real binary: from the first run to the log. And what goes wrong on the way.
 
 use std::net::TcpListener;
-use std::process::Stdio;
+use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use rustix::process::Signal;
 use serde_json::Value;
 
-use crate::support::program::{Home, Started, eventually};
+use crate::support::program::{Home, Started, UP, eventually};
 
 const RUN: &str = "coordinator-yourarm";
 const THERE: &str = "move arm 0.3 -0.2 0.5 0 0.4 0";
@@ -376,6 +376,25 @@ fn everything_that_prints_a_table_prints_json() {
         assert!(ended.json().is_object() || ended.json().is_array(), "{verb}: {}", ended.out);
         assert_eq!(ended.out.lines().count(), 1, "{verb}");
     }
+}
+
+/// A service or a shell may limit the stack: it is not the program's.
+#[test]
+fn a_stack_of_64_kib_is_enough() {
+    let home = Home::new();
+    let limited = |arguments: &str| {
+        let mut command = Command::new("sh");
+        command.args(["-c", "ulimit -s 64; exec \"$0\" \"$@\"", env!("CARGO_BIN_EXE_dimos")]);
+        home.settle(command.args(arguments.split_whitespace()).stdin(Stdio::null()));
+        Started::of(&mut command)
+    };
+    limited("check xarm7-planner").wait().with(0);
+    let run = limited("run coordinator-yourarm --no-view");
+    run.until(UP);
+    limited("move arm 0.1 0 0.6 0 0.8 0").wait().with(0);
+    limited("down").wait().with(0);
+    run.wait().with(0);
+    limited("log verify --last").wait().with(0);
 }
 
 fn lines(text: &str) -> impl Iterator<Item = Value> + '_ {
