@@ -118,7 +118,8 @@ impl SimArm {
                 (self.advanced_to.seconds_since(at), steps.fold(0.0, f64::max))
             });
         let streamed = pause < STREAM.0 && step < STREAM.1;
-        if direct || (streamed && step > 0.0) {
+        // What bridges gaps sees that a goal is repeated: it has arrived.
+        if direct || (streamed && (step > 0.0 || self.plant.bridges_gaps())) {
             self.plant.servo(goal);
         } else if !streamed {
             self.plant.move_to(goal, speed);

@@ -145,6 +145,11 @@ impl Plant {
         self
     }
 
+    /// Returns whether it follows setpoints, and continues without them.
+    pub fn bridges_gaps(&self) -> bool {
+        self.drive == Drive::Servo && self.bridges > 0.0
+    }
+
     /// A hand pushes a joint (index from 0) against its motor: it is `amount` [rad] beside its place. `None`: no hand.
     pub fn nudge(&mut self, nudged: Option<(usize, f64)>) {
         self.nudged = nudged;

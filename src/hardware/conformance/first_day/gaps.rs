@@ -12,7 +12,7 @@ const OMITTED: [u64; 5] = [1, 3, 6, 12, 25];
 /// Parts of the top speed at which setpoints end for good.
 const SPEEDS: [f64; 3] = [0.05, 0.1, 0.2];
 /// How often at each: the steps of an encoder are as large as what is measured at the lowest speed.
-const REPEATED: usize = 3;
+const REPEATED: usize = 5;
 /// How long the joint moves evenly before [s].
 const EVEN: f64 = 0.35;
 /// An arm that continues for less than this many periods rests at its last setpoint.
@@ -22,20 +22,34 @@ const SILENCE: Duration = Duration::from_millis(80);
 const LONG_SILENCE: Duration = Duration::from_millis(400);
 /// Steps of the search for the longest silence without an error.
 const BISECTIONS: u32 = 5;
-/// Time over which a speed is taken [s], and readings of the even motion before a gap.
+/// Shortest time over which a speed is taken [s], and readings of the even motion before a gap.
 const LOOK: f64 = 0.025;
 const EVEN_READINGS: usize = 30;
+/// Part of the speed that readings of an even motion must show throughout.
+const EVEN_SPEED: f64 = 0.8;
 /// How long the arm may refuse a new connection after one was cut.
 const CONNECT: Duration = Duration::from_secs(5);
 
 /// An arm's error: code and text.
 type ArmError = (i32, String);
 
-/// Returns the lowest speed in a direction over a time in which a late reading does not matter [rad/s].
-fn lowest(seen: &[(Mono, f64)], direction: f64) -> f64 {
+/// Returns the time in which a late reading does not matter, nor that an evenly moving arm reports in stairs [s].
+fn look(even: &[(Mono, f64)]) -> f64 {
+    let (mut longest, mut since) = (0.0_f64, even.first());
+    for now in even {
+        if let Some((then, _)) = since.filter(|(_, was)| *was != now.1) {
+            longest = longest.max(now.0.seconds_since(*then));
+            since = Some(now);
+        }
+    }
+    LOOK.max(2.0 * longest)
+}
+
+/// Returns the lowest speed in a direction over at least this time [rad/s].
+fn lowest(seen: &[(Mono, f64)], direction: f64, look: f64) -> f64 {
     let mut lowest = f64::INFINITY;
     for (i, (at, value)) in seen.iter().enumerate() {
-        if let Some((then, was)) = seen.iter().take(i).rev().find(|(then, _)| at.seconds_since(*then) >= LOOK) {
+        if let Some((then, was)) = seen.iter().take(i).rev().find(|(then, _)| at.seconds_since(*then) >= look) {
             lowest = lowest.min((value - was) * direction / at.seconds_since(*then));
         }
     }
@@ -51,9 +65,10 @@ impl Tour<'_> {
         for ms in OMITTED {
             self.person.tell(&format!("setpoints left out for {ms} ms"));
             match self.omit(Duration::from_millis(ms))? {
-                (kept, None) => {
+                (Some(kept), None) => {
                     self.figure(format!("speed kept through {ms} ms without setpoints"), 100.0 * kept, "%", None);
                 }
+                (None, None) => self.person.tell("its readings are too coarse to show a dip of its speed"),
                 (_, Some((code, text))) => {
                     self.person.tell(&format!("error {code}: {text}"));
                     faults = Some(ms);
@@ -67,19 +82,19 @@ impl Tour<'_> {
         let (mut overshoots, mut error) = (Vec::new(), None);
         for part in SPEEDS {
             self.person.tell(&format!("no more setpoints, from {:.0} % of the top speed", 100.0 * part));
-            let first = overshoots.len();
-            for _ in 0..REPEATED {
+            let mut repeats = Vec::new();
+            while repeats.len() < REPEATED && error.is_none() {
                 let (speed, overshoot, found) = self.silence(part)?;
-                overshoots.push((speed, overshoot));
-                error = error.or(found);
-                if error.is_some() {
-                    break;
-                }
+                repeats.push((speed, overshoot));
+                error = found;
             }
-            let (mut speed, mut overshoot, seen) = (0.0, 0.0, overshoots.get(first..).unwrap_or_default());
-            for (v, way) in seen {
-                (speed, overshoot) = (speed + v / seen.len() as f64, overshoot + way / seen.len() as f64);
-            }
+            // Without the extremes: a stall of this computer at the end of a motion spoils no figure.
+            repeats.sort_by(|(v, way), (w, other)| (way / v).total_cmp(&(other / w)));
+            let middle = repeats.get(1..repeats.len().saturating_sub(1)).filter(|middle| !middle.is_empty());
+            let seen = middle.unwrap_or(&repeats);
+            let mean = |of: fn(&(f64, f64)) -> f64| seen.iter().map(of).sum::<f64>() / seen.len() as f64;
+            let (speed, overshoot) = (mean(|(speed, _)| *speed), mean(|(_, way)| *way));
+            overshoots.push((speed, overshoot));
             let name = format!("motion past the last setpoint from {speed:.2} rad/s");
             self.figure(name, overshoot.to_degrees(), "°", None);
         }
@@ -123,15 +138,15 @@ impl Tour<'_> {
     }
 
     /// Leaves out setpoints for this time, at a tenth of the top speed. Returns the lowest speed that was seen, as a
-    /// part of it, and the arm's error.
-    fn omit(&mut self, gap: Duration) -> Result<(f64, Option<ArmError>), End> {
+    /// part of it, and the arm's error. `None`: the readings of an even motion vary as much.
+    fn omit(&mut self, gap: Duration) -> Result<(Option<f64>, Option<ArmError>), End> {
         let speed = 0.1 * self.top();
         let mut log = self.cruise(speed, EVEN)?;
         let before = log.seen.len();
         self.quiet(&mut log, gap)?;
         if let Some(error) = self.error()? {
             self.recover()?;
-            return Ok((0.0, Some(error)));
+            return Ok((None, Some(error)));
         }
         // As of a client that was late: its path continued.
         let missed = log.written.last().map_or(0.0, |(at, _)| MonotonicClock.now().seconds_since(*at)).min(0.1);
@@ -139,16 +154,18 @@ impl Tour<'_> {
         let result = self.stream(&mut log, |t| (t <= 0.2).then_some(from + direction * speed * (missed + t)));
         if let Some(error) = self.error()? {
             self.recover()?;
-            return Ok((0.0, Some(error)));
+            return Ok((None, Some(error)));
         }
         result?;
         // Compared with the lowest speed of an even motion: positions come in steps, and not evenly.
         let (even, later) = log.seen.split_at(before.saturating_sub(1));
         let even = even.get(even.len().saturating_sub(EVEN_READINGS)..).unwrap_or_default();
-        let kept = lowest(later, direction) / lowest(even, direction).max(0.1 * speed);
+        let look = look(even);
+        let usual = Some(lowest(even, direction, look)).filter(|usual| *usual > EVEN_SPEED * speed);
+        let kept = usual.map(|usual| (lowest(later, direction, look) / usual).clamp(0.0, 1.0));
         self.brake(speed)?;
         self.go(0.0)?;
-        Ok((kept.clamp(0.0, 1.0), None))
+        Ok((kept, None))
     }
 
     /// Writes nothing for a time. The states are read meanwhile, unless reading answers them.
