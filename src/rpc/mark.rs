@@ -1,7 +1,7 @@
 //! The mark of a live run: an abstract socket with its name. Whatever happens to the run directory, the kernel lists
 //! the mark, in every network namespace with a `/proc`, and gives no two processes the same one.
 
-use std::io;
+use std::io::{self, Write};
 use std::os::fd::AsFd;
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -10,18 +10,30 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use rustix::net::Shutdown;
-use tokio::sync::mpsc::UnboundedSender;
 
+use super::handover::Handover;
 use crate::rt::abstract_name::{self, Taken};
 use crate::sync::lock;
 
 /// Pause after a failed accept (no file descriptors left).
 const PAUSE: Duration = Duration::from_millis(100);
+/// Maximum number of connections that wait for the thread that serves stops, and the pause until there is room.
+const MAX_WAITING: usize = 64;
+const ROOM_PAUSE: Duration = Duration::from_millis(1);
 /// Stack size of the thread [bytes].
 const STACK: usize = 1 << 17;
 
 /// Where connections to the mark go.
-pub(super) type Way = Arc<Mutex<Option<UnboundedSender<UnixStream>>>>;
+#[derive(Debug, Clone, Default)]
+pub(super) enum Way {
+    /// The run starts or ends: they are closed, and their clients may try again.
+    #[default]
+    Nowhere,
+    /// To the thread that answers stops.
+    To(Arc<Handover<UnixStream>>),
+    /// They get this line.
+    Refused(String),
+}
 
 /// A mark that is held. A thread takes its connections: those of other users are closed at once, so that none of them
 /// fills the queue or delays the thread that serves stops.
@@ -29,7 +41,7 @@ pub(super) type Way = Arc<Mutex<Option<UnboundedSender<UnixStream>>>>;
 pub(super) struct Mark {
     name: String,
     listener: Arc<UnixListener>,
-    way: Way,
+    way: Arc<Mutex<Way>>,
     ended: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
@@ -38,7 +50,7 @@ impl Mark {
     /// Takes a mark, or returns who has it.
     pub fn take(name: String) -> Result<Self, Taken> {
         let listener = Arc::new(abstract_name::take(&name)?);
-        let (way, ended) = (Way::default(), Arc::new(AtomicBool::new(false)));
+        let (way, ended) = (Arc::<Mutex<Way>>::default(), Arc::new(AtomicBool::new(false)));
         let accepting = { (listener.clone(), way.clone(), ended.clone()) };
         let thread = std::thread::Builder::new().name("rpc-far".into()).stack_size(STACK);
         let thread = thread.spawn(move || accept(&accepting.0, &accepting.1, &accepting.2)).map_err(Taken::Io)?;
@@ -50,9 +62,9 @@ impl Mark {
         &self.name
     }
 
-    /// Returns where its connections go; nowhere at first, and with a receiver that is gone they are closed.
-    pub fn way(&self) -> Way {
-        self.way.clone()
+    /// Sets where its connections go; nowhere at first.
+    pub fn lead(&self, way: Way) {
+        *lock(&self.way) = way;
     }
 }
 
@@ -67,12 +79,22 @@ impl Drop for Mark {
     }
 }
 
-fn accept(listener: &UnixListener, way: &Way, ended: &AtomicBool) {
+fn accept(listener: &UnixListener, way: &Mutex<Way>, ended: &AtomicBool) {
     while !ended.load(Ordering::Acquire) {
         match listener.accept() {
             Ok((stream, _)) if is_owner_or_root(&stream) => {
-                if let Some(to) = lock(way).as_ref() {
-                    let _ = to.send(stream);
+                let way = lock(way).clone();
+                match way {
+                    Way::Nowhere => {}
+                    Way::To(queue) => {
+                        // More wait in the kernel, which has a limit.
+                        while queue.len() >= MAX_WAITING && !ended.load(Ordering::Acquire) {
+                            std::thread::sleep(ROOM_PAUSE);
+                        }
+                        queue.put(stream);
+                    }
+                    // Never blocks: a new socket's buffer is empty.
+                    Way::Refused(line) => drop((&stream).write_all(line.as_bytes())),
                 }
             }
             Ok(_) => {}
