@@ -231,13 +231,8 @@ impl Session {
         (self.stream, self.resting) = (None, None);
         let arm = self.setting.arm.clone();
         let stop = Stop { arm: Some(arm.clone()) };
-        let reply = match self.client.call(stop.clone()) {
-            Err(error) if error.is_passing() => {
-                Client::urgent(None, || connect(Some(&self.setting.run)), &stop).map(|(_, reply)| reply)
-            }
-            reply => reply,
-        };
-        let text = match reply {
+        let run = &self.setting.run;
+        let text = match self.client.call_urgently(|| connect(Some(run)), &stop) {
             Ok(reply) => {
                 let result = reply.arms.get(&arm).map_or("unknown", |confirmation| confirmation.text());
                 format!("stop of {arm}: {result}; next: `dimos arm reset {arm}`, `dimos arm enable {arm}`")
