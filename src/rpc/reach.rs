@@ -43,6 +43,7 @@ pub fn open(socket: &Path) -> io::Result<UnixStream> {
 }
 
 /// Returns whether a process listens there. Never blocks.
+#[cfg(feature = "share")]
 pub fn is_there(socket: &Path) -> bool {
     match connect(socket) {
         Ok(_) => true,

@@ -14,6 +14,9 @@ use crate::sync::lock;
 /// Maximum number of connections that have no permit yet, and of urgent requests that are answered without one.
 pub(super) const MAX_WITHOUT_PERMIT: usize = 256;
 
+/// A connection, and the number of its permit.
+type Connection = (Weak<UnixStream>, Option<u64>);
+
 /// Life signs of one thread, and the connections that it serves.
 #[derive(Debug)]
 pub(super) struct Turn {
@@ -23,7 +26,7 @@ pub(super) struct Turn {
     /// Urgent requests that may still be answered without a permit.
     pub unbound: Semaphore,
     next: AtomicU64,
-    served: Mutex<BTreeMap<u64, (Weak<UnixStream>, Option<u64>)>>,
+    served: Mutex<BTreeMap<u64, Connection>>,
 }
 
 impl Default for Turn {

@@ -138,6 +138,26 @@ fn a_stop_that_reaches_no_socket_names_the_process() {
 }
 
 #[test]
+fn a_name_that_another_user_has_taken_is_said() {
+    let (home, name) = (Home::new(), own_name());
+    let mark = format!("dimos/run/{}/{name}", rustix::process::geteuid().as_raw());
+    let script = format!(
+        "import os, socket, sys; os.setuid(65534); s = socket.socket(socket.AF_UNIX); s.bind('\\0{mark}')\n\
+         s.listen(); print('it listens', flush=True); sys.stdin.read()"
+    );
+    let taken = Started::of(Command::new("python3").args(["-c", &script]).stdin(Stdio::piped()));
+    eventually("it listens or may not", || taken.out().contains("it listens") || taken.over());
+    if taken.over() {
+        return skip_privileged(&format!("another user: {}", taken.err()), CapabilitySet::SETUID);
+    }
+    let line = format!("run coordinator-mock --no-record --duration 1s --name {name}");
+    let refused = Started::of(&mut open(&home, &line)).wait();
+    let says = format!("another user has the name \"{name}\" (uid 65534, pid {})", taken.pid());
+    assert_ne!(refused.says(&[&says, "hint: choose another name"]).code, Some(0));
+    elsewhere(&home, &format!("stop --run {name}")).with(2).says(&["no live run is named"]);
+}
+
+#[test]
 fn a_closed_world_has_a_folder_and_arms_of_this_computer() {
     let home = Home::new();
     let wrong = |world: &str, verb: &str| Started::of(home.command(verb).env("DIMOS_WORLD", world)).wait();

@@ -145,6 +145,10 @@ impl Session {
             match &self.link {
                 Link::Back if resume => self.resume()?,
                 Link::Back if stops => self.stop()?,
+                Link::Lost(_) if stops => {
+                    let text = "not stopped: the connection is lost; use the arm's own stop, or `dimos stop`";
+                    self.message = Some((text.into(), true));
+                }
                 _ => {}
             }
             return Ok(None);
