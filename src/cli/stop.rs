@@ -130,8 +130,8 @@ fn not_stopped(run: &LiveRun, error: ClientError) -> Failure {
     Failure::new(Exit::Failed, format!("run {name} (pid {pid}) is not stopped: {why}")).hint(hint)
 }
 
-/// Returns whether a run says that it serves no clients (`rpc.enabled: false`), or closes each connection to its mark: it
-/// starts or ends.
+/// Returns whether a run says that it serves no clients (`rpc.enabled: false`), or closes each connection to its mark:
+/// it starts or ends.
 fn serves_none(run: &LiveRun, error: &ClientError) -> bool {
     match error {
         ClientError::Refused(refusal) => refusal.code == Code::Unsupported,

@@ -99,7 +99,8 @@ impl Claim {
     /// Refuses all connections to its mark: the run serves no clients.
     pub fn refuse_clients(&self) {
         let text = format!("run {} serves no clients: its blueprint has rpc.enabled: false", self.run());
-        let error = RpcError::new(Code::Unsupported, text).hint("end it with a signal: kill -INT its pid");
+        let error = RpcError::new(Code::Unsupported, text)
+            .hint(format!("end it with a signal: kill -INT {}", std::process::id()));
         self.lead(Way::Refused(wire::reply::<()>(&serde_json::Value::Null, Err(error))));
     }
 }
@@ -275,4 +276,24 @@ fn try_lock(path: &Path, run: &str) -> Result<Result<File, u32>, RunDirError> {
 
 fn taken(run: &str, pid: u32) -> RunDirError {
     RunDirError::Taken { run: run.to_owned(), pid }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::run_dir::RunDir;
+
+    #[test]
+    fn nothing_is_made_again_once_the_name_is_released() {
+        let folder = tempfile::tempdir().unwrap();
+        let claim = RunDir::closed(folder.path().join("runs")).claim("cell").unwrap();
+        let (files, socket) = (claim.files(), claim.socket());
+        drop(files.bind().unwrap());
+        assert!(files.restore().is_none(), "it is there");
+        std::fs::remove_file(&socket).unwrap();
+        drop(files.restore().unwrap());
+        assert!(socket.exists());
+        drop(claim);
+        assert!(files.restore().is_none() && !socket.exists());
+        assert_eq!(std::fs::read_dir(folder.path().join("runs")).unwrap().count(), 0);
+    }
 }

@@ -124,8 +124,8 @@ pub(super) fn remove_left(path: &Path) -> Result<(), RunDirError> {
     }
 }
 
-/// Returns whether a file of this user has the form that its ending says: a socket, or a small file with nothing but the
-/// URL of a page.
+/// Returns whether a file of this user has the form that its ending says: a socket, or a small file with nothing but
+/// the URL of a page.
 fn has_form(path: &Path) -> bool {
     let Ok(found) = fs::symlink_metadata(path) else { return false };
     match path.extension().is_some_and(|ending| ending == "sock") {

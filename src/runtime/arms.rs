@@ -58,8 +58,8 @@ pub struct BroughtUp {
     pub connected: Vec<(Connected, JointLimits)>,
 }
 
-/// Connects all arms in parallel. If one fails, the others are released again. In a closed world of runs they are of this
-/// computer, and may share serial numbers.
+/// Connects all arms in parallel. If one fails, the others are released again. In a closed world of runs they are of
+/// this computer, and may share serial numbers.
 pub fn bring_up(
     blueprint: &Blueprint,
     is_closed: bool,

@@ -186,6 +186,8 @@ mod tests {
         }
         assert!(take("test", &at("127.0.0.2"), false).is_ok());
         assert!(take("other", &at("127.0.0.1"), false).is_err(), "whatever the adapter");
+        let elsewhere = take("test", "192.0.2.7:502", true).unwrap_err();
+        assert!(matches!(elsewhere, DeviceLockError::OtherWorld { .. }), "{elsewhere}");
         drop(held);
         assert!(take("test", &at("127.0.0.1"), false).is_ok());
     }

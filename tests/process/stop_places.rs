@@ -13,7 +13,6 @@ use std::time::{Duration, Instant};
 
 use dimos::rpc::api::{Confirmation, Stop};
 use dimos::rpc::client::Client;
-use dimos::rpc::run_dir::RunDir;
 use rustix::thread::CapabilitySet;
 
 use crate::support::program::{Home, Started, eventually};
@@ -68,7 +67,7 @@ fn connect(at: &Path) -> std::io::Result<UnixStream> {
 
 /// Where the run is reached without its folder.
 fn mark(home: &Home) -> PathBuf {
-    let folder = RunDir::closed(home.path().join("run/dimos"));
+    let folder = home.runs();
     let mark = folder.lasting(&folder.runs().unwrap()[0]);
     assert!(mark.to_str().unwrap().starts_with("@dimos/run/"), "{mark:?}");
     mark

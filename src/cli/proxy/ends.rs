@@ -1,4 +1,4 @@
-//! Stops and cancels of the proxy, which always get through: each kind on its own thread and connection, so that no stop
+//! Stops and cancels of the proxy, which always get through: each kind has a thread and a connection, so that no stop
 //! waits for the answer to a cancel.
 
 use std::sync::Arc;
