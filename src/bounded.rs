@@ -1,6 +1,6 @@
 //! Reads files whole: of limited size, and none that would be waited for or read without end.
 
-use std::fs::OpenOptions;
+use std::fs::{File, OpenOptions};
 use std::io::{self, ErrorKind, Read};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
@@ -12,6 +12,11 @@ pub const LARGE: u64 = 1 << 30;
 
 /// Reads a regular file of at most `max` bytes. The error names no file; it may end with a hint.
 pub fn read(path: &Path, max: u64) -> io::Result<Vec<u8>> {
+    take(open(path)?, max)
+}
+
+/// Opens a regular file to read it.
+pub fn open(path: &Path) -> io::Result<File> {
     // A pipe would be waited for until a program writes to it.
     let flags = rustix::fs::OFlags::NONBLOCK.bits().cast_signed();
     let file = OpenOptions::new().read(true).custom_flags(flags).open(path)?;
@@ -24,7 +29,7 @@ pub fn read(path: &Path, max: u64) -> io::Result<Vec<u8>> {
         let what = "not a regular file\nhint: write the output of a command to a file first";
         return Err(io::Error::new(ErrorKind::InvalidInput, what));
     }
-    take(file, max)
+    Ok(file)
 }
 
 /// Reads what is at most `max` bytes to its end: a file, or a pipe that a program writes to.

@@ -40,6 +40,8 @@ pub mod message;
 mod named;
 mod packed;
 pub mod pose;
+#[cfg(any(feature = "share", feature = "view"))]
+mod random;
 pub mod sync;
 pub mod telemetry;
 pub mod trajectory;

@@ -103,7 +103,7 @@ pub fn report(name: &str, overrides: &Overrides, catalog: Catalog<'_>, as_json: 
     for asset in awaited {
         output::note(format_args!("{} is not downloaded yet: its contents were not checked", asset.name));
     }
-    if std::env::var_os(run_dir::WORLD).is_some() {
+    if run_dir::RunDir::standard().is_closed() {
         let arms = summary.arms.iter().filter(|arm| !arm.simulated && !arm.address.is_empty());
         for arm in arms.filter(|arm| !device_lock::is_this_computer(&arm.address)) {
             let (id, address) = (&arm.hardware_id, &arm.address);

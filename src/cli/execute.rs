@@ -52,7 +52,7 @@ pub fn run(args: &Args) -> Result {
     let begun = match trajectory {
         Some(mut trajectory) => {
             let joints = trajectory.joint_names.clone();
-            stretch(&mut trajectory, full_speed::limit_of(&mut client, |_| Ok(joints))?);
+            stretch(&mut trajectory, full_speed::limit_of(&mut client, |_| Ok(Some(joints)))?);
             let points = trajectory.points.len();
             let begun = client.call(Execute { trajectory, task: args.task.clone(), retraces_to: None })?;
             output::note(format_args!(
@@ -62,9 +62,15 @@ pub fn run(args: &Args) -> Result {
             begun
         }
         None => {
-            let max_speed = full_speed::limit_of(&mut client, |client| joints_of(client, args.plan))?;
+            // The plan that is judged is the one that is executed.
+            let mut plan = args.plan;
+            let max_speed = full_speed::limit_of(&mut client, |client| {
+                plan =
+                    plan.map_or_else(|| client.call(Planner {}).map(|planner| planner.plan), |plan| Ok(Some(plan)))?;
+                joints_of(client, plan)
+            })?;
             let begun = client.call(ExecutePlan {
-                plan: args.plan,
+                plan,
                 replan: args.replan,
                 unproven: args.unproven,
                 max_speed: Some(max_speed).filter(|speed| *speed < 1.0),
@@ -96,12 +102,8 @@ fn stretch(trajectory: &mut Trajectory, speed: f64) {
     }
 }
 
-/// Returns the joints that a plan moves; none without a plan: `execute_plan` says why.
-fn joints_of(client: &mut Client, plan: Option<u64>) -> Result<Vec<String>> {
-    let plan = match plan {
-        Some(plan) => Some(plan),
-        None => client.call(Planner {})?.plan,
-    };
+/// Returns the joints that a plan moves; `None` if that is not known.
+fn joints_of(client: &mut Client, plan: Option<u64>) -> Result<Option<Vec<String>>> {
     let report = plan.map(|plan| client.call(Planning { plan })).transpose()?;
-    Ok(report.and_then(|report| report.summary).map(|summary| summary.joints).unwrap_or_default())
+    Ok(report.and_then(|report| report.summary).map(|summary| summary.joints))
 }

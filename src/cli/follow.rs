@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressFinish, ProgressStyle};
 
+use super::arguments::connect;
 use super::banner;
 use super::exit::{Exit, Failure, Result};
 use super::output::{self, Table, Tone, fixed, signed, toned};
@@ -103,7 +104,8 @@ pub fn watch(
         }
         if cancelled.is_none() && signals.last().is_some() {
             bar.suspend(|| output::note(format_args!("cancelling motion {motion}: the arm decelerates")));
-            client.call(cancel.clone())?;
+            let run = client.run().to_owned();
+            client.call_urgently(|| connect(Some(&run)), cancel)?;
             cancelled = Some(Instant::now());
         }
         if cancelled.is_some_and(|since| since.elapsed() > REST_TIMEOUT) {

@@ -13,9 +13,9 @@ use super::output;
 use crate::bounded;
 use crate::recording::files::log_folder;
 use crate::rpc::api::{Planner, State, Status};
-use crate::rpc::client::Client;
+use crate::rpc::client::{Client, ClientError};
+use crate::rpc::error::Code;
 use crate::rpc::report::ArmReport;
-use crate::runtime::device_lock::is_this_computer;
 
 /// Fraction of its speed at which an arm moves that is new to this user.
 const FIRST: f64 = 0.25;
@@ -24,17 +24,23 @@ const FIRST: f64 = 0.25;
 /// Says so if it is not 1.
 pub fn limit(client: &mut Client, names: &[String]) -> Result<f64> {
     limit_of(client, |client| {
-        let robots = client.call(Planner {}).map(|planner| planner.robots).unwrap_or_default().into_iter();
+        let robots = match client.call(Planner {}) {
+            Ok(planner) => planner.robots.into_iter(),
+            Err(ClientError::Refused(refusal)) if refusal.code == Code::NoPlanner => Vec::new().into_iter(),
+            // Its robots may move an arm that is new.
+            Err(error) => return Err(error.into()),
+        };
         let arms = client.call(State {})?.arms.into_iter();
         let arms =
             arms.map(|arm| (arm.hardware_id, arm.joints.into_iter().map(|joint| joint.name).collect::<Vec<_>>()));
         let both = robots.map(|robot| (robot.name, robot.joints)).chain(arms);
-        Ok(both.filter(|(name, _)| names.contains(name)).flat_map(|(_, joints)| joints).collect())
+        Ok(Some(both.filter(|(name, _)| names.contains(name)).flat_map(|(_, joints)| joints).collect()))
     })
 }
 
-/// Returns it for a motion of the joints that `joints` finds; it is asked only if an arm of the run is new.
-pub fn limit_of(client: &mut Client, joints: impl FnOnce(&mut Client) -> Result<Vec<String>>) -> Result<f64> {
+/// Returns it for a motion of the joints that `joints` finds; it is asked only if an arm of the run is new. `None`: the
+/// motion may be of any joint.
+pub fn limit_of(client: &mut Client, joints: impl FnOnce(&mut Client) -> Result<Option<Vec<String>>>) -> Result<f64> {
     let known = known();
     let mut arms = client.call(Status {})?.arms;
     arms.retain(|arm| !is_pretended(arm) && !known.contains(&key(arm)));
@@ -44,7 +50,7 @@ pub fn limit_of(client: &mut Client, joints: impl FnOnce(&mut Client) -> Result<
     let (joints, state) = (joints(client)?, client.call(State {})?.arms);
     let moves = |arm: &&ArmReport| {
         let own = state.iter().filter(|own| own.hardware_id == arm.hardware_id).flat_map(|own| &own.joints);
-        { own }.any(|joint| joints.contains(&joint.name))
+        { own }.any(|joint| joints.as_ref().is_none_or(|joints| joints.contains(&joint.name)))
     };
     let Some(arm) = arms.iter().find(moves).map(|arm| &arm.hardware_id) else { return Ok(1.0) };
     let part = 100.0 * FIRST;
@@ -83,9 +89,10 @@ fn key(arm: &ArmReport) -> String {
     }
 }
 
-/// Returns whether nothing can be hurt: an emulator, or something that this computer's programs speak for.
+/// Returns whether nothing can be hurt: an emulator, or something that a program on the run's computer speaks for. The
+/// run says so: its loopback address is not that of a client elsewhere.
 fn is_pretended(arm: &ArmReport) -> bool {
-    arm.simulated || is_this_computer(&arm.address)
+    arm.simulated || arm.local
 }
 
 fn file() -> Option<PathBuf> {

@@ -7,6 +7,7 @@
 //! The proxy is a client of the run: it holds the lease while the program moves the arm, and every command passes the
 //! run's limits and guards.
 
+mod ends;
 mod refusals;
 mod replies;
 mod run_arm;

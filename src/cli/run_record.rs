@@ -1,9 +1,7 @@
 //! Record of the latest run of a name: `<run>.json` beside the logs, written when the run is up and again when it has
 //! ended. A record without an end whose process is gone belongs to a crashed run.
 
-use std::fs::{File, OpenOptions};
 use std::io::{self, Read, Seek, SeekFrom};
-use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -11,13 +9,12 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
 use super::exit::{Exit, Failure};
+use crate::bounded;
 use crate::recording::files;
 use crate::rpc::report::StatusReport;
 
 /// Size of the tail of a text log that is searched for its last lines [bytes].
 const TAIL: u64 = 8192;
-/// Maximum size of a record [bytes].
-const MAX_RECORD: u64 = 1 << 20;
 /// Maximum time from the release of a run's name to the record of its end.
 const LAST_LINES_LIMIT: Duration = Duration::from_secs(2);
 /// Maximum number of last lines.
@@ -204,25 +201,13 @@ fn path_in(folder: &Path, run: &str) -> PathBuf {
 /// Reads a record; `None` if there is none or it is not valid.
 fn read(path: &Path) -> Option<RunRecord> {
     path.extension().filter(|ending| *ending == "json")?;
-    let mut bytes = Vec::new();
-    open(path).ok()?.take(MAX_RECORD).read_to_end(&mut bytes).ok()?;
-    serde_json::from_slice(&bytes).ok()
-}
-
-/// Opens a file to read it; fails for what is none, which might block.
-fn open(path: &Path) -> io::Result<File> {
-    let flags = rustix::fs::OFlags::NONBLOCK.bits() as i32;
-    let file = OpenOptions::new().read(true).custom_flags(flags).open(path)?;
-    match file.metadata()?.is_file() {
-        true => Ok(file),
-        false => Err(io::Error::new(io::ErrorKind::InvalidInput, "not a file")),
-    }
+    serde_json::from_slice(&bounded::read(path, bounded::SMALL).ok()?).ok()
 }
 
 /// Returns the last lines of a text file; empty if it cannot be read.
 pub fn last_lines(path: &Path) -> Vec<String> {
     let tail = || {
-        let mut file = open(path)?;
+        let mut file = bounded::open(path)?;
         let length = file.metadata()?.len();
         file.seek(SeekFrom::Start(length.saturating_sub(TAIL)))?;
         let mut bytes = Vec::new();

@@ -172,8 +172,9 @@ pub fn run(args: &Args) -> Result {
         Some(refusals(&config, move |line| terminal.note(format_args!("warning: {line}"))))
     };
     let _terminal = Terminal::start_with(refusals).map_err(|e| Failure::new(Exit::Failed, e.to_string()))?;
-    let found = client::find(&RunDir::standard(), args.run.as_deref())?;
-    let gateway = Gateway::start(&found.name, found.socket.clone(), config.clone()).map_err(ClientError::from)?;
+    let folder = RunDir::standard();
+    let found = client::find(&folder, args.run.as_deref())?;
+    let gateway = Gateway::start(&found.name, folder.lasting(&found), config.clone()).map_err(ClientError::from)?;
     if !is_child {
         // The gateway of a blueprint continues to serve what else it has.
         if let Some(error) = gateway.face_error() {

@@ -114,10 +114,10 @@ fn result(replies: Replies<'_>) -> Result {
 /// Returns the failure of a run that may not be stopped, with what ends it otherwise.
 fn not_stopped(run: &LiveRun, error: ClientError) -> Failure {
     let why = match &error {
+        _ if serves_none(run, &error) => "it serves no clients".to_owned(),
         // The run itself refuses, or it is on another computer.
         ClientError::Refused(_) => return error.into(),
         _ if run.at.is_some() => return error.into(),
-        ClientError::Io { error, .. } if serves_none(run, error) => "it serves no clients".to_owned(),
         ClientError::Io { error, .. } => client::io_text(error),
         ClientError::Protocol { what, .. } => format!("invalid reply: {what}"),
         other => other.to_string(),
@@ -130,10 +130,17 @@ fn not_stopped(run: &LiveRun, error: ClientError) -> Failure {
     Failure::new(Exit::Failed, format!("run {name} (pid {pid}) is not stopped: {why}")).hint(hint)
 }
 
-/// Returns whether a run closes each connection: it has no socket (`rpc.enabled: false`), or starts or ends.
-fn serves_none(run: &LiveRun, error: &std::io::Error) -> bool {
-    run.socket.as_os_str().as_encoded_bytes().starts_with(b"@")
-        && matches!(error.kind(), ErrorKind::UnexpectedEof | ErrorKind::BrokenPipe | ErrorKind::ConnectionReset)
+/// Returns whether a run says that it serves no clients (`rpc.enabled: false`), or closes each connection to its mark:
+/// it starts or ends.
+fn serves_none(run: &LiveRun, error: &ClientError) -> bool {
+    match error {
+        ClientError::Refused(refusal) => refusal.code == Code::Unsupported,
+        ClientError::Io { error, .. } => {
+            let is_closed = [ErrorKind::UnexpectedEof, ErrorKind::BrokenPipe, ErrorKind::ConnectionReset];
+            run.socket.as_os_str().as_encoded_bytes().starts_with(b"@") && is_closed.contains(&error.kind())
+        }
+        _ => false,
+    }
 }
 
 /// Calls `stop` for every run and returns every result. The calls are concurrent: a run that does not answer must not

@@ -288,7 +288,7 @@ methods! {
 }
 
 /// Parses and checks the parameters of a method; null means `{}`.
-pub(super) fn read_params<M: Method>(params: Value) -> Result<M, RpcError> {
+pub(crate) fn read_params<M: Method>(params: Value) -> Result<M, RpcError> {
     let params = if params.is_null() { Value::Object(Default::default()) } else { params };
     let invalid = |what: String| RpcError::new(Code::InvalidParams, format!("params of {:?}: {what}", M::NAME));
     let params: M = serde_json::from_value(params).map_err(|e| invalid(e.to_string()))?;

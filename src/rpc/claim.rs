@@ -5,16 +5,20 @@ use std::io::{self, Write};
 use std::os::unix::fs::PermissionsExt;
 use std::os::unix::net::UnixListener;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, MutexGuard, TryLockError as TryLockMutex};
 use std::time::Duration;
 
+use super::error::{Code, RpcError};
 use super::mark::{Mark, Way};
 use super::run_dir::{RunDirError, view_file};
 use super::run_files::{id_of, is_at, open_lock, pid_in, prepare, remove_left};
+use super::wire;
 use crate::sync::lock;
 
 /// Attempts to lock a name that is not taken: a process that lists the runs holds each lock briefly.
 const ATTEMPTS: u32 = 400;
+/// Attempts to lock the files of a run that ends: 0.5 s.
+const ATTEMPTS_LOCK: u32 = 100;
 /// Pause between attempts.
 const PAUSE: Duration = Duration::from_millis(5);
 
@@ -42,6 +46,8 @@ struct Files {
     url: Option<String>,
     /// Whether a lost socket was reported.
     is_reported: bool,
+    /// Whether the claim has ended: then nothing is made again.
+    is_released: bool,
 }
 
 impl Claim {
@@ -52,7 +58,8 @@ impl Claim {
         remove_left(&socket)?;
         remove_left(&view_file(&socket))?;
         let (run, folders) = (run.to_owned(), vec![folder.to_owned()]);
-        let files = Files { run, folders, socket, bound: None, lock, url: None, is_reported: false };
+        let (bound, url, is_reported, is_released) = (None, None, false, false);
+        let files = Files { run, folders, socket, bound, lock, url, is_reported, is_released };
         Ok(Self { files: RunFiles(Arc::new(Mutex::new(files))), mark })
     }
 
@@ -82,23 +89,28 @@ impl Claim {
         self.mark.as_ref().map_or_else(|| self.socket(), |mark| PathBuf::from(format!("@{}", mark.name())))
     }
 
-    /// Serves no clients: from now on a connection to its mark is closed at once.
-    pub fn serve_none(&self) {
-        if let Some(way) = self.way() {
-            way.close();
+    /// Sets where connections to its mark go.
+    pub(super) fn lead(&self, way: Way) {
+        if let Some(mark) = &self.mark {
+            mark.lead(way);
         }
     }
 
-    /// Returns where connections to its mark go; `None` without a mark.
-    pub(super) fn way(&self) -> Option<Way> {
-        self.mark.as_ref().map(Mark::way)
+    /// Refuses all connections to its mark: the run serves no clients.
+    pub fn refuse_clients(&self) {
+        let text = format!("run {} serves no clients: its blueprint has rpc.enabled: false", self.run());
+        let error = RpcError::new(Code::Unsupported, text)
+            .hint(format!("end it with a signal: kill -INT {}", std::process::id()));
+        self.lead(Way::Refused(wire::reply::<()>(&serde_json::Value::Null, Err(error))));
     }
 }
 
 impl Drop for Claim {
     fn drop(&mut self) {
         // Still locked, so these are not another run's files. After a failure the next run removes them.
-        lock(&self.files.0).remove();
+        if let Some(mut files) = self.files.within_reach() {
+            files.remove();
+        }
     }
 }
 
@@ -106,6 +118,18 @@ impl RunFiles {
     /// Returns the path of the socket.
     pub fn socket(&self) -> PathBuf {
         lock(&self.0).socket.clone()
+    }
+
+    /// Locks them. `None`: a file system hangs under the thread that looks after them.
+    fn within_reach(&self) -> Option<MutexGuard<'_, Files>> {
+        for _ in 0..ATTEMPTS_LOCK {
+            match self.0.try_lock() {
+                Ok(files) => return Some(files),
+                Err(TryLockMutex::Poisoned(files)) => return Some(files.into_inner()),
+                Err(TryLockMutex::WouldBlock) => std::thread::sleep(PAUSE),
+            }
+        }
+        None
     }
 
     /// Opens the socket.
@@ -134,7 +158,7 @@ pub struct UrlFile(RunFiles);
 
 impl Drop for UrlFile {
     fn drop(&mut self) {
-        let mut files = lock(&self.0.0);
+        let Some(mut files) = self.0.within_reach() else { return };
         files.url = None;
         // If that fails, the next run of this name removes it.
         let _ = remove_left(&view_file(&files.socket));
@@ -152,6 +176,9 @@ impl Files {
     }
 
     fn restore(&mut self) -> Option<UnixListener> {
+        if self.is_released {
+            return None;
+        }
         let there = fs::symlink_metadata(&self.socket).ok().map(|found| id_of(&found));
         if there.is_some() && there == self.bound {
             return None;
@@ -196,7 +223,8 @@ impl Files {
         writeln!(file, "{url}")
     }
 
-    fn remove(&self) {
+    fn remove(&mut self) {
+        self.is_released = true;
         let lock_path = self.socket.with_extension("lock");
         if is_at(&self.lock, &lock_path) {
             let _ = remove_left(&self.socket);
@@ -248,4 +276,24 @@ fn try_lock(path: &Path, run: &str) -> Result<Result<File, u32>, RunDirError> {
 
 fn taken(run: &str, pid: u32) -> RunDirError {
     RunDirError::Taken { run: run.to_owned(), pid }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::run_dir::RunDir;
+
+    #[test]
+    fn nothing_is_made_again_once_the_name_is_released() {
+        let folder = tempfile::tempdir().unwrap();
+        let claim = RunDir::closed(folder.path().join("runs")).claim("cell").unwrap();
+        let (files, socket) = (claim.files(), claim.socket());
+        drop(files.bind().unwrap());
+        assert!(files.restore().is_none(), "it is there");
+        std::fs::remove_file(&socket).unwrap();
+        drop(files.restore().unwrap());
+        assert!(socket.exists());
+        drop(claim);
+        assert!(files.restore().is_none() && !socket.exists());
+        assert_eq!(std::fs::read_dir(folder.path().join("runs")).unwrap().count(), 0);
+    }
 }

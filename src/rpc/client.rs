@@ -159,14 +159,15 @@ pub fn find(folder: &RunDir, name: Option<&str>) -> Result<LiveRun, ClientError>
 /// Returns the URL of a run's live view, with its token: that of a planner attached to the run, whose page also has the
 /// planner's robots, if it serves one here.
 pub fn view_url(run: &str, socket: &Path) -> Option<String> {
+    let path = run_dir::path_of(socket)?;
     let of_planner = || {
         let status = Client::connect(run, socket).ok()?.call(Status {}).ok()?;
         let name = status.planner?.attached?.name;
         run_dir::check_name(&name).ok()?;
-        let planners = RunDir::at(socket.parent()?).planners();
+        let planners = RunDir::at(path.parent()?).planners();
         run_dir::url_in(&planners.path().join(format!("{name}.view")))
     };
-    of_planner().or_else(|| run_dir::url_in(&run_dir::view_file(socket)))
+    of_planner().or_else(|| run_dir::url_in(&run_dir::view_file(&path)))
 }
 
 impl Client {

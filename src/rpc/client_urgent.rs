@@ -12,6 +12,8 @@ use super::error::Code;
 /// the time: an arm may need seconds to confirm a stop.
 const URGENT_TIMEOUT: Duration = Duration::from_secs(10);
 const FIRST_ATTEMPT: Duration = Duration::from_secs(1);
+/// Maximum time for a socket at which nothing listens: that of a run that begins to listen, or is opened again.
+const ABSENT_TIMEOUT: Duration = Duration::from_secs(1);
 /// Pause between two attempts.
 const RETRY_PAUSE: Duration = Duration::from_millis(20);
 
@@ -28,6 +30,14 @@ impl ClientError {
             _ => false,
         }
     }
+
+    /// Returns for how long an urgent request is repeated after this error.
+    fn patience(&self) -> Duration {
+        match self {
+            Self::Io { error, .. } if error.kind() == io::ErrorKind::ConnectionRefused => ABSENT_TIMEOUT,
+            _ => URGENT_TIMEOUT,
+        }
+    }
 }
 
 impl Client {
@@ -39,18 +49,18 @@ impl Client {
         connect: impl Fn() -> Result<Self, ClientError>,
         params: &M,
     ) -> Result<(Self, M::Reply), ClientError> {
-        let deadline = Instant::now() + URGENT_TIMEOUT;
+        let began = Instant::now();
         let mut attempt = FIRST_ATTEMPT;
         loop {
             let mut call = || -> Result<_, ClientError> {
                 let mut client = open.take().map_or_else(&connect, Ok)?;
-                client.timeout = attempt.min(deadline.saturating_duration_since(Instant::now()));
+                client.timeout = attempt.min(URGENT_TIMEOUT.saturating_sub(began.elapsed()));
                 let reply = client.call(params.clone())?;
                 client.timeout = REPLY_TIMEOUT;
                 Ok((client, reply))
             };
             match call() {
-                Err(error) if error.is_passing() && Instant::now() + RETRY_PAUSE < deadline => {
+                Err(error) if error.is_passing() && began.elapsed() + RETRY_PAUSE < error.patience() => {
                     if error.is_timeout() {
                         attempt *= 2;
                     }
@@ -58,6 +68,24 @@ impl Client {
                 }
                 result => return result,
             }
+        }
+    }
+}
+
+impl Client {
+    /// Sends such a request over this connection; where it gets no reply at once, over others of `connect` as
+    /// [`Client::urgent`] does. This one remains open.
+    pub fn call_urgently<M: Method + Clone>(
+        &mut self,
+        connect: impl Fn() -> Result<Self, ClientError>,
+        params: &M,
+    ) -> Result<M::Reply, ClientError> {
+        let timeout = std::mem::replace(&mut self.timeout, FIRST_ATTEMPT);
+        let reply = self.call(params.clone());
+        self.timeout = timeout;
+        match reply {
+            Err(error) if error.is_passing() => Self::urgent(None, connect, params).map(|(_, reply)| reply),
+            reply => reply,
         }
     }
 }
@@ -79,10 +107,15 @@ mod tests {
         Hangs,
         /// Confirms a stop after this time.
         Confirms(Duration),
+        /// Does not listen.
+        IsAbsent,
     }
 
     /// A connection to a run that does this.
     fn connection(run: Run) -> Result<Client, ClientError> {
+        if matches!(run, Run::IsAbsent) {
+            return Err(ClientError::Io { run: "cell".into(), error: io::ErrorKind::ConnectionRefused.into() });
+        }
         let (mut theirs, ours) = UnixStream::pair().unwrap();
         std::thread::spawn(move || {
             let mut line = String::new();
@@ -92,7 +125,7 @@ mod tests {
                         format!("{{\"id\": null, \"error\": {{\"code\": \"{}\", \"message\": \"\"}}}}\n", code.name());
                     theirs.write_all(refusal.as_bytes()).unwrap();
                 }
-                Run::Closes => {}
+                Run::Closes | Run::IsAbsent => {}
                 Run::Hangs => std::thread::sleep(2 * URGENT_TIMEOUT),
                 Run::Confirms(after) => {
                     BufReader::new(theirs.try_clone().unwrap()).read_line(&mut line).unwrap();
@@ -142,6 +175,14 @@ mod tests {
         let (result, connections) = stop(&[Run::Refuses(Code::TooManyConnections)]);
         assert!(matches!(result, Err(ClientError::Refused(error)) if error.code == Code::TooManyConnections));
         assert!(connections > 50 && began.elapsed() < URGENT_TIMEOUT + Duration::from_secs(1), "{connections}");
+    }
+
+    #[test]
+    fn a_socket_at_which_nothing_listens_is_not_waited_for() {
+        let began = Instant::now();
+        assert!(stop(&[Run::IsAbsent]).0.is_err());
+        assert!(began.elapsed() < 3 * ABSENT_TIMEOUT, "{:?}", began.elapsed());
+        assert!(stop(&[Run::IsAbsent, AT_ONCE]).0.is_ok(), "it has begun to listen");
     }
 
     #[test]

@@ -16,7 +16,7 @@ use serde_json::Value;
 use tokio::io::{AsyncBufRead, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::UnixStream;
 use tokio::net::unix::OwnedWriteHalf;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::{sleep, timeout};
 
@@ -48,7 +48,11 @@ const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Serves one client until it closes its end, sends a line that is too long, or must make room for another connection.
 /// Returns a connection that is silent for a while: its next request may be one of those that always get through.
-pub(super) async fn serve(transfer: Transfer, backend: Arc<dyn Backend>) -> Option<Transfer> {
+pub(super) async fn serve(
+    transfer: Transfer,
+    backend: Arc<dyn Backend>,
+    ended: watch::Receiver<bool>,
+) -> Option<Transfer> {
     let Transfer { stream, read, lessee, permit } = transfer;
     let stream =
         UnixStream::from_std(stream).inspect_err(|e| tracing::warn!("rpc: cannot serve a connection: {e}")).ok()?;
@@ -70,6 +74,7 @@ pub(super) async fn serve(transfer: Transfer, backend: Arc<dyn Backend>) -> Opti
         planner: None,
         behalf: None,
         is_gateway: false,
+        ended,
     };
     let Some((lessee, permit)) = connection.answer_requests(&mut from_client).await else {
         if timeout(CLOSE_TIMEOUT, &mut writer).await.is_err() {
@@ -118,6 +123,8 @@ struct Connection {
     behalf: Option<(bool, Commanded)>,
     /// Whether the run's gateway registered on it.
     is_gateway: bool,
+    /// Whether the run ends.
+    ended: watch::Receiver<bool>,
     /// The run's epoch when the connection last waited for a line. Lines that were there already may be as old.
     epoch: u64,
     /// The epoch of the request that is answered.
@@ -161,7 +168,7 @@ impl Connection {
 
     /// Answers requests. Returns whether the connection is silent, and has not ended.
     async fn is_silent(&mut self, from: &mut (impl AsyncBufRead + Unpin)) -> bool {
-        let mut line = Vec::new();
+        let (mut line, mut ended) = (Vec::new(), self.ended.clone());
         loop {
             let (max_line, mut waited) = (self.max_line(), false);
             if self.pending.is_empty() {
@@ -171,6 +178,12 @@ impl Connection {
             let read = tokio::select! {
                 biased;
                 reason = self.permit.evicted() => {
+                    let _ = timeout(CLOSE_TIMEOUT, self.reply::<Done>(&Value::Null, Err(reason))).await;
+                    return false;
+                }
+                () = until(&mut ended), if self.is_gateway => {
+                    // The end of a run that is killed is silent.
+                    let reason = RpcError::new(Code::ShuttingDown, "the run has ended");
                     let _ = timeout(CLOSE_TIMEOUT, self.reply::<Done>(&Value::Null, Err(reason))).await;
                     return false;
                 }
@@ -426,6 +439,11 @@ impl Connection {
     async fn send(&mut self, line: String) -> Result<(), Disconnected> {
         self.queue.send(line).await.map_err(|_| Disconnected)
     }
+}
+
+/// Waits for the end of the run.
+async fn until(ended: &mut watch::Receiver<bool>) {
+    let _ = ended.wait_for(|ended| *ended).await;
 }
 
 /// Waits for a future, and notes whether it was not ready at once.

@@ -24,9 +24,7 @@ pub(super) fn here(prefix: &str) -> io::Result<Vec<LiveRun>> {
         let socket = format!("@{prefix}{name}");
         match holder(&format!("{prefix}{name}")) {
             Ok(peer) if peer.uid == us => {
-                let same = |path: &Path| peer_at(path).is_some_and(|found| found == peer);
-                let own = paths(&table, &name).map(PathBuf::from).find(|path| same(path));
-                let socket = own.unwrap_or_else(|| socket.into());
+                let socket = path_in(&table, &name, peer).unwrap_or_else(|| socket.into());
                 Some(LiveRun { name, pid: peer.pid, socket, at: None })
             }
             // Another user holds it: no run of this one.
@@ -39,6 +37,16 @@ pub(super) fn here(prefix: &str) -> io::Result<Vec<LiveRun>> {
     let mut runs: Vec<LiveRun> = marks(&table, prefix).filter_map(of_mark).collect();
     runs.dedup_by(|a, b| a.name == b.name);
     Ok(runs)
+}
+
+/// Returns the path at which the process with this mark listens.
+pub(super) fn path_of(mark: &str) -> Option<PathBuf> {
+    let (table, name) = (socket_list::of("self").ok()?, mark.rsplit('/').next()?);
+    path_in(&table, name, holder(mark).ok()?)
+}
+
+fn path_in(table: &str, run: &str, process: Peer) -> Option<PathBuf> {
+    paths(table, run).map(PathBuf::from).find(|path| peer_at(path).is_some_and(|found| found == process))
 }
 
 /// Returns whether the process of a run has a mark of its name in another world.
@@ -70,12 +78,11 @@ pub(super) fn elsewhere(prefix: &str) -> Seen {
         }
     }
     for (namespace, pids) in by_namespace {
-        // Without a number each process may be in another one.
-        let asked = if namespace.is_some() { pids.get(..1).unwrap_or_default() } else { &pids[..] };
-        for pid in asked {
+        let mut refused = Vec::new();
+        for pid in &pids {
             let Ok(table) = socket_list::of(&pid.to_string()) else {
                 // A process that has ended since hides nothing.
-                seen.unseen.extend(user_of(*pid).map(|_| *pid));
+                refused.extend(user_of(*pid).map(|_| *pid));
                 continue;
             };
             for (inode, name) in marks(&table, prefix) {
@@ -83,7 +90,13 @@ pub(super) fn elsewhere(prefix: &str) -> Seen {
                     seen.runs.push(far_run(&table, name, &pids, us));
                 }
             }
+            // One list shows the whole namespace. Without a number each process may be in another one.
+            if namespace.is_some() {
+                refused.clear();
+                break;
+            }
         }
+        seen.unseen.extend(refused);
     }
     seen
 }

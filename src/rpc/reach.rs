@@ -15,7 +15,7 @@ const TIMEOUT: Duration = Duration::from_secs(2);
 const PAUSE: Duration = Duration::from_millis(5);
 
 /// Why there is no connection.
-pub(super) enum Unreached {
+pub enum Unreached {
     /// The kernel refuses it.
     Io(io::Error),
     /// This user listens there.
@@ -28,17 +28,34 @@ impl From<io::Error> for Unreached {
     }
 }
 
+impl From<Unreached> for io::Error {
+    fn from(unreached: Unreached) -> Self {
+        match unreached {
+            Unreached::Io(error) => error,
+            Unreached::OtherUser(uid) => Self::new(ErrorKind::PermissionDenied, format!("it belongs to user {uid}")),
+        }
+    }
+}
+
 /// Opens a connection. Never blocks, and the stream does not block either.
 pub fn open(socket: &Path) -> io::Result<UnixStream> {
-    connect(socket).map_err(|unreached| match unreached {
-        Unreached::Io(error) => error,
-        Unreached::OtherUser(uid) => io::Error::new(ErrorKind::PermissionDenied, format!("it belongs to user {uid}")),
-    })
+    Ok(connect(socket)?)
+}
+
+/// Returns whether a process listens there. Never blocks.
+#[cfg(feature = "share")]
+pub fn is_there(socket: &Path) -> bool {
+    match connect(socket) {
+        Ok(_) => true,
+        // A full queue is that of a process.
+        Err(Unreached::Io(error)) => error.kind() == ErrorKind::WouldBlock,
+        Err(Unreached::OtherUser(_)) => false,
+    }
 }
 
 /// Opens a connection whose stream blocks. Waits while the queue is full: many clients connect at once, or the run
 /// takes no connections.
-pub(super) fn wait_for(socket: &Path) -> Result<UnixStream, Unreached> {
+pub fn wait_for(socket: &Path) -> Result<UnixStream, Unreached> {
     let deadline = Instant::now() + TIMEOUT;
     loop {
         match connect(socket) {

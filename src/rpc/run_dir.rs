@@ -9,13 +9,12 @@ use std::fs::{self, TryLockError};
 use std::io;
 use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 pub use super::claim::{Claim, RunFiles, UrlFile};
 use super::mark::Mark;
 use super::run_files::{FOLDERS, is_ours, open_lock, pid_in, prepare};
 use super::{live_runs, run_files};
-use crate::rt::abstract_name::Taken;
+use crate::rt::abstract_name::{Taken, holder};
 
 /// Environment variable of the directory of a closed world of runs.
 pub const WORLD: &str = "DIMOS_WORLD";
@@ -23,10 +22,6 @@ pub const WORLD: &str = "DIMOS_WORLD";
 const MAX_NAME: usize = 64;
 /// Maximum length of a socket's path in Linux [bytes].
 const MAX_SOCKET_PATH: usize = 107;
-/// For a run to release its name after its connections: 10 s.
-const ATTEMPTS_RELEASED: u32 = 2000;
-/// Pause between attempts.
-const PAUSE: Duration = Duration::from_millis(5);
 
 /// Why a run name or the run directory cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -39,6 +34,16 @@ pub enum RunDirError {
     Taken {
         /// The name.
         run: String,
+        /// Process id of its holder; 0 while unknown.
+        pid: u32,
+    },
+    /// Another user has taken this name.
+    #[error("another user has the name {run:?} (uid {uid}, pid {})", pid_text(*.pid))]
+    TakenByOther {
+        /// The name.
+        run: String,
+        /// The user.
+        uid: u32,
         /// Process id of its holder; 0 while unknown.
         pid: u32,
     },
@@ -70,6 +75,7 @@ impl RunDirError {
         match self {
             Self::BadName(_) => "use 1 to 64 letters, digits, '-', '_' and '.', without a leading '.'",
             Self::Taken { .. } => "choose another name with `--name`, or end that run with `dimos down`",
+            Self::TakenByOther { .. } => "choose another name with `--name`, and ask that user to end the program",
             Self::NotOurs(_) => "remove it, or set XDG_RUNTIME_DIR to a directory of this user",
             Self::OtherFiles(_) => "move it away, or set XDG_RUNTIME_DIR to another directory",
             Self::World(_) => "make the directory, or unset DIMOS_WORLD",
@@ -204,6 +210,9 @@ impl RunDir {
         let taken = |pid| RunDirError::Taken { run: run.to_owned(), pid };
         let mark = match self.marks() {
             Some(prefix) => Some(Mark::take(format!("{prefix}{run}")).map_err(|refused| match refused {
+                Taken::By(Some(peer)) if peer.uid != rustix::process::geteuid().as_raw() => {
+                    RunDirError::TakenByOther { run: run.to_owned(), uid: peer.uid, pid: peer.pid }
+                }
                 Taken::By(peer) => taken(peer.map_or(0, |peer| peer.pid)),
                 Taken::Io(error) => RunDirError::Io { path: socket.clone(), error },
             })?),
@@ -264,6 +273,14 @@ impl RunDir {
         }
         seen.runs.sort_by(|a, b| a.name.cmp(&b.name));
         Ok(seen)
+    }
+
+    /// Returns where a live run is reached whatever becomes of its directory: at its mark. One in another network
+    /// namespace, whose mark cannot be reached, at its socket.
+    pub fn lasting(&self, run: &LiveRun) -> PathBuf {
+        let mark = self.marks().map(|prefix| format!("{prefix}{}", run.name));
+        let is_its = |mark: &String| holder(mark).is_ok_and(|peer| peer.pid == run.pid);
+        mark.filter(is_its).map_or_else(|| run.socket.clone(), |mark| format!("@{mark}").into())
     }
 
     fn check_world(&self) -> Result<(), RunDirError> {
@@ -333,22 +350,12 @@ impl RunDir {
     }
 }
 
-/// Waits until a run whose connections have closed has released its name. Returns whether it ended in order: then it
-/// removes its socket, and a run that was killed leaves it.
-pub fn has_ended_in_order(socket: &Path) -> bool {
-    let lock = socket.with_extension("lock");
-    for _ in 0..ATTEMPTS_RELEASED {
-        // Asked first: the socket is removed before the name is released.
-        let held = open_lock(&lock, false).map(|file| matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock)));
-        if !socket.exists() {
-            return true;
-        }
-        if !held.unwrap_or(false) {
-            return false;
-        }
-        std::thread::sleep(PAUSE);
+/// Returns the path of a run's socket: of an abstract one, that at which the same process listens now.
+pub fn path_of(socket: &Path) -> Option<PathBuf> {
+    match socket.to_str().and_then(|text| text.strip_prefix('@')) {
+        Some(mark) => live_runs::path_of(mark),
+        None => Some(socket.to_owned()),
     }
-    true
 }
 
 /// Returns the URL in the file of a run's live view; `None` if there is none, or it is not of this user.

@@ -74,7 +74,8 @@ pub(super) fn open_lock(path: &Path, create: bool) -> io::Result<File> {
         let mut text = String::new();
         (&file).take(MAX_LOCK).read_to_string(&mut text).is_ok() && text.trim().bytes().all(|b| b.is_ascii_digit())
     };
-    if found.is_file() && is_own(&found) && found.nlink() == 1 && found.len() <= MAX_LOCK && is_number() {
+    // Without a link: its holder has just removed it, and the caller looks again.
+    if found.is_file() && is_own(&found) && found.nlink() <= 1 && found.len() <= MAX_LOCK && is_number() {
         return Ok(file);
     }
     Err(io::Error::new(io::ErrorKind::AlreadyExists, "this is not the lock of a run of this user"))
@@ -123,12 +124,23 @@ pub(super) fn remove_left(path: &Path) -> Result<(), RunDirError> {
     }
 }
 
-/// Returns whether a file of this user has the form that its ending says: a socket, or a small file.
+/// Returns whether a file of this user has the form that its ending says: a socket, or a small file with nothing but
+/// the URL of a page.
 fn has_form(path: &Path) -> bool {
     let Ok(found) = fs::symlink_metadata(path) else { return false };
-    let is_socket = path.extension().is_some_and(|ending| ending == "sock");
-    let is_small = found.is_file() && found.len() <= MAX_SIZE;
-    is_own(&found) && if is_socket { found.file_type().is_socket() } else { is_small }
+    match path.extension().is_some_and(|ending| ending == "sock") {
+        true => is_own(&found) && found.file_type().is_socket(),
+        // With the rights and the size of such a file: others may end in `.view`, too.
+        false => {
+            found.mode() & 0o077 == 0 && found.len() <= MAX_SIZE && read_text(path).is_some_and(|text| is_url(&text))
+        }
+    }
+}
+
+/// Returns whether a text is a URL as a run writes it, or what a full disk left of it: nothing.
+fn is_url(text: &str) -> bool {
+    text.is_empty()
+        || text.starts_with("http://") && text.contains("/#") && text.trim().bytes().all(|b| b.is_ascii_graphic())
 }
 
 fn is_own(found: &Metadata) -> bool {

@@ -23,6 +23,8 @@ use tokio::sync::watch;
 use super::api::Backend;
 use super::connection;
 use super::error::RpcError;
+use super::look::Look;
+use super::mark::Way;
 use super::run_dir::Claim;
 use super::stop_thread::{BEAT_PERIOD, Reception, StopThread};
 use super::urgent::Transfer;
@@ -43,6 +45,7 @@ pub struct Server {
     claim: Claim,
     socket: PathBuf,
     end: watch::Sender<bool>,
+    look: Option<Look>,
     /// The thread `rpc`.
     thread: Option<JoinHandle<()>>,
 }
@@ -51,16 +54,18 @@ impl Server {
     /// Opens the socket of a claimed name and starts serving it.
     pub fn start(claim: Claim, backend: Arc<dyn Backend>) -> io::Result<Self> {
         let files = claim.files();
-        let listener = files.bind()?;
+        let (opened, listeners) = watch::channel(Arc::new(files.bind()?));
         let (end, ended) = watch::channel(false);
         let (arrivals, arrived) = channel();
-        let reception = Reception::new((listener, files, claim.way()), backend, arrivals, ended);
+        let reception = Reception::new(listeners, backend, arrivals, ended);
         let stop_thread = StopThread::start(reception.clone())?;
+        let look = Look::start(files, opened)?;
+        claim.lead(Way::To(reception.far.clone()));
         let socket = claim.socket();
         let serving = std::thread::Builder::new().name("rpc".into());
         let thread = serving.spawn(move || serve_passed_on(&arrived, &reception, stop_thread));
         // If there is no thread, `end` is dropped, which ends the other one.
-        Ok(Self { claim, socket, end, thread: Some(thread?) })
+        Ok(Self { claim, socket, end, look: Some(look), thread: Some(thread?) })
     }
 
     /// Returns the path that its socket had at the start.
@@ -77,9 +82,11 @@ impl Server {
 impl Drop for Server {
     fn drop(&mut self) {
         let _ = self.end.send(true);
+        self.look = None;
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
         }
+        self.claim.lead(Way::Nowhere);
     }
 }
 
@@ -130,8 +137,10 @@ fn start_client(transfer: Transfer, reception: Arc<Reception>, alive: Sender<()>
     let started = thread.spawn(move || {
         match runtime() {
             Ok(runtime) => until_the_end(runtime, reception.ended.clone(), async move {
-                if let Some(silent) = connection::serve(transfer, reception.backend.clone()).await {
-                    reception.give_back(silent);
+                if let Some(silent) =
+                    connection::serve(transfer, reception.backend.clone(), reception.ended.clone()).await
+                {
+                    reception.silent.put(silent);
                 }
             }),
             Err(e) => tracing::warn!("rpc: cannot serve a connection: {e}"),

@@ -2,12 +2,12 @@
 //! answers them, as long as a connection sends nothing else. So they never wait for another client's request, and may
 //! use the reserved connections; the first `stop`, `cancel` or `shutdown` of a new connection needs none.
 
+use std::io::{self, ErrorKind};
 use std::sync::Arc;
 use std::sync::mpsc::Sender;
 use std::time::Duration;
 
 use serde_json::Value;
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::UnixStream;
 use tokio::sync::oneshot;
 use tokio::time::timeout;
@@ -18,7 +18,8 @@ use super::connection_limit::Permit;
 use super::error::RpcError;
 use super::lease::Lessee;
 use super::server::refuse;
-use super::stop_thread::{Reception, Turn};
+use super::stop_thread::Reception;
+use super::turn::Turn;
 use super::wire;
 
 /// Maximum length of an urgent request [bytes].
@@ -47,15 +48,18 @@ pub(super) struct Transfer {
 /// Serves a new connection. A stop, cancel or shutdown needs no permit: other connections do not get in its way. What
 /// sends anything else, or nothing for [`FIRST_LINE_TIMEOUT`], or must make room for newer ones (`out`), needs one.
 pub(super) async fn receive(
-    mut stream: UnixStream,
+    stream: UnixStream,
     mut out: oneshot::Receiver<()>,
     reception: Arc<Reception>,
     turn: Arc<Turn>,
 ) {
-    let mut read = Vec::new();
+    let (mut read, stream) = (Vec::new(), Arc::new(stream));
+    let served = turn.serves(&stream, None);
     loop {
+        // What has arrived is read before it must make room.
         let filled = tokio::select! {
-            filled = timeout(FIRST_LINE_TIMEOUT, fill(&mut stream, &mut read)) => filled,
+            biased;
+            filled = timeout(FIRST_LINE_TIMEOUT, fill(&stream, &mut read)) => filled,
             _ = &mut out => break,
         };
         match filled {
@@ -65,16 +69,19 @@ pub(super) async fn receive(
         }
         let Some(line) = next_line(&mut read) else { if read.len() > MAX_URGENT { break } else { continue } };
         let ends = urgent(&line).filter(|(_, request)| !matches!(request, Request::Status(_)));
-        let (Some((id, request)), Ok(_held)) = (ends, reception.unbound.try_acquire()) else {
+        let (Some((id, request)), Ok(_held)) = (ends, turn.unbound.try_acquire()) else {
             read.splice(..0, line);
             break;
         };
         let (name, result) = (request.written().0, reception.backend.call(request));
         let result = answer(name, result, &reception.leases).await;
-        if !send::<Reply>(&mut stream, &id, result).await {
+        if !send::<Reply>(&stream, &id, result).await {
             return;
         }
     }
+    drop(served);
+    // Else it is being closed.
+    let Ok(stream) = Arc::try_unwrap(stream) else { return };
     let permit = match reception.limit.acquire() {
         Ok(permit) => permit,
         Err(error) => return refuse(&stream, error),
@@ -87,10 +94,10 @@ pub(super) async fn receive(
 }
 
 /// Reads until a line is complete or longer than an urgent request; returns `false` if the connection ends before.
-async fn fill(stream: &mut UnixStream, read: &mut Vec<u8>) -> bool {
+async fn fill(stream: &UnixStream, read: &mut Vec<u8>) -> bool {
     let mut chunk = [0; MAX_URGENT];
     while !read.contains(&b'\n') && read.len() <= MAX_URGENT {
-        match stream.read(&mut chunk).await {
+        match receive_some(stream, &mut chunk).await {
             Ok(length @ 1..) => read.extend(chunk.iter().take(length)),
             _ => return false,
         }
@@ -101,9 +108,9 @@ async fn fill(stream: &mut UnixStream, read: &mut Vec<u8>) -> bool {
 /// Serves a connection until it ends or sends another request; then passes it on.
 pub(super) async fn serve(transfer: Transfer, reception: Arc<Reception>, turn: Arc<Turn>) {
     let Transfer { stream, mut read, lessee, permit } = transfer;
-    let _served = turn.serves(permit.number(), &stream);
     let (backend, others) = (&reception.backend, &reception.others);
-    let Ok(mut stream) = UnixStream::from_std(stream) else { return };
+    let Ok(stream) = UnixStream::from_std(stream).map(Arc::new) else { return };
+    let served = turn.serves(&stream, Some(permit.number()));
     let mut statuses = 0;
     loop {
         while let Some(line) = next_line(&mut read) {
@@ -111,27 +118,30 @@ pub(super) async fn serve(transfer: Transfer, reception: Arc<Reception>, turn: A
             statuses += u32::from(matches!(urgent, Some((_, Request::Status(_)))));
             let Some((id, request)) = urgent.filter(|_| statuses <= MAX_STATUS || permit.is_reserved()) else {
                 read.splice(..0, line);
+                drop(served);
                 return pass_on(stream, read, lessee, permit, others).await;
             };
             permit.set_busy();
             let (name, result) = (request.written().0, backend.call(request));
             let result = answer(name, result, lessee.leases()).await;
-            if !send::<Reply>(&mut stream, &id, result).await {
+            if !send::<Reply>(&stream, &id, result).await {
                 return;
             }
             // Lets the other connections proceed before the next request.
             tokio::task::yield_now().await;
         }
         if read.len() > MAX_URGENT {
+            drop(served);
             return pass_on(stream, read, lessee, permit, others).await;
         }
         permit.set_idle();
         let max_silence = if permit.is_reserved() { IDLE_TIMEOUT } else { Duration::MAX };
         let mut chunk = [0; MAX_URGENT];
         let received = tokio::select! {
-            received = timeout(max_silence, stream.read(&mut chunk)) => received,
+            biased;
+            received = timeout(max_silence, receive_some(&stream, &mut chunk)) => received,
             reason = permit.evicted() => {
-                send::<Reply>(&mut stream, &Value::Null, Err(reason)).await;
+                send::<Reply>(&stream, &Value::Null, Err(reason)).await;
                 return;
             }
         };
@@ -166,20 +176,45 @@ fn urgent(line: &[u8]) -> Option<(Value, Request)> {
     }
 }
 
-async fn pass_on(mut stream: UnixStream, read: Vec<u8>, lessee: Lessee, permit: Permit, others: &Sender<Transfer>) {
+async fn pass_on(stream: Arc<UnixStream>, read: Vec<u8>, lessee: Lessee, permit: Permit, others: &Sender<Transfer>) {
     permit.set_busy();
     if let Err(refusal) = permit.promote() {
-        send::<Reply>(&mut stream, &Value::Null, Err(refusal)).await;
+        send::<Reply>(&stream, &Value::Null, Err(refusal)).await;
         return;
     }
+    // Else it is being closed.
+    let Ok(stream) = Arc::try_unwrap(stream) else { return };
     if let Ok(stream) = stream.into_std() {
         // Fails only while the server shuts down.
         let _ = others.send(Transfer { stream, read, lessee, permit });
     }
 }
 
+/// Waits for bytes; returns how many were read.
+async fn receive_some(stream: &UnixStream, to: &mut [u8]) -> io::Result<usize> {
+    loop {
+        stream.readable().await?;
+        match stream.try_read(to) {
+            Err(error) if error.kind() == ErrorKind::WouldBlock => {}
+            read => return read,
+        }
+    }
+}
+
 /// Sends a reply; returns whether the client took it in time.
-async fn send<T: serde::Serialize>(stream: &mut UnixStream, id: &Value, result: Result<T, RpcError>) -> bool {
+async fn send<T: serde::Serialize>(stream: &UnixStream, id: &Value, result: Result<T, RpcError>) -> bool {
     let line = wire::reply(id, result);
-    matches!(timeout(WRITE_TIMEOUT, stream.write_all(line.as_bytes())).await, Ok(Ok(())))
+    matches!(timeout(WRITE_TIMEOUT, write_all(stream, line.as_bytes())).await, Ok(Ok(())))
+}
+
+async fn write_all(stream: &UnixStream, mut rest: &[u8]) -> io::Result<()> {
+    while !rest.is_empty() {
+        stream.writable().await?;
+        match stream.try_write(rest) {
+            Ok(written) => rest = rest.get(written..).unwrap_or_default(),
+            Err(error) if error.kind() == ErrorKind::WouldBlock => {}
+            Err(error) => return Err(error),
+        }
+    }
+    Ok(())
 }

@@ -58,8 +58,8 @@ pub struct BroughtUp {
     pub connected: Vec<(Connected, JointLimits)>,
 }
 
-/// Connects all arms in parallel. If one fails, the others are released again. In a closed world of runs they may share
-/// serial numbers.
+/// Connects all arms in parallel. If one fails, the others are released again. In a closed world of runs they are of
+/// this computer, and may share serial numbers.
 pub fn bring_up(
     blueprint: &Blueprint,
     is_closed: bool,
@@ -77,7 +77,7 @@ pub fn bring_up(
     };
     let mut slots = Slots::default();
     for (index, arm) in blueprint.arms.iter().enumerate() {
-        let config = configure(&blueprint.arms, index, &mut arms)?;
+        let config = configure(&blueprint.arms, index, is_closed, &mut arms)?;
         let adapter = (arm.adapter.create)(&config).map_err(|e| unfit(arm, &e))?;
         let (state_writer, state_reader) = slot(ArmState::default());
         let (command_writer, command_reader) = slot(ArmCommand::default());
@@ -139,7 +139,7 @@ pub fn bring_up(
 }
 
 /// Locks the device or starts its emulator. Returns the adapter's configuration.
-fn configure(all: &[Arm], index: usize, arms: &mut Arms) -> Result<AdapterConfig, StartError> {
+fn configure(all: &[Arm], index: usize, is_closed: bool, arms: &mut Arms) -> Result<AdapterConfig, StartError> {
     let Some((arm, before)) = all.get(index).zip(all.get(..index)) else {
         return Err(StartError::other("no such arm", "this is a defect of the program"));
     };
@@ -157,13 +157,11 @@ fn configure(all: &[Arm], index: usize, arms: &mut Arms) -> Result<AdapterConfig
         }
         _ if arm.address.is_empty() || arm.address == SIM => {}
         _ => {
-            // The blueprint was checked: an address that cannot be completed stays as it is.
-            let full = |arm: &Arm| (arm.adapter.address.check)(&arm.address).unwrap_or_else(|_| arm.address.clone());
-            let address = full(arm);
-            let lock = device_lock::take(&arm.adapter_type, &address).map_err(|e| {
+            let address = full_address(arm);
+            let lock = device_lock::take(&arm.adapter_type, &address, is_closed).map_err(|e| {
                 let has_lock = |other: &&Arm| !other.address.is_empty() && other.address != SIM;
                 let mut others = before.iter().filter(has_lock);
-                let same = others.find(|other| device_lock::is_same_place(&full(other), &address));
+                let same = others.find(|other| device_lock::is_same_place(&full_address(other), &address));
                 let (what, hint) = match same.filter(|_| matches!(e, DeviceLockError::By { .. })) {
                     Some(same) => {
                         let what =
@@ -178,6 +176,12 @@ fn configure(all: &[Arm], index: usize, arms: &mut Arms) -> Result<AdapterConfig
         }
     }
     Ok(config)
+}
+
+/// Returns the complete address of an arm's device.
+pub fn full_address(arm: &Arm) -> String {
+    // The blueprint was checked: an address that cannot be completed stays as it is.
+    (arm.adapter.address.check)(&arm.address).unwrap_or_else(|_| arm.address.clone())
 }
 
 /// Creates the error of contradictory settings of an arm. No arm was contacted yet, so the hint about power is absent.

@@ -9,7 +9,6 @@ use std::sync::mpsc;
 use std::time::Duration;
 
 use crate::hardware::registry::SIM;
-use crate::rpc::run_dir::WORLD;
 use crate::rt::abstract_name::{self, Taken, fit};
 
 /// Timeout for the lookup of a host name.
@@ -63,9 +62,9 @@ impl DeviceLockError {
 }
 
 /// Locks the device at a complete address; the error names the process that holds it. Resolves host names. In a closed
-/// world of runs it refuses a device that is not of this computer.
-pub fn take(adapter: &str, address: &str) -> Result<DeviceLock, DeviceLockError> {
-    if std::env::var_os(WORLD).is_some() && !is_this_computer(address) {
+/// world of runs (`is_closed`) it refuses a device that is not of this computer.
+pub fn take(adapter: &str, address: &str, is_closed: bool) -> Result<DeviceLock, DeviceLockError> {
+    if is_closed && !is_this_computer(address) {
         return Err(DeviceLockError::OtherWorld { adapter: adapter.to_owned(), address: address.to_owned() });
     }
     // Without the adapter: no two of them can use one place.
@@ -179,16 +178,18 @@ mod tests {
     fn f29_a_device_is_taken_once_and_names_the_holder() {
         let port = std::process::id();
         let at = |host: &str| format!("{host}:{port}");
-        let held = take("test", &at("LOCALHOST")).unwrap();
+        let held = take("test", &at("LOCALHOST"), false).unwrap();
         for _ in 0..200 {
-            let refused = take("test", &at("127.0.0.1")).unwrap_err().to_string();
+            let refused = take("test", &at("127.0.0.1"), false).unwrap_err().to_string();
             // The queue of connections fills up; then no process is named, and the call does not block.
             assert!(refused.contains(&format!("process {port}")) || refused.contains("unknown"), "{refused}");
         }
-        assert!(take("test", &at("127.0.0.2")).is_ok());
-        assert!(take("other", &at("127.0.0.1")).is_err(), "whatever the adapter");
+        assert!(take("test", &at("127.0.0.2"), false).is_ok());
+        assert!(take("other", &at("127.0.0.1"), false).is_err(), "whatever the adapter");
+        let elsewhere = take("test", "192.0.2.7:502", true).unwrap_err();
+        assert!(matches!(elsewhere, DeviceLockError::OtherWorld { .. }), "{elsewhere}");
         drop(held);
-        assert!(take("test", &at("127.0.0.1")).is_ok());
+        assert!(take("test", &at("127.0.0.1"), false).is_ok());
     }
 
     #[test]

@@ -112,6 +112,7 @@ impl Service {
             adapter: arm.adapter_type.clone(),
             address: arm.address.clone(),
             simulated: !arm.is_real(),
+            local: self.parts.local.get(index).is_some_and(|local| *local),
             link: view.state.link.name().to_owned(),
             phase: view.phase.name().to_owned(),
             led_by: (view.phase == Phase::Led).then(|| self.led_by(index as u16).to_owned()),

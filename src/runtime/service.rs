@@ -58,6 +58,8 @@ pub struct ServiceParts {
     pub connected: Vec<Connected>,
     /// Per arm, what is to be said of its factory kinematics.
     pub kinematics: Vec<Option<String>>,
+    /// Per arm, whether only a program on this computer can be at its address.
+    pub local: Vec<bool>,
     pub devices: Vec<Arc<Device>>,
     pub serials: Arc<SerialLocks>,
     pub dispatcher: Arc<Dispatcher>,

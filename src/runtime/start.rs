@@ -14,8 +14,9 @@ use std::sync::mpsc::{Sender, channel};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use super::arms::{self, Arms, BroughtUp, Slots};
+use super::arms::{self, Arms, BroughtUp, Slots, full_address};
 use super::control_config::{coordinator_config, names_of, tasks, tools};
+use super::device_lock::is_this_computer;
 use super::dispatch::{Dispatcher, OutcomeThread};
 use super::guard_worlds::{GuardEnds, GuardWorlds};
 use super::kinematics::{self, Known};
@@ -72,7 +73,7 @@ impl Run {
                 run.serve_view();
             }
         } else {
-            claim.serve_none();
+            claim.refuse_clients();
             run.handle.service.keep(claim);
         }
         if let Some(manager) = &run.manager {
@@ -223,6 +224,8 @@ impl Connected {
             names: prepared.names.clone(),
             connected,
             kinematics,
+            // Once, as it may wait for the name of a host.
+            local: prepared.blueprint.arms.iter().map(|arm| is_this_computer(&full_address(arm))).collect(),
             devices: arms.devices.clone(),
             serials: arms.serials.clone(),
             dispatcher: dispatcher.clone(),

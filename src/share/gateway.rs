@@ -1,7 +1,7 @@
 //! The gateway: a client of a run's socket that gives it to other computers.
 //!
 //! ```text
-//!  client ─ zenoh ─▶ queryable: key, role, form ─▶ Remote: a connection per client; per user for stop, cancel ─▶ run
+//!  client ─ zenoh ─▶ queryable: key, role, form ─▶ Remote: a connection per client; per stop, per cancel ─▶ run
 //!         ◀─ streams that everyone may read, read once ────────────────────────────────────────────────────── run
 //! ```
 //!
@@ -9,11 +9,12 @@
 //! closes when a client is lost. It decides nothing that the run decides.
 
 mod clients;
+mod run_end;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::io::{self, BufRead, BufReader, Write};
 use std::os::unix::net::UnixStream;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, SyncSender, channel, sync_channel};
 use std::sync::{Arc, Mutex, Weak};
@@ -26,6 +27,7 @@ use zenoh::query::Query;
 use zenoh::{Session, Wait};
 
 use super::class::{Class, PAGE, permit};
+use super::ends::Ends;
 use super::keys::{self, Who};
 use super::page::Pages;
 use super::remote::{Closed, Remote, Request, refuse};
@@ -34,7 +36,6 @@ use crate::blueprint::share::ShareConfig;
 use crate::rpc::api::{FaceReport, MAX_ANSWER, MAX_LINE, METHODS, Method, PlannerAnswer, RegisterGateway};
 use crate::rpc::error::{Code, RpcError};
 use crate::rpc::reach;
-use crate::rpc::run_dir::has_ended_in_order;
 use crate::sync::lock;
 
 /// Period of the checks of the clients.
@@ -84,8 +85,8 @@ struct Shared {
     session: Session,
     news: Sender<News>,
     clients: Mutex<BTreeMap<Who, Arc<Remote>>>,
-    /// The connection for what ends motion, by user: it needs no place among the clients.
-    ends: Mutex<BTreeMap<String, Arc<Remote>>>,
+    /// Requests that end motion.
+    ends: Ends,
     /// Set with the lock of `clients`: there are no new ones.
     run_ended: AtomicBool,
     /// Commanders whose leases ended because they were silent.
@@ -95,7 +96,7 @@ struct Shared {
 }
 
 impl Gateway {
-    /// Starts the gateway of a run. Fails if the run has another one.
+    /// Starts the gateway of a run; `socket` is to outlast its directory. Fails if the run has another one.
     pub fn start(run: &str, socket: PathBuf, config: ShareConfig) -> Result<Self, RpcError> {
         if let Some((what, hint)) = config.mistake() {
             return Err(RpcError::new(Code::InvalidParams, what).hint(hint));
@@ -103,7 +104,7 @@ impl Gateway {
         if let Some(soon) = certificates::check_gateway(&config)? {
             tracing::warn!("share: {soon}");
         }
-        let mut control = connect(&socket).map_err(|e| failed(format!("run {run}: {e}")))?;
+        let mut control = reach::wait_for(&socket).map_err(|e| failed(format!("run {run}: {}", io::Error::from(e))))?;
         let endpoints = config.listen.iter().chain(&config.connect).map(ToString::to_string).collect();
         register(&mut control, &RegisterGateway { endpoints, starting: true, ..RegisterGateway::default() })
             .map_err(|e| failed(e.to_string()))?;
@@ -131,7 +132,7 @@ impl Gateway {
             session,
             news: news.clone(),
             clients: Mutex::default(),
-            ends: Mutex::default(),
+            ends: Ends::default(),
             run_ended: AtomicBool::new(false),
             lost: Mutex::default(),
             pages,
@@ -141,10 +142,8 @@ impl Gateway {
         std::thread::Builder::new()
             .name("run-end".into())
             .spawn(move || {
-                // Replies to what is registered; then the end of the connection.
-                let _ = io::copy(&mut replies, &mut io::sink());
-                let ended = has_ended_in_order(&socket);
-                let _ = news.send(if ended { News::RunEnded } else { News::RunLost });
+                let in_order = run_end::is_in_order(&mut replies, &socket);
+                let _ = news.send(if in_order { News::RunEnded } else { News::RunLost });
             })
             .map_err(|e| failed(e.to_string()))?;
         let declared = shared.declare().map_err(|e| failed(e.to_string()))?;
@@ -236,13 +235,14 @@ impl Gateway {
         let clients: Vec<Arc<Remote>> = {
             let clients = lock(&shared.clients);
             shared.run_ended.store(true, Ordering::Release);
-            clients.values().chain(lock(&shared.ends).values()).cloned().collect()
+            clients.values().cloned().collect()
         };
         clients.iter().for_each(|remote| remote.close(Closed::RunEnded));
         let end = shared.session.put(keys::end(&shared.run), "").priority(Priority::RealTime);
         let _ = end.congestion_control(CongestionControl::Block).express(true).wait();
         let began = Instant::now();
-        while clients.iter().any(|remote| !remote.has_ended()) && began.elapsed() < LAST_ANSWERS {
+        let answers = || clients.iter().any(|remote| !remote.has_ended()) || !shared.ends.is_empty();
+        while answers() && began.elapsed() < LAST_ANSWERS {
             std::thread::sleep(Duration::from_millis(1));
         }
         // The end of the declarations would overtake it, and look like a loss.
@@ -308,16 +308,11 @@ impl Shared {
                     self.refuse(query, error);
                 }
             }
-            Ok((who, Class::End, method, params, bytes)) => {
+            Ok((who, Class::End, method, params, _)) => {
                 let name = lock(&self.clients).get(&who).map_or_else(|| who.short(), |known| lock(&known.name).clone());
                 tracing::warn!("share: {method} by {}", who.title(&name));
-                match self.end(&who.user) {
-                    Ok(remote) => {
-                        if let Some(query) = remote.queue(Request { query, class: Class::End, method, params, bytes }) {
-                            self.refuse(query, remote.over(&self.run));
-                        }
-                    }
-                    Err(error) => self.refuse(query, error),
+                if let Some((query, error)) = self.end(query, (&who.user, method, params)) {
+                    self.refuse(query, error);
                 }
             }
             Ok((who, class, method, params, bytes)) => match self.proved_client(&who, &query) {
@@ -380,11 +375,6 @@ impl Shared {
 
 fn failed(text: String) -> RpcError {
     RpcError::new(Code::Internal, text)
-}
-
-fn connect(socket: &Path) -> io::Result<UnixStream> {
-    let stream = reach::open(socket)?;
-    stream.set_nonblocking(false).map(|()| stream)
 }
 
 /// Sends what the gateway says of itself.

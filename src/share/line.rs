@@ -8,7 +8,7 @@
 //! So every verb works over it unchanged, and a client that does not read delays neither the network nor the gateway.
 
 use std::collections::BTreeMap;
-use std::io::{self, BufRead, BufReader, Read, Write};
+use std::io::{self, BufRead, BufReader, Write};
 use std::net::{Shutdown, TcpStream, ToSocketAddrs};
 use std::os::unix::net::UnixStream;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -27,6 +27,7 @@ use super::class::Class;
 use super::gateway::PROOF;
 use super::place::Place;
 use super::{certificates, keys, settings};
+use crate::random;
 use crate::rpc::api::{METHODS, Method};
 use crate::rpc::client::{Client, ClientError};
 use crate::rpc::error::{Code, RpcError};
@@ -135,7 +136,7 @@ impl Line {
         let (out, lines) = sync_channel(QUEUE);
         let line = Arc::new(Self {
             id: session.zid().to_string(),
-            proof: random()?,
+            proof: random::bytes()?,
             session,
             place: place.name.clone(),
             run: run.to_owned(),
@@ -295,13 +296,6 @@ impl Line {
         let text = format!("the connection to {} is lost", self.place);
         self.over(Code::Lost, text);
     }
-}
-
-/// Returns random bytes.
-fn random() -> io::Result<[u8; PROOF]> {
-    let mut bytes = [0; PROOF];
-    std::fs::File::open("/dev/urandom")?.read_exact(&mut bytes)?;
-    Ok(bytes)
 }
 
 /// Beats until the connection ends.

@@ -15,6 +15,8 @@ mod certificates;
 #[cfg(feature = "share")]
 mod class;
 #[cfg(feature = "share")]
+mod ends;
+#[cfg(feature = "share")]
 mod gateway;
 #[cfg(feature = "share")]
 mod keys;

@@ -1,5 +1,4 @@
-//! A client on another computer: a connection to the run's socket, with its own thread and queue. Requests that end
-//! motion have one for all clients of a user, so that a `stop` waits behind no slow request and needs no free place.
+//! A client on another computer: a connection to the run's socket, with its own thread and queue.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -93,8 +92,8 @@ pub(super) struct Ways<'a> {
 }
 
 impl Remote {
-    /// Starts the thread of a client; of the requests that end motion, with `ends`.
-    pub fn start(who: Who, ends: bool, ways: &Ways<'_>) -> io::Result<Arc<Self>> {
+    /// Starts the thread of a client.
+    pub fn start(who: Who, ways: &Ways<'_>) -> io::Result<Arc<Self>> {
         let (to, requests) = channel(QUEUE);
         let remote = Arc::new(Self {
             name: Mutex::new(who.short()),
@@ -113,8 +112,8 @@ impl Remote {
             pending: BTreeMap::new(),
             next: BEHALF + 1,
         };
-        let (socket, behalf) = (ways.socket.to_owned(), (!ends).then_some(ways.cancel_at_end));
-        std::thread::Builder::new().name(if ends { "client-stop" } else { "client" }.into()).spawn(move || {
+        let (socket, behalf) = (ways.socket.to_owned(), ways.cancel_at_end);
+        std::thread::Builder::new().name("client".into()).spawn(move || {
             let runtime = tokio::runtime::Builder::new_current_thread().enable_io().enable_time().build();
             let served = runtime.map(|runtime| runtime.block_on(line.serve(requests, &socket, behalf)));
             if let Err(e) = served {
@@ -203,12 +202,14 @@ struct Line {
 
 impl Line {
     /// Serves until the connection ends, and refuses what is without a reply then.
-    async fn serve(mut self, mut requests: Receiver<Request>, socket: &Path, behalf: Option<bool>) {
+    async fn serve(mut self, mut requests: Receiver<Request>, socket: &Path, behalf: bool) {
         let mut end = self.remote.end.subscribe();
-        let connected = reach::open(socket).and_then(UnixStream::from_std);
+        let connected = reach::wait_for(socket).map_err(io::Error::from);
+        let connected = connected.and_then(|stream| stream.set_nonblocking(true).map(|()| stream));
+        let connected = connected.and_then(UnixStream::from_std);
         let refused = connected.as_ref().err().map(ToString::to_string);
         if let Ok(stream) = connected {
-            self.exchange(stream, &mut requests, &mut end, behalf).await;
+            self.exchange(stream, &mut requests, &mut end, Some(behalf)).await;
         }
         // A run that ends closes all connections: this one perhaps first.
         let is_closed = tokio::time::timeout(END_TIMEOUT, end.wait_for(Option::is_some)).await.is_ok();
@@ -289,6 +290,13 @@ impl Line {
             let key = keys::to(&self.run, &self.remote.who.user, &self.remote.who.id, stream);
             let priority = if stream == PLANNER_REQUESTS { Priority::DataHigh } else { Priority::RealTime };
             let _ = self.session.put(key, line).priority(priority).express(true).wait();
+            return;
+        }
+        // The run refuses the connection, and with it all that was asked.
+        if incoming["id"].is_null()
+            && let Ok(error) = serde_json::from_value::<RpcError>(incoming["error"].take())
+        {
+            std::mem::take(&mut self.pending).into_values().for_each(|request| refuse(&request.query, &error));
             return;
         }
         let Some(request) = incoming["id"].as_u64().and_then(|id| self.pending.remove(&id)) else { return };

@@ -1,9 +1,10 @@
 //! Who may use the page: those with the token, from a page of this server. Another page in the same browser has
 //! neither: its `Origin` differs, and a name that it resolves to this computer is not an accepted `Host`.
 
-use std::fs::File;
-use std::io::{self, Read};
+use std::io;
 use std::net::{IpAddr, SocketAddr};
+
+use crate::random;
 
 /// What gives access to the page of one run.
 #[derive(Debug)]
@@ -15,9 +16,7 @@ pub struct Access {
 impl Access {
     /// Makes a new token for the page at this address.
     pub fn new(at: SocketAddr) -> io::Result<Self> {
-        let mut random = [0; 16];
-        File::open("/dev/urandom")?.read_exact(&mut random)?;
-        Ok(Self { at, token: format!("{:032x}", u128::from_le_bytes(random)) })
+        Ok(Self { at, token: format!("{:032x}", u128::from_le_bytes(random::bytes()?)) })
     }
 
     /// Returns the address of the page. A browser on this computer opens it, whatever address the server listens at.

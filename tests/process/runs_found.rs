@@ -136,11 +136,37 @@ fn a_stop_that_reaches_no_socket_names_the_process() {
     let not_stopped = format!("error: run {name} (pid {pid}) is not stopped: ");
     let hint = format!("hint: its own stop, or kill -INT {pid}: its arms decelerate to rest");
     elsewhere(&home, &format!("stop --run {name}")).with(1).says(&[&not_stopped, &hint]);
-    // Many times: nothing fills up.
+    // Many times: nothing fills up. At once: the run says so itself.
+    let began = Instant::now();
     for _ in 0..10 {
         Started::of(&mut open(&home, &format!("stop --run {name}"))).wait().with(1).says(&[&not_stopped]);
     }
+    for verb in ["cancel --run", "down"] {
+        let refused = elsewhere(&home, &format!("{verb} {name}"));
+        assert_ne!(refused.says(&["serves no clients", "hint: "]).code, Some(0), "{verb}");
+    }
+    assert!(began.elapsed() < Duration::from_secs(10), "{:?}", began.elapsed());
     run.end(Signal::INT).with(130);
+}
+
+#[test]
+fn a_name_that_another_user_has_taken_is_said() {
+    let (home, name) = (Home::new(), own_name());
+    let mark = format!("dimos/run/{}/{name}", rustix::process::geteuid().as_raw());
+    let script = format!(
+        "import os, socket, sys; os.setuid(65534); s = socket.socket(socket.AF_UNIX); s.bind('\\0{mark}')\n\
+         s.listen(); print('it listens', flush=True); sys.stdin.read()"
+    );
+    let taken = Started::of(Command::new("python3").args(["-c", &script]).stdin(Stdio::piped()));
+    eventually("it listens or may not", || taken.out().contains("it listens") || taken.over());
+    if taken.over() {
+        return skip_privileged(&format!("another user: {}", taken.err()), CapabilitySet::SETUID);
+    }
+    let line = format!("run coordinator-mock --no-record --duration 1s --name {name}");
+    let refused = Started::of(&mut open(&home, &line)).wait();
+    let says = format!("another user has the name \"{name}\" (uid 65534, pid {})", taken.pid());
+    assert_ne!(refused.says(&[&says, "hint: choose another name"]).code, Some(0));
+    elsewhere(&home, &format!("stop --run {name}")).with(2).says(&["no live run is named"]);
 }
 
 #[test]
@@ -174,8 +200,16 @@ fn files_that_no_run_made_are_left_alone() {
         files.iter().for_each(|file| fs::write(folder.join(file), "precious").unwrap());
         drop(UnixListener::bind(folder.join("other.sock")).unwrap());
         for verb in ["status", "stop", "view", "down x", "run coordinator-mock --duration 1s --no-record"] {
-            let code = home.dimos(verb).code;
-            assert!(verb == "status" || code != Some(0), "{verb}: {code:?}");
+            let ended = home.dimos(verb);
+            let says = match verb.split(' ').next().unwrap() {
+                "status" => vec![],
+                "stop" | "view" => vec!["no run of this user is live", "hint: "],
+                "down" => vec!["no live run is named"],
+                _ if is_link => vec!["is not a directory of this user", "hint: "],
+                _ => vec!["was not made by a run", "hint: "],
+            };
+            assert_eq!(ended.code == Some(0), says.is_empty(), "{verb}: {:?}", ended.code);
+            ended.says(&says);
         }
         let tab = Started::of(home.command("-- dimos status ").env("DIMOS_COMPLETE", "bash")).wait();
         assert!(tab.code.is_some());
@@ -187,7 +221,22 @@ fn files_that_no_run_made_are_left_alone() {
             let refused = home.dimos("run coordinator-mock --duration 1s --no-record --name Cargo");
             assert_ne!(refused.says(&["Cargo.lock was not made by a run"]).code, Some(0));
             assert_eq!(fs::read(folder.join("Cargo.lock")).unwrap(), b"precious");
+            // Nor that of the name of a text: not beside a lock of its own.
             fs::remove_file(folder.join("other.sock")).unwrap();
+            for (text, rights) in
+                [("precious", 0o600), ("http://127.0.0.1:1/#0 is my arm", 0o600), ("http://a/#b", 0o644)]
+            {
+                fs::write(folder.join("notes.view"), text).unwrap();
+                fs::set_permissions(folder.join("notes.view"), PermissionsExt::from_mode(rights)).unwrap();
+                let refused = home.dimos("run coordinator-mock --duration 1s --no-record --name notes");
+                assert_ne!(refused.says(&["notes.view was not made by a run"]).code, Some(0));
+                assert_eq!(fs::read(folder.join("notes.view")).unwrap(), text.as_bytes());
+            }
+            // What a run that was killed left is no obstacle.
+            fs::write(folder.join("notes.view"), "http://127.0.0.1:1/#0\n").unwrap();
+            fs::set_permissions(folder.join("notes.view"), PermissionsExt::from_mode(0o600)).unwrap();
+            home.dimos("run coordinator-mock --duration 1s --no-record --name notes").with(0);
+            fs::write(folder.join("notes.view"), "precious").unwrap();
         }
     }
 }

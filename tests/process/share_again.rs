@@ -67,6 +67,25 @@ fn a_watcher_says_what_is_lost_and_goes_on_when_it_is_back() {
 }
 
 #[test]
+fn a_run_without_its_folder_is_reached_from_elsewhere_and_its_end_is_said() {
+    if !is_built() {
+        return;
+    }
+    let shared = Shared::start(", users: {'-': operator}");
+    let folder = shared.home.path().join("run/dimos");
+    std::fs::remove_dir_all(&folder).unwrap();
+    std::fs::write(&folder, "").unwrap();
+    shared.there("stop").with(0).shows(&["confirmed"]);
+    shared.there("state").with(0);
+    let watch = Started::of(shared.command("state --watch --json").stdin(Stdio::null()));
+    watch.until("arm_joint1");
+    shared.run.signal(Signal::INT);
+    watch.until("waiting for it");
+    assert!(watch.err().contains("has ended; waiting for it"), "{}", watch.err());
+    watch.end(Signal::INT);
+}
+
+#[test]
 fn every_request_that_is_pending_at_the_end_of_a_run_is_told_of_it() {
     if !is_built() {
         return;

@@ -198,6 +198,37 @@ fn n08_a_flood_of_requests_is_bounded_and_delays_no_stop() {
 }
 
 #[test]
+fn every_request_that_ends_motion_is_answered_and_no_cancel_takes_the_place_of_a_stop() {
+    if !is_built() {
+        return;
+    }
+    let shared = Shared::start(", users: {'-': operator}");
+    let Some(mut judge) = Judge::open(&shared.at, "-", Value::Null) else { return };
+    let Some(mut other) = Judge::open(&shared.at, "-", Value::Null) else { return };
+    judge.does("announce", json!({}));
+    other.does("announce", json!({}));
+    let run = shared.run.pid() as i32;
+    signal(run, Signal::STOP);
+    let cancelling = std::thread::spawn(move || {
+        let flood = judge.does("flood", json!({"method": "cancel", "cls": "end", "count": 60}));
+        (judge, flood)
+    });
+    std::thread::sleep(Duration::from_millis(500));
+    let stopping = std::thread::spawn(move || {
+        let stop = other.asks("end", "stop", json!({}));
+        (other, stop)
+    });
+    std::thread::sleep(Duration::from_millis(500));
+    signal(run, Signal::CONT);
+    let (_other, stop) = stopping.join().unwrap();
+    assert_eq!(stop["result"]["arms"]["arm"], "confirmed", "{stop}");
+    let (_judge, flood) = cancelling.join().unwrap();
+    let (done, refused) = (flood["done"].as_u64().unwrap(), flood["refused"].as_u64().unwrap());
+    assert_eq!((done, done + refused), (16, 60), "{flood}");
+    assert_eq!(flood["codes"]["TOO_MANY_REQUESTS"], refused, "{flood}");
+}
+
+#[test]
 fn n18_an_id_belongs_to_the_program_that_used_it_first() {
     if !is_built() {
         return;

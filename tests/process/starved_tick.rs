@@ -53,6 +53,8 @@ fn a_starved_tick_does_not_end_the_run() {
     hogs.iter().for_each(|hog| pin(hog.pid(), cpu));
     std::thread::sleep(Duration::from_secs(6));
     assert!(!run.over(), "it has ended: {}", run.err());
+    let arm = &home.status()["arms"][0];
+    assert_eq!((&arm["phase"], &arm["enabled"]), (&"held".into(), &true.into()), "{arm}");
     drop(hogs);
     let mut client = home.client();
     eventually("it ticks again, and the arm can be made ready", || {

@@ -1,8 +1,9 @@
 //! A stop needs no place among the connections of a run, and a thread that hangs does not keep it from being answered.
 //! Judged on the verb, as a user types it, and on its exit code.
 
-use std::io::Write;
-use std::os::unix::net::UnixStream;
+use std::io::{BufRead, BufReader, Write};
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::net::{SocketAddr, UnixStream};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::Arc;
@@ -10,6 +11,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use dimos::rpc::api::{Confirmation, Stop};
+use dimos::rpc::client::Client;
 use rustix::thread::CapabilitySet;
 
 use crate::support::program::{Home, Started, eventually};
@@ -33,7 +36,7 @@ impl Flood {
             std::thread::spawn(move || {
                 let mut kept = std::collections::VecDeque::new();
                 while !stop.load(Ordering::Relaxed) {
-                    if let Ok(mut stream) = UnixStream::connect(&socket) {
+                    if let Ok(mut stream) = connect(&socket) {
                         let _ = stream.write_all(first);
                         kept.push_back(stream);
                     }
@@ -52,6 +55,28 @@ impl Drop for Flood {
         self.stop.store(true, Ordering::Relaxed);
         self.threads.drain(..).for_each(|thread| drop(thread.join()));
     }
+}
+
+/// Connects to a path, or to the mark `@NAME`.
+fn connect(at: &Path) -> std::io::Result<UnixStream> {
+    match at.to_str().unwrap().strip_prefix('@') {
+        Some(name) => UnixStream::connect_addr(&SocketAddr::from_abstract_name(name)?),
+        None => UnixStream::connect(at),
+    }
+}
+
+/// Where the run is reached without its folder.
+fn mark(home: &Home) -> PathBuf {
+    let folder = home.runs();
+    let mark = folder.lasting(&folder.runs().unwrap()[0]);
+    assert!(mark.to_str().unwrap().starts_with("@dimos/run/"), "{mark:?}");
+    mark
+}
+
+/// Asks for a stop at a socket, as the verb does.
+fn stop_at(socket: &Path) -> Confirmation {
+    let connect = || Client::connect("cell", socket);
+    Client::urgent(None, connect, &Stop::default()).unwrap().1.arms["arm"]
 }
 
 fn socket(home: &Home) -> PathBuf {
@@ -105,7 +130,7 @@ fn a_stop_that_needs_no_place_leaves_a_connection_that_can_be_used() {
     let _run = home.run("coordinator-mock --no-record");
     let mut client = home.client();
     for _ in 0..3 {
-        client.call(dimos::rpc::api::Stop::default()).unwrap();
+        client.call(Stop::default()).unwrap();
         assert_eq!(client.call(dimos::rpc::api::State {}).unwrap().arms.len(), 1);
         client.call(dimos::rpc::api::Cancel::default()).unwrap();
     }
@@ -164,7 +189,97 @@ fn a_hung_thread_for_stops_is_replaced() {
     // Its client gets an end, no endless wait; the lease is free.
     assert!(holder.call(dimos::rpc::api::Status {}).is_err());
     assert!(home.status()["arms"][0]["commander"].is_null());
+    // As many as hang at the same time are replaced, and one that recovers counts no longer.
+    let Some(last) = hang(&run, "rpc-stop") else { return };
+    eventually("it says that it is at its end", || run.err().contains("hangs, like 3 before it"));
+    drop(debuggers);
+    eventually("it is replaced", || run.err().matches("another one takes its place").count() == 4);
+    assert!(home.dimos("stop").with(0).out.contains("confirmed"));
+    drop(last);
     home.dimos("arm reset arm").with(0);
     home.dimos("down").with(0);
     run.wait().with(0);
+}
+
+#[test]
+fn a_stop_without_a_folder_is_answered_beside_floods_and_a_hung_thread() {
+    let home = Home::new();
+    let run = home.run("coordinator-mock --no-record");
+    let mark = mark(&home);
+    for first in [&b""[..], b"{\"id\":1,\"method\":\"stop\",\"params\":{"] {
+        let _flood = Flood::begin(&mark, first);
+        for _ in 0..5 {
+            assert_eq!(stop_at(&mark), Confirmation::Confirmed);
+        }
+    }
+    let Some(_debugger) = hang(&run, "rpc-stop") else { return };
+    // What waits for the thread that hangs is answered by the next one.
+    let began = Instant::now();
+    let mut waiting = connect(&mark).unwrap();
+    waiting.set_read_timeout(Some(2 * STOP_LIMIT)).unwrap();
+    waiting.write_all(b"{\"id\":1,\"method\":\"stop\"}\n").unwrap();
+    let mut reply = String::new();
+    BufReader::new(waiting).read_line(&mut reply).unwrap();
+    assert!(reply.contains("confirmed") && began.elapsed() < STOP_LIMIT, "{:?}: {reply}", began.elapsed());
+    assert_eq!(stop_at(&mark), Confirmation::Confirmed);
+}
+
+#[test]
+fn stops_that_are_under_way_when_a_thread_hangs_end() {
+    let home = Home::new();
+    let run = home.run("coordinator-mock --no-record");
+    let (socket, ended) = (socket(&home), Arc::new(AtomicBool::new(false)));
+    let until = ended.clone();
+    let asking = std::thread::spawn(move || {
+        let mut longest = Duration::ZERO;
+        while !until.load(Ordering::Relaxed) {
+            let Ok(mut stream) = connect(&socket) else { continue };
+            stream.set_read_timeout(Some(Duration::from_secs(5))).unwrap();
+            let began = Instant::now();
+            let _ = stream.write_all(b"{\"id\":1,\"method\":\"stop\"}\n");
+            // A reply, or an end: then it is asked again.
+            BufReader::new(stream).read_line(&mut String::new()).expect("an end");
+            longest = longest.max(began.elapsed());
+        }
+        longest
+    });
+    for _ in 0..3 {
+        let Some(_debugger) = hang(&run, "rpc-stop") else { break };
+        std::thread::sleep(Duration::from_secs(1));
+    }
+    ended.store(true, Ordering::Relaxed);
+    let longest = asking.join().unwrap();
+    assert!(longest < STOP_LIMIT, "{longest:?}");
+}
+
+#[test]
+fn the_python_client_stops_beside_a_hung_thread() {
+    let home = Home::new();
+    let run = home.run("coordinator-mock --no-record");
+    let script = "import dimos_client as d, sys; c = d.Client.connect(); c.status(); print('connected', flush=True)
+sys.stdin.readline(); print(c.stop(), c.cancel(), flush=True)";
+    let mut python = Command::new("python3");
+    home.settle(python.args(["-c", script]).env("PYTHONDONTWRITEBYTECODE", "1").stdin(Stdio::piped()));
+    python.env("PYTHONPATH", concat!(env!("CARGO_MANIFEST_DIR"), "/assets/python"));
+    let mut client = Started::of(&mut python);
+    client.until("connected");
+    let Some(_debugger) = hang(&run, "rpc-stop") else { return };
+    let began = Instant::now();
+    client.stdin().write_all(b"\n").unwrap();
+    client.wait().with(0).shows(&["{'arm': 'confirmed'}"]);
+    assert!(began.elapsed() < STOP_LIMIT, "{:?}", began.elapsed());
+}
+
+#[test]
+fn a_file_system_that_hangs_delays_neither_a_stop_nor_the_end() {
+    let home = Home::new();
+    let run = home.run("coordinator-mock --no-record");
+    let Some(_debugger) = hang(&run, "rpc-look") else { return };
+    std::fs::remove_file(socket(&home)).unwrap();
+    let began = Instant::now();
+    assert!(home.dimos("stop").with(0).out.contains("confirmed"));
+    home.dimos("arm reset arm").with(0);
+    home.dimos("down").with(0);
+    run.wait().with(0);
+    assert!(began.elapsed() < Duration::from_secs(10), "{:?}", began.elapsed());
 }

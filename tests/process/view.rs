@@ -8,14 +8,16 @@ use std::os::unix::fs::PermissionsExt;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
+use dimos::rpc::client::view_url;
 use dimos::rpc::run_dir::RunDir;
 use dimos::runtime::{Record, Run};
+use rustix::process::Signal;
 use serde_json::{Value, json};
 use tungstenite::client::IntoClientRequest;
 use tungstenite::http::HeaderValue;
 use tungstenite::{Message, WebSocket};
 
-use crate::support::program::{Ended, Home, Started, TIMEOUT, eventually};
+use crate::support::program::{Ended, Home, Started, TIMEOUT, UP, eventually};
 
 /// An arm with a mesh in two places, one that is missing, and a primitive.
 const URDF: &str = r#"<robot name="cell">
@@ -138,6 +140,19 @@ fn unpacked(content: &[u8]) -> String {
     let mut gzip = Command::new("gzip").arg("-dc").stdin(piped()).stdout(piped()).spawn().unwrap();
     gzip.stdin.take().unwrap().write_all(content).unwrap();
     Ended::from(gzip.wait_with_output().unwrap()).with(0).out
+}
+
+#[test]
+fn the_page_of_a_run_is_found_by_its_mark() {
+    let home = Home::new();
+    let mut command = home.as_typed("run yourarm-planner --no-record --set view.port=0");
+    let run = Started::of(command.stdin(Stdio::null()));
+    run.until(UP);
+    let (folder, live) = (home.runs(), home.runs().runs().unwrap().remove(0));
+    let at_socket = view_url(&live.name, &live.socket).unwrap();
+    assert_eq!(view_url(&live.name, &folder.lasting(&live)).unwrap(), at_socket);
+    assert_ne!(folder.lasting(&live), live.socket);
+    run.end(Signal::INT);
 }
 
 #[test]

@@ -30,6 +30,8 @@ pub struct FakeBackend {
     pub plans: bool,
     /// When set, the arm is real, at this address.
     pub address: Option<&'static str>,
+    /// Whether it is a program on the run's computer.
+    pub local: bool,
     /// While set, `planner` is not answered.
     pub holds_planner: AtomicBool,
 }
@@ -97,7 +99,8 @@ impl Backend for FakeBackend {
                 Request::Status(_) => {
                     let mut status = status();
                     if let Some(address) = self.address {
-                        (status.arms[0].address, status.arms[0].simulated) = (address.to_owned(), false);
+                        let arm = &mut status.arms[0];
+                        (arm.address, arm.simulated, arm.local) = (address.to_owned(), false, self.local);
                     }
                     Reply::Status(status)
                 }

@@ -153,7 +153,7 @@ class Client(Planning):
 
     def cancel(self, arm: Optional[str] = None, task: Optional[str] = None) -> Dict[str, str]:
         """Ends motions by decelerating: of an arm, of a task, or all; without a task also planning."""
-        ended: Dict[str, str] = self.call("cancel", arm=arm, task=task)["tasks"]
+        ended: Dict[str, str] = self._urgent("cancel", arm=arm, task=task)["tasks"]
         return ended
 
     def speed(self, fraction: Optional[float] = None, paused: Optional[bool] = None) -> Dict[str, Any]:
@@ -167,7 +167,7 @@ class Client(Planning):
 
     def stop(self, arm: Optional[str] = None) -> Dict[str, str]:
         """Latched hold at once, of an arm or of all: an operational stop. Per arm `confirmed`, or not."""
-        stopped: Dict[str, str] = self.call("stop", arm=arm)["arms"]
+        stopped: Dict[str, str] = self._urgent("stop", arm=arm)["arms"]
         return stopped
 
     def reset(self, arm: str) -> str:

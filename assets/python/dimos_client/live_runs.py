@@ -82,7 +82,7 @@ def _locked(folder: Path) -> Iterator[Tuple[str, Path, int]]:
             continue
         try:
             found = os.fstat(file)
-            is_lock = stat.S_ISREG(found.st_mode) and found.st_uid == os.geteuid() and found.st_nlink == 1
+            is_lock = stat.S_ISREG(found.st_mode) and found.st_uid == os.geteuid() and found.st_nlink <= 1
             pid = b"0" + os.read(file, 20).strip() if is_lock and found.st_size <= 20 else b""
             if pid.isdigit():
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # what is not locked is what a dead run left
@@ -142,31 +142,40 @@ def _here(rows: List[_Row], prefix: str, name: str) -> Optional[Path]:
 
 def _elsewhere(known: Set[str], prefix: str) -> Iterator[Tuple[str, Path]]:
     """Runs with marks in the network namespaces of other processes of this user, by a path that leads there."""
-    for pid in filter(str.isdigit, os.listdir("/proc")):
-        try:
-            with open(f"/proc/{pid}/status") as status:
-                users = next(line for line in status if line.startswith("Uid:")).split()
-            if int(users[2]) != os.geteuid() or _is_here(pid):
-                continue
-        except (OSError, StopIteration):
-            continue
-        rows = _rows(pid)
+    for pids in _other_namespaces():
+        rows = next(filter(None, map(_rows, pids)), [])  # a process may be closed to this one, another one is not
         for inode, path in rows:
             names = _marked([(inode, path)], prefix)
             if inode in known or not names:
                 continue
             known.add(inode)
             ways = [way for _, way in rows if way.startswith("/") and way.endswith(f"/{names[0]}.sock")]
-            for way in [f"/proc/{pid}/root{way}" for way in ways] + ways:
-                found = _peer_at(way)
-                if found and found[1] == os.geteuid():
+            for way in [f"/proc/{pid}/root{way}" for way in ways for pid in pids] + ways:
+                pid, user = _peer_at(way) or (-1, -1)
+                if user == os.geteuid() and (pid == 0 or str(pid) in pids):  # a run of this namespace may be there
                     yield names[0], Path(way)
                     break
 
 
-def _is_here(pid: str) -> bool:
-    """Whether a process is known to be in this network namespace."""
+def _other_namespaces() -> List[List[str]]:
+    """The processes of this user in each other network namespace. One whose namespace is not known is alone in it."""
+    own = _namespace("self")
+    found: Dict[Union[int, str], List[str]] = {}
+    for pid in filter(str.isdigit, os.listdir("/proc")):
+        try:
+            with open(f"/proc/{pid}/status") as status:
+                users = next(line for line in status if line.startswith("Uid:")).split()
+        except (OSError, StopIteration):
+            continue
+        namespace = _namespace(pid)
+        if int(users[2]) == os.geteuid() and (namespace is None or namespace != own):
+            found.setdefault(namespace or pid, []).append(pid)
+    return list(found.values())
+
+
+def _namespace(pid: str) -> Optional[int]:
+    """The number of the network namespace of a process; None if it is not shown."""
     try:
-        return os.stat(f"/proc/{pid}/ns/net").st_ino == os.stat("/proc/self/ns/net").st_ino
+        return os.stat(f"/proc/{pid}/ns/net").st_ino
     except OSError:
-        return False
+        return None

@@ -20,6 +20,7 @@ use crate::hardware::conformance::lag::Lag;
 use crate::hardware::conformance::{Check, Made, Subject, checks, figures, first_motion, run_all};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, EmulatorAddress, Registry, SIM};
 use crate::joint::ControlMode;
+use crate::rpc::run_dir::RunDir;
 use crate::runtime::device_lock::{self, DeviceLock};
 
 /// For how long the state is watched.
@@ -167,7 +168,7 @@ impl Args {
                 let full = (row.address.check)(address)
                     .map_err(|e| Failure::usage(format!("--address {address}: {e}")).hint(row.address.form))?;
                 let config = self.made(row, &full)?;
-                let lock = device_lock::take(row.name, &full)
+                let lock = device_lock::take(row.name, &full, RunDir::standard().is_closed())
                     .map_err(|e| Failure::new(Exit::Hardware, e.to_string()).hint(e.hint()))?;
                 Ok(Bench { subject: subject(config, true), address: full, emulator: None, _lock: Some(lock) })
             }

@@ -10,6 +10,7 @@ use super::super::output;
 use crate::hardware::adapter::AdapterError;
 use crate::hardware::registry::{AdapterSpec, Registry};
 use crate::hardware::service::{OpenService, Service};
+use crate::rpc::run_dir::RunDir;
 use crate::runtime::device_lock::{self, DeviceLock};
 
 /// Which arm, and where.
@@ -43,7 +44,8 @@ impl fmt::Display for BusArgs {
 
 /// Locks a device against runs and other verbs. `address` is complete.
 pub fn lock(row: &AdapterSpec, address: &str) -> Result<DeviceLock> {
-    device_lock::take(row.name, address).map_err(|e| Failure::new(Exit::Hardware, e.to_string()).hint(e.hint()))
+    let taken = device_lock::take(row.name, address, RunDir::standard().is_closed());
+    taken.map_err(|e| Failure::new(Exit::Hardware, e.to_string()).hint(e.hint()))
 }
 
 /// Returns the row of an adapter with work to do outside a run, and its service.

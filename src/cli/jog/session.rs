@@ -145,6 +145,10 @@ impl Session {
             match &self.link {
                 Link::Back if resume => self.resume()?,
                 Link::Back if stops => self.stop()?,
+                Link::Lost(_) if stops => {
+                    let text = "not stopped: the connection is lost; use the arm's own stop, or `dimos stop`";
+                    self.message = Some((text.into(), true));
+                }
                 _ => {}
             }
             return Ok(None);
@@ -231,13 +235,8 @@ impl Session {
         (self.stream, self.resting) = (None, None);
         let arm = self.setting.arm.clone();
         let stop = Stop { arm: Some(arm.clone()) };
-        let reply = match self.client.call(stop.clone()) {
-            Err(error) if error.is_passing() => {
-                Client::urgent(None, || connect(Some(&self.setting.run)), &stop).map(|(_, reply)| reply)
-            }
-            reply => reply,
-        };
-        let text = match reply {
+        let run = &self.setting.run;
+        let text = match self.client.call_urgently(|| connect(Some(run)), &stop) {
             Ok(reply) => {
                 let result = reply.arms.get(&arm).map_or("unknown", |confirmation| confirmation.text());
                 format!("stop of {arm}: {result}; next: `dimos arm reset {arm}`, `dimos arm enable {arm}`")

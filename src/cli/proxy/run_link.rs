@@ -2,12 +2,11 @@
 //!
 //! ```text
 //!  RunArm ──▶ commands  lease, move, targets; a thread takes the replies
-//!         ──▶ urgent    stop and cancel, which always get through; a thread sends them
+//!         ──▶ ends      stop and cancel, which always get through; a thread for each kind sends them
 //!  View   ◀── state     a thread reads joints, pose, gripper, the motion's progress, and the status
 //! ```
 
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
@@ -15,12 +14,13 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use nalgebra::Isometry3;
 
+use super::ends::Ends;
 use super::replies::Commands;
 use crate::cli::arguments;
 use crate::cli::exit::Result;
 use crate::joint::Joints;
 use crate::pose::from_xyz_rpy;
-use crate::rpc::api::{Cancel, Motion, State, Status, Stop};
+use crate::rpc::api::{Cancel, Motion, State, Status};
 use crate::rpc::client::{Client, ClientError};
 use crate::rpc::report::{ArmReport, ArmStateReport, StatusReport};
 use crate::sync::lock;
@@ -224,16 +224,7 @@ impl Shared {
 pub struct RunLink {
     pub shared: Arc<Shared>,
     pub commands: Arc<Mutex<Commands>>,
-    urgent: Sender<Urgent>,
-    /// Number of the latest stop.
-    stops: AtomicU64,
-}
-
-/// A request that always gets through.
-enum Urgent {
-    /// The stop with this number.
-    Stop(u64),
-    Cancel(Cancel),
+    ends: Ends,
 }
 
 impl RunLink {
@@ -241,13 +232,12 @@ impl RunLink {
     pub fn open(run: &str, arm: &str, streams: [Option<String>; 2]) -> Result<Self> {
         let connect = || arguments::connect(Some(run));
         let shared = Arc::new(Shared::new(arm, streams));
-        let (mut state, urgent, mut replies) = (connect()?, connect()?, connect()?);
+        let (mut state, mut replies) = (connect()?, connect()?);
         read_state(&mut state, &shared)?;
         shared.keep_status(&state.call(Status {})?, Instant::now());
         let commands = Arc::new(Mutex::new(Commands::new(replies.sender()?)));
         start("proxy-state", &shared, move |shared| watch_state(&mut state, shared))?;
-        let (to_urgent, requests) = channel();
-        start("proxy-stops", &shared, move |shared| send_urgent_requests(&requests, urgent, shared))?;
+        let ends = Ends::start(&shared, [connect()?, connect()?])?;
         let taker = commands.clone();
         start("proxy-replies", &shared, move |shared| {
             loop {
@@ -256,21 +246,17 @@ impl RunLink {
                 }
             }
         })?;
-        Ok(Self { shared, commands, urgent: to_urgent, stops: AtomicU64::new(0) })
+        Ok(Self { shared, commands, ends })
     }
 
     /// Stops the arm. Until the run answers, it counts as held.
     pub fn stop(&self) {
-        let mut view = self.shared.view();
-        let number = self.stops.fetch_add(1, Ordering::Relaxed);
-        (view.ready, view.held, view.stopping) = (false, true, Some(number));
-        // Fails only once the run is lost.
-        let _ = self.urgent.send(Urgent::Stop(number));
+        self.ends.stop(&self.shared);
     }
 
     /// Cancels motions, also beside clients that occupy all connections of the run.
     pub fn cancel(&self, cancel: Cancel) {
-        let _ = self.urgent.send(Urgent::Cancel(cancel));
+        self.ends.cancel(cancel);
     }
 }
 
@@ -282,7 +268,7 @@ impl Drop for RunLink {
 }
 
 /// Starts a thread that ends with its connection.
-fn start(
+pub(super) fn start(
     name: &str,
     shared: &Arc<Shared>,
     work: impl FnOnce(&Shared) -> std::result::Result<(), ClientError> + Send + 'static,
@@ -336,35 +322,6 @@ fn watch_state(client: &mut Client, shared: &Shared) -> std::result::Result<(), 
         }
         next = (next + STATE_PERIOD).max(Instant::now());
         sleep(next.saturating_duration_since(Instant::now()));
-    }
-    Ok(())
-}
-
-/// Sends the requests that always get through, over `open` and, where the run closes it, over new connections.
-fn send_urgent_requests(
-    requests: &Receiver<Urgent>,
-    open: Client,
-    shared: &Shared,
-) -> std::result::Result<(), ClientError> {
-    let run = open.run().to_owned();
-    let (connect, mut open) = (|| arguments::connect(Some(&run)), Some(open));
-    for request in requests {
-        let answered = match &request {
-            Urgent::Stop(_) => {
-                let stop = Stop { arm: Some(shared.arm.clone()) };
-                Client::urgent(open.take(), connect, &stop).map(|(client, _)| client)
-            }
-            Urgent::Cancel(cancel) => Client::urgent(open.take(), connect, cancel).map(|(client, _)| client),
-        };
-        match answered {
-            Ok(client) => open = Some(client),
-            Err(ClientError::Refused(refusal)) => shared.note(refusal.to_string()),
-            Err(error) => return Err(error),
-        }
-        let mut view = shared.view();
-        if matches!(request, Urgent::Stop(number) if view.stopping == Some(number)) {
-            (view.stopping, view.not_before) = (None, Instant::now());
-        }
     }
     Ok(())
 }

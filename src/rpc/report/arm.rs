@@ -19,6 +19,9 @@ pub struct ArmReport {
     pub address: String,
     /// Whether it is an emulator, or an ideal arm in memory.
     pub simulated: bool,
+    /// Whether only a program on the run's own computer can be at its address: an emulator, for example.
+    #[serde(default)]
+    pub local: bool,
     /// State of the connection: `down`, `up`, `stale`, `faulted`.
     pub link: String,
     /// Its phase: `unknown`, `disabled`, `activating`, `ready`, `held`, `standby`, `led`.

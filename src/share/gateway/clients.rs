@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
+use serde_json::Value;
 use zenoh::bytes::ZBytes;
 use zenoh::query::Query;
 use zenoh::sample::{Sample, SampleKind};
@@ -62,34 +63,28 @@ impl Shared {
             let hint = "`dimos status` names them; the limit for each user is `share.max_clients`";
             return Err(RpcError::new(Code::TooManyConnections, text).hint(hint));
         }
-        let remote = self.start_remote(who.clone(), false)?;
+        let remote = self.start_remote(who.clone())?;
         clients.insert(who.clone(), remote.clone());
         let _ = self.news.send(News::Clients);
         Ok(remote)
     }
 
-    /// Returns the connection for what ends motion, of all clients of a user.
-    pub(super) fn end(&self, user: &str) -> Result<Arc<Remote>, RpcError> {
-        let mut ends = lock(&self.ends);
+    /// Passes on a request that ends motion. Returns one that is refused, and why.
+    pub(super) fn end(&self, query: Query, (user, method, params): (&str, String, Value)) -> Option<(Query, RpcError)> {
         if self.run_ended.load(Ordering::Acquire) {
-            return Err(ended(&self.run));
+            return Some((query, ended(&self.run)));
         }
-        if let Some(remote) = ends.get(user).filter(|remote| !remote.is_closed()) {
-            return Ok(remote.clone());
-        }
-        let remote = self.start_remote(Who { user: user.to_owned(), id: String::new() }, true)?;
-        ends.insert(user.to_owned(), remote.clone());
-        Ok(remote)
+        self.ends.begin(query, (user, method, params), (&self.run, &self.socket))
     }
 
-    fn start_remote(&self, who: Who, ends: bool) -> Result<Arc<Remote>, RpcError> {
+    fn start_remote(&self, who: Who) -> Result<Arc<Remote>, RpcError> {
         let ways = Ways {
             session: &self.session,
             run: &self.run,
             socket: &self.socket,
             cancel_at_end: self.config.on_lost == OnLost::Cancel,
         };
-        Remote::start(who, ends, &ways).map_err(|e| failed(format!("no thread for a client: {e}")))
+        Remote::start(who, &ways).map_err(|e| failed(format!("no thread for a client: {e}")))
     }
 
     pub(super) fn see_token(&self, sample: &Sample) {
