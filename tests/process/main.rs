@@ -66,6 +66,7 @@ mod share_tls;
 mod share_verbs;
 mod small_verbs;
 mod so101_service;
+mod split_logs;
 mod start_stages;
 mod starved_tick;
 mod stop_input;
