@@ -233,14 +233,15 @@ def disordered_chunks():
 def wrong_map():
     """The index of chunks names another channel than the chunks and their message indexes have."""
     own, other = motion(), motion(topic="/other")
-    path = write("wrong_map", [message for pair in zip(own, other) for message in pair])
+    third = [("/third", time + 2_000 * MS, data) for _, time, data in motion(20)]
+    path = write("wrong_map", [message for pair in zip(own, other) for message in pair] + third)
     data = bytearray(open(path, "rb").read())
     for at, opcode, _ in list(records(data)):
         if opcode == 8:
             length = struct.unpack_from("<I", data, at + 9 + 32)[0]
             for entry in range(at + 9 + 36, at + 9 + 36 + length, 10):
                 if struct.unpack_from("<H", data, entry)[0] == 1:
-                    struct.pack_into("<H", data, entry, 2)
+                    struct.pack_into("<H", data, entry, 3)
     # The summary has no checksum.
     struct.pack_into("<I", data, len(data) - 12, 0)
     open(path, "wb").write(data)
