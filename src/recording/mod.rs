@@ -10,6 +10,7 @@
 mod arm_messages;
 pub mod attachment;
 pub mod cdr;
+mod channels;
 pub mod chunk;
 mod chunk_index;
 pub mod disk_space;

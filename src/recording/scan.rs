@@ -8,26 +8,12 @@ use std::path::Path;
 use mcap::parse_record;
 use mcap::records::{Record, Statistics, op};
 
-use super::cdr::CdrError;
+use super::channels::Described;
 use super::loss::Loss;
 use super::records::{RawRecord, ReplayError};
-use super::ros2msg::Schema;
 use super::source::{Block, Source};
 
-/// A channel of a log.
-#[derive(Debug, Clone, Default)]
-pub struct LogChannel {
-    /// Topic.
-    pub topic: String,
-    /// Encoding of messages: `cdr`.
-    pub encoding: String,
-    /// Further properties, such as the offered QoS.
-    pub metadata: BTreeMap<String, String>,
-    /// Name, encoding and text of the schema.
-    pub schema: (String, String, Vec<u8>),
-    /// The schema, to decode messages; an error if they cannot be decoded.
-    pub decoder: Option<Schema>,
-}
+pub use super::channels::LogChannel;
 
 /// A message of the current batch.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -101,17 +87,6 @@ pub struct Scan {
     others: VecDeque<(usize, u64, u8)>,
     /// Bytes of the blocks that were read.
     passed: u64,
-}
-
-/// What describes channels, by file and its own ids.
-#[derive(Default)]
-struct Described {
-    schemas: HashMap<(usize, u16), (String, String, Vec<u8>)>,
-    /// Ids in [`Scan::channels`].
-    ids: HashMap<(usize, u16), u16>,
-    profile: Option<String>,
-    /// By file.
-    statistics: Vec<(usize, Statistics)>,
 }
 
 impl Scan {
@@ -394,51 +369,5 @@ impl Scan {
             let bytes = self.held.get(&message.block)?.bytes.get(message.span.0..message.span.1)?;
             Some((message, self.channels.get(&message.channel)?, bytes))
         })
-    }
-}
-
-impl Described {
-    /// Takes a record that describes messages. Equal channels of several files become one.
-    fn learn(&mut self, channels: &mut BTreeMap<u16, LogChannel>, file: usize, opcode: u8, body: &[u8]) {
-        match parse_record(opcode, body) {
-            Ok(Record::Header(header)) => {
-                self.profile.get_or_insert(header.profile);
-            }
-            Ok(Record::Schema { header, data }) => {
-                self.schemas.insert((file, header.id), (header.name, header.encoding, data.into_owned()));
-            }
-            Ok(Record::Channel(channel)) => {
-                let schema = self.schemas.get(&(file, channel.schema_id)).cloned().unwrap_or_default();
-                let id = channel.id;
-                let is_it = |known: &LogChannel| {
-                    (&known.topic, &known.encoding, &known.metadata, &known.schema)
-                        == (&channel.topic, &channel.message_encoding, &channel.metadata, &schema)
-                };
-                // Its own id if that is free: copies of a log have the same ids.
-                let same = channels.get(&id).is_some_and(is_it).then_some(id);
-                let same =
-                    same.or_else(|| channels.iter().find(|(_, known)| file > 0 && is_it(known)).map(|(id, _)| *id));
-                let free = || std::iter::once(id).chain(1..=u16::MAX).find(|id| !channels.contains_key(id));
-                let Some(own) = same.or_else(free) else { return };
-                self.ids.insert((file, id), own);
-                if same.is_some() {
-                    return;
-                }
-                let readable = schema.1 == "ros2msg" && channel.message_encoding == "cdr";
-                let text = std::str::from_utf8(&schema.2).ok().filter(|_| readable);
-                let decoder = text.and_then(|text| Schema::parse(&schema.0, text).ok());
-                let (topic, encoding, metadata) = (channel.topic, channel.message_encoding, channel.metadata);
-                channels.insert(own, LogChannel { topic, encoding, metadata, schema, decoder });
-            }
-            Ok(Record::Statistics(statistics)) => self.statistics.push((file, statistics)),
-            _ => {}
-        }
-    }
-}
-
-impl LogChannel {
-    /// Appends a message as JSON. An error if its schema is not understood, or if it does not match.
-    pub fn json(&self, bytes: &[u8], out: &mut String) -> Result<(), CdrError> {
-        self.decoder.as_ref().ok_or(CdrError::Header)?.json(bytes, out)
     }
 }

@@ -23,6 +23,7 @@ mod fault_table;
 mod first_day;
 mod first_run;
 mod foreign_logs;
+mod foreign_paths;
 mod franka_run;
 mod grip_outcome;
 mod gripper_force;

@@ -6,6 +6,9 @@ use rustix::process::Signal;
 
 use crate::support::program::Home;
 
+/// Kind of a chunk record.
+const CHUNK: u8 = 0x06;
+
 /// A run whose log has at least four files.
 fn recorded() -> (Home, Vec<PathBuf>) {
     let home = Home::new();
@@ -98,9 +101,15 @@ fn the_list_says_which_logs_are_damaged() {
     assert_eq!(state(), "complete");
     let logs = home.logs();
     let (first, second) = (std::fs::read(&logs[0]).unwrap(), std::fs::read(&logs[1]).unwrap());
-    // One bit in the middle of a chunk.
+    // A byte in the middle of the largest chunk.
+    let (mut at, mut chunks) = (8, Vec::new());
+    while let Some(length) = first.get(at + 1..at + 9) {
+        let length = u64::from_le_bytes(length.try_into().unwrap()) as usize;
+        chunks.extend((first[at] == CHUNK).then_some((length, at + 9 + length / 2)));
+        at += 9 + length;
+    }
     let mut flipped = first.clone();
-    flipped[first.len() / 2] ^= 1;
+    flipped[chunks.iter().max().unwrap().1] ^= 0x55;
     std::fs::write(&logs[0], flipped).unwrap();
     assert_eq!(state(), "damaged");
     std::fs::write(&logs[0], &first).unwrap();
