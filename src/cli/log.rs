@@ -22,7 +22,8 @@ use super::replay;
 use crate::blueprint::Catalog;
 use crate::recording::files;
 use crate::recording::messages::JointState;
-use crate::recording::replay::{LogInfo, LogReader, ReplayError};
+use crate::recording::replay::{LogInfo, ReplayError};
+use crate::recording::source::Source;
 use crate::recording::wire::Message;
 
 /// Topic of joint states.
@@ -235,9 +236,9 @@ pub(super) fn found(path: &Path) -> PathBuf {
 impl Part {
     /// Returns the first and last Unix time [ns], within a log that has messages.
     fn of(&self, path: &Path) -> Result<(u64, u64)> {
-        let reader = LogReader::open(path).map_err(unreadable)?;
+        let source = Source::open(path).map_err(unreadable)?;
         let empty = || Failure::usage(format!("the log {} has no messages", path.display()));
-        let (start, end) = reader.info().span.ok_or_else(empty)?;
+        let (start, end) = source.span().ok_or_else(empty)?;
         let at = |offset: Duration| start.saturating_add(offset.as_nanos().try_into().unwrap_or(u64::MAX));
         let (from, to) = (at(self.from), self.to.map_or(end, at));
         if from > end || from > to {

@@ -1,6 +1,7 @@
 //! The path of a motion that was led by hand or recorded: from a file to the waypoints of `--path`.
 
 mod logged;
+mod steps;
 
 use std::path::Path;
 
@@ -8,10 +9,11 @@ use super::exit::{Failure, Result};
 use super::{output, trajectory_file};
 use crate::planning::path::unwind;
 use crate::planning::thin::thin;
-use crate::recording::joints::Places;
+use crate::recording::joints::{Places, twice};
 use crate::rpc::api::{JointPath, MAX_LINE, MAX_PATH};
 use crate::rpc::client::ClientError;
 use crate::rpc::{Code, RpcError};
+use steps::{Recording, Steps};
 
 /// Bytes of a request besides its waypoints, at most.
 const ENVELOPE: usize = 1024;
@@ -70,11 +72,19 @@ fn written(file: &Path, joints: &[String], turns: &[bool]) -> Result<Vec<Vec<f64
             Failure::usage(format!("{path}: no joint {missing}; it has {}", trajectory.joint_names.join(", ")));
         return Err(failure.hint("joints are matched by name, as `dimos state` shows them"));
     }
+    if let Some(joint) = twice(&trajectory.joint_names) {
+        let failure = Failure::usage(format!("{path}: joint_names has {joint} twice"));
+        return Err(failure.hint("a point has one position per joint name"));
+    }
     if !trajectory.points.is_sorted_by_key(|point| point.time_from_start) {
         output::note(format_args!("{path}: the rows were not in order of time"));
         trajectory.points.sort_by(|a, b| a.time_from_start.total_cmp(&b.time_from_start));
     }
     let (mut places, mut rows) = (Places::new(joints), Vec::<Vec<f64>>::new());
+    let (mut steps, mut time) = (Steps::new(joints, Recording::File), f64::NEG_INFINITY);
+    let ends = trajectory.points.first().zip(trajectory.points.last());
+    // Points without times are places to go through.
+    let has_times = ends.is_some_and(|(first, last)| first.time_from_start < last.time_from_start);
     for point in &trajectory.points {
         let mut row: Vec<f64> = places.pick(&trajectory.joint_names, &point.positions).collect();
         if row.iter().any(|q| !q.is_finite()) {
@@ -83,7 +93,12 @@ fn written(file: &Path, joints: &[String], turns: &[bool]) -> Result<Vec<Vec<f64
         }
         if let Some(last) = rows.last() {
             unwind(&mut row, last, turns);
+            if has_times {
+                let checked = steps.check(time, point.time_from_start - time, last, &row);
+                checked.map_err(|failure| Failure { what: format!("{path}: {}", failure.what), ..failure })?;
+            }
         }
+        time = point.time_from_start;
         rows.push(row);
     }
     Ok(rows)

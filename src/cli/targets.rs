@@ -125,7 +125,7 @@ impl<R: Read> Iterator for Lines<R> {
                 Err(e) => return Some(Err(self.mistake(e))),
             }
             let Ok(text) = std::str::from_utf8(&text) else { return Some(Err(self.mistake("not UTF-8"))) };
-            let text = text.trim();
+            let text = text.trim_start_matches('\u{feff}').trim();
             if text.is_empty() || text.starts_with('#') {
                 continue;
             }

@@ -25,9 +25,11 @@ pub fn read(path: &Path) -> Result<Trajectory> {
     if read as u64 > MAX_FILE {
         return Err(unreadable(&"larger than 16 MiB"));
     }
+    // What some editors and spreadsheets write first: a mark of the encoding.
+    let text = text.trim_start_matches('\u{feff}');
     let parsed = match path.extension().and_then(|e| e.to_str()) {
-        Some("json") => json(&text),
-        Some("csv") => csv(&text),
+        Some("json") => json(text),
+        Some("csv") => csv(text),
         _ => return Err(unreadable(&"neither .json nor .csv").hint("the extension decides the format")),
     };
     let mut trajectory = parsed.map_err(|e| unreadable_at(path, &e))?;
@@ -82,8 +84,7 @@ fn as_of_ros(text: &str) -> Option<Trajectory> {
 }
 
 fn csv(text: &str) -> std::result::Result<Trajectory, Mistake> {
-    // What spreadsheets write: a mark of the encoding; with semicolons between cells a comma is the decimal point.
-    let text = text.trim_start_matches('\u{feff}');
+    // What spreadsheets write: with semicolons between cells a comma is the decimal point.
     let heading = text.lines().find(|line| !line.trim().is_empty()).unwrap_or_default();
     let semicolons = heading.contains(';') && !heading.contains(',');
     let text = if semicolons { text.replace(',', ".").replace(';', ",") } else { text.to_owned() };

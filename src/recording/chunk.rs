@@ -12,6 +12,8 @@ const MAX_CONTENTS: u64 = 1 << 30;
 /// An unpacked chunk.
 pub struct Chunk<'a> {
     plain: Cow<'a, [u8]>,
+    /// Whether a part of its contents is missing.
+    pub is_cut: bool,
     /// What is wrong with it. What could be unpacked is there all the same.
     pub damage: Option<String>,
 }
@@ -19,14 +21,17 @@ pub struct Chunk<'a> {
 impl<'a> Chunk<'a> {
     /// Unpacks a chunk record and verifies its checksum.
     pub fn open(body: &'a [u8]) -> Self {
-        let nothing = |why: String| Self { plain: Cow::Borrowed(&[]), damage: Some(why) };
+        let nothing = |why: String| Self { plain: Cow::Borrowed(&[]), is_cut: true, damage: Some(why) };
         let (header, data) = match parse_record(op::CHUNK, body) {
             Ok(Record::Chunk { header, data: Cow::Borrowed(data) }) => (header, data),
             Ok(_) => return nothing(McapError::UnexpectedEoc.to_string()),
             Err(e) => return nothing(e.to_string()),
         };
         match unpacked(&header, data) {
-            Ok(plain) => Self { damage: wrong(&header, &plain), plain },
+            Ok(plain) => {
+                let is_cut = plain.len() as u64 != header.uncompressed_size;
+                Self { damage: wrong(&header, &plain), is_cut, plain }
+            }
             Err(why) => nothing(why),
         }
     }
@@ -34,6 +39,7 @@ impl<'a> Chunk<'a> {
     /// Passes on its records in order; notes where they break off.
     pub fn each(&mut self, each: impl FnMut(u8, &[u8])) {
         if walk(&self.plain, each).is_none() {
+            self.is_cut = true;
             self.damage.get_or_insert_with(|| "a record in the chunk is longer than the chunk".to_owned());
         }
     }

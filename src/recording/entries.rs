@@ -27,6 +27,9 @@ pub struct Entry {
     pub log_time: u64,
     /// Contents.
     pub data: Payload,
+    /// The publisher on this topic: a channel, which is the same in all files.
+    #[serde(skip)]
+    pub publisher: u16,
 }
 
 macro_rules! payloads {
@@ -106,14 +109,21 @@ type KnownSchema = (String, Option<usize>, Option<Schema>);
 pub(super) struct Channels {
     schemas: HashMap<(usize, u16), KnownSchema>,
     channels: HashMap<(usize, u16), KnownChannel>,
+    publishers: Vec<Publisher>,
     /// Samples that the recorder lost, in the messages taken.
     pub lost: u64,
-    /// Messages of channels that are not described.
+    /// Messages taken, wanted or not, and of these those of channels that are not described.
+    pub count: u64,
     pub unknown: u64,
 }
 
+/// What two channels of different files have in common if they are of one publisher: topic, properties, and how many
+/// equal ones its file has before.
+type Publisher = (String, BTreeMap<String, String>, usize);
+
 struct KnownChannel {
     topic: String,
+    publisher: u16,
     schema: String,
     /// Number of known fields of its messages; `None`: they are not CDR with a ROS 2 schema known here.
     fields: Option<usize>,
@@ -151,7 +161,28 @@ impl Channels {
         let (schema, fields, other) = self.schemas.get(&(file, channel.schema_id)).cloned().unwrap_or_default();
         let is_cdr = channel.message_encoding == "cdr";
         let (fields, other) = (fields.filter(|_| is_cdr), other.filter(|_| is_cdr));
-        self.channels.insert((file, channel.id), KnownChannel { topic: channel.topic, schema, fields, other });
+        let publisher = match self.channels.get(&(file, channel.id)) {
+            Some(known) if known.topic == channel.topic => known.publisher,
+            _ => self.publisher(file, &channel),
+        };
+        self.channels
+            .insert((file, channel.id), KnownChannel { topic: channel.topic, publisher, schema, fields, other });
+    }
+
+    /// Returns the number of a publisher whose channel is new in a file.
+    fn publisher(&mut self, file: usize, channel: &Channel) -> u16 {
+        let of_file = self.channels.iter().filter(|((known, _), _)| *known == file).map(|(_, known)| known.publisher);
+        let is_equal = |number: u16| {
+            let known = self.publishers.get(usize::from(number));
+            known.is_some_and(|(topic, metadata, _)| (topic, metadata) == (&channel.topic, &channel.metadata))
+        };
+        let own = (channel.topic.clone(), channel.metadata.clone(), of_file.filter(|number| is_equal(*number)).count());
+        let known = self.publishers.iter().position(|known| *known == own);
+        let number = known.unwrap_or(self.publishers.len());
+        if known.is_none() {
+            self.publishers.push(own);
+        }
+        number.try_into().unwrap_or(u16::MAX)
     }
 
     /// Returns whether all these channels of a file are described.
@@ -163,6 +194,7 @@ impl Channels {
     pub(super) fn take(&mut self, file: usize, opcode: u8, body: &[u8], wanted: &Selection) -> Option<Entry> {
         self.learn(file, opcode, body);
         let (header, bytes) = message(opcode, body)?;
+        self.count += 1;
         let Some(channel) = self.channels.get(&(file, header.channel_id)) else {
             self.unknown += 1;
             return None;
@@ -178,7 +210,8 @@ impl Channels {
         if let Payload::Tick(tick) = &data {
             self.lost += u64::from(tick.dropped);
         }
-        chosen.then(|| Entry { topic: channel.topic.clone(), log_time: header.log_time, data })
+        let (topic, publisher) = (channel.topic.clone(), channel.publisher);
+        chosen.then_some(Entry { topic, log_time: header.log_time, data, publisher })
     }
 
     /// Returns the topics and their schemas.

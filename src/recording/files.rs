@@ -57,9 +57,27 @@ pub fn part(first: &Path, number: u32) -> PathBuf {
     first.with_file_name(format!("{}_{number}.{LOG}", first.file_stem().unwrap_or_default().display()))
 }
 
-/// Returns the further files of a log that exist, in order.
+/// Returns the further files of a log that exist, in order. Files between them may be missing.
 pub fn further_parts(first: &Path) -> impl Iterator<Item = PathBuf> {
-    (1..).map(|number| part(first, number)).take_while(|path| path.exists())
+    numbered_parts(first).into_iter().map(|(_, path)| path)
+}
+
+/// Same, with their numbers.
+pub fn numbered_parts(first: &Path) -> Vec<(u32, PathBuf)> {
+    let folder = first.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let names = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.file_name());
+    let numbers = names.filter_map(|name| number_of(Path::new(&name)));
+    let mut parts: Vec<(u32, PathBuf)> =
+        numbers.map(|number| (number, part(first, number))).filter(|(_, path)| path.exists()).collect();
+    parts.sort();
+    parts.dedup();
+    parts
+}
+
+/// Returns the number in the name of a further file of a log.
+pub fn number_of(path: &Path) -> Option<u32> {
+    let number: u32 = path.file_stem()?.to_str()?.rsplit_once('_')?.1.parse().ok()?;
+    (number > 0).then_some(number)
 }
 
 /// Returns the size of all files of a log, or in its folder [bytes].
@@ -223,14 +241,18 @@ mod tests {
         let parts = [1, 2].map(|number| part(&first, number));
         parts.iter().for_each(|path| std::fs::write(path, b"").unwrap());
         assert_eq!(all(folder.path()).unwrap(), std::slice::from_ref(&first));
-        assert_eq!(further_parts(&first).collect::<Vec<_>>(), parts);
+        // A gap ends nothing.
+        let later = touch(folder.path(), "run-20251121T141630Z_12.mcap");
+        touch(folder.path(), "z-20251121T141630Z_3.mcap");
+        let all: Vec<PathBuf> = parts.iter().cloned().chain([later]).collect();
+        assert_eq!(further_parts(&first).collect::<Vec<_>>(), all);
         assert_eq!(logs_in(folder.path()).first(), Some(&first));
         let writing = File::open(&parts[1]).unwrap();
         mark_as_being_written(&writing);
         assert_eq!(retain(folder.path(), 0).unwrap(), <[PathBuf; 0]>::default());
         drop(writing);
         assert_eq!(retain(folder.path(), 0).unwrap(), [first]);
-        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "that of another log");
     }
 
     #[test]

@@ -1,5 +1,10 @@
 //! Values of joints by their names: from one message of a topic to the next, joints and their order may differ.
 
+/// Returns a joint that is more than once in a message.
+pub fn twice(names: &[String]) -> Option<&String> {
+    names.iter().enumerate().find(|(at, name)| names.iter().take(*at).any(|other| other == *name)).map(|(_, name)| name)
+}
+
 /// Picks the values of some joints out of messages.
 #[derive(Debug)]
 pub struct Places {
@@ -44,5 +49,6 @@ mod tests {
         let lacks = pick("c b b", &[3.0, 2.0, 2.5]);
         assert!(lacks[0].is_nan() && lacks[1].is_nan() && lacks[2] == 3.0, "{lacks:?}");
         assert!(pick("a b c", &[1.0]).iter().filter(|v| v.is_nan()).count() == 2);
+        assert_eq!((twice(&names("a b c")), twice(&names("a b a b")).unwrap().as_str()), (None, "a"));
     }
 }

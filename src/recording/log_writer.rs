@@ -10,6 +10,7 @@ use std::time::Duration;
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Attachment, Compression, McapResult, WriteOptions};
 
+use super::CONTINUES;
 use super::cdr::Encoder;
 use super::long_log::LongLog;
 use super::wire::Message;
@@ -190,6 +191,12 @@ impl<W: Write + Seek> LogWriter<W> {
     /// Returns the number of messages written.
     pub fn written(&self) -> u64 {
         self.written
+    }
+
+    /// Notes the name of the file that continues the log: without that file, readers know what is missing.
+    pub(super) fn continues_in(&mut self, name: String) -> McapResult<()> {
+        let metadata = BTreeMap::from([(CONTINUES.to_owned(), name)]);
+        self.mcap.write_metadata(&Metadata { name: CONTINUES.to_owned(), metadata })
     }
 
     /// Closes the log: indexes, statistics, summary. Returns the sink.

@@ -27,9 +27,12 @@ impl Loss {
         let mut parts = Vec::new();
         if let Some(first) = self.damage.first() {
             let seconds = |time: u64| time.saturating_sub(self.began) as f64 * 1e-9;
-            let span = first.span.map_or_else(String::new, |(from, to)| {
-                format!(" (messages from {:.3} s to {:.3} s)", seconds(from), seconds(to))
-            });
+            let span = match first.span {
+                None => String::new(),
+                // A file is missing, and no other one shows where that ends.
+                Some((from, to)) if from == to && first.at == 0 => format!(" (at {:.3} s)", seconds(from)),
+                Some((from, to)) => format!(" (messages from {:.3} s to {:.3} s)", seconds(from), seconds(to)),
+            };
             let more = match self.damage.len() {
                 1 => String::new(),
                 n => format!("; damaged in {} more places", n - 1),

@@ -10,7 +10,9 @@
 mod arm_messages;
 pub mod attachment;
 pub mod cdr;
+mod channels;
 pub mod chunk;
+mod chunk_index;
 pub mod disk_space;
 mod disk_sync;
 pub mod display_messages;
@@ -23,6 +25,7 @@ mod long_log;
 pub mod loss;
 pub mod messages;
 pub mod notes;
+mod open_files;
 mod packed_samples;
 pub mod parquet;
 mod pending_executes;
@@ -50,5 +53,7 @@ mod tests;
 pub const CONFIG_VERSION_KEY: &str = "config_version";
 /// Key in the metadata of a log in several files, from the second on: the number of the file, from 1.
 pub const PART: &str = "part";
+/// Name of the metadata at the end of a file that another one continues, and their key for its name.
+pub const CONTINUES: &str = "continues";
 /// Name of the attachment with the coordinator's configuration.
 pub const COORDINATOR: &str = "coordinator.json";

@@ -51,7 +51,7 @@ pub enum ReplayError {
         reason: String,
     },
     /// A part of it is damaged. Reading continues after it.
-    #[error("the log {path} is {damage}\nhint: `dimos log doctor` checks all of it", path = damage.path.display())]
+    #[error("the log {path}: {damage}\nhint: `dimos log doctor` checks all of it", path = damage.path.display())]
     Damaged {
         /// The damage.
         damage: Damage,
@@ -71,20 +71,38 @@ pub enum ReplayError {
 pub struct Damage {
     /// The file.
     pub path: PathBuf,
-    /// Start of the damaged record [bytes from the start].
+    /// Start of the damaged record [bytes from the start]; 0: the file is missing, or no log.
     pub at: u64,
     /// Unix times of the first and last message in it [ns], where they are known.
     pub span: Option<(u64, u64)>,
     /// What is wrong.
     pub reason: String,
-    /// Whether its messages were read all the same.
-    pub kept: bool,
+    /// What was read of its messages all the same.
+    pub kept: Kept,
+}
+
+/// Which messages of a damaged part were read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kept {
+    /// All of them.
+    All,
+    /// Some of them.
+    Some,
+    /// None of them.
+    None,
 }
 
 impl std::fmt::Display for Damage {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let end = if self.kept { "its messages are kept, and may be wrong" } else { "its messages are left out" };
-        write!(f, "damaged at byte {}: {}; {end}", self.at, self.reason)
+        let end = match self.kept {
+            Kept::All => "its messages are kept, and may be wrong",
+            Kept::Some => "some of its messages are left out, the others may be wrong",
+            Kept::None => "its messages are left out",
+        };
+        if self.at > 0 {
+            write!(f, "damaged at byte {}: ", self.at)?;
+        }
+        write!(f, "{}; {end}", self.reason)
     }
 }
 
@@ -120,6 +138,14 @@ impl Head {
             _ => None,
         }
     }
+
+    /// Returns the channel of a message index, and how many messages it has.
+    pub fn indexed(&self) -> Option<(u16, u64)> {
+        let (channel, rest) = self.first.split_first_chunk::<2>().filter(|_| self.opcode == op::MESSAGE_INDEX)?;
+        let length = u32::from_le_bytes(*rest.first_chunk::<4>()?);
+        // An entry is a time and a position.
+        Some((u16::from_le_bytes(*channel), u64::from(length) / 16))
+    }
 }
 
 /// Reads an MCAP file record by record.
@@ -148,10 +174,12 @@ impl RecordReader {
         let mut file = BufReader::with_capacity(64 * 1024, file);
         let mut magic = Vec::new();
         file.by_ref().take(MAGIC.len() as u64).read_to_end(&mut magic).map_err(io)?;
-        if magic != MAGIC {
+        // A run that has just created its file has yet to write to it.
+        if magic != MAGIC && !(live && MAGIC.starts_with(&magic)) {
             return Err(ReplayError::NotMcap { path: path.to_owned() });
         }
-        let at = magic.len() as u64;
+        let at = MAGIC.len() as u64;
+        let length = length.max(at);
         let mut records = Self { path: path.to_owned(), file, length, at, ended: false, attachments: false, live };
         // A log that has its end is closed; its last sync to a slow disk may keep the lock for a while.
         records.live = live && records.summary_start()?.is_none();
@@ -228,7 +256,7 @@ impl RecordReader {
         let length = self.at - at - PREFIX as u64;
         let body = match opcode {
             op::ATTACHMENT if self.attachments => self.body(length)?,
-            op::ATTACHMENT | op::MESSAGE_INDEX | op::ATTACHMENT_INDEX | op::METADATA_INDEX | op::SUMMARY_OFFSET => {
+            op::ATTACHMENT | op::MESSAGE_INDEX | op::ATTACHMENT_INDEX | op::SUMMARY_OFFSET => {
                 self.skip(length)?;
                 Vec::new()
             }

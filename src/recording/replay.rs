@@ -1,15 +1,16 @@
 //! Reads a log: its decoded messages in order of time.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::cmp::{Ordering, Reverse};
+use std::collections::{BTreeMap, BinaryHeap, HashSet, VecDeque};
 use std::path::{Path, PathBuf};
 
 use mcap::parse_record;
 use mcap::records::{Record, op};
 
-use super::attachment;
+use super::attachment::{self, DAMAGED};
 use super::entries::Channels;
 use super::loss::Loss;
-use super::records::{Damage, RawRecord, RecordReader};
+use super::records::{Damage, Kept, RawRecord, RecordReader};
 use super::source::{Block, Source};
 use super::source_files;
 
@@ -48,8 +49,32 @@ pub struct LogInfo {
     pub topics: BTreeMap<String, String>,
 }
 
-/// Order of messages: their time, then the file and position of their block.
-type Key = (u64, (usize, u64));
+/// A message that waits for its time.
+struct Ready {
+    /// Order of messages: their time, then the file and position of their block, and their number in it.
+    key: (u64, (usize, u64, u32)),
+    entry: Entry,
+}
+
+impl Ord for Ready {
+    fn cmp(&self, other: &Self) -> Ordering {
+        self.key.cmp(&other.key)
+    }
+}
+
+impl PartialOrd for Ready {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl PartialEq for Ready {
+    fn eq(&self, other: &Self) -> bool {
+        self.key == other.key
+    }
+}
+
+impl Eq for Ready {}
 
 /// A log opened for reading: of one in several files all of them, if it is opened by the first or their folder.
 pub struct LogReader {
@@ -59,11 +84,13 @@ pub struct LogReader {
     channels: Channels,
     /// Blocks to read.
     queue: VecDeque<usize>,
-    /// Messages that were read, in order of time.
-    ready: VecDeque<(Key, Entry)>,
+    /// Messages that were read, the first one on top.
+    ready: BinaryHeap<Reverse<Ready>>,
     /// Damage to report after what is ready.
     failed: VecDeque<ReplayError>,
     found: Loss,
+    /// Messages that the summaries count.
+    counted: u64,
     ended: bool,
     /// Whether all channels were looked for when it was opened: others belong to no message.
     knows_all: bool,
@@ -84,8 +111,12 @@ impl LogReader {
     fn open_with(path: &Path, topics: Option<&[&str]>) -> Result<Self, ReplayError> {
         let mut source = Source::open(path)?;
         let mut channels = Channels::default();
+        let mut counted = 0;
         for (file, opcode, body) in std::mem::take(&mut source.outside) {
             channels.learn(file, opcode, &body);
+            if let Ok(Record::Statistics(statistics)) = parse_record(opcode, &body) {
+                counted += statistics.message_count;
+            }
         }
         let enough = |channels: &Channels| {
             topics.is_some_and(|topics| topics.iter().all(|topic| channels.topics().contains_key(*topic)))
@@ -94,7 +125,7 @@ impl LogReader {
             let described = |block: &Block, channels: &Channels| {
                 block.channels.as_deref().is_some_and(|ids| channels.know(block.file, ids))
             };
-            let known: Vec<(usize, u64)> = source
+            let known: HashSet<(usize, u64)> = source
                 .blocks
                 .iter()
                 .filter(|block| described(block, &channels))
@@ -105,7 +136,7 @@ impl LogReader {
                     channels.learn(file, opcode, body);
                     opcode == op::CHANNEL && enough(&channels)
                 },
-                |block| known.binary_search(&(block.file, block.at)).is_ok(),
+                |block| known.contains(&(block.file, block.at)),
             )?;
         }
         let mut info = LogInfo {
@@ -130,9 +161,10 @@ impl LogReader {
             info,
             channels,
             queue: VecDeque::new(),
-            ready: VecDeque::new(),
+            ready: BinaryHeap::new(),
             failed: VecDeque::new(),
             found: Loss::default(),
+            counted,
             ended: false,
             knows_all: topics.is_none(),
         };
@@ -150,7 +182,7 @@ impl LogReader {
         self.ready.clear();
         self.ended = false;
         self.found = Loss { began: self.info.span.map_or(0, |(start, _)| start), ..Loss::default() };
-        (self.channels.lost, self.channels.unknown) = (0, 0);
+        (self.channels.lost, self.channels.unknown, self.channels.count) = (0, 0, 0);
         let inside = |start: u64, end: u64| end >= selection.from && start <= selection.to;
         let blocks = self.source.blocks.iter().enumerate();
         self.queue = blocks.filter(|(_, block)| inside(block.start, block.end)).map(|(index, _)| index).collect();
@@ -169,7 +201,8 @@ impl LogReader {
             // Later blocks may have messages as old as that.
             let later = self.queue.front().and_then(|next| self.source.blocks.get(*next));
             let until = later.map_or(u64::MAX, |block| block.start);
-            if let Some((_, entry)) = self.ready.pop_front_if(|((time, _), _)| *time <= until) {
+            let is_due = self.ready.peek().is_some_and(|Reverse(first)| first.key.0 <= until);
+            if let Some(Reverse(Ready { entry, .. })) = is_due.then(|| self.ready.pop()).flatten() {
                 if matches!(entry.data, Payload::Damaged { .. } | Payload::Unknown { .. }) {
                     self.found.undecoded += 1;
                 }
@@ -189,13 +222,14 @@ impl LogReader {
             };
             let Self { source, channels, selection, ready, .. } = self;
             let Some(place) = source.blocks.get(next).map(|block| (block.file, block.at)) else { continue };
+            let mut number = 0;
             let damage = source.read(next, |file, opcode, body| {
                 if let Some(entry) = channels.take(file, opcode, body, selection) {
-                    ready.push_back(((entry.log_time, place), entry));
+                    number += 1;
+                    ready.push(Reverse(Ready { key: (entry.log_time, (place.0, place.1, number)), entry }));
                 }
             })?;
             self.failed.extend(damage.map(|damage| ReplayError::Damaged { damage }));
-            self.ready.make_contiguous().sort_by_key(|(key, _)| *key);
         }
     }
 
@@ -203,8 +237,14 @@ impl LogReader {
     pub fn loss(&self) -> Loss {
         let mut loss = self.found.clone();
         loss.unknown = if self.knows_all { self.channels.unknown } else { 0 };
-        if self.info.span.is_some_and(|(_, end)| self.selection.to < end) {
+        let (start, end) = self.info.span.unwrap_or_default();
+        if self.selection.to < end {
             loss.cut = None;
+        }
+        // All blocks were read, whatever topics are wanted.
+        let is_whole = self.selection.from <= start && self.selection.to >= end && self.queue.is_empty();
+        if is_whole && self.info.complete && self.counted > self.channels.count {
+            loss.missing = (self.counted - self.channels.count, self.counted);
         }
         loss
     }
@@ -215,19 +255,22 @@ impl LogReader {
     }
 }
 
-/// Returns the files of a log in order: of one in several files all of them, if this is the first or their folder.
+/// Returns the files of a log that can be read, in order: of one in several files all of them, if this is the first or
+/// their folder.
 pub fn parts(path: &Path) -> Result<Vec<PathBuf>, ReplayError> {
-    Ok(source_files::of(path)?.files)
+    Ok(source_files::of(path)?.into_iter().filter(|file| file.wrong.is_none()).map(|file| file.path).collect())
 }
 
-/// Returns an attachment by name; `None` if there is none.
+/// Returns an attachment by name; `None` if there is none. An error if it is damaged, also if that was before this log
+/// was copied.
 pub fn attachment(path: &Path, name: &str) -> Result<Option<Vec<u8>>, ReplayError> {
     let named = |record: &RawRecord, path: &Path| {
         let is_one = record.opcode == op::ATTACHMENT;
         let found = attachment::of(&record.body).filter(|found| is_one && found.header.name == name)?;
-        Some(found.damage.map_or(Ok(Some(found.data)), |reason| {
+        let before = || attachment::metadata(&mut RecordReader::open(path).ok()?, DAMAGED)?.remove(name);
+        Some(found.damage.or_else(before).map_or(Ok(Some(found.data)), |reason| {
             let (path, reason) = (path.to_owned(), format!("{name}: {reason}"));
-            Err(ReplayError::Damaged { damage: Damage { path, at: record.at, span: None, reason, kept: false } })
+            Err(ReplayError::Damaged { damage: Damage { path, at: record.at, span: None, reason, kept: Kept::None } })
         }))
     };
     // Most are before the first message: a long log is not read for them.

@@ -1,21 +1,20 @@
 //! Copies what can be read of a log to a new one: a part of a log, or what a crash left.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{BufWriter, Error};
 use std::path::Path;
 
-use mcap::records::{AttachmentHeader, MessageHeader, Metadata, Record, op};
-use mcap::{Attachment, McapError, WriteOptions, Writer, parse_record};
+use mcap::records::{AttachmentHeader, MessageHeader, Metadata};
+use mcap::{Attachment, McapError, WriteOptions, Writer};
 
-use super::attachment;
-use super::records::{RawRecord, ReplayError};
+use super::CONTINUES;
+use super::attachment::{DAMAGED, Other, check};
+use super::records::ReplayError;
 use super::scan::{Item, LogChannel, RawMessage, Scan};
 
 /// Key in the metadata of a part of a log: the log that it was cut out of.
 pub const PART_OF: &str = "part_of";
-/// Name of the metadata of a copy that has what was damaged: attachments, and what is wrong with them.
-pub const DAMAGED: &str = "damaged";
 /// Topics whose messages are moments, not states: they are not repeated at the beginning of a part.
 const MOMENTS: [&str; 5] = ["/dimos/tick", "/dimos/events", "/dimos/requests", "/rosout", "/joint_trajectory"];
 /// A topic whose messages add to each other.
@@ -50,12 +49,21 @@ pub struct Written {
     pub span: Option<(u64, u64)>,
 }
 
+/// What a copy says of itself.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Label<'a> {
+    /// The log that it is a part of.
+    pub part_of: Option<&'a str>,
+    /// Its profile; `None`: that of the log.
+    pub profile: Option<&'a str>,
+}
+
 /// Copies the messages of a log between two Unix times [ns] to a new file, with all attachments and metadata, and, at
 /// its beginning, the latest state before. Calls `progress` after each batch.
 pub fn copy(
     scan: &mut Scan,
     to: &Path,
-    part_of: Option<&str>,
+    label: Label<'_>,
     mut progress: impl FnMut(&Scan),
 ) -> Result<Written, RewriteError> {
     let failed = |e: Error| {
@@ -67,25 +75,27 @@ pub fn copy(
         e => RewriteError::Write { path: to.display().to_string(), reason: e.to_string(), exists: false },
     };
     let file = File::create_new(to).map_err(failed)?;
-    let options = WriteOptions::new().profile(scan.profile()).library(concat!("dimos/", env!("CARGO_PKG_VERSION")));
+    let options = WriteOptions::new()
+        .profile(label.profile.unwrap_or(scan.profile()))
+        .library(concat!("dimos/", env!("CARGO_PKG_VERSION")));
     let options = options.compression_level(1).compression_threads(0).disable_seeking(true);
     let mut copy = Copy {
         writer: options.create(BufWriter::new(file)).map_err(refused)?,
         ids: BTreeMap::new(),
         before: BTreeMap::new(),
         added: Vec::new(),
-        others: BTreeSet::new(),
+        others: BTreeMap::new(),
+        damaged: BTreeMap::new(),
         written: Written::default(),
     };
     let (from, until) = scan.part();
-    let (mut in_part, mut damaged) = (false, BTreeMap::new());
+    let mut in_part = false;
     while let Some(item) = scan.next_item()? {
         match item {
-            Item::Other(record) => {
-                if let Some((name, why)) = copy.other(&record, part_of).map_err(refused)? {
-                    scan.lacks(format!("{name} at byte {}: {why}", record.at));
-                    damaged.insert(name, why);
-                }
+            Item::Other(file, record) => {
+                let other = check(&record);
+                other.damage(record.at).into_iter().for_each(|damage| scan.lacks(damage));
+                copy.other(file, other, label.part_of).map_err(refused)?;
             }
             Item::Messages => {
                 for (message, channel, bytes) in scan.messages() {
@@ -109,8 +119,9 @@ pub fn copy(
     for (id, channel) in &scan.channels {
         copy.id(*id, channel).map_err(refused)?;
     }
-    if !damaged.is_empty() {
-        copy.writer.write_metadata(&Metadata { name: DAMAGED.to_owned(), metadata: damaged }).map_err(refused)?;
+    if !copy.damaged.is_empty() {
+        let metadata = std::mem::take(&mut copy.damaged);
+        copy.writer.write_metadata(&Metadata { name: DAMAGED.to_owned(), metadata }).map_err(refused)?;
     }
     copy.writer.finish().map_err(refused)?;
     let file = copy.writer.into_inner().into_inner().map_err(|e| failed(e.into_error()))?;
@@ -125,39 +136,48 @@ struct Copy {
     /// The latest message of each channel before the part.
     before: BTreeMap<u16, (RawMessage, LogChannel, Vec<u8>)>,
     added: Vec<(RawMessage, LogChannel, Vec<u8>)>,
-    /// Names, lengths and checksums of the attachments and metadata that were copied.
-    others: BTreeSet<(String, usize, u32)>,
+    /// Names, lengths and checksums of the attachments and metadata that were copied, and the file of the first.
+    others: BTreeMap<(String, usize, u32), usize>,
+    /// What is damaged, and how.
+    damaged: BTreeMap<String, String>,
     written: Written,
 }
 
 impl Copy {
-    /// Copies an attachment or metadata, once. Returns its name and what is wrong with it.
-    fn other(&mut self, record: &RawRecord, part_of: Option<&str>) -> Result<Option<(String, String)>, McapError> {
-        if record.opcode == op::ATTACHMENT {
-            let Some(found) = attachment::of(&record.body) else {
-                return Ok(Some(("an attachment".to_owned(), "it cannot be read, and is left out".to_owned())));
-            };
-            let AttachmentHeader { log_time, create_time, name, media_type } = found.header;
-            // Every file of a split log has the same.
-            if !self.others.insert((name.clone(), found.data.len(), crc32fast::hash(&found.data))) {
-                return Ok(None);
-            }
-            let data = found.data.into();
-            let kept = Attachment { log_time, create_time, name: name.clone(), media_type, data };
-            self.writer.attach(&kept)?;
-            return Ok(found.damage.map(|why| (name, format!("{why}; its bytes are kept, and may be wrong"))));
-        }
-        let Ok(Record::Metadata(Metadata { name, mut metadata })) = parse_record(record.opcode, &record.body) else {
-            return Ok(Some(("metadata".to_owned(), "they cannot be read, and are left out".to_owned())));
+    /// Copies an attachment or metadata of a file. Every file of a split log has the same: they are copied once.
+    fn other(&mut self, file: usize, other: Other, part_of: Option<&str>) -> Result<(), McapError> {
+        let mut is_new = |name: &str, length, sum| {
+            let first = *self.others.entry((name.to_owned(), length, sum)).or_insert(file);
+            first == file
         };
-        if !self.others.insert((name.clone(), 0, if name == "dimos" { 0 } else { crc32fast::hash(&record.body) })) {
-            return Ok(None);
+        match other {
+            Other::Attachment(found) => {
+                let AttachmentHeader { log_time, create_time, name, media_type } = found.header;
+                if !is_new(&name, found.data.len(), crc32fast::hash(&found.data)) {
+                    return Ok(());
+                }
+                let data = found.data.into();
+                let kept = Attachment { log_time, create_time, name: name.clone(), media_type, data };
+                self.writer.attach(&kept)?;
+                let damage = found.damage.map(|why| (name, format!("{why}; its bytes are kept, and may be wrong")));
+                self.damaged.extend(damage);
+            }
+            Other::Metadata(Metadata { name, mut metadata }) => {
+                // The copy has all files in one.
+                if name == CONTINUES || !is_new(&name, 0, sum_of(&name, &metadata)) {
+                    return Ok(());
+                }
+                if let Some(whole) = part_of.filter(|_| name == "dimos") {
+                    metadata.insert(PART_OF.to_owned(), whole.to_owned());
+                }
+                self.writer.write_metadata(&Metadata { name, metadata })?;
+            }
+            Other::Damaged(Metadata { metadata, .. }) => self.damaged.extend(metadata),
+            Other::Unreadable(what, why) => {
+                drop(self.damaged.insert(what.to_owned(), format!("{why}, and is left out")))
+            }
         }
-        if let Some(whole) = part_of.filter(|_| name == "dimos") {
-            metadata.insert(PART_OF.to_owned(), whole.to_owned());
-        }
-        self.writer.write_metadata(&Metadata { name, metadata })?;
-        Ok(None)
+        Ok(())
     }
 
     fn keep(&mut self, message: RawMessage, channel: &LogChannel, bytes: &[u8]) {
@@ -201,4 +221,13 @@ impl Copy {
         self.ids.insert(channel_id, id);
         Ok(id)
     }
+}
+
+/// Returns the checksum of metadata. That of a run differs from file to file by their numbers only.
+fn sum_of(name: &str, metadata: &BTreeMap<String, String>) -> u32 {
+    let mut sum = crc32fast::Hasher::new();
+    for (key, value) in metadata.iter().filter(|_| name != "dimos") {
+        [key, value].into_iter().for_each(|text| sum.update(format!("{}:{text}", text.len()).as_bytes()));
+    }
+    sum.finalize()
 }

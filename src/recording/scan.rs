@@ -1,35 +1,22 @@
 //! Reads all messages of a log as bytes in order of time, with their schemas: for tools that check, print, cut or
 //! repair logs of any origin. What is damaged is reported.
 
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BinaryHeap, HashMap, VecDeque};
 use std::path::Path;
 
 use mcap::parse_record;
 use mcap::records::{Record, Statistics, op};
 
-use super::cdr::CdrError;
+use super::channels::Described;
 use super::loss::Loss;
 use super::records::{RawRecord, ReplayError};
-use super::ros2msg::Schema;
 use super::source::{Block, Source};
 
-/// A channel of a log.
-#[derive(Debug, Clone, Default)]
-pub struct LogChannel {
-    /// Topic.
-    pub topic: String,
-    /// Encoding of messages: `cdr`.
-    pub encoding: String,
-    /// Further properties, such as the offered QoS.
-    pub metadata: BTreeMap<String, String>,
-    /// Name, encoding and text of the schema.
-    pub schema: (String, String, Vec<u8>),
-    /// The schema, to decode messages; an error if they cannot be decoded.
-    pub decoder: Option<Schema>,
-}
+pub use super::channels::LogChannel;
 
 /// A message of the current batch.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RawMessage {
     /// Unix time [ns].
     pub time: u64,
@@ -39,18 +26,38 @@ pub struct RawMessage {
     pub sequence: u32,
     /// Unix time at which it was published [ns].
     pub published: u64,
-    /// Where it was written: file and position of its chunk. What was written later is greater.
-    pub place: (usize, u64),
-    /// Where its bytes are in the batch.
+    /// Where it was written: file, position of its chunk, number in it. What was written later is greater.
+    pub place: (usize, u64, u32),
+    /// The block that has its bytes, and where they are in it.
+    pub(super) block: usize,
     pub(super) span: (usize, usize),
+}
+
+impl Ord for RawMessage {
+    fn cmp(&self, other: &Self) -> std::cmp::Ordering {
+        (self.time, self.place).cmp(&(other.time, other.place))
+    }
+}
+
+impl PartialOrd for RawMessage {
+    fn partial_cmp(&self, other: &Self) -> Option<std::cmp::Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+/// The bytes of messages of a block, and how many of these were not given out yet.
+#[derive(Default)]
+struct Held {
+    bytes: Vec<u8>,
+    left: usize,
 }
 
 /// What was read.
 pub enum Item {
     /// A batch of messages, none older than those before: see [`Scan::messages`].
     Messages,
-    /// An attachment or metadata; they come before all messages.
-    Other(RawRecord),
+    /// An attachment or metadata, with the index of its file; they come before all messages.
+    Other(usize, RawRecord),
 }
 
 /// A log that is read from its beginning to its end.
@@ -65,27 +72,21 @@ pub struct Scan {
     topics: Vec<String>,
     /// What was found damaged so far.
     found: Loss,
-    /// Messages that were read.
+    /// Messages on the wanted topics that were read.
     count: u64,
-    /// Bytes of the messages, of which the first `given` are the current batch.
-    bytes: Vec<u8>,
-    messages: Vec<RawMessage>,
-    given: usize,
+    /// Whether these are to be all of them: a window is no measure of what is missing.
+    counts: bool,
+    /// The current batch.
+    batch: Vec<RawMessage>,
+    /// Messages that were read and are too late for it.
+    waiting: BinaryHeap<Reverse<RawMessage>>,
+    /// What both need, by block.
+    held: HashMap<usize, Held>,
     /// Blocks to read.
     pub(super) queue: VecDeque<usize>,
     others: VecDeque<(usize, u64, u8)>,
     /// Bytes of the blocks that were read.
     passed: u64,
-}
-
-/// What describes channels, by file and its own ids.
-#[derive(Default)]
-struct Described {
-    schemas: HashMap<(usize, u16), (String, String, Vec<u8>)>,
-    /// Ids in [`Scan::channels`].
-    ids: HashMap<(usize, u16), u16>,
-    profile: Option<String>,
-    statistics: Vec<Statistics>,
 }
 
 impl Scan {
@@ -105,13 +106,15 @@ impl Scan {
             topics: topics.to_vec(),
             found: Loss::default(),
             count: 0,
-            bytes: Vec::new(),
-            messages: Vec::new(),
-            given: 0,
+            counts: false,
+            batch: Vec::new(),
+            waiting: BinaryHeap::new(),
+            held: HashMap::new(),
             queue: VecDeque::new(),
             others: VecDeque::new(),
             passed: 0,
         };
+        scan.counts = scan.source.span().is_none_or(|(start, end)| part.0 <= start && part.1 >= end);
         scan.describe()?;
         scan.others = scan.source.others.iter().copied().collect();
         scan.choose(part.0);
@@ -195,7 +198,23 @@ impl Scan {
     /// Returns the number of messages that the summaries count, and those of each channel of the first file.
     pub fn statistics(&self) -> Option<(u64, &Statistics)> {
         let all = &self.described.statistics;
-        Some((all.iter().map(|s| s.message_count).sum(), all.first()?))
+        Some((all.iter().map(|(_, s)| s.message_count).sum(), &all.first()?.1))
+    }
+
+    /// Returns the number of messages on the wanted topics that the summaries count.
+    fn counted(&self) -> u64 {
+        let wanted = |file: usize, id: u16| {
+            let topic = self.channel_of(file, id).map(|(_, channel)| &channel.topic);
+            topic.is_some_and(|topic| self.topics.contains(topic))
+        };
+        let of_file = |(file, statistics): &(usize, Statistics)| match self.topics.is_empty() {
+            true => statistics.message_count,
+            false => {
+                let counts = statistics.channel_message_counts.iter();
+                counts.filter(|(id, _)| wanted(*file, **id)).map(|(_, count)| count).sum()
+            }
+        };
+        self.described.statistics.iter().map(of_file).sum()
     }
 
     /// Returns whether it was closed properly.
@@ -243,8 +262,8 @@ impl Scan {
         } else if !self.is_complete() && !self.is_live() && reaches_end {
             loss.cut = Some("it was not closed".to_owned());
         }
-        let is_whole = self.topics.is_empty() && (from, to) == (0, u64::MAX) && self.queue.is_empty();
-        let counted = self.statistics().filter(|_| is_whole && self.is_complete()).map_or(0, |(count, _)| count);
+        let is_whole = self.counts && self.queue.is_empty() && self.is_complete();
+        let counted = if is_whole { self.counted() } else { 0 };
         if counted > self.count {
             loss.missing = (counted - self.count, counted);
         }
@@ -253,9 +272,11 @@ impl Scan {
 
     /// Restarts with another part, without attachments and metadata; what was found before is kept.
     pub(super) fn restart(&mut self, part: (u64, u64)) {
-        (self.part, self.given, self.found.unknown) = (part, self.messages.len(), 0);
+        (self.part, self.counts, self.found.unknown) = (part, false, 0);
         self.others.clear();
-        self.forget_given();
+        self.batch.clear();
+        self.waiting.clear();
+        self.held.clear();
         self.choose(part.0);
     }
 
@@ -273,7 +294,7 @@ impl Scan {
         self.forget_given();
         while let Some(other) = self.others.pop_front() {
             if let Some(record) = self.source.other(other)? {
-                return Ok(Some(Item::Other(record)));
+                return Ok(Some(Item::Other(other.0, record)));
             }
         }
         loop {
@@ -284,37 +305,32 @@ impl Scan {
             // Later blocks may have messages as old as that.
             let later = self.queue.front().and_then(|next| self.source.blocks.get(*next));
             let until = later.map_or(u64::MAX, |block| block.start);
-            self.given = self.messages.partition_point(|message| message.time <= until);
-            match (self.given, next) {
-                (0, None) => return Ok(None),
-                (0, Some(_)) => {}
+            while self.waiting.peek().is_some_and(|Reverse(first)| first.time <= until) {
+                self.batch.extend(self.waiting.pop().map(|Reverse(first)| first));
+            }
+            match (self.batch.is_empty(), next) {
+                (true, None) => return Ok(None),
+                (true, Some(_)) => {}
                 _ => return Ok(Some(Item::Messages)),
             }
         }
     }
 
-    /// Removes the batch that was given out.
-    pub(super) fn forget_given(&mut self) {
-        if self.given == self.messages.len() {
-            self.messages.clear();
-            self.bytes.clear();
-        } else if self.given > 0 {
-            self.messages.drain(..self.given);
-            let mut bytes = Vec::new();
-            for message in &mut self.messages {
-                let start = bytes.len();
-                bytes.extend_from_slice(self.bytes.get(message.span.0..message.span.1).unwrap_or_default());
-                message.span = (start, bytes.len());
+    /// Removes the batch that was given out, and the blocks that only it needed.
+    fn forget_given(&mut self) {
+        for message in self.batch.drain(..) {
+            let Some(held) = self.held.get_mut(&message.block) else { continue };
+            held.left -= 1;
+            if held.left == 0 {
+                self.held.remove(&message.block);
             }
-            self.bytes = bytes;
         }
-        self.given = 0;
     }
 
     fn read(&mut self, index: usize) -> Result<(), ReplayError> {
-        let Self { source, channels, described, bytes, messages, found, count, .. } = self;
+        let Self { source, channels, described, topics, waiting, found, count, .. } = self;
         let Some(block) = source.blocks.get(index) else { return Ok(()) };
-        let place = (block.file, block.at);
+        let (at, mut held) = (block.at, Held::default());
         self.passed += block.length();
         let damage = source.read(index, |file, opcode, body| {
             if opcode != op::MESSAGE {
@@ -325,74 +341,33 @@ impl Scan {
                 found.unknown += 1;
                 return;
             };
-            *count += 1;
-            let start = bytes.len();
-            bytes.extend_from_slice(&data);
-            messages.push(RawMessage {
+            let is_wanted = |channel: &LogChannel| topics.is_empty() || topics.contains(&channel.topic);
+            *count += u64::from(channels.get(channel).is_some_and(is_wanted));
+            let start = held.bytes.len();
+            held.bytes.extend_from_slice(&data);
+            waiting.push(Reverse(RawMessage {
                 time: header.log_time,
                 channel: *channel,
                 sequence: header.sequence,
                 published: header.publish_time,
-                place,
-                span: (start, bytes.len()),
-            });
+                place: (file, at, held.left as u32),
+                block: index,
+                span: (start, held.bytes.len()),
+            }));
+            held.left += 1;
         })?;
+        if held.left > 0 {
+            self.held.insert(index, held);
+        }
         found.damage.extend(damage.filter(|damage| !found.damage.contains(damage)));
-        messages.sort_by_key(|message| (message.time, message.place));
         Ok(())
     }
 
     /// Returns the messages of the batch, in order of time.
     pub fn messages(&self) -> impl Iterator<Item = (&RawMessage, &LogChannel, &[u8])> {
-        self.messages.iter().take(self.given).filter_map(|message| {
-            let bytes = self.bytes.get(message.span.0..message.span.1)?;
+        self.batch.iter().filter_map(|message| {
+            let bytes = self.held.get(&message.block)?.bytes.get(message.span.0..message.span.1)?;
             Some((message, self.channels.get(&message.channel)?, bytes))
         })
-    }
-}
-
-impl Described {
-    /// Takes a record that describes messages. Equal channels of several files become one.
-    fn learn(&mut self, channels: &mut BTreeMap<u16, LogChannel>, file: usize, opcode: u8, body: &[u8]) {
-        match parse_record(opcode, body) {
-            Ok(Record::Header(header)) => {
-                self.profile.get_or_insert(header.profile);
-            }
-            Ok(Record::Schema { header, data }) => {
-                self.schemas.insert((file, header.id), (header.name, header.encoding, data.into_owned()));
-            }
-            Ok(Record::Channel(channel)) => {
-                let schema = self.schemas.get(&(file, channel.schema_id)).cloned().unwrap_or_default();
-                let id = channel.id;
-                let is_it = |known: &LogChannel| {
-                    (&known.topic, &known.encoding, &known.metadata, &known.schema)
-                        == (&channel.topic, &channel.message_encoding, &channel.metadata, &schema)
-                };
-                // Its own id if that is free: copies of a log have the same ids.
-                let same = channels.get(&id).is_some_and(is_it).then_some(id);
-                let same =
-                    same.or_else(|| channels.iter().find(|(_, known)| file > 0 && is_it(known)).map(|(id, _)| *id));
-                let free = || std::iter::once(id).chain(1..=u16::MAX).find(|id| !channels.contains_key(id));
-                let Some(own) = same.or_else(free) else { return };
-                self.ids.insert((file, id), own);
-                if same.is_some() {
-                    return;
-                }
-                let readable = schema.1 == "ros2msg" && channel.message_encoding == "cdr";
-                let text = std::str::from_utf8(&schema.2).ok().filter(|_| readable);
-                let decoder = text.and_then(|text| Schema::parse(&schema.0, text).ok());
-                let (topic, encoding, metadata) = (channel.topic, channel.message_encoding, channel.metadata);
-                channels.insert(own, LogChannel { topic, encoding, metadata, schema, decoder });
-            }
-            Ok(Record::Statistics(statistics)) => self.statistics.push(statistics),
-            _ => {}
-        }
-    }
-}
-
-impl LogChannel {
-    /// Appends a message as JSON. An error if its schema is not understood, or if it does not match.
-    pub fn json(&self, bytes: &[u8], out: &mut String) -> Result<(), CdrError> {
-        self.decoder.as_ref().ok_or(CdrError::Header)?.json(bytes, out)
     }
 }

@@ -95,7 +95,8 @@ mod tests {
     use std::fs::File;
 
     use super::*;
-    use crate::recording::files::mark_as_being_written;
+    use crate::recording::PART;
+    use crate::recording::files::{mark_as_being_written, part as part_of};
     use crate::recording::log_writer::LogWriter;
     use crate::recording::messages::Text;
 
@@ -157,6 +158,11 @@ mod tests {
         check(&mut log);
         assert!(log.scan.source.blocks.len() > 100, "{}", log.scan.source.blocks.len());
         assert!(log.loss().is_none() && !log.is_live());
+        // Windows that end at the end of the log, read everything, or nothing are no measure of it.
+        for (window, points) in [((0, u64::MAX), 3), ((90 * SECOND, u64::MAX), 0), ((0, u64::MAX), 0), ((5, 6), 0)] {
+            times(&mut log, "/fast", window, points);
+            assert_eq!(log.loss(), None, "{window:?} {points}");
+        }
     }
 
     #[test]
@@ -189,5 +195,39 @@ mod tests {
         assert!(log.refresh().unwrap() && before < 200 * SECOND);
         assert_eq!(log.span().unwrap().1, 200 * SECOND);
         assert_eq!(times(&mut log, "/fast", (150 * SECOND, u64::MAX), 0), [200 * SECOND]);
+    }
+
+    #[test]
+    fn the_log_of_a_live_run_continues_in_another_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.mcap");
+        let about = |part: Option<u32>| {
+            let run = BTreeMap::from([("run".to_owned(), "r".to_owned())]);
+            run.into_iter().chain(part.map(|part| (PART.to_owned(), part.to_string()))).collect::<BTreeMap<_, _>>()
+        };
+        let begin = |path: &Path, part| {
+            let file = File::create(path).unwrap();
+            mark_as_being_written(&file);
+            LogWriter::create(file, 0, &[], about(part)).unwrap()
+        };
+        let mut writer = begin(&path, None);
+        text(&mut writer, "/fast", SECOND);
+        writer.flush_soon();
+        writer.flush_if_due(crate::clock::Mono(SECOND)).unwrap();
+        let mut log = LogWindows::open(&path).unwrap();
+        for part in 1..4 {
+            let next = part_of(&path, part);
+            writer.continues_in(next.file_name().unwrap().to_str().unwrap().to_owned()).unwrap();
+            drop(writer.finish().unwrap());
+            writer = begin(&next, Some(part));
+            text(&mut writer, "/fast", (1 + u64::from(part)) * SECOND);
+            writer.flush_soon();
+            writer.flush_if_due(crate::clock::Mono(SECOND)).unwrap();
+            assert!(log.refresh().unwrap() && log.is_live() && log.loss().is_none(), "{part}: {:?}", log.loss());
+            assert_eq!(times(&mut log, "/fast", (0, u64::MAX), 0).len(), 1 + part as usize);
+        }
+        drop(writer.finish().unwrap());
+        assert!(log.refresh().unwrap() && !log.is_live());
+        assert!(!log.refresh().unwrap() && log.loss().is_none(), "{:?}", log.loss());
     }
 }

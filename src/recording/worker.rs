@@ -259,15 +259,17 @@ where
 
     /// Continues in another file.
     fn split(&mut self, deadline: Mono) -> Result<(), RecordError> {
-        let Some((log, first)) = self.log.take().zip(self.config.path.clone()) else { return Ok(()) };
+        let Some((mut log, first)) = self.log.take().zip(self.config.path.clone()) else { return Ok(()) };
         self.topics.clone_from(log.topics());
-        log.finish().map_err(|e| write_error(&self.path, &e))?;
+        self.part += 1;
+        let next = files::part(&first, self.part);
+        let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let finished = log.continues_in(name(&next)).and_then(|()| log.finish());
+        finished.map_err(|e| write_error(&self.path, &e))?;
         // Its thread syncs it once more.
         self.sync = None;
-        self.part += 1;
-        let name = first.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let more = BTreeMap::from([(PART.to_owned(), self.part.to_string()), (PART_OF.to_owned(), name)]);
-        self.begin(files::part(&first, self.part), deadline, more)
+        let more = BTreeMap::from([(PART.to_owned(), self.part.to_string()), (PART_OF.to_owned(), name(&first))]);
+        self.begin(next, deadline, more)
     }
 
     /// Takes from a note what every file begins with.

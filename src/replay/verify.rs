@@ -17,8 +17,9 @@ use crate::control::request::Envelope;
 use crate::control::task::Task;
 use crate::control::task_spec::TaskTable;
 use crate::recording::chunk;
-use crate::recording::records::{RawRecord, RecordReader};
-use crate::recording::replay::{ReplayError, parts};
+use crate::recording::records::{Damage, Kept, RawRecord, RecordReader};
+use crate::recording::replay::ReplayError;
+use crate::recording::source_files::{self, LogFile};
 
 /// Result of a verification.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -133,10 +134,14 @@ impl<'a> Rerun<'a> {
         path: &Path,
         progress: &mut dyn FnMut(u64, u64),
     ) -> Result<Option<ReplayError>, RecordedError> {
-        let (parts, mut before) = (parts(path)?, 0);
-        let length = parts.iter().filter_map(|part| Some(part.metadata().ok()?.len())).sum();
-        for part in parts {
-            let mut records = RecordReader::open(&part)?;
+        let (files, mut before) = (source_files::of(path)?, 0);
+        let length = files.iter().filter_map(|file| Some(file.path.metadata().ok()?.len())).sum();
+        for LogFile { path, wrong } in files {
+            if let Some(reason) = wrong {
+                let damage = Damage { path, at: 0, span: None, reason, kept: Kept::None };
+                return Ok(Some(ReplayError::Damaged { damage }));
+            }
+            let mut records = RecordReader::open(&path)?;
             self.counts.live = records.is_live();
             loop {
                 progress(before + records.position().0, length);

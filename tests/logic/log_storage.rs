@@ -101,9 +101,11 @@ fn a_log_in_several_files_is_read_and_verified_as_one() {
     run.finish();
     std::fs::rename(files::part(&other, 1), files::part(&log, 4)).unwrap();
     assert_eq!(reproducible(&log).ticks, 3500);
-    // A missing one ends it.
+    // A missing one ends it, and is said.
     std::fs::remove_file(&others[1]).unwrap();
-    assert_eq!(reproducible(&log).ticks, 2002);
+    let found = verify(&log, &TaskTable::builtin()).unwrap();
+    let Finding::Incomplete { why, .. } = &found.finding else { panic!("{found:?}") };
+    assert!(why.contains("run_2.mcap is missing: the log continues in run_3.mcap") && found.ticks == 2001, "{found:?}");
 }
 
 /// Messages of the first file alone.

@@ -178,6 +178,126 @@ def two_publishers():
     write("two_publishers", sorted(motion() + other, key=lambda m: m[1]))
 
 
+def slow_publishers():
+    """Two publishers at 10 Hz in one channel, as rosbag2 records them: no step is fast."""
+
+    def at(k):
+        q = pose(k) if k % 2 else [q + 0.3 for q in pose(k)]
+        return state(JOINTS, q, T + k * 50 * MS)
+
+    write("slow_publishers", [(STATES, T + k * 50 * MS, at(k)) for k in range(200)])
+
+
+def uneven_publishers():
+    """One publisher at 20 Hz and one at 10 Hz in one channel."""
+
+    def at(k):
+        q = [q + 0.3 for q in pose(k)] if k % 3 == 2 else pose(k)
+        return state(JOINTS, q, T + k * 33 * MS)
+
+    write("uneven_publishers", [(STATES, T + k * 33 * MS, at(k)) for k in range(200)])
+
+
+def two_channels():
+    """Two publishers whose positions are nearly the same."""
+    own = [(STATES, T + k * 100 * MS, state(JOINTS, pose(k), T + k * 100 * MS)) for k in range(200)]
+    near = []
+    for k, (_, time, _) in enumerate(own):
+        near.append((STATES + "|b", time + 50 * MS, state(JOINTS, [q + 0.01 for q in pose(k)], time)))
+    write("two_channels", sorted(own + near, key=lambda m: m[1]))
+
+
+def restarted():
+    """A driver that was restarted has another channel from then on."""
+    messages = motion()
+    write("restarted", messages[:100] + [(STATES + "|b", time, data) for _, time, data in messages[100:]])
+
+
+def joint_twice():
+    messages = motion()
+    for k in (70, 71):
+        names, positions = [*JOINTS, JOINTS[2]], [*pose(k), 0.0]
+        messages[k] = (STATES, messages[k][1], state(names, positions, messages[k][1]))
+    write("joint_twice", messages)
+
+
+def disordered_chunks():
+    messages = motion()
+    for k in range(0, 200, 20):
+        part = messages[k : k + 20]
+        random.Random(k).shuffle(part)
+        messages[k : k + 20] = part
+    write("disordered_chunks", messages)
+
+
+def wrong_map():
+    """The index of chunks names another channel than the chunks and their message indexes have."""
+    own, other = motion(), motion(topic="/other")
+    third = [("/third", time + 2_000 * MS, data) for _, time, data in motion(20)]
+    path = write("wrong_map", [message for pair in zip(own, other) for message in pair] + third)
+    data = bytearray(open(path, "rb").read())
+    for at, opcode, _ in list(records(data)):
+        if opcode == 8:
+            length = struct.unpack_from("<I", data, at + 9 + 32)[0]
+            for entry in range(at + 9 + 36, at + 9 + 36 + length, 10):
+                if struct.unpack_from("<H", data, entry)[0] == 1:
+                    struct.pack_into("<H", data, entry, 3)
+    # The summary has no checksum.
+    struct.pack_into("<I", data, len(data) - 12, 0)
+    open(path, "wb").write(data)
+
+
+def no_profile():
+    write("no_profile", motion(), profile="")
+
+
+def late():
+    """The first message of the states is two hours after the log began."""
+    hours = 7_200_000 * MS
+    later = [(topic, time + hours, data) for topic, time, data in motion(20)]
+    write("late", [("/other", T, motion(1)[0][2]), *later])
+
+
+def equal_attachments():
+    def before(writer):
+        for _ in range(2):
+            writer.add_attachment(1, 2, "same.txt", "text/plain", b"the same")
+            writer.add_metadata("same", {"a": "b"})
+
+    write("equal_attachments", motion(), before)
+
+
+def partly():
+    """The length of the tenth message of a chunk is wrong."""
+
+    def change(data, chunks):
+        inside = chunks[3] + 9 + 40
+        at = inside
+        for _ in range(10):
+            at += 9 + struct.unpack_from("<Q", data, at + 1)[0]
+        data[at + 3] ^= 0x7F
+
+    changed("partly", change, compression=C.NONE)
+
+
+def swallowed():
+    """A message of a chunk has become another kind of record."""
+
+    def change(data, chunks):
+        data[chunks[3] + 9 + 40] = 0x80
+
+    changed("swallowed", change, compression=C.NONE)
+
+
+def hidden():
+    """A chunk has become a kind of record of another program."""
+
+    def change(data, chunks):
+        data[chunks[3]] = 0x86
+
+    changed("hidden", change)
+
+
 def whole_turn():
     def at(k):
         q = [HOME[0] + 3.0 + 0.002 * k, *HOME[1:]]
@@ -287,9 +407,11 @@ def giant():
     write("giant", [("/blob", T, blob), *motion()], chunk_size=1 << 30)
 
 
-def bag(name, missing=False):
+def bag(name, missing=False, third=None):
     os.makedirs(os.path.join(FOLDER, name), exist_ok=True)
-    names = [f"{name}_0.mcap", f"{name}_1.mcap"] + ([f"{name}_2.mcap"] if missing else [])
+    names = [f"{name}_0.mcap", f"{name}_1.mcap"] + ([f"{name}_2.mcap"] if missing or third is not None else [])
+    if third is not None:
+        open(os.path.join(FOLDER, name, f"{name}_2.mcap"), "wb").write(third)
     with open(os.path.join(FOLDER, name, "metadata.yaml"), "w") as out:
         listed = "".join(f"    - {n}\n" for n in names)
         out.write(f"rosbag2_bagfile_information:\n  version: 5\n  storage_identifier: mcap\n  relative_file_paths:\n{listed}")
@@ -309,6 +431,14 @@ def split_missing():
     bag("split_missing", missing=True)
 
 
+def split_empty():
+    bag("split_empty", third=b"")
+
+
+def split_no_log():
+    bag("split_no_log", third=b"this is no log")
+
+
 def unrelated():
     os.makedirs(os.path.join(FOLDER, "unrelated"), exist_ok=True)
     for run in ("a", "b"):
@@ -321,6 +451,8 @@ if __name__ == "__main__":
         plain, lz4, raw, no_chunks, indexes, out_of_order, out_of_order_no_chunks, other_order, other_joints, growing,
         in_parts, two_publishers, whole_turn, gap, elsewhere, bad_message, chunk_crc, first_crc, flipped, broken,
         first_broken, length, cut, times, attached, bad_attachment, giant, split, split_missing, unrelated,
+        slow_publishers, uneven_publishers, two_channels, restarted, joint_twice, disordered_chunks, wrong_map,
+        no_profile, late, equal_attachments, partly, swallowed, hidden, split_empty, split_no_log,
     ]  # fmt: skip
     for make in made:
         make()

@@ -1,6 +1,7 @@
 """What PyPI mcap reads in logs: read_foreign.py FILE... prints JSON lists, one for all files, of [topic, log time, publish
 time, {joint: position}], in order of time, with `null` for what cannot be decoded. What is damaged is left out; a wrong
-checksum alone damages nothing. `--csv FILE` prints [time, {column: value}] as pandas reads it."""
+checksum alone damages nothing. `--csv FILE` prints [time, {column: value}] as pandas reads it, `--bag FOLDER` how many
+messages rosbags reads on each topic."""
 
 import json
 import os
@@ -80,7 +81,22 @@ def table(path):
     return rows
 
 
-if sys.argv[1] == "--csv":
+def bag(path):
+    from pathlib import Path
+
+    from rosbags.highlevel import AnyReader
+
+    counts = {}
+    with AnyReader([Path(path)]) as reader:
+        for connection, _, data in reader.messages():
+            reader.deserialize(data, connection.msgtype)
+            counts[connection.topic] = counts.get(connection.topic, 0) + 1
+    return counts
+
+
+if sys.argv[1] == "--bag":
+    print(json.dumps(bag(sys.argv[2])))
+elif sys.argv[1] == "--csv":
     print(json.dumps(table(sys.argv[2])))
 elif sys.argv[1] == "--about":
     print(json.dumps(about(sys.argv[2])))

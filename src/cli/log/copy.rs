@@ -7,7 +7,7 @@ use serde_json::json;
 use super::{Part, ended, progress, unreadable};
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output;
-use crate::recording::rewrite::{RewriteError, Written, copy};
+use crate::recording::rewrite::{Label, RewriteError, Written, copy};
 use crate::recording::scan::Scan;
 
 /// Writes a part of a log.
@@ -15,7 +15,8 @@ pub fn cut(path: &Path, part: &Part, to: &Path, json: bool) -> Result {
     let part = part.of(path)?;
     let mut scan = Scan::open_part(path, &[], part).map_err(unreadable)?.with_earlier();
     let name = path.file_name().unwrap_or_default().to_string_lossy();
-    let written = copy(&mut scan, to, Some(&name), progress::of_scan(false)).map_err(|e| failure(e, to))?;
+    let label = Label { part_of: Some(&name), ..Label::default() };
+    let written = copy(&mut scan, to, label, progress::of_scan(false)).map_err(|e| failure(e, to))?;
     Ok(print("cut", scan.loss().text().as_deref(), &written, to, json))
 }
 
@@ -28,7 +29,7 @@ pub fn recover(path: &Path, to: Option<&Path>, json: bool) -> Result {
     }
     let beside = path.with_file_name(format!("{}-recovered.mcap", path.file_stem().unwrap_or_default().display()));
     let to = to.unwrap_or(&beside);
-    let written = copy(&mut scan, to, None, progress::of_scan(false)).map_err(|e| failure(e, to))?;
+    let written = copy(&mut scan, to, Label::default(), progress::of_scan(false)).map_err(|e| failure(e, to))?;
     Ok(print("recovered", scan.loss().text().as_deref(), &written, to, json))
 }
 

@@ -5,10 +5,10 @@ use std::path::Path;
 
 use serde_json::{Value, json};
 
-use super::info::check_other;
 use super::{progress, unreadable};
 use crate::cli::exit::{Exit, Result};
 use crate::cli::output;
+use crate::recording::attachment::check;
 use crate::recording::messages::Tick;
 use crate::recording::records::check_sections;
 use crate::recording::replay::parts;
@@ -22,7 +22,9 @@ pub fn run(path: &Path, json: bool) -> Result {
     while let Some(item) = scan.next_item().map_err(unreadable)? {
         match item {
             Item::Messages => found.batch(&scan),
-            Item::Other(record) => drop(check_other(&mut scan, &record)),
+            Item::Other(_, record) => {
+                check(&record).damage(record.at).into_iter().for_each(|damage| scan.lacks(damage));
+            }
         }
         bar(&scan);
     }
@@ -41,27 +43,32 @@ pub fn run(path: &Path, json: bool) -> Result {
     if found.undecoded > 0 {
         found.problems.push(format!("{} messages do not match their schema", found.undecoded));
     }
-    if found.unordered > 0 {
-        found.problems.push(format!("{} messages are older than the one before on their topic", found.unordered));
-    }
     if found.lost > 0 {
         found.problems.push(format!("{} samples of ticks were lost while recording", found.lost));
     }
-    let healthy = found.problems.is_empty();
+    let (healthy, unordered) = (found.problems.is_empty(), found.unordered);
     if json {
         let data = json!({
-            "healthy": healthy, "live": scan.is_live(), "messages": found.messages, "ticks": found.ticks,
-            "topics": found.times.len(), "problems": found.problems,
+            "healthy": healthy, "out_of_order": unordered, "live": scan.is_live(), "messages": found.messages,
+            "ticks": found.ticks, "topics": found.times.len(), "problems": found.problems,
         });
         output::json(&data);
     } else {
         found.problems.iter().for_each(|problem| output::line(format_args!("problem: {problem}")));
+        let (verdict, recovers) = match (healthy, unordered) {
+            (true, 0) => ("healthy", None),
+            // Nothing is missing, and every verb reads it in order.
+            (true, _) => ("whole, but out of order", Some("the messages in order of time")),
+            (false, _) => ("not whole", Some("what can be read")),
+        };
+        if unordered > 0 {
+            output::line(format_args!("{unordered} messages are older than the one before on their topic"));
+        }
         let (messages, topics) = (found.messages, found.times.len());
-        let verdict = if healthy { "healthy" } else { "not whole" };
         let live = if scan.is_live() { ", live: read up to its newest chunk" } else { "" };
         output::line(format_args!("{verdict}: {messages} messages on {topics} topics, {} ticks{live}", found.ticks));
-        if !healthy {
-            output::note("hint: `dimos log recover` writes what can be read to a new file");
+        if let Some(recovers) = recovers {
+            output::note(format_args!("hint: `dimos log recover` writes {recovers} to a new file"));
         }
     }
     Ok(if healthy { Exit::Ok } else { Exit::Log })
@@ -75,9 +82,10 @@ struct Findings {
     next: Option<u64>,
     lost: u64,
     undecoded: u64,
+    /// Messages that were written before older ones of their channel.
     unordered: u64,
     /// Where the latest message of each channel was written.
-    times: BTreeMap<u16, (usize, u64)>,
+    times: BTreeMap<u16, (usize, u64, u32)>,
     problems: Vec<String>,
     text: String,
 }

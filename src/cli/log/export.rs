@@ -11,7 +11,7 @@ use super::{Part, STATES, ended, no_states, progress, unreadable, written};
 use crate::cli::escapes::safe;
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output;
-use crate::recording::joints::Places;
+use crate::recording::joints::{Places, twice};
 use crate::recording::messages::JointState;
 use crate::recording::parquet::{Column, ParquetWriter};
 use crate::recording::replay::{Entry, LogReader, Payload, ReplayError, Selection};
@@ -265,20 +265,44 @@ pub fn each(
 ) -> Result<Option<String>> {
     let (from, length) = (selection.from, selection.to.saturating_sub(selection.from));
     log.select(selection).map_err(unreadable)?;
+    let mut doubled: Option<(String, u64)> = None;
     loop {
         match log.next_entry() {
-            Ok(Some(entry)) => {
+            Ok(Some(mut entry)) => {
+                if let Payload::JointState(state) = &mut entry.data
+                    && let Some(joint) = without_doubled(state)
+                {
+                    doubled.get_or_insert((joint, 0)).1 += 1;
+                }
                 progress(entry.log_time.saturating_sub(from), length);
                 if !take(entry)? {
                     return Ok(None);
                 }
             }
-            Ok(None) => return Ok(log.loss().text()),
+            Ok(None) => {
+                let mut loss = log.loss();
+                let text = |(joint, count)| format!("{count} messages have {joint} twice: its values are left out");
+                loss.others.extend(doubled.map(text));
+                return Ok(loss.text());
+            }
             // It is in the loss.
             Err(ReplayError::Cut { .. } | ReplayError::Damaged { .. }) => {}
             Err(e) => return Err(unreadable(e)),
         }
     }
+}
+
+/// Removes the values of joints that are more than once in a message: none of them is known to be right. Returns one of
+/// these joints.
+fn without_doubled(state: &mut JointState) -> Option<String> {
+    let first = twice(&state.name)?.clone();
+    let count = |name: &String| state.name.iter().filter(|other| *other == name).count();
+    for at in (0..state.name.len()).filter(|at| state.name.get(*at).is_some_and(|name| count(name) > 1)) {
+        for list in [&mut state.position, &mut state.velocity, &mut state.effort] {
+            list.get_mut(at).into_iter().for_each(|value| *value = f64::NAN);
+        }
+    }
+    Some(first)
 }
 
 fn cell(value: f64) -> String {

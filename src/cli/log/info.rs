@@ -3,18 +3,15 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use mcap::records::{Record, op};
 use serde_json::{Value, json};
 
 use super::{ended, progress, unreadable};
 use crate::cli::exit::Result;
 use crate::cli::output::{self, Table, fixed};
-use crate::recording::attachment::{self, LoggedAttachment};
+use crate::recording::attachment::{Other, check};
 use crate::recording::disk_space::Megabytes;
 use crate::recording::files;
-use crate::recording::records::RawRecord;
 use crate::recording::replay::{LogInfo, LogReader, ReplayError};
-use crate::recording::rewrite::DAMAGED;
 use crate::recording::scan::{Item, Scan};
 
 /// Prints what is in a log.
@@ -28,16 +25,19 @@ pub fn run(path: &Path, json: bool) -> Result {
             Item::Messages => {
                 scan.messages().for_each(|(message, ..)| *counts.entry(message.channel).or_default() += 1);
             }
-            Item::Other(record) => {
-                let found = check_other(&mut scan, &record);
-                attachments.extend(found.map(|found| json!({"name": found.header.name, "size": found.data.len()})));
+            Item::Other(_, record) => {
+                let other = check(&record);
+                other.damage(record.at).into_iter().for_each(|damage| scan.lacks(damage));
+                if let Other::Attachment(found) = other {
+                    attachments.push(json!({"name": found.header.name, "size": found.data.len()}));
+                }
             }
         }
         bar(&scan);
     }
-    let faults = faults(path, info).map_err(unreadable)?;
+    let (faults, _) = faults(path, info, false).map_err(unreadable)?;
     let loss = scan.loss().text();
-    let state = if loss.is_some() && info.complete { "damaged" } else { state(info) };
+    let state = state(info, loss.is_some());
     let length = length(info);
     let mut topics: Vec<_> = scan.channels.iter().collect();
     topics.sort_by_key(|(_, channel)| &channel.topic);
@@ -81,30 +81,6 @@ pub fn run(path: &Path, json: bool) -> Result {
     Ok(ended(loss.as_deref()))
 }
 
-/// Checks an attachment or metadata, and adds its damage to what the log lacks. Returns the attachment.
-pub fn check_other(scan: &mut Scan, record: &RawRecord) -> Option<LoggedAttachment> {
-    if record.opcode == op::ATTACHMENT {
-        let found = attachment::of(&record.body);
-        let (name, damage) = match &found {
-            None => ("an attachment", Some("it cannot be read")),
-            Some(found) => (found.header.name.as_str(), found.damage.as_deref()),
-        };
-        if let Some(why) = damage {
-            scan.lacks(format!("{name} at byte {}: {why}", record.at));
-        }
-        return found;
-    }
-    match mcap::parse_record(record.opcode, &record.body) {
-        // What was damaged already in the log that this one is a copy of.
-        Ok(Record::Metadata(found)) if found.name == DAMAGED => {
-            found.metadata.iter().for_each(|(name, why)| scan.lacks(format!("{name}: {why}")));
-        }
-        Ok(_) => {}
-        Err(e) => scan.lacks(format!("metadata at byte {}: {e}", record.at)),
-    }
-    None
-}
-
 /// Returns the length of a log [s].
 pub fn length(info: &LogInfo) -> f64 {
     info.span.map_or(0.0, |(start, end)| (end - start) as f64 * 1e-9)
@@ -116,10 +92,11 @@ pub fn started(info: &LogInfo) -> String {
     time.map_or_else(|| "-".to_owned(), |time| time.to_string())
 }
 
-/// Returns whether a log is whole.
-pub fn state(info: &LogInfo) -> &'static str {
+/// Returns whether a log is whole, as far as it was read.
+pub fn state(info: &LogInfo, lacks: bool) -> &'static str {
     match (info.live, info.complete) {
         (true, _) => "live",
+        (_, true) if lacks => "damaged",
         (_, true) => "complete",
         _ => "cut",
     }
@@ -131,14 +108,23 @@ pub fn arms(info: &LogInfo) -> Option<Vec<String>> {
     Some(arms.into_keys().collect())
 }
 
-/// Returns the errors among the events of a log, with their times [s from its start].
-pub fn faults(path: &Path, info: &LogInfo) -> std::result::Result<Vec<Value>, ReplayError> {
-    let topic = "/dimos/events".to_owned();
-    let mut scan = Scan::open_part(path, std::slice::from_ref(&topic), (0, u64::MAX))?;
+/// Returns the errors among the events of a log, with their times [s from its start], and what it lacks as far as it
+/// was read: no more than events need, or `all` of it.
+pub fn faults(
+    path: &Path,
+    info: &LogInfo,
+    all: bool,
+) -> std::result::Result<(Vec<Value>, Option<String>), ReplayError> {
+    let events = "/dimos/events".to_owned();
+    let topics = if all { &[] } else { std::slice::from_ref(&events) };
+    let mut scan = Scan::open_part(path, topics, (0, u64::MAX))?;
     let (start, mut faults, mut text) = (info.span.map_or(0, |(start, _)| start), Vec::new(), String::new());
     while let Some(item) = scan.next_item()? {
-        let Item::Messages = item else { continue };
-        for (message, _, bytes) in scan.messages().filter(|(_, channel, _)| channel.topic == topic) {
+        if let Item::Other(_, record) = &item {
+            check(record).damage(record.at).into_iter().for_each(|damage| scan.lacks(damage));
+            continue;
+        }
+        for (message, _, bytes) in scan.messages().filter(|(_, channel, _)| channel.topic == events) {
             text.clear();
             let channel = scan.channels.get(&message.channel);
             let known = channel.is_some_and(|channel| channel.json(bytes, &mut text).is_ok());
@@ -149,5 +135,5 @@ pub fn faults(path: &Path, info: &LogInfo) -> std::result::Result<Vec<Value>, Re
             }
         }
     }
-    Ok(faults)
+    Ok((faults, scan.loss().text()))
 }

@@ -9,6 +9,10 @@ use crate::recording::disk_space::Megabytes;
 use crate::recording::files;
 use crate::recording::replay::LogReader;
 
+/// Largest log that is read whole [bytes]: a list is to be quick. Whether chunks of a larger one are damaged is not
+/// known: it is `closed`.
+const READ_WHOLE: u64 = 32 << 20;
+
 /// Prints the logs, the newest first.
 pub fn run(json: bool) -> Result {
     let Some(folder) = files::log_folder() else {
@@ -20,20 +24,26 @@ pub fn run(json: bool) -> Result {
     for path in logs.iter().rev() {
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let size = files::size(path);
-        let read = LogReader::open(path).and_then(|log| Ok((faults(path, log.info())?.len(), log.info().clone())));
-        let Ok((faults, info)) = read else {
+        let is_read = size <= READ_WHOLE;
+        let read = LogReader::open(path).and_then(|log| Ok((faults(path, log.info(), is_read)?, log.info().clone())));
+        let Ok(((faults, loss), info)) = read else {
             all.push(json!({"path": path, "size": size, "state": "unreadable"}));
             let size = Megabytes(size).to_string();
             table.row([name, "-".into(), size, "unreadable".into(), "-".into(), "-".into()]);
             continue;
         };
         let (run, arms) = (info.metadata.get("run"), arms(&info).unwrap_or_default());
+        let state = match state(&info, loss.is_some()) {
+            "complete" if !is_read => "closed",
+            state => state,
+        };
+        let faults = faults.len();
         all.push(json!({
             "path": path, "run": run, "start": info.span.map(|(start, _)| start), "length": length(&info), "size": size,
-            "arms": arms, "state": state(&info), "faults": faults,
+            "arms": arms, "state": state, "loss": loss, "faults": faults,
         }));
         let (length, size) = (span(length(&info)), Megabytes(size).to_string());
-        table.row([name, length, size, state(&info).into(), faults.to_string(), arms.join(", ")]);
+        table.row([name, length, size, state.into(), faults.to_string(), arms.join(", ")]);
     }
     if json {
         output::json(&all);

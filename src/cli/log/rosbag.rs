@@ -10,7 +10,7 @@ use super::export::cannot_write;
 use super::{Part, ended, progress, unreadable};
 use crate::cli::exit::Result;
 use crate::cli::output;
-use crate::recording::rewrite::copy;
+use crate::recording::rewrite::{Label, copy};
 use crate::recording::scan::Scan;
 
 /// Writes a log, or a part of it, as one file with a `metadata.yaml`.
@@ -20,7 +20,14 @@ pub fn run(path: &Path, part: &Part, folder: &Path, json: bool) -> Result {
     let name = format!("{}_0.mcap", folder.file_name().unwrap_or_default().display());
     let to = folder.join(&name);
     let mut scan = Scan::open_part(path, &[], part).map_err(unreadable)?.with_earlier();
-    copy(&mut scan, &to, None, progress::of_scan(false)).map_err(|e| failure(e, &to))?;
+    // Readers of bags refuse other profiles.
+    let label = Label { profile: Some("ros2"), ..Label::default() };
+    copy(&mut scan, &to, label, progress::of_scan(false)).map_err(|e| failure(e, &to))?;
+    let others = scan.channels.values().filter(|channel| channel.encoding != "cdr");
+    let others: Vec<&str> = others.map(|channel| channel.topic.as_str()).collect();
+    if !others.is_empty() {
+        output::note(format_args!("warning: ROS 2 cannot read {}: the messages are not CDR", others.join(", ")));
+    }
     let metadata = metadata(&to, &name).map_err(unreadable)?;
     let file = folder.join("metadata.yaml");
     std::fs::write(&file, metadata).map_err(|e| cannot_write(&file, e))?;

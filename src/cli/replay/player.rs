@@ -4,6 +4,7 @@ use std::io;
 use std::time::Duration;
 
 use super::view::View;
+use crate::cli::output;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::recording::replay::{LogReader, ReplayError, Selection};
 
@@ -155,9 +156,12 @@ pub fn play(
         loop {
             match log.next_entry() {
                 Ok(Some(entry)) => {
-                    if let Some(last) = shown.filter(|last| entry.log_time.saturating_sub(*last) > MAX_WAIT) {
-                        let hours = (entry.log_time - last) as f64 / 3.6e12;
-                        eprintln!("note: the log has nothing for {hours:.0} h: that is not waited for");
+                    let gap = entry.log_time.saturating_sub(shown.unwrap_or(part.from));
+                    if gap > MAX_WAIT {
+                        let hours = gap as f64 / 3.6e12;
+                        output::note(format_args!(
+                            "note: the log has nothing for {hours:.0} h: that is not waited for"
+                        ));
                         pace.from = (time.time(), entry.log_time);
                     }
                     if shown != Some(entry.log_time)

@@ -275,12 +275,12 @@ mod tests {
     fn joints(log_time: u64, position: &[f64]) -> Entry {
         let name = (1..=position.len()).map(|i| format!("joint{i}")).collect();
         let data = JointState { name, position: position.to_vec(), ..JointState::default() };
-        Entry { topic: "/joint_states".into(), log_time, data: Payload::JointState(data) }
+        Entry { topic: "/joint_states".into(), log_time, data: Payload::JointState(data), publisher: 0 }
     }
 
     fn text(log_time: u64) -> Entry {
         let log = Log { level: 30, msg: "arm is held".into(), ..Log::default() };
-        Entry { topic: "/rosout".into(), log_time, data: Payload::Log(log) }
+        Entry { topic: "/rosout".into(), log_time, data: Payload::Log(log), publisher: 0 }
     }
 
     #[test]
@@ -312,7 +312,7 @@ mod tests {
         use crate::recording::messages::Text;
         let (mut out, mut answer) = (Vec::new(), text(0));
         let data = Text { data: "{\"id\":6,\"request\":{\"execute\":{\"task\":0}}}".into() };
-        let request = Entry { topic: "/dimos/requests".into(), log_time: 0, data: Payload::Text(data) };
+        let request = Entry { topic: "/dimos/requests".into(), log_time: 0, data: Payload::Text(data), publisher: 0 };
         if let Payload::Log(log) = &mut answer.data {
             log.msg = "request 6: accepted".into();
         }

@@ -111,8 +111,7 @@ export class LogSource {
     this.length = reply.length;
     this.live = reply.live;
     this.loss = reply.loss;
-    // Chunks are in the order of their first messages.
-    return reply.messages.sort((a, b) => a.t - b.t);
+    return reply.messages;
   }
 }
 
