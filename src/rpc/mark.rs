@@ -17,8 +17,8 @@ use crate::sync::lock;
 
 /// Pause after a failed accept (no file descriptors left).
 const PAUSE: Duration = Duration::from_millis(100);
-/// Maximum number of connections that wait until the run serves them, or for the thread that serves stops, and the pause
-/// until there is room.
+/// Maximum number of connections that wait until the run serves them, or for the thread that serves stops, and the
+/// pause until there is room.
 const MAX_WAITING: usize = 64;
 const ROOM_PAUSE: Duration = Duration::from_millis(1);
 /// Stack size of the thread [bytes].

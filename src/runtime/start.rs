@@ -225,7 +225,10 @@ impl Connected {
             connected,
             kinematics,
             // Once, as it may wait for the name of a host.
-            local: prepared.blueprint.arms.iter().map(|arm| is_this_computer(&full_address(arm))).collect(),
+            local: { &prepared.blueprint.arms }
+                .iter()
+                .map(|arm| !arm.is_real() || is_this_computer(&full_address(arm)))
+                .collect(),
             devices: arms.devices.clone(),
             serials: arms.serials.clone(),
             dispatcher: dispatcher.clone(),

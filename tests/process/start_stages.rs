@@ -63,8 +63,8 @@ impl Bench {
         let blueprint = format!(
             "
 hardware:
-  - {{hardware_id: left, adapter_type: wrapped, address: left-{pid}, joints: {{prefix: left, count: 6}}}}
-  - {{hardware_id: right, adapter_type: wrapped, address: right-{pid}, joints: {{prefix: right, count: 6}}}}
+  - {{hardware_id: left, adapter_type: wrapped, address: 'memory:left-{pid}', joints: {{prefix: left, count: 6}}}}
+  - {{hardware_id: right, adapter_type: wrapped, address: 'memory:right-{pid}', joints: {{prefix: right, count: 6}}}}
 tasks:
   - {{name: traj_left, type: trajectory, joint_names: {{hardware: left}}}}
 planner:
@@ -146,7 +146,7 @@ fn a_model_that_does_not_load() {
 fn a_device_that_another_run_has() {
     let bench = Bench::new();
     let other =
-        "hardware: [{hardware_id: right, adapter_type: wrapped, address: right-PID, joints: {prefix: a, count: 6}}]";
+        "hardware: [{hardware_id: right, adapter_type: wrapped, address: 'memory:right-PID', joints: {prefix: a, count: 6}}]";
     let other = other.replace("PID", &std::process::id().to_string());
     let other = Run::from_yaml("other", &other).adapters(&[SPEC]).record(Record::Off);
     let folder = tempfile::tempdir().unwrap();
