@@ -145,8 +145,7 @@ fn a_model_that_does_not_load() {
 #[test]
 fn a_device_that_another_run_has() {
     let bench = Bench::new();
-    let other =
-        "hardware: [{hardware_id: right, adapter_type: wrapped, address: 'memory:right-PID', joints: {prefix: a, count: 6}}]";
+    let other = "hardware: [{hardware_id: right, adapter_type: wrapped, address: 'memory:right-PID', joints: {prefix: a, count: 6}}]";
     let other = other.replace("PID", &std::process::id().to_string());
     let other = Run::from_yaml("other", &other).adapters(&[SPEC]).record(Record::Off);
     let folder = tempfile::tempdir().unwrap();
@@ -210,10 +209,12 @@ fn a_live_view_that_cannot_be_served_ends_no_start() {
     assert!(elsewhere.socket().is_some() && elsewhere.stop().troubles.is_empty());
     // Its file is in the way of another one.
     let (run, file) = (bench.run("other.mcap"), bench.path("runs/stages.view"));
-    *APPEARS.lock().unwrap() = Some(file);
+    *APPEARS.lock().unwrap() = Some(file.clone());
     let run = run.start().unwrap();
     assert!(run.view_url().is_none() && run.stop().troubles.is_empty());
     eventually("all threads are gone", || threads().is_empty());
+    // No run removes it.
+    fs::remove_file(file).unwrap();
     let served = bench.run("again.mcap").start().unwrap();
     assert!(served.view_url().is_some() && bench.path("runs/stages.view").exists());
     assert!(served.stop().troubles.is_empty() && !bench.path("runs/stages.view").exists());
