@@ -120,6 +120,14 @@ impl RobotConfig {
         })
     }
 
+    /// Returns the joints that others move: the model's names and the coordinator's.
+    pub fn moved_by_others(&self) -> impl Iterator<Item = (&str, &str)> {
+        self.unplanned.iter().filter_map(|(model, unplanned)| match unplanned {
+            Unplanned::Measured(ours) => Some((model.as_str(), ours.as_str())),
+            Unplanned::Fixed(_) => None,
+        })
+    }
+
     /// Returns the files of its description.
     pub fn source(&self) -> Source {
         Source {

@@ -62,17 +62,14 @@ impl PlannedRobot {
 
     /// Returns the coordinator's names of the joints that others move: where these are must be known, too.
     pub fn moved_by_others(&self) -> impl Iterator<Item = (&str, &str)> {
-        self.config.unplanned.iter().filter_map(|(model, unplanned)| match unplanned {
-            Unplanned::Measured(ours) => Some((model.as_str(), ours.as_str())),
-            Unplanned::Fixed(_) => None,
-        })
+        self.config.moved_by_others()
     }
 
     /// Returns the model with the joints fixed that the blueprint fixes.
     pub fn model_with_fixed(&self) -> RobotModel {
-        let fixed = self.config.unplanned.iter().filter(|(_, unplanned)| matches!(unplanned, Unplanned::Fixed(_)));
+        let fixed = self.config.fixed_joints().filter_map(|(name, _)| self.model.joint_index(name));
         let mut model = (*self.model).clone();
-        model.fix(fixed.filter_map(|(name, _)| self.model.joint_index(name)), &self.rest);
+        model.fix(fixed, &self.rest);
         model
     }
 

@@ -79,8 +79,8 @@ fn wrong(header: &ChunkHeader, plain: &[u8]) -> Option<String> {
     (saved != 0 && saved != calculated).then(|| McapError::BadChunkCrc { saved, calculated }.to_string())
 }
 
-/// Passes on the records of an unpacked chunk; `None` if they break off.
-fn walk(mut rest: &[u8], mut each: impl FnMut(u8, &[u8])) -> Option<()> {
+/// Passes on records that follow each other, as in an unpacked chunk; `None` if they break off.
+pub(super) fn walk(mut rest: &[u8], mut each: impl FnMut(u8, &[u8])) -> Option<()> {
     while let Some((&opcode, after)) = rest.split_first() {
         let (length, after) = after.split_first_chunk()?;
         let length = usize::try_from(u64::from_le_bytes(*length)).ok()?;

@@ -14,12 +14,11 @@ use mcap::records::{MessageHeader, Metadata, Statistics, op};
 use mcap::{Attachment, MAGIC, McapResult, WriteOptions, Writer};
 use rustix::fs::{self, Mode, OFlags};
 
+use super::chunk::walk;
 use crate::sync::lock;
 
 /// Chunks of one writer: two minutes of a log.
 const CHUNKS: u32 = 1024;
-/// Length of the head of a record: its opcode, and the length of its body [bytes].
-const HEAD: usize = 9;
 /// Length of the body of the last record [bytes].
 const FOOTER: u64 = 20;
 
@@ -202,21 +201,18 @@ impl Earlier {
     }
 
     /// Takes what a writer has written at its end.
-    fn add(&mut self, mut rest: &[u8], stats: &Statistics) -> io::Result<()> {
+    fn add(&mut self, caught: &[u8], stats: &Statistics) -> io::Result<()> {
         self.records.retain(|opcode, _| !matches!(*opcode, op::SCHEMA | op::CHANNEL));
-        while let Some((head, _)) = rest.split_first_chunk::<HEAD>().filter(|_| rest != MAGIC) {
-            let [opcode, length @ ..] = *head;
-            let length = HEAD.saturating_add(usize::try_from(u64::from_le_bytes(length)).unwrap_or(usize::MAX));
-            let Some((record, after)) = rest.split_at_checked(length) else { break };
-            match opcode {
-                op::CHUNK_INDEX => self.chunk_indexes.write_all(record)?,
-                op::SCHEMA | op::CHANNEL | op::ATTACHMENT_INDEX | op::METADATA_INDEX => {
-                    self.records.entry(opcode).or_default().extend_from_slice(record);
-                }
-                _ => {}
+        let mut kept = Ok(());
+        // Its own records: they do not break off.
+        let _ = walk(caught.strip_suffix(MAGIC).unwrap_or(caught), |opcode, body| match opcode {
+            op::CHUNK_INDEX if kept.is_ok() => kept = self.chunk_indexes.write_all(&record(opcode, body)),
+            op::SCHEMA | op::CHANNEL | op::ATTACHMENT_INDEX | op::METADATA_INDEX => {
+                self.records.entry(opcode).or_default().extend(record(opcode, body));
             }
-            rest = after;
-        }
+            _ => {}
+        });
+        kept?;
         let all = &mut self.stats;
         let span = |s: &Statistics| (s.message_count > 0).then_some((s.message_start_time, s.message_end_time));
         let spans = span(all).into_iter().chain(span(stats));

@@ -4,7 +4,7 @@ use nalgebra::{Matrix4, Vector3};
 use serde_json::json;
 
 use crate::arm::Dh;
-use crate::arm::test_dh::product;
+use crate::arm::test_dh::{FAR_AWAY, product};
 use crate::rpc::api::{Method, Plan, RobotDescription};
 use crate::rpc::report::{ArmStateReport, PoseReport};
 use crate::rpc::run_dir::RunDir;
@@ -29,23 +29,12 @@ fn far(pose: &PoseReport, from: &Matrix4<f64>) -> f64 {
     (Vector3::from(pose.xyz) - from.fixed_view::<3, 1>(0, 3)).norm()
 }
 
-/// Parameters theta, a, d, alpha of a UR5e whose axes are off by less than a milliradian and a millimetre, as a fit has
-/// them: the frames of joints 2 and 3 are hundreds of metres away.
-const FAR_AWAY: [[f64; 4]; 6] = [
-    [-0.00020000000600000018, 0.00039999999199999956, 0.162699999976, 1.5710963267928966],
-    [2.098870680437141, 0.21500894765079231, 264.8859262294122, 0.0013892443931384714],
-    [-2.9949260586669872, -0.2431937656730391, -424.1382037796513, 0.0019209372399950906],
-    [0.8964556382492318, -0.0008329271700449597, 159.38550985984153, 1.5701965268618963],
-    [-0.0005003199966525113, 0.0002601199765320025, 0.09889298061388459, -1.5709963267895632],
-    [-0.0004000000053332294, 0.0, 0.09941994002213486, 0.0],
-];
-
 /// Returns parameters of a UR5e with differences of up to 20 mm at the flange, and with joints far away.
 fn arms() -> [[Dh; 6]; 2] {
     let mut large = crate::hardware::arms::ur::model::Model::Ur5e.dh();
     (large[1].a, large[2].d, large[5].d) = (large[1].a + 0.009, 0.006, large[5].d + 0.005);
     (large[0].theta, large[2].alpha) = (0.006, 0.004);
-    [large, FAR_AWAY.map(|[theta, a, d, alpha]| Dh { theta, a, d, alpha })]
+    [large, FAR_AWAY]
 }
 
 #[test]

@@ -5,7 +5,7 @@ use nalgebra::Isometry3;
 use crate::blueprint::{Blueprint, TaskRobot};
 use crate::control::config::CoordinatorConfig;
 use crate::joint::JointLimits;
-use crate::planning::config::{GripperJoint, RobotConfig, Unplanned};
+use crate::planning::config::{GripperJoint, RobotConfig};
 use crate::robot::Source;
 use crate::rpc::report::{ArmReport, StateReport, StatusReport};
 
@@ -155,13 +155,6 @@ pub(crate) fn robots(blueprint: &Blueprint) -> Vec<ShownRobot> {
 }
 
 fn of_planner(robot: &RobotConfig) -> ShownRobot {
-    let (mut moved_by_others, mut fixed) = (Vec::new(), Vec::new());
-    for (model, unplanned) in &robot.unplanned {
-        match unplanned {
-            Unplanned::Measured(ours) => moved_by_others.push((ours.clone(), model.clone())),
-            Unplanned::Fixed(position) => fixed.push((model.clone(), *position)),
-        }
-    }
     ShownRobot {
         name: robot.name.clone(),
         source: robot.source(),
@@ -169,8 +162,8 @@ fn of_planner(robot: &RobotConfig) -> ShownRobot {
         base_pose: robot.base_pose,
         tip: robot.end_effector_link.clone(),
         joints: robot.coordinator_joints.iter().cloned().zip(robot.joints.iter().cloned()).collect(),
-        moved_by_others,
-        fixed,
+        moved_by_others: { robot.moved_by_others() }.map(|(model, ours)| (ours.to_owned(), model.to_owned())).collect(),
+        fixed: { robot.fixed_joints() }.map(|(name, position)| (name.to_owned(), position)).collect(),
         poses: robot.named_poses.clone().into_iter().collect(),
         gripper: robot.gripper_joint.clone(),
     }

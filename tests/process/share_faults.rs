@@ -14,6 +14,13 @@ use crate::support::program::{Started, eventually};
 /// Silence after which a commander is lost, as configured by default, and a margin for a busy computer.
 const LOST_AFTER: Duration = Duration::from_millis(1300 + 500);
 
+/// Two programs of one user on other computers, announced.
+fn announced(shared: &Shared) -> Option<[Judge; 2]> {
+    let mut both = [Judge::open(&shared.at, "-", Value::Null)?, Judge::open(&shared.at, "-", Value::Null)?];
+    both.iter_mut().for_each(|judge| drop(judge.does("announce", json!({}))));
+    Some(both)
+}
+
 /// A verb on another computer that holds the lease and keeps the arm moving, until its input ends.
 fn commander(shared: &Shared) -> (Started, ChildStdin) {
     let mut stream = shared.command("task stream velocity_arm");
@@ -178,10 +185,7 @@ fn n08_a_flood_of_requests_is_bounded_and_delays_no_stop() {
         return;
     }
     let shared = Shared::start("");
-    let Some(mut judge) = Judge::open(&shared.at, "-", Value::Null) else { return };
-    let Some(mut other) = Judge::open(&shared.at, "-", Value::Null) else { return };
-    judge.does("announce", json!({}));
-    other.does("announce", json!({}));
+    let Some([mut judge, mut other]) = announced(&shared) else { return };
     let flooding = std::thread::spawn(move || {
         let answer = judge.does("flood", json!({"method": "state", "cls": "read", "count": 2000}));
         (judge, answer)
@@ -203,10 +207,7 @@ fn every_request_that_ends_motion_is_answered_and_no_cancel_takes_the_place_of_a
         return;
     }
     let shared = Shared::start(", users: {'-': operator}");
-    let Some(mut judge) = Judge::open(&shared.at, "-", Value::Null) else { return };
-    let Some(mut other) = Judge::open(&shared.at, "-", Value::Null) else { return };
-    judge.does("announce", json!({}));
-    other.does("announce", json!({}));
+    let Some([mut judge, mut other]) = announced(&shared) else { return };
     let run = shared.run.pid() as i32;
     signal(run, Signal::STOP);
     let cancelling = std::thread::spawn(move || {
@@ -310,10 +311,7 @@ fn n12_garbage_costs_its_sender_only() {
         return;
     }
     let shared = Shared::start(", users: {'-': operator}");
-    let Some(mut judge) = Judge::open(&shared.at, "-", Value::Null) else { return };
-    let Some(mut other) = Judge::open(&shared.at, "-", Value::Null) else { return };
-    judge.does("announce", json!({}));
-    other.does("announce", json!({}));
+    let Some([mut judge, mut other]) = announced(&shared) else { return };
     assert!(judge.asks("read", "state", json!({}))["result"].is_object());
     let gateway = shared.gateway().unwrap();
     let before = memory(gateway);
