@@ -7,8 +7,8 @@ use super::DOF;
 use super::adapter::UrAdapter;
 use super::emulator::UrEmulator;
 use super::tests::{arm, positions, until};
-use crate::arm::test_dh::{FAR_AWAY, product as flange};
 use crate::arm::ControllerPose;
+use crate::arm::test_dh::{FAR_AWAY, product as flange};
 use crate::hardware::adapter::{Cartesian, ManipulatorAdapter};
 
 /// The pose that a controller states, with the joints at which it does.
