@@ -11,25 +11,13 @@ READERS := tests/readers
 SYSTEM_TOOLS := cyclictest linux.uml insmod ip tc cansend chromium
 SYSTEM_PACKAGES := rt-tests user-mode-linux kmod iproute2 can-utils chromium
 
-# A comma in the argument of a function.
-, := ,
 TARGET := $(or $(CARGO_TARGET_DIR),target)
 # Where the stripped program, its debug file and the packages go.
 SHIPPED := $(TARGET)/shipped
-# Largest program that is shipped [bytes]: 12 MB, 1.5 MB for the live view and the verbs of `dimos log`, and 12 MB for
-# the network.
-LARGEST := 25500000
 # For all users where root installs, else for this user.
 PREFIX ?= $(if $(filter 0,$(shell id -u)),/usr/local,$(HOME)/.local)
-# The shipped program contains equal functions once (Rust's own linker, which is the default on x86-64, does that),
-# relative relocations in their short form where the C library knows it (glibc 2.36), no paths of the computer that built
-# it, and a zstd with the compressor of level 1, which logs are written with, and the smaller decoders.
-LLD = $(filter x86_64-unknown-linux-gnu,$(shell rustc --print host-tuple))
-NEW_GLIBC = $(shell printf '%s\n' 2.36 "$$(getconf GNU_LIBC_VERSION | cut -d' ' -f2)" | sort -V | sed -n '1s/^2\.36$$/yes/p')
-SMALL_LINK = $(if $(LLD),-Clink-arg=-Wl$(,)--icf=all $(if $(NEW_GLIBC),-Clink-arg=-Wl$(,)-z$(,)pack-relative-relocs))
+# No paths of the computer that built it.
 SHORT_PATHS := --remap-path-prefix=$(or $(CARGO_HOME),$(HOME)/.cargo)/registry/src/=
-SMALL_ZSTD := $(foreach kind,DFAST GREEDY LAZY LAZY2 BTLAZY2 BTOPT BTULTRA,-DZSTD_EXCLUDE_$(kind)_BLOCK_COMPRESSOR) \
--DHUF_FORCE_DECOMPRESS_X1=1 -DZSTD_FORCE_DECOMPRESS_SEQUENCES_SHORT=1 -DDYNAMIC_BMI2=0
 # Without objcopy the linker drops the debug information.
 STRIP := $(if $(shell command -v objcopy),,CARGO_PROFILE_DIST_STRIP=symbols)
 
@@ -57,10 +45,8 @@ dist: shipped
 # The optimized program without debug information, and its debug file.
 shipped: viewer
 	@echo "building dimos as it is shipped: several minutes" >&2
-	$(STRIP) CFLAGS="$(SMALL_ZSTD)" RUSTFLAGS="$(SMALL_LINK) $(SHORT_PATHS)" cargo build --profile dist --locked --features share --bin dimos
+	$(STRIP) RUSTFLAGS="$(SHORT_PATHS)" cargo build --profile dist --locked --features share --bin dimos
 	packaging/strip.sh $(TARGET)/dist/dimos $(SHIPPED)
-	@size=$$(stat -c %s $(SHIPPED)/dimos); [ $$size -le $(LARGEST) ] || \
-	{ echo "error: the program has $$size bytes (limit $(LARGEST))" >&2; exit 1; }
 
 # The page of the live view, which the next build embeds. Without Node that build embeds a page that says so.
 viewer: $(if $(NODE),$(PAGE))

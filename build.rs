@@ -1,14 +1,18 @@
-//! What the build tells the program: its version with the commit, the shipped blueprints, and the texts that it packs.
+//! What the build gives the program: its version with the commit, the shipped blueprints and templates, and the page.
 
+use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::{env, fs, io};
+use std::{env, fs};
+
+use flate2::Compression;
+use flate2::write::GzEncoder;
 
 fn main() -> io::Result<()> {
     println!("cargo::rerun-if-changed=build.rs");
     version();
-    blueprints()?;
-    packed()?;
+    texts("blueprints")?;
+    texts("assets/templates")?;
     page()
 }
 
@@ -30,47 +34,22 @@ fn version() {
     }
 }
 
-/// Writes the table of names and texts of `blueprints/*.yaml` that `src/blueprint/registry.rs` includes.
-fn blueprints() -> io::Result<()> {
-    let root = PathBuf::from(env::var("CARGO_MANIFEST_DIR").unwrap_or_default());
-    let out = PathBuf::from(env::var("OUT_DIR").unwrap_or_default());
-    let folder = root.join("blueprints");
+/// Writes the table of names and texts of the files below a folder, as `registry.rs` and `templates.rs` include it.
+fn texts(folder: &str) -> io::Result<()> {
     // Relative, as all that cargo compares: a build in a folder of another name is the same build.
-    println!("cargo::rerun-if-changed=blueprints");
-
-    let mut files: Vec<PathBuf> = fs::read_dir(&folder)?.map(|e| e.map(|e| e.path())).collect::<Result<_, _>>()?;
-    files.retain(|path| path.extension().is_some_and(|ext| ext == "yaml"));
+    println!("cargo::rerun-if-changed={folder}");
+    let root = PathBuf::from(env::var("CARGO_MANIFEST_DIR").unwrap_or_default());
+    let mut files = Vec::new();
+    collect(Path::new(folder), &mut files)?;
     files.sort();
-
     let row = |path: &PathBuf| {
-        let name = path.file_stem().unwrap_or_default().to_string_lossy();
-        format!("    ({name:?}, include_str!({:?})),\n", path.display().to_string())
+        let name = path.strip_prefix(folder).unwrap_or(path).display().to_string();
+        format!("    ({name:?}, include_str!({:?})),\n", root.join(path).display().to_string())
     };
     let rows: String = files.iter().map(row).collect();
-    fs::write(out.join("blueprints.rs"), format!("&[\n{rows}]\n"))
-}
-
-const SCHEMAS: [&str; 2] = ["assets/job.schema.json", "assets/rpc.schema.json"];
-
-/// Deflates the texts that are seldom needed, and writes the table of their names that `src/packed.rs` includes.
-fn packed() -> io::Result<()> {
-    let out = PathBuf::from(env::var("OUT_DIR").unwrap_or_default());
-    let mut files: Vec<_> = SCHEMAS.iter().map(PathBuf::from).collect();
-    for folder in ["assets/robots", "assets/templates"] {
-        println!("cargo::rerun-if-changed={folder}");
-        collect(Path::new(folder), &mut files)?;
-    }
-    SCHEMAS.iter().for_each(|file| println!("cargo::rerun-if-changed={file}"));
-    files.sort();
-    let mut rows = String::new();
-    for (number, file) in files.iter().enumerate() {
-        let text = fs::read(file)?;
-        let deflated = out.join(format!("{number}.deflated"));
-        fs::write(&deflated, miniz_oxide::deflate::compress_to_vec(&text, 9))?;
-        let name = file.strip_prefix("assets").unwrap_or(file).display().to_string();
-        rows += &format!("    ({name:?}, include_bytes!({:?})),\n", deflated.display().to_string());
-    }
-    fs::write(out.join("packed.rs"), format!("&[\n{rows}]\n"))
+    let name = Path::new(folder).file_name().unwrap_or_default();
+    let out = PathBuf::from(env::var("OUT_DIR").unwrap_or_default()).join(name).with_extension("rs");
+    fs::write(out, format!("&[\n{rows}]\n"))
 }
 
 /// Adds the files below a folder.
@@ -94,15 +73,8 @@ fn page() -> io::Result<()> {
         println!("cargo::rerun-if-changed={watched}");
     }
     let text = fs::read(PAGE).or_else(|_| fs::read(NO_PAGE))?;
-    let mut file = vec![0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 2, 255];
-    file.extend(miniz_oxide::deflate::compress_to_vec(&text, 9));
-    file.extend(crc32(&text).to_le_bytes());
-    file.extend((text.len() as u32).to_le_bytes());
-    fs::write(PathBuf::from(env::var("OUT_DIR").unwrap_or_default()).join("page.html.gz"), file)
-}
-
-/// The check sum at the end of a gzip file.
-fn crc32(bytes: &[u8]) -> u32 {
-    let bit = |crc: u32, _| if crc & 1 == 1 { (crc >> 1) ^ 0xedb8_8320 } else { crc >> 1 };
-    !bytes.iter().fold(!0, |crc, byte| (0..8).fold(crc ^ u32::from(*byte), bit))
+    let out = PathBuf::from(env::var("OUT_DIR").unwrap_or_default()).join("page.html.gz");
+    let mut file = GzEncoder::new(fs::File::create(out)?, Compression::best());
+    file.write_all(&text)?;
+    file.finish().map(drop)
 }

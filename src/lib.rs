@@ -38,7 +38,6 @@ pub mod clock;
 pub mod joint;
 pub mod message;
 mod named;
-mod packed;
 pub mod pose;
 #[cfg(any(feature = "share", feature = "view"))]
 mod random;

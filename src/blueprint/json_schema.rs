@@ -70,7 +70,7 @@ pub(super) fn home_of(key: &str) -> Option<String> {
 }
 
 /// Groups of the schema, and their paths in a blueprint.
-const GROUPS: [(&str, &str); 13] = [
+const GROUPS: [(&str, &str); 12] = [
     ("", ""),
     ("/$defs/CoordinatorConfig", "coordinator"),
     ("/$defs/HardwareEntry", "hardware"),
@@ -82,7 +82,6 @@ const GROUPS: [(&str, &str); 13] = [
     ("/$defs/RecordingConfig", "recording"),
     ("/$defs/ViewConfig", "view"),
     ("/$defs/ShareEntry", "share"),
-    ("/$defs/PythonDimosEntry", "share.python_dimos"),
     ("/$defs/RosEntry", "share.ros"),
 ];
 

@@ -18,7 +18,6 @@ pub mod planner;
 mod planner_check;
 mod planner_files;
 mod planner_models;
-mod python_dimos;
 mod registry;
 mod resolve;
 mod ros;

@@ -12,7 +12,7 @@ use crate::blueprint::catalog::Catalog;
 use crate::blueprint::load::{Overrides, load_from};
 use crate::yaml::{MAX_BYTES, closest, quote};
 
-/// Names and texts of the blueprints in the binary, embedded by `build.rs` from `blueprints/`.
+/// Files and texts of the blueprints in the binary, embedded by `build.rs` from `blueprints/`.
 const EMBEDDED: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/blueprints.rs"));
 
 /// Blueprints added by a program that embeds this crate.
@@ -25,7 +25,8 @@ pub fn embed(more: Vec<(&'static str, &'static str)>) {
 
 /// Returns all blueprints in the program, by name.
 fn embedded() -> BTreeMap<&'static str, &'static str> {
-    EMBEDDED.iter().chain(MORE.get().into_iter().flatten()).copied().collect()
+    let shipped = EMBEDDED.iter().map(|(file, text)| (file.strip_suffix(".yaml").unwrap_or(file), *text));
+    shipped.chain(MORE.get().into_iter().flatten().copied()).collect()
 }
 
 /// Origin of a blueprint.

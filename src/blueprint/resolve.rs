@@ -264,9 +264,7 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
         let diag = Diag::warning(what).note("anyone who reads the traffic has the token, and can command the arms");
         checker.error(view.at, diag.hint("remove `host` and connect through ssh: docs/view.md"));
     }
-    let known: Vec<&str> = hardware.arms.iter().flat_map(|arm| &arm.joints).map(String::as_str).collect();
-    let joints = (!checker.incomplete).then_some(known.as_slice());
-    let share = file.share.as_ref().map(|entry| share::resolve(&mut checker, entry, joints));
+    let share = file.share.as_ref().map(|entry| share::resolve(&mut checker, entry));
     Blueprint {
         name: name.value,
         description: file.description,

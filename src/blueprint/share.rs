@@ -10,14 +10,12 @@ use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
 
 use crate::blueprint::planner_files::file;
-use crate::blueprint::python_dimos;
 use crate::blueprint::resolve::Checker;
 use crate::blueprint::ros;
 use crate::named::named;
 use crate::yaml::range::positive;
 use crate::yaml::{Diag, Keyed, Located, NodeId, quote};
 
-pub use crate::blueprint::python_dimos::{PythonDimosConfig, PythonDimosEntry};
 pub use crate::blueprint::ros::{Distro, RosConfig, RosEntry, is_ros_name};
 
 /// User name of clients without a certificate.
@@ -53,8 +51,6 @@ pub struct ShareEntry {
     /// Maximum number of clients of each user.
     #[schemars(range(min = 1, max = 48))]
     pub max_clients: Located<usize>,
-    /// The run as the coordinator of Python dimos.
-    pub python_dimos: Option<Located<PythonDimosEntry>>,
     /// The run as a node of ROS 2.
     pub ros: Option<Located<RosEntry>>,
 }
@@ -72,7 +68,6 @@ impl Default for ShareEntry {
             observers_stop: true,
             remote_enable: false,
             max_clients: 32.into(),
-            python_dimos: None,
             ros: None,
         }
     }
@@ -217,9 +212,6 @@ pub struct ShareConfig {
     pub remote_enable: bool,
     /// Maximum number of clients of each user.
     pub max_clients: usize,
-    /// The run as the coordinator of Python dimos.
-    #[serde(default)]
-    pub python_dimos: Option<PythonDimosConfig>,
     /// The run as a node of ROS 2.
     #[serde(default)]
     pub ros: Option<RosConfig>,
@@ -251,7 +243,6 @@ impl Default for ShareConfig {
             observers_stop: entry.observers_stop,
             remote_enable: entry.remote_enable,
             max_clients: entry.max_clients.value,
-            python_dimos: None,
             ros: None,
         }
     }
@@ -260,10 +251,8 @@ impl Default for ShareConfig {
 impl ShareConfig {
     /// Returns what is wrong with it as a whole, with a hint; `None` if nothing is.
     pub fn mistake(&self) -> Option<(String, &'static str)> {
-        let faces = self.python_dimos.is_some() || self.ros.is_some();
-        if self.listen.is_empty() && self.connect.is_empty() && !faces {
-            let hint =
-                "give `listen: [tls/0.0.0.0:7447]`, `connect` to a router, or a face: `python_dimos: {}`, `ros: {}`";
+        if self.listen.is_empty() && self.connect.is_empty() && self.ros.is_none() {
+            let hint = "give `listen: [tls/0.0.0.0:7447]`, `connect` to a router, or `ros: {}`";
             return Some(("it listens nowhere".into(), hint));
         }
         let endpoints = || self.listen.iter().chain(&self.connect).chain(self.ros.as_ref().map(|ros| &ros.router));
@@ -298,8 +287,7 @@ pub fn is_user(name: &str) -> bool {
 }
 
 /// Checks the section, and resolves its paths.
-/// `joints`: those of all arms; `None`: not known completely.
-pub(super) fn resolve(checker: &mut Checker<'_>, entry: &Located<ShareEntry>, joints: Option<&[&str]>) -> ShareConfig {
+pub(super) fn resolve(checker: &mut Checker<'_>, entry: &Located<ShareEntry>) -> ShareConfig {
     let path = |checker: &Checker<'_>, at: NodeId, path: &str| file(checker, at, path);
     let config = ShareConfig {
         listen: entry.listen.iter().map(|e| e.value.clone()).collect(),
@@ -316,7 +304,6 @@ pub(super) fn resolve(checker: &mut Checker<'_>, entry: &Located<ShareEntry>, jo
         observers_stop: entry.observers_stop,
         remote_enable: entry.remote_enable,
         max_clients: entry.max_clients.value,
-        python_dimos: entry.python_dimos.as_ref().map(|face| python_dimos::resolve(checker, face, joints)),
         ros: entry.ros.as_ref().map(|face| ros::resolve(checker, face)),
     };
     if !(1..=MOST_CLIENTS).contains(&config.max_clients) {
@@ -328,7 +315,7 @@ pub(super) fn resolve(checker: &mut Checker<'_>, entry: &Located<ShareEntry>, jo
     let whole = |list| {
         !checker.tree.is_damaged(list) && !checker.tree.items(list).iter().any(|item| checker.lost.dropped(*item))
     };
-    let read = ["listen", "connect", "insecure", "identity", "users", "python_dimos", "ros"]
+    let read = ["listen", "connect", "insecure", "identity", "users", "ros"]
         .iter()
         .all(|key| checker.has(entry.at, key) && checker.tree.get(entry.at, key).is_none_or(whole));
     if let Some((what, hint)) = config.mistake().filter(|_| read) {

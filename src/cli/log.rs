@@ -9,6 +9,7 @@ mod lerobot;
 mod list;
 mod plot;
 pub mod progress;
+mod python_writer;
 mod rosbag;
 mod what_if;
 
@@ -117,13 +118,14 @@ are empty. With --topic a row is a message, with the columns of all of them.")]
         /// The new CSV file; default: standard output
         #[arg(short, long, value_name = "FILE")]
         output: Option<PathBuf>,
-        /// Write a Parquet file with the same columns; unknown values are NaN
+        /// Write a Parquet file with the same columns; unknown values are NaN. Needs Python with pyarrow
         #[arg(long, value_name = "FILE", conflicts_with_all = ["topic", "output"])]
         parquet: Option<PathBuf>,
         /// Write a folder that `ros2 bag` opens, with all topics
         #[arg(long, value_name = "DIR", conflicts_with_all = ["topic", "output", "parquet"])]
         rosbag2: Option<PathBuf>,
-        /// Write a LeRobot data set (v3.0) with one episode: positions are states, commanded positions are actions
+        /// Write a LeRobot data set (v3.0) with one episode: positions are states, commanded positions are actions.
+        /// Needs Python with lerobot
         #[arg(long, value_name = "DIR", conflicts_with_all = ["topic", "output", "parquet", "rosbag2"])]
         lerobot: Option<PathBuf>,
         /// Frames per second of the data set; default: the tick rate

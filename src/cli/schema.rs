@@ -5,7 +5,6 @@ use serde_json::Value;
 use super::exit::{Exit, Result};
 use super::output;
 use crate::blueprint::{self, Catalog};
-use crate::packed;
 
 /// Arguments of `schema`.
 #[derive(Debug, clap::Args)]
@@ -18,14 +17,13 @@ pub struct Args {
     job: bool,
 }
 
-/// What [`crate::rpc::schema::json_schema`] returns, and the schema of jobs: made by tests, because the program is
-/// smaller without what makes them.
-const RPC: &str = "rpc.schema.json";
-const JOB: &str = "job.schema.json";
+/// What [`crate::rpc::schema::json_schema`] returns, and the schema of jobs, as tests write them.
+const RPC: &str = include_str!("../../assets/rpc.schema.json");
+const JOB: &str = include_str!("../../assets/job.schema.json");
 
 /// Runs the verb.
 pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
-    let made = |name| packed::text(name).and_then(|text| serde_json::from_str(text).ok()).unwrap_or_default();
+    let made = |text| serde_json::from_str(text).unwrap_or_default();
     let schema: Value = match (args.rpc, args.job) {
         (true, _) => made(RPC),
         (_, true) => made(JOB),

@@ -12,9 +12,7 @@ use serde_json::json;
 use super::exit::{Exit, Failure, Result};
 use super::output;
 use super::text_log::Terminal;
-use crate::blueprint::share::{
-    ANYONE, Distro, Endpoint, Identity, OnLost, PythonDimosConfig, Role, RosConfig, ShareConfig, is_ros_name,
-};
+use crate::blueprint::share::{ANYONE, Distro, Endpoint, Identity, OnLost, Role, RosConfig, ShareConfig, is_ros_name};
 use crate::rpc::client;
 use crate::rpc::client::ClientError;
 use crate::rpc::run_dir::RunDir;
@@ -34,7 +32,7 @@ pub struct Args {
     #[arg(long, value_name = "RUN")]
     run: Option<String>,
     /// Listen here: tls/0.0.0.0:7447, or tcp/127.0.0.1:7447 (repeatable)
-    #[arg(long, value_name = "ENDPOINT", required_unless_present_any = ["connect", "python_dimos", "ros", "config"])]
+    #[arg(long, value_name = "ENDPOINT", required_unless_present_any = ["connect", "ros", "config"])]
     listen: Vec<Endpoint>,
     /// Join the router there (repeatable)
     #[arg(long, value_name = "ENDPOINT")]
@@ -55,9 +53,6 @@ pub struct Args {
     /// Let operators reset and enable arms from other computers
     #[arg(long)]
     remote_enable: bool,
-    /// Be the ControlCoordinator of Python dimos 0.0.15 on this computer
-    #[arg(long)]
-    python_dimos: bool,
     /// Be the node `dimos` of ROS 2, through the router of rmw_zenoh: tcp/127.0.0.1:7447, or this one
     #[arg(long, value_name = "ROUTER", num_args = 0..=1)]
     ros: Option<Option<Endpoint>>,
@@ -70,12 +65,9 @@ pub struct Args {
     /// Distribution of the other nodes of ROS 2: jazzy, kilted, lyrical
     #[arg(long, value_name = "DISTRO", default_value = "jazzy", value_parser = distro)]
     ros_distro: Distro,
-    /// Let Python dimos and ROS move arms: every program that reaches them can then
+    /// Let ROS move arms: every node that reaches the router can then
     #[arg(long)]
     command: bool,
-    /// Multicast group of the bus of Python dimos, if it has another one (ZENOH_SCOUT_ADDR)
-    #[arg(long, value_name = "GROUP", env = "ZENOH_SCOUT_ADDR")]
-    scout_addr: Option<String>,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -115,11 +107,9 @@ impl Args {
         if let Some(config) = &self.config {
             return Ok(config.clone());
         }
-        if self.command && !self.python_dimos && self.ros.is_none() {
-            let failure = Failure::usage("--command lets a face move arms, and there is none");
-            return Err(
-                failure.hint("add --python-dimos or --ros; users of an endpoint get a role: --user NAME=operator")
-            );
+        if self.command && self.ros.is_none() {
+            let failure = Failure::usage("--command lets ROS move arms, and it is not served");
+            return Err(failure.hint("add --ros; users of an endpoint get a role: --user NAME=operator"));
         }
         Ok(ShareConfig {
             listen: self.listen.clone(),
@@ -129,11 +119,6 @@ impl Args {
             users: self.user.iter().cloned().collect(),
             on_lost: self.on_lost,
             remote_enable: self.remote_enable,
-            python_dimos: self.python_dimos.then(|| PythonDimosConfig {
-                command: self.command,
-                scout_addr: self.scout_addr.clone().filter(|group| !group.is_empty()),
-                ..PythonDimosConfig::default()
-            }),
             ros: self.ros.as_ref().map(|router| RosConfig {
                 router: router.clone().unwrap_or_else(|| RosConfig::default().router),
                 domain: self.ros_domain,
@@ -184,9 +169,6 @@ pub fn run(args: &Args) -> Result {
         match args.json {
             true => {
                 let mut shared = json!({"event": "shared", "run": found.name, "endpoints": endpoints});
-                if let Some(face) = &config.python_dimos {
-                    shared["python_dimos"] = json!({"name": face.name, "command": face.command});
-                }
                 if let Some(face) = &config.ros {
                     shared["ros"] = json!({"router": face.router, "domain": face.domain, "command": face.command});
                 }
@@ -231,10 +213,6 @@ pub(super) fn lines(config: &ShareConfig) -> Vec<String> {
     let listen = config.listen.iter().map(|endpoint| line("at", endpoint));
     let mut lines: Vec<String> =
         listen.chain(config.connect.iter().map(|endpoint| line("through", endpoint))).collect();
-    if let Some(face) = &config.python_dimos {
-        let who = if face.command { "EVERY PROGRAM ON THIS COMPUTER MAY MOVE THE ARMS" } else { reads(config) };
-        lines.push(format!("with Python dimos as {} (multicast on lo): {who}", face.name));
-    }
     if let Some(face) = &config.ros {
         let who = if face.command { "EVERY NODE THAT REACHES THE ROUTER MAY MOVE THE ARMS" } else { reads(config) };
         let domain = if face.domain == 0 { String::new() } else { format!(", domain {}", face.domain) };

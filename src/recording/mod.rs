@@ -27,7 +27,6 @@ pub mod messages;
 pub mod notes;
 mod open_files;
 mod packed_samples;
-pub mod parquet;
 mod pending_executes;
 pub mod recorder;
 pub mod records;

@@ -2,8 +2,6 @@
 
 use std::sync::OnceLock;
 
-use crate::packed;
-
 /// Prefix of a built-in robot's name in place of a path: `builtin:xarm6`.
 pub const PREFIX: &str = "builtin:";
 
@@ -11,6 +9,8 @@ macro_rules! robots {
     ($($name:literal),* $(,)?) => {
         /// Names of the robots shipped with this crate.
         pub const NAMES: &[&str] = &[$($name),*];
+        const TEXTS: &[&str] =
+            &[$(include_str!(concat!(env!("CARGO_MANIFEST_DIR"), "/assets/robots/", $name, ".urdf"))),*];
     };
 }
 
@@ -48,7 +48,8 @@ fn more() -> impl Iterator<Item = (&'static str, &'static str)> {
 
 /// Returns the URDF of a built-in or embedded robot.
 pub fn text(name: &str) -> Option<&'static str> {
-    more().find(|(own, _)| *own == name).map(|(_, text)| text).or_else(|| packed::text(&format!("robots/{name}.urdf")))
+    let shipped = || NAMES.iter().copied().zip(TEXTS.iter().copied());
+    more().chain(shipped()).find(|(own, _)| *own == name).map(|(_, text)| text)
 }
 
 /// Returns all names, shipped and embedded.

@@ -31,8 +31,6 @@ pub enum Code {
     TooManyRequests,
     /// Another gateway shares the run.
     HasGateway,
-    /// Another coordinator is on the bus of Python dimos.
-    HasCoordinator,
     /// No such method.
     UnknownMethod,
     /// The parameters do not fit the method.

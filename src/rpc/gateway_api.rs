@@ -46,7 +46,7 @@ pub struct RegisterGateway {
     /// Its clients: `alice on 10.0.0.5`.
     #[serde(default)]
     pub clients: Vec<String>,
-    /// Its faces to other systems: Python dimos.
+    /// Its faces to other systems: ROS 2.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub faces: Vec<FaceReport>,
     /// Whether it does not listen yet: it is the run's only gateway already, and not in `status`.
@@ -58,7 +58,7 @@ pub struct RegisterGateway {
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct FaceReport {
-    /// The system: `python_dimos`.
+    /// The system: `ros`.
     pub face: String,
     /// What the run is there: `ControlCoordinator`.
     pub name: String,

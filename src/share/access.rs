@@ -3,8 +3,7 @@
 
 use serde_json::{Value, json};
 
-use super::class::role_of;
-use super::{keys, python_dimos};
+use super::keys;
 use crate::blueprint::share::{ANYONE, ShareConfig};
 
 /// Returns the rules of a run's gateway.
@@ -23,12 +22,6 @@ pub fn control(run: &str, config: &ShareConfig) -> Value {
             &[format!("dimos/{run}/**")],
         ),
     ];
-    if let Some(face) = &config.python_dimos {
-        let (streams, calls) = (python_dimos::streams(face), python_dimos::calls(face));
-        let served = ["put", "reply", "declare_queryable"];
-        rules.push(rule("python_dimos", "egress", &served, &[streams.clone(), calls]));
-        rules.push(rule("python_dimos states", "ingress", &["declare_subscriber"], &[streams]));
-    }
     let (mut subjects, mut policies) = (Vec::new(), Vec::new());
     let mut users: Vec<&str> = config.users.keys().map(String::as_str).collect();
     // Someone without a certificate comes by tcp only; then the role of `-` is that of an observer, unless given.
@@ -47,40 +40,11 @@ pub fn control(run: &str, config: &ShareConfig) -> Value {
             ANYONE => json!({"id": user, "link_protocols": ["tcp"]}),
             _ => json!({"id": user, "link_protocols": ["tls"], "cert_common_names": [user]}),
         });
-        let mut own = vec!["list".to_owned(), "streams".into(), "read".into(), "serve".into(), from, to, asks];
-        if let (Some(face), Some(role)) = (&config.python_dimos, role_of(user, config)) {
-            let calls = format!("python_dimos of {user}");
-            let keys = python_dimos::calls_of(role, config, face);
-            rules.push(rule(&calls, "ingress", &["query"], &keys));
-            own.extend([calls, "python_dimos".into(), "python_dimos states".into()]);
-        }
+        let own = ["list".to_owned(), "streams".into(), "read".into(), "serve".into(), from, to, asks];
         policies.push(json!({"rules": own, "subjects": [user]}));
     }
     json!({"access_control": {
         "enabled": true, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies,
-    }})
-}
-
-/// Returns the rules of a session that talks to programs on this computer only.
-pub fn this_computer_only() -> Value {
-    let messages = [
-        "put",
-        "delete",
-        "declare_subscriber",
-        "query",
-        "declare_queryable",
-        "reply",
-        "liveliness_token",
-        "declare_liveliness_subscriber",
-        "liveliness_query",
-    ];
-    let both = json!({
-        "id": "all", "permission": "allow", "flows": ["ingress", "egress"], "messages": messages, "key_exprs": ["**"],
-    });
-    json!({"access_control": {
-        "enabled": true, "default_permission": "deny", "rules": [both],
-        "subjects": [{"id": "here", "interfaces": ["lo"]}],
-        "policies": [{"rules": ["all"], "subjects": ["here"]}],
     }})
 }
 

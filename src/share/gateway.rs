@@ -31,7 +31,7 @@ use super::ends::Ends;
 use super::keys::{self, Who};
 use super::page::Pages;
 use super::remote::{Closed, Remote, Request, refuse};
-use super::{certificates, python_dimos, ros, settings, streams};
+use super::{certificates, ros, settings, streams};
 use crate::blueprint::share::ShareConfig;
 use crate::rpc::api::{FaceReport, MAX_ANSWER, MAX_LINE, METHODS, Method, PlannerAnswer, RegisterGateway};
 use crate::rpc::error::{Code, RpcError};
@@ -61,8 +61,6 @@ pub struct Gateway {
     /// What happens: the clients have changed, or the run has ended.
     news: Receiver<News>,
     control: UnixStream,
-    /// The face to Python dimos, or why it does not serve.
-    python_dimos: Option<Result<python_dimos::Face, RpcError>>,
     /// The face to ROS 2, or why it does not serve.
     ros: Option<Result<ros::Face, RpcError>>,
     /// Declarations; they end with it.
@@ -151,16 +149,12 @@ impl Gateway {
             let news = shared.news.clone();
             move || drop(news.send(News::Faces))
         };
-        let python_dimos = shared.config.python_dimos.as_ref().map(|config| {
-            let run = (shared.run.as_str(), shared.socket.clone());
-            python_dimos::Face::start(run, &shared.session, &shared.config, config, changed())
-        });
         let ros = shared
             .config
             .ros
             .as_ref()
             .map(|config| ros::Face::start((&shared.run, &shared.socket), &shared.config, config, changed()));
-        let mut gateway = Self { shared, news: received, control, python_dimos, ros, _declared: declared };
+        let mut gateway = Self { shared, news: received, control, ros, _declared: declared };
         if let Some(error) = gateway.face_error() {
             tracing::error!("share: {error}");
         }
@@ -171,8 +165,7 @@ impl Gateway {
 
     /// Returns why a face cannot serve; `None`: all can.
     pub fn face_error(&self) -> Option<&RpcError> {
-        let python_dimos = self.python_dimos.as_ref().and_then(|face| face.as_ref().err());
-        python_dimos.or_else(|| self.ros.as_ref().and_then(|face| face.as_ref().err()))
+        self.ros.as_ref().and_then(|face| face.as_ref().err())
     }
 
     /// Returns which faces do not serve at present, and why: one may wait for its router.
@@ -187,16 +180,11 @@ impl Gateway {
             Some(format!("{}{hint}", error.message))
         };
         let config = &self.shared.config;
-        let python_dimos =
-            config.python_dimos.as_ref().zip(self.python_dimos.as_ref()).map(|(config, face)| match face {
-                Ok(face) => face.report(),
-                Err(error) => python_dimos::report(config, why(error)),
-            });
         let ros = config.ros.as_ref().zip(self.ros.as_ref()).map(|(config, face)| match face {
             Ok(face) => face.report(),
             Err(error) => ros::report(config, why(error)),
         });
-        python_dimos.into_iter().chain(ros).collect()
+        ros.into_iter().collect()
     }
 
     /// Reports to the run where it listens and what it serves.
@@ -224,7 +212,6 @@ impl Gateway {
             self.shared.look_after_clients();
         }
         self._declared.clear();
-        self.python_dimos.take();
         self.ros.take();
         let _ = self.shared.session.close().wait();
     }

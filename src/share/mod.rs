@@ -1,5 +1,5 @@
 //! A run on the network: `dimos share` gives it to other computers, `--at` reaches it from there. Over
-//! [zenoh](https://zenoh.io), because Python dimos and ROS 2 speak it.
+//! [zenoh](https://zenoh.io), because ROS 2 speaks it.
 //!
 //! ```text
 //!  cell computer:  run ◀─ socket ─ gateway (its own process) ◀─ zenoh, TLS ─ line ◀─ any verb with --at :laptop
@@ -27,7 +27,6 @@ mod page;
 #[cfg(feature = "share")]
 mod place;
 #[cfg(feature = "share")]
-mod python_dimos;
 #[cfg(feature = "share")]
 mod refusals;
 #[cfg(feature = "share")]

@@ -8,7 +8,7 @@ use zenoh::Config;
 
 use super::access;
 use super::place::Place;
-use crate::blueprint::share::{Identity, PythonDimosConfig, RosConfig, ShareConfig};
+use crate::blueprint::share::{Identity, RosConfig, ShareConfig};
 use crate::rpc::error::{Code, RpcError};
 
 /// Largest message that is accepted [bytes]: an answer of a planner.
@@ -29,8 +29,6 @@ const QUEUE: usize = 16;
 const RETRY: (u64, u64) = (100, 500);
 /// Sessions beside those of the clients: routers, and clients that are being refused.
 const MORE_SESSIONS: usize = 4;
-/// Sessions on the bus of Python dimos: its processes have one each.
-const MAX_ON_BUS: usize = 128;
 /// Waits of a message for a congested client before it is dropped [µs]: of a whole one, of one in fragments.
 const WAIT_BEFORE_DROP: (u64, u64) = (1000, 5000);
 
@@ -117,27 +115,6 @@ fn client_values(place: &Place) -> Value {
     with_common(more)
 }
 
-/// Returns the settings on the bus of Python dimos: like its own, which meet by multicast on `lo`.
-pub fn of_python_dimos(config: &PythonDimosConfig) -> Result<Config, RpcError> {
-    built(&python_dimos_values(config))
-}
-
-fn python_dimos_values(config: &PythonDimosConfig) -> Value {
-    let mut more = json!({
-        "mode": "peer",
-        "listen": {"endpoints": ["tcp/127.0.0.1:0"]},
-        "connect": {"endpoints": []},
-        "scouting": {"multicast": {"enabled": true, "interface": "lo"}},
-        "transport": {"unicast": {"max_sessions": MAX_ON_BUS}},
-    });
-    // zenoh takes answers to its search from any computer, and would connect to what they name.
-    merge(&mut more, access::this_computer_only());
-    if let Some(group) = &config.scout_addr {
-        merge(&mut more, json!({"scouting": {"multicast": {"address": group}}}));
-    }
-    with_common(more)
-}
-
 /// Returns the settings of a node of ROS 2: a client of its router, for which it waits.
 pub fn of_ros(config: &RosConfig, identity: Option<&Identity>) -> Result<Config, RpcError> {
     built(&ros_values(config, identity))
@@ -219,18 +196,6 @@ mod tests {
         assert_eq!((&ros["mode"], &ros["listen"]["endpoints"]), (&json!("client"), &json!([])));
         assert_eq!(ros["scouting"]["multicast"]["enabled"], false);
         built(&ros).unwrap();
-        let bus = PythonDimosConfig { scout_addr: Some("224.0.0.224:7500".into()), ..PythonDimosConfig::default() };
-        let bus = python_dimos_values(&bus);
-        // Multicast never leaves this computer.
-        assert_eq!(
-            bus["scouting"]["multicast"],
-            json!({"enabled": true, "interface": "lo", "address": "224.0.0.224:7500"})
-        );
-        assert_eq!(bus["listen"]["endpoints"], json!(["tcp/127.0.0.1:0"]));
-        assert_eq!(bus["access_control"]["default_permission"], "deny");
-        assert_eq!(bus["access_control"]["subjects"], json!([{"id": "here", "interfaces": ["lo"]}]));
-        assert_eq!(bus["transport"]["link"]["rx"]["max_message_size"], MAX_MESSAGE);
-        built(&bus).unwrap();
         assert_eq!(gateway["access_control"]["default_permission"], "deny");
     }
 }

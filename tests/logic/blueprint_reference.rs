@@ -7,7 +7,7 @@ use std::path::Path;
 
 use dimos::blueprint::planner::{GripperJointEntry, ObjectEntry, PlannerEntry, PoseEntry, RobotEntry, ViewConfig};
 use dimos::blueprint::schema::{AssetEntry, BlueprintFile, CountedJoints, HardwareEntry, TaskEntry};
-use dimos::blueprint::share::{IdentityEntry, PythonDimosEntry, RosEntry, ShareEntry};
+use dimos::blueprint::share::{IdentityEntry, RosEntry, ShareEntry};
 use dimos::blueprint::{
     Catalog, CoordinatorConfig, GuardConfig, LimitsEntry, MountingEntry, PayloadEntry, RecordingConfig, RpcConfig,
     StopInputEntry, full_schema, json_schema,
@@ -76,7 +76,7 @@ const SECTIONS: [Section; 9] = [
     section("`tasks[]`", TASKS, "/$defs/TaskEntry", keys::<TaskEntry>),
 ];
 /// Those behind the parameters of the task types.
-const SECTIONS_AFTER_TASKS: [Section; 14] = [
+const SECTIONS_AFTER_TASKS: [Section; 13] = [
     section("`planner`", "", "/$defs/PlannerEntry", keys::<PlannerEntry>),
     section("`planner.robots[]`", "A list of robots, merged by `name`.", "/$defs/RobotEntry", keys::<RobotEntry>),
     section("`planner.robots[].gripper_joint`", "", "/$defs/GripperJointEntry", keys::<GripperJointEntry>),
@@ -88,7 +88,6 @@ const SECTIONS_AFTER_TASKS: [Section; 14] = [
     section("`rpc`", "", "/$defs/RpcConfig", keys::<RpcConfig>),
     section("`share`", "", "/$defs/ShareEntry", keys::<ShareEntry>),
     section("`share.identity`", "", "/$defs/IdentityEntry", keys::<IdentityEntry>),
-    section("`share.python_dimos`", "", "/$defs/PythonDimosEntry", keys::<PythonDimosEntry>),
     section("`share.ros`", "", "/$defs/RosEntry", keys::<RosEntry>),
     section("`assets`", "A group of files by name.", "/$defs/AssetEntry", keys::<AssetEntry>),
 ];

@@ -128,11 +128,10 @@ fn half_of_a_motion_is_not_followed() {
             onto.with(5).says(&[why, "nothing has moved", "hint: "]);
             home.dimos(&format!("log verify {log}.mcap")).with(5);
             home.dimos(&format!("log info {log}.mcap")).with(5).shows(&[log]).says(&[why]);
-            for verb in ["export -o a.csv", "plot -o a.svg", "recover -o a.mcap", "cat", "export --lerobot set"] {
+            for verb in ["export -o a.csv", "plot -o a.svg", "recover -o a.mcap", "cat"] {
                 home.dimos(&format!("log {verb} {log}.mcap")).with(5).says(&[why]);
             }
             ["a.csv", "a.mcap"].iter().for_each(|file| std::fs::remove_file(home.path().join(file)).unwrap());
-            std::fs::remove_dir_all(home.path().join("set")).unwrap();
         }
         let followed = home.dimos("replay --last --onto coordinator-yourarm --no-record").with(0);
         followed.shows(&["COMPLETED"]);

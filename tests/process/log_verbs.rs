@@ -1,12 +1,13 @@
 //! `dimos log` and what 3D tools need, on logs of real runs.
 
+use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::Command;
 
 use rustix::process::Signal;
 use serde_json::Value;
 
-use crate::support::program::{Home, eventually};
+use crate::support::program::{Home, Started, eventually};
 use crate::support::skip::skip_tool;
 
 /// Runs the example arm with a planner: two motions, an obstacle that comes and goes.
@@ -221,7 +222,9 @@ fn other_tools_place_the_tool_where_the_model_does() {
     home.dimos("log export --last -o table.csv").with(0);
     home.dimos("log export --last --parquet table.parquet").with(0).shows(&["rows"]);
     home.dimos("log export --last --rosbag2 bag").with(0);
-    let set = home.dimos("log export --last --lerobot set --task wave --json").with(0).json();
+    let mut export = home.command("log export --last --lerobot set --task wave --json");
+    export.env("PYTHONPATH", root.join("tests/python/recorded"));
+    let set = Started::of(&mut export).wait().with(0).json();
     assert!(set["frames"].as_u64().unwrap() > 100 && set["fps"] == 100.0, "{set}");
     let mut read = Command::new(root.join(".venv/bin/python"));
     let output = read.arg(root.join("tests/readers/read_exports.py")).arg(&home.logs()[0]).arg(home.path()).output();
@@ -230,6 +233,24 @@ fn other_tools_place_the_tool_where_the_model_does() {
     assert_eq!(String::from_utf8_lossy(&output.stdout).matches("are the same").count(), 3);
     home.dimos("log verify bag").with(0).shows(&["reproducible"]);
     home.dimos("log export --last --rosbag2 bag").with(1).says(&["cannot write", "hint: choose another file"]);
+}
+
+/// Without the package, or Python, nothing is written, and the message has what is to be installed.
+#[test]
+fn exports_say_what_python_lacks() {
+    let home = recorded();
+    let bare = home.path().join("python");
+    std::fs::write(&bare, "#!/bin/sh\nexec python3 -I -S \"$@\"\n").unwrap();
+    std::fs::set_permissions(&bare, std::fs::Permissions::from_mode(0o755)).unwrap();
+    for (format, to, package) in [("parquet", "a.parquet", "pyarrow"), ("lerobot", "set", "lerobot")] {
+        let mut export = home.command(&format!("log export --last --{format} {to}"));
+        let ended = Started::of(export.env("DIMOS_PYTHON", &bare)).wait().with(2);
+        ended.says(&["has no package to write", "hint: ", &format!("-m pip install {package}"), "DIMOS_PYTHON"]);
+        let mut export = home.command(&format!("log export --last --{format} {to}"));
+        let ended = Started::of(export.env("DIMOS_PYTHON", "/nowhere/python")).wait().with(2);
+        ended.says(&["/nowhere/python does not start", "hint: install Python 3, or set DIMOS_PYTHON"]);
+        assert!(!home.path().join(to).exists());
+    }
 }
 
 /// `make test-lerobot` installs LeRobot and asks for this one; it is too large for `make test-tools`.
@@ -241,8 +262,10 @@ fn lerobot_loads_a_data_set() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let home = recorded();
     for (folder, options) in [("set", ""), ("slow", "--fps 30")] {
-        home.dimos(&format!("log export --last --lerobot {folder} --task wave {options}")).with(0);
-        let mut load = Command::new(root.join(".venv-lerobot/bin/python"));
+        let python = root.join(".venv-lerobot/bin/python");
+        let mut export = home.command(&format!("log export --last --lerobot {folder} --task wave {options}"));
+        Started::of(export.env("DIMOS_PYTHON", &python)).wait().with(0);
+        let mut load = Command::new(python);
         let output = load.arg(root.join("tests/readers/load_lerobot.py")).arg(home.path().join(folder)).output();
         let output = output.unwrap();
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));

@@ -57,7 +57,6 @@ mod readers;
 mod remote_peers;
 mod remote_shim;
 mod ros;
-mod ros2;
 mod rpc_page;
 mod runs_found;
 mod share;

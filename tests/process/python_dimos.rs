@@ -7,17 +7,18 @@ use rustix::process::Signal;
 use serde_json::{Value, json};
 
 use crate::support::certificates::Authority;
-use crate::support::network::{CELL, free_port};
+use crate::support::network::{CELL, free_port, is_built};
 use crate::support::program::{Home, Started, eventually};
 use crate::support::python_dimos::Bus;
 
-/// A run that Python dimos commands.
-fn cell(bus: &Bus, more: &str) -> (Home, Started) {
+/// A run that Python dimos commands, and its bridge.
+fn cell(bus: &Bus, more: &str) -> (Home, Started, Started) {
     let home = Home::new();
-    bus.write(&home, CELL, more);
+    home.write("cell.yaml", CELL);
     let run = home.run("cell.yaml --no-record");
-    eventually("the face serves", || home.status()["share"]["faces"][0]["serves"] == true);
-    (home, run)
+    let bridge = bus.bridge(&home, more);
+    bridge.until("of Python dimos on this computer");
+    (home, run, bridge)
 }
 
 fn status(result: &Value) -> &str {
@@ -80,7 +81,7 @@ fn their_client_reads_states_and_executes_as_with_their_own_coordinator() {
     check_client(&bus.does("client"));
     assert_eq!(theirs.end()["state"], "ABORTED");
 
-    let (home, run) = cell(&bus, ", command: true");
+    let (home, run, _bridge) = cell(&bus, "--command");
     let seen = bus.does("client");
     check_client(&seen);
     let text = seen["unknown_joint"][2].as_str().unwrap();
@@ -109,7 +110,7 @@ fn their_planner_executes_as_through_their_own_coordinator() {
     assert_eq!(seen["other"][0], "ACCEPTED");
     drop(theirs);
 
-    let (home, _run) = cell(&bus, ", command: true");
+    let (home, _run, _bridge) = cell(&bus, "--command");
     let seen = bus.does("execution");
     check_execution(&seen);
     assert_eq!(seen["other"][0], "REJECTED", "{seen}");
@@ -120,13 +121,11 @@ fn their_planner_executes_as_through_their_own_coordinator() {
 #[test]
 fn without_leave_it_reads_and_ends_motion_only() {
     let Some(bus) = Bus::new() else { return };
-    let (home, run) = cell(&bus, "");
-    run.until("with Python dimos as ControlCoordinator (multicast on lo): reads, and ends motion");
-    home.dimos("status").with(0).shows(&["shared with python_dimos as ControlCoordinator: its programs read"]);
+    let (home, _run, _bridge) = cell(&bus, "");
     let seen = bus.does("client");
     for refused in ["execute", "by_task"] {
         assert_eq!(status(&seen[refused]), "INVALID_TRAJECTORY");
-        assert!(seen[refused][2].as_str().unwrap().contains("share.python_dimos.command: true"), "{seen}");
+        assert!(seen[refused][2].as_str().unwrap().contains("start its bridge with --command"), "{seen}");
     }
     assert_eq!((&seen["ended"], status(&seen["cancel"])), (&json!("IDLE"), "ALREADY_STOPPED"));
     assert_eq!(home.positions("arm")[0], 0.0);
@@ -137,9 +136,8 @@ fn without_leave_it_reads_and_ends_motion_only() {
 #[test]
 fn names_domain_and_lease_are_as_configured() {
     let Some(bus) = Bus::new() else { return };
-    let joints = "joints: {arm_joint2: arm/shoulder, arm_joint6: tool/spin}";
-    let (home, _run) = cell(&bus, &format!(", command: true, name: Cell7, domain: lab, {joints}"));
-    home.dimos("status").with(0).shows(&["shared with python_dimos as Cell7: its programs may move the arms"]);
+    let joints = "--joint arm_joint2=arm/shoulder --joint arm_joint6=tool/spin";
+    let (home, _run, _bridge) = cell(&bus, &format!("--command --name Cell7 --domain lab {joints}"));
     let seen = bus.does("mapped Cell7 lab");
     let named = json!(["arm/joint1", "arm/shoulder", "arm/joint3", "arm/joint4", "arm/joint5", "tool/spin"]);
     assert_eq!((&seen["joints"], &seen["states"]), (&named, &named));
@@ -158,9 +156,9 @@ fn names_domain_and_lease_are_as_configured() {
 fn a_gripper_is_a_task_from_0_closed_to_1_open() {
     let Some(bus) = Bus::new() else { return };
     let home = Home::new();
-    bus.write(&home, "include: [coordinator-yourarm]\n", ", command: true");
-    let _run = home.run("cell.yaml --no-record");
-    eventually("the face serves", || home.status()["share"]["faces"][0]["serves"] == true);
+    let _run = home.run("coordinator-yourarm --no-record");
+    let bridge = bus.bridge(&home, "--command");
+    bridge.until("of Python dimos on this computer");
     let seen = bus.does("gripper");
     assert_eq!(seen["tasks"], json!(["joint_trajectory", "arm_gripper"]));
     assert_eq!((&seen["set"], &seen["beyond"], &seen["two"]), (&json!(true), &json!(false), &json!(false)));
@@ -172,7 +170,7 @@ fn a_gripper_is_a_task_from_0_closed_to_1_open() {
 #[test]
 fn n12_garbage_costs_its_sender_only() {
     let Some(bus) = Bus::new() else { return };
-    let (home, _run) = cell(&bus, ", command: true");
+    let (home, _run, bridge) = cell(&bus, "--command");
     let line = |method: &str, hex: &str, attachment: &str| {
         format!("{}\n", json!({"method": method, "hex": hex, "attachment": attachment, "timeout": 1.0}))
     };
@@ -212,61 +210,43 @@ fn n12_garbage_costs_its_sender_only() {
     let silent = |at: usize| answers[at]["answers"].as_array().unwrap().iter().all(|answer| answer["ok"] != true);
     assert!((6..9).all(silent), "{answers:?}");
     assert!(!home.path().join("owned").exists(), "a pickle was executed");
-    assert_eq!(home.status()["share"]["faces"][0]["serves"], true);
+    bridge.end(Signal::INT).with(0);
 }
 
 #[test]
 fn n13_of_two_coordinators_on_a_bus_ours_is_refused_or_ends() {
     let Some(bus) = Bus::new() else { return };
-    // Before: the run continues, without the face.
+    // Before: it does not serve.
     let theirs = bus.coordinator();
     let home = Home::new();
-    bus.write(&home, CELL, ", command: true");
+    home.write("cell.yaml", CELL);
     let run = home.run("cell.yaml --no-record");
     let refusal = "another ControlCoordinator with arm is on the bus of Python dimos; both would move";
-    eventually("the face is refused", || {
-        let face = &home.status()["share"]["faces"][0];
-        face["serves"] == false && face["reason"].as_str().is_some_and(|reason| reason.contains(refusal))
-    });
-    home.dimos("status").with(0).shows(&["DOES NOT SERVE: another ControlCoordinator with arm"]);
-    drop(run);
-    // By hand it is an error.
-    home.write("alone.yaml", CELL);
-    let alone = home.run("alone.yaml --no-record");
-    let by_hand = format!("share --python-dimos --scout-addr {}", bus.group);
-    home.dimos(&by_hand).with(1).says(&[refusal, "[HAS_COORDINATOR]", "hint: end that one"]);
-    drop(alone);
+    bus.bridge(&home, "--command").wait().with(1).says(&[refusal, "hint: end that one"]);
     drop(theirs);
+    drop(run);
 
-    // After: it stops serving within 5.5 s, with an event, and its motion is cancelled.
-    let (home, _run) = cell(&bus, ", command: true");
-    let mut events = home.client();
-    let stream = dimos::rpc::streams::Stream::Events;
-    events.call(dimos::rpc::streams::Subscribe::to(stream)).unwrap();
+    // After: it ends within 5.5 s, and its motion is cancelled.
+    let (home, _run, bridge) = cell(&bus, "--command");
     let slow = bus.says("begin", "").pop().unwrap();
     assert_eq!(status(&slow), "ACCEPTED");
     let _theirs = bus.coordinator();
     let began = Instant::now();
-    let event = loop {
-        let message = events.next_message().unwrap();
-        if message.data["kind"] == "share" {
-            break message.data;
-        }
-    };
-    assert!(began.elapsed() < Duration::from_millis(5500), "{:?}", began.elapsed());
-    assert_eq!(event["level"], "error");
-    assert!(event["text"].as_str().unwrap().contains(refusal), "{event}");
+    bridge.wait().with(1).says(&[refusal]);
+    assert!(began.elapsed() < Duration::from_millis(5800), "{:?}", began.elapsed());
     eventually("the motion is cancelled", || home.status()["tasks"][0]["state"] == "ABORTED");
     eventually("the lease is free", || home.status()["arms"][0]["commander"].is_null());
-    assert_eq!(home.status()["share"]["faces"][0]["serves"], false);
     // Theirs is the only one.
     check_client(&bus.does("client"));
     assert!(home.positions("arm")[0] < 0.9);
 }
 
 #[test]
-fn from_another_computer_they_come_with_the_role_of_their_certificate() {
-    let Some(mut bus) = Bus::new() else { return };
+fn a_run_on_another_computer_is_served_with_the_role_of_the_certificate() {
+    let Some(bus) = Bus::new() else { return };
+    if !is_built() {
+        return;
+    }
     let home = Home::new();
     let Some(lab) = Authority::create(&home.path().join("lab")) else { return };
     lab.sign("cell1", "DNS:localhost,IP:127.0.0.1", 30);
@@ -276,78 +256,34 @@ fn from_another_computer_they_come_with_the_role_of_their_certificate() {
         "cell.yaml",
         &format!(
             "{CELL}share: {{listen: ['tls/127.0.0.1:{port}'], users: {{alice: operator, bob: observer}},
-  identity: {{ca: lab/ca.pem, cert: lab/cell1.pem, key: lab/cell1.key}},
-  python_dimos: {{scout_addr: '{}', command: true}}}}\n",
-            bus.group
+  identity: {{ca: lab/ca.pem, cert: lab/cell1.pem, key: lab/cell1.key}}}}\n"
         ),
     );
     let _run = home.run("cell.yaml --no-record");
-    eventually("the face serves", || home.status()["share"]["faces"][0]["serves"] == true);
-    let as_user = |user: &str| {
-        let [key, pem] = ["key", "pem"].map(|name| lab.file(&format!("{user}.{name}")));
-        let ca = lab.file("ca.pem");
-        format!(
-            "tls/localhost:{port}#root_ca_certificate_file={ca};connect_private_key_file={key};\
-             connect_certificate_file={pem};enable_mtls=true"
-        )
-    };
-    bus.through = Some(as_user("alice"));
-    let seen = bus.does("far");
-    assert_eq!((seen["joints"].as_array().unwrap().len(), status(&seen["execute"])), (6, "ACCEPTED"), "{seen}");
-    assert_eq!(seen["ended"], "COMPLETED");
-    assert!(seen["states"].as_u64().unwrap() > 50, "{seen}");
-
-    let call = |method: &str| format!("{}\n", json!({"method": method, "hex": "8004297d862e", "timeout": 1.0}));
-    let calls = ["list_joints", "cancel_trajectory", "task_invoke", "execute_trajectory"].map(call).concat();
-    let answered = |answers: Vec<Value>| -> Vec<bool> {
-        let by_us = |answer: &Value| answer["ok"] == true || answer["encoding"] == "dimos/rpc-exception";
-        answers.iter().map(|answer| answer["answers"].as_array().unwrap().iter().any(by_us)).collect()
-    };
-    assert_eq!(answered(bus.says("raw", &calls)), [true; 4]);
-    bus.through = Some(as_user("bob"));
-    assert_eq!(answered(bus.says("raw", &calls)), [true, true, false, false]);
+    for (user, accepted) in [("bob", "INVALID_TRAJECTORY"), ("alice", "ACCEPTED")] {
+        let far = Home::new();
+        let bridge =
+            bus.bridge(&far, &format!("--command --at tls/localhost:{port} --user {user} --identity {}", lab.file("")));
+        bridge.until("of Python dimos on this computer");
+        let seen = bus.does("far");
+        assert_eq!((seen["joints"].as_array().unwrap().len(), status(&seen["execute"])), (6, accepted), "{seen}");
+        assert!(seen["states"].as_u64().unwrap() > 50, "{seen}");
+        bridge.end(Signal::INT).with(0);
+    }
+    assert!((home.positions("arm")[0] - 0.1).abs() < 0.01);
 }
 
 #[test]
-fn by_hand_a_live_run_is_a_coordinator_until_its_gateway_ends() {
+fn a_killed_bridge_leaves_nothing_moving() {
     let Some(bus) = Bus::new() else { return };
-    let home = Home::new();
-    home.write("cell.yaml", CELL);
-    let _run = home.run("cell.yaml --no-record");
-    let share = home.start(&format!("share --python-dimos --command --scout-addr {}", bus.group));
-    share.until("EVERY PROGRAM ON THIS COMPUTER MAY MOVE THE ARMS");
-    // Another run of ours is another coordinator.
-    let other = Home::new();
-    bus.write(&other, CELL, "");
-    let _other = other.run("cell.yaml --no-record");
-    eventually("the second one is refused", || {
-        let reason = other.status()["share"]["faces"][0]["reason"].clone();
-        reason.as_str().is_some_and(|reason| reason.contains("another ControlCoordinator with arm is on the bus"))
-    });
+    let (home, run, bridge) = cell(&bus, "--command");
     assert_eq!(status(&bus.does("begin")), "ACCEPTED");
-    share.signal(Signal::KILL);
-    // As `on_lost` says.
+    bridge.signal(Signal::KILL);
     eventually("the motion is cancelled", || home.status()["tasks"][0]["state"] == "ABORTED");
-    let status = home.status();
-    assert!(status["share"].is_null() && status["arms"][0]["commander"].is_null(), "{status}");
-}
-
-#[test]
-fn mistakes_of_the_section_are_named() {
-    let home = Home::new();
-    let check = |face: &str| {
-        home.write("face.yaml", &format!("{CELL}share: {{python_dimos: {face}}}\n"));
-        home.dimos("check face.yaml")
-    };
-    check("{}").with(0);
-    check("{joints: {arm_joint1: left/j1}}").with(0);
-    let unknown = check("{joints: {arm_joint9: left/j1}}").with(2);
-    unknown.says(&["face.yaml:7:", "no arm has a joint named", "hint: joints: arm_joint1"]);
-    check("{joints: {arm_joint1: j1}}").with(2).says(&["is no joint of Python dimos", "arm/joint1"]);
-    let twice = check("{joints: {arm_joint1: a/j, arm_joint2: a/j}}").with(2);
-    twice.says(&["arm_joint1 and arm_joint2 would both be"]);
-    check("{name: 'a/b'}").with(2).says(&["characters that separate keys"]);
-    check("{domain: '*'}").with(2).says(&["characters that separate keys"]);
-    check("{scout_addr: 10.0.0.1:7446}").with(2).says(&["is no multicast group with a port", "224.0.0.224:7446"]);
-    check("{commandx: true}").with(2).says(&["did you mean `command`?"]);
+    eventually("the lease is free", || home.status()["arms"][0]["commander"].is_null());
+    drop(run);
+    // A bridge ends with its run.
+    let (_home, run, bridge) = cell(&bus, "");
+    run.end(Signal::INT).with(130);
+    bridge.wait().with(0).says(&["the run is gone"]);
 }

@@ -51,6 +51,7 @@ impl Home {
             .env("XDG_STATE_HOME", self.path().join("state"))
             .env("XDG_CACHE_HOME", self.path().join("cache"))
             .env("XDG_CONFIG_HOME", self.path().join("config"))
+            .env("DIMOS_PYTHON", Path::new(env!("CARGO_MANIFEST_DIR")).join(".venv/bin/python"))
             .env_remove("DIMOS_BLUEPRINT_PATH")
             .env_remove("DIMOS_LOG")
             .current_dir(self.path())

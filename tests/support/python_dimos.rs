@@ -7,8 +7,8 @@ use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
 use serde_json::Value;
 
-use super::network::{free_port, is_built};
-use super::program::Home;
+use super::network::free_port;
+use super::program::{Home, Started};
 use super::python::python_with;
 
 /// A bus.
@@ -17,20 +17,15 @@ pub struct Bus {
     home: tempfile::TempDir,
     /// Its multicast group: `224.0.0.224:50123`.
     pub group: String,
-    /// How its programs reach a gateway instead: their `ZENOH_CONNECT`.
-    pub through: Option<String>,
 }
 
 impl Bus {
-    /// A new bus; nothing where Python dimos is not installed, or this build has no network.
+    /// A new bus; nothing where Python dimos is not installed.
     #[track_caller]
     pub fn new() -> Option<Self> {
-        if !is_built() {
-            return None;
-        }
         let python = python_with(&["dimos", "dimos_lcm", "zenoh"])?;
         let (home, group) = (tempfile::tempdir().unwrap(), format!("224.0.0.224:{}", free_port()));
-        Some(Self { python, home, group, through: None })
+        Some(Self { python, home, group })
     }
 
     fn command(&self, arguments: &str) -> Command {
@@ -45,9 +40,6 @@ impl Bus {
             .current_dir(self.home.path())
             .stderr(Stdio::null())
             .stdout(Stdio::piped());
-        if let Some(through) = &self.through {
-            command.env("ZENOH_MULTICAST", "false").env("ZENOH_CONNECT", through);
-        }
         command
     }
 
@@ -78,10 +70,17 @@ impl Bus {
         coordinator
     }
 
-    /// Writes a blueprint whose run is a coordinator on this bus. `more`: further keys, each with a leading comma.
-    pub fn write(&self, home: &Home, blueprint: &str, more: &str) {
-        let face = format!("{{scout_addr: '{}'{more}}}", self.group);
-        home.write("cell.yaml", &format!("{blueprint}share: {{python_dimos: {face}}}\n"));
+    /// Starts the bridge to a run of this user.
+    pub fn bridge(&self, home: &Home, options: &str) -> Started {
+        let mut command = Command::new(&self.python);
+        home.settle(command.args(["-m", "dimos_client.python_dimos"]).args(options.split_whitespace()));
+        command
+            .env("PYTHONPATH", Path::new(env!("CARGO_MANIFEST_DIR")).join("assets/python"))
+            .env("PYTHONPYCACHEPREFIX", home.path())
+            .env("ZENOH_SCOUT_ADDR", &self.group)
+            .env_remove("DIMOS_TRANSPORT")
+            .stdin(Stdio::null());
+        Started::of(&mut command)
     }
 }
 

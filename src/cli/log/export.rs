@@ -7,13 +7,13 @@ use std::path::Path;
 
 use serde_json::{Value, json};
 
+use super::python_writer::PythonWriter;
 use super::{Part, STATES, ended, no_states, progress, unreadable, written};
 use crate::cli::escapes::safe;
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output;
 use crate::recording::joints::{Places, twice};
 use crate::recording::messages::JointState;
-use crate::recording::parquet::{Column, ParquetWriter};
 use crate::recording::replay::{Entry, LogReader, Payload, ReplayError, Selection};
 use crate::recording::scan::{Item, Scan};
 
@@ -50,26 +50,18 @@ pub fn csv(path: &Path, part: &Part, topic: Option<&str>, to: Option<&Path>, jso
 pub fn parquet(path: &Path, part: &Part, to: &Path, json: bool) -> Result {
     let part_of_log = part.of(path)?;
     let began = part_of_log.0.saturating_sub(part.from.as_nanos() as u64);
-    let out = new_file(to)?;
     let names = joint_names(path, part_of_log, false)?;
-    let numbers = || Column::Numbers(Vec::new());
-    let mut columns = vec![("time".to_owned(), numbers()), ("log_time".to_owned(), Column::Integers(Vec::new()))];
-    columns.extend(columns_of(&names).map(|name| (name, numbers())));
-    let failed = |e| cannot_write(to, e);
-    let mut file = ParquetWriter::new(out, columns).map_err(failed)?;
+    let mut columns = vec![("time".to_owned(), "<f8"), ("log_time".to_owned(), "<i8")];
+    columns.extend(columns_of(&names).map(|name| (name, "<f8")));
+    let mut file = PythonWriter::start("parquet", "pyarrow", to, &json!({"columns": columns}))?;
+    let mut rows = 0;
     let loss = joint_rows(path, part_of_log, &names, false, |time, values| {
-        for (column, value) in file.columns.iter_mut().skip(2).zip(values) {
-            if let Column::Numbers(list) = column {
-                list.push(*value);
-            }
-        }
-        if let [Column::Numbers(seconds), Column::Integers(times), ..] = &mut file.columns[..] {
-            seconds.push(time.saturating_sub(began) as f64 * 1e-9);
-            times.push(time as i64);
-        }
-        file.row_added().map_err(failed).map(|()| true)
+        rows += 1;
+        let seconds = time.saturating_sub(began) as f64 * 1e-9;
+        let values = values.iter().map(|value| value.to_le_bytes());
+        file.row([seconds.to_le_bytes(), time.to_le_bytes()].into_iter().chain(values)).map(|()| true)
     })?;
-    let rows = file.finish(&[]).map_err(failed)?;
+    file.finish()?;
     output::done(format_args!("{rows} rows: {}", to.display()), json!({"file": to, "rows": rows, "loss": loss}), json);
     Ok(ended(loss.as_deref()))
 }

@@ -6,7 +6,6 @@
 use super::Transport;
 use super::description;
 use super::name::Name;
-use crate::packed;
 
 /// Files of an arm in its template.
 const COMMON: &[&str] = &["mod.rs", "adapter.rs", "protocol.rs", "golden.rs", "emulator.rs"];
@@ -25,9 +24,12 @@ const CRATE: [(&str, &str); 5] = [
     ("tests/conformance.rs", "crate/conformance.rs"),
 ];
 
+/// Files of `assets/templates`: path, text.
+static TEMPLATES: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/templates.rs"));
+
 /// Returns a template. All are there: a test asks for each.
 fn template(name: &str) -> &'static str {
-    packed::text(&format!("templates/{name}")).unwrap_or_default()
+    TEMPLATES.iter().find(|(file, _)| *file == name).map(|(_, text)| *text).unwrap_or_default()
 }
 
 /// The arm that is to be written.

@@ -1,1 +1,0 @@
-"""A run of dimos as a node of ROS 2."""
