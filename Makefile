@@ -67,8 +67,8 @@ viewer/node_modules/.package-lock.json: viewer/package.json viewer/package-lock.
 check: lint spelling licences
 
 lint:
-	cargo fmt --check
-	cargo clippy --all-targets --locked $(WITH) -- -D warnings
+	cargo fmt --all --check
+	cargo clippy --workspace --all-targets --locked $(WITH) -- -D warnings
 	cargo clippy --no-default-features --locked -- -D warnings
 
 spelling:
@@ -86,17 +86,17 @@ deny:
 # Installs nothing: tests whose tools are missing are skipped.
 test: viewer-if-possible
 	@[ -e .venv/readers-installed ] || echo "note: some tests will be skipped; make test-tools installs what they need"
-	cargo test --locked $(WITH) --doc
-	@if ! cargo nextest --version >/dev/null 2>&1; then cargo test --locked $(WITH) --lib --bins --tests; \
+	cargo test --workspace --locked $(WITH) --doc
+	@if ! cargo nextest --version >/dev/null 2>&1; then cargo test --workspace --locked $(WITH) --lib --bins --tests; \
 	elif command -v $(PYTHON) >/dev/null; then $(PYTHON) tests/suite.py; \
-	else cargo nextest run --locked $(WITH); \
+	else cargo nextest run --workspace --locked $(WITH); \
 	fi
 
 # The logic, in a minute: no run of the program, no vendor's tool.
 test-fast:
 	@if cargo nextest --version >/dev/null 2>&1; \
-	then cargo nextest run --locked --profile fast --lib --test logic; \
-	else cargo test --locked --lib; \
+	then cargo nextest run --workspace --locked --profile fast --lib --test logic; \
+	else cargo test --workspace --locked --lib; \
 	fi
 
 # Writes docs/verified.md from the reports in docs/reports.
@@ -148,7 +148,7 @@ test-lerobot:
 	DIMOS_LEROBOT=1 cargo test --locked --test process log_verbs::lerobot
 
 # Changes the code of the control path a little, hundreds of times, and runs the fast tests on each change: what no test
-# notices is listed, without those in tests/mutants-equivalent.txt. Hours; `make mutants MUTANTS="--file src/control/limit.rs"`
+# notices is listed, without those in tests/mutants-equivalent.txt. Hours; `make mutants MUTANTS="--file crates/control/src/limit.rs"`
 # is one file. Wants cargo-mutants and cargo-nextest.
 mutants:
 	cargo mutants $(MUTANTS) || [ $$? -eq 2 ] || [ $$? -eq 3 ]

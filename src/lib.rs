@@ -12,7 +12,7 @@
 //!     └──(ring, drop-counted)──▶ recorder ─▶ MCAP          └──▶ rpc: published joint state
 //! ```
 //!
-//! A module may use only those above it in this list; `tests/logic/layering.rs` checks that.
+//! Everything below the run is a crate of its own in `crates/`, which this one shows under the names of its modules.
 //!
 //! As a library: [`runtime::Run`] builds a run from a blueprint, [`hardware::registry`] makes adapters,
 //! [`hardware::adapter::ManipulatorAdapter`] is what a new arm implements, [`testing`] has a mock for unit tests,
@@ -32,52 +32,27 @@
 /// Version of this program, with the commit it was built from where that is known.
 pub const VERSION: &str = env!("DIMOS_VERSION");
 
-pub mod arm;
-mod bounded;
-pub mod clock;
-pub mod joint;
-pub mod message;
-mod named;
-pub mod pose;
-#[cfg(any(feature = "share", feature = "view"))]
-mod random;
-pub mod sync;
-pub mod telemetry;
-pub mod trajectory;
-pub mod yaml;
-
-pub mod rt;
-
-pub mod robot;
+pub use dimos_arms as arms;
+pub use dimos_control as control;
+pub use dimos_core::{arm, clock, joint, message, pose, sync, telemetry, trajectory};
+pub use dimos_hardware as hardware;
+pub use dimos_hardware::testing;
+pub use dimos_log as recording;
+pub use dimos_planner::{collision, planning};
+pub use dimos_robot as robot;
+pub use dimos_rpc as rpc;
+pub use dimos_rt as rt;
+pub use dimos_yaml as yaml;
 /// The type of robots from and for other programs: `RobotModel::try_from(&urdf_rs::Robot)`, and back.
 pub use urdf_rs;
 
 pub mod assets;
-
-pub mod collision;
-
-pub mod hardware;
-
-pub mod control;
-
-pub mod planning;
-
-pub mod rpc;
-
-pub mod recording;
-
 pub mod blueprint;
-
-pub mod view;
-
-pub mod share;
-
-pub mod runtime;
-
-pub mod replay;
-
 pub mod cli;
-pub mod testing;
+pub mod replay;
+pub mod runtime;
+pub mod share;
+pub mod view;
 
 /// The examples of `docs/kit.md`, as tests.
 #[cfg(doctest)]

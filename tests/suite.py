@@ -85,7 +85,7 @@ def failures():
 def nextest(arguments):
     features = os.environ.get("FEATURES")
     chosen = ["--features", features] if features else []
-    return subprocess.run(["cargo", "nextest", "run", "--locked", *chosen, *arguments]).returncode
+    return subprocess.run(["cargo", "nextest", "run", "--workspace", "--locked", *chosen, *arguments]).returncode
 
 
 def alone(tests):

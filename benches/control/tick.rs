@@ -7,11 +7,11 @@ use std::sync::mpsc::{Sender, channel};
 use std::time::{Duration, Instant};
 
 use dimos::arm::{ArmCommand, ArmState};
+use dimos::arms::mock::MockArm;
 use dimos::clock::{Clock, Mono, MonotonicClock, VirtualClock};
 use dimos::control::coordinator::{Coordinator, TickTime};
 use dimos::control::tick_loop::{self, Pulse, TickPorts};
 use dimos::hardware::adapter::{JointReading, ManipulatorAdapter};
-use dimos::hardware::arms::mock::MockArm;
 use dimos::hardware::registry::AdapterConfig;
 use dimos::rt::host;
 use dimos::rt::slot::{SlotReader, SlotWriter, slot};

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
-use dimos::hardware::arms::franka::emulator::FrankaEmulator;
+use dimos::arms::franka::emulator::FrankaEmulator;
 use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 
 use crate::support::measure::{figure, print_rows, quantile, verdict};

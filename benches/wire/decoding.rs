@@ -3,7 +3,7 @@
 use std::hint::black_box;
 use std::time::Instant;
 
-use dimos::hardware::arms::xarm::protocol::report::Motion;
+use dimos::arms::xarm::protocol::report::Motion;
 
 use crate::support::Effort;
 use crate::support::measure::{Goal, Measure, print};
@@ -33,9 +33,9 @@ pub fn measure(effort: Effort) -> Result<(), String> {
 
 /// Decodes the frames of one burst of a Piper repeatedly, and assembles them to the arm's feedback.
 fn piper(repeats: usize, packets: u64) -> Vec<f64> {
+    use dimos::arms::piper::feedback::Feedback;
+    use dimos::arms::piper::protocol::decode;
     use dimos::clock::{Clock, MonotonicClock};
-    use dimos::hardware::arms::piper::feedback::Feedback;
-    use dimos::hardware::arms::piper::protocol::decode;
     use dimos::hardware::transport::can::CanFrame;
     let ids = [0x2A1, 0x2A2, 0x2A3, 0x2A4, 0x2A5, 0x2A6, 0x2A7, 0x2A8, 0x251, 0x252, 0x253, 0x254, 0x255, 0x256, 0x261];
     let frames = ids.map(|id| CanFrame::new(id, &[0, 0, 0, 1, 0, 0, 0, 2]));

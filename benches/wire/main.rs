@@ -19,7 +19,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bed::{Arm, tick};
-use dimos::hardware::arms::xarm;
+use dimos::arms::xarm;
 use dimos::hardware::registry::{self, AdapterConfig, EmulatorAddress};
 use dimos::joint::ControlMode;
 use dimos::rt::heartbeat::Heartbeat;
@@ -63,8 +63,8 @@ fn config(adapter: &str, address: String, dof: usize) -> AdapterConfig {
 /// Returns a built-in arm with its emulator.
 fn arm(name: &str, dof: usize, period: Duration, beat: &Arc<Heartbeat>, room: usize) -> Result<Arm, String> {
     let text = |e: dimos::hardware::adapter::AdapterError| e.to_string();
-    let emulator = registry::emulate(name, dof).map_err(text)?;
-    let adapter = registry::create(name, &emulator.address(), dof).map_err(text)?;
+    let emulator = dimos::arms::emulate(name, dof).map_err(text)?;
+    let adapter = dimos::arms::create(name, &emulator.address(), dof).map_err(text)?;
     Arm::new(adapter, Box::new(emulator), period, beat, room)
 }
 
@@ -100,9 +100,9 @@ fn states(effort: Effort) -> Result<(), String> {
     let (mut p50, mut p99) = (Vec::new(), Vec::new());
     for _ in 0..effort.of(1, 5) {
         let beat = Arc::new(Heartbeat::default());
-        let emulator = registry::emulate("xarm", 7).map_err(|e| e.to_string())?;
+        let emulator = dimos::arms::emulate("xarm", 7).map_err(|e| e.to_string())?;
         let address = relay::start(&emulator.address())?;
-        let adapter = registry::create("xarm", &address, 7).map_err(|e| e.to_string())?;
+        let adapter = dimos::arms::create("xarm", &address, 7).map_err(|e| e.to_string())?;
         let mut arms = [Arm::new(adapter, Box::new(emulator), period, &beat, 3 * periods as usize)?];
         // Times pose as the positions of a joint, so nothing may be commanded.
         tick(&mut arms, period, periods, &beat, None);
@@ -128,20 +128,20 @@ fn streams(effort: Effort) -> Result<(), String> {
         );
         emulator.record();
         let address = registry::Emulator::address(&*emulator);
-        let adapter = registry::create("xarm", &address, 6).map_err(|e| e.to_string())?;
+        let adapter = dimos::arms::create("xarm", &address, 6).map_err(|e| e.to_string())?;
         let arm = Arm::new(adapter, Box::new(emulator.clone()), period, beat, room)?;
         let points = move || emulator.trace().iter().filter(|request| request.register == SETPOINT).count() as u64;
         Ok((arm, Box::new(points)))
     })?;
     stream("Piper at 200 Hz", 200, seconds, |period, beat, room| {
-        use dimos::hardware::arms::piper;
+        use dimos::arms::piper;
         let settings = config("piper", "sim".into(), 6);
         let emulator = Arc::new(
             piper::emulator::PiperEmulator::start(&settings, &EmulatorAddress::InProcess).map_err(|e| e.to_string())?,
         );
         emulator.record();
         let address = registry::Emulator::address(&*emulator);
-        let adapter = registry::create("piper", &address, 6).map_err(|e| e.to_string())?;
+        let adapter = dimos::arms::create("piper", &address, 6).map_err(|e| e.to_string())?;
         let arm = Arm::new(adapter, Box::new(emulator.clone()), period, beat, room)?;
         // A setpoint is complete with its last frame.
         let points = move || emulator.trace().iter().filter(|(_, frame)| frame.id == 0x157).count() as u64;

@@ -5,7 +5,7 @@ use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::time::Duration;
 
-use dimos::hardware::arms::xarm::address::Address;
+use dimos::arms::xarm::address::Address;
 use dimos::rt::host;
 
 use crate::timed::moment;

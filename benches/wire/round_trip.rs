@@ -6,7 +6,6 @@ use std::time::{Duration, Instant};
 
 use dimos::arm::StopPoint;
 use dimos::hardware::adapter::{AdapterResult, JointReading};
-use dimos::hardware::registry;
 use dimos::joint::ControlMode;
 use dimos::rt::host;
 use dimos::rt::wake::Wake;
@@ -52,7 +51,7 @@ class IdleArm:
 pub fn measure(effort: Effort) -> Result<(), String> {
     let text = |e: dimos::hardware::adapter::AdapterError| e.to_string();
     let folder = tempfile::tempdir().map_err(|e| e.to_string())?;
-    let emulator = registry::emulate("remote", DOF).map_err(text)?;
+    let emulator = dimos::arms::emulate("remote", DOF).map_err(text)?;
     let rust = repeats(effort, &emulator.address())?;
     drop(emulator);
     let goal = |p99: Vec<f64>, most| Measure::new("p99", "µs", p99).goal(Goal::AtMost(most));
@@ -112,7 +111,7 @@ fn repeats(effort: Effort, address: &str) -> Result<(Vec<f64>, Vec<f64>), String
 
 /// Sends commands at 100 Hz and returns the times until the state after each was read [µs].
 fn series(address: &str, cycles: usize) -> AdapterResult<Vec<f64>> {
-    let mut arm = registry::create("remote", address, DOF)?;
+    let mut arm = dimos::arms::create("remote", address, DOF)?;
     arm.connect()?;
     arm.activate()?;
     arm.set_control_mode(ControlMode::ServoPosition)?;

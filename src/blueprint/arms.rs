@@ -2,14 +2,14 @@
 
 use std::time::Duration;
 
-use crate::arm::{Supervision, Topology};
 use crate::blueprint::resolve::{Arm, Checker};
 use crate::blueprint::schema::{HardwareEntry, Joints, OnExit};
 use crate::blueprint::{limits, park, parts};
-use crate::hardware::check::Checked;
-use crate::hardware::registry::{AdapterConfig, AdapterSpec, SIM};
-use crate::joint::{MAX_DOF, make_joints};
-use crate::yaml::{Diag, Located, NodeId, Tree, did_you_mean, quote};
+use dimos_core::arm::{Supervision, Topology};
+use dimos_core::joint::{MAX_DOF, make_joints};
+use dimos_hardware::check::Checked;
+use dimos_hardware::registry::{AdapterConfig, AdapterSpec, SIM};
+use dimos_yaml::{Diag, Located, NodeId, Tree, did_you_mean, quote};
 
 /// The arms, and the names that tasks may refer to.
 pub(super) struct Hardware {

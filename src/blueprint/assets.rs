@@ -6,8 +6,8 @@ use crate::assets::{Asset, Cache, split};
 use crate::blueprint::planner::{PlannerEntry, ShapeEntry};
 use crate::blueprint::resolve::{Checker, UsedAsset};
 use crate::blueprint::schema::{AssetEntry, TaskEntry};
-use crate::robot::Source;
-use crate::yaml::{Diag, Keyed, Located, NodeId, did_you_mean, quote};
+use dimos_robot::Source;
+use dimos_yaml::{Diag, Keyed, Located, NodeId, did_you_mean, quote};
 
 /// The assets of a blueprint, while it is checked.
 pub(super) struct Assets {

@@ -1,7 +1,7 @@
 //! The adapters and task types that a blueprint may use.
 
-use crate::control::task_spec::TaskTable;
-use crate::hardware::registry::Registry;
+use dimos_control::task_spec::TaskTable;
+use dimos_hardware::registry::Registry;
 
 /// The tables that a blueprint is checked against.
 #[derive(Debug, Clone, Copy)]

@@ -1,7 +1,7 @@
 //! Reads a blueprint's file and its includes into one tree.
 
 use crate::blueprint::registry::{Found, SearchPath, Source};
-use crate::yaml::{Diag, Kind, Label, Located, MergeRules, Missing, NodeId, Tree, merge, quote, read};
+use dimos_yaml::{Diag, Kind, Label, Located, MergeRules, Missing, NodeId, Tree, merge, quote, read};
 
 /// Merge rules of blueprints.
 pub(super) const RULES: MergeRules = MergeRules {

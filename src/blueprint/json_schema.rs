@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 
 use crate::blueprint::catalog::Catalog;
 use crate::blueprint::schema::BlueprintFile;
-use crate::hardware::registry::Registry;
+use dimos_hardware::registry::Registry;
 
 /// Returns the JSON Schema (draft 2020-12) of blueprints with the adapters and task types of the catalog.
 pub fn json_schema<'a>(catalog: impl Into<Catalog<'a>>) -> Value {

@@ -7,8 +7,8 @@ use serde::de::{Deserializer, Error, MapAccess, SeqAccess, Visitor};
 use serde::{Deserialize, Serialize};
 
 use crate::blueprint::resolve::Checker;
-use crate::joint::JointLimits;
-use crate::yaml::{Diag, Keyed, Located, NodeId, did_you_mean, quote};
+use dimos_core::joint::JointLimits;
+use dimos_yaml::{Diag, Keyed, Located, NodeId, did_you_mean, quote};
 
 /// Limits narrower than the arm's own.
 #[derive(Debug, Clone, Default, Deserialize, JsonSchema)]

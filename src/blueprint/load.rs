@@ -9,8 +9,9 @@ use crate::blueprint::json_schema::home_of;
 use crate::blueprint::registry::{Found, SearchPath};
 use crate::blueprint::resolve::{Blueprint, Checker, resolve};
 use crate::blueprint::schema::BlueprintFile;
-use crate::hardware::registry::{Registry, SIM};
-use crate::yaml::{self, Diag, Keyed, Label, Missing, NodeId, Report, Severity, Tree, did_you_mean, quote, read};
+use dimos_hardware::registry::{Registry, SIM};
+use dimos_yaml as yaml;
+use dimos_yaml::{Diag, Keyed, Label, Missing, NodeId, Report, Severity, Tree, did_you_mean, quote, read};
 
 /// Changes of a blueprint by command-line options.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]

@@ -4,10 +4,10 @@ use crate::blueprint::arms::Hardware;
 use crate::blueprint::limits::JointOverride;
 use crate::blueprint::resolve::{Checker, Task};
 use crate::blueprint::schema::{HardwareEntry, OnExit};
-use crate::control::config::POSITION_MARGIN;
-use crate::control::task_body::TargetKind;
-use crate::joint::JointLimits;
-use crate::yaml::{Diag, Located, Severity, quote};
+use dimos_control::config::POSITION_MARGIN;
+use dimos_control::task_body::TargetKind;
+use dimos_core::joint::JointLimits;
+use dimos_yaml::{Diag, Located, Severity, quote};
 
 /// Checks the pose of an arm; returns it with `on_exit: park`, otherwise nothing.
 pub(super) fn resolve(

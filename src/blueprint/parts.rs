@@ -3,13 +3,13 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::arm::{Load, MAX_DIGITAL, StopInput, UPRIGHT, channel};
 use crate::blueprint::resolve::Checker;
 use crate::blueprint::schema::HardwareEntry;
-use crate::hardware::check::Checked;
-use crate::hardware::device::Setup;
-use crate::pose;
-use crate::yaml::{Diag, Located, quote};
+use dimos_core::arm::{Load, MAX_DIGITAL, StopInput, UPRIGHT, channel};
+use dimos_core::pose;
+use dimos_hardware::check::Checked;
+use dimos_hardware::device::Setup;
+use dimos_yaml::{Diag, Located, quote};
 
 /// A digital input that holds the arm while it is open. It is an operational stop, not a safety function.
 #[derive(Debug, Clone, Deserialize, JsonSchema)]

@@ -9,9 +9,9 @@ use serde::de::value::MapAccessDeserializer;
 use serde::de::{Deserializer, MapAccess, SeqAccess, Visitor};
 use serde::{Deserialize, Serialize};
 
-use crate::collision::body::MeshMode;
-use crate::yaml::range::{maybe_positive, non_negative, positive};
-use crate::yaml::{Keyed, Located, Text};
+use dimos_planner::collision::body::MeshMode;
+use dimos_yaml::range::{maybe_positive, non_negative, positive};
+use dimos_yaml::{Keyed, Located, Text};
 
 /// Default distance that plans keep from obstacles and other arms [m].
 const PADDING: f64 = 0.003;

@@ -6,9 +6,9 @@ use crate::blueprint::planner_files;
 use crate::blueprint::planner_models::Described;
 use crate::blueprint::resolve::Checker;
 use crate::blueprint::schema::{JointNames, TaskEntry};
-use crate::control::task_body::TargetKind;
-use crate::planning::config::MAX_OBJECTS;
-use crate::yaml::{Diag, Located, did_you_mean, quote};
+use dimos_control::task_body::TargetKind;
+use dimos_planner::planning::config::MAX_OBJECTS;
+use dimos_yaml::{Diag, Located, did_you_mean, quote};
 
 pub(super) fn check(
     checker: &mut Checker<'_>,

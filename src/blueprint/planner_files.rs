@@ -10,10 +10,10 @@ use crate::blueprint::arms::Hardware;
 use crate::blueprint::planner::{ModelMismatch, ObjectEntry, PlannerEntry, PoseEntry, RobotEntry, ShapeEntry};
 use crate::blueprint::planner_models::Described;
 use crate::blueprint::resolve::Checker;
-use crate::planning::config::{GripperJoint, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig, Unplanned};
-use crate::pose;
-use crate::robot::Source;
-use crate::yaml::{Located, NodeId};
+use dimos_core::pose;
+use dimos_planner::planning::config::{GripperJoint, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig, Unplanned};
+use dimos_robot::Source;
+use dimos_yaml::{Located, NodeId};
 
 /// Returns the configuration of the planner; only valid if nothing was reported.
 pub(super) fn resolve(
@@ -139,7 +139,7 @@ fn object(checker: &Checker<'_>, name: &str, entry: &Located<ObjectEntry>) -> Ob
 /// Returns a path into an asset, or a path relative to the file that names it; relative to the working directory if
 /// that file is built-in.
 pub(super) fn file(checker: &Checker<'_>, at: NodeId, path: &str) -> PathBuf {
-    if path.starts_with(crate::robot::builtin::PREFIX) {
+    if path.starts_with(dimos_robot::builtin::PREFIX) {
         return path.into();
     }
     if let Some(path) = checker.assets.path(path) {

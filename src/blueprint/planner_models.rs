@@ -8,12 +8,12 @@ use crate::blueprint::arms::Hardware;
 use crate::blueprint::planner::{PlannerEntry, RobotEntry, RobotJoints, ShapeEntry};
 use crate::blueprint::planner_files;
 use crate::blueprint::resolve::Checker;
-use crate::planning::config::{ObjectShape, PlannerConfig, RobotConfig, Unplanned};
-use crate::robot::model::{Joint, RobotModel};
-use crate::robot::srdf::Semantics;
-use crate::robot::urdf::VISUAL_NOT_FOUND;
-use crate::robot::{Source, load};
-use crate::yaml::{Diag, Located, NodeId, Report, Severity, did_you_mean, quote};
+use dimos_planner::planning::config::{ObjectShape, PlannerConfig, RobotConfig, Unplanned};
+use dimos_robot::model::{Joint, RobotModel};
+use dimos_robot::srdf::Semantics;
+use dimos_robot::urdf::VISUAL_NOT_FOUND;
+use dimos_robot::{Source, load};
+use dimos_yaml::{Diag, Located, NodeId, Report, Severity, did_you_mean, quote};
 
 /// Maximum number of missing visual meshes shown per description; `dimos model check` shows all.
 const NOT_SHOWN: usize = 5;

@@ -10,7 +10,7 @@ use serde::Serialize;
 
 use crate::blueprint::catalog::Catalog;
 use crate::blueprint::load::{Overrides, load_from};
-use crate::yaml::{MAX_BYTES, closest, quote};
+use dimos_yaml::{MAX_BYTES, closest, quote};
 
 /// Files and texts of the blueprints in the binary, embedded by `build.rs` from `blueprints/`.
 const EMBEDDED: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/blueprints.rs"));

@@ -4,7 +4,6 @@ use std::collections::BTreeMap;
 
 use serde_json::Value;
 
-use crate::arm::Supervision;
 use crate::assets::{Asset, Cache};
 use crate::blueprint::assets::Assets;
 use crate::blueprint::catalog::Catalog;
@@ -19,15 +18,16 @@ use crate::blueprint::{
     arms, assets, park, planner_check, planner_files, planner_models, share, task_leaders, tasks, tick_clock,
     tool_speed,
 };
-use crate::control::task_leader::LeaderJoint;
-use crate::control::task_spec::TaskSpec;
-use crate::hardware::check::ToolFacts;
-use crate::hardware::device::Setup;
-use crate::hardware::registry::AdapterSpec;
-use crate::joint::{JointLimits, LONGEST_NAME, may_be_in_name};
-use crate::planning::config::PlannerConfig;
-use crate::robot::Source;
-use crate::yaml::{Diag, Located, Lost, NOWHERE, NodeId, Severity, Tree, quote};
+use dimos_control::task_leader::LeaderJoint;
+use dimos_control::task_spec::TaskSpec;
+use dimos_core::arm::Supervision;
+use dimos_core::joint::{JointLimits, LONGEST_NAME, may_be_in_name};
+use dimos_hardware::check::ToolFacts;
+use dimos_hardware::device::Setup;
+use dimos_hardware::registry::AdapterSpec;
+use dimos_planner::planning::config::PlannerConfig;
+use dimos_robot::Source;
+use dimos_yaml::{Diag, Located, Lost, NOWHERE, NodeId, Severity, Tree, quote};
 
 /// A blueprint without mistakes.
 #[derive(Debug, Clone)]

@@ -5,8 +5,8 @@ use serde::{Deserialize, Serialize};
 
 use super::resolve::Checker;
 use super::share::Endpoint;
-use crate::named::named;
-use crate::yaml::{Diag, Located, quote};
+use dimos_core::named::named;
+use dimos_yaml::{Diag, Located, quote};
 
 /// Largest domain of ROS 2.
 const MAX_DOMAIN: u32 = 232;

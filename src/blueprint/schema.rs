@@ -13,8 +13,8 @@ use crate::blueprint::planner::{PlannerEntry, ViewConfig};
 use crate::blueprint::share::ShareEntry;
 use crate::blueprint::size::Size;
 use crate::blueprint::tick_clock::TickClock;
-use crate::yaml::range::{self, tick_rate};
-use crate::yaml::{Keyed, Located, Raw};
+use dimos_yaml::range::{self, tick_rate};
+use dimos_yaml::{Keyed, Located, Raw};
 
 /// A blueprint: the arms, tasks, planner and log of a run.
 #[derive(Debug, Clone, Default, Deserialize, JsonSchema)]

@@ -12,9 +12,9 @@ use serde::{Deserialize, Serialize};
 use crate::blueprint::planner_files::file;
 use crate::blueprint::resolve::Checker;
 use crate::blueprint::ros;
-use crate::named::named;
-use crate::yaml::range::positive;
-use crate::yaml::{Diag, Keyed, Located, NodeId, quote};
+use dimos_core::named::named;
+use dimos_yaml::range::positive;
+use dimos_yaml::{Diag, Keyed, Located, NodeId, quote};
 
 pub use crate::blueprint::ros::{Distro, RosConfig, RosEntry, is_ros_name};
 

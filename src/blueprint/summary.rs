@@ -5,8 +5,8 @@ use serde_json::Value;
 
 use crate::blueprint::resolve::{Arm, Blueprint};
 use crate::blueprint::schema::{CoordinatorConfig, OnExit};
-use crate::joint::{DEFAULT_ACCELERATION, DEFAULT_JERK};
-use crate::named::named;
+use dimos_core::joint::{DEFAULT_ACCELERATION, DEFAULT_JERK};
+use dimos_core::named::named;
 
 named! {
     /// Origin of a value.

@@ -4,13 +4,13 @@ use std::collections::BTreeMap;
 
 use serde::Deserialize;
 
-use crate::arm::Topology;
 use crate::blueprint::arms::{Entry, Hardware};
 use crate::blueprint::resolve::{Checker, Task};
 use crate::blueprint::schema::TaskEntry;
 use crate::blueprint::task_pos::TaskPos;
-use crate::control::task_leader::{LeaderJoint, LeaderParams};
-use crate::yaml::{Diag, Located, NodeId, did_you_mean, quote};
+use dimos_control::task_leader::{LeaderJoint, LeaderParams};
+use dimos_core::arm::Topology;
+use dimos_yaml::{Diag, Located, NodeId, did_you_mean, quote};
 
 /// Sets the leader's joints of every task whose type has a leader.
 pub(super) fn resolve(

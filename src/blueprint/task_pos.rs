@@ -2,7 +2,7 @@
 
 use crate::blueprint::resolve::Checker;
 use crate::blueprint::schema::TaskEntry;
-use crate::yaml::{Located, NodeId};
+use dimos_yaml::{Located, NodeId};
 
 /// Position of a task in its file.
 pub(super) struct TaskPos<'e> {

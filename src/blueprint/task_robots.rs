@@ -13,12 +13,12 @@ use crate::blueprint::planner_models::within;
 use crate::blueprint::resolve::{Checker, Task, TaskRobot};
 use crate::blueprint::schema::TaskEntry;
 use crate::blueprint::task_pos::TaskPos;
-use crate::control::task_robot::{FramePose, RobotParams, TaskKinematics};
-use crate::planning::config::{PlannerConfig, RobotConfig};
-use crate::robot::kinematics::Kinematics;
-use crate::robot::model::{Joint, JointKind, RobotModel};
-use crate::robot::{Source, load};
-use crate::yaml::{Diag, Located, Severity, did_you_mean, quote};
+use dimos_control::task_robot::{FramePose, RobotParams, TaskKinematics};
+use dimos_planner::planning::config::{PlannerConfig, RobotConfig};
+use dimos_robot::kinematics::Kinematics;
+use dimos_robot::model::{Joint, JointKind, RobotModel};
+use dimos_robot::{Source, load};
+use dimos_yaml::{Diag, Located, Severity, did_you_mean, quote};
 
 /// Sets the robot of every task whose type moves an end effector.
 pub(super) fn resolve(

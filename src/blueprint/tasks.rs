@@ -5,10 +5,10 @@ use serde_json::Value;
 use crate::blueprint::arms::Hardware;
 use crate::blueprint::resolve::{Checker, Task};
 use crate::blueprint::schema::{JointNames, TaskEntry};
-use crate::control::task_body::TargetKind;
-use crate::control::task_spec::{TaskSetup, TaskSpec};
-use crate::joint::{ControlMode, MAX_DOF};
-use crate::yaml::{Diag, Located, NodeId, did_you_mean, quote};
+use dimos_control::task_body::TargetKind;
+use dimos_control::task_spec::{TaskSetup, TaskSpec};
+use dimos_core::joint::{ControlMode, MAX_DOF};
+use dimos_yaml::{Diag, Located, NodeId, did_you_mean, quote};
 
 /// The readable part of a task.
 struct Checked<'e> {

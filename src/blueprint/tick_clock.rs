@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::blueprint::arms::Hardware;
 use crate::blueprint::resolve::Checker;
-use crate::yaml::{Diag, quote};
+use dimos_yaml::{Diag, quote};
 
 /// What starts a tick.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]

@@ -7,11 +7,11 @@ use crate::blueprint::arms::Hardware;
 use crate::blueprint::resolve::{Arm, Checker, Task, TaskRobot};
 use crate::blueprint::schema::HardwareEntry;
 use crate::blueprint::task_robots::of_planner;
-use crate::control::config::ToolLimit;
-use crate::planning::config::PlannerConfig;
-use crate::robot::builtin::PREFIX;
-use crate::robot::{Source, load};
-use crate::yaml::{Diag, Located};
+use dimos_control::config::ToolLimit;
+use dimos_planner::planning::config::PlannerConfig;
+use dimos_robot::builtin::PREFIX;
+use dimos_robot::{Source, load};
+use dimos_yaml::{Diag, Located};
 
 /// What the speed of an arm's tool is computed with.
 #[derive(Debug, Clone, PartialEq)]

@@ -7,9 +7,9 @@ use clap::Args;
 
 use super::exit::Result;
 use crate::blueprint::Overrides;
-use crate::rpc::client::{self, Client, ClientError};
-use crate::rpc::run_dir::{LiveRun, RunDir};
 use crate::share;
+use dimos_rpc::client::{self, Client, ClientError};
+use dimos_rpc::run_dir::{LiveRun, RunDir};
 
 /// Where the run is, if it is on another computer, and whether the command line says so.
 static PLACE: OnceLock<Option<(String, bool)>> = OnceLock::new();
@@ -123,7 +123,7 @@ pub fn finite(text: &str) -> std::result::Result<f64, String> {
 
 /// Parses a fraction of the limits or of the speed: `0.3` or `30%`.
 pub fn speed(text: &str) -> std::result::Result<f64, String> {
-    let lowest = crate::rpc::api::MIN_SPEED;
+    let lowest = dimos_rpc::api::MIN_SPEED;
     let value = match text.strip_suffix('%') {
         Some(percent) => finite(percent)? / 100.0,
         None => finite(text)?,

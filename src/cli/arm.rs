@@ -22,8 +22,8 @@ use super::exit::{Exit, Result};
 use super::follow::Signals;
 use super::grip::{GripAction, Objects, Opening, opening};
 use super::output;
-use crate::hardware::registry::Registry;
-use crate::rpc::api::{ArmDisable, ArmEnable, ArmReply, ArmReset, Method};
+use dimos_hardware::registry::Registry;
+use dimos_rpc::api::{ArmDisable, ArmEnable, ArmReply, ArmReset, Method};
 
 /// Arguments of `arm`.
 #[derive(Debug, clap::Args)]

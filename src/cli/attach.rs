@@ -15,15 +15,15 @@ use super::run::Args;
 use super::run_record::RunRecord;
 use super::text_log::Terminal;
 use crate::blueprint::Blueprint;
-use crate::planning::config::RobotConfig;
-use crate::rpc::api::{State, Status};
-use crate::rpc::client::{self, Client, ClientError};
-use crate::rpc::report::{ArmReport, StatusReport};
-use crate::rpc::run_dir::{Claim, LiveRun, RunDir};
 use crate::runtime::kinematics::use_kept;
 use crate::runtime::{AttachedPlanner, Ending, LinkEvent};
 use crate::share::Relay;
 use crate::view::{self, Shown, View};
+use dimos_planner::planning::config::RobotConfig;
+use dimos_rpc::api::{State, Status};
+use dimos_rpc::client::{self, Client, ClientError};
+use dimos_rpc::report::{ArmReport, StatusReport};
+use dimos_rpc::run_dir::{Claim, LiveRun, RunDir};
 
 /// A planner attached to a run, in its own process.
 pub struct Attached {

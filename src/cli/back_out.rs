@@ -10,21 +10,21 @@ use super::exit::{Exit, Failure, Result};
 use super::follow::{Signals, follow};
 use super::goal::{has_planner, plan, show};
 use super::output::{self, Table, fixed, signed, span};
-use crate::planning::path::length;
-use crate::planning::thin::thin;
-use crate::planning::timing::time_within;
-use crate::planning::topp::JointBound;
-use crate::recording::replay::LogReader;
 use crate::replay::motion::{RecordedMotion, tcp_path};
 use crate::replay::recorded::Recorded;
 use crate::replay::recorded::RecordedError;
 use crate::replay::retrace::{Back, ON_PATH, Retrace, RetraceError, retrace};
-use crate::rpc::api::{
+use dimos_core::trajectory::JointTrajectory;
+use dimos_log::replay::LogReader;
+use dimos_planner::planning::path::length;
+use dimos_planner::planning::thin::thin;
+use dimos_planner::planning::timing::time_within;
+use dimos_planner::planning::topp::JointBound;
+use dimos_rpc::api::{
     Execute, ExecutePlan, MAX_LINE, Motion, Plan, PlanGoal, Planner, Point, State, Status, Trajectory,
 };
-use crate::rpc::client::Client;
-use crate::rpc::report::{ArmReport, StatusReport};
-use crate::trajectory::JointTrajectory;
+use dimos_rpc::client::Client;
+use dimos_rpc::report::{ArmReport, StatusReport};
 
 /// Deviation from the logged path at its corners [rad]: between two corners it is straight.
 const DEVIATION: f64 = 1e-3;
@@ -153,7 +153,7 @@ fn arm_of<'s>(status: &'s StatusReport, name: Option<&str>) -> Result<&'s ArmRep
                 .hint("name one: dimos back-out ARM"))
         }
         (Some(name), arms) => arms.iter().find(|arm| arm.hardware_id == name).ok_or_else(|| {
-            Failure::usage(format!("no arm is named {name}")).maybe_hint(crate::yaml::did_you_mean(name, names, "arms"))
+            Failure::usage(format!("no arm is named {name}")).maybe_hint(dimos_yaml::did_you_mean(name, names, "arms"))
         }),
     }
 }
@@ -261,7 +261,7 @@ fn describe(arm: &str, joints: &[String], way: &Retrace, ago: f64) {
 /// Returns the planning request: the way, in the order of the planning robot's joints.
 fn request(client: &mut Client, arm: &str, joints: &[String], way: &Retrace, speed: f64) -> Result<Plan> {
     let robots = client.call(Planner {})?.robots;
-    let order = |robot: &crate::rpc::api::RobotReport| -> Option<Vec<usize>> {
+    let order = |robot: &dimos_rpc::api::RobotReport| -> Option<Vec<usize>> {
         robot.joints.iter().map(|joint| joints.iter().position(|j| j == joint)).collect()
     };
     let fitting = robots.iter().filter_map(|robot| Some((robot, order(robot)?)));

@@ -5,10 +5,10 @@ use std::path::Path;
 use serde::Serialize;
 
 use super::text_log::Terminal;
-use crate::control::arm_control::effective;
-use crate::rpc::report::{ArmReport, RealtimeReport, StatusReport};
 use crate::runtime::Ended;
-use crate::telemetry::texts::percent;
+use dimos_control::arm_control::effective;
+use dimos_core::telemetry::texts::percent;
+use dimos_rpc::report::{ArmReport, RealtimeReport, StatusReport};
 
 /// Fractions from here on are shown as full speed.
 const FULL: f64 = 0.9995;
@@ -158,7 +158,7 @@ pub fn realtime(measure: &RealtimeReport) -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::rpc::report::CauseReport;
+    use dimos_rpc::report::CauseReport;
 
     #[test]
     fn the_banner_shows_arms_motors_real_time_and_log() {

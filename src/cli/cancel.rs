@@ -5,9 +5,9 @@ use std::time::Duration;
 use super::arguments::{Target, connect};
 use super::exit::{Exit, Result};
 use super::output;
-use crate::rpc::api::{Cancel, Status};
-use crate::rpc::client::Client;
-use crate::rpc::report::TaskReport;
+use dimos_rpc::api::{Cancel, Status};
+use dimos_rpc::client::Client;
+use dimos_rpc::report::TaskReport;
 
 /// Time in which a client that streams sends its next targets.
 const STREAM_PERIOD: Duration = Duration::from_millis(250);

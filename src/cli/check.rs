@@ -9,12 +9,12 @@ use super::exit::{Exit, Failure, Result};
 use super::output::{self, Table};
 use super::{banner, fetch};
 use crate::blueprint::{self, Catalog, Limit, Loaded, OnExit, Overrides, Summary};
-use crate::message::Message;
-use crate::rpc::RpcError;
-use crate::rpc::run_dir;
 use crate::runtime::device_lock;
 use crate::share;
-use crate::yaml::Diag;
+use dimos_core::message::Message;
+use dimos_rpc::RpcError;
+use dimos_rpc::run_dir;
+use dimos_yaml::Diag;
 
 /// Arguments of `check`.
 #[derive(Debug, clap::Args)]

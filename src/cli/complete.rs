@@ -16,11 +16,11 @@ use clap_complete::engine::{
 use super::log;
 use super::run_record::RunRecord;
 use crate::blueprint::{self, Catalog, Overrides};
-use crate::robot::builtin;
-use crate::rpc::api::{Planner, Poses, State, Status, World};
-use crate::rpc::client::Client;
-use crate::rpc::report::StatusReport;
-use crate::rpc::run_dir::RunDir;
+use dimos_robot::builtin;
+use dimos_rpc::api::{Planner, Poses, State, Status, World};
+use dimos_rpc::client::Client;
+use dimos_rpc::report::StatusReport;
+use dimos_rpc::run_dir::RunDir;
 
 /// Environment variable by which the script asks for completions; its value is the shell.
 pub const VARIABLE: &str = "DIMOS_COMPLETE";

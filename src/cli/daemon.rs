@@ -24,8 +24,8 @@ use super::run::{Args, check_name};
 use super::run_record::last_lines;
 use super::{banner, check, output};
 use crate::blueprint::Catalog;
-use crate::recording::files::{self, KEPT_LOGS};
-use crate::rpc::report::{ArmReport, StatusReport};
+use dimos_log::files::{self, KEPT_LOGS};
+use dimos_rpc::report::{ArmReport, StatusReport};
 
 /// Last line of the banner of a run without a terminal.
 pub const HOW_TO_END: &str = "Run `dimos down` for a controlled stop.";
@@ -251,7 +251,7 @@ fn of_arms(report: &StatusReport, value: fn(&ArmReport) -> Option<String>) -> BT
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::rpc::report::{CauseReport, DeviceError};
+    use dimos_rpc::report::{CauseReport, DeviceError};
 
     #[test]
     fn the_new_process_gets_the_same_arguments() {

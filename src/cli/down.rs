@@ -11,10 +11,10 @@ use super::attach;
 use super::exit::{Exit, Failure, Result};
 use super::output;
 use super::run_record::{RunRecord, RunState};
-use crate::rpc::api::{Shutdown, Status};
-use crate::rpc::client::{self, Client, ClientError};
-use crate::rpc::error::Code;
-use crate::rpc::run_dir::{LiveRun, RunDir};
+use dimos_rpc::api::{Shutdown, Status};
+use dimos_rpc::client::{self, Client, ClientError};
+use dimos_rpc::error::Code;
+use dimos_rpc::run_dir::{LiveRun, RunDir};
 
 /// Maximum wait for a controlled stop, with some margin; with an arm that parks.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(6);

@@ -6,8 +6,8 @@ use super::arguments::Target;
 use super::exit::{Exit, Failure, Result};
 use super::follow::{Signals, follow};
 use super::{full_speed, output, trajectory_file};
-use crate::rpc::api::{Execute, ExecutePlan, Planner, Planning, Trajectory};
-use crate::rpc::client::Client;
+use dimos_rpc::api::{Execute, ExecutePlan, Planner, Planning, Trajectory};
+use dimos_rpc::client::Client;
 
 /// Arguments of `execute`.
 #[derive(Debug, clap::Args)]

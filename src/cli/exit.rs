@@ -4,10 +4,10 @@ use std::fmt::Display;
 
 use serde_json::{Value, json};
 
-use crate::message::Message;
-use crate::rpc::client::ClientError;
-use crate::rpc::{Code, RpcError};
 use crate::runtime::StartError;
+use dimos_core::message::Message;
+use dimos_rpc::client::ClientError;
+use dimos_rpc::{Code, RpcError};
 
 /// The exit codes; scripts depend on them. `dimos --help` lists them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

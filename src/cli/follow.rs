@@ -11,10 +11,10 @@ use super::arguments::connect;
 use super::banner;
 use super::exit::{Exit, Failure, Result};
 use super::output::{self, Table, Tone, fixed, signed, toned};
-use crate::rpc::api::{Cancel, Motion, Status};
-use crate::rpc::client::Client;
-use crate::rpc::report::{Deviation, MotionReport};
-use crate::telemetry::texts::percent;
+use dimos_core::telemetry::texts::percent;
+use dimos_rpc::api::{Cancel, Motion, Status};
+use dimos_rpc::client::Client;
+use dimos_rpc::report::{Deviation, MotionReport};
 
 /// Poll period.
 const POLL_PERIOD: Duration = Duration::from_millis(20);

@@ -10,12 +10,12 @@ use std::path::PathBuf;
 use super::arm::ArmArgs;
 use super::exit::{Exit, Failure, Result};
 use super::output;
-use crate::bounded;
-use crate::recording::files::log_folder;
-use crate::rpc::api::{Planner, State, Status};
-use crate::rpc::client::{Client, ClientError};
-use crate::rpc::error::Code;
-use crate::rpc::report::ArmReport;
+use dimos_core::bounded;
+use dimos_log::files::log_folder;
+use dimos_rpc::api::{Planner, State, Status};
+use dimos_rpc::client::{Client, ClientError};
+use dimos_rpc::error::Code;
+use dimos_rpc::report::ArmReport;
 
 /// Fraction of its speed at which an arm moves that is new to this user.
 const FIRST: f64 = 0.25;
@@ -65,7 +65,7 @@ pub fn run(args: &ArmArgs) -> Result {
     let arms = args.target_run.connect()?.call(Status {})?.arms;
     let names = arms.iter().map(|arm| arm.hardware_id.as_str());
     let Some(arm) = arms.iter().find(|arm| arm.hardware_id == args.arm) else {
-        let hint = crate::yaml::did_you_mean(&args.arm, names, "the run's arms");
+        let hint = dimos_yaml::did_you_mean(&args.arm, names, "the run's arms");
         return Err(Failure::usage(format!("the run has no arm {}", args.arm)).maybe_hint(hint));
     };
     let name = &arm.hardware_id;

@@ -12,12 +12,12 @@ use super::follow::Signals;
 use super::grip::{self, GripAction};
 use super::output::{self, fixed};
 use super::recorded_path;
-use crate::rpc::api::{
+use dimos_rpc::api::{
     Cancel, DEFAULT_REFINE, DEFAULT_SPEED, JointPath, PATH_TOLERANCE, Plan, PlanGoal, PlanLevel, PlanSummary, Planner,
     Planning, PoseSpec,
 };
-use crate::rpc::client::{Client, ClientError};
-use crate::rpc::{Code, RpcError};
+use dimos_rpc::client::{Client, ClientError};
+use dimos_rpc::{Code, RpcError};
 
 /// Poll period while planning.
 const POLL_PERIOD: Duration = Duration::from_millis(20);

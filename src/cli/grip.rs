@@ -10,14 +10,14 @@ use super::arguments::finite;
 use super::exit::{Exit, Failure, Result};
 use super::follow::Signals;
 use super::output;
-use crate::arm::GripperUnit;
-use crate::rpc::api::{
+use dimos_core::arm::GripperUnit;
+use dimos_rpc::api::{
     Attach, Detach, GRASP_REACH, Grip, GripOutcome, GripReport, Gripper, GripperReply, Planner, RobotReport, State,
     Status, World, WorldObject,
 };
-use crate::rpc::client::Client;
-use crate::rpc::report::ArmReport;
-use crate::yaml::did_you_mean;
+use dimos_rpc::client::Client;
+use dimos_rpc::report::ArmReport;
+use dimos_yaml::did_you_mean;
 
 /// Poll period of the outcome.
 const POLL_PERIOD: Duration = Duration::from_millis(20);

@@ -18,7 +18,7 @@ use super::arguments::Target;
 use super::exit::{Exit, Failure, Result};
 use super::follow::{Signals, held};
 use super::output;
-use crate::rpc::api::{Lease, World};
+use dimos_rpc::api::{Lease, World};
 use execute::{End, Runner};
 use names::Names;
 use step::{Job, Step};

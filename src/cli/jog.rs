@@ -25,8 +25,8 @@ use anyhow::Context;
 use super::arguments::{Target, finite};
 use super::exit::{Failure, Result};
 use super::follow::Signals;
-use crate::rpc::api::{Lease, Status};
-use crate::rpc::{Code, RpcError};
+use dimos_rpc::api::{Lease, Status};
+use dimos_rpc::{Code, RpcError};
 use drive::Drives;
 use session::{Session, Setting};
 use terminal::Terminal;
@@ -86,7 +86,7 @@ pub fn run(args: &Args) -> Result {
     if !status.arms.iter().any(|arm| arm.hardware_id == args.arm) {
         let names: Vec<&str> = status.arms.iter().map(|arm| arm.hardware_id.as_str()).collect();
         let error = RpcError::unknown(Code::UnknownArm, "arm", &args.arm, &names);
-        return Err(crate::rpc::client::ClientError::Refused(error).into());
+        return Err(dimos_rpc::client::ClientError::Refused(error).into());
     }
     let joints = session::joints_of(&mut client, &args.arm)?;
     let drives = Drives::of(&status.tasks, &joints);

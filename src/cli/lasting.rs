@@ -6,9 +6,9 @@ use std::time::{Duration, Instant};
 
 use super::arguments::place;
 use super::output;
-use crate::rpc::client::{Client, ClientError};
-use crate::rpc::error::Code;
 use crate::share;
+use dimos_rpc::client::{Client, ClientError};
+use dimos_rpc::error::Code;
 
 /// Pause between two attempts.
 const PAUSE: Duration = Duration::from_millis(200);

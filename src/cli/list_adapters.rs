@@ -4,8 +4,8 @@ use serde_json::json;
 
 use super::exit::{Exit, Result};
 use super::output::{self, Table};
-use crate::hardware::registry::{Absent, AdapterConfig, AdapterSpec, Registry, Teach};
-use crate::joint::{JointLimits, MAX_DOF};
+use dimos_core::joint::{JointLimits, MAX_DOF};
+use dimos_hardware::registry::{Absent, AdapterConfig, AdapterSpec, Registry, Teach};
 
 /// Arguments of `list-adapters`.
 #[derive(Debug, clap::Args)]
@@ -149,10 +149,10 @@ mod tests {
     #[test]
     fn an_adapter_missing_in_this_build_is_listed_with_its_remedy() {
         let absent = Absent { name: "servobot", about: "a serial arm", remedy: "build with --features servobot" };
-        let lines = lines(&Registry::builtin().lacking(&[absent]));
+        let lines = lines(&dimos_arms::registry().lacking(&[absent]));
         assert!(lines.iter().any(|line| line.starts_with("servobot  not in this build")), "{lines:?}");
         assert_eq!(lines.last().unwrap(), "  not in this build: build with --features servobot");
-        let rows = Registry::builtin();
+        let rows = dimos_arms::registry();
         let listed = |name: &str| lines.iter().any(|line| line.starts_with(&format!("{name}: ")));
         assert!(rows.rows().iter().all(|row| listed(row.name)) && listed("servobot"), "{lines:?}");
     }

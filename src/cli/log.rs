@@ -21,11 +21,11 @@ use super::arguments::{setting, time};
 use super::exit::{Exit, Failure, Result};
 use super::replay;
 use crate::blueprint::Catalog;
-use crate::recording::files;
-use crate::recording::messages::JointState;
-use crate::recording::replay::{LogInfo, ReplayError};
-use crate::recording::source::Source;
-use crate::recording::wire::Message;
+use dimos_log::files;
+use dimos_log::messages::JointState;
+use dimos_log::replay::{LogInfo, ReplayError};
+use dimos_log::source::Source;
+use dimos_log::wire::Message;
 
 /// Topic of joint states.
 pub(super) const STATES: &str = "/joint_states";

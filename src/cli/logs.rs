@@ -13,9 +13,9 @@ use super::escapes::safe;
 use super::exit::{Exit, Failure, Result};
 use super::run_record::{RunRecord, RunState};
 use super::{lasting, output};
-use crate::rpc::api::TextLog;
-use crate::rpc::client::ClientError;
-use crate::rpc::run_dir::RunDir;
+use dimos_rpc::api::TextLog;
+use dimos_rpc::client::ClientError;
+use dimos_rpc::run_dir::RunDir;
 
 /// Longest line that is printed whole [bytes].
 const MAX_LINE: usize = 1 << 20;

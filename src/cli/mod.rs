@@ -64,9 +64,9 @@ use clap::{ArgMatches, CommandFactory, FromArgMatches, Parser, Subcommand};
 use rustix::process::{Resource, getrlimit};
 
 use crate::blueprint::{self, Catalog};
-use crate::control::task_spec::{TaskSpec, TaskTable};
-use crate::hardware::registry::{Absent, AdapterSpec, Registry};
-use crate::robot::builtin;
+use dimos_control::task_spec::{TaskSpec, TaskTable};
+use dimos_hardware::registry::{Absent, AdapterSpec};
+use dimos_robot::builtin;
 
 /// Stack that the command line takes at most, and the stack that it has where that of the process is smaller [bytes].
 const MIN_STACK: u64 = 4 << 20;
@@ -194,7 +194,7 @@ impl Command {
 /// use std::process::ExitCode;
 /// use dimos::hardware::registry::AdapterSpec;
 ///
-/// # mod acme { pub const SPEC: dimos::hardware::registry::AdapterSpec = dimos::hardware::arms::mock::SPEC; }
+/// # mod acme { pub const SPEC: dimos::hardware::registry::AdapterSpec = dimos::arms::mock::SPEC; }
 /// fn main() -> ExitCode {
 ///     let blueprint = "hardware: [{hardware_id: arm, adapter_type: acme, joints: {prefix: arm, count: 6}}]";
 ///     dimos::cli::Program::new().adapter(acme::SPEC).blueprint("coordinator-acme", blueprint).main()
@@ -273,7 +273,7 @@ impl Program {
         let _ = VERBS.set(self.verbs);
         blueprint::embed(self.blueprints);
         builtin::embed(self.robots);
-        let adapters = Registry::with(&self.adapters).lacking(&self.absent);
+        let adapters = dimos_arms::registry().with(&self.adapters).lacking(&self.absent);
         command_line(Catalog { adapters: &adapters, tasks: &TaskTable::with(&self.tasks) })
     }
 }
@@ -295,7 +295,7 @@ fn added<'a>(verbs: &'a [Verb], arguments: &'a ArgMatches) -> Option<(&'a Verb, 
 
 /// Runs the command line with adapters besides the built-in ones. [`Program`] can add more than that.
 pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
-    command_line(Catalog::from(&Registry::with(adapters)))
+    command_line(Catalog::from(&dimos_arms::registry().with(adapters)))
 }
 
 /// Runs the command line, on a stack of its own where that of the process may not grow (`ulimit -s 64`).
@@ -354,7 +354,7 @@ fn answer(catalog: Catalog<'_>) -> ExitCode {
 fn set_threads_of_the_network() {
     let (name, value) = crate::share::THREADS;
     if !name.is_empty() && std::env::var_os(name).is_none() {
-        crate::rt::host::set_variable(name, value);
+        dimos_rt::host::set_variable(name, value);
     }
 }
 

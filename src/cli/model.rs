@@ -13,8 +13,8 @@ use std::path::{Path, PathBuf};
 use super::exit::{Exit, Failure, Result};
 use super::output;
 use crate::blueprint::Catalog;
-use crate::robot::urdf::Meshes;
-use crate::robot::{Loaded, RobotModel, Source, load};
+use dimos_robot::urdf::Meshes;
+use dimos_robot::{Loaded, RobotModel, Source, load};
 
 /// Arguments of `model`.
 #[derive(Debug, clap::Args)]

@@ -7,12 +7,12 @@ use super::follow::{Signals, follow, follow_until};
 use super::goal::{Goal, Leg, Search, checked, has_planner, plan, show};
 use super::grip::{self, Objects};
 use super::{full_speed, output, recorded_path};
-use crate::rpc::Code;
-use crate::rpc::api::{
+use dimos_core::telemetry::texts::percent;
+use dimos_rpc::Code;
+use dimos_rpc::api::{
     Cancel, ExecutePlan, Move, MoveNative, MoveReply, Plan, PlanLevel, Planner, Poses, State, Status, World,
 };
-use crate::rpc::client::Client;
-use crate::telemetry::texts::percent;
+use dimos_rpc::client::Client;
 
 /// Arguments of `move`.
 #[derive(Debug, clap::Args)]

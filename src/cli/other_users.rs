@@ -6,8 +6,8 @@ use std::path::Path;
 
 use super::arguments::place;
 use super::output;
-use crate::rpc::run_dir::{RunDir, check_name};
-use crate::rt::socket_list;
+use dimos_rpc::run_dir::{RunDir, check_name};
+use dimos_rt::socket_list;
 
 /// A live run of another user.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]

@@ -13,7 +13,7 @@ use serde::Serialize;
 
 use super::escapes::{in_json, safe};
 use super::exit::{Exit, Failure};
-use crate::rpc::run_dir::LiveRun;
+use dimos_rpc::run_dir::LiveRun;
 
 /// Minimum width of a squeezed table [columns]; below, the terminal wraps the lines.
 const MIN_COLUMNS: u16 = 40;

@@ -3,7 +3,7 @@
 use super::arguments::Target;
 use super::exit::{Exit, Result};
 use super::output::{self, Table, fixed};
-use crate::rpc::api::{PoseRemove, PoseSave, Poses, SavedPose};
+use dimos_rpc::api::{PoseRemove, PoseSave, Poses, SavedPose};
 
 /// Arguments of `pose`.
 #[derive(Debug, clap::Args)]

@@ -9,8 +9,8 @@ use super::escapes::safe;
 use super::exit::{Exit, Result};
 use super::goal::{Planned, show};
 use super::output::{self, Table, fixed, number};
-use crate::rpc::api::{Preview, PreviewReply};
-use crate::rpc::report::TcpReport;
+use dimos_rpc::api::{Preview, PreviewReply};
+use dimos_rpc::report::TcpReport;
 
 /// Columns of the table: samples of the motion.
 const COLUMNS: usize = 8;

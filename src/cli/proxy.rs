@@ -24,14 +24,14 @@ use super::arguments::Target;
 use super::exit::{Exit, Failure, Result};
 use super::follow::Signals;
 use super::output;
-use crate::hardware::arms::xarm::emulator::{ControlBox, ControlledArm, Links};
-use crate::hardware::arms::xarm::model::Model;
-use crate::hardware::arms::xarm::protocol::gripper::GripperKind;
-use crate::hardware::sim::events::{self, SimEvent};
-use crate::rpc::api::{State, Status};
-use crate::rpc::client::{Client, ClientError};
-use crate::rpc::report::{ArmReport, StatusReport};
-use crate::rpc::{Code, RpcError};
+use dimos_arms::xarm::emulator::{ControlBox, ControlledArm, Links};
+use dimos_arms::xarm::model::Model;
+use dimos_arms::xarm::protocol::gripper::GripperKind;
+use dimos_hardware::sim::events::{self, SimEvent};
+use dimos_rpc::api::{State, Status};
+use dimos_rpc::client::{Client, ClientError};
+use dimos_rpc::report::{ArmReport, StatusReport};
+use dimos_rpc::{Code, RpcError};
 use run_arm::{ArmInfo, RunArm, StreamTask};
 use run_link::RunLink;
 
@@ -149,14 +149,14 @@ fn info(client: &mut Client, status: &StatusReport, arm: &ArmReport) -> Result<A
     let state = client.call(State {})?.arms.into_iter().find(|state| state.hardware_id == arm.hardware_id);
     let names: Vec<String> = state.into_iter().flat_map(|state| state.joints).map(|joint| joint.name).collect();
     let stream = |method: &str| {
-        let whole = |task: &&crate::rpc::report::TaskReport| {
+        let whole = |task: &&dimos_rpc::report::TaskReport| {
             task.takes(method) && task.joints.len() == names.len() && names.iter().all(|j| task.joints.contains(j))
         };
         let task = status.tasks.iter().filter(whole).max_by_key(|task| task.priority)?;
         let joints = task.joints.iter().filter_map(|joint| names.iter().position(|name| name == joint)).collect();
         Some(StreamTask { name: task.name.clone(), joints })
     };
-    let covers = |task: &&crate::rpc::report::TaskReport| {
+    let covers = |task: &&dimos_rpc::report::TaskReport| {
         task.takes("execute") && names.iter().all(|joint| task.joints.contains(joint))
     };
     let trajectory = status.tasks.iter().filter(covers).min_by_key(|task| task.joints.len());

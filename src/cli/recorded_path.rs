@@ -7,12 +7,12 @@ use std::path::Path;
 
 use super::exit::{Failure, Result};
 use super::{output, trajectory_file};
-use crate::planning::path::unwind;
-use crate::planning::thin::thin;
-use crate::recording::joints::{Places, twice};
-use crate::rpc::api::{JointPath, MAX_LINE, MAX_PATH};
-use crate::rpc::client::ClientError;
-use crate::rpc::{Code, RpcError};
+use dimos_log::joints::{Places, twice};
+use dimos_planner::planning::path::unwind;
+use dimos_planner::planning::thin::thin;
+use dimos_rpc::api::{JointPath, MAX_LINE, MAX_PATH};
+use dimos_rpc::client::ClientError;
+use dimos_rpc::{Code, RpcError};
 use steps::{Recording, Steps};
 
 /// Bytes of a request besides its waypoints, at most.

@@ -22,9 +22,9 @@ use super::share_child::ShareChild;
 use super::text_log::Terminal;
 use super::{banner, check, daemon};
 use crate::blueprint::Catalog;
-use crate::rpc::report::StatusReport;
-use crate::rpc::run_dir;
 use crate::runtime::{Ended, Ending, Options, Record, Run, ServiceManager};
+use dimos_rpc::report::StatusReport;
+use dimos_rpc::run_dir;
 
 /// Arguments of `run`.
 #[derive(Debug, Clone, PartialEq, clap::Args)]

@@ -9,9 +9,9 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
 use super::exit::{Exit, Failure};
-use crate::bounded;
-use crate::recording::files;
-use crate::rpc::report::StatusReport;
+use dimos_core::bounded;
+use dimos_log::files;
+use dimos_rpc::report::StatusReport;
 
 /// Size of the tail of a text log that is searched for its last lines [bytes].
 const TAIL: u64 = 8192;
@@ -109,7 +109,7 @@ impl RunRecord {
 
     /// Returns the record of a name.
     pub fn of(run: &str) -> Option<Self> {
-        crate::rpc::run_dir::check_name(run).ok()?;
+        dimos_rpc::run_dir::check_name(run).ok()?;
         read(&path_in(&files::log_folder()?, run))
     }
 

@@ -13,10 +13,10 @@ use super::exit::{Exit, Failure, Result};
 use super::output;
 use super::text_log::Terminal;
 use crate::blueprint::share::{ANYONE, Distro, Endpoint, Identity, OnLost, Role, RosConfig, ShareConfig, is_ros_name};
-use crate::rpc::client;
-use crate::rpc::client::ClientError;
-use crate::rpc::run_dir::RunDir;
 use crate::share::{Gateway, refusals};
+use dimos_rpc::client;
+use dimos_rpc::client::ClientError;
+use dimos_rpc::run_dir::RunDir;
 
 /// Time in which a face joins its router, if that is there.
 const JOIN_TIMEOUT: Duration = Duration::from_secs(1);

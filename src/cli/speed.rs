@@ -3,8 +3,8 @@
 use super::arguments::{self, Target};
 use super::exit::{Exit, Result};
 use super::output;
-use crate::rpc::api::{Speed, SpeedReport};
-use crate::telemetry::texts::percent;
+use dimos_core::telemetry::texts::percent;
+use dimos_rpc::api::{Speed, SpeedReport};
 
 /// Arguments of `speed`.
 #[derive(Debug, clap::Args)]

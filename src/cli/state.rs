@@ -10,11 +10,11 @@ use super::escapes::safe;
 use super::exit::{Exit, Result};
 use super::lasting;
 use super::output::{self, Table, fixed, number};
-use crate::rpc::api::{State, gripper_text};
-use crate::rpc::client::{self, ClientError};
-use crate::rpc::error::{Code, RpcError};
-use crate::rpc::report::{ArmStateReport, JointReport, PoseReport, StateReport};
-use crate::rpc::run_dir::RunDir;
+use dimos_rpc::api::{State, gripper_text};
+use dimos_rpc::client::{self, ClientError};
+use dimos_rpc::error::{Code, RpcError};
+use dimos_rpc::report::{ArmStateReport, JointReport, PoseReport, StateReport};
+use dimos_rpc::run_dir::RunDir;
 
 /// Marks poses of the arm's own controller.
 const DEVICE: &str = " (device)";

@@ -12,11 +12,11 @@ use super::other_users;
 use super::output::{self, Table, Tone, number, span, toned};
 use super::run_record::{RunRecord, RunState};
 use super::speed::describe;
-use crate::rpc::api::{SpeedReport, Status};
-use crate::rpc::client::ClientError;
-use crate::rpc::report::{ArmReport, Percentiles, PlannerStatus, StatusReport, TaskReport};
-use crate::rpc::report::{LED_BY_CONTROLLER, end_of_lead};
-use crate::rpc::run_dir::LiveRun;
+use dimos_rpc::api::{SpeedReport, Status};
+use dimos_rpc::client::ClientError;
+use dimos_rpc::report::{ArmReport, Percentiles, PlannerStatus, StatusReport, TaskReport};
+use dimos_rpc::report::{LED_BY_CONTROLLER, end_of_lead};
+use dimos_rpc::run_dir::LiveRun;
 
 /// Arguments of `status`.
 #[derive(Debug, clap::Args)]

@@ -7,10 +7,10 @@ use super::arguments::{self, Target, connect_to};
 use super::exit::{Exit, Failure};
 use super::other_users;
 use super::output::{self, Table, Tone, toned};
-use crate::rpc::api::{Confirmation, Stop, StopReply};
-use crate::rpc::client::{self, Client, ClientError, find};
-use crate::rpc::run_dir::{LiveRun, RunDir};
-use crate::rpc::{Code, RpcError};
+use dimos_rpc::api::{Confirmation, Stop, StopReply};
+use dimos_rpc::client::{self, Client, ClientError, find};
+use dimos_rpc::run_dir::{LiveRun, RunDir};
+use dimos_rpc::{Code, RpcError};
 
 /// Arguments of `stop`.
 #[derive(Debug, clap::Args)]

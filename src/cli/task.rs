@@ -10,10 +10,10 @@ use super::exit::{Exit, Failure, Result};
 use super::follow::Signals;
 use super::targets::{Source, Width};
 use super::{output, status};
-use crate::rpc::api::{Cancel, Pose, Servo, Start, Status, Twist, TwistFrame, Velocity};
-use crate::rpc::client::{Client, ClientError};
-use crate::rpc::report::TaskReport;
-use crate::rpc::{Code, RpcError};
+use dimos_rpc::api::{Cancel, Pose, Servo, Start, Status, Twist, TwistFrame, Velocity};
+use dimos_rpc::client::{Client, ClientError};
+use dimos_rpc::report::TaskReport;
+use dimos_rpc::{Code, RpcError};
 
 /// Poll period for Ctrl-C while waiting for the next target.
 const POLL_PERIOD: Duration = Duration::from_millis(50);

@@ -17,7 +17,7 @@ use tracing_subscriber::{Layer, Registry};
 
 use super::escapes::safe;
 use super::output;
-use crate::rpc::api::TextLines;
+use dimos_rpc::api::TextLines;
 
 /// Capacity of the queue [lines].
 const QUEUE: usize = 1024;

@@ -8,8 +8,8 @@ use std::path::Path;
 use serde_json::Value;
 
 use super::exit::{Failure, Result};
-use crate::rpc::api::{Point, Trajectory};
-use crate::trajectory::MAX_DURATION;
+use dimos_core::trajectory::MAX_DURATION;
+use dimos_rpc::api::{Point, Trajectory};
 
 /// Maximum file size [bytes].
 const MAX_FILE: u64 = 16 << 20;

@@ -15,8 +15,8 @@ use super::exit::{Exit, Failure, Result};
 use super::model::With;
 use super::output;
 use crate::blueprint::Catalog;
-use crate::rpc::client;
-use crate::rpc::run_dir::RunDir;
+use dimos_rpc::client;
+use dimos_rpc::run_dir::RunDir;
 
 /// Arguments of `view`.
 #[derive(Debug, clap::Args)]

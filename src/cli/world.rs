@@ -9,12 +9,12 @@ use super::arguments::{Target, angle, finite};
 use super::arm::parts::payload_text;
 use super::exit::{Exit, Failure, Result};
 use super::output::{self, Table, done, fixed};
-use crate::bounded;
-use crate::robot::mesh::Size;
-use crate::rpc::api::{
+use dimos_core::bounded;
+use dimos_robot::mesh::Size;
+use dimos_rpc::api::{
     Attach, Detach, PoseSpec, ShapeSpec, World, WorldAdd, WorldEntry, WorldMove, WorldObject, WorldRemove,
 };
-use crate::rpc::client::Client;
+use dimos_rpc::client::Client;
 
 /// Arguments of `world`.
 #[derive(Debug, clap::Args)]

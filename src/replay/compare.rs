@@ -6,11 +6,11 @@ use serde::Serialize;
 
 use super::inputs::{LoggedTick, values};
 use super::recorded::Recorded;
-use crate::arm::VelocitySource;
-use crate::control::coordinator::TickOutput;
-use crate::joint::ControlMode;
-use crate::recording::messages::Event;
-use crate::telemetry::describe::{Described, Names, describe};
+use dimos_control::coordinator::TickOutput;
+use dimos_core::arm::VelocitySource;
+use dimos_core::joint::ControlMode;
+use dimos_core::telemetry::describe::{Described, Names, describe};
+use dimos_log::messages::Event;
 
 /// A value that differs.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -116,7 +116,7 @@ impl<'a> Comparison<'a> {
         for ((then, now), names) in logged.arms.iter().zip(&output.arms).zip(&self.names.arms) {
             let dof = names.joints.len();
             let mode = ControlMode::of_name(&then.output.mode);
-            let none = [f64::NAN; crate::joint::MAX_DOF];
+            let none = [f64::NAN; dimos_core::joint::MAX_DOF];
             let was = mode.and_then(|mode| values(column(mode, logged).1, first, dof)).unwrap_or(none);
             let comparable = now.command.mode.is_some() && (mode.is_none() || mode == now.command.mode);
             let is = if comparable { now.command.values } else { none };
@@ -146,7 +146,7 @@ impl<'a> Comparison<'a> {
             let (command, wanted) = (&now.command, &then.output);
             if let Some(mode) = command.mode {
                 let (what, column) = column(mode, logged);
-                let absent = [f64::NAN; crate::joint::MAX_DOF];
+                let absent = [f64::NAN; dimos_core::joint::MAX_DOF];
                 let then = values(column, first, dof).unwrap_or(absent);
                 let mut pairs = then.iter().zip(&command.values).take(dof).enumerate();
                 if let Some(found) = pairs.find_map(|(j, (then, now))| joint(what, *then, *now, j)) {

@@ -7,7 +7,7 @@
 //! between their neighbours reproduces are left out.
 
 use super::motion::RecordedMotion;
-use crate::trajectory::{JointTrajectory, JointValues, TrajectoryPoint};
+use dimos_core::trajectory::{JointTrajectory, JointValues, TrajectoryPoint};
 
 /// Maximum deviation from leaving out a point [rad].
 const TOLERANCE: f64 = 5e-7;
@@ -99,10 +99,10 @@ fn is_reproduced(knots: &[Knot], a: usize, b: usize, dt: f64) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::control::limit::{Bounds, Limiter};
-    use crate::control::point_to_point::point_to_point;
-    use crate::joint::{JointLimits, make_joints};
-    use crate::trajectory::{Cursor, Sample, Spline};
+    use dimos_control::limit::{Bounds, Limiter};
+    use dimos_control::point_to_point::point_to_point;
+    use dimos_core::joint::{JointLimits, make_joints};
+    use dimos_core::trajectory::{Cursor, Sample, Spline};
 
     const DT: f64 = 0.01;
 

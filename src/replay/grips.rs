@@ -5,7 +5,7 @@ use std::ops::RangeInclusive;
 use std::path::Path;
 
 use super::recorded::RecordedError;
-use crate::recording::replay::{LogReader, Payload, ReplayError, Selection};
+use dimos_log::replay::{LogReader, Payload, ReplayError, Selection};
 
 /// A recorded gripper command.
 #[derive(Debug, Clone, PartialEq)]

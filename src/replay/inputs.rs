@@ -4,17 +4,17 @@ use std::collections::BTreeMap;
 
 use super::recorded::Recorded;
 use super::requests;
-use crate::arm::{ArmState, Commanded, Interference, Link, VelocitySource};
-use crate::clock::Mono;
-use crate::control::coordinator::TickTime;
-use crate::control::guard::Verdict;
-use crate::control::request::{Envelope, Request};
-use crate::joint::{ControlMode, Joints, MAX_DOF};
-use crate::recording::cdr::{CdrError, Decoder, Encoder};
-use crate::recording::messages::{ArmInput, ArmOutput, Event, JointState, Text, Tick};
-use crate::recording::wire::{Field, Message};
-use crate::telemetry::describe::Names;
-use crate::telemetry::{Guarded, Origin};
+use dimos_control::coordinator::TickTime;
+use dimos_control::guard::Verdict;
+use dimos_control::request::{Envelope, Request};
+use dimos_core::arm::{ArmState, Commanded, Interference, Link, VelocitySource};
+use dimos_core::clock::Mono;
+use dimos_core::joint::{ControlMode, Joints, MAX_DOF};
+use dimos_core::telemetry::describe::Names;
+use dimos_core::telemetry::{Guarded, Origin};
+use dimos_log::cdr::{CdrError, Decoder, Encoder};
+use dimos_log::messages::{ArmInput, ArmOutput, Event, JointState, Text, Tick};
+use dimos_log::wire::{Field, Message};
 
 /// Length of the header before every message [bytes].
 const HEADER: usize = 4;
@@ -264,7 +264,7 @@ fn message<M: Message>(bytes: &[u8]) -> Result<M, String> {
 
 /// Returns the values of an arm's joints from those of all.
 pub(super) fn values(list: &[f64], first: usize, dof: usize) -> Option<Joints> {
-    list.get(first..first + dof).map(crate::joint::joints_of)
+    list.get(first..first + dof).map(dimos_core::joint::joints_of)
 }
 
 /// Reads a state besides joint values. Skips efforts, pose and wrench, which no tick uses.
@@ -288,8 +288,8 @@ fn read_input(input: &ArmInput, state: &mut ArmState) -> Result<(), String> {
         stop_input_open: input.stop_input_open,
         gripper: input.gripper.first().copied(),
         commanded: (!input.commanded_position.is_empty()).then(|| Commanded {
-            position: crate::joint::joints_of(&input.commanded_position),
-            velocity: crate::joint::joints_of(&input.commanded_velocity),
+            position: dimos_core::joint::joints_of(&input.commanded_position),
+            velocity: dimos_core::joint::joints_of(&input.commanded_velocity),
         }),
         refused: input.refused,
         speed_fraction: input.speed_fraction.first().copied(),

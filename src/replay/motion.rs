@@ -8,10 +8,10 @@ use std::path::Path;
 
 use super::grips::{self, RecordedGrip};
 use super::recorded::{Recorded, RecordedError};
-use crate::recording::joints::Places;
-use crate::recording::messages::JointState;
-use crate::recording::replay::{LogReader, Payload, ReplayError, Selection};
-use crate::trajectory::smooth_step;
+use dimos_core::trajectory::smooth_step;
+use dimos_log::joints::Places;
+use dimos_log::messages::JointState;
+use dimos_log::replay::{LogReader, Payload, ReplayError, Selection};
 
 /// Measured positions are averaged over this time before and after [s].
 const AVERAGING_TIME: f64 = 0.1;

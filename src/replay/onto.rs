@@ -5,10 +5,10 @@ use serde::Serialize;
 use thiserror::Error;
 
 use crate::blueprint::{Arm, Blueprint};
-use crate::control::config::CoordinatorConfig;
-use crate::control::limit::Bounds;
-use crate::control::task_body::TargetKind;
-use crate::trajectory::{JointTrajectory, Spline, TrajectoryError, TrajectoryPoint};
+use dimos_control::config::CoordinatorConfig;
+use dimos_control::limit::Bounds;
+use dimos_control::task_body::TargetKind;
+use dimos_core::trajectory::{JointTrajectory, Spline, TrajectoryError, TrajectoryPoint};
 
 /// Maximum values in one trajectory: it is checked, logged and held in memory as a whole.
 const MAX_VALUES: usize = 300_000;

@@ -6,12 +6,12 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 use thiserror::Error;
 
-use crate::control::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, FIRST_CONFIG_VERSION};
-use crate::joint::MAX_DOF;
-use crate::recording::replay::{LogInfo, LogReader, ReplayError, attachment};
-use crate::recording::rewrite::PART_OF;
-use crate::recording::{CONFIG_VERSION_KEY, COORDINATOR};
-use crate::telemetry::describe::{ArmNames, Names};
+use dimos_control::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, FIRST_CONFIG_VERSION};
+use dimos_core::joint::MAX_DOF;
+use dimos_core::telemetry::describe::{ArmNames, Names};
+use dimos_log::replay::{LogInfo, LogReader, ReplayError, attachment};
+use dimos_log::rewrite::PART_OF;
+use dimos_log::{CONFIG_VERSION_KEY, COORDINATOR};
 
 /// Why a log cannot be replayed.
 #[derive(Debug, Error)]

@@ -2,12 +2,12 @@
 
 use serde::{Deserialize, Deserializer};
 
-use crate::clock::Mono;
-use crate::control::request::{Goal, Motion, Request};
-use crate::control::task_robot::FramePose;
-use crate::joint::{Joints, joints_of};
-use crate::telemetry::{LedBy, Origin};
-use crate::trajectory::{JointTrajectory, Spline};
+use dimos_control::request::{Goal, Motion, Request};
+use dimos_control::task_robot::FramePose;
+use dimos_core::clock::Mono;
+use dimos_core::joint::{Joints, joints_of};
+use dimos_core::telemetry::{LedBy, Origin};
+use dimos_core::trajectory::{JointTrajectory, Spline};
 
 /// A message of `/dimos/requests`.
 #[derive(Debug, Deserialize)]
@@ -214,7 +214,7 @@ mod tests {
 
     use super::*;
     use crate::runtime::log_of;
-    use crate::trajectory::TrajectoryPoint;
+    use dimos_core::trajectory::TrajectoryPoint;
 
     /// Reading and logging a request again gives the same text.
     #[test]

@@ -112,7 +112,7 @@ pub fn retrace(
     let mut tolerance = TOLERANCE;
     let path = loop {
         let short = shortened(&whole, tolerance);
-        if short.len() < crate::rpc::api::MAX_RETRACE {
+        if short.len() < dimos_rpc::api::MAX_RETRACE {
             break short;
         }
         tolerance *= 2.0;

@@ -10,16 +10,16 @@ use serde::Serialize;
 use super::compare::{Comparison, Difference};
 use super::inputs::{Assembler, LoggedTick, Topic};
 use super::recorded::{Recorded, RecordedError};
-use crate::arm::ArmState;
-use crate::control::config::CoordinatorConfig;
-use crate::control::coordinator::{Coordinator, TickOutput};
-use crate::control::request::Envelope;
-use crate::control::task::Task;
-use crate::control::task_spec::TaskTable;
-use crate::recording::chunk;
-use crate::recording::records::{Damage, Kept, RawRecord, RecordReader};
-use crate::recording::replay::ReplayError;
-use crate::recording::source_files::{self, LogFile};
+use dimos_control::config::CoordinatorConfig;
+use dimos_control::coordinator::{Coordinator, TickOutput};
+use dimos_control::request::Envelope;
+use dimos_control::task::Task;
+use dimos_control::task_spec::TaskTable;
+use dimos_core::arm::ArmState;
+use dimos_log::chunk;
+use dimos_log::records::{Damage, Kept, RawRecord, RecordReader};
+use dimos_log::replay::ReplayError;
+use dimos_log::source_files::{self, LogFile};
 
 /// Result of a verification.
 #[derive(Debug, Clone, PartialEq, Serialize)]

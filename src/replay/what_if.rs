@@ -9,8 +9,8 @@ use serde_json::Value;
 use super::compare::{Comparison, Difference};
 use super::recorded::{Recorded, RecordedError};
 use super::verify::{Finding, Rerun};
-use crate::control::config::CoordinatorConfig;
-use crate::control::task_spec::TaskTable;
+use dimos_control::config::CoordinatorConfig;
+use dimos_control::task_spec::TaskTable;
 
 /// Maximum number of events that are kept.
 const MAX_EVENTS: usize = 1000;

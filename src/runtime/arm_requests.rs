@@ -7,17 +7,17 @@ use std::time::{Duration, Instant};
 
 use super::dispatch::log_of;
 use super::service::{Service, internal};
-use crate::arm::{GripperInfo, Link};
-use crate::control::request::Request;
-use crate::hardware::adapter::{AdapterError, AdapterResult};
-use crate::hardware::device::{Answer, Device};
-use crate::joint::STANDSTILL;
-use crate::message::Message;
-use crate::rpc::api::{self, Reply};
-use crate::rpc::{Code, RpcError};
-use crate::sync::lock;
-use crate::telemetry::texts::cause_text;
-use crate::telemetry::{ArmSample, Outcome, Phase};
+use dimos_control::request::Request;
+use dimos_core::arm::{GripperInfo, Link};
+use dimos_core::joint::STANDSTILL;
+use dimos_core::message::Message;
+use dimos_core::sync::lock;
+use dimos_core::telemetry::texts::cause_text;
+use dimos_core::telemetry::{ArmSample, Outcome, Phase};
+use dimos_hardware::adapter::{AdapterError, AdapterResult};
+use dimos_hardware::device::{Answer, Device};
+use dimos_rpc::api::{self, Reply};
+use dimos_rpc::{Code, RpcError};
 
 /// Timeout for a stopped arm to decelerate to rest and confirm.
 const STOP_LIMIT: Duration = Duration::from_secs(3);

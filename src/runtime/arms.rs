@@ -6,17 +6,17 @@ use std::time::{Duration, Instant};
 use super::StartError;
 use super::device_lock::{self, DeviceLock, DeviceLockError};
 use super::serial_locks::SerialLocks;
-use crate::arm::{ArmCommand, ArmState};
 use crate::blueprint::{Arm, Blueprint, JointOverride, OnExit, TickClock};
-use crate::clock::MonotonicClock;
-use crate::hardware::adapter::AdapterError;
-use crate::hardware::device::{Connected, Device, DeviceConfig, Note};
-use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, SIM};
-use crate::joint::JointLimits;
-use crate::message::Message;
-use crate::rt::heartbeat::Heartbeat;
-use crate::rt::slot::{SlotReader, SlotWriter, slot};
-use crate::rt::wake::Wake;
+use dimos_core::arm::{ArmCommand, ArmState};
+use dimos_core::clock::MonotonicClock;
+use dimos_core::joint::JointLimits;
+use dimos_core::message::Message;
+use dimos_hardware::adapter::AdapterError;
+use dimos_hardware::device::{Connected, Device, DeviceConfig, Note};
+use dimos_hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, SIM};
+use dimos_rt::heartbeat::Heartbeat;
+use dimos_rt::slot::{SlotReader, SlotWriter, slot};
+use dimos_rt::wake::Wake;
 
 /// Timeout for an adapter to connect, with some margin for this computer.
 const CONNECT_LIMIT: Duration = Duration::from_millis(3_500);

@@ -13,11 +13,11 @@ use super::StartError;
 use super::planner_link::answer_encoded;
 use super::planner_port::{PlannerPort, registered};
 use super::start::robots;
-use crate::planning::config::PlannerConfig;
-use crate::planning::planning_scene::PlanningScene;
-use crate::rpc::api::{RegisterPlanner, RegisteredRobot};
-use crate::rpc::error::Code;
-use crate::rpc::planner_stub::{PlannerStub, RegisterError};
+use dimos_planner::planning::config::PlannerConfig;
+use dimos_planner::planning::planning_scene::PlanningScene;
+use dimos_rpc::api::{RegisterPlanner, RegisteredRobot};
+use dimos_rpc::error::Code;
+use dimos_rpc::planner_stub::{PlannerStub, RegisterError};
 
 /// First pause before a reconnect; each further one is twice as long.
 const FIRST_PAUSE: Duration = Duration::from_millis(200);
@@ -160,7 +160,7 @@ impl Process {
     }
 }
 
-type Limits = std::collections::BTreeMap<String, crate::rpc::api::CommandLimits>;
+type Limits = std::collections::BTreeMap<String, dimos_rpc::api::CommandLimits>;
 
 fn is_away(code: Code) -> bool {
     matches!(code, Code::Unreachable | Code::Lost | Code::ShuttingDown)

@@ -3,10 +3,10 @@
 use super::{Options, Record, Run, StartError};
 use crate::assets::{Cache, NoProgress};
 use crate::blueprint::{self, Catalog, FindError, Found, Loaded, Overrides, Source};
-use crate::control::task_spec::{TaskSpec, TaskTable};
-use crate::hardware::registry::{AdapterSpec, Registry};
-use crate::planning::planner_thread::Solver;
-use crate::rpc::run_dir::RunDir;
+use dimos_control::task_spec::{TaskSpec, TaskTable};
+use dimos_hardware::registry::{AdapterSpec, Registry};
+use dimos_planner::planning::planner_thread::Solver;
+use dimos_rpc::run_dir::RunDir;
 
 /// A run that is not started yet. Settings that are not changed here come from the blueprint.
 ///
@@ -62,7 +62,7 @@ impl Builder {
         Self {
             found,
             overrides: Overrides::default(),
-            adapters: Registry::builtin(),
+            adapters: dimos_arms::registry(),
             tasks: TaskTable::builtin(),
             options: Options::default(),
         }
@@ -94,7 +94,7 @@ impl Builder {
 
     /// Adds adapters; they replace built-in ones of the same name.
     pub fn adapters(mut self, more: &[AdapterSpec]) -> Self {
-        self.adapters = Registry::with(more);
+        self.adapters = dimos_arms::registry().with(more);
         self
     }
 

@@ -3,16 +3,16 @@
 use serde_json::json;
 
 use super::service::Service;
-use crate::clock::Mono;
-use crate::control::limit::Bounds;
-use crate::control::request::{Motion, Request};
-use crate::control::task_body::TargetKind;
-use crate::control::tasks::chunk::curve;
-use crate::joint::JointLimits;
-use crate::rpc::api;
-use crate::rpc::{Code, RpcError};
-use crate::telemetry::{Origin, Outcome};
-use crate::trajectory::Spline;
+use dimos_control::limit::Bounds;
+use dimos_control::request::{Motion, Request};
+use dimos_control::task_body::TargetKind;
+use dimos_control::tasks::chunk::curve;
+use dimos_core::clock::Mono;
+use dimos_core::joint::JointLimits;
+use dimos_core::telemetry::{Origin, Outcome};
+use dimos_core::trajectory::Spline;
+use dimos_rpc::api;
+use dimos_rpc::{Code, RpcError};
 
 /// Chunks that begin this far from now are mistaken about the clock [s].
 const MAX_DISTANCE: f64 = 600.0;

@@ -1,12 +1,12 @@
 //! The coordinator's configuration: names and limits of a blueprint, and what its arms report.
 
 use crate::blueprint::Blueprint;
-use crate::control::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, TaskConfig, TaskKind, ToolLimit};
-use crate::control::task::Task;
-use crate::control::task_spec::{TaskSpec, TaskTable};
-use crate::hardware::device;
-use crate::joint::{JointLimits, MAX_DOF};
-use crate::telemetry::describe::{ArmNames, Names};
+use dimos_control::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, TaskConfig, TaskKind, ToolLimit};
+use dimos_control::task::Task;
+use dimos_control::task_spec::{TaskSpec, TaskTable};
+use dimos_core::joint::{JointLimits, MAX_DOF};
+use dimos_core::telemetry::describe::{ArmNames, Names};
+use dimos_hardware::device;
 
 /// Returns the names of arms, joints and tasks, in the order of their indices.
 pub(super) fn names_of(blueprint: &Blueprint) -> Names {

@@ -8,8 +8,8 @@ use std::os::unix::net::UnixListener;
 use std::sync::mpsc;
 use std::time::Duration;
 
-use crate::hardware::registry::SIM;
-use crate::rt::abstract_name::{self, Taken, fit};
+use dimos_hardware::registry::SIM;
+use dimos_rt::abstract_name::{self, Taken, fit};
 
 /// Timeout for the lookup of a host name.
 const LOOK_UP_LIMIT: Duration = Duration::from_secs(3);

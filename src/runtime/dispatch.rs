@@ -10,16 +10,16 @@ use std::time::Duration;
 use serde_json::{Value, json};
 use tokio::sync::oneshot;
 
-use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::control::request::{Envelope, Goal, Motion, Request};
-use crate::control::task_robot::FramePose;
-use crate::recording::notes::{Note, Notes};
-use crate::rt::host;
-use crate::rt::wake::Wake;
-use crate::sync::lock;
-use crate::telemetry::describe::Severity;
-use crate::telemetry::{Origin, Outcome};
-use crate::trajectory::JointTrajectory;
+use dimos_control::request::{Envelope, Goal, Motion, Request};
+use dimos_control::task_robot::FramePose;
+use dimos_core::clock::{Clock, Mono, MonotonicClock};
+use dimos_core::sync::lock;
+use dimos_core::telemetry::describe::Severity;
+use dimos_core::telemetry::{Origin, Outcome};
+use dimos_core::trajectory::JointTrajectory;
+use dimos_log::notes::{Note, Notes};
+use dimos_rt::host;
+use dimos_rt::wake::Wake;
 
 /// Capacity of the ring of requests.
 pub const REQUEST_RING: usize = 256;

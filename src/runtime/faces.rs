@@ -1,8 +1,8 @@
 //! Faces of the run to other systems, which the gateway serves: what becomes of them is an event of the run.
 
 use super::service::Service;
-use crate::rpc::api::FaceReport;
-use crate::telemetry::describe::{Described, Severity};
+use dimos_core::telemetry::describe::{Described, Severity};
+use dimos_rpc::api::FaceReport;
 
 impl Service {
     /// Reports that a face of the gateway serves no more, or not at all.

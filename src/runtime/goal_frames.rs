@@ -5,11 +5,11 @@ use nalgebra::Isometry3;
 use super::planner_port::{PlannerPort, isometry, positions_of};
 use super::tcp::MAP;
 use super::world_requests::link_pose;
-use crate::planning::planning_scene::PlannedRobot;
-use crate::robot::kinematics::pose;
-use crate::rpc::api::{Moment, PlanGoal};
-use crate::rpc::{Code, RpcError};
-use crate::sync::lock;
+use dimos_core::sync::lock;
+use dimos_planner::planning::planning_scene::PlannedRobot;
+use dimos_robot::kinematics::pose;
+use dimos_rpc::api::{Moment, PlanGoal};
+use dimos_rpc::{Code, RpcError};
 
 impl PlannerPort {
     /// Returns the pose in `map` that a goal asks of a robot; `None` if it is no pose.

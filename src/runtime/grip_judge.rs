@@ -3,9 +3,9 @@
 
 use std::time::Duration;
 
-use crate::arm::{GripperInfo, GripperUnit};
-use crate::clock::Mono;
-use crate::rpc::api::GripOutcome;
+use dimos_core::arm::{GripperInfo, GripperUnit};
+use dimos_core::clock::Mono;
+use dimos_rpc::api::GripOutcome;
 
 /// Time for the fingers to begin to move, and for the device to report an object.
 const STARTS: Duration = Duration::from_secs(1);

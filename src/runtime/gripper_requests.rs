@@ -6,16 +6,16 @@ use std::time::{Duration, Instant};
 use super::arm_requests::ORDER_LIMIT;
 use super::grip_judge::{GripJudge, Reading};
 use super::service::{Service, internal};
-use crate::arm::{GripperUnit, Link};
-use crate::clock::Mono;
-use crate::control::request::Request;
-use crate::hardware::adapter::AdapterError;
-use crate::message::Message;
-use crate::rpc::api::{self, GripReport, Reply};
-use crate::rpc::{Code, RpcError};
-use crate::sync::lock;
-use crate::telemetry::texts::cause_text;
-use crate::telemetry::{ArmSample, Origin, Outcome, Phase};
+use dimos_control::request::Request;
+use dimos_core::arm::{GripperUnit, Link};
+use dimos_core::clock::Mono;
+use dimos_core::message::Message;
+use dimos_core::sync::lock;
+use dimos_core::telemetry::texts::cause_text;
+use dimos_core::telemetry::{ArmSample, Origin, Outcome, Phase};
+use dimos_hardware::adapter::AdapterError;
+use dimos_rpc::api::{self, GripReport, Reply};
+use dimos_rpc::{Code, RpcError};
 
 /// Default time for an outcome [s].
 const TIMEOUT: f64 = 20.0;

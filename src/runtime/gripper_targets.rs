@@ -8,13 +8,13 @@ use std::time::Duration;
 
 use super::dispatch::log_of;
 use super::service::{Service, internal};
-use crate::arm::GripperUnit;
-use crate::clock::Mono;
-use crate::control::request::Request;
-use crate::rpc::report::StreamCounts;
-use crate::rpc::{Code, RpcError};
-use crate::sync::lock;
-use crate::telemetry::{Origin, Outcome, TaskState};
+use dimos_control::request::Request;
+use dimos_core::arm::GripperUnit;
+use dimos_core::clock::Mono;
+use dimos_core::sync::lock;
+use dimos_core::telemetry::{Origin, Outcome, TaskState};
+use dimos_rpc::report::StreamCounts;
+use dimos_rpc::{Code, RpcError};
 
 /// Least time between two commands to a gripper.
 const PERIOD: Duration = Duration::from_millis(50);

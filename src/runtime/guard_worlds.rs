@@ -7,11 +7,11 @@ use std::time::Duration;
 
 use super::planner_port::PlannerPort;
 use super::service::Service;
-use crate::collision::{OwnMargins, Scene};
-use crate::control::guard::GuardWorld;
-use crate::rpc::api::Moment;
-use crate::sync::lock;
-use crate::telemetry::describe::Names;
+use dimos_control::guard::GuardWorld;
+use dimos_core::sync::lock;
+use dimos_core::telemetry::describe::Names;
+use dimos_planner::collision::{OwnMargins, Scene};
+use dimos_rpc::api::Moment;
 
 /// Distance that the links of one arm keep from each other, where their covers are fine enough [m].
 const OWN_MARGIN: f64 = 0.002;

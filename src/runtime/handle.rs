@@ -5,12 +5,12 @@ use std::time::Duration;
 
 use super::service::Service;
 use super::{in_process, watchdog};
-use crate::rpc::api::{
+use dimos_rpc::api::{
     ArmDisable, ArmEnable, ArmReply, ArmReset, Backend, Cancel, CancelReply, Execute, ExecuteReply, Grip, GripReport,
     Gripper, Method, Move, MoveReply, Servo, Stop, StopReply, Trajectory, Velocity,
 };
-use crate::rpc::report::{MotionReport, StateReport, StatusReport};
-use crate::rpc::{Code, RpcError};
+use dimos_rpc::report::{MotionReport, StateReport, StatusReport};
+use dimos_rpc::{Code, RpcError};
 
 /// Poll period while waiting for a motion.
 const POLL_PERIOD: Duration = Duration::from_millis(10);
@@ -177,7 +177,7 @@ impl Handle {
         self.call(Velocity { task: task.to_owned(), velocities: velocities.to_vec() }).map(drop)
     }
 
-    /// Calls any method of [`api`](crate::rpc::api), with the checks of the socket.
+    /// Calls any method of [`api`](dimos_rpc::api), with the checks of the socket.
     pub fn call<M: Method>(&self, params: M) -> Result<M::Reply, RpcError> {
         let answers = self.call_together(std::slice::from_ref(&params));
         answers.into_iter().next().unwrap_or_else(|| Err(in_process::defect("no answer")))

@@ -7,10 +7,10 @@ use std::task::Poll;
 use tokio::runtime::{Builder, Handle, Runtime};
 
 use super::service::Service;
-use crate::rpc::api::{Backend, METHODS, Method, Reply, Request};
-use crate::rpc::server::CALL_TIMEOUT;
-use crate::rpc::{Code, RpcError};
-use crate::telemetry::Origin;
+use dimos_core::telemetry::Origin;
+use dimos_rpc::api::{Backend, METHODS, Method, Reply, Request};
+use dimos_rpc::server::CALL_TIMEOUT;
+use dimos_rpc::{Code, RpcError};
 
 /// The runtime of all calls in this process. It has no threads: each call runs on the calling thread.
 static RUNTIME: LazyLock<std::io::Result<Runtime>> =

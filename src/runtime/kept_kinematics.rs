@@ -8,9 +8,9 @@ use std::time::SystemTime;
 
 use serde::{Deserialize, Serialize};
 
-use crate::arm::FactoryKinematics;
-use crate::bounded;
-use crate::recording::files::log_folder;
+use dimos_core::arm::FactoryKinematics;
+use dimos_core::bounded;
+use dimos_log::files::log_folder;
 
 /// Kinematics of one arm, as they are kept.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

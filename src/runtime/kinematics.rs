@@ -3,12 +3,12 @@
 use std::path::Path;
 
 use super::kept_kinematics::{self, KeptKinematics};
-use crate::arm::FactoryKinematics;
 use crate::blueprint::{Arm, Blueprint};
-use crate::hardware::device::Connected;
-use crate::robot::calibrated::{self, Places};
-use crate::robot::urdf::Meshes;
-use crate::robot::{Source, load};
+use dimos_core::arm::FactoryKinematics;
+use dimos_hardware::device::Connected;
+use dimos_robot::calibrated::{self, Places};
+use dimos_robot::urdf::Meshes;
+use dimos_robot::{Source, load};
 
 /// What is known of the dimensions of an arm.
 pub(super) struct Known {

@@ -3,13 +3,13 @@
 use nalgebra::{Matrix4, Vector3};
 use serde_json::json;
 
-use crate::arm::Dh;
-use crate::arm::test_dh::{FAR_AWAY, product};
-use crate::rpc::api::{Method, Plan, RobotDescription};
-use crate::rpc::report::{ArmStateReport, PoseReport};
-use crate::rpc::run_dir::RunDir;
-use crate::rpc::{Code, RpcError};
 use crate::runtime::{Record, Run};
+use dimos_core::arm::Dh;
+use dimos_core::arm::test_dh::{FAR_AWAY, product};
+use dimos_rpc::api::{Method, Plan, RobotDescription};
+use dimos_rpc::report::{ArmStateReport, PoseReport};
+use dimos_rpc::run_dir::RunDir;
+use dimos_rpc::{Code, RpcError};
 
 /// Starts a run of a shipped blueprint with these settings.
 fn run(blueprint: &str, settings: &[(&str, String)]) -> (tempfile::TempDir, Run) {
@@ -31,7 +31,7 @@ fn far(pose: &PoseReport, from: &Matrix4<f64>) -> f64 {
 
 /// Returns parameters of a UR5e with differences of up to 20 mm at the flange, and with joints far away.
 fn arms() -> [[Dh; 6]; 2] {
-    let mut large = crate::hardware::arms::ur::model::Model::Ur5e.dh();
+    let mut large = dimos_arms::ur::model::Model::Ur5e.dh();
     (large[1].a, large[2].d, large[5].d) = (large[1].a + 0.009, 0.006, large[5].d + 0.005);
     (large[0].theta, large[2].alpha) = (0.006, 0.004);
     [large, FAR_AWAY]
@@ -55,7 +55,7 @@ fn poses_of_a_run_are_those_of_the_arm_that_is_connected() {
         assert_eq!(notes.len(), 1, "the model fits: {notes:?}");
         // The description has the same arm.
         let urdf = run.call(RobotDescription {}).unwrap().urdf.unwrap();
-        let described = crate::robot::urdf::from_text("described", &urdf).unwrap();
+        let described = dimos_robot::urdf::from_text("described", &urdf).unwrap();
         let named = described.joints.iter().filter(|joint| joint.is_independent());
         let named = named.map(|joint| joint.name.clone()).zip(q).collect();
         let links = described.link_poses(&described.positions(&named));
@@ -77,8 +77,8 @@ fn a_planner_without_the_arm_uses_what_was_kept_of_it_and_says_so() {
     };
     let mut own = blueprint("127.0.77.3");
     let address = super::address(&own.arms[0]);
-    let kinematics = crate::arm::FactoryKinematics {
-        nominal: crate::hardware::arms::ur::model::Model::Ur5e.dh().to_vec(),
+    let kinematics = dimos_core::arm::FactoryKinematics {
+        nominal: dimos_arms::ur::model::Model::Ur5e.dh().to_vec(),
         actual: Some(arms()[1].to_vec()),
         checksum: "0123456789abcdef0123".into(),
     };

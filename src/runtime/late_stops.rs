@@ -6,11 +6,11 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::service::Service;
-use crate::clock::WallOffset;
-use crate::rpc::api::Confirmation;
-use crate::sync::lock;
-use crate::telemetry::Phase;
-use crate::telemetry::describe::{Described, Severity};
+use dimos_core::clock::WallOffset;
+use dimos_core::sync::lock;
+use dimos_core::telemetry::Phase;
+use dimos_core::telemetry::describe::{Described, Severity};
+use dimos_rpc::api::Confirmation;
 
 /// The stops of a run that were not sent.
 #[derive(Debug, Default)]

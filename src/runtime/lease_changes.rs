@@ -4,9 +4,9 @@ use std::sync::Mutex;
 
 use super::dispatch::{SendError, log_of};
 use super::service::Service;
-use crate::control::request::Request;
-use crate::rpc::RpcError;
-use crate::sync::lock;
+use dimos_control::request::Request;
+use dimos_core::sync::lock;
+use dimos_rpc::RpcError;
 
 /// Ends of leases that the ring of requests had no room for: arm and connection.
 pub(super) type UnsentEnds = Mutex<Vec<(u16, u64)>>;

@@ -6,16 +6,16 @@ use std::time::Duration;
 
 use super::{Options, Record, StartError};
 use crate::blueprint::{Blueprint, Compression};
-use crate::clock::{Clock, MonotonicClock, WallOffset};
-use crate::control::config::CoordinatorConfig;
-use crate::hardware::device;
-use crate::message::Message;
-use crate::recording::log_writer::LogAttachment;
-use crate::recording::notes::Notes;
-use crate::recording::recorder::Note;
-use crate::recording::storage::{FaultLog, Storage};
-use crate::recording::{CONFIG_VERSION_KEY, COORDINATOR, disk_space, files};
-use crate::telemetry::describe::{Names, Severity};
+use dimos_control::config::CoordinatorConfig;
+use dimos_core::clock::{Clock, MonotonicClock, WallOffset};
+use dimos_core::message::Message;
+use dimos_core::telemetry::describe::{Names, Severity};
+use dimos_hardware::device;
+use dimos_log::log_writer::LogAttachment;
+use dimos_log::notes::Notes;
+use dimos_log::recorder::Note;
+use dimos_log::storage::{FaultLog, Storage};
+use dimos_log::{CONFIG_VERSION_KEY, COORDINATOR, disk_space, files};
 
 /// Returns the path of the log, if there is one. An error if the disk lacks space for it.
 pub(super) fn log_path(

@@ -4,8 +4,8 @@ use std::collections::HashMap;
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
-use crate::sync::lock;
-use crate::telemetry::describe::Described;
+use dimos_core::sync::lock;
+use dimos_core::telemetry::describe::Described;
 
 /// Shortest interval between lines of one kind.
 const EVERY: Duration = Duration::from_secs(10);
@@ -41,8 +41,8 @@ impl LogThrottle {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::telemetry::describe::{Names, describe};
-    use crate::telemetry::{Cause, Event, Phase};
+    use dimos_core::telemetry::describe::{Names, describe};
+    use dimos_core::telemetry::{Cause, Event, Phase};
 
     #[test]
     fn repeated_events_are_logged_every_ten_seconds_with_a_count() {

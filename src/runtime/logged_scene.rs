@@ -5,19 +5,19 @@ use std::sync::Arc;
 
 use super::planner_port::isometry;
 use super::service::Service;
-use crate::bounded;
-use crate::clock::{Clock, MonotonicClock};
-use crate::planning::planning_scene::PlannedRobot;
-use crate::recording::display_messages::{ColorRGBA, Marker, MarkerArray};
-use crate::recording::log_writer::LogAttachment;
-use crate::recording::messages::{Point, Pose, Quaternion, Vector3};
-use crate::recording::recorder::Note;
-use crate::recording::robots::{LoggedGripper, LoggedRobot, LoggedRobots};
-use crate::robot::kinematics::pose;
-use crate::robot::load;
-use crate::robot::model::{Geometry, RobotModel};
-use crate::rpc::api::{ShapeSpec, WorldObject};
-use crate::sync::lock;
+use dimos_core::bounded;
+use dimos_core::clock::{Clock, MonotonicClock};
+use dimos_core::sync::lock;
+use dimos_log::display_messages::{ColorRGBA, Marker, MarkerArray};
+use dimos_log::log_writer::LogAttachment;
+use dimos_log::messages::{Point, Pose, Quaternion, Vector3};
+use dimos_log::recorder::Note;
+use dimos_log::robots::{LoggedGripper, LoggedRobot, LoggedRobots};
+use dimos_planner::planning::planning_scene::PlannedRobot;
+use dimos_robot::kinematics::pose;
+use dimos_robot::load;
+use dimos_robot::model::{Geometry, RobotModel};
+use dimos_rpc::api::{ShapeSpec, WorldObject};
 
 /// Maximum size of all meshes that are attached to a log [bytes].
 const MAX_MESHES: usize = 8 << 20;

@@ -7,11 +7,11 @@ use nalgebra::Isometry3;
 
 use super::service::Service;
 use super::tcp::TcpModel;
-use crate::arm::{ArmState, Link, Pose, VelocitySource};
-use crate::joint::STANDSTILL;
-use crate::rpc::api::Plan;
-use crate::rpc::{Code, RpcError};
-use crate::sync::lock;
+use dimos_core::arm::{ArmState, Link, Pose, VelocitySource};
+use dimos_core::joint::STANDSTILL;
+use dimos_core::sync::lock;
+use dimos_rpc::api::Plan;
+use dimos_rpc::{Code, RpcError};
 
 /// Difference that is reported, and added to the padding [m, rad].
 const NOTED: (f64, f64) = (0.005, 1.0 / 180.0 * std::f64::consts::PI);

@@ -3,9 +3,9 @@
 use nalgebra::Isometry3;
 
 use super::service::Service;
-use crate::recording::display_messages::TFMessage;
-use crate::recording::messages::Header;
-use crate::rpc::api::{DescriptionReport, TransformReport, TransformsReport};
+use dimos_log::display_messages::TFMessage;
+use dimos_log::messages::Header;
+use dimos_rpc::api::{DescriptionReport, TransformReport, TransformsReport};
 
 impl Service {
     pub(super) fn robot_description(&self) -> DescriptionReport {
@@ -31,7 +31,7 @@ impl Service {
 }
 
 fn reports(message: TFMessage) -> Vec<TransformReport> {
-    let report = |stamped: crate::recording::display_messages::TransformStamped| {
+    let report = |stamped: dimos_log::display_messages::TransformStamped| {
         let (t, q) = (stamped.transform.translation, stamped.transform.rotation);
         TransformReport {
             parent: stamped.header.frame_id,

@@ -3,9 +3,9 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use crate::rpc::api::Presence;
-use crate::telemetry::{Origin, Reason, TaskState};
-use crate::trajectory::Spline;
+use dimos_core::telemetry::{Origin, Reason, TaskState};
+use dimos_core::trajectory::Spline;
+use dimos_rpc::api::Presence;
 
 /// The task of a native motion: none, the arm's own controller executes it.
 pub const NATIVE: u16 = u16::MAX;

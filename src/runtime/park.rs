@@ -9,9 +9,9 @@ use std::time::{Duration, Instant};
 
 use super::{Ended, Ending, Run, in_process};
 use crate::blueprint::OnExit;
-use crate::control::request::Request;
-use crate::rpc::api::{Backend, Move, Reply};
-use crate::telemetry::{Origin, Phase};
+use dimos_control::request::Request;
+use dimos_core::telemetry::{Origin, Phase};
+use dimos_rpc::api::{Backend, Move, Reply};
 
 /// Fraction of the velocity limits of the motion to the park pose.
 const SPEED: f64 = 0.3;

@@ -2,14 +2,14 @@
 
 use super::arm_requests::{order, refused};
 use super::service::{Service, internal};
-use crate::arm::{IoInfo, IoState};
-use crate::hardware::device::Details;
-use crate::recording::notes::Note;
-use crate::rpc::api::{self, AnalogReport, IoReport, Reply, StopInputReport};
-use crate::rpc::report::JointStatusReport;
-use crate::rpc::{Code, RpcError};
-use crate::sync::lock;
-use crate::telemetry::describe::Severity;
+use dimos_core::arm::{IoInfo, IoState};
+use dimos_core::sync::lock;
+use dimos_core::telemetry::describe::Severity;
+use dimos_hardware::device::Details;
+use dimos_log::notes::Note;
+use dimos_rpc::api::{self, AnalogReport, IoReport, Reply, StopInputReport};
+use dimos_rpc::report::JointStatusReport;
+use dimos_rpc::{Code, RpcError};
 
 impl Service {
     /// Reads an arm's inputs and outputs.
@@ -53,7 +53,7 @@ impl Service {
     pub(super) fn io_report(&self, arm: usize, info: &IoInfo, state: &IoState) -> IoReport {
         let levels =
             |bits: u32, count: u8| (0..count).map(|i| bits.checked_shr(i.into()).unwrap_or(0) & 1 != 0).collect();
-        let analog = |values: &[f64], units: &[crate::arm::AnalogUnit]| {
+        let analog = |values: &[f64], units: &[dimos_core::arm::AnalogUnit]| {
             let channels = values.iter().zip(units);
             channels.map(|(value, unit)| AnalogReport { value: *value, unit: unit.name().to_owned() }).collect()
         };

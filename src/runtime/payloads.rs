@@ -5,15 +5,15 @@ use std::time::{Duration, Instant};
 
 use super::arm_requests::{order, refused};
 use super::service::{Service, internal};
-use crate::arm::Load;
-use crate::control::request::Request;
-use crate::hardware::adapter::AdapterError;
-use crate::joint::STANDSTILL;
-use crate::rpc::api::{self, AttachReply, LoadReport, PayloadReply, Reply, Request as Call};
-use crate::rpc::report::end_of_lead;
-use crate::rpc::{Code, RpcError};
-use crate::telemetry::describe::Severity;
-use crate::telemetry::{Phase, TaskState};
+use dimos_control::request::Request;
+use dimos_core::arm::Load;
+use dimos_core::joint::STANDSTILL;
+use dimos_core::telemetry::describe::Severity;
+use dimos_core::telemetry::{Phase, TaskState};
+use dimos_hardware::adapter::AdapterError;
+use dimos_rpc::api::{self, AttachReply, LoadReport, PayloadReply, Reply, Request as Call};
+use dimos_rpc::report::end_of_lead;
+use dimos_rpc::{Code, RpcError};
 
 /// How long a controller may count an arm as moving that is at rest here: after this time a refused load is tried once
 /// more. Not more often: a try may reset the controller.

@@ -11,20 +11,20 @@ use super::planner_port::{PlannerPort, run_blocking};
 use super::service::{Service, internal};
 use super::tcp::TcpModel;
 use crate::blueprint::Arm;
-use crate::control::config::CoordinatorConfig;
-use crate::control::limit::Bounds;
-use crate::control::task_body::TargetKind;
-use crate::joint::DEFAULT_JERK;
-use crate::rpc::api::{
+use dimos_control::config::CoordinatorConfig;
+use dimos_control::limit::Bounds;
+use dimos_control::task_body::TargetKind;
+use dimos_core::joint::DEFAULT_JERK;
+use dimos_core::sync::lock;
+use dimos_core::telemetry::Origin;
+use dimos_core::telemetry::describe::Names;
+use dimos_rpc::api::{
     self, CommandLimits, ExecutePlan, Moment, PlannerReport, RECHECK, Recheck, RecheckReply, RegisterPlanner,
     Registered, ReleasedPlan, Reply, Request as Call,
 };
-use crate::rpc::planner_proxy::{PlannerProxy, gone};
-use crate::rpc::report::{AttachedReport, PlannerStatus};
-use crate::rpc::{Code, RpcError};
-use crate::sync::lock;
-use crate::telemetry::Origin;
-use crate::telemetry::describe::Names;
+use dimos_rpc::planner_proxy::{PlannerProxy, gone};
+use dimos_rpc::report::{AttachedReport, PlannerStatus};
+use dimos_rpc::{Code, RpcError};
 
 /// Maximum age of a state to plan from.
 const MAX_STATE_AGE: Duration = Duration::from_secs(1);
@@ -314,8 +314,9 @@ impl Service {
     pub(super) fn moment(&self, plan: u64) -> Moment {
         let (now, mut positions, mut grippers) = (self.now(), BTreeMap::new(), BTreeMap::new());
         for (index, arm) in self.parts.names.arms.iter().enumerate() {
-            let fresh =
-                |view: &crate::telemetry::ArmSample| view.state.seq > 0 && now.since(view.state.stamp) <= MAX_STATE_AGE;
+            let fresh = |view: &dimos_core::telemetry::ArmSample| {
+                view.state.seq > 0 && now.since(view.state.stamp) <= MAX_STATE_AGE
+            };
             let Some(view) = self.arm_view(index).filter(fresh) else { continue };
             let commanded = view.command.mode.is_some_and(|mode| mode.is_position());
             let values = if commanded { view.command.values } else { view.state.position };

@@ -11,18 +11,18 @@ use super::recheck::Released;
 use super::service::internal;
 use super::tcp::TcpModel;
 use super::world_requests::typed;
-use crate::planning::config::{JointBounds, PlannerConfig};
-use crate::planning::pipeline::solve;
-use crate::planning::planner_thread::{PlannerThread, Solver};
-use crate::planning::planning_scene::PlanningScene;
-use crate::planning::unplanned_joints::Measured;
-use crate::pose;
-use crate::rpc::api::{
+use dimos_core::pose;
+use dimos_core::sync::lock;
+use dimos_planner::planning::config::{JointBounds, PlannerConfig};
+use dimos_planner::planning::pipeline::solve;
+use dimos_planner::planning::planner_thread::{PlannerThread, Solver};
+use dimos_planner::planning::planning_scene::PlanningScene;
+use dimos_planner::planning::unplanned_joints::Measured;
+use dimos_rpc::api::{
     ArmToolReply, ArmToolSet, CancelReply, CommandLimits, Moment, PoseSpec, RegisteredRobot, Reply, WorldObject,
 };
-use crate::rpc::api::{Request as Call, WorldAdd, WorldReport};
-use crate::rpc::{Code, RpcError};
-use crate::sync::lock;
+use dimos_rpc::api::{Request as Call, WorldAdd, WorldReport};
+use dimos_rpc::{Code, RpcError};
 
 /// A planner.
 pub struct PlannerPort {
@@ -100,7 +100,7 @@ impl PlannerPort {
 
 /// Returns the robots of a planner, for its registration at a run.
 pub fn registered(setup: &PlanningScene) -> Vec<RegisteredRobot> {
-    let robot = |robot: &crate::planning::planning_scene::PlannedRobot| RegisteredRobot {
+    let robot = |robot: &dimos_planner::planning::planning_scene::PlannedRobot| RegisteredRobot {
         name: robot.config.name.clone(),
         joints: robot.config.coordinator_joints.clone(),
         task: robot.config.task.clone(),

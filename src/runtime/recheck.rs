@@ -10,14 +10,14 @@ use super::plan_requests::all_positions;
 use super::planner_link::Planner;
 use super::planner_port::{PlannerPort, run_blocking};
 use super::service::Service;
-use crate::collision::Stop;
-use crate::control::request::Request;
-use crate::planning::ahead::rests_before;
-use crate::planning::pipeline::PlannedMotion;
-use crate::rpc::api::{BlockedReport, Moment, Recheck, RecheckReply};
-use crate::rpc::{Code, RpcError};
-use crate::sync::lock;
-use crate::telemetry::TaskState;
+use dimos_control::request::Request;
+use dimos_core::sync::lock;
+use dimos_core::telemetry::TaskState;
+use dimos_planner::collision::Stop;
+use dimos_planner::planning::ahead::rests_before;
+use dimos_planner::planning::pipeline::PlannedMotion;
+use dimos_rpc::api::{BlockedReport, Moment, Recheck, RecheckReply};
+use dimos_rpc::{Code, RpcError};
 
 /// Timeout for checking the rest of a motion; after that the motion is cancelled.
 const LIMIT: Duration = Duration::from_secs(1);
@@ -55,7 +55,8 @@ impl PlannerPort {
         {
             released.1 = released.1.max(version);
         }
-        let report = |b: crate::planning::ahead::Blocked| BlockedReport { free_until: b.free_until, what: b.what };
+        let report =
+            |b: dimos_planner::planning::ahead::Blocked| BlockedReport { free_until: b.free_until, what: b.what };
         Ok(RecheckReply { blocked: blocked.map(report) })
     }
 }

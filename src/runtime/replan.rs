@@ -5,11 +5,11 @@ use std::time::{Duration, Instant};
 
 use super::motions::UnderWay;
 use super::service::{Service, internal};
-use crate::joint::STANDSTILL;
-use crate::rpc::api::{ExecutePlan, Plan, PlanGoal, PlanLevel, Planner, Planning, Reply, Request as Call};
-use crate::rpc::{Code, RpcError};
-use crate::sync::lock;
-use crate::telemetry::{Origin, Phase, TaskState};
+use dimos_core::joint::STANDSTILL;
+use dimos_core::sync::lock;
+use dimos_core::telemetry::{Origin, Phase, TaskState};
+use dimos_rpc::api::{ExecutePlan, Plan, PlanGoal, PlanLevel, Planner, Planning, Reply, Request as Call};
+use dimos_rpc::{Code, RpcError};
 
 /// Timeout for the arm to decelerate to rest.
 const REST_TIMEOUT: Duration = Duration::from_secs(10);

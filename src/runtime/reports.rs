@@ -6,20 +6,20 @@ use std::time::Instant;
 use super::motions::{End, NATIVE, Next};
 use super::service::Service;
 use super::tcp::TcpModel;
-use crate::arm::{ArmState, Pose, VelocitySource};
-use crate::clock::WallOffset;
-use crate::control::arm_control::effective;
-use crate::hardware::device::Connected;
-use crate::hardware::registry::Teach;
-use crate::rpc::api::{LoadReport, SpeedReport, TextLog, TextLogReport};
-use crate::rpc::report::*;
-use crate::rpc::streams::{EventReport, JointState, Level};
-use crate::rpc::{Code, RpcError};
-use crate::rt::histogram::Figures;
-use crate::sync::lock;
-use crate::telemetry::describe::{Described, Severity};
-use crate::telemetry::texts::{bound_text, cause_text, outcome_text, reason_text};
-use crate::telemetry::{Cause, Outcome, Phase, Reason, TaskState};
+use dimos_control::arm_control::effective;
+use dimos_core::arm::{ArmState, Pose, VelocitySource};
+use dimos_core::clock::WallOffset;
+use dimos_core::sync::lock;
+use dimos_core::telemetry::describe::{Described, Severity};
+use dimos_core::telemetry::texts::{bound_text, cause_text, outcome_text, reason_text};
+use dimos_core::telemetry::{Cause, Outcome, Phase, Reason, TaskState};
+use dimos_hardware::device::Connected;
+use dimos_hardware::registry::Teach;
+use dimos_rpc::api::{LoadReport, SpeedReport, TextLog, TextLogReport};
+use dimos_rpc::report::*;
+use dimos_rpc::streams::{EventReport, JointState, Level};
+use dimos_rpc::{Code, RpcError};
+use dimos_rt::histogram::Figures;
 
 impl Service {
     /// Returns the reply to `status`.

@@ -7,8 +7,8 @@ use std::path::PathBuf;
 use super::planner_port::run_blocking;
 use super::service::{Service, internal};
 use crate::blueprint::Blueprint;
-use crate::rpc::api::{self, SavedPose};
-use crate::rpc::{Code, RpcError};
+use dimos_rpc::api::{self, SavedPose};
+use dimos_rpc::{Code, RpcError};
 
 /// Maximum number of poses per blueprint.
 const MOST: usize = 1000;

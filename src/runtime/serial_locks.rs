@@ -5,9 +5,9 @@ use std::os::unix::net::UnixListener;
 use std::sync::Mutex;
 
 use crate::blueprint::Arm;
-use crate::hardware::adapter::ManipulatorInfo;
-use crate::rt::abstract_name::{self, Taken, fit};
-use crate::sync::lock;
+use dimos_core::sync::lock;
+use dimos_hardware::adapter::ManipulatorInfo;
+use dimos_rt::abstract_name::{self, Taken, fit};
 
 /// The serial numbers of a run's arms, held for the lifetime of this value.
 #[derive(Debug, Default)]

@@ -25,29 +25,27 @@ use super::planner_link::Attached;
 use super::planner_port::PlannerPort;
 use super::serial_locks::SerialLocks;
 use super::waiting::Progress;
-use crate::arm::{ArmState, Link};
 use crate::blueprint::Blueprint;
-use crate::clock::{Mono, WallOffset};
-use crate::control::config::CoordinatorConfig;
-use crate::control::request::Request;
-use crate::control::tick_loop::Pulse;
-use crate::hardware::device::{Connected, Details, Device};
-use crate::joint::STANDSTILL;
-use crate::recording::recorder::{Notice, RecorderStats};
-use crate::recording::tcp_log::TcpChains;
-use crate::rpc::api::{
-    self, Backend, BoxFuture, Done, FaceReport, RegisterPlanner, Registered, Reply, Request as Call,
-};
-use crate::rpc::planner_proxy::PlannerProxy;
-use crate::rpc::report::StatusReport;
-use crate::rpc::run_dir::Claim;
-use crate::rpc::streams::Streams;
-use crate::rpc::{Code, RpcError, Subject};
-use crate::rt::host::{self, Grant};
-use crate::rt::slot::SlotReader;
-use crate::sync::lock;
-use crate::telemetry::describe::{ArmNames, Names};
-use crate::telemetry::{ArmSample, Event, Origin, Outcome, Phase, TaskView};
+use dimos_control::config::CoordinatorConfig;
+use dimos_control::request::Request;
+use dimos_control::tick_loop::Pulse;
+use dimos_core::arm::{ArmState, Link};
+use dimos_core::clock::{Mono, WallOffset};
+use dimos_core::joint::STANDSTILL;
+use dimos_core::sync::lock;
+use dimos_core::telemetry::describe::{ArmNames, Names};
+use dimos_core::telemetry::{ArmSample, Event, Origin, Outcome, Phase, TaskView};
+use dimos_hardware::device::{Connected, Details, Device};
+use dimos_log::recorder::{Notice, RecorderStats};
+use dimos_log::tcp_log::TcpChains;
+use dimos_rpc::api::{self, Backend, BoxFuture, Done, FaceReport, RegisterPlanner, Registered, Reply, Request as Call};
+use dimos_rpc::planner_proxy::PlannerProxy;
+use dimos_rpc::report::StatusReport;
+use dimos_rpc::run_dir::Claim;
+use dimos_rpc::streams::Streams;
+use dimos_rpc::{Code, RpcError, Subject};
+use dimos_rt::host::{self, Grant};
+use dimos_rt::slot::SlotReader;
 
 /// Parts of a service.
 pub struct ServiceParts {
@@ -441,7 +439,7 @@ impl Service {
     }
 
     pub(super) fn now(&self) -> Mono {
-        crate::clock::Clock::now(&crate::clock::MonotonicClock)
+        dimos_core::clock::Clock::now(&dimos_core::clock::MonotonicClock)
     }
 }
 

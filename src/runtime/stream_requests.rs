@@ -5,12 +5,12 @@ use std::time::Instant;
 
 use super::planner_port::isometry;
 use super::service::Service;
-use crate::arm::ArmCommand;
-use crate::control::request::{Goal, Request};
-use crate::joint::joints_of;
-use crate::rpc::api::{self, Done};
-use crate::rpc::{Code, RpcError};
-use crate::telemetry::Origin;
+use dimos_control::request::{Goal, Request};
+use dimos_core::arm::ArmCommand;
+use dimos_core::joint::joints_of;
+use dimos_core::telemetry::Origin;
+use dimos_rpc::api::{self, Done};
+use dimos_rpc::{Code, RpcError};
 
 /// Commanded velocities below this are at rest [rad/s].
 const AT_REST: f64 = 1e-6;
@@ -61,7 +61,7 @@ impl Service {
             let command = self.arm_view(arm as usize)?.command;
             let Some(mode) = command.mode else { return Some(()) };
             let last = before.replace(command);
-            let of = |values: &crate::joint::Joints| values.iter().take(dof).copied().collect::<Vec<f64>>();
+            let of = |values: &dimos_core::joint::Joints| values.iter().take(dof).copied().collect::<Vec<f64>>();
             let values = of(&command.values);
             let rests = if mode.is_position() {
                 // The same view may come twice: only another tick's command shows that nothing moves.

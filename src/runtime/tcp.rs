@@ -10,12 +10,12 @@ use nalgebra::Isometry3;
 
 use super::planner_port::{isometry, spec};
 use super::service::Service;
-use crate::planning::planning_scene::PlannedRobot;
-use crate::recording::tcp_log::TcpChain;
-use crate::robot::kinematics::{Kinematics, frame, pose};
-use crate::rpc::api::{RegisteredFlange, RegisteredModel, RegisteredRobot};
-use crate::rpc::report::{PoseReport, TcpReport, ToolReport};
-use crate::sync::lock;
+use dimos_core::sync::lock;
+use dimos_log::tcp_log::TcpChain;
+use dimos_planner::planning::planning_scene::PlannedRobot;
+use dimos_robot::kinematics::{Kinematics, frame, pose};
+use dimos_rpc::api::{RegisteredFlange, RegisteredModel, RegisteredRobot};
+use dimos_rpc::report::{PoseReport, TcpReport, ToolReport};
 
 /// The reference frame of all poses.
 pub(super) const MAP: &str = "map";
@@ -110,7 +110,7 @@ impl TcpModel {
             index: *index,
             root: frame(&isometry(root)),
             link: tcp.link.clone(),
-            tool: tcp.tool.map(|tool| crate::pose::from_xyz_rpy(tool.xyz, tool.rpy)),
+            tool: tcp.tool.map(|tool| dimos_core::pose::from_xyz_rpy(tool.xyz, tool.rpy)),
             flange,
             allows_mismatch: *allows_mismatch,
         }))
@@ -159,7 +159,7 @@ impl TcpModel {
         let mut frames = self.kinematics.frames();
         self.kinematics.forward_from(&self.root, &q, &mut frames);
         let link = pose(&self.kinematics.link_frame(self.index, &frames));
-        let (xyz, rpy) = crate::pose::to_xyz_rpy(&(link * self.tool.unwrap_or_default()));
+        let (xyz, rpy) = dimos_core::pose::to_xyz_rpy(&(link * self.tool.unwrap_or_default()));
         let TcpReport { link, tool } = self.report();
         Some(PoseReport { link, tool, frame: MAP.to_owned(), xyz, rpy })
     }

@@ -8,13 +8,13 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use super::{Ending, watchdog};
-use crate::clock::{Clock, MonotonicClock};
-use crate::control::config::CoordinatorConfig;
-use crate::control::coordinator::Coordinator;
-use crate::control::task::Task;
-use crate::control::tick_loop::{self, Probe, Pulse, TickPorts};
-use crate::rt::host;
-use crate::sync::panic_text;
+use dimos_control::config::CoordinatorConfig;
+use dimos_control::coordinator::Coordinator;
+use dimos_control::task::Task;
+use dimos_control::tick_loop::{self, Probe, Pulse, TickPorts};
+use dimos_core::clock::{Clock, MonotonicClock};
+use dimos_core::sync::panic_text;
+use dimos_rt::host;
 
 /// Timeout for the thread to end.
 const END_LIMIT: Duration = Duration::from_millis(300);

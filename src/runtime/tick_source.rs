@@ -5,8 +5,8 @@ use std::time::Duration;
 use super::StartError;
 use super::arms::Arms;
 use crate::blueprint::{Blueprint, TickClock};
-use crate::control::pace::Source;
-use crate::hardware::device::Connected;
+use dimos_control::pace::Source;
+use dimos_hardware::device::Connected;
 
 /// Maximum ratio between the arm's rate and the tick's.
 const MAX_RATIO: f64 = 100.0;

@@ -5,13 +5,13 @@ use nalgebra::Isometry3;
 use super::planner_port::{isometry, spec};
 use super::service::{Service, internal};
 use super::tcp::TcpModel;
-use crate::control::request::Request;
-use crate::control::task_robot::FramePose;
-use crate::rpc::api::{self, ArmToolReply, Reply, Request as Call};
-use crate::rpc::report::{TcpReport, ToolReport};
-use crate::rpc::{Code, RpcError};
-use crate::sync::lock;
-use crate::telemetry::describe::Severity;
+use dimos_control::request::Request;
+use dimos_control::task_robot::FramePose;
+use dimos_core::sync::lock;
+use dimos_core::telemetry::describe::Severity;
+use dimos_rpc::api::{self, ArmToolReply, Reply, Request as Call};
+use dimos_rpc::report::{TcpReport, ToolReport};
+use dimos_rpc::{Code, RpcError};
 
 impl Service {
     /// Returns an arm's tool centre point.
@@ -70,7 +70,7 @@ impl Service {
     fn tasks_of(&self, arm: u16, link: &str) -> Vec<u16> {
         let joints = self.joints_of_arm(arm);
         let tasks = self.parts.config.tasks.iter().zip(&self.parts.blueprint.tasks).zip(0..);
-        let moves = |task: &crate::control::config::TaskConfig| task.joints.iter().any(|j| joints.contains(j));
+        let moves = |task: &dimos_control::config::TaskConfig| task.joints.iter().any(|j| joints.contains(j));
         let same = |task: &crate::blueprint::Task| task.robot.as_ref().is_some_and(|robot| robot.link == link);
         tasks.filter(|((config, task), _)| moves(config) && same(task)).map(|(_, index)| index).collect()
     }

@@ -4,16 +4,16 @@ use nalgebra::Isometry3;
 
 use super::planner_port::run_blocking;
 use super::service::Service;
-use crate::control::config::ToolLimit;
-use crate::control::request::Request;
-use crate::control::task_robot::FramePose;
-use crate::joint::MAX_DOF;
-use crate::planning::tool_timing::slowed;
-use crate::planning::topp::JointBound;
-use crate::robot::kinematics::tool_speed::ToolSpeed;
-use crate::rpc::RpcError;
-use crate::telemetry::describe::Severity;
-use crate::trajectory::JointTrajectory;
+use dimos_control::config::ToolLimit;
+use dimos_control::request::Request;
+use dimos_control::task_robot::FramePose;
+use dimos_core::joint::MAX_DOF;
+use dimos_core::telemetry::describe::Severity;
+use dimos_core::trajectory::JointTrajectory;
+use dimos_planner::planning::tool_timing::slowed;
+use dimos_planner::planning::topp::JointBound;
+use dimos_robot::kinematics::tool_speed::ToolSpeed;
+use dimos_rpc::RpcError;
 
 /// An arm that a motion moves.
 struct Moved {
@@ -58,8 +58,8 @@ impl Service {
             let limits = &self.parts.config.arms.get(arm)?.limits;
             Some(JointBound {
                 velocity: of(&limits.velocity_max, f64::INFINITY),
-                acceleration: of(&limits.acceleration_max, crate::joint::DEFAULT_ACCELERATION),
-                jerk: of(&limits.jerk_max, crate::joint::DEFAULT_JERK),
+                acceleration: of(&limits.acceleration_max, dimos_core::joint::DEFAULT_ACCELERATION),
+                jerk: of(&limits.jerk_max, dimos_core::joint::DEFAULT_JERK),
             })
         };
         let Some(bounds) = joints.iter().map(bound).collect::<Option<Vec<_>>>() else { return Ok(motion) };

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use tokio::sync::watch;
 
 use super::service::Service;
-use crate::control::tick_loop::Pulse;
+use dimos_control::tick_loop::Pulse;
 
 /// Maximum wait for a tick.
 const TICK_LIMIT: Duration = Duration::from_secs(1);

@@ -9,9 +9,9 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use super::Ending;
-use crate::clock::{Clock, MonotonicClock};
-use crate::rt::heartbeat::Heartbeat;
-use crate::rt::host;
+use dimos_core::clock::{Clock, MonotonicClock};
+use dimos_rt::heartbeat::Heartbeat;
+use dimos_rt::host;
 
 /// Period of the check: each one costs a wake-up of the processor.
 const CHECK_PERIOD: Duration = Duration::from_millis(100);

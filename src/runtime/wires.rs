@@ -6,15 +6,15 @@ use super::StartError;
 use super::arms::{Arms, Slots};
 use super::dispatch::REQUEST_RING;
 use super::guard_worlds::GuardEnds;
-use crate::arm::{ArmCommand, ArmState};
-use crate::control::config::CoordinatorConfig;
-use crate::control::pace::Source;
-use crate::control::request::{Envelope, Motion};
-use crate::control::tick_loop::{GuardPorts, Pulse, TickPorts};
-use crate::rt::host;
-use crate::rt::slot::{SlotReader, slot};
-use crate::rt::wake::Wake;
-use crate::telemetry::{ArmSample, Cause, Outcome, Phase, Sample, TaskView, TickSample};
+use dimos_control::config::CoordinatorConfig;
+use dimos_control::pace::Source;
+use dimos_control::request::{Envelope, Motion};
+use dimos_control::tick_loop::{GuardPorts, Pulse, TickPorts};
+use dimos_core::arm::{ArmCommand, ArmState};
+use dimos_core::telemetry::{ArmSample, Cause, Outcome, Phase, Sample, TaskView, TickSample};
+use dimos_rt::host;
+use dimos_rt::slot::{SlotReader, slot};
+use dimos_rt::wake::Wake;
 
 /// Capacity of the recorder's ring [s].
 const RING_SECONDS: f64 = 5.0;

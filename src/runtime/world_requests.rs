@@ -9,15 +9,15 @@ use nalgebra::{Isometry3, Matrix3, Vector3};
 
 use super::planner_port::{PlannerPort, isometry, positions_of, robot_index, run_blocking, spec};
 use super::service::internal;
-use crate::collision::pairs;
-use crate::collision::shape::Placed;
-use crate::collision::world::{Attached, Obstacle, World};
-use crate::planning::config::{MAX_OBJECTS, ObjectConfig, ObjectShape};
-use crate::planning::planning_scene::{PlannedRobot, obstacle};
-use crate::robot::kinematics::{frame, pose};
-use crate::rpc::api::{self, AttachReply, Done, LoadReport, Moment, ShapeSpec, WorldObject};
-use crate::rpc::{Code, RpcError};
-use crate::sync::lock;
+use dimos_core::sync::lock;
+use dimos_planner::collision::pairs;
+use dimos_planner::collision::shape::Placed;
+use dimos_planner::collision::world::{Attached, Obstacle, World};
+use dimos_planner::planning::config::{MAX_OBJECTS, ObjectConfig, ObjectShape};
+use dimos_planner::planning::planning_scene::{PlannedRobot, obstacle};
+use dimos_robot::kinematics::{frame, pose};
+use dimos_rpc::api::{self, AttachReply, Done, LoadReport, Moment, ShapeSpec, WorldObject};
+use dimos_rpc::{Code, RpcError};
 
 /// The objects by name.
 type Objects = BTreeMap<String, WorldObject>;
@@ -251,8 +251,8 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
-    use crate::planning::config::{PlannerConfig, RobotConfig};
-    use crate::planning::planning_scene::PlanningScene;
+    use dimos_planner::planning::config::{PlannerConfig, RobotConfig};
+    use dimos_planner::planning::planning_scene::PlanningScene;
 
     /// A planner with the built-in robot and a ball in its world, and its present state.
     fn with_a_ball(at: [f64; 3]) -> (PlannerPort, Moment) {

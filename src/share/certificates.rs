@@ -10,8 +10,8 @@ use x509_parser::prelude::{FromDer, X509Certificate};
 
 use super::place::Place;
 use crate::blueprint::share::{Identity, ShareConfig};
-use crate::clock::wall_now;
-use crate::rpc::error::{Code, RpcError};
+use dimos_core::clock::wall_now;
+use dimos_rpc::error::{Code, RpcError};
 
 /// An end of validity that is nearer than this is reported [s].
 const SOON: i64 = 14 * DAY;

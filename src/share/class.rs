@@ -1,8 +1,8 @@
 //! Which right a request needs, and who has it.
 
 use crate::blueprint::share::{ANYONE, Role, ShareConfig};
-use crate::named::named;
-use crate::rpc::error::{Code, RpcError};
+use dimos_core::named::named;
+use dimos_rpc::error::{Code, RpcError};
 
 /// The request for a file of the live view.
 pub const PAGE: &str = "page";
@@ -89,7 +89,7 @@ pub fn permit(user: &str, method: &str, class: Class, config: &ShareConfig) -> R
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::rpc::api::METHODS;
+    use dimos_rpc::api::METHODS;
 
     /// What only a gateway says of itself.
     const OF_GATEWAYS: [&str; 2] = ["on_behalf_of", "register_gateway"];

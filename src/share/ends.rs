@@ -10,10 +10,10 @@ use zenoh::Wait;
 use zenoh::query::Query;
 
 use super::remote::refuse;
-use crate::rpc::api::{Cancel, Method, Stop, read_params};
-use crate::rpc::client::{Client, ClientError};
-use crate::rpc::error::{Code, RpcError};
-use crate::sync::lock;
+use dimos_core::sync::lock;
+use dimos_rpc::api::{Cancel, Method, Stop, read_params};
+use dimos_rpc::client::{Client, ClientError};
+use dimos_rpc::error::{Code, RpcError};
 
 /// Requests of a user and a method that may be under way; more are refused. Cancels so take no place of stops.
 const MAX_UNDER_WAY: usize = 16;

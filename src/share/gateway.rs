@@ -33,10 +33,10 @@ use super::page::Pages;
 use super::remote::{Closed, Remote, Request, refuse};
 use super::{certificates, ros, settings, streams};
 use crate::blueprint::share::ShareConfig;
-use crate::rpc::api::{FaceReport, MAX_ANSWER, MAX_LINE, METHODS, Method, PlannerAnswer, RegisterGateway};
-use crate::rpc::error::{Code, RpcError};
-use crate::rpc::reach;
-use crate::sync::lock;
+use dimos_core::sync::lock;
+use dimos_rpc::api::{FaceReport, MAX_ANSWER, MAX_LINE, METHODS, Method, PlannerAnswer, RegisterGateway};
+use dimos_rpc::error::{Code, RpcError};
+use dimos_rpc::reach;
 
 /// Period of the checks of the clients.
 const PERIOD: Duration = Duration::from_millis(50);

@@ -27,12 +27,12 @@ use super::class::Class;
 use super::gateway::PROOF;
 use super::place::Place;
 use super::{certificates, keys, settings};
-use crate::random;
-use crate::rpc::api::{METHODS, Method};
-use crate::rpc::client::{Client, ClientError};
-use crate::rpc::error::{Code, RpcError};
-use crate::rpc::server::CALL_TIMEOUT;
-use crate::rpc::streams::{Stream, Subscribe, Unsubscribe};
+use dimos_core::random;
+use dimos_rpc::api::{METHODS, Method};
+use dimos_rpc::client::{Client, ClientError};
+use dimos_rpc::error::{Code, RpcError};
+use dimos_rpc::server::CALL_TIMEOUT;
+use dimos_rpc::streams::{Stream, Subscribe, Unsubscribe};
 
 /// Pause between two beats: a gateway takes a client for lost after 0.3 s or more without one.
 const BEAT: Duration = Duration::from_millis(100);

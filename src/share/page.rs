@@ -17,8 +17,8 @@ use super::place::Place;
 use super::remote::refuse;
 use super::settings::MAX_MESSAGE;
 use super::{keys, line};
-use crate::rpc::client::{self, ClientError};
-use crate::rpc::error::{Code, RpcError};
+use dimos_rpc::client::{self, ClientError};
+use dimos_rpc::error::{Code, RpcError};
 
 /// Requests that may wait.
 const QUEUE: usize = 16;

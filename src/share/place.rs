@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 
 use crate::blueprint::share::{ANYONE, Endpoint, Identity, is_user};
-use crate::bounded;
-use crate::yaml::{did_you_mean, quote};
+use dimos_core::bounded;
+use dimos_yaml::{did_you_mean, quote};
 
 /// Where a run, or a router of runs, is reached, and as whom.
 #[derive(Debug, Clone, PartialEq)]

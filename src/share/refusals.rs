@@ -15,7 +15,7 @@ use tracing_subscriber::registry::LookupSpan;
 
 use super::class::role_of;
 use crate::blueprint::share::ShareConfig;
-use crate::sync::lock;
+use dimos_core::sync::lock;
 
 /// The part of zenoh that accepts connections with certificates.
 const TLS: &str = "zenoh_link_tls";

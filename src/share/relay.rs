@@ -14,9 +14,9 @@ use serde_json::json;
 
 use super::place::Place;
 use super::{line, remote_runs};
-use crate::rpc::client::ClientError;
-use crate::rpc::error::{Code, RpcError};
-use crate::rpc::run_dir::{Claim, RunDir};
+use dimos_rpc::client::ClientError;
+use dimos_rpc::error::{Code, RpcError};
+use dimos_rpc::run_dir::{Claim, RunDir};
 
 /// Time for the client to read why there is no connection.
 const REFUSAL: Duration = Duration::from_secs(1);

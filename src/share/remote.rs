@@ -21,10 +21,10 @@ use zenoh::{Session, Wait};
 
 use super::class::Class;
 use super::keys::{self, Who};
-use crate::rpc::api::{Method, OnBehalfOf, PLANNER_REQUESTS, RegisterPlanner, Release};
-use crate::rpc::error::{Code, RpcError};
-use crate::rpc::reach;
-use crate::sync::lock;
+use dimos_core::sync::lock;
+use dimos_rpc::api::{Method, OnBehalfOf, PLANNER_REQUESTS, RegisterPlanner, Release};
+use dimos_rpc::error::{Code, RpcError};
+use dimos_rpc::reach;
 
 /// Requests of a client that may wait for their replies; more are refused.
 const MAX_PENDING: usize = 32;

@@ -10,9 +10,9 @@ use super::page::Page;
 use super::place::Place;
 use super::settings::OPEN_TIMEOUT;
 use crate::blueprint::share::ANYONE;
-use crate::rpc::client::{Client, ClientError};
-use crate::rpc::error::{Code, RpcError};
-use crate::rpc::run_dir::LiveRun;
+use dimos_rpc::client::{Client, ClientError};
+use dimos_rpc::error::{Code, RpcError};
+use dimos_rpc::run_dir::LiveRun;
 
 /// Maximum time until a place accepts a connection again: those who connect again try until it does.
 pub(super) const AGAIN_TIMEOUT: Duration = Duration::from_millis(500);

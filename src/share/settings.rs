@@ -9,7 +9,7 @@ use zenoh::Config;
 use super::access;
 use super::place::Place;
 use crate::blueprint::share::{Identity, RosConfig, ShareConfig};
-use crate::rpc::error::{Code, RpcError};
+use dimos_rpc::error::{Code, RpcError};
 
 /// Largest message that is accepted [bytes]: an answer of a planner.
 pub const MAX_MESSAGE: usize = 16 << 20;

@@ -1,7 +1,7 @@
 //! Fewer points for a long trajectory: planners of Python dimos and ROS make 100 a second, and a request to the run
 //! holds 1200 points of six joints.
 
-use crate::rpc::api::Point;
+use dimos_rpc::api::Point;
 
 /// Largest distance of the curve from a point that is left out [rad]. On straight lines between points 10 ms apart, as
 /// Python dimos takes them, a joint deviates more from its curve.
@@ -77,11 +77,11 @@ mod tests {
         assert!((2..1200).contains(&thin.len()), "{}", thin.len());
         assert_eq!((thin.first(), thin.last()), (given.first(), given.last()));
         // The run's own curve through the points that are left.
-        let trajectory = crate::trajectory::JointTrajectory {
+        let trajectory = dimos_core::trajectory::JointTrajectory {
             joint_names: vec!["a".into()],
             points: thin
                 .iter()
-                .map(|point| crate::trajectory::TrajectoryPoint {
+                .map(|point| dimos_core::trajectory::TrajectoryPoint {
                     time_from_start: point.time_from_start,
                     positions: [point.positions[0]][..].into(),
                     velocities: [point.velocities.as_ref().unwrap()[0]][..].into(),
@@ -89,10 +89,10 @@ mod tests {
                 })
                 .collect(),
         };
-        let spline = crate::trajectory::Spline::new(&trajectory).unwrap();
-        let mut cursor = crate::trajectory::Cursor::default();
+        let spline = dimos_core::trajectory::Spline::new(&trajectory).unwrap();
+        let mut cursor = dimos_core::trajectory::Cursor::default();
         for point in &given {
-            let mut sample = [crate::trajectory::Sample::default()];
+            let mut sample = [dimos_core::trajectory::Sample::default()];
             spline.sample(point.time_from_start, &mut cursor, &mut sample);
             assert!((sample[0].position - point.positions[0]).abs() < 1.1e-5, "at {} s", point.time_from_start);
         }

@@ -3,9 +3,9 @@
 use std::path::PathBuf;
 
 use crate::blueprint::share::ShareConfig;
-use crate::rpc::client::{Client, ClientError};
-use crate::rpc::error::{Code, RpcError};
-use crate::rpc::run_dir::LiveRun;
+use dimos_rpc::client::{Client, ClientError};
+use dimos_rpc::error::{Code, RpcError};
+use dimos_rpc::run_dir::LiveRun;
 
 /// No environment variable.
 pub const THREADS: (&str, &str) = ("", "");

@@ -4,7 +4,7 @@
 use std::io;
 use std::net::{IpAddr, SocketAddr};
 
-use crate::random;
+use dimos_core::random;
 
 /// What gives access to the page of one run.
 #[derive(Debug)]

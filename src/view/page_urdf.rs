@@ -3,9 +3,9 @@
 
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 
-use crate::pose::{from_xyz_rpy, to_xyz_rpy};
-use crate::robot::urdf;
-use crate::robot::xml::{Element, Node};
+use dimos_core::pose::{from_xyz_rpy, to_xyz_rpy};
+use dimos_robot::urdf;
+use dimos_robot::xml::{Element, Node};
 
 /// Rewrites a description that was read without mistakes.
 pub(super) fn simplify(root: &mut Element) {
@@ -87,10 +87,10 @@ fn parts_of_capsule(shape: &Element) -> Option<[Element; 3]> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::robot::RobotModel;
-    use crate::robot::urdf::from_text;
-    use crate::robot::xml::parse;
-    use crate::yaml::Tree;
+    use dimos_robot::RobotModel;
+    use dimos_robot::urdf::from_text;
+    use dimos_robot::xml::parse;
+    use dimos_yaml::Tree;
 
     const ARM: &str = "<robot name='r' version='1.1'><link name='a'>\
         <visual name='v'><origin xyz='0 0 0.5' quat_xyzw='1 0 0 1'/>\

@@ -9,10 +9,10 @@ use nalgebra::Isometry3;
 use serde::{Serialize, Serializer};
 
 use super::{Shown, ShownArm, ShownRobot, page_urdf};
-use crate::bounded;
-use crate::robot;
-use crate::robot::urdf::Meshes;
-use crate::robot::xml::{Element, Node};
+use dimos_core::bounded;
+use dimos_robot as robot;
+use dimos_robot::urdf::Meshes;
+use dimos_robot::xml::{Element, Node};
 
 /// Version of the form of the scene.
 const VERSION: u32 = 1;

@@ -21,7 +21,7 @@ use super::scene::{self, Scene};
 use super::subject::{Live, Subject};
 use super::{Shown, bridge, stl};
 use crate::blueprint::planner::ViewConfig;
-use crate::rpc::run_dir::{RunFiles, UrlFile};
+use dimos_rpc::run_dir::{RunFiles, UrlFile};
 
 /// The page, compressed by the build.
 static PAGE: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/page.html.gz"));

@@ -3,11 +3,11 @@
 use nalgebra::Isometry3;
 
 use crate::blueprint::{Blueprint, TaskRobot};
-use crate::control::config::CoordinatorConfig;
-use crate::joint::JointLimits;
-use crate::planning::config::{GripperJoint, RobotConfig};
-use crate::robot::Source;
-use crate::rpc::report::{ArmReport, StateReport, StatusReport};
+use dimos_control::config::CoordinatorConfig;
+use dimos_core::joint::JointLimits;
+use dimos_planner::planning::config::{GripperJoint, RobotConfig};
+use dimos_robot::Source;
+use dimos_rpc::report::{ArmReport, StateReport, StatusReport};
 
 /// The arms and robots that a page shows.
 #[derive(Debug, Clone, Default)]

@@ -7,10 +7,10 @@ use std::path::Path;
 use nalgebra::Vector3;
 
 use super::scene::MeshFile;
-use crate::bounded;
-use crate::collision::ply;
-use crate::robot::mesh::Mesh;
-use crate::rpc::api::ShapeSpec;
+use dimos_core::bounded;
+use dimos_planner::collision::ply;
+use dimos_robot::mesh::Mesh;
+use dimos_rpc::api::ShapeSpec;
 
 /// Bytes before the number of triangles.
 const HEADER: usize = 80;

@@ -4,8 +4,8 @@ use std::path::PathBuf;
 
 use super::Shown;
 use super::scene::Scene;
-use crate::rpc::api::{World, WorldObject};
-use crate::rpc::client::Client;
+use dimos_rpc::api::{World, WorldObject};
+use dimos_rpc::client::Client;
 
 /// What the pages of a server show. It is asked on a thread for files, which may wait.
 pub trait Subject: Send + Sync {

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::Shown;
 use crate::blueprint::planner::ViewConfig;
-use crate::rpc::run_dir::RunFiles;
+use dimos_rpc::run_dir::RunFiles;
 
 /// No view.
 #[derive(Debug)]

@@ -7,7 +7,6 @@ use dimos::blueprint::{self, Catalog, Found, Loaded, Overrides, Source};
 use dimos::control::config::{TaskConfig, TaskKind};
 use dimos::control::request::Request;
 use dimos::control::task_spec::{TaskSpec, TaskTable};
-use dimos::hardware::registry::Registry;
 use dimos::joint::joints_of;
 use dimos::replay::verify::{Finding, verify};
 use dimos::telemetry::{Reason, TaskState};
@@ -50,7 +49,7 @@ fn check(params: &str, types: &[TaskSpec]) -> Loaded {
          tasks:\n  - {{name: stick, type: joystick, joint_names: {{hardware: arm}}, params: {params}}}\n"
     );
     let found = Found { name: "stick".into(), source: Source::Embedded, bytes: text.into_bytes() };
-    let (adapters, tasks) = (Registry::builtin(), TaskTable::with(types));
+    let (adapters, tasks) = (dimos::arms::registry(), TaskTable::with(types));
     blueprint::load(&found, &Overrides::default(), Catalog { adapters: &adapters, tasks: &tasks })
 }
 
@@ -68,7 +67,7 @@ fn blueprints_are_checked_against_its_row() {
 
 #[test]
 fn the_schema_and_the_reference_have_its_parameters() {
-    let (adapters, tasks) = (Registry::builtin(), TaskTable::with(&[SPEC]));
+    let (adapters, tasks) = (dimos::arms::registry(), TaskTable::with(&[SPEC]));
     let catalog = Catalog { adapters: &adapters, tasks: &tasks };
     let schema = blueprint::json_schema(catalog);
     let types = &schema["$defs"]["TaskEntry"]["properties"]["type"];

@@ -265,12 +265,12 @@ fn check(path: &str, generated: &str) {
 
 #[test]
 fn the_committed_reference_is_up_to_date() {
-    check("docs/blueprint-reference.md", &reference(&Registry::builtin()));
+    check("docs/blueprint-reference.md", &reference(&dimos::arms::registry()));
 }
 
 #[test]
 fn the_committed_schema_is_up_to_date() {
-    let schema = serde_json::to_string_pretty(&json_schema(&Registry::builtin())).unwrap();
+    let schema = serde_json::to_string_pretty(&json_schema(&dimos::arms::registry())).unwrap();
     check("assets/blueprint.schema.json", &format!("{schema}\n"));
 }
 

@@ -152,11 +152,11 @@ fn an_adapter_of_another_build_is_refused_with_a_hint() {
         let found = Found { name: "absent".to_owned(), source: Source::Embedded, bytes: text.as_bytes().to_vec() };
         load_from(&SearchPath::default(), &found, &Overrides::default(), registry).render(false)
     };
-    let said = answer(&Registry::builtin().lacking(&[absent]));
+    let said = answer(&dimos::arms::registry().lacking(&[absent]));
     assert!(said.contains("error: adapter `servobot` is not in this build"), "{said}");
     assert!(said.contains("hint: build with --features servobot"), "{said}");
     assert!(said.ends_with("1 error\n"), "nothing else: {said}");
-    assert!(answer(&Registry::builtin()).contains("there is no adapter `servobot`"));
+    assert!(answer(&dimos::arms::registry()).contains("there is no adapter `servobot`"));
     let there = fake_arms::registry().lacking(&[absent]);
     assert_eq!(there.absent().count(), 0, "a row is a row");
 }

@@ -4,7 +4,6 @@ use std::path::{Path, PathBuf};
 use std::{env, fs};
 
 use dimos::blueprint::{self, Loaded, OnExit, Overrides, SearchPath, Source, Summary, find, load, load_from};
-use dimos::hardware::registry::Registry;
 
 use crate::support::fake_arms;
 
@@ -26,7 +25,7 @@ fn answer(name: &str) -> String {
 
 #[test]
 fn shipped_blueprints_have_no_mistakes() {
-    let (builtin, fake) = (Registry::builtin(), fake_arms::registry());
+    let (builtin, fake) = (dimos::arms::registry(), fake_arms::registry());
     let has_arms = builtin.get("yourarm").is_some() && builtin.get("mock").is_some();
     let listed = blueprint::list(&builtin);
     let shipped = listed.iter().map(|listing| listing.name.as_str());
@@ -58,7 +57,7 @@ fn an_address_makes_an_arm_real() {
     };
     let with = |name: &str, address: &[(&str, &str)]| {
         let address = address.iter().map(|(arm, at)| ((*arm).to_owned(), (*at).to_owned())).collect();
-        load(&find(name).unwrap(), &Overrides { address, ..Overrides::default() }, &Registry::builtin())
+        load(&find(name).unwrap(), &Overrides { address, ..Overrides::default() }, &dimos::arms::registry())
     };
     let at = |address: &str| (address.to_owned(), address != "sim");
     assert_eq!(addresses(with("coordinator-xarm6", &[("arm", "192.168.1.185")])), [at("192.168.1.185")]);
@@ -73,7 +72,7 @@ fn an_address_makes_an_arm_real() {
     let own = folder.path().join("cell.yaml");
     fs::write(&own, "include: [coordinator-xarm6]\nhardware: [{hardware_id: arm, address: 192.168.1.185}]\n").unwrap();
     let found = find(own.to_str().unwrap()).unwrap();
-    let load_own = |overrides: Overrides| load(&found, &overrides, &Registry::builtin());
+    let load_own = |overrides: Overrides| load(&found, &overrides, &dimos::arms::registry());
     assert_eq!(addresses(load_own(Overrides::default())), [at("192.168.1.185")]);
     assert_eq!(addresses(load_own(Overrides { sim: true, ..Overrides::default() })), [at("sim")]);
 }
@@ -84,7 +83,7 @@ fn an_address_makes_an_arm_real() {
 fn options_that_do_not_fit_are_located() {
     let file = fixtures().join("misfits.yaml");
     let found = SearchPath { folders: vec![fixtures()] }.find(file.to_str().unwrap()).unwrap();
-    let loaded = load_from(&SearchPath::default(), &found, &Overrides::default(), &Registry::builtin());
+    let loaded = load_from(&SearchPath::default(), &found, &Overrides::default(), &dimos::arms::registry());
     let got = loaded.render(false).replace(&format!("{}/", fixtures().display()), "");
     if env::var_os("DIMOS_REGENERATE").is_some() {
         fs::write(file.with_extension("txt"), &got).unwrap();
@@ -98,7 +97,7 @@ fn limits_are_those_of_the_model() {
     let joint = |name: &str, overrides: &[&str]| {
         let set = overrides.iter().map(|text| (*text).to_owned()).collect();
         let loaded =
-            load(&find(name).unwrap(), &Overrides { set, sim: true, ..Overrides::default() }, &Registry::builtin());
+            load(&find(name).unwrap(), &Overrides { set, sim: true, ..Overrides::default() }, &dimos::arms::registry());
         assert_eq!(loaded.render(false), "", "{name}");
         let lower = Summary::of(&loaded.blueprint.unwrap()).arms[0].joints[2].position_lower.unwrap().value;
         (lower * 1e6).round() / 1e6
@@ -235,7 +234,7 @@ fn a_simulated_arm_may_be_silent_for_250_ms() {
         let set = set.iter().map(|&s| s.to_owned()).collect();
         let address = vec![("arm".to_owned(), "192.168.1.185".to_owned())];
         let overrides = Overrides { set, sim, address };
-        let loaded = load(&find("coordinator-xarm7").unwrap(), &overrides, &Registry::builtin());
+        let loaded = load(&find("coordinator-xarm7").unwrap(), &overrides, &dimos::arms::registry());
         loaded.blueprint.unwrap().arms[0].supervision.stale_after.as_millis()
     };
     assert_eq!(stale_after(false, &[]), 50);
@@ -336,7 +335,7 @@ tasks:
     };
     for (task, errors) in [("trajectory", 0), ("servo", 1), ("velocity", 1)] {
         let found = blueprint::Found { name: "wide".into(), source: Source::Embedded, bytes: text(task).into_bytes() };
-        let loaded = load_from(&SearchPath::default(), &found, &Overrides::default(), &Registry::builtin());
+        let loaded = load_from(&SearchPath::default(), &found, &Overrides::default(), &dimos::arms::registry());
         assert_eq!(loaded.errors(), errors, "{task}: {}", loaded.render(false));
         assert!(errors == 0 || loaded.render(false).contains("at most 16 joints, this one names 18"));
     }
@@ -363,7 +362,7 @@ tasks:
 {planner}"
         );
         let found = blueprint::Found { name: "cart".into(), source: Source::Embedded, bytes: text.into_bytes() };
-        load_from(&SearchPath::default(), &found, &Overrides::default(), &Registry::builtin())
+        load_from(&SearchPath::default(), &found, &Overrides::default(), &dimos::arms::registry())
     };
     let task = |params: &str| format!("{{name: c, type: cartesian_ik, joint_names: {{hardware: arm}}, {params}}}");
     let own = |more: &str| task(&format!("params: {{model_path: 'builtin:yourarm', {more}}}"));

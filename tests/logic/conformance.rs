@@ -1,13 +1,12 @@
 //! Every row of the adapter table against the conformance suite. A new row needs no further line here.
 
 use dimos::hardware::conformance::{Outcome, Subject, checks, run_all};
-use dimos::hardware::registry::Registry;
 
 use dimos::rt::counting::allocations;
 
 #[test]
 fn every_adapter_conforms() {
-    let registry = Registry::builtin();
+    let registry = dimos::arms::registry();
     assert!(!registry.rows().is_empty());
     let mut failures = Vec::new();
     for row in registry.rows() {

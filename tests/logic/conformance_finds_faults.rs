@@ -1,6 +1,6 @@
 //! The conformance suite must be able to fail: adapters with one mistake each, and the check that finds it.
 
-use dimos::hardware::arms::mock;
+use dimos::arms::mock;
 use dimos::hardware::conformance::first_motion::{Motion, refusal, run_first_motion};
 use dimos::hardware::conformance::{Outcome, checks, run};
 use dimos::hardware::registry::{AdapterConfig, AdapterSpec};

@@ -7,9 +7,9 @@ use std::os::unix::net::UnixStream;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use dimos::arms::mock;
 use dimos::clock::{Clock, Mono, MonotonicClock};
 use dimos::hardware::adapter::*;
-use dimos::hardware::arms::mock;
 use dimos::hardware::conformance::{Outcome, checks, run};
 use dimos::hardware::registry::{AdapterConfig, AdapterSpec};
 

@@ -6,12 +6,12 @@ use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
 use dimos::arm::{ArmCommand, ArmState, Interference, IoInfo, IoState, Link, Supervision};
+use dimos::arms::piper::{self, emulator::PiperEmulator};
+use dimos::arms::xarm::{self, emulator::XArmEmulator};
 use dimos::clock::{Clock, Mono, MonotonicClock};
 use dimos::hardware::adapter::{
     AdapterError, AdapterResult, Io, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
 };
-use dimos::hardware::arms::piper::{self, emulator::PiperEmulator};
-use dimos::hardware::arms::xarm::{self, emulator::XArmEmulator};
 use dimos::hardware::device::{Device, DeviceConfig};
 use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::joint::ControlMode;

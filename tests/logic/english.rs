@@ -9,7 +9,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Folders and files whose text is checked.
-const CHECKED: [&str; 7] = ["src", "tests", "benches", "blueprints", "docs", "assets", "README.md"];
+const CHECKED: [&str; 8] = ["src", "crates", "tests", "benches", "blueprints", "docs", "assets", "README.md"];
 /// Texts of other programs, and the lists themselves.
 const FIXTURES: &str = "tests/fixtures";
 /// File types besides Rust that are checked as a whole.

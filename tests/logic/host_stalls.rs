@@ -60,7 +60,7 @@ fn what_a_stall_interrupted_is_run_again_and_nothing_else() {
     if realtime {
         assert_eq!((code, runs.lines().count()), (Some(0), 2), "{output}{runs}");
         assert!(output.contains("INTERRUPTED: dimos::logic one: this computer was stalled for"), "{output}");
-        let again = "nextest run --locked --test-threads 1 -E (binary_id(=dimos::logic) & test(=one))";
+        let again = "nextest run --workspace --locked --test-threads 1 -E (binary_id(=dimos::logic) & test(=one))";
         assert_eq!(runs.lines().nth(1), Some(again), "{runs}");
     } else {
         assert_eq!((code, runs.lines().count()), (Some(100), 1), "{output}{runs}");
@@ -72,7 +72,7 @@ fn what_fails_beside_others_must_pass_each_time_alone() {
     if Command::new("python3").arg("--version").output().is_err() {
         return skip::skip_tool("python3");
     }
-    let again = "nextest run --locked --test-threads 1 -E (binary_id(=dimos::logic) & test(=one))";
+    let again = "nextest run --workspace --locked --test-threads 1 -E (binary_id(=dimos::logic) & test(=one))";
     for (fails, ends, count) in [("", 0, 3), ("2", 100, 2), ("3", 100, 3)] {
         let (code, output, runs) = suite(false, "2", fails);
         assert_eq!((code, runs.lines().count()), (Some(ends), count), "{fails}: {output}{runs}");

@@ -227,7 +227,7 @@ fn has_the_flange(name: &str, tip: &str, of: impl Fn(&[f64]) -> nalgebra::Isomet
 
 #[test]
 fn a_ur5e_has_the_controllers_kinematics() {
-    use dimos::hardware::arms::ur::model::Model;
+    use dimos::arms::ur::model::Model;
 
     has_the_flange("ur5e", "tool0", |q| {
         let links = q.iter().enumerate().map(|(joint, position)| Model::Ur5e.link(joint, *position).unwrap());
@@ -237,7 +237,7 @@ fn a_ur5e_has_the_controllers_kinematics() {
 
 #[test]
 fn fr3_and_fer_have_the_controllers_kinematics_and_limits() {
-    use dimos::hardware::arms::franka::model::Model;
+    use dimos::arms::franka::model::Model;
 
     for (name, arm) in [("fr3", Model::Fr3), ("fer", Model::Fer)] {
         has_the_flange(name, "flange", |q| {

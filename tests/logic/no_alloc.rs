@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use dimos::arm::{ArmCommand, ArmState, Link};
+use dimos::arms::mock::SPEC;
 use dimos::clock::{Clock, MonotonicClock};
 use dimos::collision::World;
 use dimos::control::config::{CartesianParams, CoordinatorConfig, TaskKind, TaskKinematics};
@@ -14,7 +15,6 @@ use dimos::control::request::{Envelope, Goal, Request};
 use dimos::control::task_spec::TaskTable;
 use dimos::control::tick_loop::{self, Pulse, TickPorts};
 use dimos::hardware::adapter::*;
-use dimos::hardware::arms::mock::SPEC;
 use dimos::hardware::device::{Device, DeviceConfig};
 use dimos::hardware::registry::AdapterConfig;
 use dimos::joint::{ControlMode, joints_of};

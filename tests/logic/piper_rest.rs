@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 use std::f64::consts::PI;
 
 use dimos::arm::StopPoint;
+use dimos::arms::piper::SPEC;
 use dimos::hardware::adapter::ManipulatorAdapter;
-use dimos::hardware::arms::piper::SPEC;
 use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::transport::can::{CanAddress, CanEvent, open};
 

@@ -6,7 +6,6 @@ use std::time::{Duration, Instant};
 
 use dimos::blueprint::{self, Overrides, find, load};
 use dimos::collision::Stop;
-use dimos::hardware::registry::Registry;
 use dimos::planning::config::{JointBounds, PlannerConfig};
 use dimos::planning::level::Level;
 use dimos::planning::pipeline::{Goal, PlanFailure, PlanRequest, PlannedMotion, solve};
@@ -22,11 +21,11 @@ const PLACE: f64 = 5e-4;
 const TURN: f64 = 1.7e-3;
 
 fn planners() -> Vec<(String, PlannerConfig)> {
-    let listed = blueprint::list(&Registry::builtin());
+    let listed = blueprint::list(&dimos::arms::registry());
     let names = listed.into_iter().map(|listing| listing.name).filter(|name| name.ends_with("-planner"));
     let config = |name: String| {
         let set = Overrides { sim: true, ..Overrides::default() };
-        let loaded = load(&find(&name).unwrap(), &set, &Registry::builtin());
+        let loaded = load(&find(&name).unwrap(), &set, &dimos::arms::registry());
         let planner = loaded.blueprint.unwrap_or_else(|| panic!("{name}")).planner;
         (name.clone(), planner.unwrap_or_else(|| panic!("{name} has no planner")))
     };

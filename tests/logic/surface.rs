@@ -14,7 +14,6 @@ use clap::{ArgAction, Command};
 use dimos::blueprint::{Overrides, find, load};
 use dimos::cli::exit::Exit;
 use dimos::clock::Mono;
-use dimos::hardware::registry::Registry;
 use dimos::joint::make_joints;
 use dimos::planning::planning_scene::PlanningScene;
 use dimos::recording::recorder::Note;
@@ -47,7 +46,7 @@ fn unchanged(name: &str, lines: &[String]) {
 
 /// The tool centre point of a YourArm.
 fn tcp() -> TcpChain {
-    let loaded = load(&find("yourarm-planner").unwrap(), &Overrides::default(), &Registry::builtin());
+    let loaded = load(&find("yourarm-planner").unwrap(), &Overrides::default(), &dimos::arms::registry());
     let robot = PlanningScene::load(&loaded.blueprint.unwrap().planner.unwrap()).unwrap().robots.remove(0);
     let (kinematics, root) = (robot.body.kinematics.clone(), robot.body.base);
     TcpChain { joints: (0..6).collect(), kinematics, link: robot.end_effector, root, tool: None }
@@ -71,7 +70,7 @@ fn a_change_is_shown_as_lines() {
 #[test]
 #[cfg(feature = "can")]
 fn blueprint_keys() {
-    let schema = dimos::blueprint::json_schema(&Registry::builtin());
+    let schema = dimos::blueprint::json_schema(&dimos::arms::registry());
     unchanged("blueprint", &schema::lines(&schema, &schema, ""));
 }
 
@@ -211,9 +210,9 @@ const ADAPTER_TRAITS: [&str; 4] = ["ManipulatorAdapter", "Gripper", "ForceTorque
 
 #[test]
 fn methods_of_an_adapter() {
-    let mut lines = source::traits(&Path::new(env!("CARGO_MANIFEST_DIR")).join("src/hardware"));
+    let mut lines = source::traits(&Path::new(env!("CARGO_MANIFEST_DIR")).join("crates/hardware/src"));
     lines.retain(|(name, _)| ADAPTER_TRAITS.contains(&name.as_str()));
     let names: Vec<_> = lines.iter().map(|(name, _)| name.as_str()).collect();
-    assert_eq!(names, ADAPTER_TRAITS, "the traits of an adapter, in one file of src/hardware");
+    assert_eq!(names, ADAPTER_TRAITS, "the traits of an adapter, in one file of crates/hardware/src");
     unchanged("adapter", &lines.into_iter().flat_map(|(_, lines)| lines).collect::<Vec<_>>());
 }

@@ -7,7 +7,6 @@ use std::collections::HashMap;
 use dimos::blueprint::{Arm, Overrides, find, load};
 use dimos::control::config::{ArmConfig, TaskKind, ToolLimit};
 use dimos::control::point_to_point::point_to_point;
-use dimos::hardware::registry::Registry;
 use dimos::joint::ControlMode;
 use dimos::joint::JointLimits;
 use dimos::planning::timing::time_within;
@@ -49,7 +48,7 @@ impl Limited {
 
     fn of(name: &str, set: &[&str]) -> Self {
         let set = set.iter().map(|set| (*set).to_owned()).collect();
-        let loaded = load(&find(name).unwrap(), &Overrides { set, ..Overrides::default() }, &Registry::builtin());
+        let loaded = load(&find(name).unwrap(), &Overrides { set, ..Overrides::default() }, &dimos::arms::registry());
         let arm = loaded.blueprint.unwrap_or_else(|| panic!("{name}")).arms.remove(0);
         let limit = arm.tool_limit().unwrap().unwrap_or_else(|| panic!("{name} has no tool limit"));
         let model = dimos::robot::load(&arm.tool_robot.as_ref().unwrap().robot.source).model.unwrap();
@@ -240,7 +239,7 @@ fn the_blueprint_narrows_it_and_raises_only_what_is_a_setting() {
     assert_eq!(of("ur5e-planner", "2.5"), 2.5, "a setting of the controller");
     let said = |name: &str, value: &str| {
         let set = vec![format!("hardware.arm.limits.tcp_velocity={value}")];
-        load(&find(name).unwrap(), &Overrides { set, ..Overrides::default() }, &Registry::builtin()).render(false)
+        load(&find(name).unwrap(), &Overrides { set, ..Overrides::default() }, &dimos::arms::registry()).render(false)
     };
     let text = said("coordinator-xarm6", "1.2");
     assert!(text.contains("1.2 m/s is above the arm's own limit") && text.contains("0.95 m/s"), "{text}");

@@ -5,7 +5,6 @@ use std::path::{Path, PathBuf};
 
 use dimos::hardware::conformance::first_day::replay::replay;
 use dimos::hardware::conformance::first_day::report::Report;
-use dimos::hardware::registry::Registry;
 
 const INTRODUCTION: &str = "\
 # Verified arms
@@ -81,7 +80,7 @@ fn the_page_is_generated_from_the_reports() {
 /// What an arm did becomes a test.
 #[test]
 fn the_emulators_do_what_the_arms_of_the_reports_did() {
-    let registry = Registry::builtin();
+    let registry = dimos::arms::registry();
     for path in reports() {
         let (report, chunks) = Report::read(&path).unwrap();
         let arm = registry.get(&report.adapter).unwrap();

@@ -5,7 +5,6 @@ use std::path::Path;
 use std::time::Duration;
 
 use dimos::blueprint::{Blueprint, Overrides};
-use dimos::hardware::registry::Registry;
 use dimos::recording::files;
 use dimos::rpc::api;
 use dimos::rpc::client::Client;
@@ -16,7 +15,7 @@ use crate::verify::reproducible;
 
 fn blueprint(name: &str, set: &[&str]) -> Blueprint {
     let set = set.iter().map(|s| (*s).to_owned()).collect();
-    let registry = Registry::builtin();
+    let registry = dimos::arms::registry();
     let found = dimos::blueprint::find(name).unwrap_or_else(|e| panic!("{}", e.message));
     let loaded = dimos::blueprint::load(&found, &Overrides { set, ..Overrides::default() }, &registry);
     loaded.blueprint.clone().unwrap_or_else(|| panic!("{}", loaded.render(false)))

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-use dimos::hardware::arms::so101::protocol::{Instruction, MAX_INSTRUCTION, SERVOS, encode};
+use dimos::arms::so101::protocol::{Instruction, MAX_INSTRUCTION, SERVOS, encode};
 
 use crate::support::program::Home;
 use crate::support::python::python_with;

@@ -5,11 +5,11 @@ use std::net::IpAddr;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-use dimos::hardware::arms::franka::emulator::{Datagram, Figures, FrankaEmulator};
-use dimos::hardware::arms::franka::model::Model;
-use dimos::hardware::arms::franka::protocol::command::{Target, encode, sent};
-use dimos::hardware::arms::franka::protocol::state::{State, generator};
-use dimos::hardware::arms::franka::shaping::Shaping;
+use dimos::arms::franka::emulator::{Datagram, Figures, FrankaEmulator};
+use dimos::arms::franka::model::Model;
+use dimos::arms::franka::protocol::command::{Target, encode, sent};
+use dimos::arms::franka::protocol::state::{State, generator};
+use dimos::arms::franka::shaping::Shaping;
 use dimos::hardware::registry::{AdapterConfig, EmulatorAddress};
 
 use crate::support::python::python_with;

@@ -4,12 +4,12 @@
 use std::path::Path;
 use std::process::{Command, Stdio};
 
+use dimos::arms::so101::SPEC;
+use dimos::arms::so101::adapter::So101Adapter;
+use dimos::arms::so101::calibration::{Calibration, NAMES};
+use dimos::arms::so101::emulator::{Servos, start};
+use dimos::arms::so101::protocol::{Instruction, MAX_INSTRUCTION, encode, with_sign};
 use dimos::hardware::adapter::ManipulatorAdapter;
-use dimos::hardware::arms::so101::SPEC;
-use dimos::hardware::arms::so101::adapter::So101Adapter;
-use dimos::hardware::arms::so101::calibration::{Calibration, NAMES};
-use dimos::hardware::arms::so101::emulator::{Servos, start};
-use dimos::hardware::arms::so101::protocol::{Instruction, MAX_INSTRUCTION, encode, with_sign};
 use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::serial_server::SerialServer;
 use serde_json::{Value, json};

@@ -7,10 +7,10 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use dimos::arm::StopPoint;
+use dimos::arms::piper::GripperKind;
+use dimos::arms::piper::adapter::PiperAdapter;
+use dimos::arms::piper::emulator::{PiperEmulator, SimOptions};
 use dimos::hardware::adapter::{AdapterError, JointReading, ManipulatorAdapter};
-use dimos::hardware::arms::piper::GripperKind;
-use dimos::hardware::arms::piper::adapter::PiperAdapter;
-use dimos::hardware::arms::piper::emulator::{PiperEmulator, SimOptions};
 use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use dimos::joint::ControlMode;

@@ -5,8 +5,8 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use dimos::hardware::arms::piper::GripperKind;
-use dimos::hardware::arms::piper::emulator::{PiperEmulator, SimOptions};
+use dimos::arms::piper::GripperKind;
+use dimos::arms::piper::emulator::{PiperEmulator, SimOptions};
 use dimos::hardware::registry::{Emulator, EmulatorAddress};
 
 use crate::support::python::python_with;

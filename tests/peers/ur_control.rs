@@ -1,8 +1,8 @@
 //! The text of the program that runs on a controller of Universal Robots, carried out by Python.
 
-use dimos::hardware::arms::ur::Options;
-use dimos::hardware::arms::ur::model::Model;
-use dimos::hardware::arms::ur::program::control;
+use dimos::arms::ur::Options;
+use dimos::arms::ur::model::Model;
+use dimos::arms::ur::program::control;
 use serde_json::{Value, json};
 
 use crate::support::python::ask_python;

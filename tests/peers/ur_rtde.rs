@@ -4,7 +4,7 @@
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-use dimos::hardware::arms::ur::protocol::rtde::{VERSION, encode, kind, recipe};
+use dimos::arms::ur::protocol::rtde::{VERSION, encode, kind, recipe};
 
 use crate::support::program::Home;
 use crate::support::python::python_with;

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
-use dimos::hardware::arms::xarm::emulator::XArmEmulator;
+use dimos::arms::xarm::emulator::XArmEmulator;
 use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use serde_json::json;

@@ -1,6 +1,5 @@
 //! `dimos adapter emulate` with the real binary: an emulator in one process, its client in another.
 
-use dimos::hardware::registry;
 use dimos::joint::ControlMode;
 use rustix::process::Signal;
 
@@ -43,7 +42,7 @@ fn a_scripted_fault_occurs() {
     let (home, address) = (Home::new(), own_address());
     home.write("faults.yaml", "- {at: 0.5, kind: error_code, code: 3}\n");
     let emulator = emulate(&home, &format!("yourarm --bind {address} --fault faults.yaml --fault at=1e5,kind=estop"));
-    let mut adapter = registry::create("yourarm", &address.to_string(), 6).unwrap();
+    let mut adapter = dimos::arms::create("yourarm", &address.to_string(), 6).unwrap();
     adapter.connect().unwrap();
     adapter.activate().unwrap();
     adapter.set_control_mode(ControlMode::Position).unwrap();

@@ -140,12 +140,12 @@ fn checkout(at: &Path) {
                 .into(),
         ),
         (
-            "src/hardware/arms/mod.rs",
+            "crates/arms/src/lib.rs",
             "use crate::hardware::registry::AdapterSpec;\n\npub const TABLE: &[AdapterSpec] = &[\n];\n"
                 .into(),
         ),
-        ("src/robot/builtin.rs", "robots!(\n);\n".into()),
-        ("assets/robots/lite6.urdf", String::new()),
+        ("crates/robot/src/builtin.rs", "robots!(\n);\n".into()),
+        ("crates/robot/robots/lite6.urdf", String::new()),
         ("tests/conformance.rs", SUITE.into()),
     ] {
         let path = at.join(path);
@@ -181,7 +181,7 @@ fn arms_in_the_tree_build_and_conform() {
         let added: Vec<_> = report["add"].as_array().unwrap().iter().map(|line| add(home.path(), line)).collect();
         assert_eq!(
             added,
-            ["tree/src/hardware/arms/mod.rs", "tree/src/hardware/arms/mod.rs", "tree/src/robot/builtin.rs"]
+            ["tree/crates/arms/src/lib.rs", "tree/crates/arms/src/lib.rs", "tree/crates/robot/src/builtin.rs"]
         );
         let files = match transport {
             "can" => 8,
@@ -197,7 +197,7 @@ fn arms_in_the_tree_build_and_conform() {
         let planner = fs::read_to_string(tree.join(format!("blueprints/{name}-planner.yaml"))).unwrap();
         assert!(planner.contains(&format!("model_path: builtin:{snake} #")), "{planner}");
     }
-    let robots = fs::read_to_string(tree.join("src/robot/builtin.rs")).unwrap();
+    let robots = fs::read_to_string(tree.join("crates/robot/src/builtin.rs")).unwrap();
     assert_eq!(robots, "robots!(\n    \"otto\",\n    \"acme\",\n    \"penny_2\",\n);\n");
     // In one workspace with the real one it needs a name of its own.
     let manifest = fs::read_to_string(tree.join("Cargo.toml")).unwrap();
@@ -213,7 +213,7 @@ fn no_file_is_overwritten_or_left_half_written() {
     fs::create_dir_all(home.path().join("taken")).unwrap();
     fs::create_dir_all(tree.join("blueprints")).unwrap();
     fs::write(tree.join("blueprints/coordinator-planned.yaml"), "mine").unwrap();
-    fs::create_dir_all(tree.join("src/hardware/arms/there")).unwrap();
+    fs::create_dir_all(tree.join("crates/arms/src/there")).unwrap();
     let before = files(home.path());
     for (arguments, part) in [
         ("taken --dof 6 --transport tcp", "taken is there already: nothing was written"),

@@ -2,8 +2,8 @@
 
 use std::io::{Read as _, Write as _};
 
-use dimos::hardware::arms::yourarm::emulator::wire::Request;
-use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
+use dimos::arms::yourarm::emulator::wire::Request;
+use dimos::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
 use dimos::hardware::registry::Emulator;
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use rustix::process::Signal;

@@ -11,7 +11,6 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use dimos::hardware::registry;
 use rustix::process::{Pid, Signal, kill_process_group};
 use std::os::unix::process::CommandExt;
 
@@ -231,7 +230,7 @@ fn every_command_of_the_page_works() {
     let mut reader = Reader::new();
     let mut made = 0;
     for block in blocks(&page) {
-        if let Some(arm) = block.value("needs").filter(|arm| !registry::available().contains(arm)) {
+        if let Some(arm) = block.value("needs").filter(|arm| !dimos::arms::available().contains(arm)) {
             skip(&format!("line {}: the arm {arm} (its cargo feature)", block.line));
             continue;
         }
@@ -262,7 +261,7 @@ fn every_command_of_the_page_works() {
 
 #[test]
 fn the_table_has_every_method_of_the_trait() {
-    let spec = include_str!("../../src/hardware/adapter.rs");
+    let spec = include_str!("../../crates/hardware/src/adapter.rs");
     let body = spec.split("pub trait ManipulatorAdapter").nth(1).unwrap();
     let methods: Vec<&str> =
         body.lines().filter_map(|line| line.strip_prefix("    fn ")?.split(['(', '<']).next()).collect();

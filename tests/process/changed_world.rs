@@ -1,8 +1,8 @@
 //! A planned motion under way and a world that changes: the arm stops before the obstacle, in whole runs.
 //! Judged from the positions of the emulated joints and a collision checker of its own.
 
+use dimos::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
 use dimos::collision::{CollisionChecker, ExactChecker, Resolution};
-use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
 use dimos::hardware::registry::Emulator;
 use dimos::planning::planning_scene::{PlanningScene, obstacle};
 use dimos::rpc::api::{

@@ -1,7 +1,7 @@
 //! `coordinator.clock: device(ARM)`: ticks begin with the states of an emulated UR, as its log shows.
 
+use dimos::arms::ur::emulator::UrEmulator;
 use dimos::clock::{Clock, MonotonicClock};
-use dimos::hardware::arms::ur::emulator::UrEmulator;
 use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use dimos::recording::replay::{LogReader, Payload};

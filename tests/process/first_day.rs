@@ -4,8 +4,8 @@
 use std::io::{Read as _, Write as _};
 use std::path::Path;
 
-use dimos::hardware::arms::yourarm::emulator::wire::Request;
-use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
+use dimos::arms::yourarm::emulator::wire::Request;
+use dimos::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
 use dimos::hardware::conformance::first_day::STEPS;
 use dimos::hardware::conformance::first_day::report::Report;
 use dimos::hardware::registry::Emulator;

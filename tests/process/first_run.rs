@@ -250,7 +250,7 @@ fn an_arm_that_cannot_be_reached_ends_the_start_within_3_s() {
 
 #[test]
 fn an_arm_already_connected_is_let_go_when_another_one_fails() {
-    use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator, wire::Request};
+    use dimos::arms::yourarm::emulator::{SimOptions, YourArmEmulator, wire::Request};
     use dimos::hardware::registry::Emulator;
     let home = Home::new();
     let closed = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();

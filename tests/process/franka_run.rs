@@ -1,6 +1,6 @@
 //! A run with an arm whose controller is the clock, and judges every command.
 
-use dimos::hardware::arms::franka::emulator::FrankaEmulator;
+use dimos::arms::franka::emulator::FrankaEmulator;
 use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use rustix::process::Signal;

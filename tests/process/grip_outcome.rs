@@ -1,7 +1,7 @@
 //! What became of a gripper command: judged by the run, awaited by the command line, between waypoints, with objects of
 //! the planner's world; and gripper targets beside those of the joints.
 
-use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
+use dimos::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
 use dimos::hardware::registry::Emulator;
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use dimos::rpc::api::{Chunk, Servo, Status};

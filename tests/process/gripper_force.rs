@@ -1,7 +1,7 @@
 //! Position and force of a gripper, judged by what the arm's controller got and what the log has of it.
 
-use dimos::hardware::arms::yourarm::emulator::wire::Request;
-use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
+use dimos::arms::yourarm::emulator::wire::Request;
+use dimos::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
 use dimos::hardware::registry::Emulator;
 use dimos::recording::replay::{LogReader, Payload};
 use serde_json::Value;

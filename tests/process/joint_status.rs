@@ -1,8 +1,8 @@
 //! The condition of the joints, their calibration and the device's own time: what the program says of them, and how
 //! often the controller is asked.
 
-use dimos::hardware::arms::yourarm::emulator::wire::Request;
-use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
+use dimos::arms::yourarm::emulator::wire::Request;
+use dimos::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
 use dimos::hardware::registry::Emulator;
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use dimos::recording::messages::JointStatus;

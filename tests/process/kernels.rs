@@ -46,7 +46,7 @@ fn every_kernel_is_compiled_with_its_vectors() {
     }
     let symbols = done(Command::new("nm").args(["--demangle", "--print-size", "--defined-only", PROGRAM]));
     let kernels = in_program(&symbols);
-    let sources = Path::new(env!("CARGO_MANIFEST_DIR")).join("kernels/src");
+    let sources = Path::new(env!("CARGO_MANIFEST_DIR")).join("crates/kernels/src");
     assert_eq!(kernels.len(), in_sources(&sources), "{:?}", kernels.keys());
     for (name, (begin, end)) in &kernels {
         let range = [format!("--start-address={begin}"), format!("--stop-address={end}")];

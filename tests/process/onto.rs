@@ -8,7 +8,6 @@ use dimos::blueprint::{Overrides, find, load};
 use dimos::control::point_to_point::point_to_point;
 use dimos::control::request::Request;
 use dimos::control::task_spec::TaskTable;
-use dimos::hardware::registry::Registry;
 use dimos::joint::make_joints;
 use dimos::replay::motion::RecordedMotion;
 use dimos::replay::verify::{Finding, verify};
@@ -80,7 +79,7 @@ impl Home {
 
     /// Records moves to and fro on a simulated yourarm.
     fn recorded_on_yourarm(&self) -> PathBuf {
-        let registry = Registry::builtin();
+        let registry = dimos::arms::registry();
         let found = find("coordinator-yourarm").unwrap_or_else(|e| panic!("{}", e.message));
         let blueprint = load(&found, &Overrides::default(), &registry).blueprint.unwrap();
         let log = self.path("yourarm.mcap");

@@ -1,6 +1,6 @@
 //! `on_exit: park`: what the emulated servos of an SO-101 have received at the end of a run.
 
-use dimos::hardware::arms::so101::emulator::{Servos, start};
+use dimos::arms::so101::emulator::{Servos, start};
 use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::arm::HasArm;
 use dimos::hardware::sim::faults::{Fault, FaultKind};

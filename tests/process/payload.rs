@@ -3,8 +3,8 @@
 
 use std::f64::consts::PI;
 
-use dimos::hardware::arms::yourarm::emulator::wire::Request;
-use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
+use dimos::arms::yourarm::emulator::wire::Request;
+use dimos::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
 use dimos::hardware::registry::Emulator;
 use dimos::recording::replay::{LogReader, Payload};
 use dimos::rpc::api::{Lease, Move};

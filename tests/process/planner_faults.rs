@@ -4,9 +4,9 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use dimos::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
 use dimos::collision::Stop;
 use dimos::collision::world::World;
-use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
 use dimos::hardware::registry::Emulator;
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use dimos::planning::pipeline::{self, solve};

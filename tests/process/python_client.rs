@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
+use dimos::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
 use dimos::hardware::registry::Emulator;
 
 use crate::support::program::{Ended, Home, Started};

@@ -8,7 +8,6 @@ use std::sync::{Arc, Mutex};
 use dimos::arm::{ArmCommand, ArmState, ControllerPose, Link, Pose, VelocitySource};
 use dimos::blueprint::{Overrides, find, load};
 use dimos::clock::{Mono, WallOffset};
-use dimos::hardware::registry::Registry;
 use dimos::joint::{ControlMode, joints_of, make_joints};
 use dimos::planning::planning_scene::{PlannedRobot, PlanningScene};
 use dimos::recording::display_messages::{Marker, MarkerArray};
@@ -74,7 +73,7 @@ fn record(path: &Path) {
 
 /// The right arm is a YourArm, with a tool; of the left one there is no model.
 fn right_arm() -> PlannedRobot {
-    let registry = Registry::builtin();
+    let registry = dimos::arms::registry();
     let loaded = load(&find("yourarm-planner").unwrap(), &Overrides { sim: true, ..Overrides::default() }, &registry);
     let mut config = loaded.blueprint.unwrap().planner.unwrap();
     config.robots[0].tool = Some(Isometry3::translation(0.0, 0.0, 0.1));

@@ -10,8 +10,8 @@ use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
-use dimos::hardware::arms::remote::SPEC;
-use dimos::hardware::arms::xarm::emulator::XArmEmulator;
+use dimos::arms::remote::SPEC;
+use dimos::arms::xarm::emulator::XArmEmulator;
 use dimos::hardware::conformance::{Check, Outcome, checks, run};
 use dimos::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, EmulatorAddress};
 use dimos::hardware::sim::faults::{Fault, FaultKind};

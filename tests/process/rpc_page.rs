@@ -210,7 +210,7 @@ fn every_method_stream_and_code_is_on_the_page() {
     }
 
     let table = PAGE.split("## Errors").nth(1).unwrap();
-    let variants = include_str!("../../src/rpc/error.rs").split("pub enum Code {").nth(1).unwrap();
+    let variants = include_str!("../../crates/rpc/src/error.rs").split("pub enum Code {").nth(1).unwrap();
     let variants = variants.split("\n}").next().unwrap().lines().filter_map(|l| l.trim().strip_suffix(','));
     let mut known = 0;
     for variant in variants {

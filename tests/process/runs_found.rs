@@ -10,7 +10,7 @@ use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
-use dimos::hardware::arms::ur::emulator::UrEmulator;
+use dimos::arms::ur::emulator::UrEmulator;
 use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use rustix::fs::{CWD, FileType, Mode, mknodat};

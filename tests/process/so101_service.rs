@@ -3,8 +3,8 @@
 
 use std::os::unix::fs::symlink;
 
-use dimos::hardware::arms::so101::calibration::{Calibration, NAMES};
-use dimos::hardware::arms::so101::emulator::{Servos, start};
+use dimos::arms::so101::calibration::{Calibration, NAMES};
+use dimos::arms::so101::emulator::{Servos, start};
 use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::arm::HasArm;
 use dimos::hardware::sim::faults::{Fault, FaultKind};

@@ -48,7 +48,7 @@ impl Bench {
         let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
         let folder = tempfile::tempdir().unwrap();
         let model = folder.path().join("model.urdf");
-        fs::copy(Path::new(env!("CARGO_MANIFEST_DIR")).join("assets/robots/yourarm.urdf"), &model).unwrap();
+        fs::copy(Path::new(env!("CARGO_MANIFEST_DIR")).join("crates/robot/robots/yourarm.urdf"), &model).unwrap();
         Self { _alone, folder, model }
     }
 

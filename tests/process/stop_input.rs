@@ -1,8 +1,8 @@
 //! The stop input of an arm, judged by what its controller receives; and its inputs and outputs at the command line.
 
+use dimos::arms::yourarm::emulator::wire::Request;
+use dimos::arms::yourarm::emulator::{Received, SimOptions, YourArmEmulator};
 use dimos::clock::{Clock, Mono, MonotonicClock};
-use dimos::hardware::arms::yourarm::emulator::wire::Request;
-use dimos::hardware::arms::yourarm::emulator::{Received, SimOptions, YourArmEmulator};
 use dimos::hardware::registry::Emulator;
 use dimos::recording::replay::{LogReader, Payload};
 use dimos::rpc::api::Move;

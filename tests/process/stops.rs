@@ -9,10 +9,10 @@ use std::sync::{Arc, LazyLock};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use dimos::hardware::arms::yourarm;
-use dimos::hardware::arms::yourarm::emulator::wire::Request;
-use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
-use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, Registry};
+use dimos::arms::yourarm;
+use dimos::arms::yourarm::emulator::wire::Request;
+use dimos::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
+use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::rpc::Code;
 use dimos::rpc::api::{
     ArmEnable, ArmReset, Confirmation, Execute, Point, Servo, State, Status, Stop, Trajectory, Velocity,
@@ -441,7 +441,7 @@ static RUNAWAY: LazyLock<MockAdapter> = LazyLock::new(|| MockAdapter::new(7).pos
 
 #[test]
 fn an_arm_that_does_not_come_to_rest_keeps_its_motors_unless_now_is_said() {
-    let mut row = *Registry::builtin().get("mock").unwrap();
+    let mut row = *dimos::arms::registry().get("mock").unwrap();
     row.create = |_| Ok(Box::new(RUNAWAY.clone()));
     let folder = tempfile::tempdir().unwrap();
     let run = Run::from_name("coordinator-mock").unwrap().record(Record::Off).folder(RunDir::closed(folder.path()));

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use dimos::hardware::arms::ur::emulator::UrEmulator;
+use dimos::arms::ur::emulator::UrEmulator;
 use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use rustix::process::Signal;
@@ -44,7 +44,7 @@ hardware:
 
 #[test]
 fn the_arms_own_kinematics_are_read_and_kept_and_another_arm_is_not_taken_for_it() {
-    let mut dh = dimos::hardware::arms::ur::model::Model::Ur5e.dh();
+    let mut dh = dimos::arms::ur::model::Model::Ur5e.dh();
     (dh[1].a, dh[2].d, dh[3].alpha) = (-0.423, 0.004, dh[3].alpha + 0.001);
     let options = json!({"sim": {"kinematics": dh}});
     let config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: 6, options };

@@ -5,7 +5,7 @@ use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::time::Duration;
 
-use dimos::hardware::arms::xarm::emulator::{Received, XArmEmulator};
+use dimos::arms::xarm::emulator::{Received, XArmEmulator};
 use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use rustix::process::Signal;

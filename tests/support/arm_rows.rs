@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use dimos::arm::{Supervision, Topology};
 use dimos::control::config::{ArmConfig, TaskKinematics};
-use dimos::hardware::registry::{AdapterConfig, Registry};
+use dimos::hardware::registry::AdapterConfig;
 use dimos::joint::{ControlMode, MAX_DOF};
 use dimos::robot::kinematics::Kinematics;
 use dimos::robot::{Source, load};
@@ -26,7 +26,7 @@ pub struct Row {
 /// All rows, in the table's order. Rows with several numbers of joints are here with 6, and xArm with 7, too.
 pub fn rows() -> &'static [Row] {
     static ROWS: LazyLock<Vec<Row>> = LazyLock::new(|| {
-        let table = Registry::builtin();
+        let table = dimos::arms::registry();
         let mut rows = Vec::new();
         for spec in table.rows() {
             let mut numbers = vec![6usize.clamp(spec.dof.0, spec.dof.1)];

@@ -12,7 +12,7 @@ use rustix::fs::{AtFlags, CWD, Timespec, Timestamps, utimensat};
 /// The checkout that is tested.
 pub const CHECKOUT: &str = env!("CARGO_MANIFEST_DIR");
 /// What cargo reads of it.
-const SOURCES: [&str; 9] = ["assets", "benches", "blueprints", "build.rs", "kernels", "src", "tests", "viewer", ".git"];
+const SOURCES: [&str; 9] = ["assets", "benches", "blueprints", "build.rs", "crates", "src", "tests", "viewer", ".git"];
 
 /// The folder of the programs that cargo builds for this test.
 pub fn programs() -> PathBuf {
@@ -38,7 +38,7 @@ pub fn share_builds(folder: &Path) {
     symlink(&target, folder.join("target")).unwrap();
     fs::copy(checkout.join("Cargo.lock"), root.join("Cargo.lock")).unwrap();
     let used = fs::read_to_string(checkout.join("Cargo.toml")).unwrap();
-    let members = "members = [\"kernels\"";
+    let members = "members = [\"crates/*\"";
     assert!(used.contains(members), "{used}");
     let workspace = used.replace(members, &format!("{members}, {:?}", folder.file_name().unwrap()));
     fs::write(root.join("Cargo.toml"), workspace).unwrap();

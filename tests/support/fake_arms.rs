@@ -113,5 +113,5 @@ pub const SERVOBOT: AdapterSpec = AdapterSpec {
 
 /// The built-in arms with those of this file in their place.
 pub fn registry() -> Registry {
-    Registry::with(&[YOURARM, MOCK, SERVOBOT])
+    dimos::arms::registry().with(&[YOURARM, MOCK, SERVOBOT])
 }

@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
+use dimos::arms::mock;
 use dimos::hardware::adapter::{AdapterResult, Gripper, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop};
-use dimos::hardware::arms::mock;
 use dimos::hardware::check::Checked;
 use dimos::hardware::registry::{AdapterSpec, AddressForm};
 use dimos::joint::JointLimits;

@@ -3,10 +3,10 @@
 use serde_json::{Map, Value};
 
 use super::super::exit::{Exit, Failure, Result};
-use crate::hardware::adapter::AdapterError;
-use crate::hardware::check::ConfigError;
-use crate::hardware::registry::{AdapterConfig, AdapterSpec, Registry};
-use crate::joint::MAX_DOF;
+use dimos_core::joint::MAX_DOF;
+use dimos_hardware::adapter::AdapterError;
+use dimos_hardware::check::ConfigError;
+use dimos_hardware::registry::{AdapterConfig, AdapterSpec, Registry};
 
 /// Which arm, and how it is made.
 #[derive(Debug, Clone, clap::Args)]
@@ -104,13 +104,13 @@ pub fn not_started(error: AdapterError) -> Failure {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::hardware::registry::Absent;
+    use dimos_hardware::registry::Absent;
     use serde_json::json;
 
     #[test]
     fn what_this_build_lacks_is_told_also_where_a_program_of_its_own_lacks_it() {
         let servobot = Absent { name: "servobot", about: "an arm", remedy: "build with --features servobot" };
-        let registry = Registry::builtin().lacking(&[servobot]);
+        let registry = dimos_arms::registry().lacking(&[servobot]);
         let choice = Choice { name: "servobot".into(), dof: None, model: None, options: Vec::new() };
         let failure = choice.row(&registry).unwrap_err();
         assert_eq!(failure.hint.as_deref(), Some("build with --features servobot"));

@@ -15,11 +15,11 @@ use super::super::follow::Signals;
 use super::super::output::{self, Table};
 use super::choice::{Choice, not_started};
 use crate::blueprint;
-use crate::bounded;
-use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::registry::{AdapterSpec, Emulator, EmulatorAddress, Registry};
-use crate::hardware::sim::events::{self, SimEvent};
-use crate::hardware::sim::faults::{Fault, FaultKind};
+use dimos_core::bounded;
+use dimos_core::clock::{Clock, Mono, MonotonicClock};
+use dimos_hardware::registry::{AdapterSpec, Emulator, EmulatorAddress, Registry};
+use dimos_hardware::sim::events::{self, SimEvent};
+use dimos_hardware::sim::faults::{Fault, FaultKind};
 
 /// How often the joints are shown.
 const LOOK: Duration = Duration::from_millis(100);
@@ -317,7 +317,7 @@ fn runnable(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::hardware::sim::faults::FaultKind;
+    use dimos_hardware::sim::faults::FaultKind;
 
     #[test]
     fn fault_scripts_are_read() {

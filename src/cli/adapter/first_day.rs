@@ -10,12 +10,12 @@ use super::super::exit::{Exit, Failure, Result};
 use super::super::follow::Signals;
 use super::super::output::{self, Table, fixed};
 use super::test::{Args, Bench};
-use crate::hardware::adapter::{AdapterError, JointReading};
-use crate::hardware::conformance::first_day::report::{Line, Report};
-use crate::hardware::conformance::first_day::{self, Answer, Made, Outcome, Person, STEPS, Step, remove_serial};
-use crate::hardware::conformance::first_motion;
-use crate::hardware::registry::AdapterSpec;
-use crate::hardware::transport::capture::{self, Capture};
+use dimos_hardware::adapter::{AdapterError, JointReading};
+use dimos_hardware::conformance::first_day::report::{Line, Report};
+use dimos_hardware::conformance::first_day::{self, Answer, Made, Outcome, Person, STEPS, Step, remove_serial};
+use dimos_hardware::conformance::first_motion;
+use dimos_hardware::registry::AdapterSpec;
+use dimos_hardware::transport::capture::{self, Capture};
 
 /// The person at the terminal, if there is one.
 struct Terminal<'a> {
@@ -143,7 +143,7 @@ fn measure(
         let name = known.map_or_else(|| "other".to_owned(), |(name, _)| (*name).to_owned());
         Line { name, datagrams: connection.datagrams, port: connection.port }
     });
-    let (format, version, dimos) = Report::marks();
+    let (format, version, dimos) = Report::marks(crate::VERSION);
     let report = Report {
         format,
         version,

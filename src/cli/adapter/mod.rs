@@ -11,7 +11,7 @@ pub mod test;
 use clap::Subcommand;
 
 use super::exit::Result;
-use crate::hardware::registry::Registry;
+use dimos_hardware::registry::Registry;
 
 /// Arguments of `adapter`.
 #[derive(Debug, clap::Args)]

@@ -12,15 +12,15 @@ use serde_json::json;
 
 use super::super::exit::{Exit, Failure, Result};
 use super::super::output;
-use crate::hardware::registry::Registry;
-use crate::joint::MAX_DOF;
+use dimos_core::joint::MAX_DOF;
+use dimos_hardware::registry::Registry;
 use name::Name;
 use templates::Arm;
 use write::Plan;
 
 /// Paths of the table of adapters and of that of robot descriptions in a checkout.
-const TABLE: &str = "src/hardware/arms/mod.rs";
-const ROBOTS: &str = "src/robot/builtin.rs";
+const TABLE: &str = "crates/arms/src/lib.rs";
+const ROBOTS: &str = "crates/robot/src/builtin.rs";
 /// The checkout that this program was built from, wherever it is now.
 const BUILT_FROM: &str = env!("CARGO_MANIFEST_DIR");
 /// Where dimos is published, if it is.
@@ -37,7 +37,7 @@ suite, runs and plans at once, with a made-up wire format and a made-up shape: s
   dimos adapter new acme --dof 6 --transport tcp
   cd acme && cargo test && cargo run -- run coordinator-acme
 
-With --in-tree the same goes into a checkout of dimos: src/hardware/arms/NAME, assets/robots and \
+With --in-tree the same goes into a checkout of dimos: crates/arms/src/NAME, crates/robot/robots and \
 blueprints. It prints the lines that you add to the tables of arms and of robots.
 
 docs/adding-an-arm.md goes through it step by step.")]
@@ -138,7 +138,7 @@ fn in_tree(args: &Args, arm: &Arm) -> Result<(Plan, Vec<Line>, Next)> {
         Line { file: root.join(ROBOTS), list: "robots!", line: format!("{name:?},") },
     ];
     let new = arm.in_tree().into_iter().map(|(path, text)| (root.join(path), text)).collect();
-    let folder = root.join("src/hardware/arms").join(name);
+    let folder = root.join("crates/arms/src").join(name);
     let next = vec![
         (
             "DIMOS_REGENERATE=1 cargo test --test logic blueprint_reference".to_owned(),
@@ -151,7 +151,7 @@ fn in_tree(args: &Args, arm: &Arm) -> Result<(Plan, Vec<Line>, Next)> {
             "the same with a planner: `cargo run -- plan arm --named home`",
         ),
         (
-            format!("grep -rn 'YOUR ARM' src/hardware/arms/{name} assets/robots/{name}.urdf"),
+            format!("grep -rn 'YOUR ARM' crates/arms/src/{name} crates/robot/robots/{name}.urdf"),
             "what to change; the URDF has no gripper",
         ),
     ];

@@ -8,9 +8,9 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::super::exit::{Exit, Failure, Result};
 use super::super::follow::Signals;
 use super::super::output::{self, Table};
-use crate::hardware::conformance::first_day::replay::{Comparison, replay};
-use crate::hardware::conformance::first_day::report::Report;
-use crate::hardware::registry::Registry;
+use dimos_hardware::conformance::first_day::replay::{Comparison, replay};
+use dimos_hardware::conformance::first_day::report::Report;
+use dimos_hardware::registry::Registry;
 
 /// Arguments of `adapter replay`.
 #[derive(Debug, clap::Args)]

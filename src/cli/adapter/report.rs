@@ -3,11 +3,11 @@
 use serde::Serialize;
 
 use super::super::output::{self, Table, Tone, fixed, toned};
-use crate::hardware::conformance::figures::{Figures, Spread};
-use crate::hardware::conformance::first_motion::Motion;
-use crate::hardware::conformance::lag::Lag;
-use crate::hardware::conformance::{Made, Needs, Outcome};
-use crate::joint::JointLimits;
+use dimos_core::joint::JointLimits;
+use dimos_hardware::conformance::figures::{Figures, Spread};
+use dimos_hardware::conformance::first_motion::Motion;
+use dimos_hardware::conformance::lag::Lag;
+use dimos_hardware::conformance::{Made, Needs, Outcome};
 
 /// The whole report.
 #[derive(Debug, Serialize)]

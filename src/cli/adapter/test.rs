@@ -15,13 +15,13 @@ use super::super::output;
 use super::choice::{Choice, not_started};
 use super::first_day;
 use super::report::{Arm, Limits, Report, Row};
-use crate::hardware::adapter::{AdapterError, ManipulatorAdapter, ManipulatorInfo};
-use crate::hardware::conformance::lag::Lag;
-use crate::hardware::conformance::{Check, Made, Subject, checks, figures, first_motion, run_all};
-use crate::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, EmulatorAddress, Registry, SIM};
-use crate::joint::ControlMode;
-use crate::rpc::run_dir::RunDir;
 use crate::runtime::device_lock::{self, DeviceLock};
+use dimos_core::joint::ControlMode;
+use dimos_hardware::adapter::{AdapterError, ManipulatorAdapter, ManipulatorInfo};
+use dimos_hardware::conformance::lag::Lag;
+use dimos_hardware::conformance::{Check, Made, Subject, checks, figures, first_motion, run_all};
+use dimos_hardware::registry::{AdapterConfig, AdapterSpec, Emulator, EmulatorAddress, Registry, SIM};
+use dimos_rpc::run_dir::RunDir;
 
 /// For how long the state is watched.
 const WATCH: Duration = Duration::from_secs(2);

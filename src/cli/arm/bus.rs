@@ -7,11 +7,11 @@ use super::super::ask;
 use super::super::exit::{Exit, Failure, Result};
 use super::super::follow::Signals;
 use super::super::output;
-use crate::hardware::adapter::AdapterError;
-use crate::hardware::registry::{AdapterSpec, Registry};
-use crate::hardware::service::{OpenService, Service};
-use crate::rpc::run_dir::RunDir;
 use crate::runtime::device_lock::{self, DeviceLock};
+use dimos_hardware::adapter::AdapterError;
+use dimos_hardware::registry::{AdapterSpec, Registry};
+use dimos_hardware::service::{OpenService, Service};
+use dimos_rpc::run_dir::RunDir;
 
 /// Which arm, and where.
 #[derive(Debug, clap::Args)]

@@ -11,10 +11,10 @@ use super::super::follow::Signals;
 use super::super::output;
 use super::bus::{self, failure};
 use super::live_table::{Place, Seen, lines};
-use crate::hardware::adapter::{AdapterError, AdapterResult};
-use crate::hardware::registry::Registry;
-use crate::hardware::service::Service;
-use crate::message::Message;
+use dimos_core::message::Message;
+use dimos_hardware::adapter::{AdapterError, AdapterResult};
+use dimos_hardware::registry::Registry;
+use dimos_hardware::service::Service;
 
 /// How often positions are read and shown.
 const PERIOD: Duration = Duration::from_millis(50);
@@ -204,7 +204,7 @@ fn absolute(file: &Path) -> PathBuf {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::hardware::service::Motor;
+    use dimos_hardware::service::Motor;
 
     const MOTORS: &[Motor] = &[Motor { name: "pan", id: 1, range: None }, Motor { name: "lift", id: 2, range: None }];
 

@@ -5,8 +5,8 @@ use super::super::exit::{Exit, Failure, Result};
 use super::super::follow::Signals;
 use super::super::output::{self, Table};
 use super::bus::{self, failure};
-use crate::hardware::registry::Registry;
-use crate::hardware::service::Setting;
+use dimos_hardware::registry::Registry;
+use dimos_hardware::service::Setting;
 
 /// Arguments of `arm configure`.
 #[derive(Debug, clap::Args)]

@@ -10,8 +10,8 @@ use super::super::exit::{Exit, Failure, Result};
 use super::super::follow::Signals;
 use super::super::output::{self, Table};
 use super::bus;
-use crate::hardware::registry::Registry;
-use crate::hardware::transport::serial_ports::{self, SerialPort};
+use dimos_hardware::registry::Registry;
+use dimos_hardware::transport::serial_ports::{self, SerialPort};
 
 /// Longest wait for a cable that is plugged in again.
 const PLUG_LIMIT: Duration = Duration::from_secs(60);

@@ -7,10 +7,10 @@ use super::super::arguments::Target;
 use super::super::exit::{Exit, Failure, Result};
 use super::super::output::{self, Table, fixed};
 use super::bus;
-use crate::arm::Dh;
-use crate::hardware::registry::Registry;
-use crate::rpc::api::Status;
 use crate::runtime::kept_kinematics::{self, KeptKinematics};
+use dimos_core::arm::Dh;
+use dimos_hardware::registry::Registry;
+use dimos_rpc::api::Status;
 
 /// Arguments of `arm kinematics`.
 #[derive(Debug, clap::Args)]

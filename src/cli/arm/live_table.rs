@@ -4,7 +4,7 @@ use std::io::{self, IsTerminal, Write};
 
 use super::super::escapes::safe;
 use super::super::output::Table;
-use crate::hardware::service::Motor;
+use dimos_hardware::service::Motor;
 
 /// Positions that each motor has had since the beginning.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -6,9 +6,9 @@ use super::super::arguments::finite;
 use super::super::exit::{Exit, Result};
 use super::super::output;
 use super::ArmArgs;
-use crate::arm::GripperUnit;
-use crate::rpc::api::{AnalogReport, ArmIo, ArmIoSet, ArmPayload, ArmPayloadSet, IoReport, LoadReport};
-use crate::rpc::report::{ArmReport, JointStatusReport};
+use dimos_core::arm::GripperUnit;
+use dimos_rpc::api::{AnalogReport, ArmIo, ArmIoSet, ArmPayload, ArmPayloadSet, IoReport, LoadReport};
+use dimos_rpc::report::{ArmReport, JointStatusReport};
 
 /// Arguments of `arm io`.
 #[derive(Debug, clap::Args)]

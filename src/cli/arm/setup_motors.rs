@@ -5,8 +5,8 @@ use super::super::exit::{Exit, Failure, Result};
 use super::super::follow::Signals;
 use super::super::output;
 use super::bus::{self, failure};
-use crate::hardware::registry::Registry;
-use crate::hardware::service::{Motor, Service};
+use dimos_hardware::registry::Registry;
+use dimos_hardware::service::{Motor, Service};
 
 /// Arguments of `arm setup-motors`.
 #[derive(Debug, clap::Args)]

@@ -16,11 +16,11 @@ use super::super::exit::{Exit, Failure, Result};
 use super::super::follow::Signals;
 use super::super::output;
 use super::ArmArgs;
-use crate::rpc::api::{ArmTakeOver, ArmTeach, State, Status};
-use crate::rpc::client::{Client, ClientError};
-use crate::rpc::report::ArmStateReport;
-use crate::rpc::{Code, RpcError};
-use crate::telemetry::Phase;
+use dimos_core::telemetry::Phase;
+use dimos_rpc::api::{ArmTakeOver, ArmTeach, State, Status};
+use dimos_rpc::client::{Client, ClientError};
+use dimos_rpc::report::ArmStateReport;
+use dimos_rpc::{Code, RpcError};
 
 /// Highest rate of samples [Hz].
 const MAX_HZ: f64 = 200.0;

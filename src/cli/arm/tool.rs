@@ -4,8 +4,8 @@ use super::super::arguments::{angle, finite};
 use super::super::exit::{Exit, Result};
 use super::super::output::{self, fixed};
 use super::ArmArgs;
-use crate::rpc::api::{ArmTool, ArmToolSet, PoseSpec};
-use crate::rpc::report::TcpReport;
+use dimos_rpc::api::{ArmTool, ArmToolSet, PoseSpec};
+use dimos_rpc::report::TcpReport;
 
 /// Arguments of `arm tool`.
 #[derive(Debug, clap::Args)]

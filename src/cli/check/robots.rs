@@ -6,11 +6,12 @@ use serde::Serialize;
 
 use crate::blueprint::{Blueprint, JointSummary, Summary};
 use crate::cli::output::{self, Table};
-use crate::planning::config::{JointBounds, ObjectConfig, ObjectShape};
-use crate::planning::planning_scene::{PlannedRobot, PlanningScene};
-use crate::robot::mesh::Size;
-use crate::robot::{self, Source};
-use crate::yaml::{Diag, Severity};
+use dimos_planner::planning::config::{JointBounds, ObjectConfig, ObjectShape};
+use dimos_planner::planning::planning_scene::{PlannedRobot, PlanningScene};
+use dimos_robot as robot;
+use dimos_robot::Source;
+use dimos_robot::mesh::Size;
+use dimos_yaml::{Diag, Severity};
 
 /// A planned robot.
 #[derive(Debug, Serialize)]

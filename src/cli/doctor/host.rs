@@ -7,10 +7,10 @@ use rustix::fs::Access;
 use rustix::process::{Resource, getrlimit};
 
 use super::Finding;
-use crate::recording::files::log_folder;
-use crate::rpc::run_dir::RunDir;
-use crate::rt::host::WATCHDOG_PRIORITY;
 use crate::share;
+use dimos_log::files::log_folder;
+use dimos_rpc::run_dir::RunDir;
+use dimos_rt::host::WATCHDOG_PRIORITY;
 
 /// Type of CAN links in `/sys/class/net/*/type` (ARPHRD_CAN).
 const CAN: &str = "280";

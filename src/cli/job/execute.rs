@@ -12,12 +12,12 @@ use crate::cli::follow::{Signals, completed, watch};
 use crate::cli::goal::plan;
 use crate::cli::grip::{self, GripAction, Objects, Opening};
 use crate::cli::output;
-use crate::rpc::Code;
-use crate::rpc::api::{
+use dimos_rpc::Code;
+use dimos_rpc::api::{
     ArmEnable, ArmIo, ArmIoSet, ArmReset, Cancel, Detach, ExecutePlan, GripOutcome, Move, Plan, Status, World,
 };
-use crate::rpc::client::{Client, ClientError};
-use crate::rpc::report::ArmReport;
+use dimos_rpc::client::{Client, ClientError};
+use dimos_rpc::report::ArmReport;
 
 /// Poll period of a wait.
 const POLL_PERIOD: Duration = Duration::from_millis(50);

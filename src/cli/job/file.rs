@@ -6,14 +6,15 @@ use std::time::Duration;
 
 use super::keys::{self, Group};
 use super::step::{Act, Job, Motion, Step};
-use crate::arm::channel;
-use crate::bounded;
 use crate::cli::arguments::{duration, finite, is_angle, speed, time};
 use crate::cli::exit::{Failure, Result};
 use crate::cli::grip::opening;
 use crate::cli::output;
-use crate::rpc::api::{Attach, DEFAULT_SPEED, PlanGoal, PoseSpec};
-use crate::yaml::{self, Diag, Kind, Label, NodeId, Tree, did_you_mean, quote};
+use dimos_core::arm::channel;
+use dimos_core::bounded;
+use dimos_rpc::api::{Attach, DEFAULT_SPEED, PlanGoal, PoseSpec};
+use dimos_yaml as yaml;
+use dimos_yaml::{Diag, Kind, Label, NodeId, Tree, did_you_mean, quote};
 
 /// Steps that `repeat` may be nested in.
 const MAX_NESTING: usize = 8;

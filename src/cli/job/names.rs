@@ -7,10 +7,10 @@ use super::times::all;
 use crate::cli::exit::Result;
 use crate::cli::goal::has_planner;
 use crate::cli::grip;
-use crate::rpc::api::{Attach, PlanGoal, Planner, Poses, RobotReport, State, Status, World};
-use crate::rpc::client::Client;
-use crate::rpc::report::{ArmReport, ArmStateReport};
-use crate::yaml::{NodeId, did_you_mean, quote};
+use dimos_rpc::api::{Attach, PlanGoal, Planner, Poses, RobotReport, State, Status, World};
+use dimos_rpc::client::Client;
+use dimos_rpc::report::{ArmReport, ArmStateReport};
+use dimos_yaml::{NodeId, did_you_mean, quote};
 
 /// What a run has.
 pub struct Names {
@@ -21,7 +21,7 @@ pub struct Names {
     /// Joints of each arm, in order.
     joints: BTreeMap<String, Vec<String>>,
     robots: Vec<RobotReport>,
-    poses: BTreeMap<String, crate::rpc::api::SavedPose>,
+    poses: BTreeMap<String, dimos_rpc::api::SavedPose>,
     objects: Vec<String>,
 }
 

@@ -6,7 +6,7 @@ use std::path::Path;
 use serde_json::{Value as Json, json};
 
 use super::keys::{Group, JOB, STEPS, Value};
-use crate::yaml::{Kind, NodeId, Tree};
+use dimos_yaml::{Kind, NodeId, Tree};
 
 fn group(group: &Group) -> Json {
     let properties: serde_json::Map<_, _> = group.keys.iter().map(|(name, v)| ((*name).into(), value(v))).collect();

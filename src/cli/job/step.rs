@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use crate::cli::grip::Opening;
-use crate::rpc::api::{Attach, PlanGoal};
-use crate::yaml::{NodeId, Tree};
+use dimos_rpc::api::{Attach, PlanGoal};
+use dimos_yaml::{NodeId, Tree};
 
 /// A job that can be run.
 pub struct Job {

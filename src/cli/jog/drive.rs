@@ -5,9 +5,9 @@ use std::time::{Duration, Instant};
 use super::link;
 use crate::cli::exit::{Failure, Result};
 use crate::cli::lasting;
-use crate::rpc::api::{Cancel, Servo, Twist, TwistFrame, Velocity};
-use crate::rpc::client::{Client, ClientError};
-use crate::rpc::report::{ArmReport, ArmStateReport, TaskReport};
+use dimos_rpc::api::{Cancel, Servo, Twist, TwistFrame, Velocity};
+use dimos_rpc::client::{Client, ClientError};
+use dimos_rpc::report::{ArmReport, ArmStateReport, TaskReport};
 
 /// Maximum lead of a servo target over its joint [rad], so that it does not wind up when the arm is blocked.
 const MAX_LEAD: f64 = 0.15;
@@ -213,7 +213,7 @@ pub fn refusal(sent: Sent) -> Result<Option<String>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::rpc::report::JointReport;
+    use dimos_rpc::report::JointReport;
 
     fn task(name: &str, takes: &str, joints: &[&str], priority: i32) -> TaskReport {
         let joints = joints.iter().map(|j| (*j).to_owned()).collect();

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use super::watch::ArmSnapshot;
-use crate::arm::GripperUnit;
+use dimos_core::arm::GripperUnit;
 
 /// Step of a tap, as a part of the range.
 const TAP: f64 = 0.025;
@@ -51,7 +51,7 @@ impl Fingers {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::rpc::report::{ArmReport, ArmStateReport};
+    use dimos_rpc::report::{ArmReport, ArmStateReport};
 
     fn at(position: f64) -> ArmSnapshot {
         ArmSnapshot {

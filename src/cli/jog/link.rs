@@ -8,8 +8,8 @@ use std::time::Duration;
 
 use crate::cli::exit::Failure;
 use crate::cli::lasting;
-use crate::rpc::client::{Client, ClientError};
-use crate::rpc::error::Code;
+use dimos_rpc::client::{Client, ClientError};
+use dimos_rpc::error::Code;
 
 /// Pause between two attempts.
 const PAUSE: Duration = Duration::from_millis(200);

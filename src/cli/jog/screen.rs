@@ -6,8 +6,8 @@ use super::keys::AXES;
 use super::terminal::{Line, Look};
 use super::watch::ArmSnapshot;
 use crate::cli::output::fixed;
-use crate::rpc::api::gripper_text;
-use crate::rpc::report::{ArmReport, ArmStateReport, JointReport, TaskReport};
+use dimos_rpc::api::gripper_text;
+use dimos_rpc::report::{ArmReport, ArmStateReport, JointReport, TaskReport};
 
 /// Age at which a state is highlighted.
 const STALE_AFTER: Duration = Duration::from_millis(200);
@@ -277,7 +277,7 @@ fn how_to_reset(arm: &ArmReport) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::rpc::report::{CauseReport, PoseReport};
+    use dimos_rpc::report::{CauseReport, PoseReport};
 
     fn seen(joints: usize) -> ArmSnapshot {
         let joint = |i: usize| JointReport {

@@ -15,8 +15,8 @@ use super::watch::{ArmSnapshot, Watch};
 use crate::cli::arguments::connect;
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::follow::Signals;
-use crate::rpc::api::{Gripper, Lease, Release, State, Stop, TwistFrame};
-use crate::rpc::client::Client;
+use dimos_rpc::api::{Gripper, Lease, Release, State, Stop, TwistFrame};
+use dimos_rpc::client::Client;
 
 /// Time between two targets.
 const PERIOD: Duration = Duration::from_millis(20);

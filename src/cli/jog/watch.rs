@@ -12,11 +12,11 @@ use super::link;
 use crate::cli::arguments;
 use crate::cli::exit::{Failure, Result};
 use crate::cli::lasting;
-use crate::rpc::api::{State, Status};
-use crate::rpc::client::{Client, ClientError};
-use crate::rpc::report::{ArmReport, ArmStateReport, TaskReport};
-use crate::rpc::streams::{Stream, Subscribe};
-use crate::sync::lock;
+use dimos_core::sync::lock;
+use dimos_rpc::api::{State, Status};
+use dimos_rpc::client::{Client, ClientError};
+use dimos_rpc::report::{ArmReport, ArmStateReport, TaskReport};
+use dimos_rpc::streams::{Stream, Subscribe};
 
 /// Period of reading the joints.
 const STATE_PERIOD: Duration = Duration::from_millis(50);

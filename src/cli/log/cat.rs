@@ -10,8 +10,8 @@ use super::{Part, ended, progress, unreadable, written};
 use crate::cli::escapes::{in_json, safe};
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output;
-use crate::recording::replay::LogReader;
-use crate::recording::scan::{Item, Scan};
+use dimos_log::replay::LogReader;
+use dimos_log::scan::{Item, Scan};
 
 /// Prints messages, one a line.
 pub fn run(path: &Path, part: &Part, topics: &[String], json: bool) -> Result {

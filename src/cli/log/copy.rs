@@ -7,8 +7,8 @@ use serde_json::json;
 use super::{Part, ended, progress, unreadable};
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output;
-use crate::recording::rewrite::{Label, RewriteError, Written, copy};
-use crate::recording::scan::Scan;
+use dimos_log::rewrite::{Label, RewriteError, Written, copy};
+use dimos_log::scan::Scan;
 
 /// Writes a part of a log.
 pub fn cut(path: &Path, part: &Part, to: &Path, json: bool) -> Result {

@@ -8,12 +8,12 @@ use serde_json::{Value, json};
 use super::{progress, unreadable};
 use crate::cli::exit::{Exit, Result};
 use crate::cli::output;
-use crate::recording::attachment::check;
-use crate::recording::messages::Tick;
-use crate::recording::records::check_sections;
-use crate::recording::replay::parts;
-use crate::recording::scan::{Item, Scan};
-use crate::recording::wire::Message;
+use dimos_log::attachment::check;
+use dimos_log::messages::Tick;
+use dimos_log::records::check_sections;
+use dimos_log::replay::parts;
+use dimos_log::scan::{Item, Scan};
+use dimos_log::wire::Message;
 
 /// Checks a log and prints the findings.
 pub fn run(path: &Path, json: bool) -> Result {

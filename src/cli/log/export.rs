@@ -12,10 +12,10 @@ use super::{Part, STATES, ended, no_states, progress, unreadable, written};
 use crate::cli::escapes::safe;
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output;
-use crate::recording::joints::{Places, twice};
-use crate::recording::messages::JointState;
-use crate::recording::replay::{Entry, LogReader, Payload, ReplayError, Selection};
-use crate::recording::scan::{Item, Scan};
+use dimos_log::joints::{Places, twice};
+use dimos_log::messages::JointState;
+use dimos_log::replay::{Entry, LogReader, Payload, ReplayError, Selection};
+use dimos_log::scan::{Item, Scan};
 
 /// Exports a log as text.
 pub fn csv(path: &Path, part: &Part, topic: Option<&str>, to: Option<&Path>, json: bool) -> Result {

@@ -8,11 +8,11 @@ use serde_json::{Value, json};
 use super::{ended, progress, unreadable};
 use crate::cli::exit::Result;
 use crate::cli::output::{self, Table, fixed};
-use crate::recording::attachment::{Other, check};
-use crate::recording::disk_space::Megabytes;
-use crate::recording::files;
-use crate::recording::replay::{LogInfo, LogReader, ReplayError};
-use crate::recording::scan::{Item, Scan};
+use dimos_log::attachment::{Other, check};
+use dimos_log::disk_space::Megabytes;
+use dimos_log::files;
+use dimos_log::replay::{LogInfo, LogReader, ReplayError};
+use dimos_log::scan::{Item, Scan};
 
 /// Prints what is in a log.
 pub fn run(path: &Path, json: bool) -> Result {

@@ -10,8 +10,8 @@ use super::python_writer::PythonWriter;
 use super::{Part, ended, progress, unreadable};
 use crate::cli::exit::{Failure, Result};
 use crate::cli::output;
-use crate::recording::joints::Places;
-use crate::recording::replay::{LogReader, Payload, Selection};
+use dimos_log::joints::Places;
+use dimos_log::replay::{LogReader, Payload, Selection};
 
 /// A tick this much of a frame after its time still counts for it.
 const LATE: f64 = 0.125;

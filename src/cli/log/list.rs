@@ -5,9 +5,9 @@ use serde_json::json;
 use super::info::{arms, faults, length, state};
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output::{self, Table, span};
-use crate::recording::disk_space::Megabytes;
-use crate::recording::files;
-use crate::recording::replay::LogReader;
+use dimos_log::disk_space::Megabytes;
+use dimos_log::files;
+use dimos_log::replay::LogReader;
 
 /// Largest log that is read whole [bytes]: a list is to be quick. Whether chunks of a larger one are damaged is not
 /// known: it is `closed`.

@@ -7,11 +7,11 @@ use serde_json::json;
 
 use super::export::each;
 use super::{Part, ended, no_states, progress, unreadable};
-use crate::arm::GripperUnit;
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output;
-use crate::recording::replay::{LogReader, Payload, Selection};
 use crate::replay::recorded::Recorded;
+use dimos_core::arm::GripperUnit;
+use dimos_log::replay::{LogReader, Payload, Selection};
 
 /// Width of the drawing, and of the plot in it [px].
 const WIDTH: f64 = 960.0;

@@ -4,7 +4,7 @@ use std::io::{self, IsTerminal};
 
 use indicatif::{ProgressBar, ProgressFinish, ProgressStyle};
 
-use crate::recording::scan::Scan;
+use dimos_log::scan::Scan;
 
 /// Returns what shows how much of how much is read: a bar on standard error, if that is a terminal, which disappears at
 /// the end. What prints as it reads has none where it prints to the terminal as well.

@@ -10,8 +10,8 @@ use super::export::cannot_write;
 use super::{Part, ended, progress, unreadable};
 use crate::cli::exit::Result;
 use crate::cli::output;
-use crate::recording::rewrite::{Label, copy};
-use crate::recording::scan::Scan;
+use dimos_log::rewrite::{Label, copy};
+use dimos_log::scan::Scan;
 
 /// Writes a log, or a part of it, as one file with a `metadata.yaml`.
 pub fn run(path: &Path, part: &Part, folder: &Path, json: bool) -> Result {
@@ -38,7 +38,7 @@ pub fn run(path: &Path, part: &Part, folder: &Path, json: bool) -> Result {
 
 /// Returns the description of a complete file, in version 5 of rosbag2's form: that of ROS 2 Humble, which later ones
 /// read.
-fn metadata(path: &Path, name: &str) -> std::result::Result<String, crate::recording::replay::ReplayError> {
+fn metadata(path: &Path, name: &str) -> std::result::Result<String, dimos_log::replay::ReplayError> {
     // Nothing of the file but its summary.
     let scan = Scan::open_part(path, &[], (0, 0))?;
     let figures = scan.statistics().map(|(_, figures)| figures.clone()).unwrap_or_default();

@@ -1,9 +1,9 @@
 //! Links and joints of `fk` and `ik`: which frames, and which joints lie between them.
 
 use crate::cli::exit::{Failure, Result};
-use crate::robot::srdf::Semantics;
-use crate::robot::{Joint, RobotModel};
-use crate::yaml::did_you_mean;
+use dimos_robot::srdf::Semantics;
+use dimos_robot::{Joint, RobotModel};
+use dimos_yaml::did_you_mean;
 
 /// Checks that there is a position for every joint of a link or robot.
 pub(super) fn check_count(of: &str, joints: &[&str], positions: &[f64]) -> Result<()> {
@@ -136,7 +136,7 @@ fn is_finger(robot: &RobotModel, number: usize) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::robot::{Source, load};
+    use dimos_robot::{Source, load};
 
     #[test]
     fn the_end_of_an_arm_is_its_last_link_before_the_fingers() {

@@ -3,10 +3,10 @@
 use super::{File, has_mistakes};
 use crate::cli::exit::{Exit, Result};
 use crate::cli::output;
-use crate::planning::planning_scene::{always_touch, whole};
-use crate::robot::urdf::Meshes;
-use crate::robot::{Loaded, RobotModel, judge};
-use crate::yaml::{Diag, quote};
+use dimos_planner::planning::planning_scene::{always_touch, whole};
+use dimos_robot::urdf::Meshes;
+use dimos_robot::{Loaded, RobotModel, judge};
+use dimos_yaml::{Diag, quote};
 
 /// Runs the verb.
 pub(super) fn run(file: &File) -> Result {

@@ -9,11 +9,11 @@ use super::chain::{check_count, group_joints};
 use crate::cli::arguments::finite;
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output::{self, Table};
-use crate::collision::world::World;
-use crate::collision::{ExactChecker, Resolution};
-use crate::planning::planning_scene::{always_touch, whole};
-use crate::robot::RobotModel;
-use crate::robot::urdf::Meshes;
+use dimos_planner::collision::world::World;
+use dimos_planner::collision::{ExactChecker, Resolution};
+use dimos_planner::planning::planning_scene::{always_touch, whole};
+use dimos_robot::RobotModel;
+use dimos_robot::urdf::Meshes;
 
 /// Arguments of `model collide`.
 #[derive(Debug, clap::Args)]

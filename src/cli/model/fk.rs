@@ -11,9 +11,9 @@ use crate::cli::arguments::finite;
 use crate::cli::exit::{Exit, Result};
 use crate::cli::output;
 use crate::cli::targets::{Source, Width};
-use crate::pose::to_xyz_rpy;
-use crate::robot::RobotModel;
-use crate::robot::urdf::Meshes;
+use dimos_core::pose::to_xyz_rpy;
+use dimos_robot::RobotModel;
+use dimos_robot::urdf::Meshes;
 
 /// Arguments of `model fk`.
 #[derive(Debug, clap::Args)]

@@ -10,12 +10,12 @@ use super::chain::Chain;
 use crate::cli::arguments::{angle, finite};
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output::{self, Table};
-use crate::collision::checker::Stop;
-use crate::planning::ik::{Ik, IkSettings};
-use crate::planning::path::distance;
-use crate::pose::from_xyz_rpy;
-use crate::robot::kinematics::{Kinematics, frame};
-use crate::robot::urdf::Meshes;
+use dimos_core::pose::from_xyz_rpy;
+use dimos_planner::collision::checker::Stop;
+use dimos_planner::planning::ik::{Ik, IkSettings};
+use dimos_planner::planning::path::distance;
+use dimos_robot::kinematics::{Kinematics, frame};
+use dimos_robot::urdf::Meshes;
 
 /// Arguments of `model ik`.
 #[derive(Debug, clap::Args)]

@@ -5,11 +5,11 @@ use serde_json::{Value, json};
 use super::File;
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output::{self, Table};
-use crate::pose::to_xyz_rpy;
-use crate::robot::mesh::MeshSizes;
-use crate::robot::srdf::Semantics;
-use crate::robot::urdf::Meshes;
-use crate::robot::{Geometry, Joint, RobotModel, Shape};
+use dimos_core::pose::to_xyz_rpy;
+use dimos_robot::mesh::MeshSizes;
+use dimos_robot::srdf::Semantics;
+use dimos_robot::urdf::Meshes;
+use dimos_robot::{Geometry, Joint, RobotModel, Shape};
 
 /// Runs `info`.
 pub(super) fn info(file: &File) -> Result {

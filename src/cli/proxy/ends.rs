@@ -9,8 +9,8 @@ use std::time::Instant;
 use super::run_link::{Shared, start};
 use crate::cli::arguments;
 use crate::cli::exit::Result;
-use crate::rpc::api::{Cancel, Method, Stop};
-use crate::rpc::client::{Client, ClientError};
+use dimos_rpc::api::{Cancel, Method, Stop};
+use dimos_rpc::client::{Client, ClientError};
 
 /// The way to both threads; they end with it.
 pub struct Ends {

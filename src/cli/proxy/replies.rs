@@ -6,10 +6,10 @@ use std::collections::VecDeque;
 use serde_json::Value;
 
 use super::run_link::{Shared, code};
-use crate::hardware::arms::xarm::emulator::{JOINT_LIMIT, Refusal};
-use crate::rpc::api::{Method, Move, Servo, Velocity};
-use crate::rpc::client::{ClientError, Sender};
-use crate::rpc::{Code, RpcError};
+use dimos_arms::xarm::emulator::{JOINT_LIMIT, Refusal};
+use dimos_rpc::api::{Method, Move, Servo, Velocity};
+use dimos_rpc::client::{ClientError, Sender};
+use dimos_rpc::{Code, RpcError};
 
 /// Maximum number of targets that the run has not answered: fewer than it reads.
 const MAX_UNANSWERED: usize = 16;
@@ -176,7 +176,7 @@ mod tests {
     use serde_json::json;
 
     use super::*;
-    use crate::rpc::client::Client;
+    use dimos_rpc::client::Client;
 
     /// A connection, and the lines that the run receives.
     fn connected() -> (Commands, Client, Lines<BufReader<UnixStream>>, Shared) {

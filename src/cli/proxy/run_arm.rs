@@ -9,15 +9,15 @@ use super::refusals::Refusals;
 use super::replies::{Commands, Target, refusal};
 use super::run_link::{RunLink, View, code};
 use super::tool_line;
-use crate::clock::Mono;
-use crate::hardware::arms::xarm::emulator::{ControlledArm, Line, Links, MoveRequest, Refusal};
-use crate::joint::{Joints, STANDSTILL};
-use crate::rpc::Code;
-use crate::rpc::api::{
+use dimos_arms::xarm::emulator::{ControlledArm, Line, Links, MoveRequest, Refusal};
+use dimos_core::clock::Mono;
+use dimos_core::joint::{Joints, STANDSTILL};
+use dimos_core::sync::lock;
+use dimos_rpc::Code;
+use dimos_rpc::api::{
     ArmDisable, ArmEnable, ArmPayloadSet, ArmReset, Cancel, Gripper, JointPath, Lease, Method, Move, PATH_TOLERANCE,
     Release, Servo, Velocity,
 };
-use crate::sync::lock;
 
 /// Positions this close to a limit count as inside: values on the wire are rounded [rad].
 const ROUNDING: f64 = 2e-5;

@@ -18,12 +18,12 @@ use super::ends::Ends;
 use super::replies::Commands;
 use crate::cli::arguments;
 use crate::cli::exit::Result;
-use crate::joint::Joints;
-use crate::pose::from_xyz_rpy;
-use crate::rpc::api::{Cancel, Motion, State, Status};
-use crate::rpc::client::{Client, ClientError};
-use crate::rpc::report::{ArmReport, ArmStateReport, StatusReport};
-use crate::sync::lock;
+use dimos_core::joint::Joints;
+use dimos_core::pose::from_xyz_rpy;
+use dimos_core::sync::lock;
+use dimos_rpc::api::{Cancel, Motion, State, Status};
+use dimos_rpc::client::{Client, ClientError};
+use dimos_rpc::report::{ArmReport, ArmStateReport, StatusReport};
 
 /// Period of reading the joints.
 const STATE_PERIOD: Duration = Duration::from_millis(10);

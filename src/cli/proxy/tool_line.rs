@@ -2,8 +2,8 @@
 //! kinematics.
 
 use super::run_link::View;
-use crate::hardware::arms::xarm::emulator::{Frame, Line, Links, MoveRequest, Target};
-use crate::hardware::sim::reach::Chain;
+use dimos_arms::xarm::emulator::{Frame, Line, Links, MoveRequest, Target};
+use dimos_hardware::sim::reach::Chain;
 
 /// Longest distance of a tool's centre point from the flange [m].
 const LONGEST_TOOL: f64 = 0.6;

@@ -9,7 +9,7 @@ use rustix::termios::{LocalModes, OptionalActions, Termios, tcgetattr, tcsetattr
 
 use super::player::{Key, Waiting};
 use crate::cli::jog::terminal::listen;
-use crate::clock::{Clock, Mono, MonotonicClock};
+use dimos_core::clock::{Clock, Mono, MonotonicClock};
 
 /// Real time, and the keys of a terminal, which it gives back as it was.
 pub struct Keys {

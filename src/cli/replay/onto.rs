@@ -21,11 +21,11 @@ use crate::replay::grips::RecordedGrip;
 use crate::replay::motion::RecordedMotion;
 use crate::replay::onto::{Approach, Plan, check as check_limits, is_real, plan};
 use crate::replay::recorded::RecordedError;
-use crate::rpc::RpcError;
-use crate::rpc::api::{self, ArmEnable, Cancel, Execute, Gripper, Move, Point, State, Trajectory};
-use crate::rpc::report::{Deviation, MotionReport, StateReport};
 use crate::runtime::{Ended, Ending, Options, Record, Run};
-use crate::trajectory::JointTrajectory;
+use dimos_core::trajectory::JointTrajectory;
+use dimos_rpc::RpcError;
+use dimos_rpc::api::{self, ArmEnable, Cancel, Execute, Gripper, Move, Point, State, Trajectory};
+use dimos_rpc::report::{Deviation, MotionReport, StateReport};
 
 /// Fraction of the limits for the approach to the start of the motion.
 const APPROACH_SPEED: f64 = 0.2;

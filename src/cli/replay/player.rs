@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use super::view::View;
 use crate::cli::output;
-use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::recording::replay::{LogReader, ReplayError, Selection};
+use dimos_core::clock::{Clock, Mono, MonotonicClock};
+use dimos_log::replay::{LogReader, ReplayError, Selection};
 
 /// A longer gap between two messages is not waited for: a clock was set [ns].
 const MAX_WAIT: u64 = 3600 * 1_000_000_000;
@@ -194,10 +194,10 @@ pub fn play(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::clock::VirtualClock;
-    use crate::recording::log_writer::LogWriter;
-    use crate::recording::messages::Text;
-    use crate::recording::replay::{Entry, Payload};
+    use dimos_core::clock::VirtualClock;
+    use dimos_log::log_writer::LogWriter;
+    use dimos_log::messages::Text;
+    use dimos_log::replay::{Entry, Payload};
     use std::collections::BTreeMap;
 
     impl Waiting for VirtualClock {

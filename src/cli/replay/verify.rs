@@ -5,10 +5,10 @@ use std::path::Path;
 use crate::cli::exit::Exit;
 use crate::cli::log::progress;
 use crate::cli::output;
-use crate::control::task_spec::TaskTable;
 use crate::replay::compare::Difference;
 use crate::replay::recorded::RecordedError;
 use crate::replay::verify::{Finding, Verification, verify_with};
+use dimos_control::task_spec::TaskTable;
 
 /// Verifies a log and prints the result.
 pub fn run(path: &Path, table: &TaskTable, json: bool) -> Result<Exit, RecordedError> {

@@ -9,9 +9,9 @@ use comfy_table::{Cell, CellAlignment, Table, presets};
 use super::player::{Pace, Part};
 use crate::cli::escapes::{in_json, safe};
 use crate::cli::output;
-use crate::clock::Mono;
-use crate::recording::messages::JointState;
-use crate::recording::replay::{Entry, Payload};
+use dimos_core::clock::Mono;
+use dimos_log::messages::JointState;
+use dimos_log::replay::{Entry, Payload};
 
 /// Requests whose kind is remembered.
 const KEPT_REQUESTS: usize = 64;
@@ -270,7 +270,7 @@ fn level(level: u8) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::recording::messages::Log;
+    use dimos_log::messages::Log;
 
     fn joints(log_time: u64, position: &[f64]) -> Entry {
         let name = (1..=position.len()).map(|i| format!("joint{i}")).collect();
@@ -309,7 +309,7 @@ mod tests {
 
     #[test]
     fn plain_lines_name_the_request_that_is_answered() {
-        use crate::recording::messages::Text;
+        use dimos_log::messages::Text;
         let (mut out, mut answer) = (Vec::new(), text(0));
         let data = Text { data: "{\"id\":6,\"request\":{\"execute\":{\"task\":0}}}".into() };
         let request = Entry { topic: "/dimos/requests".into(), log_time: 0, data: Payload::Text(data), publisher: 0 };

@@ -5,9 +5,9 @@ use std::sync::Arc;
 
 use crate::blueprint::planner::ViewConfig;
 use crate::cli::exit::{Exit, Failure, Result};
-use crate::rpc::api::WorldObject;
 use crate::share::{self, Page, Relay};
 use crate::view::{Scene, Subject, View};
+use dimos_rpc::api::WorldObject;
 
 /// What the pages show.
 struct Elsewhere {

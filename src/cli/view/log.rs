@@ -7,12 +7,12 @@ use std::sync::Mutex;
 use serde_json::{Map, Value, json};
 
 use crate::cli::exit::{Exit, Failure, Result};
-use crate::recording::replay::{LogReader, attachment};
-use crate::recording::window::LogWindows;
 use crate::replay::recorded::Recorded;
-use crate::rpc::api::WorldObject;
-use crate::sync::lock;
 use crate::view::{MeshFile, Scene, Subject, value};
+use dimos_core::sync::lock;
+use dimos_log::replay::{LogReader, attachment};
+use dimos_log::window::LogWindows;
+use dimos_rpc::api::WorldObject;
 
 /// Maximum length of a reply [bytes]: a window with more messages ends early.
 const MAX_REPLY: usize = 32 << 20;
@@ -174,8 +174,8 @@ mod tests {
     use std::fs::File;
 
     use super::*;
-    use crate::recording::log_writer::{LogAttachment, LogWriter};
-    use crate::recording::messages::JointState;
+    use dimos_log::log_writer::{LogAttachment, LogWriter};
+    use dimos_log::messages::JointState;
 
     const URDF: &str = r#"<robot name="r"><link name="map"><visual><geometry><mesh filename="package://a/b.stl"/>
         </geometry></visual></link><link name="l"><visual><geometry><mesh filename="gone.stl" scale="1 1 1"/></geometry>
@@ -203,7 +203,7 @@ mod tests {
                 ..JointState::default()
             };
             log.publish("/joint_states", 5_000_000_000 + u64::try_from(i).unwrap() * 10_000_000, &state).unwrap();
-            log.flush_if_due(crate::clock::Mono(u64::try_from(i).unwrap() * 10_000_000)).unwrap();
+            log.flush_if_due(dimos_core::clock::Mono(u64::try_from(i).unwrap() * 10_000_000)).unwrap();
         }
         log.finish().unwrap();
         Log::open(&path).unwrap()

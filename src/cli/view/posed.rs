@@ -13,20 +13,20 @@ use super::super::model::chain::end_of_arm;
 use super::super::model::{self, With};
 use super::super::output;
 use crate::blueprint::{Blueprint, Catalog, Overrides, Summary};
-use crate::collision::{ExactChecker, Resolution};
-use crate::joint::JointLimits;
-use crate::planning::config::{ObjectConfig, PlannerConfig, RobotConfig};
-use crate::planning::ignored_pairs::IgnoredPair;
-use crate::planning::planning_scene::PlanningScene;
-use crate::pose::to_xyz_rpy;
-use crate::robot::kinematics::pose;
-use crate::robot::urdf::Meshes;
-use crate::robot::{Source, load};
-use crate::rpc::api::WorldObject;
 use crate::runtime::kinematics::use_kept;
 use crate::runtime::world_object;
-use crate::sync::lock;
 use crate::view::{Scene, Shown, ShownArm, ShownRobot, Subject, robots, value};
+use dimos_core::joint::JointLimits;
+use dimos_core::pose::to_xyz_rpy;
+use dimos_core::sync::lock;
+use dimos_planner::collision::{ExactChecker, Resolution};
+use dimos_planner::planning::config::{ObjectConfig, PlannerConfig, RobotConfig};
+use dimos_planner::planning::ignored_pairs::IgnoredPair;
+use dimos_planner::planning::planning_scene::PlanningScene;
+use dimos_robot::kinematics::pose;
+use dimos_robot::urdf::Meshes;
+use dimos_robot::{Source, load};
+use dimos_rpc::api::WorldObject;
 
 /// Pairs closer than this are shown [m].
 const CLOSE: f64 = 0.05;
@@ -49,7 +49,7 @@ impl Posed {
         let names = || independent().map(|joint| joint.name.clone());
         let tip = robot.links.get(end_of_arm(&robot)).map_or("", |link| &link.name).to_owned();
         // A pose of a group leaves the other joints where they are closest to zero.
-        let rest = |joint: &crate::robot::Joint| 0.0_f64.max(joint.limits.lower).min(joint.limits.upper);
+        let rest = |joint: &dimos_robot::Joint| 0.0_f64.max(joint.limits.lower).min(joint.limits.upper);
         let poses = loaded.semantics.poses.iter().map(|pose| {
             let own = |name: &str| pose.positions.iter().find(|(joint, _)| joint == name).map(|(_, q)| *q);
             let all = independent().map(|joint| own(&joint.name).unwrap_or_else(|| rest(joint)));
@@ -273,7 +273,7 @@ mod tests {
 
     #[test]
     fn a_blueprint_has_its_obstacles_and_poses_and_all_robots_are_checked() {
-        let catalog = crate::hardware::registry::Registry::with(&[]);
+        let catalog = dimos_arms::registry().with(&[]);
         let posed = Posed::blueprint("yourarm-planner", Catalog::from(&catalog)).unwrap();
         let scene = json(&posed.scene().json);
         assert_eq!((&scene["kind"], &scene["name"]), (&json!("blueprint"), &json!("yourarm-planner")));

@@ -11,12 +11,12 @@ use zenoh::sample::{Sample, SampleKind};
 
 use super::{FORGET_AFTER, MAX_LOST, News, Shared, failed};
 use crate::blueprint::share::OnLost;
-use crate::rpc::api::{Lease, Method};
-use crate::rpc::error::{Code, RpcError};
 use crate::share::class::Class;
 use crate::share::keys::Who;
 use crate::share::remote::{Closed, Remote, Ways, ended};
-use crate::sync::lock;
+use dimos_core::sync::lock;
+use dimos_rpc::api::{Lease, Method};
+use dimos_rpc::error::{Code, RpcError};
 
 impl Shared {
     /// Fails for a commander that was lost, until it takes its lease again.

@@ -8,19 +8,19 @@ use std::sync::{Arc, Mutex, Weak};
 
 use super::follow::{Watcher, Way, follow};
 use super::goal::{Code, Goal, Outcome, Values};
-use super::messages::{
-    CancelRequest, CancelResponse, Feedback, FeedbackRest, FollowResult, GoalInfo, GoalStatus, GoalStatusArray,
-    ResultRequest, ResultResponse, SendGoalRequest, SendGoalResponse, Uuid,
-};
 use super::node::{Latched, Node, Request, Topic};
 use super::types;
 use crate::blueprint::share::Distro;
-use crate::clock::wall_now;
-use crate::recording::cdr::Encoder;
-use crate::recording::display_messages::JointTrajectoryPoint;
-use crate::recording::messages::{Header, Time};
-use crate::recording::wire::Field;
-use crate::sync::lock;
+use dimos_core::clock::wall_now;
+use dimos_core::sync::lock;
+use dimos_log::cdr::Encoder;
+use dimos_log::display_messages::JointTrajectoryPoint;
+use dimos_log::messages::{Header, Time};
+use dimos_log::node_messages::{
+    CancelRequest, CancelResponse, Feedback, FeedbackRest, FollowResult, GoalInfo, GoalStatus, GoalStatusArray,
+    ResultRequest, ResultResponse, SendGoalRequest, SendGoalResponse, Uuid,
+};
+use dimos_log::wire::Field;
 
 /// Goals of an action that may be under way: one moves, and others are being refused by the run.
 const MAX_LIVE: usize = 4;

@@ -1,8 +1,8 @@
 //! The condition of arms and tick, as ROS shows it.
 
-use crate::recording::display_messages::{DiagnosticArray, DiagnosticStatus, KeyValue};
-use crate::recording::messages::{Header, Time};
-use crate::rpc::report::{ArmReport, StatusReport, TickReport};
+use dimos_log::display_messages::{DiagnosticArray, DiagnosticStatus, KeyValue};
+use dimos_log::messages::{Header, Time};
+use dimos_rpc::report::{ArmReport, StatusReport, TickReport};
 
 /// Levels of a status.
 const OK: u8 = 0;
@@ -68,7 +68,7 @@ fn row<const N: usize>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::rpc::report::{CauseReport, DeviceError};
+    use dimos_rpc::report::{CauseReport, DeviceError};
 
     #[test]
     fn what_needs_attention_is_a_warning_or_an_error() {

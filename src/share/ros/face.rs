@@ -14,11 +14,11 @@ use super::node::Node;
 use super::publish::{Source, publish};
 use super::services::{Services, of_ends, of_lists};
 use crate::blueprint::share::{OnLost, RosConfig, ShareConfig, is_ros_name};
-use crate::rpc::api::{FaceReport, OnBehalfOf, Status};
-use crate::rpc::client::Client;
-use crate::rpc::error::{Code, RpcError};
 use crate::share::settings;
-use crate::sync::lock;
+use dimos_core::sync::lock;
+use dimos_rpc::api::{FaceReport, OnBehalfOf, Status};
+use dimos_rpc::client::Client;
+use dimos_rpc::error::{Code, RpcError};
 
 /// Requests of services that may wait.
 const QUEUE: usize = 32;

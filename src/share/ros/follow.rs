@@ -4,11 +4,11 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use super::goal::{Code, Curve, Goal, Outcome, Values};
-use crate::clock::wall_now;
-use crate::rpc::api::{Cancel, Execute, Motion, OnBehalfOf, State, Status};
-use crate::rpc::client::{Client, ClientError};
-use crate::rpc::error::RpcError;
-use crate::rpc::report::MotionReport;
+use dimos_core::clock::wall_now;
+use dimos_rpc::api::{Cancel, Execute, Motion, OnBehalfOf, State, Status};
+use dimos_rpc::client::{Client, ClientError};
+use dimos_rpc::error::RpcError;
+use dimos_rpc::report::MotionReport;
 
 /// Period of the feedback.
 const PERIOD: Duration = Duration::from_millis(50);

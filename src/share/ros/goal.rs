@@ -1,11 +1,11 @@
 //! A goal of `FollowJointTrajectory`: its trajectory as one of the run, and its tolerances.
 
-use super::messages::{FollowGoal, FollowResult, JointTolerance};
-use crate::recording::display_messages::{Duration, JointTrajectoryPoint};
-use crate::recording::messages::Time;
-use crate::rpc::api::{MAX_LINE, Point, Trajectory};
 use crate::share::thinning::thinned;
-use crate::trajectory::{Cursor, JointTrajectory, Sample, Spline, TrajectoryPoint};
+use dimos_core::trajectory::{Cursor, JointTrajectory, Sample, Spline, TrajectoryPoint};
+use dimos_log::display_messages::{Duration, JointTrajectoryPoint};
+use dimos_log::messages::Time;
+use dimos_log::node_messages::{FollowGoal, FollowResult, JointTolerance};
+use dimos_rpc::api::{MAX_LINE, Point, Trajectory};
 
 /// Time below which a point is at the start [s].
 const AT_START: f64 = 1e-6;

@@ -17,7 +17,6 @@ mod diagnostics;
 mod face;
 mod follow;
 mod goal;
-mod messages;
 mod names;
 mod node;
 mod publish;

@@ -15,10 +15,10 @@ use super::attachment::{Sender, is_of_request};
 use super::names::{Names, Part, Qos};
 use super::types::Type;
 use crate::blueprint::share::RosConfig;
-use crate::clock::wall_now;
-use crate::recording::cdr::{CdrError, Decoder, Encoder};
-use crate::recording::wire::Field;
-use crate::sync::lock;
+use dimos_core::clock::wall_now;
+use dimos_core::sync::lock;
+use dimos_log::cdr::{CdrError, Decoder, Encoder};
+use dimos_log::wire::Field;
 
 /// The node in a session. Its parts end with it.
 pub struct Node {

@@ -9,13 +9,13 @@ use std::time::{Duration, Instant};
 use super::diagnostics::diagnostics;
 use super::node::{Latched, Node, Topic};
 use super::types;
-use crate::clock::wall_now;
-use crate::recording::display_messages::{TFMessage, Transform, TransformStamped};
-use crate::recording::messages::{Header, JointState, Quaternion, Text, Time, Vector3};
-use crate::rpc::api::{RobotDescription, Status, TransformReport, Transforms};
-use crate::rpc::client::{Client, ClientError};
-use crate::rpc::streams;
-use crate::rpc::streams::{Stream, Subscribe};
+use dimos_core::clock::wall_now;
+use dimos_log::display_messages::{TFMessage, Transform, TransformStamped};
+use dimos_log::messages::{Header, JointState, Quaternion, Text, Time, Vector3};
+use dimos_rpc::api::{RobotDescription, Status, TransformReport, Transforms};
+use dimos_rpc::client::{Client, ClientError};
+use dimos_rpc::streams;
+use dimos_rpc::streams::{Stream, Subscribe};
 
 /// Maximum rate of the joint states [Hz].
 const JOINT_STATES: f64 = 100.0;

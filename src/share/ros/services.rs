@@ -3,17 +3,17 @@
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::Receiver;
 
-use super::messages::{
-    ComponentBegin, ComponentEnd, ControllerList, ControllerState, HardwareInterface, LifecycleState, TriggerResponse,
-};
 use super::node::{Request, encoded};
 use super::types;
 use crate::blueprint::share::Distro;
-use crate::recording::cdr::Encoder;
-use crate::recording::wire::Field;
-use crate::rpc::api::{Cancel, Confirmation, State, Status, Stop};
-use crate::rpc::client::{Client, ClientError};
-use crate::rpc::report::{StateReport, StatusReport, TaskReport};
+use dimos_log::cdr::Encoder;
+use dimos_log::node_messages::{
+    ComponentBegin, ComponentEnd, ControllerList, ControllerState, HardwareInterface, LifecycleState, TriggerResponse,
+};
+use dimos_log::wire::Field;
+use dimos_rpc::api::{Cancel, Confirmation, State, Status, Stop};
+use dimos_rpc::client::{Client, ClientError};
+use dimos_rpc::report::{StateReport, StatusReport, TaskReport};
 
 /// State `active` of a component.
 const ACTIVE: u8 = 3;

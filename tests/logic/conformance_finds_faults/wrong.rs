@@ -1,9 +1,9 @@
 //! An adapter with one mistake, around one that has none.
 
 use dimos::arm::{JointStatus, StopPoint};
+use dimos::arms::{mock, so101, xarm, yourarm};
 use dimos::clock::{Clock, MonotonicClock};
 use dimos::hardware::adapter::*;
-use dimos::hardware::arms::{mock, so101, xarm, yourarm};
 use dimos::hardware::registry::{AdapterConfig, AdapterSpec};
 use dimos::joint::ControlMode;
 

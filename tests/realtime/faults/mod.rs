@@ -5,9 +5,9 @@
 mod arms;
 mod process;
 
+use dimos::arms::yourarm::emulator::wire::Request;
+use dimos::arms::yourarm::emulator::{Received, SimOptions, YourArmEmulator};
 use dimos::clock::{Clock, Mono, MonotonicClock};
-use dimos::hardware::arms::yourarm::emulator::wire::Request;
-use dimos::hardware::arms::yourarm::emulator::{Received, SimOptions, YourArmEmulator};
 use dimos::hardware::registry::Emulator;
 use dimos::robot::random::Random;
 use serde_json::Value;

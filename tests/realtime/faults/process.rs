@@ -6,7 +6,6 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
-use dimos::hardware::registry::Registry;
 use dimos::rpc::api::Move;
 use rustix::process::Signal;
 
@@ -50,7 +49,7 @@ fn child_whose_tick_breaks() {
     let found = dimos::blueprint::find(RUN).ok().unwrap();
     let set = vec![format!("hardware.arm.address={address}")];
     let overrides = dimos::blueprint::Overrides { set, ..Default::default() };
-    let loaded = dimos::blueprint::load(&found, &overrides, &Registry::with(&[]));
+    let loaded = dimos::blueprint::load(&found, &overrides, &dimos::arms::registry().with(&[]));
     let (broken, broke) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU64::new(0)));
     let (flag, when) = (broken.clone(), broke.clone());
     let probe = move |_| {

@@ -4,9 +4,9 @@ use std::any::Any;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use dimos::arms::ur::emulator::UrEmulator;
 use dimos::clock::Mono;
-use dimos::hardware::arms::ur::emulator::UrEmulator;
-use dimos::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, EmulatorAddress, Registry, Truth};
+use dimos::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, EmulatorAddress, Truth};
 use dimos::hardware::sim::faults::Fault;
 use dimos::rpc::run_dir::RunDir;
 use dimos::runtime::{Record, Run};
@@ -157,7 +157,7 @@ impl Arm {
     }
 
     fn spec(&self) -> AdapterSpec {
-        self.row.copied().unwrap_or_else(|| *Registry::builtin().get(self.name).unwrap())
+        self.row.copied().unwrap_or_else(|| *dimos::arms::registry().get(self.name).unwrap())
     }
 }
 

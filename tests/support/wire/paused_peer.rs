@@ -6,7 +6,7 @@ use std::process::{Child, ChildStdout, Command, Stdio};
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use dimos::hardware::registry::{EmulatorAddress, Registry};
+use dimos::hardware::registry::EmulatorAddress;
 use dimos::robot::random::Random;
 use rustix::process::Pid;
 use serde_json::json;
@@ -27,7 +27,7 @@ pub struct Peer {
 impl Peer {
     /// On an emulated arm of a case of the FR3.
     pub fn new(python: &Path, case: &'static Case) -> Self {
-        let (row, address) = (*Registry::builtin().get("franka").unwrap(), own_address());
+        let (row, address) = (*dimos::arms::registry().get("franka").unwrap(), own_address());
         let sim = json!({ "initial_positions": case.ends[0] });
         let emulator = emulator(&row, case, &EmulatorAddress::Bind(address.into()), sim);
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/franka_pauses.py");

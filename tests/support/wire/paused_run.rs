@@ -3,7 +3,7 @@
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use dimos::hardware::registry::{AdapterConfig, AdapterSpec, EmulatorAddress, Registry};
+use dimos::hardware::registry::{AdapterConfig, AdapterSpec, EmulatorAddress};
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use dimos::robot::random::Random;
 use dimos::rpc::api::{ArmEnable, ArmReset, Execute, Motion, Move, Point, Trajectory};
@@ -61,7 +61,7 @@ pub struct Bed<'a> {
 
 impl<'a> Bed<'a> {
     pub fn new(case: &'a Case, loss: f64) -> Self {
-        let row = *Registry::builtin().get(case.name).unwrap();
+        let row = *dimos::arms::registry().get(case.name).unwrap();
         let mut start = case.ends[0].to_vec();
         start.extend((case.name == "so101").then_some(0.5));
         let mut sim = json!({ "initial_positions": start });

@@ -145,18 +145,18 @@ mod tests {
     use std::collections::BTreeMap;
     use std::time::Duration;
 
-    use crate::clock::Mono;
-    use crate::hardware::sim::arm::{PLAYABLE, SimArm, SimOptions};
-    use crate::joint::{JointLimits, MAX_DOF};
-    use crate::planning::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
-    use crate::planning::planning_scene::PlanningScene;
+    use dimos_core::clock::Mono;
+    use dimos_core::joint::{JointLimits, MAX_DOF};
+    use dimos_hardware::sim::arm::{PLAYABLE, SimArm, SimOptions};
+    use dimos_planner::planning::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
+    use dimos_planner::planning::planning_scene::PlanningScene;
     use nalgebra::Isometry3;
 
     /// The arm beside the table of the template's blueprint.
     fn setup(dof: u8, folder: &std::path::Path) -> PlanningScene {
         let path = folder.join(format!("{dof}.urdf"));
         std::fs::write(&path, urdf("acme", "Acme", dof, "src/lib.rs")).unwrap();
-        let loaded = crate::robot::load(&crate::robot::Source::new(&path));
+        let loaded = dimos_robot::load(&dimos_robot::Source::new(&path));
         assert_eq!(loaded.render(false), "", "{dof} joints: no mistake, no warning");
         let joints: Vec<String> = joint_names(dof).split(", ").map(str::to_owned).collect();
         assert_eq!(joints.len(), usize::from(dof));
@@ -186,7 +186,7 @@ mod tests {
 
     #[test]
     fn an_arm_of_any_number_of_joints_can_be_planned_for() {
-        use crate::collision::{CollisionChecker, ExactChecker, Resolution};
+        use dimos_planner::collision::{CollisionChecker, ExactChecker, Resolution};
         let folder = tempfile::tempdir().unwrap();
         for dof in 1..=MAX_DOF as u8 {
             let setup = setup(dof, folder.path());

@@ -1,6 +1,6 @@
 //! The name of a new arm, in the forms in which code and files write it.
 
-use crate::hardware::registry::Registry;
+use dimos_hardware::registry::Registry;
 
 /// Longest name: it is part of lines of code.
 const LONGEST: usize = 24;
@@ -94,7 +94,7 @@ mod tests {
 
     #[test]
     fn adapters_that_there_are_keep_their_names() {
-        assert!(Name::parse("yourarm").unwrap().is_taken(&Registry::builtin()));
-        assert!(!Name::parse("acme").unwrap().is_taken(&Registry::builtin()));
+        assert!(Name::parse("yourarm").unwrap().is_taken(&dimos_arms::registry()));
+        assert!(!Name::parse("acme").unwrap().is_taken(&dimos_arms::registry()));
     }
 }

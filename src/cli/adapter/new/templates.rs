@@ -61,12 +61,13 @@ impl Arm {
 
     /// The new files in a checkout of dimos, with their paths below it.
     pub fn in_tree(&self) -> Vec<(String, String)> {
-        let folder = format!("src/hardware/arms/{}", self.name.snake);
+        let folder = format!("crates/arms/src/{}", self.name.snake);
         let sources = self.sources().map(|(file, text)| {
-            let text = self.code(text).replace("dimos::", "crate::");
+            let text = self.code(text).replace("dimos::hardware::", "dimos_hardware::");
+            let text = text.replace("dimos::arms::", "crate::").replace("dimos::", "dimos_core::");
             (format!("{folder}/{file}"), text)
         });
-        let robot = (format!("assets/robots/{}.urdf", self.name.snake), self.urdf(&format!("{folder}/mod.rs")));
+        let robot = (format!("crates/robot/robots/{}.urdf", self.name.snake), self.urdf(&format!("{folder}/mod.rs")));
         sources.chain(self.blueprints()).chain([robot]).collect()
     }
 

@@ -1,0 +1,149 @@
+//! The state of all servos and writes to all of them: one request reads the state; what is written has no answer, so it
+//! is read back where it matters.
+
+use std::time::Duration;
+
+use super::SPEC;
+use super::adapter::So101Adapter;
+use super::calibration::NAMES;
+use super::protocol::{self, Instruction, MAX_DATA, MAX_INSTRUCTION, SERVOS, STATE, Servo, TURN, register};
+use dimos_core::clock::{Clock, MonotonicClock};
+use dimos_hardware::adapter::{AdapterError, AdapterResult};
+use dimos_hardware::transport::request_reply::Retry;
+
+/// Longest wait for the state of all servos. All attempts together stay below `stale_after`.
+const CYCLE: Retry = Retry { each: Duration::from_millis(30), times: 3 };
+/// A state answers further questions for this time.
+const STATE_AGE: Duration = Duration::from_millis(5);
+/// How often torque and goals are written until the servos show them: nothing acknowledges a write to all.
+const WRITES: u32 = 4;
+/// Furthest that a goal is taken back to end an overload [counts].
+const RELIEF: i32 = (SPEC.relief * TURN / std::f64::consts::TAU) as i32;
+
+impl So101Adapter {
+    /// Writes the same registers of all servos.
+    pub(super) fn write<const N: usize>(&mut self, address: u8, values: [[u8; N]; SERVOS]) -> AdapterResult<()> {
+        let mut frame = [0; MAX_INSTRUCTION];
+        let values = values.as_flattened();
+        self.state = None;
+        self.bus.line.tell(protocol::encode(Instruction::WriteAll(address, N as u8, values), &mut frame))
+    }
+
+    /// Asks for the state of all servos.
+    pub(super) fn fetch(&mut self) -> AdapterResult<[Servo; SERVOS]> {
+        self.state = None;
+        let asked = MonotonicClock.now();
+        let mut frame = [0; MAX_INSTRUCTION];
+        let frame = protocol::encode(Instruction::ReadAll(STATE.0, STATE.1), &mut frame);
+        let mut servos: [Option<Servo>; SERVOS] = [None; SERVOS];
+        let scan = |bytes: &[u8]| {
+            protocol::scan(bytes, 1..=SERVOS as u8, usize::from(STATE.1)).map(|status| {
+                let mut data = [0; MAX_DATA];
+                data.iter_mut().zip(status.data).for_each(|(to, byte)| *to = *byte);
+                (status.id, data)
+            })
+        };
+        let result = self.bus.line.gather(frame, CYCLE, SERVOS, scan, |(id, data)| {
+            let slot = usize::from(id).checked_sub(1).and_then(|servo| servos.get_mut(servo));
+            slot.is_some_and(|slot| slot.replace(Servo::decode(&data).unwrap_or_default()).is_none())
+        });
+        if let (Err(AdapterError::Timeout(text)), Some(missing)) = (&result, servos.iter().position(Option::is_none)) {
+            let name = NAMES.get(missing).copied().unwrap_or_default();
+            return Err(AdapterError::Timeout(format!("{text}; servo {} ({name}) did not", missing + 1)));
+        }
+        result?;
+        let servos = servos.map(Option::unwrap_or_default);
+        self.seams.take(&servos, asked);
+        self.state = Some((servos, asked));
+        Ok(servos)
+    }
+
+    /// Returns the last state, or a new one when that is too old.
+    pub(super) fn recent(&mut self) -> AdapterResult<[Servo; SERVOS]> {
+        self.not_older(STATE_AGE)
+    }
+
+    pub(super) fn not_older(&mut self, age: Duration) -> AdapterResult<[Servo; SERVOS]> {
+        match self.state {
+            Some((servos, at)) if self.bus.line.is_open() && MonotonicClock.now().since(at) <= age => Ok(servos),
+            _ => self.fetch(),
+        }
+    }
+
+    /// Writes the same registers of all servos until they show it. Returns whether they do.
+    fn confirmed<const N: usize>(
+        &mut self,
+        address: u8,
+        values: [[u8; N]; SERVOS],
+        shown: impl Fn(usize, &Servo) -> bool,
+    ) -> AdapterResult<bool> {
+        for _ in 0..WRITES {
+            self.write(address, values)?;
+            if self.fetch()?.iter().enumerate().all(|(j, servo)| shown(j, servo)) {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+
+    /// Writes registers with the goals in them until the servos show these.
+    pub(super) fn write_motion<const N: usize>(
+        &mut self,
+        address: u8,
+        values: [[u8; N]; SERVOS],
+        goals: &[i32; SERVOS],
+    ) -> AdapterResult<()> {
+        match self.confirmed(address, values, |j, servo| goals.get(j) == Some(&servo.goal))? {
+            true => Ok(()),
+            false => Err(AdapterError::Protocol("so101: the servos do not take their goals".into())),
+        }
+    }
+
+    /// Writes goals until the servos show them.
+    pub(super) fn write_goals(&mut self, goals: [i32; SERVOS]) -> AdapterResult<()> {
+        self.write_motion(register::GOAL, goals.map(|goal| (goal.max(0) as u16).to_le_bytes()), &goals)
+    }
+
+    /// Switches all motors on or off until the servos show it.
+    pub(super) fn write_torque(&mut self, on: bool) -> AdapterResult<()> {
+        if self.confirmed(register::TORQUE, [[u8::from(on)]; SERVOS], |_, servo| servo.on == on)? {
+            return Ok(());
+        }
+        let what = if on { "on" } else { "off" };
+        Err(AdapterError::Protocol(format!("so101: not all motors can be switched {what}")))
+    }
+
+    /// Writes goals of the servos whose motors are on; the others might come on.
+    pub(super) fn write_goals_of_enabled(
+        &mut self,
+        servos: &[Servo; SERVOS],
+        goals: [i32; SERVOS],
+    ) -> AdapterResult<()> {
+        if servos.iter().all(|servo| servo.on) {
+            return self.write_goals(goals);
+        }
+        self.state = None;
+        let each = (1..).zip(servos.iter().zip(goals)).filter(|(_, (servo, _))| servo.on);
+        { each }.try_for_each(|(id, (_, goal))| self.bus.write(id, register::GOAL, &(goal.max(0) as u16).to_le_bytes()))
+    }
+
+    /// Returns the goals with those of overloaded servos taken back towards the joint: by at most [`RELIEF`] from what
+    /// was commanded, however often this is asked for. A wrong reading moves a joint no further than that.
+    pub(super) fn relieved_goals(&mut self, servos: &[Servo; SERVOS]) -> [i32; SERVOS] {
+        let mut goals = servos.map(|servo| servo.goal);
+        for ((goal, servo), commanded) in goals.iter_mut().zip(servos).zip(&mut self.relieved) {
+            if servo.on && servo.error != 0 {
+                let from = *commanded.get_or_insert(servo.goal);
+                *goal = servo.position.max(from - RELIEF).min(from + RELIEF).max(0);
+            }
+        }
+        goals
+    }
+}
+
+/// Returns code and text of the first servo in error; the text names it.
+pub(super) fn error_of(servos: &[Servo; SERVOS]) -> Option<(i32, String)> {
+    let (i, servo) = servos.iter().enumerate().find(|(_, servo)| servo.error != 0)?;
+    let (name, text) = (NAMES.get(i).copied().unwrap_or_default(), protocol::error_text(servo.error));
+    Some((servo.error.into(), format!("servo {} ({name}): {text}", i + 1)))
+}

@@ -1,0 +1,260 @@
+//! Whether a start or a goal is enclosed: whether a joint that must move to the other end of the path cannot leave a
+//! part of its range.
+//!
+//! One tree with short edges explores what can be reached (LaValle, 1998). A joint that does not get farther says
+//! little: among many joints, one is often slow. It is believed in two cases:
+//! - a **pocket**: no joint gets farther, other than those that have their whole range;
+//! - a **wall**: at some position of the joint, on the way to the other end, the arm touches whatever the others do.
+//!
+//! It is no proof: a narrow way out may be missed. So it is asked only once a search has taken long.
+
+use super::nearest::Tree;
+use super::path::{between, unwind};
+use crate::collision::checker::{CollisionChecker, Stop};
+use crate::collision::report::{Contact, Pair};
+use dimos_robot::random::Random;
+
+/// Most joints: with those of two arms, so few edges reach too little to say anything.
+const JOINTS: usize = 8;
+/// Edges that are tried.
+const EDGES: usize = 6000;
+/// Length of an edge [rad].
+const STEP: f64 = 0.15;
+/// A quarter of the samples are within this distance of what is reached [rad].
+const NEARBY: f64 = 0.5;
+/// One of this number of samples is the other end of the path.
+const BIAS: usize = 8;
+/// How much wider the part of a joint's range may become in the second half of the edges [rad or m], and as a part of
+/// the range.
+const STILL: f64 = 0.04;
+const STILL_PART: f64 = 0.02;
+/// A joint that gets this part of its range is not enclosed.
+const WHOLE: f64 = 0.9;
+/// How far outside of what a joint reached the other end must be [rad or m].
+const GAP: f64 = 0.1;
+/// Positions of a joint at which a wall is looked for: this far from what was reached, the first one, and each twice
+/// as far as the one before [rad or m].
+const WALLS: usize = 8;
+const FIRST_WALL: f64 = 0.01;
+/// Configurations that are tried at each of them, and at the one that counts.
+const TRIES: usize = 256;
+const LAST_TRIES: usize = 4096;
+/// Configurations at the end of what was reached that are checked for what is in the way.
+const LOOKS: usize = 40;
+/// How far they are moved on [rad].
+const BEYOND: f64 = 0.05;
+/// Most pairs that are named.
+const NAMED: usize = 3;
+
+/// What encloses a configuration.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Enclosed {
+    /// The joint that cannot get to the other end.
+    pub joint: usize,
+    /// The part of its range that was reached [rad or m].
+    pub reached: [f64; 2],
+    /// What touches beyond that, the most frequent pair first.
+    pub contacts: Vec<Contact>,
+}
+
+impl Enclosed {
+    /// Returns the pairs in the way as text.
+    pub fn pairs(&self) -> String {
+        let pairs: Vec<String> = self.contacts.iter().map(named).collect();
+        pairs.join("; ")
+    }
+}
+
+fn named(contact: &Contact) -> String {
+    let kind = if matches!(contact.pair, Pair::Links(..)) { "link" } else { "obstacle" };
+    format!("link {:?} and {kind} {:?}", contact.link, contact.other)
+}
+
+/// Returns what encloses `from`, if nothing leads to any of `others`. `exact`: where covers touch, what they cover may
+/// be free. The same seed explores the same way.
+pub fn enclosed<C: CollisionChecker>(
+    checker: &mut C,
+    from: &[f64],
+    others: &[Vec<f64>],
+    (seed, exact): (u64, bool),
+    stop: &Stop,
+) -> Option<Enclosed> {
+    if from.len() > JOINTS {
+        return None;
+    }
+    let mut explored = Explored::new(checker, from, seed, exact);
+    explored.grow(checker, others, EDGES / 2, stop)?;
+    explored.halfway.clone_from(&explored.reached);
+    explored.grow(checker, others, EDGES / 2, stop)?;
+    let (pocket, turns) = (explored.is_pocket(), checker.turns().to_vec());
+    let mut widest: Option<(usize, f64, f64)> = None;
+    for other in others {
+        let gap = |joint: usize| explored.gap(joint, other[joint]).filter(|_| !turns[joint]).map(|gap| (joint, gap));
+        let mut gaps: Vec<(usize, f64)> = (0..from.len()).filter_map(gap).collect();
+        gaps.sort_by(|(_, a), (_, b)| b.total_cmp(a));
+        let mut encloses = |joint: usize| pocket || explored.is_walled(checker, joint, other[joint], stop);
+        let (joint, gap) = gaps.into_iter().find(|(joint, _)| encloses(*joint))?;
+        if widest.is_none_or(|(.., most)| gap > most) {
+            widest = Some((joint, other[joint], gap));
+        }
+    }
+    let (joint, other, _) = widest?;
+    let reached = explored.reached[joint];
+    Some(Enclosed { joint, reached, contacts: explored.in_the_way(checker, joint, other > reached[1]) })
+}
+
+/// What can be reached.
+struct Explored {
+    tree: Tree,
+    random: Random,
+    /// Where samples are drawn, per joint [rad or m].
+    ranges: Vec<[f64; 2]>,
+    /// What was reached, per joint.
+    reached: Vec<[f64; 2]>,
+    /// The same after half of the edges.
+    halfway: Vec<[f64; 2]>,
+    sample: Vec<f64>,
+    at: Vec<f64>,
+    /// Whether solids decide where covers touch.
+    exact: bool,
+}
+
+impl Explored {
+    fn new<C: CollisionChecker>(checker: &C, from: &[f64], seed: u64, exact: bool) -> Self {
+        let mut tree = Tree::new(checker.turns());
+        tree.add(from, None);
+        let pi = std::f64::consts::PI;
+        let finite = |limit: f64, otherwise: f64| if limit.is_finite() { limit } else { otherwise };
+        let ranges = checker.limits().iter().zip(from);
+        let ranges = ranges.map(|(l, q)| [finite(l.lower, q - pi), finite(l.upper, q + pi)]).collect();
+        let reached: Vec<[f64; 2]> = from.iter().map(|q| [*q; 2]).collect();
+        let (halfway, random, sample, at) = (reached.clone(), Random::new(seed), from.to_vec(), from.to_vec());
+        Self { tree, random, ranges, reached, halfway, sample, at, exact }
+    }
+
+    /// Returns the range of a joint [rad or m].
+    fn range(&self, joint: usize) -> f64 {
+        let [low, high] = self.ranges[joint];
+        high - low
+    }
+
+    /// Returns whether a joint got no farther, downwards and upwards, in the second half of the edges.
+    fn still(&self, joint: usize) -> [bool; 2] {
+        let ([low, high], [low_before, high_before]) = (self.reached[joint], self.halfway[joint]);
+        let most = STILL.min(STILL_PART * self.range(joint));
+        [low_before - low <= most, high - high_before <= most]
+    }
+
+    /// Returns whether no joint gets farther, other than those that have their whole range.
+    fn is_pocket(&self) -> bool {
+        let whole = |joint: usize| self.reached[joint][1] - self.reached[joint][0] >= WHOLE * self.range(joint);
+        (0..self.reached.len()).all(|joint| whole(joint) || self.still(joint) == [true; 2])
+    }
+
+    /// Returns how far a position is outside of what was reached [rad or m], if that is far and the joint got no
+    /// farther on that side.
+    fn gap(&self, joint: usize, other: f64) -> Option<f64> {
+        let [low, high] = self.reached[joint];
+        let (below, above) = (low - other, other - high);
+        let gap = below.max(above);
+        (gap >= GAP && self.still(joint)[usize::from(above > below)]).then_some(gap)
+    }
+
+    /// Tries this number of edges; `None` if it was stopped.
+    fn grow<C: CollisionChecker>(
+        &mut self,
+        checker: &mut C,
+        others: &[Vec<f64>],
+        edges: usize,
+        stop: &Stop,
+    ) -> Option<()> {
+        let turns = checker.turns().to_vec();
+        for edge in 0..edges {
+            if edge.is_multiple_of(BIAS) && stop.is_over() {
+                return None;
+            }
+            self.draw(others, edge);
+            let (nearest, far) = self.tree.nearest(&self.sample);
+            if far < 1e-6 {
+                continue;
+            }
+            let node = self.tree.node(nearest);
+            unwind(&mut self.sample, node, &turns);
+            between(node, &self.sample, (STEP / far).min(1.0), &mut self.at);
+            let free = checker.motion_looks_free(node, &self.at)
+                || (self.exact && checker.is_free(&self.at) && checker.motion_is_free(node, &self.at, stop));
+            if free {
+                for ([low, high], q) in self.reached.iter_mut().zip(&self.at) {
+                    (*low, *high) = (low.min(*q), high.max(*q));
+                }
+                self.tree.add(&self.at, Some(nearest));
+            }
+        }
+        Some(())
+    }
+
+    fn draw(&mut self, others: &[Vec<f64>], edge: usize) {
+        if let Some(other) = others.get((edge / BIAS) % others.len().max(1)).filter(|_| edge.is_multiple_of(BIAS)) {
+            return self.sample.copy_from_slice(other);
+        }
+        self.draw_anywhere(edge % 4 == 1);
+    }
+
+    /// Draws a configuration, near to one that was reached or not.
+    fn draw_anywhere(&mut self, near: bool) {
+        let around = near.then(|| self.random.below(self.tree.len()));
+        let around = around.map(|node| self.tree.node(node));
+        for (joint, (q, [low, high])) in self.sample.iter_mut().zip(&self.ranges).enumerate() {
+            *q = match around.and_then(|node| node.get(joint)) {
+                Some(near) => self.random.between((near - NEARBY).max(*low), (near + NEARBY).min(*high)),
+                None => self.random.between(*low, *high),
+            };
+        }
+    }
+
+    /// Returns whether a joint has a position, between what was reached and `other`, at which nothing is free.
+    fn is_walled<C: CollisionChecker>(&mut self, checker: &mut C, joint: usize, other: f64, stop: &Stop) -> bool {
+        let [low, high] = self.reached[joint];
+        let (edge, far) = if other > high { (high, other - high) } else { (low, other - low) };
+        let walls = (0..WALLS as i32).map(|k| FIRST_WALL * 2.0_f64.powi(k)).take_while(|away| *away < far.abs());
+        let walls = walls.map(|away| edge + away * far.signum());
+        let blocked: Vec<f64> = walls.filter(|&at| self.is_blocked(checker, (joint, at), TRIES, stop)).collect();
+        // The middle one is the most likely.
+        blocked.get(blocked.len() / 2).is_some_and(|&at| self.is_blocked(checker, (joint, at), LAST_TRIES, stop))
+    }
+
+    /// Returns whether none of a number of configurations with a joint at a position is free.
+    fn is_blocked<C: CollisionChecker>(
+        &mut self,
+        checker: &mut C,
+        (joint, at): (usize, f64),
+        tries: usize,
+        stop: &Stop,
+    ) -> bool {
+        (0..tries).all(|number| {
+            self.draw_anywhere(number % 2 == 1);
+            self.sample[joint] = at;
+            let q = &self.sample;
+            !(stop.is_over() || checker.motion_looks_free(q, q) || self.exact && checker.is_free(q))
+        })
+    }
+
+    /// Returns what touches a little beyond the configurations that reached the end of a joint's part.
+    fn in_the_way<C: CollisionChecker>(&self, checker: &mut C, joint: usize, above: bool) -> Vec<Contact> {
+        let sign = if above { 1.0 } else { -1.0 };
+        let mut ends: Vec<usize> = (0..self.tree.len()).collect();
+        ends.sort_by(|a, b| (sign * self.tree.node(*b)[joint]).total_cmp(&(sign * self.tree.node(*a)[joint])));
+        let mut seen: Vec<(usize, Contact)> = Vec::new();
+        for node in ends.into_iter().take(LOOKS) {
+            let mut q = self.tree.node(node).to_vec();
+            q[joint] += sign * BEYOND;
+            let Some(contact) = checker.contacts(&q).into_iter().next() else { continue };
+            match seen.iter_mut().find(|(_, other)| other.pair == contact.pair) {
+                Some((times, _)) => *times += 1,
+                None => seen.push((1, contact)),
+            }
+        }
+        seen.sort_by_key(|(times, _)| std::cmp::Reverse(*times));
+        seen.into_iter().take(NAMED).map(|(_, contact)| contact).collect()
+    }
+}

@@ -1,0 +1,171 @@
+//! Measures how much of each limit a trajectory uses, on the curve between its points.
+
+use dimos_kernels::Width;
+use dimos_kernels::states::{JOINTS, States};
+
+use super::topp::JointBound;
+
+/// The largest part of each limit that a trajectory uses: above 1 it exceeds the limit.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Excess {
+    /// Part of the velocity limit.
+    pub velocity: f64,
+    /// Part of the acceleration limit.
+    pub acceleration: f64,
+    /// Part of the jerk limit; 0 without a limit.
+    pub jerk: f64,
+}
+
+impl Excess {
+    /// Returns the factor by which the motion must be slowed down to keep all limits; at least 1.
+    pub fn slower(&self) -> f64 {
+        if self.velocity <= 1.0 && self.acceleration <= 1.0 && self.jerk <= 1.0 {
+            return 1.0;
+        }
+        self.velocity.max(self.acceleration.sqrt()).max(self.jerk.cbrt())
+    }
+
+    /// Returns the values after stretching the motion in time by `factor`.
+    pub fn stretched(self, factor: f64) -> Self {
+        Self {
+            velocity: self.velocity / factor,
+            acceleration: self.acceleration / factor.powi(2),
+            jerk: self.jerk / factor.powi(3),
+        }
+    }
+
+    /// Returns the larger of each.
+    pub fn max(self, other: Self) -> Self {
+        Self {
+            velocity: self.velocity.max(other.velocity),
+            acceleration: self.acceleration.max(other.acceleration),
+            jerk: self.jerk.max(other.jerk),
+        }
+    }
+}
+
+/// Bounds that exceed a limit by no more than this part need no closer look: they may be rounding errors, and a motion
+/// that is slowed down by as little is hardly slower.
+const NEGLIGIBLE: f64 = 1e-6;
+
+/// Measures the curve through states: quintic, or cubic, as in `Spline`. The values are upper bounds, exact where the
+/// acceleration is constant, or linear without a change of its sign ([`States::most`]). If these exceed a limit, they
+/// are the extremes of cubics, and quintics are sampled in quarters of each segment.
+pub fn excess(states: &States, bounds: &[JointBound], quintic: bool) -> Excess {
+    let most = upper_bounds(states, bounds, quintic);
+    if most.slower() <= 1.0 + NEGLIGIBLE {
+        return most;
+    }
+    let mut all = Excess::default();
+    for (j, bound) in bounds.iter().enumerate() {
+        let mut most = [0.0; 3];
+        for (i, times) in states.times().windows(2).enumerate() {
+            let h = times[1] - times[0];
+            let inverse = 1.0 / h;
+            let [positions, speeds, accelerations] =
+                [0, 1, 2].map(|which| [states.values(i, which)[j], states.values(i + 1, which)[j]]);
+            let d = (positions[1] - positions[0]) * inverse;
+            let used = if quintic {
+                of_quintic(d, speeds, accelerations, h, inverse)
+            } else {
+                of_cubic(d, speeds, h, inverse)
+            };
+            most.iter_mut().zip(used).for_each(|(m, u)| *m = larger(*m, u));
+        }
+        all = all.max(part_of(most, bound));
+    }
+    all
+}
+
+/// Returns the parts of a joint's limits that these are.
+fn part_of([velocity, acceleration, jerk]: [f64; 3], bound: &JointBound) -> Excess {
+    Excess {
+        velocity: velocity / bound.velocity,
+        acceleration: acceleration / bound.acceleration,
+        jerk: jerk / bound.jerk,
+    }
+}
+
+fn larger(a: f64, b: f64) -> f64 {
+    if b > a { b } else { a }
+}
+
+/// Returns the maximum speed, acceleration and jerk of a cubic with mean speed `d` over `h`.
+fn of_cubic(d: f64, [v0, v1]: [f64; 2], h: f64, inverse: f64) -> [f64; 3] {
+    // Acceleration is linear from a0 to a1; velocity has its extreme where it is zero.
+    let (a0, a1) = ((6.0 * d - 4.0 * v0 - 2.0 * v1) * inverse, (2.0 * v0 + 4.0 * v1 - 6.0 * d) * inverse);
+    let mut speed = larger(v0.abs(), v1.abs());
+    if a0 * a1 < 0.0 {
+        speed = larger(speed, (v0 - 0.5 * a0 * a0 * h / (a1 - a0)).abs());
+    }
+    [speed, larger(a0.abs(), a1.abs()), (a1 - a0).abs() * inverse]
+}
+
+/// Returns the maximum speed, acceleration and jerk of a quintic with mean speed `d` over `h`.
+fn of_quintic(d: f64, [v0, v1]: [f64; 2], [a0, a1]: [f64; 2], h: f64, inverse: f64) -> [f64; 3] {
+    // Speed is v0 + x·(c1 + x·(c2 + x·(c3 + x·c4))), with x from 0 to 1.
+    let (c1, b1) = (a0 * h, a1 * h);
+    let (rise, change) = (d - v0, v1 - v0);
+    let c2 = 30.0 * rise - 12.0 * change - 4.5 * c1 + 1.5 * b1;
+    let c3 = -60.0 * rise + 28.0 * change + 6.0 * c1 - 4.0 * b1;
+    let c4 = 30.0 * rise - 15.0 * change - 2.5 * c1 + 2.5 * b1;
+    let speed = |x: f64| (v0 + x * (c1 + x * (c2 + x * (c3 + x * c4)))).abs();
+    let acceleration = |x: f64| (c1 + x * (2.0 * c2 + x * (3.0 * c3 + x * 4.0 * c4))).abs();
+    let jerk = |x: f64| (2.0 * c2 + x * (6.0 * c3 + x * 12.0 * c4)).abs();
+    let most = |ends: f64, f: &dyn Fn(f64) -> f64| larger(larger(ends, f(0.25)), larger(f(0.5), f(0.75)));
+    [
+        most(larger(v0.abs(), v1.abs()), &speed),
+        most(larger(c1.abs(), b1.abs()), &acceleration) * inverse,
+        most(larger(jerk(0.0), jerk(1.0)), &jerk) * inverse * inverse,
+    ]
+}
+
+/// Returns upper bounds of what the spline through states uses.
+fn upper_bounds(states: &States, bounds: &[JointBound], quintic: bool) -> Excess {
+    let mut all = Excess::default();
+    for (block, bounds) in bounds.chunks(JOINTS).enumerate() {
+        let most = states.most(block, quintic, Width::widest());
+        for (k, bound) in bounds.iter().enumerate() {
+            all = all.max(part_of([0, 1, 2].map(|which| most[which][k]), bound));
+        }
+    }
+    all
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use dimos_core::trajectory::{Cursor, JointTrajectory, Sample, Spline, TrajectoryPoint};
+    use dimos_robot::random::Random;
+
+    #[test]
+    fn no_sample_of_a_spline_exceeds_the_bounds() {
+        let mut random = Random::new(3);
+        for (joints, quintic) in [(3, true), (7, true), (7, false), (9, true)] {
+            let mut states = States::new(joints, 20);
+            for k in 0..20 {
+                let three = |_| [1.0, 1.0, 2.0].map(|scale| random.between(-scale, scale));
+                states.push(0.3 * k as f64, (0..joints).map(three));
+            }
+            let point = |(k, time): (usize, &f64)| TrajectoryPoint {
+                time_from_start: *time,
+                positions: states.values(k, 0).into(),
+                velocities: states.values(k, 1).into(),
+                accelerations: if quintic { states.values(k, 2).into() } else { Default::default() },
+            };
+            let points = states.times().iter().enumerate().map(point).collect();
+            let limits = vec![JointBound { velocity: 2.0, acceleration: 30.0, jerk: 500.0 }; joints];
+            let most = upper_bounds(&states, &limits, quintic);
+            let names = (0..joints).map(|j| format!("j{j}")).collect();
+            let spline = Spline::new(&JointTrajectory { joint_names: names, points }).unwrap();
+            let (mut cursor, mut samples) = (Cursor::default(), vec![Sample::default(); joints]);
+            for k in 0..=5700 {
+                spline.sample(f64::from(k) * 1e-3, &mut cursor, &mut samples);
+                for s in &samples {
+                    assert!(s.velocity.abs() / 2.0 <= most.velocity + 1e-9, "{joints} {quintic}: {s:?}, {most:?}");
+                    assert!(s.acceleration.abs() / 30.0 <= most.acceleration + 1e-9, "{joints} {quintic}: {s:?}");
+                }
+            }
+        }
+    }
+}
