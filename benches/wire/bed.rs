@@ -52,6 +52,7 @@ impl Arm {
         let config = DeviceConfig {
             hardware_id: "bench".to_owned(),
             dof,
+            usb: Box::new(|| None),
             tick_period: period,
             native_rate: 250.0,
             supervision: dimos::arm::Supervision::default(),

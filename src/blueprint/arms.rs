@@ -7,7 +7,7 @@ use crate::blueprint::schema::{HardwareEntry, Joints, OnExit};
 use crate::blueprint::{limits, park, parts};
 use dimos_core::arm::{Supervision, Topology};
 use dimos_core::joint::{MAX_DOF, make_joints};
-use dimos_hardware::check::Checked;
+use dimos_hardware::check::{Checked, LineShare};
 use dimos_hardware::registry::{AdapterConfig, AdapterSpec, SIM};
 use dimos_yaml::{Diag, Located, NodeId, Tree, did_you_mean, quote};
 
@@ -35,6 +35,8 @@ pub(super) struct Entry {
     pub(super) adapter: Option<AdapterSpec>,
     /// Its complete address and the position of that; `None` if it has none, or is simulated.
     place: Option<(String, NodeId)>,
+    /// What it takes of its line, if other arms may be on it.
+    line: Option<LineShare>,
 }
 
 pub(super) fn resolve(checker: &mut Checker<'_>, hardware: &[Located<HardwareEntry>]) -> Hardware {
@@ -55,13 +57,18 @@ pub(super) fn resolve(checker: &mut Checker<'_>, hardware: &[Located<HardwareEnt
         let adapter = adapter(checker, entry);
         found.ids_known &= !id.is_empty();
         found.joints_known &= joints_known;
+        let mut line = None;
         match adapter {
-            Some(row) => found.arms.push(arm(checker, entry, row, &id, &joints, joints_known)),
+            Some(row) => {
+                let arm = arm(checker, entry, row, &id, &joints, joints_known);
+                line = arm.line;
+                found.arms.push(arm);
+            }
             None if joints_known => drop(limits::resolve(checker, &entry.limits, &joints, None)),
             None => {}
         }
-        let place = adapter.as_ref().and_then(|row| place(checker, entry, row, &found.entries));
-        found.entries.push(Entry { id, at: entry.hardware_id.at, joints, adapter, place });
+        let place = adapter.as_ref().and_then(|row| place(checker, entry, (row, line), &found.entries));
+        found.entries.push(Entry { id, at: entry.hardware_id.at, joints, adapter, place, line });
     }
     found
 }
@@ -82,24 +89,60 @@ fn id(checker: &mut Checker<'_>, entry: &Located<HardwareEntry>, others: &[Entry
     (id.value.clone(), duplicate.is_some())
 }
 
-/// Returns an arm's complete address; reports one that an earlier arm has.
+/// Returns an arm's complete address; reports one that an earlier arm has, unless both can be on one line.
 fn place(
     checker: &mut Checker<'_>,
     entry: &Located<HardwareEntry>,
-    row: &AdapterSpec,
+    (row, line): (&AdapterSpec, Option<LineShare>),
     others: &[Entry],
 ) -> Option<(String, NodeId)> {
     let given = entry.address.as_ref().filter(|given| given.value != SIM && row.transport != "memory")?;
     let full = (row.address.check)(given).ok().filter(|full| !full.is_empty())?;
     // Names of hosts and interfaces in any case; those of files as they are.
     let full = if full.contains('/') { full } else { full.to_ascii_lowercase() };
-    let first = others.iter().find_map(|other| other.place.as_ref().filter(|(place, _)| *place == full));
-    if let Some((_, first)) = first {
-        let also = checker.tree.label(*first).with_text("first used here");
-        let diag = Diag::error(format!("two arms have the address {}", quote(given)));
-        checker.error(given.at, diag.also(also).hint("give each arm the address of its own controller"));
+    let same = others.iter().filter(|other| other.place.as_ref().is_some_and(|(place, _)| *place == full));
+    let is_beside = |other: &Entry| line.zip(other.line).is_some_and(|(own, line)| own.is_beside(&line));
+    match { same.clone() }.find(|other| !is_beside(other)) {
+        Some(other) => same_place(checker, entry, given, line.filter(|_| other.line.is_some()), other),
+        None => {
+            let load = same.filter_map(|other| other.line).chain(line).map(|line| line.load).sum::<f64>();
+            if load > LineShare::MAX_LOAD {
+                let (percent, most) = (load * 100.0, LineShare::MAX_LOAD * 100.0);
+                let what =
+                    format!("the arms at {} need {percent:.0} % of the line's time (limit {most:.0} %)", quote(given));
+                checker.error(given.at, Diag::error(what).hint("give them a higher rate, or a line each"));
+            }
+        }
     }
     Some((full, given.at))
+}
+
+/// Reports an arm at the address of `other`. `line`: both could be on one line, with other numbers.
+fn same_place(
+    checker: &mut Checker<'_>,
+    entry: &HardwareEntry,
+    given: &Located<String>,
+    line: Option<LineShare>,
+    other: &Entry,
+) {
+    let also = other.place.as_ref().map(|(_, first)| checker.tree.label(*first).with_text("first used here"));
+    let also = also.into_iter();
+    let option = line.zip(entry.options.as_ref()).and_then(|(line, options)| {
+        let at = checker.tree.nearest(options.at, line.option);
+        (at != options.at).then_some((line.numbers, at))
+    });
+    let diag = match option {
+        Some(((from, to), _)) => {
+            let what = format!("some of the numbers {from} to {to} are those of {}, on the same line", other.id);
+            Diag::error(what).hint("give the devices of each arm their own numbers")
+        }
+        None => {
+            let own_numbers = line.map_or(String::new(), |line| format!(", or its own `options.{}`", line.option));
+            let hint = format!("give each arm the address of its own controller{own_numbers}");
+            Diag::error(format!("two arms have the address {}", quote(given))).hint(hint)
+        }
+    };
+    checker.error(option.map_or(given.at, |(_, at)| at), also.fold(diag, Diag::also));
 }
 
 /// Checks the settings that depend on the adapter, and builds the arm.
@@ -155,6 +198,7 @@ fn arm(
         own_limits: own.unwrap_or_default(),
         limits,
         tool: checked.tool,
+        line: checked.line,
         tcp_velocity: None,
         tool_robot: None,
     }

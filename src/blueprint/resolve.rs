@@ -22,7 +22,7 @@ use dimos_control::task_leader::LeaderJoint;
 use dimos_control::task_spec::TaskSpec;
 use dimos_core::arm::Supervision;
 use dimos_core::joint::{JointLimits, LONGEST_NAME, may_be_in_name};
-use dimos_hardware::check::ToolFacts;
+use dimos_hardware::check::{LineShare, ToolFacts};
 use dimos_hardware::device::Setup;
 use dimos_hardware::registry::AdapterSpec;
 use dimos_planner::planning::config::PlannerConfig;
@@ -121,6 +121,8 @@ pub struct Arm {
     pub limits: Vec<JointOverride>,
     /// What is known of its tool.
     pub tool: ToolFacts,
+    /// What it takes of its line, if other arms may be on it.
+    pub line: Option<LineShare>,
     /// Highest speed of its tool [m/s]: the blueprint's, else the vendor's.
     pub tcp_velocity: Option<f64>,
     /// What the speed of its tool is computed with, if a model is known.

@@ -131,9 +131,10 @@ impl Service {
     fn accept_identity(&self, id: &str, arm: u16) -> Result<(), RpcError> {
         let health = |device: &Arc<Device>| device.health().identity();
         let Some(device) = self.parts.devices.get(usize::from(arm)) else { return Ok(()) };
-        let Some(found) = health(device).other else { return Ok(()) };
+        let own = health(device);
+        let Some(found) = own.other.clone() else { return Ok(()) };
         let others = self.parts.devices.iter().enumerate().filter(|(index, _)| *index != usize::from(arm));
-        if let Some((_, other)) = { others }.find(|(_, other)| health(other).accepted.as_ref() == Some(&found)) {
+        if let Some((_, other)) = { others }.find(|(_, other)| own.is_exchanged_with(&health(other))) {
             let what =
                 format!("{found} answers at the address of {id}, and is the arm {} of this run", other.hardware_id());
             return Err(RpcError::new(Code::ArmLatched, what).hint(

@@ -14,6 +14,7 @@ use dimos_core::message::Message;
 use dimos_hardware::adapter::AdapterError;
 use dimos_hardware::device::{Connected, Device, DeviceConfig, Note};
 use dimos_hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, SIM};
+use dimos_hardware::transport::serial_ports;
 use dimos_rt::heartbeat::Heartbeat;
 use dimos_rt::slot::{SlotReader, SlotWriter, slot};
 use dimos_rt::wake::Wake;
@@ -79,6 +80,7 @@ pub fn bring_up(
     for (index, arm) in blueprint.arms.iter().enumerate() {
         let config = configure(&blueprint.arms, index, is_closed, &mut arms)?;
         let adapter = (arm.adapter.create)(&config).map_err(|e| unfit(arm, &e))?;
+        let address = config.address;
         let (state_writer, state_reader) = slot(ArmState::default());
         let (command_writer, command_reader) = slot(ArmCommand::default());
         let note = note.clone();
@@ -90,6 +92,7 @@ pub fn bring_up(
         let device = DeviceConfig {
             hardware_id: arm.hardware_id.clone(),
             dof: arm.joints.len(),
+            usb: Box::new(move || serial_ports::usb_at(&address)),
             tick_period: period,
             native_rate: arm.adapter.native_rate,
             supervision: arm.supervision,
@@ -158,11 +161,17 @@ fn configure(all: &[Arm], index: usize, is_closed: bool, arms: &mut Arms) -> Res
         _ if arm.address.is_empty() || arm.address == SIM => {}
         _ => {
             let address = full_address(arm);
+            let is_there = |other: &&Arm| {
+                let has_lock = !other.address.is_empty() && other.address != SIM;
+                has_lock && device_lock::is_same_place(&full_address(other), &address)
+            };
+            let same = || before.iter().filter(is_there);
+            let beside = |other: &Arm| arm.line.zip(other.line).is_some_and(|(own, line)| own.is_beside(&line));
+            if same().next().is_some() && same().all(beside) {
+                return Ok(config); // the first arm of the line has its lock
+            }
             let lock = device_lock::take(&arm.adapter_type, &address, is_closed).map_err(|e| {
-                let has_lock = |other: &&Arm| !other.address.is_empty() && other.address != SIM;
-                let mut others = before.iter().filter(has_lock);
-                let same = others.find(|other| device_lock::is_same_place(&full_address(other), &address));
-                let (what, hint) = match same.filter(|_| matches!(e, DeviceLockError::By { .. })) {
+                let (what, hint) = match same().next().filter(|_| matches!(e, DeviceLockError::By { .. })) {
                     Some(same) => {
                         let what =
                             format!("{} at {address} is the arm {} of this run", arm.adapter_type, same.hardware_id);

@@ -74,6 +74,7 @@ pub(crate) fn spawn(
     let config = DeviceConfig {
         hardware_id: "arm".into(),
         dof: 6,
+        usb: Box::new(|| None),
         tick_period: Duration::from_millis(10),
         native_rate,
         supervision: Supervision { accept_zero_pose: true, ..Supervision::default() },

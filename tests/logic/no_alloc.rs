@@ -298,6 +298,7 @@ fn a_healthy_device_thread_does_not_allocate() {
     let device = DeviceConfig {
         hardware_id: "arm".into(),
         dof: 6,
+        usb: Box::new(|| None),
         tick_period: Duration::from_millis(2),
         native_rate: 500.0,
         supervision: dimos::arm::Supervision::default(),

@@ -37,9 +37,9 @@ fn the_adapters_instructions_are_the_sdks() {
     let ours = [
         Instruction::Ping(1),
         Instruction::Read(3, 9, 4),
-        Instruction::ReadAll(40, 31),
-        Instruction::ReadAll(56, 2),
-        Instruction::WriteAll(42, 2, &goals),
+        Instruction::ReadAll(1, 40, 31),
+        Instruction::ReadAll(1, 56, 2),
+        Instruction::WriteAll(1, 42, 2, &goals),
     ];
     let ours = ours.map(|instruction| {
         let mut frame = [0; MAX_INSTRUCTION];

@@ -44,7 +44,7 @@ fn lerobots_bus_uses_the_emulated_servos_and_its_packets_and_calibration_are_our
     let Some(sent) = lerobot(&["use", &config.address, theirs.to_str().unwrap()]) else { return };
 
     // The packets that both send.
-    let file = Calibration::read(&theirs).unwrap();
+    let file = Calibration::read(&theirs, 1).unwrap();
     assert_eq!(file[0].homing_offset, 66, "0.1 rad is 65 counts from 2048, and the middle reads 2047");
     let offset = with_sign(file[1].homing_offset, 11).to_le_bytes();
     let range = (file[1].range_max as u16).to_le_bytes();
@@ -63,8 +63,8 @@ fn lerobots_bus_uses_the_emulated_servos_and_its_packets_and_calibration_are_our
         Instruction::Write(2, 40, &[0]),
         Instruction::Write(2, 55, &[0]),
         Instruction::Write(6, 16, &500u16.to_le_bytes()),
-        Instruction::ReadAll(56, 2),
-        Instruction::WriteAll(42, 2, &goals),
+        Instruction::ReadAll(1, 56, 2),
+        Instruction::WriteAll(1, 42, 2, &goals),
     ] {
         let ours = ours_of(instruction);
         assert!(sent.lines().any(|line| line == ours), "{instruction:?}: {ours} is not among\n{sent}");
@@ -88,6 +88,26 @@ fn lerobots_bus_uses_the_emulated_servos_and_its_packets_and_calibration_are_our
     service.write_calibration(&ours).unwrap();
     drop(service);
     assert_eq!(lerobot(&["calibrated", &config.address, ours.to_str().unwrap()]).as_deref(), Some("as it says\n"));
+}
+
+#[test]
+fn lerobots_bus_uses_the_second_arm_of_a_line() {
+    let (config, servos) = line(json!({"ids": (1..=12).collect::<Vec<u8>>(), "lag": 0.0}));
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("second.json");
+    let Some(sent) = lerobot(&["use", &config.address, file.to_str().unwrap(), "7"]) else { return };
+    let mut frame = [0; MAX_INSTRUCTION];
+    let ours = encode(Instruction::ReadAll(7, 56, 2), &mut frame);
+    let ours = ours.iter().map(|byte| format!("{byte:02x}")).collect::<String>();
+    assert!(sent.lines().any(|line| line == ours), "{ours} is not among\n{sent}");
+    servos.with(|servos, _| {
+        assert!((0..6).all(|servo| servos.byte(servo, 40) == 0), "the first arm's motors stay off");
+        assert!((0..6).all(|servo| servos.stored(servo, 31) == 0), "and it has its own offsets");
+    });
+    // Both arms on that line, the second one with LeRobot's calibration.
+    let arm = |options: Value| So101Adapter::new(&AdapterConfig { options, ..config.clone() }).unwrap();
+    let mut arms = [arm(json!({})), arm(json!({"first_id": 7, "calibration": file}))];
+    arms.iter_mut().for_each(|arm| arm.connect().unwrap());
 }
 
 #[test]

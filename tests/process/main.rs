@@ -65,6 +65,7 @@ mod share_faults;
 mod share_tls;
 mod share_verbs;
 mod small_verbs;
+mod so101_line;
 mod so101_service;
 mod split_logs;
 mod start_stages;

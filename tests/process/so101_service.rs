@@ -75,7 +75,7 @@ fn an_arm_is_calibrated_by_hand_with_its_motors_off() {
     terminal.until("written to the motors, read back, and saved: mine/arm.json");
 
     let path = home.path().join("mine/arm.json");
-    let [pan, .., roll, gripper] = Calibration::read(&path).unwrap();
+    let [pan, .., roll, gripper] = Calibration::read(&path, 1).unwrap();
     // The middle of the travel is that of the turn.
     assert_eq!((pan.homing_offset, pan.range_min, pan.range_max), (1, 795, 3299));
     assert_eq!((roll.range_min, roll.range_max), (0, 4095), "it was not led");
@@ -88,7 +88,7 @@ fn an_arm_is_calibrated_by_hand_with_its_motors_off() {
     // A joint that was not moved has no range; nothing is written.
     let again = format!("{line} --force --yes --record-for 100ms");
     home.dimos(&again).with(1).says(&["shoulder_pan was not moved: its range is 0 counts", "nothing was written"]);
-    assert_eq!(Calibration::read(&path).unwrap()[0], pan);
+    assert_eq!(Calibration::read(&path, 1).unwrap()[0], pan);
     let restore = format!("arm calibrate so101 --address {} --yes --restore mine/arm.json", servos.address());
     home.dimos(&restore).with(0).says(&["the motors have the calibration of mine/arm.json already"]);
 }
@@ -119,7 +119,7 @@ fn a_recording_outlives_a_failed_write() {
     home.dimos(&format!("{restore} --yes"))
         .with(0)
         .says(&["written and read back: elbow_flex, ", "mv arm.json.part arm.json"]);
-    let [pan, _, elbow, ..] = Calibration::read(&home.path().join("arm.json.part")).unwrap();
+    let [pan, _, elbow, ..] = Calibration::read(&home.path().join("arm.json.part"), 1).unwrap();
     let stored = |servo| servos.with(|servos, _| i32::from(servos.stored(servo, 9)));
     assert_eq!((stored(0), stored(2)), (pan.range_min & 0xFF, elbow.range_min & 0xFF));
 }

@@ -1,5 +1,7 @@
 """LeRobot's own bus on a line of emulated servos.
 
+The servos of an arm have the numbers from 1 on, or from the one on that is the last argument.
+
 lerobot_bus.py use PATH FILE: everything that its SO-101 follower does with the bus, and its calibration into FILE; prints
 each different packet that it sent, in hexadecimal.
 lerobot_bus.py calibrated PATH FILE: whether the servos have the calibration of FILE, and FILE is as LeRobot writes it.
@@ -22,6 +24,7 @@ from lerobot.motors import Motor, MotorCalibration, MotorNormMode  # noqa: E402
 from lerobot.motors.feetech import FeetechMotorsBus, OperatingMode  # noqa: E402
 
 NAMES = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper"]
+FIRST = int(sys.argv.pop()) if sys.argv[-1].isdigit() else 1
 SENT = []
 write_port = scservo_sdk.PortHandler.writePort
 
@@ -44,7 +47,7 @@ def bus_at(path, calibration=None):
         norm = MotorNormMode.RANGE_0_100 if name == "gripper" else MotorNormMode.DEGREES
         return Motor(number, "sts3215", norm)
 
-    motors = {name: motor(number, name) for number, name in enumerate(NAMES, 1)}
+    motors = {name: motor(number, name) for number, name in enumerate(NAMES, FIRST)}
     bus = FeetechMotorsBus(port=path, motors=motors, calibration=calibration)
     # It waits 50 ms for an answer; the emulator's thread may have to wait longer for a busy processor.
     brief = bus.port_handler.setPacketTimeout
@@ -72,7 +75,7 @@ def use(path, file):
     middle = bus.sync_read("Present_Position", normalize=False)
     check(f"the middle pose reads 2047: {middle}", set(middle.values()) == {2047})
     calibration = {}
-    for number, name in enumerate(NAMES, 1):
+    for number, name in enumerate(NAMES, FIRST):
         low, high = (0, 4095) if name == "wrist_roll" else (before[name].range_min, before[name].range_max)
         low, high = (low, high) if name == "wrist_roll" else (low - offsets[name], high - offsets[name])
         calibration[name] = MotorCalibration(number, 0, offsets[name], low, high)

@@ -26,6 +26,29 @@ pub struct Checked {
     pub topology: Vec<Topology>,
     /// What limits the speed of the tool.
     pub tool: ToolFacts,
+    /// What it takes of its line, if other arms may be on it.
+    pub line: Option<LineShare>,
+}
+
+/// What an arm takes of a line that several arms may share.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LineShare {
+    /// First and last number of its devices on the line.
+    pub numbers: (u8, u8),
+    /// The option that sets them.
+    pub option: &'static str,
+    /// Share of the line's time that its messages take at the arm's own rate.
+    pub load: f64,
+}
+
+impl LineShare {
+    /// Highest sum of the loads of a line: the rest is for the gaps between messages, and for those that are repeated.
+    pub const MAX_LOAD: f64 = 0.8;
+
+    /// Returns whether both arms can be on one line: no device of theirs has the same number.
+    pub fn is_beside(&self, other: &Self) -> bool {
+        self.numbers.1 < other.numbers.0 || other.numbers.1 < self.numbers.0
+    }
 }
 
 /// What is known of an arm's tool without the arm.
@@ -60,6 +83,11 @@ impl Checked {
     /// Says what limits the speed of the tool.
     pub fn tool(self, tool: ToolFacts) -> Self {
         Self { tool, ..self }
+    }
+
+    /// Says what the arm takes of its line.
+    pub fn line(self, line: LineShare) -> Self {
+        Self { line: Some(line), ..self }
     }
 
     /// Says how each joint's reading counts turns.

@@ -3,7 +3,6 @@
 use std::time::Duration;
 
 use super::adapter::So101Adapter;
-use super::bus::servo as name_of;
 use super::calibration::{NAMES, Range};
 use super::protocol::{SERVOS, Servo, TURN};
 use super::seam::{LOW_TORQUE, way_back};
@@ -45,7 +44,7 @@ impl So101Adapter {
         for (j, (goal, servo)) in goals.iter_mut().zip(&servos).enumerate().filter(|(_, (_, servo))| !servo.on) {
             *goal = hold_goal(j, self.range(j), positions.get(j).copied().unwrap_or(servo.position))?;
         }
-        for (id, _) in (1..).zip(&servos).filter(|(_, servo)| servo.torque_limit == LOW_TORQUE) {
+        for (id, _) in self.bus.ids().zip(&servos).filter(|(_, servo)| servo.torque_limit == LOW_TORQUE) {
             self.restore_torque(id)?;
         }
         (self.gripper_goal, self.relieved) = (None, [None; SERVOS]);
@@ -87,7 +86,7 @@ impl So101Adapter {
         AdapterError::Rejected(format!(
             "the positions of {} contradict each other or its velocity ({:.1}° and {:.1}°): not enabled\nhint: keep the \
              arm still, and look at the cables",
-            name_of(j as u8 + 1),
+            self.bus.servo(self.bus.first() + j as u8),
             degrees(before),
             degrees(now),
         ))

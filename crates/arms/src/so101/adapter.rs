@@ -10,7 +10,6 @@ use super::bus::Bus;
 use super::calibration::{Calibration, Range};
 use super::protocol::{SERVOS, Servo, TURN, register};
 use super::seam::Seams;
-use super::servos::error_of;
 use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, TOP_SPEED, check, limits};
 use dimos_core::arm::{Commanded, StopPoint};
 use dimos_core::clock::Mono;
@@ -117,7 +116,7 @@ impl So101Adapter {
 
     /// Returns code and text of the first error.
     fn error(&self, servos: &[Servo; SERVOS]) -> Option<(i32, String)> {
-        self.seams.error(|j| self.range(j)).or_else(|| error_of(servos))
+        self.seams.error(|j| self.range(j)).or_else(|| self.error_of(servos))
     }
 
     /// Returns the positions [rad], counted over the seam.
@@ -274,17 +273,18 @@ impl ManipulatorAdapter for So101Adapter {
         if let Some((_, text)) = self.seams.error(|j| self.range(j)) {
             return Err(AdapterError::Rejected(text));
         }
-        if error_of(&servos).is_none() {
+        if self.error_of(&servos).is_none() {
             return Ok(());
         }
         // An overload ends when the goal no longer asks for force, or when the motor is switched off. The other servos
         // keep their goals.
         let goals = self.relieved_goals(&servos);
         self.write_goals_of_enabled(&servos, goals)?;
-        for (id, _) in (1..).zip(&servos).filter(|(_, servo)| !servo.on && servo.error != 0) {
+        for (id, _) in self.bus.ids().zip(&servos).filter(|(_, servo)| !servo.on && servo.error != 0) {
             self.bus.write(id, register::TORQUE, &[0])?;
         }
-        match error_of(&self.fetch()?) {
+        let servos = self.fetch()?;
+        match self.error_of(&servos) {
             None => Ok(()),
             Some((_, text)) => Err(AdapterError::Rejected(format!(
                 "{text}, still\nhint: support the arm, switch its motors off (dimos arm disable) and on again"

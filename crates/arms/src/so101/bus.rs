@@ -1,14 +1,16 @@
 //! The servos' line with requests to one servo: what the adapter and the service verbs share.
 
+use std::ops::RangeInclusive;
 use std::time::Duration;
 
 use super::calibration::NAMES;
-use super::protocol::{self, Instruction, MAX_INSTRUCTION, MODEL, register};
+use super::protocol::{self, Instruction, MAX_INSTRUCTION, MODEL, SERVOS, register};
 use super::{BAUD, Options};
 use dimos_hardware::adapter::{AdapterError, AdapterResult};
 use dimos_hardware::registry::AdapterConfig;
 use dimos_hardware::transport::request_reply::{RequestReply, Retry};
-use dimos_hardware::transport::serial::{SerialAddress, SerialLink};
+use dimos_hardware::transport::serial::SerialAddress;
+use dimos_hardware::transport::shared_serial::SharedLink;
 
 /// Servos may just be starting. With six of them: below 3 s.
 const INTRODUCTION: Retry = Retry { each: Duration::from_millis(40), times: 5 };
@@ -20,17 +22,21 @@ const SEND_TIMEOUT: Duration = Duration::from_millis(100);
 /// The line of the servos.
 pub struct Bus {
     address: SerialAddress,
+    /// Number of the first servo.
+    first: u8,
     /// Timeout of requests to one servo.
     timeout: Retry,
     /// Requests to several servos at once.
-    pub line: RequestReply<SerialLink>,
+    pub line: RequestReply<SharedLink>,
 }
 
 impl Bus {
     /// Creates the line at `config.address`. Does not open it.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
         let address = config.parse_address(|address| SerialAddress::parse(address, BAUD))?;
-        Ok(Self { address, timeout: INTRODUCTION, line: RequestReply::half_duplex(config.options::<Options>()?.echo) })
+        let options = config.options::<Options>()?;
+        let line = RequestReply::half_duplex(options.echo);
+        Ok(Self { address, first: options.first_id, timeout: INTRODUCTION, line })
     }
 
     /// Waits longer for answers, for work outside a run.
@@ -46,13 +52,36 @@ impl Bus {
     /// Opens the line at another rate [bit/s].
     pub fn open_at(&mut self, baud: u32) -> AdapterResult<()> {
         self.line.close();
-        self.line.open(SerialLink::connect("so101", &self.address.path, baud, SEND_TIMEOUT)?);
+        self.line.open(SharedLink::connect("so101", &self.address.path, baud, SEND_TIMEOUT)?);
         Ok(())
     }
 
     /// The device and its rate, for messages.
     pub fn address(&self) -> &SerialAddress {
         &self.address
+    }
+
+    /// The number of the first servo.
+    pub fn first(&self) -> u8 {
+        self.first
+    }
+
+    /// The numbers of the servos, from the base.
+    pub fn ids(&self) -> RangeInclusive<u8> {
+        self.first..=self.first + (SERVOS as u8 - 1)
+    }
+
+    /// Returns which servo has a number, from the base.
+    pub fn index(&self, id: u8) -> Option<usize> {
+        id.checked_sub(self.first).map(usize::from).filter(|servo| *servo < SERVOS)
+    }
+
+    /// Returns a servo's number and joint: `servo 3 (elbow_flex)`.
+    pub fn servo(&self, id: u8) -> String {
+        match self.index(id).and_then(|servo| NAMES.get(servo)) {
+            Some(name) => format!("servo {id} ({name})"),
+            None => format!("servo {id}"),
+        }
     }
 
     /// Reads the model of a servo and returns its firmware version; `Rejected` for another model.
@@ -84,7 +113,7 @@ impl Bus {
         }
         Err(AdapterError::Protocol(format!(
             "{} keeps {found:?} in register {address} instead of {values:?}",
-            servo(id)
+            self.servo(id)
         )))
     }
 
@@ -111,18 +140,10 @@ impl Bus {
         reply.map_err(|error| match error {
             AdapterError::Timeout(_) => AdapterError::Timeout(format!(
                 "{} at {} does not answer\nhint: is the arm powered, and is each cable plugged in?",
-                servo(id),
+                self.servo(id),
                 self.address
             )),
             error => error,
         })
-    }
-}
-
-/// `servo 3 (elbow_flex)`.
-pub fn servo(id: u8) -> String {
-    match usize::from(id).checked_sub(1).and_then(|servo| NAMES.get(servo)) {
-        Some(name) => format!("servo {id} ({name})"),
-        None => format!("servo {id}"),
     }
 }

@@ -108,21 +108,22 @@ impl Default for Calibration {
 }
 
 impl Calibration {
-    /// Reads LeRobot's file; zero is the middle of each range. The error is a sentence without full stop.
-    pub fn load(path: &Path) -> Result<Self, String> {
-        Self::read(path).map(|servos| Self::of(&servos))
+    /// Reads LeRobot's file of an arm whose servos have the numbers from `first` on; zero is the middle of each range.
+    /// The error is a sentence without full stop.
+    pub fn load(path: &Path, first: u8) -> Result<Self, String> {
+        Self::read(path, first).map(|servos| Self::of(&servos))
     }
 
     /// Reads LeRobot's file as it is.
-    pub fn read(path: &Path) -> Result<[Servo; SERVOS], String> {
+    pub fn read(path: &Path, first: u8) -> Result<[Servo; SERVOS], String> {
         let text =
             bounded::read_text(path, bounded::SMALL).map_err(|e| format!("cannot read {}: {e}", path.display()))?;
-        entries(&text).map_err(|e| format!("{}: {e}", path.display()))
+        entries(&text, first).map_err(|e| format!("{}: {e}", path.display()))
     }
 
     /// Reads the text of LeRobot's file.
-    pub fn parse(text: &str) -> Result<Self, String> {
-        entries(text).map(|servos| Self::of(&servos))
+    pub fn parse(text: &str, first: u8) -> Result<Self, String> {
+        entries(text, first).map(|servos| Self::of(&servos))
     }
 
     fn of(servos: &[Servo; SERVOS]) -> Self {
@@ -146,11 +147,11 @@ fn clear_of_seam(servo: &Servo) -> (i32, i32) {
     (servo.range_min.max(SEAM_MARGIN), servo.range_max.min(LAST - SEAM_MARGIN))
 }
 
-fn entries(text: &str) -> Result<[Servo; SERVOS], String> {
+fn entries(text: &str, first: u8) -> Result<[Servo; SERVOS], String> {
     let file: std::collections::BTreeMap<String, Servo> =
         serde_json::from_str(text).map_err(|e| format!("this is no calibration of LeRobot: {e}"))?;
     let mut servos = [Servo::default(); SERVOS];
-    for ((name, id), servo) in NAMES.into_iter().zip(1u8..).zip(&mut servos) {
+    for ((name, id), servo) in NAMES.into_iter().zip(first..).zip(&mut servos) {
         let entry = file.get(name).ok_or_else(|| format!("{name} is missing"))?;
         if entry.id != id {
             return Err(format!("{name} is servo {}, expected {id}", entry.id));
@@ -186,7 +187,7 @@ mod tests {
 
     #[test]
     fn zero_is_the_middle_of_the_range_in_lerobots_file() {
-        let Calibration([pan, .., gripper]) = Calibration::parse(FILE).unwrap();
+        let Calibration([pan, .., gripper]) = Calibration::parse(FILE, 1).unwrap();
         assert_eq!((pan.low, pan.high, pan.offset), (758, 3420, Some(-50)));
         assert!(pan.angle(2089).abs() < 1e-12 && (pan.angle(2089 + 1024) - TAU / 4.0).abs() < 1e-12);
         assert_eq!(pan.counts(TAU / 8.0), 2089 + 512);
@@ -196,37 +197,37 @@ mod tests {
 
     #[test]
     fn goals_keep_clear_of_the_seam_and_zero_stays_where_it_is() {
-        let Calibration([pan, .., roll, gripper]) = Calibration::parse(FILE).unwrap();
+        let Calibration([pan, .., roll, gripper]) = Calibration::parse(FILE, 1).unwrap();
         assert_eq!((pan.low, pan.high), pan.registers);
         assert_eq!((roll.low, roll.high, roll.registers), (SEAM_MARGIN, 4095 - SEAM_MARGIN, (0, 4095)));
         assert!(SEAM_MARGIN == 111 && (roll.angles().1 - 2.9706).abs() < 1e-3, "0.17 rad: {:?}", roll.angles());
         assert!(roll.angle(2048) > 0.0 && roll.angle(2047) < 0.0);
         let at_the_end = FILE.replace("2000, \"range_max\": 3500", "0, \"range_max\": 3500");
-        assert_eq!(Calibration::parse(&at_the_end).unwrap().0[5].low, 0, "the gripper has an end stop");
+        assert_eq!(Calibration::parse(&at_the_end, 1).unwrap().0[5].low, 0, "the gripper has an end stop");
         assert_eq!(gripper.registers, (2000, 3500));
     }
 
     #[test]
     fn a_file_that_was_written_is_read_as_it_was() {
-        let servos = entries(FILE).unwrap();
+        let servos = entries(FILE, 1).unwrap();
         let text = file(&servos);
-        assert_eq!(entries(&text), Ok(servos));
+        assert_eq!(entries(&text, 1), Ok(servos));
         let begin = "{\n    \"shoulder_pan\": {\n        \"id\": 1,\n        \"drive_mode\": 0,\n        \"homing_offset\": -50,";
         assert!(text.starts_with(begin) && text.ends_with("\"range_max\": 3500\n    }\n}"), "{text}");
     }
 
     #[test]
     fn mistakes_in_the_file_are_named() {
-        let wrong = |from: &str, to: &str| Calibration::parse(&FILE.replace(from, to)).unwrap_err();
+        let wrong = |from: &str, to: &str| Calibration::parse(&FILE.replace(from, to), 1).unwrap_err();
         assert_eq!(wrong("wrist_roll", "wrist"), "wrist_roll is missing");
         assert_eq!(wrong(r#""id": 3"#, r#""id": 4"#), "elbow_flex is servo 4, expected 3");
         assert_eq!(wrong("-50", "2048"), "shoulder_pan: 2048 is not an offset within -2047 to 2047");
         assert_eq!(wrong("3420", "4096"), "shoulder_pan: 758 to 4096 is not a range within 0 to 4095");
         let beside = FILE.replace("758, \"range_max\": 3420", "0, \"range_max\": 90");
-        let error = Calibration::parse(&beside).unwrap_err();
+        let error = Calibration::parse(&beside, 1).unwrap_err();
         assert_eq!(error, "shoulder_pan: 0 to 90 is beside the seam of its encoder (0 and 4095)");
         assert!(wrong("range_max", "max").starts_with("this is no calibration of LeRobot"));
-        let error = Calibration::load(Path::new("/no/such/file")).unwrap_err();
+        let error = Calibration::load(Path::new("/no/such/file"), 1).unwrap_err();
         assert!(error.starts_with("cannot read /no/such/file: "), "{error}");
     }
 }

@@ -2,8 +2,7 @@
 //! moves nothing.
 
 use super::adapter::So101Adapter;
-use super::bus::servo;
-use super::protocol::{SERVOS, register, signed};
+use super::protocol::{register, signed};
 use super::settings;
 use dimos_hardware::adapter::{AdapterError, AdapterResult};
 
@@ -11,7 +10,7 @@ impl So101Adapter {
     /// Checks that the servos are those of this arm, calibrated as the blueprint says.
     pub(super) fn introduce(&mut self) -> AdapterResult<()> {
         let at = self.bus.address().to_string();
-        for (i, id) in (1..=SERVOS as u8).enumerate() {
+        for (i, id) in self.bus.ids().enumerate() {
             self.firmware = self.bus.identify(id)?;
             let [low0, low1, high0, high1] = self.bus.read::<4>(id, register::RANGE)?;
             let found = (u16::from_le_bytes([low0, low1]), u16::from_le_bytes([high0, high1]));
@@ -24,7 +23,7 @@ impl So101Adapter {
                     "so101 at {at}: {} has the range {} to {} and the offset {offset}, not those of the calibration \
                      file\nhint: write the file to the servos (dimos arm calibrate so101 --address {at} --restore FILE), \
                      or name another",
-                    servo(id),
+                    self.bus.servo(id),
                     found.0,
                     found.1
                 )));

@@ -21,6 +21,8 @@ mod settings;
 #[cfg(test)]
 mod tests;
 #[cfg(test)]
+mod tests_line;
+#[cfg(test)]
 mod tests_seam;
 #[cfg(test)]
 mod tests_service;
@@ -37,10 +39,11 @@ use serde::{Deserialize, Serialize};
 use calibration::Calibration;
 use dimos_core::arm::{AfterGap, Topology};
 use dimos_core::joint::{ControlMode, JointLimits};
-use dimos_hardware::check::{Checked, ConfigError};
+use dimos_hardware::check::{Checked, ConfigError, LineShare};
 use dimos_hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use dimos_hardware::transport::serial::SerialAddress;
 use emulator::SimOptions;
+use protocol::SERVOS;
 
 /// Number of joints.
 pub const DOF: usize = 5;
@@ -52,6 +55,11 @@ const NATIVE_RATE: f64 = 100.0;
 const HOLDS_WHEN_DISABLED: bool = false;
 /// Rate of the line, where an address names none [bit/s].
 const BAUD: u32 = 1_000_000;
+/// Highest number of a first servo: five follow it, and 252 is the highest number that servos take.
+const LAST_FIRST: u8 = 247;
+/// Bits on the line for a state of all servos and one setpoint of each, in characters of ten: a request of 14 bytes,
+/// six replies of 37, and 56.
+const CYCLE_BITS: u32 = 10 * (14 + 6 * 37 + 56);
 /// Top speed [rad/s], acceleration [rad/s²] and jerk [rad/s³] of every joint: less than a servo's 45 rpm without load.
 const TOP_SPEED: f64 = 3.0;
 const ACCELERATION: f64 = 15.0;
@@ -103,7 +111,14 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("so101", SPEC.dof)?;
     let options = config.options::<Options>()?;
     options.sim.check()?;
-    Ok(Checked::new(limits(&options.calibration()?)).digital_inputs(0).max_payload(0.0))
+    let first = options.first_id;
+    if !(1..=LAST_FIRST).contains(&first) {
+        return Err(ConfigError::new("first_id", format!("servos have the numbers 1 to {}", LAST_FIRST + 5)));
+    }
+    let baud = SerialAddress::parse(&config.address, BAUD).map_or(BAUD, |address| address.baud);
+    let load = f64::from(CYCLE_BITS) * NATIVE_RATE / f64::from(baud);
+    let line = LineShare { numbers: (first, first + SERVOS as u8 - 1), option: "first_id", load };
+    Ok(Checked::new(limits(&options.calibration()?)).digital_inputs(0).max_payload(0.0).line(line))
 }
 
 /// Returns the joint limits of a calibrated arm in SI units.
@@ -120,9 +135,12 @@ fn limits(calibration: &Calibration) -> JointLimits {
 }
 
 /// What a blueprint may set of an SO-101.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
+    /// Number of the first servo; the others follow it. A second arm on the same line has 7.
+    #[schemars(range(min = 1, max = 247))]
+    pub first_id: u8,
     /// LeRobot's calibration file of this arm, such as `~/.cache/huggingface/lerobot/calibration/robots/…/my_arm.json`.
     /// Without one, zero of each joint is the middle of its servo's turn.
     pub calibration: Option<PathBuf>,
@@ -135,10 +153,18 @@ pub struct Options {
     pub sim: SimOptions,
 }
 
+impl Default for Options {
+    fn default() -> Self {
+        Self { first_id: 1, calibration: None, echo: false, write_settings: false, sim: SimOptions::default() }
+    }
+}
+
 impl Options {
     /// Reads the calibration file, if there is one.
     fn calibration(&self) -> Result<Calibration, ConfigError> {
-        let load = |path: &PathBuf| Calibration::load(&expanded(path)).map_err(|e| ConfigError::new("calibration", e));
+        let load = |path: &PathBuf| {
+            Calibration::load(&expanded(path), self.first_id).map_err(|e| ConfigError::new("calibration", e))
+        };
         self.calibration.as_ref().map_or(Ok(Calibration::default()), load)
     }
 }

@@ -4,7 +4,7 @@ use std::f64::consts::TAU;
 
 use super::DOF;
 use super::adapter::{So101Adapter, counts_of_speed};
-use super::protocol::{SERVOS, TURN, register};
+use super::protocol::{TURN, register};
 use dimos_core::arm::{GripperUnit, JointStatus};
 use dimos_hardware::adapter::{AdapterError, AdapterResult, Gripper, JointMonitor};
 use dimos_hardware::adapter_util::{fill, within};
@@ -54,7 +54,7 @@ impl Gripper for So101Adapter {
             return Err(AdapterError::Rejected("the motor of the gripper is off".into()));
         }
         if servos.get(DOF).is_some_and(|servo| servo.top_speed != self.gripper_speed) {
-            self.bus.write(SERVOS as u8, register::TOP_SPEED, &self.gripper_speed.to_le_bytes())?;
+            self.bus.write(*self.bus.ids().end(), register::TOP_SPEED, &self.gripper_speed.to_le_bytes())?;
         }
         let goal = range.low + (position * TURN / TAU).round() as i32;
         self.gripper_goal = Some(goal);

@@ -10,7 +10,7 @@
 
 use dimos_hardware::transport::Scan;
 
-/// Servos: five joints and the gripper, numbered from 1.
+/// Servos: five joints and the gripper, numbered in a row.
 pub const SERVOS: usize = 6;
 /// Counts of a turn of the output shaft.
 pub const TURN: f64 = 4096.0;
@@ -65,10 +65,11 @@ pub enum Instruction<'a> {
     Read(u8, u8, u8),
     /// Writes registers of a servo: address, bytes.
     Write(u8, u8, &'a [u8]),
-    /// Reads the same registers of the servos 1 to `SERVOS`; each answers, in order.
-    ReadAll(u8, u8),
-    /// Writes the same registers of the servos 1 to `SERVOS`: address, bytes of one servo, those of all. No answer.
-    WriteAll(u8, u8, &'a [u8]),
+    /// Reads the same registers of all servos of an arm, of which the first has this number; each answers, in order.
+    ReadAll(u8, u8, u8),
+    /// Writes the same registers of all servos of an arm: the first number, address, bytes of one servo, those of all.
+    /// No answer.
+    WriteAll(u8, u8, u8, &'a [u8]),
 }
 
 /// Writes an instruction into `frame`; the result is the part that was written.
@@ -79,7 +80,7 @@ pub fn encode<'a>(instruction: Instruction<'_>, frame: &'a mut [u8; MAX_INSTRUCT
             (*to, at) = (byte, at + 1);
         }
     };
-    let ids = 1..=SERVOS as u8;
+    let ids = |first: u8| first..first + SERVOS as u8;
     let id = match instruction {
         Instruction::Ping(id) => {
             put(0x01);
@@ -93,13 +94,13 @@ pub fn encode<'a>(instruction: Instruction<'_>, frame: &'a mut [u8; MAX_INSTRUCT
             [0x03, address].iter().chain(values).copied().for_each(put);
             id
         }
-        Instruction::ReadAll(address, length) => {
-            [0x82, address, length].into_iter().chain(ids).for_each(put);
+        Instruction::ReadAll(first, address, length) => {
+            [0x82, address, length].into_iter().chain(ids(first)).for_each(put);
             BROADCAST
         }
-        Instruction::WriteAll(address, length, values) => {
+        Instruction::WriteAll(first, address, length, values) => {
             [0x83, address, length].into_iter().for_each(&mut put);
-            for (id, values) in ids.zip(values.chunks(usize::from(length).max(1))) {
+            for (id, values) in ids(first).zip(values.chunks(usize::from(length).max(1))) {
                 put(id);
                 values.iter().copied().for_each(&mut put);
             }
@@ -243,12 +244,12 @@ mod tests {
         assert_eq!(bytes(Instruction::Ping(1)), [0xFF, 0xFF, 0x01, 0x02, 0x01, 0xFB]);
         assert_eq!(bytes(Instruction::Read(1, 3, 2)), [0xFF, 0xFF, 0x01, 0x04, 0x02, 0x03, 0x02, 0xF3]);
         let all = [0xFF, 0xFF, 0xFE, 0x0A, 0x82, 0x38, 0x02, 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x26];
-        assert_eq!(bytes(Instruction::ReadAll(56, 2)), all);
+        assert_eq!(bytes(Instruction::ReadAll(1, 56, 2)), all);
         let goal = [0xFF, 0xFF, 0x01, 0x05, 0x03, 0x2A, 0x00, 0x08, 0xC4];
         assert_eq!(bytes(Instruction::Write(1, 42, &[0x00, 0x08])), goal);
         // The SDK writes two servos where this writes as many as there are values.
         let two = [0xFF, 0xFF, 0xFE, 0x0A, 0x83, 0x2A, 0x02, 0x01, 0x00, 0x08, 0x02, 0x00, 0x04, 0x39];
-        assert_eq!(bytes(Instruction::WriteAll(42, 2, &[0x00, 0x08, 0x00, 0x04])), two);
+        assert_eq!(bytes(Instruction::WriteAll(1, 42, 2, &[0x00, 0x08, 0x00, 0x04])), two);
     }
 
     #[test]

@@ -113,7 +113,7 @@ impl So101Adapter {
         for (j, servo) in servos.iter().enumerate().take(DOF) {
             let range = self.range(j);
             let Some(order) = self.seams.order(j, servo, range) else { continue };
-            let id = j as u8 + 1;
+            let id = self.bus.first() + j as u8;
             if let Order::Yield(goal) = order {
                 let words = [goal.max(0) as u16, 0, SLOW, LOW_TORQUE].map(u16::to_le_bytes);
                 self.bus.write(id, register::GOAL, words.as_flattened())?;

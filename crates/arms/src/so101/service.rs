@@ -7,7 +7,7 @@
 use std::path::Path;
 use std::time::Duration;
 
-use super::bus::{Bus, servo};
+use super::bus::Bus;
 use super::calibration::{Calibration, NAMES, Servo, file};
 use super::protocol::{self, BROADCAST, Instruction, MAX_INSTRUCTION, SERVOS, register, signed, with_sign};
 use super::settings;
@@ -30,16 +30,8 @@ const PING: Retry = Retry::once(Duration::from_millis(150));
 /// A servo writes its EEPROM, and changes its rate, in this time.
 const SETTLE: Duration = Duration::from_millis(50);
 
-/// The motors: the wrist may turn without end stops.
-const MOTORS: [Motor; SERVOS] = {
-    let mut motors = [Motor { name: "", id: 0, range: None }; SERVOS];
-    let mut i = 0;
-    while i < SERVOS {
-        motors[i] = Motor { name: NAMES[i], id: i as u8 + 1, range: if i == 4 { Some((0, TURN - 1)) } else { None } };
-        i += 1;
-    }
-    motors
-};
+/// The joint that may turn without end stops.
+const WRIST: &str = "wrist_roll";
 
 /// Returns the offset that puts the middle of a range at [`MIDDLE`], and the range then: the seam of the encoder is
 /// opposite, outside the travel where there is room.
@@ -54,6 +46,7 @@ fn centred(offset: i32, (low, high): (i32, i32)) -> (i32, i32, i32) {
 /// The servos' line.
 struct Servos {
     bus: Bus,
+    motors: &'static [Motor],
     /// Homing offsets that make the middle pose read [`MIDDLE`].
     offsets: Option<[i32; SERVOS]>,
 }
@@ -62,7 +55,10 @@ struct Servos {
 pub fn open(config: &AdapterConfig) -> AdapterResult<Box<dyn Service>> {
     let mut bus = Bus::new(config)?.patient();
     bus.open()?;
-    Ok(Box::new(Servos { bus, offsets: None }))
+    let motor = |(id, name)| Motor { name, id, range: (name == WRIST).then_some((0, TURN - 1)) };
+    // A program has one service, and keeps it to its end.
+    let motors = bus.ids().zip(NAMES).map(motor).collect::<Vec<_>>().leak();
+    Ok(Box::new(Servos { bus, motors, offsets: None }))
 }
 
 impl Servos {
@@ -107,7 +103,7 @@ impl Servos {
         // What the register keeps must also be what the position follows.
         let turned = (self.encoder(id)? - before + TURN / 2).rem_euclid(TURN) - TURN / 2;
         if turned.abs() > MOVED {
-            let what = format!("{} reads {turned} counts more than its new offset makes", servo(id));
+            let what = format!("{} reads {turned} counts more than its new offset makes", self.bus.servo(id));
             return Err(AdapterError::Protocol(what));
         }
         Ok(changed)
@@ -133,12 +129,12 @@ impl Servos {
 
 impl Service for Servos {
     fn motors(&self) -> &'static [Motor] {
-        &MOTORS
+        self.motors
     }
 
     fn identify(&mut self) -> AdapterResult<String> {
         let mut firmware = (0, 0);
-        for motor in MOTORS {
+        for motor in self.motors {
             firmware = self.bus.identify(motor.id)?;
         }
         Ok(format!("SO-101: {SERVOS} servos STS3215, firmware {}.{}", firmware.0, firmware.1))
@@ -146,7 +142,7 @@ impl Service for Servos {
 
     fn powered(&mut self) -> AdapterResult<Vec<&'static str>> {
         let mut on = Vec::new();
-        for motor in MOTORS {
+        for motor in self.motors {
             if self.bus.read::<1>(motor.id, register::TORQUE)? != [0] {
                 on.push(motor.name);
             }
@@ -155,15 +151,16 @@ impl Service for Servos {
     }
 
     fn release(&mut self) -> AdapterResult<()> {
-        MOTORS.iter().try_for_each(|motor| self.bus.set(motor.id, register::TORQUE, [0]).map(drop))
+        self.motors.iter().try_for_each(|motor| self.bus.set(motor.id, register::TORQUE, [0]).map(drop))
     }
 
     fn take_middle(&mut self) -> AdapterResult<()> {
         let mut offsets = [0; SERVOS];
-        for (offset, motor) in offsets.iter_mut().zip(MOTORS) {
+        for (offset, motor) in offsets.iter_mut().zip(self.motors) {
             *offset = self.encoder(motor.id)? - MIDDLE;
             if *offset > MAX_OFFSET {
-                let what = format!("{} is exactly half a turn from what its offset can reach", servo(motor.id));
+                let what =
+                    format!("{} is exactly half a turn from what its offset can reach", self.bus.servo(motor.id));
                 return Err(AdapterError::Rejected(format!("{what}\nhint: move that joint by a degree")));
             }
         }
@@ -172,29 +169,29 @@ impl Service for Servos {
     }
 
     fn positions(&mut self) -> AdapterResult<Vec<i32>> {
-        let offsets = self.offsets.unwrap_or_default();
+        let (motors, offsets) = (self.motors, self.offsets.unwrap_or_default());
         let position = |(motor, offset): (&Motor, i32)| Ok((self.encoder(motor.id)? - offset).rem_euclid(TURN));
-        MOTORS.iter().zip(offsets).map(position).collect()
+        motors.iter().zip(offsets).map(position).collect()
     }
 
     fn calibration(&self, ranges: &[(i32, i32)]) -> AdapterResult<String> {
         let offsets = self.offsets.ok_or_else(|| AdapterError::Rejected("no middle pose was taken".into()))?;
         let mut servos = [Servo::default(); SERVOS];
-        for (((servo, motor), offset), range) in servos.iter_mut().zip(MOTORS).zip(offsets).zip(ranges) {
+        for (((servo, motor), offset), range) in servos.iter_mut().zip(self.motors).zip(offsets).zip(ranges) {
             let (homing_offset, range_min, range_max) = centred(offset, *range);
             *servo = Servo { id: motor.id, drive_mode: 0, homing_offset, range_min, range_max };
         }
         let text = file(&servos);
         // What the adapter would not read is not saved.
-        Calibration::parse(&text).map_err(AdapterError::Rejected)?;
+        Calibration::parse(&text, self.bus.first()).map_err(AdapterError::Rejected)?;
         Ok(text)
     }
 
     fn write_calibration(&mut self, path: &Path) -> AdapterResult<Vec<&'static str>> {
-        let servos = Calibration::read(path).map_err(AdapterError::Rejected)?;
+        let servos = Calibration::read(path, self.bus.first()).map_err(AdapterError::Rejected)?;
         self.refuse_while_on()?;
         let mut changed = Vec::new();
-        for (motor, to) in MOTORS.iter().zip(&servos) {
+        for (motor, to) in self.motors.iter().zip(&servos) {
             if self.write_servo(motor.id, to)? {
                 changed.push(motor.name);
             }

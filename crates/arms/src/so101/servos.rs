@@ -5,7 +5,6 @@ use std::time::Duration;
 
 use super::SPEC;
 use super::adapter::So101Adapter;
-use super::calibration::NAMES;
 use super::protocol::{self, Instruction, MAX_DATA, MAX_INSTRUCTION, SERVOS, STATE, Servo, TURN, register};
 use dimos_core::clock::{Clock, MonotonicClock};
 use dimos_hardware::adapter::{AdapterError, AdapterResult};
@@ -24,9 +23,9 @@ impl So101Adapter {
     /// Writes the same registers of all servos.
     pub(super) fn write<const N: usize>(&mut self, address: u8, values: [[u8; N]; SERVOS]) -> AdapterResult<()> {
         let mut frame = [0; MAX_INSTRUCTION];
-        let values = values.as_flattened();
+        let write = Instruction::WriteAll(self.bus.first(), address, N as u8, values.as_flattened());
         self.state = None;
-        self.bus.line.tell(protocol::encode(Instruction::WriteAll(address, N as u8, values), &mut frame))
+        self.bus.line.tell(protocol::encode(write, &mut frame))
     }
 
     /// Asks for the state of all servos.
@@ -34,22 +33,23 @@ impl So101Adapter {
         self.state = None;
         let asked = MonotonicClock.now();
         let mut frame = [0; MAX_INSTRUCTION];
-        let frame = protocol::encode(Instruction::ReadAll(STATE.0, STATE.1), &mut frame);
+        let frame = protocol::encode(Instruction::ReadAll(self.bus.first(), STATE.0, STATE.1), &mut frame);
+        let (ids, first) = (self.bus.ids(), self.bus.first());
         let mut servos: [Option<Servo>; SERVOS] = [None; SERVOS];
         let scan = |bytes: &[u8]| {
-            protocol::scan(bytes, 1..=SERVOS as u8, usize::from(STATE.1)).map(|status| {
+            protocol::scan(bytes, ids.clone(), usize::from(STATE.1)).map(|status| {
                 let mut data = [0; MAX_DATA];
                 data.iter_mut().zip(status.data).for_each(|(to, byte)| *to = *byte);
                 (status.id, data)
             })
         };
         let result = self.bus.line.gather(frame, CYCLE, SERVOS, scan, |(id, data)| {
-            let slot = usize::from(id).checked_sub(1).and_then(|servo| servos.get_mut(servo));
+            let slot = id.checked_sub(first).map(usize::from).and_then(|servo| servos.get_mut(servo));
             slot.is_some_and(|slot| slot.replace(Servo::decode(&data).unwrap_or_default()).is_none())
         });
         if let (Err(AdapterError::Timeout(text)), Some(missing)) = (&result, servos.iter().position(Option::is_none)) {
-            let name = NAMES.get(missing).copied().unwrap_or_default();
-            return Err(AdapterError::Timeout(format!("{text}; servo {} ({name}) did not", missing + 1)));
+            let missing = self.bus.servo(first + missing as u8);
+            return Err(AdapterError::Timeout(format!("{text}; {missing} did not")));
         }
         result?;
         let servos = servos.map(Option::unwrap_or_default);
@@ -123,7 +123,7 @@ impl So101Adapter {
             return self.write_goals(goals);
         }
         self.state = None;
-        let each = (1..).zip(servos.iter().zip(goals)).filter(|(_, (servo, _))| servo.on);
+        let each = self.bus.ids().zip(servos.iter().zip(goals)).filter(|(_, (servo, _))| servo.on);
         { each }.try_for_each(|(id, (_, goal))| self.bus.write(id, register::GOAL, &(goal.max(0) as u16).to_le_bytes()))
     }
 
@@ -139,11 +139,10 @@ impl So101Adapter {
         }
         goals
     }
-}
 
-/// Returns code and text of the first servo in error; the text names it.
-pub(super) fn error_of(servos: &[Servo; SERVOS]) -> Option<(i32, String)> {
-    let (i, servo) = servos.iter().enumerate().find(|(_, servo)| servo.error != 0)?;
-    let (name, text) = (NAMES.get(i).copied().unwrap_or_default(), protocol::error_text(servo.error));
-    Some((servo.error.into(), format!("servo {} ({name}): {text}", i + 1)))
+    /// Returns code and text of the first servo in error; the text names it.
+    pub(super) fn error_of(&self, servos: &[Servo; SERVOS]) -> Option<(i32, String)> {
+        let (id, servo) = self.bus.ids().zip(servos).find(|(_, servo)| servo.error != 0)?;
+        Some((servo.error.into(), format!("{}: {}", self.bus.servo(id), protocol::error_text(servo.error))))
+    }
 }

@@ -3,12 +3,10 @@
 
 use super::bus::Bus;
 use super::calibration::NAMES;
-use super::protocol::{SERVOS, register};
+use super::protocol::register;
 use dimos_hardware::adapter::{AdapterError, AdapterResult};
 use dimos_hardware::service;
 
-/// The gripper's number.
-const GRIPPER: u8 = 6;
 /// Registers of all settings but the maximum acceleration are read at once: the first one, and how many.
 const BLOCK: (u8, usize) = (7, 30);
 /// Maximum acceleration.
@@ -80,9 +78,10 @@ fn differing(
     bus: &mut Bus,
     mut each: impl FnMut(&mut Bus, u8, &Setting, u16) -> AdapterResult<()>,
 ) -> AdapterResult<()> {
-    for id in 1..=SERVOS as u8 {
+    let gripper = *bus.ids().end();
+    for id in bus.ids() {
         let registers = Registers::read(bus, id)?;
-        for setting in SETTINGS.iter().filter(|setting| !setting.gripper || id == GRIPPER) {
+        for setting in SETTINGS.iter().filter(|setting| !setting.gripper || id == gripper) {
             let register = registers.of(setting);
             if register & setting.mask != setting.value {
                 each(bus, id, setting, register)?;
@@ -95,8 +94,8 @@ fn differing(
 /// Returns the settings with other values than wanted.
 pub fn check(bus: &mut Bus) -> AdapterResult<Vec<service::Setting>> {
     let mut found = Vec::new();
-    differing(bus, |_, id, setting, register| {
-        let motor = usize::from(id).checked_sub(1).and_then(|i| NAMES.get(i)).copied().unwrap_or_default();
+    differing(bus, |bus, id, setting, register| {
+        let motor = bus.index(id).and_then(|i| NAMES.get(i)).copied().unwrap_or_default();
         let Setting { name, address, value: wanted, .. } = *setting;
         found.push(service::Setting { motor, name, register: address.into(), found: register & setting.mask, wanted });
         Ok(())

@@ -125,7 +125,7 @@ fn no_goal_moves_at_a_seam_in_ten_thousand_states_and_pushes() {
             1 => (random.below(200), 4095 - random.below(200)),
             _ => (random.below(1500), 2500 + random.below(1595)),
         };
-        let range = Calibration::parse(&file(low, high, random.within(-2047, 2047))).unwrap().0[WRIST];
+        let range = Calibration::parse(&file(low, high, random.within(-2047, 2047)), 1).unwrap().0[WRIST];
         let mut watch = Watch { seams: Seams::default(), range, now: 1_000_000_000 };
         // Near an end of the range, or anywhere in it.
         let goal = match random.below(3) {

@@ -69,7 +69,7 @@ fn a_calibration_is_that_of_lerobot_and_outlives_a_power_loss() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("arm.json");
     calibrate(&mut *arm, &ranges, &path).unwrap();
-    let file = Calibration::read(&path).unwrap();
+    let file = Calibration::read(&path, 1).unwrap();
     // The middle of the travel, 796 to 3300, reads 2047, wherever the pose at the beginning was.
     assert_eq!((file[0].homing_offset, file[0].range_min, file[0].range_max), (1, 795, 3299));
     for servo in &file[..4] {

@@ -48,6 +48,8 @@ pub struct DeviceConfig {
     pub hardware_id: String,
     /// Number of joints in the blueprint.
     pub dof: usize,
+    /// Returns the USB device at the arm's address, if it is one.
+    pub usb: Box<dyn Fn() -> Option<String> + Send>,
     /// Period of the tick.
     pub tick_period: Duration,
     /// Rate at which the device delivers its state [Hz].

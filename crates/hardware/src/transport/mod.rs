@@ -9,6 +9,7 @@ pub mod pty;
 pub mod request_reply;
 pub mod serial;
 pub mod serial_ports;
+pub mod shared_serial;
 pub mod tcp;
 pub mod udp;
 

@@ -22,6 +22,10 @@ pub trait ByteLink {
     fn receive<T>(&mut self, timeout: Duration, scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<T>;
     /// Discards everything received so far.
     fn drain(&mut self) -> AdapterResult<()>;
+    /// Makes an exchange, a command with its replies. Where others use the line it waits for its turn.
+    fn exchange<T>(&mut self, make: impl FnOnce(&mut Self) -> T) -> T {
+        make(self)
+    }
     /// Closes the link and discards unsent bytes.
     fn abort(self)
     where
@@ -202,12 +206,12 @@ impl<L: ByteLink> RequestReply<L> {
     /// failures, and when it breaks.
     fn attempt<T>(&mut self, times: u32, mut make: impl FnMut(&mut L, Bus) -> AdapterResult<T>) -> AdapterResult<T> {
         let (bus, link) = (self.bus, self.link.as_mut().ok_or(AdapterError::NotConnected)?);
-        let mut result = make(link, bus);
+        let mut result = link.exchange(|link| make(link, bus));
         for _ in 1..times {
             if !matches!(result, Err(AdapterError::Timeout(_))) {
                 break;
             }
-            result = make(link, bus);
+            result = link.exchange(|link| make(link, bus));
         }
         match result {
             Ok(_) => self.lost = 0,

@@ -78,7 +78,12 @@ impl SerialLink {
     /// Closes the line and discards unsent bytes.
     pub fn abort(self) {
         // A line that cannot be flushed is broken already.
-        let _ = tcflush(&self.line, QueueSelector::OFlush);
+        let _ = self.discard();
+    }
+
+    /// Discards unsent bytes.
+    pub fn discard(&self) -> AdapterResult<()> {
+        tcflush(&self.line, QueueSelector::OFlush).map_err(|e| broken(&self.peer, e))
     }
 
     /// Opens the serial device at `path` with `baud` [bit/s]. `device` names the arm in messages, `timeout` limits each

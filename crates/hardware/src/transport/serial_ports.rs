@@ -28,6 +28,31 @@ pub struct Usb {
     pub product: Option<String>,
     /// Its serial number.
     pub serial: Option<String>,
+    /// Where it is plugged in: `1-2` is bus and port.
+    pub place: String,
+}
+
+/// Returns the USB device at an arm's address, a serial port or a network interface: its ids with its serial number, or
+/// with where it is plugged in. `None` for what is no USB device.
+pub fn usb_at(address: &str) -> Option<String> {
+    usb_at_in(Path::new("/sys/class"), address)
+}
+
+fn usb_at_in(classes: &Path, address: &str) -> Option<String> {
+    // `/dev/ttyACM0@115200`, `slcan:/dev/ttyACM0`, `can0`
+    let device = match address.find('/').and_then(|at| address.get(at..)) {
+        Some(path) => {
+            let path = path.rsplit_once('@').map_or(path, |(path, _)| path);
+            let path = fs::canonicalize(path).unwrap_or_else(|_| path.into());
+            classes.join("tty").join(path.file_name()?)
+        }
+        None => classes.join("net").join(address),
+    };
+    let Usb { id, serial, place, .. } = usb(&device.join("device"))?;
+    Some(match serial {
+        Some(serial) => format!("USB {id} serial {serial}"),
+        None => format!("USB {id} at {place}"),
+    })
 }
 
 /// Lists the serial devices by path. Opens none.
@@ -65,7 +90,9 @@ fn usb(device: &Path) -> Option<Usb> {
     let read = |folder: &Path, name: &str| Some(fs::read_to_string(folder.join(name)).ok()?.trim().to_owned());
     device.ancestors().take(ABOVE).find_map(|folder| {
         let id = format!("{}:{}", read(folder, "idVendor")?, read(folder, "idProduct")?);
-        Some(Usb { id, product: read(folder, "product"), serial: read(folder, "serial") })
+        let serial = read(folder, "serial").filter(|serial| !serial.is_empty());
+        let place = folder.file_name()?.to_string_lossy().into_owned();
+        Some(Usb { id, product: read(folder, "product"), serial, place })
     })
 }
 
@@ -105,5 +132,20 @@ mod tests {
         assert_eq!(ports[0].usb.as_ref().unwrap().product.as_deref(), Some("USB Single Serial"));
         assert!(ports[0].by_id.as_ref().unwrap().ends_with("/usb-1a86_USB_Single_Serial_5A46-if00"));
         assert!(list_in(&at("nothing"), &at("nothing")).is_empty());
+
+        // Which adapter an arm is connected with.
+        fs::write(at("sys/usb/1-2/serial"), "5A46\n").unwrap();
+        fs::create_dir_all(at("sys/class/net/can0")).unwrap();
+        symlink("../../../usb/1-3/1-3:1.0", at("sys/class/net/can0/device")).unwrap();
+        let usb = |address: &str| usb_at_in(&at("sys/class"), address);
+        let by_id = at("dev/serial/by-id/usb-1a86_USB_Single_Serial_5A46-if00").display().to_string();
+        for address in ["/dev/ttyACM0", "/dev/ttyACM0@500000", "slcan:/dev/ttyACM0", &by_id] {
+            assert_eq!(usb(address).as_deref(), Some("USB 1a86:55d3 serial 5A46"), "{address}");
+        }
+        assert_eq!(usb("/dev/ttyUSB10@1000000").as_deref(), Some("USB 0403:6014 at 1-3"));
+        assert_eq!(usb("can0").as_deref(), Some("USB 0403:6014 at 1-3"));
+        for none in ["/dev/pts/3", "/dev/ttyUSB9", "192.168.1.5:502", "sim", "", "/"] {
+            assert_eq!(usb(none), None, "{none}");
+        }
     }
 }

@@ -58,7 +58,8 @@ pub struct SimOptions {
     pub droop: f64,
     /// Whether the line returns what is sent on it.
     pub echo: bool,
-    /// Numbers of the servos, from the base; 0 for one that is not on the line. Empty: 1 to 6. New servos all have 1.
+    /// Numbers of the servos, from the base; 0 for one that is not on the line. Empty: those of the arm. New servos all
+    /// have 1. Those after six are a second arm on the same line.
     pub ids: Vec<u8>,
     /// Whether the servos have the settings of the factory instead of those of an arm that is set up.
     pub factory: bool,
@@ -96,8 +97,8 @@ impl SimOptions {
     /// Returns an error for values that the emulator cannot have.
     pub(super) fn check(&self) -> Result<(), ConfigError> {
         arm::check_range("voltage", self.voltage, 4.0..=14.0, "V")?;
-        if self.ids.len() > RANGES.len() || self.ids.iter().any(|id| *id > 252) {
-            return Err(ConfigError::new("sim.ids", "at most six servos have a number, 0 to 252"));
+        if self.ids.len() > 2 * RANGES.len() || self.ids.iter().any(|id| *id > 252) {
+            return Err(ConfigError::new("sim.ids", "at most twelve servos have a number, 0 to 252"));
         }
         self.common().check("so101", &limits(), PLAYABLE)
     }
@@ -118,6 +119,10 @@ fn limits() -> JointLimits {
 /// Starts an emulator at `place`, with the `sim` part of the arm's options. It runs until it is dropped.
 pub fn start(config: &AdapterConfig, place: &EmulatorAddress) -> AdapterResult<SerialServer<Servos>> {
     config.check(super::check)?;
-    let sim = config.options::<super::Options>()?.sim;
+    let options = config.options::<super::Options>()?;
+    let mut sim = options.sim.clone();
+    if sim.ids.is_empty() {
+        sim.ids = (options.first_id..).take(RANGES.len()).collect();
+    }
     SerialServer::start("so101", Servos::new(&sim, MonotonicClock.now())?, place)
 }

@@ -2,7 +2,7 @@
 
 use std::f64::consts::TAU;
 
-use super::wire::{ALL, packet, status};
+use super::wire::{ALL, Packet, packet, status};
 use super::{PLAYABLE, RANGES, SPEED, SimOptions, limits};
 use dimos_core::clock::Mono;
 use dimos_core::joint::Joints;
@@ -62,6 +62,8 @@ pub struct Servos {
     turns: [i32; SERVOS],
     /// Instructions since the start.
     instructions: u64,
+    /// A second arm on the same line.
+    beside: Option<Box<Servos>>,
 }
 
 impl Servos {
@@ -106,7 +108,12 @@ impl Servos {
             misread: [(0, 0); SERVOS],
             turns: [0; SERVOS],
             instructions: 0,
+            beside: None,
         };
+        if let Some(rest) = options.ids.get(SERVOS..).filter(|rest| !rest.is_empty()) {
+            let options = SimOptions { ids: rest.to_vec(), ..options.clone() };
+            servos.beside = Some(Box::new(Self::new(&options, now)?));
+        }
         for (servo, id) in options.ids.iter().take(SERVOS).enumerate() {
             servos.plug(servo, *id);
         }
@@ -130,6 +137,16 @@ impl Servos {
     /// Wears out the EEPROM of a servo (index from 0), which then keeps its values, or replaces it.
     pub fn wear_out(&mut self, servo: usize, worn: bool) {
         self.worn.iter_mut().skip(servo).take(1).for_each(|state| *state = worn);
+    }
+
+    /// Returns the second arm of the line.
+    pub fn beside(&mut self) -> Option<&mut Self> {
+        self.beside.as_deref_mut()
+    }
+
+    /// Returns the angles of the servos [rad].
+    pub fn angles(&self) -> Joints {
+        self.arm.joints().0
     }
 
     /// Returns how many instructions have arrived.
@@ -314,6 +331,24 @@ impl Servos {
         }
     }
 
+    /// Takes a packet of the line.
+    fn hear(&mut self, Packet { id, instruction, parameters }: &Packet, now: Mono, answer: &mut Vec<u8>) {
+        self.arm.client_came();
+        self.arm.advance(now);
+        let turns = std::array::from_fn(|servo| self.position(servo).1);
+        if turns != std::mem::replace(&mut self.turns, turns) {
+            self.go();
+        }
+        if self.arm.take_fault(FaultKind::WrongModel).is_some() {
+            self.wrong_model = true;
+        }
+        // Writes to several servos have no status.
+        let unanswered = matches!((*id, *instruction), (_, 0x83) | (ALL, 0x03..=0x05));
+        if !(unanswered && self.arm.loses_command()) {
+            self.execute(*id, *instruction, parameters, answer);
+        }
+    }
+
     /// Executes an instruction; puts statuses into `answer`.
     pub fn execute(&mut self, id: u8, instruction: u8, parameters: &[u8], answer: &mut Vec<u8>) {
         self.instructions += 1;
@@ -408,29 +443,20 @@ impl HasArm for Servos {
 
 impl Controller for Servos {
     fn serve(&mut self, bytes: &[u8], now: Mono, answer: &mut Vec<u8>) -> Scan<Delivery> {
-        let (id, instruction, parameters, length) = match packet(bytes) {
+        let (packet, length) = match packet(bytes) {
             Scan::More => return Scan::More,
             Scan::Skip(n) => return Scan::Skip(n),
-            Scan::Take(n, packet) => (packet.id, packet.instruction, packet.parameters, n),
+            Scan::Take(n, packet) => (packet, n),
         };
-        self.arm.client_came();
-        self.arm.advance(now);
-        let turns = std::array::from_fn(|servo| self.position(servo).1);
-        if turns != std::mem::replace(&mut self.turns, turns) {
-            self.go();
-        }
-        if self.arm.take_fault(FaultKind::WrongModel).is_some() {
-            self.wrong_model = true;
-        }
-        // Writes to several servos have no status.
-        let unanswered = matches!((id, instruction), (_, 0x83) | (ALL, 0x03..=0x05));
-        if !(unanswered && self.arm.loses_command()) {
-            self.execute(id, instruction, &parameters, answer);
+        self.hear(&packet, now, answer);
+        if let Some(beside) = &mut self.beside {
+            beside.hear(&packet, now, answer);
         }
         // Only what is answered can be lost.
         let delivery = if answer.is_empty() { Delivery::Send } else { self.arm.delivery() };
         if matches!(delivery, Delivery::PowerLoss(_)) {
             self.power_up();
+            self.beside.iter_mut().for_each(|beside| beside.power_up());
         }
         if self.echo {
             drop(answer.splice(0..0, bytes.iter().take(length).copied()));
@@ -441,5 +467,6 @@ impl Controller for Servos {
     /// Servos do not know their client.
     fn client_gone(&mut self, now: Mono) {
         self.arm.advance(now);
+        self.beside.iter_mut().for_each(|beside| beside.arm.advance(now));
     }
 }

@@ -6,6 +6,7 @@ use std::time::Duration;
 use super::commands::MAX_IN_FLIGHT;
 use super::{BACK_OFF, MAX_FAILURES, TURNS, Worker, slow_readings};
 use crate::adapter::{AdapterError, AdapterResult, ManipulatorAdapter, ManipulatorInfo};
+use crate::device::identity::PARTS as IDENTITY_PARTS;
 use crate::device::{Connected, Note};
 use dimos_core::arm::{Interference, Link};
 use dimos_core::joint::{JointLimits, Joints, STANDSTILL};
@@ -39,7 +40,7 @@ impl Worker {
         self.write_errors = 0;
         self.reconnect.1 = BACK_OFF.0;
         self.plausible.reset();
-        let identity = identity(&info, calibration_offsets.as_ref());
+        let identity = identity(&info, calibration_offsets.as_ref(), (self.config.usb)());
         self.health.with_identity(|known| known.connected(identity.clone()));
         self.expect_nothing(None);
         self.compare_identity();
@@ -232,11 +233,16 @@ impl Worker {
     }
 }
 
-/// Returns which arm this is: its serial number, else the calibration that its drives keep.
-fn identity(info: &ManipulatorInfo, offsets: Option<&Joints>) -> Option<String> {
+/// Returns which arm this is: its serial number, else the calibration that its drives keep and the USB device of its
+/// port.
+fn identity(info: &ManipulatorInfo, offsets: Option<&Joints>, usb: Option<String>) -> Option<String> {
     let of_drives = |offsets: &Joints| {
         let offsets = offsets.iter().take(info.dof).map(|offset| format!("{offset:.4}")).collect::<Vec<_>>();
         format!("servo offsets {} rad", offsets.join(" "))
     };
-    info.serial_number.clone().map(|serial| format!("serial {serial}")).or_else(|| offsets.map(of_drives))
+    if let Some(serial) = &info.serial_number {
+        return Some(format!("serial {serial}"));
+    }
+    let parts: Vec<String> = { offsets }.map(of_drives).into_iter().chain(usb).collect();
+    (!parts.is_empty()).then(|| parts.join(IDENTITY_PARTS))
 }

@@ -96,6 +96,23 @@ fn another_arm_of_the_kind_gets_nothing_until_it_is_accepted() {
 }
 
 #[test]
+fn an_arm_without_a_number_is_known_by_its_usb_device() {
+    let mut bench = Bench::enabled();
+    let reconnect = |bench: &mut Bench, usb: &'static str| {
+        bench.worker.config.usb = Box::new(move || Some(usb.to_owned()));
+        bench.worker.mark_lost();
+        bench.advance(Duration::from_millis(500));
+        bench.cycle().interference
+    };
+    assert_eq!(reconnect(&mut bench, "USB 1a86:55d3 serial 5A46"), Interference::None);
+    assert_eq!(reconnect(&mut bench, "USB 1a86:55d3 serial 5A47"), Interference::Identity);
+    let accept = |bench: &Bench| bench.worker.health.with_identity(|identity| identity.accept());
+    let shown = Err(("USB 1a86:55d3 serial 5A46".to_owned(), "USB 1a86:55d3 serial 5A47".to_owned()));
+    assert_eq!((accept(&bench), accept(&bench)), (shown, Ok(())));
+    assert_eq!(reconnect(&mut bench, "USB 1a86:55d3 serial 5A47"), Interference::None);
+}
+
+#[test]
 fn another_arm_at_the_address_is_said_once_it_is_found() {
     let mut bench = Bench::enabled();
     bench.worker.mark_lost();

@@ -71,6 +71,7 @@ impl Bench {
         let mut config = DeviceConfig {
             hardware_id: "arm".into(),
             dof: DOF,
+            usb: Box::new(|| None),
             tick_period: PERIOD,
             native_rate: 1000.0,
             supervision: Supervision { accept_zero_pose: true, ..Supervision::default() },
