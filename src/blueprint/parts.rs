@@ -70,6 +70,7 @@ pub(super) fn resolve(checker: &mut Checker<'_>, entry: &HardwareEntry, arm: &Ch
         stop_input: entry.stop_input.as_ref().and_then(|stop| stop_input(checker, stop, arm.digital_inputs)),
         payload: payload.and_then(|payload| load(checker, payload, arm.max_payload.filter(|most| *most > 0.0))),
         gravity: entry.mounting.as_ref().and_then(|mounting| gravity(checker, mounting)),
+        tool_velocity: None, // resolved with the arm's model
     }
 }
 

@@ -56,7 +56,7 @@ pub fn text(report: &StatusReport, socket: &Path, url: Option<&str>, end: &str) 
         if let Some(cause) = cause(arm) {
             row("", format!("{}: {cause}", arm.phase));
         }
-        arm.model_notes.iter().for_each(|note| row("", format!("model: {note}")));
+        arm.notes().for_each(|(about, note)| row("", format!("{about}: {note}")));
         row("", format!("at exit: {}", at_exit(arm)));
     }
     let clock = Some(&report.ticks.clock).filter(|clock| clock.starts_with("device"));

@@ -387,8 +387,8 @@ fn print_arms(arms: &[ArmReport], verbose: bool) {
                 "  {name}: identity unknown: the arm has no serial number that this program reads"
             ));
         }
-        for note in &arm.model_notes {
-            output::wrapped(format_args!("  {name}: model: {note}"));
+        for (about, note) in arm.notes() {
+            output::wrapped(format_args!("  {name}: {about}: {note}"));
         }
         if let Some(load) = &arm.payload {
             output::wrapped(format_args!("  {name}: payload {}", payload_text(load)));

@@ -12,7 +12,7 @@ use dimos_core::clock::MonotonicClock;
 use dimos_core::joint::JointLimits;
 use dimos_core::message::Message;
 use dimos_hardware::adapter::AdapterError;
-use dimos_hardware::device::{Connected, Device, DeviceConfig, Note};
+use dimos_hardware::device::{Connected, Device, DeviceConfig, Note, Setup};
 use dimos_hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, SIM};
 use dimos_hardware::transport::serial_ports;
 use dimos_rt::heartbeat::Heartbeat;
@@ -96,7 +96,7 @@ pub fn bring_up(
             tick_period: period,
             native_rate: arm.adapter.native_rate,
             supervision: arm.supervision,
-            setup: arm.setup,
+            setup: Setup { tool_velocity: arm.tcp_velocity, ..arm.setup },
             beat: beat.clone(),
             pace: arms.pace.clone().filter(|_| clocks),
             clock: Arc::new(MonotonicClock),

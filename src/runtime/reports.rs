@@ -92,7 +92,7 @@ impl Service {
     fn arm_report(&self, index: usize, tcp: Option<&TcpModel>) -> Option<ArmReport> {
         let (arm, device) = (self.parts.blueprint.arms.get(index)?, self.parts.devices.get(index)?);
         let (view, health, now) = (self.arm_view(index)?, device.health(), self.now());
-        let Connected { info, gripper, io, .. } = self.parts.connected.get(index)?;
+        let Connected { info, gripper, io, reduction, .. } = self.parts.connected.get(index)?;
         let faults = health.episodes().into_iter().map(|e| FaultReport {
             since: now.seconds_since(e.since),
             over: e.until.is_some(),
@@ -146,6 +146,7 @@ impl Service {
             tcp: tcp.map(TcpModel::report),
             identity: self.parts.devices.get(index).and_then(|device| device.health().identity().accepted),
             model_notes: self.model_notes(index),
+            limits_note: reduction.as_ref().map(|reduction| reduction.text.clone()),
             position_limits: self.position_limits(index),
             on_exit: arm.on_exit.name().to_owned(),
             holds_when_disabled: info.holds_when_disabled,

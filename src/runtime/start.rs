@@ -151,6 +151,8 @@ impl Prepared {
                 arm.supervision.gap_tolerance = bridging.tolerance;
                 arm.supervision.after_gap = bridging.after;
             }
+            let own = said.reduction.as_ref().and_then(|reduction| reduction.tool_velocity);
+            arm.tcp_velocity = arm.tcp_velocity.into_iter().chain(own).reduce(f64::min);
         }
         let kinematics = self.calibrate(&connected)?;
         let tools = tools(&self.blueprint).map_err(wrong_model)?;

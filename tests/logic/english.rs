@@ -9,7 +9,19 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Folders and files whose text is checked.
-const CHECKED: [&str; 8] = ["src", "crates", "tests", "benches", "blueprints", "docs", "assets", "README.md"];
+const CHECKED: [&str; 11] = [
+    "src",
+    "crates",
+    "tests",
+    "benches",
+    "blueprints",
+    "docs",
+    "assets",
+    "README.md",
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+    "SECURITY.md",
+];
 /// Texts of other programs, and the lists themselves.
 const FIXTURES: &str = "tests/fixtures";
 /// File types besides Rust that are checked as a whole.

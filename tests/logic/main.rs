@@ -66,6 +66,7 @@ mod task_conformance;
 mod templates;
 mod test_support;
 mod tick_rules;
+mod tool_line;
 mod tool_speed;
 mod verified;
 mod verify;

@@ -9,6 +9,7 @@ use std::time::Duration;
 use dimos::arms::xarm::emulator::XArmEmulator;
 use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::faults::{Fault, FaultKind};
+use dimos::hardware::sim::tool_device::ToolDevice;
 use serde_json::json;
 
 use crate::support::program;
@@ -87,6 +88,30 @@ fn the_vendors_client_sees_errors_and_clears_them() {
     let fault = Fault::new(FaultKind::ErrorCode).code(31).at(3.0);
     emulator.inject(fault).unwrap();
     let Some(child) = client("errors", &host) else { return };
+    ends_well(child);
+}
+
+#[test]
+fn the_vendors_client_sets_reduced_mode_and_meets_its_limits() {
+    let Some((_emulator, host)) = emulator(4, 6, json!({})) else { return };
+    let Some(child) = client("reduced", &host) else { return };
+    ends_well(child);
+}
+
+/// Answers in capitals.
+struct Capitals;
+
+impl ToolDevice for Capitals {
+    fn exchange(&mut self, bytes: &[u8], answer: &mut Vec<u8>) {
+        answer.extend(bytes.to_ascii_uppercase());
+    }
+}
+
+#[test]
+fn the_vendors_client_reaches_a_device_at_the_tools_line() {
+    let Some((emulator, host)) = emulator(5, 6, json!({})) else { return };
+    emulator.fit_tool(Capitals, 115_200);
+    let Some(child) = client("tool-line", &host) else { return };
     ends_well(child);
 }
 

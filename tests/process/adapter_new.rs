@@ -110,7 +110,7 @@ use real::hardware::conformance::{Outcome, Subject, checks, run_all};
 
 #[test]
 fn the_table_conforms() {
-    let table = skeleton::hardware::arms::TABLE;
+    let table = skeleton::TABLE;
     assert_eq!(table.len(), 3);
     for row in table {
         for (check, outcome, _) in run_all(&Subject::emulated(row), &checks().collect::<Vec<_>>(), &|_, _| (), &|| false) {
@@ -120,35 +120,32 @@ fn the_table_conforms() {
 }
 "#;
 
-/// A checkout of dimos as far as a new arm sees it: the table of arms, and around it what the sources name as
-/// `crate::…`, borrowed from the real one. So new arms are compiled and tested without building the tree again.
-fn checkout(at: &Path) {
+/// A checkout of dimos as far as a new arm sees it: the table of arms, on the crates of the real one. So new arms are
+/// compiled and tested without building the tree again.
+fn checkout(folder: &Path) {
+    let real = fs::canonicalize(CHECKOUT).unwrap();
     for (path, text) in [
         (
             "Cargo.toml",
             format!(
-                "[package]\nname = \"dimos\"\nversion = \"0.0.0\"\nedition = \"2024\"\n\n[lib]\nname = \"skeleton\"\n\n\
-                 [dependencies]\nreal = {{ package = \"dimos\", path = {:?} }}\nschemars = \"1\"\n\
+                "[package]\nname = \"dimos\"\nversion = \"0.0.0\"\nedition = \"2024\"\n\n\
+                 [lib]\nname = \"skeleton\"\npath = \"crates/arms/src/lib.rs\"\n\n\
+                 [dependencies]\nreal = {{ package = \"dimos\", path = {real:?} }}\ndimos-core = {{ path = \"{}/crates/core\" }}\n\
+                 dimos-hardware = {{ path = \"{}/crates/hardware\" }}\nschemars = \"1\"\n\
                  serde = {{ version = \"1\", features = [\"derive\"] }}\n",
-                fs::canonicalize(CHECKOUT).unwrap()
+                real.display(),
+                real.display()
             ),
         ),
         (
-            "src/lib.rs",
-            "pub use real::{arm, clock, joint};\npub mod hardware {\n    pub mod arms;\n    pub use real::hardware::{adapter, adapter_util, check, \
-             registry, sim, transport};\n}\n"
-                .into(),
-        ),
-        (
             "crates/arms/src/lib.rs",
-            "use crate::hardware::registry::AdapterSpec;\n\npub const TABLE: &[AdapterSpec] = &[\n];\n"
-                .into(),
+            "use dimos_hardware::registry::AdapterSpec;\n\npub use real::arms::line;\n\npub const TABLE: &[AdapterSpec] = &[\n];\n".into(),
         ),
         ("crates/robot/src/builtin.rs", "robots!(\n);\n".into()),
         ("crates/robot/robots/lite6.urdf", String::new()),
         ("tests/conformance.rs", SUITE.into()),
     ] {
-        let path = at.join(path);
+        let path = folder.join(path);
         fs::create_dir_all(path.parent().unwrap()).unwrap();
         fs::write(path, text).unwrap();
     }
@@ -193,7 +190,7 @@ fn arms_in_the_tree_build_and_conform() {
         assert!(blueprint.contains(&format!("count: {dof}}}")), "{blueprint}");
         let snake = name.replace('-', "_");
         assert!(blueprint.contains(&format!("adapter_type: {snake}\n")), "{blueprint}");
-        home.dimos(&format!("model check tree/assets/robots/{snake}.urdf")).with(0);
+        home.dimos(&format!("model check tree/crates/robot/robots/{snake}.urdf")).with(0);
         let planner = fs::read_to_string(tree.join(format!("blueprints/{name}-planner.yaml"))).unwrap();
         assert!(planner.contains(&format!("model_path: builtin:{snake} #")), "{planner}");
     }
@@ -221,7 +218,7 @@ fn no_file_is_overwritten_or_left_half_written() {
         ("acme --dof 6 --transport tcp --dimos taken", "taken is no checkout of dimos"),
         ("acme --dof 6 --transport tcp --in-tree --path taken", "taken is no checkout of dimos"),
         ("planned --dof 6 --transport tcp --in-tree --path tree", "coordinator-planned.yaml is there already"),
-        ("there --dof 6 --transport can --in-tree --path tree", "arms/there is there already"),
+        ("there --dof 6 --transport can --in-tree --path tree", "arms/src/there is there already"),
         ("lite6 --dof 6 --transport tcp --in-tree --path tree", "lite6.urdf is there already"),
         ("yourarm --dof 6 --transport serial", "there is an adapter yourarm already"),
         ("loop --dof 6 --transport serial", "it is a word of Rust"),

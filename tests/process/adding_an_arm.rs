@@ -186,7 +186,7 @@ impl Reader {
 
 /// A copy of what is needed of this checkout.
 fn check_out(into: &Path) {
-    let copy = format!("mkdir {0} && cp -r Cargo.toml src blueprints {0}", into.display());
+    let copy = format!("mkdir {0} && cp -r Cargo.toml src crates blueprints {0}", into.display());
     let done = Command::new("sh").args(["-c", &copy]).current_dir(env!("CARGO_MANIFEST_DIR")).status().unwrap();
     assert!(done.success());
 }

@@ -136,6 +136,59 @@ fn an_arm_at_zero_is_enabled_and_one_that_has_not_measured_is_not() {
     assert!(!unmeasured.enabled());
 }
 
+fn floats(values: &[f32]) -> Vec<u8> {
+    values.iter().flat_map(|value| value.to_le_bytes()).collect()
+}
+
+/// Sets the limits of reduced mode and switches it on: speed of the tool [mm/s] and of joints [rad/s].
+fn reduce(client: &mut TcpStream, tool: f32, joint: f32) {
+    send(client, 47, &floats(&[tool]));
+    send(client, 48, &floats(&[joint]));
+    let ranges = [[-6.0, 6.0], [-2.0, 2.0], [-3.8, 0.1], [-6.0, 6.0], [-1.6, 3.0], [-6.0, 0.5], [-6.0, 6.0]];
+    send(client, 58, &floats(ranges.as_flattened()));
+    send(client, 50, &[1]);
+}
+
+#[test]
+fn a_run_keeps_within_reduced_mode_and_is_held_if_it_becomes_narrower() {
+    let (home, emulator) = (Home::new(), emulator(json!({})));
+    let mut client = connect(&emulator);
+    reduce(&mut client, 200.0, 0.5);
+    let run = run(&home, &emulator, &format!("{NO_GRIPPER} --set hardware.arm.auto_enable=false"));
+    run.until(program::UP);
+    // An arm that is off is not enabled while its box allows less than the run.
+    reduce(&mut client, 100.0, 0.5);
+    let tool = "its controller's settings limit the tool to 0.10 m/s, the run to 0.19 m/s";
+    eventually("the limits", || run.err().contains(tool));
+    home.dimos("arm enable arm").with(1).says(&[tool, "hint: restart the run"]);
+    reduce(&mut client, 200.0, 0.5);
+    eventually("enabled", || home.dimos("arm enable arm").code == Some(0));
+    eventually("ready", || phase(&home).0 == "ready");
+    home.dimos("status").with(0).shows(&["reduced mode is on: joints 0.50 rad/s, tool 0.19 m/s"]);
+    assert_eq!(home.status()["arms"][0]["position_limits"][5], json!([-6.0, 0.5]));
+    // A far joint is limited by its own speed, the first one by that of the tool. Faster, the box reports error 24 or
+    // 60.
+    home.dimos("move arm 0.8 -0.6 -0.8 0.9 1.4 0.1").with(0);
+    home.dimos("move arm 0.1 -0.6 -0.8 0.05 1.4 0.6").with(1).says(&["joint6"]);
+    // Wider limits change nothing, narrower ones hold the arm: also in a motion.
+    reduce(&mut client, 400.0, 1.0);
+    std::thread::sleep(Duration::from_millis(500));
+    assert_eq!(phase(&home).0, "ready");
+    let moves = home.start("move arm -0.8 -0.6 -0.8 0.05 1.4 0.1");
+    eventually("the motion", || emulator.joints().1.iter().any(|v| v.abs() > 0.1));
+    reduce(&mut client, 400.0, 0.4);
+    eventually("the hold", || phase(&home) == ("held".into(), "limits_changed".into()));
+    assert_ne!(moves.wait().code, Some(0));
+    let said = "its controller limits joint 1 to 0.40 rad/s, the run to 0.50 rad/s";
+    assert!(run.err().contains(said), "{}", run.err());
+    home.dimos("arm reset arm").with(1).says(&["narrower than those of the run"]);
+    reduce(&mut client, 200.0, 0.5);
+    eventually("a reset", || home.dimos("arm reset arm").code == Some(0));
+    home.dimos("arm enable arm").with(0);
+    eventually("ready", || phase(&home).0 == "ready");
+    run.end(Signal::INT).with(130);
+}
+
 /// What is said of a Lite 6's gripper is what its outputs are, and never that it holds something.
 #[test]
 fn a_gripper_that_only_opens_and_closes_is_ordered_and_not_measured() {

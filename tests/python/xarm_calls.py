@@ -106,6 +106,17 @@ def rests(arm, before):
     return near(a, joints(), 0.01)
 
 
+def reduced(index, wanted):
+    """Whether this part of the box's reduced mode is so: mode, boundary, tool, joints, ranges of joints, fence."""
+    def holds(arm):
+        states = arm.get_reduced_states()[1]
+        value = states[index] if isinstance(wanted, list) else [states[index]]
+        wants = wanted if isinstance(wanted, list) else [wanted]
+        return near(value[:len(wants)], wants, 0.5)
+
+    return shows(holds)
+
+
 def outputs(*levels):
     """Whether the first outputs of the tool board are at these levels."""
     return shows(lambda arm: arm.get_tgpio_output_digital()[1][:len(levels)] == list(levels))
@@ -248,6 +259,15 @@ CHANGES = {
         lambda a, p: a.send_cmd_sync("G7 I4 J-20 K-30 L0 M50 N0 F40"), 0, shows(lambda arm: near(joints(), [4,
     *POSE[1:]], 0.2))),
     "send_hex_cmd": (lambda a, p: raw(a.send_hex_cmd("00 07 00 02 00 01 FA".split())), 0, None),
+    # Limits of reduced mode, so wide that nothing else is judged by them; the walk switches it off again.
+    "set_reduced_max_tcp_speed": (lambda a, p: a.set_reduced_max_tcp_speed(900), 0, reduced(2, 900)),
+    "set_reduced_max_joint_speed": (lambda a, p: a.set_reduced_max_joint_speed(170), 0, reduced(3, 170)),
+    "set_reduced_joint_range": (lambda a, p: a.set_reduced_joint_range([-360, 360] * 7), 0, reduced(4, [-360, 360])),
+    "set_reduced_tcp_boundary": (
+        lambda a, p: a.set_reduced_tcp_boundary([2000, -2000] * 3), 0, reduced(1, [2000, -2000] * 3)),
+    "set_reduced_mode": (lambda a, p: a.set_reduced_mode(True), 0, reduced(0, 1)),
+    "set_fence_mode": (lambda a, p: a.set_fence_mode(True)[0], 0, reduced(5, 1)),
+    "set_collision_rebound": (lambda a, p: a.set_collision_rebound(True), 0, reduced(6, 1)),
     "only_check_type 1": (lambda a, p: checked(a, p), 0, at(*POSE)),
 }
 
@@ -276,21 +296,19 @@ REFUSED = {
     [0] * 3, 1),
     "set_cgpio_digital": (0, 1), "set_cgpio_digital_input_function": (0, 1), "set_cgpio_digital_output_function": (0,
     1),
-    "set_cgpio_digital_with_xyz": (0, 1, [0] * 3, 1), "set_cmd_mat_history_num": (1,), "set_collision_rebound": (True,),
+    "set_cgpio_digital_with_xyz": (0, 1, [0] * 3, 1), "set_cmd_mat_history_num": (1,),
     "set_collision_tool_model": (1,), "set_counter_increase": (), "set_counter_reset": (),
     "set_dh_params": ([0.0] * 28,),
     "set_dhpgc_gripper_activate": (False,), "set_dhpgc_gripper_position": (10, 50, 50, False),
     "set_external_device_monitor_params": (1, 1), "set_fdb_mat_history_num": (1,), "set_feedback_type": (1,),
-    "set_fence_mode": (True,), "set_ft_admittance_ctrl_threshold": ([1] * 6,), "set_ft_collision_detection": (1,),
+    "set_ft_admittance_ctrl_threshold": ([1] * 6,), "set_ft_collision_detection": (1,),
     "set_ft_collision_reb_distance": ([1] * 6,), "set_ft_collision_rebound": (1,),
     "set_ft_collision_threshold": ([10] * 6,),
     "set_ft_sensor_admittance_parameters": (0, [0] * 6, [0.1] * 6, [10] * 6, [0] * 6),
     "set_ft_sensor_force_parameters": (0, [0] * 6, [0] * 6, [0] * 6), "set_ft_sensor_load_offset": ([0.0] * 10,),
     "set_gravity_direction": ([0, 0, 1],), "set_linear_motor_back_origin": (False,), "set_linear_motor_enable": (True,),
     "set_linear_motor_pos": (10, 100, False), "set_linear_motor_speed": (100,), "set_linear_motor_stop": (),
-    "set_modbusrtu_params": (1, 115200), "set_reduced_joint_range": ([-1, 1] * 7,),
-    "set_reduced_max_joint_speed": (10,),
-    "set_reduced_max_tcp_speed": (100,), "set_reduced_mode": (True,), "set_reduced_tcp_boundary": ([1, -1] * 3,),
+    "set_modbusrtu_params": (1, 115200),
     "set_rh56_finger_position": (1, 100), "set_rs485_timeout": (10,), "set_self_collision_detection": (True,),
     "set_simulation_robot": (True,), "set_tgpio_digital_with_xyz": (0, 1, [0] * 3, 1),
     "set_tgpio_modbus_timeout": (10,), "set_tgpio_monitor_params": (1, 1),
@@ -303,6 +321,8 @@ QUERIES = {
     "get_robot_sn": lambda a, v: v.startswith("XI1305"),
     "get_state": lambda a, v: v == 2,
     "get_is_moving": lambda a, v: v is False,
+    "get_reduced_mode": lambda a, v: v == 0,
+    "get_reduced_states": lambda a, v: v[0] == 0 and v[2] > 0 and near(v[4][:2], [-360, 360], 0.5),
     "get_cmdnum": lambda a, v: v == 0,
     "get_err_warn_code": lambda a, v: v == [0, 0],
     "get_position": lambda a, v: near(v, a.position, 0.5),

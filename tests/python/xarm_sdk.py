@@ -164,7 +164,91 @@ def takeover(host, pause):
     arm.disconnect()
 
 
+def stream(arm, joint, speed):
+    """Setpoints of one joint at a speed, until the controller refuses one, for 3 s at most."""
+    joints, end = list(arm.get_servo_angle()[1]), time.monotonic() + 3
+    while arm.error_code == 0 and time.monotonic() < end:
+        joints[joint] += speed * 0.01
+        arm.set_servo_angle_j(joints)
+        time.sleep(0.01)
+
+
+def reduced(host):
+    arm = connect(host)
+    check(arm.get_reduced_mode() == (0, 0), f"get_reduced_mode: {arm.get_reduced_mode()}")
+    # What is set is what is read, and reported.
+    ranges, boundary = [-6.0, 6.0, -1.5, 1.5, -3.0, 0.1, -6.0, 6.0, -1.6, 3.0, -6.0, 0.3, 0.0, 0.0], [900, -900] * 3
+    ok(arm.set_reduced_max_tcp_speed(250), "set_reduced_max_tcp_speed")
+    ok(arm.set_reduced_max_joint_speed(0.5), "set_reduced_max_joint_speed")
+    ok(arm.set_reduced_joint_range(ranges), "set_reduced_joint_range")
+    ok(arm.set_reduced_tcp_boundary(boundary), "set_reduced_tcp_boundary")
+    ok(arm.set_fence_mode(True)[0], "set_fence_mode")
+    ok(arm.set_reduced_mode(True), "set_reduced_mode")
+    check(arm.get_reduced_mode() == (0, 1), "get_reduced_mode")
+    code, states = arm.get_reduced_states()
+    check(code == 0 and states[:2] == [1, boundary] and states[5:] == [1, 0], f"get_reduced_states: {code}, {states}")
+    check(near(states[2:4], [250, 0.5], 1e-3) and near(states[4], ranges, 1e-3), f"get_reduced_states: {states}")
+    until("the report", lambda: arm.is_reduced_mode and arm.is_fence_mode and arm.reduced_max_tcp_speed == 250)
+    check(near([arm.reduced_max_joint_speed], [0.5], 1e-3), f"{arm.reduced_max_joint_speed}")
+    check(near(arm.reduced_joint_limits[5], ranges[10:12], 1e-3), f"{arm.reduced_joint_limits}")
+    # The box plans slower moves.
+    enable(arm, 0)
+    start, began = list(arm.get_servo_angle()[1]), time.monotonic()
+    ok(arm.set_servo_angle(angle=[start[0] + 0.5, *start[1:]], speed=3.0, wait=True), "set_servo_angle")
+    check(time.monotonic() - began > 0.95, "a move of 0.5 rad takes 1 s at 0.5 rad/s")
+
+    def fails(what, code, mode, act):
+        enable(arm, mode)
+        act()
+        until(what, lambda: arm.error_code != 0)
+        check(arm.error_code == code, f"{what}: error {arm.error_code}")
+        arm.clean_error()
+        until("no error", lambda: arm.error_code == 0)
+
+    turns = lambda joint, speed: lambda: arm.vc_set_joint_velocity([0] * joint + [speed], duration=9)
+    fails("a joint that is too fast", 24, 1, lambda: stream(arm, 5, 1.0))
+    fails("a velocity that is too high", 24, 4, turns(5, 0.8))
+    fails("a joint outside its range", 23, 1, lambda: stream(arm, 5, 0.3))
+    fails("a velocity out of the range", 23, 4, turns(5, 0.3))
+    # Back into the range, without its limits.
+    ok(arm.set_reduced_mode(False), "set_reduced_mode")
+    enable(arm, 0)
+    ok(arm.set_servo_angle(angle=start, speed=1.0, wait=True), "set_servo_angle")
+    # A limit that is set takes effect when reduced mode is switched on again.
+    ok(arm.set_reduced_max_tcp_speed(50), "set_reduced_max_tcp_speed")
+    ok(arm.set_reduced_mode(True), "set_reduced_mode")
+    fails("a tool that is too fast", 60, 1, lambda: stream(arm, 0, 0.45))
+    ok(arm.set_reduced_mode(False), "set_reduced_mode")
+    # The boundary holds without reduced mode.
+    z = int(arm.get_position()[1][2])
+    ok(arm.set_reduced_tcp_boundary([900, -900, 900, -900, z + 20, -900]), "set_reduced_tcp_boundary")
+    enable(arm, 0)
+    rise = lambda: arm.set_position(z=z + 60, speed=50, wait=False)
+    fails("a tool outside the boundary", 35, 0, rise)
+    ok(arm.set_fence_mode(False)[0], "set_fence_mode")
+    enable(arm, 0)
+    ok(arm.set_position(z=z, speed=50, wait=True), "back")
+    arm.disconnect()
+
+
+def tool_line(host):
+    arm = connect(host)
+    ok(arm.set_tgpio_modbus_baudrate(115200), "set_tgpio_modbus_baudrate")
+    check(arm.get_tgpio_modbus_baudrate() == (0, 115200), "get_tgpio_modbus_baudrate")
+    for port_503 in (False, True):
+        answer = arm.getset_tgpio_modbus_data(
+            list(b"hello"), min_res_len=5, is_transparent_transmission=True, use_503_port=port_503
+        )
+        check(answer == (0, list(b"HELLO")), f"transparent, 503 {port_503}: {answer}")
+    # Modbus: the box adds the checksum, and takes it away.
+    answer = arm.getset_tgpio_modbus_data(list(b"abc"), min_res_len=3)
+    check(answer[0] != 0, f"no device of Modbus: {answer}")
+    arm.disconnect()
+
+
 SCENARIOS = {
+    "reduced": reduced,
+    "tool-line": tool_line,
     "takeover-0": lambda host: takeover(host, 0),
     "takeover-5": lambda host: takeover(host, 0.005),
     "takeover-200": lambda host: takeover(host, 0.2),

@@ -95,6 +95,9 @@ def main():
             failures.append(f"{name} returns {code} and has moved the arm")
         if "tcp_offset" in name and EMULATED:
             arm.set_tcp_offset([0] * 6)
+        if ("reduced" in name or "fen" in name) and EMULATED:
+            arm.set_reduced_mode(False)
+            arm.set_fence_mode(False)
         if name == "set_world_offset" and EMULATED:
             arm.set_world_offset([0] * 6)
     for name in WORKS + (WORKS_EMULATED if EMULATED else []):

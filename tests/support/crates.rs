@@ -49,6 +49,8 @@ pub fn share_builds(folder: &Path) {
         assert_eq!(manifest.matches(once).count(), 1, "{once} in {manifest}");
     }
     let manifest = manifest.replace("[dependencies]\n", &format!("[dependencies]\n{}\n", used.trim()));
+    let crates = format!("path = \"{}/crates/", fs::canonicalize(checkout).unwrap().display());
+    let manifest = manifest.replace(&crates, "path = \"../crates/");
     let features = if cfg!(feature = "share") { ", features = [\"share\"]" } else { "" };
     fs::write(folder.join("Cargo.toml"), manifest.replace(&path, &format!("path = \"..\"{features} }}"))).unwrap();
 }

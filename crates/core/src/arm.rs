@@ -171,6 +171,8 @@ named! {
         Stop = "stop",
         /// Another arm than the one of the run answers.
         Identity = "identity",
+        /// The controller's limits have become narrower than those of the run.
+        Limits = "limits",
     }
 }
 

@@ -116,6 +116,15 @@ pub struct JointReading {
     pub speed_fraction: Option<f64>,
 }
 
+/// What the settings of an arm's controller leave of its limits.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Reduction {
+    /// Highest speed of the tool [m/s], if the settings limit it.
+    pub tool_velocity: Option<f64>,
+    /// The settings, for `status`.
+    pub text: String,
+}
+
 /// The device's own state codes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct RobotState {
@@ -184,6 +193,17 @@ pub trait ManipulatorAdapter: Send {
     /// connected.
     fn bridging(&self) -> Option<Bridging> {
         None
+    }
+
+    /// Returns what the settings of the arm's controller, such as a reduced mode, leave of its limits, in words and
+    /// beyond [`get_limits`](Self::get_limits), which has them too; `None`: nothing is known of them. Known once
+    /// connected.
+    fn reduction(&self) -> Option<Reduction> {
+        None
+    }
+    /// Returns whether these settings have changed since `get_limits`. Must not allocate.
+    fn reduction_changed(&self) -> bool {
+        false
     }
 
     // --- Mode ---

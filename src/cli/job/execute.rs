@@ -23,7 +23,7 @@ use dimos_rpc::report::ArmReport;
 const POLL_PERIOD: Duration = Duration::from_millis(50);
 /// Causes of a hold by a person or another program, or by what somebody has put in the way: a job neither clears them
 /// nor continues after them.
-const BY_OTHERS: [&str; 9] = [
+const BY_OTHERS: [&str; 10] = [
     "operator_stop",
     "stop_input",
     "stopped_elsewhere",
@@ -31,6 +31,7 @@ const BY_OTHERS: [&str; 9] = [
     "power_changed",
     "power_lost",
     "identity_changed",
+    "limits_changed",
     "way_blocked",
     "shutdown",
 ];

@@ -26,6 +26,8 @@ pub enum Service {
     RealTime = 4,
     /// RTDE: state and registers (30004).
     Rtde = 5,
+    /// RS-485 of the tool (54321): not one of the consecutive ports.
+    Tool = 6,
 }
 
 /// A controller's ports, which are consecutive as on every controller.
@@ -47,6 +49,9 @@ impl Address {
 
     /// Returns the host and the port of a service.
     pub fn port(&self, service: Service) -> Endpoint {
+        if service == Service::Tool {
+            return Endpoint { host: self.first.host.clone(), port: super::TOOL_PORT };
+        }
         if service == Service::RobotApi && self.first.port == FIRST_PORT {
             return Endpoint { host: self.first.host.clone(), port: API_PORT };
         }

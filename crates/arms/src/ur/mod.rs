@@ -38,6 +38,7 @@ mod tests_power;
 mod tests_speed;
 #[cfg(test)]
 mod tests_stream;
+mod tool_line;
 
 use std::time::Duration;
 
@@ -50,6 +51,7 @@ use dimos_core::joint::{ControlMode, JointLimits};
 use dimos_hardware::check::{Checked, ConfigError, ToolFacts, in_range};
 use dimos_hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use model::Model;
+pub use tool_line::{PORT as TOOL_PORT, ToolLine};
 
 /// Number of joints.
 pub const DOF: usize = 6;
@@ -118,6 +120,8 @@ pub struct Options {
     /// Deceleration of a stop, of a hold and after a gap, 1 to 40 [rad/s²]. Setpoints are followed with at most this.
     #[schemars(range(min = 1, max = 40))]
     pub stop_deceleration: f64,
+    /// RS-485 at the tool connector: set whenever the arm is enabled. `null`: as set at the pendant.
+    pub tool_line: Option<ToolLine>,
     /// Whether to read force and torque at the TCP. An e-Series arm measures them; a CB3 arm estimates them from its
     /// currents.
     pub force_torque: bool,
@@ -132,6 +136,7 @@ impl Default for Options {
             lookahead_time: 0.05,
             gain: 500.0,
             stop_deceleration: 8.0,
+            tool_line: None,
             force_torque: false,
             sim: emulator::SimOptions::default(),
         }
@@ -155,6 +160,7 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     in_range("lookahead_time", options.lookahead_time, (0.03, 0.2))?;
     in_range("gain", options.gain, (100.0, 2000.0))?;
     in_range("stop_deceleration", options.stop_deceleration, (1.0, 40.0))?;
+    options.tool_line.iter().try_for_each(|line| line.check(options.model))?;
     let limits = options.limits();
     options.sim.check(&limits)?;
     let topology = |joint| if options.model.is_endless(joint) { Topology::Endless } else { SPEC.topology };

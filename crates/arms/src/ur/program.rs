@@ -14,7 +14,9 @@ const STANDARD_GRAVITY: f64 = 9.82;
 pub fn control(number: i32, options: &Options, limits: &JointLimits) -> String {
     // Of floats, also whole ones: the program changes items of the lists.
     let list = |values: &[f64]| values.iter().map(|value| format!("{value:?}")).collect::<Vec<_>>().join(", ");
+    let tool = options.tool_line.map(|line| line.script()).unwrap_or_default();
     CONTROL
+        .replace("  # @TOOL@\n", &tool)
         .replace("@SPEEDS@", &list(&limits.velocity_max))
         .replace("@LOWER@", &list(&limits.position_lower))
         .replace("@UPPER@", &list(&limits.position_upper))

@@ -3,6 +3,8 @@
 //! Wire: rad, rad/s, Nm, but millimetres. Here: SI units. The conversions between the two are in this file, those of
 //! the gripper's pulses in `protocol/gripper.rs`.
 
+mod parts;
+
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
@@ -12,16 +14,16 @@ use super::connect::{connect, ends_velocities};
 pub use super::control::Counts;
 use super::model::{Model, VELOCITY};
 use super::protocol::commands::{Command, WireJoints};
-use super::protocol::gripper::{FORCE_RANGE_G2, GripperKind};
+use super::protocol::gripper::GripperKind;
 use super::protocol::report::Motion;
-use super::report_validity::{MM_PER_M, measured, pose};
+use super::report_validity::{measured, pose};
 use super::session::Session;
 use super::{HOLDS_WHEN_DISABLED, MODES, MODES_WITHOUT_VELOCITY, Options, check, model_of};
-use dimos_core::arm::{ControllerPose, ForceUnit, GripperUnit, JointStatus, Load, Pose, StopPoint};
+use dimos_core::arm::{ControllerPose, JointStatus, StopPoint};
 use dimos_core::joint::{ControlMode, JointLimits, joints_of};
 use dimos_hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, HandGuiding, JointMonitor, JointReading,
-    ManipulatorAdapter, ManipulatorInfo, Payload, RobotState, Stop,
+    ManipulatorAdapter, ManipulatorInfo, Payload, Reduction, RobotState, Stop,
 };
 use dimos_hardware::registry::AdapterConfig;
 
@@ -186,7 +188,15 @@ impl ManipulatorAdapter for XArmAdapter {
     }
 
     fn get_limits(&mut self) -> AdapterResult<JointLimits> {
-        Ok(self.session.as_ref().map_or_else(|| self.model.limits(), |session| session.device.limits.clone()))
+        Ok(self.session.as_mut().map_or_else(|| self.model.limits(), Session::limits))
+    }
+
+    fn reduction(&self) -> Option<Reduction> {
+        self.session.as_ref()?.reduction()
+    }
+
+    fn reduction_changed(&self) -> bool {
+        self.session.as_ref().is_some_and(Session::reduction_changed)
     }
 
     // --- Mode ---
@@ -390,98 +400,6 @@ impl JointMonitor for XArmAdapter {
             };
         }
         Ok(())
-    }
-}
-
-impl Payload for XArmAdapter {
-    /// The controller keeps no inertia.
-    fn read_payload(&mut self) -> AdapterResult<Option<Load>> {
-        let [mass, x, y, z] = self.recent()?.condition().load;
-        Ok(Some(Load { mass, center: [x, y, z].map(|v| v / MM_PER_M), inertia: [0.0; 6] }))
-    }
-
-    fn write_payload(&mut self, load: &Load) -> AdapterResult<()> {
-        let [x, y, z] = load.center.map(|v| v * MM_PER_M);
-        self.target = None;
-        self.with(|session| session.set_load([load.mass, x, y, z]))
-    }
-
-    fn resets_controller(&self) -> bool {
-        true
-    }
-
-    fn read_mounting(&mut self) -> AdapterResult<Option<[f64; 3]>> {
-        Ok(self.recent()?.condition().gravity)
-    }
-}
-
-impl Gripper for XArmAdapter {
-    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
-        Ok(self.recent()?.gripper().opening())
-    }
-
-    fn get_gripper_unit(&self) -> GripperUnit {
-        if self.options.gripper.is_on_off() { GripperUnit::OnOff } else { GripperUnit::Meters }
-    }
-
-    fn read_gripper_holds(&mut self) -> AdapterResult<Option<bool>> {
-        Ok(self.recent()?.gripper().holds())
-    }
-
-    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
-        self.options.gripper.widest().map(|widest| (0.0, widest))
-    }
-
-    fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
-        self.with(|session| session.gripper().go_to(position))
-    }
-
-    /// The vendor gives the force of a G2 as a number from 1 to 100.
-    fn get_gripper_force_unit(&self) -> ForceUnit {
-        ForceUnit::Percent
-    }
-
-    fn has_gripper_speed(&self) -> bool {
-        !self.options.gripper.is_on_off()
-    }
-
-    fn set_gripper_speed(&mut self, fraction: Option<f64>) {
-        let _ = self.with(|session| {
-            session.gripper().set_speed(fraction);
-            Ok(())
-        });
-    }
-
-    fn get_gripper_force_range(&mut self) -> Option<(f64, f64)> {
-        (self.options.gripper == GripperKind::XarmG2).then_some(FORCE_RANGE_G2)
-    }
-
-    fn write_gripper_position_with_force(&mut self, position: f64, force: f64) -> AdapterResult<()> {
-        self.with(|session| session.gripper().grip(position, force))
-    }
-}
-
-impl ForceTorque for XArmAdapter {
-    fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>> {
-        Ok(self.recent()?.wrench())
-    }
-}
-
-impl Cartesian for XArmAdapter {
-    fn read_cartesian_position(&mut self) -> AdapterResult<Option<ControllerPose>> {
-        let session = self.recent()?;
-        Ok(Some(stated(session.motion().0, session.condition())))
-    }
-
-    fn write_cartesian_position(&mut self, pose: &Pose, velocity: f64) -> AdapterResult<()> {
-        let ([x, y, z], [roll, pitch, yaw]) = (pose.xyz.map(|v| v * MM_PER_M), pose.rpy);
-        let pose = [x, y, z, roll, pitch, yaw];
-        if !pose.iter().all(|value| value.is_finite()) {
-            return Err(AdapterError::Rejected("the pose is not finite".into()));
-        }
-        let speed = self.speed(velocity, self.model.line_speed(), SLOWEST.1);
-        self.target = None;
-        self.with(|session| session.plan(&Command::MoveLine { pose, speed, acceleration: LINE_ACCELERATION }))
     }
 }
 

@@ -6,6 +6,7 @@ use std::time::Duration;
 use super::errors::{error_text, servo_text};
 use super::protocol::commands::Command;
 use super::protocol::frame::{Response, Status};
+use super::protocol::reduced::Reduced;
 use super::protocol::report::{Health, Motors};
 use dimos_core::clock::Mono;
 
@@ -39,6 +40,11 @@ pub struct Condition {
     pub motors: Option<Motors>,
     /// Error codes of the joints' servos.
     pub servos: [u8; 7],
+    /// The settings of reduced mode; `None`: not known.
+    pub reduced: Option<Reduced>,
+    /// Reports do not have them: register 53 is read instead, in turn with register 15 when nothing else is sent.
+    asks_reduced: bool,
+    asked_reduced: bool,
     /// Whether something has changed, so that register 15 must be read.
     pub changed: bool,
     /// When a change was seen that only a later request explains.
@@ -69,6 +75,7 @@ impl Condition {
     pub fn report(&mut self, health: Health) {
         (self.enabled, self.tool, self.base) = (health.enabled, Some(health.tool), health.base);
         (self.load, self.gravity, self.motors) = (health.load, health.gravity, health.motors);
+        self.reduced = health.reduced.or(self.reduced);
         self.changed |= health.error != self.error || health.warning != self.warning;
     }
 
@@ -94,6 +101,10 @@ impl Condition {
                 self.servos.iter_mut().zip(codes).for_each(|(to, code)| *to = *code);
                 (self.servos_changed, self.asked) = (false, None);
             }
+            (53, data) => {
+                self.reduced = Some(data).filter(|_| !response.status.invalid()).and_then(Reduced::decode);
+                (self.asks_reduced, self.asked) = (self.reduced.is_some(), None);
+            }
             _ => {}
         }
     }
@@ -103,14 +114,17 @@ impl Condition {
         if self.asked.is_some_and(|asked| now.since(asked) < RETRY_AFTER) {
             return None;
         }
-        let command = if self.changed || now.since(last_sent) > HEARTBEAT {
+        let idle = now.since(last_sent) > HEARTBEAT;
+        let command = if idle && !self.changed && self.asks_reduced && !self.asked_reduced {
+            Command::ReducedMode
+        } else if self.changed || idle {
             Command::GetError
         } else if self.servos_changed {
             Command::ServoErrors
         } else {
             return None;
         };
-        self.asked = Some(now);
+        (self.asked, self.asked_reduced) = (Some(now), command == Command::ReducedMode);
         Some(command)
     }
 

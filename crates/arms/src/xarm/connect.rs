@@ -62,6 +62,12 @@ pub fn connect(address: &Address, model: Model, options: &Options) -> AdapterRes
     let full = motion.kind() == Kind::Full;
     let currents = !full && ask(&mut control, &Command::ReportsCurrents, QUICK)?.data().first() == Some(&1);
     condition.take(&ask(&mut control, &Command::GetError, QUICK)?);
+    // Older firmware does not report it.
+    if condition.reduced.is_none()
+        && let Ok(answer) = ask(&mut control, &Command::ReducedMode, QUICK)
+    {
+        condition.take(&answer);
+    }
     let (bus, pulses) = find_gripper(&mut control, options.gripper, address, until)?;
 
     let limits = identity.limits().unwrap_or_else(|| model.limits());

@@ -24,6 +24,7 @@ mod motion_commands;
 mod other_clients;
 mod output_gripper;
 pub mod protocol;
+mod reduced_mode;
 mod report_validity;
 mod session;
 mod state_commands;
@@ -37,7 +38,10 @@ mod tests_other_clients;
 #[cfg(test)]
 mod tests_outputs;
 #[cfg(test)]
+mod tests_reduced;
+#[cfg(test)]
 mod tests_slow;
+pub mod tool_line;
 
 use std::time::Duration;
 

@@ -66,7 +66,7 @@ impl Session {
     /// Sends a move that the controller plans, and waits for its response.
     pub fn plan(&mut self, command: &Command) -> AdapterResult<()> {
         self.may_move(0)?;
-        let status = self.ask(command)?.status;
+        let status = self.ask(&self.within_reduced(*command))?.status;
         if status.error() || status.warning() {
             self.check_error()?;
         }

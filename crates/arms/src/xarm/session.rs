@@ -14,6 +14,7 @@ use super::model::{Model, VELOCITY};
 use super::protocol::commands::{Command, QUICK, SLOW};
 use super::protocol::frame::Response;
 use super::protocol::identity::Firmware;
+use super::protocol::reduced::Reduced;
 use super::protocol::report::{Health, Kind, Motion};
 use super::stream::Stream;
 use dimos_core::clock::{Clock, Mono, MonotonicClock};
@@ -99,6 +100,8 @@ pub struct Session {
     pub(super) failed: Option<(u8, &'static str)>,
     /// When the force/torque sensor was switched on: before that, reports contain zeros for it.
     pub(super) wrench_since: Option<Mono>,
+    /// The settings of reduced mode that the limits were read with.
+    pub(super) limited_by: Option<Reduced>,
     updated: Mono,
 }
 
@@ -130,6 +133,7 @@ impl Session {
             change: None,
             failed: None,
             wrench_since: None,
+            limited_by: condition.reduced,
             updated: arrived,
         }
     }

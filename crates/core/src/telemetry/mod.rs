@@ -171,6 +171,8 @@ pub enum Cause {
     StoppedElsewhere,
     /// Another arm than the one of the run answers.
     IdentityChanged,
+    /// The limits of the arm's controller have become narrower than those of the run.
+    LimitsChanged,
     /// The arm's stop input is open.
     StopInput,
     /// Something appeared in the way of its motion, and it could not rest before it.
@@ -220,6 +222,7 @@ impl Cause {
             Self::ModeChanged => "mode_changed",
             Self::PowerChanged => "power_changed",
             Self::IdentityChanged => "identity_changed",
+            Self::LimitsChanged => "limits_changed",
             Self::StoppedElsewhere => "stopped_elsewhere",
             Self::StopInput => "stop_input",
             Self::WayBlocked => "way_blocked",

@@ -25,7 +25,7 @@ pub use health::{Episode, Health, Note};
 pub use identity::Identity;
 pub use thread::Way;
 
-use crate::adapter::{AdapterError, AdapterResult, ManipulatorAdapter, ManipulatorInfo};
+use crate::adapter::{AdapterError, AdapterResult, ManipulatorAdapter, ManipulatorInfo, Reduction};
 use dimos_core::arm::{
     ArmCommand, ArmState, Bridging, FactoryKinematics, GripperInfo, IoInfo, IoState, Load, OutputValue, StopInput,
     Supervision,
@@ -78,6 +78,8 @@ pub struct Setup {
     /// Direction of gravity in the base frame, a unit vector: set before the motors are enabled. `None`: the
     /// controller keeps its own setting.
     pub gravity: Option<[f64; 3]>,
+    /// Highest speed of the tool [m/s], if it is limited: the blueprint's, or the vendor's.
+    pub tool_velocity: Option<f64>,
 }
 
 impl DeviceConfig {
@@ -123,6 +125,8 @@ pub struct Connected {
     pub kinematics: Option<FactoryKinematics>,
     /// What it makes of gaps in its setpoints, if it says so itself.
     pub bridging: Option<Bridging>,
+    /// What the settings of its controller leave of its limits, if it reports them.
+    pub reduction: Option<Reduction>,
     /// Whether it streams its state.
     pub streams: bool,
     /// Whether its controller takes the load at the flange.

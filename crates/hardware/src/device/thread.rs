@@ -3,6 +3,7 @@
 mod commands;
 mod connection;
 mod lead;
+mod limits;
 mod payload;
 mod readings;
 mod slow_readings;
@@ -82,6 +83,8 @@ pub(super) struct Worker {
     /// Velocity limit of the fastest joint [rad/s].
     speed: f64,
     guard: WireGuard,
+    /// Limits of commands, compared with the controller's own.
+    limits: limits::RunLimits,
     /// Setpoints without an acknowledgement that may still reach the arm.
     in_flight: u32,
     /// The newest command was not sent because earlier ones were still in flight.
@@ -123,6 +126,7 @@ impl Worker {
         Self {
             due,
             guard: WireGuard::new(config.dof, config.write_period(None), config.supervision),
+            limits: limits::RunLimits::default(),
             in_flight: 0,
             resend: false,
             ordered_mode: None,

@@ -44,4 +44,5 @@ pub mod stream;
 mod tcp_listener;
 pub mod tcp_server;
 mod tcp_session;
+pub mod tool_device;
 pub mod trace;

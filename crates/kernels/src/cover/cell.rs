@@ -30,8 +30,8 @@ pub(super) struct Cell {
 impl Cell {
     /// Cuts out the part in a box; `None` if there is none.
     ///
-    /// Whatever part of the solid lies inside the box, its extreme points are on its surface or corners of the box: a ball
-    /// that contains the polygons and the corners that are inside contains the part.
+    /// Whatever part of the solid lies inside the box, its extreme points are on its surface or corners of the box: a
+    /// ball that contains the polygons and the corners that are inside contains the part.
     pub fn new(
         polygons: Vec<Vec<Vector>>,
         low: Vector,

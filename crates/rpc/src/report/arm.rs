@@ -99,6 +99,10 @@ pub struct ArmReport {
     /// What is known of how its model fits the arm: factory kinematics, and where model and controller have the flange.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub model_notes: Vec<String>,
+    /// What the settings of its controller, such as a reduced mode, left of its limits when the run began; absent if
+    /// nothing is known of them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub limits_note: Option<String>,
     /// Lower and upper position limits of its joints [rad], in their order.
     #[serde(default)]
     pub position_limits: Vec<[f64; 2]>,
@@ -178,6 +182,14 @@ pub struct FaultReport {
     pub count: u64,
     /// Description.
     pub text: String,
+}
+
+impl ArmReport {
+    /// Returns what is known of its model and of its limits: each with what it is about.
+    pub fn notes(&self) -> impl Iterator<Item = (&'static str, &String)> {
+        let about = |what: &'static str| move |note| (what, note);
+        self.model_notes.iter().map(about("model")).chain(self.limits_note.iter().map(about("limits")))
+    }
 }
 
 /// `led_by` of an arm that is moved by its own controller.

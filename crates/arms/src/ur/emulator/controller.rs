@@ -16,6 +16,7 @@ use dimos_hardware::adapter::AdapterResult;
 use dimos_hardware::sim::arm::{ESTOP, HasArm, SimArm};
 use dimos_hardware::sim::faults::FaultKind;
 use dimos_hardware::sim::reach::Chain;
+use dimos_hardware::sim::tool_device::ToolSocket;
 
 /// Pose at power-up [rad]: upright, and no joint as another one.
 const POSE: [f64; DOF] = [0.3, -1.4, 1.5, -1.7, -1.5, 0.4];
@@ -109,6 +110,9 @@ pub struct Controller {
     /// Inputs that have arrived, and outputs as they are reported.
     pub(super) exchanged: Registers,
     pub(super) outputs: Outputs,
+    /// The tool's line: what is connected, and its rate while it is on [bit/s].
+    pub(super) tool: ToolSocket,
+    pub(super) tool_rate: Option<u32>,
     /// Digital inputs, and those that a fault pulls low.
     inputs: (u64, u64),
     pub(super) payload: (f64, [f64; 3], [f64; 6]),
@@ -163,6 +167,8 @@ impl Controller {
             registers: Registers::new(),
             exchanged: Registers::new(),
             outputs: Outputs { voltage: 0b11, ..Outputs::default() },
+            tool: ToolSocket::default(),
+            tool_rate: None,
             inputs: (INPUTS, 0),
             payload: (0.0, [0.0; 3], [0.0; 6]),
             gravity: [0.0, 0.0, 9.82],

@@ -37,6 +37,7 @@ use dimos_hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, Truth};
 use dimos_hardware::sim::arm;
 use dimos_hardware::sim::faults::{Fault, FaultKind};
 use dimos_hardware::sim::tcp_server::{Port, TcpServer, cannot_listen, emulator_ports};
+use dimos_hardware::sim::tool_device::ToolDevice;
 
 /// The faults that the controller can play. Its joints have one supply, so no single motor goes off.
 const PLAYABLE: &[FaultKind] = &[
@@ -61,8 +62,8 @@ const PLAYABLE: &[FaultKind] = &[
     FaultKind::InputLow,
 ];
 /// The ports, in the order of their numbers here.
-const SERVICES: [Service; 5] =
-    [Service::Dashboard, Service::Primary, Service::Secondary, Service::RealTime, Service::Rtde];
+const SERVICES: [Service; 6] =
+    [Service::Dashboard, Service::Primary, Service::Secondary, Service::RealTime, Service::Rtde, Service::Tool];
 /// Whether programs may come at a port, by its number here.
 fn takes_scripts(port: usize) -> bool {
     matches!(SERVICES.get(port), Some(Service::Primary | Service::Secondary | Service::RealTime))
@@ -177,6 +178,8 @@ fn parse_software(text: &str) -> Option<[u8; 3]> {
 pub struct UrEmulator {
     server: TcpServer<Controller>,
     address: SocketAddr,
+    /// The port of the tool's line.
+    tool: Option<SocketAddr>,
 }
 
 impl UrEmulator {
@@ -204,10 +207,20 @@ impl UrEmulator {
         }
         let listeners = listeners.into_iter().enumerate().filter(|(i, _)| used.contains(i));
         let listeners = listeners.filter_map(|(_, listener)| listener);
+        let tool = match options.model.is_cb3() {
+            true => None,
+            false => {
+                let port = if address.port() == FIRST_PORT { super::TOOL_PORT } else { 0 };
+                let place = SocketAddr::new(address.ip(), port);
+                Some(TcpListener::bind(place).map_err(|e| cannot_listen("ur emulator", place, &e))?)
+            }
+        };
+        let tool_at = tool.as_ref().and_then(|listener| listener.local_addr().ok());
+        let listeners = listeners.chain(tool);
         let period = Duration::from_secs_f64(1.0 / options.model.rate());
         let ports = listeners.zip(SERVICES).map(|(listener, service)| {
             let period = match service {
-                Service::Dashboard => NEVER,
+                Service::Dashboard | Service::Tool => NEVER,
                 Service::Rtde => period,
                 _ => MESSAGES,
             };
@@ -215,7 +228,17 @@ impl UrEmulator {
         });
         let server = TcpServer::with_ports("ur", controller, ports.collect(), CLIENTS, |_| true);
         let server = server.map_err(|e| AdapterError::Io(format!("ur emulator: cannot serve: {e}")))?;
-        Ok(Self { server, address })
+        Ok(Self { server, address, tool: tool_at })
+    }
+
+    /// Returns the address of the tool's RS-485 line, as the vendor's URCap has it; `None` for a CB3 arm.
+    pub fn tool_line(&self) -> Option<SocketAddr> {
+        self.tool
+    }
+
+    /// Connects a device to that line, which runs at `baud` [bit/s].
+    pub fn fit_tool(&self, device: impl ToolDevice, baud: u32) {
+        self.with(|controller| controller.tool.fit(device, baud));
     }
 
     /// Calls `act` with the controller, advanced to the present.

@@ -39,6 +39,12 @@ impl stream::Controller for Controller {
         if service == Service::Rtde {
             return self.rtde_request(who, bytes, answer);
         }
+        if service == Service::Tool {
+            if let Some(rate) = self.tool_rate {
+                self.tool.exchange(rate, bytes, answer);
+            }
+            return Scan::Take(bytes.len(), Delivery::Send);
+        }
         if service == Service::Dashboard && self.is_polyscope_x() {
             // A connection for each request.
             return self.robot_api(bytes, answer).map(|()| Delivery::HangUp);
@@ -95,7 +101,7 @@ impl stream::Controller for Controller {
         let (who, service) = ((port, client), service(port));
         match service {
             Service::Rtde => return self.rtde_report(who, packet),
-            Service::Dashboard => return Some(Delivery::Send),
+            Service::Dashboard | Service::Tool => return Some(Delivery::Send),
             _ => {}
         }
         let session = self.sessions.get_mut(&who).filter(|session| !session.closing)?;

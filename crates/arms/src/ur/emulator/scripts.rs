@@ -36,6 +36,12 @@ impl Controller {
         }
         let (kind, head) = text.split_once(' ').unwrap_or_default();
         let name = head.split('(').next().unwrap_or_default().to_owned();
+        if kind == "def" {
+            text.lines()
+                .map(str::trim)
+                .filter(|line| line.starts_with("set_tool_"))
+                .for_each(|line| self.statement(line));
+        }
         match (kind, name.as_str()) {
             ("sec", _) => text.lines().for_each(|line| self.statement(line.trim())),
             (_, ours::NAME) => match Ours::new(text) {
@@ -66,6 +72,9 @@ impl Controller {
             ("set_target_payload", [mass, x, y, z, inertia @ ..]) => {
                 (self.payload.0, self.payload.1) = (*mass, [*x, *y, *z]);
                 self.payload.2.iter_mut().zip(inertia).for_each(|(to, value)| *to = *value);
+            }
+            ("set_tool_communication", [baud, _, _, _, _]) => {
+                self.tool_rate = arguments.starts_with("True").then_some(*baud as u32);
             }
             ("set_tool_voltage", [volts]) => self.outputs.tool_voltage = *volts as i32,
             _ => {}

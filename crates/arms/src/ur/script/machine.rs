@@ -230,6 +230,8 @@ impl<'a> Compiler<'a> {
                 let (index, value) = (self.number(index)?, self.number(value)?);
                 self.code.push(Instruction::Item(number_of(&mut self.lists, name), index, value));
             }
+            // The emulator takes settings of the tool from the text: they take no step.
+            Action::Evaluate(Expression { kind: Kind::Call(name, _), .. }) if name.starts_with("set_tool_") => {}
             Action::Evaluate(call) => {
                 let instruction = self.call(call)?;
                 self.code.push(instruction);

@@ -31,7 +31,7 @@ const SLICE: Duration = Duration::from_millis(20);
 /// The mode that executes setpoints.
 pub(super) const SERVO: u8 = 1;
 /// Positions this close to a limit count as inside [rad]: the vendor's client allows as much.
-const TOLERANCE: f64 = 0.00175;
+pub(super) const TOLERANCE: f64 = 0.00175;
 /// What the force/torque sensor feels of the tool [N, Nm].
 const TOOL_WEIGHT: [f32; 6] = [0.3, -0.2, -4.9, 0.01, 0.02, 0.0];
 /// States, as reported. While it is ready, 1 or 2 is reported by whether it moves.

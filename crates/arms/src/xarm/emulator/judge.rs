@@ -4,7 +4,7 @@
 
 use nalgebra::Isometry3;
 
-use super::super::model::{Model, VELOCITY};
+use super::super::model::Model;
 use super::kinematics::Links;
 use dimos_core::clock::Mono;
 use dimos_hardware::sim::reach::Chain;
@@ -54,12 +54,13 @@ impl Judge {
         self.last.map(|(setpoint, _)| setpoint)
     }
 
-    /// Takes a setpoint [rad] for an arm that is at `at`; the error if a joint would have to be too fast.
-    pub fn setpoint(&mut self, target: &[f64; 7], at: &[f64; 7], now: Mono) -> Result<(), u8> {
+    /// Takes a setpoint [rad] for an arm that is at `at`; the error if a joint would have to be faster than `top`
+    /// [rad/s].
+    pub fn setpoint(&mut self, target: &[f64; 7], at: &[f64; 7], top: f64, now: Mono) -> Result<(), u8> {
         let (before, passed) = self.last.map_or((*at, LATE), |(last, since)| (last, now.seconds_since(since)));
         let mut jumps = false;
         for ((credit, target), before) in self.credit.iter_mut().zip(target).zip(before) {
-            *credit = (*credit + VELOCITY * SLACK * passed).min(VELOCITY * LATE) - (target - before).abs();
+            *credit = (*credit + top * SLACK * passed).min(top * LATE) - (target - before).abs();
             jumps |= *credit < 0.0;
         }
         (self.last, self.goal) = (Some((*target, now)), Some(*target));
@@ -106,6 +107,7 @@ pub fn tool_limit(model: Option<Model>, firmware: [u16; 3], factor: f32) -> (f64
 mod tests {
     use std::time::Duration;
 
+    use super::super::super::model::VELOCITY;
     use super::*;
 
     /// Streams a ramp of joint 1, one setpoint per `period` [s]; the time until it is refused [s].
@@ -115,7 +117,7 @@ mod tests {
             let mut target = [0.0; 7];
             target[0] = speed * period * f64::from(i);
             now = now.after(Duration::from_secs_f64(period));
-            judge.setpoint(&target, &[0.0; 7], now).is_err().then_some(f64::from(i) * period)
+            judge.setpoint(&target, &[0.0; 7], VELOCITY, now).is_err().then_some(f64::from(i) * period)
         })
     }
 
@@ -132,11 +134,11 @@ mod tests {
         let mut judge = Judge::default();
         let at = |degrees: f64| [degrees.to_radians(), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
         let time = |ms: u64| Mono(1).after(Duration::from_millis(ms));
-        assert_eq!(judge.setpoint(&at(0.5), &at(0.0), time(0)), Ok(()));
-        assert_eq!(judge.setpoint(&at(10.0), &at(0.0), time(80)), Ok(()), "80 ms late at 120°/s");
-        assert_eq!(judge.setpoint(&at(50.0), &at(0.0), time(2000)), Err(SPEED), "40° at once");
+        assert_eq!(judge.setpoint(&at(0.5), &at(0.0), VELOCITY, time(0)), Ok(()));
+        assert_eq!(judge.setpoint(&at(10.0), &at(0.0), VELOCITY, time(80)), Ok(()), "80 ms late at 120°/s");
+        assert_eq!(judge.setpoint(&at(50.0), &at(0.0), VELOCITY, time(2000)), Err(SPEED), "40° at once");
         judge.forget();
-        assert_eq!(judge.setpoint(&at(40.0), &at(0.0), time(3000)), Err(SPEED), "the first setpoint too");
+        assert_eq!(judge.setpoint(&at(40.0), &at(0.0), VELOCITY, time(3000)), Err(SPEED), "the first setpoint too");
     }
 
     #[test]

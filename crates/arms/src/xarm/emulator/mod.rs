@@ -15,6 +15,7 @@ mod motion;
 mod move_request;
 mod ports;
 mod queue;
+mod reduced_mode;
 mod registers;
 mod report;
 mod settings;
@@ -49,6 +50,7 @@ use dimos_hardware::sim::arm::{self, HasArm, SimArm};
 use dimos_hardware::sim::faults::{Fault, FaultKind};
 use dimos_hardware::sim::peer;
 use dimos_hardware::sim::tcp_server::{ATTEMPTS, Port, TcpServer, cannot_listen, ports_in_a_row};
+use dimos_hardware::sim::tool_device::ToolDevice;
 pub use kinematics::Links;
 pub use line::Line;
 pub use move_request::{Frame, MoveRequest, Target};
@@ -238,6 +240,11 @@ impl XArmEmulator {
             controller.advance(now);
             controller.tool.opening()
         })
+    }
+
+    /// Connects a device to the RS-485 line at the tool, which runs at `baud` [bit/s].
+    pub fn fit_tool(&self, device: impl ToolDevice, baud: u32) {
+        self.server.with(|controller, _| controller.tool.socket.fit(device, baud));
     }
 
     /// Starts to record what comes over the wire, up to 200 000 requests; forgets what was recorded before.

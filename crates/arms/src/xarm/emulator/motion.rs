@@ -56,6 +56,9 @@ impl<A: ControlledArm> Controller<A> {
                 if !speeds.iter().all(|speed| speed.is_finite()) {
                     return Err(Warning(BAD_PARAMETER));
                 }
+                if let Some(code) = self.too_fast(&speeds.map(f64::from)) {
+                    return Err(Error(code));
+                }
                 let duration = number(data, 29, 0).filter(|duration| *duration > 0.0);
                 let duration = duration.map(|duration| Duration::from_secs_f32(duration.min(3600.0)));
                 self.judge.turns_at(&speeds.map(f64::from));
@@ -79,7 +82,9 @@ impl<A: ControlledArm> Controller<A> {
     fn servo(&mut self, target: &[f64; 7]) -> Result<(), Refusal> {
         let (now, at) = (self.arm.now(), self.seven());
         if self.chain.is_some() {
-            self.judge.setpoint(target, &at, now).map_err(Error)?;
+            let reduced = self.settings.reduced.active.map(|limits| f64::from(limits.joint_speed));
+            let top = reduced.map_or(VELOCITY, |reduced| reduced.min(VELOCITY));
+            self.judge.setpoint(target, &at, top, now).map_err(Error)?;
         }
         self.arm.follow(target)
     }
@@ -98,6 +103,14 @@ impl<A: ControlledArm> Controller<A> {
         }
         let goal = self.goal(request, data)?;
         let speed = f64::from(request.speed);
+        // In reduced mode the box plans slower moves (our choice).
+        let reduced = self.settings.reduced.active;
+        let speed = match (&request.target, reduced) {
+            _ if speed.is_nan() => speed,
+            (Target::Joints(_) | Target::JointChange(_), Some(limits)) => speed.min(limits.joint_speed.into()),
+            (_, Some(limits)) => speed.min(limits.line_speed.into()),
+            _ => speed,
+        };
         let speed = match (&request.target, &goal) {
             _ if speed.is_nan() => 0.0,
             (Target::Joints(_) | Target::JointChange(_), _) => speed,
@@ -188,7 +201,8 @@ impl<A: ControlledArm> Controller<A> {
         if !target.iter().all(|value| value.is_finite()) {
             return Err(Warning(BAD_PARAMETER));
         }
-        if self.arm.is_within(&target) { Ok(target) } else { Err(Error(JOINT_LIMIT)) }
+        let within = self.arm.is_within(&target) && !self.leaves_reduced_range(&target);
+        if within { Ok(target) } else { Err(Error(JOINT_LIMIT)) }
     }
 
     pub(super) fn inverse(&self, pose: [f32; 6]) -> Result<[f64; 7], Refusal> {

@@ -46,6 +46,7 @@ impl<A: ControlledArm> Controller<A> {
             load: self.settings.load,
             sensitivity: self.settings.sensitivity,
             motion: self.settings.motion,
+            reduced: self.settings.reduced,
             wrench,
             wrench_raw,
             counter: self.counter,

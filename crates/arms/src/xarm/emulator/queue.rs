@@ -6,6 +6,7 @@ use super::controlled_arm::{ControlledArm, Refusal};
 use super::controller::{Controller, SERVO, first, state};
 use super::judge::{tool_limit, tool_speed};
 use super::line::Line;
+use super::registers::GUIDED;
 use crate::xarm::model::Model;
 use dimos_hardware::sim::faults::FaultKind;
 
@@ -55,9 +56,16 @@ impl<A: ControlledArm> Controller<A> {
         if self.mode == SERVO && self.state == state::STANDING {
             let model = Model::of(&self.identity);
             let (limit, code) = tool_limit(model, self.firmware, self.settings.limit_factor);
+            let reduced = self.settings.reduced.active.map(|limits| f64::from(limits.line_speed) / 1000.0);
+            let limit = reduced.map_or(limit, |reduced| reduced.min(limit));
             if tool_speed(chain, &self.tool_offset(), &positions, &velocities) > limit {
                 return self.fail(code);
             }
+        }
+        if self.mode != GUIDED
+            && let Some(code) = self.outside(&positions, &velocities)
+        {
+            return self.fail(code);
         }
         let collides = self.settings.sensitivity[0] > 0 && self.arm.lasts(FaultKind::Blocked);
         if let Some(code) = self.judge.blocked(collides, &positions, self.mode, self.arm.now()) {

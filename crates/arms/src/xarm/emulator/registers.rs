@@ -10,7 +10,7 @@ use super::wire::{self, Request, number, numbers, put_numbers};
 use dimos_hardware::sim::faults::FaultKind;
 
 /// The mode of guiding by hand.
-const GUIDED: u8 = 2;
+pub(super) const GUIDED: u8 = 2;
 /// Warnings.
 pub(super) const QUEUE_FULL: u8 = 11;
 pub(super) const BAD_PARAMETER: u8 = 12;
@@ -36,7 +36,7 @@ fn length_of(register: u8) -> usize {
     match register {
         41 | 44 | 76 | 91 | 150 | 200 => 4 * 6,
         43 | 55 => 4 * 7,
-        53 => 78,
+        53 => 79,
         67 => 4 * 28,
         111..=114 => 4 * 3,
         212 => 280,
@@ -130,6 +130,12 @@ impl<A: ControlledArm> Controller<A> {
                 let answer = self.telegram(telegram)?;
                 out.extend([TOOL].into_iter().chain(answer));
             }
+            (241, [TOOL, bytes @ ..]) if self.arm.takes_settings() => {
+                // A device that is silent is no error: the box passes bytes on and does not know what they are.
+                out.push(TOOL);
+                out.extend(self.tool.pass(bytes));
+            }
+            (241, _) => return Err(NotNow),
             // Nothing is at the box's own bus, such as a linear track.
             (124, [BOX, ..]) if self.arm.takes_settings() => return Err(Error(BOX_SILENT)),
             (124, _) => return Err(NotNow),
@@ -154,6 +160,9 @@ impl<A: ControlledArm> Controller<A> {
 
     /// Returns the answer of the device at the tool.
     fn telegram(&mut self, telegram: &[u8]) -> Result<Vec<u8>, Refusal> {
+        if let Some(answer) = self.tool.pass_modbus(telegram).filter(|_| self.arm.takes_settings()) {
+            return Ok(answer);
+        }
         if !self.tool.hears(telegram) {
             // An arm of a run is not stopped because a client looks for a device.
             return Err(if self.arm.takes_settings() { Error(TOOL_SILENT) } else { NotNow });

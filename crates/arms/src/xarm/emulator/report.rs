@@ -1,5 +1,6 @@
 //! The reports, byte by byte as the vendor's page "Data Description of TCP port" has them.
 
+use super::reduced_mode::ReducedMode;
 use dimos_hardware::sim::arm::SimArm;
 
 /// What a report shows, in units of the wire.
@@ -43,6 +44,8 @@ pub struct Snapshot {
     pub sensitivity: [u8; 2],
     /// Jerk and largest acceleration of the tool [mm/s³, mm/s²], then of the joints [rad/s³, rad/s²].
     pub motion: [f32; 4],
+    /// Reduced mode.
+    pub reduced: ReducedMode,
     /// Force and torque, without and with what the tool weighs [N, Nm].
     pub wrench: [f32; 6],
     /// See `wrench`.
@@ -173,4 +176,8 @@ fn rich(s: &Snapshot, out: &mut Vec<u8>) {
     packet.floats(288, &s.base);
     packet.floats(433, &s.wrench);
     packet.floats(457, &s.wrench_raw);
+    let mut reduced = Vec::with_capacity(79);
+    s.reduced.write(&mut reduced);
+    packet.bytes(494, &[u8::from(s.reduced.active.is_some()) | u8::from(s.reduced.fence) << 1]);
+    packet.bytes(495, &reduced);
 }

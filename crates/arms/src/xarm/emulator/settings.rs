@@ -6,6 +6,7 @@ use super::controlled_arm::{ControlledArm, Refusal};
 use super::controller::{Controller, state};
 use super::judge::LIMIT_FACTOR;
 use super::kinematics::from_wire;
+use super::reduced_mode::{ReducedMode, is_of_reduced_mode};
 use super::registers::BAD_PARAMETER;
 use super::wire::{number, numbers, put_numbers};
 use Refusal::{NotNow, Warning};
@@ -28,6 +29,8 @@ pub struct Settings {
     pub motion: [f32; 4],
     /// Limit of the tool's speed in servo mode, as a multiple of its top speed.
     pub limit_factor: f32,
+    /// Reduced mode.
+    pub reduced: ReducedMode,
     /// Reports hold currents in the place of torques.
     pub currents: bool,
     /// The force/torque sensor is on.
@@ -45,6 +48,7 @@ impl Default for Settings {
             sensitivity: [3, 3],
             motion: [10_000.0, 50_000.0, 20.0, 20.0],
             limit_factor: LIMIT_FACTOR,
+            reduced: ReducedMode::default(),
             currents: false,
             wrench_on: false,
             wrench_zero: [0.0; 6],
@@ -54,7 +58,7 @@ impl Default for Settings {
 
 /// Returns whether a register belongs to this module.
 pub(super) fn is_setting(register: u8) -> bool {
-    matches!(register, 31..=40 | 70 | 73 | 201..=203 | 206 | 232 | 233)
+    matches!(register, 31..=40 | 70 | 73 | 201..=203 | 206 | 232 | 233) || is_of_reduced_mode(register)
 }
 
 impl<A: ControlledArm> Controller<A> {
@@ -75,6 +79,10 @@ impl<A: ControlledArm> Controller<A> {
             }
             (201, [1]) if self.arm.wrench().is_some() => {}
             _ if !own => return Err(NotNow),
+            _ if is_of_reduced_mode(register) => {
+                let firmware = self.firmware;
+                self.settings.reduced_mode(register, data, firmware, out)?;
+            }
             (31..=34, _) => {
                 let value = number(data, 0, 0).filter(|value| value.is_finite() && *value > 0.0).ok_or(bad)?;
                 if let Some(to) = self.settings.motion.get_mut(usize::from(register - 31)) {

@@ -3,8 +3,14 @@
 use super::super::protocol::gripper::GripperKind;
 use dimos_hardware::sim::faults::{Fault, FaultKind};
 use dimos_hardware::sim::gripper::Gripper;
+use dimos_hardware::sim::tool_device::ToolSocket;
 
-/// Index of 2 Mbit/s among the baud rates.
+/// Rates of the line [bit/s], in the order of their numbers.
+const RATES: [u32; 13] = [
+    4_800, 9_600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600, 1_000_000, 1_500_000, 2_000_000,
+    2_500_000,
+];
+/// Index of 2 Mbit/s among them.
 const TWO_MBIT: i32 = 11;
 /// Nominal speed of the fingers at the largest speed of their motor [m/s], and that speed in the units of each
 /// gripper's telegrams.
@@ -40,6 +46,8 @@ pub struct Tool {
     outputs: u16,
     /// The gripper's error.
     pub error: u16,
+    /// Another device at the line.
+    pub socket: ToolSocket,
 }
 
 impl Tool {
@@ -56,7 +64,30 @@ impl Tool {
             order: None,
             outputs: 0,
             error: 0,
+            socket: ToolSocket::default(),
         }
+    }
+
+    /// Passes bytes to the device at the line, and returns what comes back.
+    pub fn pass(&mut self, bytes: &[u8]) -> Vec<u8> {
+        let mut answer = Vec::new();
+        let rate = usize::try_from(self.baud).ok().and_then(|index| RATES.get(index));
+        if let Some(rate) = rate {
+            self.socket.exchange(*rate, bytes, &mut answer);
+        }
+        answer
+    }
+
+    /// Returns the answer of that device to a telegram of Modbus RTU, to which the box adds the checksum.
+    pub fn pass_modbus(&mut self, telegram: &[u8]) -> Option<Vec<u8>> {
+        let check = |bytes: &[u8]| {
+            bytes.iter().fold(0xFFFF_u16, |sum, byte| {
+                (0..8).fold(sum ^ u16::from(*byte), |sum, _| if sum & 1 == 0 { sum >> 1 } else { (sum >> 1) ^ 0xA001 })
+            })
+        };
+        let answer = self.pass(&[telegram, &check(telegram).to_le_bytes()].concat());
+        let (data, sum) = answer.split_last_chunk::<2>()?;
+        (check(data).to_le_bytes() == *sum).then(|| data.to_vec())
     }
 
     /// Plays the faults of the gripper that are due.

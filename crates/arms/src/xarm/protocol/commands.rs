@@ -80,6 +80,8 @@ pub enum Command {
         /// The arm stops when no other follows within this time [s]; only newer firmware knows it.
         duration: Option<f64>,
     },
+    /// The settings of reduced mode.
+    ReducedMode,
     /// Errors of the joints' servos.
     ServoErrors,
     /// Something to the device at the tool flange, and its answer.
@@ -112,6 +114,7 @@ impl Command {
             Self::MoveJoints { .. } => 23,
             Self::Servo(_) => 29,
             Self::SetLoad(_) => 36,
+            Self::ReducedMode => 53,
             Self::Velocity { .. } => 81,
             Self::ServoErrors => 106,
             Self::Tool(_) => 124,
@@ -137,7 +140,7 @@ impl Command {
         let mut out = Writer::new(frame);
         match self {
             Self::Version | Self::Serials | Self::ReportsCurrents | Self::GetState | Self::GetError => {}
-            Self::ClearError | Self::ClearWarning | Self::ServoErrors => {}
+            Self::ClearError | Self::ClearWarning | Self::ServoErrors | Self::ReducedMode => {}
             Self::Enable(on) => out.put(&[ALL_JOINTS, u8::from(*on)]),
             Self::SetState(state) => out.put(&[*state]),
             Self::SetMode { mode, detect: false } => out.put(&[*mode]),

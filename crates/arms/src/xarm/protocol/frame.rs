@@ -15,7 +15,7 @@ pub const MAX_REQUEST: usize = 64;
 /// Longest response that is believed.
 const MAX_RESPONSE: usize = 512;
 /// Most bytes of a response that are kept.
-const KEPT: usize = 64;
+const KEPT: usize = 80;
 /// In place of the register: unsolicited feedback about a task.
 const FEEDBACK: u8 = 0xFF;
 

@@ -8,6 +8,7 @@ pub mod commands;
 pub mod frame;
 pub mod gripper;
 pub mod identity;
+pub mod reduced;
 pub mod report;
 #[cfg(test)]
 mod tests;

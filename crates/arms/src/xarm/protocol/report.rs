@@ -1,6 +1,7 @@
 //! Reports that the controller streams, each on its own port. Every report begins with its length (u32, big-endian),
 //! which is constant on a connection; floats are little-endian.
 
+use super::reduced::{self, Reduced};
 use super::take;
 use dimos_hardware::transport::tcp::Scan;
 
@@ -127,6 +128,8 @@ pub struct Health {
     pub gravity: Option<[f64; 3]>,
     /// The joints' motors, if reported.
     pub motors: Option<Motors>,
+    /// The settings of reduced mode, if reported.
+    pub reduced: Option<Reduced>,
 }
 
 /// Condition of the joints' motors.
@@ -164,8 +167,9 @@ impl Health {
         let [state_mode] = take::bytes(packet, 4)?;
         let (tool, load) = (take::floats(packet, 91)?, take::floats(packet, 115)?);
         let (gravity, motors, base) = (take::floats(packet, 133), Motors::decode(packet), take::floats(packet, 288));
+        let reduced = packet.get(495..495 + reduced::LENGTH).and_then(Reduced::decode);
         let valid = collision <= 5 && teach <= 5 && state_mode & 0x0F <= 9;
-        valid.then_some(Self { enabled, error, warning, tool, base, load, gravity, motors })
+        valid.then_some(Self { enabled, error, warning, tool, base, load, gravity, motors, reduced })
     }
 }
 

@@ -46,9 +46,13 @@ impl Worker {
         self.compare_identity();
         self.guard.forget();
         self.in_flight = 0;
+        let reduction = adapter.reduction();
+        let tool = reduction.as_ref().and_then(|reduction| reduction.tool_velocity);
         if self.speed == 0.0 {
             self.set_limits(&limits);
+            self.limits.set_tool(self.config.setup.tool_velocity, tool);
         }
+        self.compare_limits(&limits, tool);
         if let Some(text) = adapter.connection_warning().filter(|_| !self.warned) {
             self.warned = true;
             (self.config.notes)(Note::Began(text.to_owned()));
@@ -75,6 +79,7 @@ impl Worker {
             calibration_offsets,
             kinematics: adapter.factory_kinematics(),
             bridging,
+            reduction,
             streams: adapter.state_fd().is_some(),
             has_payload,
             payload_resets,
@@ -86,6 +91,7 @@ impl Worker {
     pub(super) fn set_limits(&mut self, limits: &JointLimits) {
         self.speed = limits.velocity_max.iter().copied().fold(0.1, f64::max);
         self.guard.set_limits(limits);
+        self.limits.set(limits);
     }
 
     /// Resets what the arm's state is compared with: no mode, and the motors as in `power`.
@@ -124,6 +130,11 @@ impl Worker {
             let what = "another arm answers than the one with which the run began";
             let hint = format!("`dimos arm reset {}` shows both", self.config.hardware_id);
             return Err(AdapterError::Rejected(format!("{what}\nhint: {hint}")));
+        }
+        if let Some(narrower) = self.limits.narrower() {
+            return Err(AdapterError::Rejected(format!(
+                "{narrower}\nhint: restart the run, which then keeps these limits, or widen them at the controller"
+            )));
         }
         let limit = self.config.clock.now().after(ACTIVATION_TIMEOUT);
         while !self.plausible.stable(self.state.stamp) {

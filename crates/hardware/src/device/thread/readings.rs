@@ -99,6 +99,10 @@ impl Worker {
         self.state.mode = adapter.get_control_mode();
         self.compare_with_orders();
         self.take_foreign_change(adapter.foreign_change());
+        if adapter.reduction_changed() {
+            let limits = adapter.get_limits()?;
+            self.compare_limits(&limits, adapter.reduction().and_then(|reduction| reduction.tool_velocity));
+        }
         Ok(())
     }
 
@@ -117,10 +121,15 @@ impl Worker {
 
     /// Records a change by another client that the adapter reports.
     pub(super) fn take_foreign_change(&mut self, foreign: Option<&'static str>) {
-        let Some(what) = foreign.filter(|_| self.state.interference == Interference::None) else { return };
+        let Some(what) = foreign.filter(|_| !self.is_taken_over()) else { return };
         let mode = self.ordered_mode.is_some_and(|ordered| ordered != self.state.mode);
         self.state.interference = if mode { Interference::Mode } else { Interference::Stop };
         self.trouble(what);
+    }
+
+    /// Returns whether another program or person, or another arm, was seen.
+    fn is_taken_over(&self) -> bool {
+        !matches!(self.state.interference, Interference::None | Interference::Limits)
     }
 
     /// Compares which arm answers with the one of the run: another one gets nothing until it is accepted.
@@ -135,6 +144,7 @@ impl Worker {
     /// Compares arm, mode and motors with what this run ordered.
     pub(super) fn compare_with_orders(&mut self) {
         self.compare_identity();
+        self.hold_for_limits();
         if !self.state.enabled {
             self.guard.forget();
         }
@@ -142,7 +152,7 @@ impl Worker {
         // The tick itself reports motors that go off.
         let power = self.ordered_power == Some(false) && self.state.enabled;
         self.disagreeing = if mode || power { self.disagreeing + 1 } else { 0 };
-        if self.disagreeing >= INTERFERENCE_READINGS && self.state.interference == Interference::None {
+        if self.disagreeing >= INTERFERENCE_READINGS && !self.is_taken_over() {
             self.state.interference = if mode { Interference::Mode } else { Interference::Power };
         }
     }
