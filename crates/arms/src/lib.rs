@@ -1,7 +1,5 @@
 //! Owns the arms: a folder each, with adapter, protocol, emulator and a row of the table. No arm uses another. Used by
-//! the run; what an adapter needs is in `dimos-hardware`.
-//!
-//! The built-in arms, one folder each. A new arm is one folder and one line here.
+//! the run; what an adapter needs is in `dimos-hardware`. A new arm is one folder and one line here.
 
 #![forbid(unsafe_code)]
 #![allow(rustdoc::broken_intra_doc_links, reason = "units are in brackets: [rad]")]

@@ -1,7 +1,5 @@
 //! Owns the contract with an arm: adapters, device threads, transports, the kit of emulators, conformance. Never knows
 //! an arm. Used by each adapter, in this repository or outside, and by the run.
-//!
-//! Everything that talks to arms: the adapter trait, the adapter registry, the arms, and one device thread per arm.
 
 #![forbid(unsafe_code)]
 #![allow(rustdoc::broken_intra_doc_links, reason = "units are in brackets: [rad]")]

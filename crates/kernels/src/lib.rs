@@ -1,6 +1,6 @@
 //! Computation in lanes: sixteen configurations of an arm at a time, in single precision, on the widest vectors that
 //! the processor has. A package of its own, because cargo optimizes whole packages: this one is compiled for speed in
-//! every profile, tests and the small program that is shipped included.
+//! every profile, tests included.
 //!
 //! The states of motions alone are in double precision, eight joints at a time ([`states`]).
 //!

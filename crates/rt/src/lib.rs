@@ -1,7 +1,7 @@
 //! Owns slots, wake-ups, scheduling and the locking of memory. Never knows arms. Used by device threads and the run.
 //!
-//! Real-time primitives: latest-value slots, wake-ups, scheduling, memory; and names that the kernel keeps. The only
-//! module with `unsafe`.
+//! Real-time primitives: latest-value slots, wake-ups, scheduling, memory; and names that the kernel keeps. Only this
+//! crate and `dimos-kernels` have `unsafe`.
 
 #![allow(rustdoc::broken_intra_doc_links, reason = "units are in brackets: [rad]")]
 
