@@ -150,9 +150,8 @@ impl ByteLink for ToolLine {
                 let peer = self.link.peer();
                 return Err(AdapterError::Timeout(format!("{peer}: nothing more came from the tool's line")));
             }
-            match &self.response(PASS_ON, until)?.1[..] {
-                [TOOL, data @ ..] => self.received.extend(data),
-                _ => {}
+            if let [TOOL, data @ ..] = &self.response(PASS_ON, until)?.1[..] {
+                self.received.extend(data);
             }
         }
     }
