@@ -3,9 +3,10 @@
 use std::path::{Path, PathBuf};
 
 use crate::assets::{Asset, Cache, split};
-use crate::blueprint::planner::{PlannerEntry, ShapeEntry};
+use crate::blueprint::planner::PlannerEntry;
 use crate::blueprint::resolve::{Checker, UsedAsset};
 use crate::blueprint::schema::{AssetEntry, TaskEntry};
+use dimos_core::written::ShapeSpec;
 use dimos_robot::Source;
 use dimos_yaml::{Diag, Keyed, Located, NodeId, did_you_mean, quote};
 
@@ -114,7 +115,7 @@ fn paths(
         all.extend(nodes.filter_map(|at| Some((at, tree.text(at)?.to_owned()))));
     }
     for (_, object) in planner.iter().flat_map(|planner| planner.world.0.iter()) {
-        if let ShapeEntry::Mesh(path) | ShapeEntry::Cloud(path) = &object.shape.value {
+        if let ShapeSpec::Mesh(path) | ShapeSpec::Cloud(path) = &object.shape.value {
             all.push((object.shape.at, path.clone()));
         }
     }

@@ -7,6 +7,7 @@ use crate::blueprint::resolve::Checker;
 use crate::blueprint::schema::HardwareEntry;
 use dimos_core::arm::{Load, MAX_DIGITAL, StopInput, UPRIGHT, channel};
 use dimos_core::pose;
+use dimos_core::written;
 use dimos_hardware::check::Checked;
 use dimos_hardware::device::Setup;
 use dimos_yaml::{Diag, Located, quote};
@@ -66,9 +67,11 @@ pub(super) fn resolve(checker: &mut Checker<'_>, entry: &HardwareEntry, arm: &Ch
         let what = format!("the controller of {} takes neither a payload nor a mounting", quote(&entry.adapter_type));
         checker.error(at, Diag::error(what).hint("remove `payload` and `mounting`"));
     }
+    let max_payload = arm.max_payload.filter(|most| *most > 0.0);
     Setup {
         stop_input: entry.stop_input.as_ref().and_then(|stop| stop_input(checker, stop, arm.digital_inputs)),
-        payload: payload.and_then(|payload| load(checker, payload, arm.max_payload.filter(|most| *most > 0.0))),
+        payload: payload.and_then(|payload| load(checker, payload, max_payload)),
+        max_payload,
         gravity: entry.mounting.as_ref().and_then(|mounting| gravity(checker, mounting)),
         tool_velocity: None, // resolved with the arm's model
     }
@@ -77,10 +80,9 @@ pub(super) fn resolve(checker: &mut Checker<'_>, entry: &HardwareEntry, arm: &Ch
 fn load(checker: &mut Checker<'_>, entry: &Located<PayloadEntry>, most: Option<f64>) -> Option<Load> {
     let PayloadEntry { mass, center, inertia } = entry.value;
     let load = Load { mass, center, inertia };
-    if let Some(most) = most.filter(|most| mass > *most) {
-        let diag = Diag::error(format!("the arm takes at most {most:.1} kg, not {mass} kg"));
+    if let Err(what) = load.within(most) {
         let at = checker.tree.entry(entry.at, "mass").map_or(entry.at, |(_, value)| value);
-        checker.error(at, diag.hint("a lighter tool or workpiece, or a larger arm"));
+        checker.error(at, Diag::error(what).hint(Load::TOO_HEAVY));
         return None;
     }
     match load.check() {
@@ -95,9 +97,8 @@ fn load(checker: &mut Checker<'_>, entry: &Located<PayloadEntry>, most: Option<f
 /// Returns the direction of gravity in the base frame.
 fn gravity(checker: &mut Checker<'_>, entry: &Located<MountingEntry>) -> Option<[f64; 3]> {
     let rpy = entry.value.rpy;
-    if rpy.iter().any(|angle| !(-7.0..=7.0).contains(angle)) {
-        let diag = Diag::error(format!("{rpy:?} are not angles in radians"));
-        checker.error(entry.at, diag.hint("for example `mounting: {rpy: [3.1416, 0, 0]}`"));
+    if let Err(what) = rpy.into_iter().try_for_each(written::angle) {
+        checker.error(entry.at, Diag::error(what).hint("for example `mounting: {rpy: [3.1416, 0, 0]}`"));
         return None;
     }
     let base = pose::from_xyz_rpy([0.0; 3], rpy);

@@ -9,6 +9,7 @@ use serde::de::value::MapAccessDeserializer;
 use serde::de::{Deserializer, MapAccess, SeqAccess, Visitor};
 use serde::{Deserialize, Serialize};
 
+use dimos_core::written::ShapeSpec;
 use dimos_planner::collision::body::MeshMode;
 use dimos_yaml::range::{maybe_positive, non_negative, positive};
 use dimos_yaml::{Keyed, Located, Text};
@@ -243,7 +244,7 @@ fn max_acceleration() -> f64 {
 #[serde(deny_unknown_fields)]
 pub struct ObjectEntry {
     /// Geometry: `box: [x, y, z]`, `sphere: radius`, `cylinder: [radius, length]` [m], `mesh: FILE`, `cloud: FILE`.
-    pub shape: Located<ShapeEntry>,
+    pub shape: Located<ShapeSpec>,
     /// Pose in the frame `map`.
     #[serde(default)]
     pub pose: Located<PoseEntry>,
@@ -251,22 +252,6 @@ pub struct ObjectEntry {
     #[serde(default, deserialize_with = "non_negative")]
     #[schemars(range(min = 0.0))]
     pub padding: f64,
-}
-
-/// Geometry of an obstacle, centred on its frame; a cylinder's axis is z.
-#[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema)]
-#[serde(rename_all = "snake_case")]
-pub enum ShapeEntry {
-    /// Edge lengths x, y, z [m].
-    Box([f64; 3]),
-    /// Radius [m].
-    Sphere(f64),
-    /// Radius and length [m].
-    Cylinder([f64; 2]),
-    /// A mesh file (STL, OBJ, DAE), relative to this file.
-    Mesh(String),
-    /// A point cloud file (PLY), relative to this file.
-    Cloud(String),
 }
 
 /// A pose.

@@ -1,12 +1,13 @@
 //! Checks the names and values of `planner` and `view`.
 
 use crate::blueprint::arms::Hardware;
-use crate::blueprint::planner::{ObjectEntry, PlannerEntry, PoseEntry, RobotEntry, ShapeEntry, ViewConfig};
+use crate::blueprint::planner::{ObjectEntry, PlannerEntry, PoseEntry, RobotEntry, ViewConfig};
 use crate::blueprint::planner_files;
 use crate::blueprint::planner_models::Described;
 use crate::blueprint::resolve::Checker;
 use crate::blueprint::schema::{JointNames, TaskEntry};
 use dimos_control::task_body::TargetKind;
+use dimos_core::written;
 use dimos_planner::planning::config::MAX_OBJECTS;
 use dimos_yaml::{Diag, Located, did_you_mean, quote};
 
@@ -24,6 +25,10 @@ pub(super) fn check(
         let at = checker.tree.entry(planner.at, "visualization").map_or(visualization.at, |(key, _)| key);
         checker.error(at, diag.hint("remove one of the two"));
     }
+    if let Err(what) = written::padding(planner.padding) {
+        let at = checker.tree.get(planner.at, "padding").unwrap_or(planner.at);
+        checker.error(at, Diag::error(what));
+    }
     for (number, (robot, described)) in planner.robots.iter().zip(described).enumerate() {
         if checker.has(robot.at, "name") {
             checker.check_name(&robot.name, "robot's name");
@@ -34,6 +39,8 @@ pub(super) fn check(
                 checker.error(robot.name.at, diag.hint("give each robot its own name"));
             }
         }
+        rate(checker, robot, "max_velocity", robot.max_velocity, "/s");
+        rate(checker, robot, "max_acceleration", robot.max_acceleration, "/s²");
         pose(checker, &robot.base_pose);
         robot.tool.iter().for_each(|tool| pose(checker, tool));
         let task = task(checker, robot, tasks);
@@ -49,23 +56,39 @@ pub(super) fn check(
     }
 }
 
+/// Checks a cap on the motions of a robot's joints.
+fn rate(checker: &mut Checker<'_>, robot: &Located<RobotEntry>, key: &str, value: f64, unit: &str) {
+    if let Err(what) = written::joint_rate(value, unit) {
+        let at = checker.tree.get(robot.at, key).unwrap_or(robot.at);
+        checker.error(at, Diag::error(what));
+    }
+}
+
 /// Checks an object of the world: name, pose, sizes.
 fn object(checker: &mut Checker<'_>, name: &Located<String>, object: &Located<ObjectEntry>) {
     checker.check_name(name, "object's name");
     pose(checker, &object.pose);
-    let sizes: &[f64] = match &object.shape.value {
-        ShapeEntry::Box(size) => size,
-        ShapeEntry::Sphere(radius) => std::slice::from_ref(radius),
-        ShapeEntry::Cylinder(size) => size,
-        ShapeEntry::Mesh(_) | ShapeEntry::Cloud(_) => &[],
-    };
-    if let Some(size) = sizes.iter().find(|size| !(**size > 0.0 && size.is_finite())) {
-        let diag = Diag::error(format!("a size of the shape is {size}"));
-        checker.error(object.shape.at, diag.hint("sizes are above 0, in metres"));
+    if let Err(what) = written::padding(object.padding) {
+        let at = checker.tree.get(object.at, "padding").unwrap_or(object.at);
+        checker.error(at, Diag::error(what));
+    }
+    if let Err(what) = object.shape.sizes_valid() {
+        checker.error(object.shape.at, Diag::error(what).hint("sizes are above 0, in metres"));
+    } else if let Some(doubt) = written::doubt(object.shape.sizes()) {
+        checker.error(object.shape.at, Diag::warning(doubt));
     }
 }
 
 fn pose(checker: &mut Checker<'_>, pose: &Located<PoseEntry>) {
+    let at = |checker: &Checker<'_>, key| checker.tree.get(pose.at, key).unwrap_or(pose.at);
+    if let Err(what) = pose.xyz.into_iter().try_for_each(written::length) {
+        checker.error(at(checker, "xyz"), Diag::error(what));
+    } else if let Some(doubt) = written::doubt(&pose.xyz) {
+        checker.error(at(checker, "xyz"), Diag::warning(doubt));
+    }
+    if let Err(what) = pose.rpy.iter().flatten().copied().try_for_each(written::angle) {
+        checker.error(at(checker, "rpy"), Diag::error(what));
+    }
     if pose.rpy.is_some() && pose.quat.is_some() {
         let diag = Diag::error("`rpy` and `quat` both give the orientation");
         checker.error(pose.at, diag.hint("remove one of the two"));
@@ -73,7 +96,7 @@ fn pose(checker: &mut Checker<'_>, pose: &Located<PoseEntry>) {
     if let Some(quat) = pose.quat
         && !(0.99..=1.01).contains(&quat.iter().map(|v| v * v).sum::<f64>().sqrt())
     {
-        let at = checker.tree.get(pose.at, "quat").unwrap_or(pose.at);
+        let at = at(checker, "quat");
         let diag = Diag::error("the quaternion's length is not 1");
         checker.error(at, diag.hint("write [x, y, z, w]; no rotation is [0, 0, 0, 1]"));
     }

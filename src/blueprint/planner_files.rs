@@ -7,10 +7,11 @@ use std::time::Duration;
 use nalgebra::Isometry3;
 
 use crate::blueprint::arms::Hardware;
-use crate::blueprint::planner::{ModelMismatch, ObjectEntry, PlannerEntry, PoseEntry, RobotEntry, ShapeEntry};
+use crate::blueprint::planner::{ModelMismatch, ObjectEntry, PlannerEntry, PoseEntry, RobotEntry};
 use crate::blueprint::planner_models::Described;
 use crate::blueprint::resolve::Checker;
 use dimos_core::pose;
+use dimos_core::written::ShapeSpec;
 use dimos_planner::planning::config::{GripperJoint, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig, Unplanned};
 use dimos_robot::Source;
 use dimos_yaml::{Located, NodeId};
@@ -127,11 +128,11 @@ fn robot(
 
 fn object(checker: &Checker<'_>, name: &str, entry: &Located<ObjectEntry>) -> ObjectConfig {
     let shape = match &entry.shape.value {
-        ShapeEntry::Box(size) => ObjectShape::Box(*size),
-        ShapeEntry::Sphere(radius) => ObjectShape::Sphere(*radius),
-        ShapeEntry::Cylinder(size) => ObjectShape::Cylinder(*size),
-        ShapeEntry::Mesh(path) => ObjectShape::Mesh(file(checker, entry.shape.at, path)),
-        ShapeEntry::Cloud(path) => ObjectShape::Cloud(file(checker, entry.shape.at, path)),
+        ShapeSpec::Box(size) => ObjectShape::Box(*size),
+        ShapeSpec::Sphere(radius) => ObjectShape::Sphere(*radius),
+        ShapeSpec::Cylinder(size) => ObjectShape::Cylinder(*size),
+        ShapeSpec::Mesh(path) => ObjectShape::Mesh(file(checker, entry.shape.at, path)),
+        ShapeSpec::Cloud(path) => ObjectShape::Cloud(file(checker, entry.shape.at, path)),
     };
     ObjectConfig { name: name.to_owned(), shape, pose: isometry(&entry.pose), padding: entry.padding }
 }

@@ -5,9 +5,10 @@
 use std::path::Path;
 
 use crate::blueprint::arms::Hardware;
-use crate::blueprint::planner::{PlannerEntry, RobotEntry, RobotJoints, ShapeEntry};
+use crate::blueprint::planner::{PlannerEntry, RobotEntry, RobotJoints};
 use crate::blueprint::planner_files;
 use crate::blueprint::resolve::Checker;
+use dimos_core::written::{self, ShapeSpec};
 use dimos_planner::planning::config::{ObjectShape, PlannerConfig, RobotConfig, Unplanned};
 use dimos_robot::model::{Joint, RobotModel};
 use dimos_robot::srdf::Semantics;
@@ -80,7 +81,7 @@ pub(super) fn check(
         }
     }
     for ((_, entry), object) in typed.world.0.iter().zip(&config.objects) {
-        if let (ShapeEntry::Mesh(_) | ShapeEntry::Cloud(_), ObjectShape::Mesh(path) | ObjectShape::Cloud(path)) =
+        if let (ShapeSpec::Mesh(_) | ShapeSpec::Cloud(_), ObjectShape::Mesh(path) | ObjectShape::Cloud(path)) =
             (&entry.shape.value, &object.shape)
             && !checker.assets.awaited(path)
         {
@@ -358,7 +359,9 @@ fn named_poses(checker: &mut Checker<'_>, robot: &RobotEntry, described: &Descri
         let mut limits = pose.iter().zip(&joints).filter_map(|(q, name)| Some((*q, name, joint(name)?)));
         limits.find(|(q, _, joint)| !(joint.limits.lower..=joint.limits.upper).contains(q)).map(|(q, name, joint)| {
             let (unit, limits) = (joint.kind.unit(), joint.limits);
-            let hint = format!("its range is {:.4} to {:.4} {unit}", limits.lower, limits.upper);
+            let degrees = written::degrees(q).filter(|_| unit == "rad");
+            let range = || format!("its range is {:.4} to {:.4} {unit}", limits.lower, limits.upper);
+            let hint = degrees.unwrap_or_else(range);
             (format!("{} at {q} {unit} is outside the model's limits", quote(name)), hint)
         })
     };

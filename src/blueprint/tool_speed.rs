@@ -8,6 +8,7 @@ use crate::blueprint::resolve::{Arm, Checker, Task, TaskRobot};
 use crate::blueprint::schema::HardwareEntry;
 use crate::blueprint::task_robots::of_planner;
 use dimos_control::config::ToolLimit;
+use dimos_core::written;
 use dimos_planner::planning::config::PlannerConfig;
 use dimos_robot::builtin::PREFIX;
 use dimos_robot::{Source, load};
@@ -54,6 +55,8 @@ fn check(checker: &mut Checker<'_>, arm: &Arm, given: &Located<f64>) {
     if !(given.value > 0.0 && given.value.is_finite()) {
         let diag = Diag::error(format!("the tool's speed limit must be above 0, not {}", given.value));
         checker.error(given.at, diag.hint("give it in m/s, or omit it to use the vendor's"));
+    } else if let Err(what) = written::tool_speed(given.value) {
+        checker.error(given.at, Diag::error(what));
     } else if let Some(own) = own {
         let diag = Diag::error(format!("{} m/s is above the arm's own limit of the tool's speed", given.value));
         let diag = diag.note(format!("the arm's own limit is {own} m/s"));

@@ -8,6 +8,7 @@ use clap::Args;
 use super::exit::Result;
 use crate::blueprint::Overrides;
 use crate::share;
+use dimos_core::written;
 use dimos_rpc::client::{self, Client, ClientError};
 use dimos_rpc::run_dir::{LiveRun, RunDir};
 
@@ -140,18 +141,16 @@ pub fn speed(text: &str) -> std::result::Result<f64, String> {
 /// Parses an angle [rad]; more than a turn counts as degrees.
 pub fn angle(text: &str) -> std::result::Result<f64, String> {
     let value = coordinate(text)?;
-    is_angle(value).map(|()| value)
+    written::angle(value).map(|()| value)
 }
 
-/// Refuses an angle of more than a turn [rad].
-pub fn is_angle(value: f64) -> std::result::Result<(), String> {
-    if value.abs() <= std::f64::consts::TAU {
-        return Ok(());
-    }
-    Err(format!("angles are in rad, at most a turn: {value}° is {:.4} rad", value.to_radians()))
+/// Parses a length or a coordinate [m]; more than 10 counts as mm.
+pub fn length(text: &str) -> std::result::Result<f64, String> {
+    let value = coordinate(text)?;
+    written::length(value).map(|()| value)
 }
 
-/// Parses a coordinate; a list with commas, and a unit, get a hint.
+/// Parses a number of a pose; a list with commas, and a unit, get a hint.
 pub fn coordinate(text: &str) -> std::result::Result<f64, String> {
     finite(text).map_err(|wrong| match text.trim_end_matches(['°', 'd', 'e', 'g', 'r', 'a', 'm']) {
         _ if text.contains(',') => format!("{wrong}: separate the numbers by blanks: {}", text.replace(',', " ")),

@@ -6,12 +6,13 @@ use std::time::Duration;
 
 use indicatif::{ProgressBar, ProgressFinish, ProgressStyle};
 
-use super::arguments::{angle, coordinate, finite, is_angle, speed};
+use super::arguments::{angle, coordinate, finite, length, speed};
 use super::exit::{Exit, Failure, Result};
 use super::follow::Signals;
 use super::grip::{self, GripAction};
 use super::output::{self, fixed};
 use super::recorded_path;
+use dimos_core::written;
 use dimos_rpc::api::{
     Cancel, DEFAULT_REFINE, DEFAULT_SPEED, JointPath, PATH_TOLERANCE, Plan, PlanGoal, PlanLevel, PlanSummary, Planner,
     Planning, PoseSpec,
@@ -30,10 +31,10 @@ pub struct Goal {
     #[arg(value_name = "Q", value_parser = position, allow_negative_numbers = true, conflicts_with_all = ["tcp", "named"], group = "goal")]
     pub joints: Vec<f64>,
     /// Target position of the tool centre point: x, y, z [m]; orientation is free unless --rpy or --quat is given
-    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = coordinate, allow_negative_numbers = true, groups = ["tcp", "goal"])]
+    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = length, allow_negative_numbers = true, groups = ["tcp", "goal"])]
     pub pose: Option<Vec<f64>>,
     /// Move the tool centre point by x, y, z [m] along the axes of --frame; --rpy or --quat turns it about them
-    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = coordinate, allow_negative_numbers = true, groups = ["tcp", "goal"])]
+    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = length, allow_negative_numbers = true, groups = ["tcp", "goal"])]
     pub by: Option<Vec<f64>>,
     /// Roll, pitch, yaw about fixed axes [rad]
     #[arg(long, value_names = ["R", "P", "Y"], num_args = 3, value_parser = angle, allow_negative_numbers = true, requires = "tcp")]
@@ -66,7 +67,7 @@ pub struct Goal {
     #[arg(long, value_name = "ANGLE", default_value_t = PATH_TOLERANCE, value_parser = tolerance, requires = "path")]
     pub tolerance: f64,
     /// How far away the tool centre point may pass the waypoints [m]; 0: it stops at each
-    #[arg(long, value_name = "DISTANCE", default_value_t = 0.0, value_parser = finite, requires = "through")]
+    #[arg(long, value_name = "DISTANCE", default_value_t = 0.0, value_parser = length, requires = "through")]
     pub blend: f64,
 }
 
@@ -159,10 +160,12 @@ fn pose_in_frame(list: &str) -> std::result::Result<(Option<PoseSpec>, Option<St
 
 fn pose(list: &str) -> std::result::Result<PoseSpec, String> {
     let (mut rpy, mut quat) = (None, None);
-    let xyz = match *numbers(list)? {
+    let numbers = numbers(list)?;
+    numbers.iter().take(3).copied().try_for_each(written::length)?;
+    let xyz = match *numbers {
         [x, y, z] => [x, y, z],
         [x, y, z, roll, pitch, yaw] => {
-            [roll, pitch, yaw].into_iter().try_for_each(is_angle)?;
+            [roll, pitch, yaw].into_iter().try_for_each(written::angle)?;
             rpy = Some([roll, pitch, yaw]);
             [x, y, z]
         }

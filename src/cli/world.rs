@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use serde_json::{Value, json};
 
-use super::arguments::{Target, angle, finite};
+use super::arguments::{Target, angle, finite, length};
 use super::arm::parts::payload_text;
 use super::exit::{Exit, Failure, Result};
 use super::output::{self, Table, done, fixed};
@@ -55,7 +55,7 @@ pub struct ListArgs {
 #[derive(Debug, Clone, clap::Args)]
 pub struct PoseArgs {
     /// Position in the frame `map`: x, y, z [m]
-    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite, allow_negative_numbers = true, required = true)]
+    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = length, allow_negative_numbers = true, required = true)]
     pub at: Vec<f64>,
     /// Roll, pitch, yaw about fixed axes [rad]
     #[arg(long, value_names = ["R", "P", "Y"], num_args = 3, value_parser = angle, allow_negative_numbers = true)]
@@ -80,13 +80,13 @@ pub struct AddArgs {
     /// Name of the object; replaces an object of the same name
     pub name: String,
     /// A box: edge lengths [m]
-    #[arg(long = "box", value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite, allow_negative_numbers = true)]
+    #[arg(long = "box", value_names = ["X", "Y", "Z"], num_args = 3, value_parser = length, allow_negative_numbers = true)]
     pub cuboid: Option<Vec<f64>>,
     /// A sphere: radius [m]
-    #[arg(long, value_name = "RADIUS", value_parser = finite, allow_negative_numbers = true)]
+    #[arg(long, value_name = "RADIUS", value_parser = length, allow_negative_numbers = true)]
     pub sphere: Option<f64>,
     /// A cylinder along z: radius and length [m]
-    #[arg(long, value_names = ["RADIUS", "LENGTH"], num_args = 2, value_parser = finite, allow_negative_numbers = true)]
+    #[arg(long, value_names = ["RADIUS", "LENGTH"], num_args = 2, value_parser = length, allow_negative_numbers = true)]
     pub cylinder: Option<Vec<f64>>,
     /// A mesh file: STL, OBJ or DAE
     #[arg(long, value_name = "FILE")]
@@ -98,7 +98,7 @@ pub struct AddArgs {
     #[command(flatten)]
     pub at: PoseArgs,
     /// Padding on all sides [m]
-    #[arg(long, value_name = "METRES", value_parser = finite, allow_negative_numbers = true, default_value_t = 0.0)]
+    #[arg(long, value_name = "METRES", value_parser = length, allow_negative_numbers = true, default_value_t = 0.0)]
     pub padding: f64,
     /// Which run
     #[command(flatten)]
@@ -244,6 +244,9 @@ pub fn run(args: &Args) -> Result {
 /// Warns of meshes with a doubtful unit.
 fn note_doubts<'a>(objects: impl IntoIterator<Item = &'a WorldObject>) {
     for object in objects {
+        if let Some(doubt) = object.doubt() {
+            output::note(format_args!("warning: {doubt}"));
+        }
         let ShapeSpec::Mesh(path) = &object.shape else { continue };
         let size = Size::read(Path::new(path)).ok();
         if let Some(doubt) = size.and_then(|size| size.doubt_of_object(&object.name, Path::new(path))) {

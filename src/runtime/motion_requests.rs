@@ -16,6 +16,7 @@ use dimos_core::joint::JointLimits;
 use dimos_core::sync::lock;
 use dimos_core::telemetry::{Origin, Outcome};
 use dimos_core::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
+use dimos_core::written;
 use dimos_planner::planning::joint_path::{JointPath, Outside};
 use dimos_planner::planning::timing::time_within;
 use dimos_planner::planning::topp::JointBound;
@@ -96,15 +97,15 @@ impl Service {
             None => point_to_point(&names, &start, &target, &limits, call.speed),
         };
         let motion = motion.map_err(|e| match e {
-            MotionError::OutOfLimits { ref joint, excess, .. } => {
+            MotionError::OutOfLimits { ref joint, excess, target, .. } => {
                 let data = json!({"joint": joint, "by": excess});
-                RpcError::new(Code::OutOfLimits, e.to_string())
-                    .hint("positions are in rad; limits are the arm's own, narrowed by `limits` in the blueprint; commands stay 0.01 rad inside")
-                    .data(data)
+                let inside = "positions are in rad; limits are the arm's own, narrowed by `limits` in the blueprint; \
+                              commands stay 0.01 rad inside";
+                let hint = written::degrees(target).unwrap_or_else(|| inside.to_owned());
+                RpcError::new(Code::OutOfLimits, e.to_string()).hint(hint).data(data)
             }
-            MotionError::NotFound(_) => {
-                RpcError::new(Code::OutOfLimits, e.to_string()).hint("try another speed, or a slightly different target")
-            }
+            MotionError::NotFound(_) => RpcError::new(Code::OutOfLimits, e.to_string())
+                .hint("try another speed, or a slightly different target"),
         })?;
         let motion = self.within_tool_speed(&joints, motion, call.speed).await?;
         let duration = motion.duration();

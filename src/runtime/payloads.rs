@@ -76,6 +76,8 @@ impl Service {
 
     /// Sets a load at rest. After an error the controller has the load that it had.
     async fn write_payload(&self, arm: u16, load: &Load) -> Result<Written, RpcError> {
+        let most = self.parts.blueprint.arms.get(arm as usize).and_then(|arm| arm.setup.max_payload);
+        load.within(most).map_err(|what| RpcError::new(Code::InvalidParams, what).hint(Load::TOO_HEAVY))?;
         self.rests(arm)?;
         let name = self.parts.names.arm(arm);
         if self.phase(arm as usize) == Phase::Led {

@@ -63,14 +63,14 @@ fn check_repeats_every_warning_of_model_check() {
     let home = turn(7, &format!("{missing}{IMPOSSIBLE}"), &LIMIT.replace("'1' e", "'0' e"));
     let alone = home.dimos("model check turn.urdf").with(0);
     assert!(alone.out.contains("no mistakes, 15 warnings"), "{}", alone.out);
-    std::fs::write(home.path().join("part.stl"), tetrahedron(100.0)).unwrap();
+    std::fs::write(home.path().join("part.stl"), tetrahedron(8.0)).unwrap();
     let shown = home.dimos("check turn.yaml").with(0).says(&[
         "no4.stl",
         "2 more visual meshes of the robot were not found",
         "a velocity limit of 0 counts as not given",
         "the inertia of the link `l0` is impossible",
         "the inertia of the link `l6` is impossible",
-        "the mesh of the object `part` extends over 100.0 × 100.0 × 100.0 m",
+        "the mesh of the object `part` extends over 8.000 × 8.000 × 8.000 m",
     ]);
     assert!(!shown.err.contains("no5.stl"), "{}", shown.err);
     // Five meshes and a line for the others, the velocity, seven inertias and the part.
@@ -116,11 +116,15 @@ fn one_joint_goes_through_positions() {
     assert!((at[0] + 0.5).abs() < 1e-3, "{at:?}");
     let added = home.dimos("world add shelf --mesh part.stl --at 0 0 9").with(0);
     assert!(!added.err.contains("warning"), "{}", added.err);
-    std::fs::write(home.path().join("part.stl"), tetrahedron(100.0)).unwrap();
-    home.dimos("world add shelf --mesh part.stl --at 0 0 900").with(0).says(&[
-        "warning: the mesh of the object `shelf` extends over 100.0 × 100.0 × 100.0 m",
+    std::fs::write(home.path().join("part.stl"), tetrahedron(8.0)).unwrap();
+    home.dimos("world add shelf --mesh part.stl --at 0 0 9").with(0).says(&[
+        "warning: the mesh of the object `shelf` extends over 8.000 × 8.000 × 8.000 m",
         "hint: a mesh in the world is in metres",
     ]);
-    home.write("more.yaml", "rack: {shape: {mesh: part.stl}, pose: {xyz: [0, 0, 900]}}\n");
-    home.dimos("world load more.yaml").with(0).says(&["the mesh of the object `rack` extends over"]);
+    std::fs::write(home.path().join("part.stl"), tetrahedron(100.0)).unwrap();
+    let refusal = &["part.stl extends over 100.0 × 100.0 × 100.0 m", "hint: a mesh in the world is in metres"];
+    home.dimos("world add shelf --mesh part.stl --at 0 0 9").with(1).says(refusal);
+    home.write("more.yaml", "rack: {shape: {mesh: part.stl}, pose: {xyz: [0, 0, 9]}}\n");
+    home.dimos("world load more.yaml").with(1).says(refusal);
+    home.dimos("check turn.yaml").with(2).says(refusal);
 }

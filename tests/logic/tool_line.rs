@@ -3,7 +3,6 @@
 
 use std::time::Duration;
 
-use dimos::arms::line::{Line, LineAddress};
 use dimos::arms::ur::adapter::UrAdapter;
 use dimos::arms::ur::emulator::UrEmulator;
 use dimos::arms::xarm::emulator::XArmEmulator;
@@ -11,6 +10,7 @@ use dimos::hardware::adapter::{AdapterError, ManipulatorAdapter};
 use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::tool_device::ToolDevice;
 use dimos::hardware::transport::Scan;
+use dimos::hardware::transport::line::{Line, LineAddress};
 use dimos::hardware::transport::request_reply::{RequestReply, Retry};
 use serde_json::{Value, json};
 

@@ -1,5 +1,6 @@
 //! `dimos adapter new`: what it writes is built, tested and run as a user would; what is in the way stays as it is.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -25,18 +26,20 @@ fn files(folder: &Path) -> Vec<(PathBuf, String)> {
     all
 }
 
-/// Builds and tests the crate in a folder; fails on any warning. Returns the folder of its programs.
-fn cargo_test(folder: &Path) -> PathBuf {
+/// Builds and tests the packages in a folder; fails on any warning. Returns the folder of its programs.
+fn cargo_test(folder: &Path, packages: &[&str]) -> PathBuf {
     share_builds(folder);
-    let mut command = Command::new(std::env::var_os("CARGO").unwrap_or("cargo".into()));
-    command.args(["test", "--quiet"]).current_dir(folder).stdin(Stdio::null());
-    let output = without_cargo_settings(&mut command).output().unwrap();
-    let text = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
-    println!("{text}");
-    assert!(output.status.success(), "cargo test in {}", folder.display());
-    // Only warnings in the crate's own files have relative paths.
-    let own = |line: &str| ["--> src/", "--> tests/"].iter().any(|start| line.trim_start().starts_with(start));
-    assert!(!text.lines().any(own), "it does not compile without warnings");
+    for verb in ["test", "build"] {
+        let mut command = Command::new(std::env::var_os("CARGO").unwrap_or("cargo".into()));
+        command.args([verb, "--quiet"]).args(packages.iter().flat_map(|name| ["-p", name]));
+        let output = without_cargo_settings(command.current_dir(folder).stdin(Stdio::null())).output().unwrap();
+        let text = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
+        println!("{text}");
+        assert!(output.status.success(), "cargo {verb} in {}", folder.display());
+        // Only warnings in the crate's own files have relative paths.
+        let own = |line: &str| ["--> src/", "--> tests/"].iter().any(|start| line.trim_start().starts_with(start));
+        assert!(!text.lines().any(own), "it does not compile without warnings");
+    }
     programs()
 }
 
@@ -49,7 +52,7 @@ fn a_new_crate_builds_passes_its_tests_and_runs() {
     assert!(next[3].contains("the URDF has no gripper") && next[4].contains("Cargo.lock"), "{}", made.out);
     assert!(next[0].contains("cd acme-arm && cargo test"), "{}", made.out);
     let folder = home.path().join("acme-arm");
-    let programs = cargo_test(&folder);
+    let programs = cargo_test(&folder, &["acme-arm", "acme-arm-program"]);
 
     let acme = |arguments: &str, at: &Path| {
         let mut command = Command::new(programs.join("acme-arm"));
@@ -68,6 +71,30 @@ fn a_new_crate_builds_passes_its_tests_and_runs() {
     let listed = acme("list-blueprints", home.path()).out;
     assert!(listed.contains("coordinator-acme-arm") && listed.contains("coordinator-yourarm"), "{listed}");
     plans_and_moves(&home, &programs.join("acme-arm"));
+}
+
+/// What `cargo test` of a new arm compiles: packages of others, and lines of dimos.
+#[test]
+fn a_new_arm_compiles_a_small_part_of_dimos() {
+    for transport in ["tcp", "can", "serial"] {
+        let home = Home::new();
+        home.dimos(&format!("adapter new acme --dof 6 --transport {transport}")).with(0);
+        let folder = home.path().join("acme");
+        fs::copy(Path::new(CHECKOUT).join("Cargo.lock"), folder.join("Cargo.lock")).unwrap();
+        let mut command = Command::new(std::env::var_os("CARGO").unwrap_or("cargo".into()));
+        command.args(["tree", "--offline", "--prefix", "none", "--edges", "normal,build"]).current_dir(&folder);
+        let output = without_cargo_settings(&mut command).output().unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let tree = String::from_utf8(output.stdout).unwrap();
+        let packages: BTreeSet<&str> = tree.lines().map(|line| line.trim_end_matches(" (*)")).collect();
+        let ours = packages.iter().filter_map(|line| line.split_once(&format!("({CHECKOUT}"))?.1.strip_suffix(')'));
+        let lines: usize = ours
+            .flat_map(|path| files(&Path::new(&format!("{CHECKOUT}{path}")).join("src")))
+            .map(|(_, text)| text.lines().count())
+            .sum();
+        println!("{transport}: {} packages, {lines} lines of dimos", packages.len());
+        assert!(packages.len() <= 80 && lines > 10_000 && lines <= 40_000, "{transport}: {packages:#?}, {lines} lines");
+    }
 }
 
 /// The new arm's description and its planner, from anywhere, before anything in them has been changed.
@@ -139,7 +166,7 @@ fn checkout(folder: &Path) {
         ),
         (
             "crates/arms/src/lib.rs",
-            "use dimos_hardware::registry::AdapterSpec;\n\npub use real::arms::line;\n\npub const TABLE: &[AdapterSpec] = &[\n];\n".into(),
+            "use dimos_hardware::registry::AdapterSpec;\n\npub const TABLE: &[AdapterSpec] = &[\n];\n".into(),
         ),
         ("crates/robot/src/builtin.rs", "robots!(\n);\n".into()),
         ("crates/robot/robots/lite6.urdf", String::new()),
@@ -199,7 +226,7 @@ fn arms_in_the_tree_build_and_conform() {
     // In one workspace with the real one it needs a name of its own.
     let manifest = fs::read_to_string(tree.join("Cargo.toml")).unwrap();
     fs::write(tree.join("Cargo.toml"), manifest.replacen("name = \"dimos\"", "name = \"tree\"", 1)).unwrap();
-    cargo_test(&tree);
+    cargo_test(&tree, &["tree"]);
 }
 
 #[test]

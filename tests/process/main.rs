@@ -75,6 +75,7 @@ mod stop_places;
 mod stops;
 mod superseded;
 mod teach;
+mod units;
 mod ur_runs;
 #[cfg(feature = "view")]
 mod view;

@@ -40,19 +40,29 @@ pub fn share_builds(folder: &Path) {
     let used = fs::read_to_string(checkout.join("Cargo.toml")).unwrap();
     let members = "members = [\"crates/*\"";
     assert!(used.contains(members), "{used}");
-    let workspace = used.replace(members, &format!("{members}, {:?}", folder.file_name().unwrap()));
-    fs::write(root.join("Cargo.toml"), workspace).unwrap();
+    let name = folder.file_name().unwrap().to_str().unwrap();
+    let packages: Vec<_> =
+        ["", "/program"].iter().filter(|at| folder.join(format!(".{at}/Cargo.toml")).exists()).collect();
+    let added: String = packages.iter().map(|at| format!(", \"{name}{at}\"")).collect();
+    fs::write(root.join("Cargo.toml"), used.replace(members, &format!("{members}{added}"))).unwrap();
     let used = used.split("[dev-dependencies]\n").nth(1).unwrap().split("\n[").next().unwrap();
-    let manifest = fs::read_to_string(folder.join("Cargo.toml")).unwrap();
-    let path = format!("path = {:?} }}", fs::canonicalize(checkout).unwrap());
-    for once in ["[dependencies]\n", &path] {
-        assert_eq!(manifest.matches(once).count(), 1, "{once} in {manifest}");
-    }
-    let manifest = manifest.replace("[dependencies]\n", &format!("[dependencies]\n{}\n", used.trim()));
-    let crates = format!("path = \"{}/crates/", fs::canonicalize(checkout).unwrap().display());
-    let manifest = manifest.replace(&crates, "path = \"../crates/");
+    // What uses a part of dimos uses all of it here: the same features of all libraries, so the same builds.
     let features = if cfg!(feature = "share") { ", features = [\"share\"]" } else { "" };
-    fs::write(folder.join("Cargo.toml"), manifest.replace(&path, &format!("path = \"..\"{features} }}"))).unwrap();
+    let real = fs::canonicalize(checkout).unwrap();
+    for at in packages {
+        let path = folder.join(format!(".{at}/Cargo.toml"));
+        let up = if at.is_empty() { ".." } else { "../.." };
+        let manifest = fs::read_to_string(&path).unwrap().replace("[workspace]\nmembers = [\"program\"]\n", "");
+        let manifest =
+            manifest.replace(&format!("path = \"{}/crates/", real.display()), &format!("path = \"{up}/crates/"));
+        let manifest = manifest.replace(", default-features = false", "");
+        let whole = format!("path = {real:?} }}");
+        let all = format!("path = \"{up}\"{features} }}");
+        let more = if manifest.contains(&whole) { String::new() } else { format!("dimos = {{ {all}\n") };
+        assert_eq!(manifest.matches("[dependencies]\n").count(), 1, "{manifest}");
+        let manifest = manifest.replace("[dependencies]\n", &format!("[dependencies]\n{}\n{more}", used.trim()));
+        fs::write(path, manifest.replace(&whole, &all)).unwrap();
+    }
 }
 
 /// Removes what the cargo that runs this test has set. With its `CARGO_PKG_NAME` or `OUT_DIR`, build scripts such as

@@ -8,15 +8,15 @@
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
-use dimos::arm::StopPoint;
-use dimos::clock::{Clock, Mono, MonotonicClock};
-use dimos::hardware::adapter::{
+use dimos_hardware::adapter::{
     AdapterError, AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
 };
-use dimos::hardware::adapter_util::{fault, fill, finite};
-use dimos::hardware::registry::AdapterConfig;
-use dimos::hardware::transport::can::{self, CanAddress, CanEvent, CanFrame, CanPort};
-use dimos::joint::{ControlMode, JointLimits, Joints, joints_of};
+use dimos_hardware::adapter_util::{fault, fill, finite};
+use dimos_hardware::arm::StopPoint;
+use dimos_hardware::clock::{Clock, Mono, MonotonicClock};
+use dimos_hardware::joint::{ControlMode, JointLimits, Joints, joints_of};
+use dimos_hardware::registry::AdapterConfig;
+use dimos_hardware::transport::can::{self, CanAddress, CanEvent, CanFrame, CanPort};
 
 use super::protocol::{self, Control, FILTERS, Feedback, Identity, Mode, PAIRS, Status, WireJoints};
 use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, check, limits};

@@ -6,13 +6,13 @@
 
 use std::time::Duration;
 
-use dimos::clock::{Clock, Mono, MonotonicClock};
-use dimos::hardware::adapter::AdapterResult;
-use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
-use dimos::hardware::sim::arm::{Delivery, HasArm, Refusal, SimArm};
-use dimos::hardware::sim::can_server::{CanController, CanServer, PLAYABLE};
-use dimos::hardware::transport::can::CanFrame;
-use dimos::joint::ControlMode;
+use dimos_hardware::adapter::AdapterResult;
+use dimos_hardware::clock::{Clock, Mono, MonotonicClock};
+use dimos_hardware::joint::ControlMode;
+use dimos_hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
+use dimos_hardware::sim::arm::{Delivery, HasArm, Refusal, SimArm};
+use dimos_hardware::sim::can_server::{CanController, CanServer, PLAYABLE};
+use dimos_hardware::transport::can::CanFrame;
 
 use super::{DOF, NATIVE_RATE, Options, limits};
 
@@ -126,7 +126,7 @@ fn identity(dof: u8) -> CanFrame {
 mod tests {
     use super::super::golden::{self, JOINTS, frame};
     use super::*;
-    use dimos::hardware::sim::arm::SimOptions;
+    use dimos_hardware::sim::arm::SimOptions;
 
     #[test]
     fn feedback_is_the_golden_bytes() {

@@ -4,7 +4,7 @@
 //! YOUR ARM: take them from the manual's examples, or record the bus (`candump`) while the vendor's own program runs.
 
 use super::DOF;
-use dimos::hardware::transport::can::CanFrame;
+use dimos_hardware::transport::can::CanFrame;
 
 /// Motors on.
 pub const ENABLE: &str = "150 01 01 00 00 00 00 00 00";

@@ -10,14 +10,14 @@ pub mod protocol;
 
 use std::time::Duration;
 
-use dimos::arm::{AfterGap, Topology};
-use dimos::hardware::check::{Checked, ConfigError};
-use dimos::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
-use dimos::hardware::sim::arm::SimOptions;
-use dimos::hardware::sim::can_server::PLAYABLE;
-use dimos::hardware::transport::can::CanAddress;
-use dimos::hardware::transport::can::address::FORMS;
-use dimos::joint::{ControlMode, JointLimits};
+use dimos_hardware::arm::{AfterGap, Topology};
+use dimos_hardware::check::{Checked, ConfigError};
+use dimos_hardware::joint::{ControlMode, JointLimits};
+use dimos_hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
+use dimos_hardware::sim::arm::SimOptions;
+use dimos_hardware::sim::can_server::PLAYABLE;
+use dimos_hardware::transport::can::CanAddress;
+use dimos_hardware::transport::can::address::FORMS;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 

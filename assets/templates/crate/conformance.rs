@@ -1,7 +1,7 @@
 //! The conformance suite of dimos over the adapter: each check has an adapter and an emulator of its own.
 
-use dimos::hardware::conformance::{Outcome, checks, run};
-use dimos::rt::counting::{self, Counting};
+use dimos_hardware::conformance::{Outcome, checks, run};
+use dimos_hardware::counting::{self, Counting};
 
 /// What runs in every cycle must not allocate: the suite counts.
 #[global_allocator]

@@ -7,15 +7,15 @@
 use std::f64::consts::TAU;
 use std::time::Duration;
 
-use dimos::arm::StopPoint;
-use dimos::clock::{Clock, Mono, MonotonicClock};
-use dimos::hardware::adapter::{
+use dimos_hardware::adapter::{
     AdapterError, AdapterResult, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
 };
-use dimos::hardware::adapter_util::{fault, fill, finite};
-use dimos::hardware::registry::AdapterConfig;
-use dimos::hardware::transport::request_reply::{RequestReply, Retry};
-use dimos::joint::{ControlMode, JointLimits, Joints, joints_of};
+use dimos_hardware::adapter_util::{fault, fill, finite};
+use dimos_hardware::arm::StopPoint;
+use dimos_hardware::clock::{Clock, Mono, MonotonicClock};
+use dimos_hardware::joint::{ControlMode, JointLimits, Joints, joints_of};
+use dimos_hardware::registry::AdapterConfig;
+use dimos_hardware::transport::request_reply::{RequestReply, Retry};
 
 use super::calibration::{Calibration, TURN};
 use super::protocol::{self, MAX_REQUEST, MODEL, Request, Servo};
@@ -406,8 +406,8 @@ impl Gripper for AcmeAdapter {
 mod tests {
     use super::super::calibration::Range;
     use super::*;
-    use dimos::hardware::registry::{Emulator, EmulatorAddress};
-    use dimos::hardware::sim::faults::{Fault, FaultKind};
+    use dimos_hardware::registry::{Emulator, EmulatorAddress};
+    use dimos_hardware::sim::faults::{Fault, FaultKind};
 
     /// A connected adapter and its servos.
     fn arm() -> (AcmeAdapter, Box<dyn Emulator>) {

@@ -5,15 +5,15 @@
 
 use std::f64::consts::TAU;
 
-use dimos::clock::{Clock, Mono, MonotonicClock};
-use dimos::hardware::adapter::AdapterResult;
-use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, Truth};
-use dimos::hardware::sim::arm::{Delivery, HasArm, SimArm};
-use dimos::hardware::sim::faults::FaultKind;
-use dimos::hardware::sim::gripper::Gripper;
-use dimos::hardware::sim::stream::Controller;
-use dimos::hardware::transport::Scan;
-use dimos::joint::Joints;
+use dimos_hardware::adapter::AdapterResult;
+use dimos_hardware::clock::{Clock, Mono, MonotonicClock};
+use dimos_hardware::joint::Joints;
+use dimos_hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, Truth};
+use dimos_hardware::sim::arm::{Delivery, HasArm, SimArm};
+use dimos_hardware::sim::faults::FaultKind;
+use dimos_hardware::sim::gripper::Gripper;
+use dimos_hardware::sim::stream::Controller;
+use dimos_hardware::transport::Scan;
 
 use super::calibration::Calibration;
 use super::{DOF, OPEN, Options, SERVOS, TOP_SPEED, limits, wire};

@@ -13,11 +13,11 @@ pub mod wire;
 
 use std::time::Duration;
 
-use dimos::arm::{AfterGap, Topology};
-use dimos::hardware::check::{Checked, ConfigError};
-use dimos::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
-use dimos::hardware::sim::arm::SimOptions;
-use dimos::joint::{ControlMode, JointLimits};
+use dimos_hardware::arm::{AfterGap, Topology};
+use dimos_hardware::check::{Checked, ConfigError};
+use dimos_hardware::joint::{ControlMode, JointLimits};
+use dimos_hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
+use dimos_hardware::sim::arm::SimOptions;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 

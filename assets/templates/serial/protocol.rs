@@ -21,7 +21,7 @@
 //! Replies do not say which request they answer: a late one looks like the next one. So the line forgets what has
 //! arrived before each request, and what has no reply is read back where it matters.
 
-use dimos::hardware::transport::Scan;
+use dimos_hardware::transport::Scan;
 
 use super::SERVOS;
 

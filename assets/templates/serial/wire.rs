@@ -3,11 +3,11 @@
 
 use std::time::Duration;
 
-use dimos::arms::line::{self, Line, LineAddress};
-use dimos::hardware::adapter::AdapterResult;
-use dimos::hardware::registry::EmulatorAddress;
-use dimos::hardware::sim::serial_server::SerialServer;
-use dimos::hardware::sim::stream::Controller;
+use dimos_hardware::adapter::AdapterResult;
+use dimos_hardware::registry::EmulatorAddress;
+use dimos_hardware::sim::serial_server::SerialServer;
+use dimos_hardware::sim::stream::Controller;
+use dimos_hardware::transport::line::{self, Line, LineAddress};
 
 /// Rate of the line, where an address names none [bit/s].
 const BAUD: u32 = 1_000_000; // YOUR ARM

@@ -7,16 +7,16 @@
 
 use std::time::Duration;
 
-use dimos::arm::StopPoint;
-use dimos::clock::{Clock, Mono, MonotonicClock};
-use dimos::hardware::adapter::{
+use dimos_hardware::adapter::{
     AdapterError, AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
 };
-use dimos::hardware::adapter_util::{fault, fill, finite};
-use dimos::hardware::registry::AdapterConfig;
-use dimos::hardware::transport::device_time::DeviceTime;
-use dimos::hardware::transport::request_reply::{RequestReply, Retry};
-use dimos::joint::{ControlMode, JointLimits, Joints, joints_of};
+use dimos_hardware::adapter_util::{fault, fill, finite};
+use dimos_hardware::arm::StopPoint;
+use dimos_hardware::clock::{Clock, Mono, MonotonicClock};
+use dimos_hardware::joint::{ControlMode, JointLimits, Joints, joints_of};
+use dimos_hardware::registry::AdapterConfig;
+use dimos_hardware::transport::device_time::DeviceTime;
+use dimos_hardware::transport::request_reply::{RequestReply, Retry};
 
 use super::protocol::{self, Command, Hello, MAX_COMMAND, Mode, State, WireJoints};
 use super::wire::{self, Address, Link};

@@ -3,14 +3,14 @@
 //! It is written from the sheet in `protocol.rs` and shares no code with it: two sides that share an encoder share its
 //! mistakes. YOUR ARM: change it as you change `protocol.rs`. `SimArm` is the arm: joints, motors, errors, faults.
 
-use dimos::clock::{Clock, Mono, MonotonicClock};
-use dimos::hardware::adapter::AdapterResult;
-use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
-use dimos::hardware::sim::arm::{Delivery, HasArm, PLAYABLE, Refusal, SimArm};
-use dimos::hardware::sim::faults::FaultKind;
-use dimos::hardware::sim::stream::Controller;
-use dimos::hardware::transport::Scan;
-use dimos::joint::{ControlMode, Joints};
+use dimos_hardware::adapter::AdapterResult;
+use dimos_hardware::clock::{Clock, Mono, MonotonicClock};
+use dimos_hardware::joint::{ControlMode, Joints};
+use dimos_hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
+use dimos_hardware::sim::arm::{Delivery, HasArm, PLAYABLE, Refusal, SimArm};
+use dimos_hardware::sim::faults::FaultKind;
+use dimos_hardware::sim::stream::Controller;
+use dimos_hardware::transport::Scan;
 
 use super::{DOF, Options, limits, wire};
 

@@ -22,7 +22,7 @@
 //! error   0 none, 1 E-stop line open, 2 collision, 3 joint too hot, 4 following error
 //! ```
 
-use dimos::hardware::transport::Scan;
+use dimos_hardware::transport::Scan;
 
 use super::DOF;
 

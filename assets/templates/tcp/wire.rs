@@ -2,11 +2,11 @@
 
 use std::time::Duration;
 
-use dimos::hardware::adapter::AdapterResult;
-use dimos::hardware::registry::EmulatorAddress;
-use dimos::hardware::sim::stream::Controller;
-use dimos::hardware::sim::tcp_server::TcpServer;
-use dimos::hardware::transport::tcp::{Endpoint, TcpLink};
+use dimos_hardware::adapter::AdapterResult;
+use dimos_hardware::registry::EmulatorAddress;
+use dimos_hardware::sim::stream::Controller;
+use dimos_hardware::sim::tcp_server::TcpServer;
+use dimos_hardware::transport::tcp::{Endpoint, TcpLink};
 
 /// The controller's TCP port, where an address names none.
 const PORT: u16 = 7700; // YOUR ARM

@@ -8,7 +8,6 @@ use dimos_hardware::adapter::{AdapterError, AdapterResult, ManipulatorAdapter};
 use dimos_hardware::registry::{Absent, AdapterConfig, AdapterSpec, Emulator, EmulatorAddress, Registry, SIM};
 
 pub mod franka;
-pub mod line;
 pub mod mock;
 pub mod piper;
 pub mod remote;

@@ -15,3 +15,4 @@ pub mod random;
 pub mod sync;
 pub mod telemetry;
 pub mod trajectory;
+pub mod written;

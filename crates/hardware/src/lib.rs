@@ -4,6 +4,11 @@
 #![forbid(unsafe_code)]
 #![allow(rustdoc::broken_intra_doc_links, reason = "units are in brackets: [rad]")]
 
+/// What the contract is written in; so an adapter needs no other crate of dimos.
+pub use dimos_core::{arm, clock, joint};
+/// An allocator that counts, for an adapter's own conformance test.
+pub use dimos_rt::counting;
+
 pub mod adapter;
 pub mod adapter_util;
 pub mod check;

@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::api::finite;
 use super::motion_api::{JointPath, Trajectory, default_speed, valid_speed};
 use super::report::{TcpReport, ToolReport};
+use dimos_core::written;
 
 /// A pose; in the frame `map` unless another is given with it.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
@@ -29,6 +30,10 @@ impl PoseSpec {
     pub(super) fn valid(&self, field: &str) -> Result<(), String> {
         finite(&format!("{field}.xyz"), &self.xyz)?;
         finite(&format!("{field}.rpy"), &self.rpy.unwrap_or_default())?;
+        let length = |v: &f64| written::length(*v).map_err(|wrong| format!("{field}.xyz: {wrong}"));
+        self.xyz.iter().try_for_each(length)?;
+        let angle = |v: &f64| written::angle(*v).map_err(|wrong| format!("{field}.rpy: {wrong}"));
+        self.rpy.iter().flatten().try_for_each(angle)?;
         let quat = self.quat.unwrap_or([0.0, 0.0, 0.0, 1.0]);
         finite(&format!("{field}.quat"), &quat)?;
         let length = quat.iter().map(|v| v * v).sum::<f64>().sqrt();

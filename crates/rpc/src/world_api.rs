@@ -6,38 +6,8 @@ use serde::{Deserialize, Serialize};
 use super::parts_api::LoadReport;
 use super::planner_api::PoseSpec;
 use dimos_core::joint::{LONGEST_NAME, may_be_in_name};
-
-/// Shape of an obstacle. Its frame is at its centre; the axis of a cylinder is z.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "snake_case", deny_unknown_fields)]
-pub enum ShapeSpec {
-    /// Edge lengths x, y, z [m].
-    Box([f64; 3]),
-    /// Radius [m].
-    Sphere(f64),
-    /// Radius and length [m].
-    Cylinder([f64; 2]),
-    /// A mesh file (STL, OBJ, DAE), as an absolute path.
-    Mesh(String),
-    /// A point cloud file (PLY), as an absolute path.
-    Cloud(String),
-}
-
-impl ShapeSpec {
-    fn valid(&self) -> Result<(), String> {
-        let sizes: &[f64] = match self {
-            Self::Box(size) => size,
-            Self::Sphere(radius) => std::slice::from_ref(radius),
-            Self::Cylinder(size) => size,
-            Self::Mesh(path) | Self::Cloud(path) if path.starts_with('/') => &[],
-            Self::Mesh(path) | Self::Cloud(path) => return Err(format!("{path:?} is not an absolute path")),
-        };
-        match sizes.iter().find(|size| !(**size > 0.0 && size.is_finite())) {
-            Some(size) => Err(format!("a size of the shape is {size}, must be above 0")),
-            None => Ok(()),
-        }
-    }
-}
+use dimos_core::written;
+pub use dimos_core::written::ShapeSpec;
 
 /// An object of the world.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -78,11 +48,16 @@ impl WorldAdd {
         if name.is_empty() || name.len() > LONGEST_NAME {
             return Err(format!("name has {} characters, must have 1 to {LONGEST_NAME}", name.len()));
         }
-        if !(0.0..=1.0).contains(&object.padding) {
-            return Err(format!("padding is {}, must be within 0–1 m", object.padding));
-        }
+        written::padding(object.padding)?;
         object.shape.valid()?;
         object.pose.valid("pose")
+    }
+}
+
+impl WorldObject {
+    /// Returns a doubt about the unit of its lengths, if they are far for an arm's cell.
+    pub fn doubt(&self) -> Option<String> {
+        written::doubt(&[&self.pose.xyz, self.shape.sizes()].concat()).map(|doubt| format!("{}: {doubt}", self.name))
     }
 }
 
@@ -178,10 +153,8 @@ impl Attach {
             (Some(mass), _) if !(mass > 0.0 && mass <= 1000.0) => {
                 Err(format!("mass is {mass} kg, must be above 0, at most 1000"))
             }
-            (_, Some(within)) if !(within >= 0.0 && within.is_finite()) => {
-                Err(format!("within is {within} m, must be 0 or more"))
-            }
-            _ => Ok(()),
+            (_, Some(within)) if within < 0.0 => Err(format!("within is {within} m, must be 0 or more")),
+            (_, within) => within.map_or(Ok(()), written::length).map_err(|wrong| format!("within: {wrong}")),
         }
     }
 }

@@ -15,7 +15,7 @@ use super::super::output;
 use dimos_core::joint::MAX_DOF;
 use dimos_hardware::registry::Registry;
 use name::Name;
-use templates::Arm;
+use templates::{Arm, Source};
 use write::Plan;
 
 /// Paths of the table of adapters and of that of robot descriptions in a checkout.
@@ -29,13 +29,13 @@ const REPOSITORY: &str = env!("CARGO_PKG_REPOSITORY");
 /// Arguments of `adapter new`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
-Writes a crate of its own, DIR/NAME: an adapter, an emulator, tests, a robot description, two \
-blueprints, and a program that is `dimos` with one arm more. It compiles, passes the conformance \
-suite, runs and plans at once, with a made-up wire format and a made-up shape: search it for \
-`YOUR ARM`. Nothing is ever written over.
+Writes a crate of its own, DIR/NAME: an adapter, an emulator, tests, a robot description and two \
+blueprints; and in its folder `program` a second one, the program `dimos` with that arm. They \
+compile, pass the conformance suite, run and plan at once, with a made-up wire format and a \
+made-up shape: search for `YOUR ARM`. Nothing is ever written over.
 
   dimos adapter new acme --dof 6 --transport tcp
-  cd acme && cargo test && cargo run -- run coordinator-acme
+  cd acme && cargo test && cargo run -p acme-program -- run coordinator-acme
 
 With --in-tree the same goes into a checkout of dimos: crates/arms/src/NAME, crates/robot/robots and \
 blueprints. It prints the lines that you add to the tables of arms and of robots.
@@ -112,13 +112,11 @@ fn own_crate(args: &Args, arm: &Arm) -> Result<(Plan, Vec<Line>, Next)> {
     let folder = args.path.join(&arm.name.kebab);
     let files = arm.own_crate(&dimos(args.dimos.as_deref())?);
     let new = files.into_iter().map(|(path, text)| (folder.join(path), text)).collect();
+    let run = format!("cargo run -p {}-program -- run", arm.name.kebab);
     let next = vec![
         (format!("cd {} && cargo test", shown(&folder)), "its bytes, and the conformance suite"),
-        (format!("cargo run -- run {}", arm.blueprint()), "with its emulator"),
-        (
-            format!("cargo run -- run {}", arm.planner()),
-            "the same with a planner: `cargo run -- plan arm --named home`",
-        ),
+        (format!("{run} {}", arm.blueprint()), "with its emulator"),
+        (format!("{run} {}", arm.planner()), "the same with a planner, for `plan arm --named home`"),
         ("grep -rn 'YOUR ARM' src robots".to_owned(), "what to change; the URDF has no gripper"),
         ("git init && git add -A".to_owned(), "with the Cargo.lock of the first build: the same versions everywhere"),
     ];
@@ -158,14 +156,14 @@ fn in_tree(args: &Args, arm: &Arm) -> Result<(Plan, Vec<Line>, Next)> {
     Ok((Plan { new, folders: vec![folder] }, lines, next))
 }
 
-/// Where a crate finds dimos, as its manifest writes it.
-fn dimos(given: Option<&Path>) -> Result<String> {
+/// Where a crate finds dimos.
+fn dimos(given: Option<&Path>) -> Result<Source> {
     let path = match given {
         Some(path) if is_checkout(path) => path,
         Some(path) => return Err(Failure::usage(format!("--dimos: {} is no checkout of dimos", path.display()))),
         // What `cargo install --git` builds from is cargo's own, and may be gone tomorrow.
         None if is_checkout(Path::new(BUILT_FROM)) && !BUILT_FROM.contains("/git/checkouts/") => Path::new(BUILT_FROM),
-        None if !REPOSITORY.is_empty() => return Ok(format!("git = {REPOSITORY:?}")),
+        None if !REPOSITORY.is_empty() => return Ok(Source::Repository(REPOSITORY.to_owned())),
         None => {
             let what = "the crate needs the source of dimos, and the one this program was built from is gone";
             return Err(Failure::usage(what).hint("give a checkout of it: --dimos DIR"));
@@ -173,7 +171,7 @@ fn dimos(given: Option<&Path>) -> Result<String> {
     };
     let full = fs::canonicalize(path).ok().and_then(|path| path.to_str().map(str::to_owned));
     match full {
-        Some(full) => Ok(format!("path = {full:?}")),
+        Some(full) => Ok(Source::Checkout(full)),
         None => Err(Failure::usage(format!("--dimos: the path {} cannot be written down", path.display()))),
     }
 }

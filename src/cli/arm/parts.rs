@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::super::arguments::finite;
+use super::super::arguments::{finite, length};
 use super::super::exit::{Exit, Result};
 use super::super::output;
 use super::ArmArgs;
@@ -34,7 +34,7 @@ pub struct PayloadArgs {
     #[arg(long, value_name = "KG", value_parser = finite, allow_negative_numbers = true)]
     mass: Option<f64>,
     /// Its centre in the flange frame [m]; default: the flange
-    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite, allow_negative_numbers = true, requires = "mass")]
+    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = length, allow_negative_numbers = true, requires = "mass")]
     center: Option<Vec<f64>>,
     /// Its inertia about the centre, along the axes of the flange frame [kg·m²]; default: a point mass
     #[arg(long, value_names = ["XX", "XY", "XZ", "YY", "YZ", "ZZ"], num_args = 6, value_parser = finite, allow_negative_numbers = true, requires = "mass")]

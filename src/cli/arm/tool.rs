@@ -1,6 +1,6 @@
 //! `dimos arm tool ARM`: the tool centre point of an arm.
 
-use super::super::arguments::{angle, finite};
+use super::super::arguments::{angle, finite, length};
 use super::super::exit::{Exit, Result};
 use super::super::output::{self, fixed};
 use super::ArmArgs;
@@ -13,7 +13,7 @@ pub struct Args {
     #[command(flatten)]
     which: ArmArgs,
     /// Set the tool centre point, in the frame of the end-effector link [m]
-    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite, allow_negative_numbers = true)]
+    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = length, allow_negative_numbers = true)]
     xyz: Option<Vec<f64>>,
     /// Roll, pitch, yaw of the tool in that frame, about fixed axes [rad]
     #[arg(long, value_names = ["R", "P", "Y"], num_args = 3, value_parser = angle, allow_negative_numbers = true, requires = "xyz")]

@@ -6,12 +6,13 @@ use std::time::Duration;
 
 use super::keys::{self, Group};
 use super::step::{Act, Job, Motion, Step};
-use crate::cli::arguments::{duration, finite, is_angle, speed, time};
+use crate::cli::arguments::{duration, finite, speed, time};
 use crate::cli::exit::{Failure, Result};
 use crate::cli::grip::opening;
 use crate::cli::output;
 use dimos_core::arm::channel;
 use dimos_core::bounded;
+use dimos_core::written;
 use dimos_rpc::api::{Attach, DEFAULT_SPEED, PlanGoal, PoseSpec};
 use dimos_yaml as yaml;
 use dimos_yaml::{Diag, Kind, Label, NodeId, Tree, did_you_mean, quote};
@@ -301,10 +302,12 @@ impl Reader {
             return self.wrong(node, "has both rpy and quat", None);
         }
         let (rpy, quat) = (self.array::<3>(node, "rpy"), self.array(node, "quat"));
-        if let Some(Err(wrong)) = rpy.map(|rpy| rpy.into_iter().try_for_each(is_angle)) {
+        let xyz = self.array::<3>(node, "xyz")?;
+        let angles = rpy.map_or(Ok(()), |rpy| rpy.into_iter().try_for_each(written::angle));
+        if let Err(wrong) = xyz.into_iter().try_for_each(written::length).and(angles) {
             return self.wrong(node, wrong, None);
         }
-        Some(PoseSpec { xyz: self.array(node, "xyz")?, rpy, quat })
+        Some(PoseSpec { xyz, rpy, quat })
     }
 
     fn through(&mut self, node: NodeId, arm: &mut String) -> Option<Motion> {

@@ -7,10 +7,14 @@ use super::times::all;
 use crate::cli::exit::Result;
 use crate::cli::goal::has_planner;
 use crate::cli::grip;
+use dimos_core::written;
 use dimos_rpc::api::{Attach, PlanGoal, Planner, Poses, RobotReport, State, Status, World};
 use dimos_rpc::client::Client;
 use dimos_rpc::report::{ArmReport, ArmStateReport};
 use dimos_yaml::{NodeId, did_you_mean, quote};
+
+/// How far beyond a limit a goal is left to the planner [rad].
+const BEYOND: f64 = 0.05;
 
 /// What a run has.
 pub struct Names {
@@ -127,6 +131,15 @@ impl Names {
                     let what = format!("{} has {count} joints, the goal {} values", step.arm, joints.len());
                     return say(what, "give one position [rad] per joint, base first");
                 }
+                PlanGoal { joints: Some(joints), .. } if beyond(joints, arm).is_some() => {
+                    let (number, position) = beyond(joints, arm).unwrap_or_default();
+                    let [lower, upper] = arm.position_limits.get(number).copied().unwrap_or_default();
+                    let limits = format!("its limits are {lower:.4} to {upper:.4} rad");
+                    let hint = written::degrees(position).unwrap_or(limits);
+                    let name = self.joints.get(&step.arm).and_then(|joints| joints.get(number));
+                    let name = name.map_or("a joint", String::as_str);
+                    return say(format!("{name} at {position} rad is outside its limits"), &hint);
+                }
                 PlanGoal { named: Some(name), .. } if self.named(&step.arm, name).is_none() => {
                     let robots = self.robots.iter().filter(|robot| robot.name == step.arm);
                     let names = robots.flat_map(|robot| robot.named_poses.keys()).chain(self.poses.keys());
@@ -151,6 +164,14 @@ impl Names {
         let value = |joint| values.get(robot.joints.iter().position(|j| j == joint)?).copied();
         joints.iter().map(value).collect()
     }
+}
+
+/// Returns the number of the first joint that a goal sends outside its limits, and its position [rad].
+fn beyond(joints: &[f64], arm: &ArmReport) -> Option<(usize, f64)> {
+    // The planner ends a motion at the limit if its goal is a little beyond.
+    let outside = |(position, [lower, upper]): (&f64, &[f64; 2])| !(lower - BEYOND..=upper + BEYOND).contains(position);
+    let number = joints.iter().zip(&arm.position_limits).position(outside)?;
+    Some((number, *joints.get(number)?))
 }
 
 /// Gives a step and its nested steps their arm.

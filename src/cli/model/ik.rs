@@ -7,7 +7,7 @@ use serde_json::json;
 
 use super::File;
 use super::chain::Chain;
-use crate::cli::arguments::{angle, finite};
+use crate::cli::arguments::{angle, finite, length};
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output::{self, Table};
 use dimos_core::pose::from_xyz_rpy;
@@ -28,7 +28,7 @@ pub struct Args {
     file: File,
     /// Target position of the link: x, y, z [m] in the base's frame; orientation is free unless --rpy or --quat is
     /// given
-    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite, allow_negative_numbers = true, required = true)]
+    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = length, allow_negative_numbers = true, required = true)]
     pose: Vec<f64>,
     /// Target roll, pitch, yaw about fixed axes [rad]
     #[arg(long, value_names = ["R", "P", "Y"], num_args = 3, value_parser = angle, allow_negative_numbers = true)]

@@ -86,6 +86,9 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     emulate: Some(|config, place| Ok(Box::new(emulator::FrankaEmulator::start(config, place)?))),
 };
 
+/// Rated payload of an FR3 and an FER, of their data sheets [kg].
+const PAYLOAD: f64 = 3.0;
+
 /// What a blueprint may set of a Franka arm.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
@@ -170,5 +173,5 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
         model: Some((options.model.option(), "flange")),
         ..ToolFacts::default()
     };
-    Ok(Checked::new(limits).digital_inputs(0).tool(tool))
+    Ok(Checked::new(limits).digital_inputs(0).max_payload(PAYLOAD).tool(tool))
 }

@@ -1,5 +1,6 @@
 //! Address of a controller: `HOST[:FIRST_PORT]`.
 
+use dimos_hardware::transport::line::UR_TOOL_PORT;
 use dimos_hardware::transport::tcp::Endpoint;
 
 /// The first of a controller's ports: the dashboard's.
@@ -50,7 +51,7 @@ impl Address {
     /// Returns the host and the port of a service.
     pub fn port(&self, service: Service) -> Endpoint {
         if service == Service::Tool {
-            return Endpoint { host: self.first.host.clone(), port: super::TOOL_PORT };
+            return Endpoint { host: self.first.host.clone(), port: UR_TOOL_PORT };
         }
         if service == Service::RobotApi && self.first.port == FIRST_PORT {
             return Endpoint { host: self.first.host.clone(), port: API_PORT };

@@ -51,7 +51,7 @@ use dimos_core::joint::{ControlMode, JointLimits};
 use dimos_hardware::check::{Checked, ConfigError, ToolFacts, in_range};
 use dimos_hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use model::Model;
-pub use tool_line::{PORT as TOOL_PORT, ToolLine};
+pub use tool_line::ToolLine;
 
 /// Number of joints.
 pub const DOF: usize = 6;

@@ -7,8 +7,6 @@ use serde::{Deserialize, Serialize};
 use super::model::Model;
 use dimos_hardware::check::{ConfigError, in_range};
 
-/// Port of the URCap.
-pub const PORT: u16 = 54321;
 /// Rates that the tool has [bit/s].
 const RATES: [u32; 8] = [9600, 19_200, 38_400, 57_600, 115_200, 1_000_000, 2_000_000, 5_000_000];
 

@@ -41,7 +41,6 @@ mod tests_outputs;
 mod tests_reduced;
 #[cfg(test)]
 mod tests_slow;
-pub mod tool_line;
 
 use std::time::Duration;
 
@@ -150,7 +149,7 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
         model: Some((model.option(), "link_eef")),
         ..ToolFacts::default()
     };
-    Ok(Checked::new(limits).digital_inputs(0).tool(tool))
+    Ok(Checked::new(limits).digital_inputs(0).max_payload(model.payload()).tool(tool))
 }
 
 /// Returns the model of options and number of joints, or why they conflict.

@@ -63,6 +63,16 @@ const XARM6_1305: [(f64, f64); 6] = [TURN, SHOULDER_1305, ELBOW_1305, TURN, WRIS
 const XARM7_1305: [(f64, f64); 7] = [TURN, SHOULDER_1305, TURN, (-0.10472, 3.92699), TURN, WRIST, TURN];
 
 impl Model {
+    /// Returns the rated payload [kg], of the vendor's data sheets.
+    pub fn payload(self) -> f64 {
+        match self {
+            Self::Xarm5 => 3.0,
+            Self::Xarm6 | Self::Xarm850 => 5.0,
+            Self::Xarm7 => 3.5,
+            Self::Lite6 => 0.6,
+        }
+    }
+
     /// Returns the default model with this number of joints.
     pub fn of_dof(dof: usize) -> Option<Self> {
         match dof {

@@ -39,6 +39,8 @@ const NATIVE_RATE: f64 = 500.0;
 /// Whether the arm keeps its pose when its motors are off: it has brakes.
 const HOLDS_WHEN_DISABLED: bool = true;
 
+/// Rated payload [kg].
+const PAYLOAD: f64 = 5.0;
 /// Maximum opening of the gripper [m].
 const GRIPPER_MAX: f64 = 0.08;
 /// Smallest and largest force of the gripper [N].
@@ -101,7 +103,7 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     let (options, limits) = (config.options::<Options>()?, limits());
     options.sim.check("yourarm", &limits, PLAYABLE)?;
     let tool = ToolFacts { model: Some(("yourarm", "flange")), ..ToolFacts::default() };
-    Ok(Checked::new(limits).digital_inputs(protocol::DIGITAL).tool(tool))
+    Ok(Checked::new(limits).digital_inputs(protocol::DIGITAL).max_payload(PAYLOAD).tool(tool))
 }
 
 /// Returns the joint limits in SI units.

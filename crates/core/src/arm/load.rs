@@ -43,6 +43,17 @@ impl Load {
         Ok(())
     }
 
+    /// What to do about a load that is too heavy.
+    pub const TOO_HEAVY: &str = "masses are in kg; take a lighter tool or workpiece, or a larger arm";
+
+    /// Refuses a load that is heavier than the arm's rated payload [kg].
+    pub fn within(&self, most: Option<f64>) -> Result<(), String> {
+        match most.filter(|most| self.mass > *most) {
+            Some(most) => Err(format!("the arm takes at most {most:.1} kg, not {} kg", self.mass)),
+            None => Ok(()),
+        }
+    }
+
     /// Returns the load of both bodies together.
     pub fn plus(&self, other: &Self) -> Self {
         if self.mass <= 0.0 {

@@ -75,6 +75,8 @@ pub struct Setup {
     pub stop_input: Option<StopInput>,
     /// Load at the flange: set before the motors are enabled.
     pub payload: Option<Load>,
+    /// Largest mass of a load [kg], if it is known.
+    pub max_payload: Option<f64>,
     /// Direction of gravity in the base frame, a unit vector: set before the motors are enabled. `None`: the
     /// controller keeps its own setting.
     pub gravity: Option<[f64; 3]>,

@@ -4,6 +4,7 @@ pub mod can;
 pub mod capture;
 pub mod device_time;
 mod incoming;
+pub mod line;
 pub mod measured;
 pub mod pty;
 pub mod request_reply;

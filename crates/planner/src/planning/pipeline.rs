@@ -25,6 +25,7 @@ use crate::collision::report::Pair;
 use crate::collision::world::{Robot, World};
 use crate::collision::{CollisionChecker, Stop};
 use dimos_core::trajectory::{JointTrajectory, JointValues, Spline, TrajectoryPoint};
+use dimos_core::written;
 use dimos_robot::model::Limits;
 
 /// A path shorter than this needs no motion [rad].
@@ -317,8 +318,11 @@ pub(super) fn failure_for(stage: &Stage<'_>, error: &PlanError) -> PlanFailure {
             let (name, unit) = name_and_unit(*joint);
             let digits = digits_outside(*position, *lower, *upper);
             let limits = format!("{lower:.digits$} … {upper:.digits$} {unit}");
+            let inside = "positions are in rad; the narrower limits of model and arm apply, and commands stay 0.01 rad \
+                          inside those of the arm; `dimos state` shows the joint positions";
+            let degrees = written::degrees(*position).filter(|_| unit == "rad");
             PlanFailure::new(format!("{which}: {name} at {position:.digits$} {unit} is outside its limits {limits}"))
-                .hint("positions are in rad; the narrower limits of model and arm apply, and commands stay 0.01 rad inside those of the arm; `dimos state` shows the joint positions")
+                .hint(degrees.unwrap_or_else(|| inside.to_owned()))
         }
         PlanError::Collides { which: "start", .. } => PlanFailure::new(error.to_string())
             .hint("move the arm out of contact with `dimos move … --direct` or by hand, or correct the world"),

@@ -20,7 +20,7 @@ use dimos_core::joint::DEFAULT_ACCELERATION;
 use dimos_robot::kinematics::tool_speed::ToolSpeed;
 use dimos_robot::kinematics::{Kinematics, KinematicsError, frame};
 use dimos_robot::load;
-use dimos_robot::mesh::Mesh;
+use dimos_robot::mesh::{Mesh, Size};
 use dimos_robot::model::{Limits, RobotModel};
 
 /// Sampled configurations for the search of links that always touch.
@@ -328,7 +328,11 @@ pub fn obstacle(object: &ObjectConfig) -> Result<Obstacle, String> {
         ObjectShape::Box(size) => Solid::cuboid(DVec3::from_array(*size), at),
         ObjectShape::Sphere(radius) => Solid::sphere(*radius, at),
         ObjectShape::Cylinder([radius, length]) => Solid::cylinder(*radius, *length, at),
-        ObjectShape::Mesh(path) => surface(&Mesh::read(path, nalgebra::Vector3::repeat(1.0))?, at),
+        ObjectShape::Mesh(path) => {
+            let mesh = Mesh::read(path, nalgebra::Vector3::repeat(1.0))?;
+            Size::of_object(&mesh, path)?;
+            surface(&mesh, at)
+        }
         ObjectShape::Cloud(path) => {
             let about = std::fs::metadata(path).map_err(|e| format!("{}: {e}", path.display()))?;
             if !about.is_file() || about.len() > MAX_CLOUD {

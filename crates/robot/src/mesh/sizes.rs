@@ -10,12 +10,14 @@ use crate::model::MeshFile;
 use crate::xml::{Document, Element};
 use crate::{Geometry, RobotModel, Shape};
 use dimos_core::message::Message;
+use dimos_core::written::{LONG, LONGEST};
 use dimos_yaml::{Diag, Label};
 
-/// Extent above which the unit of a mesh is doubted [m].
-const LARGE: f64 = 10.0;
 /// Extent below which the unit of a mesh is doubted [m].
 const SMALL: f64 = 1e-4;
+
+/// What to do about a mesh of an object that is in another unit.
+const OBJECT_HINT: &str = "a mesh in the world is in metres: convert the file, for example from millimetres";
 
 /// Size of a mesh.
 #[derive(Debug, Clone, Copy)]
@@ -36,31 +38,37 @@ impl Size {
         Self { triangles: mesh.triangles.len(), extents: mesh.extents() }
     }
 
-    /// Returns why the unit of the mesh is doubtful.
-    fn doubt(&self) -> Option<String> {
+    /// Returns why the unit of the mesh is doubtful: it is larger than this [m], or tiny.
+    fn doubt(&self, large: f64) -> Option<String> {
         let (most, shown) = (self.extents.amax(), self.shown());
-        if most > LARGE {
+        if most > large {
             return Some(format!("extends over {shown}"));
         }
         (most < SMALL).then(|| format!("extends over only {shown}"))
     }
 
+    /// Refuses the mesh of an object in the world that is not in metres.
+    pub fn of_object(mesh: &Mesh, path: &Path) -> Result<(), String> {
+        let size = Self::of(mesh);
+        match size.extents.amax() > LONGEST {
+            true => Err(format!("{} extends over {}\nhint: {OBJECT_HINT}", path.display(), size.shown())),
+            false => Ok(()),
+        }
+    }
+
     /// Returns a warning if the unit of the mesh of an object in the world is doubtful: such a mesh has no scale.
     pub fn doubt_of_object(&self, object: &str, path: &Path) -> Option<Diag> {
-        let what = format!("the mesh of the object `{object}` {}: {}", self.doubt()?, path.display());
-        Some(
-            Diag::warning(what)
-                .hint("a mesh in the world is in metres: convert the file, for example from millimetres"),
-        )
+        let doubt = self.doubt(LONG).filter(|_| self.extents.amax() <= LONGEST)?;
+        Some(Diag::warning(format!("the mesh of the object `{object}` {doubt}: {}", path.display())).hint(OBJECT_HINT))
     }
 
     /// Returns a warning if the unit of the mesh of a link is doubtful.
     fn doubt_of_link(&self, link: &str, uri: &str) -> Option<Diag> {
-        let hint = match self.extents.amax() > LARGE {
+        let hint = match self.extents.amax() > LONGEST {
             true => "a URDF is in metres: if the file is in millimetres, add scale=\"0.001 0.001 0.001\"",
             false => "is it scaled twice? a file in metres needs no scale",
         };
-        Some(Diag::warning(format!("the mesh of the link `{link}` {}: {uri}", self.doubt()?)).hint(hint))
+        Some(Diag::warning(format!("the mesh of the link `{link}` {}: {uri}", self.doubt(LONGEST)?)).hint(hint))
     }
 
     /// Returns the extents as text.

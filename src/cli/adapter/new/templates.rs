@@ -16,12 +16,13 @@ const SERIAL: (&str, &[&str]) = ("serial", &["wire.rs", "calibration.rs"]);
 const BLUEPRINT: &str = "blueprint.yaml";
 const PLANNER: &str = "planner.yaml";
 /// What a crate has besides: its path in the crate, and its template.
-const CRATE: [(&str, &str); 5] = [
+const CRATE: [(&str, &str); 6] = [
     ("Cargo.toml", "crate/manifest.toml"),
     ("README.md", "crate/README.md"),
     (".gitignore", "crate/gitignore"),
-    ("src/main.rs", "crate/main.rs"),
     ("tests/conformance.rs", "crate/conformance.rs"),
+    ("program/Cargo.toml", "crate/program.toml"),
+    ("program/main.rs", "crate/main.rs"),
 ];
 
 /// Files of `assets/templates`: path, text.
@@ -30,6 +31,32 @@ static TEMPLATES: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/template
 /// Returns a template. All are there: a test asks for each.
 fn template(name: &str) -> &'static str {
     TEMPLATES.iter().find(|(file, _)| *file == name).map(|(_, text)| *text).unwrap_or_default()
+}
+
+/// Where a crate finds the crates of dimos.
+#[derive(Debug, Clone)]
+pub enum Source {
+    /// A checkout, by its full path.
+    Checkout(String),
+    /// A repository, by its address.
+    Repository(String),
+}
+
+impl Source {
+    /// The text of a manifest with the places of the two crates that it uses.
+    fn put_into(&self, manifest: &str, transport: Transport) -> String {
+        let [hardware, program] = match self {
+            Self::Checkout(path) => {
+                ["/crates/hardware", ""].map(|folder| format!("path = {:?}", path.clone() + folder))
+            }
+            Self::Repository(address) => [(); 2].map(|()| format!("git = {address:?}")),
+        };
+        // SocketCAN is a feature: ten packages that the other arms do without.
+        let features = if transport == Transport::Can { ", features = [\"can\"]" } else { "" };
+        manifest
+            .replace("HARDWARE", &format!("{hardware}, default-features = false{features}"))
+            .replace("DIMOS", &program)
+    }
 }
 
 /// The arm that is to be written.
@@ -44,16 +71,15 @@ pub struct Arm {
 }
 
 impl Arm {
-    /// The files of a crate of its own, with their paths below its folder. `dimos` is where the crate finds dimos, as
-    /// the manifest writes it: `path = "…"`.
-    pub fn own_crate(&self, dimos: &str) -> Vec<(String, String)> {
+    /// The files of a crate of its own, with their paths below its folder.
+    pub fn own_crate(&self, dimos: &Source) -> Vec<(String, String)> {
         let sources = self.sources().map(|(file, text)| {
             let file = if file == "mod.rs" { "lib.rs" } else { file };
             (format!("src/{file}"), self.code(text))
         });
         let rest = CRATE.iter().map(|(file, text)| match file.ends_with(".rs") {
             true => ((*file).to_owned(), self.code(template(text))),
-            false => ((*file).to_owned(), self.words(template(text)).replace("DIMOS", dimos)),
+            false => ((*file).to_owned(), dimos.put_into(&self.words(template(text)), self.transport)),
         });
         let robot = (format!("robots/{}.urdf", self.name.snake), self.urdf("src/lib.rs"));
         rest.chain(sources).chain(self.blueprints()).chain([robot]).collect()
@@ -62,11 +88,7 @@ impl Arm {
     /// The new files in a checkout of dimos, with their paths below it.
     pub fn in_tree(&self) -> Vec<(String, String)> {
         let folder = format!("crates/arms/src/{}", self.name.snake);
-        let sources = self.sources().map(|(file, text)| {
-            let text = self.code(text).replace("dimos::hardware::", "dimos_hardware::");
-            let text = text.replace("dimos::arms::", "crate::").replace("dimos::", "dimos_core::");
-            (format!("{folder}/{file}"), text)
-        });
+        let sources = self.sources().map(|(file, text)| (format!("{folder}/{file}"), self.code(text)));
         let robot = (format!("crates/robot/robots/{}.urdf", self.name.snake), self.urdf(&format!("{folder}/mod.rs")));
         sources.chain(self.blueprints()).chain([robot]).collect()
     }
@@ -175,7 +197,7 @@ mod tests {
     #[test]
     fn an_arm_like_the_template_is_the_template() {
         for (transport, sources) in [(Transport::Tcp, TCP), (Transport::Can, CAN), (Transport::Serial, SERIAL)] {
-            let files = arm("acme", 6, transport).own_crate("path = \"x\"");
+            let files = arm("acme", 6, transport).own_crate(&Source::Checkout("x".into()));
             let (folder, more) = sources;
             for file in COMMON.iter().chain(more) {
                 let path = if *file == "mod.rs" { "src/lib.rs".to_owned() } else { format!("src/{file}") };
@@ -187,19 +209,22 @@ mod tests {
 
     #[test]
     fn names_that_contain_the_template_s_are_put_in_once() {
-        let files = arm("acme-2", 8, Transport::Can).own_crate("git = \"x\"");
+        let files = arm("acme-2", 8, Transport::Can).own_crate(&Source::Repository("x".into()));
         let text = |path: &str| &files.iter().find(|(p, _)| p == path).unwrap().1;
-        assert!(text("src/main.rs").contains("include_str!(\"../blueprints/coordinator-acme-2.yaml\")"));
-        assert!(text("src/main.rs").contains("acme_2::SPEC"));
+        assert!(text("program/main.rs").contains("include_str!(\"../blueprints/coordinator-acme-2.yaml\")"));
+        assert!(text("program/main.rs").contains("acme_2::SPEC"));
         assert!(text("src/lib.rs").contains("Acme2, an 8-joint arm") && text("src/lib.rs").contains("usize = 8;"));
         assert!(text("src/lib.rs").contains("name: \"acme_2\""));
         assert!(
-            text("Cargo.toml").contains("name = \"acme-2\"") && text("Cargo.toml").contains("dimos = { git = \"x\" }")
+            text("Cargo.toml").contains("name = \"acme-2\"")
+                && text("Cargo.toml").contains("{ git = \"x\", default-features = false, features = [\"can\"] }")
         );
+        assert!(text("program/Cargo.toml").contains("dimos = { git = \"x\" }"));
         assert!(text("blueprints/coordinator-acme-2.yaml").contains("adapter_type: acme_2\n"));
-        assert!(text("src/main.rs").contains("(\"acme_2\", include_str!(\"../robots/acme_2.urdf\"))"));
+        assert!(text("program/main.rs").contains("(\"acme_2\", include_str!(\"../robots/acme_2.urdf\"))"));
         assert!(
-            text("src/main.rs").contains("(\"acme-2-planner\", include_str!(\"../blueprints/acme-2-planner.yaml\"))")
+            text("program/main.rs")
+                .contains("(\"acme-2-planner\", include_str!(\"../blueprints/acme-2-planner.yaml\"))")
         );
         let planner = text("blueprints/acme-2-planner.yaml");
         assert!(planner.contains("model_path: builtin:acme_2 ") && planner.contains("include: [coordinator-acme-2]"));
@@ -207,9 +232,10 @@ mod tests {
         assert!(planner.contains("home: [0, 0.4, 0, 0.4, 0, 0.4, 0, 0.4]"), "{planner}");
         assert!(text("robots/acme_2.urdf").contains("<robot name=\"acme_2\">"));
         assert!(text("README.md").contains("--address arm=can0"));
-        assert!(
-            files.iter().all(|(_, text)| !text.is_empty() && !text.contains("acme_2_2") && !text.contains("DIMOS"))
-        );
+        assert!(files.iter().all(|(_, text)| !text.is_empty()
+            && !text.contains("acme_2_2")
+            && !text.contains("DIMOS")
+            && !text.contains("HARDWARE")));
     }
 
     #[test]
@@ -222,7 +248,7 @@ mod tests {
                 Transport::Serial => 10,
             };
             assert_eq!(files.len(), count);
-            let left = |text: &str| text.contains("dimos::") || text.to_lowercase().contains("acme");
+            let left = |text: &str| text.contains(" dimos::") || text.to_lowercase().contains("acme");
             assert!(files.iter().all(|(_, text)| !left(text)), "{transport:?}");
         }
     }

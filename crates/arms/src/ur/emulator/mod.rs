@@ -38,6 +38,7 @@ use dimos_hardware::sim::arm;
 use dimos_hardware::sim::faults::{Fault, FaultKind};
 use dimos_hardware::sim::tcp_server::{Port, TcpServer, cannot_listen, emulator_ports};
 use dimos_hardware::sim::tool_device::ToolDevice;
+use dimos_hardware::transport::line::UR_TOOL_PORT;
 
 /// The faults that the controller can play. Its joints have one supply, so no single motor goes off.
 const PLAYABLE: &[FaultKind] = &[
@@ -210,7 +211,7 @@ impl UrEmulator {
         let tool = match options.model.is_cb3() {
             true => None,
             false => {
-                let port = if address.port() == FIRST_PORT { super::TOOL_PORT } else { 0 };
+                let port = if address.port() == FIRST_PORT { UR_TOOL_PORT } else { 0 };
                 let place = SocketAddr::new(address.ip(), port);
                 Some(TcpListener::bind(place).map_err(|e| cannot_listen("ur emulator", place, &e))?)
             }

@@ -3,13 +3,16 @@
 
 use std::time::Duration;
 
-use dimos_hardware::adapter::AdapterResult;
-use dimos_hardware::transport::Scan;
-use dimos_hardware::transport::request_reply::ByteLink;
-use dimos_hardware::transport::serial::{SerialAddress, SerialLink};
-use dimos_hardware::transport::tcp::{Endpoint, TcpLink};
+use super::Scan;
+use super::request_reply::ByteLink;
+use super::serial::{SerialAddress, SerialLink};
+use super::tcp::{Endpoint, TcpLink};
+use crate::adapter::AdapterResult;
 
-use crate::{ur, xarm};
+pub mod xarm_tool;
+
+/// Port of a UR's RS485 URCap, or of tool forwarding of PolyScope X.
+pub const UR_TOOL_PORT: u16 = 54321;
 
 /// Address of a line: `/dev/ttyX[@BAUD]`, `tcp:HOST:PORT`, `ur:HOST[:PORT]` or `xarm:HOST[:PORT][@BAUD]`.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -39,12 +42,12 @@ impl LineAddress {
                 endpoint => Ok(Self::Tcp(endpoint)),
             },
             "ur" if rest.contains('@') => Err("the rate of a UR's tool is the arm's option `tool_line`".to_owned()),
-            "ur" => Endpoint::parse(rest, ur::TOOL_PORT).map(Self::UrTool),
+            "ur" => Endpoint::parse(rest, UR_TOOL_PORT).map(Self::UrTool),
             "xarm" => {
                 let (host, rate) = rest.split_once('@').map_or((rest, None), |(host, rate)| (host, Some(rate)));
                 let baud = rate.map_or(Ok(default_baud), str::parse);
                 let baud = baud.map_err(|_| format!("{:?} is not a rate [bit/s]", rate.unwrap_or_default()))?;
-                Ok(Self::XarmTool(Endpoint::parse(host, xarm::tool_line::PORT)?, baud))
+                Ok(Self::XarmTool(Endpoint::parse(host, xarm_tool::PORT)?, baud))
             }
             _ => Err(format!("{text:?} is not a line: {FORM}")),
         }
@@ -70,7 +73,7 @@ pub enum Line {
     /// A socket.
     Tcp(TcpLink),
     /// The tool of an xArm.
-    XarmTool(xarm::tool_line::ToolLine),
+    XarmTool(xarm_tool::ToolLine),
 }
 
 impl Line {
@@ -85,7 +88,7 @@ impl Line {
                 Self::Tcp(TcpLink::connect(device, endpoint, timeout)?)
             }
             LineAddress::XarmTool(endpoint, baud) => {
-                Self::XarmTool(xarm::tool_line::ToolLine::connect(device, endpoint, *baud, timeout)?)
+                Self::XarmTool(xarm_tool::ToolLine::connect(device, endpoint, *baud, timeout)?)
             }
         })
     }

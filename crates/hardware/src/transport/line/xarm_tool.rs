@@ -1,4 +1,4 @@
-//! The RS-485 line at the tool flange as a byte stream. Register 241 of the control box passes bytes on unchanged, and
+//! The RS-485 line at the tool flange of an xArm as a byte stream. Register 241 of the control box passes bytes on unchanged, and
 //! its response has what came back from the tool within the box's own timeout (register 240).
 //!
 //! Bytes that the device sends without being asked, or later than that timeout, do not arrive.
@@ -6,17 +6,18 @@
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
-use super::protocol::gripper::BAUD_REGISTER;
-use dimos_hardware::adapter::{AdapterError, AdapterResult};
-use dimos_hardware::transport::Scan;
-use dimos_hardware::transport::request_reply::ByteLink;
-use dimos_hardware::transport::tcp::{Endpoint, TcpLink};
+use crate::adapter::{AdapterError, AdapterResult};
+use crate::transport::Scan;
+use crate::transport::request_reply::ByteLink;
+use crate::transport::tcp::{Endpoint, TcpLink};
 
 /// Port of the control box for devices at its lines.
 pub const PORT: u16 = 503;
 /// Registers: bytes for the line, and a value of the tool board.
 const PASS_ON: u8 = 241;
 const READ_BOARD: u8 = 128;
+/// Register of the tool board that has the index of the line's rate.
+const BAUD_REGISTER: u16 = 0x0A0B;
 /// The number of the tool flange among the devices behind the controller.
 const TOOL: u8 = 9;
 /// The private protocol.
