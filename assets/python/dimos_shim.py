@@ -51,9 +51,8 @@ INSTEAD: dict[str, tuple[str, tuple[Any, ...]]] = {
 DISABLED, MISSING = "it stopped on its own or is not enabled: enable it first", (ModuleNotFoundError, AttributeError)
 
 
-def control_modes() -> (
-    Any
-):  # of dimos; objects replace what adapters of the guide import from it and it lacks, or all of it
+# Of dimos; objects replace what adapters of the guide import from it and it lacks, or all of it.
+def control_modes() -> Any:
     name, bag = "dimos.hardware.manipulators", argparse.Namespace
     with contextlib.suppress(ImportError):
         vars(spec := importlib.import_module(name + ".spec")).setdefault("JointLimits", bag)  # elsewhere since 0.0.15
