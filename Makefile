@@ -26,7 +26,7 @@ PAGE := viewer/dist/index.html
 PAGE_SOURCES := $(wildcard viewer/*.json viewer/*.mjs) $(shell find viewer/src -type f 2>/dev/null)
 NODE := $(if $(wildcard viewer/package.json),$(shell command -v npm))
 
-.PHONY: run install dist shipped viewer viewer-if-possible check lint spelling licences test test-fast verified test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants bench bench-quick bench-page bench-share jitter soak lies lies-wire pauses
+.PHONY: run install dist shipped viewer viewer-if-possible check lint scripts spelling licences test test-fast verified test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants bench bench-quick bench-page bench-share jitter soak lies lies-wire pauses
 
 # Builds the program to try it, not optimized, and starts the shipped blueprint; its arm is simulated. Ends with Ctrl-C.
 run: viewer-if-possible
@@ -64,12 +64,22 @@ viewer/node_modules/.package-lock.json: viewer/package.json viewer/package-lock.
 	cd viewer && npm ci --no-audit --no-fund
 	@touch $@
 
-check: lint spelling licences
+check: lint scripts spelling licences
 
 lint:
 	cargo fmt --all --check
 	cargo clippy --workspace --all-targets --locked $(WITH) -- -D warnings
 	cargo clippy --no-default-features --locked -- -D warnings
+
+# Format, lints and types of Python (pyproject.toml) and of the page (viewer/biome.jsonc, viewer/tsconfig.json). The
+# client and the shim are for Python 3.9; tests need what test-tools installs.
+scripts:
+	@if [ -x .venv/bin/ruff ] && [ -x .venv/bin/mypy ]; then PATH="$$PWD/.venv/bin:$$PATH"; set -ex; \
+	ruff format --check; ruff check; mypy --strict assets/python; \
+	mypy --python-version 3.11 tests/python tests/readers tests/suite.py; \
+	else echo "note: Python is not checked; make test-tools installs ruff and mypy"; fi
+	@if [ -x viewer/node_modules/.bin/biome ]; then cd viewer && npm run --silent check; \
+	else echo "note: the page's TypeScript is not checked; make test-tools installs biome"; fi
 
 spelling:
 	@if [ -x .venv/bin/codespell ]; then .venv/bin/codespell; \

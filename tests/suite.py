@@ -78,8 +78,8 @@ def failures():
         for case in suite.iter("testcase"):
             if case.find("failure") is None and case.find("error") is None:
                 continue
-            begin = datetime.fromisoformat(case.get("timestamp").replace("Z", "+00:00")).timestamp()
-            yield suite.get("name"), case.get("name"), begin, begin + float(case.get("time"))
+            begin = datetime.fromisoformat(case.attrib["timestamp"].replace("Z", "+00:00")).timestamp()
+            yield suite.get("name"), case.get("name"), begin, begin + float(case.attrib["time"])
 
 
 def nextest(arguments):

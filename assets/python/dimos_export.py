@@ -6,7 +6,8 @@ package is missing."""
 
 import json
 import sys
-from typing import Any, Iterator
+from collections.abc import Iterator
+from typing import Any
 
 ROWS = 65_536
 
@@ -44,7 +45,11 @@ def lerobot(target: str) -> None:
     width = len(names)
     feature = {"dtype": "float32", "shape": (width,), "names": names}
     data = LeRobotDataset.create(
-        repo_id="dimos/export", fps=header["fps"], root=target, robot_type=header["robot_type"], use_videos=False,
+        repo_id="dimos/export",
+        fps=header["fps"],
+        root=target,
+        robot_type=header["robot_type"],
+        use_videos=False,
         features={"observation.state": feature, "action": feature},
     )
     for block in blocks(numpy.dtype((numpy.float64, (2 * width,)))):

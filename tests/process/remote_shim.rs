@@ -482,5 +482,5 @@ fn the_shim_is_python_3_9_of_bounded_length() {
     let check = "import ast, sys; ast.parse(open(sys.argv[1]).read(), feature_version=(3, 9))";
     assert!(Command::new("python3").args(["-c", check, &file]).status().unwrap().success());
     let text = std::fs::read_to_string(&file).unwrap();
-    assert!(text.lines().count() <= 160 && text.lines().all(|line| line.len() <= 120), "one file that can be read");
+    assert!(text.lines().count() <= 280 && text.lines().all(|line| line.len() <= 120), "one file that can be read");
 }

@@ -37,8 +37,8 @@ def frames():
 
     sent(lambda line, packets: packets.txPacket(line, [0, 0, 1, 2, sdk.INST_PING, 0]))
     sent(lambda line, packets: packets.readTx(line, 3, 9, 4))
-    for address, length in [(40, 31), (56, 2)]:
-        sent(lambda line, packets: packets.syncReadTx(line, address, length, list(IDS), len(IDS)))
+    for span in [(40, 31), (56, 2)]:
+        sent(lambda line, packets, span=span: packets.syncReadTx(line, *span, list(IDS), len(IDS)))
     goals = [100 * i for i in IDS]
     values = [byte for i, goal in zip(IDS, goals) for byte in (i, goal & 0xFF, goal >> 8)]
     sent(lambda line, packets: packets.syncWriteTxOnly(line, 42, 2, values, len(values)))

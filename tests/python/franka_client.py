@@ -3,6 +3,7 @@ libfranka 0.9 as panda-python has it."""
 
 import sys
 import time
+from typing import Any
 
 DURATION = 1.0
 
@@ -80,7 +81,7 @@ class Fer:
     def move(self, velocity, of):
         kind = self.it.JointVelocities if velocity else self.it.JointPositions
         control = self.robot.control_joint_velocity if velocity else self.robot.control_joint_position
-        seen = {}
+        seen: dict[str, Any] = {}
 
         def callback(state, step):
             seen.setdefault("q", list(state.q_d))
@@ -134,7 +135,7 @@ def main(model, address):
 
     # A jump is an error by its name, and ends with a recovery.
     try:
-        arm.move(False, lambda t, q: ([q[0] + 0.1] + q[1:], t > 0.5))
+        arm.move(False, lambda t, q: ([q[0] + 0.1, *q[1:]], t > 0.5))
         # Its own limits made it slow: no error.
         check("a jump is refused", model == "fer")
     except Exception as error:

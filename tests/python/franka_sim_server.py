@@ -5,10 +5,11 @@ model of the arm is the URDF that it ships, without meshes and with the rotor in
 nothing is downloaded. It prints every limit that is broken.
 
 A command that misses its millisecond is dropped, and the extrapolated one is kept, as Franka documents it. franka-sim
-otherwise applies late commands after all, for clients that are no real-time programs, and takes back what it has reported
-in their place: then no client can know what the next command is compared with.
+otherwise applies late commands after all, for clients that are no real-time programs, and takes back what it has
+reported in their place: then no client can know what the next command is compared with.
 """
 
+import contextlib
 import logging
 import os
 import sys
@@ -34,7 +35,9 @@ os.environ["FR3_MJCF"] = str(file)
 
 from franka_sim.franka_sim_server import FrankaSimServer  # noqa: E402 (reads the model's path)
 
-logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(relativeCreated)d %(name)s %(levelname)s %(message)s")
+logging.basicConfig(
+    level=logging.INFO, stream=sys.stdout, format="%(relativeCreated)d %(name)s %(levelname)s %(message)s"
+)
 
 
 def until_parent_ends() -> None:
@@ -43,6 +46,8 @@ def until_parent_ends() -> None:
 
 
 threading.Thread(target=until_parent_ends, daemon=True).start()
+
+
 class Judge(FrankaSimServer):
     """Drops late commands."""
 
@@ -51,10 +56,12 @@ class Judge(FrankaSimServer):
 
 
 server = Judge(
-    host="127.0.0.1", port=int(sys.argv[1]), enforce_comm_constraints=True, enforce_motion_limits=True, enable_gripper=False
+    host="127.0.0.1",
+    port=int(sys.argv[1]),
+    enforce_comm_constraints=True,
+    enforce_motion_limits=True,
+    enable_gripper=False,
 )
-try:
+with contextlib.suppress(PermissionError):
     os.nice(-10)  # a controller does not wait for other programs
-except PermissionError:
-    pass
 server.start()

@@ -18,6 +18,7 @@ faulthandler.dump_traceback_later(60, exit=True)  # ends a wait without a bound
 
 class Run:
     """A run that answers only the methods in `answers`: with a value, or with what a function returns."""
+
     def __init__(self, folder, **answers):
         self.answers, self.asked, path = answers, [], Path(tempfile.mktemp(dir=folder))
         self.listener = socket.socket(socket.AF_UNIX)

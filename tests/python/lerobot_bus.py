@@ -2,8 +2,8 @@
 
 The servos of an arm have the numbers from 1 on, or from the one on that is the last argument.
 
-lerobot_bus.py use PATH FILE: everything that its SO-101 follower does with the bus, and its calibration into FILE; prints
-each different packet that it sent, in hexadecimal.
+lerobot_bus.py use PATH FILE: everything that its SO-101 follower does with the bus, and its calibration into FILE;
+prints each different packet that it sent, in hexadecimal.
 lerobot_bus.py calibrated PATH FILE: whether the servos have the calibration of FILE, and FILE is as LeRobot writes it.
 lerobot_bus.py setup PATH NAME: gives the only servo on the line the number of NAME.
 """
@@ -15,7 +15,7 @@ import types
 
 # Two helpers for terminals; their module imports torch and much else, which the bus needs nothing of.
 terminal = types.ModuleType("lerobot.utils.utils")
-terminal.enter_pressed = terminal.move_cursor_up = lambda *_: None
+vars(terminal).update(dict.fromkeys(["enter_pressed", "move_cursor_up"], lambda *_: None))
 sys.modules["lerobot.utils.utils"] = terminal
 
 import draccus  # noqa: E402

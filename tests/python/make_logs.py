@@ -7,6 +7,7 @@ import os
 import random
 import struct
 import sys
+from pathlib import Path
 
 from mcap.writer import CompressionType as C
 from mcap.writer import IndexType, Writer
@@ -101,9 +102,9 @@ def records(data):
 def changed(name, change, source="plain", **options):
     write(name, motion(), **options)
     path = os.path.join(FOLDER, name + ".mcap")
-    data = bytearray(open(path, "rb").read())
+    data = bytearray(Path(path).read_bytes())
     data = change(data, [at for at, opcode, _ in records(data) if opcode == 6]) or data
-    open(path, "wb").write(data)
+    Path(path).write_bytes(data)
 
 
 def plain():
@@ -235,7 +236,7 @@ def wrong_map():
     own, other = motion(), motion(topic="/other")
     third = [("/third", time + 2_000 * MS, data) for _, time, data in motion(20)]
     path = write("wrong_map", [message for pair in zip(own, other) for message in pair] + third)
-    data = bytearray(open(path, "rb").read())
+    data = bytearray(Path(path).read_bytes())
     for at, opcode, _ in list(records(data)):
         if opcode == 8:
             length = struct.unpack_from("<I", data, at + 9 + 32)[0]
@@ -244,7 +245,7 @@ def wrong_map():
                     struct.pack_into("<H", data, entry, 3)
     # The summary has no checksum.
     struct.pack_into("<I", data, len(data) - 12, 0)
-    open(path, "wb").write(data)
+    Path(path).write_bytes(data)
 
 
 def no_profile():
@@ -397,9 +398,11 @@ def attached():
 
 
 def bad_attachment():
-    path = write("bad_attachment", motion(), lambda writer: writer.add_attachment(1, 2, "a.txt", "text/plain", b"intact"))
-    data = open(path, "rb").read().replace(b"intact", b"infact")
-    open(path, "wb").write(data)
+    path = write(
+        "bad_attachment", motion(), lambda writer: writer.add_attachment(1, 2, "a.txt", "text/plain", b"intact")
+    )
+    data = Path(path).read_bytes().replace(b"intact", b"infact")
+    Path(path).write_bytes(data)
 
 
 def giant():
@@ -411,10 +414,12 @@ def bag(name, missing=False, third=None):
     os.makedirs(os.path.join(FOLDER, name), exist_ok=True)
     names = [f"{name}_0.mcap", f"{name}_1.mcap"] + ([f"{name}_2.mcap"] if missing or third is not None else [])
     if third is not None:
-        open(os.path.join(FOLDER, name, f"{name}_2.mcap"), "wb").write(third)
+        Path(FOLDER, name, f"{name}_2.mcap").write_bytes(third)
     with open(os.path.join(FOLDER, name, "metadata.yaml"), "w") as out:
         listed = "".join(f"    - {n}\n" for n in names)
-        out.write(f"rosbag2_bagfile_information:\n  version: 5\n  storage_identifier: mcap\n  relative_file_paths:\n{listed}")
+        out.write(
+            f"rosbag2_bagfile_information:\n  version: 5\n  storage_identifier: mcap\n  relative_file_paths:\n{listed}"
+        )
     for k in range(2):
         own = motion()[100 * k : 100 * k + 100]
         other = motion(topic="/other")[100 * k : 100 * k + 100]

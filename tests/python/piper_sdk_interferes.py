@@ -10,6 +10,7 @@ import time
 
 from piper_sdk import C_PiperInterface_V2
 
+piper = C_PiperInterface_V2("sim", judge_flag=False, can_auto_init=False)
 CALLS = {
     # A pose 20 mm above the emulator's start.
     "pose": (
@@ -19,8 +20,6 @@ CALLS = {
     "guiding": (lambda: piper.MotionCtrl_1(0, 0, 1), lambda: piper.MotionCtrl_1(0, 0, 2)),
     "power": (lambda: piper.DisableArm(7), lambda: piper.EnableArm(7)),
 }
-
-piper = C_PiperInterface_V2("sim", judge_flag=False, can_auto_init=False)
 piper.CreateCanBus(sys.argv[1], bustype="socketcan", judge_flag=False)
 piper.ConnectPort(piper_init=False)
 print("ready", flush=True)

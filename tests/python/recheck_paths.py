@@ -10,6 +10,7 @@ import json
 import math
 import tempfile
 import xml.etree.ElementTree as xml
+from pathlib import Path
 
 import coal
 import numpy as np
@@ -32,7 +33,7 @@ class Robot:
     """The arm with its sliding joints, a gripper's, open."""
 
     def __init__(self, path, packages):
-        text = open(path).read()
+        text = Path(path).read_text()
         for package in packages:
             name, folder = package.split("=", 1)
             text = text.replace(f"package://{name}/", f"file://{folder}/")
@@ -42,8 +43,10 @@ class Robot:
             file.flush()
             self.links = pin.buildGeomFromUrdf(self.model, file.name, pin.GeometryType.COLLISION)
         root = xml.fromstring(text)
-        joints = [j for j in root.iter("joint") if j.find("parent") is not None]
-        self.neighbours = {frozenset((j.find("parent").get("link"), j.find("child").get("link"))) for j in joints}
+        ends = [(j.find("parent"), j.find("child")) for j in root.iter("joint")]
+        self.neighbours = {
+            frozenset((a.get("link"), b.get("link"))) for a, b in ends if a is not None and b is not None
+        }
         self.rest = pin.neutral(self.model)
         for j in range(1, self.model.njoints):
             if self.model.joints[j].shortname().startswith("JointModelP"):
@@ -54,7 +57,9 @@ class Robot:
         return self.model.frames[geometry.parentFrame].name
 
     def own_name(self, name):
-        ends = [n for n in self.model.names if n == name] or [n for n in self.model.names if n.split("_", 1)[-1] == name.split("_", 1)[-1]]
+        ends = [n for n in self.model.names if n == name] or [
+            n for n in self.model.names if n.split("_", 1)[-1] == name.split("_", 1)[-1]
+        ]
         assert len(ends) == 1, (name, ends)
         return ends[0]
 
@@ -107,9 +112,14 @@ class Judge:
         hit = pin.computeCollisions(self.robot.model, self.data, self.geometry, self.checks, full, not everything)
         if not hit:
             return []
-        name = lambda i: self.geometry.geometryObjects[i].name
+
+        def name(i):
+            return self.geometry.geometryObjects[i].name
+
         pairs = enumerate(self.geometry.collisionPairs)
-        return [f"{name(p.first)} and {name(p.second)}" for i, p in pairs if self.checks.collisionResults[i].isCollision()]
+        return [
+            f"{name(p.first)} and {name(p.second)}" for i, p in pairs if self.checks.collisionResults[i].isCollision()
+        ]
 
     def outside(self, q):
         low, high = self.robot.model.lowerPositionLimit[self.at], self.robot.model.upperPositionLimit[self.at]
@@ -122,13 +132,15 @@ def main():
         arguments.add_argument(f"--{name}", required=True)
     arguments.add_argument("--package", action="append", default=[])
     arguments.add_argument("--every", type=int, default=1, help="only one path in N")
-    arguments = arguments.parse_args()
-    robot = Robot(arguments.urdf, arguments.package)
-    problems = {(p["problem"], p["index"]): p for p in map(json.loads, open(arguments.problems))}
-    rows = json.load(open(arguments.rows))["rows"]
-    judged, touching, looks, unsolved, explained = 0, 0, 0, 0, {}
+    given = arguments.parse_args()
+    robot = Robot(given.urdf, given.package)
+    lines = Path(given.problems).read_text().splitlines()
+    problems = {(p["problem"], p["index"]): p for p in map(json.loads, lines)}
+    rows = json.loads(Path(given.rows).read_text())["rows"]
+    judged, touching, looks, unsolved = 0, 0, 0, 0
+    explained: dict[str, int] = {}
     for number, row in enumerate(rows):
-        if row["solved"] and number % arguments.every:
+        if row["solved"] and number % given.every:
             continue
         problem = problems[row["problem"], row["index"]]
         judge = Judge(robot, problem)

@@ -7,8 +7,13 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 STORES = {"jazzy": Stores.ROS2_JAZZY, "kilted": Stores.ROS2_KILTED, "lyrical": Stores.ROS2_LYRICAL}
-MESSAGES = ["sensor_msgs/msg/JointState", "tf2_msgs/msg/TFMessage", "std_msgs/msg/String",
-            "diagnostic_msgs/msg/DiagnosticArray", "action_msgs/msg/GoalStatusArray"]
+MESSAGES = [
+    "sensor_msgs/msg/JointState",
+    "tf2_msgs/msg/TFMessage",
+    "std_msgs/msg/String",
+    "diagnostic_msgs/msg/DiagnosticArray",
+    "action_msgs/msg/GoalStatusArray",
+]
 
 TOLERANCE = "string name\nfloat64 position\nfloat64 velocity\nfloat64 acceleration\n"
 COMPONENT_TOLERANCE = "string joint_name\nuint16 component\nfloat64 position\nfloat64 velocity\nfloat64 acceleration\n"
@@ -77,20 +82,29 @@ def store_of(distro):
     feedback = FEEDBACK.replace("MULTI_INDEX", "int32 multi_dof_index" if new else "")
     feedback = feedback.replace("INDEX", "int32 index" if new else "")
     component = COMPONENT_STATE.replace("CLASS_TYPE", "" if new else "string class_type")
-    texts = {f"{MANAGER}/msg/ChainConnection": "string name\nstring[] reference_interfaces\n",
-             f"{MANAGER}/msg/ControllerState": CONTROLLER_STATE, f"{MANAGER}/msg/HardwareComponentState": component,
-             f"{MANAGER}/msg/HardwareInterface": "string name\nstring data_type\nbool is_available\nbool is_claimed\n",
-             "control_msgs/msg/JointTolerance": TOLERANCE,
-             "control_msgs/msg/JointComponentTolerance": COMPONENT_TOLERANCE, f"{ACTION}_Goal": GOAL,
-             f"{ACTION}_Result": RESULT, f"{ACTION}_Feedback": feedback}
+    texts = {
+        f"{MANAGER}/msg/ChainConnection": "string name\nstring[] reference_interfaces\n",
+        f"{MANAGER}/msg/ControllerState": CONTROLLER_STATE,
+        f"{MANAGER}/msg/HardwareComponentState": component,
+        f"{MANAGER}/msg/HardwareInterface": "string name\nstring data_type\nbool is_available\nbool is_claimed\n",
+        "control_msgs/msg/JointTolerance": TOLERANCE,
+        "control_msgs/msg/JointComponentTolerance": COMPONENT_TOLERANCE,
+        f"{ACTION}_Goal": GOAL,
+        f"{ACTION}_Result": RESULT,
+        f"{ACTION}_Feedback": feedback,
+    }
     for name, text in texts.items():
         store.register(get_types_from_msg(text, name))
     uuid, time, boolean = ("unique_identifier_msgs/msg/UUID", "builtin_interfaces/msg/Time", base("bool"))
     compose(store, f"{ACTION}_FeedbackMessage", goal_id=uuid, feedback=f"{ACTION}_Feedback")
     service(store, f"{ACTION}_SendGoal", dict(goal_id=uuid, goal=f"{ACTION}_Goal"), dict(accepted=boolean, stamp=time))
     service(store, f"{ACTION}_GetResult", dict(goal_id=uuid), dict(status=base("int8"), result=f"{ACTION}_Result"))
-    service(store, "action_msgs/srv/CancelGoal", dict(goal_info="action_msgs/msg/GoalInfo"),
-            dict(return_code=base("int8"), goals_canceling=sequence("action_msgs/msg/GoalInfo")))
+    service(
+        store,
+        "action_msgs/srv/CancelGoal",
+        dict(goal_info="action_msgs/msg/GoalInfo"),
+        dict(return_code=base("int8"), goals_canceling=sequence("action_msgs/msg/GoalInfo")),
+    )
     outcome = dict(success=boolean, message=base("string"))
     service(store, "std_srvs/srv/Trigger", {}, outcome)
     service(store, "std_srvs/srv/SetBool", dict(data=boolean), outcome)
@@ -128,15 +142,32 @@ def service(store, name, request, response):
     """A service: the message of its request, its response and its event."""
     compose(store, f"{name}_Request", **request)
     compose(store, f"{name}_Response", **response)
-    compose(store, f"{name}_Event", info=EVENT_INFO, request=sequence(f"{name}_Request", 1),
-            response=sequence(f"{name}_Response", 1))
-    compose(store, name, request_message=f"{name}_Request", response_message=f"{name}_Response",
-            event_message=f"{name}_Event")
+    compose(
+        store,
+        f"{name}_Event",
+        info=EVENT_INFO,
+        request=sequence(f"{name}_Request", 1),
+        response=sequence(f"{name}_Response", 1),
+    )
+    compose(
+        store,
+        name,
+        request_message=f"{name}_Request",
+        response_message=f"{name}_Response",
+        event_message=f"{name}_Event",
+    )
 
 
-NAMES = [*MESSAGES, *(f"{ACTION}_{part}" for part in ("SendGoal", "GetResult", "FeedbackMessage")),
-         "action_msgs/srv/CancelGoal", f"{MANAGER}/srv/ListControllers", f"{MANAGER}/srv/ListHardwareComponents",
-         "std_srvs/srv/Trigger", "std_srvs/srv/SetBool", "example_interfaces/srv/AddTwoInts"]
+NAMES = [
+    *MESSAGES,
+    *(f"{ACTION}_{part}" for part in ("SendGoal", "GetResult", "FeedbackMessage")),
+    "action_msgs/srv/CancelGoal",
+    f"{MANAGER}/srv/ListControllers",
+    f"{MANAGER}/srv/ListHardwareComponents",
+    "std_srvs/srv/Trigger",
+    "std_srvs/srv/SetBool",
+    "example_interfaces/srv/AddTwoInts",
+]
 
 if __name__ == "__main__":
     for distro in STORES:

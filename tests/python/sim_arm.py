@@ -36,8 +36,13 @@ class SimSDK:
         for _ in range(steps):
             for i in range(self.dof):
                 gap = self.target[i] - self.q[i]
-                wanted = self.target[i] if self.mode == 4 else math.copysign(
-                    min(math.sqrt(2 * 0.8 * self.ACCELERATION * abs(gap)), self.speed, abs(gap) / 0.002), gap)
+                wanted = (
+                    self.target[i]
+                    if self.mode == 4
+                    else math.copysign(
+                        min(math.sqrt(2 * 0.8 * self.ACCELERATION * abs(gap)), self.speed, abs(gap) / 0.002), gap
+                    )
+                )
                 wanted = wanted if self.on and not self.error else 0.0
                 most = self.ACCELERATION * 0.002
                 self.v[i] += max(-most, min(most, wanted - self.v[i]))
@@ -100,15 +105,19 @@ class SimArmAdapter:
         return self.write_stop()
 
     def get_info(self) -> ManipulatorInfo:
-        return ManipulatorInfo(vendor="SimVendor", model="SimArm", dof=self._dof, firmware_version="1.2",
-                               serial_number=None)
+        return ManipulatorInfo(
+            vendor="SimVendor", model="SimArm", dof=self._dof, firmware_version="1.2", serial_number=None
+        )
 
     def get_dof(self) -> int:
         return self._dof
 
     def get_limits(self) -> JointLimits:
-        return JointLimits(position_lower=[-math.pi] * self._dof, position_upper=[math.pi] * self._dof,
-                           velocity_max=[math.pi] * self._dof)
+        return JointLimits(
+            position_lower=[-math.pi] * self._dof,
+            position_upper=[math.pi] * self._dof,
+            velocity_max=[math.pi] * self._dof,
+        )
 
     def set_control_mode(self, mode: ControlMode) -> bool:
         if not self._sdk:
@@ -230,8 +239,13 @@ class HostileAdapter(SimArmAdapter):
     HOSTILE = "\x1b]0;owned\x07\x1b[2J\u202eevil\x7f\x9b5m"
 
     def get_info(self) -> ManipulatorInfo:
-        return ManipulatorInfo(vendor=self.HOSTILE, model=self.HOSTILE, dof=self._dof, firmware_version=self.HOSTILE,
-                               serial_number=self.HOSTILE)
+        return ManipulatorInfo(
+            vendor=self.HOSTILE,
+            model=self.HOSTILE,
+            dof=self._dof,
+            firmware_version=self.HOSTILE,
+            serial_number=self.HOSTILE,
+        )
 
     def read_error(self) -> tuple[int, str]:
         code, _ = super().read_error()

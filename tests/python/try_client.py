@@ -1,4 +1,7 @@
-"""Tries assets/python/dimos_client against a live run of tests/process/python_client.rs; fails at the first difference from its page."""
+"""Tries assets/python/dimos_client against a live run of tests/process/python_client.rs.
+
+It fails at the first difference from its page.
+"""
 
 import itertools
 import math
@@ -43,7 +46,7 @@ def moves(robot):
     refused(dimos.Refused, "INVALID_PARAMS", lambda: robot.move("arm", named="home", direct=True))
     held = refused(dimos.LeaseHeld, "LEASE_HELD", lambda: Client.connect().move("arm", READY))
     assert held.data["pid"] == os.getpid() and "try_client.py" in held.data["program"], held.data
-    far = refused(dimos.OutOfLimits, "OUT_OF_LIMITS", lambda: robot.move("arm", [99.0] + READY[1:]))
+    far = refused(dimos.OutOfLimits, "OUT_OF_LIMITS", lambda: robot.move("arm", [99.0, *READY[1:]]))
     assert far.data["joint"] == "arm_joint1" and far.hint
     refused(dimos.Refused, "INVALID_PARAMS", lambda: robot.move("arm", [math.nan] * 6))
     points = [{"time_from_start": t, "positions": [READY[0] + 0.05 * t], "velocities": [0.0]} for t in (0, 1)]
@@ -62,7 +65,7 @@ def a_move_ends_the_streams_of_its_client(robot):
     """Also while these move the arm."""
     for _ in range(10):
         here = robot.state("arm").position
-        robot.servo("servo_arm", [here[0] + 0.01] + here[1:])
+        robot.servo("servo_arm", [here[0] + 0.01, *here[1:]])
         time.sleep(0.02)
     assert robot.move("arm", READY)["state"] == "COMPLETED"
     robot.velocity("velocity_arm", [0.3, 0, 0, 0, 0, 0])
@@ -76,14 +79,15 @@ def a_move_ends_the_streams_of_its_client(robot):
 
 def follows_a_policy(robot, watcher):
     """50 Hz for 4 s: every target is taken, and the stream never goes stale."""
-    home, asked = [], []
+    home: list[float] = []
+    asked = []
     seen = watcher._subscribe("events", None, 4096)
 
     def policy(state, t):
         if not home:
             home.extend(state.position)
         asked.append(t)
-        return [home[0] + 0.1 * (1 - math.cos(2 * t))] + home[1:]
+        return [home[0] + 0.1 * (1 - math.cos(2 * t)), *home[1:]]
 
     report = robot.follow("servo_arm", policy, rate=50, duration=4)
     print(f"50 Hz: {report}")

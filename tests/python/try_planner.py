@@ -74,7 +74,7 @@ def a_planned_move_ends_the_streams_of_its_client(robot):
         time.sleep(0.02)
     assert robot.move("arm", named="home", speed=1.0)["state"] == "COMPLETED"  # while the arm moves up
     assert is_at(robot, HOME)
-    robot.follow("servo_arm", lambda state, t: [state.position[0] + 0.01] + state.position[1:], 50, 0.4)
+    robot.follow("servo_arm", lambda state, t: [state.position[0] + 0.01, *state.position[1:]], 50, 0.4)
     robot.execute(robot.plan("arm", named="home"))
     assert is_at(robot, HOME)
 

@@ -1,10 +1,11 @@
-"""`ur_rtde` on an emulated controller: ur_rtde_client.py use ADDRESS. Or, with `bytes`, prints the packets with which it
-asks for values, one in hexadecimal a line."""
+"""`ur_rtde` on an emulated controller: ur_rtde_client.py use ADDRESS. Or, with `bytes`, prints the packets with which
+it asks for values, one in hexadecimal a line."""
 
 import multiprocessing
 import socket
 import sys
 import time
+from functools import partial
 
 # Its clients keep the interpreter's lock while they connect, so what they connect to is in another process.
 PROXY = "127.48.17.7"
@@ -62,13 +63,13 @@ def use(address):
 
     # A line: 5 cm along x.
     pose = receive.getActualTCPPose()
-    check("moveL", control.moveL([pose[0] + 0.05] + pose[1:], 0.2, 0.5))
-    check("straight", near(receive.getActualTCPPose(), [pose[0] + 0.05] + pose[1:]))
+    check("moveL", control.moveL([pose[0] + 0.05, *pose[1:]], 0.2, 0.5))
+    check("straight", near(receive.getActualTCPPose(), [pose[0] + 0.05, *pose[1:]]))
 
     here = receive.getActualQ()
     for i in range(250):
         period = control.initPeriod()
-        point = [here[0] + 0.2 * i / 250] + here[1:]
+        point = [here[0] + 0.2 * i / 250, *here[1:]]
         check("servoJ", control.servoJ(point, 0, 0, 0.002, 0.05, 300))
         control.waitPeriod(period)
     within("the last setpoint", 3, lambda: near(receive.getActualQ(), point))
@@ -112,7 +113,7 @@ def again(address):
         check(f"client {turn}", os.waitpid(child, 0)[1] == 0)
     control = rtde_control.RTDEControlInterface(address)
     here = receive.getActualQ()
-    goal = [here[0] + 0.05] + here[1:]
+    goal = [here[0] + 0.05, *here[1:]]
     check("moveJ after them", control.moveJ(goal, 1.0, 2.0) and near(receive.getActualQ(), goal))
 
     commands = [
@@ -123,7 +124,7 @@ def again(address):
     ]
     for name, act in commands:
         check(f"its program runs before {name}", control.isProgramRunning())
-        check(f"{name} fails", not tried(lambda: act(control)))
+        check(f"{name} fails", not tried(partial(act, control)))
         # A new client clears the command that is left in the register.
         control.disconnect()
         control = rtde_control.RTDEControlInterface(address)
@@ -168,7 +169,7 @@ def serve(address, sent):
 
 
 def packets(address):
-    sent = multiprocessing.Queue()
+    sent: multiprocessing.Queue[bytes] = multiprocessing.Queue()
     server = multiprocessing.Process(target=serve, args=(address, sent))
     server.start()
     sent.get(timeout=10)

@@ -7,18 +7,36 @@ import json
 import math
 import sys
 import time
+from typing import Any, Callable, Optional
 
 WHAT, HOST = sys.argv[1:]
 EMULATED = WHAT == "emulator"
 POSE = [0, -20, -30, 0, 50, 0]
 
 # The client object's own affairs: nothing goes over the wire, or only what connecting needs.
-LOCAL = """connect disconnect set_timeout set_baud_checkset_enable set_checkset_default_baud get_checkset_default_baud
-set_rs485_use_503_port set_only_check_type""".split()
+LOCAL = [
+    "connect",
+    "disconnect",
+    "set_timeout",
+    "set_baud_checkset_enable",
+    "set_checkset_default_baud",
+    "get_checkset_default_baud",
+    "set_rs485_use_503_port",
+    "set_only_check_type",
+]
 # They speak to UFACTORY Studio, or run a program of the client's own calls.
-STUDIO = """get_trajectories delete_trajectory delete_blockly_app run_blockly_app run_gcode_app run_gcode_file
-get_initial_point
-set_initial_point get_mount_direction set_mount_direction""".split()
+STUDIO = [
+    "get_trajectories",
+    "delete_trajectory",
+    "delete_blockly_app",
+    "run_blockly_app",
+    "run_gcode_app",
+    "run_gcode_file",
+    "get_initial_point",
+    "set_initial_point",
+    "get_mount_direction",
+    "set_mount_direction",
+]
 # They return nothing, or not a code: judged by what they do.
 WITHOUT_CODE = {"emergency_stop", "reset", "move_arc_lines", "send_cmd_sync", "get_is_moving"}
 
@@ -108,23 +126,27 @@ def rests(arm, before):
 
 def reduced(index, wanted):
     """Whether this part of the box's reduced mode is so: mode, boundary, tool, joints, ranges of joints, fence."""
+
     def holds(arm):
         states = arm.get_reduced_states()[1]
         value = states[index] if isinstance(wanted, list) else [states[index]]
         wants = wanted if isinstance(wanted, list) else [wanted]
-        return near(value[:len(wants)], wants, 0.5)
+        return near(value[: len(wants)], wants, 0.5)
 
     return shows(holds)
 
 
 def outputs(*levels):
     """Whether the first outputs of the tool board are at these levels."""
-    return shows(lambda arm: arm.get_tgpio_output_digital()[1][:len(levels)] == list(levels))
+    return shows(lambda arm: arm.get_tgpio_output_digital()[1][: len(levels)] == list(levels))
 
 
 def gripped(*pulses):
     """Whether the gripper is at one of these positions."""
-    at = lambda opening: opening is not None and any(abs(opening - p / 1e4) < 1e-3 for p in pulses)
+
+    def at(opening):
+        return opening is not None and any(abs(opening - p / 1e4) < 1e-3 for p in pulses)
+
     return shows(lambda arm: at(truth()["gripper"]), 4)
 
 
@@ -143,52 +165,80 @@ def slower(arm, before):
     arm.set_gripper_position(800, wait=True)
     began = time.monotonic()
     arm.set_gripper_position(500, wait=True)
-    return 0.4 < time.monotonic() - began
+    return time.monotonic() - began > 0.4
 
 
 # What would change something: arguments, the mode for it, and what must have changed if it returns 0.
-CHANGES = {
+CHANGES: dict[str, tuple[Callable[..., Any], int, Optional[Callable[..., Any]]]] = {
     "set_position": (
-        lambda a, p: a.set_position(p[0], p[1], p[2] + 20, *p[3:], speed=80, wait=True), 0, tool(0, 0, 20)),
+        lambda a, p: a.set_position(p[0], p[1], p[2] + 20, *p[3:], speed=80, wait=True),
+        0,
+        tool(0, 0, 20),
+    ),
     "set_position relative": (lambda a, p: a.set_position(z=20, relative=True, speed=80, wait=True), 0, tool(0, 0, 20)),
     "set_position y only": (lambda a, p: a.set_position(y=30, speed=80, wait=True), 0, tool(0, 30, 0)),
     "set_tool_position": (lambda a, p: a.set_tool_position(z=20, speed=80, wait=True), 0, tool_down),
     "set_position_aa": (
-        lambda a, p: a.set_position_aa([0, 0, 20, 0, 0, 0], relative=True, speed=80, wait=True), 0, tool(0, 0, 20)),
+        lambda a, p: a.set_position_aa([0, 0, 20, 0, 0, 0], relative=True, speed=80, wait=True),
+        0,
+        tool(0, 0, 20),
+    ),
     "set_position_aa absolute": (lambda a, p: absolute_aa(a), 0, tool(10, 0, 0)),
     "set_position_aa tool": (
-        lambda a, p: a.set_position_aa([0, 0, 20, 0, 0, 0], is_tool_coord=True, speed=80, wait=True), 0, tool_down),
+        lambda a, p: a.set_position_aa([0, 0, 20, 0, 0, 0], is_tool_coord=True, speed=80, wait=True),
+        0,
+        tool_down,
+    ),
     "set_servo_angle": (lambda a, p: a.set_servo_angle(servo_id=1, angle=4, speed=40, wait=True), 0, at(4, *POSE[1:])),
     "set_servo_angle relative": (
-        lambda a, p: a.set_servo_angle(servo_id=2, angle=-3, relative=True, speed=40, wait=True), 0, None),
+        lambda a, p: a.set_servo_angle(servo_id=2, angle=-3, relative=True, speed=40, wait=True),
+        0,
+        None,
+    ),
     "set_servo_angle all relative": (
-        lambda a, p: a.set_servo_angle(angle=[0, 3, 0, 0, 0, 5], relative=True, speed=40, wait=True), 0,
-        at(0, -17, -30, 0, 50, 5)),
+        lambda a, p: a.set_servo_angle(angle=[0, 3, 0, 0, 0, 5], relative=True, speed=40, wait=True),
+        0,
+        at(0, -17, -30, 0, 50, 5),
+    ),
     "set_servo_angle_j": (lambda a, p: a.set_servo_angle_j([2, *POSE[1:]]), 1, at(2, *POSE[1:])),
     "set_servo_angle_j jump": (lambda a, p: a.set_servo_angle_j([40, *POSE[1:]]), 1, None),
     "set_servo_cartesian": (lambda a, p: a.set_servo_cartesian([*p[:2], p[2] + 2, *p[3:]]), 1, tool(0, 0, 2)),
     "set_servo_cartesian_aa": (
-        lambda a, p: a.set_servo_cartesian_aa([0, 0, 2, 0, 0, 0], relative=True), 1, tool(0, 0, 2)),
+        lambda a, p: a.set_servo_cartesian_aa([0, 0, 2, 0, 0, 0], relative=True),
+        1,
+        tool(0, 0, 2),
+    ),
     "vc_set_joint_velocity": (
-        lambda a, p: a.vc_set_joint_velocity([10, 0, 0, 0, 0, 0], duration=0.3), 4,
-        lambda arm, before: 1.5 < joints()[0] < 4.5),
+        lambda a, p: a.vc_set_joint_velocity([10, 0, 0, 0, 0, 0], duration=0.3),
+        4,
+        lambda arm, before: 1.5 < joints()[0] < 4.5,
+    ),
     "vc_set_cartesian_velocity": (
-        lambda a, p: a.vc_set_cartesian_velocity([0, 0, 30, 0, 0, 0], duration=0.5), 4, tool(0, 0, 15)),
+        lambda a, p: a.vc_set_cartesian_velocity([0, 0, 30, 0, 0, 0], duration=0.5),
+        4,
+        tool(0, 0, 15),
+    ),
     "move_gohome": (lambda a, p: a.move_gohome(speed=60, wait=True), 0, at(0, 0, 0, 0, 0, 0)),
     "reset": (lambda a, p: a.reset(speed=60, wait=True), 0, at(0, 0, 0, 0, 0, 0)),
     "move_circle": (
-        lambda a, p: a.move_circle([p[0] + 20, p[1] + 20, *p[2:]], [p[0] + 40, *p[1:]], 100, speed=80, wait=True), 0,
-        None),
+        lambda a, p: a.move_circle([p[0] + 20, p[1] + 20, *p[2:]], [p[0] + 40, *p[1:]], 100, speed=80, wait=True),
+        0,
+        None,
+    ),
     "move_arc_lines": (
-        lambda a, p: a.move_arc_lines([[*p[:2], p[2] + 10, *p[3:]]], speed=80, first_pause_time=0, wait=True), 0,
-        lambda arm, before: not EMULATED or moved(arm, before["pose"], [0, 0, 10])),
+        lambda a, p: a.move_arc_lines([[*p[:2], p[2] + 10, *p[3:]]], speed=80, first_pause_time=0, wait=True),
+        0,
+        lambda arm, before: not EMULATED or moved(arm, before["pose"], [0, 0, 10]),
+    ),
     "set_pause_time": (lambda a, p: a.set_pause_time(1.5), 0, pauses),
     "motion_enable": (lambda a, p: a.motion_enable(False), 0, shows(lambda arm: not truth()["motors"])),
     "set_servo_attach": (lambda a, p: a.set_servo_attach(8), 0, shows(lambda arm: truth()["motors"])),
     "set_servo_detach": (lambda a, p: a.set_servo_detach(1), 0, shows(lambda arm: not truth()["motors"])),
     "set_mode": (lambda a, p: a.set_mode(4), 0, shows(lambda arm: arm.mode == 4)),
-    **{f"set_mode {m}": (lambda a, p, m=m: a.set_mode(m), 0, shows(lambda arm, m=m: arm.mode == m))
-       for m in (1, 2, 3, 5, 6, 7, 11)},
+    **{
+        f"set_mode {m}": (lambda a, p, m=m: a.set_mode(m), 0, shows(lambda arm, m=m: arm.mode == m))
+        for m in (1, 2, 3, 5, 6, 7, 11)
+    },
     "set_state": (lambda a, p: a.set_state(4), 0, shows(lambda arm: arm.get_state()[1] == 4)),
     "set_state 3": (lambda a, p: a.set_state(3), 0, shows(lambda arm: arm.get_state()[1] == 3)),
     "set_state 6": (lambda a, p: a.set_state(6), 0, shows(lambda arm: arm.get_state()[1] in (4, 6))),
@@ -198,36 +248,66 @@ CHANGES = {
     "clean_error": (lambda a, p: a.clean_error(), 0, shows(lambda arm: arm.get_err_warn_code()[1][0] == 0)),
     "clean_warn": (lambda a, p: a.clean_warn(), 0, shows(lambda arm: arm.get_err_warn_code()[1][1] == 0)),
     "set_tcp_load": (
-        lambda a, p: a.set_tcp_load(0.6, [0, 0, 30]), 0, shows(lambda arm: near(arm.tcp_load[1], [0, 0, 30]))),
+        lambda a, p: a.set_tcp_load(0.6, [0, 0, 30]),
+        0,
+        shows(lambda arm: near(arm.tcp_load[1], [0, 0, 30])),
+    ),
     "set_tcp_offset": (
-        lambda a, p: a.set_tcp_offset([0, 0, 100, 0, 0, 0]), 0,
-        lambda arm, before: near(arm.tcp_offset, [0, 0, 100, 0, 0, 0]) and moved(arm, before["pose"], [0, 0, -100])),
+        lambda a, p: a.set_tcp_offset([0, 0, 100, 0, 0, 0]),
+        0,
+        lambda arm, before: near(arm.tcp_offset, [0, 0, 100, 0, 0, 0]) and moved(arm, before["pose"], [0, 0, -100]),
+    ),
     "set_world_offset": (
-        lambda a, p: a.set_world_offset([0, 0, 100, 0, 0, 0]), 0,
-        lambda arm, before: near(arm.world_offset, [0, 0, 100, 0, 0, 0]) and moved(arm, before["pose"], [0, 0, 100])),
+        lambda a, p: a.set_world_offset([0, 0, 100, 0, 0, 0]),
+        0,
+        lambda arm, before: near(arm.world_offset, [0, 0, 100, 0, 0, 0]) and moved(arm, before["pose"], [0, 0, 100]),
+    ),
     "set_tcp_jerk": (lambda a, p: a.set_tcp_jerk(8000), 0, shows(lambda arm: abs(arm.tcp_jerk - 8000) < 1)),
     "set_tcp_maxacc": (lambda a, p: a.set_tcp_maxacc(9000), 0, shows(lambda arm: abs(arm.tcp_acc_limit[1] - 9000) < 1)),
     "set_joint_jerk": (lambda a, p: a.set_joint_jerk(800), 0, shows(lambda arm: abs(arm.joint_jerk - 800) < 1)),
     "set_joint_maxacc": (
-        lambda a, p: a.set_joint_maxacc(900), 0, shows(lambda arm: abs(arm.joint_acc_limit[1] - 900) < 1)),
+        lambda a, p: a.set_joint_maxacc(900),
+        0,
+        shows(lambda arm: abs(arm.joint_acc_limit[1] - 900) < 1),
+    ),
     "set_collision_sensitivity": (
-        lambda a, p: a.set_collision_sensitivity(5), 0, shows(lambda arm: arm.collision_sensitivity == 5)),
+        lambda a, p: a.set_collision_sensitivity(5),
+        0,
+        shows(lambda arm: arm.collision_sensitivity == 5),
+    ),
     "set_teach_sensitivity": (
-        lambda a, p: a.set_teach_sensitivity(4), 0, shows(lambda arm: arm.teach_sensitivity == 4)),
+        lambda a, p: a.set_teach_sensitivity(4),
+        0,
+        shows(lambda arm: arm.teach_sensitivity == 4),
+    ),
     "save_conf": (lambda a, p: a.save_conf(), 0, rests),
     "clean_conf": (lambda a, p: a.clean_conf(), 0, shows(lambda arm: arm.collision_sensitivity == 3)),
     "set_report_tau_or_i": (
-        lambda a, p: a.set_report_tau_or_i(1), 0, shows(lambda arm: arm.get_report_tau_or_i() == (0, 1))),
+        lambda a, p: a.set_report_tau_or_i(1),
+        0,
+        shows(lambda arm: arm.get_report_tau_or_i() == (0, 1)),
+    ),
     "set_linear_spd_limit_factor": (
-        lambda a, p: a.set_linear_spd_limit_factor(1.1), 0,
-        lambda arm, before: abs(arm.get_linear_spd_limit_factor()[1] - 1.1) < 1e-3),
+        lambda a, p: a.set_linear_spd_limit_factor(1.1),
+        0,
+        lambda arm, before: abs(arm.get_linear_spd_limit_factor()[1] - 1.1) < 1e-3,
+    ),
     "set_ft_sensor_enable": (
-        lambda a, p: a.set_ft_sensor_enable(1), 0, lambda arm, before: abs(arm.get_ft_sensor_data()[1][2] + 4.9) < 0.1),
+        lambda a, p: a.set_ft_sensor_enable(1),
+        0,
+        lambda arm, before: abs(arm.get_ft_sensor_data()[1][2] + 4.9) < 0.1,
+    ),
     "set_ft_sensor_mode": (
-        lambda a, p: a.set_ft_sensor_mode(0), 0, lambda arm, before: arm.get_ft_sensor_mode() == (0, 0)),
+        lambda a, p: a.set_ft_sensor_mode(0),
+        0,
+        lambda arm, before: arm.get_ft_sensor_mode() == (0, 0),
+    ),
     "set_ft_sensor_mode 1": (lambda a, p: a.set_ft_sensor_mode(1), 0, None),
     "set_ft_sensor_zero": (
-        lambda a, p: a.set_ft_sensor_zero(), 0, lambda arm, before: near(arm.get_ft_sensor_data()[1], [0] * 6)),
+        lambda a, p: a.set_ft_sensor_zero(),
+        0,
+        lambda arm, before: near(arm.get_ft_sensor_data()[1], [0] * 6),
+    ),
     "set_gripper_enable": (lambda a, p: a.set_gripper_enable(True), 0, rests),
     "set_gripper_mode": (lambda a, p: a.set_gripper_mode(0), 0, rests),
     "set_gripper_mode 1": (lambda a, p: a.set_gripper_mode(1), 0, None),
@@ -236,12 +316,20 @@ CHANGES = {
     "set_gripper_speed": (lambda a, p: a.set_gripper_speed(1000), 0, slower),
     "set_gripper_g2_position": (lambda a, p: a.set_gripper_g2_position(20), 0, gripped(200)),
     "clean_gripper_error": (
-        lambda a, p: a.clean_gripper_error(), 0, lambda arm, before: arm.get_gripper_err_code()[1] == 0),
+        lambda a, p: a.clean_gripper_error(),
+        0,
+        lambda arm, before: arm.get_gripper_err_code()[1] == 0,
+    ),
     "set_tgpio_modbus_baudrate": (
-        lambda a, p: a.set_tgpio_modbus_baudrate(2000000), 0, lambda arm,
-    before: arm.get_tgpio_modbus_baudrate() == (0, 2000000)),
+        lambda a, p: a.set_tgpio_modbus_baudrate(2000000),
+        0,
+        lambda arm, before: arm.get_tgpio_modbus_baudrate() == (0, 2000000),
+    ),
     "set_rs485_baudrate": (
-        lambda a, p: a.set_rs485_baudrate(2000000), 0, lambda arm, before: arm.get_rs485_baudrate() == (0, 2000000)),
+        lambda a, p: a.set_rs485_baudrate(2000000),
+        0,
+        lambda arm, before: arm.get_rs485_baudrate() == (0, 2000000),
+    ),
     # Outputs of the tool board, and the grippers that they open and close.
     "set_tgpio_digital": (lambda a, p: a.set_tgpio_digital(4, 1), 0, outputs(0, 0, 0, 0, 1)),
     "open_lite6_gripper": (lambda a, p: a.open_lite6_gripper(), 0, outputs(1, 0)),
@@ -250,21 +338,29 @@ CHANGES = {
     "set_vacuum_gripper": (lambda a, p: a.set_vacuum_gripper(True, wait=False), 0, outputs(1, 0)),
     # They ask the gripper for its error: its answer is right.
     "getset_tgpio_modbus_data": (
-        lambda a, p: data(a.getset_tgpio_modbus_data([8, 3, 0, 15, 0, 1]), [8, 3, 2, 0, 0]), 0, rests),
+        lambda a, p: data(a.getset_tgpio_modbus_data([8, 3, 0, 15, 0, 1]), [8, 3, 2, 0, 0]),
+        0,
+        rests,
+    ),
     "set_rs485_data": (lambda a, p: data(a.set_rs485_data([8, 3, 0, 15, 0, 1]), [8, 3, 2, 0, 0]), 0, rests),
     # A bio gripper has the telegrams of a G1: what they move here is the G1.
     "close_bio_gripper": (lambda a, p: a.close_bio_gripper(wait=False), 0, gripped(50, 71)),
     "open_bio_gripper": (lambda a, p: a.open_bio_gripper(wait=False), 0, gripped(130, 150)),
     "send_cmd_sync": (
-        lambda a, p: a.send_cmd_sync("G7 I4 J-20 K-30 L0 M50 N0 F40"), 0, shows(lambda arm: near(joints(), [4,
-    *POSE[1:]], 0.2))),
-    "send_hex_cmd": (lambda a, p: raw(a.send_hex_cmd("00 07 00 02 00 01 FA".split())), 0, None),
+        lambda a, p: a.send_cmd_sync("G7 I4 J-20 K-30 L0 M50 N0 F40"),
+        0,
+        shows(lambda arm: near(joints(), [4, *POSE[1:]], 0.2)),
+    ),
+    "send_hex_cmd": (lambda a, p: raw(a.send_hex_cmd(["00", "07", "00", "02", "00", "01", "FA"])), 0, None),
     # Limits of reduced mode, so wide that nothing else is judged by them; the walk switches it off again.
     "set_reduced_max_tcp_speed": (lambda a, p: a.set_reduced_max_tcp_speed(900), 0, reduced(2, 900)),
     "set_reduced_max_joint_speed": (lambda a, p: a.set_reduced_max_joint_speed(170), 0, reduced(3, 170)),
     "set_reduced_joint_range": (lambda a, p: a.set_reduced_joint_range([-360, 360] * 7), 0, reduced(4, [-360, 360])),
     "set_reduced_tcp_boundary": (
-        lambda a, p: a.set_reduced_tcp_boundary([2000, -2000] * 3), 0, reduced(1, [2000, -2000] * 3)),
+        lambda a, p: a.set_reduced_tcp_boundary([2000, -2000] * 3),
+        0,
+        reduced(1, [2000, -2000] * 3),
+    ),
     "set_reduced_mode": (lambda a, p: a.set_reduced_mode(True), 0, reduced(0, 1)),
     "set_fence_mode": (lambda a, p: a.set_fence_mode(True)[0], 0, reduced(5, 1)),
     "set_collision_rebound": (lambda a, p: a.set_collision_rebound(True), 0, reduced(6, 1)),
@@ -274,45 +370,86 @@ CHANGES = {
 # Arguments of methods that have no effect here: whatever they return, it is not 0.
 X = [0.0] * 6
 REFUSED = {
-    "calibrate_tcp_coordinate_offset": ([X] * 4,), "calibrate_tcp_orientation_offset": ([0] * 3, [0] * 3),
-    "calibrate_user_coordinate_offset": ([0] * 3, [0] * 3), "calibrate_user_orientation_offset": ([X] * 3,),
-    "check_verification": (), "clean_bio_gripper_error": (), "clean_linear_motor_error": (),
-    "config_cgpio_reset_when_stop": (True,), "config_tgpio_reset_when_stop": (True,),
-    "iden_ft_sensor_load_offset": (), "iden_joint_friction": ("XI130500000000",), "iden_tcp_load": (),
-    "load_trajectory": ("a", False), "playback_trajectory": (1, None, False), "save_record_trajectory": ("a", False),
-    "start_record_trajectory": (), "stop_record_trajectory": (), "mask_write_holding_register": (0, 1, 1),
-    "read_coil_bits": (0, 1), "read_holding_registers": (0, 1), "read_input_bits": (0, 1),
+    "calibrate_tcp_coordinate_offset": ([X] * 4,),
+    "calibrate_tcp_orientation_offset": ([0] * 3, [0] * 3),
+    "calibrate_user_coordinate_offset": ([0] * 3, [0] * 3),
+    "calibrate_user_orientation_offset": ([X] * 3,),
+    "check_verification": (),
+    "clean_bio_gripper_error": (),
+    "clean_linear_motor_error": (),
+    "config_cgpio_reset_when_stop": (True,),
+    "config_tgpio_reset_when_stop": (True,),
+    "iden_ft_sensor_load_offset": (),
+    "iden_joint_friction": ("XI130500000000",),
+    "iden_tcp_load": (),
+    "load_trajectory": ("a", False),
+    "playback_trajectory": (1, None, False),
+    "save_record_trajectory": ("a", False),
+    "start_record_trajectory": (),
+    "stop_record_trajectory": (),
+    "mask_write_holding_register": (0, 1, 1),
+    "read_coil_bits": (0, 1),
+    "read_holding_registers": (0, 1),
+    "read_input_bits": (0, 1),
     "read_input_registers": (0, 1),
-    "write_and_read_holding_registers": (0, 1, 0, [1]), "write_multiple_coil_bits": (0, [1]),
-    "write_multiple_holding_registers": (0, [1]), "write_single_coil_bit": (0, 1),
+    "write_and_read_holding_registers": (0, 1, 0, [1]),
+    "write_multiple_coil_bits": (0, [1]),
+    "write_multiple_holding_registers": (0, [1]),
+    "write_single_coil_bit": (0, 1),
     "write_single_holding_register": (0, 1),
-    "robotiq_close": (255, 255, False), "robotiq_get_status": (), "robotiq_open": (255, 255, False),
+    "robotiq_close": (255, 255, False),
+    "robotiq_get_status": (),
+    "robotiq_open": (255, 255, False),
     "robotiq_reset": (),
-    "robotiq_set_activate": (False,), "robotiq_set_position": (100, 255, 255, False),
-    "set_allow_approx_motion": (True,), "set_bio_gripper_control_mode": (1,), "set_bio_gripper_enable": (True, False),
-    "set_bio_gripper_force": (50,), "set_bio_gripper_g2_position": (100, 2000, 100, False),
+    "robotiq_set_activate": (False,),
+    "robotiq_set_position": (100, 255, 255, False),
+    "set_allow_approx_motion": (True,),
+    "set_bio_gripper_control_mode": (1,),
+    "set_bio_gripper_enable": (True, False),
+    "set_bio_gripper_force": (50,),
+    "set_bio_gripper_g2_position": (100, 2000, 100, False),
     "set_bio_gripper_speed": (100,),
-    "set_cartesian_velo_continuous": (True,), "set_cgpio_analog": (0, 5), "set_cgpio_analog_with_xyz": (0, 5,
-    [0] * 3, 1),
-    "set_cgpio_digital": (0, 1), "set_cgpio_digital_input_function": (0, 1), "set_cgpio_digital_output_function": (0,
-    1),
-    "set_cgpio_digital_with_xyz": (0, 1, [0] * 3, 1), "set_cmd_mat_history_num": (1,),
-    "set_collision_tool_model": (1,), "set_counter_increase": (), "set_counter_reset": (),
+    "set_cartesian_velo_continuous": (True,),
+    "set_cgpio_analog": (0, 5),
+    "set_cgpio_analog_with_xyz": (0, 5, [0] * 3, 1),
+    "set_cgpio_digital": (0, 1),
+    "set_cgpio_digital_input_function": (0, 1),
+    "set_cgpio_digital_output_function": (0, 1),
+    "set_cgpio_digital_with_xyz": (0, 1, [0] * 3, 1),
+    "set_cmd_mat_history_num": (1,),
+    "set_collision_tool_model": (1,),
+    "set_counter_increase": (),
+    "set_counter_reset": (),
     "set_dh_params": ([0.0] * 28,),
-    "set_dhpgc_gripper_activate": (False,), "set_dhpgc_gripper_position": (10, 50, 50, False),
-    "set_external_device_monitor_params": (1, 1), "set_fdb_mat_history_num": (1,), "set_feedback_type": (1,),
-    "set_ft_admittance_ctrl_threshold": ([1] * 6,), "set_ft_collision_detection": (1,),
-    "set_ft_collision_reb_distance": ([1] * 6,), "set_ft_collision_rebound": (1,),
+    "set_dhpgc_gripper_activate": (False,),
+    "set_dhpgc_gripper_position": (10, 50, 50, False),
+    "set_external_device_monitor_params": (1, 1),
+    "set_fdb_mat_history_num": (1,),
+    "set_feedback_type": (1,),
+    "set_ft_admittance_ctrl_threshold": ([1] * 6,),
+    "set_ft_collision_detection": (1,),
+    "set_ft_collision_reb_distance": ([1] * 6,),
+    "set_ft_collision_rebound": (1,),
     "set_ft_collision_threshold": ([10] * 6,),
     "set_ft_sensor_admittance_parameters": (0, [0] * 6, [0.1] * 6, [10] * 6, [0] * 6),
-    "set_ft_sensor_force_parameters": (0, [0] * 6, [0] * 6, [0] * 6), "set_ft_sensor_load_offset": ([0.0] * 10,),
-    "set_gravity_direction": ([0, 0, 1],), "set_linear_motor_back_origin": (False,), "set_linear_motor_enable": (True,),
-    "set_linear_motor_pos": (10, 100, False), "set_linear_motor_speed": (100,), "set_linear_motor_stop": (),
+    "set_ft_sensor_force_parameters": (0, [0] * 6, [0] * 6, [0] * 6),
+    "set_ft_sensor_load_offset": ([0.0] * 10,),
+    "set_gravity_direction": ([0, 0, 1],),
+    "set_linear_motor_back_origin": (False,),
+    "set_linear_motor_enable": (True,),
+    "set_linear_motor_pos": (10, 100, False),
+    "set_linear_motor_speed": (100,),
+    "set_linear_motor_stop": (),
     "set_modbusrtu_params": (1, 115200),
-    "set_rh56_finger_position": (1, 100), "set_rs485_timeout": (10,), "set_self_collision_detection": (True,),
-    "set_simulation_robot": (True,), "set_tgpio_digital_with_xyz": (0, 1, [0] * 3, 1),
-    "set_tgpio_modbus_timeout": (10,), "set_tgpio_monitor_params": (1, 1),
-    "set_xarm7_ik_redundancy": ([0.0] * 7, 1), "system_control": (1,),
+    "set_rh56_finger_position": (1, 100),
+    "set_rs485_timeout": (10,),
+    "set_self_collision_detection": (True,),
+    "set_simulation_robot": (True,),
+    "set_tgpio_digital_with_xyz": (0, 1, [0] * 3, 1),
+    "set_tgpio_modbus_timeout": (10,),
+    "set_tgpio_monitor_params": (1, 1),
+    "set_xarm7_ik_redundancy": ([0.0] * 7, 1),
+    "system_control": (1,),
 }
 
 # Queries, and what their values must be if they return 0.
@@ -352,12 +489,17 @@ QUERIES = {
     "get_tgpio_analog": lambda a, v: near(v, [0, 0], 0.01),
     "get_vacuum_gripper": lambda a, v: v == -1,  # off
     # The client's own: what it has last seen.
-    "get_bio_gripper_error": None, "get_linear_motor_registers": None,
+    "get_bio_gripper_error": None,
+    "get_linear_motor_registers": None,
     # Of the G1, whose telegrams they share.
-    "get_bio_gripper_status": lambda a, v: v in (0, 2), "get_bio_gripper_g2_position": lambda a, v: math.isfinite(v),
+    "get_bio_gripper_status": lambda a, v: v in (0, 2),
+    "get_bio_gripper_g2_position": lambda a, v: math.isfinite(v),
 }
 ARGUMENTS = {
-    "get_forward_kinematics": (POSE,), "is_joint_limit": (POSE,), "is_tcp_limit": (X,), "get_pose_offset": (X, X),
+    "get_forward_kinematics": (POSE,),
+    "is_joint_limit": (POSE,),
+    "is_tcp_limit": (X,),
+    "get_pose_offset": (X, X),
     "get_traj_speeding": (1,),
 }
 

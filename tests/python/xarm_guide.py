@@ -96,7 +96,9 @@ class XArmAdapter:
         if sdk_mode is None:
             return False  # Unsupported mode
         # A controller that is ready may fall back to mode 0 instead: it takes a new mode in state 4, stopped.
-        success = all(code == 0 for code in (self._sdk.set_state(4), self._sdk.set_mode(sdk_mode), self._sdk.set_state(0)))
+        success = all(
+            code == 0 for code in (self._sdk.set_state(4), self._sdk.set_mode(sdk_mode), self._sdk.set_state(0))
+        )
         if success:
             self._control_mode = mode
         return success
@@ -110,7 +112,7 @@ class XArmAdapter:
         code, raw_positions = self._sdk.get_servo_angle()
         if code != 0:
             raise RuntimeError(f"get_servo_angle returns {code}")
-        return [math.radians(p) for p in raw_positions[:self._dof]]
+        return [math.radians(p) for p in raw_positions[: self._dof]]
 
     def read_joint_velocities(self) -> list[float]:
         return [0.0] * self._dof
@@ -160,7 +162,7 @@ class XArmAdapter:
     def read_enabled(self) -> bool:
         if not self._sdk:
             return False
-        return all(self._sdk.motor_enable_states[:self._dof])
+        return all(self._sdk.motor_enable_states[: self._dof])
 
     def write_clear_errors(self) -> bool:
         if not self._sdk:

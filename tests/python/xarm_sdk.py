@@ -3,6 +3,7 @@
 import math
 import sys
 import time
+from functools import partial
 
 from xarm.wrapper import XArmAPI
 
@@ -38,7 +39,10 @@ def enable(arm, mode):
     ok(arm.motion_enable(True), "motion_enable")
     ok(arm.set_mode(mode), "set_mode")
     ok(arm.set_state(0), "set_state")
-    motors = lambda: all(arm.motor_enable_states[: arm.axis])
+
+    def motors():
+        return all(arm.motor_enable_states[: arm.axis])
+
     until(f"mode {mode}", lambda: arm.mode == mode and arm.state in (1, 2) and motors())
 
 
@@ -142,11 +146,15 @@ def model(host, axes, kind):
     arm.disconnect()
 
 
+def reports(arm):
+    return near(arm.angles, arm.get_servo_angle()[1], 1e-3) and arm.angles[1] != 0
+
+
 def old(host):
     for report in ("rich", "normal", "real"):
         arm = connect(host, report_type=report)
         check(arm.version_number == (1, 12, 10), f"version {arm.version_number}")
-        until("reports", lambda: near(arm.angles, arm.get_servo_angle()[1], 1e-3) and arm.angles[1] != 0)
+        until("reports", partial(reports, arm))
         arm.disconnect()
 
 
@@ -205,7 +213,9 @@ def reduced(host):
         arm.clean_error()
         until("no error", lambda: arm.error_code == 0)
 
-    turns = lambda joint, speed: lambda: arm.vc_set_joint_velocity([0] * joint + [speed], duration=9)
+    def turns(joint, speed):
+        return lambda: arm.vc_set_joint_velocity([0] * joint + [speed], duration=9)
+
     fails("a joint that is too fast", 24, 1, lambda: stream(arm, 5, 1.0))
     fails("a velocity that is too high", 24, 4, turns(5, 0.8))
     fails("a joint outside its range", 23, 1, lambda: stream(arm, 5, 0.3))
@@ -223,7 +233,10 @@ def reduced(host):
     z = int(arm.get_position()[1][2])
     ok(arm.set_reduced_tcp_boundary([900, -900, 900, -900, z + 20, -900]), "set_reduced_tcp_boundary")
     enable(arm, 0)
-    rise = lambda: arm.set_position(z=z + 60, speed=50, wait=False)
+
+    def rise():
+        return arm.set_position(z=z + 60, speed=50, wait=False)
+
     fails("a tool outside the boundary", 35, 0, rise)
     ok(arm.set_fence_mode(False)[0], "set_fence_mode")
     enable(arm, 0)

@@ -24,6 +24,10 @@ for positions in asked["configurations"]:
         place = data.oMf[frame]
         jacobian = pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
         columns = {n: jacobian[:, model.joints[i].idx_v].tolist() for i, n in enumerate(model.names) if i > 0}
-        links[name] = {"rotation": place.rotation.tolist(), "translation": place.translation.tolist(), "jacobian": columns}
+        links[name] = {
+            "rotation": place.rotation.tolist(),
+            "translation": place.translation.tolist(),
+            "jacobian": columns,
+        }
     answers.append(links)
 json.dump(answers, sys.stdout)

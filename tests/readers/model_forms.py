@@ -13,7 +13,10 @@ def robot(text):
         model = pin.buildModelFromXML(text)
     except Exception:  # of several kinds, all of which refuse the text
         return None
-    finite = lambda values: [x if abs(x) < 1e300 else None for x in values.tolist()]
+
+    def finite(values):
+        return [x if abs(x) < 1e300 else None for x in values.tolist()]
+
     place = pin.Quaternion(model.jointPlacements[1].rotation).coeffs().tolist()
     limits = [model.lowerPositionLimit, model.upperPositionLimit, model.velocityLimit, model.effortLimit]
     return {"quaternion": place, "limits": [finite(limit)[0] for limit in limits]}

@@ -10,10 +10,10 @@ import os
 import sys
 import threading
 import time
+from typing import Any
 
 import numpy as np
 import zenoh
-
 from dimos.control.components import HardwareComponent, HardwareType, make_joints
 from dimos.control.coordinator import ControlCoordinator
 from dimos.control.tasks.trajectory_task.trajectory_task import joint_trajectory_task
@@ -46,7 +46,7 @@ def serve(name=None):
 
 
 def client():
-    remote, rpc = connect()
+    remote, _ = connect()
     lists = ("list_joints", "list_hardware", "list_tasks")
     seen = {method: getattr(remote, method)() for method in (*lists, "get_joint_positions", "get_tick_count")}
     joints = seen["list_joints"]
@@ -89,7 +89,7 @@ def client():
 
 
 def execution():
-    remote, rpc = connect()
+    remote, _ = connect()
     joints = remote.list_joints()
     manager = PlanExecutionManager(joint_names=joints, coordinator=remote, default_timeout=10.0)
 
@@ -117,7 +117,7 @@ def execution():
 def mapped(name, domain):
     os.environ["COORDINATOR"] = name
     global_config.update(zenoh_domain=domain)
-    remote, rpc = connect()
+    remote, _ = connect()
     joints = remote.list_joints()
     seen = {"joints": joints, "states": listen(0.5)[-1].name}
     seen["execute"] = result(remote.execute_trajectory(line(remote.get_joint_positions(), ["arm/shoulder"], 0.1)))
@@ -128,7 +128,7 @@ def mapped(name, domain):
 
 
 def gripper():
-    remote, rpc = connect()
+    remote, _ = connect()
 
     def task(method, **arguments):
         return remote.task_invoke("arm_gripper", method, arguments)
@@ -144,7 +144,7 @@ def gripper():
 
 
 def far():
-    remote, rpc = connect()
+    remote, _ = connect()
     joints = remote.list_joints()
     seen = {"joints": joints, "states": len(listen(1.0))}
     seen["execute"] = result(remote.execute_trajectory(line(remote.get_joint_positions(), joints, 0.1)))
@@ -155,13 +155,13 @@ def far():
 
 def begin():
     """Begins a slow motion of all joints, and leaves."""
-    remote, rpc = connect()
+    remote, _ = connect()
     say(result(remote.execute_trajectory(line(remote.get_joint_positions(), remote.list_joints(), 1.0, 20.0))))
     remote.stop_rpc_client()
 
 
 def times():
-    remote, rpc = connect()
+    remote, _ = connect()
     took = {}
     status = ("get_status", lambda: remote.task_invoke(TASK, "get_status", {"t_now": None}))
     positions = ("get_joint_positions", remote.get_joint_positions)
@@ -187,9 +187,10 @@ def raw():
     remote, rpc = connect()
     for text in sys.stdin:
         query = json.loads(text)
-        answers, done = [], threading.Event()
+        answers: list[dict[str, Any]] = []
+        done = threading.Event()
 
-        def reply(reply):
+        def reply(reply, answers=answers):
             good = reply.ok is not None
             value = reply.ok if good else reply.err
             answers.append({"ok": good, "encoding": str(value.encoding), "hex": value.payload.to_bytes().hex()})
@@ -197,8 +198,14 @@ def raw():
         handler = zenoh.handlers.Callback(reply, drop=done.set)
         key = f"dimos/rpc/{os.environ.get('COORDINATOR', 'ControlCoordinator')}/{query['method']}"
         more = {"attachment": query["attachment"].encode()} if query.get("attachment") else {}
-        rpc.session.get(key, handler, target=zenoh.QueryTarget.ALL, timeout=query.get("timeout", 5.0),
-                        payload=bytes.fromhex(query["hex"]), **more)
+        rpc.session.get(
+            key,
+            handler,
+            target=zenoh.QueryTarget.ALL,
+            timeout=query.get("timeout", 5.0),
+            payload=bytes.fromhex(query["hex"]),
+            **more,
+        )
         done.wait(10.0)
         say({"answers": answers})
     remote.stop_rpc_client()
@@ -254,7 +261,7 @@ def fields(status):
 def raised(call):
     try:
         return call()
-    except Exception as error:  # noqa: BLE001
+    except Exception as error:
         return [type(error).__name__, str(error)]
 
 

@@ -20,7 +20,7 @@ log, folder = map(Path, sys.argv[1:])
 
 
 def same(a, b):
-    return a == b or math.isnan(a) and math.isnan(b)
+    return a == b or (math.isnan(a) and math.isnan(b))
 
 
 # The table: the same columns and the same numbers, bit for bit, for two readers.
@@ -40,8 +40,8 @@ assert all(abs(t - float(row["time"])) < 1e-9 for t, row in zip(table["time"].to
 print(f"table: {table.num_rows} rows, {table.num_columns} columns are the same")
 
 # The bag: every message of the log.
-with log.open("rb") as file:
-    summary = make_reader(file).get_summary()
+with log.open("rb") as recorded:
+    summary = make_reader(recorded).get_summary()
 counts = {summary.channels[i].topic: n for i, n in summary.statistics.channel_message_counts.items()}
 with Reader(folder / "bag") as bag:
     found = {topic: info.msgcount for topic, info in bag.topics.items()}

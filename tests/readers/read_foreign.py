@@ -1,14 +1,14 @@
-"""What PyPI mcap reads in logs: read_foreign.py FILE... prints JSON lists, one for all files, of [topic, log time, publish
-time, {joint: position}], in order of time, with `null` for what cannot be decoded. What is damaged is left out; a wrong
-checksum alone damages nothing. `--csv FILE` prints [time, {column: value}] as pandas reads it, `--bag FOLDER` how many
-messages rosbags reads on each topic."""
+"""What PyPI mcap reads in logs: read_foreign.py FILE... prints JSON lists, one for all files, of [topic, log time,
+publish time, {joint: position}], in order of time, with `null` for what cannot be decoded. What is damaged is left out;
+a wrong checksum alone damages nothing. `--csv FILE` prints [time, {column: value}] as pandas reads it, `--bag FOLDER`
+how many messages rosbags reads on each topic."""
 
 import json
 import os
 import sys
 
-from mcap.records import Chunk, Channel, Message, Schema
 from mcap.reader import make_reader
+from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap_ros2.decoder import DecoderFactory
 
@@ -67,7 +67,12 @@ def about(path):
         attachments = {a.name: [len(a.data), a.data[:20].decode("latin1")] for a in reader.iter_attachments()}
         metadata = {m.name: m.metadata for m in reader.iter_metadata()}
         topics = sorted(c.topic for c in reader.get_summary().channels.values())
-        return {"attachments": attachments, "metadata": metadata, "topics": topics, "profile": reader.get_header().profile}
+        return {
+            "attachments": attachments,
+            "metadata": metadata,
+            "topics": topics,
+            "profile": reader.get_header().profile,
+        }
 
 
 def table(path):
@@ -86,7 +91,7 @@ def bag(path):
 
     from rosbags.highlevel import AnyReader
 
-    counts = {}
+    counts: dict[str, int] = {}
     with AnyReader([Path(path)]) as reader:
         for connection, _, data in reader.messages():
             reader.deserialize(data, connection.msgtype)
@@ -104,7 +109,9 @@ else:
     files = []
     for path in sys.argv[1:]:
         inside = sorted(os.listdir(path)) if os.path.isdir(path) else None
-        files += [os.path.join(path, name) for name in inside if name.endswith(".mcap")] if inside is not None else [path]
+        files += (
+            [os.path.join(path, name) for name in inside if name.endswith(".mcap")] if inside is not None else [path]
+        )
     found = [message for path in files for message in read(path)]
     found.sort(key=lambda message: message[1])
     print(json.dumps(found))

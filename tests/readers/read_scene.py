@@ -23,12 +23,14 @@ def matrix(transform):
     """A transform as a 4 × 4 matrix."""
     t, q = transform.translation, transform.rotation
     x, y, z, w = q.x, q.y, q.z, q.w
-    return numpy.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), t.x],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), t.y],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), t.z],
-        [0, 0, 0, 1],
-    ])
+    return numpy.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), t.x],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), t.y],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), t.z],
+            [0, 0, 0, 1],
+        ]
+    )
 
 
 def placed(frames, name):
@@ -41,11 +43,12 @@ def placed(frames, name):
 
 def main():
     log, frame, urdf = sys.argv[1:]
-    frames, states, counts, found = {}, {}, Counter(), None
+    frames, states, found = {}, {}, None
+    counts: Counter[str] = Counter()
     with open(log, "rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
         attached = {a.name: a.data for a in reader.iter_attachments()}
-        for _, channel, message, data in reader.iter_decoded_messages():
+        for _, channel, _, data in reader.iter_decoded_messages():
             counts[channel.topic] += 1
             if channel.topic == "/robot_description":
                 assert data.data.encode() == attached["robot_description.urdf"]
@@ -61,9 +64,13 @@ def main():
         for connection in reader.connections:
             durability = connection.ext.offered_qos_profiles[0].durability.value
             assert (durability == 1) == (connection.topic in LATCHED), (connection.topic, durability)
-        counted = Counter(connection.topic for connection, _, raw in reader.messages()
-                          if reader.deserialize(raw, connection.msgtype) is not None)
+        counted = Counter(
+            connection.topic
+            for connection, _, raw in reader.messages()
+            if reader.deserialize(raw, connection.msgtype) is not None
+        )
         assert counted == counts, (counted, counts)
+    assert found, "no /tf"
     pose, states = found
     print(json.dumps({"pose": pose.tolist(), "joints": states, "frames": sorted(frames), "counts": counts}))
 

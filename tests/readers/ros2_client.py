@@ -19,7 +19,7 @@ import numpy
 import zenoh
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "python"))
-import ros_types  # noqa: E402
+import ros_types
 
 ACTION = ros_types.ACTION
 LIFECYCLE = {0: "UNKNOWN", 1: "ACCEPTED", 2: "EXECUTING", 3: "CANCELING", 4: "SUCCEEDED", 5: "CANCELED", 6: "ABORTED"}
@@ -69,8 +69,7 @@ class Client:
         """The class of a message; those that ros_types composes have none yet."""
         if kind not in self.store.types:
             names = [name for name, _ in self.store.fielddefs[kind][1]]
-            made = dataclasses.make_dataclass(kind.replace("/", "__"), names)
-            made.__msgtype__ = kind
+            made = dataclasses.make_dataclass(kind.replace("/", "__"), names, namespace={"__msgtype__": kind})
             self.store.types[kind] = made
         return self.store.types[kind]
 
@@ -112,9 +111,14 @@ class Client:
     def call(self, name, kind, payload, timeout=5.0):
         """The reply of a service; None if none came. The attachment must come back."""
         attachment = self.attachment()
-        replies = self.session.get(self.key(name, kind), payload=payload, attachment=attachment, timeout=timeout,
-                                   target=zenoh.QueryTarget.ALL_COMPLETE,
-                                   consolidation=zenoh.ConsolidationMode.NONE)
+        replies = self.session.get(
+            self.key(name, kind),
+            payload=payload,
+            attachment=attachment,
+            timeout=timeout,
+            target=zenoh.QueryTarget.ALL_COMPLETE,
+            consolidation=zenoh.ConsolidationMode.NONE,
+        )
         for reply in replies:
             if reply.ok is not None:
                 assert reply.ok.attachment.to_bytes() == attachment, "the reply has another attachment"
@@ -128,15 +132,29 @@ class Client:
         return None if reply is None else [bool(reply.success), reply.message]
 
     def controllers(self):
-        reply = self.call("controller_manager/list_controllers", "controller_manager_msgs/srv/ListControllers",
-                          b"\x00\x01\x00\x00\x00")
+        reply = self.call(
+            "controller_manager/list_controllers",
+            "controller_manager_msgs/srv/ListControllers",
+            b"\x00\x01\x00\x00\x00",
+        )
         return [[c.name, c.state, c.type, list(c.claimed_interfaces)] for c in reply.controller]
 
     def hardware(self):
-        reply = self.call("controller_manager/list_hardware_components",
-                          "controller_manager_msgs/srv/ListHardwareComponents", b"\x00\x01\x00\x00\x00")
-        return [[c.name, c.plugin_name, c.state.label, [i.name for i in c.state_interfaces],
-                 [i.is_claimed for i in c.command_interfaces]] for c in reply.component]
+        reply = self.call(
+            "controller_manager/list_hardware_components",
+            "controller_manager_msgs/srv/ListHardwareComponents",
+            b"\x00\x01\x00\x00\x00",
+        )
+        return [
+            [
+                c.name,
+                c.plugin_name,
+                c.state.label,
+                [i.name for i in c.state_interfaces],
+                [i.is_claimed for i in c.command_interfaces],
+            ]
+            for c in reply.component
+        ]
 
     def tokens(self):
         """All tokens of the graph, without the numbers of sessions and parts."""
@@ -167,8 +185,10 @@ class Client:
         action = f"{task}/follow_joint_trajectory/_action"
         self.watched[task] = [
             self.session.declare_subscriber(self.key(f"{action}/feedback", f"{ACTION}_FeedbackMessage"), self.feedback),
-            self.session.declare_subscriber(self.key(f"{action}/status", "action_msgs/msg/GoalStatusArray"),
-                                            self.status)]
+            self.session.declare_subscriber(
+                self.key(f"{action}/status", "action_msgs/msg/GoalStatusArray"), self.status
+            ),
+        ]
         return True
 
     def feedback(self, sample):
@@ -176,26 +196,48 @@ class Client:
         goal = self.goals.get(bytes(message.goal_id.uuid).hex())
         if goal is not None:
             body = message.feedback
-            goal["feedback"].append([list(body.joint_names), list(body.desired.positions), list(body.actual.positions),
-                                     list(body.error.positions), getattr(body, "index", None)])
+            goal["feedback"].append(
+                [
+                    list(body.joint_names),
+                    list(body.desired.positions),
+                    list(body.actual.positions),
+                    list(body.error.positions),
+                    getattr(body, "index", None),
+                ]
+            )
 
     def status(self, sample):
         message = self.decode(sample.payload, "action_msgs/msg/GoalStatusArray")
         self.statuses.append({bytes(s.goal_info.goal_id.uuid).hex(): LIFECYCLE[s.status] for s in message.status_list})
 
-    def goal(self, task, joints, points, path={}, end={}, late=0.0, stamp=0.0):
+    def goal(self, task, joints, points, path=None, end=None, late=0.0, stamp=0.0):
         """Sends a goal: rows of (time, positions, velocities). Returns its number; None if it was rejected."""
         number = uuid.uuid4()
-        rows = [self.make("trajectory_msgs/msg/JointTrajectoryPoint", positions=numpy.array(p, dtype=float),
-                          velocities=numpy.array(v, dtype=float), time_from_start=self.duration(t))
-                for t, p, v in points]
+        rows = [
+            self.make(
+                "trajectory_msgs/msg/JointTrajectoryPoint",
+                positions=numpy.array(p, dtype=float),
+                velocities=numpy.array(v, dtype=float),
+                time_from_start=self.duration(t),
+            )
+            for t, p, v in points
+        ]
+
         def tolerances(given):
-            return [self.make("control_msgs/msg/JointTolerance", name=joint, position=limit)
-                    for joint, limit in given.items()]
+            return [
+                self.make("control_msgs/msg/JointTolerance", name=joint, position=limit)
+                for joint, limit in (given or {}).items()
+            ]
+
         header = self.make("std_msgs/msg/Header", stamp=self.make("builtin_interfaces/msg/Time", **parts(stamp)))
         trajectory = self.make("trajectory_msgs/msg/JointTrajectory", header=header, joint_names=joints, points=rows)
-        goal = self.make(f"{ACTION}_Goal", trajectory=trajectory, path_tolerance=tolerances(path),
-                         goal_tolerance=tolerances(end), goal_time_tolerance=self.duration(late))
+        goal = self.make(
+            f"{ACTION}_Goal",
+            trajectory=trajectory,
+            path_tolerance=tolerances(path),
+            goal_tolerance=tolerances(end),
+            goal_time_tolerance=self.duration(late),
+        )
         identifier = self.identifier(number.hex)
         self.goals[number.hex] = {"feedback": [], "result": None}
         payload = self.encode(f"{ACTION}_SendGoal_Request", goal_id=identifier, goal=goal)
@@ -217,10 +259,15 @@ class Client:
         payload = self.encode(f"{ACTION}_GetResult_Request", goal_id=self.identifier(goal))
 
         def ask():
-            reply = self.call(f"{task}/follow_joint_trajectory/_action/get_result", f"{ACTION}_GetResult", payload, 60.0)
+            reply = self.call(
+                f"{task}/follow_joint_trajectory/_action/get_result", f"{ACTION}_GetResult", payload, 60.0
+            )
             if reply is not None:
-                self.goals[goal]["result"] = [LIFECYCLE[reply.status], int(reply.result.error_code),
-                                              reply.result.error_string]
+                self.goals[goal]["result"] = [
+                    LIFECYCLE[reply.status],
+                    int(reply.result.error_code),
+                    reply.result.error_string,
+                ]
 
         threading.Thread(target=ask, daemon=True).start()
 
@@ -260,13 +307,20 @@ class Client:
         dice = random.Random(seed)
         goal = self.make(f"{ACTION}_Goal")
         whole = self.encode(f"{ACTION}_SendGoal_Request", goal_id=self.identifier(uuid.uuid4().hex), goal=goal)
-        services = [("send_goal", f"{ACTION}_SendGoal"), ("get_result", f"{ACTION}_GetResult"),
-                    ("cancel_goal", "action_msgs/srv/CancelGoal")]
+        services = [
+            ("send_goal", f"{ACTION}_SendGoal"),
+            ("get_result", f"{ACTION}_GetResult"),
+            ("cancel_goal", "action_msgs/srv/CancelGoal"),
+        ]
         for _ in range(count):
             part, kind = dice.choice(services)
             attachment = dice.choice([self.attachment(), b"", b"x", dice.randbytes(33)])
-            replies = self.session.get(self.key(f"{task}/follow_joint_trajectory/_action/{part}", kind),
-                                       payload=damaged(dice, whole), attachment=attachment, timeout=0.02)
+            replies = self.session.get(
+                self.key(f"{task}/follow_joint_trajectory/_action/{part}", kind),
+                payload=damaged(dice, whole),
+                attachment=attachment,
+                timeout=0.02,
+            )
             del replies
         return True
 

@@ -8,16 +8,21 @@ import os
 import sys
 import tempfile
 import time
+from typing import Any
 
 from rosbags.typesys import Stores, get_typestore
 
 os.environ["ZENOH_ROS2_SDK_CACHE"] = tempfile.mkdtemp()
 
-from zenoh_ros2_sdk import ROS2Subscriber  # noqa: E402
-from zenoh_ros2_sdk.discovery import get_service_names_and_types, get_topic_info, get_topic_names_and_types  # noqa: E402
-from zenoh_ros2_sdk.qos import QosDurability, QosProfile  # noqa: E402
-from zenoh_ros2_sdk.message_registry import get_registry  # noqa: E402
-from zenoh_ros2_sdk.session import ZenohSession  # noqa: E402
+from zenoh_ros2_sdk import ROS2Subscriber
+from zenoh_ros2_sdk.discovery import (
+    get_service_names_and_types,
+    get_topic_info,
+    get_topic_names_and_types,
+)
+from zenoh_ros2_sdk.message_registry import get_registry
+from zenoh_ros2_sdk.qos import QosDurability, QosProfile
+from zenoh_ros2_sdk.session import ZenohSession
 
 PORT = int(sys.argv[1])
 ROUTER = {"router_ip": "127.0.0.1", "router_port": PORT}
@@ -40,7 +45,7 @@ def write_definitions():
 
 def listen(topic, kind, seconds, qos=None):
     """The messages of a topic."""
-    seen = []
+    seen: list[Any] = []
     subscriber = ROS2Subscriber(topic, kind, seen.append, qos=qos, **ROUTER)
     time.sleep(seconds)
     subscriber.close()
@@ -50,7 +55,7 @@ def listen(topic, kind, seconds, qos=None):
 def main():
     ZenohSession.get_instance(**ROUTER)
     write_definitions()
-    seen = {"topics": dict(get_topic_names_and_types(**ROUTER, timeout=2.0))}
+    seen: dict[str, Any] = {"topics": dict(get_topic_names_and_types(**ROUTER, timeout=2.0))}
     info = get_topic_info("/robot_description", **ROUTER, timeout=2.0, verbose=True)
     seen["services"] = dict(get_service_names_and_types(**ROUTER, timeout=2.0))
     seen["publisher"] = [info.publishers[0].node_name, info.publishers[0].qos] if info.publishers else []
@@ -58,8 +63,13 @@ def main():
     began = time.time()
     states = listen("/joint_states", "sensor_msgs/msg/JointState", 1.5)
     stamp = states[-1].header.stamp
-    seen["joint_states"] = {"count": len(states), "name": list(states[-1].name), "position": list(states[-1].position),
-                            "age": time.time() - (stamp.sec + stamp.nanosec * 1e-9), "took": time.time() - began}
+    seen["joint_states"] = {
+        "count": len(states),
+        "name": list(states[-1].name),
+        "position": list(states[-1].position),
+        "age": time.time() - (stamp.sec + stamp.nanosec * 1e-9),
+        "took": time.time() - began,
+    }
     # It was published before this subscriber came.
     described = listen("/robot_description", "std_msgs/msg/String", 0.3, LATCHED)
     seen["robot_description"] = [message.data[:200] for message in described]
@@ -68,7 +78,9 @@ def main():
     tree = {t.child_frame_id: t.header.frame_id for t in [*fixed[-1].transforms, *moving[-1].transforms]}
     seen["frames"] = {"tree": tree, "rate": len(moving)}
     rows = listen("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", 2.0)[-1].status
-    seen["diagnostics"] = [[row.name, row.level if isinstance(row.level, int) else row.level[0], row.message] for row in rows]
+    seen["diagnostics"] = [
+        [row.name, row.level if isinstance(row.level, int) else row.level[0], row.message] for row in rows
+    ]
     print(json.dumps(seen), flush=True)
 
 

@@ -10,11 +10,16 @@ import toppra.algorithm as algorithm
 import toppra.constraint as constraint
 
 logging.getLogger("toppra").setLevel(logging.ERROR)
+
+
+def limit(values):
+    return np.array([[-v, v] for v in values])
+
+
 durations = []
 for curve in json.load(sys.stdin):
     s, q = np.array(curve["s"]), np.array(curve["q"])
     path = toppra.SplineInterpolator(s, q)
-    limit = lambda values: np.array([[-v, v] for v in values])
     acceleration = constraint.JointAccelerationConstraint(
         limit(curve["acceleration"]), discretization_scheme=constraint.DiscretizationType.Interpolation
     )

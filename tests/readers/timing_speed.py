@@ -14,15 +14,20 @@ import toppra.constraint as constraint
 logging.getLogger("toppra").setLevel(logging.ERROR)
 asked = json.load(sys.stdin)
 times, durations = [], []
+
+
+def limit(value, joints):
+    return np.tile([-value, value], (joints, 1))
+
+
 for waypoints in asked["paths"]:
     began = time.perf_counter()
     q = np.array(waypoints)
-    limit = lambda value: np.tile([-value, value], (q.shape[1], 1))
     s = np.linspace(0.0, len(q) - 1.0, len(q))
     path = toppra.SplineInterpolator(s, q)
     limits = [
-        constraint.JointVelocityConstraint(limit(asked["velocity"])),
-        constraint.JointAccelerationConstraint(limit(asked["acceleration"])),
+        constraint.JointVelocityConstraint(limit(asked["velocity"], q.shape[1])),
+        constraint.JointAccelerationConstraint(limit(asked["acceleration"], q.shape[1])),
     ]
     # A grid point at each waypoint: its quickest, not its best.
     solver = algorithm.TOPPRA(limits, path, gridpoints=s, parametrizer="ParametrizeConstAccel")

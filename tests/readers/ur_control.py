@@ -5,6 +5,8 @@ the beginning; the answer is what each step ordered, and the state that it wrote
 import json
 import math
 import sys
+from contextlib import suppress
+from typing import Any
 
 
 class Over(Exception):
@@ -12,8 +14,9 @@ class Over(Exception):
 
 
 def run(text, step, steps, target):
-    ordered, out, position = [], {}, 0
-    reads = 0
+    ordered: list[Any] = []
+    out: dict[int, Any] = {}
+    position, reads = 0, 0
 
     def read(kind):
         def register(number):
@@ -52,10 +55,8 @@ def run(text, step, steps, target):
     }
     lines = [line for line in text.splitlines() if line.strip() != "end"]
     exec("\n".join(lines), names)
-    try:
+    with suppress(Over):
         names["dimos_control"]()
-    except Over:
-        pass
     return {"ordered": ordered, "out": {str(n): value for n, value in out.items()}}
 
 

@@ -1,7 +1,7 @@
 """A client of a shared run that uses none of our code: eclipse-zenoh and the keys of docs/many-machines.md.
 
-Reads one command per line from stdin, as JSON, and answers each with one line. The first line has the endpoint, the run,
-the user, and the files for TLS.
+Reads one command per line from stdin, as JSON, and answers each with one line. The first line has the endpoint, the
+run, the user, and the files for TLS.
 """
 
 import json
@@ -9,6 +9,7 @@ import random
 import sys
 import threading
 import time
+from typing import Any
 
 import zenoh
 
@@ -114,14 +115,20 @@ class Client:
         if answers[0].ok is None:
             error = answers[0].err
             kind, text = str(error.encoding), error.payload.to_string()
-            return {"answers": len(answers), "error": json.loads(text) if text.startswith("{") else text, "encoding": kind, "took": took}
+            return {
+                "answers": len(answers),
+                "error": json.loads(text) if text.startswith("{") else text,
+                "encoding": kind,
+                "took": took,
+            }
         return {"answers": len(answers), "result": json.loads(answers[0].ok.payload.to_string()), "took": took}
 
     def flood(self, method, cls, count):
         """Many requests at once; how many were answered, refused, and got nothing."""
         key = f"{self.own}/{cls}/{self.id}/{method}"
         pending = [self.session.get(key, payload="{}", timeout=12.0) for _ in range(count)]
-        done, refused, codes = 0, 0, {}
+        done, refused = 0, 0
+        codes: dict[str, int] = {}
         for replies in pending:
             for reply in replies:
                 if reply.ok is None:
@@ -137,7 +144,7 @@ class Client:
 
     def both(self, slow, fast):
         """Two requests of this client at once."""
-        answers = {}
+        answers: dict[str, Any] = {}
         thread = threading.Thread(target=lambda: answers.update(slow=self.ask(**slow)))
         thread.start()
         time.sleep(0.02)
@@ -161,7 +168,8 @@ class Client:
 
     def fuzz(self, seed, count, valid):
         """Sends `count` damaged requests, puts and tokens, at most 64 at a time; how many were answered, by code."""
-        dice, codes, pending = random.Random(seed), {}, []
+        dice, pending = random.Random(seed), []
+        codes: dict[str, int] = {}
 
         def collect(replies):
             for reply in replies:
@@ -175,7 +183,7 @@ class Client:
             cls, method, params = dice.choice(valid)
             key = damaged_key(dice, f"{self.own}/{cls}/{self.id}/{method}")
             payload = damaged(dice, json.dumps(params).encode())
-            more = {"attachment": dice.randbytes(dice.randrange(1, 300))} if dice.random() < 0.2 else {}
+            more: dict[str, Any] = {"attachment": dice.randbytes(dice.randrange(1, 300))} if dice.random() < 0.2 else {}
             encoding = dice.choice([None, "application/json", "zenoh/bytes", "text/plain;x=" + "y" * 200])
             if encoding:
                 more["encoding"] = encoding

@@ -2,11 +2,11 @@
 import {Flow} from './flow';
 import {History} from './history';
 import {RpcError, type SceneArm, type SceneRobot} from './protocol';
-import {Run} from './run';
-import {Gizmo} from './scene/gizmo';
+import type {Run} from './run';
+import type {Gizmo} from './scene/gizmo';
+import type {View} from './scene/view';
 import {Signal} from './signal';
 import {Stop} from './stop';
-import type {View} from './scene/view';
 
 export interface Notice {
   text: string;

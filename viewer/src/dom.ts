@@ -72,7 +72,9 @@ export function choice<T extends string>(
   onChange: (value: T) => void,
 ): {element: HTMLElement; choose(value: T): void} {
   const buttons = new Map<T, HTMLButtonElement>();
-  const choose = (value: T) => buttons.forEach((each, key) => each.setAttribute('aria-pressed', String(key === value)));
+  const choose = (value: T) => {
+    for (const [key, each] of buttons) each.setAttribute('aria-pressed', String(key === value));
+  };
   for (const [value, text] of values) {
     buttons.set(
       value,

@@ -1,6 +1,6 @@
 // One motion from goal to end: plan, preview, execute, cancel. Nothing moves before `execute` or `moveDirect`.
 import {type MotionReport, type PlanningReport, type Preview, type Quat, RpcError, type Vec3} from './protocol';
-import {type Run} from './run';
+import type {Run} from './run';
 import {Signal} from './signal';
 
 const POLL = 100; // ms

@@ -1,5 +1,5 @@
 // The frame of a page that shows a file: header, view, panels with their tabs. Nothing of it can command an arm.
-import {type Context} from './context';
+import type {Context} from './context';
 import {button, el} from './dom';
 import {notice} from './panels/notice';
 import {toolbar} from './panels/toolbar';
@@ -70,9 +70,8 @@ export function frame(context: Context, parts: Parts): HTMLElement[] {
     // On a desktop the other columns are always there.
     const shown = parts.tabs.some(([name]) => name === tab) || narrow.matches ? tab : parts.tabs[0]![0];
     for (const [name, , panel] of parts.tabs) panel.classList.toggle('hidden', name !== shown);
-    tabs
-      .querySelectorAll('button')
-      .forEach((each) => each.setAttribute('aria-selected', String(each.dataset.tab === tab)));
+    for (const each of tabs.querySelectorAll('button'))
+      each.setAttribute('aria-selected', String(each.dataset.tab === tab));
     window.dispatchEvent(new Event('resize'));
   };
   choose(narrow.matches ? 'arms' : parts.tabs[0]![0]);

@@ -1,11 +1,11 @@
 // The goals that people set up, one per arm: joints (by sliders or a named pose), or a pose (by the handles); and the
 // waypoints before it. Goals of several arms are planned together.
 import {Quaternion, Vector3} from 'three';
-import {type Context} from './context';
-import {type Goal, type PlanRequest} from './flow';
-import {type Vec3} from './protocol';
+import type {Context} from './context';
+import type {Goal, PlanRequest} from './flow';
+import type {Vec3} from './protocol';
 import {Reach} from './reach';
-import {type Handles} from './scene/gizmo';
+import type {Handles} from './scene/gizmo';
 import {quaternionOf} from './scene/robot';
 import {Signal} from './signal';
 import {figure} from './units';

@@ -1,5 +1,5 @@
 // What the plots show: the last minutes of each joint, of the tracking error, and of the tick, in buffers that never grow.
-import {type JointState, type State} from './protocol';
+import type {JointState, State} from './protocol';
 
 export const LONGEST = 180; // s that are kept
 const GAP = 0.7; // s without a sample

@@ -1,7 +1,7 @@
 // Jogging, the requests of `dimos jog`: targets are sent while something is held, and nothing else moves the arm.
 // Dead-man by design: if the page, the browser or the connection fails, the stream ends and the task's timeout
 // decelerates the joints to rest.
-import {type Context} from './context';
+import type {Context} from './context';
 import {pause} from './flow';
 import {RpcError, type Task} from './protocol';
 import {Signal} from './signal';
@@ -127,7 +127,7 @@ export class Jog {
     this.targets = [];
     this.sent = performance.now();
     try {
-      for (let rest = 0; ;) {
+      for (let rest = 0; ; ) {
         const began = performance.now();
         if (this.held.size && run.age > BLIND_AFTER) throw new RpcError('STALE', 'no joint states: the jog ended');
         if (this.held.size && this.mode === mode && this.context.selected === arm) {

@@ -5,13 +5,9 @@ import './acts.css';
 import './strip.css';
 import {Context} from './context';
 import {button, el} from './dom';
+import {pause} from './flow';
 import {logPage} from './log/page';
 import {modelPage} from './model/page';
-import {type Scene} from './protocol';
-import {Run} from './run';
-import {Gizmo} from './scene/gizmo';
-import {Stage} from './scene/stage';
-import {View} from './scene/view';
 import {armsPanel} from './panels/arms';
 import {eventsPanel} from './panels/events';
 import {header} from './panels/header';
@@ -24,7 +20,11 @@ import {strip} from './panels/strip';
 import {timeline} from './panels/timeline';
 import {toolbar} from './panels/toolbar';
 import {worldPanel} from './panels/world';
-import {pause} from './flow';
+import type {Scene} from './protocol';
+import {Run} from './run';
+import {Gizmo} from './scene/gizmo';
+import {Stage} from './scene/stage';
+import {View} from './scene/view';
 
 const LONGEST_DELAY = 4000; // ms between two attempts to read the scene
 const NO_ACTS_AFTER = 1500; // ms without a joint state
@@ -56,7 +56,9 @@ async function main(): Promise<void> {
   let enabled = false;
   enableActs(enabled);
   window.setInterval(() => {
-    if (usable() !== enabled) enableActs((enabled = usable()));
+    if (usable() === enabled) return;
+    enabled = !enabled;
+    enableActs(enabled);
   }, 100);
   // For tests: what was drawn, and how long the page's own code took.
   Object.assign(window, {
@@ -104,7 +106,14 @@ function layout(context: Context, canvas: HTMLElement): void {
     armsPanel(context),
     jointsPanel(context),
   );
-  const panels = el('div', {class: 'panels'}, movePanel(context), jogPanel(context), worldPanel(context), eventsPanel(context));
+  const panels = el(
+    'div',
+    {class: 'panels'},
+    movePanel(context),
+    jogPanel(context),
+    worldPanel(context),
+    eventsPanel(context),
+  );
   const tabs = el(
     'nav',
     {class: 'tabs'},
@@ -120,9 +129,8 @@ function layout(context: Context, canvas: HTMLElement): void {
   const choose = (tab: string) => {
     document.body.dataset.tab = tab;
     panels.scrollTop = 0;
-    tabs
-      .querySelectorAll('button')
-      .forEach((each) => each.setAttribute('aria-selected', String(each.dataset.tab === tab)));
+    for (const each of tabs.querySelectorAll('button'))
+      each.setAttribute('aria-selected', String(each.dataset.tab === tab));
     window.dispatchEvent(new Event('resize'));
     context.onTab.emit();
   };

@@ -1,7 +1,7 @@
 // Inverse kinematics of the pose that is dragged: one request at a time, the newest pose next. Moves nothing.
 import {pause} from './flow';
 import {type IkReply, type Quat, RpcError, type Vec3} from './protocol';
-import {type Run} from './run';
+import type {Run} from './run';
 import {Signal} from './signal';
 
 /** Shortest time between two requests [ms]. */

@@ -1,15 +1,6 @@
 // The run as the page knows it: newest joint states, state, status, world and events, and the age of the data.
 import {Connection} from './connection';
-import {
-  type JointState,
-  type PlannerReport,
-  type PosesReport,
-  type RunEvent,
-  type Scene,
-  type State,
-  type Status,
-  type WorldObject,
-} from './protocol';
+import type {JointState, PlannerReport, PosesReport, RunEvent, Scene, State, Status, WorldObject} from './protocol';
 import {Signal} from './signal';
 
 const JOINT_RATE = 30; // Hz

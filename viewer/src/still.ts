@@ -1,6 +1,7 @@
 // What is not live, in the form of a run: the panels that show a run also show a log, or a model at joint positions.
+
+import type {Scene} from './protocol';
 import {Run} from './run';
-import {type Scene} from './protocol';
 
 export class Still extends Run {
   constructor(scene: Scene) {

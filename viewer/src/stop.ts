@@ -1,6 +1,6 @@
 // Stop: holds all arms of the run. It says what the run confirmed, and for each arm when it was held.
 import {RpcError, type StopReply} from './protocol';
-import {type Run} from './run';
+import type {Run} from './run';
 import {Signal} from './signal';
 import {clock} from './units';
 

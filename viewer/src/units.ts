@@ -62,5 +62,5 @@ export function clock(date: Date): string {
 
 /** The joint's name without the arm's: `joint1` of `left_joint1`. */
 export function shortJoint(joint: string, arm: string): string {
-  return joint.startsWith(arm + '_') && joint.length > arm.length + 1 ? joint.slice(arm.length + 1) : joint;
+  return joint.startsWith(`${arm}_`) && joint.length > arm.length + 1 ? joint.slice(arm.length + 1) : joint;
 }

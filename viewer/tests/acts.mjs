@@ -47,11 +47,25 @@ test('jog moves while a button or key is held, and never longer', async () => {
   const measured = [];
   // The end effector along y moves joint 1.
   await page.waitForSelector('[data-jog="y+"]:enabled');
-  measured.push(await jogs('left_joint1', 'tool', () => press(page, 'y+'), () => page.mouse.up()));
+  measured.push(
+    await jogs(
+      'left_joint1',
+      'tool',
+      () => press(page, 'y+'),
+      () => page.mouse.up(),
+    ),
+  );
   await page.click('[data-panel=jog] [data-value=joints]');
   await page.waitForSelector('[data-jog="joint1+"]:enabled');
   const start = joint1();
-  measured.push(await jogs('left_joint1', 'button', () => press(page, 'joint1+'), () => page.mouse.up()));
+  measured.push(
+    await jogs(
+      'left_joint1',
+      'button',
+      () => press(page, 'joint1+'),
+      () => page.mouse.up(),
+    ),
+  );
   assert.ok(joint1() > start + 0.005, `in the direction of the button: ${start} → ${joint1()}`);
   await page.click('#jog-keys');
   const down = () => page.keyboard.down('-');
@@ -63,7 +77,14 @@ test('jog moves while a button or key is held, and never longer', async () => {
   await other.click('[data-tab=jog]');
   await other.click('[data-panel=jog] [data-value=joints]');
   await other.waitForSelector('[data-jog="joint1+"]:enabled');
-  measured.push(await jogs('left_joint1', 'page closed', () => press(other, 'joint1+'), () => other.close()));
+  measured.push(
+    await jogs(
+      'left_joint1',
+      'page closed',
+      () => press(other, 'joint1+'),
+      () => other.close(),
+    ),
+  );
   await other.context().close();
   console.log(`at rest after: ${measured.join(', ')}`);
   // Another client has the arm: the refusal is in words, and nothing moves.
@@ -119,10 +140,14 @@ test('waypoints are passed in one motion, and a dragged pose shows its joints', 
   await page.waitForSelector('#execute:enabled');
   await page.click('#execute');
   let farthest = 0;
-  await until('it completed', async () => {
-    farthest = Math.max(farthest, joint1());
-    return /completed/.test(await page.textContent('#report'));
-  }, 20);
+  await until(
+    'it completed',
+    async () => {
+      farthest = Math.max(farthest, joint1());
+      return /completed/.test(await page.textContent('#report'));
+    },
+    20,
+  );
   assert.ok(farthest > 0.2, `it passed the waypoint: joint 1 was at ${farthest} rad`);
   assert.ok(near(run.positions('left'), HOME));
 

@@ -6,7 +6,7 @@ import {execFileSync, spawn} from 'node:child_process';
 import {mkdtempSync, readdirSync, readFileSync, rmSync, writeFileSync} from 'node:fs';
 import os from 'node:os';
 import {join} from 'node:path';
-import {browser as launch, environment, open, Run, text} from './rig.mjs';
+import {environment, browser as launch, open, Run, text} from './rig.mjs';
 
 const ROUNDS = Number(process.env.ROUNDS ?? 7);
 /** Time in motion of each round [s]. */
@@ -79,7 +79,10 @@ function swing(run, arm, failed) {
   const next = (to) => {
     if (ended) return;
     const goal = [to, -0.3, 0.6, 0, 0.8, to].map(String);
-    const child = spawn(process.env.DIMOS, ['move', arm, ...goal, '--direct'], {env: environment(run.home), cwd: run.home});
+    const child = spawn(process.env.DIMOS, ['move', arm, ...goal, '--direct'], {
+      env: environment(run.home),
+      cwd: run.home,
+    });
     let errors = '';
     child.stderr.on('data', (data) => (errors += data));
     child.on('exit', (code) => (code ? ended || failed(errors) : next(-to)));
@@ -134,7 +137,7 @@ async function inMotion(browser, file, names, viewed) {
       frames: frames / took,
     };
   } finally {
-    swings.forEach((end) => end());
+    for (const end of swings) end();
     run.end();
   }
 }

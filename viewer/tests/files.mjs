@@ -4,7 +4,7 @@ import {spawn} from 'node:child_process';
 import {readFileSync, writeFileSync} from 'node:fs';
 import {join} from 'node:path';
 import {after, before, test} from 'node:test';
-import {browser as launch, changed, environment, open, picture, Run, text, TIMEOUT, until} from './rig.mjs';
+import {changed, environment, browser as launch, open, picture, Run, TIMEOUT, text, until} from './rig.mjs';
 
 let browser, run;
 const served = [];
@@ -98,13 +98,17 @@ test('a log is scrubbed and played: arm, table, plan and marks', async () => {
   await page.selectOption('#rate', '10');
   await page.click('#play');
   await until('it played to its end', async () => near(await joint(page, 2), 0));
-  const coloured = await page.locator('.plot canvas').first().evaluate((canvas) => {
-    const {data} = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
-    // Axes are grey.
-    let count = 0;
-    for (let i = 0; i < data.length; i += 4) count += data[i + 3] > 128 && Math.abs(data[i] - data[i + 2]) > 60 ? 1 : 0;
-    return count;
-  });
+  const coloured = await page
+    .locator('.plot canvas')
+    .first()
+    .evaluate((canvas) => {
+      const {data} = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+      // Axes are grey.
+      let count = 0;
+      for (let i = 0; i < data.length; i += 4)
+        count += data[i + 3] > 128 && Math.abs(data[i] - data[i + 2]) > 60 ? 1 : 0;
+      return count;
+    });
   assert.ok(coloured > 300, `the joints are drawn: ${coloured} pixels`);
   await page.locator('.events .seekable').first().click();
   for (const width of [1100, 1280, 1400]) {

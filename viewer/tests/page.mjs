@@ -1,7 +1,7 @@
 // The page of a live run in a real browser: what it shows, and what its clicks do to the run.
 import assert from 'node:assert/strict';
 import {after, before, test} from 'node:test';
-import {browser as launch, changed, open, picture, Run, text, until} from './rig.mjs';
+import {changed, browser as launch, open, picture, Run, text, until} from './rig.mjs';
 
 const HOME = [0, -0.3, 0.6, 0, 0.8, 0];
 let browser, run, page;
@@ -35,7 +35,8 @@ test('the arm on screen moves when another program moves it', async () => {
   let before, rest;
   await until('the view is at rest', async () => {
     before = await picture(page);
-    return (rest = await changed(browser, before, await picture(page))) < 0.001;
+    rest = await changed(browser, before, await picture(page));
+    return rest < 0.001;
   });
   const frames = () => page.evaluate(() => window.dimos.measured.frames);
   await until('no frame is drawn at rest', async () => {
@@ -48,10 +49,10 @@ test('the arm on screen moves when another program moves it', async () => {
     /^joint20\.000/.test(await page.textContent('.joints tbody tr:nth-child(2)')),
   );
   let moved = 0;
-  await until(
-    'the arm looks different',
-    async () => (moved = await changed(browser, before, await picture(page))) > 0.01,
-  );
+  await until('the arm looks different', async () => {
+    moved = await changed(browser, before, await picture(page));
+    return moved > 0.01;
+  });
   console.log(`pixels changed: ${(rest * 100).toFixed(3)} % at rest, ${(moved * 100).toFixed(1)} % after the motion`);
 });
 
@@ -139,7 +140,15 @@ test('what keeps an arm from moving is seen on every screen and tab, and Stop is
   run.dimos('speed', '30%');
   await text(page, '#strip', /speed 30 %/);
   assert.match(await text(page, '#strip', /held/), /arm held: stopped by an operator/);
-  for (const [width, height] of [[390, 844], [844, 390], [600, 960], [960, 600], [1024, 768], [768, 1024], [1920, 1080]]) {
+  for (const [width, height] of [
+    [390, 844],
+    [844, 390],
+    [600, 960],
+    [960, 600],
+    [1024, 768],
+    [768, 1024],
+    [1920, 1080],
+  ]) {
     await page.setViewportSize({width, height});
     for (const tab of ['move', 'jog', 'world', 'events', ...(width <= 960 ? ['arms', 'plots'] : [])]) {
       const where = `${width} x ${height}, ${tab}`;
@@ -149,7 +158,8 @@ test('what keeps an arm from moving is seen on every screen and tab, and Stop is
       assert.ok(await seen(page, '#stop'), `Stop: ${where}`);
       if (tab === 'jog') assert.ok(await seen(page, '#jog-rows .hold'), `a jog button: ${where}`);
     }
-    if (process.env.DIMOS_PICTURES) await page.screenshot({path: `${process.env.DIMOS_PICTURES}/${width}x${height}.png`});
+    if (process.env.DIMOS_PICTURES)
+      await page.screenshot({path: `${process.env.DIMOS_PICTURES}/${width}x${height}.png`});
   }
   await page.setViewportSize({width: 1200, height: 760});
   await click('[data-tab=move]');

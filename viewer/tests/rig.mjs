@@ -119,7 +119,7 @@ export class Watch {
   }
 
   send(method, params) {
-    this.socket.write(JSON.stringify({id: 1, method, params}) + '\n');
+    this.socket.write(`${JSON.stringify({id: 1, method, params})}\n`);
   }
 
   take({stream, data}) {
@@ -140,11 +140,15 @@ export class Watch {
   /** Waits until a joint has been at rest for 0.3 s; returns when that began [s since 1970]. */
   async resting(joint) {
     let since = 0;
-    await until(`${joint} is at rest`, () => {
-      if (Math.abs(this.velocities[joint]) > 1e-3) since = 0;
-      else since ||= this.stamp;
-      return since && this.stamp - since > 0.3;
-    }, 5);
+    await until(
+      `${joint} is at rest`,
+      () => {
+        if (Math.abs(this.velocities[joint]) > 1e-3) since = 0;
+        else since ||= this.stamp;
+        return since && this.stamp - since > 0.3;
+      },
+      5,
+    );
     return since;
   }
 

@@ -35,7 +35,10 @@ test(`nothing grows in ${MINUTES} min`, {timeout: (MINUTES + 5) * 60_000}, async
         assert.ok(to <= from + most, `${what} grew from ${from} to ${to} in ${cycles} cycles`);
       }
     }
-    assert.deepEqual(page.errors.filter((error) => !/WebSocket|net::/.test(error)), []);
+    assert.deepEqual(
+      page.errors.filter((error) => !/WebSocket|net::/.test(error)),
+      [],
+    );
   } finally {
     run.end();
     await browser.close();
@@ -84,7 +87,9 @@ async function cycle(page, number) {
     await page.mouse.up();
     await until('the jog has ended', async () => !(await page.textContent('#jog-report')).includes('is jogged'));
   }
-  await page.evaluate(() => [window.dimos.run.work, window.dimos.run.watch].forEach((each) => each.drop()));
+  await page.evaluate(() => {
+    for (const each of [window.dimos.run.work, window.dimos.run.watch]) each.drop();
+  });
   await text(page, '#age', /^live$/);
 }
 

@@ -14,12 +14,46 @@ at a time may move an arm: LeaseHeld names the other one. Everything that waits 
 
 from .client import Client
 from .connection import KEPT, MAX_LINE
-from .errors import (ArmNotReady, ConnectionLost, DimosError, LeaseHeld, MotionFailed, NoRun, OutOfLimits, OutOfReach,
-                     PlanningFailed, Refused)
+from .errors import (
+    ArmNotReady,
+    ConnectionLost,
+    DimosError,
+    LeaseHeld,
+    MotionFailed,
+    NoRun,
+    OutOfLimits,
+    OutOfReach,
+    PlanningFailed,
+    Refused,
+)
 from .live_runs import runs
 from .records import ArmState, ChunkReport, Goal, Grip, JointState, LoopReport, Plan, Pose, Waypoint
 from .streams import IN_FLIGHT, Policy
 
-__all__ = ["ArmNotReady", "ArmState", "ChunkReport", "Client", "ConnectionLost", "DimosError", "Goal", "Grip",
-           "IN_FLIGHT", "JointState", "KEPT", "LeaseHeld", "LoopReport", "MAX_LINE", "MotionFailed", "NoRun",
-           "OutOfLimits", "OutOfReach", "Plan", "PlanningFailed", "Policy", "Pose", "Refused", "Waypoint", "runs"]
+__all__ = [
+    "IN_FLIGHT",
+    "KEPT",
+    "MAX_LINE",
+    "ArmNotReady",
+    "ArmState",
+    "ChunkReport",
+    "Client",
+    "ConnectionLost",
+    "DimosError",
+    "Goal",
+    "Grip",
+    "JointState",
+    "LeaseHeld",
+    "LoopReport",
+    "MotionFailed",
+    "NoRun",
+    "OutOfLimits",
+    "OutOfReach",
+    "Plan",
+    "PlanningFailed",
+    "Policy",
+    "Pose",
+    "Refused",
+    "Waypoint",
+    "runs",
+]

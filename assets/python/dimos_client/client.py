@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from typing import Any, Collection, Dict, List, Mapping, Optional, Sequence, Set, Union
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, Optional, Union
 
 from .errors import ArmNotReady, MotionFailed, Refused
 from .planning import Goals, Planning, plan_number, where_to
@@ -15,28 +16,60 @@ STALLED = 15.0  # s without progress, after which `wait` cancels a motion
 
 class Client(Planning):
     """A connection to a run."""
+
     def state(self, arm: str) -> ArmState:
         """The latest state of an arm."""
         reply = self.call("state")
         if (found := next((a for a in reply["arms"] if a["hardware_id"] == arm), None)) is None:
             raise Refused("UNKNOWN_ARM", f"no arm named {arm}", "`dimos status` lists the arms")
-        name, position, velocity, effort = ([joint[key] for joint in found["joints"]]
-                                            for key in ("name", "position", "velocity", "effort"))
+        name, position, velocity, effort = (
+            [joint[key] for joint in found["joints"]] for key in ("name", "position", "velocity", "effort")
+        )
         pose, age = found["pose"] or {}, found["age_ms"]
-        return ArmState(reply["tick"], reply["stamp"], name, position, velocity, effort, 0, age and age / 1000,
-                        found["gripper"], pose.get("xyz"), pose.get("rpy"), found["wrench"], found.get("gripper_unit"),
-                        found.get("gripper_force"), found.get("gripper_force_unit"), pose.get("link"),
-                        pose.get("frame"))
+        return ArmState(
+            reply["tick"],
+            reply["stamp"],
+            name,
+            position,
+            velocity,
+            effort,
+            0,
+            age and age / 1000,
+            found["gripper"],
+            pose.get("xyz"),
+            pose.get("rpy"),
+            found["wrench"],
+            found.get("gripper_unit"),
+            found.get("gripper_force"),
+            found.get("gripper_force_unit"),
+            pose.get("link"),
+            pose.get("frame"),
+        )
 
-    def move(self, arm: Goals, target: Optional[Sequence[float]] = None, speed: float = 0.5, wait: bool = True, *,
-             named: Optional[str] = None, pose: Optional[Pose] = None, by: Optional[Pose] = None,
-             frame: Optional[str] = None, linear: bool = False, through: Sequence[Waypoint] = (), blend: float = 0.0,
-             direct: bool = False, replan: bool = False, seed: int = 0,
-             timeout: Optional[float] = None) -> Dict[str, Any]:
+    def move(
+        self,
+        arm: Goals,
+        target: Optional[Sequence[float]] = None,
+        speed: float = 0.5,
+        wait: bool = True,
+        *,
+        named: Optional[str] = None,
+        pose: Optional[Pose] = None,
+        by: Optional[Pose] = None,
+        frame: Optional[str] = None,
+        linear: bool = False,
+        through: Sequence[Waypoint] = (),
+        blend: float = 0.0,
+        direct: bool = False,
+        replan: bool = False,
+        seed: int = 0,
+        timeout: Optional[float] = None,
+    ) -> dict[str, Any]:
         """Moves an arm to `target` [rad], a `named` pose, a `pose`, `by` a pose or `through` waypoints, or several arms
-        together, with all keywords of `plan`; `speed`: 0.01–1 of the limits. With a planner in the run the motion is planned around obstacles, and after `replan` planned
-        again when the world changes; `direct` moves straight in joint space, not collision-checked. Without a planner
-        it is direct: `collision_checked` in the result says which. Ends this client's own streams to the arm."""
+        together, with all keywords of `plan`; `speed`: 0.01–1 of the limits. With a planner in the run the motion is
+        planned around obstacles, and after `replan` planned again when the world changes; `direct` moves straight in
+        joint space, not collision-checked. Without a planner it is direct: `collision_checked` in the result says
+        which. Ends this client's own streams to the arm."""
         where = where_to(arm, Goal(target, named, pose, linear, frame, by), through, blend)
         plain = isinstance(arm, str) and target is not None and not (named or pose or by or frame or linear)
         joints = numbers(target) if plain and target is not None else []
@@ -53,7 +86,7 @@ class Client(Planning):
         begun = self.call("move", arm=arm, target=joints, speed=speed, direct=direct or None)
         return self.wait(begun["motion"]) if wait else begun
 
-    def _streams_to(self, arms: Collection[str]) -> Set[str]:
+    def _streams_to(self, arms: Collection[str]) -> set[str]:
         """The tasks to which this client streams, and whose joints a planned motion needs."""
         if not (self._streams or self._targets):
             return set()
@@ -61,19 +94,27 @@ class Client(Planning):
         joints = {joint for robot in robots if robot["name"] in arms for joint in robot["joints"]}
         return {task["name"] for task in self.status()["tasks"] if joints & set(task["joints"])}
 
-    def execute(self, motion: Union[Plan, int, Mapping[str, Any], None] = None, task: Optional[str] = None,
-                wait: bool = True, *, replan: bool = False, unproven: bool = False) -> Dict[str, Any]:
+    def execute(
+        self,
+        motion: Union[Plan, int, Mapping[str, Any], None] = None,
+        task: Optional[str] = None,
+        wait: bool = True,
+        *,
+        replan: bool = False,
+        unproven: bool = False,
+    ) -> dict[str, Any]:
         """Executes a plan (by default the newest of `plan`), or follows a trajectory: joint_names, and points of
         time_from_start [s], positions [rad], velocities [rad/s]. A trajectory is not collision-checked, a plan of the
         level "fast" at samples only: it needs `unproven`."""
         if motion is None or isinstance(motion, (Plan, int)):
-            begun = self.call("execute_plan", plan=plan_number(motion), replan=replan or None,
-                              unproven=unproven or None)
+            begun = self.call(
+                "execute_plan", plan=plan_number(motion), replan=replan or None, unproven=unproven or None
+            )
         else:
             begun = self.call("execute", trajectory=dict(motion), task=task)
         return self.wait(begun["motion"]) if wait else begun
 
-    def wait(self, motion: int) -> Dict[str, Any]:
+    def wait(self, motion: int) -> dict[str, Any]:
         """Waits for a motion's end, and for that of the one that continues it around an obstacle. Ctrl-C cancels it,
         and so do 15 s without progress. Raises MotionFailed when it ended elsewhere than it should."""
         report, elapsed, deadline = self.call("motion", motion=motion), None, 0.0
@@ -95,8 +136,17 @@ class Client(Planning):
             raise MotionFailed(report["state"], report["error"] or "it ended before its goal", data=report)
         return report
 
-    def gripper(self, arm: str, opening: Union[float, str], force: Optional[float] = None, wait: bool = True, *,
-                speed: Optional[float] = None, timeout: Optional[float] = None, attach: Optional[str] = None) -> Grip:
+    def gripper(
+        self,
+        arm: str,
+        opening: Union[float, str],
+        force: Optional[float] = None,
+        wait: bool = True,
+        *,
+        speed: Optional[float] = None,
+        timeout: Optional[float] = None,
+        attach: Optional[str] = None,
+    ) -> Grip:
         """Moves a gripper to a position (an opening [m], or the angle [rad] of a rotary one), to "open" or "close",
         with a largest `force` (unit and range are in `status`) and a `speed` (0.01-1 of its top speed) if it has them.
         Waits until the fingers rest, at most `timeout` [s] (20), and returns where and why: `outcome`, as the run
@@ -104,9 +154,12 @@ class Client(Planning):
         if attach is not None:
             known = [entry["name"] for entry in self.world_list()]
             if attach not in known:
-                raise Refused("UNKNOWN_OBJECT", f"the planner's world has no object {attach}: nothing has moved",
-                              f"it has: {', '.join(known) or 'none'}")
-        span: Optional[List[float]] = self._report(arm).get("gripper_range")
+                raise Refused(
+                    "UNKNOWN_OBJECT",
+                    f"the planner's world has no object {attach}: nothing has moved",
+                    f"it has: {', '.join(known) or 'none'}",
+                )
+        span: Optional[list[float]] = self._report(arm).get("gripper_range")
         if isinstance(opening, str):
             if opening not in ("open", "close"):
                 raise Refused("INVALID_PARAMS", f"a gripper cannot {opening}", 'give "open", "close" or a number')
@@ -122,52 +175,58 @@ class Client(Planning):
             if self._report(arm).get("phase") == "held":  # a stop holds the fingers, too
                 raise ArmNotReady("ARM_LATCHED", f"{arm}: {error}", "`reset`, then `enable`")
             raise MotionFailed("NO_ANSWER", f"the gripper of {arm}: {error}", data=report)
-        grip = Grip(report["position"], report["unit"], report["outcome"] or "moving", report.get("force"),
-                    report["force_unit"], report["elapsed"])
+        grip = Grip(
+            report["position"],
+            report["unit"],
+            report["outcome"] or "moving",
+            report.get("force"),
+            report["force_unit"],
+            report["elapsed"],
+        )
         if attach is not None and grip.holding:
             self.attach(attach, arm, within=GRASP_REACH)
         return grip
 
-    def _report(self, arm: str) -> Dict[str, Any]:
-        arms: List[Dict[str, Any]] = self.status()["arms"]
+    def _report(self, arm: str) -> dict[str, Any]:
+        arms: list[dict[str, Any]] = self.status()["arms"]
         return next((report for report in arms if report["hardware_id"] == arm), {})
 
-    def io(self, arm: str) -> Dict[str, Any]:
+    def io(self, arm: str) -> dict[str, Any]:
         """Digital and analogue inputs and outputs of an arm, as docs/rpc.md says."""
         return self.call("arm_io", arm=arm)
 
-    def set_io(self, arm: str, **outputs: float) -> Dict[str, Any]:
+    def set_io(self, arm: str, **outputs: float) -> dict[str, Any]:
         """Sets outputs, `do3=1` or `ao0=2.5`; the levels that are read back."""
         return self.call("arm_io_set", arm=arm, outputs=outputs)
 
-    def payload(self, arm: str) -> Optional[Dict[str, Any]]:
+    def payload(self, arm: str) -> Optional[dict[str, Any]]:
         """The load at the flange that the controller reports: mass [kg], center [m], inertia [kg·m²]."""
-        load: Optional[Dict[str, Any]] = self.call("arm_payload", arm=arm)["payload"]
+        load: Optional[dict[str, Any]] = self.call("arm_payload", arm=arm)["payload"]
         return load
 
-    def set_payload(self, arm: str, mass: float, center: Sequence[float] = (0, 0, 0)) -> Optional[Dict[str, Any]]:
+    def set_payload(self, arm: str, mass: float, center: Sequence[float] = (0, 0, 0)) -> Optional[dict[str, Any]]:
         """Sets the load of everything at the flange [kg, m], at rest; what the controller then reports."""
         reply = self.call("arm_payload_set", arm=arm, mass=mass, center=numbers(center))
-        load: Optional[Dict[str, Any]] = reply["payload"]
+        load: Optional[dict[str, Any]] = reply["payload"]
         return load
 
-    def cancel(self, arm: Optional[str] = None, task: Optional[str] = None) -> Dict[str, str]:
+    def cancel(self, arm: Optional[str] = None, task: Optional[str] = None) -> dict[str, str]:
         """Ends motions by decelerating: of an arm, of a task, or all; without a task also planning."""
-        ended: Dict[str, str] = self._urgent("cancel", arm=arm, task=task)["tasks"]
+        ended: dict[str, str] = self._urgent("cancel", arm=arm, task=task)["tasks"]
         return ended
 
-    def speed(self, fraction: Optional[float] = None, paused: Optional[bool] = None) -> Dict[str, Any]:
+    def speed(self, fraction: Optional[float] = None, paused: Optional[bool] = None) -> dict[str, Any]:
         """Sets the speed override of the run (0.01–1), pauses or resumes all motions; `fraction` and `paused` now."""
         return self.call("speed", fraction=fraction, paused=paused)
 
-    def save_pose(self, name: str, *arms: str) -> Dict[str, Any]:
+    def save_pose(self, name: str, *arms: str) -> dict[str, Any]:
         """Saves where arms are, by default all, as a named pose. What was saved [rad], by arm and joint."""
-        saved: Dict[str, Any] = self.call("pose_save", name=name, arms=list(arms))["pose"]
+        saved: dict[str, Any] = self.call("pose_save", name=name, arms=list(arms))["pose"]
         return saved
 
-    def stop(self, arm: Optional[str] = None) -> Dict[str, str]:
+    def stop(self, arm: Optional[str] = None) -> dict[str, str]:
         """Latched hold at once, of an arm or of all: an operational stop. Per arm `confirmed`, or not."""
-        stopped: Dict[str, str] = self._urgent("stop", arm=arm)["arms"]
+        stopped: dict[str, str] = self._urgent("stop", arm=arm)["arms"]
         return stopped
 
     def reset(self, arm: str) -> str:

@@ -7,9 +7,10 @@ import os
 import socket
 import time
 from collections import deque
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Callable, Deque, Dict, Iterator, Optional, Type, TypeVar, Union
+from typing import Any, Callable, Optional, TypeVar, Union
 
 from .errors import ConnectionLost, NoRun, Refused, refusal
 from .live_runs import _address, _peer, runs
@@ -23,12 +24,13 @@ _Self = TypeVar("_Self", bound="Connection")
 
 class Connection:
     """A connection to a run."""
+
     def __init__(self, path: Union[str, Path, socket.socket], timeout: float = 15.0) -> None:
         """Connects to a socket, or uses one. `timeout` [s] bounds every wait for the run."""
         self.timeout, self._next_id, self._unread = timeout, 0, b""
         self._path = None if isinstance(path, socket.socket) else path
-        self._replies: Dict[int, Dict[str, Any]] = {}
-        self._queues: Dict[int, Deque[Dict[str, Any]]] = {}
+        self._replies: dict[int, dict[str, Any]] = {}
+        self._queues: dict[int, deque[dict[str, Any]]] = {}
         if isinstance(path, socket.socket):
             self._socket = path
             return
@@ -44,20 +46,30 @@ class Connection:
             raise ConnectionLost("NO_CONNECTION", f"{path}: {error}", "see `dimos status`") from None
 
     @classmethod
-    def connect(cls: Type[_Self], run: Optional[str] = None, timeout: float = 15.0) -> _Self:
+    def connect(cls: type[_Self], run: Optional[str] = None, timeout: float = 15.0) -> _Self:
         """Connects to the run of a name or, without one, to the only live run."""
         live = runs()
         if run is None and len(live) > 1:
             raise NoRun("SEVERAL_RUNS", f"several runs are live: {', '.join(live)}", "say which")
         if not live or run not in (None, *live):
-            raise NoRun("NO_RUN", f"no run of this user is live{f' by the name of {run}' if run else ''}", "start one: dimos run")
+            raise NoRun(
+                "NO_RUN",
+                f"no run of this user is live{f' by the name of {run}' if run else ''}",
+                "start one: dimos run",
+            )
         return cls(live[run or next(iter(live))], timeout)
 
     @classmethod
-    def at(cls: Type[_Self], place: str, run: Optional[str] = None, user: Optional[str] = None,
-           identity: Optional[str] = None, timeout: float = 15.0) -> _Self:
-        """Connects to a run on another computer: `tls/HOST:PORT`. `identity` is a folder with ca.pem and the certificate
-        and key of `user`, by default the only one in it. Needs eclipse-zenoh."""
+    def at(
+        cls: type[_Self],
+        place: str,
+        run: Optional[str] = None,
+        user: Optional[str] = None,
+        identity: Optional[str] = None,
+        timeout: float = 15.0,
+    ) -> _Self:
+        """Connects to a run on another computer: `tls/HOST:PORT`. `identity` is a folder with ca.pem and the
+        certificate and key of `user`, by default the only one in it. Needs eclipse-zenoh."""
         from .network import connect
 
         return cls(connect(place, run, user, identity), timeout)
@@ -69,19 +81,20 @@ class Connection:
     def __enter__(self: _Self) -> _Self:
         return self
 
-    def __exit__(self, kind: Optional[Type[BaseException]], error: Optional[BaseException],
-                 trace: Optional[TracebackType]) -> None:
+    def __exit__(
+        self, kind: Optional[type[BaseException]], error: Optional[BaseException], trace: Optional[TracebackType]
+    ) -> None:
         self.close()
 
-    def call(self, method: str, **params: Any) -> Dict[str, Any]:
+    def call(self, method: str, **params: Any) -> dict[str, Any]:
         """Any request of docs/rpc.md: its `result`. Parameters that are None are left out. Raises Refused."""
         return self._answer(self._send(method, params))
 
-    def status(self) -> Dict[str, Any]:
+    def status(self) -> dict[str, Any]:
         """Arms, tasks, timing, recorder, as docs/rpc.md says."""
         return self.call("status")
 
-    def _send(self, method: str, params: Dict[str, Any]) -> int:
+    def _send(self, method: str, params: dict[str, Any]) -> int:
         self._next_id += 1
         params = {key: value for key, value in params.items() if value is not None}
         try:
@@ -97,7 +110,7 @@ class Connection:
             raise ConnectionLost("NO_CONNECTION", f"the run is gone: {error}") from None
         return self._next_id
 
-    def _urgent(self, method: str, **params: Any) -> Dict[str, Any]:
+    def _urgent(self, method: str, **params: Any) -> dict[str, Any]:
         """A request that always gets through: over new connections where it gets no answer at once, so that it may be
         sent several times. Over a network it is sent once."""
         if self._path is None:
@@ -120,13 +133,13 @@ class Connection:
                 attempt *= 2 if error.code == "NO_ANSWER" else 1
                 time.sleep(0.02)
 
-    def _answer(self, number: int, limit: Optional[float] = None) -> Dict[str, Any]:
+    def _answer(self, number: int, limit: Optional[float] = None) -> dict[str, Any]:
         limit = self.timeout if limit is None else limit
         self._await(lambda: number in self._replies, limit, "answer", "`dimos status` may say why")
         reply = self._replies.pop(number)
         if "error" in reply:
             raise refusal(reply["error"])
-        result: Dict[str, Any] = reply["result"]
+        result: dict[str, Any] = reply["result"]
         return result
 
     def _await(self, ready: Callable[[], Any], limit: float, what: str, hint: str) -> None:
@@ -158,7 +171,7 @@ class Connection:
                 self._replies[message["id"]] = message
         return True
 
-    def _queue(self, message: Dict[str, Any]) -> None:
+    def _queue(self, message: dict[str, Any]) -> None:
         queue = self._queues.get(message["subscription"])
         if queue is not None:
             dropped = queue.popleft() if len(queue) == queue.maxlen else None
@@ -176,11 +189,11 @@ class Connection:
         if self._socket.fileno() >= 0:  # an iterator may outlive its connection
             self.call("unsubscribe", subscription=number)
 
-    def _messages(self, stream: str, rate: Optional[float]) -> Iterator[Dict[str, Any]]:
+    def _messages(self, stream: str, rate: Optional[float]) -> Iterator[dict[str, Any]]:
         """Subscribes at once, so that nothing is missed before the first message is read."""
         return self._received(stream, rate, self._subscribe(stream, rate, KEPT))
 
-    def _received(self, stream: str, rate: Optional[float], number: int) -> Iterator[Dict[str, Any]]:
+    def _received(self, stream: str, rate: Optional[float], number: int) -> Iterator[dict[str, Any]]:
         try:
             while True:
                 while stream == "events" and not self._queues[number]:  # the run may be silent, but answers

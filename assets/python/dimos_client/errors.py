@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Dict, Optional, Type
+from typing import Any, Optional
 
 
 class DimosError(Exception):
     """What went wrong: `code` for programs, `message` and `hint` for people, `data` with the figures."""
+
     def __init__(self, code: str, message: str, hint: Optional[str] = None, data: Any = None) -> None:
         super().__init__(f"{message} [{code}]" + (f"\nhint: {hint}" if hint else ""))
         self.code, self.message, self.hint, self.data = code, message, hint, data
@@ -49,12 +50,17 @@ class MotionFailed(DimosError):
     """A motion ended elsewhere than it should; `data` is the reply to `motion`."""
 
 
-_REFUSALS: Dict[str, Type[Refused]] = {
-    "LEASE_HELD": LeaseHeld, "OUT_OF_LIMITS": OutOfLimits, "OUT_OF_REACH": OutOfReach, "ARM_LATCHED": ArmNotReady, "ARM_NOT_READY": ArmNotReady,
-    "STILL_FAULTED": ArmNotReady}
+_REFUSALS: dict[str, type[Refused]] = {
+    "LEASE_HELD": LeaseHeld,
+    "OUT_OF_LIMITS": OutOfLimits,
+    "OUT_OF_REACH": OutOfReach,
+    "ARM_LATCHED": ArmNotReady,
+    "ARM_NOT_READY": ArmNotReady,
+    "STILL_FAULTED": ArmNotReady,
+}
 
 
-def refusal(error: Dict[str, Any]) -> Refused:
+def refusal(error: dict[str, Any]) -> Refused:
     """The exception for the `error` of a reply."""
     kind = _REFUSALS.get(error["code"], Refused)
     return kind(error["code"], error["message"], error.get("hint"), error.get("data"))

@@ -8,16 +8,17 @@ import socket
 import stat
 import struct
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Dict, Iterator, List, Optional, Set, Tuple, Union
+from typing import Optional, Union
 
 from .errors import NoRun
 
 _LISTENING = "00010000"  # flag of a socket in /proc/net/unix
-_Row = Tuple[str, str]  # inode and path of a socket
+_Row = tuple[str, str]  # inode and path of a socket
 
 
-def runs() -> Dict[str, Path]:
+def runs() -> dict[str, Path]:
     """The sockets of the live runs of this user, by name; @NAME is an abstract one."""
     folder, prefix, is_open = _world()
     here = _rows("self")
@@ -39,13 +40,13 @@ def _address(path: Union[str, Path]) -> str:
     return "\0" + text[1:] if text.startswith("@") else text
 
 
-def _peer(connection: socket.socket) -> Tuple[int, int]:
+def _peer(connection: socket.socket) -> tuple[int, int]:
     """Process id and user at the other end."""
     pid, uid, _ = struct.unpack("3i", connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
     return pid, uid
 
 
-def _world() -> Tuple[Path, str, bool]:
+def _world() -> tuple[Path, str, bool]:
     """The run directory, the beginning of the marks of its runs, and whether others are looked for."""
     uid, world = os.geteuid(), os.environ.get("DIMOS_WORLD")
     if world is None:
@@ -69,7 +70,7 @@ def _is_ours(folder: Path) -> bool:
     return stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid()
 
 
-def _locked(folder: Path) -> Iterator[Tuple[str, Path, int]]:
+def _locked(folder: Path) -> Iterator[tuple[str, Path, int]]:
     """Runs with a lock in a directory of this user, and their pids. Nothing there is followed, or waited for."""
     try:
         locks = sorted(folder.glob("*.lock")) if _is_ours(folder) else []
@@ -94,7 +95,7 @@ def _locked(folder: Path) -> Iterator[Tuple[str, Path, int]]:
             os.close(file)
 
 
-def _rows(pid: str) -> List[_Row]:
+def _rows(pid: str) -> list[_Row]:
     """The listening sockets in the network namespace of a process; none if it cannot be seen."""
     try:
         with open(f"/proc/{pid}/net/unix", errors="surrogateescape") as table:
@@ -104,12 +105,12 @@ def _rows(pid: str) -> List[_Row]:
     return [(row[6], row[7]) for row in columns if len(row) == 8 and row[3] == _LISTENING]
 
 
-def _marked(rows: List[_Row], prefix: str) -> List[str]:
+def _marked(rows: list[_Row], prefix: str) -> list[str]:
     names = [path[len(prefix) + 1 :] for _, path in rows if path.startswith(f"@{prefix}")]
     return [name for name in names if name and "/" not in name]
 
 
-def _peer_at(path: str) -> Optional[Tuple[int, int]]:
+def _peer_at(path: str) -> Optional[tuple[int, int]]:
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
         connection.setblocking(False)
         try:
@@ -121,7 +122,7 @@ def _peer_at(path: str) -> Optional[Tuple[int, int]]:
             return None
 
 
-def _is_of_other_world(rows: List[_Row], prefix: str, name: str, pid: int) -> bool:
+def _is_of_other_world(rows: list[_Row], prefix: str, name: str, pid: int) -> bool:
     """Whether a process has a mark of this name in another world."""
     user = prefix.split("@")[0].rstrip("/")
     marks = [path for _, path in rows if path.startswith(f"@{user}") and path != f"@{prefix}{name}"]
@@ -130,7 +131,7 @@ def _is_of_other_world(rows: List[_Row], prefix: str, name: str, pid: int) -> bo
     return any((_peer_at(path) or (-1, 0))[0] == pid for path in others)
 
 
-def _here(rows: List[_Row], prefix: str, name: str) -> Optional[Path]:
+def _here(rows: list[_Row], prefix: str, name: str) -> Optional[Path]:
     """The socket of a run with a mark in this network namespace; None if another user has the mark."""
     mark = f"@{prefix}{name}"
     holder = _peer_at(mark)
@@ -140,7 +141,7 @@ def _here(rows: List[_Row], prefix: str, name: str) -> Optional[Path]:
     return Path(next((path for path in paths if _peer_at(path) == holder), mark))
 
 
-def _elsewhere(known: Set[str], prefix: str) -> Iterator[Tuple[str, Path]]:
+def _elsewhere(known: set[str], prefix: str) -> Iterator[tuple[str, Path]]:
     """Runs with marks in the network namespaces of other processes of this user, by a path that leads there."""
     for pids in _other_namespaces():
         rows = next(filter(None, map(_rows, pids)), [])  # a process may be closed to this one, another one is not
@@ -157,10 +158,10 @@ def _elsewhere(known: Set[str], prefix: str) -> Iterator[Tuple[str, Path]]:
                     break
 
 
-def _other_namespaces() -> List[List[str]]:
+def _other_namespaces() -> list[list[str]]:
     """The processes of this user in each other network namespace. One whose namespace is not known is alone in it."""
     own = _namespace("self")
-    found: Dict[Union[int, str], List[str]] = {}
+    found: dict[Union[int, str], list[str]] = {}
     for pid in filter(str.isdigit, os.listdir("/proc")):
         try:
             with open(f"/proc/{pid}/status") as status:

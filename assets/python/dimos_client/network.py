@@ -1,4 +1,4 @@
-"""A run on another computer, as docs/many-machines.md has it: needs `pip install eclipse-zenoh`, and nothing else does."""
+"""A run on another computer (docs/many-machines.md): needs `pip install eclipse-zenoh`, and nothing else does."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import os
 import socket
 import sys
 import threading
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, Dict, List, Optional, Tuple
+from typing import Any, Optional
 
 from .errors import ConnectionLost, NoRun
 
@@ -20,11 +21,11 @@ ANSWERED = 11.0  # s for an answer of the run, whose own limit is 10 s
 OWN = 1 << 32  # numbers of the subscriptions that are served here; a run's own are below
 CLASSES = {
     "read": "status state text_log motion planner planning preview world grip arm_io arm_payload arm_tool poses "
-            "robot_description transforms subscribe unsubscribe",
+    "robot_description transforms subscribe unsubscribe",
     "end": "stop cancel",
     "plan": "plan ik world_add world_move world_remove attach detach register_planner planner_answer",
     "move": "lease release move move_native execute execute_plan servo velocity chunk twist pose start gripper speed "
-            "arm_disable arm_io_set arm_payload_set arm_tool_set pose_save pose_remove",
+    "arm_disable arm_io_set arm_payload_set arm_tool_set pose_save pose_remove",
     "enable": "arm_reset arm_enable arm_teach arm_take_over",
     "own": "shutdown",
 }
@@ -38,7 +39,9 @@ def connect(place: str, run: Optional[str], user: Optional[str], identity: Optio
     try:
         zenoh: Any = importlib.import_module("zenoh")
     except ImportError:
-        raise ConnectionLost("UNSUPPORTED", "a run on another computer needs zenoh", "pip install eclipse-zenoh") from None
+        raise ConnectionLost(
+            "UNSUPPORTED", "a run on another computer needs zenoh", "pip install eclipse-zenoh"
+        ) from None
     settings, user = _settings(place, user, identity)
     config = zenoh.Config()
     for key, value in settings.items():
@@ -50,7 +53,7 @@ def connect(place: str, run: Optional[str], user: Optional[str], identity: Optio
         raise ConnectionLost("UNREACHABLE", f"{place}: {error}", hint) from None
     found = session.liveliness().get("dimos/*/alive", timeout=LISTED)
     runs = sorted(str(reply.ok.key_expr).split("/")[1] for reply in found if reply.ok is not None)
-    if run not in (None, *runs) or len(runs) != 1 and run is None:
+    if run not in (None, *runs) or (len(runs) != 1 and run is None):
         session.close()
         named = f"shares {', '.join(runs)}" if runs else f"shares no run with {user}"
         raise NoRun("SEVERAL_RUNS" if runs and run is None else "NO_RUN", f"{place} {named}", "say which run")
@@ -59,8 +62,8 @@ def connect(place: str, run: Optional[str], user: Optional[str], identity: Optio
     return ours
 
 
-def _settings(place: str, user: Optional[str], identity: Optional[str]) -> Tuple[Dict[str, Any], str]:
-    settings: Dict[str, Any] = {
+def _settings(place: str, user: Optional[str], identity: Optional[str]) -> tuple[dict[str, Any], str]:
+    settings: dict[str, Any] = {
         "mode": "client",
         "connect/endpoints": [place],
         "connect/timeout_ms": 2000,
@@ -76,7 +79,11 @@ def _settings(place: str, user: Optional[str], identity: Optional[str]) -> Tuple
     if user is None and len(keys) != 1:
         raise ConnectionLost("UNREACHABLE", f"{folder} has {len(keys)} private keys", "say which: user=NAME")
     name = user or keys[0]
-    files = {"root_ca_certificate": "ca.pem", "connect_certificate": f"{name}.pem", "connect_private_key": f"{name}.key"}
+    files = {
+        "root_ca_certificate": "ca.pem",
+        "connect_certificate": f"{name}.pem",
+        "connect_private_key": f"{name}.key",
+    }
     settings.update({f"transport/link/tls/{key}": str(folder / file) for key, file in files.items()})
     settings["transport/link/tls/enable_mtls"] = True
     return settings, name
@@ -91,10 +98,11 @@ class _Line:
         self.own = f"{self.root}/by/{user}"
         self.proof = os.urandom(16)  # another program of the same user cannot speak for this one
         self.lock, self.ended = threading.Lock(), threading.Event()
-        self.subscribers: List[Any] = []
+        self.subscribers: list[Any] = []
         self.alive = session.liveliness().declare_subscriber(f"{self.root}/alive", self._gateway)
         self.thinned = session.declare_subscriber(
-            f"{self.root}/to/{user}/{self.id}/*", lambda sample: self._out(sample.payload.to_bytes() + b"\n"))
+            f"{self.root}/to/{user}/{self.id}/*", lambda sample: self._out(sample.payload.to_bytes() + b"\n")
+        )
         self.token = session.liveliness().declare_token(f"{self.own}/client/{self.id}")
         self.threads = [threading.Thread(target=task, daemon=True) for task in (self._beats, self._requests)]
         for thread in self.threads:
@@ -105,16 +113,19 @@ class _Line:
     def _end(self) -> None:
         """Closes the session before the interpreter ends: a callback must not come after that."""
         self.ended.set()
-        try:
+        with suppress(OSError):  # closed already
             self.line.shutdown(socket.SHUT_RDWR)
-        except OSError:  # closed already
-            pass
         for thread in self.threads:
             thread.join(2.0)
 
     def _gateway(self, sample: Any) -> None:
         if sample.kind == self.zenoh.SampleKind.DELETE:
-            self._error(None, "LOST", f"the connection to {self.place} is lost", "it may still do what was asked: ask for status")
+            self._error(
+                None,
+                "LOST",
+                f"the connection to {self.place} is lost",
+                "it may still do what was asked: ask for status",
+            )
             self.ended.set()
             self.line.shutdown(socket.SHUT_RDWR)
 
@@ -135,7 +146,7 @@ class _Line:
         self.session.close()
         self.line.close()
 
-    def _ask(self, request: Dict[str, Any]) -> None:
+    def _ask(self, request: dict[str, Any]) -> None:
         number, method, params = request["id"], request["method"], request["params"]
         if method == "subscribe" and "rate" not in params:
             return self._subscribe(number, params["stream"])
@@ -169,7 +180,7 @@ class _Line:
     def _error(self, number: Optional[int], code: str, message: str, hint: str) -> None:
         self._say({"id": number, "error": {"code": code, "message": message, "hint": hint}})
 
-    def _say(self, message: Dict[str, Any]) -> None:
+    def _say(self, message: dict[str, Any]) -> None:
         self._out(json.dumps(message).encode() + b"\n")
 
     def _out(self, line: bytes) -> None:

@@ -15,7 +15,8 @@ import pickle
 import sys
 import threading
 import time
-from typing import Any, Dict, List, Optional, Sequence, Tuple
+from collections.abc import Sequence
+from typing import Any, Optional
 
 import zenoh
 from dimos.core.global_config import global_config
@@ -33,11 +34,24 @@ SEARCH_PERIOD, ANSWER_TIMEOUT = 5.0, 0.3  # s, of the search for another coordin
 CLASSES = {  # what a call may contain: planners put the numbers of numpy into lists
     ("dimos.msgs.trajectory_msgs.JointTrajectory", "JointTrajectory"),
     ("dimos.msgs.trajectory_msgs.TrajectoryPoint", "TrajectoryPoint"),
-    ("numpy", "dtype"), ("numpy.core.multiarray", "scalar"), ("numpy._core.multiarray", "scalar"),
+    ("numpy", "dtype"),
+    ("numpy.core.multiarray", "scalar"),
+    ("numpy._core.multiarray", "scalar"),
 }
 # Methods that pass live Python objects, or change what is the blueprint's.
-UNSUPPORTED = ("add_hardware", "add_task", "get_stream_descriptors", "get_task", "peek_stream", "remove_hardware",
-               "remove_task", "set_activated", "set_dry_run", "set_module_ref", "set_transport")
+UNSUPPORTED = (
+    "add_hardware",
+    "add_task",
+    "get_stream_descriptors",
+    "get_task",
+    "peek_stream",
+    "remove_hardware",
+    "remove_task",
+    "set_activated",
+    "set_dry_run",
+    "set_module_ref",
+    "set_transport",
+)
 
 
 class Reader(pickle.Unpickler):
@@ -49,7 +63,7 @@ class Reader(pickle.Unpickler):
         return super().find_class(module, name)
 
 
-def arguments(payload: bytes) -> Tuple[Sequence[Any], Dict[str, Any]]:
+def arguments(payload: bytes) -> tuple[Sequence[Any], dict[str, Any]]:
     """The arguments of a call."""
     if len(payload) > MAX_BYTES:
         raise TypeError(f"the call has {len(payload)} bytes (limit {MAX_BYTES})")
@@ -71,7 +85,7 @@ class Server:
 
     def other(self) -> Optional[str]:
         """The arms of another coordinator of this name, in words."""
-        found: List[str] = []
+        found: list[str] = []
         deadline = time.monotonic() + ANSWER_TIMEOUT
         while not found and (left := deadline - time.monotonic()) > 0:
             done = threading.Event()
@@ -87,9 +101,15 @@ class Server:
                     found.append("")
 
             handler = zenoh.handlers.Callback(answer, drop=done.set)
-            self.rpc.session.get(f"dimos/rpc/{self.name}/list_hardware", handler, payload=pickle.dumps(([], {})),
-                                 target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE, timeout=left,
-                                 allowed_destination=zenoh.Locality.REMOTE)
+            self.rpc.session.get(
+                f"dimos/rpc/{self.name}/list_hardware",
+                handler,
+                payload=pickle.dumps(([], {})),
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=left,
+                allowed_destination=zenoh.Locality.REMOTE,
+            )
             done.wait(left)
             time.sleep(0.05)
         return found[0] if found else None
@@ -108,8 +128,10 @@ class Server:
         silent = query.attachment is not None
         try:
             if method in UNSUPPORTED:
-                raise NotImplementedError(f"{self.name} is a run of the dimos binary: it has no {method}(); its "
-                                          "blueprint has the arms and the tasks")
+                raise NotImplementedError(
+                    f"{self.name} is a run of the dimos binary: it has no {method}(); its "
+                    "blueprint has the arms and the tasks"
+                )
             if method.startswith("_") or method == "free_lease" or not callable(getattr(Coordinator, method, None)):
                 raise AttributeError(f"'{self.name}' object has no attribute '{method[:80]}'")
             positional, named = arguments(query.payload.to_bytes() if query.payload else b"")
@@ -132,8 +154,14 @@ class Server:
                 known = [at for at, position in enumerate(state.position) if position is not None]
                 rest = [[values[at] for at in known] for values in (state.velocity, state.effort)]
                 velocity, effort = (values if None not in values else [] for values in rest)
-                message = JointState(ts=state.stamp, frame_id="coordinator", name=[theirs[state.name[at]] for at in known],
-                                     position=[state.position[at] for at in known], velocity=velocity, effort=effort)
+                message = JointState(
+                    ts=state.stamp,
+                    frame_id="coordinator",
+                    name=[theirs[state.name[at]] for at in known],
+                    position=[state.position[at] for at in known],
+                    velocity=velocity,
+                    effort=effort,
+                )
                 message.tick = state.tick
                 self.coordinator.newest = (time.monotonic(), message)
                 transport.broadcast(None, message)
@@ -143,7 +171,9 @@ class Server:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python3 -m dimos_client.python_dimos", description=(__doc__ or "").split("\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="python3 -m dimos_client.python_dimos", description=(__doc__ or "").split("\n")[0]
+    )
     parser.add_argument("--run", help="the run, if several are live")
     parser.add_argument("--at", metavar="PLACE", help="a run on another computer: tls/HOST:PORT")
     parser.add_argument("--user", help="the user of the certificate, with --at")
@@ -175,8 +205,11 @@ def main() -> int:
 
     def other() -> bool:
         if (arms := server.other()) is not None:
-            print(f"error: another {given.name}{arms} is on the bus of Python dimos; both would move\n"
-                  "hint: end that one, then start this again; or give this one another name: --name", file=sys.stderr)
+            print(
+                f"error: another {given.name}{arms} is on the bus of Python dimos; both would move\n"
+                "hint: end that one, then start this again; or give this one another name: --name",
+                file=sys.stderr,
+            )
         return arms is not None
 
     if other():
@@ -185,8 +218,11 @@ def main() -> int:
     while coordinator.newest is None and not ended.wait(0.01):
         pass
     server.serve()
-    print(f"the run is {given.name} of Python dimos on this computer: it reads, and ends motion"
-          + ("; EVERY PROGRAM ON THIS COMPUTER MAY MOVE THE ARMS" if given.command else ""), flush=True)
+    print(
+        f"the run is {given.name} of Python dimos on this computer: it reads, and ends motion"
+        + ("; EVERY PROGRAM ON THIS COMPUTER MAY MOVE THE ARMS" if given.command else ""),
+        flush=True,
+    )
     search = time.monotonic()
     found = False
     try:

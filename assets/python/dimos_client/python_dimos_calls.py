@@ -6,7 +6,8 @@ from __future__ import annotations
 import inspect
 import threading
 import time
-from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple
+from collections.abc import Sequence
+from typing import Any, Callable, ClassVar, Optional
 
 from dimos.control.tasks.trajectory_task import trajectory_task as theirs
 from dimos.msgs.trajectory_msgs.JointTrajectory import JointTrajectory
@@ -27,9 +28,9 @@ CANCELLATION = theirs.TrajectoryCancellationStatus
 class Names:
     """Joints, arms and tasks of a run, with the names of Python dimos."""
 
-    def __init__(self, client: Client, given: Dict[str, str]) -> None:
+    def __init__(self, client: Client, given: dict[str, str]) -> None:
         state, status = client.call("state"), client.status()
-        self.theirs: Dict[str, str] = {}
+        self.theirs: dict[str, str] = {}
         for arm in state["arms"]:
             for joint in (joint["name"] for joint in arm["joints"]):
                 self.theirs[joint] = given.pop(joint, "") or of_joint(joint, arm["hardware_id"])
@@ -38,11 +39,12 @@ class Names:
         self.ours = {name: joint for joint, name in self.theirs.items()}
         if len(self.ours) < len(self.theirs):
             raise SystemExit("error: --joint: two joints would have the same name")
-        self.arms: List[str] = [arm["hardware_id"] for arm in state["arms"]]
+        self.arms: list[str] = [arm["hardware_id"] for arm in state["arms"]]
         ranges = {arm["hardware_id"]: arm.get("gripper_range") for arm in status["arms"]}
-        self.grippers: Dict[str, Optional[List[float]]] = {
-            arm["hardware_id"] + GRIPPER: ranges[arm["hardware_id"]] for arm in state["arms"] if arm.get("gripper_unit")}
-        self.trajectory_tasks: List[str] = [t["name"] for t in status["tasks"] if "execute" in t["takes"]]
+        self.grippers: dict[str, Optional[list[float]]] = {
+            arm["hardware_id"] + GRIPPER: ranges[arm["hardware_id"]] for arm in state["arms"] if arm.get("gripper_unit")
+        }
+        self.trajectory_tasks: list[str] = [t["name"] for t in status["tasks"] if "execute" in t["takes"]]
 
 
 def of_joint(joint: str, arm: str) -> str:
@@ -59,7 +61,7 @@ class Link:
         self.client: Optional[Client] = None
         self.used = 0.0
 
-    def call(self, method: str, **params: Any) -> Dict[str, Any]:
+    def call(self, method: str, **params: Any) -> dict[str, Any]:
         with self.lock:
             if self.client is not None and time.monotonic() - self.used > LEASE_KEPT:
                 self.close()  # the run may have closed it in favour of others
@@ -81,31 +83,32 @@ class Link:
 class Coordinator:
     """The methods of a `ControlCoordinator`, by their names. A cancellation waits for no trajectory that is checked."""
 
-    def __init__(self, connect: Callable[[bool], Client], joints: Dict[str, str], command: bool) -> None:
+    def __init__(self, connect: Callable[[bool], Client], joints: dict[str, str], command: bool) -> None:
         self.reads, self.ends = Link(lambda: connect(False)), Link(lambda: connect(False))
         self.moves = Link(lambda: connect(True))
         with connect(False) as client:
             self.names = Names(client, joints)
-        self.command, self.ended, self.motion = command, 0, None  # type: bool, int, Optional[int]
-        self.newest: Optional[Tuple[float, Any]] = None
-        self.tasks = {name: GripperTask(self, name) for name in self.names.grippers}  # type: Dict[str, Any]
+        self.command, self.ended = command, 0
+        self.motion: Optional[int] = None
+        self.newest: Optional[tuple[float, Any]] = None
+        self.tasks: dict[str, Any] = {name: GripperTask(self, name) for name in self.names.grippers}
         if self.names.trajectory_tasks:
             self.tasks = {TASK: TrajectoryTask(self), **self.tasks}
 
-    def list_joints(self) -> List[str]:
+    def list_joints(self) -> list[str]:
         return list(self.names.ours)
 
-    def list_hardware(self) -> List[str]:
+    def list_hardware(self) -> list[str]:
         return self.names.arms
 
-    def list_tasks(self) -> List[str]:
+    def list_tasks(self) -> list[str]:
         return list(self.tasks)
 
-    def get_active_tasks(self) -> List[str]:
+    def get_active_tasks(self) -> list[str]:
         moving = TASK in self.tasks and self.tasks[TASK].get_state() is TrajectoryState.EXECUTING
         return [TASK] * moving + list(self.names.grippers)  # to Python dimos a gripper's task is always active
 
-    def get_joint_positions(self) -> Dict[str, float]:
+    def get_joint_positions(self) -> dict[str, float]:
         if self.newest and time.monotonic() - self.newest[0] < STALE_AFTER:
             return dict(zip(self.newest[1].name, self.newest[1].position))
         joints = (joint for arm in self.reads.call("state")["arms"] for joint in arm["joints"])
@@ -114,7 +117,7 @@ class Coordinator:
     def get_tick_count(self) -> int:
         return int(self.newest[1].tick) if self.newest else 0
 
-    def get_skills(self) -> List[Any]:
+    def get_skills(self) -> list[Any]:
         return []
 
     def build(self) -> None:
@@ -122,7 +125,7 @@ class Coordinator:
 
     start = stop = build
 
-    def reset_runtime_state(self, reactivate: bool = True) -> Dict[str, Any]:
+    def reset_runtime_state(self, reactivate: bool = True) -> dict[str, Any]:
         return {}
 
     def describe_task(self, task_name: str) -> Any:
@@ -132,7 +135,7 @@ class Coordinator:
         described = {name: {"signature": str(of), "params": list(of.parameters)} for name, of in commands.items()}
         return {"task": task_name, "commands": described, "streams": []}
 
-    def task_invoke(self, task_name: str, method: str, kwargs: Optional[Dict[str, Any]] = None) -> Any:
+    def task_invoke(self, task_name: str, method: str, kwargs: Optional[dict[str, Any]] = None) -> Any:
         if (task := self.tasks.get(task_name)) is None:
             return None
         where = f"task_invoke({task_name!r}, {str(method)[:80]!r})"
@@ -176,7 +179,8 @@ class Coordinator:
 
 class TrajectoryTask:
     """All trajectory tasks of the run: to Python dimos they are one."""
-    COMMANDS = ["cancel", "execute", "get_state", "get_status"]
+
+    COMMANDS: ClassVar[list[str]] = ["cancel", "execute", "get_state", "get_status"]
 
     def __init__(self, of: Coordinator) -> None:
         self.__of = of
@@ -212,16 +216,21 @@ class TrajectoryTask:
         of = self.__of
         of.ended += 1
         if not of.names.trajectory_tasks:
-            return theirs.TrajectoryCancellationResult(CANCELLATION.NO_TRAJECTORY_TASK, "the run has no trajectory task")
+            return theirs.TrajectoryCancellationResult(
+                CANCELLATION.NO_TRAJECTORY_TASK, "the run has no trajectory task"
+            )
         try:
-            ended = [result for task in of.names.trajectory_tasks
-                     for result in of.ends.call("cancel", task=task)["tasks"].values()]
+            ended = [
+                result
+                for task in of.names.trajectory_tasks
+                for result in of.ends.call("cancel", task=task)["tasks"].values()
+            ]
         except DimosError as error:
             return theirs.TrajectoryCancellationResult(CANCELLATION.UNCERTAIN, str(error))
         stopped = CANCELLATION.CANCELLED if "CANCELLED" in ended else CANCELLATION.ALREADY_STOPPED
         return theirs.TrajectoryCancellationResult(stopped, "")
 
-    def __report(self) -> Optional[Dict[str, Any]]:
+    def __report(self) -> Optional[dict[str, Any]]:
         of = self.__of
         if of.motion is None:
             return None
@@ -241,12 +250,16 @@ class TrajectoryTask:
         now, moving = report or {}, state is TrajectoryState.EXECUTING
         done = state is TrajectoryState.COMPLETED
         return TrajectoryStatus(
-            timestamp=time.time(), state=state, progress=1.0 if done else now.get("progress", 0.0),
-            time_elapsed=now.get("elapsed", 0.0), time_remaining=now.get("remaining", 0.0) if moving else 0.0,
-            error="" if moving else now.get("error") or "")
+            timestamp=time.time(),
+            state=state,
+            progress=1.0 if done else now.get("progress", 0.0),
+            time_elapsed=now.get("elapsed", 0.0),
+            time_remaining=now.get("remaining", 0.0) if moving else 0.0,
+            error="" if moving else now.get("error") or "",
+        )
 
 
-def state_of(report: Optional[Dict[str, Any]]) -> Any:
+def state_of(report: Optional[dict[str, Any]]) -> Any:
     """The state of a motion, which ends when the arm is at rest, and is completed only at its goal."""
     if report is None:
         return TrajectoryState.IDLE
@@ -269,14 +282,16 @@ def mistake(trajectory: Any, names: Names) -> Optional[str]:
     return None
 
 
-def request(trajectory: Any, names: Names) -> Dict[str, Any]:
+def request(trajectory: Any, names: Names) -> dict[str, Any]:
     """A trajectory as the run takes it. Python dimos fills in zeros where no velocities were given, and ignores them:
     taken at their word the arm would rest at each point."""
     moves = any(any(point.velocities) for point in trajectory.points)
     points = []
     for point in trajectory.points:
-        made: Dict[str, Any] = {"time_from_start": float(point.time_from_start),
-                                "positions": [round(float(q), 9) for q in point.positions]}
+        made: dict[str, Any] = {
+            "time_from_start": float(point.time_from_start),
+            "positions": [round(float(q), 9) for q in point.positions],
+        }
         if moves and point.velocities:
             made["velocities"] = [round(float(v), 9) for v in point.velocities]
         points.append(made)
@@ -285,17 +300,18 @@ def request(trajectory: Any, names: Names) -> Dict[str, Any]:
 
 class GripperTask:
     """A gripper, in its own unit or from 0, closed, to 1, open."""
-    COMMANDS = ["get_normalized", "get_position", "set_normalized", "set_position"]
+
+    COMMANDS: ClassVar[list[str]] = ["get_normalized", "get_position", "set_normalized", "set_position"]
 
     def __init__(self, of: Coordinator, name: str) -> None:
         self.__of, self.__arm, self.__range = of, name[: -len(GRIPPER)], of.names.grippers[name]
 
-    def get_position(self) -> Optional[List[float]]:
+    def get_position(self) -> Optional[list[float]]:
         arms = self.__of.reads.call("state")["arms"]
         position = next(arm["gripper"] for arm in arms if arm["hardware_id"] == self.__arm)
         return None if position is None else [position]
 
-    def get_normalized(self) -> Optional[List[float]]:
+    def get_normalized(self) -> Optional[list[float]]:
         position = self.get_position()
         if position is None or self.__range is None or self.__range[0] == self.__range[1]:
             return None

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Dict, List, Optional, Sequence, Union
+from typing import Any, Optional, Union
 
 from .errors import Refused
 
 
-def numbers(values: Sequence[float]) -> List[float]:
+def numbers(values: Sequence[float]) -> list[float]:
     """Plain numbers, also of an array of another library."""
     try:
         return [float(value) for value in values]
@@ -20,12 +21,13 @@ def numbers(values: Sequence[float]) -> List[float]:
 @dataclass(frozen=True)
 class JointState:
     """Joints after a tick, all lists in the order of `name`."""
+
     tick: int
     stamp: float  # s since 1970
-    name: List[str]
-    position: List[Optional[float]]  # rad
-    velocity: List[Optional[float]]  # rad/s
-    effort: List[Optional[float]]  # Nm
+    name: list[str]
+    position: list[Optional[float]]  # rad
+    velocity: list[Optional[float]]  # rad/s
+    effort: list[Optional[float]]  # Nm
     lost: int = 0  # messages that this reader missed just before, because it was too slow
 
     def only(self, names: Sequence[str]) -> JointState:
@@ -38,11 +40,12 @@ class JointState:
 @dataclass(frozen=True)
 class ArmState(JointState):
     """An arm after a tick."""
+
     age: Optional[float] = None  # s, of its joints
     gripper: Optional[float] = None  # m of opening, or rad of a rotary jaw
-    xyz: Optional[List[float]] = None  # m, of the tool centre point in `frame`; None without a model of the arm
-    rpy: Optional[List[float]] = None  # rad, fixed axes
-    wrench: Optional[List[float]] = None  # N, N, N, Nm, Nm, Nm
+    xyz: Optional[list[float]] = None  # m, of the tool centre point in `frame`; None without a model of the arm
+    rpy: Optional[list[float]] = None  # rad, fixed axes
+    wrench: Optional[list[float]] = None  # N, N, N, Nm, Nm, Nm
     gripper_unit: Optional[str] = None  # "m" or "rad"
     gripper_force: Optional[float] = None  # measured, in gripper_force_unit
     gripper_force_unit: Optional[str] = None  # "N" or "Nm"
@@ -53,11 +56,12 @@ class ArmState(JointState):
 @dataclass(frozen=True)
 class Pose:
     """A pose of an arm's tool centre point, or of an object; in the frame `map` unless a goal has another one."""
+
     xyz: Sequence[float]  # m
     rpy: Optional[Sequence[float]] = None  # rad, fixed axes; without rpy and quat the orientation is free
     quat: Optional[Sequence[float]] = None  # x, y, z, w
 
-    def params(self) -> Dict[str, Any]:
+    def params(self) -> dict[str, Any]:
         """The pose as a parameter of a request."""
         given = {"xyz": self.xyz, "rpy": self.rpy, "quat": self.quat}
         return {key: numbers(value) for key, value in given.items() if value is not None}
@@ -66,6 +70,7 @@ class Pose:
 @dataclass(frozen=True)
 class Goal:
     """Goal or waypoint of an arm: one of `joints` [rad], `named`, `pose`, `by`."""
+
     joints: Optional[Sequence[float]] = None
     named: Optional[str] = None
     pose: Optional[Pose] = None
@@ -73,9 +78,9 @@ class Goal:
     frame: Optional[str] = None  # of `pose` or `by`: "map" (default), "base", "tool", or an object of the world
     by: Optional[Pose] = None  # a motion of the tool centre point from where it is, along the axes of `frame`
 
-    def params(self, arm: str) -> Dict[str, Any]:
+    def params(self, arm: str) -> dict[str, Any]:
         """The goal as a parameter of `plan`."""
-        goal: Dict[str, Any] = {"robot": arm}
+        goal: dict[str, Any] = {"robot": arm}
         if self.joints is not None:
             goal["joints"] = numbers(self.joints)
         if self.named is not None:
@@ -97,9 +102,10 @@ Waypoint = Union[str, Sequence[float], Pose, Goal]  # a named pose, joints [rad]
 @dataclass(frozen=True)
 class Plan:
     """A motion that was planned, and has not moved anything."""
+
     number: int
     elapsed: float  # s of planning
-    summary: Dict[str, Any]  # joints, start, goal, duration, clearance, …: docs/rpc.md
+    summary: dict[str, Any]  # joints, start, goal, duration, clearance, …: docs/rpc.md
 
     @property
     def duration(self) -> float:
@@ -116,6 +122,7 @@ class Plan:
 @dataclass(frozen=True)
 class Grip:
     """A gripper after a command."""
+
     position: float  # in `unit`
     unit: str  # "m", "rad" or "on_off" (0 closed, 1 open)
     # "open", "closed" or "reached"; "holding" (stopped while closing), "blocked" (opening); "ordered" (nothing measures
@@ -134,6 +141,7 @@ class Grip:
 @dataclass(frozen=True)
 class ChunkReport:
     """What became of a chunk."""
+
     actions: int
     late: int  # of them, skipped because their time was over; if all are late, nothing has changed
 
@@ -141,14 +149,22 @@ class ChunkReport:
 @dataclass(frozen=True)
 class LoopReport:
     """How a policy loop kept its time."""
+
     sent: int  # targets that the run took
     missed: int  # periods that were missed because the policy or the computer took longer than one
     worst: float  # s, the latest start of a period
     seconds: float  # s, how long the loop ran
 
 
-def joint_state(message: Dict[str, Any]) -> JointState:
+def joint_state(message: dict[str, Any]) -> JointState:
     """The joint state of a stream's message."""
     data = message["data"]
-    return JointState(data["tick"], data["stamp"], data["name"], data["position"], data["velocity"], data["effort"],
-                      message.get("lost", 0))
+    return JointState(
+        data["tick"],
+        data["stamp"],
+        data["name"],
+        data["position"],
+        data["velocity"],
+        data["effort"],
+        message.get("lost", 0),
+    )

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Generator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Callable, Deque, Dict, Generator, List, Optional, Sequence, Set, Tuple, Union
+from typing import Any, Callable, Optional, Union
 
 from .connection import Connection
 from .errors import ConnectionLost, Refused
@@ -19,16 +20,17 @@ Policy = Callable[[JointState, float], Optional[Sequence[float]]]  # from joints
 
 class Streams(Connection):
     """A connection that subscribes to streams and sends streams of targets."""
+
     def __init__(self, path: Union[str, Path], timeout: float = 15.0) -> None:
         super().__init__(path, timeout)
-        self._targets: Deque[Tuple[int, str]] = deque()  # targets that are not answered yet, and their tasks
-        self._streams: Set[str] = set()  # tasks that took a target of this client
+        self._targets: deque[tuple[int, str]] = deque()  # targets that are not answered yet, and their tasks
+        self._streams: set[str] = set()  # tasks that took a target of this client
 
     def joint_states(self, rate: Optional[float] = None) -> Generator[JointState, None, None]:
         """The joints of all arms after every tick, or at `rate` [Hz]. Close the iterator, or leave its loop, to end."""
         return (joint_state(message) for message in self._messages("coordinator_joint_state", rate))
 
-    def events(self) -> Generator[Dict[str, Any], None, None]:
+    def events(self) -> Generator[dict[str, Any], None, None]:
         """What happens from now on: `text` for people, `kind`, `level`, `arm`, `task`, `joint` for programs."""
         return (message["data"] for message in self._messages("events", None))
 
@@ -45,13 +47,24 @@ class Streams(Connection):
         """Sends an eef_twist task its next velocity [m/s, rad/s], along the axes of "base" or "tool"; as `servo`."""
         self._target("twist", {"task": task, "linear": numbers(linear), "angular": numbers(angular), "frame": frame})
 
-    def pose(self, task: str, xyz: Sequence[float], rpy: Optional[Sequence[float]] = None,
-             quat: Optional[Sequence[float]] = None) -> None:
+    def pose(
+        self,
+        task: str,
+        xyz: Sequence[float],
+        rpy: Optional[Sequence[float]] = None,
+        quat: Optional[Sequence[float]] = None,
+    ) -> None:
         """Sends a cartesian_ik task its next pose [m], with `rpy` [rad] or `quat` (x, y, z, w); as `servo`."""
         self._target("pose", {"task": task, **Pose(xyz, rpy, quat).params()})
 
-    def chunk(self, task: str, actions: Sequence[Sequence[float]], period: float,
-              start: Optional[float] = None, gripper: Optional[Sequence[float]] = None) -> ChunkReport:
+    def chunk(
+        self,
+        task: str,
+        actions: Sequence[Sequence[float]],
+        period: float,
+        start: Optional[float] = None,
+        gripper: Optional[Sequence[float]] = None,
+    ) -> ChunkReport:
         """Sends a chunk task its next horizon: joint positions [rad], `period` [s] apart, the first at `start`, a
         `stamp` of a joint state (default: now), and with each a position of the gripper [m, or rad of a rotary one]. It
         replaces the rest of the chunk before it from its start on."""
@@ -71,7 +84,7 @@ class Streams(Connection):
         while self._targets:
             self._take_answer()
 
-    def _target(self, method: str, params: Dict[str, Any]) -> None:
+    def _target(self, method: str, params: dict[str, Any]) -> None:
         self._read(0.0)
         while self._targets and (len(self._targets) >= IN_FLIGHT or self._targets[0][0] in self._replies):
             self._take_answer()
@@ -86,7 +99,7 @@ class Streams(Connection):
         """A policy loop. Calls `policy(state, t)` at `rate` [Hz] with the newest joints of the servo task and the time
         since the start [s], and sends what it returns: the next positions [rad]. None, or `duration` [s], ends it. The
         stream ends with the loop, also after an exception: the arm is at rest when `follow` returns."""
-        names: List[str] = next((t["joints"] for t in self.status()["tasks"] if t["name"] == task), [])
+        names: list[str] = next((t["joints"] for t in self.status()["tasks"] if t["name"] == task), [])
         number = self._subscribe("coordinator_joint_state", 2 * rate, 1)
         queue, sent, missed, worst = self._queues[number], 0, 0, 0.0
         try:
@@ -111,7 +124,7 @@ class Streams(Connection):
                 self._unsubscribe(number)
         return LoopReport(sent, missed, worst, seconds)
 
-    def _end_streams(self, tasks: Set[str]) -> None:
+    def _end_streams(self, tasks: set[str]) -> None:
         """Ends the streams of this client to these tasks, and waits until the joints' commands are at rest. Leaves a
         task alone that took no target of this client: its stream is another program's."""
         while self._targets:  # the reply shows whether the task took it

@@ -24,6 +24,8 @@ pub fn python(text: &str) -> Vec<String> {
             let Some(next) = lines.next() else { break };
             statement = format!("{statement} {}", next.trim());
         }
+        // As if it were on one line.
+        let statement = statement.replace("( ", "(").replace(", )", ")").replace(" )", ")");
         let body = statement.trim_start();
         let indent = statement.len() - body.len();
         let name: String = body

@@ -1,7 +1,7 @@
 // The timeline of a log: play, pause, rate, and marks of motions, warnings and errors.
 import {button, el, setText} from '../dom';
 import {clock, figure} from '../units';
-import {type Player} from './player';
+import type {Player} from './player';
 
 const RATES = [0.1, 0.25, 0.5, 1, 2, 5, 10, 30];
 const STEPS = 10_000;

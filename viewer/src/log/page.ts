@@ -5,13 +5,13 @@ import {el, setClass, setText} from '../dom';
 import {frame, makeView} from '../frame';
 import {armsPanel} from '../panels/arms';
 import {jointsPanel} from '../panels/joints';
-import {type Preview, type Scene} from '../protocol';
+import type {Preview, Scene} from '../protocol';
 import {Server} from '../server';
 import {clock, duration, figure} from '../units';
 import {bar} from './bar';
 import {Player} from './player';
 import {logPlots} from './plots';
-import {LogSource, type LogScene} from './source';
+import {type LogScene, LogSource} from './source';
 import {type Motion, Story} from './story';
 import {Trails} from './trails';
 

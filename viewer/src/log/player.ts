@@ -1,18 +1,18 @@
 // A log that is played: the run as it was at a time. It reads blocks of ten seconds, and keeps the last ones.
 import {Euler, Quaternion} from 'three';
-import {type ArmStatus, type Vec3} from '../protocol';
+import type {ArmStatus, Vec3} from '../protocol';
 import {Signal} from '../signal';
 import {Still} from '../still';
 import {
   type Joints,
-  type LogSource,
   type LoggedPose,
   type LoggedStatus,
-  type Message,
+  type LogSource,
   lastBefore,
+  type Message,
   poseOf,
 } from './source';
-import {type Story} from './story';
+import type {Story} from './story';
 
 const BLOCK = 10; // s
 const PER_BLOCK = 500; // messages of each topic

@@ -1,10 +1,10 @@
 // Plots of a log around the time that is shown; a click goes to a time. Commands are dashed.
 import uPlot from 'uplot';
-import {type Context} from '../context';
+import type {Context} from '../context';
 import {choice, el, jointColor} from '../dom';
 import {angle, shortJoint} from '../units';
-import {type Player} from './player';
-import {type Joints, type Message} from './source';
+import type {Player} from './player';
+import type {Joints, Message} from './source';
 
 type Quantity = 'position' | 'velocity' | 'effort' | 'error';
 const QUANTITIES: readonly (readonly [Quantity, string])[] = [
@@ -52,14 +52,16 @@ export function logPlots(context: Context, player: Player): HTMLElement {
       const commands = new Map(messages.filter(({topic}) => topic === '/joint_commands').map(({t, data}) => [t, data]));
       const joints = messages.filter(({topic}) => topic === '/joint_states');
       samples = {...wide, joints, commands: joints.map(({t}) => commands.get(t) ?? null)};
-      plots.forEach((plot) => plot.fill(samples!));
+      for (const plot of plots) plot.fill(samples);
       draw();
     } catch {
       /* A later window is being read, or the server is gone: the header says so. */
     }
     reading = null;
   };
-  const draw = () => plots.forEach((plot) => plot.show(window_(), player.time));
+  const draw = () => {
+    for (const plot of plots) plot.show(window_(), player.time);
+  };
   const check = () => {
     const [from, to] = window_();
     const inside = samples && from > samples.from - 1e-6 && to < samples.to + 1e-6;
@@ -84,8 +86,8 @@ export function logPlots(context: Context, player: Player): HTMLElement {
   );
   player.onTime.on(check);
   const rebuild = () => {
-    plots.forEach((plot) => plot.build());
-    if (samples) plots.forEach((plot) => plot.fill(samples!));
+    for (const plot of plots) plot.build();
+    if (samples) for (const plot of plots) plot.fill(samples);
     draw();
   };
   context.onSelect.on(rebuild);

@@ -1,6 +1,6 @@
 // Windows of a log: the server reads the chunks that are shown, and of a long window few messages of each topic.
-import {type Pose, type Scene, type Vec3} from '../protocol';
-import {type Server} from '../server';
+import type {Pose, Scene, Vec3} from '../protocol';
+import type {Server} from '../server';
 
 export interface LogScene extends Scene {
   log: {file: string; start: number; length: number; live: boolean; loss: string | null; topics: string[]};

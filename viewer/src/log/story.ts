@@ -1,15 +1,15 @@
 // What happened in a log besides motion: events, motions that were accepted, objects of the world. Read once; that of a
 // live run is read on.
-import {type Vec3, type WorldObject} from '../protocol';
+import type {Vec3, WorldObject} from '../protocol';
 import {Signal} from '../signal';
 import {
-  type LogSource,
   type LoggedEvent,
+  type LogSource,
+  lastBefore,
   type Markers,
   type Message,
-  type Trajectory,
-  lastBefore,
   poseOf,
+  type Trajectory,
 } from './source';
 
 const EVENTS = '/dimos/events';

@@ -1,7 +1,7 @@
 // The measured ways of tool centre points, as lines.
 import {BufferAttribute, BufferGeometry, Line, LineBasicMaterial} from 'three';
-import {type Vec3} from '../protocol';
-import {type Stage} from '../scene/stage';
+import type {Vec3} from '../protocol';
+import type {Stage} from '../scene/stage';
 
 const POINTS = 2000;
 
@@ -15,10 +15,11 @@ export class Trails {
 
   draw(ways: Vec3[][]): void {
     ways.forEach((way, i) => {
-      const line = (this.lines[i] ??= this.add());
+      this.lines[i] ??= this.add();
+      const line = this.lines[i];
       const attribute = line.geometry.getAttribute('position') as BufferAttribute;
       const points = way.slice(-POINTS);
-      points.forEach((point, k) => attribute.setXYZ(k, ...point));
+      for (const [k, point] of points.entries()) attribute.setXYZ(k, ...point);
       attribute.needsUpdate = true;
       line.geometry.setDrawRange(0, points.length);
     });

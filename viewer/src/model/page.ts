@@ -3,7 +3,7 @@ import '../files.css';
 import {Context} from '../context';
 import {el} from '../dom';
 import {frame, makeView} from '../frame';
-import {type Scene} from '../protocol';
+import type {Scene} from '../protocol';
 import {Server} from '../server';
 import {checks, ignored, limits} from './panels';
 import {type ModelScene, Posed} from './posed';

@@ -1,8 +1,8 @@
 // What is known of a model at its joint positions: pairs that touch, tool centre points, limits, pairs never checked.
-import {type Context} from '../context';
+import type {Context} from '../context';
 import {el, setText} from '../dom';
 import {angle, angleText, figure} from '../units';
-import {type Posed} from './posed';
+import type {Posed} from './posed';
 
 export function checks(context: Context, run: Posed): HTMLElement {
   const verdict = el('p', {class: 'verdict', id: 'verdict', attributes: {role: 'status'}});

@@ -1,7 +1,7 @@
 // A model whose joints are where people put them. The server says what touches there, and where the tool centre points
 // are: it has the kinematics and the collision geometry of plans.
-import {type Quat, type Scene, type SceneRobot, type Vec3, type WorldObject} from '../protocol';
-import {type Server} from '../server';
+import type {Quat, Scene, SceneRobot, Vec3, WorldObject} from '../protocol';
+import type {Server} from '../server';
 import {Signal} from '../signal';
 import {Still} from '../still';
 

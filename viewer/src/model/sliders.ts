@@ -1,9 +1,9 @@
 // One slider for each joint of a robot, within its limits, and its named poses.
-import {type Context} from '../context';
+import type {Context} from '../context';
 import {button, choice, el, setText} from '../dom';
-import {type SceneRobot} from '../protocol';
+import type {SceneRobot} from '../protocol';
 import {angle, figure, shortJoint} from '../units';
-import {type Posed} from './posed';
+import type {Posed} from './posed';
 
 const STEPS = 2000;
 
@@ -44,7 +44,7 @@ export function sliders(context: Context, run: Posed, robot: SceneRobot): HTMLEl
   });
   const note = el('p', {class: 'minor'});
   const show = () => {
-    rows.forEach((row) => row.show());
+    for (const row of rows) row.show();
     const lengths = Object.keys(robot.joints).some(linear) ? ', or m' : '';
     setText(note, `in ${angle.unit === 'deg' ? 'degrees' : 'rad'}${lengths}`);
   };

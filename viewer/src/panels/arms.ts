@@ -1,7 +1,7 @@
 // Arms of the run: state, cause of a hold, faults with what to do, and the acts that make an arm ready again.
-import {type Context} from '../context';
+import type {Context} from '../context';
 import {button, el, setClass, setText} from '../dom';
-import {type ArmStatus, type Status, type Task} from '../protocol';
+import type {ArmStatus, Status, Task} from '../protocol';
 import {duration, figure} from '../units';
 
 /** How an arm's phase is coloured. */
@@ -18,7 +18,9 @@ const LEVELS: Record<string, string> = {
 export function armsPanel(context: Context): HTMLElement {
   const cards = context.run.scene.arms.map(({name}) => card(context, name));
   const element = el('section', {class: 'arms'}, ...cards.map((each) => each.element));
-  const show = () => cards.forEach((each) => each.show(context.run.status));
+  const show = () => {
+    for (const each of cards) each.show(context.run.status);
+  };
   context.run.onStatus.on(show);
   context.onSelect.on(show);
   show();
@@ -60,7 +62,7 @@ function card(context: Context, name: string) {
     const old = arm.state_age_ms === null ? 'no state yet' : `age ${duration(arm.state_age_ms)}`;
     setText(
       figures,
-      `${arm.adapter} at ${arm.address} · ${rate} Hz · ${old} · ` + (arm.enabled ? 'motors on' : 'motors off'),
+      `${arm.adapter} at ${arm.address} · ${rate} Hz · ${old} · ${arm.enabled ? 'motors on' : 'motors off'}`,
     );
     notes.replaceChildren(
       ...notesOf(arm, tasksOf(status, context.run.scene.arms.find((a) => a.name === name)!.joints)),

@@ -1,7 +1,7 @@
 // Events of the run, the newest first.
-import {type Context} from '../context';
+import type {Context} from '../context';
 import {el} from '../dom';
-import {type RunEvent} from '../protocol';
+import type {RunEvent} from '../protocol';
 import {clock} from '../units';
 
 const SHOWN = 200;

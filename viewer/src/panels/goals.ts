@@ -1,7 +1,7 @@
 // What is planned together: the goals of several arms, or the waypoints before the goal of one.
-import {type Context} from '../context';
+import type {Context} from '../context';
 import {button, el, NumberField, setClass} from '../dom';
-import {type GoalEditor} from '../goal';
+import type {GoalEditor} from '../goal';
 
 export function goalsPart(context: Context, editor: GoalEditor): HTMLElement {
   const several = context.run.scene.arms.length > 1;

@@ -1,5 +1,5 @@
 // The gripper of the selected arm: open, close, a position; and how the run judges the grip.
-import {type Context} from '../context';
+import type {Context} from '../context';
 import {button, el, setClass, setText} from '../dom';
 import {pause} from '../flow';
 import {figure} from '../units';
@@ -37,7 +37,7 @@ export function gripperPanel(context: Context): HTMLElement {
     show();
     try {
       const reply = await context.act<{order: number}>('gripper', {arm, position});
-      for (let grip: Grip | null = null; reply && !grip?.done;) {
+      for (let grip: Grip | null = null; reply && !grip?.done; ) {
         grip = await run.work.request<Grip>('grip', {arm, order: reply.order});
         setText(outcome, grip.error ?? (grip.done ? `${grip.outcome} at ${text(grip.position)}` : 'moving…'));
         await pause(100);

@@ -1,5 +1,5 @@
 // The bar at the top: which run, simulated or real, age of the data, speed override, pause, and Stop.
-import {type Context} from '../context';
+import type {Context} from '../context';
 import {button, el, setClass, setText} from '../dom';
 import {duration} from '../units';
 

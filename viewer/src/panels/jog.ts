@@ -1,5 +1,5 @@
 // The jog panel: buttons and keys that move single joints or the end effector while they are held.
-import {type Context} from '../context';
+import type {Context} from '../context';
 import {button, choice, el, setClass, setText} from '../dom';
 import {Jog, type JogMode, type Motion, SPEEDS, TOP} from '../jog';
 import {angle, angleText, figure, shortJoint} from '../units';
@@ -36,7 +36,10 @@ export function jogPanel(context: Context): HTMLElement {
       ['joints', 'Joints'],
     ],
     jog.mode,
-    (mode) => jog.set({mode: (wanted = mode)}),
+    (mode) => {
+      wanted = mode;
+      jog.set({mode});
+    },
   );
   const frames = choice(
     [
@@ -120,7 +123,8 @@ export function jogPanel(context: Context): HTMLElement {
         setText(each.querySelector('kbd')!, keysOn() ? keyOf(jog.mode, motion.index, i, chosen) : '');
       });
     }
-    list.forEach(({element}, i) => setClass(element, 'chosen', jog.mode === 'joints' && keysOn() && i === chosen));
+    for (const [i, {element}] of list.entries())
+      setClass(element, 'chosen', jog.mode === 'joints' && keysOn() && i === chosen);
     const on = keys.getAttribute('aria-pressed') === 'true';
     const meaning = jog.mode === 'tool' ? 'hold a key; [ ] speed, B axes' : '1–9 joint, hold + or −; [ ] speed';
     setText(keysText, on ? meaning : '');
@@ -165,7 +169,7 @@ export function jogPanel(context: Context): HTMLElement {
     const motion = motionOf(pressed, jog.mode, chosen);
     if (motion) {
       event.preventDefault();
-      if (!event.repeat && !list[motion.index]?.buttons[0]!.matches(':disabled')) jog.hold(`key ${event.code}`, motion);
+      if (!event.repeat && !list[motion.index]?.buttons[0]?.matches(':disabled')) jog.hold(`key ${event.code}`, motion);
     } else if (pressed === '[' || pressed === ']') jog.set({speed: jog.speed + (pressed === ']' ? 1 : -1)});
     else if (pressed === 'b' && jog.mode === 'tool') {
       jog.set({frame: jog.frame === 'base' ? 'tool' : 'base'});

@@ -1,5 +1,5 @@
 // Joints of the selected arm: where each is between its limits, velocity, effort; pose of the tool, gripper.
-import {type Context} from '../context';
+import type {Context} from '../context';
 import {choice, el, jointColor, setClass, setText} from '../dom';
 import {angle, angleText, figure, shortJoint} from '../units';
 
@@ -46,7 +46,8 @@ export function jointsPanel(context: Context): HTMLElement {
     show();
   };
   const head = () => {
-    units.forEach((cell, i) => setText(cell, [angle.label, angle.unit === 'deg' ? '°/s' : 'rad/s', 'Nm'][i]!));
+    const texts = [angle.label, angle.unit === 'deg' ? '°/s' : 'rad/s', 'Nm'];
+    for (const [i, cell] of units.entries()) setText(cell, texts[i]!);
   };
   const readLimits = () => {
     const known = run.arm(context.selected)?.position_limits;

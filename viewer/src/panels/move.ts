@@ -1,13 +1,13 @@
 // The motion panel: a goal, then Plan, Preview, Execute and Cancel. Only Execute (or Move, without a planner) moves.
-import {type Context} from '../context';
+import type {Context} from '../context';
 import {button, choice, el, setClass, setText} from '../dom';
 import {GoalEditor, type Mode} from '../goal';
 import {figure} from '../units';
-import {jointSliders} from './sliders';
-import {poseFields} from './pose';
 import {goalsPart} from './goals';
 import {gripperPanel} from './gripper';
+import {poseFields} from './pose';
 import {savePose} from './save';
+import {jointSliders} from './sliders';
 
 export function movePanel(context: Context): HTMLElement {
   const {run, flow} = context;
@@ -64,7 +64,9 @@ export function movePanel(context: Context): HTMLElement {
   const cancel = button(
     'Cancel',
     () => {
-      flow.cancel(flow.arms[0] && flow.busy ? flow.arms[0] : context.selected).catch((error: unknown) => context.report(error));
+      flow
+        .cancel(flow.arms[0] && flow.busy ? flow.arms[0] : context.selected)
+        .catch((error: unknown) => context.report(error));
     },
     {id: 'cancel', title: 'Ends planning, or decelerates the motion to rest'},
   );

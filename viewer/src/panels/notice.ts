@@ -1,5 +1,5 @@
 // What went wrong with the last act, and what to do about it.
-import {type Context} from '../context';
+import type {Context} from '../context';
 import {button, el} from '../dom';
 
 export function notice(context: Context): HTMLElement {

@@ -1,8 +1,8 @@
 // Plots of the last minutes: joints of the selected arm, or the lateness of ticks.
 import uPlot from 'uplot';
-import {type Context} from '../context';
+import type {Context} from '../context';
 import {choice, el, jointColor} from '../dom';
-import {type Quantity} from '../history';
+import type {Quantity} from '../history';
 import {angle, shortJoint} from '../units';
 
 const REDRAW = 200; // ms
@@ -36,9 +36,11 @@ export function plotsPanel(context: Context): HTMLElement {
     spans.element,
   );
   window.setInterval(() => {
-    if (!document.hidden) plots.forEach((plot) => plot.draw());
+    if (!document.hidden) for (const plot of plots) plot.draw();
   }, REDRAW);
-  const rebuild = () => plots.forEach((plot) => plot.build());
+  const rebuild = () => {
+    for (const plot of plots) plot.build();
+  };
   context.onSelect.on(rebuild);
   angle.changed.on(rebuild);
   matchMedia('(prefers-color-scheme: dark)').addEventListener('change', rebuild);

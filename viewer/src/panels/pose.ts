@@ -1,7 +1,7 @@
 // Figures of a pose goal, beside the handles in the view.
 import {choice, el, NumberField, setClass, setText} from '../dom';
-import {type GoalEditor} from '../goal';
-import {type Handles} from '../scene/gizmo';
+import type {GoalEditor} from '../goal';
+import type {Handles} from '../scene/gizmo';
 import {angle} from '../units';
 
 export function poseFields(editor: GoalEditor): HTMLElement {

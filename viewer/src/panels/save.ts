@@ -1,5 +1,5 @@
 // Saves where the arm is under a name, for later goals and waypoints.
-import {type Context} from '../context';
+import type {Context} from '../context';
 import {button, el} from '../dom';
 
 export function savePose(context: Context): HTMLElement {

@@ -1,7 +1,7 @@
 // One slider per joint of a joint goal, between its limits.
-import {type Context} from '../context';
+import type {Context} from '../context';
 import {el, setClass, setText} from '../dom';
-import {type GoalEditor} from '../goal';
+import type {GoalEditor} from '../goal';
 import {angle, angleText, shortJoint} from '../units';
 
 const STEPS = 2000;

@@ -1,7 +1,7 @@
 // The strip below the bar: what keeps each arm from moving or slows it, and who commands it. On every screen and tab.
-import {type Context} from '../context';
+import type {Context} from '../context';
 import {el} from '../dom';
-import {type ArmStatus, type Status} from '../protocol';
+import type {ArmStatus, Status} from '../protocol';
 
 /** A line of the strip: what it is about, what is so, and how much that matters. */
 interface Line {
@@ -28,7 +28,13 @@ function ofRun({speed}: Status): Line[] {
   return percent < 100 ? [{level: 'warn', text: `speed ${percent} %`}] : [];
 }
 
-const LEVELS: Record<string, Line['level']> = {ready: 'good', led: 'info', held: 'bad', activating: 'warn', standby: 'warn'};
+const LEVELS: Record<string, Line['level']> = {
+  ready: 'good',
+  led: 'info',
+  held: 'bad',
+  activating: 'warn',
+  standby: 'warn',
+};
 
 /** One line an arm, so that two arms fit a phone; its card has the rest. */
 function ofArm(arm: ArmStatus): Line {

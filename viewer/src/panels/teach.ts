@@ -1,5 +1,5 @@
 // Leading an arm by hand: begin, save poses, and hold it where it is. The words and conditions of `dimos arm teach`.
-import {type Context} from '../context';
+import type {Context} from '../context';
 import {button, el, setClass} from '../dom';
 import {pause} from '../flow';
 import {RpcError} from '../protocol';
@@ -44,7 +44,7 @@ export function teachPanel(context: Context): HTMLElement {
     const arm = context.selected;
     taking = arm;
     show();
-    for (const began = performance.now(); ;) {
+    for (const began = performance.now(); ; ) {
       try {
         await run.work.request('arm_take_over', {arm});
         say('good', `${arm}: ready, held where it is`);

@@ -1,5 +1,5 @@
 // The planned motion as a ghost: play it, or drag it to a time. While the arm moves, it follows the motion.
-import {type Context} from '../context';
+import type {Context} from '../context';
 import {button, el, setClass, setText} from '../dom';
 import {figure} from '../units';
 

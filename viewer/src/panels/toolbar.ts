@@ -1,7 +1,7 @@
 // Buttons over the view: where the camera looks from, and what is shown.
-import {type Context} from '../context';
+import type {Context} from '../context';
 import {button, el} from '../dom';
-import {type Robot} from '../scene/robot';
+import type {Robot} from '../scene/robot';
 import {VIEWS} from '../scene/stage';
 
 const NAMES: Record<keyof typeof VIEWS, string> = {iso: 'Fit', front: 'Front', side: 'Side', top: 'Top'};

@@ -1,8 +1,8 @@
 // Obstacles: a list with moving and removing by hand, and a form for new ones.
-import {type Context} from '../context';
+import type {Context} from '../context';
 import {button, choice, el, NumberField, setClass} from '../dom';
-import {type Shape, type Vec3, type WorldObject} from '../protocol';
-import {type Handles} from '../scene/gizmo';
+import type {Shape, Vec3, WorldObject} from '../protocol';
+import type {Handles} from '../scene/gizmo';
 import {place} from '../scene/obstacles';
 import {figure} from '../units';
 
@@ -67,7 +67,7 @@ function movePart(context: Context) {
     context.gizmo.detach();
     context.view.obstacles.held = current = null;
     element.classList.add('hidden');
-    listeners.forEach((listener) => listener());
+    for (const listener of listeners) listener();
   };
   const attach = () => {
     const object = current && context.view.obstacles.get(current.name);
@@ -109,7 +109,7 @@ function movePart(context: Context) {
       context.view.obstacles.held = object.name;
       element.classList.remove('hidden');
       attach();
-      listeners.forEach((listener) => listener());
+      for (const listener of listeners) listener();
     },
   };
 }

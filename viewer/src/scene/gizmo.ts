@@ -1,7 +1,7 @@
 // The handles that people drag: the pose goal of an arm, or an obstacle.
-import {AxesHelper, Group, Mesh, MeshBasicMaterial, Object3D, SphereGeometry} from 'three';
+import {AxesHelper, Group, Mesh, MeshBasicMaterial, type Object3D, SphereGeometry} from 'three';
 import {TransformControls} from 'three/addons/controls/TransformControls.js';
-import {type Stage} from './stage';
+import type {Stage} from './stage';
 
 export type Handles = 'translate' | 'rotate';
 

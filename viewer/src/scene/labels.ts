@@ -1,7 +1,7 @@
 // Names of the arms in the view, where there are several: a click selects one.
-import {Object3D, Vector3} from 'three';
+import {type Object3D, Vector3} from 'three';
 import {el} from '../dom';
-import {type Stage} from './stage';
+import type {Stage} from './stage';
 
 export class Labels {
   private readonly labels: {element: HTMLElement; object: Object3D; name: string}[] = [];

@@ -1,22 +1,22 @@
 // Obstacles of the world, and objects that arms hold.
 import {
   BoxGeometry,
-  BufferGeometry,
+  type BufferGeometry,
   CylinderGeometry,
   EdgesGeometry,
   LineBasicMaterial,
   LineSegments,
   Mesh,
   MeshLambertMaterial,
-  Object3D,
+  type Object3D,
   OctahedronGeometry,
   Points,
   PointsMaterial,
   Quaternion,
   SphereGeometry,
 } from 'three';
-import {type Pose, type Shape, type WorldObject} from '../protocol';
-import {type Meshes} from './meshes';
+import type {Pose, Shape, WorldObject} from '../protocol';
+import type {Meshes} from './meshes';
 import {quaternionOf} from './robot';
 import {dispose} from './stage';
 

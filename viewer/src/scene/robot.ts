@@ -4,7 +4,7 @@ import {
   Color,
   DoubleSide,
   Group,
-  Material,
+  type Material,
   Matrix4,
   Mesh,
   MeshLambertMaterial,
@@ -14,8 +14,8 @@ import {
   Vector3,
 } from 'three';
 import URDFLoader, {type URDFRobot} from 'urdf-loader';
-import {type ArmStatus, type SceneRobot} from '../protocol';
-import {Meshes} from './meshes';
+import type {ArmStatus, SceneRobot} from '../protocol';
+import type {Meshes} from './meshes';
 import {dispose} from './stage';
 
 type Kind = 'goal' | 'plan';

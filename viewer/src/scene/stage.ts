@@ -8,7 +8,7 @@ import {
   GridHelper,
   Group,
   HemisphereLight,
-  Object3D,
+  type Object3D,
   PerspectiveCamera,
   Scene as ThreeScene,
   Vector3,

@@ -1,6 +1,6 @@
 // Lines in the view: the way that a tool centre point came, and the way of a plan.
 import {BufferAttribute, BufferGeometry, Line, LineBasicMaterial, Vector3} from 'three';
-import {type Vec3} from '../protocol';
+import type {Vec3} from '../protocol';
 
 const POINTS = 900;
 const SHORTEST = 0.001; // m between two points

@@ -1,13 +1,13 @@
 // The arms of the run in the 3D view: measured joints, goals and plans as ghosts, traces, obstacles.
-import {Line, Quaternion, Vector3} from 'three';
-import {type Context} from '../context';
-import {type Preview} from '../protocol';
+import {type Line, Quaternion, Vector3} from 'three';
+import type {Context} from '../context';
+import type {Preview} from '../protocol';
 import {Labels} from './labels';
 import {Meshes} from './meshes';
 import {Obstacles} from './obstacles';
 import {Robot} from './robot';
-import {Stage, dispose} from './stage';
-import {Trace, planLine} from './trace';
+import {dispose, type Stage} from './stage';
+import {planLine, Trace} from './trace';
 
 /** Smallest motion of a joint for which a frame is drawn [rad]: noise at rest is less. */
 const SMALLEST = 1e-5;
