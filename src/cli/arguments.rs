@@ -122,7 +122,7 @@ pub fn finite(text: &str) -> std::result::Result<f64, String> {
     }
 }
 
-/// Parses a fraction of the limits or of the speed: `0.3` or `30%`.
+/// Parses a fraction of the speed: `0.3` or `30%`.
 pub fn speed(text: &str) -> std::result::Result<f64, String> {
     let lowest = dimos_rpc::api::MIN_SPEED;
     let value = match text.strip_suffix('%') {

@@ -59,7 +59,7 @@ pub struct Args {
     /// Go back by this many motions
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..), conflicts_with = "time")]
     pub motions: u32,
-    /// Fraction of the velocity and acceleration limits to use
+    /// Fraction of the highest speed
     #[arg(long, default_value_t = 0.2, value_parser = arguments::speed)]
     pub speed: f64,
     /// Show the way and check it; move nothing
@@ -278,7 +278,7 @@ fn request(client: &mut Client, arm: &str, joints: &[String], way: &Retrace, spe
     Ok(Plan { goals: vec![goal], speed, by_number: true, ..Plan::default() })
 }
 
-/// Returns the way as a trajectory within `speed` of the arm's limits, from where the arm is. It is as close to the
+/// Returns the way as a trajectory at `speed` times the highest speed, from where the arm is. It is as close to the
 /// logged path as one request allows.
 fn timed(client: &mut Client, log: &Path, arm: &str, way: &Retrace, speed: f64) -> Result<Trajectory> {
     let fail = |e: String| Failure::new(Exit::Failed, format!("no trajectory: {e}"));
@@ -286,18 +286,15 @@ fn timed(client: &mut Client, log: &Path, arm: &str, way: &Retrace, speed: f64) 
     let recorded = Recorded::of(log, opened.info().clone()).map_err(|e| Failure::of(Exit::Failed, e))?;
     let config = recorded.config.arms.iter().find(|config| config.name == arm);
     let l = &config.ok_or_else(|| fail(format!("the log has no limits of {arm}")))?.limits;
-    let bound = |j: usize| JointBound {
-        velocity: l.velocity_max[j] * speed,
-        acceleration: l.acceleration_max[j] * speed,
-        jerk: l.jerk_max[j] * speed,
-    };
+    let bound =
+        |j: usize| JointBound { velocity: l.velocity_max[j], acceleration: l.acceleration_max[j], jerk: l.jerk_max[j] };
     let (_, joints, now) = present(client, arm)?;
     let bounds: Vec<JointBound> = (0..joints.len()).map(bound).collect();
     let whole: Vec<Vec<f64>> = std::iter::once(now).chain(way.path.iter().cloned()).collect();
     // Half of the distance is for the straight lines, half for the blends between them.
     let (mut path, mut deviation) = (whole.clone(), DEVIATION);
     while deviation <= FARTHEST / 2.0 {
-        let timed = time_within(&joints, &path, &bounds, &vec![deviation; path.len()], 1.0, |_, _| true);
+        let timed = time_within(&joints, &path, &bounds, &vec![deviation; path.len()], speed, |_, _| true);
         let trajectory = request_of(&joints, timed.map_err(|e| fail(e.to_string()))?.trajectory);
         if serde_json::to_string(&trajectory).is_ok_and(|text| text.len() + ENVELOPE <= MAX_LINE) {
             if deviation > DEVIATION {

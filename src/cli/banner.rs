@@ -95,7 +95,9 @@ pub fn standing(simulated: bool, address: &str) -> String {
 
 /// Returns why an arm is held, with the text of its error; `None` if it is not held.
 pub fn cause(arm: &ArmReport) -> Option<String> {
-    let cause = &arm.cause.as_ref()?.text;
+    let cause = arm.cause.as_ref()?;
+    let by = cause.by.as_ref().map_or_else(String::new, |by| format!(": {by}"));
+    let cause = &format!("{}{by}", cause.text);
     let error = arm.error.as_ref().filter(|error| cause.ends_with(&format!("error {}", error.code)));
     Some(error.map_or_else(|| cause.clone(), |error| format!("{cause}: {}", error.text)))
 }
@@ -174,7 +176,8 @@ mod tests {
             holds_when_disabled,
             ..Default::default()
         };
-        let cause = CauseReport { name: "device_error".into(), text: "the arm reports error 1: E-stop".into() };
+        let cause =
+            CauseReport { name: "device_error".into(), text: "the arm reports error 1: E-stop".into(), by: None };
         let real = ArmReport {
             adapter: "xarm".into(),
             address: "192.168.1.185".into(),

@@ -265,7 +265,7 @@ mod tests {
 
     #[test]
     fn an_arm_that_is_held_is_a_failure_with_its_cause() {
-        let cause = CauseReport { name: "device_fault".into(), text: "the arm reports error 1".into() };
+        let cause = CauseReport { name: "device_fault".into(), text: "the arm reports error 1".into(), by: None };
         let error = Some(DeviceError { code: 1, text: "E-stop line open".into() });
         let ready = ArmReport { hardware_id: "left".into(), phase: "ready".into(), ..ArmReport::default() };
         let held =

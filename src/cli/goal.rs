@@ -187,7 +187,7 @@ fn level(text: &str) -> std::result::Result<PlanLevel, String> {
 /// Settings of the search and the speed.
 #[derive(Debug, Clone, clap::Args)]
 pub struct Search {
-    /// Fraction of the velocity and acceleration limits to use: 0.01–1, or 1–100%
+    /// Fraction of the highest speed: 0.01–1, or 1–100%; at 0.5 the same motion takes twice as long
     #[arg(long, value_name = "FRACTION", default_value_t = DEFAULT_SPEED, value_parser = speed)]
     pub speed: f64,
     /// Move the tool centre point on a straight line to --pose or by --by; waypoints of --through have line: for that

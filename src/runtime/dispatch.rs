@@ -1,7 +1,7 @@
 //! Sends requests to the tick and receives their outcomes: requests are put into its ring and logged; the outcome
 //! thread delivers outcomes, frees finished motions and publishes the joint state.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
@@ -10,12 +10,13 @@ use std::time::Duration;
 use serde_json::{Value, json};
 use tokio::sync::oneshot;
 
+use super::asker::asker;
 use dimos_control::request::{Envelope, Goal, Motion, Request};
 use dimos_control::task_robot::FramePose;
 use dimos_core::clock::{Clock, Mono, MonotonicClock};
 use dimos_core::sync::lock;
 use dimos_core::telemetry::describe::Severity;
-use dimos_core::telemetry::{Origin, Outcome};
+use dimos_core::telemetry::{Origin, Outcome, Who};
 use dimos_core::trajectory::JointTrajectory;
 use dimos_log::notes::{Note, Notes};
 use dimos_rt::host;
@@ -36,6 +37,8 @@ pub struct Dispatcher {
     waiting: Mutex<HashMap<u64, oneshot::Sender<Outcome>>>,
     next_id: AtomicU64,
     notes: Notes,
+    /// Who stopped all arms (`None`), or an arm since.
+    stopped_by: Mutex<BTreeMap<Option<u16>, Arc<Who>>>,
 }
 
 /// Why a request got no outcome.
@@ -52,7 +55,8 @@ pub enum SendError {
 impl Dispatcher {
     /// Creates a dispatcher for a ring.
     pub fn new(requests: rtrb::Producer<Envelope>, notes: Notes) -> Self {
-        Self { requests: Mutex::new(requests), waiting: Mutex::default(), next_id: AtomicU64::new(1), notes }
+        let (waiting, next_id, stopped_by) = (Mutex::default(), AtomicU64::new(1), Mutex::default());
+        Self { requests: Mutex::new(requests), waiting, next_id, notes, stopped_by }
     }
 
     /// Returns a unique number for a motion or a request.
@@ -106,6 +110,10 @@ impl Dispatcher {
                 | Request::Shutdown
         );
         let id = self.next_id();
+        let who = asker();
+        if let Request::Stop { arm } = request {
+            self.note_stop(arm, who.clone());
+        }
         let (sender, receiver) = oneshot::channel();
         // Made before the lock: a stop never waits for the text of another request.
         let note = note(id, MonotonicClock.now());
@@ -115,12 +123,30 @@ impl Dispatcher {
         }
         lock(&self.waiting).insert(id, sender);
         // The recorder counts notes that do not fit; without a recorder the run is shutting down.
+        if let Some(who) = who {
+            let _ = self.notes.send(Note::Asked { id, who });
+        }
         let _ = self.notes.send(note);
         if ring.push(Envelope { id, origin, request }).is_err() {
             lock(&self.waiting).remove(&id);
             return Err(SendError::Full);
         }
         Ok(receiver)
+    }
+
+    fn note_stop(&self, arm: Option<u16>, who: Option<Arc<Who>>) {
+        let mut stopped_by = lock(&self.stopped_by);
+        match arm {
+            Some(_) => drop(stopped_by.remove(&arm)),
+            None => stopped_by.clear(),
+        }
+        stopped_by.extend(who.map(|who| (arm, who)));
+    }
+
+    /// Returns who stopped an arm last; `None`: this program.
+    pub fn stopped_by(&self, arm: u16) -> Option<Arc<Who>> {
+        let stopped_by = lock(&self.stopped_by);
+        stopped_by.get(&Some(arm)).or_else(|| stopped_by.get(&None)).cloned()
     }
 
     /// Sends a request and waits for its outcome.

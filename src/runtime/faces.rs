@@ -18,6 +18,7 @@ impl Service {
             task: None,
             joint: None,
             values: Vec::new(),
+            by: None,
         };
         self.report_now(&described, self.parts.wall);
     }

@@ -73,6 +73,7 @@ impl Service {
             task: None,
             joint: None,
             values: Vec::new(),
+            by: None,
         };
         self.report_now(&described, wall);
     }

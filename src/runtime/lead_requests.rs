@@ -9,6 +9,7 @@ use nalgebra::{Isometry3, Vector3};
 use tokio::sync::oneshot;
 
 use super::arm_requests::{order, refused};
+use super::asker::asker;
 use super::motions::{NATIVE, Planned};
 use super::planner_port::isometry;
 use super::service::{Service, internal};
@@ -155,6 +156,7 @@ impl Service {
             next: None,
             retraces_to: None,
             began: None,
+            by: asker(),
         };
         lock(&self.motions).plan(motion, planned);
         let speed = call.speed * self.speed_override().fraction;

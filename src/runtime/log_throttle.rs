@@ -21,7 +21,7 @@ impl LogThrottle {
     /// Returns the line to log now, if any. Events of arms and tasks are always logged: they occur once per episode.
     pub fn line(&self, described: &Described, now: Instant) -> Option<String> {
         if matches!(described.kind, "arm" | "task") {
-            return Some(described.text.clone());
+            return Some(described.line());
         }
         let mut all = lock(&self.0);
         let entry = all.entry((described.kind, described.status));
@@ -32,8 +32,8 @@ impl LogThrottle {
         }
         let withheld = std::mem::replace(known, (now, 0)).1;
         Some(match withheld {
-            0 => described.text.clone(),
-            n => format!("{} (and {n} more like it before)", described.text),
+            0 => described.line(),
+            n => format!("{} (and {n} more like it before)", described.line()),
         })
     }
 }

@@ -8,6 +8,7 @@
 
 mod arm_requests;
 mod arms;
+mod asker;
 mod attached;
 mod builder;
 mod chunk_requests;

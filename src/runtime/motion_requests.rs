@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use serde_json::json;
 
+use super::asker::asker;
 use super::motions::{Carried, Planned};
 use super::planner_port::run_blocking;
 use super::service::{Service, internal};
@@ -187,6 +188,7 @@ impl Service {
             next: None,
             retraces_to: None,
             began: None,
+            by: asker(),
         };
         lock(&self.motions).plan(number, planned);
         let motion = Box::new(Motion { id: number, joints, spline });

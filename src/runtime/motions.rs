@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use dimos_core::telemetry::{Origin, Reason, TaskState};
+use dimos_core::telemetry::{Origin, Reason, TaskState, Who};
 use dimos_core::trajectory::Spline;
 use dimos_rpc::api::Presence;
 
@@ -33,6 +33,8 @@ pub struct Planned {
     pub retraces_to: Option<f64>,
     /// The tick at which its task began it, once that is known.
     pub began: Option<u64>,
+    /// Who asked for it; `None`: this program.
+    pub by: Option<Arc<Who>>,
 }
 
 /// What a planned motion executes.
@@ -76,6 +78,8 @@ pub struct UnderWay {
     pub replan: Option<Option<Presence>>,
     /// As [`Carried::origin`].
     pub origin: Origin,
+    /// As [`Planned::by`].
+    pub by: Option<Arc<Who>>,
 }
 
 /// How a motion ended.
@@ -146,7 +150,8 @@ impl Motions {
         let planned = going.filter_map(|(number, (planned, _))| {
             let Carried { plan, spline, replan, origin } = planned.plan.clone()?;
             let (number, task, joints) = (*number, planned.task, planned.joints.clone());
-            Some(UnderWay { number, task, joints, plan, spline, replan, origin })
+            let by = planned.by.clone();
+            Some(UnderWay { number, task, joints, plan, spline, replan, origin, by })
         });
         planned.collect()
     }
@@ -215,6 +220,7 @@ mod tests {
             next: None,
             retraces_to: None,
             began: None,
+            by: None,
         };
         let mut m = Motions::default();
         (1..=3).for_each(|n| m.plan(n, planned((n % 2) as u16)));

@@ -13,7 +13,7 @@ use dimos_control::request::Request;
 use dimos_core::telemetry::{Origin, Phase};
 use dimos_rpc::api::{Backend, Move, Reply};
 
-/// Fraction of the velocity limits of the motion to the park pose.
+/// Fraction of the highest speed of the motion to the park pose.
 const SPEED: f64 = 0.3;
 /// Longest motion to a park pose.
 const LONGEST: Duration = Duration::from_secs(20);

@@ -3,6 +3,7 @@
 
 use std::time::{Duration, Instant};
 
+use super::asker::asked_by;
 use super::motions::UnderWay;
 use super::service::{Service, internal};
 use dimos_core::joint::STANDSTILL;
@@ -87,7 +88,12 @@ impl Service {
         let presence = motion.replan.clone().flatten();
         let execute =
             ExecutePlan { plan: Some(begun.plan), replan: true, unproven, presence, ..ExecutePlan::default() };
-        match self.planner_call_from(Call::ExecutePlan(execute), motion.origin).await? {
+        let execute = self.planner_call_from(Call::ExecutePlan(execute), motion.origin);
+        let executed = match motion.by.clone() {
+            Some(who) => asked_by(who, execute).await?,
+            None => execute.await?,
+        };
+        match executed {
             Reply::ExecutePlan(begun) => Ok(begun.motion),
             _ => Err(internal()),
         }

@@ -1,5 +1,6 @@
 //! Reports of a run: status, state, motions, streams.
 
+use std::sync::Arc;
 use std::sync::atomic::Ordering::{Acquire, Relaxed};
 use std::time::Instant;
 
@@ -121,8 +122,14 @@ impl Service {
                 Teach::MotorsOff => Some("motors_off".into()),
                 Teach::No(_) => None,
             },
-            cause: (view.cause != Cause::None)
-                .then(|| CauseReport { name: view.cause.name().to_owned(), text: cause_text(view.cause) }),
+            cause: (view.cause != Cause::None).then(|| {
+                let by = (view.cause == Cause::Operator).then(|| self.parts.dispatcher.stopped_by(index as u16));
+                CauseReport {
+                    name: view.cause.name().to_owned(),
+                    text: cause_text(view.cause),
+                    by: by.flatten().map(Arc::unwrap_or_clone),
+                }
+            }),
             stop_pending: self.late_stops.is_waiting(index),
             enabled: view.state.enabled,
             mode: view.state.mode.name().to_owned(),
@@ -246,7 +253,9 @@ impl Service {
         let task = if planned.task == NATIVE { "native".to_owned() } else { self.parts.names.task(planned.task) };
         let collision_checked = planned.plan.is_some();
         let retraces_to = planned.retraces_to;
-        let mut report = MotionReport { motion: number, task, collision_checked, retraces_to, ..Default::default() };
+        let by = planned.by.as_deref().cloned();
+        let mut report =
+            MotionReport { motion: number, task, by, collision_checked, retraces_to, ..Default::default() };
         let view = self.task_view(planned.task as usize);
         if view.motion == number {
             (report.progress, report.elapsed, report.remaining) = (view.progress, view.elapsed, view.remaining);
@@ -439,6 +448,7 @@ impl Service {
             task: described.task.clone(),
             joint: described.joint.clone(),
             text: described.text.clone(),
+            by: described.by.clone(),
         });
     }
 }

@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 use nalgebra::Isometry3;
 
 use super::Ending;
+use super::asker::asked_by;
 use super::dispatch::{Dispatcher, SendError, log_of};
 use super::gripper_requests::LatestGrip;
 use super::gripper_targets::{Counters, GripperTargets};
@@ -34,7 +35,7 @@ use dimos_core::clock::{Mono, WallOffset};
 use dimos_core::joint::STANDSTILL;
 use dimos_core::sync::lock;
 use dimos_core::telemetry::describe::{ArmNames, Names};
-use dimos_core::telemetry::{ArmSample, Event, Origin, Outcome, Phase, TaskView};
+use dimos_core::telemetry::{ArmSample, Event, Origin, Outcome, Phase, TaskView, Who};
 use dimos_hardware::device::{Connected, Details, Device};
 use dimos_log::recorder::{Notice, RecorderStats};
 use dimos_log::tcp_log::TcpChains;
@@ -364,7 +365,7 @@ impl Service {
         Ok(self.speed_override())
     }
 
-    async fn answer(&self, call: Call, origin: Origin) -> Result<Reply, RpcError> {
+    pub(super) async fn answer(&self, call: Call, origin: Origin) -> Result<Reply, RpcError> {
         let reads =
             matches!(call, Call::Status(_) | Call::State(_) | Call::TextLog(_) | Call::Motion(_) | Call::Grip(_));
         if !reads && self.is_closed() {
@@ -451,11 +452,17 @@ impl Backend for Service {
     }
 
     fn call(&self, request: Call) -> BoxFuture<'_, Result<Reply, RpcError>> {
-        self.call_from(request, Origin { epoch: self.epoch(), client: 0 })
+        Box::pin(self.answer(request, Origin { epoch: self.epoch(), client: 0 }))
     }
 
-    fn call_from(&self, request: Call, origin: Origin) -> BoxFuture<'_, Result<Reply, RpcError>> {
-        Box::pin(self.answer(request, origin))
+    fn call_from(
+        &self,
+        request: Call,
+        origin: Option<Origin>,
+        who: Arc<Who>,
+    ) -> BoxFuture<'_, Result<Reply, RpcError>> {
+        let origin = origin.unwrap_or_else(|| Origin { epoch: self.epoch(), client: 0 });
+        Box::pin(asked_by(who, self.answer(request, origin)))
     }
 
     fn epoch(&self) -> u64 {

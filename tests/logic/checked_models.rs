@@ -16,7 +16,7 @@ planner:
     - {name: turn, model_path: turn.urdf, base_link: a, end_effector_link: b, joint_names: [j], joint_prefix: turn_, \
        coordinator_task_name: traj}
   world:
-    part: {shape: {mesh: part.stl}, pose: {xyz: [0, 0, 9]}}
+    part: {shape: {mesh: part.stl}, pose: {xyz: [0, 0, 4.9]}}
 ";
 
 /// A binary STL file of a tetrahedron with edges of this length.
@@ -114,17 +114,17 @@ fn one_joint_goes_through_positions() {
     home.dimos("move turn --through 0.5 -0.5").with(0);
     let at = home.positions("turn");
     assert!((at[0] + 0.5).abs() < 1e-3, "{at:?}");
-    let added = home.dimos("world add shelf --mesh part.stl --at 0 0 9").with(0);
+    let added = home.dimos("world add shelf --mesh part.stl --at 0 0 4.9").with(0);
     assert!(!added.err.contains("warning"), "{}", added.err);
     std::fs::write(home.path().join("part.stl"), tetrahedron(8.0)).unwrap();
-    home.dimos("world add shelf --mesh part.stl --at 0 0 9").with(0).says(&[
+    home.dimos("world add shelf --mesh part.stl --at 0 0 4.9").with(0).says(&[
         "warning: the mesh of the object `shelf` extends over 8.000 × 8.000 × 8.000 m",
         "hint: a mesh in the world is in metres",
     ]);
     std::fs::write(home.path().join("part.stl"), tetrahedron(100.0)).unwrap();
     let refusal = &["part.stl extends over 100.0 × 100.0 × 100.0 m", "hint: a mesh in the world is in metres"];
-    home.dimos("world add shelf --mesh part.stl --at 0 0 9").with(1).says(refusal);
-    home.write("more.yaml", "rack: {shape: {mesh: part.stl}, pose: {xyz: [0, 0, 9]}}\n");
-    home.dimos("world load more.yaml").with(1).says(refusal);
+    home.dimos("world add shelf --mesh part.stl --at 0 0 4.9").with(2).says(refusal);
+    home.write("more.yaml", "rack: {shape: {mesh: part.stl}, pose: {xyz: [0, 0, 4.9]}}\n");
+    home.dimos("world load more.yaml").with(2).says(refusal);
     home.dimos("check turn.yaml").with(2).says(refusal);
 }

@@ -67,6 +67,7 @@ mod share_verbs;
 mod small_verbs;
 mod so101_line;
 mod so101_service;
+mod speed;
 mod split_logs;
 mod start_stages;
 mod starved_tick;
@@ -80,4 +81,5 @@ mod ur_runs;
 #[cfg(feature = "view")]
 mod view;
 mod waypoints;
+mod who;
 mod xarm_runs;

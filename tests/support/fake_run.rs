@@ -57,6 +57,7 @@ impl FakeBackend {
         MotionReport {
             motion,
             task: "traj_arm".into(),
+            by: None,
             state: state.into(),
             done,
             progress: polls as f64 / 10.0,
@@ -213,7 +214,7 @@ pub fn status() -> StatusReport {
             simulated: true,
             link: "up".into(),
             phase: "held".into(),
-            cause: Some(CauseReport { name: "operator_stop".into(), text: "stopped by an operator".into() }),
+            cause: Some(CauseReport { name: "operator_stop".into(), text: "stopped by an operator".into(), by: None }),
             enabled: true,
             mode: "servo_position".into(),
             state_age_ms: Some(3.2),

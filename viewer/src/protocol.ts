@@ -70,6 +70,15 @@ export interface RunEvent {
   level: 'info' | 'warning' | 'error';
   kind: string;
   text: string;
+  /** Who asked for it, if it is the effect of a request. */
+  by?: string | null;
+}
+
+/** Who made a request. */
+export interface Who {
+  program: string;
+  pid?: number | null;
+  user?: string | null;
 }
 
 export interface JointReport {
@@ -113,7 +122,7 @@ export interface ArmStatus {
   led_by?: string | null;
   /** How it may be led by hand: `hand_guiding` or `motors_off`. */
   teach?: string | null;
-  cause: {name: string; text: string} | null;
+  cause: {name: string; text: string; by?: Who | null} | null;
   enabled: boolean;
   mode: string;
   /** Fraction of its speed at which its controller runs motions. */

@@ -14,6 +14,7 @@
 #![allow(rustdoc::broken_intra_doc_links, reason = "units are in brackets: [rad]")]
 
 mod arm_messages;
+mod askers;
 pub mod attachment;
 pub mod cdr;
 mod channels;

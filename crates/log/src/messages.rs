@@ -235,6 +235,8 @@ message! {
         values: Vec<f64>,
         /// The event as a sentence.
         text: String,
+        /// Who asked for it: program, process, user, or the client over the network; empty if no request did.
+        by: String,
     }
 }
 

@@ -10,8 +10,8 @@ use super::robots::LoggedRobots;
 use dimos_core::arm::{IoInfo, IoState, JointStatus, Load};
 use dimos_core::clock::Mono;
 use dimos_core::joint::MAX_DOF;
-use dimos_core::telemetry::Origin;
 use dimos_core::telemetry::describe::Severity;
+use dimos_core::telemetry::{Origin, Who};
 use dimos_core::trajectory::JointTrajectory;
 
 /// Maximum memory of queued notes [bytes]: minutes of requests, dozens of the longest trajectories.
@@ -32,6 +32,13 @@ pub enum Note {
         origin: Option<Origin>,
         /// The request as passed to the tick.
         json: String,
+    },
+    /// Who made the request that is noted next.
+    Asked {
+        /// Id of the request.
+        id: u64,
+        /// Who.
+        who: Arc<Who>,
     },
     /// A trajectory request; noted before it is passed to the tick. Logged with the tick's answer: if that is a
     /// rejection, without the points that the tick did not check.
@@ -113,7 +120,7 @@ pub enum Note {
 }
 
 impl Note {
-    /// Returns its time; that of a text for an arm's error is unknown.
+    /// Returns its time; that of a text for an arm's error, and of who asked, is unknown.
     pub(super) fn stamp(&self) -> Mono {
         match self {
             Self::Request { stamp, .. }
@@ -124,7 +131,7 @@ impl Note {
             | Self::Payload { stamp, .. }
             | Self::Robots { stamp, .. }
             | Self::Markers { stamp, .. } => *stamp,
-            Self::ArmText { .. } => Mono::ZERO,
+            Self::ArmText { .. } | Self::Asked { .. } => Mono::ZERO,
         }
     }
 
@@ -141,6 +148,7 @@ impl Note {
         NOTE_OVERHEAD
             + match self {
                 Self::Request { json: text, .. } | Self::Log { text, .. } | Self::ArmText { text, .. } => text.len(),
+                Self::Asked { .. } => 0,
                 Self::Robots { description, .. } => description.len(),
                 Self::Markers { markers, .. } => size_of_val(markers.markers.as_slice()),
                 Self::Io { .. } => size_of::<IoState>(),

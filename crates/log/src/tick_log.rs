@@ -387,6 +387,7 @@ impl TickLog {
             status: d.status.into(),
             values: d.values,
             text: d.text,
+            by: d.by.unwrap_or_default(),
         }
     }
 }

@@ -13,6 +13,7 @@ use std::time::Duration;
 use mcap::{McapError, McapResult};
 
 use super::arm_messages::{io, joint_status, payload};
+use super::askers::Askers;
 use super::disk_sync::DiskSync;
 use super::fault_ring::{AFTER, FaultRing};
 use super::log_writer::{LogWriter, Topics};
@@ -24,7 +25,7 @@ use super::storage::FaultLog;
 use super::tick_log::TickLog;
 use super::{PART, disk_space, files};
 use dimos_core::clock::{Clock, Mono, MonotonicClock};
-use dimos_core::telemetry::describe::{Severity, describe};
+use dimos_core::telemetry::describe::{Described, Severity, describe};
 use dimos_core::telemetry::{Event, Outcome, Sample, TickSample};
 
 /// Longest wait for the disk at the end: a run ends soon after Ctrl-C, whatever its disk does.
@@ -56,6 +57,7 @@ pub(super) struct Worker<W: Write + Seek, F, O> {
     executes: PendingExecutes,
     /// The latest inputs and outputs, and the latest load, of each arm.
     latest: BTreeMap<(bool, u16), Note>,
+    askers: Askers,
     /// What is kept of a run without a log.
     faults: Option<(FaultLog, FaultRing)>,
     /// End of the log of a fault; the end of time until the tick with the fault is closed.
@@ -102,6 +104,7 @@ where
             notes,
             executes: PendingExecutes::default(),
             latest: BTreeMap::new(),
+            askers: Askers::default(),
             faults: faults.map(|faults| (faults.clone(), FaultRing::new())),
             until: None,
             faulted: false,
@@ -157,6 +160,7 @@ where
             (self.on_notice)(Notice::Lost(lost.min(u64::from(u32::MAX)) as u32));
         }
         let samples: Vec<Sample> = self.ring.read_chunk(waiting).into_iter().flatten().collect();
+        notes.iter().for_each(|note| self.askers.know(note));
         // Events are reported before any disk access.
         let fault = self.report_events(&samples);
         let done = if self.log.is_none() && self.faults.is_some() {
@@ -182,12 +186,17 @@ where
         self.stop_log(closed.map_or_else(|e| write_error(&self.path, &e), |_| reason));
     }
 
+    fn described(&mut self, tick: u64, event: &Event, later: &[Sample]) -> Described {
+        Described { by: self.askers.of(tick, event, later), ..describe(event, &self.config.names) }
+    }
+
     /// Reports the events among samples. Returns whether there is a fault.
     fn report_events(&mut self, samples: &[Sample]) -> bool {
         let mut fault = false;
-        for sample in samples {
+        for (n, sample) in samples.iter().enumerate() {
             if let Sample::Event(tick, event) = sample {
-                let described = describe(event, &self.config.names);
+                let later = samples.get(n + 1..).unwrap_or_default();
+                let described = self.described(*tick, event, later);
                 fault |= described.severity == Severity::Error;
                 (self.on_notice)(Notice::Event { tick: *tick, event, described: &described });
             }
@@ -215,14 +224,15 @@ where
         for note in notes {
             self.note(note).map_err(|e| write_error(&self.path, &e))?;
         }
-        for sample in samples {
+        for (n, sample) in samples.iter().enumerate() {
             match sample {
                 Sample::Arm(arm) => self.ticks.arm(*arm),
                 Sample::Event(tick, event) => {
                     if let Event::Request(id, outcome) = event {
                         self.answered(*id, outcome).map_err(|e| write_error(&self.path, &e))?;
                     }
-                    let described = describe(event, &self.config.names);
+                    let later = samples.get(n + 1..).unwrap_or_default();
+                    let described = self.described(*tick, event, later);
                     self.faulted |= described.severity == Severity::Error;
                     self.ticks.event(*tick, Some(described));
                 }
@@ -309,7 +319,7 @@ where
             }
             Note::Robots { stamp, .. } => self.ticks.latched(log, stamp),
             Note::Markers { stamp, markers } => self.ticks.markers(log, stamp, markers),
-            Note::ArmText { .. } => Ok(()),
+            Note::ArmText { .. } | Note::Asked { .. } => Ok(()),
         }
     }
 

@@ -29,7 +29,7 @@ use super::schema::MethodSchema;
 use super::streams::Streams;
 pub use super::text_api::*;
 pub use super::world_api::*;
-use dimos_core::telemetry::Origin;
+use dimos_core::telemetry::{Origin, Who};
 
 /// Maximum length of a request line, including its newline [bytes].
 pub const MAX_LINE: usize = 256 * 1024;
@@ -39,7 +39,7 @@ pub const MAX_CONNECTIONS: usize = 128;
 pub const RESERVED_CONNECTIONS: usize = 8;
 /// Maximum number of subscriptions of a connection.
 pub const MAX_SUBSCRIPTIONS: usize = 16;
-/// Minimum `speed` of a motion, as a fraction of the limits.
+/// Minimum `speed` of a motion, as a fraction of the highest.
 pub const MIN_SPEED: f64 = dimos_core::joint::LOWEST_SPEED;
 
 /// A boxed future, for trait objects.
@@ -50,9 +50,14 @@ pub trait Backend: Send + Sync + 'static {
     /// Answers one request. Called concurrently from the server's threads. Must not block its thread: a stop may wait
     /// for it. Dropped after [`server::CALL_TIMEOUT`](super::server::CALL_TIMEOUT).
     fn call(&self, request: Request) -> BoxFuture<'_, Result<Reply, RpcError>>;
-    /// Same, for a request of this origin.
-    fn call_from(&self, request: Request, origin: Origin) -> BoxFuture<'_, Result<Reply, RpcError>> {
-        let _ = origin;
+    /// Same, for a request that this client made then; `origin` is `None` if it moves nothing.
+    fn call_from(
+        &self,
+        request: Request,
+        origin: Option<Origin>,
+        who: Arc<Who>,
+    ) -> BoxFuture<'_, Result<Reply, RpcError>> {
+        let _ = (origin, who);
         self.call(request)
     }
     /// Returns the number of interruptions of all arms so far.

@@ -318,7 +318,8 @@ impl Connection {
     fn call(&self, method: String, request: Request) -> Answer {
         let (backend, leases) = (self.backend.clone(), self.lessee.leases().clone());
         let origin = Origin { epoch: self.wanted, client: self.lessee.connection() };
-        Box::pin(async move { answer(&method, backend.call_from(request, origin), &leases).await })
+        let who = self.lessee.who();
+        Box::pin(async move { answer(&method, backend.call_from(request, Some(origin), who), &leases).await })
     }
 
     /// Waits for the answers to all pending targets and sends them.

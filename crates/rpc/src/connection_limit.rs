@@ -189,7 +189,7 @@ mod tests {
         let leases = Arc::new(Leases::default());
         let limit = ConnectionLimit::new(leases.clone());
         let all: Vec<Permit> = (0..MAX_CONNECTIONS).map(|_| limit.acquire().unwrap()).collect();
-        let lessee = Lessee::new(leases, all[0].number(), None);
+        let lessee = Lessee::new(leases, all[0].number(), Default::default());
         lessee.take(&["arm".to_owned()]).unwrap();
         all[1].set_pinned(true);
         all[2].set_busy();

@@ -7,7 +7,7 @@
 
 use std::collections::BTreeMap;
 use std::fmt::{self, Debug, Formatter};
-use std::sync::{Arc, Mutex, MutexGuard};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 use std::time::Instant;
 
 use serde_json::json;
@@ -15,7 +15,9 @@ use serde_json::json;
 use super::api::{Attach, Backend, ExecutePlan, FaceReport, GatewayReport, Presence, RegisterGateway, Reply, Request};
 use super::error::{Code, RpcError};
 use super::report::CommanderReport;
+use super::who::Peer;
 use dimos_core::sync::lock;
+use dimos_core::telemetry::Who;
 
 /// The arms that a request concerns, for [`Backend::arms_of`].
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -86,8 +88,7 @@ pub(super) fn need(request: &Request) -> Need<'_> {
 #[derive(Debug, Clone)]
 struct Holder {
     connection: u64,
-    pid: Option<i32>,
-    program: String,
+    who: Arc<Who>,
     since: Instant,
     /// A request was accepted under it, or `lease` took it: it remains until it is released.
     kept: bool,
@@ -96,7 +97,7 @@ struct Holder {
 impl Holder {
     fn report(&self) -> CommanderReport {
         let held_for = self.since.elapsed().as_secs_f64();
-        CommanderReport { pid: self.pid, program: self.program.clone(), held_for }
+        CommanderReport { pid: self.who.pid, program: self.who.program.clone(), held_for }
     }
 }
 
@@ -178,17 +179,17 @@ impl Leases {
 pub(super) struct Lessee {
     leases: Arc<Leases>,
     connection: u64,
-    pid: Option<i32>,
-    /// On whose behalf it speaks, if it is a connection of a gateway.
-    client: Option<String>,
+    peer: Peer,
+    /// Who that is, once it has asked for something; the client, if it is a connection of a gateway.
+    who: OnceLock<Arc<Who>>,
     /// Dropped with the connection.
     alive: Arc<()>,
 }
 
 impl Lessee {
-    /// Creates a lessee without leases. `connection` is unique within the run; `pid` is the client's process.
-    pub fn new(leases: Arc<Leases>, connection: u64, pid: Option<i32>) -> Self {
-        Self { leases, connection, pid, client: None, alive: Arc::default() }
+    /// Creates a lessee without leases. `connection` is unique within the run; `peer` is the client's process.
+    pub fn new(leases: Arc<Leases>, connection: u64, peer: Peer) -> Self {
+        Self { leases, connection, peer, who: OnceLock::new(), alive: Arc::default() }
     }
 
     /// Returns the connection's number.
@@ -198,12 +199,22 @@ impl Lessee {
 
     /// Returns the client's process, if the system reports it.
     pub fn pid(&self) -> Option<i32> {
-        self.pid
+        self.peer.pid
+    }
+
+    /// Returns who asks on this connection.
+    pub fn who(&self) -> Arc<Who> {
+        self.who.get_or_init(|| Arc::new(self.peer.who())).clone()
+    }
+
+    /// The same for a stop, which never waits.
+    pub fn who_at_once(&self, verb: &str) -> Arc<Who> {
+        self.who.get().cloned().unwrap_or_else(|| Arc::new(self.peer.at_once(verb)))
     }
 
     /// Shows another name than that of the process to those who ask who commands an arm.
     pub fn set_client(&mut self, client: String) {
-        self.client = Some(client);
+        self.who = OnceLock::from(Arc::new(Who { program: client, ..self.peer.who() }));
     }
 
     /// Returns whether this connection holds the leases of all these arms.
@@ -229,7 +240,7 @@ impl Lessee {
         let RegisterGateway { endpoints, clients, faces, starting } = gateway;
         let known = registered.take().map(|known| known.report.faces).unwrap_or_default();
         let fallen = faces.iter().filter(|face| !face.serves && !known.contains(face)).cloned().collect();
-        let report = GatewayReport { pid: self.pid, endpoints, clients, faces };
+        let report = GatewayReport { pid: self.peer.pid, endpoints, clients, faces };
         *registered = Some(Gateway { connection: self.connection, starting, report });
         Ok(fallen)
     }
@@ -300,9 +311,8 @@ impl Lessee {
             match held.get_mut(arm) {
                 Some(holder) => holder.kept |= kept,
                 None => {
-                    let (connection, pid, since) = (self.connection, self.pid, Instant::now());
-                    let program = self.client.clone().unwrap_or_else(|| program(pid));
-                    held.insert(arm.clone(), Holder { connection, pid, program, since, kept });
+                    let (connection, who, since) = (self.connection, self.who(), Instant::now());
+                    held.insert(arm.clone(), Holder { connection, who, since, kept });
                 }
             }
         }
@@ -341,31 +351,13 @@ impl Drop for Lessee {
     }
 }
 
-/// Name of the program where a page of the live view commands the arm.
-const LIVE_VIEW: &str = "a page of the live view";
-
-/// Returns the name of a process from its command line: `dimos move`, `python3 policy.py`.
-fn program(pid: Option<i32>) -> String {
-    let read = |pid: i32| std::fs::read(format!("/proc/{pid}/cmdline")).ok();
-    let line = pid.and_then(read).unwrap_or_default();
-    let words = line.split(|byte| *byte == 0).map(String::from_utf8_lossy).filter(|word| !word.is_empty());
-    let mut name = String::new();
-    for word in words.take(2).take_while(|word| !word.starts_with('-')) {
-        let word: String = word.rsplit('/').next().unwrap_or_default().chars().take(40).collect();
-        name = if name.is_empty() { word } else { format!("{name} {word}") };
-    }
-    // Of `dimos run`, whether it is this run or a planner that is attached to it, only the live view commands arms.
-    if name == "dimos run" {
-        return LIVE_VIEW.to_owned();
-    }
-    // Other users' terminals show the name.
-    name.retain(|c| !c.is_control());
-    if name.is_empty() { "another program".to_owned() } else { name }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn own() -> Peer {
+        Peer { pid: Some(std::process::id() as i32), uid: None }
+    }
 
     fn names(arms: &[&str]) -> Vec<String> {
         arms.iter().map(|arm| (*arm).to_owned()).collect()
@@ -374,7 +366,7 @@ mod tests {
     #[test]
     fn leases_are_taken_all_or_none_and_released_with_the_connection() {
         let leases = Arc::new(Leases::default());
-        let lessee = |connection| Lessee::new(leases.clone(), connection, Some(std::process::id() as i32));
+        let lessee = |connection| Lessee::new(leases.clone(), connection, own());
         let (one, two) = (lessee(1), lessee(2));
         one.take(&names(&["left"])).unwrap();
         one.take(&names(&["left"])).unwrap();
@@ -392,7 +384,7 @@ mod tests {
     #[test]
     fn a_refused_request_keeps_no_lease() {
         let leases = Arc::new(Leases::default());
-        let (one, arms) = (Lessee::new(leases.clone(), 1, None), names(&["left"]));
+        let (one, arms) = (Lessee::new(leases.clone(), 1, Peer::default()), names(&["left"]));
         one.claim(&arms, false).unwrap();
         assert!(leases.holds(1), "during the request");
         one.settle(&arms, false);
@@ -402,13 +394,5 @@ mod tests {
         one.claim(&arms, false).unwrap();
         one.settle(&arms, false);
         assert!(leases.holds(1), "a later refusal does not release it");
-    }
-
-    #[test]
-    fn a_program_is_named_by_its_command_line() {
-        let mine = program(Some(std::process::id() as i32));
-        assert!(mine.starts_with("dimos"), "{mine}");
-        assert_eq!(program(None), "another program");
-        assert_eq!(program(Some(-5)), "another program");
     }
 }

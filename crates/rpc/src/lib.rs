@@ -56,6 +56,7 @@ mod subscription;
 mod text_api;
 mod turn;
 mod urgent;
+pub mod who;
 mod wire;
 mod world_api;
 

@@ -64,7 +64,7 @@ pub struct Move {
     /// Path that the joints follow, after a straight motion to its first point.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub path: Option<JointPath>,
-    /// Fraction of the velocity and acceleration limits to use, 0.01–1.
+    /// Fraction of the highest speed, 0.01–1: the same motion takes 1 / `speed` times as long.
     #[serde(default = "default_speed")]
     pub speed: f64,
     /// Velocity that no joint exceeds [rad/s], besides the limits; `speed` scales it too.
@@ -87,14 +87,14 @@ pub struct Start {
     pub task: String,
 }
 
-/// Default fraction of the limits for a motion.
+/// Default fraction of the highest speed for a motion.
 pub const DEFAULT_SPEED: f64 = 0.5;
 
 pub(super) fn default_speed() -> f64 {
     DEFAULT_SPEED
 }
 
-/// Checks a fraction of the limits.
+/// Checks a fraction of the highest speed.
 pub(super) fn valid_speed(speed: f64) -> Result<(), String> {
     let valid = (MIN_SPEED..=1.0).contains(&speed);
     if valid { Ok(()) } else { Err(format!("speed is {speed}, must be within {MIN_SPEED}–1")) }

@@ -89,7 +89,7 @@ pub struct PlanGoal {
 pub struct Plan {
     /// Goals of the robots, at most one each. Robots without a goal do not move.
     pub goals: Vec<PlanGoal>,
-    /// Fraction of the velocity and acceleration limits to use, 0.01–1.
+    /// Fraction of the highest speed, 0.01–1: the same motion takes 1 / `speed` times as long.
     #[serde(default = "default_speed")]
     pub speed: f64,
     /// Seed of the search; the same request from the same state with the same seed gives the same plan.
@@ -405,7 +405,7 @@ pub struct ExecutePlan {
     /// Required for a plan of the level `fast`: it is not proven to be free.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub unproven: bool,
-    /// A plan that was made for a larger fraction of the limits is stretched in time to this one, 0.01–1.
+    /// A plan that was made for a larger speed is stretched in time to this one, 0.01–1.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub max_speed: Option<f64>,
     /// If the motion retraces the log: time in it of the goal [s since 1970]. `motion` reports it.

@@ -28,6 +28,7 @@ use super::mark::Way;
 use super::run_dir::Claim;
 use super::stop_thread::{BEAT_PERIOD, Reception, StopThread};
 use super::urgent::Transfer;
+use super::who;
 use super::wire;
 
 /// Maximum duration of a request.
@@ -53,6 +54,7 @@ pub struct Server {
 impl Server {
     /// Opens the socket of a claimed name and starts serving it.
     pub fn start(claim: Claim, backend: Arc<dyn Backend>) -> io::Result<Self> {
+        who::read_users();
         let files = claim.files();
         let (opened, listeners) = watch::channel(Arc::new(files.bind()?));
         let (end, ended) = watch::channel(false);

@@ -138,6 +138,9 @@ pub struct EventReport {
     pub joint: Option<String>,
     /// Description for people, without full stop.
     pub text: String,
+    /// Who asked for it: `dimos stop (pid 4242, user ana)`; absent if it is not the effect of a request.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub by: Option<String>,
 }
 
 /// Severity of an event.

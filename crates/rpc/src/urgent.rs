@@ -20,6 +20,7 @@ use super::lease::Lessee;
 use super::server::refuse;
 use super::stop_thread::Reception;
 use super::turn::Turn;
+use super::who::Peer;
 use super::wire;
 
 /// Maximum length of an urgent request [bytes].
@@ -73,7 +74,9 @@ pub(super) async fn receive(
             read.splice(..0, line);
             break;
         };
-        let (name, result) = (request.written().0, reception.backend.call(request));
+        let name = request.written().0;
+        let who = Arc::new(Peer::of(&stream).at_once(name));
+        let result = reception.backend.call_from(request, None, who);
         let result = answer(name, result, &reception.leases).await;
         if !send::<Reply>(&stream, &id, result).await {
             return;
@@ -86,8 +89,7 @@ pub(super) async fn receive(
         Ok(permit) => permit,
         Err(error) => return refuse(&stream, error),
     };
-    let pid = stream.peer_cred().ok().and_then(|peer| peer.pid());
-    let lessee = Lessee::new(reception.leases.clone(), permit.number(), pid);
+    let lessee = Lessee::new(reception.leases.clone(), permit.number(), Peer::of(&stream));
     if let Ok(stream) = stream.into_std() {
         serve(Transfer { stream, read, lessee, permit }, reception, turn).await;
     }
@@ -122,7 +124,9 @@ pub(super) async fn serve(transfer: Transfer, reception: Arc<Reception>, turn: A
                 return pass_on(stream, read, lessee, permit, others).await;
             };
             permit.set_busy();
-            let (name, result) = (request.written().0, backend.call(request));
+            let name = request.written().0;
+            let who = lessee.who_at_once(name);
+            let result = backend.call_from(request, None, who);
             let result = answer(name, result, lessee.leases()).await;
             if !send::<Reply>(&stream, &id, result).await {
                 return;

@@ -74,7 +74,7 @@ pub struct Motion {
     pub goal: PlanGoal,
     /// How far away waypoints may be passed [m].
     pub blend: f64,
-    /// Fraction of the limits.
+    /// Fraction of the highest speed.
     pub speed: f64,
     /// Whether it is straight in joint space, without a planner.
     pub direct: bool,

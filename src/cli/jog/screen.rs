@@ -384,7 +384,7 @@ mod tests {
         let mut seen = seen(2);
         let arm = seen.arm.as_mut().unwrap();
         arm.phase = "held".into();
-        arm.cause = Some(CauseReport { name: "operator_stop".into(), text: "stopped by an operator".into() });
+        arm.cause = Some(CauseReport { name: "operator_stop".into(), text: "stopped by an operator".into(), by: None });
         seen.bound = Some(("arm_joint1 is limited in velocity".into(), std::time::Instant::now()));
         let all = text(&view(&seen, false), (80, 24)).join("\n");
         for part in ["held: stopped by an operator", "dimos arm reset arm", "limited: arm_joint1 is limited"] {

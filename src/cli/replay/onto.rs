@@ -27,7 +27,7 @@ use dimos_rpc::RpcError;
 use dimos_rpc::api::{self, ArmEnable, Cancel, Execute, Gripper, Move, Point, State, Trajectory};
 use dimos_rpc::report::{Deviation, MotionReport, StateReport};
 
-/// Fraction of the limits for the approach to the start of the motion.
+/// Fraction of the highest speed for the approach to the start of the motion.
 const APPROACH_SPEED: f64 = 0.2;
 /// Poll period.
 const POLL_PERIOD: Duration = Duration::from_millis(50);

@@ -89,7 +89,7 @@ mod tests {
             assert_eq!(of_arm("cell", &arm(phase, link)).level, wanted, "{phase} {link}");
         }
         let stopped = ArmReport {
-            cause: Some(CauseReport { name: "operator_stop".into(), text: "stopped by an operator".into() }),
+            cause: Some(CauseReport { name: "operator_stop".into(), text: "stopped by an operator".into(), by: None }),
             error: Some(DeviceError { code: 22, text: "self-collision".into() }),
             ..arm("held", "up")
         };

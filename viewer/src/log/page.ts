@@ -109,7 +109,7 @@ function events(player: Player): HTMLElement {
         'li',
         {class: `${data.severity === 'warn' ? 'warning' : data.severity} seekable`, onclick: () => player.seek(t)},
         el('time', {text: `${figure(t, 2)} s`, title: clock(new Date((source.scene.log.start + t) * 1000))}),
-        el('span', {text: data.text}),
+        el('span', {text: data.by ? `${data.text}, by ${data.by}` : data.text}),
       );
       return {t, item};
     });

@@ -43,6 +43,8 @@ export interface LoggedEvent {
   arm: string;
   task: string;
   text: string;
+  /** Who asked for it; absent in logs of earlier versions. */
+  by?: string;
 }
 
 interface Marker {

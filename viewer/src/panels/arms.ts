@@ -1,7 +1,7 @@
 // Arms of the run: state, cause of a hold, faults with what to do, and the acts that make an arm ready again.
 import type {Context} from '../context';
 import {button, el, setClass, setText} from '../dom';
-import type {ArmStatus, Status, Task} from '../protocol';
+import type {ArmStatus, Status, Task, Who} from '../protocol';
 import {duration, figure} from '../units';
 
 /** How an arm's phase is coloured. */
@@ -80,6 +80,13 @@ function tasksOf(status: Status, joints: string[]): Task[] {
   return status.tasks.filter((task) => task.joints.some((joint) => joints.includes(joint)));
 }
 
+/** Who made a request, as the terminal writes it. */
+function shown(who: Who): string {
+  const process = who.pid ? `pid ${who.pid}` : '';
+  const more = [process, who.user ? `user ${who.user}` : ''].filter((part) => part !== '');
+  return more.length > 0 ? `${who.program} (${more.join(', ')})` : who.program;
+}
+
 /** What a person must know about an arm: the cause of a hold, errors, faults that last, who commands it. */
 function notesOf(arm: ArmStatus, tasks: Task[]): HTMLElement[] {
   const notes: HTMLElement[] = [];
@@ -88,7 +95,10 @@ function notesOf(arm: ArmStatus, tasks: Task[]): HTMLElement[] {
       el('div', {class: `note ${level}`}, el('span', {text}), hint ? el('span', {class: 'hint', text: hint}) : null),
     );
   if (arm.stop_pending) note('bad', 'a stop could not be sent', 'it is delivered when the arm is reachable again');
-  if (arm.cause) note('bad', `held: ${arm.cause.text}`, 'when it may move again: Reset, then Enable');
+  if (arm.cause) {
+    const by = arm.cause.by ? `: ${shown(arm.cause.by)}` : '';
+    note('bad', `held: ${arm.cause.text}${by}`, 'when it may move again: Reset, then Enable');
+  }
   if (arm.error) note('bad', `error ${arm.error.code}: ${arm.error.text}`, 'remove the cause, then Reset');
   const speed = arm.speed_fraction ?? 1;
   if (speed < 1e-4) note('warn', 'stopped by its controller at 0 % of the speed', 'motions wait on their paths');

@@ -16,7 +16,7 @@ export function eventsPanel(context: Context): HTMLElement {
         'li',
         {class: event.level},
         el('time', {text: clock(new Date(event.stamp * 1000))}),
-        el('span', {text: event.text}),
+        el('span', {text: event.by ? `${event.text}, by ${event.by}` : event.text}),
       ),
     );
     while (list.children.length > SHOWN) list.lastElementChild!.remove();

@@ -86,6 +86,30 @@ pub struct Described {
     pub values: Vec<f64>,
     /// One sentence, without a full stop.
     pub text: String,
+    /// Who asked for it, if it is the effect of a request.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub by: Option<String>,
+}
+
+impl Described {
+    /// Returns the sentence with who asked for it.
+    pub fn line(&self) -> String {
+        self.by.as_ref().map_or_else(|| self.text.clone(), |by| format!("{}, by {by}", self.text))
+    }
+}
+
+/// Returns whether an event is the effect of a request that the same tick answered, and not of something else.
+pub fn follows_request(event: &Event) -> bool {
+    match event {
+        Event::Request(..) => true,
+        Event::Arm(_, _, cause) => matches!(cause, Cause::None | Cause::Operator),
+        Event::Task(_, _, reason) => matches!(
+            reason,
+            Reason::None | Reason::Cancelled | Reason::StreamEnded | Reason::ArmHeld(_, Cause::Operator)
+        ),
+        Event::Preempted(..) => true,
+        _ => false,
+    }
 }
 
 /// Describes an event.
@@ -146,7 +170,8 @@ pub fn describe(event: &Event, names: &Names) -> Described {
 }
 
 fn plain(kind: &'static str, severity: Severity, status: &'static str, text: String) -> Described {
-    Described { kind, severity, request: None, arm: None, task: None, joint: None, status, values: Vec::new(), text }
+    let (request, arm, task, joint, by) = (None, None, None, None, None);
+    Described { kind, severity, request, arm, task, joint, status, values: Vec::new(), text, by }
 }
 
 fn request(id: u64, outcome: Outcome, names: &Names) -> Described {

@@ -5,6 +5,7 @@ pub mod describe;
 mod interruption;
 mod label;
 pub mod texts;
+mod who;
 
 use serde::{Deserialize, Serialize};
 
@@ -14,6 +15,7 @@ use crate::named::named;
 
 pub use interruption::{Interruption, Origin};
 pub use label::Label;
+pub use who::Who;
 
 /// One entry of the ring.
 // The ring holds values: a box would allocate in the tick.

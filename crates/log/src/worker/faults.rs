@@ -24,7 +24,8 @@ where
     pub(super) fn keep(&mut self, notes: Vec<Note>, samples: Vec<Sample>) {
         for note in notes {
             self.know(&note);
-            let known = matches!(note, Note::Robots { .. } | Note::Markers { .. } | Note::ArmText { .. });
+            let known =
+                matches!(note, Note::Robots { .. } | Note::Markers { .. } | Note::ArmText { .. } | Note::Asked { .. });
             if let (Some((_, ring)), false) = (&mut self.faults, known) {
                 ring.note(note);
             }

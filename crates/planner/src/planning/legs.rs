@@ -8,7 +8,7 @@ use super::level::Level;
 use super::padded::Near;
 use super::path::{Path, distance, unwind};
 use super::path_planner::{PlanSettings, plan};
-use super::pipeline::{Goal, PlanFailure, PlanRequest, Stage, StageTimes, bounds_at, failure_for};
+use super::pipeline::{Goal, PlanFailure, PlanRequest, Stage, StageTimes, bounds_of, failure_for};
 use super::timing::TimingSettings;
 use crate::collision::{CollisionChecker, Stop};
 use dimos_robot::kinematics::frame;
@@ -26,8 +26,6 @@ pub(super) struct SearchOptions {
     pub seed: u64,
     pub level: Level,
     pub refine: u32,
-    /// Part of the speed of the motion.
-    pub speed: f64,
 }
 
 /// The way to one goal.
@@ -49,8 +47,8 @@ pub(super) fn legs(
     times: &mut StageTimes,
 ) -> Result<Vec<Leg>, PlanFailure> {
     let begin = stage.start.clone();
-    let PlanRequest { seed, level, refine, speed, .. } = *request;
-    let search = SearchOptions { seed, level, refine, speed };
+    let PlanRequest { seed, level, refine, .. } = *request;
+    let search = SearchOptions { seed, level, refine };
     let mut legs: Vec<Leg> = Vec::new();
     for (i, goals) in request.through.iter().chain([&request.goals]).enumerate() {
         if let Some(at) = legs.last().and_then(|leg| leg.path.last()) {
@@ -105,7 +103,7 @@ pub(super) fn leg(
                 stage.checker.give_up(Near::Goal, &goal);
             }
             took("ik", began.elapsed().as_secs_f64());
-            let SearchOptions { seed, level, refine, speed } = search;
+            let SearchOptions { seed, level, refine } = search;
             let settings = PlanSettings { seed, level, refine, ..PlanSettings::default() };
             let start = stage.start.clone();
             let found =
@@ -114,7 +112,7 @@ pub(super) fn leg(
             took("shorten", found.shorten_time.as_secs_f64());
             let choosing = Instant::now();
             let refined = found.refine_time;
-            let (path, clamped) = match bounds_at(stage, speed) {
+            let (path, clamped) = match bounds_of(stage) {
                 Ok(bounds) => {
                     let Stage { joints, checker, .. } = stage;
                     found.quickest(joints, &bounds, |a, b| checker.motion_looks_free(a, b))

@@ -66,7 +66,7 @@ pub struct PlanRequest {
     pub goals: Vec<(usize, Goal)>,
     /// Current positions of all robots [rad], in the order of the scene.
     pub positions: Vec<Vec<f64>>,
-    /// Part of the limits for speed and acceleration, above 0 and at most 1.
+    /// Part of the highest speed, above 0 and at most 1: the same motion takes 1 / `speed` times as long.
     pub speed: f64,
     /// Seed of all random numbers.
     pub seed: u64,
@@ -375,7 +375,7 @@ fn timed(
     request: &PlanRequest,
     stop: &Stop,
 ) -> Result<JointTrajectory, PlanFailure> {
-    let bounds = bounds_at(stage, request.speed)?;
+    let bounds = bounds_of(stage)?;
     let checker = &mut stage.checker;
     let free = |a: &[f64], b: &[f64]| passes(checker, request.level, escape_path, (a, b), stop);
     let timed = time_within(&stage.joints, path, &bounds, deviation, 1.0, free);
@@ -383,7 +383,9 @@ fn timed(
         let unproven = matches!(error, TimingError::NotFree(..));
         late(stop).unwrap_or_else(|| PlanFailure { unproven, ..PlanFailure::new(error.to_string()) })
     })?;
-    Ok(tools(stage).slowed(&timed.trajectory, &bounds, request.speed).unwrap_or(timed.trajectory))
+    let motion = tools(stage).slowed(&timed.trajectory, &bounds, 1.0).unwrap_or(timed.trajectory);
+    // The same motion in a longer time, as a direct move and the speed override have it.
+    Ok(if request.speed < 1.0 { motion.scaled(request.speed) } else { motion })
 }
 
 /// Returns the tools of the moving robots whose speed is limited.
@@ -399,16 +401,9 @@ fn tools(stage: &Stage<'_>) -> Tools {
     tools
 }
 
-/// Returns the bounds of the joints at a part of their speed: half the speed means half the velocity and half the
-/// acceleration, as in a direct move.
-pub(super) fn bounds_at(stage: &Stage<'_>, speed: f64) -> Result<Vec<JointBound>, PlanFailure> {
-    let mut bounds = bounds(&stage.joints, &stage.limits).map_err(|e| PlanFailure::new(e.to_string()))?;
-    for b in &mut bounds {
-        b.velocity *= speed;
-        b.acceleration *= speed;
-        b.jerk *= speed;
-    }
-    Ok(bounds)
+/// Returns the bounds of the joints.
+pub(super) fn bounds_of(stage: &Stage<'_>) -> Result<Vec<JointBound>, PlanFailure> {
+    bounds(&stage.joints, &stage.limits).map_err(|e| PlanFailure::new(e.to_string()))
 }
 
 /// Returns the failure if the request was cancelled or its timeout was reached.

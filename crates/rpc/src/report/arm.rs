@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::TcpReport;
 use crate::api::{IoReport, LoadReport};
+use dimos_core::telemetry::Who;
 
 /// One arm in `status`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
@@ -151,6 +152,9 @@ pub struct CauseReport {
     pub name: String,
     /// For people.
     pub text: String,
+    /// Who stopped it, if a client did.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub by: Option<Who>,
 }
 
 /// State and mode codes of a device.

@@ -4,6 +4,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::api::SpeedReport;
+use dimos_core::telemetry::Who;
 
 /// One task in `status`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
@@ -66,6 +67,9 @@ pub struct MotionReport {
     pub motion: u64,
     /// The task that executes it.
     pub task: String,
+    /// Who asked for it; absent: the run itself.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub by: Option<Who>,
     /// The task's state in this motion: `EXECUTING`, `COMPLETED`, `ABORTED`, …
     pub state: String,
     /// Whether it has ended and the arm is at rest.

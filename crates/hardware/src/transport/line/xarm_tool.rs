@@ -1,5 +1,5 @@
-//! The RS-485 line at the tool flange of an xArm as a byte stream. Register 241 of the control box passes bytes on unchanged, and
-//! its response has what came back from the tool within the box's own timeout (register 240).
+//! The RS-485 line at the tool flange of an xArm as a byte stream. Register 241 of the control box passes bytes on
+//! unchanged, and its response has what came back from the tool within the box's own timeout (register 240).
 //!
 //! Bytes that the device sends without being asked, or later than that timeout, do not arrive.
 
