@@ -6,6 +6,8 @@
 //! stop:  park, where asked ─▶ decelerate ─▶ end the tick ─▶ release the arms ─▶ close rpc ─▶ close the log
 //! ```
 
+#![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::unreachable))]
+
 mod arm_requests;
 mod arms;
 mod asker;

@@ -1,5 +1,5 @@
-//! The house rules that a machine can check: who may use whom, where `unsafe` may stand, how long a file may be,
-//! and what may not stand on a path that runs with hardware.
+//! The house rules that neither the manifests of the crates nor clippy check: who may use whom inside of a crate, how
+//! long a file may be.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -19,17 +19,11 @@ const LAYERS: &[(&str, &[&str])] = &[
 /// Sources of the program and of all crates.
 const CODE: [&str; 2] = ["src", "crates"];
 
-/// The mock arm panics when a test's script of faults says so.
-const SCRIPTED_PANIC: &str = "crates/arms/src/mock/device.rs";
-
-/// A source file: its path below the checkout, its text, its code without comments and strings, and the part of
-/// that before the unit tests.
+/// A source file: its path below the checkout, its text, its code without comments and strings.
 struct Source {
     path: String,
     text: String,
     code: String,
-    shipped: String,
-    for_tests: bool,
 }
 
 fn sources(folder: &str) -> Vec<Source> {
@@ -39,23 +33,9 @@ fn sources(folder: &str) -> Vec<Source> {
     paths.sort();
     assert!(paths.len() > 5, "no sources in {folder}");
     let texts: Vec<String> = paths.iter().map(|path| fs::read_to_string(path).unwrap()).collect();
-    let for_tests = |path: &Path| {
-        let name = path.file_stem().unwrap().to_string_lossy().into_owned();
-        let ways = [format!("#[cfg(test)]\nmod {name};"), format!("#[cfg(test)]\n#[path = \"{name}.rs\"]")];
-        let folder = path.parent().unwrap();
-        let beside = |other: &Path| other.parent() == Some(folder) || other == folder.with_extension("rs");
-        let mut others = paths.iter().zip(&texts).filter(|(other, _)| beside(other));
-        others.any(|(_, text)| ways.iter().any(|way| text.contains(way)))
-    };
     let source = |(path, text): (&PathBuf, &String)| {
         let code = code(text);
-        Source {
-            path: path.strip_prefix(root).unwrap().to_string_lossy().into_owned(),
-            shipped: code.split("#[cfg(test)]\nmod tests {").next().unwrap_or_default().to_owned(),
-            for_tests: path.ancestors().take(3).any(for_tests),
-            text: text.clone(),
-            code,
-        }
+        Source { path: path.strip_prefix(root).unwrap().to_string_lossy().into_owned(), text: text.clone(), code }
     };
     paths.iter().zip(&texts).map(source).collect()
 }
@@ -226,29 +206,6 @@ fn one_task_type_does_not_use_another_and_the_coordinator_uses_none() {
     fail_on(&found, "task types do not use each other; only the table has all");
 }
 
-/// Words of a line of code.
-fn words(line: &str) -> impl Iterator<Item = &str> {
-    line.split(|c: char| !(c.is_alphanumeric() || c == '_'))
-}
-
-#[test]
-fn unsafe_stands_only_in_rt_and_says_why() {
-    let mut found = Vec::new();
-    for source in CODE.into_iter().flat_map(sources) {
-        let lines: Vec<&str> = source.text.lines().collect();
-        for (i, line) in source.code.lines().enumerate().filter(|(_, l)| words(l).any(|w| w == "unsafe")) {
-            if !matches!(module_of(&source.path), "rt" | "kernels") {
-                found.push(format!("{}:{}: {}", source.path, i + 1, line.trim()));
-            } else if module_of(&source.path) == "rt"
-                && !lines[i.saturating_sub(3)..i].iter().any(|l| l.contains("// SAFETY:"))
-            {
-                found.push(format!("{}:{}: without `// SAFETY:`", source.path, i + 1));
-            }
-        }
-    }
-    fail_on(&found, "`unsafe` only in rt and kernels, in rt each with `// SAFETY:`");
-}
-
 #[test]
 fn no_file_is_too_long_and_no_test_is_skipped_for_good() {
     let mut found = Vec::new();
@@ -280,25 +237,6 @@ fn no_comment_is_wider_than_the_code() {
         }
     }
     fail_on(&found, "comments of at most 120 columns");
-}
-
-#[test]
-fn nothing_panics_on_purpose_where_hardware_runs() {
-    let mut found = Vec::new();
-    for source in CODE.into_iter().flat_map(sources) {
-        if source.for_tests || !matches!(module_of(&source.path), "control" | "hardware" | "arms" | "rt" | "runtime") {
-            continue;
-        }
-        for (i, line) in source.shipped.lines().enumerate() {
-            for bad in [".unwrap()", ".expect(", "panic!(", "unreachable!(", "todo!(", "unimplemented!("] {
-                let scripted = source.path == SCRIPTED_PANIC && bad == "panic!(";
-                if line.contains(bad) && !scripted {
-                    found.push(format!("{}:{}: {bad} {}", source.path, i + 1, line.trim()));
-                }
-            }
-        }
-    }
-    fail_on(&found, "no unwrap, expect or panic on a path that runs with hardware");
 }
 
 #[test]

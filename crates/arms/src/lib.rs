@@ -1,27 +1,70 @@
 //! Owns the arms: a folder each, with adapter, protocol, emulator and a row of the table. No arm uses another. Used by
-//! the run; what an adapter needs is in `dimos-hardware`. A new arm is one folder and one line here.
+//! the run; what an adapter needs is in `dimos-hardware`. A new arm is one folder, a feature and a row here; `mock` and
+//! `yourarm` are always there.
 
+#![cfg_attr(
+    not(test),
+    deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::unreachable, clippy::indexing_slicing)
+)]
 #![forbid(unsafe_code)]
 #![allow(rustdoc::broken_intra_doc_links, reason = "units are in brackets: [rad]")]
 
 use dimos_hardware::adapter::{AdapterError, AdapterResult, ManipulatorAdapter};
 use dimos_hardware::registry::{Absent, AdapterConfig, AdapterSpec, Emulator, EmulatorAddress, Registry, SIM};
 
+#[cfg(feature = "franka")]
 pub mod franka;
 pub mod mock;
+#[cfg(feature = "piper")]
 pub mod piper;
+#[cfg(feature = "remote")]
 pub mod remote;
+#[cfg(feature = "so101")]
 pub mod so101;
+#[cfg(feature = "ur")]
 pub mod ur;
+#[cfg(feature = "xarm")]
 pub mod xarm;
 pub mod yourarm;
 
 /// The compile-time adapter table.
-pub const TABLE: &[AdapterSpec] =
-    &[mock::SPEC, yourarm::SPEC, xarm::SPEC, piper::SPEC, so101::SPEC, ur::SPEC, franka::SPEC, remote::SPEC];
+pub const TABLE: &[AdapterSpec] = &[
+    mock::SPEC,
+    yourarm::SPEC,
+    #[cfg(feature = "xarm")]
+    xarm::SPEC,
+    #[cfg(feature = "piper")]
+    piper::SPEC,
+    #[cfg(feature = "so101")]
+    so101::SPEC,
+    #[cfg(feature = "ur")]
+    ur::SPEC,
+    #[cfg(feature = "franka")]
+    franka::SPEC,
+    #[cfg(feature = "remote")]
+    remote::SPEC,
+];
 
-/// Adapters that this build lacks because their cargo feature is off. No built-in adapter has one.
-pub const ABSENT: &[Absent] = &[];
+/// Adapters that this build lacks because their cargo feature is off.
+pub const ABSENT: &[Absent] = &[
+    #[cfg(not(feature = "xarm"))]
+    lacking("xarm", "UFACTORY xArm 5, 6, 7, 850, Lite 6", "build with --features xarm"),
+    #[cfg(not(feature = "piper"))]
+    lacking("piper", "AgileX Piper", "build with --features piper"),
+    #[cfg(not(feature = "so101"))]
+    lacking("so101", "SO-101", "build with --features so101"),
+    #[cfg(not(feature = "ur"))]
+    lacking("ur", "Universal Robots", "build with --features ur"),
+    #[cfg(not(feature = "franka"))]
+    lacking("franka", "Franka FR3 and FER", "build with --features franka"),
+    #[cfg(not(feature = "remote"))]
+    lacking("remote", "an adapter in another process", "build with --features remote"),
+];
+
+#[allow(dead_code, reason = "not in a build with all arms")]
+const fn lacking(name: &'static str, about: &'static str, remedy: &'static str) -> Absent {
+    Absent { name, about, remedy }
+}
 
 /// Returns the table of the built-in adapters.
 pub fn registry() -> Registry {

@@ -7,6 +7,10 @@
 //! states ─▶ read ─▶ failsafe ─▶ requests ─▶ compute (tasks) ─▶ arbitrate ─▶ limit ─▶ route ─▶ commands
 //! ```
 
+#![cfg_attr(
+    not(test),
+    deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::unreachable, clippy::indexing_slicing)
+)]
 #![forbid(unsafe_code)]
 #![allow(rustdoc::broken_intra_doc_links, reason = "units are in brackets: [rad]")]
 

@@ -41,7 +41,9 @@ pub enum MotionError {
 }
 
 /// Returns the fastest motion from `start` to `target` [rad] with `speed` (0–1] times the joints' velocities, and
-/// accelerations and jerks scaled to match (`speed²`, `speed³`), so that it is the same motion, slower.
+/// accelerations and jerks scaled to match (`speed²`, `speed³`), so that it is the same motion, slower. `start`,
+/// `target` and `limits` have a value for each joint.
+#[allow(clippy::indexing_slicing, reason = "a value for each joint; not on the tick's path")]
 pub fn point_to_point(
     joints: &[String],
     start: &[f64],

@@ -1,6 +1,10 @@
 //! Owns the contract with an arm: adapters, device threads, transports, the kit of emulators, conformance. Never knows
 //! an arm. Used by each adapter, in this repository or outside, and by the run.
 
+#![cfg_attr(
+    not(test),
+    deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::unreachable, clippy::indexing_slicing)
+)]
 #![forbid(unsafe_code)]
 #![allow(rustdoc::broken_intra_doc_links, reason = "units are in brackets: [rad]")]
 

@@ -8,6 +8,8 @@
 //! width, bit for bit: a block always has sixteen lanes, and every width computes the same operations in the same
 //! order.
 
+#![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::unreachable))]
+
 pub mod apart;
 pub mod block;
 pub mod bodies;

@@ -10,6 +10,7 @@
 //!
 //! Every element keeps its position in the source, through includes and macros, so that diagnostics point at it.
 
+#![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::unreachable))]
 #![forbid(unsafe_code)]
 #![allow(rustdoc::broken_intra_doc_links, reason = "units are in brackets: [rad]")]
 

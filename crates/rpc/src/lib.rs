@@ -15,6 +15,7 @@
 //! [`api`] has the methods and their parameters, [`report`] the status reports, [`error`] the errors. [`run_dir`] finds
 //! the sockets of live runs; [`server`] and [`client`] are the two sides of a connection.
 
+#![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::unreachable))]
 #![forbid(unsafe_code)]
 #![allow(rustdoc::broken_intra_doc_links, reason = "units are in brackets: [rad]")]
 

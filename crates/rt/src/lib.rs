@@ -3,6 +3,10 @@
 //! Real-time primitives: latest-value slots, wake-ups, scheduling, memory; and names that the kernel keeps. Only this
 //! crate and `dimos-kernels` have `unsafe`.
 
+#![cfg_attr(
+    not(test),
+    deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::unreachable, clippy::indexing_slicing)
+)]
 #![allow(rustdoc::broken_intra_doc_links, reason = "units are in brackets: [rad]")]
 
 pub mod abstract_name;

@@ -62,6 +62,7 @@ impl<T: Copy> SlotReader<T> {
             let before = self.shared.middle.swap(self.own, Ordering::AcqRel);
             self.own = before & INDEX;
         }
+        #[allow(clippy::indexing_slicing, reason = "the remainder of a division by three")]
         let cell = &self.shared.buffers[(self.own & INDEX) as usize % 3];
         // SAFETY: the buffer with our own index belongs to the reader alone until the next swap.
         unsafe { *cell.get() }

@@ -13,6 +13,7 @@
 //! * **error recovery**: [`read`] records an error, works around it and reads again until no error is left;
 //! * [`Located`] values, so that later checks can also point at the exact position.
 
+#![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::unreachable))]
 #![forbid(unsafe_code)]
 #![allow(rustdoc::broken_intra_doc_links, reason = "units are in brackets: [rad]")]
 

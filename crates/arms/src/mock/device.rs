@@ -154,6 +154,7 @@ impl Device {
             _ => {}
         }
         self.advance();
+        #[allow(clippy::panic, reason = "a test's script of faults says so")]
         if self.arm.take_fault(FaultKind::Panic).is_some() {
             panic!("scripted fault: the adapter panics");
         }

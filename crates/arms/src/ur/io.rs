@@ -109,6 +109,7 @@ impl UrAdapter {
     }
 }
 
+#[allow(clippy::indexing_slicing, reason = "computed when compiled")]
 const fn units<const N: usize, const KINDS: usize>() -> [[AnalogUnit; N]; KINDS] {
     let mut all = [[AnalogUnit::Ampere; N]; KINDS];
     let mut bits = 0;

@@ -288,7 +288,7 @@ impl Bench {
     /// Runs the task of higher priority for this time [s].
     pub fn interfere(&mut self, seconds: f64) {
         for _ in 0..(seconds * RATE).round() as u64 {
-            let here = self.arm.position[usize::from(CONTESTED)];
+            let here = self.arm.position.get(usize::from(CONTESTED)).copied().unwrap_or_default();
             let request = match self.spec.demand {
                 Demand::Velocities => Request::Velocity { task: STRONGER, target: joints_of(&[0.0]) },
                 _ => Request::Servo { task: STRONGER, target: joints_of(&[here]) },

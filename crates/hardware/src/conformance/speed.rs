@@ -77,8 +77,9 @@ pub fn slow_move(
             seen.pop_front();
         }
         let Some((then, before)) = seen.front().filter(|(then, _)| now - then >= WINDOW) else { continue };
-        for (i, top) in limits.velocity_max.iter().enumerate() {
-            let (speed, ordered) = ((reading.position[i] - before[i]).abs() / (now - then), SLOW * top);
+        let moved = reading.position.iter().zip(before).map(|(now, before)| (now - before).abs());
+        for (i, (moved, top)) in moved.zip(&limits.velocity_max).enumerate() {
+            let (speed, ordered) = (moved / (now - then), SLOW * top);
             require(speed <= TOO_FAST * ordered, || {
                 format!("joint {} moves at {speed:.2} rad/s, ordered were {ordered:.2}", i + 1)
             })?;

@@ -46,6 +46,7 @@ pub const PLAYABLE: &[FaultKind] = &[
 ];
 
 /// Returns [`PLAYABLE`] and more kinds; `N` is how many all are.
+#[allow(clippy::indexing_slicing, reason = "computed when compiled")]
 pub const fn playable_and<const N: usize>(more: &[FaultKind]) -> [FaultKind; N] {
     let mut all = [FaultKind::Stall; N];
     let mut i = 0;

@@ -65,7 +65,7 @@ impl Controller {
             if done >= 1.0 - ROUNDING {
                 (target, self.segment) = (Some(to), None);
             } else {
-                target = Some(std::array::from_fn(|i| from[i] + (to[i] - from[i]) * done));
+                target = Some(between(&from, &to, done));
             }
             if ends || left < ROUNDING {
                 break;
@@ -74,10 +74,19 @@ impl Controller {
         if let Some(target) = target
             && self.arm.servo(&target) != Err(Refusal::OutOfRange)
         {
-            self.commanded = (target, std::array::from_fn(|i| (target[i] - before[i]) / step));
+            let mut velocity = target;
+            velocity.iter_mut().zip(before).for_each(|(v, before)| *v = (*v - before) / step);
+            self.commanded = (target, velocity);
         }
         if ends {
             self.stop_program();
         }
     }
+}
+
+/// The point at a part of the way.
+fn between(from: &[f64; DOF], to: &[f64; DOF], part: f64) -> [f64; DOF] {
+    let mut at = *from;
+    at.iter_mut().zip(to).for_each(|(at, to)| *at += (to - *at) * part);
+    at
 }

@@ -33,7 +33,8 @@ impl Points {
     /// Takes a point, `step` [s] after the last one; an invalid one is a protective stop.
     pub fn take(&mut self, arm: &mut SimArm, goal: &[f64; DOF], step: f64, lookahead: f64) {
         let from = self.last.unwrap_or_else(|| super::programs::joints(arm));
-        let velocity: [f64; DOF] = std::array::from_fn(|i| (goal[i] - from[i]) / step);
+        let mut velocity = *goal;
+        velocity.iter_mut().zip(from).for_each(|(v, from)| *v = (*v - from) / step);
         let change = velocity.iter().zip(&self.velocity).map(|(now, before)| (now - before).abs()).fold(0.0, f64::max);
         let jumps = velocity.iter().any(|v| v.abs() > JUMP);
         if jumps || change > SUDDEN * lookahead {

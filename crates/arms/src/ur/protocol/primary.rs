@@ -175,6 +175,7 @@ fn kinematics(body: &mut Reader<'_>) -> Option<Kinematics> {
     let checksum = std::array::from_fn(|_| body.u32());
     let mut list = || -> [f64; 6] { std::array::from_fn(|_| body.f64()) };
     let (theta, a, d, alpha) = (list(), list(), list(), list());
+    #[allow(clippy::indexing_slicing, reason = "four lists of six")]
     let joints = std::array::from_fn(|i| Dh { theta: theta[i], a: a[i], d: d[i], alpha: alpha[i] });
     let found = Kinematics { checksum, joints };
     (body.ok && found.is_possible()).then_some(found)
