@@ -1,4 +1,4 @@
-# run install dist viewer check test test-fast verified · test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants ·
+# run install dist viewer check test test-fast package verified · test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants ·
 # bench bench-quick bench-page bench-share jitter soak lies lies-wire pauses
 
 PYTHON ?= python3
@@ -26,7 +26,7 @@ PAGE := viewer/dist/index.html
 PAGE_SOURCES := $(wildcard viewer/*.json viewer/*.mjs) $(shell find viewer/src -type f 2>/dev/null)
 NODE := $(if $(wildcard viewer/package.json),$(shell command -v npm))
 
-.PHONY: run install dist shipped viewer viewer-if-possible check lint scripts spelling licences test test-fast verified test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants bench bench-quick bench-page bench-share jitter soak lies lies-wire pauses
+.PHONY: run install dist shipped viewer viewer-if-possible check lint scripts spelling licences test test-fast package verified test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants bench bench-quick bench-page bench-share jitter soak lies lies-wire pauses
 
 # Builds the program to try it, not optimized, and starts the shipped blueprint; its arm is simulated. Ends with Ctrl-C.
 run: viewer-if-possible
@@ -97,10 +97,14 @@ deny:
 test: viewer-if-possible
 	@[ -e .venv/readers-installed ] || echo "note: some tests will be skipped; make test-tools installs what they need"
 	cargo test --workspace --locked $(WITH) --doc
-	@if ! cargo nextest --version >/dev/null 2>&1; then cargo test --workspace --locked $(WITH) --lib --bins --tests; \
+	@if ! cargo nextest --version >/dev/null 2>&1; then cargo test --workspace --locked $(WITH) --lib --bins --tests --examples; \
 	elif command -v $(PYTHON) >/dev/null; then $(PYTHON) tests/suite.py; \
 	else cargo nextest run --workspace --locked $(WITH); \
 	fi
+
+# The crates that others may use, and those that they use, as a registry takes them: each is built from its package.
+package:
+	cargo package --locked $(addprefix -p dimos-,core rt yaml kernels robot planner hardware)
 
 # The logic, in a minute: no run of the program, no vendor's tool.
 test-fast:

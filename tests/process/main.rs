@@ -14,6 +14,7 @@ mod built_in_arms;
 mod changed_world;
 mod clearances;
 mod cli_verbs;
+mod crate_examples;
 mod daemon;
 mod device_clock;
 mod disk;

@@ -143,12 +143,13 @@ impl RobotConfig {
 }
 
 impl RobotConfig {
-    /// Returns the built-in robot `yourarm` at the origin, for examples and tests.
-    pub fn yourarm() -> Self {
-        let joints: Vec<String> = (1..=6).map(|k| format!("joint{k}")).collect();
+    /// Creates a robot at the origin from a description, a file or `builtin:NAME`. `joints`: those that are planned, by
+    /// their names in the model, from the base; in trajectories they have the robot's name in front. Moves at up to
+    /// 1 rad/s and 2 rad/s².
+    pub fn new(name: &str, model_path: impl Into<PathBuf>, end_effector_link: &str, joints: Vec<String>) -> Self {
         Self {
-            name: "arm".into(),
-            model_path: "builtin:yourarm".into(),
+            name: name.into(),
+            model_path: model_path.into(),
             packages: BTreeMap::new(),
             xacro_args: BTreeMap::new(),
             srdf: None,
@@ -158,12 +159,12 @@ impl RobotConfig {
             convert_meshes: true,
             base_pose: Isometry3::identity(),
             base_link: "base_link".into(),
-            end_effector_link: "flange".into(),
+            end_effector_link: end_effector_link.into(),
             tool: None,
-            flange_link: Some("flange".into()),
+            flange_link: Some(end_effector_link.into()),
             controller_base: None,
             allows_mismatch: false,
-            coordinator_joints: joints.iter().map(|joint| format!("arm_{joint}")).collect(),
+            coordinator_joints: joints.iter().map(|joint| format!("{name}_{joint}")).collect(),
             joints,
             unplanned: BTreeMap::new(),
             gripper_joint: None,
@@ -174,6 +175,11 @@ impl RobotConfig {
             max_jerk: None,
             named_poses: BTreeMap::new(),
         }
+    }
+
+    /// Returns the built-in robot `yourarm` at the origin, for examples and tests.
+    pub fn yourarm() -> Self {
+        Self::new("arm", "builtin:yourarm", "flange", (1..=6).map(|k| format!("joint{k}")).collect())
     }
 }
 

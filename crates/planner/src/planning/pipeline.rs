@@ -82,6 +82,23 @@ pub struct PlanRequest {
     pub by_number: bool,
 }
 
+impl PlanRequest {
+    /// Creates a request of a robot alone in its scene: from these positions to a goal at full speed, proven.
+    pub fn new(positions: Vec<f64>, goal: Goal) -> Self {
+        Self {
+            goals: vec![(0, goal)],
+            positions: vec![positions],
+            speed: 1.0,
+            seed: 0,
+            level: Level::default(),
+            refine: 0,
+            through: Vec::new(),
+            blend: 0.0,
+            by_number: false,
+        }
+    }
+}
+
 /// A planned motion.
 #[derive(Debug, Clone)]
 pub struct PlannedMotion {

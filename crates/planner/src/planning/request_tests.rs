@@ -27,17 +27,7 @@ fn ask(scene: &PlanningScene, goal: Goal, start: &[f64]) -> Result<PlannedMotion
 }
 
 fn ask_at(level: Level, scene: &PlanningScene, goal: Goal, start: &[f64]) -> Result<PlannedMotion, String> {
-    let request = PlanRequest {
-        goals: vec![(0, goal)],
-        positions: vec![start.to_vec()],
-        speed: 1.0,
-        seed: 0,
-        level,
-        refine: 0,
-        through: Vec::new(),
-        blend: 0.0,
-        by_number: false,
-    };
+    let request = PlanRequest { level, ..PlanRequest::new(start.to_vec(), goal) };
     solve(scene, &scene.world, &request, &Stop::never()).map_err(|failure| failure.what)
 }
 
@@ -49,17 +39,7 @@ fn refinement_leaves_time_for_the_rest_of_the_request() {
     let middle = flange(&scene(vec![RobotConfig::yourarm()], Vec::new()), 0, &at(0.0)).translation;
     let ball = ObjectConfig { name: "ball".into(), shape: ObjectShape::Sphere(0.1), pose: middle.into(), padding: 0.0 };
     let scene = scene(vec![RobotConfig::yourarm()], vec![ball]);
-    let request = PlanRequest {
-        goals: vec![(0, Goal::Joints(at(0.9)))],
-        positions: vec![at(-0.9)],
-        speed: 1.0,
-        seed: 0,
-        level: Level::Certified,
-        refine: u32::MAX,
-        through: Vec::new(),
-        blend: 0.0,
-        by_number: false,
-    };
+    let request = PlanRequest { refine: u32::MAX, ..PlanRequest::new(at(-0.9), Goal::Joints(at(0.9))) };
     let stop = Stop::new(Some(Instant::now() + Duration::from_secs(4)), None);
     let motion = solve(&scene, &scene.world, &request, &stop).unwrap();
     assert!(motion.path.len() > 2 && motion.times["refine"] > 0.1, "{:?}", motion.times);
@@ -76,17 +56,8 @@ fn a_refined_plan_is_no_slower() {
     let (mut shorter, mut quicker) = (0, 0);
     for seed in 0..24 {
         let [plain, refined] = [0, 60].map(|refine| {
-            let request = PlanRequest {
-                goals: vec![(0, Goal::Joints(at(0.9)))],
-                positions: vec![at(-0.9)],
-                speed: 1.0,
-                seed,
-                level: Level::Certified,
-                refine,
-                through: Vec::new(),
-                blend: 0.0,
-                by_number: false,
-            };
+            let goal = Goal::Joints(at(0.9));
+            let request = PlanRequest { seed, refine, ..PlanRequest::new(at(-0.9), goal) };
             let motion = solve(&scene, &scene.world, &request, &Stop::never()).unwrap();
             (motion.trajectory.duration(), length(&motion.path))
         });
