@@ -171,10 +171,9 @@ mutants:
 	then echo "error: no test notices these changes" >&2; exit 1; fi
 
 # Compute time of a tick, cost per arm, memory, start-up, processor time; the way to the wire and back; what talking to a
-# run costs; how fast logs
-# are written, read and verified.
+# run costs; how fast logs are written, read and verified. Writes what it measured into docs/figures.md.
 bench:
-	cargo bench --locked --bench control --bench wire --bench rpc --bench recorder --bench verify
+	DIMOS_FIGURES=$(abspath docs/figures.md) cargo bench --locked --bench control --bench wire --bench rpc --bench recorder --bench verify
 
 # Starts every benchmark in a form of a few seconds, without optimization: to see that each still runs. Fails where a part
 # of one does not; its figures mean nothing.

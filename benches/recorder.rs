@@ -9,6 +9,7 @@ mod support;
 
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::process::ExitCode;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
@@ -21,7 +22,7 @@ use dimos::recording::replay::LogReader;
 use dimos::rpc::api::Status;
 use dimos::telemetry::describe::{ArmNames, Names};
 use dimos::telemetry::{ArmSample, Cause, Phase, Sample, TickSample};
-use support::measure::{quantile, verdict};
+use support::measure::{Goal, Measure, print};
 use support::run::{LiveRun, keep_moving};
 
 const ARMS: u16 = 4;
@@ -29,31 +30,37 @@ const PERIOD: u64 = 1_000_000;
 /// Messages a second, written and read.
 const GOAL: f64 = 500_000.0;
 
-fn main() {
+fn main() -> ExitCode {
     let effort = support::Effort::from_environment();
+    support::machine::print();
     let folder = tempfile::tempdir().expect("a temporary folder can be made");
     let log = folder.path().join("paced.mcap");
     let ticks = effort.of(3_000, 60_000);
     let (messages, dropped, _) = record(&log, ticks, true);
     let (size, seconds) = (std::fs::metadata(&log).map_or(0, |m| m.len()) as f64 / 1e6, ticks as f64 * 1e-3);
-    let verdict = if dropped == 0 { "met" } else { "missed" };
-    println!(
-        "{ARMS} arms at 1 kHz, {seconds:.0} s: {messages} messages, {size:.1} MB, {dropped} samples lost (goal 0: {verdict})"
-    );
+    let title = format!("{ARMS} arms at 1 kHz, {seconds:.0} s: {messages} messages, {size:.1} MB");
+    print(&title, &[Measure::new("samples lost", "", vec![dropped as f64]).goal(Goal::AtMost(0.0))]);
     let log = folder.path().join("fast.mcap");
     let (messages, dropped, took) = record(&log, effort.of(20_000, 200_000), false);
-    report("written", messages, took, &format!(", {dropped} lost"));
+    let written = messages as f64 / took.as_secs_f64();
     let began = Instant::now();
     let mut reader = LogReader::open(&log).expect("the log can be read");
     let read = std::iter::from_fn(|| reader.next_entry().expect("the log is whole")).map(std::hint::black_box).count();
-    report("decoded", read as u64, began.elapsed(), "");
-    if std::env::args().any(|a| a == "alone") {
-        return;
+    let decoded = read as f64 / began.elapsed().as_secs_f64();
+    print(
+        "as fast as possible",
+        &[
+            Measure::new("written", "messages/s", vec![written]).goal(Goal::AtLeast(GOAL)),
+            Measure::new("lost", "", vec![dropped as f64]).goal(Goal::AtMost(0.0)),
+            Measure::new("decoded", "messages/s", vec![decoded]).goal(Goal::AtLeast(GOAL)),
+        ],
+    );
+    if !std::env::args().any(|a| a == "alone")
+        && let Err(e) = beside_a_tick(effort)
+    {
+        support::empty(&e);
     }
-    if let Err(e) = beside_a_tick(effort) {
-        println!("FAILED: {e}");
-        std::process::exit(1);
-    }
+    effort.end()
 }
 
 /// Compares the lateness of the tick with and without a recorder, and counts what is lost in a long run.
@@ -70,18 +77,19 @@ fn beside_a_tick(effort: support::Effort) -> Result<(), String> {
         with.push(late[1]);
         ratios.push(late[1] / late[0]);
     }
-    let [without, with, ratio] = [without, with, ratios].map(|all| quantile(&all, 0.5));
-    println!(
-        "lateness of a tick of {ARMS} arms at 1 kHz, p99, medians of {pairs} pairs of {seconds} s: {with:.0} µs recorded, \
-         {without:.0} µs not; ratio {ratio:.2} (goal ≤ 1.10: {})",
-        verdict(ratio <= 1.1)
+    let title = format!("lateness of a tick of {ARMS} arms at 1 kHz, p99, {pairs} pairs of {seconds} s");
+    print(
+        &title,
+        &[
+            Measure::new("recorded", "µs", with),
+            Measure::new("not recorded", "µs", without),
+            Measure::new("ratio", "", ratios).goal(Goal::AtMost(1.1)),
+        ],
     );
     let seconds = effort.of(2, 600);
     let (_, messages, lost) = run(true, seconds)?;
-    println!(
-        "{ARMS} arms at 1 kHz beside the tick, {seconds} s: {messages} messages, {lost} samples lost (goal 0: {})",
-        verdict(lost == 0)
-    );
+    let title = format!("{ARMS} arms at 1 kHz beside the tick, {seconds} s: {messages} messages");
+    print(&title, &[Measure::new("samples lost", "", vec![lost as f64]).goal(Goal::AtMost(0.0))]);
     Ok(())
 }
 
@@ -104,15 +112,6 @@ fn run(recorded: bool, seconds: u64) -> Result<(f64, u64, u64), String> {
     let status = client.call(Status {}).map_err(|e| e.to_string())?;
     let (messages, lost) = status.recorder.map_or((0, 0), |recorder| (recorder.messages, recorder.dropped));
     run.end(|_| (status.ticks.lateness_us.p99, messages, lost))
-}
-
-fn report(what: &str, messages: u64, took: Duration, more: &str) {
-    let rate = messages as f64 / took.as_secs_f64();
-    let verdict = if rate >= GOAL { "met" } else { "missed" };
-    println!(
-        "{what}: {messages} messages in {:.2} s{more}: {rate:.0}/s (goal {GOAL:.0}: {verdict})",
-        took.as_secs_f64()
-    );
 }
 
 /// Records ticks, at their time or as fast as the recorder takes them. Returns messages, lost samples, and the time

@@ -8,6 +8,7 @@ mod virtual_run;
 #[allow(dead_code, reason = "shared with the other benchmarks")]
 mod support;
 
+use std::process::ExitCode;
 use std::time::Instant;
 
 use dimos::control::point_to_point::point_to_point;
@@ -16,22 +17,27 @@ use dimos::control::task_spec::TaskTable;
 use dimos::joint::{JointLimits, make_joints};
 use dimos::replay::verify::{Finding, verify};
 use dimos::telemetry::TaskState;
+use support::measure::{Goal, Measure};
 use virtual_run::{VirtualRun, one_arm};
 
 const GOAL: f64 = 200_000.0;
 
-fn main() {
+fn main() -> ExitCode {
+    let effort = support::Effort::from_environment();
+    support::machine::print();
     let folder = tempfile::tempdir().expect("a temporary folder can be made");
-    let ticks = support::Effort::from_environment().of(2_000, 60_000);
+    let ticks = effort.of(2_000, 60_000);
+    let mut measures = Vec::new();
     for dof in [6, 7] {
         let log = folder.path().join(format!("{dof}.mcap"));
         record(dof, ticks, &log);
         let size = std::fs::metadata(&log).map_or(0, |m| m.len()) as f64 / 1e6;
-        // The best of a few: the machine may be busy.
-        let best = (0..5).map(|_| ticks_per_second(&log)).fold(0.0, f64::max);
-        let verdict = if best >= GOAL { "met" } else { "missed" };
-        println!("verify, {dof} joints, {ticks} ticks, {size:.1} MB: {best:.0} ticks/s (goal {GOAL:.0}: {verdict})");
+        let rates = (0..5).map(|_| ticks_per_second(&log)).collect();
+        let what = format!("{dof} joints, {ticks} ticks, {size:.1} MB");
+        measures.push(Measure::new(what, "ticks/s", rates).goal(Goal::AtLeast(GOAL)));
     }
+    support::measure::print("dimos log verify", &measures);
+    effort.end()
 }
 
 fn ticks_per_second(log: &std::path::Path) -> f64 {

@@ -3,22 +3,37 @@
 use std::fs;
 use std::process::Command;
 
-/// Prints machine and versions.
-pub fn print() {
+/// Returns the processor and its cores.
+fn processor() -> String {
     let cpu = read("/proc/cpuinfo");
     let model = cpu.lines().find_map(|l| l.strip_prefix("model name")).map(|l| l.trim_start_matches([' ', '\t', ':']));
     let cores = std::thread::available_parallelism().map_or(0, usize::from);
-    let governor = read("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor");
     let virtual_machine = if cpu.contains(" hypervisor") { ", virtual machine" } else { "" };
+    format!("{}, {cores} cores{virtual_machine}", model.unwrap_or("unknown processor"))
+}
+
+fn date() -> String {
+    first_line("date", &["-u", "+%Y-%m-%d %H:%M UTC"]).unwrap_or_default()
+}
+
+/// Returns machine, version and date in a line.
+pub fn line() -> String {
+    let kernel = read("/proc/sys/kernel/osrelease");
+    format!("{}; kernel {}; dimos {}; {}", processor(), kernel.trim(), dimos::VERSION, date())
+}
+
+/// Prints machine and versions.
+pub fn print() {
+    let governor = read("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor");
     let preemption = if read("/sys/kernel/realtime").trim() == "1" { "PREEMPT_RT" } else { "no PREEMPT_RT" };
-    println!("machine   {}, {cores} cores{virtual_machine}", model.unwrap_or("unknown processor"));
+    println!("machine   {}", processor());
     println!("kernel    {}, {preemption}", read("/proc/sys/kernel/osrelease").trim());
     println!("governor  {}", if governor.is_empty() { "not readable" } else { governor.trim() });
     println!("load      {}", read("/proc/loadavg").trim());
     println!("dimos     {}", dimos::VERSION);
     println!("rustc     {}", first_line("rustc", &["--version"]).unwrap_or_else(|| "unknown".into()));
     println!("cyclictest  {}", cyclictest().unwrap_or_else(|| "none".into()));
-    println!("date      {}\n", first_line("date", &["-u", "+%Y-%m-%d %H:%M UTC"]).unwrap_or_default());
+    println!("date      {}\n", date());
 }
 
 /// Returns the version of cyclictest, if it is installed.

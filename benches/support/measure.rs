@@ -1,5 +1,7 @@
 //! Repeated figures, their goals, and their table.
 
+use super::{empty, figures};
+
 /// Goal of a figure.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Goal {
@@ -61,6 +63,8 @@ pub fn quantile(values: &[f64], q: f64) -> f64 {
 
 /// Prints figures with a title: median, p95 and p99 over the repeats, and the goal.
 pub fn print(title: &str, measures: &[Measure]) {
+    let without = |m: &&Measure| m.repeats.is_empty() || m.repeats.iter().any(|value| !value.is_finite());
+    measures.iter().filter(without).for_each(|m| empty(&format!("{title}: {}", m.what)));
     let head = ["", "median", "p95", "p99", "", "n", "goal", ""].map(str::to_owned);
     let rows = std::iter::once(head).chain(measures.iter().map(Measure::row)).map(Vec::from).collect();
     print_rows(title, rows);
@@ -69,6 +73,7 @@ pub fn print(title: &str, measures: &[Measure]) {
 /// Prints rows with a title, aligned: the first column left, the others right.
 pub fn print_rows(title: &str, rows: Vec<Vec<String>>) {
     println!("{title}");
+    figures::keep(title, &rows);
     let columns = rows.iter().map(Vec::len).max().unwrap_or_default();
     let width = |c: usize| rows.iter().filter_map(|r| r.get(c)).map(|v| v.chars().count()).max().unwrap_or_default();
     let widths: Vec<usize> = (0..columns).map(width).collect();

@@ -1,5 +1,6 @@
 //! Shared by the benchmarks: the machine, statistics, tables, a live run of the real binary.
 
+pub mod figures;
 pub mod machine;
 pub mod measure;
 pub mod process;
@@ -10,6 +11,14 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// Number of parts that could not be measured.
 static MISSING: AtomicUsize = AtomicUsize::new(0);
+/// Number of figures without a value.
+static EMPTY: AtomicUsize = AtomicUsize::new(0);
+
+/// Reports a figure without a value: nothing was measured, or no number. It fails the benchmark.
+pub fn empty(what: &str) {
+    println!("FAILED: {what} has no value");
+    EMPTY.fetch_add(1, Ordering::Relaxed);
+}
 
 /// Reports a part that could not be measured, and why; not for tools that are not installed.
 pub fn skipped(what: &str) {
@@ -31,9 +40,12 @@ impl Effort {
         Self { quick: asked || std::env::var_os("DIMOS_BENCH_QUICK").is_some_and(|v| v == "1") }
     }
 
-    /// Returns the exit code: no figure fails a benchmark, but the short form fails if a part did not run.
+    /// Returns the exit code: a missed goal fails no benchmark, but a figure without a value does, and in the short
+    /// form a part that did not run. Writes the figures of the long form where `DIMOS_FIGURES` says.
     pub fn end(self) -> ExitCode {
-        match self.quick && MISSING.load(Ordering::Relaxed) > 0 {
+        let missing = self.quick && MISSING.load(Ordering::Relaxed) > 0;
+        let written = self.quick || figures::write();
+        match missing || EMPTY.load(Ordering::Relaxed) > 0 || !written {
             true => ExitCode::FAILURE,
             false => ExitCode::SUCCESS,
         }

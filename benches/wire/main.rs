@@ -88,7 +88,10 @@ fn commands(effort: Effort) -> Result<(), String> {
         }
         print(
             &format!("from the tick's write to the bytes on the socket, {count} xArm 7 at {rate} Hz"),
-            &[Measure::new("p50", "µs", p50), Measure::new("p99", "µs", p99).goal(Goal::AtMost(goal))],
+            &[
+                Measure::new("p50", "µs", p50).goal(Goal::AtMost(100.0)),
+                Measure::new("p99", "µs", p99).goal(Goal::AtMost(goal)),
+            ],
         );
     }
     Ok(())
