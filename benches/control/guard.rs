@@ -15,7 +15,7 @@ use dimos::control::coordinator::{Coordinator, TickTime};
 use dimos::control::guard::GuardWorld;
 use dimos::control::request::{Envelope, Request};
 use dimos::joint::joints_of;
-use dimos::planning::planning_scene::{always_touch, whole};
+use dimos::planning::scene::planning_scene::{always_touch, whole};
 use dimos::robot::random::Random;
 use dimos::robot::{Source, load};
 use dimos::rt::host;

@@ -28,8 +28,8 @@ use std::time::{Duration, Instant};
 
 use clap::Parser;
 use dimos::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
-use dimos::planning::level::Level;
-use dimos::planning::path_planner::{Plan, PlanError, PlanSettings, plan};
+use dimos::planning::search::level::Level;
+use dimos::planning::search::path_planner::{Plan, PlanError, PlanSettings, plan};
 use dimos::planning::timing::{TimingSettings, bounds, time};
 use dimos_kernels::Width;
 use problems::{Arm, Problem, Shapes, load, packages};

@@ -5,8 +5,8 @@ use std::time::Instant;
 
 use dimos::collision::Stop;
 use dimos::planning::ik::{Ik, IkSettings};
+use dimos::planning::timing::topp::JointBound;
 use dimos::planning::timing::{TimingSettings, time};
-use dimos::planning::topp::JointBound;
 use dimos::robot::kinematics::Kinematics;
 use dimos::robot::model::RobotModel;
 use dimos::robot::random::Random;

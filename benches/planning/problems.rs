@@ -9,7 +9,7 @@ use std::sync::Arc;
 use dimos::collision::body::{MeshMode, solids};
 use dimos::collision::world::{Obstacle, Robot};
 use dimos::collision::{Scene, Solid, World};
-use dimos::planning::planning_scene::always_touch;
+use dimos::planning::scene::planning_scene::always_touch;
 use dimos::robot::Source;
 use dimos::robot::kinematics::Kinematics;
 use dimos::robot::model::{JointKind, RobotModel};

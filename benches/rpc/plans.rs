@@ -10,11 +10,11 @@ use std::time::{Duration, Instant};
 use dimos::blueprint::names;
 use dimos::collision::world::World;
 use dimos::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
-use dimos::planning::ahead::look_ahead;
-use dimos::planning::config::{ObjectConfig, ObjectShape};
-use dimos::planning::level::Level;
-use dimos::planning::pipeline::{Goal as PlanningGoal, PlanRequest, solve};
-use dimos::planning::planning_scene::{PlanningScene, obstacle};
+use dimos::planning::request::ahead::look_ahead;
+use dimos::planning::request::pipeline::{Goal as PlanningGoal, PlanRequest, solve};
+use dimos::planning::scene::config::{ObjectConfig, ObjectShape};
+use dimos::planning::scene::planning_scene::{PlanningScene, obstacle};
+use dimos::planning::search::level::Level;
 use dimos::robot::kinematics::pose;
 use dimos::robot::random::Random;
 use dimos::rpc::api::{

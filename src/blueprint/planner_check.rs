@@ -8,7 +8,7 @@ use crate::blueprint::resolve::Checker;
 use crate::blueprint::schema::{JointNames, TaskEntry};
 use dimos_control::task_body::TargetKind;
 use dimos_core::written;
-use dimos_planner::planning::config::MAX_OBJECTS;
+use dimos_planner::planning::scene::config::MAX_OBJECTS;
 use dimos_yaml::{Diag, Located, did_you_mean, quote};
 
 pub(super) fn check(

@@ -12,7 +12,9 @@ use crate::blueprint::planner_models::Described;
 use crate::blueprint::resolve::Checker;
 use dimos_core::pose;
 use dimos_core::written::ShapeSpec;
-use dimos_planner::planning::config::{GripperJoint, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig, Unplanned};
+use dimos_planner::planning::scene::config::{
+    GripperJoint, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig, Unplanned,
+};
 use dimos_robot::Source;
 use dimos_yaml::{Located, NodeId};
 

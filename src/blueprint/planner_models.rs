@@ -9,7 +9,7 @@ use crate::blueprint::planner::{PlannerEntry, RobotEntry, RobotJoints};
 use crate::blueprint::planner_files;
 use crate::blueprint::resolve::Checker;
 use dimos_core::written::{self, ShapeSpec};
-use dimos_planner::planning::config::{ObjectShape, PlannerConfig, RobotConfig, Unplanned};
+use dimos_planner::planning::scene::config::{ObjectShape, PlannerConfig, RobotConfig, Unplanned};
 use dimos_robot::model::{Joint, RobotModel};
 use dimos_robot::srdf::Semantics;
 use dimos_robot::urdf::VISUAL_NOT_FOUND;

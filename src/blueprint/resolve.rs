@@ -25,7 +25,7 @@ use dimos_core::joint::{JointLimits, LONGEST_NAME, may_be_in_name};
 use dimos_hardware::check::{LineShare, ToolFacts};
 use dimos_hardware::device::Setup;
 use dimos_hardware::registry::AdapterSpec;
-use dimos_planner::planning::config::PlannerConfig;
+use dimos_planner::planning::scene::config::PlannerConfig;
 use dimos_robot::Source;
 use dimos_yaml::{Diag, Located, Lost, NOWHERE, NodeId, Severity, Tree, quote};
 

@@ -14,7 +14,7 @@ use crate::blueprint::resolve::{Checker, Task, TaskRobot};
 use crate::blueprint::schema::TaskEntry;
 use crate::blueprint::task_pos::TaskPos;
 use dimos_control::task_robot::{FramePose, RobotParams, TaskKinematics};
-use dimos_planner::planning::config::{PlannerConfig, RobotConfig};
+use dimos_planner::planning::scene::config::{PlannerConfig, RobotConfig};
 use dimos_robot::kinematics::Kinematics;
 use dimos_robot::model::{Joint, JointKind, RobotModel};
 use dimos_robot::{Source, load};

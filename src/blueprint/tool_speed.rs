@@ -9,7 +9,7 @@ use crate::blueprint::schema::HardwareEntry;
 use crate::blueprint::task_robots::of_planner;
 use dimos_control::config::ToolLimit;
 use dimos_core::written;
-use dimos_planner::planning::config::PlannerConfig;
+use dimos_planner::planning::scene::config::PlannerConfig;
 use dimos_robot::builtin::PREFIX;
 use dimos_robot::{Source, load};
 use dimos_yaml::{Diag, Located};

@@ -19,7 +19,7 @@ use crate::runtime::kinematics::use_kept;
 use crate::runtime::{AttachedPlanner, Ending, LinkEvent};
 use crate::share::Relay;
 use crate::view::{self, Shown, View};
-use dimos_planner::planning::config::RobotConfig;
+use dimos_planner::planning::scene::config::RobotConfig;
 use dimos_rpc::api::{State, Status};
 use dimos_rpc::client::{self, Client, ClientError};
 use dimos_rpc::report::{ArmReport, StatusReport};

@@ -16,10 +16,10 @@ use crate::replay::recorded::RecordedError;
 use crate::replay::retrace::{Back, ON_PATH, Retrace, RetraceError, retrace};
 use dimos_core::trajectory::JointTrajectory;
 use dimos_log::replay::LogReader;
-use dimos_planner::planning::path::length;
-use dimos_planner::planning::thin::thin;
+use dimos_planner::planning::search::path::length;
+use dimos_planner::planning::search::thin::thin;
 use dimos_planner::planning::timing::time_within;
-use dimos_planner::planning::topp::JointBound;
+use dimos_planner::planning::timing::topp::JointBound;
 use dimos_rpc::api::{
     Execute, ExecutePlan, MAX_LINE, Motion, Plan, PlanGoal, Planner, Point, State, Status, Trajectory,
 };

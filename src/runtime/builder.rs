@@ -5,7 +5,7 @@ use crate::assets::{Cache, NoProgress};
 use crate::blueprint::{self, Catalog, FindError, Found, Loaded, Overrides, Source};
 use dimos_control::task_spec::{TaskSpec, TaskTable};
 use dimos_hardware::registry::{AdapterSpec, Registry};
-use dimos_planner::planning::planner_thread::Solver;
+use dimos_planner::planning::request::planner_thread::Solver;
 use dimos_rpc::run_dir::RunDir;
 
 /// A run that is not started yet. Settings that are not changed here come from the blueprint.

@@ -6,7 +6,7 @@ use super::planner_port::{PlannerPort, isometry, positions_of};
 use super::tcp::MAP;
 use super::world_requests::link_pose;
 use dimos_core::sync::lock;
-use dimos_planner::planning::planning_scene::PlannedRobot;
+use dimos_planner::planning::scene::planning_scene::PlannedRobot;
 use dimos_robot::kinematics::pose;
 use dimos_rpc::api::{Moment, PlanGoal};
 use dimos_rpc::{Code, RpcError};

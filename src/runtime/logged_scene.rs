@@ -13,7 +13,7 @@ use dimos_log::log_writer::LogAttachment;
 use dimos_log::messages::{Point, Pose, Quaternion, Vector3};
 use dimos_log::recorder::Note;
 use dimos_log::robots::{LoggedGripper, LoggedRobot, LoggedRobots};
-use dimos_planner::planning::planning_scene::PlannedRobot;
+use dimos_planner::planning::scene::planning_scene::PlannedRobot;
 use dimos_robot::kinematics::pose;
 use dimos_robot::load;
 use dimos_robot::model::{Geometry, RobotModel};

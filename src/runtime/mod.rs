@@ -84,7 +84,7 @@ use dimos_control::request::Request;
 use dimos_control::tick_loop::{Probe, Pulse};
 use dimos_core::sync::lock;
 use dimos_log::recorder::Recorder;
-use dimos_planner::planning::planner_thread::Solver;
+use dimos_planner::planning::request::planner_thread::Solver;
 use dimos_rpc::api::TextLines;
 use dimos_rpc::report::ArmReport;
 use dimos_rpc::run_dir::RunDir;

@@ -18,9 +18,9 @@ use dimos_core::sync::lock;
 use dimos_core::telemetry::{Origin, Outcome};
 use dimos_core::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
 use dimos_core::written;
-use dimos_planner::planning::joint_path::{JointPath, Outside};
+use dimos_planner::planning::request::joint_path::{JointPath, Outside};
 use dimos_planner::planning::timing::time_within;
-use dimos_planner::planning::topp::JointBound;
+use dimos_planner::planning::timing::topp::JointBound;
 use dimos_rpc::api::{self, Reply};
 use dimos_rpc::{Code, RpcError};
 

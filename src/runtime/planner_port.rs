@@ -13,11 +13,11 @@ use super::tcp::TcpModel;
 use super::world_requests::typed;
 use dimos_core::pose;
 use dimos_core::sync::lock;
-use dimos_planner::planning::config::{JointBounds, PlannerConfig};
-use dimos_planner::planning::pipeline::solve;
-use dimos_planner::planning::planner_thread::{PlannerThread, Solver};
-use dimos_planner::planning::planning_scene::PlanningScene;
-use dimos_planner::planning::unplanned_joints::Measured;
+use dimos_planner::planning::request::pipeline::solve;
+use dimos_planner::planning::request::planner_thread::{PlannerThread, Solver};
+use dimos_planner::planning::scene::config::{JointBounds, PlannerConfig};
+use dimos_planner::planning::scene::planning_scene::PlanningScene;
+use dimos_planner::planning::scene::unplanned_joints::Measured;
 use dimos_rpc::api::{
     ArmToolReply, ArmToolSet, CancelReply, CommandLimits, Moment, PoseSpec, RegisteredRobot, Reply, WorldObject,
 };
@@ -100,7 +100,7 @@ impl PlannerPort {
 
 /// Returns the robots of a planner, for its registration at a run.
 pub fn registered(setup: &PlanningScene) -> Vec<RegisteredRobot> {
-    let robot = |robot: &dimos_planner::planning::planning_scene::PlannedRobot| RegisteredRobot {
+    let robot = |robot: &dimos_planner::planning::scene::planning_scene::PlannedRobot| RegisteredRobot {
         name: robot.config.name.clone(),
         joints: robot.config.coordinator_joints.clone(),
         task: robot.config.task.clone(),

@@ -14,8 +14,8 @@ use dimos_control::request::Request;
 use dimos_core::sync::lock;
 use dimos_core::telemetry::TaskState;
 use dimos_planner::collision::Stop;
-use dimos_planner::planning::ahead::rests_before;
-use dimos_planner::planning::pipeline::PlannedMotion;
+use dimos_planner::planning::request::ahead::rests_before;
+use dimos_planner::planning::request::pipeline::PlannedMotion;
 use dimos_rpc::api::{BlockedReport, Moment, Recheck, RecheckReply};
 use dimos_rpc::{Code, RpcError};
 
@@ -55,8 +55,10 @@ impl PlannerPort {
         {
             released.1 = released.1.max(version);
         }
-        let report =
-            |b: dimos_planner::planning::ahead::Blocked| BlockedReport { free_until: b.free_until, what: b.what };
+        let report = |b: dimos_planner::planning::request::ahead::Blocked| BlockedReport {
+            free_until: b.free_until,
+            what: b.what,
+        };
         Ok(RecheckReply { blocked: blocked.map(report) })
     }
 }

@@ -12,7 +12,7 @@ use super::planner_port::{isometry, spec};
 use super::service::Service;
 use dimos_core::sync::lock;
 use dimos_log::tcp_log::TcpChain;
-use dimos_planner::planning::planning_scene::PlannedRobot;
+use dimos_planner::planning::scene::planning_scene::PlannedRobot;
 use dimos_robot::kinematics::{Kinematics, frame, pose};
 use dimos_rpc::api::{RegisteredFlange, RegisteredModel, RegisteredRobot};
 use dimos_rpc::report::{PoseReport, TcpReport, ToolReport};

@@ -10,8 +10,8 @@ use dimos_control::task_robot::FramePose;
 use dimos_core::joint::MAX_DOF;
 use dimos_core::telemetry::describe::Severity;
 use dimos_core::trajectory::JointTrajectory;
-use dimos_planner::planning::tool_timing::slowed;
-use dimos_planner::planning::topp::JointBound;
+use dimos_planner::planning::timing::tool_timing::slowed;
+use dimos_planner::planning::timing::topp::JointBound;
 use dimos_robot::kinematics::tool_speed::ToolSpeed;
 use dimos_rpc::RpcError;
 

@@ -13,8 +13,8 @@ use dimos_core::sync::lock;
 use dimos_planner::collision::pairs;
 use dimos_planner::collision::shape::Placed;
 use dimos_planner::collision::world::{Attached, Obstacle, World};
-use dimos_planner::planning::config::{MAX_OBJECTS, ObjectConfig, ObjectShape};
-use dimos_planner::planning::planning_scene::{PlannedRobot, obstacle};
+use dimos_planner::planning::scene::config::{MAX_OBJECTS, ObjectConfig, ObjectShape};
+use dimos_planner::planning::scene::planning_scene::{PlannedRobot, obstacle};
 use dimos_robot::kinematics::{frame, pose};
 use dimos_rpc::api::{self, AttachReply, Done, LoadReport, Moment, ShapeSpec, WorldObject};
 use dimos_rpc::{Code, RpcError};
@@ -251,8 +251,8 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
-    use dimos_planner::planning::config::{PlannerConfig, RobotConfig};
-    use dimos_planner::planning::planning_scene::PlanningScene;
+    use dimos_planner::planning::scene::config::{PlannerConfig, RobotConfig};
+    use dimos_planner::planning::scene::planning_scene::PlanningScene;
 
     /// A planner with the built-in robot and a ball in its world, and its present state.
     fn with_a_ball(at: [f64; 3]) -> (PlannerPort, Moment) {

@@ -5,7 +5,7 @@ use nalgebra::Isometry3;
 use crate::blueprint::{Blueprint, TaskRobot};
 use dimos_control::config::CoordinatorConfig;
 use dimos_core::joint::JointLimits;
-use dimos_planner::planning::config::{GripperJoint, RobotConfig};
+use dimos_planner::planning::scene::config::{GripperJoint, RobotConfig};
 use dimos_robot::Source;
 use dimos_rpc::report::{ArmReport, StateReport, StatusReport};
 

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use dimos::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
-use dimos::planning::path_planner::{PlanSettings, plan};
+use dimos::planning::search::path_planner::{PlanSettings, plan};
 use dimos::robot::builtin;
 use dimos::robot::model::JointKind;
 use dimos::robot::random::Random;

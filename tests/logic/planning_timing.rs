@@ -1,8 +1,8 @@
 //! Trajectories with jerk limits: measured sample by sample, as an arm gets them.
 
-use dimos::planning::path::{distance, tidy};
+use dimos::planning::search::path::{distance, tidy};
+use dimos::planning::timing::topp::JointBound;
 use dimos::planning::timing::{Timed, TimingSettings, time};
-use dimos::planning::topp::JointBound;
 use dimos::robot::random::Random;
 use dimos::trajectory::{Cursor, Sample, Spline};
 

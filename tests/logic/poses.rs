@@ -6,10 +6,10 @@ use std::time::{Duration, Instant};
 
 use dimos::blueprint::{self, Overrides, find, load};
 use dimos::collision::Stop;
-use dimos::planning::config::{JointBounds, PlannerConfig};
-use dimos::planning::level::Level;
-use dimos::planning::pipeline::{Goal, PlanFailure, PlanRequest, PlannedMotion, solve};
-use dimos::planning::planning_scene::{PlannedRobot, PlanningScene};
+use dimos::planning::request::pipeline::{Goal, PlanFailure, PlanRequest, PlannedMotion, solve};
+use dimos::planning::scene::config::{JointBounds, PlannerConfig};
+use dimos::planning::scene::planning_scene::{PlannedRobot, PlanningScene};
+use dimos::planning::search::level::Level;
 use dimos::pose::{from_xyz_rpy, to_xyz_rpy};
 use dimos::robot::kinematics::pose;
 use dimos::robot::random::Random;

@@ -15,7 +15,7 @@ use dimos::blueprint::{Overrides, find, load};
 use dimos::cli::exit::Exit;
 use dimos::clock::Mono;
 use dimos::joint::make_joints;
-use dimos::planning::planning_scene::PlanningScene;
+use dimos::planning::scene::planning_scene::PlanningScene;
 use dimos::recording::recorder::Note;
 use dimos::recording::robots::{LoggedRobot, LoggedRobots};
 use dimos::recording::tcp_log::TcpChain;

@@ -4,7 +4,7 @@
 use dimos::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
 use dimos::collision::{CollisionChecker, ExactChecker, Resolution};
 use dimos::hardware::registry::Emulator;
-use dimos::planning::planning_scene::{PlanningScene, obstacle};
+use dimos::planning::scene::planning_scene::{PlanningScene, obstacle};
 use dimos::rpc::api::{
     ExecutePlan, Move, Plan, PlanGoal, Planning, PoseSpec, Preview, ShapeSpec, WorldAdd, WorldObject, WorldRemove,
 };
@@ -80,9 +80,9 @@ impl Cell {
         for object in objects {
             let ShapeSpec::Sphere(radius) = object.shape else { unreachable!() };
             let [x, y, z] = object.pose.xyz;
-            let config = dimos::planning::config::ObjectConfig {
+            let config = dimos::planning::scene::config::ObjectConfig {
                 name: object.name.clone(),
-                shape: dimos::planning::config::ObjectShape::Sphere(radius),
+                shape: dimos::planning::scene::config::ObjectShape::Sphere(radius),
                 pose: nalgebra::Isometry3::translation(x, y, z),
                 padding: 0.0,
             };

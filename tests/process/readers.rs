@@ -9,7 +9,7 @@ use dimos::arm::{ArmCommand, ArmState, ControllerPose, Link, Pose, VelocitySourc
 use dimos::blueprint::{Overrides, find, load};
 use dimos::clock::{Mono, WallOffset};
 use dimos::joint::{ControlMode, joints_of, make_joints};
-use dimos::planning::planning_scene::{PlannedRobot, PlanningScene};
+use dimos::planning::scene::planning_scene::{PlannedRobot, PlanningScene};
 use dimos::recording::display_messages::{Marker, MarkerArray};
 use dimos::recording::log_writer::LogAttachment;
 use dimos::recording::notes::channel;

@@ -7,7 +7,7 @@ use dimos::collision::world::{Obstacle, Robot};
 use dimos::collision::{CollisionChecker, ExactChecker, OwnMargins, Resolution, Scene, Solid, World};
 use dimos::control::config::{ArmConfig, TaskConfig};
 use dimos::control::guard::GuardWorld;
-use dimos::planning::planning_scene::{always_touch, whole};
+use dimos::planning::scene::planning_scene::{always_touch, whole};
 use dimos::robot::{Source, load};
 use glamx::{DAffine3, DVec3};
 

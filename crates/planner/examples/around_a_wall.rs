@@ -1,9 +1,9 @@
 //! Plans a motion around a wall, and prints it as CSV: time [s], positions [rad].
 
 use dimos_planner::collision::Stop;
-use dimos_planner::planning::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
-use dimos_planner::planning::pipeline::{Goal, PlanRequest, solve};
-use dimos_planner::planning::planning_scene::PlanningScene;
+use dimos_planner::planning::request::pipeline::{Goal, PlanRequest, solve};
+use dimos_planner::planning::scene::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
+use dimos_planner::planning::scene::planning_scene::PlanningScene;
 use nalgebra::Isometry3;
 
 fn main() -> Result<(), String> {

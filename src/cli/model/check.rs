@@ -3,7 +3,7 @@
 use super::{File, has_mistakes};
 use crate::cli::exit::{Exit, Result};
 use crate::cli::output;
-use dimos_planner::planning::planning_scene::{always_touch, whole};
+use dimos_planner::planning::scene::planning_scene::{always_touch, whole};
 use dimos_robot::urdf::Meshes;
 use dimos_robot::{Loaded, RobotModel, judge};
 use dimos_yaml::{Diag, quote};

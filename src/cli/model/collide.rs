@@ -11,7 +11,7 @@ use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output::{self, Table};
 use dimos_planner::collision::world::World;
 use dimos_planner::collision::{ExactChecker, Resolution};
-use dimos_planner::planning::planning_scene::{always_touch, whole};
+use dimos_planner::planning::scene::planning_scene::{always_touch, whole};
 use dimos_robot::RobotModel;
 use dimos_robot::urdf::Meshes;
 

@@ -13,7 +13,7 @@ use crate::cli::output::{self, Table};
 use dimos_core::pose::from_xyz_rpy;
 use dimos_planner::collision::checker::Stop;
 use dimos_planner::planning::ik::{Ik, IkSettings};
-use dimos_planner::planning::path::distance;
+use dimos_planner::planning::search::path::distance;
 use dimos_robot::kinematics::{Kinematics, frame};
 use dimos_robot::urdf::Meshes;
 

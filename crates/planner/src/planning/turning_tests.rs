@@ -6,8 +6,8 @@ use std::sync::Arc;
 use glamx::{DAffine3, DVec3};
 
 use super::ik::{Ik, IkSettings};
-use super::path::{length, unwind};
-use super::path_planner::{Plan, PlanError, PlanSettings, plan};
+use super::search::path::{length, unwind};
+use super::search::path_planner::{Plan, PlanError, PlanSettings, plan};
 use super::timing::{TimingSettings, bounds, time};
 use crate::collision::body::{MeshMode, solids};
 use crate::collision::checker::{CollisionChecker, Resolution, Stop};

@@ -148,8 +148,8 @@ mod tests {
     use dimos_core::clock::Mono;
     use dimos_core::joint::{JointLimits, MAX_DOF};
     use dimos_hardware::sim::arm::{PLAYABLE, SimArm, SimOptions};
-    use dimos_planner::planning::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
-    use dimos_planner::planning::planning_scene::PlanningScene;
+    use dimos_planner::planning::scene::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
+    use dimos_planner::planning::scene::planning_scene::PlanningScene;
     use nalgebra::Isometry3;
 
     /// The arm beside the table of the template's blueprint.

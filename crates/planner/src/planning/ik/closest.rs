@@ -7,7 +7,7 @@ use glamx::DAffine3;
 
 use super::{Ik, IkFailure, IkSettings, settings_met};
 use crate::collision::checker::Stop;
-use crate::planning::path::distance;
+use crate::planning::search::path::distance;
 use dimos_robot::kinematics::jacobian::{cholesky, gram, solve as solve_gram};
 use dimos_robot::random::Random;
 

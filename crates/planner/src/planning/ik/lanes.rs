@@ -8,7 +8,7 @@ use glamx::DAffine3;
 
 use super::{Ik, IkSettings, PoseError, settings_met};
 use crate::collision::allowed_pairs::sample;
-use crate::planning::path::distance;
+use crate::planning::search::path::distance;
 use dimos_robot::kinematics::Kinematics;
 use dimos_robot::random::Random;
 

@@ -1,0 +1,249 @@
+//! From a request's goals to goal configurations.
+
+use super::ahead::describe_contact;
+use super::pipeline::{Goal, PlanFailure, Stage, late};
+use super::start_contact::{EscapePath, passes};
+use crate::collision::report::{Contact, Pair};
+use crate::collision::{CollisionChecker, Stop};
+use crate::planning::ik::cartesian::{LineSettings, straight_line};
+use crate::planning::ik::{Ik, IkSettings};
+use crate::planning::scene::padded::{Near, Padded};
+use crate::planning::scene::planning_scene::PlannedRobot;
+use crate::planning::search::level::Level;
+use crate::planning::search::path::{Path, between, distance, length, unwind};
+use crate::planning::search::path_planner::digits_outside;
+use dimos_robot::kinematics::frame;
+use dimos_robot::kinematics::step::rotation_between;
+use dimos_robot::model::JointKind;
+use glamx::DAffine3;
+
+/// Number of IK solutions to look for when one robot moves to a pose.
+const SOLUTIONS: usize = 8;
+/// Attempts to find them.
+const ATTEMPTS: usize = 3200;
+/// Tolerance of a pose goal [m, rad].
+const POSE_TOLERANCE: f64 = 1e-5;
+/// Distance [m] and rotation [rad] from the present pose within which a robot that is slightly outside its limits
+/// counts as being at a pose.
+const SAME_PLACE: f64 = 5e-4;
+const SAME_TURN: f64 = 1.7e-3;
+/// Largest distance outside the limits for that [rad]: as for the start of a plan.
+const LIMIT_TOLERANCE: f64 = 0.02;
+/// Configurations checked on the piece of a line that is not free, to find what blocks it.
+const BLOCK_SAMPLES: u32 = 100;
+/// Part of a straight line that counts as complete.
+const COMPLETE: f64 = 1.0 - 1e-9;
+
+/// Returns goal configurations of all moving robots, several for a pose goal. Those of one robot collide neither with
+/// itself nor with anything that is fixed, if any does not; otherwise the search reports what touches. Several moving
+/// robots may still collide with each other.
+pub(in crate::planning) fn configurations(
+    stage: &mut Stage<'_>,
+    wanted: &[(usize, Goal)],
+    seed: u64,
+    stop: &Stop,
+) -> Result<Path, PlanFailure> {
+    // One list of configurations per robot; a combination of one from each is a goal of all.
+    let mut all: Path = vec![Vec::new()];
+    let mut first = 0;
+    for (number, (robot, index)) in stage.robots.iter().zip(&stage.indices).enumerate() {
+        let own = stage.start.get(first..first + robot.joints.len()).unwrap_or_default().to_vec();
+        first += robot.joints.len();
+        let goal = wanted.iter().find(|(wanted, _)| wanted == index).map(|(_, goal)| goal);
+        let checker = stage.apart.get_mut(number).unwrap_or(&mut stage.checker);
+        let mut free = |q: &[f64], padded: bool| if padded { checker.is_free(q) } else { checker.touches_nothing(q) };
+        let several = match goal {
+            Some(Goal::Joints(values)) => {
+                // If the model's joint is continuous but the arm's range is limited, whole turns are the same goal.
+                let mut near = values.clone();
+                robot.body.kinematics.unwind(&mut near, &own, |kind| kind == JointKind::Continuous);
+                vec![near]
+            }
+            Some(Goal::Pose(pose)) => {
+                let settings = IkSettings { seed, ..reach() };
+                reached(robot, &frame(pose), &own, &settings, &mut free, stop)?
+            }
+            Some(Goal::Position(place)) => {
+                let target = DAffine3::from_translation(glamx::DVec3::new(place.x, place.y, place.z));
+                let settings = IkSettings { seed, position_only: true, ..reach() };
+                reached(robot, &target, &own, &settings, &mut free, stop)?
+            }
+            Some(Goal::Line(_) | Goal::Path(_) | Goal::Retrace(_)) | None => vec![own],
+        };
+        all = all.iter().flat_map(|before| several.iter().map(move |own| [&before[..], own].concat())).collect();
+        all.truncate(SOLUTIONS * SOLUTIONS);
+    }
+    Ok(all)
+}
+
+fn reach() -> IkSettings {
+    IkSettings {
+        position: POSE_TOLERANCE,
+        rotation: POSE_TOLERANCE,
+        attempts: ATTEMPTS,
+        solutions: SOLUTIONS,
+        ..IkSettings::default()
+    }
+}
+
+fn reached(
+    robot: &PlannedRobot,
+    target: &DAffine3,
+    near: &[f64],
+    settings: &IkSettings,
+    free: &mut impl FnMut(&[f64], bool) -> bool,
+    stop: &Stop,
+) -> Result<Path, PlanFailure> {
+    let in_root = robot.body.base.inverse() * *target;
+    let mut ik = Ik::new(&robot.body.kinematics, robot.tcp());
+    if let Some(own) = already_there(robot, &mut ik, &in_root, near, settings) {
+        return Ok(vec![own]);
+    }
+    // Those that keep the padding; otherwise those that touch nothing.
+    for padded in [true, false] {
+        if let Ok(several) = ik.solve(&in_root, near, settings, |q| free(q, padded), stop) {
+            return Ok(several);
+        }
+    }
+    ik.solve(&in_root, near, settings, |_| true, stop).map_err(|failure| {
+        if stop.is_cancelled() {
+            return PlanFailure::cancelled();
+        }
+        PlanFailure::new(format!("{}: {failure}", robot.config.name))
+            .hint(format!("the pose is that of {} in map [m, rad]", robot.config.tcp_name()))
+    })
+}
+
+/// Returns the present configuration if the robot is at the pose: a goal that needs no motion. Slightly outside its
+/// limits, its nearest configuration inside; another solution of the pose would be a large motion.
+fn already_there(
+    robot: &PlannedRobot,
+    ik: &mut Ik<'_>,
+    target: &DAffine3,
+    own: &[f64],
+    settings: &IkSettings,
+) -> Option<Vec<f64>> {
+    let inside: Vec<f64> = own.iter().zip(&robot.limits).map(|(q, l)| q.max(l.lower).min(l.upper)).collect();
+    let is_inside = inside == own;
+    let (far, turned) = if is_inside { (settings.position, settings.rotation) } else { (SAME_PLACE, SAME_TURN) };
+    let is_at = ik.pose(own);
+    let turn = rotation_between(&is_at.matrix3, &target.matrix3).length();
+    let there = is_at.translation.distance(target.translation) <= far && (settings.position_only || turn <= turned);
+    (there && (is_inside || distance(&inside, own) <= LIMIT_TOLERANCE)).then_some(inside)
+}
+
+/// Follows the straight line of the only moving robot's end effector as far as possible; returns the path and the part
+/// followed.
+pub(in crate::planning) fn line(
+    stage: &mut Stage<'_>,
+    target: &DAffine3,
+    stop: &Stop,
+) -> Result<(Path, f64), PlanFailure> {
+    let Some(robot) = stage.robots.first().copied() else { return Err(PlanFailure::new("no robot moves")) };
+    let in_root = robot.body.base.inverse() * *target;
+    let kinematics = robot.body.kinematics.clone();
+    let (checker, start) = (&mut stage.checker, stage.start.clone());
+    let contacts = checker.contacts(&start);
+    if let Some(contact) = contacts.first() {
+        return Err(PlanFailure::new(format!("the start collides: {contact}")));
+    }
+    // The end is known only after following the line.
+    let settings = LineSettings::default();
+    let ahead = straight_line(&kinematics, robot.tcp(), &start, &in_root, &settings, |_, _| true);
+    if let Some(goal) = ahead.path.last().filter(|_| ahead.fraction >= COMPLETE) {
+        checker.give_up(Near::Goal, goal);
+    }
+    let mut blocked = None;
+    let line = straight_line(&kinematics, robot.tcp(), &start, &in_root, &settings, |a, b| {
+        let free = checker.motion_is_free(a, b, stop);
+        if !free {
+            blocked = Some([a.to_vec(), b.to_vec()]);
+        }
+        free
+    });
+    if line.fraction >= COMPLETE {
+        return Ok((line.path, 1.0));
+    }
+    if let Some(failure) = late(stop) {
+        return Err(failure);
+    }
+    let mut ik = Ik::new(&kinematics, robot.tcp());
+    let contact = blocked.and_then(|[a, b]| describe_block(checker, &mut ik, (&a, &b), &ahead.path, &in_root));
+    let reason = line.shortfall.map_or_else(String::new, |shortfall| format!(": {shortfall}"));
+    let reason = contact.map_or(reason, |contact| format!(": {contact}"));
+    let part = 100.0 * line.fraction;
+    Err(PlanFailure::new(format!("only {part:.1} % of the straight line is possible{reason}"))
+        .hint("omit --linear (in a waypoint: line:) for any collision-free path, or choose a closer pose"))
+}
+
+/// Follows given configurations straight in joint space, from the stage's start; fails where they are blocked.
+pub(in crate::planning) fn follow(stage: &mut Stage<'_>, given: &Path, stop: &Stop) -> Result<Path, PlanFailure> {
+    let mut path = vec![stage.start.clone()];
+    path.extend(given.iter().cloned());
+    let checker = &mut stage.checker;
+    let turns = checker.turns().to_vec();
+    for k in 1..path.len() {
+        let (before, rest) = path.split_at_mut(k);
+        if let (Some(before), Some(q)) = (before.last(), rest.first_mut()) {
+            unwind(q, before, &turns);
+        }
+    }
+    if let Some(goal) = path.last() {
+        checker.give_up(Near::Goal, goal);
+    }
+    let escape_path = EscapePath::of(checker, &path);
+    let mut q = stage.start.clone();
+    for (k, pair) in path.windows(2).enumerate() {
+        let [a, b] = pair else { continue };
+        if passes(checker, Level::Certified, escape_path.as_ref(), (a, b), stop) {
+            continue;
+        }
+        if let Some(failure) = late(stop) {
+            return Err(failure);
+        }
+        let contact = (0..=BLOCK_SAMPLES).find_map(|k| {
+            between(a, b, f64::from(k) / f64::from(BLOCK_SAMPLES), &mut q);
+            checker.contacts(&q).into_iter().next()
+        });
+        let what = contact.map_or_else(String::new, |c| format!(": {}", describe_contact(&c, checker.padding())));
+        let (free, whole) = (length(path.get(..=k).unwrap_or_default()), length(&path));
+        return Err(PlanFailure::new(format!("the path is blocked after {free:.3} of {whole:.3} rad{what}"))
+            .hint("correct the world, or plan a motion around it: `dimos move`"));
+    }
+    Ok(path)
+}
+
+/// Returns where on a line which pair blocks it, and how close or deep that pair would get on the whole line: `blocked`
+/// is the piece that is not free, `whole` the line without regard to collisions.
+fn describe_block(
+    checker: &mut Padded,
+    ik: &mut Ik<'_>,
+    (a, b): (&[f64], &[f64]),
+    whole: &Path,
+    target: &DAffine3,
+) -> Option<String> {
+    let mut q = a.to_vec();
+    let first = (0..=BLOCK_SAMPLES).find_map(|k| {
+        between(a, b, f64::from(k) / f64::from(BLOCK_SAMPLES), &mut q);
+        checker.contacts(&q).into_iter().next()
+    })?;
+    let start = ik.pose(whole.first()?).translation;
+    let (along, length) = (ik.pose(&q).translation.distance(start), target.translation.distance(start));
+    let of_pair = |contact: &Contact| contact.pair == first.pair;
+    let mut least = first.distance;
+    for q in whole {
+        least = checker.contacts(q).iter().filter(|contact| of_pair(contact)).fold(least, |d, c| d.min(c.distance));
+    }
+    let kind = if matches!(first.pair, Pair::Links(..)) { "link" } else { "obstacle" };
+    let place = if length > 1e-3 { format!("after {along:.3} of {length:.3} m ") } else { String::new() };
+    let (link, other) = (&first.link, &first.other);
+    let closest = match least {
+        least if least > 0.0 => {
+            let padding = checker.padding();
+            let digits = digits_outside(least, padding, f64::INFINITY);
+            format!("within {least:.digits$} m (padding {padding:.digits$} m)")
+        }
+        least => format!("{:.4} m deep", -least),
+    };
+    Some(format!("{place}link {link:?} would come too close to {kind} {other:?}, on the whole line {closest}"))
+}

@@ -1,0 +1,13 @@
+//! A request from its goals to a verified trajectory, and the thread that plans.
+
+pub mod ahead;
+pub(in crate::planning) mod goals;
+pub mod joint_path;
+pub(in crate::planning) mod legs;
+pub mod pipeline;
+pub mod planner_thread;
+pub mod revalidate;
+pub mod start_contact;
+
+#[cfg(test)]
+mod request_tests;
