@@ -15,7 +15,7 @@ use super::run::Args;
 use super::run_record::RunRecord;
 use super::text_log::Terminal;
 use crate::blueprint::Blueprint;
-use crate::runtime::kinematics::use_kept;
+use crate::runtime::tool::kinematics::use_kept;
 use crate::runtime::{AttachedPlanner, Ending, LinkEvent};
 use crate::share::Relay;
 use crate::view::{self, Shown, View};

@@ -9,7 +9,7 @@ use super::exit::{Exit, Failure, Result};
 use super::output::{self, Table};
 use super::{banner, fetch};
 use crate::blueprint::{self, Catalog, Limit, Loaded, OnExit, Overrides, Summary};
-use crate::runtime::device_lock;
+use crate::runtime::arm::device_lock;
 use crate::share;
 use dimos_core::message::Message;
 use dimos_rpc::RpcError;

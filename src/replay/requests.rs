@@ -1,4 +1,4 @@
-//! Converts logged requests back to requests: the inverse of `runtime::dispatch`.
+//! Converts logged requests back to requests: the inverse of `runtime::client::dispatch`.
 
 use serde::{Deserialize, Deserializer};
 

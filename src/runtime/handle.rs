@@ -3,8 +3,9 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use super::client::in_process;
 use super::service::Service;
-use super::{in_process, watchdog};
+use super::watchdog;
 use dimos_rpc::api::{
     ArmDisable, ArmEnable, ArmReply, ArmReset, Backend, Cancel, CancelReply, Execute, ExecuteReply, Grip, GripReport,
     Gripper, Method, Move, MoveReply, Servo, Stop, StopReply, Trajectory, Velocity,
@@ -22,13 +23,13 @@ const POLL_PERIOD: Duration = Duration::from_millis(10);
 /// call them in async code.
 #[derive(Clone)]
 pub struct Handle {
-    pub(super) service: Arc<Service>,
+    pub(in crate::runtime) service: Arc<Service>,
     /// The epoch of its requests; `None`: that in which each is made.
     epoch: Option<u64>,
 }
 
 impl Handle {
-    pub(super) fn new(service: Arc<Service>) -> Self {
+    pub(in crate::runtime) fn new(service: Arc<Service>) -> Self {
         Self { service, epoch: None }
     }
 

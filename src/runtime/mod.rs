@@ -8,59 +8,21 @@
 
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::unreachable))]
 
-mod arm_requests;
-mod arms;
-mod asker;
-mod attached;
+pub(crate) mod arm;
 mod builder;
-mod chunk_requests;
-mod control_config;
-pub(crate) mod device_lock;
-mod dispatch;
-mod faces;
-mod goal_frames;
-mod grip_judge;
-mod gripper_requests;
-mod gripper_targets;
-mod guard_worlds;
+mod client;
+mod gripper;
 mod handle;
-mod in_process;
-pub mod kept_kinematics;
-pub mod kinematics;
-mod late_stops;
-mod lead_requests;
-mod lease_changes;
-mod log_file;
-mod log_throttle;
-mod logged_scene;
-mod model_check;
-mod model_requests;
-mod motion_requests;
-mod motions;
-mod park;
-mod part_requests;
-mod payloads;
-mod plan_requests;
-mod planner_link;
-mod planner_port;
-mod recheck;
-mod replan;
-mod reports;
-mod saved_poses;
-mod serial_locks;
+mod log;
+mod motion;
+mod plan;
 mod service;
 mod service_manager;
 mod start;
-mod stream_requests;
-mod tcp;
 mod tick;
 mod tick_source;
-mod tool_requests;
-mod tool_speed;
-mod waiting;
+pub mod tool;
 mod watchdog;
-mod wires;
-mod world_requests;
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -68,17 +30,18 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender};
 use std::time::{Duration, Instant};
 
-pub use attached::{AttachedPlanner, LinkEvent};
+pub use arm::device_lock::DeviceLockError;
 pub use builder::Builder;
-pub use device_lock::DeviceLockError;
-pub use dispatch::log_of;
+pub use client::dispatch::log_of;
 pub use handle::Handle;
-pub use service_manager::ServiceManager;
+pub use plan::attached::{AttachedPlanner, LinkEvent};
 #[cfg(feature = "view")]
-pub(crate) use world_requests::typed as world_object;
+pub(crate) use plan::world_requests::typed as world_object;
+pub use service_manager::ServiceManager;
 
 use crate::view::View;
-use arms::Arms;
+use arm::arms::Arms;
+use client::dispatch::{Dispatcher, OutcomeThread};
 use dimos_control::config::CoordinatorConfig;
 use dimos_control::request::Request;
 use dimos_control::tick_loop::{Probe, Pulse};
@@ -90,7 +53,6 @@ use dimos_rpc::report::ArmReport;
 use dimos_rpc::run_dir::RunDir;
 use dimos_rpc::server::Server;
 use dimos_rt::host::LatencyHold;
-use dispatch::{Dispatcher, OutcomeThread};
 use tick::Tick;
 use watchdog::Watchdog;
 
@@ -383,6 +345,6 @@ impl Run {
             let rests = still_since.elapsed() >= STILL_FOR.max(2 * service.period());
             (rests || !tick.is_alive()).then_some(rests)
         };
-        in_process::wait_for(service.until(Instant::now() + REST_LIMIT, look)).flatten() == Some(true)
+        client::in_process::wait_for(service.until(Instant::now() + REST_LIMIT, look)).flatten() == Some(true)
     }
 }

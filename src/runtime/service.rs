@@ -10,22 +10,22 @@ use std::time::{Duration, Instant};
 use nalgebra::Isometry3;
 
 use super::Ending;
-use super::asker::asked_by;
-use super::dispatch::{Dispatcher, SendError, log_of};
-use super::gripper_requests::LatestGrip;
-use super::gripper_targets::{Counters, GripperTargets};
-use super::guard_worlds::GuardWorlds;
-use super::late_stops::LateStops;
-use super::lease_changes::UnsentEnds;
-use super::log_throttle::LogThrottle;
-use super::logged_scene::{Described, LoggedWorld};
-use super::model_check::Checked;
-use super::motions::Motions;
-use super::payloads::HeldLoads;
-use super::planner_link::Attached;
-use super::planner_port::PlannerPort;
-use super::serial_locks::SerialLocks;
-use super::waiting::Progress;
+use super::arm::late_stops::LateStops;
+use super::arm::model_check::Checked;
+use super::arm::serial_locks::SerialLocks;
+use super::client::asker::asked_by;
+use super::client::dispatch::{Dispatcher, SendError, log_of};
+use super::client::lease_changes::UnsentEnds;
+use super::client::waiting::Progress;
+use super::gripper::gripper_requests::LatestGrip;
+use super::gripper::gripper_targets::{Counters, GripperTargets};
+use super::log::log_throttle::LogThrottle;
+use super::log::logged_scene::{Described, LoggedWorld};
+use super::motion::motions::Motions;
+use super::plan::guard_worlds::GuardWorlds;
+use super::plan::planner_link::Attached;
+use super::plan::planner_port::PlannerPort;
+use super::tool::payloads::HeldLoads;
 use crate::blueprint::Blueprint;
 use dimos_control::config::CoordinatorConfig;
 use dimos_control::request::Request;
@@ -79,55 +79,55 @@ pub struct ServiceParts {
 
 /// The run, for its clients.
 pub struct Service {
-    pub(super) parts: ServiceParts,
-    pub(super) started: Instant,
-    pub(super) motions: Mutex<Motions>,
-    pub(super) recorder: OnceLock<Arc<RecorderStats>>,
+    pub(in crate::runtime) parts: ServiceParts,
+    pub(in crate::runtime) started: Instant,
+    pub(in crate::runtime) motions: Mutex<Motions>,
+    pub(in crate::runtime) recorder: OnceLock<Arc<RecorderStats>>,
     /// The logs of faults, of a run that is not recorded.
-    pub(super) fault_logs: Mutex<Vec<PathBuf>>,
+    pub(in crate::runtime) fault_logs: Mutex<Vec<PathBuf>>,
     /// Address of the live view.
-    pub(super) view: OnceLock<String>,
+    pub(in crate::runtime) view: OnceLock<String>,
     /// The arms' tool centre points, for the log.
-    pub(super) logged_tcps: TcpChains,
+    pub(in crate::runtime) logged_tcps: TcpChains,
     /// The robots with their names in the run.
-    pub(super) described: OnceLock<Described>,
+    pub(in crate::runtime) described: OnceLock<Described>,
     /// The objects of the world, as logged.
-    pub(super) logged_world: Mutex<LoggedWorld>,
-    pub(super) log_throttle: LogThrottle,
-    pub(super) late_stops: LateStops,
-    pub(super) unsent_ends: UnsentEnds,
+    pub(in crate::runtime) logged_world: Mutex<LoggedWorld>,
+    pub(in crate::runtime) log_throttle: LogThrottle,
+    pub(in crate::runtime) late_stops: LateStops,
+    pub(in crate::runtime) unsent_ends: UnsentEnds,
     /// Per arm, the number of stops that clients have ordered.
-    pub(super) stops: Vec<AtomicU64>,
-    pub(super) progress: Progress,
+    pub(in crate::runtime) stops: Vec<AtomicU64>,
+    pub(in crate::runtime) progress: Progress,
     /// One gripper order per arm at a time, so that each gets its own answer.
-    pub(super) grippers: Vec<tokio::sync::Mutex<()>>,
+    pub(in crate::runtime) grippers: Vec<tokio::sync::Mutex<()>>,
     /// Per arm, whether its own controller moves it.
-    pub(super) natives: Vec<AtomicBool>,
+    pub(in crate::runtime) natives: Vec<AtomicBool>,
     /// Per arm, the latest gripper command.
-    pub(super) grips: Vec<Mutex<LatestGrip>>,
+    pub(in crate::runtime) grips: Vec<Mutex<LatestGrip>>,
     /// Per arm, the gripper targets of streams.
-    pub(super) gripper_targets: Vec<Mutex<GripperTargets>>,
+    pub(in crate::runtime) gripper_targets: Vec<Mutex<GripperTargets>>,
     /// Per task, what its streams sent.
-    pub(super) counters: Vec<Counters>,
+    pub(in crate::runtime) counters: Vec<Counters>,
     /// Per arm, the numbers of the slowly changing values that were logged last.
-    pub(super) details_logged: Mutex<Vec<Details>>,
+    pub(in crate::runtime) details_logged: Mutex<Vec<Details>>,
     /// Per arm, the objects that it holds and whose mass is known. Locked while a load is set.
-    pub(super) held_loads: Vec<tokio::sync::Mutex<HeldLoads>>,
+    pub(in crate::runtime) held_loads: Vec<tokio::sync::Mutex<HeldLoads>>,
     /// Number of ticks when the joint state was last published.
-    pub(super) published: AtomicU64,
+    pub(in crate::runtime) published: AtomicU64,
     /// Per arm, where model and controller have the flange.
-    pub(super) checks: Mutex<Vec<Checked>>,
+    pub(in crate::runtime) checks: Mutex<Vec<Checked>>,
     /// The attached planner, also after it disconnected.
-    pub(super) attached: Mutex<Option<Arc<Attached>>>,
+    pub(in crate::runtime) attached: Mutex<Option<Arc<Attached>>>,
     /// The last executed plan, and its motion.
-    pub(super) executed: Mutex<Option<(u64, u64)>>,
+    pub(in crate::runtime) executed: Mutex<Option<(u64, u64)>>,
     /// Per task, the tool of its end effector.
-    pub(super) task_tools: Mutex<Vec<Option<Isometry3<f64>>>>,
+    pub(in crate::runtime) task_tools: Mutex<Vec<Option<Isometry3<f64>>>>,
     /// Per task, whether a client has sent it a target since its stream was last ended for a motion.
-    pub(super) streamed: Vec<AtomicBool>,
+    pub(in crate::runtime) streamed: Vec<AtomicBool>,
     /// Requests of plans, by the plans' numbers.
-    pub(super) plan_requests: Mutex<BTreeMap<u64, (api::Plan, Origin)>>,
-    pub(super) me: Weak<Self>,
+    pub(in crate::runtime) plan_requests: Mutex<BTreeMap<u64, (api::Plan, Origin)>>,
+    pub(in crate::runtime) me: Weak<Self>,
     closed: AtomicBool,
     /// Whether the tick still runs: stops are accepted although the run is closed.
     stoppable: AtomicBool,
@@ -216,7 +216,7 @@ impl Service {
     }
 
     /// Returns the latest sample of an arm.
-    pub(super) fn arm_view(&self, arm: usize) -> Option<ArmSample> {
+    pub(in crate::runtime) fn arm_view(&self, arm: usize) -> Option<ArmSample> {
         lock(&self.parts.arm_views).get_mut(arm).map(SlotReader::read)
     }
 
@@ -227,7 +227,7 @@ impl Service {
         views.iter_mut().map(SlotReader::read).all(|view| view.state.link != Link::Up || still(&view.state))
     }
 
-    pub(super) fn task_view(&self, task: usize) -> TaskView {
+    pub(in crate::runtime) fn task_view(&self, task: usize) -> TaskView {
         lock(&self.parts.task_views).get_mut(task).map(SlotReader::read).unwrap_or_default()
     }
 
@@ -260,7 +260,7 @@ impl Service {
     }
 
     /// Returns the measured positions of all joints [rad].
-    pub(super) fn positions(&self) -> Vec<f64> {
+    pub(in crate::runtime) fn positions(&self) -> Vec<f64> {
         let dofs = self.parts.config.arms.iter().map(|a| a.dof);
         let mut all = Vec::new();
         for (arm, dof) in dofs.enumerate() {
@@ -270,7 +270,7 @@ impl Service {
         all
     }
 
-    pub(super) fn arm_index(&self, id: &str) -> Result<u16, RpcError> {
+    pub(in crate::runtime) fn arm_index(&self, id: &str) -> Result<u16, RpcError> {
         let ids: Vec<&str> = self.parts.config.arms.iter().map(|a| a.name.as_str()).collect();
         match ids.iter().position(|a| *a == id) {
             Some(i) => Ok(i as u16),
@@ -278,7 +278,7 @@ impl Service {
         }
     }
 
-    pub(super) fn task_index(&self, name: &str) -> Result<u16, RpcError> {
+    pub(in crate::runtime) fn task_index(&self, name: &str) -> Result<u16, RpcError> {
         match self.parts.names.tasks.iter().position(|t| t == name) {
             Some(i) => Ok(i as u16),
             None => Err(RpcError::unknown(Code::UnknownTask, "task", name, &self.parts.names.tasks)),
@@ -286,31 +286,35 @@ impl Service {
     }
 
     /// Returns the indices of an arm's joints over all arms.
-    pub(super) fn joints_of_arm(&self, arm: u16) -> std::ops::Range<u16> {
+    pub(in crate::runtime) fn joints_of_arm(&self, arm: u16) -> std::ops::Range<u16> {
         let dofs = || self.parts.config.arms.iter().map(|a| a.dof as u16);
         let first = dofs().take(arm as usize).sum();
         first..first + dofs().nth(arm as usize).unwrap_or(0)
     }
 
     /// Asks something that moves no arm.
-    pub(super) async fn ask(&self, request: Request) -> Result<Outcome, RpcError> {
+    pub(in crate::runtime) async fn ask(&self, request: Request) -> Result<Outcome, RpcError> {
         self.ask_from(request, None).await
     }
 
     /// Asks something that a client requested, when and by whom.
-    pub(super) async fn ask_from(&self, request: Request, origin: Option<Origin>) -> Result<Outcome, RpcError> {
+    pub(in crate::runtime) async fn ask_from(
+        &self,
+        request: Request,
+        origin: Option<Origin>,
+    ) -> Result<Outcome, RpcError> {
         let log = log_of(&request);
         self.outcome(self.parts.dispatcher.ask(request, origin, log).await)
     }
 
     /// Returns the outcome of a request, or an error if there is none.
-    pub(super) fn outcome(&self, answer: Result<Outcome, SendError>) -> Result<Outcome, RpcError> {
+    pub(in crate::runtime) fn outcome(&self, answer: Result<Outcome, SendError>) -> Result<Outcome, RpcError> {
         let outcome = answer.map_err(|e| self.not_sent(e))?;
         self.refusal(&outcome).map_or(Ok(outcome), Err)
     }
 
     /// Returns why a request got no outcome as an error.
-    pub(super) fn not_sent(&self, error: SendError) -> RpcError {
+    pub(in crate::runtime) fn not_sent(&self, error: SendError) -> RpcError {
         let hint = match error {
             SendError::Full => "send fewer requests at once",
             SendError::NoAnswer => "`dimos status` shows whether the run is alive",
@@ -319,7 +323,7 @@ impl Service {
     }
 
     /// Returns the arm of a joint, and the joint's index in the arm.
-    pub(super) fn locate(&self, joint: u16) -> Option<(usize, usize)> {
+    pub(in crate::runtime) fn locate(&self, joint: u16) -> Option<(usize, usize)> {
         let mut left = joint as usize;
         for (i, arm) in self.parts.config.arms.iter().enumerate() {
             if left < arm.dof {
@@ -365,7 +369,7 @@ impl Service {
         Ok(self.speed_override())
     }
 
-    pub(super) async fn answer(&self, call: Call, origin: Origin) -> Result<Reply, RpcError> {
+    pub(in crate::runtime) async fn answer(&self, call: Call, origin: Origin) -> Result<Reply, RpcError> {
         let reads =
             matches!(call, Call::Status(_) | Call::State(_) | Call::TextLog(_) | Call::Motion(_) | Call::Grip(_));
         if !reads && self.is_closed() {
@@ -439,7 +443,7 @@ impl Service {
         }
     }
 
-    pub(super) fn now(&self) -> Mono {
+    pub(in crate::runtime) fn now(&self) -> Mono {
         dimos_core::clock::Clock::now(&dimos_core::clock::MonotonicClock)
     }
 }
@@ -518,6 +522,6 @@ impl Backend for Service {
     }
 }
 
-pub(super) fn internal() -> RpcError {
+pub(in crate::runtime) fn internal() -> RpcError {
     RpcError::new(Code::Internal, "an arm of this run is not there: a defect of the program")
 }

@@ -14,22 +14,23 @@ use std::sync::mpsc::{Sender, channel};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use super::arms::{self, Arms, BroughtUp, Slots, full_address};
-use super::control_config::{coordinator_config, names_of, tasks, tools};
-use super::device_lock::is_this_computer;
-use super::dispatch::{Dispatcher, OutcomeThread};
-use super::guard_worlds::{GuardEnds, GuardWorlds};
-use super::kinematics::{self, Known};
-use super::log_file::{attachments, log_device_note, log_path, metadata, no_log, retain, storage};
-use super::planner_link::command_limits;
-use super::planner_port::PlannerPort;
+use super::arm::arms::{self, Arms, BroughtUp, Slots, full_address};
+use super::arm::control_config::{coordinator_config, names_of, tasks, tools};
+use super::arm::device_lock::is_this_computer;
+use super::arm::wires::wires;
+use super::client::dispatch::{Dispatcher, OutcomeThread};
+use super::client::in_process;
+use super::log::log_file::{attachments, log_device_note, log_path, metadata, no_log, retain, storage};
+use super::plan::guard_worlds::{GuardEnds, GuardWorlds};
+use super::plan::planner_link::command_limits;
+use super::plan::planner_port::PlannerPort;
 use super::service::{Service, ServiceParts};
 use super::service_manager::ServiceManager;
 use super::tick::Tick;
 use super::tick_source::source;
+use super::tool::kinematics::{self, Known};
 use super::watchdog::Watchdog;
-use super::wires::wires;
-use super::{Ending, Handle, Options, Run, StartError, in_process};
+use super::{Ending, Handle, Options, Run, StartError};
 use crate::blueprint::Blueprint;
 use crate::view::{self, Shown, View};
 use dimos_control::config::{CoordinatorConfig, TaskConfig};
@@ -359,7 +360,7 @@ fn wrong_model(what: String) -> StartError {
 }
 
 /// Loads the planner's robots and logs warnings about them.
-pub(super) fn robots(config: &PlannerConfig) -> Result<PlanningScene, StartError> {
+pub(in crate::runtime) fn robots(config: &PlannerConfig) -> Result<PlanningScene, StartError> {
     let setup = PlanningScene::load(config).map_err(wrong_model)?;
     for (robot, [a, b]) in &setup.always_touching {
         tracing::warn!(

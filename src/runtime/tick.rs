@@ -22,7 +22,7 @@ const END_LIMIT: Duration = Duration::from_millis(300);
 const POLL_PERIOD: Duration = Duration::from_millis(1);
 
 /// The running tick. Ends when dropped.
-pub(super) struct Tick {
+pub(in crate::runtime) struct Tick {
     pulse: Arc<Pulse>,
     period: Duration,
     thread: Option<JoinHandle<()>>,

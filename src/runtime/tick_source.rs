@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::StartError;
-use super::arms::Arms;
+use super::arm::arms::Arms;
 use crate::blueprint::{Blueprint, TickClock};
 use dimos_control::pace::Source;
 use dimos_hardware::device::Connected;
@@ -13,7 +13,7 @@ const MAX_RATIO: f64 = 100.0;
 
 /// Returns the source of the ticks. An arm that cannot clock them is an error: it must stream its state,
 /// at the tick's rate or a multiple of it.
-pub(super) fn source<'a>(
+pub(in crate::runtime) fn source<'a>(
     blueprint: &Blueprint,
     arms: &mut Arms,
     connected: impl IntoIterator<Item = &'a Connected>,

@@ -15,7 +15,7 @@ use super::super::output;
 use super::choice::{Choice, not_started};
 use super::first_day;
 use super::report::{Arm, Limits, Report, Row};
-use crate::runtime::device_lock::{self, DeviceLock};
+use crate::runtime::arm::device_lock::{self, DeviceLock};
 use dimos_core::joint::ControlMode;
 use dimos_hardware::adapter::{AdapterError, ManipulatorAdapter, ManipulatorInfo};
 use dimos_hardware::conformance::lag::Lag;

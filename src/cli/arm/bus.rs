@@ -7,7 +7,7 @@ use super::super::ask;
 use super::super::exit::{Exit, Failure, Result};
 use super::super::follow::Signals;
 use super::super::output;
-use crate::runtime::device_lock::{self, DeviceLock};
+use crate::runtime::arm::device_lock::{self, DeviceLock};
 use dimos_hardware::adapter::AdapterError;
 use dimos_hardware::registry::{AdapterSpec, Registry};
 use dimos_hardware::service::{OpenService, Service};

@@ -7,7 +7,7 @@ use super::super::arguments::Target;
 use super::super::exit::{Exit, Failure, Result};
 use super::super::output::{self, Table, fixed};
 use super::bus;
-use crate::runtime::kept_kinematics::{self, KeptKinematics};
+use crate::runtime::tool::kept_kinematics::{self, KeptKinematics};
 use dimos_core::arm::Dh;
 use dimos_hardware::registry::Registry;
 use dimos_rpc::api::Status;

@@ -13,7 +13,7 @@ use super::super::model::chain::end_of_arm;
 use super::super::model::{self, With};
 use super::super::output;
 use crate::blueprint::{Blueprint, Catalog, Overrides, Summary};
-use crate::runtime::kinematics::use_kept;
+use crate::runtime::tool::kinematics::use_kept;
 use crate::runtime::world_object;
 use crate::view::{Scene, Shown, ShownArm, ShownRobot, Subject, robots, value};
 use dimos_core::joint::JointLimits;

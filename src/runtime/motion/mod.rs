@@ -1,0 +1,7 @@
+//! Motions, streams and chunks: checked, passed to the tick, planned again when blocked.
+
+pub(in crate::runtime) mod chunk_requests;
+pub(in crate::runtime) mod motion_requests;
+pub(in crate::runtime) mod motions;
+pub(in crate::runtime) mod replan;
+pub(in crate::runtime) mod stream_requests;
