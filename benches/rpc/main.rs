@@ -18,7 +18,7 @@ use std::time::{Duration, Instant};
 
 use dimos::rpc::api::{State, Status};
 use dimos::rpc::client::Client;
-use dimos::rpc::streams::{Stream, Subscribe};
+use dimos::rpc::server::streams::{Stream, Subscribe};
 use support::measure::{Goal, Measure, print, quantile};
 use support::run::LiveRun;
 use support::{Effort, machine};

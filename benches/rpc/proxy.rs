@@ -12,7 +12,7 @@ use dimos::rpc::api::Done;
 use dimos::rpc::report::{ArmReport, ArmStateReport, JointReport, StateReport, StatusReport, TaskReport};
 use dimos::rpc::run_dir::RunDir;
 use dimos::rpc::server::Server;
-use dimos::rpc::streams::Streams;
+use dimos::rpc::server::streams::Streams;
 use dimos::rpc::{Backend, BoxFuture, Code, Reply, Request, RpcError, Subject};
 
 use super::Effort;

@@ -8,7 +8,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use dimos::rpc::api::Status;
 use dimos::rpc::client::Client;
-use dimos::rpc::streams::{Stream, Subscribe};
+use dimos::rpc::server::streams::{Stream, Subscribe};
 
 use crate::support::Effort;
 use crate::support::measure::{Goal, Measure, print, quantile};

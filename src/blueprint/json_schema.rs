@@ -48,9 +48,27 @@ pub fn full_schema<'a>(catalog: impl Into<Catalog<'a>>) -> Value {
     schema
 }
 
+/// Keys of earlier versions, and what took their place.
+const GONE: [(&str, &str); 1] = [(
+    "python_dimos",
+    "the coordinator of Python dimos is a bridge now: python3 -m dimos_client.python_dimos --command \
+     (docs/many-machines.md)",
+)];
+
+/// Returns what to say of an unknown key: what took its place, or the group that it belongs to.
+pub(super) fn hint_of(key: &str) -> Option<String> {
+    if let Some((_, hint)) = GONE.iter().find(|(gone, _)| *gone == key) {
+        return Some((*hint).to_owned());
+    }
+    home_of(key).map(|home| match home.is_empty() {
+        true => format!("`{key}` belongs at the top of the file, without indentation"),
+        false => format!("`{key}` belongs under `{home}`"),
+    })
+}
+
 /// Returns the group that a key belongs to: `coordinator` for `tick_rate`, an empty name for the top level. Returns
 /// `None` if no group has it, or several.
-pub(super) fn home_of(key: &str) -> Option<String> {
+fn home_of(key: &str) -> Option<String> {
     static HOMES: OnceLock<BTreeMap<String, Vec<&'static str>>> = OnceLock::new();
     let homes = HOMES.get_or_init(|| {
         let mut homes: BTreeMap<String, Vec<&'static str>> = BTreeMap::new();

@@ -5,7 +5,7 @@ use serde::Serialize;
 use crate::blueprint::assets::Assets;
 use crate::blueprint::catalog::Catalog;
 use crate::blueprint::include::{Includer, RULES};
-use crate::blueprint::json_schema::home_of;
+use crate::blueprint::json_schema::hint_of;
 use crate::blueprint::registry::{Found, SearchPath};
 use crate::blueprint::resolve::{Blueprint, Checker, resolve};
 use crate::blueprint::schema::BlueprintFile;
@@ -146,7 +146,7 @@ fn read_blueprint(
     overrides: &Overrides,
     catalog: Catalog<'_>,
 ) -> Option<Blueprint> {
-    tree.know_homes(home_of);
+    tree.know_hints(hint_of);
     let mut includer = Includer::new(tree, search);
     let root = includer.read(found);
     let incomplete = includer.incomplete;

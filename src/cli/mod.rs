@@ -350,7 +350,7 @@ fn answer(catalog: Catalog<'_>) -> ExitCode {
     }
 }
 
-/// Sets how many threads the network has, unless the user has. No other thread runs yet.
+/// Sets how many threads the network has, unless the user has, or a program that embeds this one runs threads already.
 fn set_threads_of_the_network() {
     let (name, value) = crate::share::THREADS;
     if !name.is_empty() && std::env::var_os(name).is_none() {

@@ -51,11 +51,11 @@ pub fn runs() -> Vec<OtherRun> {
     let others = socket_list::listening(&sockets).filter_map(|socket| {
         let path = Path::new(socket.path);
         if let Some((user, name)) = marked(path) {
-            return (user != us).then(|| OtherRun { name, user: dimos_rpc::who::user_name(user) });
+            return (user != us).then(|| OtherRun { name, user: dimos_rpc::server::who::user_name(user) });
         }
         let name = run_of(path)?;
         let user = owner(path).filter(|user| *user != us)?;
-        Some(OtherRun { name, user: dimos_rpc::who::user_name(user) })
+        Some(OtherRun { name, user: dimos_rpc::server::who::user_name(user) })
     });
     let mut others: Vec<OtherRun> = others.collect();
     others.sort();
@@ -98,6 +98,6 @@ mod tests {
         let mark = |path: &str| marked(Path::new(path));
         assert_eq!(mark("@dimos/run/1001/cell"), Some((1001, "cell".to_owned())));
         assert_eq!(mark("@dimos/run/1001@00000000000000ab/cell"), None, "a closed world");
-        assert_eq!(dimos_rpc::who::user_name(0), "root");
+        assert_eq!(dimos_rpc::server::who::user_name(0), "root");
     }
 }

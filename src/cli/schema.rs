@@ -17,7 +17,7 @@ pub struct Args {
     job: bool,
 }
 
-/// What [`dimos_rpc::schema::json_schema`] returns, and the schema of jobs, as tests write them.
+/// What [`dimos_rpc::api::schema::json_schema`] returns, and the schema of jobs, as tests write them.
 const RPC: &str = include_str!("../../assets/rpc.schema.json");
 const JOB: &str = include_str!("../../assets/job.schema.json");
 

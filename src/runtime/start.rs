@@ -50,7 +50,7 @@ use dimos_robot::calibrated::Places;
 use dimos_rpc::report::StatusReport;
 use dimos_rpc::run_dir::Claim;
 use dimos_rpc::server::Server;
-use dimos_rpc::streams::Streams;
+use dimos_rpc::server::streams::Streams;
 use dimos_rt::host::{self, Grant, LatencyHold};
 
 /// Minimum time between two looks for values of an arm that change slowly.

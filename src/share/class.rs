@@ -1,62 +1,28 @@
 //! Which right a request needs, and who has it.
 
 use crate::blueprint::share::{ANYONE, Role, ShareConfig};
-use dimos_core::named::named;
+use dimos_rpc::api::Class;
 use dimos_rpc::error::{Code, RpcError};
 
 /// The request for a file of the live view.
 pub const PAGE: &str = "page";
 
-named! {
-    /// The right that a request needs; part of its key.
-    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-    pub enum Class {
-        /// To read.
-        Read = "read",
-        /// To end motion.
-        End = "end",
-        /// To plan, to change the world, to be the planner.
-        Plan = "plan",
-        /// To move an arm, and to change what its motion depends on.
-        Move = "move",
-        /// To make an arm ready for motion.
-        Enable = "enable",
-        /// To end the run.
-        Own = "own",
-    }
+/// Returns the class of a method, or of the request for a file of the live view; `None` for a method that is not for
+/// clients on other computers.
+pub fn class_of(method: &str) -> Option<Class> {
+    // Answered by the gateway.
+    if method == PAGE { Some(Class::Read) } else { Class::of(method) }
 }
 
-impl Class {
-    /// Returns the class of a method; `None` for a method that is not for clients on other computers.
-    pub fn of(method: &str) -> Option<Self> {
-        Some(match method {
-            // Answered by the gateway.
-            PAGE => Self::Read,
-            "status" | "state" | "text_log" | "motion" | "planner" | "planning" | "preview" | "world" | "grip"
-            | "arm_io" | "arm_payload" | "arm_tool" | "poses" | "robot_description" | "transforms" | "subscribe"
-            | "unsubscribe" => Self::Read,
-            "stop" | "cancel" => Self::End,
-            "plan" | "ik" | "world_add" | "world_move" | "world_remove" | "attach" | "detach" | "register_planner"
-            | "planner_answer" => Self::Plan,
-            "lease" | "release" | "move" | "move_native" | "execute" | "execute_plan" | "servo" | "velocity"
-            | "chunk" | "twist" | "pose" | "start" | "gripper" | "speed" | "arm_disable" | "arm_io_set"
-            | "arm_payload_set" | "arm_tool_set" | "pose_save" | "pose_remove" => Self::Move,
-            "arm_reset" | "arm_enable" | "arm_teach" | "arm_take_over" => Self::Enable,
-            "shutdown" => Self::Own,
-            _ => return None,
-        })
-    }
-
-    /// Returns whether a role has this right.
-    fn is_of(self, role: Role, config: &ShareConfig) -> bool {
-        match self {
-            Self::Read => true,
-            Self::End => config.observers_stop || role > Role::Observer,
-            Self::Plan => role >= Role::Planner,
-            Self::Move => role >= Role::Operator,
-            Self::Enable => role >= Role::Operator && config.remote_enable,
-            Self::Own => role >= Role::Owner,
-        }
+/// Returns whether a role has this right.
+fn includes(role: Role, class: Class, config: &ShareConfig) -> bool {
+    match class {
+        Class::Read => true,
+        Class::End => config.observers_stop || role > Role::Observer,
+        Class::Plan => role >= Role::Planner,
+        Class::Move => role >= Role::Operator,
+        Class::Enable => role >= Role::Operator && config.remote_enable,
+        Class::Own => role >= Role::Owner,
     }
 }
 
@@ -71,7 +37,7 @@ pub fn permit(user: &str, method: &str, class: Class, config: &ShareConfig) -> R
         let text = format!("{user} is no user of this run");
         return Err(RpcError::new(Code::Forbidden, text).hint("its owner adds users: `share.users` in the blueprint"));
     };
-    if class.is_of(role, config) {
+    if includes(role, class, config) {
         return Ok(());
     }
     let who = if user == ANYONE { "a client without a certificate".to_owned() } else { format!("user {user}") };
@@ -104,15 +70,15 @@ mod tests {
     #[test]
     fn every_method_has_a_class() {
         for method in METHODS {
-            assert_eq!(Class::of(method).is_none(), OF_GATEWAYS.contains(method), "{method}: give it a class");
+            assert_eq!(class_of(method).is_none(), OF_GATEWAYS.contains(method), "{method}: give it a class");
         }
-        assert_eq!(Class::of("mvoe"), None);
+        assert_eq!(class_of("mvoe"), None);
     }
 
     #[test]
     fn what_moves_an_arm_needs_an_operator_and_ending_motion_nobody() {
         let config = config();
-        let may = |user: &str, method: &str| permit(user, method, Class::of(method).unwrap(), &config).is_ok();
+        let may = |user: &str, method: &str| permit(user, method, class_of(method).unwrap(), &config).is_ok();
         for (method, of) in [
             ("state", ["-", "op", "boss"].as_slice()),
             ("stop", &["-", "op", "boss"]),

@@ -26,7 +26,7 @@ use zenoh::qos::{CongestionControl, Priority};
 use zenoh::query::Query;
 use zenoh::{Session, Wait};
 
-use super::class::{Class, PAGE, permit};
+use super::class::{PAGE, class_of, permit};
 use super::ends::Ends;
 use super::keys::{self, Who};
 use super::page::Pages;
@@ -34,9 +34,10 @@ use super::remote::{Closed, Remote, Request, refuse};
 use super::{certificates, ros, settings, streams};
 use crate::blueprint::share::ShareConfig;
 use dimos_core::sync::lock;
+use dimos_rpc::api::Class;
 use dimos_rpc::api::{FaceReport, MAX_ANSWER, MAX_LINE, METHODS, Method, PlannerAnswer, RegisterGateway};
+use dimos_rpc::client::reach;
 use dimos_rpc::error::{Code, RpcError};
-use dimos_rpc::reach;
 
 /// Period of the checks of the clients.
 const PERIOD: Duration = Duration::from_millis(50);
@@ -327,7 +328,7 @@ impl Shared {
             let text = "the key names no client, class and method, or several";
             return Err(RpcError::new(Code::Malformed, text).hint("docs/many-machines.md lists the keys"));
         };
-        match Class::of(method) {
+        match class_of(method) {
             None => return Err(RpcError::unknown(Code::UnknownMethod, "method", method, METHODS)),
             Some(right) if right != class => {
                 let text = format!("`{method}` is of the class {}, not {}", right.name(), class.name());

@@ -9,8 +9,8 @@
 //! dimos/<run>/stream/end                               put once: the run has ended
 //! ```
 
-use super::class::Class;
 use crate::blueprint::share::ANYONE;
+use dimos_rpc::api::Class;
 
 /// First part of all keys.
 const ROOT: &str = "dimos";

@@ -23,7 +23,7 @@ use zenoh::query::{ConsolidationMode, Reply};
 use zenoh::sample::SampleKind;
 use zenoh::{Session, Wait};
 
-use super::class::Class;
+use super::class::class_of;
 use super::gateway::PROOF;
 use super::place::Place;
 use super::{certificates, keys, settings};
@@ -32,7 +32,7 @@ use dimos_rpc::api::{METHODS, Method};
 use dimos_rpc::client::{Client, ClientError};
 use dimos_rpc::error::{Code, RpcError};
 use dimos_rpc::server::CALL_TIMEOUT;
-use dimos_rpc::streams::{Stream, Subscribe, Unsubscribe};
+use dimos_rpc::server::streams::{Stream, Subscribe, Unsubscribe};
 
 /// Pause between two beats: a gateway takes a client for lost after 0.3 s or more without one.
 const BEAT: Duration = Duration::from_millis(100);
@@ -241,7 +241,7 @@ impl Line {
             *subscriber = Box::new(());
             return self.answer(&id, Ok(json!({})));
         }
-        let Some(class) = Class::of(&method) else {
+        let Some(class) = class_of(&method) else {
             return self.answer(&id, Err(RpcError::unknown(Code::UnknownMethod, "method", &method, METHODS)));
         };
         let pending =

@@ -12,11 +12,12 @@ use serde_json::{Value, json};
 use zenoh::query::Query;
 use zenoh::{Session, Wait};
 
-use super::class::{Class, PAGE};
+use super::class::PAGE;
 use super::place::Place;
 use super::remote::refuse;
 use super::settings::MAX_MESSAGE;
 use super::{keys, line};
+use dimos_rpc::api::Class;
 use dimos_rpc::client::{self, ClientError};
 use dimos_rpc::error::{Code, RpcError};
 

@@ -19,12 +19,12 @@ use zenoh::qos::Priority;
 use zenoh::query::Query;
 use zenoh::{Session, Wait};
 
-use super::class::Class;
 use super::keys::{self, Who};
 use dimos_core::sync::lock;
+use dimos_rpc::api::Class;
 use dimos_rpc::api::{Method, OnBehalfOf, PLANNER_REQUESTS, RegisterPlanner, Release};
+use dimos_rpc::client::reach;
 use dimos_rpc::error::{Code, RpcError};
-use dimos_rpc::reach;
 
 /// Requests of a client that may wait for their replies; more are refused.
 const MAX_PENDING: usize = 32;

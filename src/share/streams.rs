@@ -12,7 +12,7 @@ use zenoh::{Session, Wait};
 
 use super::keys;
 use dimos_rpc::client::{Client, ClientError};
-use dimos_rpc::streams::{Stream, Subscribe};
+use dimos_rpc::server::streams::{Stream, Subscribe};
 
 /// Publishes the streams of a run until the result is dropped. A stream without subscribers is not read.
 pub(super) fn publish(session: &Session, run: &str, socket: &Path) -> zenoh::Result<Vec<Box<dyn Send>>> {

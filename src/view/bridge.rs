@@ -26,7 +26,7 @@ use tokio_tungstenite::tungstenite::{Error, Message};
 
 use super::access::Access;
 use super::http::Request;
-use dimos_rpc::reach;
+use dimos_rpc::client::reach;
 
 /// Maximum length of a message of the page [bytes].
 const MAX_MESSAGE: usize = 64 << 10;

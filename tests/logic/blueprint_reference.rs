@@ -286,5 +286,5 @@ fn the_reference_names_every_key_of_the_schema() {
 
 #[test]
 fn the_schema_of_the_protocol_is_current() {
-    check("assets/rpc.schema.json", &format!("{}\n", dimos::rpc::schema::json_schema()));
+    check("assets/rpc.schema.json", &format!("{}\n", dimos::rpc::api::schema::json_schema()));
 }

@@ -12,7 +12,7 @@ use dimos::rpc::api::{MAX_CONNECTIONS, MAX_LINE, MAX_SUBSCRIPTIONS, Move, RESERV
 use dimos::rpc::client::{Client, ClientError};
 use dimos::rpc::run_dir::{RunDir, RunDirError};
 use dimos::rpc::server::Server;
-use dimos::rpc::streams::{EventReport, JointState, Stream, Subscribe, Unsubscribe};
+use dimos::rpc::server::streams::{EventReport, JointState, Stream, Subscribe, Unsubscribe};
 use serde_json::{Value, json};
 
 use crate::support::fake_run::{FakeBackend, start};

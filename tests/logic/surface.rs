@@ -76,7 +76,7 @@ fn blueprint_keys() {
 
 #[test]
 fn rpc_methods() {
-    let schema = dimos::rpc::schema::json_schema();
+    let schema = dimos::rpc::api::schema::json_schema();
     let mut lines = Vec::new();
     for (table, parts) in
         [("methods", &["params", "result"][..]), ("planner_requests", &["params", "result"]), ("streams", &["data"])]

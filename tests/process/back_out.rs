@@ -26,7 +26,8 @@ fn an_arm_backs_out_the_way_it_came_and_not_through_obstacles() {
     // Held: the way is shown, and nothing moves.
     let held = home.positions("arm");
     home.dimos("back-out arm").with(1).shows(&["where it was at rest"]).says(&[
-        "arm is held: stopped by an operator; nothing has moved",
+        "arm is held: stopped by an operator: dimos stop (pid ",
+        "; nothing has moved",
         "hint: when it may move again: dimos arm reset arm, then dimos arm enable arm",
     ]);
     let shown = home.dimos("back-out --check --json").with(0).json();

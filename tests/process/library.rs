@@ -9,7 +9,7 @@ use dimos::control::task_spec::TaskTable;
 use dimos::rpc::Code;
 use dimos::rpc::api::Move;
 use dimos::rpc::run_dir::RunDir;
-use dimos::rpc::streams::{Stream, Subscribe};
+use dimos::rpc::server::streams::{Stream, Subscribe};
 use dimos::runtime::{Builder, Ending, Options, Record, Run, StartError};
 
 fn mock(folder: &Path) -> Builder {

@@ -65,7 +65,7 @@ fn an_attached_object_of_known_mass_is_carried_and_taken_back() {
     eventually("it is at rest", || home.status()["tasks"][0]["state"] == "COMPLETED");
     eventually("ball is let go of", || home.dimos("world detach ball").code == Some(0));
     assert_eq!(load(&arm), [0.8, 0.0, 0.0, 50.0]);
-    home.dimos("world attach ball arm --mass 9").with(1).says(&["did not take the payload"]);
+    home.dimos("world attach ball arm --mass 9").with(2).says(&["the arm takes at most 5.0 kg, not 9.8 kg"]);
     assert!(!home.dimos("world list").with(0).out.contains("arm link"), "it is not held");
     assert_eq!(load(&arm), [0.8, 0.0, 0.0, 50.0]);
 
@@ -105,9 +105,9 @@ fn the_mounting_is_set_before_the_motors_and_a_refusal_ends_the_start() {
     home.dimos("down").with(0);
     drop(run);
     arm.record();
-    let refused = home.dimos(&format!("run {} --no-record", blueprint(&home, &arm, "payload: {mass: 6}"))).with(3);
-    assert!(refused.err.contains("outside the arm's limits"), "{}", refused.err);
-    assert!(!arm.trace().iter().any(|r| r.request == Request::Enable(true)));
+    let refused = home.dimos(&format!("run {} --no-record", blueprint(&home, &arm, "payload: {mass: 6}"))).with(2);
+    assert!(refused.err.contains("the arm takes at most 5.0 kg, not 6 kg"), "{}", refused.err);
+    assert!(arm.trace().is_empty(), "nothing was connected");
     let wrong = home.dimos(&format!("check {}", blueprint(&home, &arm, "payload: {mass: -1}"))).with(2);
     assert!(wrong.err.contains("the mass is -1 kg") && wrong.err.contains("cell.yaml:2:"), "{}", wrong.err);
 }

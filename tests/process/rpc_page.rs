@@ -8,7 +8,7 @@ use dimos::rpc::Code;
 use dimos::rpc::api::{ArmEnable, ArmReset, METHODS, Planner, State, Status};
 use dimos::rpc::client::Client;
 use dimos::rpc::report::TaskReport;
-use dimos::rpc::streams::Stream;
+use dimos::rpc::server::streams::Stream;
 use serde_json::Value;
 
 use crate::support::program::{Home, TIMEOUT, eventually};

@@ -16,7 +16,7 @@ fn events(home: &Home) -> Vec<Value> {
 fn motions_stops_and_holds_say_who_asked() {
     let home = Home::new();
     let run = home.run("dual-yourarm-planner");
-    let user = dimos::rpc::who::user_name(rustix::process::getuid().as_raw());
+    let user = dimos::rpc::server::who::user_name(rustix::process::getuid().as_raw());
     let moved = home.dimos("move left 0.3 0 0.3 0 0.5 0 --json").with(0).json();
     assert_eq!(moved["by"]["program"], "dimos move", "{moved}");
     assert_eq!(moved["by"]["user"], user, "{moved}");

@@ -9,7 +9,7 @@ use dimos::rpc::api::*;
 use dimos::rpc::report::*;
 use dimos::rpc::run_dir::RunDir;
 use dimos::rpc::server::Server;
-use dimos::rpc::streams::Streams;
+use dimos::rpc::server::streams::Streams;
 use dimos::rpc::{Backend, BoxFuture, Code, Reply, Request, RpcError, Subject};
 
 /// Answers like a run with one 2-joint arm named `arm`.

@@ -20,47 +20,13 @@
 #![allow(rustdoc::broken_intra_doc_links, reason = "units are in brackets: [rad]")]
 
 pub mod api;
-mod arm_api;
-mod attach_api;
-mod cartesian_api;
-mod claim;
 pub mod client;
-mod client_urgent;
-mod commanded;
-mod connection;
-mod connection_limit;
 pub mod error;
-mod gateway_api;
-mod handover;
-mod ik_api;
-mod lease;
-mod line_reader;
-mod live_runs;
-mod look;
-mod mark;
-mod model_api;
-mod motion_api;
-mod parts_api;
-mod planner_api;
-pub mod planner_proxy;
-pub mod planner_stub;
-mod poses_api;
-pub mod reach;
 pub mod report;
 pub mod run_dir;
-mod run_files;
-pub mod schema;
 pub mod server;
-mod stop_thread;
-pub mod streams;
-mod subscription;
-mod text_api;
-mod turn;
-mod urgent;
-pub mod who;
 mod wire;
-mod world_api;
 
 pub use api::{Backend, BoxFuture, Method, Reply, Request};
 pub use error::{Code, RpcError};
-pub use lease::Subject;
+pub use server::lease::Subject;

@@ -11,7 +11,7 @@ const MAX_ID: usize = 128;
 /// A request line; its parameters are not parsed yet.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Envelope {
+pub(crate) struct Envelope {
     /// Chosen by the client, repeated in the reply: a number, a string, or null.
     #[serde(default)]
     pub id: Value,
@@ -24,7 +24,7 @@ pub(super) struct Envelope {
 }
 
 /// Parses a request line. An error has the id, or null if that could not be read.
-pub(super) fn read(line: &[u8]) -> Result<Envelope, (Value, RpcError)> {
+pub(crate) fn read(line: &[u8]) -> Result<Envelope, (Value, RpcError)> {
     let malformed = |id: Value, what: String| {
         let hint = r#"one JSON object per line: {"id":1,"method":"state","params":{}}"#;
         Err((id, RpcError::new(Code::Malformed, what).hint(hint)))
@@ -46,7 +46,7 @@ pub(super) fn read(line: &[u8]) -> Result<Envelope, (Value, RpcError)> {
 }
 
 /// Encodes the reply to a request as a line.
-pub(super) fn reply<T: Serialize>(id: &Value, result: Result<T, RpcError>) -> String {
+pub(crate) fn reply<T: Serialize>(id: &Value, result: Result<T, RpcError>) -> String {
     #[derive(Serialize)]
     #[serde(rename_all = "snake_case")]
     enum Outcome<T> {
@@ -71,19 +71,19 @@ pub(super) fn reply<T: Serialize>(id: &Value, result: Result<T, RpcError>) -> St
 
 /// Encodes a message of a subscription as a line. `data` is JSON; `lost` counts the messages that this client missed
 /// just before.
-pub(super) fn message(stream: &str, subscription: u64, lost: u64, data: &str) -> String {
+pub(crate) fn message(stream: &str, subscription: u64, lost: u64, data: &str) -> String {
     let lost = if lost == 0 { String::new() } else { format!(r#","lost":{lost}"#) };
     format!("{{\"stream\":\"{stream}\",\"subscription\":{subscription}{lost},\"data\":{data}}}\n")
 }
 
 /// Encodes a message that was published before the subscription.
-pub(super) fn past_message(stream: &str, subscription: u64, data: &str) -> String {
+pub(crate) fn past_message(stream: &str, subscription: u64, data: &str) -> String {
     format!("{{\"stream\":\"{stream}\",\"subscription\":{subscription},\"past\":true,\"data\":{data}}}\n")
 }
 
 /// A line received by a client: a reply or a message of a subscription.
 #[derive(Debug, Deserialize)]
-pub(super) struct Incoming {
+pub(crate) struct Incoming {
     pub id: Option<u64>,
     #[serde(default)]
     pub result: Value,

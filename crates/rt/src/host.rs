@@ -238,15 +238,27 @@ pub fn cpu_time_of(clock: libc::clockid_t) -> Option<Duration> {
     (error == 0).then(|| Duration::new(time.tv_sec.unsigned_abs(), time.tv_nsec.unsigned_abs() as u32))
 }
 
-/// Sets an environment variable. Only while this process has one thread: others may read the environment meanwhile.
-pub fn set_variable(name: &str, value: &str) {
-    // SAFETY: the caller has started no thread yet.
-    unsafe { std::env::set_var(name, value) }
+/// Sets an environment variable, if this process has one thread: others may read the environment meanwhile. Returns
+/// whether it did.
+pub fn set_variable(name: &str, value: &str) -> bool {
+    let alone = std::fs::read_dir("/proc/self/task").is_ok_and(|threads| threads.count() == 1);
+    if alone {
+        // SAFETY: no other thread can read the environment.
+        unsafe { std::env::set_var(name, value) }
+    }
+    alone
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_environment_of_several_threads_stays_as_it_is() {
+        // The harness has a thread for each test, and one of its own.
+        assert!(!set_variable("DIMOS_TEST_OF_A_VARIABLE", "1"));
+        assert_eq!(std::env::var_os("DIMOS_TEST_OF_A_VARIABLE"), None);
+    }
 
     #[test]
     fn the_cpu_time_of_another_thread_is_known_until_it_ends() {

@@ -196,12 +196,9 @@ fn unknown_key_hint(tree: &Tree, given: &str, known: &[&'static str]) -> Option<
         return Some(format!("if this is part of a number, use a decimal point: 0.{given}"));
     }
     if closest(given, known.iter().copied()).is_none()
-        && let Some(home) = tree.home_of(given)
+        && let Some(hint) = tree.hint_of(given)
     {
-        return Some(match home.is_empty() {
-            true => format!("`{given}` belongs at the top of the file, without indentation"),
-            false => format!("`{given}` belongs under `{home}`"),
-        });
+        return Some(hint);
     }
     match known.is_empty() {
         true => Some("remove it; this group takes no keys".to_owned()),

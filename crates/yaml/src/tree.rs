@@ -66,7 +66,7 @@ pub struct Tree {
     /// Nodes with skipped parts, whose absence must not be reported.
     pub(super) damaged: HashSet<NodeId>,
     /// Looks up the group of a misplaced key.
-    homes: Option<fn(&str) -> Option<String>>,
+    hints: Option<fn(&str) -> Option<String>>,
     /// Number of errors and of warnings that are not listed.
     pub(super) unlisted: [usize; 2],
 }
@@ -245,13 +245,13 @@ impl Tree {
         self.damaged.contains(&id)
     }
 
-    /// Sets the lookup of a misplaced key's group, for hints.
-    pub fn know_homes(&mut self, homes: fn(&str) -> Option<String>) {
-        self.homes = Some(homes);
+    /// Sets what is said of an unknown key: where it belongs, or what took its place.
+    pub fn know_hints(&mut self, hints: fn(&str) -> Option<String>) {
+        self.hints = Some(hints);
     }
 
-    pub(super) fn home_of(&self, key: &str) -> Option<String> {
-        self.homes.and_then(|homes| homes(key))
+    pub(super) fn hint_of(&self, key: &str) -> Option<String> {
+        self.hints.and_then(|hints| hints(key))
     }
 
     /// Returns a label on a node; of lists and groups only the first line is marked.

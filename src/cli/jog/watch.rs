@@ -16,7 +16,7 @@ use dimos_core::sync::lock;
 use dimos_rpc::api::{State, Status};
 use dimos_rpc::client::{Client, ClientError};
 use dimos_rpc::report::{ArmReport, ArmStateReport, TaskReport};
-use dimos_rpc::streams::{Stream, Subscribe};
+use dimos_rpc::server::streams::{Stream, Subscribe};
 
 /// Period of reading the joints.
 const STATE_PERIOD: Duration = Duration::from_millis(50);

@@ -18,7 +18,7 @@ use dimos_hardware::device::Connected;
 use dimos_hardware::registry::Teach;
 use dimos_rpc::api::{LoadReport, SpeedReport, TextLog, TextLogReport};
 use dimos_rpc::report::*;
-use dimos_rpc::streams::{EventReport, JointState, Level};
+use dimos_rpc::server::streams::{EventReport, JointState, Level};
 use dimos_rpc::{Code, RpcError};
 use dimos_rt::histogram::Figures;
 

@@ -16,8 +16,8 @@ use crate::runtime::start::robots;
 use dimos_planner::planning::scene::config::PlannerConfig;
 use dimos_planner::planning::scene::planning_scene::PlanningScene;
 use dimos_rpc::api::{RegisterPlanner, RegisteredRobot};
+use dimos_rpc::client::planner_stub::{PlannerStub, RegisterError};
 use dimos_rpc::error::Code;
-use dimos_rpc::planner_stub::{PlannerStub, RegisterError};
 
 /// First pause before a reconnect; each further one is twice as long.
 const FIRST_PAUSE: Duration = Duration::from_millis(200);

@@ -22,8 +22,8 @@ use dimos_rpc::api::{
     self, CommandLimits, ExecutePlan, Moment, PlannerReport, RECHECK, Recheck, RecheckReply, RegisterPlanner,
     Registered, ReleasedPlan, Reply, Request as Call,
 };
-use dimos_rpc::planner_proxy::{PlannerProxy, gone};
 use dimos_rpc::report::{AttachedReport, PlannerStatus};
+use dimos_rpc::server::planner_proxy::{PlannerProxy, gone};
 use dimos_rpc::{Code, RpcError};
 
 /// Maximum age of a state to plan from.

@@ -11,10 +11,10 @@ use zenoh::sample::{Sample, SampleKind};
 
 use super::{FORGET_AFTER, MAX_LOST, News, Shared, failed};
 use crate::blueprint::share::OnLost;
-use crate::share::class::Class;
 use crate::share::keys::Who;
 use crate::share::remote::{Closed, Remote, Ways, ended};
 use dimos_core::sync::lock;
+use dimos_rpc::api::Class;
 use dimos_rpc::api::{Lease, Method};
 use dimos_rpc::error::{Code, RpcError};
 

@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
+use dimos_rpc::client::reach;
 use dimos_rpc::error::Code;
-use dimos_rpc::reach;
 
 /// Maximum time for a run to release its name after its connections, and the period of the look at that.
 const RELEASED_TIMEOUT: Duration = Duration::from_secs(10);

@@ -14,8 +14,8 @@ use dimos_log::display_messages::{TFMessage, Transform, TransformStamped};
 use dimos_log::messages::{Header, JointState, Quaternion, Text, Time, Vector3};
 use dimos_rpc::api::{RobotDescription, Status, TransformReport, Transforms};
 use dimos_rpc::client::{Client, ClientError};
-use dimos_rpc::streams;
-use dimos_rpc::streams::{Stream, Subscribe};
+use dimos_rpc::server::streams;
+use dimos_rpc::server::streams::{Stream, Subscribe};
 
 /// Maximum rate of the joint states [Hz].
 const JOINT_STATES: f64 = 100.0;

@@ -1,4 +1,4 @@
-//! From a start and a goal to a motion. Pure computation: no threads outside `request::planner_thread`, no clock but the
+//! From a start and a goal to a motion. Pure computation: no thread outside `request::planner_thread`, no clock but the
 //! given deadline; the same seed gives the same path.
 //!
 //! ```text
