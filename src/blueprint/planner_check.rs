@@ -39,8 +39,8 @@ pub(super) fn check(
                 checker.error(robot.name.at, diag.hint("give each robot its own name"));
             }
         }
-        rate(checker, robot, "max_velocity", robot.max_velocity, "/s");
-        rate(checker, robot, "max_acceleration", robot.max_acceleration, "/s²");
+        cap(checker, robot, "max_velocity", written::joint_speed(robot.max_velocity));
+        cap(checker, robot, "max_acceleration", written::joint_acceleration(robot.max_acceleration));
         pose(checker, &robot.base_pose);
         robot.tool.iter().for_each(|tool| pose(checker, tool));
         let task = task(checker, robot, tasks);
@@ -56,9 +56,9 @@ pub(super) fn check(
     }
 }
 
-/// Checks a cap on the motions of a robot's joints.
-fn rate(checker: &mut Checker<'_>, robot: &Located<RobotEntry>, key: &str, value: f64, unit: &str) {
-    if let Err(what) = written::joint_rate(value, unit) {
+/// Reports what is wrong with a cap on the motions of a robot's joints.
+fn cap(checker: &mut Checker<'_>, robot: &Located<RobotEntry>, key: &str, valid: Result<(), String>) {
+    if let Err(what) = valid {
         let at = checker.tree.get(robot.at, key).unwrap_or(robot.at);
         checker.error(at, Diag::error(what));
     }

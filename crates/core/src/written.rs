@@ -11,7 +11,7 @@ pub const LONGEST: f64 = 10.0;
 /// Highest speed of a tool [m/s], of a joint [rad/s], and acceleration of a joint [rad/s²].
 const FASTEST: f64 = 10.0;
 const FASTEST_JOINT: f64 = 20.0;
-const HARDEST_JOINT: f64 = 200.0;
+const QUICKEST_JOINT: f64 = 200.0;
 /// Length above which the unit is doubted [m].
 pub const LONG: f64 = 5.0;
 
@@ -49,13 +49,21 @@ pub fn tool_speed(value: f64) -> Result<(), String> {
     }
 }
 
-/// Refuses a speed [rad/s] or an acceleration [rad/s²] that no joint has; `unit` is its unit without the angle.
-pub fn joint_rate(value: f64, unit: &str) -> Result<(), String> {
-    let most = if unit == "/s" { FASTEST_JOINT } else { HARDEST_JOINT };
+/// Refuses a speed that no joint has [rad/s].
+pub fn joint_speed(value: f64) -> Result<(), String> {
+    rate(value, FASTEST_JOINT, "/s")
+}
+
+/// Refuses an acceleration that no joint has [rad/s²].
+pub fn joint_acceleration(value: f64) -> Result<(), String> {
+    rate(value, QUICKEST_JOINT, "/s²")
+}
+
+fn rate(value: f64, most: f64, per: &str) -> Result<(), String> {
     match value.abs() <= most {
         true => Ok(()),
         false => {
-            Err(format!("joints have at most {most} rad{unit}: {value}°{unit} is {:.4} rad{unit}", value.to_radians()))
+            Err(format!("joints have at most {most} rad{per}: {value}°{per} is {:.4} rad{per}", value.to_radians()))
         }
     }
 }
@@ -133,8 +141,8 @@ mod tests {
         assert!(length(-10.0).is_ok() && length(f64::INFINITY).is_err());
         assert_eq!(length(350.1).unwrap_err(), "lengths are in m, at most 10: 350.1 mm is 0.3501 m");
         assert_eq!(tool_speed(250.0).unwrap_err(), "tool speeds are in m/s, at most 10: 250 mm/s is 0.25 m/s");
-        assert_eq!(joint_rate(60.0, "/s").unwrap_err(), "joints have at most 20 rad/s: 60°/s is 1.0472 rad/s");
-        assert!(joint_rate(60.0, "/s²").is_ok() && padding(0.02).is_ok() && padding(20.0).is_err());
+        assert_eq!(joint_speed(60.0).unwrap_err(), "joints have at most 20 rad/s: 60°/s is 1.0472 rad/s");
+        assert!(joint_acceleration(60.0).is_ok() && padding(0.02).is_ok() && padding(20.0).is_err());
         assert_eq!(degrees(-90.0).unwrap(), "positions are in rad: -90° is -1.5708 rad");
         assert_eq!(degrees(6.0), None);
         assert_eq!(doubt(&[5.0, -4.0]), None);
