@@ -17,7 +17,7 @@ use dimos_rpc::server::streams::Streams;
 use log_throttle::LogThrottle;
 use logged_scene::{Described, LoggedWorld};
 
-/// What a run tells its log and its subscribers.
+/// What goes from a run to its log and its subscribers.
 #[derive(Default)]
 pub(in crate::runtime) struct Journal {
     subscribers: Streams,
