@@ -22,7 +22,8 @@ use dimos_rpc::run_dir::LiveRun;
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
 What needs attention comes first: arms that are held, faults, tasks that were aborted, a log that ended, real-time measures \
-that the system did not grant. -v adds what is read, counted and measured.")]
+that the system did not grant to a run with a real arm. -v adds what is read, counted and measured, with the ranges of the \
+gripper and the link whose pose is printed.")]
 pub struct Args {
     /// Run to show in full
     #[arg(value_name = "RUN", conflicts_with = "run")]
@@ -312,7 +313,8 @@ fn attention(r: &StatusReport) -> Vec<String> {
     if let Some(error) = r.recorder.as_ref().and_then(|recorder| recorder.error.as_ref()) {
         lines.push(format!("the log ENDED: {error}"));
     }
-    lines.extend(r.realtime.iter().filter(|measure| !measure.granted).flat_map(banner::realtime));
+    let needed = r.realtime.iter().filter(|measure| !measure.granted && !banner::is_simulated(r));
+    lines.extend(needed.flat_map(banner::realtime));
     lines
 }
 
@@ -345,7 +347,7 @@ fn print_planners<'r>(planners: impl Iterator<Item = (&'r str, &'r PlannerStatus
 }
 
 fn print_arms(arms: &[ArmReport], verbose: bool) {
-    let mut table = Table::new(&["ARM", "PHASE", "LINK", "MOTORS", "MODE", ">AGE ms", ">RATE Hz", ">NATIVE Hz"]);
+    let mut table = Table::new(&["ARM", "PHASE", "LINK", "MOTORS", "MODE", ">?AGE ms", ">?RATE Hz", ">?NATIVE Hz"]);
     for arm in arms {
         let good = |well: bool| if well { Tone::Good } else { Tone::Bad };
         let phase_tone = match arm.phase.as_str() {
@@ -376,10 +378,10 @@ fn print_arms(arms: &[ArmReport], verbose: bool) {
         for line in joint_lines(&arm.joints).iter().filter(|_| verbose) {
             output::wrapped(format_args!("  {name}: {line}"));
         }
-        if let Some(line) = gripper_line(arm) {
+        if let Some(line) = gripper_line(arm).filter(|_| verbose) {
             output::wrapped(format_args!("  {name}: {line}"));
         }
-        if let Some(tcp) = &arm.tcp {
+        if let Some(tcp) = arm.tcp.as_ref().filter(|_| verbose) {
             output::wrapped(format_args!("  {name}: poses in map are those of {}", tcp_text(tcp)));
         }
         if !arm.simulated && arm.identity.is_none() {
@@ -390,7 +392,7 @@ fn print_arms(arms: &[ArmReport], verbose: bool) {
         for (about, note) in arm.notes() {
             output::wrapped(format_args!("  {name}: {about}: {note}"));
         }
-        if let Some(load) = &arm.payload {
+        if let Some(load) = arm.payload.as_ref().filter(|load| verbose || load.mass > 0.0) {
             output::wrapped(format_args!("  {name}: payload {}", payload_text(load)));
         }
         if let Some(io) = arm.io.as_ref().filter(|_| verbose) {
@@ -494,7 +496,7 @@ fn print_timing(r: &StatusReport, verbose: bool) {
     if !clocked.is_empty() {
         output::wrapped(format_args!("  ticks without a state of the arm that clocks them: {}", t.without_state));
     }
-    for text in r.realtime.iter().filter(|measure| verbose && measure.granted).flat_map(banner::realtime) {
+    for text in r.realtime.iter().filter(|measure| verbose && (measure.granted || banner::is_simulated(r))).flat_map(banner::realtime) {
         output::wrapped(format_args!("  {text}"));
     }
 }

@@ -35,6 +35,7 @@ pub fn run(path: &Path, json: bool) -> Result {
         }
         bar(&scan);
     }
+    drop(bar);
     let (faults, _) = faults(path, info, false).map_err(unreadable)?;
     let loss = scan.loss().text();
     let state = state(info, loss.is_some());
