@@ -1,9 +1,11 @@
 //! Texts of a run at start-up and after its end.
 
+use std::io;
 use std::path::Path;
 
 use serde::Serialize;
 
+use super::output;
 use super::text_log::Terminal;
 use crate::runtime::Ended;
 use dimos_control::arm_control::effective;
@@ -39,7 +41,7 @@ pub(super) fn print(
     for line in text(report, socket, url, end) {
         match url {
             Some(url) if line.contains(url) => terminal.private(line),
-            _ => terminal.note(line),
+            _ => output::folded(&line, output::columns(io::stderr())).iter().for_each(|line| terminal.note(line)),
         }
     }
 }
@@ -152,7 +154,7 @@ pub fn after_exit(arm: &ArmReport, ended: &Ended) -> &'static str {
 fn realtime_of(report: &StatusReport) -> Vec<String> {
     let missing = report.realtime.iter().any(|measure| !measure.granted);
     match missing && is_simulated(report) {
-        true => vec!["not granted, nor needed by simulated arms; `dimos doctor` shows how to get it".to_owned()],
+        true => vec!["not granted; simulated arms need none (`dimos doctor`)".to_owned()],
         false => report.realtime.iter().flat_map(realtime).collect(),
     }
 }

@@ -167,7 +167,7 @@ enum Command {
     Completions(completions::Args),
     /// Print the manual page, or write one for every verb
     Man(man::Args),
-    #[command(about = "Play a log in the terminal, verify it, or repeat its motion with an arm")]
+    #[command(about = "Play a log in the terminal, or repeat its motion with an arm")]
     Replay(replay::ReplayArgs),
 }
 

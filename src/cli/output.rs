@@ -34,12 +34,7 @@ pub fn line(text: impl Display) {
 
 /// Prints a sentence to stdout; a terminal that is narrower gets it in several lines, indented below the first.
 pub fn wrapped(text: impl Display) {
-    folded(&text.to_string(), columns()).iter().for_each(line);
-}
-
-/// Returns the width of the terminal at stdout, if it has one that is wide enough for columns.
-pub fn columns() -> Option<u16> {
-    width(io::stdout())
+    folded(&text.to_string(), columns(io::stdout())).iter().for_each(line);
 }
 
 /// Breaks a text at blanks, with the lines after the first indented.
@@ -161,9 +156,9 @@ pub fn toned(text: impl Display, tone: Tone) -> Cell {
     Cell::new(text).fg(colour)
 }
 
-/// Returns the width of a terminal that reports one and is wide enough for columns. Pseudo-terminals (`script`, a
+/// Returns the columns of a terminal that reports them and has enough for tables. Pseudo-terminals (`script`, a
 /// container) may report 0.
-fn width(out: impl AsFd) -> Option<u16> {
+pub fn columns(out: impl AsFd) -> Option<u16> {
     rustix::termios::tcgetwinsize(out).ok().map(|size| size.ws_col).filter(|columns| *columns >= MIN_COLUMNS)
 }
 
@@ -180,7 +175,7 @@ impl Table {
     /// wrap at blanks on a narrow terminal; all other columns, and the names in them, stay whole. Columns with a `?` are
     /// left out where they do not fit, the last first.
     pub fn new(headings: &[&str]) -> Self {
-        Self::of_width(headings, columns())
+        Self::of_width(headings, columns(io::stdout()))
     }
 
     fn of_width(headings: &[&str], width: Option<u16>) -> Self {
@@ -304,12 +299,12 @@ mod tests {
     #[test]
     fn a_terminal_without_a_width_squeezes_no_table() {
         let terminal = std::fs::File::options().read(true).write(true).open("/dev/ptmx").unwrap();
-        assert_eq!(width(&terminal), None, "a new one has no size");
-        for (columns, usable) in [(80, Some(80)), (1, None), (0, None)] {
-            tcsetwinsize(&terminal, Winsize { ws_row: 24, ws_col: columns, ws_xpixel: 0, ws_ypixel: 0 }).unwrap();
-            assert_eq!(width(&terminal), usable, "{columns}");
+        assert_eq!(columns(&terminal), None, "a new one has no size");
+        for (width, usable) in [(80, Some(80)), (1, None), (0, None)] {
+            tcsetwinsize(&terminal, Winsize { ws_row: 24, ws_col: width, ws_xpixel: 0, ws_ypixel: 0 }).unwrap();
+            assert_eq!(columns(&terminal), usable, "{width}");
         }
-        assert_eq!(width(std::fs::File::open("/dev/null").unwrap()), None);
+        assert_eq!(columns(std::fs::File::open("/dev/null").unwrap()), None);
     }
 
     #[test]

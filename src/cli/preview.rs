@@ -92,7 +92,8 @@ fn table(reply: &PreviewReply) -> Table {
     };
     let tcps: Vec<String> = reply.end_effectors.keys().flat_map(tcp).collect();
     let names = reply.trajectory.joint_names.iter().chain(&tcps).map(|name| name.chars().count()).max().unwrap_or(0);
-    let room = output::columns().map_or(SAMPLES, |columns| usize::from(columns).saturating_sub(names) / SAMPLE_COLUMNS);
+    let room = output::columns(std::io::stdout())
+        .map_or(SAMPLES, |columns| usize::from(columns).saturating_sub(names) / SAMPLE_COLUMNS);
     let points = &reply.trajectory.points;
     let last = points.len().saturating_sub(1);
     let columns = room.clamp(2, SAMPLES).min(points.len());

@@ -76,7 +76,10 @@ mod tests {
         assert_eq!(redraw.frame(&lines, (10, 6), false), format!("{}\nb\nc\n", lines[0]));
         assert!(redraw.frame(&lines, (10, 5), false).starts_with("\x1b[5A\x1b[J"));
         let last = redraw.frame(&lines, (30, 24), false);
-        assert!(last.starts_with("\x1b[2A\x1b[J") && last.ends_with("\nb\nc\n"), "{last:?}: c had no row, a now has one");
+        assert!(
+            last.starts_with("\x1b[2A\x1b[J") && last.ends_with("\nb\nc\n"),
+            "{last:?}: c had no row, a now has one"
+        );
         assert!(redraw.frame(&[], (0, 0), false).starts_with("\x1b[3A"));
     }
 }

@@ -303,7 +303,13 @@ fn attention(r: &StatusReport) -> Vec<String> {
     if r.speed.paused {
         lines.push("all motions are paused: nothing moves until `dimos resume`".to_owned());
     }
-    for task in r.tasks.iter().filter(|task| matches!(task.state.as_str(), "ABORTED" | "FAULT")) {
+    // What held an arm that is ready again is over.
+    let is_over = |task: &TaskReport| {
+        let ready = r.arms.iter().filter(|arm| arm.phase == "ready");
+        let why = task.reason.as_deref().unwrap_or_default();
+        ready.map(|arm| format!("{} is held", arm.hardware_id)).any(|held| why.starts_with(&held))
+    };
+    for task in r.tasks.iter().filter(|task| matches!(task.state.as_str(), "ABORTED" | "FAULT") && !is_over(task)) {
         let why = task.reason.as_deref().unwrap_or("unknown reason");
         lines.push(format!("{} is {}: {why}", task.name, task.state));
     }
@@ -496,7 +502,12 @@ fn print_timing(r: &StatusReport, verbose: bool) {
     if !clocked.is_empty() {
         output::wrapped(format_args!("  ticks without a state of the arm that clocks them: {}", t.without_state));
     }
-    for text in r.realtime.iter().filter(|measure| verbose && (measure.granted || banner::is_simulated(r))).flat_map(banner::realtime) {
+    for text in r
+        .realtime
+        .iter()
+        .filter(|measure| verbose && (measure.granted || banner::is_simulated(r)))
+        .flat_map(banner::realtime)
+    {
         output::wrapped(format_args!("  {text}"));
     }
 }

@@ -354,9 +354,7 @@ fn list(client: &mut Client, json: bool) -> Result<()> {
     } else {
         table.print();
         if world.objects.iter().any(|object| object.held_by.is_some()) {
-            output::note(
-                "the pose of a held object is in the frame of the link that holds it, all others in `map`",
-            );
+            output::note("the pose of a held object is in the frame of the link that holds it, all others in `map`");
         }
     }
     Ok(())
