@@ -88,9 +88,11 @@ impl Screen {
     }
 
     fn show(&mut self, lines: &[String]) -> io::Result<()> {
-        let before = if self.live { &mut self.redraw } else { &mut Redraw::default() };
-        let size = if self.live { redraw::stdout_size() } else { (0, 0) };
-        let text = before.frame(lines, size, output::colour(&io::stdout()));
+        let colour = output::colour(&io::stdout());
+        let text = match self.live {
+            true => self.redraw.frame(lines, redraw::stdout_size(), colour),
+            false => Redraw::default().frame(lines, (0, 0), colour),
+        };
         let mut out = io::stdout().lock();
         out.write_all(text.as_bytes())?;
         out.flush()

@@ -34,7 +34,7 @@ export function setText(element: Element, text: string): void {
   if (element.textContent !== text) element.textContent = text;
 }
 
-/** What a slider stands at, as a screen reader says it: not the steps of the element. */
+/** The value of a slider as a screen reader says it: not the steps of the element. */
 export function setValueText(range: HTMLInputElement, text: string): void {
   if (range.getAttribute('aria-valuetext') !== text) range.setAttribute('aria-valuetext', text);
 }
