@@ -1,11 +1,9 @@
 //! Texts of a run at start-up and after its end.
 
-use std::io;
 use std::path::Path;
 
 use serde::Serialize;
 
-use super::output;
 use super::text_log::Terminal;
 use crate::runtime::Ended;
 use dimos_control::arm_control::effective;
@@ -41,7 +39,7 @@ pub(super) fn print(
     for line in text(report, socket, url, end) {
         match url {
             Some(url) if line.contains(url) => terminal.private(line),
-            _ => output::folded(&line, output::columns(io::stderr())).iter().for_each(|line| terminal.note(line)),
+            _ => terminal.note(line),
         }
     }
 }

@@ -13,6 +13,7 @@ use serde::Serialize;
 
 use super::escapes::{in_json, safe};
 use super::exit::{Exit, Failure};
+use super::redraw;
 use dimos_rpc::run_dir::LiveRun;
 
 /// Minimum width of a squeezed table [columns]; below, the terminal wraps the lines.
@@ -44,7 +45,7 @@ pub fn folded(text: &str, width: Option<u16>) -> Vec<String> {
     let mut lines: Vec<String> = Vec::new();
     for word in text.split(' ') {
         match lines.last_mut() {
-            Some(last) if last.chars().count() + 1 + word.chars().count() <= width => {
+            Some(last) if redraw::width(last) + 1 + redraw::width(word) <= width => {
                 last.push(' ');
                 last.push_str(word);
             }

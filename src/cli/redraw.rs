@@ -49,7 +49,7 @@ pub fn stdout_size() -> (usize, usize) {
 }
 
 /// Returns the columns that a line takes at most: colours take none, a tab eight.
-fn width(line: &str) -> usize {
+pub fn width(line: &str) -> usize {
     let mut escaped = false;
     let is_shown = |c: &char| {
         let shown = !escaped && *c != '\x1b';

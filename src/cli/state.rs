@@ -128,6 +128,14 @@ fn of_arm(arm: &ArmStateReport) -> Vec<String> {
         ]);
     }
     lines.extend(table.lines());
+    let rest = below(arm);
+    lines.extend(rest.iter().flat_map(|line| output::folded(line, output::columns(io::stdout()))));
+    lines
+}
+
+/// Returns the lines below the joints.
+fn below(arm: &ArmStateReport) -> Vec<String> {
+    let mut lines = Vec::new();
     if let Some(gripper) = arm.gripper {
         let unit = arm.gripper_unit.as_deref().unwrap_or("m");
         lines.push(format!("gripper  {}{}", gripper_text(gripper, unit), force(arm)));

@@ -428,7 +428,7 @@ fn print_arms(arms: &[ArmReport], verbose: bool) {
 
 /// Prints the tasks as a table.
 pub(super) fn print_tasks(tasks: &[TaskReport]) {
-    let mut table = Table::new(&["TASK", "TYPE", ">PRIORITY", "STATE", ">DONE", "JOINTS"]);
+    let mut table = Table::new(&["TASK", "TYPE", ">?PRIORITY", "STATE", ">?DONE", "?JOINTS"]);
     for task in tasks {
         let tone = match task.state.as_str() {
             "ABORTED" | "FAULT" => Tone::Bad,

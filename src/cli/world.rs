@@ -330,7 +330,7 @@ fn list(client: &mut Client, json: bool) -> Result<()> {
         output::json(&world);
         return Ok(());
     }
-    let mut table = Table::new(&["NAME", "SHAPE", "~SIZE m", ">XYZ m", ">RPY rad", ">?PADDING m", "HELD BY"]);
+    let mut table = Table::new(&["NAME", "?SHAPE", "~SIZE m", ">XYZ m", ">?RPY rad", ">?PADDING m", "?HELD BY"]);
     let three = |values: [f64; 3], decimals| values.map(|v| fixed(v, decimals)).join(" ");
     for object in &world.objects {
         let (kind, size) = match &object.shape {

@@ -1,15 +1,15 @@
 // Pictures of the arms' pages: each shipped planner with a motion that is planned, as the page of the live view draws
-// it. `make screenshots` writes them to docs/images.
+// it. `make screenshots` writes them to docs/images; names of pages limit it to those.
 import {writeFileSync} from 'node:fs';
 import {browser as launch, open, Run, text} from './rig.mjs';
 
 /** Page, blueprint, and how far each joint goes from the pose `home` [rad]. */
 const ARMS = [
-  ['xarm', 'xarm6-planner', [0.9, 0.3, -0.2, 0, -0.1, 0]],
-  ['ur', 'ur5e-planner', [0.9, 0.3, 0.2, -0.5, 0, 0]],
-  ['franka', 'fr3-planner', [0.9, 0.2, 0, 0.2, 0, 0, 0]],
-  ['piper', 'piper-planner', [0.9, 0.3, -0.2, 0, 0, 0]],
-  ['so101', 'so101-planner', [0.9, 0.3, -0.2, 0, 0]],
+  ['xarm', 'xarm6-planner', [-0.9, 0.2, -0.2, 0, 0, 0]],
+  ['ur', 'ur5e-planner', [-0.9, 0.3, 0.2, -0.5, 0, 0]],
+  ['franka', 'fr3-planner', [-0.9, 0.2, 0, 0.2, 0, 0, 0]],
+  ['piper', 'piper-planner', [-0.9, 0.3, -0.2, 0, 0, 0]],
+  ['so101', 'so101-planner', [-0.9, 0.1, -0.2, 0.1, 0]],
 ];
 const SIZE = {width: 1500, height: 780};
 const MOST = 60_000; // bytes
@@ -33,7 +33,8 @@ async function webp(browser, png) {
 }
 
 const browser = await launch();
-for (const [name, blueprint, by] of ARMS) {
+const only = process.argv.slice(2);
+for (const [name, blueprint, by] of ARMS.filter(([name]) => !only.length || only.includes(name))) {
   const run = await Run.start(blueprint, '--sim');
   try {
     if (run.arm().phase !== 'ready') run.dimos('arm', 'enable', 'arm');
