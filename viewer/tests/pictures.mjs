@@ -40,6 +40,7 @@ for (const [name, blueprint, by] of ARMS.filter(([name]) => !only.length || only
     if (run.arm().phase !== 'ready') run.dimos('arm', 'enable', 'arm');
     run.dimos('move', 'arm', '--named', 'home', '--speed', '1');
     const page = await open(browser, run.url, SIZE);
+    page.setDefaultTimeout(120_000);
     await text(page, '#age', /^live$/);
     const from = run.positions();
     for (const [joint, angle] of by.entries()) {
