@@ -1,5 +1,5 @@
 # run install dist viewer check test test-fast package verified · test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants ·
-# bench bench-quick bench-page bench-share jitter soak lies lies-wire pauses
+# bench bench-quick bench-page bench-share screenshots jitter soak lies lies-wire pauses
 
 PYTHON ?= python3
 # Most tests wait rather than compute. More at a time than this and whole runs no longer keep their time.
@@ -26,7 +26,7 @@ PAGE := viewer/dist/index.html
 PAGE_SOURCES := $(wildcard viewer/*.json viewer/*.mjs) $(shell find viewer/src -type f 2>/dev/null)
 NODE := $(if $(wildcard viewer/package.json),$(shell command -v npm))
 
-.PHONY: run install dist shipped viewer viewer-if-possible check lint scripts spelling licences test test-fast package verified test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants bench bench-quick bench-page bench-share jitter soak lies lies-wire pauses
+.PHONY: run install dist shipped viewer viewer-if-possible check lint scripts spelling licences test test-fast package verified test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants bench bench-quick bench-page bench-share screenshots jitter soak lies lies-wire pauses
 
 # Builds the program to try it, not optimized, and starts the shipped blueprint; its arm is simulated. Ends with Ctrl-C.
 run: viewer-if-possible
@@ -186,6 +186,11 @@ bench-quick:
 bench-page: viewer
 	cargo build --release --locked --bin dimos
 	DIMOS=$(abspath $(TARGET))/release/dimos node viewer/tests/bench.mjs
+
+# The pictures of the arms' pages, in docs/images: shipped planners with their emulators, in Chromium.
+screenshots: viewer
+	cargo build --locked --bin dimos
+	DIMOS=$(abspath $(TARGET))/debug/dimos node viewer/tests/pictures.mjs
 
 # What a run on the network costs and how fast it is, over the loopback interface. PART=stops: one part of it.
 bench-share:

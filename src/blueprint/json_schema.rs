@@ -52,7 +52,7 @@ pub fn full_schema<'a>(catalog: impl Into<Catalog<'a>>) -> Value {
 const GONE: [(&str, &str); 1] = [(
     "python_dimos",
     "the coordinator of Python dimos is a bridge now: python3 -m dimos_client.python_dimos --command \
-     (docs/many-machines.md)",
+     (docs/from-python-dimos.md)",
 )];
 
 /// Returns what to say of an unknown key: what took its place, or the group that it belongs to.

@@ -28,7 +28,7 @@ named! {
 
 /// The run as the node `dimos` of ROS 2 with the middleware rmw_zenoh: joint states, transforms, robot description,
 /// diagnostics, and, with `command`, the action `FollowJointTrajectory` of each trajectory task. Needs its router:
-/// `ros2 run rmw_zenoh_cpp rmw_zenohd`. See `docs/many-machines.md`.
+/// `ros2 run rmw_zenoh_cpp rmw_zenohd`. See `docs/from-ros.md`.
 #[derive(Debug, Clone, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct RosEntry {

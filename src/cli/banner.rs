@@ -62,7 +62,7 @@ pub fn text(report: &StatusReport, socket: &Path, url: Option<&str>, end: &str) 
     let clock = Some(&report.ticks.clock).filter(|clock| clock.starts_with("device"));
     let clock = clock.map(|clock| format!(", clock: {clock}")).unwrap_or_default();
     row("tick", format!("{} Hz{clock}", report.tick_rate));
-    for (index, text) in report.realtime.iter().flat_map(realtime).enumerate() {
+    for (index, text) in realtime_of(report).into_iter().enumerate() {
         row(if index == 0 { "real time" } else { "" }, text);
     }
     row("log", report.log.clone().unwrap_or_else(|| "none".into()));
@@ -148,6 +148,20 @@ pub fn after_exit(arm: &ArmReport, ended: &Ended) -> &'static str {
     }
 }
 
+/// Returns the real-time measures of a run. Where nothing moves but emulators, those that are missing are one line.
+fn realtime_of(report: &StatusReport) -> Vec<String> {
+    let missing = report.realtime.iter().any(|measure| !measure.granted);
+    match missing && is_simulated(report) {
+        true => vec!["not granted; simulated arms need none (`dimos doctor`)".to_owned()],
+        false => report.realtime.iter().flat_map(realtime).collect(),
+    }
+}
+
+/// Returns whether no arm of a run is real.
+pub fn is_simulated(report: &StatusReport) -> bool {
+    report.arms.iter().all(|arm| arm.simulated)
+}
+
 /// Returns one real-time measure; if it was refused, a second line gives the fix.
 pub fn realtime(measure: &RealtimeReport) -> Vec<String> {
     if measure.granted {
@@ -214,6 +228,10 @@ run coordinator-yourarm  PARTLY SIMULATED  (pid 42, dimos 0.1.0)
 Press Ctrl-C for a controlled stop. In a second terminal: dimos status";
         let socket = Path::new("/run/dimos.sock");
         assert_eq!(text(&report, socket, None, IN_A_TERMINAL).join("\n"), expected);
+        let simulated = StatusReport { arms: vec![arm("hold", false)], ..report.clone() };
+        let lines = text(&simulated, socket, None, IN_A_TERMINAL);
+        let about = lines.iter().filter(|line| line.contains("real time") || line.contains("ulimit"));
+        assert_eq!(about.count(), 1, "{lines:#?}");
         let viewed = StatusReport { view: Some("http://127.0.0.1:7000/".into()), ..report };
         let line = |url| text(&viewed, socket, url, "end").into_iter().rev().nth(1).unwrap();
         assert_eq!(line(Some("http://127.0.0.1:7000/#1f")), "  view       http://127.0.0.1:7000/#1f");

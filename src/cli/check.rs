@@ -139,7 +139,7 @@ fn print(summary: &Summary) {
         };
         output::wrapped(format_args!("  motors: {motors}; at exit they {exit} ({})", arm.on_exit_from.name()));
         let mut table =
-            Table::new(&["  JOINT", ">LOWER rad", ">UPPER rad", ">rad/s", ">rad/s²", ">rad/s³", "~WHERE FROM"]);
+            Table::new(&["  JOINT", ">LOWER rad", ">UPPER rad", ">rad/s", ">?rad/s²", ">?rad/s³", "~?WHERE FROM"]);
         for joint in &arm.joints {
             let limits = [
                 joint.position_lower,
@@ -160,7 +160,7 @@ fn print(summary: &Summary) {
         }
     }
     output::line("");
-    let mut table = Table::new(&["TASK", "TYPE", ">PRIORITY", "~JOINTS"]);
+    let mut table = Table::new(&["TASK", "TYPE", ">?PRIORITY", "~JOINTS"]);
     for task in &summary.tasks {
         let kind = task.kind.clone();
         table.row([task.name.clone(), kind, task.priority.to_string(), task.joints.join(" ")]);

@@ -95,7 +95,7 @@ pub type Result<T = Exit> = std::result::Result<T, Failure>;
 impl Failure {
     /// Creates a failure without a hint.
     pub fn new(exit: Exit, what: impl Into<String>) -> Self {
-        Self { exit, what: what.into(), hint: None, code: String::new(), data: None }
+        Self { exit, what: without_number(what.into()), hint: None, code: String::new(), data: None }
     }
 
     /// Creates a failure from the text of an error, which may end with a hint.
@@ -163,6 +163,12 @@ impl From<ClientError> for Failure {
             _ => failure,
         }
     }
+}
+
+/// Returns a text without the number of an error of the system, whose words are before it: ` (os error 2)`.
+fn without_number(text: String) -> String {
+    let Some((before, after)) = text.split_once(" (os error ") else { return text };
+    after.split_once(')').map_or_else(|| text.clone(), |(_, after)| without_number(format!("{before}{after}")))
 }
 
 /// Returns the text about wrong parameters without the names of the rpc method and of its lists, which a user of the
@@ -234,6 +240,9 @@ mod tests {
         let denied = || std::io::Error::from(std::io::ErrorKind::PermissionDenied);
         let failure: Failure = Err::<(), _>(denied()).context("plan.json").unwrap_err().into();
         assert_eq!(failure, Failure::new(Exit::Failed, "plan.json: permission denied"));
+        let of_system = std::io::Error::from_raw_os_error(2);
+        let what = format!("a.yaml: {of_system}; b.yaml: {of_system}");
+        assert_eq!(Failure::usage(what).what, "a.yaml: No such file or directory; b.yaml: No such file or directory");
         let usage = Failure::usage("no such arm").hint("there is `left`");
         assert_eq!(Failure::from(anyhow::Error::from(usage.clone())), usage);
     }

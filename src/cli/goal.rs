@@ -367,37 +367,37 @@ pub fn checked(level: PlanLevel) -> &'static str {
 /// Prints a plan's figures.
 pub fn show(planned: &Planned) {
     let s = &planned.summary;
-    output::line(format_args!(
+    output::wrapped(format_args!(
         "plan {}: {:.2} s, {:.3} rad long, {} waypoints, found in {:.3} s (seed {})",
         planned.plan, s.duration, s.length, s.waypoints, planned.elapsed, s.seed
     ));
     if let Some(fraction) = s.fraction.filter(|fraction| *fraction < 1.0) {
-        output::line(format_args!("  straight line: {} % of the way", fixed(fraction * 100.0, 1)));
+        output::wrapped(format_args!("  straight line: {} % of the way", fixed(fraction * 100.0, 1)));
     }
     match (s.clearance, &s.closest) {
         (Some(depth), Some([a, b])) if depth < 0.0 => {
-            output::line(format_args!("  begins in contact: {a} and {b}, {} m deep", fixed(-depth, 4)));
+            output::wrapped(format_args!("  begins in contact: {a} and {b}, {} m deep", fixed(-depth, 4)));
         }
         (Some(clearance), Some([a, b])) if clearance < 1e-6 => {
-            output::line(format_args!("  proven free of contact; {a} comes within 1 mm of {b}"));
+            output::wrapped(format_args!("  proven free of contact; {a} comes within 1 mm of {b}"));
         }
         (Some(clearance), Some([a, b])) => {
-            output::line(format_args!(
+            output::wrapped(format_args!(
                 "  proven clearance {} m, least between {a} and {b}",
                 fixed(clearance, if clearance < 1e-3 { 6 } else { 4 })
             ));
         }
         (Some(clearance), None) => {
-            output::line(format_args!("  proven clearance {} m or more", fixed(clearance, 4)));
+            output::wrapped(format_args!("  proven clearance {} m or more", fixed(clearance, 4)));
         }
         (None, _) if s.level == PlanLevel::Fast => {
-            output::line("  not proven free of contact: checked at samples only");
+            output::wrapped("  not proven free of contact: checked at samples only");
         }
         _ => {}
     }
     for clamped in &s.goal_clamped {
         let (joint, used, requested) = (&clamped.joint, fixed(clamped.used, 6), fixed(clamped.requested, 6));
-        output::line(format_args!("  goal of {joint}: {used}, its limit, instead of {requested}"));
+        output::wrapped(format_args!("  goal of {joint}: {used}, its limit, instead of {requested}"));
     }
     for given_up in &s.padding_given_up {
         let where_ = match given_up.near.as_str() {
@@ -406,7 +406,7 @@ pub fn show(planned: &Planned) {
         };
         let (link, other, distance) = (&given_up.link, &given_up.other, fixed(given_up.distance, 4));
         let padding = fixed(s.padding, 4);
-        output::line(format_args!("  less than {padding} m {where_}: {link} is {distance} m from {other} there"));
+        output::wrapped(format_args!("  less than {padding} m {where_}: {link} is {distance} m from {other} there"));
     }
 }
 

@@ -58,7 +58,8 @@ pub fn run(args: &Args) -> Result {
     if args.check {
         return check(args, &mut job);
     }
-    let mut client = args.target_run.connect()?;
+    // A mistake in the file is reported without a run, too; with one, together with names that it does not know.
+    let mut client = args.target_run.connect().or_else(|failure| job.verdict().and(Err(failure)))?;
     let signals = Signals::watch();
     let names = Names::of(&mut client)?;
     names.check(&mut job)?;
@@ -132,11 +133,23 @@ pub fn run(args: &Args) -> Result {
 fn check(args: &Args, job: &mut Job) -> Result {
     match args.target_run.connect_if_live()? {
         Some(mut client) => Names::of(&mut client)?.check(job)?,
-        None => output::note("no run is live: the names of arms, poses, inputs and objects were not checked"),
+        None => {
+            job.verdict()?;
+            output::note("no run is live: the names of arms, poses, inputs and objects were not checked");
+        }
     }
+    let count = |steps: &[Step]| {
+        let mut all = Vec::new();
+        times::all(steps, &mut all);
+        all.len()
+    };
+    let (steps, on_fault) = (count(&job.steps), count(&job.on_fault));
     match args.target_run.json {
-        true => output::json(&json!({"ok": true, "steps": job.count})),
-        false => output::line(format_args!("{}: {} steps, no mistakes", job.file, job.count)),
+        true => output::json(&json!({"ok": true, "steps": steps, "on_fault": on_fault})),
+        false => {
+            let more = if on_fault > 0 { format!(" and {on_fault} on a fault") } else { String::new() };
+            output::line(format_args!("{}: {steps} steps{more}, no mistakes", job.file));
+        }
     }
     Ok(Exit::Ok)
 }

@@ -25,7 +25,7 @@ pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
         output::json(&rows.collect::<Vec<_>>());
         return Ok(Exit::Ok);
     }
-    let mut table = Table::new(&["NAME", "SOURCE", "~ARMS", "~DESCRIPTION"]);
+    let mut table = Table::new(&["NAME", "?SOURCE", "~?ARMS", "~DESCRIPTION"]);
     for b in all {
         let about = match b.problem {
             Some(problem) => output::toned(format!("wrong: {problem}"), output::Tone::Bad),

@@ -65,6 +65,10 @@ enum Command {
     /// Read all of a log and check it: checksums, order, gaps, messages
     Doctor(Log),
     /// Replay a log through the control code and compare its commands bit for bit
+    ///
+    /// The inputs and requests of every tick pass through the same control code again, and every command must be
+    /// identical. Otherwise exits with 1 and prints the first difference; exits with 5 if a part is missing in the log,
+    /// up to which all commands are identical.
     Verify(Log),
     /// Run a log again with a changed limit, task or tolerance, and show what differs
     #[command(after_help = "\

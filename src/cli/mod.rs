@@ -39,6 +39,7 @@ pub mod pose;
 pub mod preview;
 pub mod proxy;
 mod recorded_path;
+mod redraw;
 pub mod replay;
 pub mod run;
 pub mod run_record;
@@ -60,6 +61,7 @@ pub mod world;
 use std::process::ExitCode;
 use std::sync::OnceLock;
 
+use clap::error::{ContextKind, ContextValue};
 use clap::{ArgMatches, CommandFactory, FromArgMatches, Parser, Subcommand};
 use rustix::process::{Resource, getrlimit};
 
@@ -165,7 +167,7 @@ enum Command {
     Completions(completions::Args),
     /// Print the manual page, or write one for every verb
     Man(man::Args),
-    #[command(about = "Play a log in the terminal, verify it, or repeat its motion with an arm")]
+    #[command(about = "Play a log in the terminal, or repeat its motion with an arm")]
     Replay(replay::ReplayArgs),
 }
 
@@ -321,7 +323,13 @@ fn answer(catalog: Catalog<'_>) -> ExitCode {
     set_threads_of_the_network();
     let typed = typed::as_parsed(std::env::args_os());
     let json = typed.iter().take_while(|word| *word != "--").any(|word| word == "--json");
-    let result = match command().try_get_matches_from(&typed) {
+    let parsed = command().try_get_matches_from(&typed).map_err(|mut error| {
+        if let Some(hint) = typed::pose_hint(&typed) {
+            error.insert(ContextKind::Suggested, ContextValue::StyledStrs(vec![hint.into()]));
+        }
+        error
+    });
+    let result = match parsed {
         Ok(arguments) => dispatch(&arguments, catalog),
         // `--help` and `--version`.
         Err(error) if !error.use_stderr() => {

@@ -13,6 +13,7 @@ use serde::Serialize;
 
 use super::escapes::{in_json, safe};
 use super::exit::{Exit, Failure};
+use super::redraw;
 use dimos_rpc::run_dir::LiveRun;
 
 /// Minimum width of a squeezed table [columns]; below, the terminal wraps the lines.
@@ -34,17 +35,17 @@ pub fn line(text: impl Display) {
 
 /// Prints a sentence to stdout; a terminal that is narrower gets it in several lines, indented below the first.
 pub fn wrapped(text: impl Display) {
-    folded(&text.to_string(), width(io::stdout())).iter().for_each(line);
+    folded(&text.to_string(), columns(io::stdout())).iter().for_each(line);
 }
 
-/// Breaks a text at blanks.
-fn folded(text: &str, width: Option<u16>) -> Vec<String> {
+/// Breaks a text at blanks, with the lines after the first indented.
+pub fn folded(text: &str, width: Option<u16>) -> Vec<String> {
     let Some(width) = width.map(usize::from) else { return vec![text.to_owned()] };
     let indent = text.len() - text.trim_start().len() + 2;
     let mut lines: Vec<String> = Vec::new();
     for word in text.split(' ') {
         match lines.last_mut() {
-            Some(last) if last.chars().count() + 1 + word.chars().count() <= width => {
+            Some(last) if redraw::width(last) + 1 + redraw::width(word) <= width => {
                 last.push(' ');
                 last.push_str(word);
             }
@@ -156,20 +157,26 @@ pub fn toned(text: impl Display, tone: Tone) -> Cell {
     Cell::new(text).fg(colour)
 }
 
-/// Returns the width of a terminal that reports one and is wide enough for columns. Pseudo-terminals (`script`, a
+/// Returns the columns of a terminal that reports them and has enough for tables. Pseudo-terminals (`script`, a
 /// container) may report 0.
-fn width(out: impl AsFd) -> Option<u16> {
+pub fn columns(out: impl AsFd) -> Option<u16> {
     rustix::termios::tcgetwinsize(out).ok().map(|size| size.ws_col).filter(|columns| *columns >= MIN_COLUMNS)
 }
 
 /// A table without borders: aligned columns, two spaces apart.
-pub struct Table(comfy_table::Table);
+pub struct Table {
+    table: comfy_table::Table,
+    width: Option<u16>,
+    /// Which columns are left out where they do not fit.
+    optional: Vec<bool>,
+}
 
 impl Table {
     /// Creates a table with these headings. A leading `>` aligns the column to the right, a leading `~` lets its text
-    /// wrap at blanks on a narrow terminal; all other columns, and the names in them, stay whole.
+    /// wrap at blanks on a narrow terminal; all other columns, and the names in them, stay whole. Columns with a `?` are
+    /// left out where they do not fit, the last first.
     pub fn new(headings: &[&str]) -> Self {
-        Self::of_width(headings, width(io::stdout()))
+        Self::of_width(headings, columns(io::stdout()))
     }
 
     fn of_width(headings: &[&str], width: Option<u16>) -> Self {
@@ -181,7 +188,7 @@ impl Table {
         if !colour(&io::stdout()) {
             table.force_no_tty();
         }
-        let title = |h: &&str| Cell::new(h.trim_start_matches(['>', '~'])).add_attribute(Attribute::Bold);
+        let title = |h: &&str| Cell::new(h.trim_start_matches(['>', '~', '?'])).add_attribute(Attribute::Bold);
         table.set_header(headings.iter().map(title).collect::<Vec<_>>());
         let last = headings.len().saturating_sub(1);
         for (index, (column, heading)) in table.column_iter_mut().zip(headings).enumerate() {
@@ -193,17 +200,18 @@ impl Table {
             let is_text = heading.starts_with('~');
             column.set_constraint(if is_text { TEXT } else { ColumnConstraint::ContentWidth });
         }
-        Self(table)
+        let optional = headings.iter().map(|h| h.trim_start_matches(['>', '~']).starts_with('?')).collect();
+        Self { table, width, optional }
     }
 
     /// Adds a row.
     pub fn row<C: Into<Cell>>(&mut self, cells: impl IntoIterator<Item = C>) {
-        self.0.add_row(cells.into_iter().map(Into::into).collect::<Vec<Cell>>());
+        self.table.add_row(cells.into_iter().map(Into::into).collect::<Vec<Cell>>());
     }
 
     /// Returns its lines as printed.
     pub fn lines(&self) -> Vec<String> {
-        let mut table = self.0.clone();
+        let mut table = self.table.clone();
         // A text that is shorter takes no more room than it has.
         let contents = table.column_max_content_widths();
         for (column, content) in table.column_iter_mut().zip(contents) {
@@ -211,7 +219,30 @@ impl Table {
                 column.set_constraint(ColumnConstraint::ContentWidth);
             }
         }
+        self.drop_columns(&mut table);
         table.lines().map(|row| row.trim_end().to_owned()).collect()
+    }
+
+    /// Hides optional columns until the others fit.
+    fn drop_columns(&self, table: &mut comfy_table::Table) {
+        let Some(width) = self.width.map(usize::from) else { return };
+        let least = |content: u16, column: &comfy_table::Column| match column.constraint() {
+            Some(constraint) if *constraint == TEXT => usize::from(MIN_TEXT),
+            _ => usize::from(content),
+        };
+        let contents = table.column_max_content_widths();
+        // Two blanks between columns.
+        let taken = contents.iter().zip(table.column_iter()).map(|(content, column)| least(*content, column) + 2);
+        let mut taken: Vec<usize> = taken.collect();
+        for (at, _) in self.optional.iter().enumerate().rev().filter(|(_, optional)| **optional) {
+            if taken.iter().sum::<usize>() <= width + 2 {
+                return;
+            }
+            if let (Some(column), Some(taken)) = (table.column_mut(at), taken.get_mut(at)) {
+                column.set_constraint(ColumnConstraint::Hidden);
+                *taken = 0;
+            }
+        }
     }
 
     /// Prints it to stdout.
@@ -269,12 +300,12 @@ mod tests {
     #[test]
     fn a_terminal_without_a_width_squeezes_no_table() {
         let terminal = std::fs::File::options().read(true).write(true).open("/dev/ptmx").unwrap();
-        assert_eq!(width(&terminal), None, "a new one has no size");
-        for (columns, usable) in [(80, Some(80)), (1, None), (0, None)] {
-            tcsetwinsize(&terminal, Winsize { ws_row: 24, ws_col: columns, ws_xpixel: 0, ws_ypixel: 0 }).unwrap();
-            assert_eq!(width(&terminal), usable, "{columns}");
+        assert_eq!(columns(&terminal), None, "a new one has no size");
+        for (width, usable) in [(80, Some(80)), (1, None), (0, None)] {
+            tcsetwinsize(&terminal, Winsize { ws_row: 24, ws_col: width, ws_xpixel: 0, ws_ypixel: 0 }).unwrap();
+            assert_eq!(columns(&terminal), usable, "{width}");
         }
-        assert_eq!(width(std::fs::File::open("/dev/null").unwrap()), None);
+        assert_eq!(columns(std::fs::File::open("/dev/null").unwrap()), None);
     }
 
     #[test]
@@ -308,5 +339,13 @@ mod tests {
         let mut names = Table::of_width(&["JOINT", "ADDRESS"], Some(40));
         names.row(["left_arm_joint1", "INTERFACE|slcan:/dev/ttyX[@BITRATE]"]);
         assert_eq!(names.lines()[1], "left_arm_joint1  INTERFACE|slcan:/dev/ttyX[@BITRATE]", "wider than the terminal");
+        let joints = |width| {
+            let mut table = Table::of_width(&["JOINT", ">rad", ">?rad/s", "~TEXT", "?LAST"], Some(width));
+            table.row(["left_arm_joint1", "0.5000", "0.2500", "a few words of a text that may wrap", "12 characters"]);
+            table.lines()[0].split_whitespace().map(str::to_owned).collect::<Vec<_>>().join(" ")
+        };
+        assert_eq!(joints(74), "JOINT rad rad/s TEXT LAST");
+        assert_eq!(joints(70), "JOINT rad rad/s TEXT");
+        assert_eq!(joints(50), "JOINT rad TEXT", "no column but the optional ones is left out");
     }
 }

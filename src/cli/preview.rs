@@ -12,8 +12,9 @@ use super::output::{self, Table, fixed, number};
 use dimos_rpc::api::{Preview, PreviewReply};
 use dimos_rpc::report::TcpReport;
 
-/// Columns of the table: samples of the motion.
-const COLUMNS: usize = 8;
+/// Most samples of the motion in the table, and the columns that each takes on the terminal.
+const SAMPLES: usize = 8;
+const SAMPLE_COLUMNS: usize = 8;
 
 /// Arguments of `preview`.
 #[derive(Debug, clap::Args)]
@@ -83,12 +84,19 @@ fn rate(text: &str) -> std::result::Result<f64, String> {
 }
 
 /// Returns samples of the motion, its ends included: a row per joint and coordinate, a column per time, so that any
-/// number of joints fits on a narrow terminal.
+/// number of joints fits on a narrow terminal. That has fewer samples.
 fn table(reply: &PreviewReply) -> Table {
-    let tcp = |robot| reply.tcps.get(robot).map_or_else(|| "end effector".to_owned(), TcpReport::name);
+    let tcp = |arm| {
+        let of = reply.tcps.get(arm).map_or_else(|| "end effector".to_owned(), TcpReport::name);
+        ["x", "y", "z"].map(|axis| format!("{arm}: {of} in map {axis}"))
+    };
+    let tcps: Vec<String> = reply.end_effectors.keys().flat_map(tcp).collect();
+    let names = reply.trajectory.joint_names.iter().chain(&tcps).map(|name| name.chars().count()).max().unwrap_or(0);
+    let room = output::columns(std::io::stdout())
+        .map_or(SAMPLES, |columns| usize::from(columns).saturating_sub(names) / SAMPLE_COLUMNS);
     let points = &reply.trajectory.points;
     let last = points.len().saturating_sub(1);
-    let columns = COLUMNS.min(points.len());
+    let columns = room.clamp(2, SAMPLES).min(points.len());
     let index = |column: usize| if columns > 1 { column * last / (columns - 1) } else { 0 };
     let shown: Vec<usize> = (0..columns).map(index).collect();
     let times =
@@ -99,14 +107,10 @@ fn table(reply: &PreviewReply) -> Table {
         let at = |i: &usize| points.get(*i).and_then(|point| point.positions.get(joint)).copied();
         table.row([name.clone()].into_iter().chain(shown.iter().map(|i| number(at(i), 3))));
     }
-    for (arm, path) in &reply.end_effectors {
-        for (axis, letter) in ["x", "y", "z"].iter().enumerate() {
+    for (path, names) in reply.end_effectors.values().zip(tcps.chunks(3)) {
+        for (axis, name) in names.iter().enumerate() {
             let at = |i: &usize| path.get(*i).and_then(|xyz| xyz.get(axis)).copied();
-            table.row(
-                [format!("{arm}: {} in map {letter}", tcp(arm))]
-                    .into_iter()
-                    .chain(shown.iter().map(|i| number(at(i), 3))),
-            );
+            table.row([name.clone()].into_iter().chain(shown.iter().map(|i| number(at(i), 3))));
         }
     }
     table

@@ -27,16 +27,12 @@ use keys::Keys;
 use player::{Pace, Part, RealTime, Waiting, delay, play};
 use view::{JsonLines, Live, Plain, View};
 
-/// Play a log in the terminal, verify it, or repeat its motion with an arm
+/// Play a log in the terminal, or repeat its motion with an arm
 ///
 /// Plays in real time: a joint table and a progress bar on a terminal (space pauses, right arrow plays the next tick,
 /// up and down play 10 % faster and slower, q ends), one line per second elsewhere, one JSON object per message with
 /// --json. The log of a live run plays up to its newest chunk. Exits with 5 if the log is truncated, or if the recorder
 /// lost samples.
-///
-/// With --verify the inputs and requests of every tick pass through the same control code again, and every command must
-/// be identical, bit for bit. Otherwise exits with 1 and prints the first difference; exits with 5 if a part is missing
-/// in the log, up to which all commands are identical.
 ///
 /// With --onto the arms of a blueprint follow the recorded motion, matched by joint names, in a separate run: first a
 /// slow approach to its start, then the motion through the blueprint's trajectory tasks, within all limits. A motion
@@ -81,8 +77,8 @@ pub struct ReplayArgs {
     /// Play all but these topics, separated by commas
     #[arg(long, value_name = "TOPIC", value_delimiter = ',', conflicts_with_all = ["topics", "verify", "blueprint"])]
     pub exclude_topics: Vec<String>,
-    /// Replay the whole log through the control code and compare its commands bit for bit
-    #[arg(long, conflicts_with_all = ["rate", "looping", "start_offset", "duration", "topics"])]
+    /// As `dimos log verify`
+    #[arg(long, hide = true, conflicts_with_all = ["rate", "looping", "start_offset", "duration", "topics"])]
     pub verify: bool,
     /// Arguments of --onto
     #[command(flatten)]

@@ -62,8 +62,8 @@ pub struct Args {
     /// Text log of the background process
     #[arg(long, value_name = "FILE", hide = true)]
     pub text_log: Option<PathBuf>,
-    /// Only check the blueprint; connect to nothing
-    #[arg(long)]
+    /// As `dimos check`
+    #[arg(long, hide = true)]
     pub check: bool,
     /// Print JSON
     #[arg(long)]

@@ -6,10 +6,10 @@ use std::time::{Duration, Instant};
 
 use super::arguments::{Target, hertz, place};
 use super::banner;
-use super::escapes::safe;
 use super::exit::{Exit, Result};
 use super::lasting;
 use super::output::{self, Table, fixed, number};
+use super::redraw::{self, Redraw};
 use dimos_rpc::api::{State, gripper_text};
 use dimos_rpc::client::{self, ClientError};
 use dimos_rpc::error::{Code, RpcError};
@@ -79,46 +79,24 @@ fn has_ended(name: &str) -> bool {
 /// Output of --watch: redrawn in place on a terminal, appended elsewhere.
 struct Screen {
     live: bool,
-    /// Lengths of the lines on the terminal [columns].
-    drawn: Vec<usize>,
+    redraw: Redraw,
 }
 
 impl Screen {
     fn new(live: bool) -> Self {
-        Self { live, drawn: Vec::new() }
+        Self { live, redraw: Redraw::default() }
     }
 
     fn show(&mut self, lines: &[String]) -> io::Result<()> {
-        // A terminal that has become narrower has wrapped the lines that are there.
-        let width = rustix::termios::tcgetwinsize(io::stdout()).map_or(0, |size| usize::from(size.ws_col));
-        let rows = |length: &usize| if width == 0 { 1 } else { length.div_ceil(width).max(1) };
-        let mut text = match self.live && !self.drawn.is_empty() {
-            true => format!("\x1b[{}A\x1b[J", self.drawn.iter().map(rows).sum::<usize>()),
-            false => String::new(),
-        };
         let colour = output::colour(&io::stdout());
-        self.drawn.clear();
-        for line in lines {
-            let line = safe(line, colour);
-            text.push_str(&line);
-            text.push('\n');
-            self.drawn.push(columns(&line));
-        }
+        let text = match self.live {
+            true => self.redraw.frame(lines, redraw::stdout_size(), colour),
+            false => Redraw::default().frame(lines, (0, 0), colour),
+        };
         let mut out = io::stdout().lock();
         out.write_all(text.as_bytes())?;
         out.flush()
     }
-}
-
-/// Returns the columns that a line takes: colours take none.
-fn columns(line: &str) -> usize {
-    let mut escaped = false;
-    let is_shown = |c: &char| {
-        let shown = !escaped && *c != '\x1b';
-        escaped = *c == '\x1b' || (escaped && *c != 'm');
-        shown
-    };
-    line.chars().filter(is_shown).count()
 }
 
 fn table(report: &StateReport) -> Vec<String> {
@@ -137,7 +115,7 @@ fn of_arm(arm: &ArmStateReport) -> Vec<String> {
     let age = arm.age_ms.map_or_else(|| "no state yet".into(), |ms| format!("state {ms:.1} ms old"));
     let mut lines = vec![format!("{}{simulated}  {age}", arm.hardware_id)];
     let mut table =
-        Table::new(&["JOINT", ">POSITION rad", ">deg", ">VELOCITY rad/s", "", ">EFFORT Nm", ">COMMAND rad"]);
+        Table::new(&["JOINT", ">POSITION rad", ">deg", ">?VELOCITY rad/s", "?", ">?EFFORT Nm", ">?COMMAND rad"]);
     for joint in &arm.joints {
         table.row([
             joint.name.clone(),
@@ -150,6 +128,14 @@ fn of_arm(arm: &ArmStateReport) -> Vec<String> {
         ]);
     }
     lines.extend(table.lines());
+    let rest = below(arm);
+    lines.extend(rest.iter().flat_map(|line| output::folded(line, output::columns(io::stdout()))));
+    lines
+}
+
+/// Returns the lines below the joints.
+fn below(arm: &ArmStateReport) -> Vec<String> {
+    let mut lines = Vec::new();
     if let Some(gripper) = arm.gripper {
         let unit = arm.gripper_unit.as_deref().unwrap_or("m");
         lines.push(format!("gripper  {}{}", gripper_text(gripper, unit), force(arm)));
@@ -182,15 +168,4 @@ fn force(arm: &ArmStateReport) -> String {
 /// Returns the source of a velocity unless it is measured.
 fn source(joint: &JointReport) -> &str {
     if joint.velocity_source == "estimated" { "est." } else { "" }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn colours_take_no_columns() {
-        assert_eq!(columns("\x1b[1mJOINT\x1b[0m  \x1b[31m0.5\x1b[0m"), 10);
-        assert_eq!(columns("µs"), 2);
-    }
 }

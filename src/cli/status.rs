@@ -22,7 +22,8 @@ use dimos_rpc::run_dir::LiveRun;
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
 What needs attention comes first: arms that are held, faults, tasks that were aborted, a log that ended, real-time measures \
-that the system did not grant. -v adds what is read, counted and measured.")]
+that the system did not grant to a run with a real arm. -v adds what is read, counted and measured, with the ranges of the \
+gripper and the link whose pose is printed.")]
 pub struct Args {
     /// Run to show in full
     #[arg(value_name = "RUN", conflicts_with = "run")]
@@ -302,7 +303,13 @@ fn attention(r: &StatusReport) -> Vec<String> {
     if r.speed.paused {
         lines.push("all motions are paused: nothing moves until `dimos resume`".to_owned());
     }
-    for task in r.tasks.iter().filter(|task| matches!(task.state.as_str(), "ABORTED" | "FAULT")) {
+    // What held an arm that is ready again is over.
+    let is_over = |task: &TaskReport| {
+        let ready = r.arms.iter().filter(|arm| arm.phase == "ready");
+        let why = task.reason.as_deref().unwrap_or_default();
+        ready.map(|arm| format!("{} is held", arm.hardware_id)).any(|held| why.starts_with(&held))
+    };
+    for task in r.tasks.iter().filter(|task| matches!(task.state.as_str(), "ABORTED" | "FAULT") && !is_over(task)) {
         let why = task.reason.as_deref().unwrap_or("unknown reason");
         lines.push(format!("{} is {}: {why}", task.name, task.state));
     }
@@ -312,7 +319,8 @@ fn attention(r: &StatusReport) -> Vec<String> {
     if let Some(error) = r.recorder.as_ref().and_then(|recorder| recorder.error.as_ref()) {
         lines.push(format!("the log ENDED: {error}"));
     }
-    lines.extend(r.realtime.iter().filter(|measure| !measure.granted).flat_map(banner::realtime));
+    let needed = r.realtime.iter().filter(|measure| !measure.granted && !banner::is_simulated(r));
+    lines.extend(needed.flat_map(banner::realtime));
     lines
 }
 
@@ -345,7 +353,7 @@ fn print_planners<'r>(planners: impl Iterator<Item = (&'r str, &'r PlannerStatus
 }
 
 fn print_arms(arms: &[ArmReport], verbose: bool) {
-    let mut table = Table::new(&["ARM", "PHASE", "LINK", "MOTORS", "MODE", ">AGE ms", ">RATE Hz", ">NATIVE Hz"]);
+    let mut table = Table::new(&["ARM", "PHASE", "LINK", "MOTORS", "MODE", ">?AGE ms", ">?RATE Hz", ">?NATIVE Hz"]);
     for arm in arms {
         let good = |well: bool| if well { Tone::Good } else { Tone::Bad };
         let phase_tone = match arm.phase.as_str() {
@@ -376,10 +384,10 @@ fn print_arms(arms: &[ArmReport], verbose: bool) {
         for line in joint_lines(&arm.joints).iter().filter(|_| verbose) {
             output::wrapped(format_args!("  {name}: {line}"));
         }
-        if let Some(line) = gripper_line(arm) {
+        if let Some(line) = gripper_line(arm).filter(|_| verbose) {
             output::wrapped(format_args!("  {name}: {line}"));
         }
-        if let Some(tcp) = &arm.tcp {
+        if let Some(tcp) = arm.tcp.as_ref().filter(|_| verbose) {
             output::wrapped(format_args!("  {name}: poses in map are those of {}", tcp_text(tcp)));
         }
         if !arm.simulated && arm.identity.is_none() {
@@ -390,7 +398,7 @@ fn print_arms(arms: &[ArmReport], verbose: bool) {
         for (about, note) in arm.notes() {
             output::wrapped(format_args!("  {name}: {about}: {note}"));
         }
-        if let Some(load) = &arm.payload {
+        if let Some(load) = arm.payload.as_ref().filter(|load| verbose || load.mass > 0.0) {
             output::wrapped(format_args!("  {name}: payload {}", payload_text(load)));
         }
         if let Some(io) = arm.io.as_ref().filter(|_| verbose) {
@@ -420,7 +428,7 @@ fn print_arms(arms: &[ArmReport], verbose: bool) {
 
 /// Prints the tasks as a table.
 pub(super) fn print_tasks(tasks: &[TaskReport]) {
-    let mut table = Table::new(&["TASK", "TYPE", ">PRIORITY", "STATE", ">DONE", "JOINTS"]);
+    let mut table = Table::new(&["TASK", "TYPE", ">?PRIORITY", "STATE", ">?DONE", "?JOINTS"]);
     for task in tasks {
         let tone = match task.state.as_str() {
             "ABORTED" | "FAULT" => Tone::Bad,
@@ -494,7 +502,12 @@ fn print_timing(r: &StatusReport, verbose: bool) {
     if !clocked.is_empty() {
         output::wrapped(format_args!("  ticks without a state of the arm that clocks them: {}", t.without_state));
     }
-    for text in r.realtime.iter().filter(|measure| verbose && measure.granted).flat_map(banner::realtime) {
+    for text in r
+        .realtime
+        .iter()
+        .filter(|measure| verbose && (measure.granted || banner::is_simulated(r)))
+        .flat_map(banner::realtime)
+    {
         output::wrapped(format_args!("  {text}"));
     }
 }

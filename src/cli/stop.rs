@@ -22,7 +22,7 @@ pub struct Args {
     /// Stop only the arm with this hardware_id, in every run that has it
     pub arm: Option<String>,
     /// Stop all arms of all runs (the default)
-    #[arg(long, conflicts_with = "arm")]
+    #[arg(long, conflicts_with = "arm", hide = true)]
     pub all: bool,
     /// Which run
     #[command(flatten)]

@@ -34,7 +34,7 @@ enum Action {
         #[command(flatten)]
         target_run: Target,
     },
-    /// Query, start or cancel one task
+    /// Start or cancel one task
     Invoke {
         /// Name of the task
         task: String,
@@ -69,7 +69,8 @@ decelerate to rest.")]
 /// Method of `task invoke`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Method {
-    /// State of the task and its reason
+    /// State of the task and its reason, as `task list` shows
+    #[value(hide = true)]
     State,
     /// Start a follow task: the arm approaches its leader at 0.3 rad/s at most, then follows it
     Start,

@@ -123,7 +123,10 @@ fn write(items: &Receiver<Item>, lost: &AtomicU64, kept: &TextLines) {
                 let line = String::from_utf8_lossy(&line);
                 let line = safe(&line, colour);
                 kept.push(&line);
-                let _ = io::stderr().write_all(line.as_bytes());
+                let columns = output::columns(io::stderr());
+                let rows = line.lines().flat_map(|line| output::folded(line, columns));
+                let text: String = rows.map(|row| row + "\n").collect();
+                let _ = io::stderr().write_all(text.as_bytes());
             }
             Item::Private(line) => {
                 let line = String::from_utf8_lossy(&line);

@@ -31,6 +31,21 @@ fn separated(arguments: impl Iterator<Item = OsString>) -> Vec<OsString> {
     words
 }
 
+/// Six or seven numbers behind `--pose`: the last ones are the orientation, which has an option.
+pub fn pose_hint(words: &[OsString]) -> Option<String> {
+    let at = words.iter().position(|word| word == "--pose" || word == "--by")?;
+    let number = |word: &&OsString| word.to_str().is_some_and(|text| text.parse::<f64>().is_ok());
+    let numbers: Vec<&str> = words.iter().skip(at + 1).take_while(number).filter_map(|word| word.to_str()).collect();
+    let option = match numbers.len() {
+        6 => "--rpy",
+        7 => "--quat",
+        _ => return None,
+    };
+    let (xyz, turn) = numbers.split_at_checked(3)?;
+    let pose = words.get(at)?.to_str()?;
+    Some(format!("{pose} takes x y z, the orientation follows: {pose} {} {option} {}", xyz.join(" "), turn.join(" ")))
+}
+
 /// Moves `--at PLACE` before the verb, where the parser expects it. `--at` before a number is a position of `world`.
 fn place_first(mut words: Vec<OsString>) -> Vec<OsString> {
     let end = words.iter().position(|word| word == "--").unwrap_or(words.len());
@@ -80,6 +95,15 @@ mod tests {
         for same in ["move a --pose 0.3,x,0.4", "move a 0.3,0.1", "move --goal a=0.1,0.2", "run --set x=1,2"] {
             assert_eq!(read(same), words(same));
         }
+    }
+
+    #[test]
+    fn the_orientation_has_its_own_option() {
+        let hint = |line: &str| pose_hint(&line.split(' ').map(OsString::from).collect::<Vec<_>>());
+        let rpy = hint("dimos move arm --pose 0.3 0 -0.4 3.14 0 0 --speed 1").unwrap();
+        assert!(rpy.ends_with(": --pose 0.3 0 -0.4 --rpy 3.14 0 0"), "{rpy}");
+        assert!(hint("dimos plan arm --pose 0.3 0 0.4 0 0 0 1").unwrap().ends_with("--quat 0 0 0 1"));
+        assert_eq!(hint("dimos move arm --pose 0.3 0 0.4 --rpy 3.14 0 0"), None);
     }
 
     #[test]

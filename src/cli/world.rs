@@ -9,10 +9,10 @@ use super::arguments::{Target, angle, finite, length};
 use super::arm::parts::payload_text;
 use super::exit::{Exit, Failure, Result};
 use super::output::{self, Table, done, fixed};
-use dimos_core::bounded;
+use dimos_core::{bounded, pose};
 use dimos_robot::mesh::Size;
 use dimos_rpc::api::{
-    Attach, Detach, PoseSpec, ShapeSpec, World, WorldAdd, WorldEntry, WorldMove, WorldObject, WorldRemove,
+    Attach, Detach, GRASP_REACH, PoseSpec, ShapeSpec, World, WorldAdd, WorldEntry, WorldMove, WorldObject, WorldRemove,
 };
 use dimos_rpc::client::Client;
 
@@ -156,6 +156,9 @@ pub struct AttachArgs {
     /// Further links that may touch it
     #[arg(long, value_name = "LINK")]
     pub touch: Vec<String>,
+    /// Largest distance of its surface from the tool centre point [m]; default: 0.2, any with --link
+    #[arg(long, value_name = "METRES", value_parser = length, allow_negative_numbers = true)]
+    pub within: Option<f64>,
     /// Its mass [kg]: the arm's controller is set to carry it, and reads it back
     #[arg(long, value_name = "KG", value_parser = finite, allow_negative_numbers = true)]
     pub mass: Option<f64>,
@@ -220,8 +223,10 @@ pub fn run(args: &Args) -> Result {
         Command::Attach(a) => {
             let (name, robot) = (a.name.clone(), a.robot.clone());
             let (link, touch_links) = (a.link.clone(), a.touch.clone());
-            let reply =
-                a.target_run.connect()?.call(Attach { name, robot, link, touch_links, mass: a.mass, within: None })?;
+            // What is farther away is not at the fingers.
+            let within = a.within.or(a.link.is_none().then_some(GRASP_REACH));
+            let attach = Attach { name, robot, link, touch_links, mass: a.mass, within };
+            let reply = a.target_run.connect()?.call(attach)?;
             if a.target_run.json {
                 output::json(&reply);
             } else {
@@ -325,27 +330,31 @@ fn list(client: &mut Client, json: bool) -> Result<()> {
         output::json(&world);
         return Ok(());
     }
-    let mut table = Table::new(&["NAME", "SHAPE", ">SIZE m", ">X m", ">Y m", ">Z m", ">PADDING m", "HELD BY"]);
+    let mut table = Table::new(&["NAME", "?SHAPE", "~SIZE m", ">XYZ m", ">?RPY rad", ">?PADDING m", "?HELD BY"]);
+    let three = |values: [f64; 3], decimals| values.map(|v| fixed(v, decimals)).join(" ");
     for object in &world.objects {
         let (kind, size) = match &object.shape {
-            ShapeSpec::Box(size) => ("box", size.map(|v| fixed(v, 3)).join(" × ")),
+            ShapeSpec::Box(size) => ("box", size.map(|v| fixed(v, 3)).join(" ")),
             ShapeSpec::Sphere(radius) => ("sphere", format!("r {}", fixed(*radius, 3))),
             ShapeSpec::Cylinder([r, l]) => ("cylinder", format!("r {}, {} long", fixed(*r, 3), fixed(*l, 3))),
             ShapeSpec::Mesh(path) => ("mesh", path.clone()),
             ShapeSpec::Cloud(path) => ("cloud", path.clone()),
         };
-        let [x, y, z] = object.pose.xyz.map(|v| fixed(v, 3));
+        let PoseSpec { xyz, quat, rpy } = object.pose;
+        let rpy = match pose::to_xyz_rpy(&pose::from_written(xyz, quat, rpy)).1 {
+            [0.0, 0.0, 0.0] => "-".to_owned(),
+            turned => three(turned, 2),
+        };
         let held = object.held_by.as_ref().map_or_else(|| "-".into(), |[robot, link]| format!("{robot} {link}"));
-        table.row([object.name.clone(), kind.into(), size, x, y, z, fixed(object.padding, 3), held]);
+        let padding = fixed(object.padding, 3);
+        table.row([object.name.clone(), kind.into(), size, three(xyz, 3), rpy, padding, held]);
     }
     if world.objects.is_empty() {
         output::note("the world is empty: add an object with `dimos world add`");
     } else {
         table.print();
         if world.objects.iter().any(|object| object.held_by.is_some()) {
-            output::note(
-                "the position of a held object is in the frame of the link that holds it, all others in `map`",
-            );
+            output::note("the pose of a held object is in the frame of the link that holds it, all others in `map`");
         }
     }
     Ok(())

@@ -199,6 +199,25 @@ fn yourarm_stands_as_its_sheet_says() {
     assert_eq!(limits.collect::<Vec<_>>(), [-170.0, -100.0, -70.0, -175.0, -100.0, -270.0]);
 }
 
+/// Positions of tcp and jaw that another reader computes from the published description (TheRobotStudio,
+/// `so101_new_calib.urdf`, whose zero is LeRobot's), to the tenth of a millimetre.
+#[test]
+fn the_so101_moves_as_published() {
+    let robot = built_in("so101");
+    for (joints, tcp, jaw) in [
+        ([0.0; 6], [0.391361, -0.000009, 0.226470], None),
+        ([0.4, -0.6, 0.7, 0.5, -0.8, 0.3], [0.274110, -0.093384, 0.122674], Some([0.231068, -0.084433, 0.191975])),
+    ] {
+        let names = ["joint1", "joint2", "joint3", "joint4", "joint5", "jaw_joint"].map(str::to_owned);
+        let poses = poses(&robot, "base_link", &names.into_iter().zip(joints).collect());
+        for (link, at) in [("tcp", Some(tcp)), ("jaw", jaw)] {
+            let Some(at) = at else { continue };
+            let off = (poses[link].translation.vector - Vector3::from(at)).norm();
+            assert!(off < 1e-4, "{link} of {joints:?} is {off} m away");
+        }
+    }
+}
+
 /// How far a point of a link's frame lies outside the nearest of its shapes [m].
 fn outside(link: &Link, point: &Point3<f64>) -> f64 {
     let distance = |shape: &dimos::robot::Shape| {

@@ -30,7 +30,7 @@ fn position_and_force_reach_the_arm_and_the_log() {
     assert_eq!((gripping["gripper_unit"].as_str(), gripping["gripper_force_unit"].as_str()), (Some("m"), Some("N")));
     home.dimos("state").with(0).shows(&["gripper  0.0300 m, force 12.50 N"]);
     let shown = "arm: gripper 0.0000 m closed, 0.0800 m open; force 1 to 60 N; measured force 12.50 N";
-    home.dimos("status").with(0).shows(&[shown]);
+    home.dimos("status -v").with(0).shows(&[shown]);
     assert_eq!(orders(&arm), [Request::Grip(20.0, 12.5)]);
 
     // A stop keeps the grip: no further command, the same force.
@@ -109,7 +109,7 @@ fn a_rotary_gripper_is_in_radians_and_has_no_force() {
     let state = || home.dimos("state --json").with(0).json()["arms"][0].clone();
     eventually("the angle", || state()["gripper"].as_f64().is_some_and(|angle| (angle - 1.2).abs() < 3e-3));
     assert_eq!((state()["gripper_unit"].as_str(), state()["gripper_force"].as_f64()), (Some("rad"), None));
-    home.dimos("status").with(0).shows(&["gripper 0.0000 rad closed, 1.9"]);
+    home.dimos("status -v").with(0).shows(&["gripper 0.0000 rad closed, 1.9"]);
     let refused = home.dimos("arm gripper arm 0.5 --force 1").with(1);
     refused.says(&["the gripper of arm has no force control", "[UNSUPPORTED]", "hint: command its position without"]);
     home.dimos("arm gripper arm -0.1").with(1).says(&["rad is not within 0 to 1.9", "[rad]"]);

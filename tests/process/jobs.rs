@@ -397,11 +397,14 @@ fn the_recipes_of_the_page_work() {
     // Names that the run does not have, each at its place.
     home.write(
         "names.yaml",
-        "steps:\n  - move: hom\n  - move: {joints: [1, 2]}\n  - wait: {input: di31}\n  - attach: prat\n  - gripper: {to: open, arm: amr}\n  - gripper: 0.5\n  - gripper: {to: open, force: 1000}\n",
+        "steps:\n  - move: hom\n  - move: {joints: [1, 2]}\n  - wait: {input: di31}\n  - attach: prat\n  - gripper: {to: open, arm: amr}\n  - gripper: 0.5\n  - gripper: {to: open, force: 1000}\n  - mov: home\n",
     );
     let before = home.positions("arm");
     for verb in ["do names.yaml", "do --check names.yaml"] {
         home.dimos(verb).with(2).says(&[
+            // Of the file as well, at once.
+            "names.yaml:9:5",
+            "did you mean `move`?",
             "names.yaml:2:5",
             "did you mean `home`?",
             "names.yaml:3:5",
@@ -420,7 +423,13 @@ fn the_recipes_of_the_page_work() {
     }
     assert!(before.iter().zip(home.positions("arm")).all(|(a, b)| (a - b).abs() < 1e-4));
     home.dimos("down").with(0);
-    home.dimos("do --check names.yaml").with(0).says(&["were not checked"]);
+    for verb in ["do names.yaml", "do --check names.yaml"] {
+        home.dimos(verb).with(2).says(&["names.yaml:9:5", "did you mean `move`?"]);
+    }
+    let fault = "steps: [{move: home}, {repeat: {times: 2, steps: [{wait: 1s}]}}]\non_fault: [{gripper: open}]\n";
+    home.write("sound.yaml", fault);
+    let checked = home.dimos("do --check sound.yaml").with(0).says(&["were not checked"]);
+    assert_eq!(checked.out, "sound.yaml: 3 steps and 1 on a fault, no mistakes\n");
 }
 
 /// As a job's: what a client wanted before a stop moves nothing after it, though the arm was reset and enabled since.

@@ -237,6 +237,21 @@ fn other_tools_place_the_tool_where_the_model_does() {
 
 /// Without the package, or Python, nothing is written, and the message has what is to be installed.
 #[test]
+fn a_table_has_the_commands_of_the_gripper() {
+    let home = Home::new();
+    let run = home.run("coordinator-yourarm");
+    home.dimos("arm gripper arm 0.02").with(0);
+    home.dimos("down").with(0);
+    run.wait().with(0);
+    let table = home.dimos("log export --last").with(0).out;
+    let mut rows = table.lines().map(|line| line.split(',').collect::<Vec<_>>());
+    let column = rows.next().unwrap().iter().position(|name| *name == "arm_gripper.command").unwrap();
+    let mut commands: Vec<&str> = rows.map(|row| row[column]).collect();
+    commands.dedup();
+    assert_eq!(commands, ["", "0.02"], "none before the command, and kept after it");
+}
+
+#[test]
 fn exports_say_what_python_lacks() {
     let home = recorded();
     let bare = home.path().join("python");

@@ -21,6 +21,8 @@ fn the_world_is_changed_while_it_runs() {
     ] {
         home.dimos(&format!("world add {name} {shape} --at 0.6 0.6 0.6")).with(0);
         assert!(world().contains(name));
+        home.dimos(&format!("world move {name} --at 0.6 0.6 0.6 --rpy 0 0 0.785")).with(0);
+        assert!(world().contains("0.600 0.600 0.600  0.00 0.00 0.79"), "{}", world());
         // It is really there: the arm's flange cannot be where it is.
         home.dimos(&format!("world move {name} --at 0.38 0.02 0.3")).with(0);
         let hit = home.dimos("plan arm --pose 0.4 0.02 0.3 --rpy 3.14 0 0").with(1);

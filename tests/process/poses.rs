@@ -52,7 +52,7 @@ fn what_state_prints_can_be_pasted() {
     assert!(preview.contains("arm: link_tcp in map x"), "{preview}");
     let shown = home.dimos("state").with(0).out;
     assert!(shown.contains("flange in base (device)"), "{shown}");
-    home.dimos("status").with(0).shows(&["arm: poses in map are those of link_tcp (no tool)"]);
+    home.dimos("status -v").with(0).shows(&["arm: poses in map are those of link_tcp (no tool)"]);
 }
 
 #[test]

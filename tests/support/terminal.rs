@@ -80,6 +80,25 @@ impl Terminal {
         lock(&self.screen).screen().contents()
     }
 
+    /// The lines that are longer than the terminal is wide.
+    pub fn wrapped(&self) -> Vec<String> {
+        let screen = lock(&self.screen);
+        let screen = screen.screen();
+        let (rows, columns) = screen.size();
+        let (mut lines, mut line) = (Vec::new(), String::new());
+        for (row, text) in (0..rows.get()).zip(screen.rows(0, columns.get())) {
+            line.push_str(&text);
+            if screen.row_wrapped(row) {
+                continue;
+            }
+            if line.chars().count() > columns.get().into() {
+                lines.push(line.clone());
+            }
+            line.clear();
+        }
+        lines
+    }
+
     #[track_caller]
     pub fn until(&self, text: &str) {
         self.until_with(text, || {});

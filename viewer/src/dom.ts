@@ -34,6 +34,11 @@ export function setText(element: Element, text: string): void {
   if (element.textContent !== text) element.textContent = text;
 }
 
+/** The value of a slider as a screen reader says it: not the steps of the element. */
+export function setValueText(range: HTMLInputElement, text: string): void {
+  if (range.getAttribute('aria-valuetext') !== text) range.setAttribute('aria-valuetext', text);
+}
+
 export function setClass(element: Element, name: string, on: boolean): void {
   if (element.classList.contains(name) !== on) element.classList.toggle(name, on);
 }
@@ -92,7 +97,44 @@ export function choice<T extends string>(
   return {element: el('div', {class: 'choice'}, ...buttons.values()), choose};
 }
 
-const COLORS = ['#4c9aff', '#f5a524', '#30a46c', '#e5484d', '#ab6bff', '#12a5b5', '#d6409f', '#8b8d98'];
+/** The tabs of a page, and what they choose; the arrow keys go from one to the next. */
+export function tabBar(
+  names: readonly (readonly [string, string])[],
+  panels: HTMLElement,
+  onChoose: (name: string) => void,
+): {element: HTMLElement; choose(name: string): void} {
+  panels.setAttribute('role', 'tabpanel');
+  const choose = (name: string) => {
+    document.body.dataset.tab = name;
+    panels.scrollTop = 0;
+    for (const each of tabs) {
+      const chosen = each.dataset.tab === name;
+      each.setAttribute('aria-selected', String(chosen));
+      each.tabIndex = chosen ? 0 : -1;
+      if (chosen) panels.setAttribute('aria-labelledby', each.id);
+    }
+    onChoose(name);
+  };
+  const tabs = names.map(([name, text]) =>
+    button(text, () => choose(name), {id: `tab-${name}`, attributes: {role: 'tab', 'data-tab': name}}),
+  );
+  const element = el('div', {class: 'tabs', attributes: {role: 'tablist'}}, ...tabs);
+  element.addEventListener('keydown', (event) => {
+    const step = {ArrowLeft: -1, ArrowRight: 1}[event.key];
+    // On a wide screen some are not shown: their panels always are.
+    const shown = tabs.filter((each) => each.offsetParent);
+    const next = step && shown[(shown.indexOf(event.target as HTMLButtonElement) + step + shown.length) % shown.length];
+    if (!next) return;
+    event.stopPropagation();
+    event.preventDefault();
+    choose(next.dataset.tab!);
+    next.focus();
+  });
+  return {element, choose};
+}
+
+/** Distinct also without red and green (deuteranopia, protanopia). */
+const COLORS = ['#2ec7fa', '#fca588', '#7ad025', '#b1435f', '#6e49df', '#43b1b1', '#a53f1d', '#1d61a5'];
 
 /** Colour of an arm's joint in tables and plots. */
 export function jointColor(index: number): string {

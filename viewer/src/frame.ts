@@ -1,6 +1,6 @@
 // The frame of a page that shows a file: header, view, panels with their tabs. Nothing of it can command an arm.
 import type {Context} from './context';
-import {button, el} from './dom';
+import {button, el, tabBar} from './dom';
 import {notice} from './panels/notice';
 import {toolbar} from './panels/toolbar';
 import {Stage} from './scene/stage';
@@ -58,23 +58,14 @@ export function frame(context: Context, parts: Parts): HTMLElement[] {
     ...parts.tabs.map(([name, text]) => [name, text] as const),
     ...(plots ? [['plots', 'Plots'] as const] : []),
   ];
-  const tabs = el(
-    'nav',
-    {class: 'tabs'},
-    ...names.map(([name, text]) => button(text, () => choose(name), {attributes: {'data-tab': name}})),
-  );
   const narrow = matchMedia('(max-width: 960px)');
-  const choose = (tab: string) => {
-    document.body.dataset.tab = tab;
-    panels.scrollTop = 0;
+  const tabs = tabBar(names, panels, (tab) => {
     // On a desktop the other columns are always there.
     const shown = parts.tabs.some(([name]) => name === tab) || narrow.matches ? tab : parts.tabs[0]![0];
     for (const [name, , panel] of parts.tabs) panel.classList.toggle('hidden', name !== shown);
-    for (const each of tabs.querySelectorAll('button'))
-      each.setAttribute('aria-selected', String(each.dataset.tab === tab));
     window.dispatchEvent(new Event('resize'));
-  };
-  choose(narrow.matches ? 'arms' : parts.tabs[0]![0]);
-  narrow.addEventListener('change', () => choose(document.body.dataset.tab!));
-  return [header, column, centre, ...(plots ? [plots] : []), el('aside', {class: 'right'}, tabs, panels)];
+  });
+  tabs.choose(narrow.matches ? 'arms' : parts.tabs[0]![0]);
+  narrow.addEventListener('change', () => tabs.choose(document.body.dataset.tab!));
+  return [header, column, centre, ...(plots ? [plots] : []), el('aside', {class: 'right'}, tabs.element, panels)];
 }

@@ -4,7 +4,7 @@ import './style.css';
 import './acts.css';
 import './strip.css';
 import {Context} from './context';
-import {button, el} from './dom';
+import {button, el, tabBar} from './dom';
 import {pause} from './flow';
 import {logPage} from './log/page';
 import {modelPage} from './model/page';
@@ -114,26 +114,18 @@ function layout(context: Context, canvas: HTMLElement): void {
     worldPanel(context),
     eventsPanel(context),
   );
-  const tabs = el(
-    'nav',
-    {class: 'tabs'},
-    ...[
-      ['arms', 'Arms'],
-      ['move', 'Move'],
-      ['jog', 'Jog'],
-      ['world', 'Obstacles'],
-      ['events', 'Events'],
-      ['plots', 'Plots'],
-    ].map(([name, text]) => button(text!, () => choose(name!), {attributes: {'data-tab': name!}})),
-  );
-  const choose = (tab: string) => {
-    document.body.dataset.tab = tab;
-    panels.scrollTop = 0;
-    for (const each of tabs.querySelectorAll('button'))
-      each.setAttribute('aria-selected', String(each.dataset.tab === tab));
+  const names = [
+    ['arms', 'Arms'],
+    ['move', 'Move'],
+    ['jog', 'Jog'],
+    ['world', 'Obstacles'],
+    ['events', 'Events'],
+    ['plots', 'Plots'],
+  ] as const;
+  const tabs = tabBar(names, panels, () => {
     window.dispatchEvent(new Event('resize'));
     context.onTab.emit();
-  };
+  });
   const licences = button('licences', () => (document.getElementById('licences') as HTMLDialogElement).show(), {
     class: 'quiet',
   });
@@ -143,8 +135,8 @@ function layout(context: Context, canvas: HTMLElement): void {
   context.run.onStatus.on(({version}) => {
     document.getElementById('version')!.textContent = `dimos ${version}`;
   });
-  app.replaceChildren(bar, left, centre, plotsPanel(context), el('aside', {class: 'right'}, tabs, panels));
-  choose('move');
+  app.replaceChildren(bar, left, centre, plotsPanel(context), el('aside', {class: 'right'}, tabs.element, panels));
+  tabs.choose('move');
 }
 
 /** Without a connection, or without data, nothing can be commanded. Stop is not among these. */

@@ -176,7 +176,7 @@ export interface Status {
   arms: ArmStatus[];
   speed: {fraction: number; paused: boolean};
   tasks: Task[];
-  planner: {state: string; error: string | null; robots: string[]} | null;
+  planner: {state: string; error: string | null; robots: string[]; attached: {name: string} | null} | null;
 }
 
 export interface PlannerReport {

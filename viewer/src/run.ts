@@ -11,6 +11,8 @@ const WORLD_PERIOD = 1000;
 export const STALE_AFTER = 500;
 const SILENT_AFTER = 3000; // ms without a reply to `status` before the connection counts as lost
 const EVENTS_KEPT = 200;
+/** Slower joints are at rest [rad/s]. */
+const STANDSTILL = 0.01;
 
 export class Run {
   status: Status | null = null;
@@ -77,6 +79,13 @@ export class Run {
 
   get stale(): boolean {
     return this.age > STALE_AFTER;
+  }
+
+  /** Whether no arm moves or is about to, as far as is known. */
+  get atRest(): boolean {
+    const moves = this.status?.tasks.some(({state}) => state === 'EXECUTING' || state === 'CANCELLING');
+    const still = this.joints?.velocity.every((velocity) => Math.abs(velocity ?? 0) < STANDSTILL);
+    return this.connected && !this.stale && !this.streaming && !!still && !moves;
   }
 
   /** Age of an arm's newest state [ms]; infinite before the first. */

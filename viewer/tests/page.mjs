@@ -121,8 +121,80 @@ test('Stop holds the moving arm and says so; Reset and Enable are separate acts'
   await until('reset', () => run.arm().phase === 'standby');
   await click('.enable');
   await until('ready', () => run.arm().phase === 'ready');
+  await until('the card is clean', async () => !/aborted|held/.test(await page.textContent('.card')));
   await until('the report of the stop is gone', async () => (await page.textContent('#stop-report')) === '');
   assert.ok(near(run.positions(), held, 1e-3), 'neither moves the arm');
+});
+
+test('at rest Escape leaves what is open or typed, and stops nothing', async () => {
+  await click('footer button');
+  await page.waitForSelector('#licences[open]');
+  await page.keyboard.press('Escape');
+  await page.waitForSelector('#licences', {state: 'hidden'});
+  await page.focus('#sliders .value');
+  await page.keyboard.press('Escape');
+  assert.equal(await page.evaluate(() => document.activeElement.tagName), 'BODY');
+  await page.waitForTimeout(300);
+  assert.equal(run.arm().phase, 'ready');
+  // While the arm moves, Escape is Stop, also in a field.
+  await page.fill('#plan-speed', '5');
+  await click('[data-pose=zero]');
+  await click('#plan');
+  await page.waitForSelector('#execute:enabled');
+  const before = run.positions();
+  await click('#execute');
+  await until('it moves', () => !near(run.positions(), before, 0.01));
+  await page.focus('#sliders .value');
+  await page.keyboard.press('Escape');
+  await until('it is held', () => run.arm().phase === 'held');
+  run.dimos('arm', 'reset', 'arm');
+  run.dimos('arm', 'enable', 'arm');
+});
+
+test('tabs and sliders are what they are to assistive technology', async () => {
+  await page.focus('[role=tab][aria-selected=true]');
+  await page.keyboard.press('ArrowRight');
+  assert.equal(await page.evaluate(() => document.activeElement.textContent), 'Jog');
+  assert.equal(await page.getAttribute('[role=tabpanel]', 'aria-labelledby'), 'tab-jog');
+  await text(page, '#jog-checked', /^Stops before what the planner knows/);
+  await page.keyboard.press('ArrowLeft');
+  await page.waitForSelector('#sliders input:visible');
+  const says = await page.getAttribute('#sliders input', 'aria-valuetext');
+  assert.match(says, /^-?\d\.\d{3} rad$/);
+  assert.match(await page.getAttribute('#speed', 'aria-valuetext'), /^\d+ %$/);
+});
+
+test('the colours of the joints differ without red and green, too', async () => {
+  // Machado, Oliveira and Fernandes (2009), severity 1.
+  const sights = {
+    normal: [1, 0, 0, 0, 1, 0, 0, 0, 1],
+    deuteranopia: [0.367, 0.861, -0.228, 0.28, 0.673, 0.047, -0.012, 0.043, 0.969],
+    protanopia: [0.152, 1.053, -0.205, 0.115, 0.786, 0.099, -0.004, -0.048, 1.052],
+  };
+  const styles = await page
+    .locator('.swatch')
+    .evaluateAll((all) => all.map((one) => one.style.getPropertyValue('--color')));
+  const linear = (hex) => [1, 3, 5].map((at) => (Number.parseInt(hex.slice(at, at + 2), 16) / 255) ** 2.2);
+  const lab = ([r, g, b]) => {
+    const root = (value) => Math.cbrt(Math.max(0, value));
+    const [x, y, z] = [
+      root((0.412 * r + 0.358 * g + 0.18 * b) / 0.95),
+      root(0.213 * r + 0.715 * g + 0.072 * b),
+      root((0.019 * r + 0.119 * g + 0.951 * b) / 1.089),
+    ];
+    return [116 * y, 500 * (x - y), 200 * (y - z)];
+  };
+  assert.equal(styles.length, 6);
+  for (const [sight, m] of Object.entries(sights)) {
+    const seen = styles.map((hex) => {
+      const c = linear(hex.trim());
+      return lab([0, 3, 6].map((row) => m[row] * c[0] + m[row + 1] * c[1] + m[row + 2] * c[2]));
+    });
+    seen.forEach((a, i) => {
+      for (const [j, b] of seen.slice(0, i).entries())
+        assert.ok(Math.hypot(...a.map((v, k) => v - b[k])) > 20, `joints ${j + 1} and ${i + 1}: ${sight}`);
+    });
+  }
 });
 
 /** What of an element a person can see and touch: its rectangle inside the window, if nothing lies over its middle. */
@@ -157,6 +229,7 @@ test('what keeps an arm from moving is seen on every screen and tab, and Stop is
       assert.ok(await seen(page, '#strip .warn'), `the speed: ${where}`);
       assert.ok(await seen(page, '#stop'), `Stop: ${where}`);
       if (tab === 'jog') assert.ok(await seen(page, '#jog-rows .hold'), `a jog button: ${where}`);
+      if (tab === 'move') assert.ok(await seen(page, '#sliders input'), `a slider beside the buttons: ${where}`);
     }
     if (process.env.DIMOS_PICTURES)
       await page.screenshot({path: `${process.env.DIMOS_PICTURES}/${width}x${height}.png`});

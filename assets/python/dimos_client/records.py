@@ -85,10 +85,13 @@ class Goal:
             goal["joints"] = numbers(self.joints)
         if self.named is not None:
             goal["named"] = self.named
-        if self.pose is not None:
-            goal["pose"] = self.pose.params()
-        if self.by is not None:
-            goal["by"] = self.by.params()
+        for key, pose in (("pose", self.pose), ("by", self.by)):
+            if pose is None:
+                continue
+            if not isinstance(pose, Pose):
+                hint = "Pose([x, y, z], rpy=[r, p, y]), or without rpy in any orientation"
+                raise Refused("INVALID_PARAMS", f"{key} is {pose!r}, must be a Pose", hint)
+            goal[key] = pose.params()
         if self.linear:
             goal["linear"] = True
         if self.frame is not None:

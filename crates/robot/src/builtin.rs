@@ -21,6 +21,7 @@ robots!(
     "lite6_gripper",
     "piper",
     "piper_gripper",
+    "so101",
     "ur5e",
     "xarm5",
     "xarm5_gripper",

@@ -2,8 +2,8 @@
 
 use std::io::{self, IsTerminal, Write};
 
-use super::super::escapes::safe;
 use super::super::output::Table;
+use super::super::redraw::{self, Redraw};
 use dimos_hardware::service::Motor;
 
 /// Positions that each motor has had since the beginning.
@@ -51,21 +51,16 @@ pub fn lines(motors: &[Motor], seen: &[Seen], turn: i32) -> Vec<String> {
 
 /// The place of the table on the terminal.
 #[derive(Debug, Default)]
-pub struct Place {
-    drawn: usize,
-}
+pub struct Place(Redraw);
 
 impl Place {
     /// Draws lines over those before. Without a terminal nothing is drawn.
     pub fn draw(&mut self, lines: &[String]) {
         let out = io::stderr();
-        if !out.is_terminal() {
-            return;
+        if out.is_terminal() {
+            let text = self.0.frame(lines, redraw::size(&out), true);
+            let _ = out.lock().write_all(text.as_bytes());
         }
-        let up = if self.drawn > 0 { format!("\x1b[{}A", self.drawn) } else { String::new() };
-        let text: String = lines.iter().map(|line| format!("\r{}\x1b[K\n", safe(line, true))).collect();
-        self.drawn = lines.len();
-        let _ = out.lock().write_all(format!("{up}{text}").as_bytes());
     }
 }
 

@@ -137,7 +137,7 @@ fn robot(planned: &PlannedRobot, setup: &PlanningScene) -> Robot {
 pub(super) fn print(robot: &Robot) {
     output::line("");
     output::line(format_args!("robot {}: {}, planned to {}", robot.name, robot.model, robot.end_effector_link));
-    let mut table = Table::new(&["  JOINT", "OF THE MODEL", ">LOWER", ">UPPER", ">/s", ">/s²", ">/s³"]);
+    let mut table = Table::new(&["  JOINT", "OF THE MODEL", ">LOWER", ">UPPER", ">?/s", ">?/s²", ">?/s³"]);
     for joint in &robot.joints {
         let limits = [joint.lower, joint.upper, joint.velocity, joint.acceleration, joint.jerk];
         let mut cells = vec![format!("  {}", joint.coordinator), joint.model.clone()];

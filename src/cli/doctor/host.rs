@@ -19,7 +19,7 @@ const MIN_FREE_SPACE: u64 = 1 << 30;
 /// Clock sources that are read without a system call.
 const FAST_CLOCKS: &[&str] = &["tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter"];
 
-const RT_KERNEL: &str = "sudo apt install linux-image-rt-amd64      # Debian; Ubuntu: sudo pro enable realtime-kernel";
+const RT_KERNEL: &str = "sudo apt install linux-image-rt-amd64 # Ubuntu: pro enable realtime-kernel";
 const RTPRIO: &str = "sudo groupadd -f realtime && sudo usermod -aG realtime $USER && echo '@realtime - rtprio 95' | sudo tee -a /etc/security/limits.d/90-realtime.conf      # then log in again";
 const MEMLOCK: &str = "sudo groupadd -f realtime && sudo usermod -aG realtime $USER && echo '@realtime - memlock unlimited' | sudo tee -a /etc/security/limits.d/90-realtime.conf      # then log in again";
 const LATENCY: &str = "echo 'KERNEL==\"cpu_dma_latency\", GROUP=\"realtime\", MODE=\"0660\"' | sudo tee /etc/udev/rules.d/90-cpu-dma-latency.rules && sudo udevadm control --reload && sudo udevadm trigger --name-match=cpu_dma_latency";

@@ -287,8 +287,10 @@ impl<'r> Runner<'r, '_> {
             return Err(End::Signal(signal));
         }
         let result = completed(self.client, &report);
-        // The words of the run for a `cancel`, and for a task that took the arm.
-        let by_others = report.error.as_deref().is_some_and(|why| why == "cancelled" || why.starts_with("task "));
+        // The words of the run for a `cancel`, its own end, and a task that took the arm.
+        let by_others = report.error.as_deref().is_some_and(|why| {
+            why == "cancelled" || ["task ", "the run ", "the log "].iter().any(|start| why.starts_with(start))
+        });
         result.map_err(|failure| if by_others { End::Stopped(failure) } else { failure.into() })
     }
 

@@ -25,14 +25,13 @@ const MAX_TIMES: f64 = 1e9;
 const GRIPPER_TIME: Duration = Duration::from_secs(5);
 
 impl Job {
-    /// Reads a job. Prints all mistakes.
+    /// Reads a job. Its mistakes are in its tree: [`Job::verdict`].
     pub fn read(path: &Path) -> Result<Self> {
         let file = path.display().to_string();
         // Also a pipe, as of `do <(command)`.
         let bytes = std::fs::File::open(path).and_then(|opened| bounded::take(opened, bounded::SMALL));
         let bytes = bytes.map_err(|e| Failure::usage(format!("{file}: {e}")))?;
-        let job = Self::parse(file, &bytes);
-        job.verdict().map(|()| job)
+        Ok(Self::parse(file, &bytes))
     }
 
     /// Reads a job; its mistakes are in its tree.

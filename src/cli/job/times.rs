@@ -54,7 +54,7 @@ pub fn all<'j>(steps: &'j [Step], found: &mut Vec<&'j Step>) {
 
 /// Prints the report.
 pub fn print(job: &Job, steps: &[Times], cycles: &Times) {
-    let mut table = Table::new(&["STEP", ">LINE", ">COUNT", ">MEAN s", ">MIN s", ">MAX s", ">P95 s"]);
+    let mut table = Table::new(&["~STEP", ">LINE", ">COUNT", ">MEAN s", ">?MIN s", ">?MAX s", ">?P95 s"]);
     if cycles.count() == 0 && steps.iter().all(|times| times.count() == 0) {
         return;
     }

@@ -51,7 +51,7 @@ pub fn lines(view: &View<'_>, (columns, rows): (usize, usize)) -> Vec<Line> {
     let motion = motion(view);
     let help = help(view, columns);
     let message = message(view, columns);
-    // Dropped first if space is short: blank lines, the keys, the pose.
+    // Dropped first if space is short: blank lines, the pose, the keys but for those that end it.
     let fixed_rows = head.len() + 1 + motion.len() + message.len();
     let joints = view.seen.state.as_ref().map_or(1, |state| state.joints.len());
     let mut spare = rows.saturating_sub(fixed_rows + joints);
@@ -64,7 +64,11 @@ pub fn lines(view: &View<'_>, (columns, rows): (usize, usize)) -> Vec<Line> {
             Vec::new()
         }
     };
-    let (pose, help) = (fits(pose), fits(help));
+    let mut help = fits(help);
+    if help.is_empty() {
+        help = fits(vec![Line::default().with("X stop, latched   Esc leave", Look::Dim)]);
+    }
+    let pose = fits(pose);
     let mut gaps = [(); 3].map(|()| fits(vec![Line::default()]));
     let [after_head, after_joints, after_motion] = &mut gaps;
     let others = fixed_rows + pose.len() + help.len() + after_head.len() + after_joints.len() + after_motion.len();
@@ -377,6 +381,16 @@ mod tests {
             }
         }
         assert!(!text(&view(&seen, false), (40, 24)).join("\n").contains('#'));
+    }
+
+    #[test]
+    fn the_keys_are_shown_before_the_pose() {
+        let seen = seen(6);
+        let keys = |size| text(&view(&seen, false), size).join("\n");
+        let all = keys((50, 20));
+        assert!(all.contains("W/S +/-x") && all.contains("Esc leave") && !all.contains("pose  link_tcp"), "{all}");
+        let few = keys((50, 15));
+        assert!(few.contains("X stop, latched   Esc leave") && !few.contains("W/S"), "{few}");
     }
 
     #[test]

@@ -28,6 +28,7 @@ pub fn run(path: &Path, json: bool) -> Result {
         }
         bar(&scan);
     }
+    drop(bar);
     let loss = scan.loss();
     let counted = scan.statistics().map(|(count, _)| count).filter(|count| *count < found.messages);
     found.problems.extend(loss.text());

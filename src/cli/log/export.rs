@@ -77,6 +77,7 @@ pub fn cannot_write(to: &Path, e: io::Error) -> Failure {
 }
 
 const COMMANDS: &str = "/joint_commands";
+const OUTPUTS: &str = "/dimos/outputs/";
 
 /// Returns all names in joint states, in the order in which they appear: a gripper gets its name when it is first
 /// measured.
@@ -117,6 +118,8 @@ fn joint_rows(
     let mut log = LogReader::open(path).map_err(unreadable)?;
     let mut waiting: Option<(u64, JointState)> = None;
     let mut commands = BTreeMap::<String, f64>::new();
+    // A gripper keeps its command; a joint has one only on the ticks that command it.
+    let mut grippers = BTreeMap::<String, f64>::new();
     let mut places = Places::new(names);
     let mut write = |time: u64, state: &JointState, commands: &BTreeMap<String, f64>| {
         let mut values = vec![f64::NAN; 4 * names.len()];
@@ -129,9 +132,18 @@ fn joint_rows(
         }
         row(time, &values)
     };
-    let both = Selection { topics: vec![STATES.to_owned(), COMMANDS.to_owned()], from, to };
-    let loss = each(&mut log, both, progress::bar(prints), |entry| {
-        let Payload::JointState(values) = entry.data else { return Ok(true) };
+    let outputs: Vec<String> = log.info().topics.keys().filter(|topic| topic.starts_with(OUTPUTS)).cloned().collect();
+    let topics = [STATES.to_owned(), COMMANDS.to_owned()].into_iter().chain(outputs).collect();
+    let loss = each(&mut log, Selection { topics, from, to }, progress::bar(prints), |entry| {
+        let values = match entry.data {
+            Payload::JointState(values) => values,
+            Payload::ArmOutput(output) if output.gripper_seq > 0 => {
+                let arm = entry.topic.trim_start_matches(OUTPUTS);
+                grippers.insert(format!("{arm}_gripper"), output.gripper);
+                return Ok(true);
+            }
+            _ => return Ok(true),
+        };
         if entry.topic == COMMANDS {
             let JointState { name, position, velocity, effort, .. } = values;
             for (i, name) in name.into_iter().enumerate() {
@@ -143,10 +155,12 @@ fn joint_rows(
             return Ok(true);
         }
         let last = waiting.replace((entry.log_time, values));
-        let commands = std::mem::take(&mut commands);
+        let mut commands = std::mem::take(&mut commands);
+        commands.extend(grippers.clone());
         last.map_or(Ok(true), |(time, state)| write(time, &state, &commands))
     })?;
     if let Some((time, state)) = waiting {
+        commands.extend(grippers);
         write(time, &state, &commands)?;
     }
     Ok(loss)

@@ -35,6 +35,7 @@ pub fn run(path: &Path, json: bool) -> Result {
         }
         bar(&scan);
     }
+    drop(bar);
     let (faults, _) = faults(path, info, false).map_err(unreadable)?;
     let loss = scan.loss().text();
     let state = state(info, loss.is_some());
@@ -66,13 +67,13 @@ pub fn run(path: &Path, json: bool) -> Result {
     let (version, config) = (text("dimos_version"), text("config_version"));
     output::line(format_args!("dimos {version}, config version {config}, tick rate {} Hz", text("tick_rate")));
     output::line(format_args!("arms: {}", arms(info).map_or_else(|| "-".to_owned(), |arms| arms.join(", "))));
-    let mut table = Table::new(&["TOPIC", "SCHEMA", ">MESSAGES", ">HZ"]);
+    let mut table = Table::new(&["TOPIC", "?SCHEMA", ">MESSAGES", ">HZ"]);
     for (id, channel) in topics {
         table.row([channel.topic.clone(), channel.schema.0.clone(), count(id).to_string(), fixed(rate(id), 1)]);
     }
     table.print();
     let sizes = attachments.iter().filter_map(|a| Some(format!("{} ({} B)", a["name"].as_str()?, a["size"])));
-    output::line(format_args!("attachments: {}", sizes.collect::<Vec<_>>().join(", ")));
+    output::wrapped(format_args!("attachments: {}", sizes.collect::<Vec<_>>().join(", ")));
     output::line(format_args!("faults: {}", faults.len()));
     for fault in &faults {
         let time = fault["time"].as_f64().unwrap_or(0.0);

@@ -20,7 +20,7 @@ pub fn run(json: bool) -> Result {
     };
     let logs = files::all(&folder).map_err(|e| Failure::of(Exit::Failed, format!("{}: {e}", folder.display())))?;
     // The name of a log in that folder has the time of its start.
-    let (mut table, mut all) = (Table::new(&["LOG", ">LENGTH", ">SIZE", "STATE", ">FAULTS", "~ARMS"]), Vec::new());
+    let (mut table, mut all) = (Table::new(&["LOG", ">?LENGTH", ">?SIZE", "STATE", ">?FAULTS", "?ARMS"]), Vec::new());
     for path in logs.iter().rev() {
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let size = files::size(path);

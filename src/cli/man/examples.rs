@@ -47,7 +47,7 @@ pub(super) const OF_VERBS: &[(&str, &[&str])] = &[
     ("jog", &["dimos jog arm"]),
     ("task", &["dimos task list"]),
     ("task list", &["dimos task list", "dimos task list --json"]),
-    ("task invoke", &["dimos task invoke traj_arm state"]),
+    ("task invoke", &["dimos task invoke follow_leader start"]),
     ("task stream", &["dimos task stream servo_arm targets.csv --hz 100"]),
     ("proxy", &["dimos proxy xarm arm"]),
     ("proxy xarm", &["dimos proxy xarm arm"]),

@@ -31,7 +31,7 @@ fn print(found: &Verification) {
     match &found.finding {
         Finding::Reproducible => {
             let live = if found.live { "; live: verified up to its newest chunk" } else { "" };
-            output::line(format_args!("reproducible: {ran}, every command bit for bit{live}"));
+            output::wrapped(format_args!("reproducible: {ran}, every command bit for bit{live}"));
         }
         Finding::Different(d) => {
             output::line(format_args!("different at tick {}, after {:.3} s: {}", d.tick, d.time, what(d)));

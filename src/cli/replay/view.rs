@@ -4,11 +4,10 @@ use std::collections::{BTreeMap, VecDeque};
 use std::io::{self, Write};
 use std::time::Duration;
 
-use comfy_table::{Cell, CellAlignment, Table, presets};
-
 use super::player::{Pace, Part};
 use crate::cli::escapes::{in_json, safe};
-use crate::cli::output;
+use crate::cli::output::{self, Table};
+use crate::cli::redraw::{self, Redraw};
 use dimos_core::clock::Mono;
 use dimos_log::messages::JointState;
 use dimos_log::replay::{Entry, Payload};
@@ -21,8 +20,9 @@ const REDRAW_EVERY: Duration = Duration::from_millis(50);
 const LINE_EVERY: u64 = 1_000_000_000;
 /// Lines of the text log below the table.
 const TEXT_LINES: usize = 5;
-/// Width of the progress bar.
+/// Largest width of the progress bar, and the columns that are left for the text behind it.
 const BAR: usize = 40;
+const BAR_TEXT: usize = 40;
 
 /// A view of messages.
 pub trait View {
@@ -132,7 +132,7 @@ pub struct Live<W> {
     pace: Pace,
     at: u64,
     drawn_at: Option<Mono>,
-    drawn_lines: usize,
+    redraw: Redraw,
     joints: usize,
     states: Option<JointState>,
     commands: BTreeMap<String, f64>,
@@ -150,7 +150,7 @@ impl<W: Write> Live<W> {
             pace: Pace::new(1.0, false),
             at: part.from,
             drawn_at: None,
-            drawn_lines: 0,
+            redraw: Redraw::default(),
             joints,
             states: None,
             commands: BTreeMap::new(),
@@ -182,48 +182,50 @@ impl<W: Write> Live<W> {
         }
     }
 
-    fn render(&self) -> String {
-        let mut lines: Vec<String> = self.arms.iter().map(|(name, text)| format!("{name}: {text}")).collect();
+    /// Returns the lines for a terminal of this size; the older texts give way to what is above them.
+    fn render(&self, (columns, rows): (usize, usize)) -> Vec<String> {
+        let width = u16::try_from(columns).ok().filter(|columns| *columns > 0);
+        let arm = |(name, text): (&String, &String)| output::folded(&format!("{name}: {text}"), width);
+        let mut lines: Vec<String> = self.arms.iter().flat_map(arm).collect();
         if let Some(states) = &self.states {
-            let mut table = Table::new();
-            table.load_style(presets::NOTHING);
-            table.set_header(["joint", "rad", "deg", "rad/s", "command rad"].map(right));
+            let mut table = Table::new(&["joint", ">rad", ">deg", ">?rad/s", ">?command rad"]);
             for (i, name) in states.name.iter().take(self.joints).enumerate() {
                 let degrees: Vec<f64> = states.position.iter().map(|p| p.to_degrees()).collect();
                 let command: Vec<f64> = self.commands.get(name).copied().into_iter().collect();
-                let cells = [
+                table.row([
+                    name.clone(),
                     number(&states.position, i, 4),
                     number(&degrees, i, 2),
                     number(&states.velocity, i, 4),
                     number(&command, 0, 4),
-                ];
-                table.add_row(std::iter::once(Cell::new(name)).chain(cells.map(right)).collect::<Vec<_>>());
+                ]);
             }
             lines.extend(table.lines());
         }
-        lines.push(self.bar());
-        lines.extend(self.texts.iter().cloned());
-        lines.join("\n")
+        lines.push(self.bar(columns));
+        let texts = self.texts.iter().flat_map(|text| text.lines());
+        let texts: Vec<String> = texts.flat_map(|text| output::folded(text, width)).collect();
+        let room = if rows == 0 { texts.len() } else { rows.saturating_sub(lines.len() + 1) };
+        lines.extend(texts.into_iter().rev().take(room).rev());
+        lines
     }
 
-    fn bar(&self) -> String {
+    fn bar(&self, columns: usize) -> String {
+        let length = if columns == 0 { BAR } else { columns.saturating_sub(BAR_TEXT).clamp(10, BAR) };
         let (at, whole) = (self.at.saturating_sub(self.from), self.to.saturating_sub(self.from));
-        let full = (at as f64 / whole.max(1) as f64 * BAR as f64) as usize;
-        let full = full.min(BAR);
+        let full = (at as f64 / whole.max(1) as f64 * length as f64) as usize;
+        let full = full.min(length);
         let (at, whole) = (at as f64 * 1e-9, whole as f64 * 1e-9);
         // 1.1, not 1.1000000000000001.
         let rate = (self.pace.rate * 1e3).round() / 1e3;
         let paused = if self.pace.paused { "  paused: space, →" } else { "" };
-        format!("[{}{}] {at:.1} / {whole:.1} s  ×{}{}", "=".repeat(full), " ".repeat(BAR - full), rate, paused)
+        format!("[{}{}] {at:.1} / {whole:.1} s  ×{}{}", "=".repeat(full), " ".repeat(length - full), rate, paused)
     }
 
     fn draw(&mut self) -> io::Result<()> {
-        let render = self.render();
-        let render = safe(&render, true);
-        // Moves up to the start of the previous frame and clears from there on.
-        let up = if self.drawn_lines > 0 { format!("\x1b[{}A\x1b[J", self.drawn_lines) } else { String::new() };
-        self.drawn_lines = render.lines().count();
-        writeln!(self.out, "{up}{render}")?;
+        let size = redraw::stdout_size();
+        let frame = self.redraw.frame(&self.render(size), size, true);
+        self.out.write_all(frame.as_bytes())?;
         self.out.flush()
     }
 }
@@ -247,10 +249,6 @@ impl<W: Write> View for Live<W> {
     fn end(&mut self) -> io::Result<()> {
         self.draw()
     }
-}
-
-fn right(text: impl ToString) -> Cell {
-    Cell::new(text).set_alignment(CellAlignment::Right)
 }
 
 /// Formats a value, or a dash if there is none.

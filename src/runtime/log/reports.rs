@@ -277,7 +277,7 @@ impl Service {
         // Cancelled or held is the state; the obstacle is the reason.
         let was_stopped = matches!(end.reason, Reason::Cancelled | Reason::WayBlocked | Reason::ArmHeld(..));
         let blocked = planned.blocked.clone().filter(|_| was_stopped);
-        report.error = blocked.or_else(|| self.reason(&end.reason));
+        report.error = blocked.or_else(|| self.shut_down(&end.reason)).or_else(|| self.reason(&end.reason));
         match &planned.next {
             Some(Next::Planning) => (report.replanning, report.done) = (true, false),
             Some(Next::Motion(next)) => report.next = Some(*next),
@@ -295,6 +295,13 @@ impl Service {
         });
         report.deviation = Some(deviation.collect());
         Ok(report)
+    }
+
+    /// Returns why a motion was cancelled, if no client asked for that: the run is ending.
+    fn shut_down(&self, reason: &Reason) -> Option<String> {
+        let log_ended = self.recorder.get().is_some_and(|stats| stats.failed.load(Relaxed));
+        let why = if log_ended { "the log has ended, and with it the run" } else { "the run is shutting down" };
+        (*reason == Reason::Cancelled && self.is_closed()).then(|| why.to_owned())
     }
 
     /// Returns the smallest fraction of the speed at which a controller of these joints runs motions, if below 1.

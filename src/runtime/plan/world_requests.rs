@@ -81,7 +81,7 @@ impl PlannerPort {
                 let what = format!("{name} is {distance:.3} m from {tcp} of {arm}: it is not what the gripper holds");
                 let hint = format!(
                     "put it where it is: `dimos world move {name} --at X Y Z`; or attach it from there: `dimos world \
-                     attach {name} {arm}`"
+                     attach {name} {arm} --within 1`"
                 );
                 Err(RpcError::new(Code::WrongObject, what).hint(hint))
             }

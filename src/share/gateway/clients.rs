@@ -96,7 +96,7 @@ impl Shared {
                     remote.is_alive();
                 }
             }
-            SampleKind::Delete => self.lose(&who, "it has closed its connection"),
+            SampleKind::Delete => self.lose(&who, false),
         }
     }
 
@@ -131,15 +131,19 @@ impl Shared {
         };
         let silent: Vec<Who> = lock(&self.clients).values().filter(silent).map(|remote| remote.who.clone()).collect();
         for who in silent {
-            self.lose(&who, "it has been silent");
+            self.lose(&who, true);
         }
     }
 
     /// Closes the connections of a client: the run frees its leases, and cancels its motions if it is to.
-    fn lose(&self, who: &Who, why: &str) {
+    fn lose(&self, who: &Who, silent: bool) {
         let Some(remote) = lock(&self.clients).remove(who) else { return };
         if remote.commands.load(Ordering::Acquire) {
-            tracing::warn!("share: the commander {} is lost: {why}", remote.title());
+            match silent {
+                true => tracing::warn!("share: the commander {} is lost: it has been silent", remote.title()),
+                // As every program at its end.
+                false => tracing::info!("share: the commander {} has closed its connection", remote.title()),
+            }
             let mut lost = lock(&self.lost);
             if lost.len() == MAX_LOST {
                 lost.pop_front();

@@ -1,5 +1,5 @@
 // The timeline of a log: play, pause, rate, and marks of motions, warnings and errors.
-import {button, el, setText} from '../dom';
+import {button, el, setText, setValueText} from '../dom';
 import {clock, figure} from '../units';
 import type {Player} from './player';
 
@@ -47,6 +47,7 @@ export function bar(player: Player): HTMLElement {
       range.value = String(Math.round((player.time / (source.length || 1)) * STEPS));
     }
     setText(text, `${figure(player.time, 2)} / ${figure(source.length, 1)} s`);
+    setValueText(range, text.textContent);
     text.title = clock(new Date((source.scene.log.start + player.time) * 1000));
   };
   let drawn = -1;

@@ -1,6 +1,6 @@
 // One slider for each joint of a robot, within its limits, and its named poses.
 import type {Context} from '../context';
-import {button, choice, el, setText} from '../dom';
+import {button, choice, el, setText, setValueText} from '../dom';
 import type {SceneRobot} from '../protocol';
 import {angle, figure, shortJoint} from '../units';
 import type {Posed} from './posed';
@@ -38,6 +38,7 @@ export function sliders(context: Context, run: Posed, robot: SceneRobot): HTMLEl
       const step = String(Math.round(((value - lower) / (upper - lower || 1)) * STEPS));
       if (input.value !== step && document.activeElement !== input) input.value = step;
       const written = text(value);
+      setValueText(input, `${written} ${linear(joint) ? 'm' : angle.label}`);
       if (document.activeElement !== output && output.value !== written) output.value = written;
     };
     return {show, element: el('label', {class: 'slider'}, el('span', {text: name, title: joint}), input, output)};

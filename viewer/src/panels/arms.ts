@@ -80,6 +80,12 @@ function tasksOf(status: Status, joints: string[]): Task[] {
   return status.tasks.filter((task) => task.joints.some((joint) => joints.includes(joint)));
 }
 
+/** Whether why a motion ended is over: somebody wanted that, or the arm was held and is ready again. */
+function isOver(reason: string | null, arm: ArmStatus): boolean {
+  const held = reason?.startsWith(`${arm.hardware_id} is held`);
+  return reason === 'cancelled' || (!!held && arm.phase === 'ready');
+}
+
 /** Who made a request, as the terminal writes it. */
 function shown(who: Who): string {
   const process = who.pid ? `pid ${who.pid}` : '';
@@ -118,7 +124,7 @@ function notesOf(arm: ArmStatus, tasks: Task[]): HTMLElement[] {
     if (task.state === 'EXECUTING' || task.state === 'CANCELLING') {
       const progress = task.progress === null ? '' : ` ${Math.round(task.progress * 100)} %`;
       note('info', `${task.name}: ${task.state.toLowerCase()}${progress}`);
-    } else if ((task.state === 'ABORTED' && task.reason !== 'cancelled') || task.state === 'FAULT') {
+    } else if ((task.state === 'ABORTED' && !isOver(task.reason, arm)) || task.state === 'FAULT') {
       note('warn', `${task.name}: ${task.state.toLowerCase()}${task.reason ? ` (${task.reason})` : ''}`);
     }
   }

@@ -1,6 +1,6 @@
 // The gripper of the selected arm: open, close, a position; and how the run judges the grip.
 import type {Context} from '../context';
-import {button, el, setClass, setText} from '../dom';
+import {button, el, setClass, setText, setValueText} from '../dom';
 import {pause} from '../flow';
 import {figure} from '../units';
 
@@ -26,6 +26,10 @@ export function gripperPanel(context: Context): HTMLElement {
     if (onOff()) return position ? 'open' : 'closed';
     const turns = run.arm(context.selected)?.gripper_unit === 'rad';
     return turns ? `${figure(position, 3)} rad` : `${figure(position * 1000, 1)} mm`;
+  };
+  const say = (position: number) => {
+    setText(value, text(position));
+    setValueText(range, value.textContent);
   };
   const target = () => {
     const [low, high] = limits() ?? [0, 0];
@@ -58,7 +62,7 @@ export function gripperPanel(context: Context): HTMLElement {
   });
   range.addEventListener('input', () => {
     touched = true;
-    setText(value, text(target()));
+    say(target());
     show();
   });
   const slider = el('label', {class: 'slider plain'}, el('span', {text: 'position'}), range, value);
@@ -80,7 +84,7 @@ export function gripperPanel(context: Context): HTMLElement {
     const position = run.armState(context.selected)?.gripper;
     if (!has || touched || typeof position !== 'number') return;
     range.value = String(Math.round(((position - has[0]) / (has[1] - has[0] || 1)) * 1000));
-    setText(value, text(position));
+    say(position);
   };
   run.onStatus.on(show);
   context.onSelect.on(() => {

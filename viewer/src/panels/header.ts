@@ -1,6 +1,6 @@
 // The bar at the top: which run, simulated or real, age of the data, speed override, pause, and Stop.
 import type {Context} from '../context';
-import {button, el, setClass, setText} from '../dom';
+import {button, el, setClass, setText, setValueText} from '../dom';
 import {duration} from '../units';
 
 export function header(context: Context): {element: HTMLElement; stop: HTMLElement} {
@@ -82,10 +82,14 @@ function override(context: Context): HTMLElement {
       'aria-label': 'speed override',
     },
   });
+  const show = () => {
+    setText(value, `${range.value} %`);
+    setValueText(range, value.textContent);
+  };
   let held = 0; // the slider is the person's until shortly after the last touch
   range.addEventListener('input', () => {
     held = performance.now();
-    setText(value, `${range.value} %`);
+    show();
   });
   range.addEventListener('change', () => {
     held = performance.now();
@@ -100,7 +104,7 @@ function override(context: Context): HTMLElement {
     setClass(pause, 'attention', speed.paused);
     if (performance.now() - held < 1500) return;
     range.value = String(Math.round(speed.fraction * 100));
-    setText(value, `${range.value} %`);
+    show();
   });
   return el(
     'fieldset',
@@ -118,14 +122,24 @@ function takesSpace(target: EventTarget | null): boolean {
   return target instanceof Element && target.closest(takers) !== null;
 }
 
+/** Closes what is open over the page, or leaves the field that has the focus. Whether there was either. */
+function leave(target: EventTarget | null): boolean {
+  const dialog = document.querySelector<HTMLDialogElement>('dialog[open]');
+  const field =
+    target instanceof HTMLElement && target.closest<HTMLElement>('input:not([type=range]), select, textarea');
+  dialog?.close();
+  if (field) field.blur();
+  return !!dialog || !!field;
+}
+
 function stopButton(context: Context): HTMLElement {
-  const {stop} = context;
+  const {run, stop} = context;
   const press = () => void stop.press();
   const lines = el('div', {class: 'stop-lines', id: 'stop-report', attributes: {role: 'alert'}});
   const control = button('STOP', press, {
     id: 'stop',
     title:
-      'Holds all arms at once, until they are reset (Escape, or Space where nothing is typed). An operational stop, ' +
+      'Holds all arms at once, until they are reset (Escape, or Space where nothing is typed; at rest, Escape leaves a field first). An operational stop, ' +
       'not a safety function',
   });
   control.append(el('kbd', {text: 'Esc'}));
@@ -136,7 +150,9 @@ function stopButton(context: Context): HTMLElement {
       if (!meant) return;
       event.preventDefault();
       event.stopPropagation();
-      if (!event.repeat) press();
+      // At rest, Escape first leaves a dialog or a field, as everywhere. In motion it is Stop.
+      const left = event.key === 'Escape' && leave(event.target);
+      if (!event.repeat && !(left && run.atRest)) press();
     },
     {capture: true},
   );

@@ -1,6 +1,6 @@
 // The jog panel: buttons and keys that move single joints or the end effector while they are held.
 import type {Context} from '../context';
-import {button, choice, el, setClass, setText} from '../dom';
+import {button, choice, el, setClass, setText, setValueText} from '../dom';
 import {Jog, type JogMode, type Motion, SPEEDS, TOP} from '../jog';
 import {angle, angleText, figure, shortJoint} from '../units';
 import {teachPanel} from './teach';
@@ -55,6 +55,7 @@ export function jogPanel(context: Context): HTMLElement {
   });
   speed.addEventListener('input', () => jog.set({speed: Number(speed.value)}));
   const speedText = el('output', {class: 'jog-speed'});
+  const checked = el('p', {id: 'jog-checked'});
   const missing = el('div', {class: 'note warn', id: 'jog-missing'});
   const rows = el('div', {class: 'jog-rows', id: 'jog-rows'});
   const report = el('div', {class: 'report', id: 'jog-report', attributes: {role: 'status'}});
@@ -110,9 +111,15 @@ export function jogPanel(context: Context): HTMLElement {
     setText(title, run.scene.arms.length > 1 ? `Jog ${context.selected}` : 'Jog');
     setClass(frames.element, 'hidden', jog.mode !== 'tool');
     setClass(missing, 'hidden', !!drive || !run.status);
+    // The collision guard of the run knows the robots of its own planner.
+    const guarded = run.status?.planner?.robots.includes(context.selected) && !run.status.planner.attached;
+    const stops = 'The arm moves while a button is held; released, it decelerates to rest.';
+    checked.className = guarded ? 'note' : 'note warn';
+    setText(checked, guarded ? `Stops before what the planner knows. ${stops}` : `Not collision-checked. ${stops}`);
     if (!drive) missing.replaceChildren(el('span', {text: missingTask(context, jog.mode)}));
     speed.value = String(jog.speed);
     setText(speedText, speedOf(jog));
+    setValueText(speed, speedText.textContent);
     const ready = !!drive && !flow.busy;
     for (const {buttons, motion} of list) {
       buttons.forEach((each, i) => {
@@ -210,10 +217,7 @@ export function jogPanel(context: Context): HTMLElement {
       'fieldset',
       {class: 'acts'},
       el('div', {class: 'section-head'}, title, modes.element),
-      el('p', {
-        class: 'note warn',
-        text: 'Not collision-checked. The arm moves while a button is held; released, it decelerates to rest.',
-      }),
+      checked,
       missing,
       el('label', {class: 'slider plain'}, el('span', {text: 'speed'}), speed, speedText),
       frames.element,

@@ -1,6 +1,6 @@
 // The motion panel: a goal, then Plan, Preview, Execute and Cancel. Only Execute (or Move, without a planner) moves.
 import type {Context} from '../context';
-import {button, choice, el, setClass, setText} from '../dom';
+import {button, choice, el, setClass, setText, setValueText} from '../dom';
 import {GoalEditor, type Mode} from '../goal';
 import {figure} from '../units';
 import {goalsPart} from './goals';
@@ -31,7 +31,11 @@ export function movePanel(context: Context): HTMLElement {
     attributes: {type: 'range', min: '5', max: '100', value: '50', 'aria-label': 'speed of the next motion'},
   });
   const speedText = el('output', {text: '50 %'});
-  speed.addEventListener('input', () => setText(speedText, `${speed.value} %`));
+  setValueText(speed, '50 %');
+  speed.addEventListener('input', () => {
+    setText(speedText, `${speed.value} %`);
+    setValueText(speed, speedText.textContent);
+  });
   const fraction = () => Number(speed.value) / 100;
 
   const plan = button(

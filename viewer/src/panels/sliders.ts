@@ -1,6 +1,6 @@
 // One slider per joint of a joint goal, between its limits.
 import type {Context} from '../context';
-import {el, setClass, setText} from '../dom';
+import {el, setClass, setText, setValueText} from '../dom';
 import type {GoalEditor} from '../goal';
 import {angle, angleText, shortJoint} from '../units';
 
@@ -68,6 +68,7 @@ export function jointSliders(context: Context, editor: GoalEditor): HTMLElement 
       const step = String(Math.round(((values[i]! - lower) / (upper - lower)) * STEPS));
       if (input.value !== step && document.activeElement !== input) input.value = step;
       const text = angleText(values[i]).replace('−', '-');
+      setValueText(input, `${text} ${angle.label}`);
       if (document.activeElement !== output && output.value !== text) output.value = text;
     });
     setClass(element, 'set', editor.joints !== null);

@@ -1,6 +1,6 @@
 // The planned motion as a ghost: play it, or drag it to a time. While the arm moves, it follows the motion.
 import type {Context} from '../context';
-import {button, el, setClass, setText} from '../dom';
+import {button, el, setClass, setText, setValueText} from '../dom';
 import {figure} from '../units';
 
 export function timeline(context: Context): HTMLElement {
@@ -24,6 +24,7 @@ export function timeline(context: Context): HTMLElement {
   const show = () => {
     range.value = String(end() ? Math.round((time / end()) * 1000) : 0);
     setText(text, `${figure(time, 1)} / ${figure(end(), 1)} s`);
+    setValueText(range, text.textContent);
     view.showPlan(flow.preview, time);
   };
   const halt = () => {
