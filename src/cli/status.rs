@@ -268,6 +268,13 @@ fn print(r: &StatusReport, verbose: bool) {
 
 /// Returns what needs attention, most urgent first, each with what to do if that is known.
 fn attention(r: &StatusReport) -> Vec<String> {
+    let mut lines = trouble(r);
+    lines.extend(r.realtime.iter().filter(|measure| !measure.granted).flat_map(banner::realtime));
+    lines
+}
+
+/// Returns what of it may change during a run.
+pub(super) fn trouble(r: &StatusReport) -> Vec<String> {
     let mut lines = Vec::new();
     for arm in &r.arms {
         let name = &arm.hardware_id;
@@ -312,7 +319,6 @@ fn attention(r: &StatusReport) -> Vec<String> {
     if let Some(error) = r.recorder.as_ref().and_then(|recorder| recorder.error.as_ref()) {
         lines.push(format!("the log ENDED: {error}"));
     }
-    lines.extend(r.realtime.iter().filter(|measure| !measure.granted).flat_map(banner::realtime));
     lines
 }
 
