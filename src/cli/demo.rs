@@ -20,6 +20,8 @@ use dimos_rpc::run_dir::{LiveRun, RunDir};
 const NAME: &str = "demo";
 /// The blueprint in the program: a file of that name may have real arms.
 const BLUEPRINT: &str = "builtin:demo";
+/// The arms of the cell.
+const ARMS: [&str; 2] = ["left", "right"];
 /// The job in the program, as `do` names it.
 pub const JOB: &str = "builtin:demo";
 /// Its text.
@@ -27,9 +29,9 @@ pub const JOB_TEXT: &str = include_str!("../../assets/demo-job.yaml");
 
 /// Three things to try, and what each shows.
 const TRIES: [(&str, &str); 3] = [
-    ("dimos do builtin:demo", "the arms carry the part over the wall, and back; each motion is planned"),
-    ("dimos top", "live status of arms, motions and timing; q ends it"),
-    ("dimos move right --pose 0.35 0.2 0.3", "the right arm reaches over the wall; try other positions [m]"),
+    ("dimos do builtin:demo", "the arms carry the part over the wall, and back: 40 s"),
+    ("dimos top", "live status of arms and motions; q ends it"),
+    ("dimos move right --pose 0.35 0.2 0.3", "reaches over the wall, to x y z [m]"),
 ];
 
 /// Arguments of `demo`.
@@ -82,22 +84,25 @@ pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
 fn live() -> Option<(LiveRun, StatusReport)> {
     let found = client::find(&RunDir::standard(), Some(NAME)).ok()?;
     let report = Client::connect(&found.name, &found.socket).ok()?.call(Status {}).ok()?;
-    (report.blueprint == NAME && report.standing() == "SIMULATED").then_some((found, report))
+    let is_cell = report.blueprint == NAME && report.arms.iter().map(|arm| arm.hardware_id.as_str()).eq(ARMS);
+    (is_cell && report.standing() == "SIMULATED").then_some((found, report))
 }
 
 /// Shows a demo that is live already.
 fn show(found: &LiveRun, report: &StatusReport, as_json: bool) {
-    let tries = TRIES.map(|(command, _)| command.to_owned() + selector());
     let url = client::view_url(&found.name, &found.socket).filter(|_| as_json || std::io::stderr().is_terminal());
     if as_json {
-        return output::json(&json!({"run": found.name, "pid": found.pid, "view": url, "try": tries}));
+        return output::json(&to_json(report, url.as_deref()));
     }
     output::note(format_args!("the demo is running already (pid {}); to end it: dimos down {NAME}", found.pid));
     lines(report, url.as_deref()).iter().for_each(output::note);
 }
 
-/// Prints what the demo is and what to try, in place of the banner.
-pub fn introduce(terminal: &Terminal, report: &StatusReport, url: Option<&str>) {
+/// Prints what the demo is and what to try: for people in place of the banner, as JSON behind that.
+pub(super) fn introduce(terminal: &Terminal, report: &StatusReport, url: Option<&str>, as_json: bool) {
+    if as_json {
+        return terminal.json(&to_json(report, url));
+    }
     terminal.note(format_args!("{}  (pid {}, dimos {})", banner::heading(report), report.pid, report.version));
     terminal.note("Two arms, a wall between them, a part to carry. Nothing moves until you ask.");
     for line in lines(report, url) {
@@ -109,19 +114,26 @@ pub fn introduce(terminal: &Terminal, report: &StatusReport, url: Option<&str>) 
     terminal.note("Press Ctrl-C for a controlled stop.");
 }
 
+/// Returns the three commands, each with what it shows.
+fn tries() -> [(String, &'static str); 3] {
+    // Beside other runs, commands name theirs.
+    let several = RunDir::standard().runs().is_ok_and(|live| live.len() > 1);
+    let selector = if several { format!(" --run {NAME}") } else { String::new() };
+    TRIES.map(|(command, what)| (command.to_owned() + &selector, what))
+}
+
 /// Returns the address of the page, and the three commands.
 fn lines(report: &StatusReport, url: Option<&str>) -> Vec<String> {
     let page =
         report.view.as_deref().map(|address| url.map_or_else(|| banner::view_without_token(address), str::to_owned));
     let page = page.map(|page| format!("The page, for a browser:  {page}"));
-    let tries = TRIES.map(|(command, what)| format!("  {:<38}  {what}", command.to_owned() + selector()));
+    let tries = tries();
+    let width = tries.iter().map(|(command, _)| command.len()).max().unwrap_or(0);
+    let tries = tries.iter().map(|(command, what)| format!("  {command:width$}  {what}"));
     page.into_iter().chain(["Three things to try, in a second terminal:".to_owned()]).chain(tries).collect()
 }
 
-/// Returns how the commands name the demo, beside other runs.
-fn selector() -> &'static str {
-    match RunDir::standard().runs() {
-        Ok(live) if live.len() > 1 => " --run demo",
-        _ => "",
-    }
+fn to_json(report: &StatusReport, url: Option<&str>) -> serde_json::Value {
+    let tries = tries().map(|(command, _)| command);
+    json!({"event": "demo", "run": report.run, "pid": report.pid, "view": url.or(report.view.as_deref()), "try": tries})
 }

@@ -61,7 +61,7 @@ pub struct Args {
     /// Start the run in the background; return when the arms are up
     #[arg(short, long)]
     pub daemon: bool,
-    /// Introduce the demo instead of the banner
+    /// Introduce the demo
     #[arg(skip)]
     pub demo: bool,
     /// Text log of the background process
@@ -237,9 +237,11 @@ fn keep_up(
     // The token is shown to a person only: what is not a terminal may be kept.
     let url = run.view_url().filter(|_| in_terminal && std::io::stderr().is_terminal());
     let socket = run.socket().unwrap_or_else(|| Path::new("none"));
-    match demo && !json {
-        true => demo::introduce(terminal, &report, url),
-        false => banner::print(terminal, &report, socket, url, how_to_end, json),
+    if json || !demo {
+        banner::print(terminal, &report, socket, url, how_to_end, json);
+    }
+    if demo {
+        demo::introduce(terminal, &report, url, json);
     }
     let ending = run.wait_for_end(duration);
     share.iter().for_each(ShareChild::run_ends);

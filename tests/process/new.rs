@@ -72,7 +72,7 @@ fn it_asks_on_a_terminal_and_a_wrong_answer_is_asked_for_again() {
         ("Its gripper: ", "xarm"),
         ("Model to plan with", ""),
         ("Tool centre point from link_tcp", "0 0 120"),
-        ("error: ", "0 0 0.12"),
+        ("120 mm is 0.12 m", "0 0 0.12"),
         ("Height of the table", "-0.05"),
     ] {
         terminal.until(question);
@@ -93,6 +93,7 @@ fn it_asks_on_a_terminal_and_a_wrong_answer_is_asked_for_again() {
     home.dimos("check cell.yaml").with(0).shows(&["REAL ARM at 192.168.1.185", "no mistakes"]);
     try_out(&home, "cell.yaml");
 
+    let terminal = Terminal::new(100, 50);
     let left = terminal.start(&home, "new other");
     terminal.until("Which arm: ");
     terminal.keys("\x03");
@@ -117,18 +118,18 @@ fn what_is_missing_or_wrong_is_named_and_nothing_is_written() {
         ("--arm xarm6 --address sim --gripper none --model xarm6 --tool 0 0", "three numbers"),
         ("--arm xarm6 --address sim --gripper none --model xarm6 --tool none --table 700", "m"),
         ("--arm yourarm --address sim --gripper claw", "no choice of grippers"),
-        ("--arm mock --model none --joints 17", "cannot have 17 joints"),
-        ("--arm mock --model none --joints 6 --table 0", "needs a model"),
+        ("--arm mock --gripper none --model none --joints 17", "cannot have 17 joints"),
+        ("--arm mock --gripper none --model none --joints 6 --table 0", "needs a model"),
         ("--arm xarm6 --address sim --joints 6 --gripper none --model none --tool 0 0 1", "needs a model"),
     ] {
         let refused = home.dimos(&format!("new cell {wrong}")).with(2);
         assert!(refused.err.contains(said) && refused.err.contains("hint: "), "{wrong}: {}", refused.err);
     }
-    home.dimos("new a/b:c --arm mock --model none --joints 2").with(2);
+    home.dimos("new a/b:c --arm mock --gripper none --model none --joints 2").with(2);
     assert!(!home.path().join("cell.yaml").exists());
 
     home.write("cell.yaml", "mine");
-    let written = "new cell --arm mock --model none --joints 2";
+    let written = "new cell --arm mock --gripper none --model none --joints 2";
     home.dimos(written).with(2).says(&["cell.yaml exists already", "--force"]);
     assert_eq!(std::fs::read_to_string(home.path().join("cell.yaml")).unwrap(), "mine");
     let said = home.dimos(&format!("{written} --force --json")).with(0).json();
@@ -160,7 +161,7 @@ fn a_model_of_your_own_is_planned_with() {
     ];
     home.write("own.urdf", &format!("<robot name=\"own\">{}</robot>", parts.concat()));
     std::fs::create_dir(home.path().join("cells")).unwrap();
-    home.dimos("new cells/own --arm mock --model own.urdf --tool none --table none").with(0);
+    home.dimos("new cells/own --arm mock --gripper none --model own.urdf --tool none --table none").with(0);
     let checked = home.dimos("check cells/own.yaml").with(0);
     assert!(checked.out.contains("arm_elbow") && checked.out.contains("planned to lower"), "{}", checked.out);
     try_out(&home, "cells/own.yaml");

@@ -53,9 +53,8 @@ impl Asker {
             return read(given).map_err(|f| Failure { what: format!("{option}: {}", f.what), ..f });
         }
         let Some(signals) = &self.person else {
-            let what =
-                format!("{option} is missing, and stdin is not a terminal that could be asked: {}", question.text);
-            return Err(Failure::usage(what).hint("`dimos new --help` shows all options"));
+            let hint = "stdin is not a terminal, so that all answers must be options: `dimos new --help` shows them";
+            return Err(Failure::usage(format!("{option} is missing: {}", question.text)).hint(hint));
         };
         let default = question.default;
         let prompt = if default.is_empty() { String::new() } else { format!(" [{default}]") };

@@ -125,7 +125,7 @@ fn arm(registry: &Registry, text: &str) -> Result<(AdapterSpec, Option<String>)>
 }
 
 fn address(args: &Args, asker: &Asker, row: &AdapterSpec) -> Result<String> {
-    if !row.address.required && args.address.is_none() {
+    if !row.address.required && args.address.as_deref().is_none_or(|address| address == SIM) {
         return Ok(String::new());
     }
     let read = |text: &str| match text {
@@ -210,7 +210,9 @@ fn planned(text: &str, blueprint: &Path) -> Result<Option<Robot>> {
         return Ok(None);
     }
     let file = if builtin::text(text).is_some() { format!("{}{text}", builtin::PREFIX) } else { text.to_owned() };
-    let (model, _) = checked_robot(robot::load(&Source::new(&file)), Path::new(&file))?;
+    let or_hint = || Some("builtin:NAME, a .urdf or .xacro file, or none".to_owned());
+    let (model, _) = checked_robot(robot::load(&Source::new(&file)), Path::new(&file))
+        .map_err(|failure| Failure { hint: failure.hint.clone().or_else(or_hint), ..failure })?;
     let end = end_of_arm(&model);
     let name = |link: usize| model.links.get(link).map(|link| link.name.clone()).unwrap_or_default();
     let between = model.independent_of(&model.path(0, end));
