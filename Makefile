@@ -26,12 +26,14 @@ PAGE := viewer/dist/index.html
 PAGE_SOURCES := $(wildcard viewer/*.json viewer/*.mjs) $(shell find viewer/src -type f 2>/dev/null)
 NODE := $(if $(wildcard viewer/package.json),$(shell command -v npm))
 
-.PHONY: run install dist shipped viewer viewer-if-possible check lint scripts spelling licences test test-fast package verified test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants bench bench-quick bench-page bench-share screenshots jitter soak lies lies-wire pauses
+.PHONY: run demo install dist shipped viewer viewer-if-possible check lint scripts spelling licences test test-fast package verified test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants bench bench-quick bench-page bench-share screenshots jitter soak lies lies-wire pauses
 
-# Builds the program to try it, not optimized, and starts the shipped blueprint; its arm is simulated. Ends with Ctrl-C.
-run: viewer-if-possible
+# Builds the program to try it, not optimized, and starts a shipped blueprint; its arms are simulated. Ends with Ctrl-C.
+run: WHAT = run coordinator-yourarm
+demo: WHAT = demo
+run demo: viewer-if-possible
 	@[ -e $(TARGET)/quick/dimos ] || echo "building dimos: 3 to 5 minutes the first time" >&2
-	@trap : INT; cargo run --profile quick --locked -- run coordinator-yourarm || [ $$? -eq 130 ]
+	@trap : INT; cargo run --profile quick --locked -- $(WHAT) || [ $$? -eq 130 ]
 
 # Installs program, man pages, completions and blueprints below PREFIX; below /usr/local also the systemd unit.
 install: shipped

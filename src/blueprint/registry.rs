@@ -10,7 +10,8 @@ use serde::Serialize;
 
 use crate::blueprint::catalog::Catalog;
 use crate::blueprint::load::{Overrides, load_from};
-use dimos_yaml::{MAX_BYTES, closest, quote};
+use dimos_robot::builtin::PREFIX;
+use dimos_yaml::{MAX_BYTES, closest, did_you_mean, quote};
 
 /// Files and texts of the blueprints in the binary, embedded by `build.rs` from `blueprints/`.
 const EMBEDDED: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/blueprints.rs"));
@@ -119,8 +120,13 @@ impl SearchPath {
         Self { folders }
     }
 
-    /// Returns the file of a name or path.
+    /// Returns the file of a name or path; `builtin:NAME` is the blueprint in the program, whatever files there are.
     pub fn find(&self, name_or_path: &str) -> Result<Found, FindError> {
+        if let Some(name) = name_or_path.strip_prefix(PREFIX) {
+            let message = format!("there is no built-in blueprint {}", quote(name));
+            let hint = did_you_mean(name, embedded().into_keys(), "the built-in ones are").unwrap_or_default();
+            return Found::embedded(name).ok_or(FindError { message, hint });
+        }
         let path = Path::new(name_or_path);
         if looks_like_path(name_or_path) || path.is_file() {
             return self.open(path);

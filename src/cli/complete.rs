@@ -63,6 +63,8 @@ fn candidates(parent: &str, verb: &str, arg: Arg) -> Arg {
     let value = arg.get_value_names().and_then(|names| names.first()).map(|name| name.as_str().to_owned());
     match (arg.get_id().as_str(), verb) {
         ("blueprint", _) => arg.add(ArgValueCompleter::new(blueprints as fn(&OsStr) -> Vec<CompletionCandidate>)),
+        ("arm", "new") => arg.add(of(adapters)),
+        ("model", "new") => arg.add(ArgValueCompleter::new(models as fn(&OsStr) -> Vec<CompletionCandidate>)),
         ("arm" | "arms" | "robot", _) => arg.add(of(arms)),
         ("task", _) => arg.add(of(tasks)),
         ("named", _) => arg.add(of(named_poses)),

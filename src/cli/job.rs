@@ -41,7 +41,7 @@ Every mistake of the file, and every name that the run does not have, is reporte
 Ctrl-C, `dimos stop` and `dimos cancel` end the job; nothing moves afterwards, and no hold is cleared. Exit code 1 names \
 the step.")]
 pub struct Args {
-    /// The job's file
+    /// The job's file; builtin:demo is that of `dimos demo`
     #[arg(value_name = "JOB.yaml")]
     pub job: PathBuf,
     /// Check the file, and its names if a run is live; move nothing

@@ -8,10 +8,12 @@ mod attach;
 pub mod back_out;
 pub mod banner;
 pub mod cancel;
+mod causes;
 pub mod check;
 pub mod complete;
 pub mod completions;
 pub mod daemon;
+pub mod demo;
 pub mod doctor;
 pub mod down;
 mod escapes;
@@ -32,6 +34,7 @@ pub mod logs;
 pub mod man;
 pub mod model;
 pub mod motion;
+pub mod new;
 mod other_users;
 pub mod output;
 pub mod plan;
@@ -53,6 +56,7 @@ pub mod stop;
 mod targets;
 pub mod task;
 mod text_log;
+pub mod top;
 mod trajectory_file;
 mod typed;
 pub mod view;
@@ -74,8 +78,10 @@ use dimos_robot::builtin;
 const MIN_STACK: u64 = 4 << 20;
 const OWN_STACK: usize = 8 << 20;
 const START_WITH: &str = "\
-Start with:  dimos run coordinator-yourarm
-Then, in a second terminal:  dimos status, dimos state, dimos move arm 0.3 -0.2 0.5 0 0.4 0";
+Start with:  dimos demo
+Then with an arm:  dimos run coordinator-yourarm, and in a second terminal:  dimos status, dimos state, dimos move arm \
+0.3 -0.2 0.5 0 0.4 0
+Your own arm:  dimos new";
 
 const NO_SAFETY_FUNCTION: &str = "\
 `stop` is an operational stop, not a safety function. Use the arm's own rated stop to protect people.";
@@ -101,10 +107,16 @@ struct Cli {
 enum Command {
     /// Start a run from a blueprint; Ctrl-C shuts it down
     Run(run::Args),
+    /// Start a simulated cell of two arms, and print three things to try
+    Demo(demo::Args),
+    /// Write a blueprint for your arm: asks six questions, or takes the answers as options
+    New(new::Args),
     /// Show all runs, or one in full: arms, tasks, timing, faults
     Status(status::Args),
     /// Show joints, gripper, pose and force of a run's arms
     State(state::Args),
+    /// Watch all runs on one screen: arms, motions, holds, timing
+    Top(top::Args),
     /// Move an arm to joint positions or a pose, and wait for the end
     Move(motion::Args),
     /// Plan a collision-free motion of one or several arms; moves nothing
@@ -180,8 +192,8 @@ impl Command {
             }
             Self::World(_) | Self::Do(_) | Self::BackOut(_) | Self::Cancel(_) | Self::Speed(_) | Self::Pause(_) => true,
             Self::Resume(_) | Self::Stop(_) | Self::Arm(_) | Self::Pose(_) | Self::Jog(_) | Self::Task(_) => true,
-            Self::Proxy(_) | Self::Run(_) | Self::View(_) | Self::Down(_) | Self::Logs(_) => true,
-            Self::Share(_) | Self::Log(_) => false,
+            Self::Proxy(_) | Self::Run(_) | Self::View(_) | Self::Down(_) | Self::Logs(_) | Self::Top(_) => true,
+            Self::Share(_) | Self::Log(_) | Self::Demo(_) | Self::New(_) => false,
             Self::Adapter(_) | Self::ListAdapters(_) | Self::ListBlueprints(_) | Self::Check(_) | Self::Schema(_) => {
                 false
             }
@@ -391,8 +403,11 @@ fn built_in(cli: &Cli, catalog: Catalog<'_>) -> exit::Result {
     let registry = catalog.adapters;
     match &cli.command {
         Command::Run(args) => run::run(args, catalog),
+        Command::Demo(args) => demo::run(args, catalog),
+        Command::New(args) => new::run(args, catalog),
         Command::Status(args) => status::run(args),
         Command::State(args) => state::run(args),
+        Command::Top(args) => top::run(args),
         Command::Move(args) => motion::run(args),
         Command::Plan(args) => plan::run(args),
         Command::Preview(args) => preview::run(args),

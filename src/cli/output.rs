@@ -38,7 +38,7 @@ pub fn wrapped(text: impl Display) {
     folded(&text.to_string(), columns(io::stdout())).iter().for_each(line);
 }
 
-/// Breaks a text at blanks, with the lines after the first indented.
+/// Breaks a text at blanks; the lines below the first are indented.
 pub fn folded(text: &str, width: Option<u16>) -> Vec<String> {
     let Some(width) = width.map(usize::from) else { return vec![text.to_owned()] };
     let indent = text.len() - text.trim_start().len() + 2;

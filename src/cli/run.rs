@@ -4,30 +4,29 @@
 
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
-use std::sync::mpsc::Sender;
 use std::time::Duration;
 
 use anyhow::Context;
 use serde::Serialize;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
-use signal_hook::iterator::Signals;
 
 use super::arguments::{Changes, duration};
 use super::attach::{self, Attached};
+use super::causes::Causes;
 use super::daemon::StartingProcess;
 use super::exit::{Exit, Failure, Result};
 use super::run_record::RunRecord;
 use super::share;
 use super::share_child::ShareChild;
 use super::text_log::Terminal;
-use super::{banner, check, daemon};
+use super::{banner, check, daemon, demo};
 use crate::blueprint::Catalog;
 use crate::runtime::{Ended, Ending, Options, Record, Run, ServiceManager};
 use dimos_rpc::report::StatusReport;
 use dimos_rpc::run_dir;
 
 /// Arguments of `run`.
-#[derive(Debug, Clone, PartialEq, clap::Args)]
+#[derive(Debug, Clone, PartialEq, Default, clap::Args)]
 pub struct Args {
     /// The blueprint: a name that `list-blueprints` shows, or a file
     #[arg(value_name = "NAME|PATH")]
@@ -38,6 +37,9 @@ pub struct Args {
     /// Stop the run after this time: 10s, 2m, or a number of seconds
     #[arg(long, value_name = "TIME", value_parser = duration)]
     pub duration: Option<Duration>,
+    /// End the run when this process has ended, however it ended: also by SIGKILL
+    #[arg(long, value_name = "PID", value_parser = clap::value_parser!(i32).range(1..))]
+    pub end_with: Option<i32>,
     /// Write the log to this file
     #[arg(long, value_name = "FILE", conflicts_with = "no_record")]
     pub record: Option<PathBuf>,
@@ -59,6 +61,9 @@ pub struct Args {
     /// Start the run in the background; return when the arms are up
     #[arg(short, long)]
     pub daemon: bool,
+    /// Introduce the demo
+    #[arg(skip)]
+    pub demo: bool,
     /// Text log of the background process
     #[arg(long, value_name = "FILE", hide = true)]
     pub text_log: Option<PathBuf>,
@@ -95,13 +100,13 @@ pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
     match &args.text_log {
         None if args.daemon => daemon::start(args, catalog),
         None => match bring_up(args, catalog)? {
-            (Up::Run(run, share), signals, terminal) => {
+            (Up::Run(run, share), causes, terminal) => {
                 let record = RunRecord::begin(&run.status(), None);
-                let keep = Keep { duration: args.duration, json: args.json, seen: true, share };
-                keep_up(*run, signals, &terminal, keep, Some(record))
+                let keep = Keep { duration: args.duration, json: args.json, demo: args.demo, seen: true, share };
+                keep_up(*run, causes, &terminal, keep, Some(record))
             }
-            (Up::Planner(planner), signals, terminal) => {
-                watch(signals, planner.endings())?;
+            (Up::Planner(planner), causes, terminal) => {
+                causes.watch(planner.endings())?;
                 planner.keep_up(&terminal, args, None)
             }
         },
@@ -112,7 +117,7 @@ pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
 /// Runs in the background: reports to the starting process that the run is up, or why not.
 fn in_background(args: &Args, catalog: Catalog<'_>, text_log: &Path) -> Result {
     let starter = StartingProcess::detach(text_log)?;
-    let (up, signals, terminal) = match bring_up(args, catalog) {
+    let (up, causes, terminal) = match bring_up(args, catalog) {
         Ok(up) => up,
         Err(failure) => {
             starter.failed(&failure);
@@ -132,12 +137,13 @@ fn in_background(args: &Args, catalog: Catalog<'_>, text_log: &Path) -> Result {
     let (run, share) = match up {
         Up::Run(run, share) => (*run, share),
         Up::Planner(planner) => {
-            watch(signals, endings)?;
+            causes.watch(endings)?;
             return planner.keep_up(&terminal, args, Some(text_log));
         }
     };
     let record = RunRecord::begin(&run.status(), Some(text_log));
-    keep_up(run, signals, &terminal, Keep { duration: args.duration, json: false, seen: notified, share }, Some(record))
+    let keep = Keep { duration: args.duration, json: false, demo: false, seen: notified, share };
+    keep_up(run, causes, &terminal, keep, Some(record))
 }
 
 /// What `dimos run` keeps up.
@@ -153,17 +159,17 @@ pub(super) fn check_name(name: &str) -> Result<()> {
     run_dir::check_name(name).map_err(|e| Failure::usage(e.to_string()).hint(e.hint()))
 }
 
-fn bring_up(args: &Args, catalog: Catalog<'_>) -> Result<(Up, Signals, Terminal)> {
+fn bring_up(args: &Args, catalog: Catalog<'_>) -> Result<(Up, Causes, Terminal)> {
     args.name.as_deref().map(check_name).transpose()?;
     let loaded = check::load_to_run(&args.blueprint, &args.changes.overrides(), catalog)?;
     let Some(blueprint) = &loaded.blueprint else { return Err(check::refuse(&loaded)) };
     check::print_warnings(&loaded);
     // Watched before anything is connected: a signal during startup ends the run, controlled, as soon as it is up.
-    let signals = signals()?;
+    let causes = Causes::of(args.end_with)?;
     let terminal = terminal()?;
     if let Some(run) = attach::chosen(args, blueprint)? {
         let planner = Attached::start(args, blueprint, run, &terminal).inspect_err(|_| terminal.flush())?;
-        return Ok((Up::Planner(Box::new(planner)), signals, terminal));
+        return Ok((Up::Planner(Box::new(planner)), causes, terminal));
     }
     // A build without the network would run it, and not be reached.
     if let Some(config) = blueprint.share.as_ref().filter(|_| cfg!(not(feature = "share"))) {
@@ -186,17 +192,14 @@ fn bring_up(args: &Args, catalog: Catalog<'_>) -> Result<(Up, Signals, Terminal)
         }
         None => None,
     };
-    Ok((Up::Run(Box::new(run), share), signals, terminal))
+    Ok((Up::Run(Box::new(run), share), causes, terminal))
 }
 
 /// Keeps a started run up until a signal, its duration, `dimos down` or a fault ends it, and stops it. Reports on the
 /// terminal.
 pub fn until_its_end(run: Run, duration: Option<Duration>, json: bool) -> Result {
-    keep_up(run, signals()?, &terminal()?, Keep { duration, json, seen: true, share: None }, None)
-}
-
-fn signals() -> Result<Signals> {
-    Ok(Signals::new([SIGINT, SIGTERM, SIGHUP]).context("cannot watch signals")?)
+    let causes = Causes::of(None)?;
+    keep_up(run, causes, &terminal()?, Keep { duration, json, demo: false, seen: true, share: None }, None)
 }
 
 fn terminal() -> Result<Terminal> {
@@ -207,6 +210,8 @@ fn terminal() -> Result<Terminal> {
 struct Keep {
     duration: Option<Duration>,
     json: bool,
+    /// Whether it is the demo.
+    demo: bool,
     /// Whether a client or a terminal was shown that the run is up: otherwise no one expects its arms to move at
     /// its end.
     seen: bool,
@@ -216,27 +221,32 @@ struct Keep {
 
 fn keep_up(
     run: Run,
-    mut signals: Signals,
+    mut causes: Causes,
     terminal: &Terminal,
-    Keep { duration, json, mut seen, share }: Keep,
+    Keep { duration, json, demo, mut seen, share }: Keep,
     record: Option<RunRecord>,
 ) -> Result {
-    for signal in signals.pending() {
+    for signal in causes.pending() {
         seen = false;
         let _ = run.endings().send(Ending::Signal(signal));
     }
-    watch(signals, run.endings())?;
+    causes.watch(run.endings())?;
     let report = run.status();
     let in_terminal = record.as_ref().is_none_or(|record| record.text_log.is_none());
     let how_to_end = if in_terminal { banner::IN_A_TERMINAL } else { daemon::HOW_TO_END };
     // The token is shown to a person only: what is not a terminal may be kept.
     let url = run.view_url().filter(|_| in_terminal && std::io::stderr().is_terminal());
     let socket = run.socket().unwrap_or_else(|| Path::new("none"));
-    banner::print(terminal, &report, socket, url, how_to_end, json);
+    if json || !demo {
+        banner::print(terminal, &report, socket, url, how_to_end, json);
+    }
+    if demo {
+        demo::introduce(terminal, &report, url, json);
+    }
     let ending = run.wait_for_end(duration);
     share.iter().for_each(ShareChild::run_ends);
-    // A terminal that is lost has no one before it who expects a motion.
-    let unwatched = matches!(ending, Ending::Fault(_) | Ending::Log(_) | Ending::Signal(SIGHUP));
+    // A terminal that is lost has no one before it who expects a motion, and neither has a program that has ended.
+    let unwatched = matches!(ending, Ending::Fault(_) | Ending::Log(_) | Ending::Signal(SIGHUP) | Ending::Orphaned);
     let parks = seen && !unwatched && report.arms.iter().any(banner::parks);
     if !json {
         let then = if parks { banner::PARKING } else { "then releasing the arms" };
@@ -250,7 +260,7 @@ fn keep_up(
         Ending::Log(_) => Exit::Log,
         _ if ended.log_cut.is_some() => Exit::Log,
         Ending::Signal(signal) => Exit::by_signal(*signal),
-        Ending::Duration | Ending::Asked => Exit::Ok,
+        Ending::Duration | Ending::Asked | Ending::Orphaned => Exit::Ok,
     };
     if let Some(record) = record {
         let why = ended.log_cut.clone().filter(|_| exit == Exit::Log).unwrap_or_else(|| why(&ending));
@@ -258,17 +268,6 @@ fn keep_up(
     }
     terminal.flush();
     Ok(exit)
-}
-
-/// Forwards signals for the lifetime of the process: a second signal ends parking, and changes nothing else.
-fn watch(mut signals: Signals, endings: Sender<Ending>) -> Result<()> {
-    let watching = std::thread::Builder::new().name("signals".into()).spawn(move || {
-        for signal in signals.forever() {
-            let _ = endings.send(Ending::Signal(signal));
-        }
-    });
-    watching.context("cannot start the thread of signals")?;
-    Ok(())
 }
 
 /// Returns why something ended, in a few words.
@@ -282,6 +281,7 @@ pub(super) fn why(ending: &Ending) -> String {
         },
         Ending::Duration => "duration reached".to_owned(),
         Ending::Asked => "shutdown requested".to_owned(),
+        Ending::Orphaned => "the process of --end-with has ended".to_owned(),
         Ending::Log(what) => what.clone(),
         Ending::Fault(what) => format!("FAULT: {what}"),
     }

@@ -269,6 +269,14 @@ fn print(r: &StatusReport, verbose: bool) {
 
 /// Returns what needs attention, most urgent first, each with what to do if that is known.
 fn attention(r: &StatusReport) -> Vec<String> {
+    let mut lines = trouble(r);
+    let needed = r.realtime.iter().filter(|measure| !measure.granted && !banner::is_simulated(r));
+    lines.extend(needed.flat_map(banner::realtime));
+    lines
+}
+
+/// Returns what of it may change during a run.
+pub(super) fn trouble(r: &StatusReport) -> Vec<String> {
     let mut lines = Vec::new();
     for arm in &r.arms {
         let name = &arm.hardware_id;
@@ -319,8 +327,6 @@ fn attention(r: &StatusReport) -> Vec<String> {
     if let Some(error) = r.recorder.as_ref().and_then(|recorder| recorder.error.as_ref()) {
         lines.push(format!("the log ENDED: {error}"));
     }
-    let needed = r.realtime.iter().filter(|measure| !measure.granted && !banner::is_simulated(r));
-    lines.extend(needed.flat_map(banner::realtime));
     lines
 }
 

@@ -114,6 +114,8 @@ pub enum Ending {
     Duration,
     /// A shutdown request over rpc.
     Asked,
+    /// The process that it was to end with has ended.
+    Orphaned,
     /// The log ended, with the reason.
     Log(String),
     /// A fault.

@@ -199,7 +199,7 @@ fn exit_codes() {
 #[test]
 fn python_client() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("assets/python/dimos_client");
-    let files = ["errors", "records", "live_runs", "connection", "streams", "planning", "client"];
+    let files = ["errors", "records", "live_runs", "connection", "streams", "planning", "client", "own_run"];
     let text = |name: &str| fs::read_to_string(folder.join(name).with_extension("py")).unwrap();
     let lines: Vec<String> = files.iter().flat_map(|name| source::python(&text(name))).collect();
     unchanged("python", &lines);

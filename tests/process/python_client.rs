@@ -32,6 +32,7 @@ fn python(home: &Home, arguments: &[&str]) -> Option<Ended> {
     let mut command = Command::new("python3");
     let assets = Path::new(env!("CARGO_MANIFEST_DIR")).join("assets/python");
     command.args(arguments).env("PYTHONPATH", assets).env("PYTHONPYCACHEPREFIX", home.path());
+    command.env("DIMOS", env!("CARGO_BIN_EXE_dimos"));
     Some(Started::of(home.settle(&mut command).stdin(Stdio::null())).wait())
 }
 

@@ -7,6 +7,8 @@
         robot.move("arm", [0.3, -0.2, 0.5, 0, 0.4, 0])       # waits; planned around obstacles if the run has a planner
         robot.gripper("arm", "close")                        # waits; .outcome: "holding", "closed", …
 
+`run("coordinator-yourarm")` starts a simulated run that ends with the program, and returns its client.
+
 Units are SI: rad, rad/s, Nm, m, N, s. Unknown values are None, never zero. docs/python.md has recipes, docs/rpc.md the
 protocol; `call` sends every other request. A client is for one thread; make another for another thread. One connection
 at a time may move an arm: LeaseHeld names the other one. Everything that waits has a bound, and so has every queue.
@@ -27,6 +29,7 @@ from .errors import (
     Refused,
 )
 from .live_runs import runs
+from .own_run import OwnRun, run
 from .records import ArmState, ChunkReport, Goal, Grip, JointState, LoopReport, Plan, Pose, Waypoint
 from .streams import IN_FLIGHT, Policy
 
@@ -49,11 +52,13 @@ __all__ = [
     "NoRun",
     "OutOfLimits",
     "OutOfReach",
+    "OwnRun",
     "Plan",
     "PlanningFailed",
     "Policy",
     "Pose",
     "Refused",
     "Waypoint",
+    "run",
     "runs",
 ]

@@ -60,7 +60,6 @@ impl Line {
     }
 
     /// Returns its text.
-    #[cfg(test)]
     pub fn text(&self) -> String {
         self.0.iter().map(|(text, _)| text.as_str()).collect()
     }

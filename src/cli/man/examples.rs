@@ -3,6 +3,9 @@
 /// Verbs as typed, and examples of each.
 pub(super) const OF_VERBS: &[(&str, &[&str])] = &[
     ("run", &["dimos run coordinator-yourarm", "dimos run xarm6-planner --address arm=192.168.1.185 -d"]),
+    ("demo", &["dimos demo", "dimos demo --job > job.yaml"]),
+    ("new", &["dimos new", "dimos new my-cell --arm xarm6 --address 192.168.1.185"]),
+    ("top", &["dimos top", "dimos top --once"]),
     ("status", &["dimos status", "dimos status -v", "dimos status coordinator-yourarm --json"]),
     ("state", &["dimos state", "dimos state --watch"]),
     ("execute", &["dimos execute", "dimos execute trajectory.csv"]),

@@ -92,7 +92,7 @@ impl Run {
         let why = |ending| match ending {
             Ending::Signal(_) => Some("it was interrupted by a second signal"),
             Ending::Fault(_) | Ending::Log(_) => Some(UNCONTROLLED),
-            Ending::Duration | Ending::Asked => None,
+            Ending::Duration | Ending::Asked | Ending::Orphaned => None,
         };
         let mut why = self.endings.1.try_iter().find_map(why);
         if self.handle.service().lifecycle.was_cancelled() {
