@@ -41,6 +41,7 @@ mod log_verbs;
 mod moved_by_others;
 mod onto;
 mod orders;
+mod other_machine;
 mod packages;
 mod park;
 mod payload;
