@@ -312,7 +312,11 @@ fn the_unit_files_are_units() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("assets/system");
     let ours = ["Type=notify", "Restart=no", "WatchdogSec=2", "KillSignal=SIGTERM"];
     for (unit, file, has) in [
-        ("dimos@.service", "dimos-system@.service", &[&ours[..], &["LimitRTPRIO=95", "LimitMEMLOCK=infinity"]].concat()),
+        (
+            "dimos@.service",
+            "dimos-system@.service",
+            &[&ours[..], &["LimitRTPRIO=95", "LimitMEMLOCK=infinity"]].concat(),
+        ),
         ("dimos@.service", "dimos-user@.service", &ours.to_vec()),
         ("dimos-can@.service", "dimos-can@.service", &vec!["Type=oneshot", "RemainAfterExit=yes"]),
     ] {

@@ -124,7 +124,8 @@ fn planned(client: &mut Client, plan: &Plan) -> (bool, String) {
     if report.state != "PLANNED" {
         return (false, format!("{}: {:?}", report.state, report.error));
     }
-    let mut preview = serde_json::to_value(client.call(Preview { plan: Some(number), hz: Some(100.0) }).unwrap()).unwrap();
+    let mut preview =
+        serde_json::to_value(client.call(Preview { plan: Some(number), hz: Some(100.0) }).unwrap()).unwrap();
     preview["summary"]["times"].take();
     (true, preview.to_string())
 }
@@ -144,7 +145,12 @@ fn seeded_plans_are_equal_in_every_bit() {
             let [ours, theirs] = clients.each_mut().map(|client| planned(client, &plan));
             found += usize::from(ours.0);
             if ours != theirs {
-                different.push(format!("{blueprint}, {index}: {}\n{}\n{}", serde_json::to_string(&plan).unwrap(), ours.1, theirs.1));
+                different.push(format!(
+                    "{blueprint}, {index}: {}\n{}\n{}",
+                    serde_json::to_string(&plan).unwrap(),
+                    ours.1,
+                    theirs.1
+                ));
             }
         }
         runs.map(|run| run.end(Signal::TERM).with(143));
@@ -177,13 +183,17 @@ fn checks_models_and_kinematics_print_the_same() {
         same(&format!("model info builtin:{model} --json"), None);
         let limits = limits(&machines[0], model);
         let line = |numbers: &mut Numbers| {
-            limits.iter().map(|(lower, upper)| format!("{} ", numbers.within(*lower, *upper))).collect::<String>() + "\n"
+            limits.iter().map(|(lower, upper)| format!("{} ", numbers.within(*lower, *upper))).collect::<String>()
+                + "\n"
         };
         let configurations: String = (0..500).map(|_| line(&mut numbers)).collect();
         let poses = same(&format!("model fk builtin:{model} --stdin"), Some(&configurations));
         for pose in poses.lines().step_by(100) {
             let p: Vec<&str> = pose.split_whitespace().collect();
-            same(&format!("model ik builtin:{model} --pose {} --quat {} --json", p[..3].join(" "), p[3..].join(" ")), None);
+            same(
+                &format!("model ik builtin:{model} --pose {} --quat {} --json", p[..3].join(" "), p[3..].join(" ")),
+                None,
+            );
         }
     }
 }
@@ -221,16 +231,19 @@ fn the_program_takes_only_exact_functions_from_the_c_library() {
         let output = Command::new("readelf").args(["--wide", "--dyn-syms"]).arg(program).output();
         output.map(|output| String::from_utf8(output.stdout).unwrap())
     };
-    let Ok(text) = symbols(Path::new(env!("CARGO_BIN_EXE_dimos"))) else { return skip("readelf (apt install binutils)") };
+    let Ok(text) = symbols(Path::new(env!("CARGO_BIN_EXE_dimos"))) else {
+        return skip("readelf (apt install binutils)");
+    };
     let taken: Vec<&str> = text
         .lines()
         .filter(|line| line.contains(" UND "))
         .filter_map(|line| line.split_whitespace().nth(7)?.split('@').next())
         .collect();
     assert!(taken.contains(&"memcpy") || taken.contains(&"malloc"), "{text}");
-    for name in "sin cos tan asin acos atan atan2 sincos sinh cosh tanh asinh acosh atanh exp exp2 exp10 expm1 log log2 log10 \
+    for name in
+        "sin cos tan asin acos atan atan2 sincos sinh cosh tanh asinh acosh atanh exp exp2 exp10 expm1 log log2 log10 \
                  log1p pow hypot cbrt"
-        .split_whitespace()
+            .split_whitespace()
     {
         for name in [name.to_owned(), format!("{name}f")] {
             assert!(!taken.contains(&name.as_str()), "{name} is the C library's");

@@ -167,10 +167,13 @@ fn the_wheel_installs_program_and_client_and_leaves_nothing() {
 
     let installed = Installed::at(venv.join("bin/dimos"));
     installed.works();
-    let asked = "import dimos_client, importlib.metadata as m; print(m.version('dimos-arm'), dimos_client.Client.__name__)";
+    let asked =
+        "import dimos_client, importlib.metadata as m; print(m.version('dimos-arm'), dimos_client.Client.__name__)";
     let mut python = Command::new(venv.join("bin/python"));
     assert_eq!(done(python.args(["-c", asked])), concat!(env!("CARGO_PKG_VERSION"), " Client\n"));
-    for file in ["man/man1/dimos.1.gz", "bash-completion/completions/dimos", "dimos/blueprints/coordinator-yourarm.yaml"] {
+    for file in
+        ["man/man1/dimos.1.gz", "bash-completion/completions/dimos", "dimos/blueprints/coordinator-yourarm.yaml"]
+    {
         assert!(venv.join("share").join(file).exists(), "{file}");
     }
     // Python dimos has a script of the same name: here, a package that claims it.

@@ -68,8 +68,14 @@ mod tests {
         for x in numbers() {
             let ours = [x.sin(), x.cos(), x.tan(), x.exp(), x.cbrt(), x.atan2(0.7), x.hypot(0.3), x.abs().ln()];
             let crates = [
-                libm::sin(x), libm::cos(x), libm::tan(x), libm::exp(x), libm::cbrt(x), libm::atan2(x, 0.7),
-                libm::hypot(x, 0.3), libm::log(x.abs()),
+                libm::sin(x),
+                libm::cos(x),
+                libm::tan(x),
+                libm::exp(x),
+                libm::cbrt(x),
+                libm::atan2(x, 0.7),
+                libm::hypot(x, 0.3),
+                libm::log(x.abs()),
             ];
             assert_eq!(ours.map(f64::to_bits), crates.map(f64::to_bits), "{x}");
             assert_eq!((x as f32).sin().to_bits(), libm::sinf(x as f32).to_bits(), "{x}");

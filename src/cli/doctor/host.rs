@@ -44,8 +44,15 @@ impl Host {
 
     /// Runs all checks.
     pub fn examine(&self) -> Vec<Finding> {
-        let mut findings =
-            vec![installed::parts(&self.root), self.kernel(), self.rtprio(), self.memlock(), self.latency(), self.governor(), self.clock()];
+        let mut findings = vec![
+            installed::parts(&self.root),
+            self.kernel(),
+            self.rtprio(),
+            self.memlock(),
+            self.latency(),
+            self.governor(),
+            self.clock(),
+        ];
         findings.push(log_room());
         findings.push(sockets());
         findings.extend(self.can_links());

@@ -47,7 +47,11 @@ pub fn namesakes(program: &Path, path: &std::ffi::OsStr) -> Vec<Finding> {
             let kind = if is_python(&real) { "a script of Python, as Python dimos has" } else { "another program" };
             let found = format!("`dimos` is {}, {kind}; this one is {shown}", candidate.display());
             let folder = program.parent().unwrap_or(Path::new("/")).display();
-            findings.push(Finding::warn(check, found, format!("export PATH={folder}:$PATH      # or: alias dimos={shown}")));
+            findings.push(Finding::warn(
+                check,
+                found,
+                format!("export PATH={folder}:$PATH      # or: alias dimos={shown}"),
+            ));
             break;
         }
     }
