@@ -26,7 +26,8 @@ fi
 
 # One compiler for both machines: what it computes in advance is then the same.
 has() { [ -n "$(ls "$(rustc --print target-libdir --target "$1-unknown-linux-gnu")" 2>/dev/null)" ]; }
-if ! { has x86_64 && has aarch64; }; then
+rustc=$cross/debian/rustc
+if [ ! -x "$rustc" ] && ! { has x86_64 && has aarch64; }; then
     # Its file names have the versions.
     debian() { packaging/debian.sh "$cross/debian" "$@"; }
     depends() {
@@ -35,12 +36,11 @@ if ! { has x86_64 && has aarch64; }; then
     debian rustc-web libstd-rust-web-dev:amd64 libstd-rust-web-dev:arm64
     std=$(depends libstd-rust-web-dev libstd-rust-web-)
     debian "$std" "$(depends "$std" libllvm)"
-    rustc=$cross/debian/rustc
-    printf '#!/bin/sh\nLD_LIBRARY_PATH=%s exec %s "$@"\n' "$(echo "$cross"/debian/usr/lib/*-linux-gnu)" \
-        "$cross/debian/usr/bin/rustc" >"$rustc"
+    printf '#!/bin/sh\nLD_LIBRARY_PATH=${0%%/*}/usr/lib/%s-linux-gnu exec "${0%%/*}/usr/bin/rustc" "$@"\n' \
+        "$(uname -m)" >"$rustc"
     chmod 755 "$rustc"
-    export RUSTC="$rustc"
 fi
+[ ! -x "$rustc" ] || export RUSTC="$rustc"
 # Clippy belongs to another compiler.
 unset RUSTC_WORKSPACE_WRAPPER RUSTC_WRAPPER
 # No paths of the computer that built it.
