@@ -8,8 +8,8 @@ export NEXTEST_TEST_THREADS ?= $(shell echo $$((2 * $$(nproc))))
 export FEATURES ?=
 WITH := $(if $(FEATURES),--features $(FEATURES))
 READERS := tests/readers
-SYSTEM_TOOLS := cyclictest linux.uml insmod ip tc cansend chromium
-SYSTEM_PACKAGES := rt-tests user-mode-linux kmod iproute2 can-utils chromium
+SYSTEM_TOOLS := cyclictest linux.uml insmod ip tc cansend chromium debootstrap
+SYSTEM_PACKAGES := rt-tests user-mode-linux kmod iproute2 can-utils chromium debootstrap
 
 TARGET := $(or $(CARGO_TARGET_DIR),target)
 # Where the stripped program, its debug file and the packages go.
@@ -128,11 +128,11 @@ verified:
 	DIMOS_REGENERATE=1 cargo test --locked --test logic verified::the_page
 
 # What tests compare with and run in: other people's readers of logs; as root, also cyclictest, a browser, and a guest
-# kernel that has CAN, with the tools for its interfaces.
+# kernel that has CAN, with the tools for its interfaces, and a root with only Debian's base.
 test-tools: .venv/readers-installed $(READERS)/node_modules/.package-lock.json viewer/node_modules/.package-lock.json
 	@if [ "$$(id -u)" = 0 ]; then missing=; for tool in $(SYSTEM_TOOLS); do command -v $$tool >/dev/null || missing=yes; done; \
 	[ -z "$$missing" ] || { apt-get update -q && apt-get install -qy --no-install-recommends $(SYSTEM_PACKAGES); }; \
-	fi
+	packaging/base.sh >/dev/null; fi
 
 .venv/readers-installed: $(READERS)/requirements.txt $(READERS)/requirements-no-deps.txt
 	$(PYTHON) -m venv .venv

@@ -7,7 +7,7 @@
 # Needs cargo, a C compiler, and Python with venv. Fetches once, into target/cross:
 #
 #   from PyPI     cargo-zigbuild and ziglang (a linker and a C compiler that know every glibc), wheel: 100 MB
-#   from Debian   rustc-web and its standard libraries for both machines: 125 MB. Not if rustc has both already, as after
+#   from Debian   rustc-web and its standard libraries for both machines: 125 MB. Not if rustc has both, as after
 #                 rustup target add aarch64-unknown-linux-gnu x86_64-unknown-linux-gnu
 set -eu
 [ $# -eq 2 ] || { sed -n '2,12s/^# \{0,1\}//p' "$0" >&2; exit 2; }

@@ -1,6 +1,6 @@
 #!/bin/sh
-# Makes all that is shipped of this version: for each machine a tarball, a Debian package, a Python wheel and a file with
-# debug information, and their SHA-256 sums.
+# Makes all that is shipped of this version: for each machine a tarball, a Debian package, a Python wheel and a file
+# with debug information; and their SHA-256 sums.
 #
 #   packaging/dist.sh FOLDER [MACHINE…]        MACHINE: x86_64, aarch64; default: both
 #

@@ -1,32 +1,20 @@
 #!/bin/sh
-# Tries packages where nothing else is: in roots with only a Debian base, without network. Times the Debian package until
-# a simulated arm has moved, and the wheel until a motion is planned; removes both and lists what is left of them.
+# Tries packages where nothing else is: in roots with only a Debian base, without network. Times the Debian package
+# until a simulated arm has moved, and the wheel until a motion is planned; removes both and lists what is left.
 #
-#   packaging/try.sh FOLDER [SUITE]     FOLDER: of `make dist`; SUITE: of Debian, default bookworm
+#   packaging/try.sh FOLDER [SUITE]     FOLDER: of `make dist`; SUITE: of Debian, default that of this computer
 #
-# As root, with debootstrap, which fetches the base once into target/cross.
+# As root, with debootstrap (packaging/base.sh).
 set -eu
-[ $# -ge 1 ] || { sed -n '2,8s/^# \{0,1\}//p' "$0" >&2; exit 2; }
-suite=${2:-bookworm}
+[ $# -ge 1 ] || { sed -n '2,7s/^# \{0,1\}//p' "$0" >&2; exit 2; }
 packages=$(realpath "$1")
-cd "$(dirname "$0")/.."
-cross=${CARGO_TARGET_DIR:-target}/cross
-mkdir -p "$cross"
-base=$(realpath "$cross")/base-$suite
-
 # Mounts, processes and network are those of this script: no other run is seen, and nothing stays.
-if [ "${TRY_INSIDE:-}" != yes ]; then
-    if [ ! -e "$base/made" ]; then
-        echo "fetching Debian's base, into $base" >&2
-        rm -rf "$base" "$base-python"
-        debootstrap --variant=minbase "$suite" "$base" >&2
-        cp -a "$base" "$base-python"
-        chroot "$base-python" apt-get install -qq --yes --no-install-recommends python3-venv >&2
-        touch "$base/made"
-    fi
-    export TRY_INSIDE=yes
-    exec unshare --mount --pid --net --fork "$0" "$packages" "$suite"
+if [ -z "${TRY_BASE:-}" ]; then
+    TRY_BASE=$("$(dirname "$0")/base.sh" ${2:+"$2"})
+    export TRY_BASE
+    exec unshare --mount --pid --net --fork "$0" "$packages"
 fi
+base=$TRY_BASE
 work=$(mktemp -d)
 trap 'umount -R "$work"/*/proc "$work"/*/dev 2>/dev/null; rm -rf --one-file-system "$work"' EXIT
 ip link set lo up 2>/dev/null || echo "note: no ip: the run has no loopback interface" >&2

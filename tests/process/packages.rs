@@ -6,8 +6,10 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
+use rustix::thread::CapabilitySet;
+
 use crate::support::python::python_with;
-use crate::support::skip::skip;
+use crate::support::skip::{skip, skip_privileged};
 
 /// Whether the tools are there.
 pub fn has(tools: &[&str]) -> bool {
@@ -139,6 +141,25 @@ fn the_tarball_and_the_debian_package_install_and_run() {
     }
     dpkg(&["--purge".as_ref(), "dimos".as_ref()]);
     assert!(files(&root.join("usr")).is_empty() && files(&root.join("etc")).is_empty(), "removed");
+}
+
+/// `make test-tools` makes the base.
+#[test]
+fn packages_work_in_a_debian_base_and_leave_it_clean() {
+    let bases = Path::new(env!("CARGO_BIN_EXE_dimos")).ancestors().nth(2).unwrap().join("cross");
+    let made = fs::read_dir(&bases).is_ok_and(|mut all| all.any(|base| base.unwrap().path().join("made").exists()));
+    if !made {
+        return skip_privileged("a Debian base (as root, make test-tools)", CapabilitySet::SYS_ADMIN);
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let Some(shipped) = shipped(folder.path()) else { return };
+    let tried = done(script("try.sh").env("CARGO_TARGET_DIR", bases.parent().unwrap()).arg(shipped));
+    println!("{tried}");
+    for (what, limit) in [("to the end of the first motion: ", 60.0), ("wheel, from nothing to a plan: ", 60.0)] {
+        let time = tried.split(what).nth(1).and_then(|rest| rest.split(' ').next()?.parse::<f64>().ok());
+        assert!(time.is_some_and(|time| time < limit), "{what}\n{tried}");
+    }
+    assert!(tried.contains("nothing is left but logs"), "{tried}");
 }
 
 /// All files below a folder.

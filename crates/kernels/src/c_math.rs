@@ -4,7 +4,7 @@
 //! C libraries differ in the last bit: by version, by processor, and by whether it has fused multiply-add. A plan or a
 //! tick would then depend on the computer. `f64::sin`, ours or a library's, becomes a call of the symbol `sin`, and the
 //! linker prefers the one defined here. What IEEE 754 rounds once (`sqrt`, `fma`, `floor`, `fmod`) is equal everywhere
-//! and left alone. A test asks the built program which symbols it still takes from the C library.
+//! and stays the C library's. A test asks the built program which symbols it still takes from the C library.
 
 macro_rules! functions {
     ($float:ty: $($name:ident($($x:ident),+))+) => {$(
