@@ -1,4 +1,4 @@
-# run install dist viewer check test test-fast package verified · test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants ·
+# run install dist arm64 viewer check test test-fast package verified · test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants ·
 # bench bench-quick bench-page bench-share screenshots jitter soak lies lies-wire pauses
 
 PYTHON ?= python3
@@ -8,14 +8,16 @@ export NEXTEST_TEST_THREADS ?= $(shell echo $$((2 * $$(nproc))))
 export FEATURES ?=
 WITH := $(if $(FEATURES),--features $(FEATURES))
 READERS := tests/readers
-SYSTEM_TOOLS := cyclictest linux.uml insmod ip tc cansend chromium
-SYSTEM_PACKAGES := rt-tests user-mode-linux kmod iproute2 can-utils chromium
+SYSTEM_TOOLS := cyclictest linux.uml insmod ip tc cansend chromium debootstrap
+SYSTEM_PACKAGES := rt-tests user-mode-linux kmod iproute2 can-utils chromium debootstrap
 
 TARGET := $(or $(CARGO_TARGET_DIR),target)
 # Where the stripped program, its debug file and the packages go.
 SHIPPED := $(TARGET)/shipped
 # For all users where root installs, else for this user.
 PREFIX ?= $(if $(filter 0,$(shell id -u)),/usr/local,$(HOME)/.local)
+# What `make dist` makes packages for.
+MACHINES ?= x86_64 aarch64
 # No paths of the computer that built it.
 SHORT_PATHS := --remap-path-prefix=$(or $(CARGO_HOME),$(HOME)/.cargo)/registry/src/=
 # Without objcopy the linker drops the debug information.
@@ -26,7 +28,7 @@ PAGE := viewer/dist/index.html
 PAGE_SOURCES := $(wildcard viewer/*.json viewer/*.mjs) $(shell find viewer/src -type f 2>/dev/null)
 NODE := $(if $(wildcard viewer/package.json),$(shell command -v npm))
 
-.PHONY: run demo install dist shipped viewer viewer-if-possible check lint scripts spelling licences test test-fast package verified test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants bench bench-quick bench-page bench-share screenshots jitter soak lies lies-wire pauses
+.PHONY: run demo install dist arm64 shipped viewer viewer-if-possible check lint scripts spelling licences test test-fast package verified test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants bench bench-quick bench-page bench-share screenshots jitter soak lies lies-wire pauses
 
 # Builds the program to try it, not optimized, and starts a shipped blueprint; its arms are simulated. Ends with Ctrl-C.
 run: WHAT = run coordinator-yourarm
@@ -40,9 +42,17 @@ install: shipped
 	packaging/install.sh $(SHIPPED)/dimos $(PREFIX) $(DESTDIR)
 	@case ":$$PATH:" in *:$(PREFIX)/bin:*) ;; *) echo "note: $(PREFIX)/bin is not in PATH" ;; esac
 
-# Makes a tarball and a Debian package in target/shipped.
-dist: shipped
-	packaging/dist.sh $(SHIPPED)/dimos $(SHIPPED)
+# Makes a tarball, a Debian package and a Python wheel for each machine, in target/shipped, with SHA256SUMS. They want
+# glibc 2.31. It fetches a cross linker from PyPI and, without rustup's targets, a compiler from Debian
+# (packaging/build.sh): 300 MB, once, into target/cross.
+dist: viewer
+	@[ -e $(PAGE) ] || { echo "error: packages have the page of the live view" >&2; \
+	echo "hint: install Node 18 or newer with npm" >&2; exit 1; }
+	packaging/dist.sh $(SHIPPED) $(MACHINES)
+
+# The program for aarch64, and an emulator that runs it here, for tests. Its profile compiles sooner and runs slower.
+arm64:
+	packaging/emulated.sh quick
 
 # The optimized program without debug information, and its debug file.
 shipped: viewer
@@ -52,11 +62,11 @@ shipped: viewer
 
 # The page of the live view, which the next build embeds. Without Node that build embeds a page that says so.
 viewer: $(if $(NODE),$(PAGE))
-	@[ -e $(PAGE) ] || echo "note: the page of the live view is not built: Node and npm are missing" >&2
+	@[ -e $(PAGE) ] || echo "note: no page of the live view: install Node with npm and build again, or a package (README.md), which has it" >&2
 
 # For those who only try: without a network it does without.
 viewer-if-possible:
-	@$(MAKE) --no-print-directory viewer || echo "note: the page of the live view is not built; all else works" >&2
+	@npm_config_fetch_retries=0 $(MAKE) --no-print-directory viewer || echo "note: the page of the live view is not built; all else works" >&2
 
 $(PAGE): viewer/node_modules/.package-lock.json $(PAGE_SOURCES)
 	cd viewer && npm run --silent build
@@ -120,11 +130,11 @@ verified:
 	DIMOS_REGENERATE=1 cargo test --locked --test logic verified::the_page
 
 # What tests compare with and run in: other people's readers of logs; as root, also cyclictest, a browser, and a guest
-# kernel that has CAN, with the tools for its interfaces.
+# kernel that has CAN, with the tools for its interfaces, and a root with only Debian's base.
 test-tools: .venv/readers-installed $(READERS)/node_modules/.package-lock.json viewer/node_modules/.package-lock.json
 	@if [ "$$(id -u)" = 0 ]; then missing=; for tool in $(SYSTEM_TOOLS); do command -v $$tool >/dev/null || missing=yes; done; \
 	[ -z "$$missing" ] || { apt-get update -q && apt-get install -qy --no-install-recommends $(SYSTEM_PACKAGES); }; \
-	fi
+	packaging/base.sh >/dev/null; fi
 
 .venv/readers-installed: $(READERS)/requirements.txt $(READERS)/requirements-no-deps.txt
 	$(PYTHON) -m venv .venv

@@ -4,9 +4,10 @@
 #
 #   packaging/install.sh PROGRAM PREFIX [DESTDIR]
 #
-# Files go to DESTDIR/PREFIX; what is written into them, such as the unit's path of the program, is below PREFIX.
+# Files go to DESTDIR/PREFIX; what is written into them, such as the unit's path of the program, is below PREFIX. Where
+# PROGRAM is for another machine, DIMOS_HERE is the same program for this one.
 set -eu
-[ $# -ge 2 ] || { sed -n '2,7s/^# \{0,1\}//p' "$0" >&2; exit 2; }
+[ $# -ge 2 ] || { sed -n '2,8s/^# \{0,1\}//p' "$0" >&2; exit 2; }
 cd "$(dirname "$0")/.."
 program=$1 prefix=${2%/} root=${3:-}$2
 umask 022
@@ -19,7 +20,7 @@ file() { # MODE FILE… FOLDER
 }
 
 file 755 "$program" "$root/bin"
-dimos=$root/bin/dimos
+dimos=${DIMOS_HERE:-$root/bin/dimos}
 
 mkdir -p "$root/share/man/man1"
 "$dimos" man --dir "$root/share/man/man1" 2>/dev/null
@@ -41,12 +42,18 @@ file 644 docs/*.md "$root/share/doc/dimos/docs"
 file 644 docs/arms/*.md "$root/share/doc/dimos/docs/arms"
 install -m 644 LICENSE "$root/share/doc/dimos/copyright"
 
-# Units are the system's: none for a user's own prefix.
+# Units, users and devices are the system's: none for a user's own prefix.
 case $prefix in
 /usr | /usr/local)
-    mkdir -p "$root/lib/systemd/system" "$root/lib/sysusers.d"
-    sed "s|^ExecStart=[^ ]*|ExecStart=$prefix/bin/dimos|" assets/systemd/dimos@.service \
-        >"$root/lib/systemd/system/dimos@.service"
-    install -m 644 assets/systemd/sysusers.conf "$root/lib/sysusers.d/dimos.conf"
+    for scope in system user; do
+        mkdir -p "$root/lib/systemd/$scope"
+        sed "s|^ExecStart=[^ ]*|ExecStart=$prefix/bin/dimos|" "assets/system/dimos-$scope@.service" \
+            >"$root/lib/systemd/$scope/dimos@.service"
+    done
+    file 644 assets/system/dimos-can@.service "$root/lib/systemd/system"
+    file 644 assets/system/60-dimos.rules "$root/lib/udev/rules.d"
+    file 644 assets/system/sysusers.conf "$root/lib/sysusers.d"
+    mv "$root/lib/sysusers.d/sysusers.conf" "$root/lib/sysusers.d/dimos.conf"
+    file 644 assets/system/limits.conf "$root/share/dimos"
     ;;
 esac

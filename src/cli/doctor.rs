@@ -1,6 +1,7 @@
 //! `dimos doctor`: checks the real-time setup, permissions and devices, and prints a fix for each problem.
 
 mod host;
+mod installed;
 
 use serde::Serialize;
 

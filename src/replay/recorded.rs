@@ -179,15 +179,17 @@ fn config_version(metadata: &BTreeMap<String, String>, json: &[u8]) -> u32 {
     version.or_else(in_configuration).unwrap_or(FIRST_CONFIG_VERSION)
 }
 
+/// Rules of the tick that have changed after a config version.
+const CHANGED: [(u32, &str); 2] = [
+    (6, "a task with auto_start does not start after a stop, a hold or a loss, and a reset needs no accepted state"),
+    (8, "sine, logarithm and the like are those of the crate libm, no longer of the C library"),
+];
+
 /// Returns the rules of the tick that have changed since a config version, as part of a sentence.
-fn changed_since(version: u32) -> &'static str {
-    match version {
-        6 => {
-            "; changed since: a task with auto_start does not start after a stop, a hold or a loss, and a reset needs no \
-             accepted state"
-        }
-        _ => "",
-    }
+fn changed_since(version: u32) -> String {
+    let is_since = |(before, _): &&(u32, &str)| (CHANGED[0].0..=*before).contains(&version);
+    let rules: Vec<&str> = CHANGED.iter().filter(is_since).map(|(_, rule)| *rule).collect();
+    if rules.is_empty() { String::new() } else { format!("; changed since: {}", rules.join("; ")) }
 }
 
 fn version_error(path: PathBuf, found: u32, info: &LogInfo) -> RecordedError {

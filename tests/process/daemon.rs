@@ -308,24 +308,33 @@ fn the_service_manager_hears_why_it_does_not_come_up() {
 }
 
 #[test]
-fn the_unit_file_is_one() {
-    let unit = Path::new(env!("CARGO_MANIFEST_DIR")).join("assets/systemd/dimos@.service");
-    let lines = text(&unit);
-    for line in ["Type=notify", "LimitRTPRIO=95", "LimitMEMLOCK=infinity", "Restart=no", "WatchdogSec=2"] {
-        assert!(lines.lines().any(|l| l == line), "{line}");
-    }
-    // It must name a program that is there.
-    let home = Home::new();
-    home.write("dimos@.service", &lines.replace("/usr/local/bin/dimos", env!("CARGO_BIN_EXE_dimos")));
-    let verified = Command::new("systemd-analyze")
-        .args(["verify", "--man=no", "dimos@.service"])
-        .current_dir(home.path())
-        .output();
-    match verified {
-        Ok(output) => {
-            let said = String::from_utf8_lossy(&output.stderr);
-            assert!(!said.lines().any(|line| line.contains("dimos@")), "{said}");
+fn the_unit_files_are_units() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("assets/system");
+    let ours = ["Type=notify", "Restart=no", "WatchdogSec=2", "KillSignal=SIGTERM"];
+    for (unit, file, has) in [
+        (
+            "dimos@.service",
+            "dimos-system@.service",
+            &[&ours[..], &["LimitRTPRIO=95", "LimitMEMLOCK=infinity"]].concat(),
+        ),
+        ("dimos@.service", "dimos-user@.service", &ours.to_vec()),
+        ("dimos-can@.service", "dimos-can@.service", &vec!["Type=oneshot", "RemainAfterExit=yes"]),
+    ] {
+        let lines = text(&folder.join(file));
+        for line in has {
+            assert!(lines.lines().any(|l| l == *line), "{file}: {line}");
         }
-        Err(_) => skip("systemd-analyze"),
+        // It must name a program that is there.
+        let home = Home::new();
+        home.write(unit, &lines.replace("/usr/local/bin/dimos", env!("CARGO_BIN_EXE_dimos")));
+        let verified =
+            Command::new("systemd-analyze").args(["verify", "--man=no", unit]).current_dir(home.path()).output();
+        match verified {
+            Ok(output) => {
+                let said = String::from_utf8_lossy(&output.stderr);
+                assert!(!said.lines().any(|line| line.contains("dimos")), "{file}: {said}");
+            }
+            Err(_) => skip("systemd-analyze"),
+        }
     }
 }

@@ -44,6 +44,7 @@ mod moved_by_others;
 mod new;
 mod onto;
 mod orders;
+mod other_machine;
 mod packages;
 mod page_commands;
 mod park;

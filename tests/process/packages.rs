@@ -1,12 +1,15 @@
-//! What is shipped, made from the program under test: the tarball, and the Debian package installed in a root of its
-//! own.
+//! What is shipped, made from the program under test: the tarball, the Debian package installed in a root of its own, the
+//! wheel installed in a virtual environment.
 
 use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
-use crate::support::skip::skip;
+use rustix::thread::CapabilitySet;
+
+use crate::support::python::python_with;
+use crate::support::skip::{skip, skip_privileged};
 
 /// Whether the tools are there.
 pub fn has(tools: &[&str]) -> bool {
@@ -31,6 +34,18 @@ fn script(name: &str) -> Command {
     let mut command = Command::new(Path::new(env!("CARGO_MANIFEST_DIR")).join("packaging").join(name));
     command.env("COMPRESS", "none");
     command
+}
+
+/// Strips the program under test and packs it into a folder. Nothing where a tool is missing.
+fn shipped(folder: &Path) -> Option<PathBuf> {
+    if !has(&["objcopy", "readelf", "ar", "dpkg", "gzip"]) {
+        return None;
+    }
+    let python = python_with(&["wheel"])?;
+    let shipped = folder.join("shipped");
+    done(script("strip.sh").arg(env!("CARGO_BIN_EXE_dimos")).arg(&shipped));
+    done(script("package.sh").env("PYTHON", python).arg(shipped.join("dimos")).arg(&shipped));
+    Some(shipped)
 }
 
 /// The one file in a folder with this ending.
@@ -70,18 +85,13 @@ impl Installed {
 
 #[test]
 fn the_tarball_and_the_debian_package_install_and_run() {
-    if !has(&["objcopy", "ar", "dpkg", "gzip"]) {
-        return;
-    }
     let folder = tempfile::tempdir().unwrap();
-    let (built, shipped) = (Path::new(env!("CARGO_BIN_EXE_dimos")), folder.path().join("shipped"));
-    done(script("strip.sh").arg(built).arg(&shipped));
+    let (built, Some(shipped)) = (Path::new(env!("CARGO_BIN_EXE_dimos")), shipped(folder.path())) else { return };
     let size = |path: &Path| fs::metadata(path).unwrap().len();
     let debug = only(&shipped, "debug");
     assert!(size(&shipped.join("dimos")) < size(built) / 2 && size(&debug) > size(built) / 2, "stripped");
     let sections = done(Command::new("objdump").args(["-s", "-j", ".gnu_debuglink"]).arg(shipped.join("dimos")));
     assert!(sections.contains("dimos-"), "it names its debug file: {sections}");
-    done(script("dist.sh").arg(shipped.join("dimos")).arg(&shipped));
 
     let unpacked = folder.path().join("unpacked");
     fs::create_dir(&unpacked).unwrap();
@@ -122,11 +132,85 @@ fn the_tarball_and_the_debian_package_install_and_run() {
         ("dimos/python/dimos_client/client.py", "class Client"),
         ("dimos/python/pyproject.toml", "dimos-client"),
         ("../lib/systemd/system/dimos@.service", "ExecStart=/usr/bin/dimos run %i"),
+        ("../lib/systemd/user/dimos@.service", "ExecStart=/usr/bin/dimos run %i"),
+        ("../lib/systemd/system/dimos-can@.service", "type can bitrate"),
+        ("../lib/udev/rules.d/60-dimos.rules", "cpu_dma_latency"),
+        ("../../etc/security/limits.d/90-dimos.conf", "@realtime - rtprio 95"),
     ] {
         assert!(fs::read_to_string(share.join(file)).unwrap().contains(says), "{file}");
     }
     dpkg(&["--purge".as_ref(), "dimos".as_ref()]);
-    assert!(!root.join("usr/bin/dimos").exists(), "removed");
+    assert!(files(&root.join("usr")).is_empty() && files(&root.join("etc")).is_empty(), "removed");
+}
+
+/// `make test-tools` makes the base.
+#[test]
+fn packages_work_in_a_debian_base_and_leave_it_clean() {
+    let bases = Path::new(env!("CARGO_BIN_EXE_dimos")).ancestors().nth(2).unwrap().join("cross");
+    let made = fs::read_dir(&bases).is_ok_and(|mut all| all.any(|base| base.unwrap().path().join("made").exists()));
+    if !made {
+        return skip_privileged("a Debian base (as root, make test-tools)", CapabilitySet::SYS_ADMIN);
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let Some(shipped) = shipped(folder.path()) else { return };
+    let tried = done(script("try.sh").env("CARGO_TARGET_DIR", bases.parent().unwrap()).arg(shipped));
+    println!("{tried}");
+    for (what, limit) in [("to the end of the first motion: ", 60.0), ("wheel, from nothing to a plan: ", 60.0)] {
+        let time = tried.split(what).nth(1).and_then(|rest| rest.split(' ').next()?.parse::<f64>().ok());
+        assert!(time.is_some_and(|time| time < limit), "{what}\n{tried}");
+    }
+    assert!(tried.contains("nothing is left but logs"), "{tried}");
+}
+
+/// All files below a folder.
+fn files(folder: &Path) -> Vec<PathBuf> {
+    let paths: Vec<PathBuf> = fs::read_dir(folder).into_iter().flatten().map(|entry| entry.unwrap().path()).collect();
+    let mut all: Vec<PathBuf> = Vec::new();
+    for path in paths {
+        if path.is_dir() && !path.is_symlink() { all.extend(files(&path)) } else { all.push(path) }
+    }
+    all.sort();
+    all
+}
+
+#[test]
+fn the_wheel_installs_program_and_client_and_leaves_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let Some(shipped) = shipped(folder.path()) else { return };
+    let wheel = only(&shipped, "whl");
+    let name = wheel.file_name().unwrap().to_str().unwrap();
+    assert!(name.starts_with(concat!("dimos_arm-", env!("CARGO_PKG_VERSION"), "-py3-none-manylinux_2_")), "{name}");
+    let venv = folder.path().join("venv");
+    done(Command::new("python3").args(["-m", "venv"]).arg(&venv));
+    let before = files(&venv);
+    let pip = |arguments: &[&str]| done(Command::new(venv.join("bin/pip")).args(arguments).env("PIP_NO_INDEX", "1"));
+    pip(&["install", "--no-compile", wheel.to_str().unwrap()]);
+
+    let installed = Installed::at(venv.join("bin/dimos"));
+    installed.works();
+    let asked =
+        "import dimos_client, importlib.metadata as m; print(m.version('dimos-arm'), dimos_client.Client.__name__)";
+    let mut python = Command::new(venv.join("bin/python"));
+    assert_eq!(done(python.args(["-c", asked])), concat!(env!("CARGO_PKG_VERSION"), " Client\n"));
+    for file in
+        ["man/man1/dimos.1.gz", "bash-completion/completions/dimos", "dimos/blueprints/coordinator-yourarm.yaml"]
+    {
+        assert!(venv.join("share").join(file).exists(), "{file}");
+    }
+    // Python dimos has a script of the same name: here, a package that claims it.
+    let record = "../../../bin/dimos,,\n";
+    let packages = venv.join("lib").read_dir().unwrap().next().unwrap().unwrap().path().join("site-packages");
+    let other = packages.join("dimos-0.0.15.dist-info");
+    fs::create_dir(&other).unwrap();
+    fs::write(other.join("RECORD"), record).unwrap();
+    let findings = installed.dimos(&["doctor", "--json"]);
+    assert!(findings.contains("the Python package dimos 0.0.15 has a script"), "{findings}");
+    fs::remove_dir_all(other).unwrap();
+
+    pip(&["uninstall", "--yes", "dimos-arm"]);
+    let left: Vec<PathBuf> = files(&venv).into_iter().filter(|file| !before.contains(file)).collect();
+    let caches = left.iter().filter(|file| !file.to_string_lossy().contains("__pycache__"));
+    assert_eq!(caches.count(), 0, "{left:?}");
 }
 
 #[test]

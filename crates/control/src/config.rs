@@ -27,7 +27,7 @@ pub const ACTIVATION_RAMP: Duration = Duration::from_millis(200);
 
 /// Config version: of the form of [`CoordinatorConfig`] and of the rules of the tick. The same configuration, states
 /// and requests give the same commands only under the same version. Increase it with every change of either.
-pub const CONFIG_VERSION: u32 = 8;
+pub const CONFIG_VERSION: u32 = 9;
 
 /// Config version of logs that have none.
 pub const FIRST_CONFIG_VERSION: u32 = 1;

@@ -6,13 +6,14 @@
 //!
 //! Every kernel is written once, over [`block::Block`], and compiled for each width. The result does not depend on the
 //! width, bit for bit: a block always has sixteen lanes, and every width computes the same operations in the same
-//! order.
+//! order. Nor does it depend on the C library: its sines are replaced here ([`c_math`]).
 
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::unreachable))]
 
 pub mod apart;
 pub mod block;
 pub mod bodies;
+mod c_math;
 pub mod chain;
 pub mod cover;
 pub mod discrete;

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use rustix::fs::Access;
 use rustix::process::{Resource, getrlimit};
 
-use super::Finding;
+use super::{Finding, installed};
 use crate::share;
 use dimos_log::files::log_folder;
 use dimos_rpc::run_dir::RunDir;
@@ -20,6 +20,11 @@ const MIN_FREE_SPACE: u64 = 1 << 30;
 const FAST_CLOCKS: &[&str] = &["tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter"];
 
 const RT_KERNEL: &str = "sudo apt install linux-image-rt-amd64 # Ubuntu: pro enable realtime-kernel";
+/// Where the package is installed, its limits and rules wait for members of the group.
+const JOIN: &str = "sudo usermod -aG realtime $USER      # then log in again";
+const LIMITS: &str = "etc/security/limits.d/90-dimos.conf";
+const RULES: &str = "lib/udev/rules.d/60-dimos.rules";
+const CAN_UNIT: &str = "lib/systemd/system/dimos-can@.service";
 const RTPRIO: &str = "sudo groupadd -f realtime && sudo usermod -aG realtime $USER && echo '@realtime - rtprio 95' | sudo tee -a /etc/security/limits.d/90-realtime.conf      # then log in again";
 const MEMLOCK: &str = "sudo groupadd -f realtime && sudo usermod -aG realtime $USER && echo '@realtime - memlock unlimited' | sudo tee -a /etc/security/limits.d/90-realtime.conf      # then log in again";
 const LATENCY: &str = "echo 'KERNEL==\"cpu_dma_latency\", GROUP=\"realtime\", MODE=\"0660\"' | sudo tee /etc/udev/rules.d/90-cpu-dma-latency.rules && sudo udevadm control --reload && sudo udevadm trigger --name-match=cpu_dma_latency";
@@ -39,14 +44,30 @@ impl Host {
 
     /// Runs all checks.
     pub fn examine(&self) -> Vec<Finding> {
-        let mut findings =
-            vec![self.kernel(), self.rtprio(), self.memlock(), self.latency(), self.governor(), self.clock()];
+        let mut findings = vec![
+            installed::parts(&self.root),
+            self.kernel(),
+            self.rtprio(),
+            self.memlock(),
+            self.latency(),
+            self.governor(),
+            self.clock(),
+        ];
         findings.push(log_room());
         findings.push(sockets());
         findings.extend(self.can_links());
         findings.extend(self.serial_ports());
         findings.extend(certificates());
+        if let Ok(program) = std::env::current_exe().and_then(|program| program.canonicalize()) {
+            let path = std::env::var_os("PATH").unwrap_or_default();
+            findings.splice(0..0, installed::namesakes(&program, &path));
+        }
         findings
+    }
+
+    /// Returns the remedy: shorter where the package has set up its part.
+    fn remedy(&self, part: &str, alone: &'static str) -> &'static str {
+        if installed::has(&self.root, part) { JOIN } else { alone }
     }
 
     fn path(&self, path: &str) -> PathBuf {
@@ -91,7 +112,7 @@ impl Host {
                 most >= wanted,
                 "rtprio",
                 format!("real-time priorities up to {most} are allowed; a run uses up to {wanted}"),
-                RTPRIO,
+                self.remedy(LIMITS, RTPRIO),
             ),
         }
     }
@@ -100,7 +121,10 @@ impl Host {
         match getrlimit(Resource::Memlock).current {
             _ if self.has_capability(14) => Finding::ok("memlock", "unlimited (CAP_IPC_LOCK)"),
             None => Finding::ok("memlock", "unlimited"),
-            Some(most) => Finding::warn("memlock", format!("{} KiB may be locked, not all", most >> 10), MEMLOCK),
+            Some(most) => {
+                let found = format!("{} KiB may be locked, not all", most >> 10);
+                Finding::warn("memlock", found, self.remedy(LIMITS, MEMLOCK))
+            }
         }
     }
 
@@ -108,7 +132,10 @@ impl Host {
         let check = "cpu_dma_latency";
         match OpenOptions::new().write(true).open(self.path("dev/cpu_dma_latency")) {
             Ok(_) => Finding::ok(check, "deep idle states can be disabled"),
-            Err(e) => Finding::warn(check, format!("deep idle states cannot be disabled: {e}"), LATENCY),
+            Err(e) => {
+                let found = format!("deep idle states cannot be disabled: {e}");
+                Finding::warn(check, found, self.remedy(RULES, LATENCY))
+            }
         }
     }
 
@@ -151,7 +178,10 @@ impl Host {
             let flags = u32::from_str_radix(flags.trim_start_matches("0x"), 16).unwrap_or_default();
             let up = flags & 1 == 1;
             let found = format!("{name} is {}", if up { "up" } else { "down" });
-            let fix = format!("sudo ip link set {name} up type can bitrate 1000000      # the bitrate of the arm");
+            let fix = match installed::has(&self.root, CAN_UNIT) {
+                true => format!("sudo systemctl enable --now dimos-can@{name}      # 1 Mbit/s, now and at every boot"),
+                false => format!("sudo ip link set {name} up type can bitrate 1000000      # the bitrate of the arm"),
+            };
             Finding::of(up, "CAN link", found, fix)
         };
         links.into_iter().map(of_link).collect()
@@ -267,7 +297,7 @@ mod tests {
             ("dev/ttyUSB0", ""),
         ]);
         let findings = host.examine();
-        let of_root = |f: &&Finding| !matches!(f.check, "log folder" | "sockets folder");
+        let of_root = |f: &&Finding| !matches!(f.check, "program" | "log folder" | "sockets folder");
         assert!(findings.iter().filter(of_root).all(|f| f.level == Level::Ok && f.fix.is_none()), "{findings:?}");
         assert!(findings.iter().any(|f| f.found == "can0 is up"), "{findings:?}");
     }
@@ -288,5 +318,8 @@ mod tests {
         }
         assert!(host.can_links()[0].fix.as_ref().unwrap().starts_with("sudo ip link set can1 up"));
         assert!(host.clock().fix.unwrap().starts_with("dmesg"), "tsc is not on offer");
+        fs::create_dir_all(host.path("usr/lib/udev/rules.d")).unwrap();
+        fs::write(host.path("usr").join(RULES), "").unwrap();
+        assert_eq!(host.latency().fix.as_deref(), Some(JOIN), "the package's rule is there");
     }
 }
