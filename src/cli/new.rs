@@ -2,6 +2,7 @@
 
 mod answers;
 mod choice;
+mod shipped;
 mod text;
 
 use std::fs::OpenOptions;
@@ -18,6 +19,7 @@ use answers::Asker;
 use choice::Cell;
 use dimos_planner::planning::scene::planning_scene::PlanningScene;
 use dimos_rpc::run_dir;
+use shipped::Known;
 
 /// Arguments of `new`.
 #[derive(Debug, clap::Args)]
@@ -74,11 +76,13 @@ pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
         return Err(exists(&path));
     }
     let cell = Cell::ask(args, &path, &Asker::new(), catalog.adapters)?;
-    let mut text = text::of(&cell, &path, &[]);
+    let mut known = cell.robot.as_ref().map_or_else(Known::default, |robot| Known::of(robot, catalog));
+    let mut text = text::of(&cell, &path, &known);
     let mut loaded = load(&path, &name, &text, catalog);
     let touching = touching(&loaded)?;
     if !touching.is_empty() {
-        text = text::of(&cell, &path, &touching);
+        known.exclusions.extend(touching);
+        text = text::of(&cell, &path, &known);
         loaded = load(&path, &name, &text, catalog);
     }
     if loaded.blueprint.is_none() {
@@ -89,22 +93,15 @@ pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
         });
     }
     write(&path, &text, args.force)?;
-    let shown = path.display();
-    let next = [
-        (format!("dimos check {shown}"), "its joints, limits and planning robot"),
-        (format!("dimos run {shown} --sim"), "with the emulator; Ctrl-C ends it"),
-        (format!("dimos arm enable {}", text::ARM), "in a second terminal: motors on; moves nothing"),
-        (format!("dimos state --run {name}"), "where its joints are"),
-    ];
+    let next = text::next(&path, &known);
     if args.json {
-        let next = next.map(|(command, _)| command);
+        let next: Vec<&String> = next.iter().map(|(command, _)| command).collect();
         output::json(&json!({"written": path, "blueprint": name, "next": next}));
         return Ok(Exit::Ok);
     }
-    output::line(format_args!("wrote {shown}"));
+    output::line(format_args!("wrote {}", path.display()));
     output::line("next:");
-    let width = next.iter().map(|(command, _)| command.len()).max().unwrap_or(0);
-    next.iter().for_each(|(command, why)| output::line(format_args!("  {command:width$}  # {why}")));
+    text::in_columns(&next).for_each(output::line);
     Ok(Exit::Ok)
 }
 

@@ -86,6 +86,7 @@ fn it_asks_on_a_terminal_and_a_wrong_answer_is_asked_for_again() {
         "options: {gripper: xarm, model: xarm6}",
         "model_path: builtin:xarm6_gripper\n",
         "tool: {xyz: [0, 0, 0.12]}",
+        "named_poses: {home: [0.0, -0.5, ",
         "pose: {xyz: [0, 0, -0.06]}",
     ] {
         assert!(text.contains(line), "no {line:?} in\n{text}");
@@ -117,7 +118,7 @@ fn what_is_missing_or_wrong_is_named_and_nothing_is_written() {
         ("--arm xarm6 --address sim --gripper none --model nothing.urdf", "nothing.urdf"),
         ("--arm xarm6 --address sim --gripper none --model xarm6 --tool 0 0", "three numbers"),
         ("--arm xarm6 --address sim --gripper none --model xarm6 --tool none --table 700", "m"),
-        ("--arm yourarm --address sim --gripper claw", "no choice of grippers"),
+        ("--arm so101 --address sim --gripper claw", "no choice of grippers"),
         ("--arm mock --gripper none --model none --joints 17", "cannot have 17 joints"),
         ("--arm mock --gripper none --model none --joints 6 --table 0", "needs a model"),
         ("--arm xarm6 --address sim --joints 6 --gripper none --model none --tool 0 0 1", "needs a model"),

@@ -48,6 +48,8 @@ pub struct Robot {
     pub flange: Option<String>,
     /// The joints between root and end.
     pub joints: Vec<String>,
+    /// All links.
+    pub links: Vec<String>,
     /// The tool centre point in the frame of the end [m].
     pub tool: Option<[f64; 3]>,
 }
@@ -226,7 +228,8 @@ fn planned(text: &str, blueprint: &Path) -> Result<Option<Robot>> {
         true => std::path::absolute(&file).unwrap_or_else(|_| PathBuf::from(&file)).display().to_string(),
         false => file,
     };
-    Ok(Some(Robot { path, base: name(0), end: name(end), flange: None, joints, tool: None }))
+    let links = model.links.iter().map(|link| link.name.clone()).collect();
+    Ok(Some(Robot { path, base: name(0), end: name(end), flange: None, joints, links, tool: None }))
 }
 
 fn config(row: &AdapterSpec, options: &Map<String, Value>, dof: usize) -> AdapterConfig {

@@ -7,6 +7,7 @@ use std::path::Path;
 use serde_json::{Map, Value};
 
 use super::choice::{Cell, Robot};
+use super::shipped::Known;
 use dimos_hardware::registry::SIM;
 
 /// The arm's name in the blueprint.
@@ -15,18 +16,32 @@ pub const ARM: &str = "arm";
 const TABLE: [f64; 3] = [1.2, 1.2, 0.02];
 const GAP: f64 = 0.01;
 
-/// Returns the text of a blueprint at `path`. `touching`: pairs of links that are not checked against each other.
-pub fn of(cell: &Cell, path: &Path, touching: &[[String; 2]]) -> String {
-    let (file, row) = (path.display(), &cell.row);
-    let next = [
+/// Returns the next commands, and what each is for.
+pub fn next(path: &Path, known: &Known) -> [(String, &'static str); 5] {
+    let file = path.display();
+    let pose = match known.home {
+        Some(_) => (format!("dimos move {ARM} --named home"), "planned around what is in its world"),
+        None => ("dimos pose save home".to_owned(), "where the arm is, for `dimos move arm --named home`"),
+    };
+    [
         (format!("dimos check {file}"), "joints, limits, mistakes with their lines"),
         (format!("dimos run {file} --sim"), "with the emulator, whatever the address is"),
         (format!("dimos arm enable {ARM}"), "in a second terminal: motors on; moves nothing"),
-        ("dimos pose save home".to_owned(), "names where the arm is, for `dimos move arm --named home`"),
+        pose,
         (format!("dimos run {file}"), "with the arm itself: read docs/safety.md before"),
-    ];
+    ]
+}
+
+/// Returns a line for each command.
+pub fn in_columns(next: &[(String, &'static str)]) -> impl Iterator<Item = String> {
     let width = next.iter().map(|(command, _)| command.len()).max().unwrap_or(0);
-    let next: String = next.iter().map(|(command, why)| format!("#   {command:width$}   {why}\n")).collect();
+    next.iter().map(move |(command, why)| format!("  {command:width$}  # {why}"))
+}
+
+/// Returns the text of a blueprint at `path`.
+pub fn of(cell: &Cell, path: &Path, known: &Known) -> String {
+    let row = &cell.row;
+    let next: String = in_columns(&next(path, known)).map(|line| format!("# {line}\n")).collect();
     let joints = joints(cell);
     let holds = if row.holds_when_disabled { "its brakes hold it" } else { "it FALLS unless supported" };
     let mut text = format!(
@@ -85,7 +100,7 @@ tasks:
     priority: 20
 "
         ));
-        text += &planner(robot, cell.table, touching);
+        text += &planner(robot, cell.table, known);
     }
     text
 }
@@ -103,7 +118,7 @@ fn joints(cell: &Cell) -> String {
     }
 }
 
-fn planner(robot: &Robot, table: Option<f64>, touching: &[[String; 2]]) -> String {
+fn planner(robot: &Robot, table: Option<f64>, known: &Known) -> String {
     let names: Vec<String> = robot.joints.iter().map(|name| scalar(name)).collect();
     let mut text = format!(
         "
@@ -133,13 +148,16 @@ planner:
         robot.joints.first().map_or("", |name| name),
         names.first().map_or("", |name| name),
     );
-    if !touching.is_empty() {
-        let pairs: Vec<String> = touching.iter().map(|[a, b]| format!("[{}, {}]", scalar(a), scalar(b))).collect();
+    if !known.exclusions.is_empty() {
+        let pairs = known.exclusions.iter().map(|[a, b]| format!("[{}, {}]", scalar(a), scalar(b)));
         text += &format!(
-            "      # The shapes of these links touch in every configuration: they are not checked against each other.
+            "      # The shapes of these links are fuller than the arm: they are not checked against each other.
       collision_exclusion_pairs: [{}]\n",
-            pairs.join(", ")
+            pairs.collect::<Vec<_>>().join(", ")
         );
+    }
+    if let Some(home) = &known.home {
+        text += &format!("      named_poses: {{home: {home:?}}}\n");
     }
     text += "
   # What the arm keeps clear of, by name. Every shape's pose is that of its middle, in the frame `map`.

@@ -1,0 +1,40 @@
+//! What the built-in blueprints know of a model beyond its description: shapes that are fuller than the arm, a pose.
+
+use super::choice::Robot;
+use crate::blueprint::{self, Catalog, Overrides};
+use dimos_planner::planning::scene::config::RobotConfig;
+use dimos_robot::builtin::PREFIX;
+
+/// What is known of a model.
+#[derive(Debug, Default)]
+pub struct Known {
+    /// Pairs of links that are not checked against each other.
+    pub exclusions: Vec<[String; 2]>,
+    /// The named pose `home` [rad].
+    pub home: Option<Vec<f64>>,
+}
+
+impl Known {
+    /// Returns what a built-in blueprint with one planning robot of this model says, with or without its gripper.
+    pub fn of(robot: &Robot, catalog: Catalog<'_>) -> Self {
+        let Some(stem) = stem(&robot.path) else { return Self::default() };
+        let mention = format!("model_path: {PREFIX}{stem}");
+        let texts = blueprint::names().into_iter().filter_map(|name| blueprint::find(&format!("{PREFIX}{name}")).ok());
+        let near = texts.filter(|found| String::from_utf8_lossy(&found.bytes).contains(&mention));
+        let planners =
+            near.filter_map(|found| blueprint::load(&found, &Overrides::default(), catalog).blueprint?.planner);
+        let single = planners.filter_map(|planner| <[RobotConfig; 1]>::try_from(planner.robots).ok());
+        let same = single.flatten().find(|known| known.model_path.to_str().and_then(self::stem) == Some(stem));
+        let Some(known) = same else { return Self::default() };
+        let pairs = known.exclusions.into_iter().map(|(a, b)| [a, b]);
+        let exclusions = pairs.filter(|pair| pair.iter().all(|link| robot.links.contains(link))).collect();
+        let home = known.named_poses.get("home").filter(|_| known.joints == robot.joints).cloned();
+        Self { exclusions, home }
+    }
+}
+
+/// Returns the name of a built-in model without its gripper.
+fn stem(path: &str) -> Option<&str> {
+    let name = path.strip_prefix(PREFIX)?;
+    Some(name.strip_suffix("_gripper").unwrap_or(name))
+}
