@@ -39,6 +39,7 @@ pub use plan::attached::{AttachedPlanner, LinkEvent};
 pub(crate) use plan::world_requests::typed as world_object;
 pub use service_manager::ServiceManager;
 
+use crate::metrics::Metrics;
 use crate::view::View;
 use arm::arms::Arms;
 use client::dispatch::{Dispatcher, OutcomeThread};
@@ -212,6 +213,7 @@ pub struct Run {
     outcomes: Option<OutcomeThread>,
     recorder: Option<Recorder>,
     view: Option<View>,
+    metrics: Option<Metrics>,
     server: Option<Server>,
     handle: Handle,
     endings: (Sender<Ending>, Receiver<Ending>),

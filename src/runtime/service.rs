@@ -27,6 +27,7 @@ use super::plan::planner_link::Attached;
 use super::plan::planner_port::PlannerPort;
 use super::tool::payloads::HeldLoads;
 use crate::blueprint::Blueprint;
+use crate::metrics::Counts;
 use dimos_control::config::CoordinatorConfig;
 use dimos_control::request::Request;
 use dimos_control::tick_loop::Pulse;
@@ -87,6 +88,8 @@ pub struct Service {
     pub(in crate::runtime) fault_logs: Mutex<Vec<PathBuf>>,
     /// Address of the live view.
     pub(in crate::runtime) view: OnceLock<String>,
+    /// URL of the metrics.
+    pub(in crate::runtime) metrics: OnceLock<String>,
     /// The arms' tool centre points, for the log.
     pub(in crate::runtime) logged_tcps: TcpChains,
     /// The robots with their names in the run.
@@ -113,6 +116,8 @@ pub struct Service {
     pub(in crate::runtime) details_logged: Mutex<Vec<Details>>,
     /// Per arm, the objects that it holds and whose mass is known. Locked while a load is set.
     pub(in crate::runtime) held_loads: Vec<tokio::sync::Mutex<HeldLoads>>,
+    /// The events so far, for the metrics.
+    pub(in crate::runtime) counts: Mutex<Counts>,
     /// Number of ticks when the joint state was last published.
     pub(in crate::runtime) published: AtomicU64,
     /// Per arm, where model and controller have the flange.
@@ -157,12 +162,14 @@ impl Service {
             recorder: OnceLock::new(),
             fault_logs: Mutex::default(),
             view: OnceLock::new(),
+            metrics: OnceLock::new(),
             logged_tcps: TcpChains::default(),
             described: OnceLock::new(),
             logged_world: Mutex::default(),
             log_throttle: LogThrottle::default(),
             late_stops: LateStops::default(),
             unsent_ends: UnsentEnds::default(),
+            counts: Mutex::default(),
             published: AtomicU64::new(0),
             attached: Mutex::default(),
             executed: Mutex::default(),
@@ -235,6 +242,7 @@ impl Service {
     pub fn notice(&self, notice: Notice<'_>, wall: WallOffset) {
         match notice {
             Notice::Event { tick, event, described } => {
+                lock(&self.counts).event(event);
                 if let Event::Task(task, state, reason) = event {
                     let actual = self.positions();
                     lock(&self.motions).task_changed(*task, (tick, *state, *reason), &actual);
@@ -456,7 +464,7 @@ impl Backend for Service {
     }
 
     fn call(&self, request: Call) -> BoxFuture<'_, Result<Reply, RpcError>> {
-        Box::pin(self.answer(request, Origin { epoch: self.epoch(), client: 0 }))
+        Box::pin(self.answer_counted(request, Origin { epoch: self.epoch(), client: 0 }))
     }
 
     fn call_from(
@@ -466,7 +474,7 @@ impl Backend for Service {
         who: Arc<Who>,
     ) -> BoxFuture<'_, Result<Reply, RpcError>> {
         let origin = origin.unwrap_or_else(|| Origin { epoch: self.epoch(), client: 0 });
-        Box::pin(asked_by(who, self.answer(request, origin)))
+        Box::pin(asked_by(who, self.answer_counted(request, origin)))
     }
 
     fn epoch(&self) -> u64 {

@@ -21,6 +21,7 @@ use super::arm::wires::wires;
 use super::client::dispatch::{Dispatcher, OutcomeThread};
 use super::client::in_process;
 use super::log::log_file::{attachments, log_device_note, log_path, metadata, no_log, retain, storage};
+use super::log::metrics;
 use super::plan::guard_worlds::{GuardEnds, GuardWorlds};
 use super::plan::planner_link::command_limits;
 use super::plan::planner_port::PlannerPort;
@@ -61,7 +62,9 @@ impl Run {
     pub fn start(blueprint: &Blueprint, options: Options) -> Result<Self, StartError> {
         let view = options.view;
         // If a later stage fails, the run ends before its name is released.
-        let (claim, mut run) = Prepared::new(blueprint, options)?.connect()?.start()?;
+        let prepared = Prepared::new(blueprint, options)?;
+        let metrics = metrics::bind(blueprint)?;
+        let (claim, mut run) = prepared.connect()?.start()?;
         run.enable(blueprint)?;
         run.handle.service.check_models();
         if blueprint.rpc.enabled {
@@ -77,6 +80,7 @@ impl Run {
             claim.refuse_clients();
             run.handle.service.keep(claim);
         }
+        run.metrics = metrics.map(|bound| metrics::serve(bound, &run.handle.service)).transpose()?;
         if let Some(manager) = &run.manager {
             manager.ready(&status_line(&run.status()));
         }
@@ -268,6 +272,7 @@ impl Connected {
             outcomes: Some(outcomes),
             recorder: Some(recorder),
             view: None,
+            metrics: None,
             server: None,
             handle: Handle::new(service),
             endings: (endings, ended),

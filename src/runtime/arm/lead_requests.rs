@@ -213,6 +213,7 @@ impl Service {
         let text = format!("{}: native motion {} is {}", native.name, native.motion, end.0.name());
         self.parts.dispatcher.log(Severity::Info, text);
         let elapsed = since.elapsed().as_secs_f64();
+        lock(&self.counts).motion(None, end.0);
         lock(&self.motions).end(native.motion, end, elapsed, &self.positions());
     }
 

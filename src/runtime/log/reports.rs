@@ -73,6 +73,7 @@ impl Service {
             tasks: (0..parts.config.tasks.len()).filter_map(|i| self.task_report(i)).collect(),
             planner: None, // filled in by the `status` method
             view: self.view.get().cloned(),
+            metrics: self.metrics.get().cloned(),
         }
     }
 
