@@ -131,7 +131,7 @@ verified:
 
 # What tests compare with and run in: other people's readers of logs; as root, also cyclictest, a browser, and a guest
 # kernel that has CAN, with the tools for its interfaces, and a root with only Debian's base.
-test-tools: .venv/readers-installed $(READERS)/node_modules/.package-lock.json viewer/node_modules/.package-lock.json
+test-tools: .venv/readers-installed $(READERS)/node_modules/.package-lock.json viewer/node_modules/.package-lock.json .venv/bin/promtool
 	@if [ "$$(id -u)" = 0 ]; then missing=; for tool in $(SYSTEM_TOOLS); do command -v $$tool >/dev/null || missing=yes; done; \
 	[ -z "$$missing" ] || { apt-get update -q && apt-get install -qy --no-install-recommends $(SYSTEM_PACKAGES); }; \
 	packaging/base.sh >/dev/null; fi
@@ -141,6 +141,12 @@ test-tools: .venv/readers-installed $(READERS)/node_modules/.package-lock.json v
 	.venv/bin/pip install -q -r $<
 	.venv/bin/pip install -q --no-deps -r $(READERS)/requirements-no-deps.txt
 	touch $@
+
+# From Debian's package, which is not installed: it would start a server.
+.venv/bin/promtool: .venv/readers-installed
+	@cd .venv && if apt-get download -q prometheus && dpkg -x prometheus_*.deb prometheus; \
+	then mv prometheus/usr/bin/promtool bin/; else echo "note: promtool is not installed: apt-get update" >&2; fi; \
+	rm -rf prometheus prometheus_*.deb
 
 $(READERS)/node_modules/.package-lock.json: $(READERS)/package-lock.json
 	cd $(READERS) && npm ci --no-audit --no-fund

@@ -38,7 +38,7 @@ file 644 assets/python/*.py assets/python/pyproject.toml "$root/share/dimos/pyth
 file 644 assets/python/dimos_client/*.py assets/python/dimos_client/py.typed "$root/share/dimos/python/dimos_client"
 file 644 assets/blueprint.schema.json "$root/share/dimos"
 file 644 README.md "$root/share/doc/dimos"
-file 644 docs/*.md "$root/share/doc/dimos/docs"
+file 644 docs/*.md docs/foxglove-layout.json "$root/share/doc/dimos/docs"
 file 644 docs/arms/*.md "$root/share/doc/dimos/docs/arms"
 install -m 644 LICENSE "$root/share/doc/dimos/copyright"
 

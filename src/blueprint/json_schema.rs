@@ -88,7 +88,7 @@ fn home_of(key: &str) -> Option<String> {
 }
 
 /// Groups of the schema, and their paths in a blueprint.
-const GROUPS: [(&str, &str); 12] = [
+const GROUPS: [(&str, &str); 14] = [
     ("", ""),
     ("/$defs/CoordinatorConfig", "coordinator"),
     ("/$defs/HardwareEntry", "hardware"),
@@ -99,6 +99,8 @@ const GROUPS: [(&str, &str); 12] = [
     ("/$defs/RobotEntry", "planner.robots"),
     ("/$defs/RecordingConfig", "recording"),
     ("/$defs/ViewConfig", "view"),
+    ("/$defs/FoxgloveConfig", "view.foxglove"),
+    ("/$defs/MetricsConfig", "metrics"),
     ("/$defs/ShareEntry", "share"),
     ("/$defs/RosEntry", "share.ros"),
 ];

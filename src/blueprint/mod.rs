@@ -8,6 +8,7 @@
 mod arms;
 mod assets;
 mod catalog;
+mod endpoints;
 mod include;
 mod json_schema;
 mod limits;
@@ -33,6 +34,7 @@ mod tick_clock;
 mod tool_speed;
 
 pub use catalog::Catalog;
+pub use endpoints::{FoxgloveConfig, MetricsConfig, WebOrigin};
 pub use json_schema::{full_schema, json_schema};
 pub use limits::{JointOverride, LimitsEntry};
 pub use load::{Loaded, Overrides, load, load_from};

@@ -9,6 +9,7 @@ use serde::de::value::MapAccessDeserializer;
 use serde::de::{Deserializer, MapAccess, SeqAccess, Visitor};
 use serde::{Deserialize, Serialize};
 
+use crate::blueprint::endpoints::FoxgloveConfig;
 use dimos_core::written::ShapeSpec;
 use dimos_planner::collision::body::MeshMode;
 use dimos_yaml::range::{maybe_positive, non_negative, positive};
@@ -278,11 +279,18 @@ pub struct ViewConfig {
     pub host: IpAddr,
     /// First port that is tried; if others have it, the next free one of 100. 0 = any free port.
     pub port: u16,
+    /// Foxglove's WebSocket, at the same address.
+    pub foxglove: FoxgloveConfig,
 }
 
 impl Default for ViewConfig {
     fn default() -> Self {
-        Self { backend: ViewBackend::Meshcat, host: Ipv4Addr::LOCALHOST.into(), port: 7000 }
+        Self {
+            backend: ViewBackend::Meshcat,
+            host: Ipv4Addr::LOCALHOST.into(),
+            port: 7000,
+            foxglove: FoxgloveConfig::default(),
+        }
     }
 }
 

@@ -7,6 +7,7 @@ use serde_json::Value;
 use crate::assets::{Asset, Cache};
 use crate::blueprint::assets::Assets;
 use crate::blueprint::catalog::Catalog;
+use crate::blueprint::endpoints::MetricsConfig;
 use crate::blueprint::limits::JointOverride;
 use crate::blueprint::planner::{ViewBackend, ViewConfig};
 use crate::blueprint::schema::{
@@ -15,8 +16,8 @@ use crate::blueprint::schema::{
 use crate::blueprint::task_robots::{self, Base};
 use crate::blueprint::tool_speed::ToolRobot;
 use crate::blueprint::{
-    arms, assets, park, planner_check, planner_files, planner_models, share, task_leaders, tasks, tick_clock,
-    tool_speed,
+    arms, assets, endpoints, park, planner_check, planner_files, planner_models, share, task_leaders, tasks,
+    tick_clock, tool_speed,
 };
 use dimos_control::task_leader::LeaderJoint;
 use dimos_control::task_spec::TaskSpec;
@@ -52,6 +53,8 @@ pub struct Blueprint {
     pub recording: RecordingConfig,
     /// The socket.
     pub rpc: RpcConfig,
+    /// Where its metrics are served; `None`: there are none.
+    pub metrics: Option<MetricsConfig>,
     /// How the run is on a network; `None`: not at all.
     pub share: Option<share::ShareConfig>,
     /// Files that are fetched on first use.
@@ -266,6 +269,7 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
         let diag = Diag::warning(what).note("anyone who reads the traffic has the token, and can command the arms");
         checker.error(view.at, diag.hint("remove `host` and connect through ssh: docs/view.md"));
     }
+    endpoints::check(&mut checker, file.metrics.as_ref());
     let share = file.share.as_ref().map(|entry| share::resolve(&mut checker, entry));
     Blueprint {
         name: name.value,
@@ -278,6 +282,7 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
         view: view.map(|v| v.value),
         recording: file.recording,
         rpc: file.rpc,
+        metrics: file.metrics.map(|metrics| metrics.value),
         share,
         assets,
         source_yaml: String::new(),

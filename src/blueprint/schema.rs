@@ -7,6 +7,7 @@ use serde::de::value::MapAccessDeserializer;
 use serde::de::{Deserializer, MapAccess, SeqAccess, Visitor};
 use serde::{Deserialize, Serialize};
 
+use crate::blueprint::endpoints::MetricsConfig;
 use crate::blueprint::limits::LimitsEntry;
 use crate::blueprint::parts::{MountingEntry, PayloadEntry, StopInputEntry};
 use crate::blueprint::planner::{PlannerEntry, ViewConfig};
@@ -45,6 +46,8 @@ pub struct BlueprintFile {
     pub recording: RecordingConfig,
     /// The socket for client programs.
     pub rpc: RpcConfig,
+    /// Metrics of the run for Prometheus and others. Without this section there are none.
+    pub metrics: Option<Located<MetricsConfig>>,
     /// The run on a network.
     pub share: Option<Located<ShareEntry>>,
     /// Files that are fetched on first use, by name: archives of robot descriptions, meshes, point clouds. Robots and

@@ -190,6 +190,9 @@ impl Attached {
         // The arms are connected in the run: their dimensions are those that were kept.
         let mut blueprint = blueprint.clone();
         use_kept(&mut blueprint).iter().for_each(|line| terminal.note(format!("  model      {line}")));
+        if blueprint.metrics.is_some() {
+            terminal.note("  metrics    those of the run; an attached planner serves none");
+        }
         let blueprint = &blueprint;
         let config = blueprint.planner.clone().unwrap_or_default();
         let (terminal, json) = (terminal.clone(), args.json);

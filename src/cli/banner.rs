@@ -70,6 +70,7 @@ pub fn text(report: &StatusReport, socket: &Path, url: Option<&str>, end: &str) 
     if let Some(address) = &report.view {
         row("view", url.map_or_else(|| view_without_token(address), str::to_owned));
     }
+    report.metrics.iter().for_each(|url| row("metrics", url.clone()));
     lines.push(end.into());
     lines
 }

@@ -234,6 +234,7 @@ fn print(r: &StatusReport, verbose: bool) {
     if let Some(address) = &r.view {
         output::wrapped(format_args!("  view {}", banner::view_without_token(address)));
     }
+    r.metrics.iter().for_each(|url| output::wrapped(format_args!("  metrics {url}")));
     if let Some(share) = &r.share {
         let clients = if share.clients.is_empty() { "no clients".to_owned() } else { share.clients.join(", ") };
         if !share.endpoints.is_empty() {

@@ -15,6 +15,7 @@ use super::exit::{Exit, Failure, Result};
 use super::model::With;
 use super::output;
 use crate::blueprint::Catalog;
+use crate::view::foxglove_url;
 use dimos_rpc::client;
 use dimos_rpc::run_dir::RunDir;
 
@@ -25,6 +26,7 @@ The URL contains a token: with that of a run, everything that `dimos` can do to 
 new run has a new one. Through ssh: ssh -L 7000:127.0.0.1:7000 HOST, then open the URL in the local browser.
 WHAT is a log (.mcap; a file name alone is looked for in the folder of logs too), a robot model (.urdf, .xacro, \
 builtin:xarm6), or a blueprint. It is shown until Ctrl-C; nothing is connected and nothing moves.
+--foxglove prints the address for Foxglove and Lichtblick: what they connect to reads the run and commands nothing.
 With --at the page of a run on another computer is served from this one, until Ctrl-C.")]
 pub struct Args {
     /// Show this log, robot model or blueprint; default: the URL of the live run
@@ -33,6 +35,9 @@ pub struct Args {
     /// Show the newest log
     #[arg(long, conflicts_with_all = ["what", "run"])]
     pub last: bool,
+    /// Print the URL for Foxglove instead, which only allows to read
+    #[arg(long, conflicts_with_all = ["what", "last"])]
+    pub foxglove: bool,
     /// How a robot model is read
     #[command(flatten)]
     with: With,
@@ -76,9 +81,12 @@ fn not_of_a_model(args: &Args, what: &str) -> Result<()> {
 }
 
 fn print(args: &Args, kind: &str, name: &str, url: &str) {
-    match args.target_run.json {
-        true => output::json(&json!({kind: name, "url": url})),
-        false => output::line(url),
+    let foxglove = foxglove_url(url).filter(|_| kind == "run");
+    let printed = foxglove.as_deref().filter(|_| args.foxglove).unwrap_or(url);
+    match (args.target_run.json, &foxglove) {
+        (true, Some(foxglove)) => output::json(&json!({kind: name, "url": url, "foxglove": foxglove})),
+        (true, None) => output::json(&json!({kind: name, "url": url})),
+        (false, _) => output::line(printed),
     }
 }
 

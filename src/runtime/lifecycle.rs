@@ -16,6 +16,8 @@ pub struct Lifecycle {
     closed: AtomicBool,
     /// Whether the tick still runs: stops are accepted although the run is closed.
     stoppable: AtomicBool,
+    /// Whether it ends by a fault, or because of its log.
+    faulted: AtomicBool,
     /// A client cancelled motion after the run was closed.
     cancelled: AtomicBool,
     /// The lock on the run's name, of a run without a server.
@@ -30,6 +32,7 @@ impl Lifecycle {
             endings,
             closed: AtomicBool::new(false),
             stoppable: AtomicBool::new(true),
+            faulted: AtomicBool::new(false),
             cancelled: AtomicBool::new(false),
             claim: Mutex::new(None),
         }
@@ -68,6 +71,16 @@ impl Lifecycle {
     /// Returns whether stops and cancels are still accepted.
     pub fn accepts_stops(&self) -> bool {
         self.stoppable.load(Ordering::Acquire)
+    }
+
+    /// Records that the end is no controlled one.
+    pub fn fault(&self) {
+        self.faulted.store(true, Ordering::Release);
+    }
+
+    /// Returns whether the end is no controlled one.
+    pub fn is_faulted(&self) -> bool {
+        self.faulted.load(Ordering::Acquire)
     }
 
     /// Records that a client cancelled motion after the run was closed.

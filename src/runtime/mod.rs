@@ -32,7 +32,6 @@ pub mod tool;
 mod watchdog;
 
 use std::sync::Weak;
-use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::{Receiver, Sender};
 
 pub use arm::device_lock::DeviceLockError;
@@ -45,6 +44,7 @@ pub use plan::attached::{AttachedPlanner, LinkEvent};
 pub(crate) use plan::world_requests::typed as world_object;
 pub use service_manager::ServiceManager;
 
+use crate::metrics::Metrics;
 use crate::view::View;
 use arm::ArmLinks;
 use arm::arms::Arms;
@@ -84,11 +84,11 @@ pub struct Run {
     outcomes: Option<OutcomeThread>,
     recorder: Option<Recorder>,
     view: Option<View>,
+    metrics: Option<Metrics>,
+    metrics: Option<Metrics>,
     server: Option<Server>,
     handle: Handle,
     endings: (Sender<Ending>, Receiver<Ending>),
-    /// Whether it ends by a fault, or because of its log: then nothing is parked.
-    faulted: AtomicBool,
     manager: Option<ServiceManager>,
     _latency: Option<LatencyHold>,
 }

@@ -69,7 +69,7 @@ impl Run {
         };
         let ending = received.unwrap_or(Ending::Duration);
         if matches!(ending, Ending::Fault(_) | Ending::Log(_)) {
-            self.faulted.store(true, Ordering::Release);
+            self.handle.service().lifecycle.fault();
         }
         ending
     }

@@ -150,7 +150,7 @@ impl Backend for Service {
     }
 
     fn call(&self, request: Call) -> BoxFuture<'_, Result<Reply, RpcError>> {
-        Box::pin(self.answer(request, Origin { epoch: self.tick.epoch(), client: 0 }))
+        Box::pin(self.answer_counted(request, Origin { epoch: self.tick.epoch(), client: 0 }))
     }
 
     fn call_from(
@@ -160,7 +160,7 @@ impl Backend for Service {
         who: Arc<Who>,
     ) -> BoxFuture<'_, Result<Reply, RpcError>> {
         let origin = origin.unwrap_or_else(|| Origin { epoch: self.tick.epoch(), client: 0 });
-        Box::pin(asked_by(who, self.answer(request, origin)))
+        Box::pin(asked_by(who, self.answer_counted(request, origin)))
     }
 
     fn epoch(&self) -> u64 {

@@ -10,7 +10,6 @@
 
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::{Sender, channel};
 use std::time::{Duration, Instant};
 
@@ -27,6 +26,7 @@ use super::gripper::Grippers;
 use super::lifecycle::Lifecycle;
 use super::log::Journal;
 use super::log::log_file::{attachments, log_device_note, log_path, metadata, no_log, retain, storage};
+use super::log::metrics;
 use super::motion::motions::Motions;
 use super::motion::streams::Streams;
 use super::plan::guard_worlds::{GuardEnds, GuardWorlds};
@@ -68,7 +68,9 @@ impl Run {
     pub fn start(blueprint: &Blueprint, options: Options) -> Result<Self, StartError> {
         let view = options.view;
         // If a later stage fails, the run ends before its name is released.
-        let (claim, mut run) = Prepared::new(blueprint, options)?.connect()?.start()?;
+        let prepared = Prepared::new(blueprint, options)?;
+        let metrics = metrics::bind(blueprint)?;
+        let (claim, mut run) = prepared.connect()?.start()?;
         run.enable(blueprint)?;
         run.handle.service().check_models();
         if blueprint.rpc.enabled {
@@ -84,6 +86,7 @@ impl Run {
             claim.refuse_clients();
             run.handle.service().lifecycle.keep(claim);
         }
+        run.metrics = metrics.map(|bound| metrics::serve(bound, run.handle.service())).transpose()?;
         if let Some(manager) = &run.manager {
             manager.ready(&status_line(&run.status()));
         }
@@ -277,10 +280,10 @@ impl Connected {
             outcomes: Some(outcomes),
             recorder: Some(recorder),
             view: None,
+            metrics: None,
             server: None,
             handle: Handle::new(service),
             endings: (endings, ended),
-            faulted: AtomicBool::new(false),
             manager,
             _latency: prepared.latency,
         };

@@ -4,6 +4,9 @@
 use std::io;
 use std::net::{IpAddr, SocketAddr};
 
+use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
+
+use crate::http;
 use dimos_core::random;
 
 /// What gives access to the page of one run.
@@ -35,8 +38,12 @@ impl Access {
 
     /// Returns whether this is the token. Takes the same time for every token of its length.
     pub fn is_token(&self, token: &str) -> bool {
-        let differ = |differ: u8, (a, b): (u8, u8)| differ | (a ^ b);
-        token.len() == self.token.len() && token.bytes().zip(self.token.bytes()).fold(0, differ) == 0
+        are_equal(token, &self.token)
+    }
+
+    /// Returns whether this is the token that only allows to read.
+    pub fn is_reading_token(&self, token: &str) -> bool {
+        are_equal(token, &reading_token(&self.token))
     }
 
     /// Returns whether an `Authorization` header has the token.
@@ -46,21 +53,19 @@ impl Access {
 
     /// Returns whether a request was sent to this server by one of its pages, or by no page.
     pub fn is_own(&self, host: Option<&str>, origin: Option<&str>) -> bool {
-        let Some(host) = host.filter(|host| self.is_host(host)) else { return false };
-        origin.is_none_or(|origin| origin.strip_prefix("http://") == Some(host))
+        http::is_own(self.at, host, origin)
     }
+}
 
-    /// Returns whether a `Host` header names this server. Only an address can: other people control what a name
-    /// resolves to, `localhost` excepted.
-    fn is_host(&self, host: &str) -> bool {
-        let (name, port) = host.rsplit_once(':').filter(|(_, port)| !port.ends_with(']')).unwrap_or((host, "80"));
-        let bare = name.strip_prefix('[').and_then(|name| name.strip_suffix(']')).unwrap_or(name);
-        let known = match bare.parse::<IpAddr>() {
-            Ok(ip) => ip.is_loopback() || self.at.ip().is_unspecified() || ip == self.at.ip(),
-            Err(_) => name.eq_ignore_ascii_case("localhost"),
-        };
-        known && port.parse() == Ok(self.at.port())
-    }
+fn are_equal(a: &str, b: &str) -> bool {
+    let differ = |differ: u8, (a, b): (u8, u8)| differ | (a ^ b);
+    a.len() == b.len() && a.bytes().zip(b.bytes()).fold(0, differ) == 0
+}
+
+/// Returns the token for viewers that only read. It is made of the page's by a hash (SHA-1, as for a WebSocket's key),
+/// so that a viewer's URL, which other sites may learn, does not allow to command the arms.
+pub fn reading_token(token: &str) -> String {
+    derive_accept_key(token.as_bytes()).chars().filter(char::is_ascii_alphanumeric).collect()
 }
 
 #[cfg(test)]
@@ -68,35 +73,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_this_server_and_its_pages_are_accepted() {
-        let access = Access::new("127.0.0.1:7000".parse().unwrap()).unwrap();
-        for host in ["127.0.0.1:7000", "localhost:7000", "LOCALHOST:7000", "[::1]:7000", "127.0.0.2:7000"] {
-            assert!(access.is_own(Some(host), None) && access.is_own(Some(host), Some(&format!("http://{host}"))));
-            assert!(
-                !access.is_own(Some(host), Some("http://evil.test:7000")) && !access.is_own(Some(host), Some("null"))
-            );
-        }
-        for host in ["evil.test:7000", "127.0.0.1.evil.test:7000", "127.0.0.1", "127.0.0.1:7001", "[::1]", "", ":7000"]
-        {
-            assert!(!access.is_own(Some(host), None), "{host}");
-        }
-        assert!(!access.is_own(None, None) && !access.is_own(Some("10.0.0.5:7000"), None));
-        assert!(!access.is_own(Some("127.0.0.1:7000"), Some("https://127.0.0.1:7000")));
-
-        let open = Access::new("0.0.0.0:7001".parse().unwrap()).unwrap();
-        assert!(open.is_own(Some("10.0.0.5:7001"), None) && !open.is_own(Some("robot.test:7001"), None));
-        assert_eq!(open.address(), "http://127.0.0.1:7001/");
-        let one = Access::new("10.0.0.5:80".parse().unwrap()).unwrap();
-        assert!(one.is_own(Some("10.0.0.5"), None) && !one.is_own(Some("10.0.0.6"), None));
-    }
-
-    #[test]
     fn every_run_has_another_token() {
         let (one, other) = [7000, 7001].map(|port| Access::new(([127, 0, 0, 1], port).into()).unwrap()).into();
         let token = |access: &Access| access.url().rsplit_once('#').unwrap().1.to_owned();
         assert_eq!((token(&one).len(), one.address()), (32, "http://127.0.0.1:7000/".to_owned()));
+        let open = Access::new(([0, 0, 0, 0], 7001).into()).unwrap();
+        assert_eq!(open.address(), "http://127.0.0.1:7001/");
         assert!(one.is_token(&token(&one)) && !one.is_token(&token(&other)) && !one.is_token(""));
         assert!(one.is_bearer(Some(&format!("Bearer {}", token(&one)))) && !one.is_bearer(None));
         assert!(!one.is_bearer(Some(&token(&one))));
+        let reading = reading_token(&token(&one));
+        assert!(one.is_reading_token(&reading) && !one.is_token(&reading) && !one.is_reading_token(&token(&one)));
+        assert!(!other.is_reading_token(&reading) && !one.is_reading_token("") && reading.len() > 20);
     }
 }

@@ -6,6 +6,7 @@
 //!  browser ── GET / ─────────▶ the page, compressed in the program
 //!          ── GET /scene.json, /mesh/N ─▶ robot descriptions, read when they are asked for
 //!          ◀─ WebSocket /rpc ─▶ bridge ◀── one connection per page ──▶ the run's socket
+//! Foxglove ◀─ WebSocket /foxglove ─▶ foxglove ◀── the same, to read only ──▶
 //! ```
 //!
 //! One thread of ordinary priority serves all pages. The run does not wait for it, and continues without it.
@@ -15,7 +16,7 @@ mod access;
 #[cfg(feature = "view")]
 mod bridge;
 #[cfg(feature = "view")]
-mod http;
+mod foxglove;
 #[cfg(feature = "view")]
 mod page_urdf;
 #[cfg(feature = "view")]
@@ -24,12 +25,16 @@ mod scene;
 mod server;
 mod shown;
 #[cfg(feature = "view")]
+mod socket;
+#[cfg(feature = "view")]
 mod stl;
 #[cfg(feature = "view")]
 mod subject;
 #[cfg(not(feature = "view"))]
 mod without_view;
 
+#[cfg(feature = "view")]
+pub use foxglove::foxglove_url;
 #[cfg(feature = "view")]
 pub use scene::{MeshFile, Scene};
 #[cfg(feature = "view")]
@@ -40,7 +45,7 @@ pub use shown::{Shown, ShownArm, ShownGripper, ShownRobot};
 #[cfg(feature = "view")]
 pub use subject::{Subject, value};
 #[cfg(not(feature = "view"))]
-pub use without_view::View;
+pub use without_view::{View, foxglove_url};
 
 use crate::blueprint::Blueprint;
 use crate::blueprint::planner::{ViewBackend, ViewConfig};

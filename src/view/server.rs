@@ -16,11 +16,13 @@ use tokio::sync::{OnceCell, Semaphore, watch};
 use tokio::task::{AbortHandle, JoinSet, spawn_blocking};
 
 use super::access::Access;
-use super::http::{self, Reply, Request};
 use super::scene::{self, Scene};
-use super::subject::{Live, Subject};
-use super::{Shown, bridge, stl};
+use super::subject::{Live, Subject, value};
+use super::{Shown, bridge, foxglove, socket, stl};
+use crate::blueprint::WebOrigin;
 use crate::blueprint::planner::ViewConfig;
+use crate::http::{self, Reply, Request};
+use dimos_core::clock::wall_now;
 use dimos_rpc::run_dir::{RunFiles, UrlFile};
 
 /// The page, compressed by the build.
@@ -61,6 +63,11 @@ struct Site {
     /// The run's socket; `None`: no run is shown.
     run: Option<PathBuf>,
     pages: Arc<Semaphore>,
+    /// Viewers of Foxglove, and the origins of other sites whose pages may be some.
+    foxglove: foxglove::Shared,
+    origins: Vec<WebOrigin>,
+    /// Whether the refusal of an origin was logged.
+    has_refused: AtomicBool,
 }
 
 impl View {
@@ -101,7 +108,23 @@ impl View {
             .build()
             .map_err(failed("no runtime"))?;
         let (end, ended) = watch::channel(false);
-        let site = Site { access, subject, scene: OnceCell::new(), run, pages: Arc::new(Semaphore::new(MAX_SOCKETS)) };
+        let pages = Arc::new(Semaphore::new(MAX_SOCKETS));
+        let shared = foxglove::Shared {
+            subject: subject.clone(),
+            meshes: OnceCell::new(),
+            session: wall_now().to_string(),
+            places: pages.clone(),
+        };
+        let site = Site {
+            access,
+            subject,
+            scene: OnceCell::new(),
+            run,
+            pages,
+            foxglove: shared,
+            origins: config.foxglove.origins.clone(),
+            has_refused: AtomicBool::new(false),
+        };
         let thread = std::thread::Builder::new().name("view".into()).spawn(move || {
             let serving = || runtime.block_on(serve(listener, Arc::new(site), ended));
             match catch_unwind(AssertUnwindSafe(serving)) {
@@ -192,8 +215,17 @@ async fn connection(mut stream: TcpStream, site: Arc<Site>, is_known: Arc<Atomic
     let reply = match http::read(&mut stream).await {
         Ok(None) => return,
         Ok(Some(request)) => match &site.run {
-            Some(run) if request.path == "/rpc" && bridge::key(&request).is_some() && is_own(&site, &request) => {
+            Some(run) if request.path == "/rpc" && socket::key(&request).is_some() && is_own(&site, &request) => {
                 return bridge::serve(stream, request, &site.access, run, (&site.pages, &is_known), ended).await;
+            }
+            Some(run) if request.path == foxglove::PATH && socket::key(&request).is_some() => {
+                match viewer(&site, &request) {
+                    Ok(protocol) => {
+                        let Some(viewer) = socket::open(stream, request, Some(protocol)).await else { return };
+                        return foxglove::serve(viewer, run, &site.foxglove, &is_known, ended).await;
+                    }
+                    Err(reply) => reply,
+                }
             }
             _ => answer(&site, &request).await,
         },
@@ -205,6 +237,26 @@ async fn connection(mut stream: TcpStream, site: Arc<Site>, is_known: Arc<Atomic
 
 fn is_own(site: &Site, request: &Request) -> bool {
     site.access.is_own(request.header("host"), request.header("origin"))
+}
+
+/// Returns the subprotocol of Foxglove for a viewer, or why it is refused.
+fn viewer(site: &Site, request: &Request) -> Result<&'static str, Reply> {
+    let (host, origin) = (request.header("host"), request.header("origin"));
+    let is_listed = origin.is_some_and(|origin| site.origins.iter().any(|known| known.as_str() == origin));
+    if !(is_own(site, request) || is_listed && site.access.is_own(host, None)) {
+        let origin = origin.unwrap_or("none");
+        let why = format!("pages of another site may not connect (Origin: {origin}); hint: view.foxglove.origins");
+        // Browsers do not show it.
+        if !site.has_refused.swap(true, Ordering::Relaxed) {
+            tracing::warn!("the live view: {}", why.escape_debug());
+        }
+        return Err(Reply::text(403, why));
+    }
+    if !value(&request.query, "token").is_some_and(|token| site.access.is_reading_token(token)) {
+        return Err(Reply::text(401, "the token is missing or wrong: `dimos view --foxglove` prints the URL"));
+    }
+    foxglove::subprotocol(request)
+        .ok_or_else(|| Reply::text(400, "the subprotocol is foxglove.sdk.v1 or foxglove.websocket.v1"))
 }
 
 async fn answer(site: &Site, request: &Request) -> Reply {
@@ -221,7 +273,7 @@ async fn answer(site: &Site, request: &Request) -> Reply {
             let body = Cow::Borrowed(PAGE);
             return Reply { status: 200, kind: "text/html; charset=utf-8", headers: PAGE_HEADERS, body, keep: false };
         }
-        "rpc" if site.run.is_some() => return Reply::text(426, "this is a WebSocket"),
+        "rpc" | "foxglove" if site.run.is_some() => return Reply::text(426, "this is a WebSocket"),
         "scene.json" | "mesh" | "object" | "messages" | "pose" => {}
         _ => return Reply::text(404, "there is no such page"),
     }

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use super::Shown;
+use super::foxglove::Asset;
 use super::scene::Scene;
 use dimos_rpc::api::{World, WorldObject};
 use dimos_rpc::client::Client;
@@ -25,6 +26,11 @@ pub trait Subject: Send + Sync {
         let _ = path;
         None
     }
+
+    /// Returns the meshes of the robots, by their URIs in the run's description, for viewers that fetch them.
+    fn meshes(&self) -> Vec<Asset> {
+        Vec::new()
+    }
 }
 
 /// A live run.
@@ -45,6 +51,11 @@ impl Subject for Live {
 
     fn answer(&self, _: &str, _: &str) -> Option<Result<String, String>> {
         None
+    }
+
+    fn meshes(&self) -> Vec<Asset> {
+        let models = self.shown.robots.iter().filter_map(|robot| dimos_robot::load(&robot.source).into_model().ok());
+        models.flat_map(|model| model.meshes().map(|m| (m.uri.clone(), m.path.clone())).collect::<Vec<_>>()).collect()
     }
 }
 

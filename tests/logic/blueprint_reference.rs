@@ -9,8 +9,8 @@ use dimos::blueprint::planner::{GripperJointEntry, ObjectEntry, PlannerEntry, Po
 use dimos::blueprint::schema::{AssetEntry, BlueprintFile, CountedJoints, HardwareEntry, TaskEntry};
 use dimos::blueprint::share::{IdentityEntry, RosEntry, ShareEntry};
 use dimos::blueprint::{
-    Catalog, CoordinatorConfig, GuardConfig, LimitsEntry, MountingEntry, PayloadEntry, RecordingConfig, RpcConfig,
-    StopInputEntry, full_schema, json_schema,
+    Catalog, CoordinatorConfig, FoxgloveConfig, GuardConfig, LimitsEntry, MetricsConfig, MountingEntry, PayloadEntry,
+    RecordingConfig, RpcConfig, StopInputEntry, full_schema, json_schema,
 };
 use dimos::control::task_spec::{TaskSpec, TaskTable};
 use dimos::hardware::registry::Registry;
@@ -76,7 +76,7 @@ const SECTIONS: [Section; 9] = [
     section("`tasks[]`", TASKS, "/$defs/TaskEntry", keys::<TaskEntry>),
 ];
 /// Those behind the parameters of the task types.
-const SECTIONS_AFTER_TASKS: [Section; 13] = [
+const SECTIONS_AFTER_TASKS: [Section; 15] = [
     section("`planner`", "", "/$defs/PlannerEntry", keys::<PlannerEntry>),
     section("`planner.robots[]`", "A list of robots, merged by `name`.", "/$defs/RobotEntry", keys::<RobotEntry>),
     section("`planner.robots[].gripper_joint`", "", "/$defs/GripperJointEntry", keys::<GripperJointEntry>),
@@ -84,8 +84,10 @@ const SECTIONS_AFTER_TASKS: [Section; 13] = [
     section("`planner.world`", "A group of obstacles by name.", "/$defs/ObjectEntry", keys::<ObjectEntry>),
     section("`guard`", "", "/$defs/GuardConfig", keys::<GuardConfig>),
     section("`view`", "", "/$defs/ViewConfig", keys::<ViewConfig>),
+    section("`view.foxglove`", "", "/$defs/FoxgloveConfig", keys::<FoxgloveConfig>),
     section("`recording`", "", "/$defs/RecordingConfig", keys::<RecordingConfig>),
     section("`rpc`", "", "/$defs/RpcConfig", keys::<RpcConfig>),
+    section("`metrics`", "", "/$defs/MetricsConfig", keys::<MetricsConfig>),
     section("`share`", "", "/$defs/ShareEntry", keys::<ShareEntry>),
     section("`share.identity`", "", "/$defs/IdentityEntry", keys::<IdentityEntry>),
     section("`share.ros`", "", "/$defs/RosEntry", keys::<RosEntry>),

@@ -10,8 +10,11 @@ const ALL: &[&str] = &["*"];
 const LAYERS: &[(&str, &[&str])] = &[
     ("assets", &[]),
     ("blueprint", &["assets"]),
-    ("view", &["blueprint"]),
-    ("share", &["blueprint"]),
+    ("http", &[]),
+    ("metrics", &["http"]),
+    ("ros_messages", &[]),
+    ("view", &["blueprint", "http", "ros_messages"]),
+    ("share", &["blueprint", "ros_messages"]),
     ("runtime", ALL),
     ("replay", ALL),
     ("cli", ALL),

@@ -27,6 +27,8 @@ mod first_day;
 mod first_run;
 mod foreign_logs;
 mod foreign_paths;
+#[cfg(feature = "view")]
+mod foxglove;
 mod franka_run;
 mod grip_outcome;
 mod gripper_force;
@@ -40,6 +42,7 @@ mod leader_follower;
 mod leases;
 mod library;
 mod log_verbs;
+mod metrics;
 mod moved_by_others;
 mod new;
 mod onto;

@@ -236,6 +236,7 @@ pub fn status() -> StatusReport {
         }],
         planner: None,
         view: None,
+        metrics: None,
     }
 }
 

@@ -31,7 +31,7 @@ pub(super) fn watch(log: &Path, file: &File, min_free: u64) -> Result<(), Record
 }
 
 /// Returns the free space on the disk of a path [bytes].
-fn free(path: &Path) -> io::Result<u64> {
+pub fn free(path: &Path) -> io::Result<u64> {
     let absolute = std::path::absolute(path)?;
     let existing = absolute.ancestors().find(|folder| folder.exists()).unwrap_or(Path::new("/"));
     let disk = rustix::fs::statvfs(existing)?;

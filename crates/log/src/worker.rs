@@ -66,6 +66,8 @@ pub(super) struct Worker<W: Write + Seek, F, O> {
     faulted: bool,
     on_notice: F,
     stats: Arc<RecorderStats>,
+    /// Messages in the earlier files of the log.
+    earlier: u64,
     ended: Option<RecordError>,
 }
 
@@ -110,6 +112,7 @@ where
             faulted: false,
             on_notice,
             stats,
+            earlier: 0,
             ended: None,
         };
         if let Some(path) = path {
@@ -216,7 +219,7 @@ where
             Ok(())
         };
         flush().map_err(|e| write_error(&self.path, &e))?;
-        self.stats.messages.store(log.written(), Ordering::Relaxed);
+        self.stats.messages.store(self.earlier + log.written(), Ordering::Relaxed);
         Ok(())
     }
 
@@ -272,6 +275,7 @@ where
         let Some((mut log, first)) = self.log.take().zip(self.config.path.clone()) else { return Ok(()) };
         self.topics.clone_from(log.topics());
         self.part += 1;
+        self.earlier += log.written();
         let next = files::part(&first, self.part);
         let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let finished = log.continues_in(name(&next)).and_then(|()| log.finish());

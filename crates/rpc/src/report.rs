@@ -57,6 +57,9 @@ pub struct StatusReport {
     /// Address of the live view, without its token; absent without one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub view: Option<String>,
+    /// URL of the metrics; absent without any.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub metrics: Option<String>,
     /// The gateway to other computers; absent without one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub share: Option<Box<GatewayReport>>,

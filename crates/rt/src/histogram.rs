@@ -7,6 +7,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 const BUCKETS_PER_POWER: usize = 16;
 /// Number of powers of two: up to 2^36 ns, about 69 s.
 const POWERS: usize = 33;
+/// Durations that [`Histogram::cumulative`] shows [ns].
+const SHOWN: std::ops::RangeInclusive<u64> = 1 << 10..=1 << 30;
 
 /// Counts of durations in nanoseconds.
 #[derive(Debug)]
@@ -64,6 +66,20 @@ impl Histogram {
         };
         Figures { count, p50: quantile(0.5), p99: quantile(0.99), p99_9: quantile(0.999), max: highest as f64 / 1e3 }
     }
+
+    /// Returns how many durations are at most 1, 2, 4, … µs long (2^10, 2^11, … ns, less 1 ns) up to 1 s, and the number
+    /// of all: `([(duration [ns], count)], count)`. No count is ever less than before.
+    pub fn cumulative(&self) -> (Vec<(u64, u64)>, u64) {
+        let (mut below, mut seen) = (Vec::new(), 0);
+        for (index, bucket) in self.buckets.iter().enumerate() {
+            seen += bucket.load(Ordering::Relaxed);
+            let end = upper_end(index);
+            if (end + 1).is_power_of_two() && SHOWN.contains(&(end + 1)) {
+                below.push((end, seen));
+            }
+        }
+        (below, seen)
+    }
 }
 
 fn index_of(ns: u64) -> usize {
@@ -96,6 +112,18 @@ mod tests {
             assert!(got >= right * 0.999 && got <= right * 1.0626, "{got} for {right}");
         }
         assert_eq!((f.count, f.max), (100_000, 100_000.0));
+    }
+
+    #[test]
+    fn durations_up_to_powers_of_two_are_counted_exactly() {
+        let h = Histogram::default();
+        for ns in [0, 1023, 1024, 2047, 2048, (1 << 30) - 1, 1 << 30, u64::MAX] {
+            h.record(ns);
+        }
+        let (below, all) = h.cumulative();
+        assert_eq!((below.len(), all), (21, 8));
+        assert_eq!((below[0], below[1], below[2]), ((1023, 2), (2047, 4), (4095, 5)));
+        assert_eq!(below[20], ((1 << 30) - 1, 6));
     }
 
     #[test]

@@ -212,6 +212,7 @@ impl Service {
         let text = format!("{}: native motion {} is {}", native.name, native.motion, end.0.name());
         self.tick.dispatcher().log(Severity::Info, text);
         let elapsed = since.elapsed().as_secs_f64();
+        self.journal.count_motion(end.0);
         self.motions.end(native.motion, end, elapsed, &self.positions());
     }
 

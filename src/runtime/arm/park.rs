@@ -4,7 +4,6 @@
 //! An arm that cannot get there is left as one without `on_exit`, with a warning. A stop, a hold of any arm, a fault of
 //! the run and a second signal prevent the motion, or end it.
 
-use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use crate::blueprint::OnExit;
@@ -77,7 +76,7 @@ impl Run {
 
     /// Ends what moves. Returns why nothing can be parked, if so.
     fn clear_the_way(&self) -> Option<String> {
-        if self.faulted.load(Ordering::Acquire) {
+        if self.handle.service().lifecycle.is_faulted() {
             return Some(UNCONTROLLED.to_owned());
         }
         let cancelled = in_process::wait_for(self.handle.service().ask(Request::Cancel { task: None }));

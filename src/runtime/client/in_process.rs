@@ -43,7 +43,7 @@ async fn ask(
     requests: Vec<Result<Request, RpcError>>,
 ) -> Vec<Result<Reply, RpcError>> {
     let begin = |request: Result<Request, RpcError>| async move {
-        tokio::time::timeout(CALL_TIMEOUT, service.answer(request?, origin)).await.unwrap_or_else(late)
+        tokio::time::timeout(CALL_TIMEOUT, service.answer_counted(request?, origin)).await.unwrap_or_else(late)
     };
     let mut begun: Vec<_> = requests.into_iter().map(|request| (Box::pin(begin(request)), None)).collect();
     poll_fn(|context| {

@@ -6,6 +6,7 @@ use std::time::Instant;
 use crate::runtime::{Ending, Service};
 use dimos_core::arm::VelocitySource;
 use dimos_core::clock::WallOffset;
+use dimos_core::sync::lock;
 use dimos_core::telemetry::Event;
 use dimos_core::telemetry::describe::{Described, Severity};
 use dimos_log::recorder::Notice;
@@ -16,6 +17,7 @@ impl Service {
     pub fn notice(&self, notice: Notice<'_>, wall: WallOffset) {
         match notice {
             Notice::Event { tick, event, described } => {
+                lock(&self.journal.counts).event(event);
                 if let Event::Task(task, state, reason) = event {
                     let actual = self.positions();
                     self.motions.task_changed(*task, (tick, *state, *reason), &actual);

@@ -3,21 +3,20 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use crate::ros_messages;
 use crate::runtime::Service;
-use crate::runtime::plan::planner_port::isometry;
 use dimos_core::bounded;
 use dimos_core::clock::{Clock, MonotonicClock};
 use dimos_core::sync::lock;
-use dimos_log::display_messages::{ColorRGBA, Marker, MarkerArray};
+use dimos_log::display_messages::MarkerArray;
 use dimos_log::log_writer::LogAttachment;
-use dimos_log::messages::{Point, Pose, Quaternion, Vector3};
 use dimos_log::recorder::Note;
 use dimos_log::robots::{LoggedGripper, LoggedRobot, LoggedRobots};
 use dimos_planner::planning::scene::planning_scene::PlannedRobot;
 use dimos_robot::kinematics::pose;
 use dimos_robot::load;
 use dimos_robot::model::{Geometry, RobotModel};
-use dimos_rpc::api::{ShapeSpec, WorldObject};
+use dimos_rpc::api::WorldObject;
 
 /// Maximum size of all meshes that are attached to a log [bytes].
 const MAX_MESHES: usize = 8 << 20;
@@ -135,57 +134,13 @@ impl Service {
         let known = logged.as_ref().map(|(version, _)| *version);
         let Some((version, objects)) = port.objects_unless(known) else { return };
         let before = logged.replace((version, objects.clone())).map(|(_, objects)| objects).unwrap_or_default();
-        let gone = before.keys().filter(|name| !objects.contains_key(*name));
-        let gone = gone.map(|name| Marker { ns: namespace(name), action: 2, ..Marker::default() });
-        let changed = objects.values().filter(|object| before.get(&object.name) != Some(object));
         let robots = self.described().robots.clone();
-        let markers: Vec<Marker> = gone.chain(changed.map(|object| marker(object, &robots))).collect();
+        let markers = ros_messages::changes(&before, &objects, |robot, link| robots.frame(robot, link));
         if !markers.is_empty() {
             let markers = MarkerArray { markers };
             self.tick.dispatcher().note(Note::Markers { stamp: MonotonicClock.now(), markers });
         }
     }
-}
-
-fn namespace(object: &str) -> String {
-    format!("world/{object}")
-}
-
-/// Returns the marker of an object.
-fn marker(object: &WorldObject, robots: &LoggedRobots) -> Marker {
-    let at = isometry(&object.pose);
-    let ([x, y, z], turn) = (at.translation.vector.into(), at.rotation.coords);
-    let mut marker = Marker {
-        ns: namespace(&object.name),
-        pose: Pose {
-            position: Point { x, y, z },
-            orientation: Quaternion { x: turn.x, y: turn.y, z: turn.z, w: turn.w },
-        },
-        color: ColorRGBA { r: 0.6, g: 0.6, b: 0.65, a: 0.8 },
-        ..Marker::default()
-    };
-    marker.header.frame_id = "map".to_owned();
-    if let Some([robot, link]) = &object.held_by {
-        marker.header.frame_id = robots.frame(robot, link).unwrap_or_else(|| link.clone());
-        marker.frame_locked = true;
-        marker.color = ColorRGBA { r: 0.9, g: 0.6, b: 0.2, a: 0.8 };
-    }
-    let (kind, [x, y, z]) = match &object.shape {
-        ShapeSpec::Box(size) => (1, *size),
-        ShapeSpec::Sphere(radius) => (2, [2.0 * radius; 3]),
-        ShapeSpec::Cylinder([radius, length]) => (3, [2.0 * radius, 2.0 * radius, *length]),
-        ShapeSpec::Mesh(path) => {
-            marker.mesh_resource = format!("file://{path}");
-            (10, [1.0; 3])
-        }
-        // Its points may be hundreds of megabytes: only its name is shown.
-        ShapeSpec::Cloud(_) => {
-            marker.text.clone_from(&object.name);
-            (9, [0.05; 3])
-        }
-    };
-    (marker.r#type, marker.scale) = (kind, Vector3 { x, y, z });
-    marker
 }
 
 /// Returns the visual meshes of all robots, named by their URLs, up to [`MAX_MESHES`].

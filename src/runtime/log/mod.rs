@@ -4,13 +4,16 @@ pub(in crate::runtime) mod events;
 pub(in crate::runtime) mod log_file;
 pub(in crate::runtime) mod log_throttle;
 pub(in crate::runtime) mod logged_scene;
+pub(in crate::runtime) mod metrics;
 pub(in crate::runtime) mod reports;
 
 use std::path::PathBuf;
 use std::sync::atomic::AtomicU64;
 use std::sync::{Arc, Mutex, OnceLock};
 
+use crate::metrics::Counts;
 use dimos_core::sync::lock;
+use dimos_core::telemetry::TaskState;
 use dimos_log::recorder::RecorderStats;
 use dimos_log::tcp_log::{TcpChain, TcpChains};
 use dimos_rpc::server::streams::Streams;
@@ -35,6 +38,10 @@ pub(in crate::runtime) struct Journal {
     published: AtomicU64,
     /// Address of the live view.
     view: OnceLock<String>,
+    /// URL of the metrics.
+    metrics: OnceLock<String>,
+    /// The events so far, for the metrics.
+    counts: Mutex<Counts>,
 }
 
 impl Journal {
@@ -51,6 +58,11 @@ impl Journal {
     /// Sets the address of the live view.
     pub fn set_view(&self, address: &str) {
         let _ = self.view.set(address.to_owned());
+    }
+
+    /// Counts a motion of an arm's own controller that has ended in this state.
+    pub fn count_motion(&self, end: TaskState) {
+        lock(&self.counts).motion(None, end);
     }
 
     /// Returns the arms' tool centre points, for the recorder.

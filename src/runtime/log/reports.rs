@@ -68,6 +68,7 @@ impl Service {
             tasks: (0..facts.config.tasks.len()).filter_map(|i| self.task_report(i)).collect(),
             planner: None, // filled in by the `status` method
             view: self.journal.view.get().cloned(),
+            metrics: self.journal.metrics.get().cloned(),
         }
     }
 

@@ -13,7 +13,6 @@
 
 mod action;
 mod attachment;
-mod diagnostics;
 mod face;
 mod follow;
 mod goal;

@@ -6,15 +6,12 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use super::diagnostics::diagnostics;
 use super::node::{Latched, Node, Topic};
 use super::types;
-use dimos_core::clock::wall_now;
-use dimos_log::display_messages::{TFMessage, Transform, TransformStamped};
-use dimos_log::messages::{Header, JointState, Quaternion, Text, Time, Vector3};
-use dimos_rpc::api::{RobotDescription, Status, TransformReport, Transforms};
+use crate::ros_messages::{diagnostics, joint_state, now, time, transforms};
+use dimos_log::messages::Text;
+use dimos_rpc::api::{RobotDescription, Status, Transforms};
 use dimos_rpc::client::{Client, ClientError};
-use dimos_rpc::server::streams;
 use dimos_rpc::server::streams::{Stream, Subscribe};
 
 /// Maximum rate of the joint states [Hz].
@@ -89,7 +86,7 @@ fn publish_joints(source: &Source, mut client: Client, topic: &Topic) -> Result<
         match client.next_message() {
             Ok(message) => {
                 if let Ok(state) = serde_json::from_value(message.data) {
-                    topic.publish(&joint_state(state));
+                    topic.publish(&joint_state(state, String::new()));
                 }
             }
             // A blueprint may turn the stream off.
@@ -98,21 +95,6 @@ fn publish_joints(source: &Source, mut client: Client, topic: &Topic) -> Result<
         }
     }
     Ok(())
-}
-
-/// Unknown values are NaN; a list without any known one is empty.
-fn joint_state(state: streams::JointState) -> JointState {
-    let known = |values: Vec<Option<f64>>| match values.iter().all(Option::is_none) {
-        true => Vec::new(),
-        false => values.into_iter().map(|value| value.unwrap_or(f64::NAN)).collect(),
-    };
-    JointState {
-        header: Header { stamp: time(state.stamp), frame_id: String::new() },
-        name: state.name,
-        position: known(state.position),
-        velocity: known(state.velocity),
-        effort: known(state.effort),
-    }
 }
 
 /// Publishes the description of the robots once, then the poses of their links.
@@ -131,7 +113,7 @@ fn publish_transforms(
         return Ok(());
     };
     description.publish(&Text { data: urdf });
-    fixed.publish(&transforms(described.fixed, wall_now() as f64 * 1e-9));
+    fixed.publish(&transforms(described.fixed, now()));
     while !source.has_ended() {
         let reply = client.call(Transforms {})?;
         moving.publish(&transforms(reply.transforms, reply.stamp));
@@ -140,48 +122,10 @@ fn publish_transforms(
     Ok(())
 }
 
-fn transforms(all: Vec<TransformReport>, stamp: f64) -> TFMessage {
-    let transform = |report: TransformReport| {
-        let ([x, y, z], [qx, qy, qz, qw]) = (report.xyz, report.quat);
-        let rotation = Quaternion { x: qx, y: qy, z: qz, w: qw };
-        TransformStamped {
-            header: Header { stamp: time(stamp), frame_id: report.parent },
-            child_frame_id: report.child,
-            transform: Transform { translation: Vector3 { x, y, z }, rotation },
-        }
-    };
-    TFMessage { transforms: all.into_iter().map(transform).collect() }
-}
-
 fn publish_condition(source: &Source, mut client: Client, topic: &Topic) -> Result<(), ClientError> {
     while !source.has_ended() {
-        topic.publish(&diagnostics(&client.call(Status {})?, Time::of(wall_now())));
+        topic.publish(&diagnostics(&client.call(Status {})?, time(now())));
         source.wait(DIAGNOSTICS);
     }
     Ok(())
-}
-
-/// Returns a time of ROS. `seconds`: since the Unix epoch.
-fn time(seconds: f64) -> Time {
-    Time::of((seconds.max(0.0) * 1e9).round() as u64)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn what_is_unknown_is_not_a_number_and_what_is_wholly_unknown_is_absent() {
-        let state = streams::JointState {
-            stamp: 1.25,
-            name: vec!["a".into(), "b".into()],
-            position: vec![Some(0.5), None],
-            velocity: vec![None, None],
-            ..streams::JointState::default()
-        };
-        let message = joint_state(state);
-        assert_eq!(message.header.stamp, Time { sec: 1, nanosec: 250_000_000 });
-        assert!(message.position[0] == 0.5 && message.position[1].is_nan());
-        assert!(message.velocity.is_empty() && message.effort.is_empty());
-    }
 }

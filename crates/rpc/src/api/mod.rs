@@ -213,6 +213,13 @@ macro_rules! methods {
                 }
             }
 
+            /// Returns the method's name.
+            pub fn method(&self) -> &'static str {
+                match self {
+                    $(Self::$variant(_) => $name,)*
+                }
+            }
+
             /// Returns the method's name and its parameters as JSON.
             pub fn written(&self) -> (&'static str, Value) {
                 // Plain structs with string keys always encode.

@@ -1,5 +1,7 @@
-//! The HTTP of the live view: one `GET` per connection. `httparse`, which hyper also uses, reads the head; a request
-//! has no body, and the end of the connection is the end of the reply.
+//! The HTTP of the live view and of the metrics: one `GET` per connection. `httparse`, which hyper also uses, reads the
+//! head; a request has no body, and the end of the connection is the end of the reply.
+
+mod origin;
 
 use std::borrow::Cow;
 use std::io;
@@ -8,6 +10,8 @@ use std::time::Duration;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::time::timeout;
+
+pub use origin::is_own;
 
 /// Maximum length of a request's head [bytes]: cookies of all servers of this computer are in it.
 const MAX_HEAD: usize = 32 << 10;
@@ -161,6 +165,7 @@ fn reason(status: u16) -> &'static str {
         404 => "Not Found",
         405 => "Method Not Allowed",
         426 => "Upgrade Required",
+        503 => "Service Unavailable",
         431 => "Request Header Fields Too Large",
         _ => "Internal Server Error",
     }
