@@ -50,6 +50,7 @@ pub use urdf_rs;
 pub mod assets;
 pub mod blueprint;
 pub mod cli;
+pub mod offline;
 pub mod replay;
 pub mod runtime;
 pub mod share;

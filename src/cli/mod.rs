@@ -21,6 +21,7 @@ mod fetch;
 mod follow;
 mod full_speed;
 mod goal;
+mod going;
 mod grip;
 pub mod job;
 pub mod jog;
@@ -63,8 +64,7 @@ use std::sync::OnceLock;
 use clap::{ArgMatches, CommandFactory, FromArgMatches, Parser, Subcommand};
 use rustix::process::{Resource, getrlimit};
 
-use crate::blueprint::{self, Catalog};
-use dimos_control::task_spec::{TaskSpec, TaskTable};
+use crate::blueprint::{self, Catalog, TaskSpec, TaskTable};
 use dimos_hardware::registry::{Absent, AdapterSpec};
 use dimos_robot::builtin;
 

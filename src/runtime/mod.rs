@@ -33,6 +33,7 @@ use std::time::{Duration, Instant};
 pub use arm::device_lock::DeviceLockError;
 pub use builder::Builder;
 pub use client::dispatch::log_of;
+pub use dimos_control::arm_control::effective as effective_speed;
 pub use handle::Handle;
 pub use plan::attached::{AttachedPlanner, LinkEvent};
 #[cfg(feature = "view")]

@@ -21,6 +21,7 @@ use super::gripper::gripper_requests::LatestGrip;
 use super::gripper::gripper_targets::{Counters, GripperTargets};
 use super::log::log_throttle::LogThrottle;
 use super::log::logged_scene::{Described, LoggedWorld};
+use super::motion::going::Goings;
 use super::motion::motions::Motions;
 use super::plan::guard_worlds::GuardWorlds;
 use super::plan::planner_link::Attached;
@@ -82,6 +83,8 @@ pub struct Service {
     pub(in crate::runtime) parts: ServiceParts,
     pub(in crate::runtime) started: Instant,
     pub(in crate::runtime) motions: Mutex<Motions>,
+    /// The requests `go`.
+    pub(in crate::runtime) goings: Goings,
     pub(in crate::runtime) recorder: OnceLock<Arc<RecorderStats>>,
     /// The logs of faults, of a run that is not recorded.
     pub(in crate::runtime) fault_logs: Mutex<Vec<PathBuf>>,
@@ -154,6 +157,7 @@ impl Service {
             parts,
             started: Instant::now(),
             motions: Mutex::default(),
+            goings: Goings::default(),
             recorder: OnceLock::new(),
             fault_logs: Mutex::default(),
             view: OnceLock::new(),
@@ -318,6 +322,7 @@ impl Service {
         let hint = match error {
             SendError::Full => "send fewer requests at once",
             SendError::NoAnswer => "`dimos status` shows whether the run is alive",
+            SendError::Ended => return RpcError::new(Code::Superseded, error.to_string()),
         };
         RpcError::new(Code::NoAnswer, error.to_string()).hint(hint)
     }
@@ -339,9 +344,14 @@ impl Service {
             let planning = self.cancel_planning(call.plan).await;
             return Ok(Reply::Cancel(api::CancelReply { planning, ..Default::default() }));
         }
+        if let Some(going) = call.going {
+            return self.cancel_going(going).await.map(Reply::Cancel);
+        }
         let arm = call.arm.as_deref().map(|a| self.arm_index(a)).transpose()?;
         let task = call.task.as_deref().map(|t| self.task_index(t)).transpose()?;
         let moves = |joints: &[u16]| arm.is_none_or(|a| joints.iter().any(|j| self.joints_of_arm(a).contains(j)));
+        // First: nothing of them begins after this.
+        self.end_goings(arm, task);
         let mut tasks = BTreeMap::new();
         for (i, config) in self.parts.config.tasks.iter().enumerate() {
             if task.is_none_or(|t| t as usize == i) && moves(&config.joints) {
@@ -370,8 +380,10 @@ impl Service {
     }
 
     pub(in crate::runtime) async fn answer(&self, call: Call, origin: Origin) -> Result<Reply, RpcError> {
-        let reads =
-            matches!(call, Call::Status(_) | Call::State(_) | Call::TextLog(_) | Call::Motion(_) | Call::Grip(_));
+        let reads = matches!(
+            call,
+            Call::Status(_) | Call::State(_) | Call::TextLog(_) | Call::Motion(_) | Call::Going(_) | Call::Grip(_)
+        );
         if !reads && self.is_closed() {
             let stops = self.stoppable.load(Ordering::Acquire);
             match call {
@@ -391,6 +403,8 @@ impl Service {
             Call::Motion(m) => self.motion(m.motion).map(Reply::Motion),
             Call::Move(m) => self.move_arm(m, origin).await,
             Call::Execute(e) => self.execute(e, origin).await,
+            Call::Go(go) => self.go(go, origin).await.map(Reply::Go),
+            Call::Going(going) => self.going(going.going).map(Reply::Going),
             Call::Plan(_)
             | Call::Planning(_)
             | Call::Preview(_)

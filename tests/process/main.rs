@@ -26,6 +26,7 @@ mod first_run;
 mod foreign_logs;
 mod foreign_paths;
 mod franka_run;
+mod go;
 mod grip_outcome;
 mod gripper_force;
 mod gripper_joint;

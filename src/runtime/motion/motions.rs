@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use crate::runtime::client::curb::Curb;
 use dimos_core::telemetry::{Origin, Reason, TaskState, Who};
 use dimos_core::trajectory::Spline;
 use dimos_rpc::api::Presence;
@@ -48,6 +49,8 @@ pub struct Carried {
     pub replan: Option<Option<Presence>>,
     /// When and by whom it was requested, also if it is planned again.
     pub origin: Origin,
+    /// Ends planning it again, and the `go` that it is a part of.
+    pub curb: Arc<Curb>,
 }
 
 /// What follows a blocked motion.
@@ -78,6 +81,8 @@ pub struct UnderWay {
     pub replan: Option<Option<Presence>>,
     /// As [`Carried::origin`].
     pub origin: Origin,
+    /// As [`Carried::curb`].
+    pub curb: Arc<Curb>,
     /// As [`Planned::by`].
     pub by: Option<Arc<Who>>,
 }
@@ -148,10 +153,10 @@ impl Motions {
     pub fn under_way(&self) -> Vec<UnderWay> {
         let going = self.0.iter().filter(|(_, (_, end))| end.is_none());
         let planned = going.filter_map(|(number, (planned, _))| {
-            let Carried { plan, spline, replan, origin } = planned.plan.clone()?;
+            let Carried { plan, spline, replan, origin, curb } = planned.plan.clone()?;
             let (number, task, joints) = (*number, planned.task, planned.joints.clone());
             let by = planned.by.clone();
-            Some(UnderWay { number, task, joints, plan, spline, replan, origin, by })
+            Some(UnderWay { number, task, joints, plan, spline, replan, origin, curb, by })
         });
         planned.collect()
     }
@@ -191,6 +196,7 @@ impl Motions {
         for (planned, _) in self.0.values_mut().filter(|(planned, _)| is_meant(planned)) {
             if let Some(carried) = &mut planned.plan {
                 carried.replan = None;
+                carried.curb.end(why);
             }
             if planned.next == Some(Next::Planning) {
                 planned.next = Some(Next::None(why.to_owned()));
