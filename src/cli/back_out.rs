@@ -126,7 +126,7 @@ pub fn run(args: &Args) -> Result {
         }
         (going, begun)
     };
-    going::finish(&mut client, (going, 0), &begun, &signals, json)
+    going::finish(&mut client, going, &begun, &signals, json)
 }
 
 /// Returns the result if nothing is to move: the arm is held, or `--check`.

@@ -83,7 +83,7 @@ pub fn run(args: &Args) -> Result {
         }
     };
     match signals {
-        Some(signals) => going::finish(&mut client, (going, 0), &begun, &signals, args.target_run.json),
+        Some(signals) => going::finish(&mut client, going, &begun, &signals, args.target_run.json),
         None => {
             if args.target_run.json {
                 output::json(&begun);

@@ -31,19 +31,19 @@ pub struct Signals(Arc<AtomicUsize>);
 pub enum Followed {
     /// It was requested by itself.
     Motion,
-    /// In the report of a request `go`: its number, and that of the step.
-    Step((u64, usize)),
+    /// In the report of this request `go`.
+    Going(u64),
 }
 
 impl Followed {
     fn report(self, client: &mut Client, motion: u64) -> Result<MotionReport> {
-        let Self::Step((going, step)) = self else { return Ok(client.call(Motion { motion })?) };
-        let steps = client.call(Going { going })?.steps;
-        let motions = steps.into_iter().nth(step).map(|step| step.motions).unwrap_or_default();
-        motions
-            .into_iter()
-            .find(|report| report.motion == motion)
-            .ok_or_else(|| Failure::new(Exit::Failed, format!("the run does not report motion {motion}")))
+        let steps = match self {
+            Self::Motion => Vec::new(),
+            Self::Going(going) => client.call(Going { going })?.steps,
+        };
+        let reported = steps.into_iter().flat_map(|step| step.motions).find(|report| report.motion == motion);
+        // One that continues another may be new.
+        Ok(reported.map_or_else(|| client.call(Motion { motion }), Ok)?)
     }
 }
 

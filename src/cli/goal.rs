@@ -335,10 +335,7 @@ impl Planned {
 /// Requests a plan and waits for it. A signal cancels planning.
 pub fn plan(client: &mut Client, request: Plan, signals: &Signals) -> Result<Planned> {
     let begun = client.call(request)?;
-    let bar = ProgressBar::new_spinner().with_finish(ProgressFinish::AndClear);
-    if let Ok(style) = ProgressStyle::with_template("{spinner} planning {msg}") {
-        bar.set_style(style);
-    }
+    let bar = planning_bar();
     let mut cancelled = false;
     let report = loop {
         let report = client.call(Planning { plan: begun.plan })?;
@@ -359,6 +356,15 @@ pub fn plan(client: &mut Client, request: Plan, signals: &Signals) -> Result<Pla
     }
     let no_plan = no_plan(&report);
     Planned::of(report).ok_or(no_plan)
+}
+
+/// Returns what shows on a terminal that a motion is planned.
+pub fn planning_bar() -> ProgressBar {
+    let bar = ProgressBar::new_spinner().with_finish(ProgressFinish::AndClear);
+    match ProgressStyle::with_template("{spinner} planning {msg}") {
+        Ok(style) => bar.with_style(style),
+        Err(_) => bar,
+    }
 }
 
 /// Returns why there is no plan.

@@ -4,13 +4,12 @@
 use std::thread::sleep;
 use std::time::Duration;
 
-use indicatif::{ProgressBar, ProgressFinish, ProgressStyle};
 use serde_json::json;
 
 use super::arguments::connect;
 use super::exit::{Exit, Failure, Result};
 use super::follow::{Followed, Signals, end, watch};
-use super::goal::{Planned, no_plan, show};
+use super::goal::{Planned, no_plan, planning_bar, show};
 use super::output;
 use dimos_rpc::api::{Cancel, Go, GoBegun, GoStep, GoStepReport, Going, GoingReport};
 use dimos_rpc::client::{Client, ClientError};
@@ -65,10 +64,7 @@ pub fn begin(
     signals: Option<&Signals>,
     shows_plan: bool,
 ) -> std::result::Result<Begun, NotBegun> {
-    let bar = ProgressBar::new_spinner().with_finish(ProgressFinish::AndClear);
-    if let Ok(style) = ProgressStyle::with_template("{spinner} planning {msg}") {
-        bar.set_style(style);
-    }
+    let bar = planning_bar();
     let (mut cancelled, mut shown) = (false, false);
     loop {
         let GoingReport { mut steps, done, error, .. } = client.call(Going { going })?;
@@ -111,18 +107,18 @@ pub fn begin(
 /// report, and the signal.
 pub fn follow(
     client: &mut Client,
-    at: (u64, usize),
+    going: u64,
     begun: &GoBegun,
     title: &str,
     signals: &Signals,
 ) -> Result<(MotionReport, Option<i32>)> {
-    let cancel = Cancel { going: Some(at.0), ..Cancel::default() };
-    watch(client, Followed::Step(at), begun.motion(), &cancel, title, signals)
+    let cancel = Cancel { going: Some(going), ..Cancel::default() };
+    watch(client, Followed::Going(going), begun.motion(), &cancel, title, signals)
 }
 
 /// As [`follow`]; prints the end, and fails if the motion did not get to its goal.
-pub fn finish(client: &mut Client, at: (u64, usize), begun: &GoBegun, signals: &Signals, json: bool) -> Result {
-    let ended = follow(client, at, begun, begun.task(), signals)?;
+pub fn finish(client: &mut Client, going: u64, begun: &GoBegun, signals: &Signals, json: bool) -> Result {
+    let ended = follow(client, going, begun, begun.task(), signals)?;
     end(client, ended, json)
 }
 

@@ -97,7 +97,7 @@ pub fn run(args: &Args) -> Result {
         begin_direct(args, &mut client, &signals)?
     };
     if !args.no_wait {
-        return going::finish(&mut client, (going, 0), &begun, &signals, json);
+        return going::finish(&mut client, going, &begun, &signals, json);
     }
     if json {
         output::json(&serde_json::to_value(&begun).unwrap_or_default());
@@ -165,7 +165,7 @@ fn run_legs(args: &Args, arm: &str, client: &mut Client, signals: &Signals) -> R
             continue;
         }
         let begun = begin_planned(client, (going, step), signals, json)?;
-        match going::finish(client, (going, step), &begun, signals, json)? {
+        match going::finish(client, going, &begun, signals, json)? {
             Exit::Ok => {}
             exit => return Ok(exit),
         }

@@ -3,12 +3,12 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use super::Service;
 use super::client::in_process;
-use super::service::Service;
 use super::watchdog;
 use dimos_rpc::api::{
-    ArmDisable, ArmEnable, ArmReply, ArmReset, Backend, Cancel, CancelReply, Execute, ExecuteReply, Grip, GripReport,
-    Gripper, Method, Move, MoveReply, Servo, Stop, StopReply, Trajectory, Velocity,
+    ArmDisable, ArmEnable, ArmReply, ArmReset, Cancel, CancelReply, Execute, ExecuteReply, Grip, GripReport, Gripper,
+    Method, Move, MoveReply, Servo, Stop, StopReply, Trajectory, Velocity,
 };
 use dimos_rpc::report::{MotionReport, StateReport, StatusReport};
 use dimos_rpc::{Code, RpcError};
@@ -23,7 +23,7 @@ const POLL_PERIOD: Duration = Duration::from_millis(10);
 /// call them in async code.
 #[derive(Clone)]
 pub struct Handle {
-    pub(in crate::runtime) service: Arc<Service>,
+    service: Arc<Service>,
     /// The epoch of its requests; `None`: that in which each is made.
     epoch: Option<u64>,
 }
@@ -33,16 +33,21 @@ impl Handle {
         Self { service, epoch: None }
     }
 
+    /// Returns the run as its requests see it.
+    pub(in crate::runtime) fn service(&self) -> &Arc<Service> {
+        &self.service
+    }
+
     /// Returns a handle for a motion in several parts: it no longer moves an arm that is stopped, held, disabled or
     /// lost from now on, not even after that was enabled again. Its requests are then refused with
     /// [`Code::Superseded`].
     pub fn until_interrupted(&self) -> Self {
-        Self { service: self.service.clone(), epoch: Some(self.service.epoch()) }
+        Self { service: self.service.clone(), epoch: Some(self.service.tick.epoch()) }
     }
 
     /// Returns the run's name.
     pub fn name(&self) -> &str {
-        &self.service.parts.run
+        &self.service.facts.run
     }
 
     /// Returns the status of arms, tasks, timing and recorder.
@@ -79,8 +84,8 @@ impl Handle {
     /// down or its tick hangs.
     pub fn wait(&self, motion: u64) -> Result<MotionReport, RpcError> {
         let (mut motion, mut last_beat, mut silent_for, mut used) = (motion, None, Duration::ZERO, None);
-        let pulse = &self.service.parts.pulse.beat;
-        let limit = 2 * watchdog::tick_timeout(self.service.period());
+        let pulse = &self.service.tick.pulse().beat;
+        let limit = 2 * watchdog::tick_timeout(self.service.facts.period());
         loop {
             let report = self.motion(motion)?;
             match report.next {
@@ -88,7 +93,7 @@ impl Handle {
                 _ if report.done => return Ok(report),
                 _ => {}
             }
-            if self.service.is_closed() {
+            if self.service.lifecycle.is_closed() {
                 return Err(RpcError::new(Code::ShuttingDown, format!("the run ends during motion {motion}")));
             }
             // Counts only the time in which this thread could run: a stall of the host also stops the tick.

@@ -9,28 +9,37 @@
 //! Only the live view may fail: the run starts without it, with a warning.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::{Sender, channel};
-use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use super::arm::ArmLinks;
 use super::arm::arms::{self, Arms, BroughtUp, Slots, full_address};
 use super::arm::control_config::{coordinator_config, names_of, tasks, tools};
 use super::arm::device_lock::is_this_computer;
 use super::arm::wires::wires;
 use super::client::dispatch::{Dispatcher, OutcomeThread};
 use super::client::in_process;
+use super::client::tick_link::TickLink;
+use super::facts::Facts;
+use super::gripper::Grippers;
+use super::lifecycle::Lifecycle;
+use super::log::Journal;
 use super::log::log_file::{attachments, log_device_note, log_path, metadata, no_log, retain, storage};
+use super::motion::going::Goings;
+use super::motion::motions::Motions;
+use super::motion::streams::Streams;
 use super::plan::guard_worlds::{GuardEnds, GuardWorlds};
 use super::plan::planner_link::command_limits;
-use super::plan::planner_port::PlannerPort;
-use super::service::{Service, ServiceParts};
+use super::plan::{PlannerPort, Plans};
 use super::service_manager::ServiceManager;
 use super::tick::Tick;
 use super::tick_source::source;
+use super::tool::Tools;
 use super::tool::kinematics::{self, Known};
 use super::watchdog::Watchdog;
-use super::{Ending, Handle, Options, Run, StartError};
+use super::{Ending, Handle, Options, Run, Service, StartError};
 use crate::blueprint::Blueprint;
 use crate::view::{self, Shown, View};
 use dimos_control::config::{CoordinatorConfig, TaskConfig};
@@ -50,7 +59,6 @@ use dimos_robot::calibrated::Places;
 use dimos_rpc::report::StatusReport;
 use dimos_rpc::run_dir::Claim;
 use dimos_rpc::server::Server;
-use dimos_rpc::server::streams::Streams;
 use dimos_rt::host::{self, Grant, LatencyHold};
 
 /// Minimum time between two looks for values of an arm that change slowly.
@@ -63,9 +71,9 @@ impl Run {
         // If a later stage fails, the run ends before its name is released.
         let (claim, mut run) = Prepared::new(blueprint, options)?.connect()?.start()?;
         run.enable(blueprint)?;
-        run.handle.service.check_models();
+        run.handle.service().check_models();
         if blueprint.rpc.enabled {
-            let server = Server::start(claim, run.handle.service.clone()).map_err(|e| {
+            let server = Server::start(claim, run.handle.service().clone()).map_err(|e| {
                 let hint = "see the folder's rights, or set rpc.enabled: false";
                 StartError::other(format!("the socket cannot be opened: {e}"), hint)
             })?;
@@ -75,7 +83,7 @@ impl Run {
             }
         } else {
             claim.refuse_clients();
-            run.handle.service.keep(claim);
+            run.handle.service().lifecycle.keep(claim);
         }
         if let Some(manager) = &run.manager {
             manager.ready(&status_line(&run.status()));
@@ -85,14 +93,14 @@ impl Run {
 
     /// Serves the live view, if the blueprint has one.
     fn serve_view(&mut self) {
-        let service = self.handle.service.clone();
-        let blueprint = &service.parts.blueprint;
+        let service = self.handle.service().clone();
+        let blueprint = &service.facts.blueprint;
         let claim = self.server.as_ref().map(Server::claim);
         let Some((config, claim)) = view::config_of(blueprint).zip(claim) else { return };
         let shown = Shown::of_run(self.name(), blueprint, self.config());
         match View::start(&config, shown, &claim.far_socket(), &claim.files()) {
             Ok(view) => {
-                let _ = self.handle.service.view.set(view.address().to_owned());
+                self.handle.service().journal.set_view(view.address());
                 self.view = Some(view);
             }
             Err(why) => tracing::warn!("no live view: {why}"),
@@ -102,7 +110,7 @@ impl Run {
     fn enable(&self, blueprint: &Blueprint) -> Result<(), StartError> {
         let which = blueprint.arms.iter().enumerate().filter(|(_, arm)| arm.auto_enable).map(|(i, _)| i);
         self.arms.enable(blueprint, which)?;
-        in_process::wait_for(self.handle.service.first_ready());
+        in_process::wait_for(self.handle.service().first_ready());
         Ok(())
     }
 }
@@ -220,7 +228,8 @@ impl Connected {
         };
         let dispatcher = Arc::new(Dispatcher::new(ends.requests, notes));
         let (endings, ended) = channel();
-        let parts = ServiceParts {
+        let tools = prepared.blueprint.tasks.iter().map(|task| task.robot.as_ref()?.tool).collect();
+        let facts = Facts {
             run: prepared.name.clone(),
             blueprint: prepared.blueprint.clone(),
             config: config.clone(),
@@ -232,22 +241,26 @@ impl Connected {
                 .iter()
                 .map(|arm| !arm.is_real() || is_this_computer(&full_address(arm)))
                 .collect(),
-            devices: arms.devices.clone(),
-            serials: arms.serials.clone(),
-            dispatcher: dispatcher.clone(),
-            pulse: pulse.clone(),
-            streams: Streams::default(),
-            arm_views: Mutex::new(ends.arm_views),
-            task_views: Mutex::new(ends.task_views),
             grants: prepared.grants.clone(),
             wall: prepared.wall,
             log: prepared.log.clone(),
-            endings: endings.clone(),
-            planner,
-            guard: guard.clone(),
             text: prepared.options.text.clone(),
         };
-        let service = Arc::new_cyclic(|me| Service::new(parts, me.clone()));
+        let devices = arms.devices.clone();
+        let service = Arc::new_cyclic(|me| Service {
+            tick: TickLink::new(dispatcher.clone(), pulse.clone(), ends.arm_views, ends.task_views),
+            grippers: Grippers::new(devices.len()),
+            tools: Tools::new(tools, devices.len()),
+            arms: ArmLinks::new(devices, arms.serials.clone()),
+            motions: Motions::default(),
+            goings: Goings::default(),
+            streams: Streams::new(facts.config.tasks.len()),
+            plans: Plans::new(planner, guard.clone()),
+            journal: Journal::default(),
+            lifecycle: Lifecycle::new(endings.clone()),
+            facts,
+            me: me.clone(),
+        });
         let recorder = start_recorder(&prepared, &config, ends.samples, noted, &service)?;
         let publish = publisher(service.clone(), prepared.wall);
         service.log_calibration();
@@ -261,10 +274,8 @@ impl Connected {
         let watchdog = start_watchdog(&pulse, &config, &endings, manager.as_ref())?;
         let run = Run {
             arms,
-            pulse,
             tick,
             watchdog,
-            dispatcher,
             outcomes: Some(outcomes),
             recorder: Some(recorder),
             view: None,
@@ -301,14 +312,14 @@ fn start_recorder(
         frame_id: blueprint.coordinator.joint_state_frame_id.clone(),
         attachments,
         metadata: metadata(blueprint, config),
-        tcps: service.logged_tcps.clone(),
+        tcps: service.journal.tcps(),
         wall,
         storage,
     };
     let receiver = service.clone();
     let notice = move |notice: Notice<'_>| receiver.notice(notice, wall);
     let recorder = Recorder::start(record, samples, noted, notice).map_err(no_log)?;
-    service.set_recorder(recorder.stats());
+    service.journal.set_recorder(recorder.stats());
     retain(blueprint, &prepared.log);
     Ok(recorder)
 }
@@ -317,9 +328,9 @@ fn start_recorder(
 fn publisher(service: Arc<Service>, wall: WallOffset) -> impl FnMut(bool) + Send + 'static {
     let mut details_due = Instant::now();
     move |woken| {
-        service.progress.made();
+        service.tick.made();
         service.publish(woken);
-        service.send_lease_ends();
+        service.tick.send_lease_ends();
         service.command_gripper_targets();
         service.judge_grips();
         if Instant::now() >= details_due {

@@ -247,8 +247,7 @@ fn serve(stream: UnixStream, script: &Mutex<Script>) {
 fn released(request: &Value) -> Value {
     let at = JOINTS.map(|joint| request["moment"]["positions"][joint].as_f64().unwrap());
     let goal = [&[at[0] + 0.5], &at[1..]].concat();
-    let point =
-        |time: f64, positions: &[f64]| json!({"time_from_start": time, "positions": positions, "velocities": [0.0; 6]});
+    let point = |time: f64, positions: &[f64]| json!({"time_from_start": time, "positions": positions, "velocities": vec![0.0; 6]});
     let trajectory = json!({"joint_names": JOINTS, "points": [point(0.0, &at), point(1.5, &goal)]});
     json!({"plan": request["params"]["plan"], "trajectory": trajectory, "task": "traj_arm"})
 }
@@ -339,7 +338,7 @@ fn a_stop_a_cancel_and_the_end_of_the_client_end_what_follows_a_motion() {
     for event in EVENTS {
         cell.home.dimos("move arm 0 0 0 0 0 0 --speed 1").with(0);
         let mut mover = cell.home.client();
-        let going = go(&mut mover, vec![to(0.8, 0.3), grip(GripperEnd::Close), to(0.0, 1.0)]);
+        let going = go(&mut mover, vec![to(0.8, 0.15), grip(GripperEnd::Close), to(0.0, 1.0)]);
         eventually("it moves", || cell.joint1() > 0.1);
         cell.arm.record();
         let report = cell.happens(event, mover, going);

@@ -279,7 +279,7 @@ impl<'r> Runner<'r, '_> {
             NotBegun::Refused(error) => error.into(),
             why => Failure::from(why).into(),
         })?;
-        let (report, signal) = going::follow(self.client, at, &begun.reply, &title, self.signals)?;
+        let (report, signal) = going::follow(self.client, at.0, &begun.reply, &title, self.signals)?;
         if let Some(signal) = signal {
             return Err(End::Signal(signal));
         }

@@ -6,12 +6,11 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use crate::runtime::client::dispatch::log_of;
-use crate::runtime::service::{Service, internal};
+use crate::runtime::{Service, internal};
 use dimos_control::request::Request;
-use dimos_core::arm::{GripperInfo, Link};
+use dimos_core::arm::Link;
 use dimos_core::joint::STANDSTILL;
 use dimos_core::message::Message;
-use dimos_core::sync::lock;
 use dimos_core::telemetry::texts::cause_text;
 use dimos_core::telemetry::{ArmSample, Outcome, Phase};
 use dimos_hardware::adapter::{AdapterError, AdapterResult};
@@ -38,23 +37,23 @@ const READY_LIMIT: Duration = Duration::from_secs(2);
 
 impl Service {
     pub(in crate::runtime) async fn stop(&self, call: api::Stop) -> Result<Reply, RpcError> {
-        let arm = call.arm.as_deref().map(|a| self.arm_index(a)).transpose()?;
-        let stopped = self.stops.iter().enumerate().filter(|(i, _)| arm.is_none_or(|a| usize::from(a) == *i));
+        let arm = call.arm.as_deref().map(|a| self.facts.arm_index(a)).transpose()?;
+        let stopped = self.arms.stops.iter().enumerate().filter(|(i, _)| arm.is_none_or(|a| usize::from(a) == *i));
         for (_, count) in stopped {
             count.fetch_add(1, Ordering::Relaxed);
         }
         // The tick refuses it in any case: no client waits for the planner in vain.
-        let concerns = |joint| self.locate(joint).is_some_and(|(i, _)| arm.is_none_or(|a| usize::from(a) == i));
-        lock(&self.motions)
+        let concerns = |joint| self.facts.locate(joint).is_some_and(|(i, _)| arm.is_none_or(|a| usize::from(a) == i));
+        self.motions
             .end_replanning("stopped by an operator", |motion| motion.joints.iter().any(|joint| concerns(*joint)));
         self.ask(Request::Stop { arm }).await?;
         let limit = Instant::now() + STOP_LIMIT;
         let mut arms = BTreeMap::new();
-        for (i, config) in self.parts.config.arms.iter().enumerate() {
+        for (i, config) in self.facts.config.arms.iter().enumerate() {
             if arm.is_some_and(|a| a as usize != i) {
                 continue;
             }
-            let confirmation = self.until(limit, || self.confirmation(i)).await;
+            let confirmation = self.tick.until(limit, || self.confirmation(i)).await;
             let confirmation = confirmation.unwrap_or(api::Confirmation::SentNotConfirmed);
             if confirmation == api::Confirmation::NotSent {
                 self.stop_not_sent(i);
@@ -66,12 +65,13 @@ impl Service {
 
     /// Returns whether the stop of each held arm was sent, or cannot be.
     pub(in crate::runtime) fn stops_are_sent(&self) -> bool {
-        (0..self.parts.config.arms.len()).all(|arm| self.phase(arm) != Phase::Held || self.confirmation(arm).is_some())
+        (0..self.facts.config.arms.len())
+            .all(|arm| self.tick.phase(arm) != Phase::Held || self.confirmation(arm).is_some())
     }
 
     /// Returns the progress of an arm's stop; `None`: not known yet.
     pub(in crate::runtime) fn confirmation(&self, arm: usize) -> Option<api::Confirmation> {
-        let (view, device) = (self.arm_view(arm)?, self.parts.devices.get(arm)?);
+        let (view, device) = (self.tick.arm_view(arm)?, self.arms.devices.get(arm)?);
         if view.state.link != Link::Up {
             return Some(api::Confirmation::NotSent);
         }
@@ -92,12 +92,12 @@ impl Service {
     }
 
     pub(in crate::runtime) async fn reset(&self, id: String) -> Result<Reply, RpcError> {
-        let arm = self.arm_index(&id)?;
-        let device = self.device(arm)?;
+        let arm = self.facts.arm_index(&id)?;
+        let device = self.arms.device(arm)?;
         self.accept_identity(&id, arm)?;
-        let count = || self.stops.get(usize::from(arm)).map_or(0, |count| count.load(Ordering::Relaxed));
+        let count = || self.arms.stops.get(usize::from(arm)).map_or(0, |count| count.load(Ordering::Relaxed));
         let stops = count();
-        let view = self.arm_view(arm as usize);
+        let view = self.tick.arm_view(arm as usize);
         let cause = view.filter(|v| v.phase == Phase::Held).map(|v| cause_text(v.cause));
         if cause.is_some() {
             let cleared = order(device.clear_errors()).await;
@@ -107,8 +107,8 @@ impl Service {
             }
             // The tick must read the state after the reset; an arm that streams its state sends it with the next
             // report.
-            self.next_tick().await;
-            self.until(self.next_report(arm), || self.seen(arm, |view| view.state.error == 0)).await;
+            self.tick.next_tick().await;
+            self.tick.until(self.next_report(arm), || self.tick.seen(arm, |view| view.state.error == 0)).await;
         }
         if count() == stops {
             self.ask(Request::Reset { arm }).await?;
@@ -130,10 +130,10 @@ impl Service {
     /// accepted.
     fn accept_identity(&self, id: &str, arm: u16) -> Result<(), RpcError> {
         let health = |device: &Arc<Device>| device.health().identity();
-        let Some(device) = self.parts.devices.get(usize::from(arm)) else { return Ok(()) };
+        let Some(device) = self.arms.devices.get(usize::from(arm)) else { return Ok(()) };
         let own = health(device);
         let Some(found) = own.other.clone() else { return Ok(()) };
-        let others = self.parts.devices.iter().enumerate().filter(|(index, _)| *index != usize::from(arm));
+        let others = self.arms.devices.iter().enumerate().filter(|(index, _)| *index != usize::from(arm));
         if let Some((_, other)) = { others }.find(|(_, other)| own.is_exchanged_with(&health(other))) {
             let what =
                 format!("{found} answers at the address of {id}, and is the arm {} of this run", other.hardware_id());
@@ -141,11 +141,11 @@ impl Service {
                 "their cables or addresses are interchanged: change them back, or end the run and start it again",
             ));
         }
-        let known = self.parts.blueprint.arms.get(usize::from(arm)).zip(self.parts.connected.get(usize::from(arm)));
+        let known = self.facts.blueprint.arms.get(usize::from(arm)).zip(self.facts.connected.get(usize::from(arm)));
         if let Some(((config, about), serial)) = known.zip(found.strip_prefix("serial ")) {
-            let taken = self.parts.serials.take(usize::from(arm), config, &about.info, serial);
+            let taken = self.arms.serials.take(usize::from(arm), config, &about.info, serial);
             taken.map_err(|holder| {
-                let (what, hint) = holder.describe(id, &self.parts.blueprint.arms, serial);
+                let (what, hint) = holder.describe(id, &self.facts.blueprint.arms, serial);
                 RpcError::new(Code::ArmLatched, what).hint(hint)
             })?;
         }
@@ -159,8 +159,8 @@ impl Service {
     }
 
     pub(in crate::runtime) async fn enable(&self, id: String, outside: bool) -> Result<Reply, RpcError> {
-        let arm = self.arm_index(&id)?;
-        let view = self.arm_view(arm as usize).ok_or_else(internal)?;
+        let arm = self.facts.arm_index(&id)?;
+        let view = self.tick.arm_view(arm as usize).ok_or_else(internal)?;
         match view.phase {
             Phase::Held => {
                 let outcome = Outcome::ArmLatched(arm, view.cause);
@@ -176,7 +176,7 @@ impl Service {
                 if phase == Phase::Standby {
                     self.wait_for_rest(&id, arm, Instant::now()).await?;
                 }
-                order(self.device(arm)?.activate()).await.map_err(|e| refused(&id, "was not enabled", &e))?;
+                order(self.arms.device(arm)?.activate()).await.map_err(|e| refused(&id, "was not enabled", &e))?;
                 self.ask(Request::Enabled { arm, outside }).await?;
             }
         }
@@ -186,8 +186,8 @@ impl Service {
     /// Waits for an enabled arm to be ready.
     pub(in crate::runtime) async fn until_ready(&self, id: String, arm: u16) -> Result<Reply, RpcError> {
         let settled = |phase| matches!(phase, Phase::Ready | Phase::Held);
-        self.until(Instant::now() + READY_LIMIT, || self.seen(arm, |view| settled(view.phase))).await;
-        let view = self.arm_view(arm as usize).ok_or_else(internal)?;
+        self.tick.until(Instant::now() + READY_LIMIT, || self.tick.seen(arm, |view| settled(view.phase))).await;
+        let view = self.tick.arm_view(arm as usize).ok_or_else(internal)?;
         let outcome = match view.phase {
             Phase::Ready => return Ok(Reply::ArmEnable(self.phase_of(id, arm))),
             // A stop or a fault came first.
@@ -200,24 +200,24 @@ impl Service {
     /// Makes the arms ready that the start has enabled, and waits for them and for the first state of the others, up to
     /// a timeout. The banner and `status` show the result.
     pub async fn first_ready(&self) {
-        let arms = || self.parts.blueprint.arms.iter().map(|arm| arm.auto_enable).enumerate();
-        let settled = |(arm, enabled): (usize, bool)| match self.phase(arm) {
+        let arms = || self.facts.blueprint.arms.iter().map(|arm| arm.auto_enable).enumerate();
+        let settled = |(arm, enabled): (usize, bool)| match self.tick.phase(arm) {
             Phase::Ready => true,
             phase => !enabled && phase != Phase::Unknown,
         };
         let limit = Instant::now() + READY_LIMIT;
         while Instant::now() < limit {
             for (arm, _) in arms().filter(|(_, enabled)| *enabled) {
-                if !matches!(self.phase(arm), Phase::Activating | Phase::Ready | Phase::Held) {
+                if !matches!(self.tick.phase(arm), Phase::Activating | Phase::Ready | Phase::Held) {
                     // The arm's phase shows whether it was accepted. On a busy host its state may be stale for a
                     // moment.
                     let ready = Request::Enabled { arm: arm as u16, outside: false };
                     let log = log_of(&ready);
-                    let _ = self.parts.dispatcher.send(ready, log);
+                    let _ = self.tick.dispatcher().send(ready, log);
                 }
             }
             let round = limit.min(Instant::now() + RETRY_PERIOD);
-            if self.until(round, || arms().all(settled).then_some(())).await.is_some() {
+            if self.tick.until(round, || arms().all(settled).then_some(())).await.is_some() {
                 return;
             }
         }
@@ -225,17 +225,17 @@ impl Service {
 
     /// Disables an arm's motors: once it is at rest, or `now`.
     pub(in crate::runtime) async fn disable(&self, id: String, now: bool) -> Result<Reply, RpcError> {
-        let arm = self.arm_index(&id)?;
+        let arm = self.facts.arm_index(&id)?;
         let began = Instant::now();
         self.ask(Request::PrepareDisable { arm }).await?;
         if !now {
             self.wait_for_rest(&id, arm, began).await?;
         }
-        let speed = self.speed(arm);
-        order(self.device(arm)?.disable()).await.map_err(|e| refused(&id, "was not disabled", &e))?;
-        self.next_tick().await;
+        let speed = self.tick.speed(arm);
+        order(self.arms.device(arm)?.disable()).await.map_err(|e| refused(&id, "was not disabled", &e))?;
+        self.tick.next_tick().await;
         let off = |view: &ArmSample| !view.state.enabled && view.phase != Phase::Standby;
-        self.until(self.next_report(arm), || self.seen(arm, off)).await;
+        self.tick.until(self.next_report(arm), || self.tick.seen(arm, off)).await;
         let mut reply = self.phase_of(id, arm);
         if now {
             let was =
@@ -247,11 +247,12 @@ impl Service {
 
     /// Waits until an arm that brakes since `began` is at rest; an error if it still moves when it has had time enough.
     pub(in crate::runtime) async fn wait_for_rest(&self, id: &str, arm: u16, began: Instant) -> Result<(), RpcError> {
-        let device = self.device(arm)?;
+        let device = self.arms.device(arm)?;
         // Without a command the arm is being stopped, or this run did not move it. The motors stay on until that stop.
         let stopped = |seq| device.health().stop_sent.load(Ordering::Acquire) == seq;
         let rests = |late| {
-            self.arm_view(arm as usize)
+            self.tick
+                .arm_view(arm as usize)
                 .is_none_or(|view| view.command.mode.is_none() && (stopped(view.command.stop_seq) || late))
         };
         let mut braking = Duration::ZERO;
@@ -259,35 +260,25 @@ impl Service {
             // A velocity may be measured far too low between two setpoints: the longest time counts.
             braking = braking.max(self.braking_limit(arm));
             let late = Instant::now() >= began + braking;
-            match self.speed(arm) {
+            match self.tick.speed(arm) {
                 speed if speed > STANDSTILL => late.then_some(Err(speed)),
                 _ => rests(late).then_some(Ok(())),
             }
         };
-        let rested = self.until(began + BRAKING_LIMIT + SETTLING_LIMIT, look).await;
-        rested.unwrap_or_else(|| Err(self.speed(arm))).map_err(|speed| still_moves(id, speed))
-    }
-
-    /// Returns units and ranges of an arm's gripper; `None` without one.
-    pub(in crate::runtime) fn gripper_info(&self, arm: usize) -> Option<GripperInfo> {
-        self.parts.connected.get(arm).and_then(|connected| connected.gripper)
-    }
-
-    /// Returns `Some` once an arm is in a condition.
-    pub(in crate::runtime) fn seen(&self, arm: u16, is: impl Fn(&ArmSample) -> bool) -> Option<()> {
-        self.arm_view(arm as usize).is_some_and(|view| is(&view)).then_some(())
+        let rested = self.tick.until(began + BRAKING_LIMIT + SETTLING_LIMIT, look).await;
+        rested.unwrap_or_else(|| Err(self.tick.speed(arm))).map_err(|speed| still_moves(id, speed))
     }
 
     /// Returns the time by which an arm must have reported again.
     pub(in crate::runtime) fn next_report(&self, arm: u16) -> Instant {
-        let own = self.parts.config.arms.get(arm as usize).map(|arm| arm.read_period);
-        Instant::now() + REPORTS * own.unwrap_or_default().max(self.period())
+        let own = self.facts.config.arms.get(arm as usize).map(|arm| arm.read_period);
+        Instant::now() + REPORTS * own.unwrap_or_default().max(self.facts.period())
     }
 
     /// Returns the time for an arm to brake: twice what its fastest joint needs at its acceleration limit.
     pub(in crate::runtime) fn braking_limit(&self, arm: u16) -> Duration {
-        let config = self.parts.config.arms.get(arm as usize);
-        let view = self.arm_view(arm as usize);
+        let config = self.facts.config.arms.get(arm as usize);
+        let view = self.tick.arm_view(arm as usize);
         let joints = view.iter().zip(config).flat_map(|(view, config)| {
             view.state.velocity.into_iter().zip(config.limits.acceleration_max.clone()).take(config.dof)
         });
@@ -298,20 +289,9 @@ impl Service {
         (braking + REACTION).min(BRAKING_LIMIT)
     }
 
-    /// Returns the velocity of an arm's fastest joint [rad/s]; 0 without a state.
-    pub(in crate::runtime) fn speed(&self, arm: u16) -> f64 {
-        let view = self.arm_view(arm as usize).filter(|view| view.state.link == Link::Up);
-        let joints = view.iter().flat_map(|view| view.state.velocity.iter().take(view.state.dof));
-        joints.map(|v| v.abs()).fold(0.0, f64::max)
-    }
-
     /// Returns an arm's phase after the latest tick.
     fn phase_of(&self, arm: String, index: u16) -> api::ArmReply {
-        api::ArmReply { arm, phase: self.phase(index as usize).name().to_owned(), note: None }
-    }
-
-    pub(in crate::runtime) fn device(&self, arm: u16) -> Result<Arc<Device>, RpcError> {
-        self.parts.devices.get(arm as usize).cloned().ok_or_else(internal)
+        api::ArmReply { arm, phase: self.tick.phase(index as usize).name().to_owned(), note: None }
     }
 }
 

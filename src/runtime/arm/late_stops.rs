@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use crate::runtime::service::Service;
+use crate::runtime::Service;
 use dimos_core::clock::WallOffset;
 use dimos_core::sync::lock;
 use dimos_core::telemetry::Phase;
@@ -36,32 +36,32 @@ impl LateStops {
 impl Service {
     /// Records that an operator was informed of an arm's undelivered stop.
     pub(in crate::runtime) fn stop_not_sent(&self, arm: usize) {
-        if let Some(device) = self.parts.devices.get(arm) {
-            self.late_stops.add(arm, device.health().stop_sent.load(Ordering::Acquire));
+        if let Some(device) = self.arms.devices.get(arm) {
+            self.arms.late_stops.add(arm, device.health().stop_sent.load(Ordering::Acquire));
         }
     }
 
     /// Reports the stops that were delivered since the last call.
     pub fn report_late_stops(&self, wall: WallOffset) {
-        if !self.late_stops.any.load(Ordering::Acquire) {
+        if !self.arms.late_stops.any.load(Ordering::Acquire) {
             return;
         }
-        let mut waiting = lock(&self.late_stops.sent_before);
+        let mut waiting = lock(&self.arms.late_stops.sent_before);
         waiting.retain(|&arm, before| {
-            let Some(device) = self.parts.devices.get(arm) else { return false };
+            let Some(device) = self.arms.devices.get(arm) else { return false };
             let sent = device.health().stop_sent.load(Ordering::Acquire);
             if sent != *before {
                 let confirmed = device.health().stop_confirmed.load(Ordering::Relaxed) == sent;
                 self.report_late_stop(arm, confirmed, wall);
             }
             // An arm that was reset must not be stopped later.
-            sent == *before && self.phase(arm) == Phase::Held
+            sent == *before && self.tick.phase(arm) == Phase::Held
         });
-        self.late_stops.any.store(!waiting.is_empty(), Ordering::Release);
+        self.arms.late_stops.any.store(!waiting.is_empty(), Ordering::Release);
     }
 
     fn report_late_stop(&self, arm: usize, confirmed: bool, wall: WallOffset) {
-        let arm = self.parts.names.arm(arm as u16);
+        let arm = self.facts.names.arm(arm as u16);
         let how = if confirmed { Confirmation::Confirmed } else { Confirmation::SentNotConfirmed };
         let described = Described {
             kind: "stop",

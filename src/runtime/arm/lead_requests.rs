@@ -12,12 +12,11 @@ use super::arm_requests::{order, refused};
 use crate::runtime::client::asker::asker;
 use crate::runtime::motion::motions::{NATIVE, Planned};
 use crate::runtime::plan::planner_port::isometry;
-use crate::runtime::service::{Service, internal};
+use crate::runtime::{Service, internal};
 use dimos_control::request::Request;
 use dimos_core::arm::{ControllerPose, Pose};
 use dimos_core::joint::STANDSTILL;
 use dimos_core::pose::from_xyz_rpy;
-use dimos_core::sync::lock;
 use dimos_core::telemetry::describe::Severity;
 use dimos_core::telemetry::{LedBy, Origin, Outcome, Phase, Reason, TaskState};
 use dimos_hardware::adapter::AdapterError;
@@ -52,9 +51,9 @@ struct Native {
 impl Service {
     /// Lets an arm be led by hand, as its adapter's row says.
     pub(in crate::runtime) async fn teach(&self, call: api::ArmTeach, origin: Origin) -> Result<Reply, RpcError> {
-        let arm = self.arm_index(&call.arm)?;
+        let arm = self.facts.arm_index(&call.arm)?;
         let name = &call.arm;
-        let (by, note) = match self.parts.blueprint.arms.get(arm as usize).ok_or_else(internal)?.adapter.teach {
+        let (by, note) = match self.facts.blueprint.arms.get(arm as usize).ok_or_else(internal)?.adapter.teach {
             Teach::No(why) => {
                 let what = format!("{name} cannot be led by hand: {why}");
                 return Err(RpcError::new(Code::Unsupported, what).hint(format!("dimos jog {name} moves it with keys")));
@@ -67,19 +66,19 @@ impl Service {
             Teach::MotorsOff => (LedBy::HandMotorsOff, "led by hand, motors off: support the arm"),
             Teach::HandGuiding => (LedBy::Hand, "led by hand, motors on: the controller compensates gravity"),
         };
-        self.end_streams(&self.joints_of_arm(arm).collect::<Vec<_>>()).await?;
+        self.end_streams(&self.facts.joints_of_arm(arm).collect::<Vec<_>>()).await?;
         let lead = self.lead(arm, by, origin).await?;
-        let device = self.device(arm)?;
+        let device = self.arms.device(arm)?;
         let begun = order(if by == LedBy::Hand { device.lead(Way::Hand, lead) } else { device.disable() }).await;
         if let Err(error) = begun {
             let _ = self.take_over(name, arm).await;
             return Err(refused(name, "cannot be led now", &error));
         }
         if by == LedBy::HandMotorsOff {
-            self.next_tick().await;
-            self.until(self.next_report(arm), || self.seen(arm, |view| !view.state.enabled)).await;
+            self.tick.next_tick().await;
+            self.tick.until(self.next_report(arm), || self.tick.seen(arm, |view| !view.state.enabled)).await;
         }
-        self.parts.dispatcher.log(Severity::Info, format!("{name}: {note}"));
+        self.tick.dispatcher().log(Severity::Info, format!("{name}: {note}"));
         Ok(Reply::ArmTeach(api::ArmReply {
             arm: call.arm,
             phase: Phase::Led.name().to_owned(),
@@ -89,7 +88,7 @@ impl Service {
 
     /// Makes a led arm ready.
     pub(in crate::runtime) async fn take_over_led(&self, id: String) -> Result<Reply, RpcError> {
-        let phase = self.phase(self.arm_index(&id)?.into());
+        let phase = self.tick.phase(self.facts.arm_index(&id)?.into());
         if phase != Phase::Led {
             let what = format!("{id} is not led, or no longer: it is {}", phase.name());
             return Err(RpcError::new(Code::Unsupported, what).hint("`dimos status` shows the cause"));
@@ -103,13 +102,13 @@ impl Service {
     /// Lets the tick pass an arm on. Returns the number of this lead.
     async fn lead(&self, arm: u16, by: LedBy, origin: Origin) -> Result<u32, RpcError> {
         self.ask_from(Request::Lead { arm, by }, Some(origin)).await?;
-        Ok(self.arm_view(arm as usize).ok_or_else(internal)?.command.lead_seq)
+        Ok(self.tick.arm_view(arm as usize).ok_or_else(internal)?.command.lead_seq)
     }
 
     /// Ends the leading of an arm whose motors are on, and makes it ready where it is.
     async fn take_over(&self, name: &str, arm: u16) -> Result<(), RpcError> {
         self.end_lead(name, arm).await?;
-        order(self.device(arm)?.take_over()).await.map_err(|e| refused(name, "was not taken over", &e))?;
+        order(self.arms.device(arm)?.take_over()).await.map_err(|e| refused(name, "was not taken over", &e))?;
         self.ask(Request::Enabled { arm, outside: false }).await?;
         self.until_ready(name.to_owned(), arm).await.map(|_| ())
     }
@@ -127,7 +126,7 @@ impl Service {
             return Err(RpcError::new(Code::ArmNotReady, format!("{name} is moved by its own controller"))
                 .hint(end_of_lead(name, LED_BY_CONTROLLER)));
         }
-        let speed = self.speed(arm);
+        let speed = self.tick.speed(arm);
         if speed <= STANDSTILL {
             return Ok(());
         }
@@ -142,14 +141,14 @@ impl Service {
         call: api::MoveNative,
         origin: Origin,
     ) -> Result<Reply, RpcError> {
-        let arm = self.arm_index(&call.arm)?;
+        let arm = self.facts.arm_index(&call.arm)?;
         if !call.direct {
-            self.needs_no_plan(&call.arm)?;
+            self.plans.needs_no_plan(&call.arm)?;
         }
-        let joints: Vec<u16> = self.joints_of_arm(arm).collect();
+        let joints: Vec<u16> = self.facts.joints_of_arm(arm).collect();
         self.end_streams(&joints).await?;
         let (target, tool) = self.native_target(arm, &call)?;
-        let motion = self.parts.dispatcher.next_id();
+        let motion = self.tick.dispatcher().next_id();
         let planned = Planned {
             task: NATIVE,
             joints,
@@ -162,8 +161,8 @@ impl Service {
             began: None,
             by: asker(),
         };
-        lock(&self.motions).plan(motion, planned);
-        let speed = call.speed * self.speed_override().fraction;
+        self.motions.plan(motion, planned);
+        let speed = call.speed * self.tick.speed_override().fraction;
         let native = Native { name: call.arm, arm, motion, target, speed, origin };
         let reply = api::NativeReply { motion, speed: native.speed, tool };
         let (begun, answer) = oneshot::channel();
@@ -176,7 +175,7 @@ impl Service {
         match answer.await {
             Ok(Ok(())) => Ok(Reply::MoveNative(reply)),
             refused => {
-                lock(&self.motions).forget(motion);
+                self.motions.forget(motion);
                 refused.map_or_else(|_| Err(internal()), |result| result.map(|()| Reply::MoveNative(reply)))
             }
         }
@@ -190,7 +189,7 @@ impl Service {
             Err(error) => return drop(begun.send(Err(error))),
         };
         self.set_native(arm, true);
-        let ordered = match self.device(arm) {
+        let ordered = match self.arms.device(arm) {
             Ok(device) => order(device.lead(Way::To(native.target, native.speed), lead)).await,
             Err(_) => Err(AdapterError::NotConnected),
         };
@@ -204,23 +203,23 @@ impl Service {
             return drop(begun.send(Err(why)));
         }
         let text = format!("{}: native motion {}, not collision-checked", native.name, native.motion);
-        self.parts.dispatcher.log(Severity::Info, text);
+        self.tick.dispatcher().log(Severity::Info, text);
         let since = Instant::now();
         // The client may be gone: the motion has begun all the same.
         let _ = begun.send(Ok(()));
         let end = self.native_end(native).await;
         self.set_native(arm, false);
         let text = format!("{}: native motion {} is {}", native.name, native.motion, end.0.name());
-        self.parts.dispatcher.log(Severity::Info, text);
+        self.tick.dispatcher().log(Severity::Info, text);
         let elapsed = since.elapsed().as_secs_f64();
-        lock(&self.motions).end(native.motion, end, elapsed, &self.positions());
+        self.motions.end(native.motion, end, elapsed, &self.positions());
     }
 
     /// Waits for the end of a native motion, takes the arm over, and returns how it ended.
     async fn native_end(&self, native: &Native) -> (TaskState, Reason, Option<String>) {
         let (arm, target) = (native.arm, from_xyz_rpy(native.target.xyz, native.target.rpy));
         let (mut anchor, mut since) = (self.positions(), Instant::now());
-        while self.phase(arm as usize) == Phase::Led && !self.is_closed() {
+        while self.tick.phase(arm as usize) == Phase::Led && !self.lifecycle.is_closed() {
             let now = self.positions();
             if anchor.iter().zip(&now).any(|(a, b)| (a - b).abs() > PROGRESS) {
                 (anchor, since) = (now, Instant::now());
@@ -229,15 +228,15 @@ impl Service {
             if since.elapsed() > if arrived { ENDED_AFTER / 10 } else { ENDED_AFTER } {
                 break;
             }
-            self.next_tick().await;
+            self.tick.next_tick().await;
         }
         let off = self.off_by(arm, &target);
-        let cancelled = self.phase(arm as usize) != Phase::Led;
-        let taken = match self.phase(arm as usize) {
-            Phase::Led | Phase::Standby if !self.is_closed() => self.take_over(&native.name, arm).await,
+        let cancelled = self.tick.phase(arm as usize) != Phase::Led;
+        let taken = match self.tick.phase(arm as usize) {
+            Phase::Led | Phase::Standby if !self.lifecycle.is_closed() => self.take_over(&native.name, arm).await,
             _ => Ok(()),
         };
-        let view = self.arm_view(arm as usize);
+        let view = self.tick.arm_view(arm as usize);
         match (view.map(|view| (view.phase, view.cause)), taken, off) {
             (Some((Phase::Held, cause)), ..) => (TaskState::Aborted, Reason::ArmHeld(arm, cause), None),
             (_, Err(error), _) => (TaskState::Aborted, Reason::Cancelled, Some(error.message)),
@@ -257,8 +256,8 @@ impl Service {
     /// Returns the pose that the controller is given: in its own base frame, of the point that it reports; and how far
     /// that point is from the tool centre point [m], if the goal is one of the latter.
     fn native_target(&self, arm: u16, call: &api::MoveNative) -> Result<(Pose, Option<f64>), RpcError> {
-        let name = self.parts.names.arm(arm);
-        let own = self.arm_view(arm as usize).and_then(|view| view.state.pose);
+        let name = self.facts.names.arm(arm);
+        let own = self.tick.arm_view(arm as usize).and_then(|view| view.state.pose);
         let own = own.ok_or_else(|| {
             let what = format!("{name} reports no pose of its own, so it does not move to one");
             RpcError::new(Code::Unsupported, what)
@@ -289,13 +288,13 @@ impl Service {
     }
 
     fn set_native(&self, arm: u16, runs: bool) {
-        if let Some(native) = self.natives.get(arm as usize) {
+        if let Some(native) = self.arms.natives.get(arm as usize) {
             native.store(runs, Ordering::Release);
         }
     }
 
     fn is_native(&self, arm: u16) -> bool {
-        self.natives.get(arm as usize).is_some_and(|native| native.load(Ordering::Acquire))
+        self.arms.natives.get(arm as usize).is_some_and(|native| native.load(Ordering::Acquire))
     }
 
     /// Returns what leads an arm that is led: `controller` or `hand`.
@@ -305,9 +304,9 @@ impl Service {
 
     /// Cancels the native motions of these arms: each gets its own stop. Returns whether there was any.
     pub(in crate::runtime) async fn cancel_natives(&self, is_meant: impl Fn(u16) -> bool) -> Result<bool, RpcError> {
-        let led = |arm: &u16| is_meant(*arm) && self.phase(*arm as usize) == Phase::Led;
+        let led = |arm: &u16| is_meant(*arm) && self.tick.phase(*arm as usize) == Phase::Led;
         let mut any = false;
-        for arm in (0..self.natives.len() as u16).filter(led) {
+        for arm in (0..self.arms.natives.len() as u16).filter(led) {
             any |= self.ask(Request::EndNative { arm }).await? == Outcome::Cancelled;
         }
         Ok(any)
@@ -315,7 +314,7 @@ impl Service {
 
     /// Returns how far the pose that an arm reports is from another one [m, rad].
     fn off_by(&self, arm: u16, target: &Isometry3<f64>) -> Option<(f64, f64)> {
-        let own = self.arm_view(arm as usize)?.state.pose?;
+        let own = self.tick.arm_view(arm as usize)?.state.pose?;
         let off = own.tcp.isometry().inverse() * target;
         Some((off.translation.vector.norm(), off.rotation.angle()))
     }

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use nalgebra::Isometry3;
 
-use crate::runtime::service::Service;
+use crate::runtime::Service;
 use crate::runtime::tool::tcp::TcpModel;
 use dimos_core::arm::{ArmState, Link, Pose, VelocitySource};
 use dimos_core::joint::STANDSTILL;
@@ -78,17 +78,17 @@ impl Service {
     /// Compares the flanges of arms that are at rest, of those that were not compared yet or have just been enabled.
     pub(in crate::runtime) fn check_models(&self) {
         let states: Vec<Option<ArmState>> =
-            (0..self.parts.names.arms.len()).map(|arm| self.arm_view(arm).map(|view| view.state)).collect();
+            (0..self.facts.names.arms.len()).map(|arm| self.tick.arm_view(arm).map(|view| view.state)).collect();
         let due = |checked: &Checked, state: &ArmState| !checked.done || (state.enabled && !checked.enabled);
         let is_due = |(checked, state): (&Checked, &Option<ArmState>)| state.is_some_and(|state| due(checked, &state));
-        if !lock(&self.checks).iter().zip(&states).any(is_due) {
+        if !lock(&self.arms.checks).iter().zip(&states).any(is_due) {
             return;
         }
         // Only planned motions need a model that fits.
         let models: Vec<_> =
             self.tcp_models().into_iter().map(|model| model.filter(|model| model.robot.is_some())).collect();
         let mut noted = Vec::new();
-        let mut checks = lock(&self.checks);
+        let mut checks = lock(&self.arms.checks);
         for (arm, ((checked, state), model)) in checks.iter_mut().zip(&states).zip(&models).enumerate() {
             let Some(state) = state.filter(is_at_rest) else { continue };
             if due(checked, &state) {
@@ -105,7 +105,7 @@ impl Service {
         }
         drop(checks);
         for (arm, found) in noted {
-            let name = self.parts.names.arm(arm as u16);
+            let name = self.facts.names.arm(arm as u16);
             tracing::warn!("{name}: the flange by its model is {} from that by its controller", found.difference());
         }
     }
@@ -113,13 +113,13 @@ impl Service {
     /// Returns of which arms model and controller were compared.
     #[cfg(test)]
     pub(in crate::runtime) fn compared(&self) -> Vec<bool> {
-        lock(&self.checks).iter().map(|checked| matches!(checked.check, Check::Compared(_))).collect()
+        lock(&self.arms.checks).iter().map(|checked| matches!(checked.check, Check::Compared(_))).collect()
     }
 
     /// Returns what is to be said of the flange of an arm.
     pub(in crate::runtime) fn model_note(&self, arm: usize) -> Option<String> {
-        let checks = lock(&self.checks);
-        let name = self.parts.names.arm(arm as u16);
+        let checks = lock(&self.arms.checks);
+        let name = self.facts.names.arm(arm as u16);
         match &checks.get(arm)?.check {
             Check::Pending => None,
             Check::NoPose => Some("not compared with the arm: it reports no pose of its own".to_owned()),
@@ -144,8 +144,8 @@ impl Service {
 
     /// Returns the distance that plans keep beyond the padding, listed for each joint of its arm [m].
     pub(in crate::runtime) fn paddings(&self) -> BTreeMap<String, f64> {
-        let checks = lock(&self.checks);
-        let arms = self.parts.names.arms.iter().zip(checks.iter());
+        let checks = lock(&self.arms.checks);
+        let arms = self.facts.names.arms.iter().zip(checks.iter());
         let padded = arms.filter_map(|(arm, checked)| match &checked.check {
             Check::Compared(found) if found.exceeds(NOTED) => Some((arm, found.distance + found.angle * REACH)),
             _ => None,
@@ -155,8 +155,8 @@ impl Service {
 
     /// Refuses a planned motion of these joints if the model of one of their arms is wrong.
     pub(in crate::runtime) fn refuse_mismatch(&self, joints: &[String]) -> Result<(), RpcError> {
-        let checks = lock(&self.checks);
-        for (arm, checked) in self.parts.names.arms.iter().zip(checks.iter()) {
+        let checks = lock(&self.arms.checks);
+        for (arm, checked) in self.facts.names.arms.iter().zip(checks.iter()) {
             let Check::Compared(found) = &checked.check else { continue };
             let name = &arm.hardware_id;
             let moves = arm.joints.iter().any(|joint| joints.contains(joint));
@@ -187,11 +187,11 @@ impl Service {
         let models = self.tcp_models();
         let meant = |model: &&TcpModel| plan.goals.iter().any(|goal| Some(&goal.robot) == model.robot.as_ref());
         let moved = |joints: &[String]| models.iter().flatten().filter(meant).any(|model| model.moves(joints));
-        self.parts.names.arms.iter().filter(|arm| moved(&arm.joints)).flat_map(|arm| arm.joints.clone()).collect()
+        self.facts.names.arms.iter().filter(|arm| moved(&arm.joints)).flat_map(|arm| arm.joints.clone()).collect()
     }
 
     fn allows_mismatch(&self, arm: &str) -> bool {
-        let joints = self.parts.blueprint.arms.iter().find(|own| own.hardware_id == arm).map(|own| &own.joints);
+        let joints = self.facts.blueprint.arms.iter().find(|own| own.hardware_id == arm).map(|own| &own.joints);
         let models = self.tcp_models();
         let model = joints.and_then(|joints| models.iter().flatten().find(|model| model.moves(joints)));
         model.is_some_and(|model| model.allows_mismatch)

@@ -12,7 +12,7 @@ use crate::runtime::client::in_process;
 use crate::runtime::{Ended, Ending, Run};
 use dimos_control::request::Request;
 use dimos_core::telemetry::{Origin, Phase};
-use dimos_rpc::api::{Backend, Move, Reply};
+use dimos_rpc::api::{Move, Reply};
 
 /// Fraction of the highest speed of the motion to the park pose.
 const SPEED: f64 = 0.3;
@@ -34,7 +34,7 @@ struct Parking {
 impl Run {
     /// Moves the arms that park, and marks those that arrive to be disabled.
     pub(in crate::runtime) fn park(&mut self, ended: &mut Ended) {
-        let arms = &self.handle.service.parts.blueprint.arms;
+        let arms = &self.handle.service().facts.blueprint.arms;
         let which: Vec<usize> =
             arms.iter().enumerate().filter(|(_, a)| a.on_exit == OnExit::Park).map(|(i, _)| i).collect();
         if which.is_empty() {
@@ -55,7 +55,7 @@ impl Run {
         }
         for (Parking { arm, .. }, result) in under_way.iter().zip(self.finish(&under_way, prevented)) {
             match result {
-                Ok(()) if self.handle.service.phase(*arm) != Phase::Ready => {
+                Ok(()) if self.handle.service().tick.phase(*arm) != Phase::Ready => {
                     self.not_parked(ended, *arm, "it was held after it had arrived");
                 }
                 Ok(()) => {
@@ -68,7 +68,7 @@ impl Run {
     }
 
     fn name_of(&self, arm: usize) -> String {
-        self.handle.service.parts.blueprint.arms.get(arm).map(|arm| arm.hardware_id.clone()).unwrap_or_default()
+        self.handle.service().facts.blueprint.arms.get(arm).map(|arm| arm.hardware_id.clone()).unwrap_or_default()
     }
 
     fn not_parked(&self, ended: &mut Ended, arm: usize, why: &str) {
@@ -80,7 +80,7 @@ impl Run {
         if self.faulted.load(Ordering::Acquire) {
             return Some(UNCONTROLLED.to_owned());
         }
-        let cancelled = in_process::wait_for(self.handle.service.ask(Request::Cancel { task: None }));
+        let cancelled = in_process::wait_for(self.handle.service().ask(Request::Cancel { task: None }));
         if !matches!(cancelled, Some(Ok(_))) {
             return Some("the coordinator accepts no requests".to_owned());
         }
@@ -95,7 +95,7 @@ impl Run {
             Ending::Duration | Ending::Asked => None,
         };
         let mut why = self.endings.1.try_iter().find_map(why);
-        if self.handle.service.was_cancelled() {
+        if self.handle.service().lifecycle.was_cancelled() {
             why = Some("it was cancelled");
         } else if !self.tick.is_alive() {
             why = Some("the tick has ended");
@@ -105,21 +105,22 @@ impl Run {
 
     /// Returns which other arm is held: it may be in the way, or have touched this one.
     fn held_beside(&self, arm: usize) -> Option<String> {
-        let arms = 0..self.handle.service.parts.blueprint.arms.len();
-        let held = arms.into_iter().find(|other| *other != arm && self.handle.service.phase(*other) == Phase::Held)?;
+        let arms = 0..self.handle.service().facts.blueprint.arms.len();
+        let held =
+            arms.into_iter().find(|other| *other != arm && self.handle.service().tick.phase(*other) == Phase::Held)?;
         Some(format!("{} is held", self.name_of(held)))
     }
 
     /// Begins the motion of an arm.
     fn begin(&self, arm: usize) -> Result<Parking, String> {
-        let service = &self.handle.service;
-        let phase = service.phase(arm);
+        let service = self.handle.service();
+        let phase = service.tick.phase(arm);
         if phase != Phase::Ready {
             return Err(format!("the arm is {}", phase.name()));
         }
-        let target = service.parts.blueprint.arms.get(arm).map(|arm| arm.park_pose.clone()).unwrap_or_default();
+        let target = service.facts.blueprint.arms.get(arm).map(|arm| arm.park_pose.clone()).unwrap_or_default();
         let call = Move::new(self.name_of(arm), target, SPEED);
-        let origin = Origin { epoch: service.epoch(), client: 0 };
+        let origin = Origin { epoch: service.tick.epoch(), client: 0 };
         match in_process::wait_for(service.move_within(call, LONGEST, origin)) {
             Some(Ok(Reply::Move(reply))) => Ok(Parking { arm, motion: reply.motion, duration: reply.duration }),
             Some(Err(error)) => Err(error.message),
@@ -129,7 +130,7 @@ impl Run {
 
     /// Waits until the arms have arrived, or cannot. `ended`: why they cannot, if that is known already.
     fn finish(&self, parking: &[Parking], mut ended: Option<String>) -> Vec<Result<(), String>> {
-        let service = &self.handle.service;
+        let service = self.handle.service();
         let longest = parking.iter().map(|parking| parking.duration).fold(0.0, f64::max);
         let limit = Instant::now() + Duration::from_secs_f64(longest) + SETTLE;
         let mut results: Vec<Option<Result<(), String>>> = parking.iter().map(|_| None).collect();
@@ -145,7 +146,7 @@ impl Run {
                     Err(error) => Some(Err(error.message)),
                 };
             }
-            std::thread::sleep(service.period());
+            std::thread::sleep(service.facts.period());
         }
         let why = ended.unwrap_or_else(|| "it did not arrive".to_owned());
         results.into_iter().map(|result| result.unwrap_or_else(|| Err(why.clone()))).collect()

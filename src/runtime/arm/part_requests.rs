@@ -1,7 +1,7 @@
 //! Requests to the optional parts of an arm: inputs and outputs.
 
 use super::arm_requests::{order, refused};
-use crate::runtime::service::{Service, internal};
+use crate::runtime::{Service, internal};
 use dimos_core::arm::{IoInfo, IoState};
 use dimos_core::sync::lock;
 use dimos_core::telemetry::describe::Severity;
@@ -14,18 +14,18 @@ use dimos_rpc::{Code, RpcError};
 impl Service {
     /// Reads an arm's inputs and outputs.
     pub(in crate::runtime) async fn io(&self, id: &str) -> Result<IoReport, RpcError> {
-        let arm = self.arm_index(id)?;
+        let arm = self.facts.arm_index(id)?;
         let info = self.io_info(arm)?;
-        let state = order(self.device(arm)?.read_io()).await;
+        let state = order(self.arms.device(arm)?.read_io()).await;
         let state = state.map_err(|e| refused(id, "did not report its inputs and outputs", &e))?;
         Ok(self.io_report(arm.into(), &info, &state))
     }
 
     /// Sets outputs in the order of their names, and reads them back.
     pub(in crate::runtime) async fn set_io(&self, call: api::ArmIoSet) -> Result<Reply, RpcError> {
-        let arm = self.arm_index(&call.arm)?;
+        let arm = self.facts.arm_index(&call.arm)?;
         self.io_info(arm)?;
-        let device = self.device(arm)?;
+        let device = self.arms.device(arm)?;
         let values = call.values().map_err(|what| RpcError::new(Code::InvalidParams, what))?;
         let mut done = Vec::new();
         for (value, (name, level)) in values.into_iter().zip(&call.outputs) {
@@ -35,15 +35,15 @@ impl Service {
                 refused(&call.arm, &format!("did not set {name}{before}"), &e)
             })?;
             done.push(name.as_str());
-            self.parts.dispatcher.log(Severity::Info, format!("{}: {name} set to {level}", call.arm));
+            self.tick.dispatcher().log(Severity::Info, format!("{}: {name} set to {level}", call.arm));
         }
         self.io(&call.arm).await.map(Reply::ArmIoSet)
     }
 
     fn io_info(&self, arm: u16) -> Result<IoInfo, RpcError> {
-        let connected = self.parts.connected.get(arm as usize).ok_or_else(internal)?;
+        let connected = self.facts.connected.get(arm as usize).ok_or_else(internal)?;
         connected.io.ok_or_else(|| {
-            let name = self.parts.names.arm(arm);
+            let name = self.facts.names.arm(arm);
             RpcError::new(Code::Unsupported, format!("{name} has no digital or analogue inputs and outputs"))
                 .hint("`dimos list-adapters` shows the adapter; its page in docs/arms lists what it supports")
         })
@@ -57,7 +57,7 @@ impl Service {
             let channels = values.iter().zip(units);
             channels.map(|(value, unit)| AnalogReport { value: *value, unit: unit.name().to_owned() }).collect()
         };
-        let stop = self.parts.blueprint.arms.get(arm).and_then(|arm| arm.setup.stop_input);
+        let stop = self.facts.blueprint.arms.get(arm).and_then(|arm| arm.setup.stop_input);
         IoReport {
             digital_inputs: levels(state.digital_inputs, info.digital_inputs),
             digital_outputs: levels(state.digital_outputs, info.digital_outputs),
@@ -70,18 +70,18 @@ impl Service {
 
     /// Logs the calibration offsets that the arms reported.
     pub fn log_calibration(&self) {
-        for (connected, arm) in self.parts.connected.iter().zip(&self.parts.names.arms) {
+        for (connected, arm) in self.facts.connected.iter().zip(&self.facts.names.arms) {
             let Some(offsets) = connected.calibration_offsets else { continue };
             let offsets: Vec<_> = offsets.iter().take(arm.joints.len()).map(|v| format!("{v:.4}")).collect();
             let text = format!("{}: calibration offsets {} rad", arm.hardware_id, offsets.join(" "));
-            self.parts.dispatcher.log(Severity::Info, text);
+            self.tick.dispatcher().log(Severity::Info, text);
         }
     }
 
     /// Returns the condition of an arm's joints; empty if the device reports none.
     pub(in crate::runtime) fn joint_status(&self, arm: usize, details: &Details) -> Vec<JointStatusReport> {
-        let offsets = self.parts.connected.get(arm).and_then(|connected| connected.calibration_offsets);
-        let names = self.parts.names.arms.get(arm).map_or(&[][..], |arm| &arm.joints);
+        let offsets = self.facts.connected.get(arm).and_then(|connected| connected.calibration_offsets);
+        let names = self.facts.names.arms.get(arm).map_or(&[][..], |arm| &arm.joints);
         if details.joints.is_none() && offsets.is_none() {
             return Vec::new();
         }
@@ -102,23 +102,23 @@ impl Service {
 
     /// Records the values that the device threads read since the last call.
     pub fn log_details(&self) {
-        let mut logged = lock(&self.details_logged);
-        for (arm, (device, logged)) in self.parts.devices.iter().zip(logged.iter_mut()).enumerate() {
+        let mut logged = lock(&self.arms.details_logged);
+        for (arm, (device, logged)) in self.arms.devices.iter().zip(logged.iter_mut()).enumerate() {
             let details = device.health().details();
             if details.joints_seq != logged.joints_seq
                 && let Some(joints) = details.joints.map(Box::new)
             {
-                self.parts.dispatcher.note(Note::JointStatus { arm: arm as u16, stamp: details.joints_stamp, joints });
+                self.tick.dispatcher().note(Note::JointStatus { arm: arm as u16, stamp: details.joints_stamp, joints });
             }
             if details.payload_seq != logged.payload_seq
                 && let Some(load) = details.payload
             {
-                self.parts.dispatcher.note(Note::Payload { arm: arm as u16, stamp: details.payload_stamp, load });
+                self.tick.dispatcher().note(Note::Payload { arm: arm as u16, stamp: details.payload_stamp, load });
             }
             if details.io_seq != logged.io_seq {
-                let info = self.parts.connected.get(arm).and_then(|connected| connected.io);
+                let info = self.facts.connected.get(arm).and_then(|connected| connected.io);
                 if let (Some(info), Some(state)) = (info, details.io) {
-                    self.parts.dispatcher.note(Note::Io { arm: arm as u16, stamp: details.io_stamp, info, state });
+                    self.tick.dispatcher().note(Note::Io { arm: arm as u16, stamp: details.io_stamp, info, state });
                 }
             }
             *logged = details;

@@ -1,6 +1,6 @@
 //! Faces of the run to other systems, which the gateway serves: what becomes of them is an event of the run.
 
-use crate::runtime::service::Service;
+use crate::runtime::Service;
 use dimos_core::telemetry::describe::{Described, Severity};
 use dimos_rpc::api::FaceReport;
 
@@ -20,6 +20,6 @@ impl Service {
             values: Vec::new(),
             by: None,
         };
-        self.report_now(&described, self.parts.wall);
+        self.report_now(&described, self.facts.wall);
     }
 }

@@ -6,9 +6,9 @@ use std::task::Poll;
 
 use tokio::runtime::{Builder, Handle, Runtime};
 
-use crate::runtime::service::Service;
+use crate::runtime::Service;
 use dimos_core::telemetry::Origin;
-use dimos_rpc::api::{Backend, METHODS, Method, Reply, Request};
+use dimos_rpc::api::{METHODS, Method, Reply, Request};
 use dimos_rpc::server::CALL_TIMEOUT;
 use dimos_rpc::{Code, RpcError};
 
@@ -22,7 +22,7 @@ pub fn call<M: Method>(service: &Arc<Service>, epoch: Option<u64>, requests: &[M
     let requests: Vec<_> = requests.iter().map(typed).collect();
     let failed: Vec<_> = requests.iter().map(|_| Err(defect("no answer"))).collect();
     let answers =
-        wait_for(ask(service, Origin { epoch: epoch.unwrap_or_else(|| service.epoch()), client: 0 }, requests))
+        wait_for(ask(service, Origin { epoch: epoch.unwrap_or_else(|| service.tick.epoch()), client: 0 }, requests))
             .unwrap_or(failed);
     answers.into_iter().map(|answer| answer.and_then(reply::<M>)).collect()
 }

@@ -6,4 +6,5 @@ pub(in crate::runtime) mod dispatch;
 pub(in crate::runtime) mod faces;
 pub(in crate::runtime) mod in_process;
 pub(in crate::runtime) mod lease_changes;
-pub(in crate::runtime) mod waiting;
+pub(in crate::runtime) mod refusals;
+pub(in crate::runtime) mod tick_link;

@@ -5,7 +5,7 @@ use serde_json::json;
 
 use super::super::motion::go_steps::Failed;
 use super::super::motion::going::{Going, POLL_PERIOD};
-use crate::runtime::service::{Service, internal};
+use crate::runtime::{Service, internal};
 use dimos_core::telemetry::{Origin, Outcome};
 use dimos_rpc::api::{
     Attach, Detach, EndedBy, GRASP_REACH, GoGripper, GoPhase, Grip, GripObjects, GripOutcome, GripReport, GripperEnd,
@@ -30,9 +30,9 @@ enum Then {
 impl Service {
     /// Checks a step before anything moves: its gripper, position, force and object.
     pub(in crate::runtime) async fn check_grip(&self, call: &GoGripper) -> Result<(), RpcError> {
-        let arm = self.arm_index(&call.arm)?;
+        let arm = self.facts.arm_index(&call.arm)?;
         let refused = |outcome| Err(self.refusal(&outcome).unwrap_or_else(internal));
-        let Some(info) = self.gripper_info(arm.into()) else { return refused(Outcome::NoGripper(arm)) };
+        let Some(info) = self.facts.gripper_info(arm.into()) else { return refused(Outcome::NoGripper(arm)) };
         let (to, within) = (self.position_of(call)?, |[low, high]: [f64; 2], value: f64| {
             (low - SAME_POSITION..=high + SAME_POSITION).contains(&value)
         });
@@ -59,7 +59,7 @@ impl Service {
             Opening::Position(position) => return Ok(position),
             Opening::End(end) => end,
         };
-        let range = self.gripper_info(self.arm_index(&call.arm)?.into()).and_then(|info| info.range);
+        let range = self.facts.gripper_info(self.facts.arm_index(&call.arm)?.into()).and_then(|info| info.range);
         let (closed, open) = range.ok_or_else(|| {
             let what = format!("the gripper of {} reports no range", call.arm);
             RpcError::new(Code::Unsupported, what).hint("give its position as a number")
@@ -101,7 +101,7 @@ impl Service {
         going.check()?;
         judge(&call.arm, &report, &then)?;
         // A load that this sets may disable the arm for a moment: that is no interruption by others.
-        let undisturbed = self.epoch() == origin.epoch;
+        let undisturbed = self.tick.epoch() == origin.epoch;
         match then {
             Then::Nothing => {}
             Then::Attach(robot, name) => {
@@ -120,7 +120,7 @@ impl Service {
             }
         }
         if undisturbed {
-            origin.epoch = self.epoch();
+            origin.epoch = self.tick.epoch();
         }
         Ok(())
     }
@@ -129,7 +129,7 @@ impl Service {
     async fn what_follows(&self, call: &GoGripper) -> Result<Then, Failed> {
         let Some(wanted) = &call.objects else { return Ok(Then::Nothing) };
         let (arm, robots) = (&call.arm, self.robots().await?);
-        let joints = self.parts.names.arms.iter().find(|own| own.hardware_id == *arm).map(|own| &own.joints);
+        let joints = self.facts.names.arms.iter().find(|own| own.hardware_id == *arm).map(|own| &own.joints);
         let has = |joint: &String| joints.is_some_and(|joints| joints.contains(joint));
         let is_of = |robot: &&RobotReport| robot.name == *arm || robot.joints.iter().any(has);
         let Some(robot) = robots.iter().find(is_of).map(|robot| robot.name.clone()) else {

@@ -1,11 +1,11 @@
 //! Gripper commands, and their outcomes. The outcome thread judges a pending one after every tick.
 
-use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use super::grip_judge::{GripJudge, Reading};
 use crate::runtime::arm::arm_requests::ORDER_LIMIT;
-use crate::runtime::service::{Service, internal};
+use crate::runtime::client::tick_link::EachTick;
+use crate::runtime::{Service, internal};
 use dimos_control::request::Request;
 use dimos_core::arm::{GripperUnit, Link};
 use dimos_core::clock::Mono;
@@ -20,37 +20,45 @@ use dimos_rpc::{Code, RpcError};
 /// Default time for an outcome [s].
 const TIMEOUT: f64 = 20.0;
 
+/// A gripper command without an outcome yet.
+struct Pending {
+    judge: GripJudge,
+    began: Mono,
+    given_up: Mono,
+    /// Every tick wakes the thread that judges.
+    _each_tick: EachTick,
+}
+
 /// The latest gripper command of an arm.
 #[derive(Default)]
 pub struct LatestGrip {
     report: Option<GripReport>,
-    /// While it is pending: its judge, when it began, and when it is given up.
-    pending: Option<(GripJudge, Mono, Mono)>,
+    pending: Option<Pending>,
 }
 
 impl Service {
     /// Commands a gripper, and waits for the arm's answer to this order.
     pub(in crate::runtime) async fn gripper(&self, call: api::Gripper, origin: Origin) -> Result<Reply, RpcError> {
-        let arm = self.arm_index(&call.arm)?;
-        let from = self.arm_view(arm as usize).map(|view| view.state.gripper);
-        let info = self.gripper_info(arm.into()).unwrap_or_default();
+        let arm = self.facts.arm_index(&call.arm)?;
+        let from = self.tick.arm_view(arm as usize).map(|view| view.state.gripper);
+        let info = self.facts.gripper_info(arm.into()).unwrap_or_default();
         // One that nothing measures has no position before its first order: it is taken to be at the other end.
         let other = info.range.filter(|_| info.unit == GripperUnit::OnOff);
         let other = other.map(|(closed, open)| if call.position == closed { open } else { closed });
         let Some(from) = from.unwrap_or(Some(call.position)).or(other) else {
             return self.refusal(&Outcome::NoGripper(arm)).map_or_else(|| Err(internal()), Err);
         };
-        let device = self.device(arm)?;
+        let device = self.arms.device(arm)?;
         let unit = info.unit.name();
-        let _turn = self.grippers.get(arm as usize).ok_or_else(internal)?.lock().await;
+        let _turn = self.grippers.turns.get(arm as usize).ok_or_else(internal)?.lock().await;
         let now = self.now();
         let request = Request::Gripper { arm, opening: call.position, force: call.force, speed: call.speed };
         self.ask_from(request, Some(origin)).await?;
-        let order = self.arm_view(arm as usize).ok_or_else(internal)?.command.gripper_seq;
+        let order = self.tick.arm_view(arm as usize).ok_or_else(internal)?.command.gripper_seq;
         let gone = |view: &ArmSample| matches!(view.state.link, Link::Down | Link::Faulted);
-        let gone = || self.seen(arm, gone).map(|()| Err(AdapterError::NotConnected));
+        let gone = || self.tick.seen(arm, gone).map(|()| Err(AdapterError::NotConnected));
         let look = || device.health().gripper_answer(order).or_else(gone);
-        match self.until(Instant::now() + ORDER_LIMIT, look).await {
+        match self.tick.until(Instant::now() + ORDER_LIMIT, look).await {
             Some(Ok(())) => {
                 let judge = GripJudge::new(info, call.position, call.force, from, now);
                 let timeout = Duration::try_from_secs_f64(call.timeout.unwrap_or(TIMEOUT)).unwrap_or_default();
@@ -88,8 +96,8 @@ impl Service {
 
     /// Returns the progress or outcome of a gripper command.
     pub(in crate::runtime) fn grip(&self, call: &api::Grip) -> Result<GripReport, RpcError> {
-        let arm = self.arm_index(&call.arm)?;
-        let latest = lock(self.grips.get(arm as usize).ok_or_else(internal)?);
+        let arm = self.facts.arm_index(&call.arm)?;
+        let latest = lock(self.grippers.latest.get(arm as usize).ok_or_else(internal)?);
         match &latest.report {
             Some(report) if call.order.is_none_or(|order| order == report.order) => Ok(report.clone()),
             Some(report) => Ok(GripReport {
@@ -107,22 +115,20 @@ impl Service {
     }
 
     fn begin_grip(&self, arm: u16, report: GripReport, pending: (GripJudge, Mono, Mono)) {
-        let Some(latest) = self.grips.get(arm as usize) else { return };
+        let Some(latest) = self.grippers.latest.get(arm as usize) else { return };
         let mut latest = lock(latest);
-        // While one is pending, every tick wakes the thread that judges.
-        if latest.pending.is_none() {
-            self.parts.pulse.waiting.fetch_add(1, Ordering::SeqCst);
-        }
+        let (judge, began, given_up) = pending;
+        let pending = Pending { judge, began, given_up, _each_tick: self.tick.each_tick() };
         *latest = LatestGrip { report: Some(report), pending: Some(pending) };
     }
 
     /// Judges the pending gripper commands by the latest measurements.
     pub fn judge_grips(&self) {
-        for (arm, latest) in self.grips.iter().enumerate() {
+        for (arm, latest) in self.grippers.latest.iter().enumerate() {
             let LatestGrip { report: Some(report), pending } = &mut *lock(latest) else { continue };
-            let Some((judge, begin, deadline)) = pending else { continue };
-            let (now, Some(view)) = (self.now(), self.arm_view(arm)) else { continue };
-            report.elapsed = now.since(*begin).as_secs_f64();
+            let Some(Pending { judge, began, given_up, .. }) = pending else { continue };
+            let (now, Some(view)) = (self.now(), self.tick.arm_view(arm)) else { continue };
+            report.elapsed = now.since(*began).as_secs_f64();
             (report.position, report.force) = (view.state.gripper.unwrap_or(report.position), view.state.gripper_force);
             match self.observe(arm, report.order, judge, &view) {
                 Ok(outcome) => report.outcome = outcome,
@@ -130,8 +136,8 @@ impl Service {
             }
             if report.outcome.is_some() {
                 report.elapsed = judge.elapsed().as_secs_f64();
-            } else if report.error.is_none() && now >= *deadline {
-                let after = deadline.since(*begin).as_secs_f64();
+            } else if report.error.is_none() && now >= *given_up {
+                let after = given_up.since(*began).as_secs_f64();
                 report.error = Some(match judge.is_unmeasured() {
                     true => format!("the order is not confirmed after {after} s"),
                     false => format!("its fingers still move after {after} s"),
@@ -140,7 +146,6 @@ impl Service {
             if report.outcome.is_some() || report.error.is_some() {
                 report.done = true;
                 *pending = None;
-                self.parts.pulse.waiting.fetch_sub(1, Ordering::SeqCst);
             }
         }
     }
@@ -160,12 +165,12 @@ impl Service {
         if view.phase == Phase::Held {
             return Err(format!("the arm was held meanwhile: {}", cause_text(view.cause)));
         }
-        if self.is_closed() {
+        if self.lifecycle.is_closed() {
             return Err("the run is shutting down".into());
         }
         match (state.link, state.gripper) {
             (Link::Up, Some(position)) => {
-                let holds = self.parts.devices.get(arm).and_then(|device| device.health().gripper_holds());
+                let holds = self.arms.get(arm).and_then(|device| device.health().gripper_holds());
                 Ok(judge.observe(&Reading { position, force: state.gripper_force, holds }, self.now()))
             }
             (Link::Down | Link::Faulted, _) => Err("the connection to the arm was lost".into()),

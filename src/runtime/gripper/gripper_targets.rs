@@ -2,18 +2,16 @@
 //! commands at a bounded rate: the newest one that is due wins.
 
 use std::collections::VecDeque;
-use std::sync::atomic::Ordering::{Relaxed, SeqCst};
-use std::sync::atomic::{AtomicBool, AtomicU64};
 use std::time::Duration;
 
 use crate::runtime::client::dispatch::log_of;
-use crate::runtime::service::{Service, internal};
+use crate::runtime::client::tick_link::EachTick;
+use crate::runtime::{Service, internal};
 use dimos_control::request::Request;
 use dimos_core::arm::GripperUnit;
 use dimos_core::clock::Mono;
 use dimos_core::sync::lock;
 use dimos_core::telemetry::{Origin, Outcome, TaskState};
-use dimos_rpc::report::StreamCounts;
 use dimos_rpc::{Code, RpcError};
 
 /// Least time between two commands to a gripper.
@@ -24,7 +22,7 @@ const SAME: f64 = 0.005;
 const BEGINS: Duration = Duration::from_millis(500);
 
 /// Pending gripper targets of an arm.
-#[derive(Debug, Default)]
+#[derive(Default)]
 pub struct GripperTargets {
     /// The task whose stream they are of, and when it sent the latest.
     task: u16,
@@ -36,6 +34,8 @@ pub struct GripperTargets {
     due: Option<f64>,
     commanded: Option<f64>,
     not_before: Mono,
+    /// While any is pending, every tick wakes the thread that commands them.
+    each_tick: Option<EachTick>,
 }
 
 impl GripperTargets {
@@ -72,56 +72,26 @@ impl GripperTargets {
     }
 }
 
-/// Counters of a task's stream, for `status`.
-#[derive(Debug, Default)]
-pub struct Counters {
-    /// Whether any was sent.
-    streamed: AtomicBool,
-    actions: AtomicU64,
-    late: AtomicU64,
-    gripper_targets: AtomicU64,
-    gripper_late: AtomicU64,
-}
-
-impl Counters {
-    /// Counts the actions of a chunk, of which some were late.
-    pub fn actions(&self, actions: usize, late: usize) {
-        self.streamed.store(true, Relaxed);
-        self.actions.fetch_add(actions as u64, Relaxed);
-        self.late.fetch_add(late as u64, Relaxed);
-    }
-
-    /// Returns the counts; `None` if nothing was counted yet.
-    pub fn report(&self) -> Option<StreamCounts> {
-        self.streamed.load(Relaxed).then(|| StreamCounts {
-            actions: self.actions.load(Relaxed),
-            late_actions: self.late.load(Relaxed),
-            gripper_targets: self.gripper_targets.load(Relaxed),
-            late_gripper_targets: self.gripper_late.load(Relaxed),
-        })
-    }
-}
-
 impl Service {
     /// Checks the gripper targets of a stream to a task: the arm of its joints has a gripper, and they are within its
     /// range. Returns the arm.
     pub(in crate::runtime) fn check_gripper_targets(&self, task: u16, targets: &[f64]) -> Result<u16, RpcError> {
-        let joints = self.parts.config.tasks.get(task as usize).map(|task| task.joints.as_slice()).unwrap_or_default();
-        let mut arms = joints.iter().filter_map(|joint| self.locate(*joint)).map(|(arm, _)| arm as u16);
+        let joints = self.facts.config.tasks.get(task as usize).map(|task| task.joints.as_slice()).unwrap_or_default();
+        let mut arms = joints.iter().filter_map(|joint| self.facts.locate(*joint)).map(|(arm, _)| arm as u16);
         let arm = arms.next().ok_or_else(internal)?;
         if arms.any(|other| other != arm) {
             let what =
-                format!("task {} has joints of several arms: whose gripper is meant?", self.parts.names.task(task));
+                format!("task {} has joints of several arms: whose gripper is meant?", self.facts.names.task(task));
             return Err(RpcError::new(Code::InvalidParams, what).hint("send gripper targets to a task of one arm"));
         }
-        let Some(info) = self.gripper_info(arm.into()) else {
+        let Some(info) = self.facts.gripper_info(arm.into()) else {
             return Err(self.refusal(&Outcome::NoGripper(arm)).unwrap_or_else(internal));
         };
         let (closed, open) = info.range.unwrap_or((f64::NEG_INFINITY, f64::INFINITY));
         let range = closed.min(open)..=closed.max(open);
         match targets.iter().find(|target| !(range.contains(target) && info.unit.has(**target))) {
             Some(wrong) => {
-                let (unit, name) = (info.unit.name(), self.parts.names.arm(arm));
+                let (unit, name) = (info.unit.name(), self.facts.names.arm(arm));
                 let what = match info.unit {
                     GripperUnit::OnOff => format!("the gripper of {name} only closes (0) and opens (1), not {wrong}"),
                     _ => format!("the gripper of {name} goes from {closed} to {open} {unit}, not to {wrong} {unit}"),
@@ -146,49 +116,41 @@ impl Service {
         let at = |k: usize| start.after(Duration::from_secs_f64(k as f64 * period));
         // A single target is for now.
         let late = (0..targets.len()).take_while(|k| targets.len() > 1 && at(*k) < now).count();
-        if let Some(counters) = self.counters.get(task as usize) {
-            counters.streamed.store(true, Relaxed);
-            counters.gripper_targets.fetch_add(targets.len() as u64, Relaxed);
-            counters.gripper_late.fetch_add(late as u64, Relaxed);
-        }
-        let Some(pending) = self.gripper_targets.get(arm as usize) else { return late };
+        self.streams.count_gripper_targets(task, targets.len(), late);
+        let Some(pending) = self.grippers.targets.get(arm as usize) else { return late };
         let mut pending = lock(pending);
-        let was = pending.is_pending();
         (pending.task, pending.origin, pending.sent) = (task, origin, now);
         pending.splice(targets.iter().enumerate().skip(late).map(|(k, target)| (at(k), *target)));
-        // While any is pending, every tick wakes the thread that commands them.
-        if pending.is_pending() && !was {
-            self.parts.pulse.waiting.fetch_add(1, SeqCst);
-        }
+        pending.each_tick = pending.is_pending().then(|| self.tick.each_tick());
         late
     }
 
     /// Commands the gripper targets that are due. Those of a stream that has ended are dropped.
     pub fn command_gripper_targets(&self) {
-        for ((arm, pending), info) in (0..).zip(&self.gripper_targets).zip(&self.parts.connected) {
+        for ((arm, pending), info) in (0..).zip(&self.grippers.targets).zip(&self.facts.connected) {
             let mut pending = lock(pending);
             if !pending.is_pending() {
                 continue;
             }
             let now = self.now();
-            let runs = self.task_view(pending.task as usize).state == TaskState::Executing;
-            if !runs && now.since(pending.sent) > BEGINS || self.is_closed() {
+            let runs = self.tick.task_view(pending.task as usize).state == TaskState::Executing;
+            if !runs && now.since(pending.sent) > BEGINS || self.lifecycle.is_closed() {
                 pending.clear();
             }
             let range = info.gripper.and_then(|gripper| gripper.range);
             let same = range.map_or(0.0, |(closed, open)| SAME * (open - closed).abs());
             // Paused, the gripper waits as the joints do.
-            let next = if self.speed_override().paused { None } else { pending.next(now, same) };
+            let next = if self.tick.speed_override().paused { None } else { pending.next(now, same) };
             if let Some(opening) = next {
                 let request = Request::Gripper { arm, opening, force: None, speed: None };
                 let log = log_of(&request);
                 // A refusal is in the log; the next target tries again.
-                if self.parts.dispatcher.send_from(request, Some(pending.origin), log).is_err() {
+                if self.tick.dispatcher().send_from(request, Some(pending.origin), log).is_err() {
                     pending.commanded = None;
                 }
             }
             if !pending.is_pending() {
-                self.parts.pulse.waiting.fetch_sub(1, SeqCst);
+                pending.each_tick = None;
             }
         }
     }

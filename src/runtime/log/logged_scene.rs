@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use crate::runtime::Service;
 use crate::runtime::plan::planner_port::isometry;
-use crate::runtime::service::Service;
 use dimos_core::bounded;
 use dimos_core::clock::{Clock, MonotonicClock};
 use dimos_core::sync::lock;
@@ -43,13 +43,13 @@ impl Service {
         };
         let meshes = meshes(&robots.combined());
         let (robots, description) = (robots.clone(), description.clone());
-        self.parts.dispatcher.note(Note::Robots { stamp: MonotonicClock.now(), robots, description });
+        self.tick.dispatcher().note(Note::Robots { stamp: MonotonicClock.now(), robots, description });
         std::iter::once(urdf).chain(meshes).collect()
     }
 
     /// Returns the robots of the run. They are named and described once, when they are first needed.
     pub(in crate::runtime) fn described(&self) -> &Described {
-        self.described.get_or_init(|| {
+        self.journal.described.get_or_init(|| {
             let robots = Arc::new(LoggedRobots::new(self.modelled()));
             let urdf = match urdf_rs::write_to_string(&urdf_rs::Robot::from(&robots.combined())) {
                 Ok(urdf) => Some(urdf).filter(|_| !robots.is_empty()),
@@ -64,10 +64,10 @@ impl Service {
 
     /// Returns the robots of the planner in this process; without one, those of tasks that have a model.
     fn modelled(&self) -> Vec<LoggedRobot> {
-        if let Some(port) = &self.parts.planner {
-            return port.thread.setup().robots.iter().filter_map(|robot| self.planned(robot)).collect();
+        if let Some(port) = self.plans.port() {
+            return port.setup().robots.iter().filter_map(|robot| self.planned(robot)).collect();
         }
-        let tasks = self.parts.config.tasks.iter().zip(&self.parts.blueprint.tasks);
+        let tasks = self.facts.config.tasks.iter().zip(&self.facts.blueprint.tasks);
         let modelled = tasks.filter_map(|(config, task)| {
             let (kinematics, robot) = (config.kind.robot.as_ref()?, task.robot.as_ref()?);
             // The blueprint was checked with it: it is known to be readable.
@@ -75,7 +75,7 @@ impl Service {
             let fixed = robot.fixed.iter().map(|(name, position)| (name.clone(), *position)).collect();
             let rest = model.positions(&fixed);
             model.fix({ robot.fixed.keys() }.filter_map(|name| model.joint_index(name)).collect::<Vec<_>>(), &rest);
-            let names = config.joints.iter().map(|joint| self.parts.names.joint(*joint));
+            let names = config.joints.iter().map(|joint| self.facts.names.joint(*joint));
             let joints = robot.joints.iter().zip(&config.joints).zip(names);
             let joints = joints.map(|((own, index), name)| Some((model.joint_index(own)?, usize::from(*index), name)));
             Some(LoggedRobot {
@@ -93,7 +93,7 @@ impl Service {
     }
 
     fn planned(&self, robot: &PlannedRobot) -> Option<LoggedRobot> {
-        let all: Vec<&String> = self.parts.names.arms.iter().flat_map(|arm| &arm.joints).collect();
+        let all: Vec<&String> = self.facts.names.arms.iter().flat_map(|arm| &arm.joints).collect();
         let in_run =
             |(index, name): (usize, &str)| Some((index, all.iter().position(|own| *own == name)?, name.to_owned()));
         let own = robot.joints.iter().copied().zip(robot.config.coordinator_joints.iter().map(String::as_str));
@@ -103,7 +103,7 @@ impl Service {
         let moved_by_others = others.collect::<Option<_>>()?;
         let gripper = robot.config.gripper_joint.as_ref().and_then(|driven| {
             let (arm, _) = self.arm_of(joints.first()?.1)?;
-            let range = self.gripper_info(arm)?.range?;
+            let range = self.facts.gripper_info(arm)?.range?;
             let joint = robot.model.joint_index(&driven.joint)?;
             Some(LoggedGripper { arm, joint, range: [range, (driven.closed, driven.open)] })
         });
@@ -122,7 +122,7 @@ impl Service {
     /// Returns the arm that has a joint: its index and name.
     fn arm_of(&self, joint: usize) -> Option<(usize, String)> {
         let mut joints = 0;
-        self.parts.names.arms.iter().enumerate().find_map(|(index, arm)| {
+        self.facts.names.arms.iter().enumerate().find_map(|(index, arm)| {
             joints += arm.joints.len();
             (joint < joints).then(|| (index, arm.hardware_id.clone()))
         })
@@ -130,13 +130,10 @@ impl Service {
 
     /// Logs the objects of the world that have changed.
     pub(in crate::runtime) fn log_world(&self) {
-        let Some(port) = &self.parts.planner else { return };
-        let mut logged = lock(&self.logged_world);
-        let objects = lock(&port.objects);
-        let version = port.thread.version();
-        if logged.as_ref().is_some_and(|(last, _)| *last == version) {
-            return;
-        }
+        let Some(port) = self.plans.port() else { return };
+        let mut logged = lock(&self.journal.world);
+        let known = logged.as_ref().map(|(version, _)| *version);
+        let Some((version, objects)) = port.objects_unless(known) else { return };
         let before = logged.replace((version, objects.clone())).map(|(_, objects)| objects).unwrap_or_default();
         let gone = before.keys().filter(|name| !objects.contains_key(*name));
         let gone = gone.map(|name| Marker { ns: namespace(name), action: 2, ..Marker::default() });
@@ -145,7 +142,7 @@ impl Service {
         let markers: Vec<Marker> = gone.chain(changed.map(|object| marker(object, &robots))).collect();
         if !markers.is_empty() {
             let markers = MarkerArray { markers };
-            self.parts.dispatcher.note(Note::Markers { stamp: MonotonicClock.now(), markers });
+            self.tick.dispatcher().note(Note::Markers { stamp: MonotonicClock.now(), markers });
         }
     }
 }

@@ -2,45 +2,40 @@
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering::{Acquire, Relaxed};
-use std::time::Instant;
 
+use crate::runtime::Service;
 use crate::runtime::motion::motions::{End, NATIVE, Next};
-use crate::runtime::service::Service;
 use crate::runtime::tool::tcp::TcpModel;
 use dimos_control::arm_control::effective;
 use dimos_core::arm::{ArmState, Pose, VelocitySource};
-use dimos_core::clock::WallOffset;
-use dimos_core::sync::lock;
-use dimos_core::telemetry::describe::{Described, Severity};
-use dimos_core::telemetry::texts::{bound_text, cause_text, outcome_text, reason_text};
-use dimos_core::telemetry::{Cause, Outcome, Phase, Reason, TaskState};
+use dimos_core::telemetry::texts::{bound_text, cause_text, reason_text};
+use dimos_core::telemetry::{Cause, Phase, Reason, TaskState};
 use dimos_hardware::device::Connected;
 use dimos_hardware::registry::Teach;
 use dimos_rpc::api::{LoadReport, SpeedReport, TextLog, TextLogReport};
 use dimos_rpc::report::*;
-use dimos_rpc::server::streams::{EventReport, JointState, Level};
 use dimos_rpc::{Code, RpcError};
 use dimos_rt::histogram::Figures;
 
 impl Service {
     /// Returns the reply to `status`.
     pub fn status(&self) -> StatusReport {
-        let (parts, pulse) = (&self.parts, &self.parts.pulse);
-        let started = parts.wall.wall(self.now()) as i64 - self.started.elapsed().as_nanos() as i64;
+        let (facts, pulse) = (&self.facts, self.tick.pulse());
+        let started = facts.wall.wall(self.now()) as i64 - self.lifecycle.uptime().as_nanos() as i64;
         StatusReport {
             // Added by the server, which knows its connections.
             share: None,
-            run: parts.run.clone(),
+            run: facts.run.clone(),
             pid: std::process::id(),
             version: crate::VERSION.to_owned(),
-            blueprint: parts.blueprint.name.clone(),
+            blueprint: facts.blueprint.name.clone(),
             started: rfc3339(started),
-            uptime: self.started.elapsed().as_secs_f64(),
+            uptime: self.lifecycle.uptime().as_secs_f64(),
             epoch: pulse.epoch.load(Acquire),
-            tick_rate: parts.config.rate,
-            simulated: parts.blueprint.arms.iter().any(|arm| !arm.is_real()),
-            log: parts.log.as_ref().map(|p| p.display().to_string()),
-            realtime: parts
+            tick_rate: facts.config.rate,
+            simulated: facts.blueprint.arms.iter().any(|arm| !arm.is_real()),
+            log: facts.log.as_ref().map(|p| p.display().to_string()),
+            realtime: facts
                 .grants
                 .iter()
                 .map(|g| RealtimeReport {
@@ -50,7 +45,7 @@ impl Service {
                 })
                 .collect(),
             ticks: TickReport {
-                clock: parts.blueprint.coordinator.clock.to_string(),
+                clock: facts.blueprint.coordinator.clock.to_string(),
                 without_state: pulse.unprompted.load(Relaxed),
                 count: pulse.ticks.load(Relaxed),
                 overruns: pulse.overruns.load(Relaxed),
@@ -58,7 +53,7 @@ impl Service {
                 lateness_us: percentiles(pulse.lateness.figures()),
                 compute_us: percentiles(pulse.compute.figures()),
             },
-            recorder: self.recorder.get().filter(|_| parts.log.is_some()).map(|stats| RecorderReport {
+            recorder: self.journal.recorder.get().filter(|_| facts.log.is_some()).map(|stats| RecorderReport {
                 messages: stats.messages.load(Relaxed),
                 dropped: stats.dropped.load(Relaxed) + pulse.dropped.load(Relaxed),
                 error: stats.failed.load(Relaxed).then(|| "a write failed: the log has ended".to_owned()),
@@ -69,31 +64,23 @@ impl Service {
                 .enumerate()
                 .filter_map(|(i, tcp)| self.arm_report(i, tcp.as_ref()))
                 .collect(),
-            speed: self.speed_override(),
-            tasks: (0..parts.config.tasks.len()).filter_map(|i| self.task_report(i)).collect(),
+            speed: self.tick.speed_override(),
+            tasks: (0..facts.config.tasks.len()).filter_map(|i| self.task_report(i)).collect(),
             planner: None, // filled in by the `status` method
-            view: self.view.get().cloned(),
+            view: self.journal.view.get().cloned(),
         }
     }
 
     /// Returns the reply to `text_log`.
     pub(in crate::runtime) fn text_log(&self, request: TextLog) -> Result<TextLogReport, RpcError> {
         let none = || RpcError::new(Code::Unsupported, "this run keeps no text log: another program started it");
-        self.parts.text.as_ref().map(|text| text.after(request.after)).ok_or_else(none)
-    }
-
-    /// Returns the speed override.
-    pub(in crate::runtime) fn speed_override(&self) -> SpeedReport {
-        let pulse = &self.parts.pulse;
-        // 0 before the first tick.
-        let fraction = Some(f64::from_bits(pulse.speed.load(Relaxed))).filter(|fraction| *fraction > 0.0);
-        SpeedReport { fraction: fraction.unwrap_or(1.0), paused: pulse.paused.load(Relaxed) }
+        self.facts.text.as_ref().map(|text| text.after(request.after)).ok_or_else(none)
     }
 
     fn arm_report(&self, index: usize, tcp: Option<&TcpModel>) -> Option<ArmReport> {
-        let (arm, device) = (self.parts.blueprint.arms.get(index)?, self.parts.devices.get(index)?);
-        let (view, health, now) = (self.arm_view(index)?, device.health(), self.now());
-        let Connected { info, gripper, io, reduction, .. } = self.parts.connected.get(index)?;
+        let (arm, device) = (self.facts.blueprint.arms.get(index)?, self.arms.get(index)?);
+        let (view, health, now) = (self.tick.arm_view(index)?, device.health(), self.now());
+        let Connected { info, gripper, io, reduction, .. } = self.facts.connected.get(index)?;
         let faults = health.episodes().into_iter().map(|e| FaultReport {
             since: now.seconds_since(e.since),
             over: e.until.is_some(),
@@ -113,7 +100,7 @@ impl Service {
             adapter: arm.adapter_type.clone(),
             address: arm.address.clone(),
             simulated: !arm.is_real(),
-            local: self.parts.local.get(index).is_some_and(|local| *local),
+            local: self.facts.local.get(index).is_some_and(|local| *local),
             link: view.state.link.name().to_owned(),
             phase: view.phase.name().to_owned(),
             led_by: (view.phase == Phase::Led).then(|| self.led_by(index as u16).to_owned()),
@@ -123,14 +110,14 @@ impl Service {
                 Teach::No(_) => None,
             },
             cause: (view.cause != Cause::None).then(|| {
-                let by = (view.cause == Cause::Operator).then(|| self.parts.dispatcher.stopped_by(index as u16));
+                let by = (view.cause == Cause::Operator).then(|| self.tick.dispatcher().stopped_by(index as u16));
                 CauseReport {
                     name: view.cause.name().to_owned(),
                     text: cause_text(view.cause),
                     by: by.flatten().map(Arc::unwrap_or_clone),
                 }
             }),
-            stop_pending: self.late_stops.is_waiting(index),
+            stop_pending: self.arms.stop_is_pending(index),
             enabled: view.state.enabled,
             mode: view.state.mode.name().to_owned(),
             speed_fraction: view.state.speed_fraction,
@@ -151,7 +138,7 @@ impl Service {
             joints: self.joint_status(index, &health.details()),
             payload: health.details().payload.map(LoadReport::from),
             tcp: tcp.map(TcpModel::report),
-            identity: self.parts.devices.get(index).and_then(|device| device.health().identity().accepted),
+            identity: self.arms.get(index).and_then(|device| device.health().identity().accepted),
             model_notes: self.model_notes(index),
             limits_note: reduction.as_ref().map(|reduction| reduction.text.clone()),
             position_limits: self.position_limits(index),
@@ -163,38 +150,38 @@ impl Service {
 
     /// Returns what is to be said of how an arm's model fits it.
     fn model_notes(&self, arm: usize) -> Vec<String> {
-        let kinematics = self.parts.kinematics.get(arm).cloned().flatten();
+        let kinematics = self.facts.kinematics.get(arm).cloned().flatten();
         kinematics.into_iter().chain(self.model_note(arm)).collect()
     }
 
     /// Returns the lowest and highest position of an arm's joints [rad].
     fn position_limits(&self, arm: usize) -> Vec<[f64; 2]> {
-        let Some(config) = self.parts.config.arms.get(arm) else { return Vec::new() };
+        let Some(config) = self.facts.config.arms.get(arm) else { return Vec::new() };
         let limits = &config.limits;
         limits.position_lower.iter().zip(&limits.position_upper).map(|(lower, upper)| [*lower, *upper]).collect()
     }
 
     fn task_report(&self, index: usize) -> Option<TaskReport> {
-        let (config, view) = (self.parts.config.tasks.get(index)?, self.task_view(index));
-        let row = &self.parts.blueprint.tasks.get(index)?.spec;
+        let (config, view) = (self.facts.config.tasks.get(index)?, self.tick.task_view(index));
+        let row = &self.facts.blueprint.tasks.get(index)?.spec;
         Some(TaskReport {
             name: config.name.clone(),
             kind: config.kind.name.clone(),
             takes: row.takes.iter().map(|kind| kind.method().to_owned()).collect(),
-            joints: config.joints.iter().map(|&j| self.parts.names.joint(j)).collect(),
+            joints: config.joints.iter().map(|&j| self.facts.names.joint(j)).collect(),
             priority: config.priority,
             state: view.state.name().to_owned(),
             progress: (view.motion > 0).then_some(view.progress),
             reason: self.reason(&view.reason),
             motion: (view.motion > 0).then_some(view.motion),
             distance: view.distance,
-            bound: Some(bound_text(view.bound, &self.parts.names)).filter(|text| !text.is_empty()),
-            stream: self.counters.get(index).and_then(|counters| counters.report()),
+            bound: Some(bound_text(view.bound, &self.facts.names)).filter(|text| !text.is_empty()),
+            stream: self.streams.counts(index as u16),
         })
     }
 
     fn reason(&self, reason: &Reason) -> Option<String> {
-        (*reason != Reason::None).then(|| reason_text(reason, &self.parts.names))
+        (*reason != Reason::None).then(|| reason_text(reason, &self.facts.names))
     }
 
     /// Returns the age of a state [ms].
@@ -205,9 +192,9 @@ impl Service {
     /// Returns the reply to `state`.
     pub fn state(&self) -> StateReport {
         let mut poses = self.tcp_poses();
-        let arms = self.parts.blueprint.arms.iter().enumerate().filter_map(|(i, arm)| {
-            let view = self.arm_view(i)?;
-            let (s, known, gripper) = (&view.state, view.state.seq > 0, self.gripper_info(i));
+        let arms = self.facts.blueprint.arms.iter().enumerate().filter_map(|(i, arm)| {
+            let view = self.tick.arm_view(i)?;
+            let (s, known, gripper) = (&view.state, view.state.seq > 0, self.facts.gripper_info(i));
             let joints = arm.joints.iter().enumerate().map(|(j, name)| JointReport {
                 name: name.clone(),
                 position: s.position.get(j).copied().filter(|_| known),
@@ -233,30 +220,25 @@ impl Service {
                 wrench: s.wrench,
             })
         });
-        StateReport { tick: self.last_tick(), stamp: self.wall_seconds(), arms: arms.collect() }
-    }
-
-    fn last_tick(&self) -> u64 {
-        self.parts.pulse.ticks.load(Relaxed).saturating_sub(1)
+        StateReport { tick: self.tick.last_tick(), stamp: self.wall_seconds(), arms: arms.collect() }
     }
 
     pub(in crate::runtime) fn wall_seconds(&self) -> f64 {
-        self.parts.wall.wall(self.now()) as f64 * 1e-9
+        self.facts.wall.wall(self.now()) as f64 * 1e-9
     }
 
     /// Returns the reply to `motion`.
     pub fn motion(&self, number: u64) -> Result<MotionReport, RpcError> {
-        let motions = lock(&self.motions);
-        let Some((planned, end)) = motions.get(number) else {
+        let Some((planned, end)) = self.motions.get(number) else {
             return Err(RpcError::new(Code::UnknownMotion, format!("no motion {number}, or too long ago")));
         };
-        let task = if planned.task == NATIVE { "native".to_owned() } else { self.parts.names.task(planned.task) };
+        let task = if planned.task == NATIVE { "native".to_owned() } else { self.facts.names.task(planned.task) };
         let collision_checked = planned.plan.is_some();
         let retraces_to = planned.retraces_to;
         let by = planned.by.as_deref().cloned();
         let mut report =
             MotionReport { motion: number, task, by, collision_checked, retraces_to, ..Default::default() };
-        let view = self.task_view(planned.task as usize);
+        let view = self.tick.task_view(planned.task as usize);
         if view.motion == number {
             (report.progress, report.elapsed, report.remaining) = (view.progress, view.elapsed, view.remaining);
         }
@@ -265,23 +247,23 @@ impl Service {
         }
         let over = !matches!(view.state, TaskState::Executing | TaskState::Cancelling);
         let end = match end {
-            Some(end) => Some(end.clone()),
+            Some(end) => Some(end),
             // The task has ended, but the recorder has not reported the end yet; if it fell behind, it never will. The
             // arm's present position is its end.
             None if view.motion == number && over => {
                 let at = self.positions();
                 let actual = planned.joints.iter().map(|j| at.get(*j as usize).copied().unwrap_or(f64::NAN)).collect();
-                Some(End { state: view.state, reason: view.reason, actual, tick: self.last_tick() })
+                Some(End { state: view.state, reason: view.reason, actual, tick: self.tick.last_tick() })
             }
             None => None,
         };
         // The task counts the time on the path: less than has passed, if the motion was slowed or paused.
         if let Some(began) = planned.began {
-            let ticks = end.as_ref().map_or_else(|| self.last_tick(), |end| end.tick).saturating_sub(began);
-            report.elapsed = report.elapsed.max(ticks as f64 * self.period().as_secs_f64());
+            let ticks = end.as_ref().map_or_else(|| self.tick.last_tick(), |end| end.tick).saturating_sub(began);
+            report.elapsed = report.elapsed.max(ticks as f64 * self.facts.period().as_secs_f64());
         }
         let Some(end) = end else {
-            let speed = self.speed_override();
+            let speed = self.tick.speed_override();
             report.remaining /= speed.fraction;
             report.speed_fraction = self.slowest(&planned.joints);
             report.remaining /= report.speed_fraction.filter(|fraction| *fraction > 0.0).unwrap_or(1.0);
@@ -307,7 +289,7 @@ impl Service {
         }
         let all = planned.joints.iter().zip(&planned.goal).zip(&end.actual);
         let deviation = all.map(|((joint, target), actual)| Deviation {
-            joint: self.parts.names.joint(*joint),
+            joint: self.facts.names.joint(*joint),
             target: *target,
             actual: *actual,
         });
@@ -317,139 +299,8 @@ impl Service {
 
     /// Returns the smallest fraction of the speed at which a controller of these joints runs motions, if below 1.
     fn slowest(&self, joints: &[u16]) -> Option<f64> {
-        let of = |joint: &u16| Some(effective(self.arm_view(self.locate(*joint)?.0)?.state.speed_fraction));
+        let of = |joint: &u16| Some(effective(self.tick.arm_view(self.facts.locate(*joint)?.0)?.state.speed_fraction));
         joints.iter().filter_map(of).min_by(f64::total_cmp).filter(|fraction| *fraction < 1.0)
-    }
-
-    /// Returns the limits of a joint [rad].
-    fn range(&self, joint: u16) -> Option<[f64; 2]> {
-        let (arm, j) = self.locate(joint)?;
-        let limits = &self.parts.config.arms.get(arm)?.limits;
-        Some([*limits.position_lower.get(j)?, *limits.position_upper.get(j)?])
-    }
-
-    /// Returns a refusal by the tick as an error; `None`: it was accepted.
-    pub(in crate::runtime) fn refusal(&self, outcome: &Outcome) -> Option<RpcError> {
-        let code = Code::of(outcome)?;
-        let names = &self.parts.names;
-        let error = RpcError::new(code, outcome_text(outcome, names));
-        let arm = |i: &u16| names.arm(*i);
-        Some(match outcome {
-            Outcome::AlreadyExecuting(_) => error.hint("wait for it, or end it with `dimos cancel`"),
-            Outcome::StartStateMismatch(joint, distance) => error
-                .hint("move to its first point first: `dimos move`")
-                .data(serde_json::json!({"joint": names.joint(*joint), "distance": distance})),
-            Outcome::StartStateUnavailable(_) => error.hint("`dimos status` shows its link and the age of its state"),
-            Outcome::ArmNotReady(a, Phase::Led, _) => error.hint(end_of_lead(&arm(a), self.led_by(*a))),
-            Outcome::ArmNotReady(a, ..) => error.hint(format!("make it ready: `dimos arm enable {}`", arm(a))),
-            Outcome::Paused => error.hint("dimos resume"),
-            Outcome::ArmMoving(_) => error.hint("again when it is at rest"),
-            Outcome::ArmLatched(a, _) => {
-                let a = arm(a);
-                error.hint(format!("when it may move again: `dimos arm reset {a}`, then `dimos arm enable {a}`"))
-            }
-            Outcome::StillFaulted(a, _) => {
-                error.hint(format!("remove the cause, then repeat `dimos arm reset {}`", arm(a)))
-            }
-            Outcome::Superseded(..) => error.hint("request it again if it is still wanted; a plan must be planned again"),
-            Outcome::OutOfReach(joint, by) => {
-                error.data(serde_json::json!({"joint": names.joint(*joint), "by": by}))
-            }
-            Outcome::OutOfLimits(joint, by) => error
-                .hint(match self.range(*joint) {
-                    Some([lower, upper]) => format!(
-                        "{} may be at {lower:.4} … {upper:.4} rad: the arm's own limits, narrowed by `limits` in the blueprint",
-                        names.joint(*joint)
-                    ),
-                    None => "limits are the arm's own, narrowed by `limits` in the blueprint".to_owned(),
-                })
-                .data(serde_json::json!({"joint": names.joint(*joint), "by": by})),
-            Outcome::GripperOutOfLimits(a, opening) => error
-                .hint("`dimos status` shows its range")
-                .data(serde_json::json!({"arm": arm(a), "opening": opening})),
-            Outcome::GripperForceOutOfLimits(a, force) => {
-                let info = self.gripper_info((*a).into()).unwrap_or_default();
-                let (least, most) = info.force_range.unwrap_or_default();
-                error
-                    .hint(format!(
-                        "give {least} to {most} {}, or no force for the one set in the arm",
-                        info.force_unit.name()
-                    ))
-                    .data(serde_json::json!({"arm": arm(a), "force": force, "range": [least, most]}))
-            }
-            Outcome::NoGripperForce(_) => error.hint("command its position without a force"),
-            Outcome::NoGripperSpeed(_) => error.hint("command its position without a speed"),
-            Outcome::WrongTask(_) => error.hint("`dimos status` lists the tasks and their types"),
-            _ => error,
-        })
-    }
-
-    /// Publishes the joint state of the last tick, unless that was done already: to subscribers, and now and then for
-    /// later ones.
-    pub fn publish(&self, ticked: bool) {
-        let (streams, now) = (&self.parts.streams, self.now());
-        let published = self.parts.blueprint.coordinator.publish_joint_state;
-        let listened_to = published && streams.has_joint_state_readers();
-        self.parts.pulse.streaming.store(listened_to, Relaxed);
-        // The tick also wakes this thread for replies; a late wake-up publishes the newest tick.
-        let ticks = self.parts.pulse.ticks.load(Relaxed);
-        let wanted = (listened_to && ticked) || (published && streams.is_state_due(now));
-        if wanted && ticks > 0 && self.published.swap(ticks, Relaxed) != ticks {
-            streams.publish_joint_state(now, &self.joint_state());
-        }
-    }
-
-    fn joint_state(&self) -> JointState {
-        let mut out = JointState {
-            tick: self.last_tick(),
-            stamp: self.wall_seconds(),
-            frame_id: self.parts.blueprint.coordinator.joint_state_frame_id.clone(),
-            ..JointState::default()
-        };
-        for (i, arm) in self.parts.blueprint.arms.iter().enumerate() {
-            let Some(view) = self.arm_view(i) else { continue };
-            let s = &view.state;
-            let velocities = s.velocity_source != VelocitySource::Absent;
-            for (j, name) in arm.joints.iter().enumerate() {
-                out.name.push(name.clone());
-                out.position.push(s.position.get(j).copied().filter(|_| s.seq > 0));
-                out.velocity.push(s.velocity.get(j).copied().filter(|_| velocities));
-                out.effort.push(s.effort.and_then(|e| e.get(j).copied()));
-            }
-        }
-        out
-    }
-
-    /// Records an event that no tick has made, and reports it.
-    pub(in crate::runtime) fn report_now(&self, described: &Described, wall: WallOffset) {
-        self.parts.dispatcher.log(described.severity, described.text.clone());
-        self.report_event(self.parts.pulse.ticks.load(Relaxed), described, wall);
-    }
-
-    /// Logs an event and publishes it to subscribers.
-    pub(in crate::runtime) fn report_event(&self, tick: u64, described: &Described, wall: WallOffset) {
-        if let Some(line) = self.log_throttle.line(described, Instant::now()) {
-            match described.severity {
-                Severity::Info => tracing::debug!("{line}"),
-                Severity::Warn => tracing::warn!("{line}"),
-                Severity::Error => tracing::error!("{line}"),
-            }
-        }
-        self.parts.streams.publish_event(&EventReport {
-            tick,
-            stamp: wall.wall(self.now()) as f64 * 1e-9,
-            level: match described.severity {
-                Severity::Info => Level::Info,
-                Severity::Warn => Level::Warning,
-                Severity::Error => Level::Error,
-            },
-            kind: described.kind.to_owned(),
-            arm: described.arm.clone(),
-            task: described.task.clone(),
-            joint: described.joint.clone(),
-            text: described.text.clone(),
-            by: described.by.clone(),
-        });
     }
 }
 

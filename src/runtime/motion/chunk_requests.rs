@@ -2,7 +2,7 @@
 
 use serde_json::json;
 
-use crate::runtime::service::Service;
+use crate::runtime::Service;
 use dimos_control::limit::Bounds;
 use dimos_control::request::{Motion, Request};
 use dimos_control::task_body::TargetKind;
@@ -24,11 +24,11 @@ impl Service {
         mut call: api::Chunk,
         origin: Origin,
     ) -> Result<api::ChunkReply, RpcError> {
-        let task = self.task_index(&call.task)?;
-        let config = &self.parts.config.tasks[task as usize];
-        let takes = self.parts.blueprint.tasks.get(task as usize).is_some_and(|t| t.spec.takes(TargetKind::Chunk));
+        let task = self.facts.task_index(&call.task)?;
+        let config = &self.facts.config.tasks[task as usize];
+        let takes = self.facts.blueprint.tasks.get(task as usize).is_some_and(|t| t.spec.takes(TargetKind::Chunk));
         if !takes {
-            return Err(self.refusal(&Outcome::WrongTask(task)).unwrap_or_else(crate::runtime::service::internal));
+            return Err(self.refusal(&Outcome::WrongTask(task)).unwrap_or_else(crate::runtime::internal));
         }
         let (width, given) = (config.joints.len(), call.actions.first().map_or(0, Vec::len));
         if width != given {
@@ -40,10 +40,8 @@ impl Service {
         let age = if now > start { now.seconds_since(start) } else { 0.0 };
         let late = ((age / call.period).ceil() as usize).min(actions);
         let arm = call.gripper.as_deref().map(|targets| self.check_gripper_targets(task, targets)).transpose()?;
-        let count =
-            |late| self.counters.get(task as usize).into_iter().for_each(|counters| counters.actions(actions, late));
         if late == actions {
-            count(late);
+            self.streams.count_actions(task, actions, late);
             return Ok(api::ChunkReply { actions, late });
         }
         let limits = self.limits_of(&config.joints);
@@ -53,16 +51,16 @@ impl Service {
                 *value = value.max(bounds.lower).min(bounds.upper);
             }
         }
-        let names: Vec<String> = config.joints.iter().map(|joint| self.parts.names.joint(*joint)).collect();
+        let names: Vec<String> = config.joints.iter().map(|joint| self.facts.names.joint(*joint)).collect();
         let trajectory = curve(&names, &call.actions, call.period, &limits);
         let spline = Spline::new(&trajectory).map_err(|e| RpcError::new(Code::InvalidTrajectory, e.to_string()))?;
         self.check_limits(&config.joints, &spline)?;
         let log = json!({"chunk": {"task": task, "start": start.0, "trajectory": trajectory}});
         let motion = Box::new(Motion { id: 0, joints: config.joints.clone(), spline });
-        let sent = self.parts.dispatcher.ask(Request::Chunk { task, start, motion }, Some(origin), log);
+        let sent = self.tick.dispatcher().ask(Request::Chunk { task, start, motion }, Some(origin), log);
         self.outcome(sent.await)?;
-        self.streams_to(task);
-        count(late);
+        self.streams.begin(task);
+        self.streams.count_actions(task, actions, late);
         if let (Some(arm), Some(targets)) = (arm, &call.gripper) {
             self.take_gripper_targets((task, origin), arm, start, call.period, targets);
         }
@@ -72,7 +70,7 @@ impl Service {
     /// Returns the time of the first action on the clock of the tick.
     fn start_of(&self, call: &api::Chunk, now: Mono) -> Result<Mono, RpcError> {
         let Some(start) = call.start else { return Ok(now) };
-        let ahead = start - self.parts.wall.wall(now) as f64 * 1e-9;
+        let ahead = start - self.facts.wall.wall(now) as f64 * 1e-9;
         if ahead.abs() > MAX_DISTANCE {
             let what = format!("start is {ahead:.1} s from now (limit {MAX_DISTANCE} s)");
             return Err(RpcError::new(Code::InvalidParams, what)
@@ -85,8 +83,8 @@ impl Service {
     /// Returns the limits of joints over all arms, in their order.
     fn limits_of(&self, joints: &[u16]) -> JointLimits {
         let of = |column: fn(&JointLimits) -> &Vec<f64>| -> Vec<f64> {
-            let located = joints.iter().filter_map(|joint| self.locate(*joint));
-            located.filter_map(|(arm, j)| column(&self.parts.config.arms.get(arm)?.limits).get(j).copied()).collect()
+            let located = joints.iter().filter_map(|joint| self.facts.locate(*joint));
+            located.filter_map(|(arm, j)| column(&self.facts.config.arms.get(arm)?.limits).get(j).copied()).collect()
         };
         JointLimits {
             position_lower: of(|limits| &limits.position_lower),

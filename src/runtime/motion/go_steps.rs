@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
 use super::going::{Going, POLL_PERIOD};
-use crate::runtime::service::{Service, internal};
+use crate::runtime::{Service, internal};
 use dimos_control::request::Request;
 use dimos_core::telemetry::{Origin, TaskState};
 use dimos_rpc::api::{
@@ -50,13 +50,13 @@ impl Service {
                 }
                 GoStep::Execute(execute) => arms.extend(self.arms_with(&execute.trajectory.joint_names)?),
                 GoStep::Move(direct) => {
-                    arms.insert(self.arm_index(&direct.arm)?);
+                    arms.insert(self.facts.arm_index(&direct.arm)?);
                     if !direct.direct {
-                        self.needs_no_plan(&direct.arm)?;
+                        self.plans.needs_no_plan(&direct.arm)?;
                     }
                 }
                 GoStep::Gripper(gripper) => {
-                    arms.insert(self.arm_index(&gripper.arm)?);
+                    arms.insert(self.facts.arm_index(&gripper.arm)?);
                     if index > 0 {
                         self.check_grip(gripper).await?;
                     }
@@ -68,7 +68,7 @@ impl Service {
 
     /// Returns the arms that have these joints.
     fn arms_with(&self, joints: &[String]) -> Result<Vec<u16>, RpcError> {
-        let arms = self.joints_named(joints)?.into_iter().filter_map(|joint| self.locate(joint));
+        let arms = self.facts.joints_named(joints)?.into_iter().filter_map(|joint| self.facts.locate(joint));
         Ok(arms.map(|(arm, _)| arm as u16).collect())
     }
 
@@ -140,7 +140,7 @@ impl Service {
                 }
                 return Err(going.check().err().filter(|_| going.is_client_gone()).unwrap_or_else(|| report.into()));
             }
-            let is_over = going.check().is_err() || self.is_closed();
+            let is_over = going.check().is_err() || self.lifecycle.is_closed();
             if is_over && !std::mem::replace(&mut ends, true) {
                 self.cancel_planning(Some(begun.plan)).await;
             }
@@ -191,10 +191,10 @@ impl Service {
             // The `cancel` that ended this was of another arm of it, or came before the motion was known.
             let is_ended = going.curb.ended().is_some() && report.state == TaskState::Executing.name();
             if is_ended && ended.get_or_insert_with(Instant::now).elapsed() > CANCEL_TIMEOUT {
-                self.ask(Request::Cancel { task: Some(self.task_index(&report.task)?) }).await?;
+                self.ask(Request::Cancel { task: Some(self.facts.task_index(&report.task)?) }).await?;
                 ended = Some(Instant::now());
             }
-            if self.is_closed() && closed.get_or_insert_with(Instant::now).elapsed() > SHUTDOWN_TIMEOUT {
+            if self.lifecycle.is_closed() && closed.get_or_insert_with(Instant::now).elapsed() > SHUTDOWN_TIMEOUT {
                 return Err(RpcError::new(Code::ShuttingDown, "the run ends").into());
             }
             tokio::time::sleep(POLL_PERIOD).await;

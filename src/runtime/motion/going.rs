@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use super::go_steps::Failed;
 use crate::runtime::client::asker::{asked_by, asker};
 use crate::runtime::client::curb::{Curb, curbed};
-use crate::runtime::service::{Service, internal};
+use crate::runtime::{Service, internal};
 use dimos_control::request::Request;
 use dimos_core::sync::lock;
 use dimos_core::telemetry::{Cause, Origin, Phase, Reason, Who};
@@ -115,7 +115,7 @@ impl Service {
     /// Begins to carry out a request `go`.
     pub(in crate::runtime) async fn go(&self, mut go: Go, origin: Origin) -> Result<GoReply, RpcError> {
         let arms = self.check_steps(&mut go.steps).await?;
-        let number = self.parts.dispatcher.next_id();
+        let number = self.tick.dispatcher().next_id();
         let by = asker();
         let report = GoingReport { going: number, by: by.as_deref().cloned(), ..GoingReport::default() };
         let going =
@@ -184,7 +184,7 @@ impl Service {
         }
         // A refusal after a stop has that cause.
         let stopped = |arm: &u16| {
-            self.arm_view(usize::from(*arm)).is_some_and(|view| view.phase == Phase::Held && is_stop(view.cause))
+            self.tick.arm_view(usize::from(*arm)).is_some_and(|view| view.phase == Phase::Held && is_stop(view.cause))
         };
         if ended.by == EndedBy::Refused && going.arms.iter().any(stopped) {
             ended.by = EndedBy::Stop;
@@ -201,9 +201,9 @@ impl Service {
 
     /// Returns what ended a motion, and what was measured of that.
     pub(in crate::runtime) fn cause_of_end(&self, motion: u64) -> (EndedBy, Option<f64>) {
-        let reason = match lock(&self.motions).get(motion) {
+        let reason = match self.motions.get(motion) {
             Some((_, Some(end))) => end.reason,
-            Some((planned, None)) => self.task_view(planned.task.into()).reason,
+            Some((planned, None)) => self.tick.task_view(planned.task.into()).reason,
             None => return (EndedBy::Other, None),
         };
         match reason {
@@ -231,13 +231,13 @@ impl Service {
     /// Ends the requests `go` that a `cancel` of this arm or task means; `None`: of any. Their motions end when the
     /// tick gets the `cancel`, or when their threads see this.
     pub(in crate::runtime) fn end_goings(&self, arm: Option<u16>, task: Option<u16>) {
-        let (tasks, goings) = (&self.parts.config.tasks, lock(&self.goings.0));
+        let (tasks, goings) = (&self.facts.config.tasks, lock(&self.goings.0));
         for going in goings.values().filter(|going| !going.is_done()) {
             let is_meant = match task.and_then(|task| tasks.get(usize::from(task))) {
                 Some(task) => match going.under_way() {
                     (_, Some(moving)) => moving == task.name,
                     _ => {
-                        let mut arms = task.joints.iter().filter_map(|joint| self.locate(*joint));
+                        let mut arms = task.joints.iter().filter_map(|joint| self.facts.locate(*joint));
                         arms.any(|(arm, _)| going.arms.iter().any(|own| usize::from(*own) == arm))
                     }
                 },
@@ -258,8 +258,8 @@ impl Service {
         going.curb.end(CANCELLED);
         match going.under_way() {
             (_, Some(task)) => {
-                let index = self.task_index(&task)?;
-                lock(&self.motions).end_replanning(CANCELLED, |planned| planned.task == index);
+                let index = self.facts.task_index(&task)?;
+                self.motions.end_replanning(CANCELLED, |planned| planned.task == index);
                 let outcome = self.ask(Request::Cancel { task: Some(index) }).await?;
                 Ok(CancelReply { tasks: [(task, outcome.name().to_owned())].into(), ..CancelReply::default() })
             }

@@ -7,3 +7,4 @@ pub(in crate::runtime) mod motion_requests;
 pub(in crate::runtime) mod motions;
 pub(in crate::runtime) mod replan;
 pub(in crate::runtime) mod stream_requests;
+pub(in crate::runtime) mod streams;

@@ -9,13 +9,12 @@ use super::motions::{Carried, Planned};
 use crate::runtime::client::asker::asker;
 use crate::runtime::client::curb::curb;
 use crate::runtime::plan::planner_port::run_blocking;
-use crate::runtime::service::{Service, internal};
+use crate::runtime::{Service, internal};
 use dimos_control::limit::Bounds;
 use dimos_control::point_to_point::{MotionError, point_to_point};
 use dimos_control::request::Motion;
 use dimos_control::task_body::TargetKind;
 use dimos_core::joint::JointLimits;
-use dimos_core::sync::lock;
 use dimos_core::telemetry::{Origin, Outcome};
 use dimos_core::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
 use dimos_core::written;
@@ -36,7 +35,7 @@ pub(in crate::runtime) type Carries = (u64, Option<Option<api::Presence>>);
 impl Service {
     /// Returns the trajectory task that covers these joints and the fewest others.
     pub(in crate::runtime) fn trajectory_task(&self, joints: &[u16]) -> Result<u16, RpcError> {
-        let tasks = self.parts.blueprint.tasks.iter().enumerate();
+        let tasks = self.facts.blueprint.tasks.iter().enumerate();
         let fitting = |(_, t): &(usize, &crate::blueprint::Task)| {
             t.spec.takes(TargetKind::Trajectory) && joints.iter().all(|&j| t.joints.contains(&j.into()))
         };
@@ -48,22 +47,12 @@ impl Service {
     }
 
     pub(in crate::runtime) async fn move_arm(&self, call: api::Move, origin: Origin) -> Result<Reply, RpcError> {
-        let arm = self.arm_index(&call.arm)?;
+        let arm = self.facts.arm_index(&call.arm)?;
         if !call.direct {
-            self.needs_no_plan(&call.arm)?;
+            self.plans.needs_no_plan(&call.arm)?;
         }
-        self.end_streams(&self.joints_of_arm(arm).collect::<Vec<_>>()).await?;
+        self.end_streams(&self.facts.joints_of_arm(arm).collect::<Vec<_>>()).await?;
         self.move_within(call, Duration::MAX, origin).await
-    }
-
-    /// Refuses a motion that is not collision-checked if the run has a planner, also one that has disconnected.
-    pub(in crate::runtime) fn needs_no_plan(&self, arm: &str) -> Result<(), RpcError> {
-        match self.planner() {
-            Ok(_) => Err(RpcError::new(Code::NotPlanned, format!("a direct motion of {arm} is not collision-checked"))
-                .hint("this run has a planner, and a planned motion is checked: plan and execute it; or order it all the same: --direct, in rpc and Python `direct`")),
-            Err(RpcError { code: Code::NoPlanner, data: None, .. }) => Ok(()),
-            Err(gone) => Err(gone),
-        }
     }
 
     /// Moves an arm, if that takes at most `longest`.
@@ -73,23 +62,23 @@ impl Service {
         longest: Duration,
         origin: Origin,
     ) -> Result<Reply, RpcError> {
-        let arm = self.arm_index(&call.arm)?;
-        let joints: Vec<u16> = self.joints_of_arm(arm).collect();
-        let config = &self.parts.config.arms[arm as usize];
+        let arm = self.facts.arm_index(&call.arm)?;
+        let joints: Vec<u16> = self.facts.joints_of_arm(arm).collect();
+        let config = &self.facts.config.arms[arm as usize];
         let target = call.path.as_ref().and_then(|path| path.points.last()).unwrap_or(&call.target).clone();
         if target.len() != joints.len() {
             let what = format!("{} has {} joints, the target {} values", call.arm, joints.len(), target.len());
             return Err(RpcError::new(Code::InvalidParams, what).hint("give one position [rad] per joint, in order"));
         }
         let task = self.trajectory_task(&joints)?;
-        let Some(view) = self.arm_view(arm as usize).filter(|v| v.state.seq > 0) else {
+        let Some(view) = self.tick.arm_view(arm as usize).filter(|v| v.state.seq > 0) else {
             return self.refusal(&Outcome::StartStateUnavailable(arm)).map_or_else(|| Err(internal()), Err);
         };
         // In position mode the motion continues from the last command: the measured position sags below it.
         let from_command = view.command.mode.is_some_and(|m| m.is_position());
         let start = if from_command { view.command.values } else { view.state.position };
         let start = start.get(..config.dof).unwrap_or_default().to_vec();
-        let names = self.parts.names.arms[arm as usize].joints.clone();
+        let names = self.facts.names.arms[arm as usize].joints.clone();
         let limits = capped(&config.limits, call.max_velocity, call.max_acceleration);
         let motion = match call.path {
             Some(path) => {
@@ -118,7 +107,7 @@ impl Service {
         let number = self.begin(task, joints, motion, origin, None).await?;
         Ok(Reply::Move(api::MoveReply {
             motion: number,
-            task: self.parts.names.task(task),
+            task: self.facts.names.task(task),
             duration,
             joints: names,
             start,
@@ -128,21 +117,11 @@ impl Service {
     }
 
     pub(in crate::runtime) async fn execute(&self, call: api::Execute, origin: Origin) -> Result<Reply, RpcError> {
-        self.end_streams(&self.joints_named(&call.trajectory.joint_names)?).await?;
+        self.end_streams(&self.facts.joints_named(&call.trajectory.joint_names)?).await?;
         let to = call.retraces_to;
         let begun = self.execute_as(call, origin, None).await?;
-        lock(&self.motions).retraces(begun.motion, to);
+        self.motions.retraces(begun.motion, to);
         Ok(Reply::Execute(begun))
-    }
-
-    /// Returns the indices of joints over all arms' joints.
-    pub(in crate::runtime) fn joints_named(&self, names: &[String]) -> Result<Vec<u16>, RpcError> {
-        let all: Vec<&String> = self.parts.names.arms.iter().flat_map(|a| &a.joints).collect();
-        let index = |name: &String| match all.iter().position(|joint| *joint == name) {
-            Some(joint) => Ok(joint as u16),
-            None => Err(RpcError::unknown(Code::InvalidTrajectory, "joint", name, &all)),
-        };
-        names.iter().map(index).collect()
     }
 
     /// Executes a trajectory, as the motion of a plan if it comes from one.
@@ -153,15 +132,15 @@ impl Service {
         plan: Option<Carries>,
     ) -> Result<api::ExecuteReply, RpcError> {
         let trajectory = trajectory_of(call.trajectory);
-        let joints = self.joints_named(&trajectory.joint_names)?;
+        let joints = self.facts.joints_named(&trajectory.joint_names)?;
         let task = match &call.task {
-            Some(name) => self.task_index(name)?,
+            Some(name) => self.facts.task_index(name)?,
             None => self.trajectory_task(&joints)?,
         };
         let trajectory = self.within_tool_speed(&joints, trajectory, 1.0).await?;
         let duration = trajectory.duration();
         let number = self.begin(task, joints, trajectory, origin, plan).await?;
-        Ok(api::ExecuteReply { motion: number, task: self.parts.names.task(task), duration })
+        Ok(api::ExecuteReply { motion: number, task: self.facts.names.task(task), duration })
     }
 
     /// Passes a trajectory to its task. Checks all of it before anything moves.
@@ -176,7 +155,7 @@ impl Service {
         let spline = Spline::new(&trajectory).map_err(|e| RpcError::new(Code::InvalidTrajectory, e.to_string()))?;
         self.check_rest(&joints, &trajectory)?;
         self.check_limits(&joints, &spline)?;
-        let number = self.parts.dispatcher.next_id();
+        let number = self.tick.dispatcher().next_id();
         let goal = (0..joints.len()).map(|k| spline.goal(k)).collect();
         let plan = plan.map(|(plan, replan)| {
             let (spline, curb) = (Arc::new(spline.clone()), curb().unwrap_or_default());
@@ -194,12 +173,12 @@ impl Service {
             began: None,
             by: asker(),
         };
-        lock(&self.motions).plan(number, planned);
+        self.motions.plan(number, planned);
         let motion = Box::new(Motion { id: number, joints, spline });
-        let sent = self.parts.dispatcher.execute(task, motion, Some(origin), Arc::new(trajectory));
+        let sent = self.tick.dispatcher().execute(task, motion, Some(origin), Arc::new(trajectory));
         let result = self.outcome(sent.await);
         if result.is_err() {
-            lock(&self.motions).forget(number);
+            self.motions.forget(number);
         }
         result.map(|_| number)
     }
@@ -210,7 +189,7 @@ impl Service {
         for (which, point) in ends.into_iter().filter_map(|(which, point)| Some((which, point?))) {
             for (&joint, velocity) in joints.iter().zip(&point.velocities) {
                 if velocity.abs() > REST {
-                    let name = self.parts.names.joint(joint);
+                    let name = self.facts.names.joint(joint);
                     let what = format!("{name} moves at {velocity:.3} rad/s at the {which} of the trajectory");
                     return Err(RpcError::new(Code::InvalidTrajectory, what)
                         .hint("let it begin and end with velocity 0, or leave the velocities out")
@@ -224,12 +203,12 @@ impl Service {
     /// F36: rejects a trajectory that exceeds a limit before it begins, with the joint and the amount.
     pub(in crate::runtime) fn check_limits(&self, joints: &[u16], spline: &Spline) -> Result<(), RpcError> {
         for (k, &joint) in joints.iter().enumerate() {
-            let Some((arm, j)) = self.locate(joint) else { continue };
-            let l = &self.parts.config.arms[arm].limits;
+            let Some((arm, j)) = self.facts.locate(joint) else { continue };
+            let l = &self.facts.config.arms[arm].limits;
             let bounds =
                 Bounds::inside(l.position_lower[j], l.position_upper[j], l.velocity_max[j], l.acceleration_max[j]);
             let e = spline.extremes(k);
-            let name = self.parts.names.joint(joint);
+            let name = self.facts.names.joint(joint);
             let refuse = |what: String, by: f64, hint: &str| {
                 let data = json!({"joint": name.clone(), "by": by});
                 Err(RpcError::new(Code::OutOfLimits, what).hint(hint.to_owned()).data(data))

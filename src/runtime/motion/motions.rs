@@ -1,9 +1,10 @@
 //! The latest motions of a run: their plans and their ends.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, MutexGuard};
 
 use crate::runtime::client::curb::Curb;
+use dimos_core::sync::lock;
 use dimos_core::telemetry::{Origin, Reason, TaskState, Who};
 use dimos_core::trajectory::Spline;
 use dimos_rpc::api::Presence;
@@ -102,26 +103,34 @@ pub struct End {
 
 /// The motions of a run, by number.
 #[derive(Debug, Default)]
-pub struct Motions(BTreeMap<u64, (Planned, Option<End>)>);
+pub struct Motions(Mutex<ByNumber>);
+
+type ByNumber = BTreeMap<u64, (Planned, Option<End>)>;
 
 impl Motions {
+    fn all(&self) -> MutexGuard<'_, ByNumber> {
+        lock(&self.0)
+    }
+
     /// Adds a motion that is about to be sent.
-    pub fn plan(&mut self, number: u64, planned: Planned) {
-        while self.0.len() >= REMEMBERED {
-            self.0.pop_first();
+    pub fn plan(&self, number: u64, planned: Planned) {
+        let mut all = self.all();
+        while all.len() >= REMEMBERED {
+            all.pop_first();
         }
-        self.0.insert(number, (planned, None));
+        all.insert(number, (planned, None));
     }
 
     /// Removes a motion that was refused.
-    pub fn forget(&mut self, number: u64) {
-        self.0.remove(&number);
+    pub fn forget(&self, number: u64) {
+        self.all().remove(&number);
     }
 
     /// Takes a change of a task's state at a tick. `positions`: present positions of all joints [rad]. Motions of a
     /// task begin and end in order.
-    pub fn task_changed(&mut self, task: u16, (tick, state, reason): (u64, TaskState, Reason), positions: &[f64]) {
-        let running = self.0.values_mut().find(|(planned, end)| planned.task == task && end.is_none());
+    pub fn task_changed(&self, task: u16, (tick, state, reason): (u64, TaskState, Reason), positions: &[f64]) {
+        let mut all = self.all();
+        let running = all.values_mut().find(|(planned, end)| planned.task == task && end.is_none());
         let Some((planned, end)) = running else { return };
         match state {
             TaskState::Executing => planned.began = planned.began.or(Some(tick)),
@@ -136,13 +145,13 @@ impl Motions {
     /// Ends a native motion after `elapsed` [s]. `positions`: as in [`Motions::task_changed`]; `why`: why it did not
     /// reach its goal.
     pub fn end(
-        &mut self,
+        &self,
         number: u64,
         (state, reason, why): (TaskState, Reason, Option<String>),
         elapsed: f64,
         positions: &[f64],
     ) {
-        if let Some((planned, end)) = self.0.get_mut(&number) {
+        if let Some((planned, end)) = self.all().get_mut(&number) {
             (planned.duration, planned.blocked) = (elapsed, why);
             let at = |j: &u16| positions.get(*j as usize).copied().unwrap_or(f64::NAN);
             *end = Some(End { state, reason, actual: planned.joints.iter().map(at).collect(), tick: 0 });
@@ -151,7 +160,8 @@ impl Motions {
 
     /// Returns the planned motions that are being executed.
     pub fn under_way(&self) -> Vec<UnderWay> {
-        let going = self.0.iter().filter(|(_, (_, end))| end.is_none());
+        let all = self.all();
+        let going = all.iter().filter(|(_, (_, end))| end.is_none());
         let planned = going.filter_map(|(number, (planned, _))| {
             let Carried { plan, spline, replan, origin, curb } = planned.plan.clone()?;
             let (number, task, joints) = (*number, planned.task, planned.joints.clone());
@@ -162,8 +172,9 @@ impl Motions {
     }
 
     /// Marks a motion as blocked. Returns whether it is to be planned again.
-    pub fn blocked(&mut self, number: u64, text: String, in_time: bool) -> bool {
-        let Some((planned, _)) = self.0.get_mut(&number) else { return false };
+    pub fn blocked(&self, number: u64, text: String, in_time: bool) -> bool {
+        let mut all = self.all();
+        let Some((planned, _)) = all.get_mut(&number) else { return false };
         planned.blocked = Some(text);
         let again = in_time && planned.plan.as_ref().is_some_and(|carried| carried.replan.is_some());
         planned.next = again.then_some(Next::Planning);
@@ -171,15 +182,15 @@ impl Motions {
     }
 
     /// Marks a motion as one that retraces the log to this time [s since 1970].
-    pub fn retraces(&mut self, number: u64, to: Option<f64>) {
-        if let Some((planned, _)) = self.0.get_mut(&number) {
+    pub fn retraces(&self, number: u64, to: Option<f64>) {
+        if let Some((planned, _)) = self.all().get_mut(&number) {
             planned.retraces_to = to;
         }
     }
 
     /// Sets the result of planning a motion again. If that was ended, its reason stays.
-    pub fn went_on(&mut self, number: u64, next: Result<u64, String>) {
-        if let Some((planned, _)) = self.0.get_mut(&number)
+    pub fn went_on(&self, number: u64, next: Result<u64, String>) {
+        if let Some((planned, _)) = self.all().get_mut(&number)
             && (next.is_ok() || !matches!(planned.next, Some(Next::None(_))))
         {
             planned.next = Some(next.map_or_else(Next::None, Next::Motion));
@@ -188,12 +199,12 @@ impl Motions {
 
     /// Returns whether a motion is being planned again.
     pub fn is_replanning(&self, number: u64) -> bool {
-        self.0.get(&number).is_some_and(|(planned, _)| planned.next == Some(Next::Planning))
+        self.all().get(&number).is_some_and(|(planned, _)| planned.next == Some(Next::Planning))
     }
 
     /// Stops planning motions again, for this reason.
-    pub fn end_replanning(&mut self, why: &str, is_meant: impl Fn(&Planned) -> bool) {
-        for (planned, _) in self.0.values_mut().filter(|(planned, _)| is_meant(planned)) {
+    pub fn end_replanning(&self, why: &str, is_meant: impl Fn(&Planned) -> bool) {
+        for (planned, _) in self.all().values_mut().filter(|(planned, _)| is_meant(planned)) {
             if let Some(carried) = &mut planned.plan {
                 carried.replan = None;
                 carried.curb.end(why);
@@ -205,8 +216,8 @@ impl Motions {
     }
 
     /// Returns a motion, and its end if it has ended.
-    pub fn get(&self, number: u64) -> Option<&(Planned, Option<End>)> {
-        self.0.get(&number)
+    pub fn get(&self, number: u64) -> Option<(Planned, Option<End>)> {
+        self.all().get(&number).cloned()
     }
 }
 
@@ -228,7 +239,7 @@ mod tests {
             began: None,
             by: None,
         };
-        let mut m = Motions::default();
+        let m = Motions::default();
         (1..=3).for_each(|n| m.plan(n, planned((n % 2) as u16)));
         m.task_changed(1, (7, TaskState::Executing, Reason::None), &[]);
         m.task_changed(1, (9, TaskState::Completed, Reason::None), &[0.0, 0.499]);

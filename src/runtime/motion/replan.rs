@@ -6,10 +6,9 @@ use std::time::{Duration, Instant};
 use super::motions::UnderWay;
 use crate::runtime::client::asker::asked_by;
 use crate::runtime::client::curb::curbed;
-use crate::runtime::service::{Service, internal};
+use crate::runtime::{Service, internal};
 use dimos_core::joint::STANDSTILL;
-use dimos_core::sync::lock;
-use dimos_core::telemetry::{Origin, Phase, TaskState};
+use dimos_core::telemetry::{Phase, TaskState};
 use dimos_rpc::api::{ExecutePlan, Plan, PlanGoal, PlanLevel, Planner, Planning, Reply, Request as Call};
 use dimos_rpc::{Code, RpcError};
 
@@ -17,8 +16,6 @@ use dimos_rpc::{Code, RpcError};
 const REST_TIMEOUT: Duration = Duration::from_secs(10);
 /// Poll period while waiting for the arm and the planner.
 const POLL_PERIOD: Duration = Duration::from_millis(10);
-/// Maximum number of requests for plans kept.
-const REMEMBERED: usize = 64;
 
 /// Returns whether a goal depends on where its robot was, or on an object that may move.
 fn is_relative(goal: &PlanGoal) -> bool {
@@ -27,15 +24,6 @@ fn is_relative(goal: &PlanGoal) -> bool {
 }
 
 impl Service {
-    /// Keeps the request of a plan, and its origin.
-    pub(in crate::runtime) fn remember_request(&self, plan: u64, request: Plan, origin: Origin) {
-        let mut requests = lock(&self.plan_requests);
-        while requests.len() >= REMEMBERED {
-            requests.pop_first();
-        }
-        requests.insert(plan, (request, origin));
-    }
-
     /// Begins to plan a blocked motion again.
     pub(in crate::runtime) fn go_around(&self, motion: &UnderWay) {
         let (number, motion) = (motion.number, motion.clone());
@@ -49,17 +37,17 @@ impl Service {
             if let Err(error) = &went_on {
                 tracing::warn!("motion {number}: not planned around what is in its way: {}", error.message);
             }
-            lock(&me.motions).went_on(number, went_on.map_err(|error| error.message));
+            me.motions.went_on(number, went_on.map_err(|error| error.message));
         });
         if let Err(e) = thread {
-            lock(&self.motions).went_on(number, Err(e.to_string()));
+            self.motions.went_on(number, Err(e.to_string()));
         }
     }
 
     async fn plan_again(&self, motion: &UnderWay) -> Result<u64, RpcError> {
         self.rested(motion).await?;
         let unknown = || RpcError::new(Code::UnknownPlan, "the request of this plan is no longer known");
-        let (mut request, _) = lock(&self.plan_requests).get(&motion.plan).cloned().ok_or_else(unknown)?;
+        let mut request = self.plans.request(motion.plan).ok_or_else(unknown)?;
         if request.goals.iter().any(|goal| goal.path.is_some()) {
             let what = "a path is followed as it is, not planned around what is in its way";
             return Err(RpcError::new(Code::NoPlan, what));
@@ -124,11 +112,11 @@ impl Service {
         let began = Instant::now();
         loop {
             self.may_go_on(motion)?;
-            let view = self.task_view(motion.task as usize);
+            let view = self.tick.task_view(motion.task as usize);
             let ends = matches!(view.state, TaskState::Executing | TaskState::Cancelling);
             let still = |joint: &u16| {
-                let (arm, j) = self.locate(*joint)?;
-                self.arm_view(arm)?.state.velocity.get(j).map(|velocity| velocity.abs() <= STANDSTILL)
+                let (arm, j) = self.facts.locate(*joint)?;
+                self.tick.arm_view(arm)?.state.velocity.get(j).map(|velocity| velocity.abs() <= STANDSTILL)
             };
             if !ends && motion.joints.iter().all(|joint| still(joint).unwrap_or(false)) {
                 return Ok(());
@@ -144,17 +132,17 @@ impl Service {
     /// Returns whether it may continue: no `cancel`, no stop, no end of the lease meanwhile.
     fn may_go_on(&self, motion: &UnderWay) -> Result<(), RpcError> {
         let ended = |what: &str| Err(RpcError::new(Code::ShuttingDown, what));
-        if self.is_closed() {
+        if self.lifecycle.is_closed() {
             return ended("the run ends");
         }
-        if !lock(&self.motions).is_replanning(motion.number) {
+        if !self.motions.is_replanning(motion.number) {
             return ended("cancelled");
         }
         if motion.replan.as_ref().is_some_and(|asked| asked.as_ref().is_some_and(|presence| presence.is_over())) {
             return ended("who asked for it has gone");
         }
-        let mut arms = motion.joints.iter().filter_map(|joint| self.locate(*joint));
-        if arms.any(|(arm, _)| self.phase(arm) != Phase::Ready) {
+        let mut arms = motion.joints.iter().filter_map(|joint| self.facts.locate(*joint));
+        if arms.any(|(arm, _)| self.tick.phase(arm) != Phase::Ready) {
             return ended("the arm is not ready");
         }
         Ok(())

@@ -1,10 +1,9 @@
 //! Targets of streams: one request each. A stream ends with the next motion of the client that sends it.
 
-use std::sync::atomic::Ordering;
 use std::time::Instant;
 
+use crate::runtime::Service;
 use crate::runtime::plan::planner_port::isometry;
-use crate::runtime::service::Service;
 use dimos_control::request::{Goal, Request};
 use dimos_core::arm::ArmCommand;
 use dimos_core::joint::joints_of;
@@ -19,15 +18,8 @@ impl Service {
     /// Sends a target to a task, and remembers that a client streams to it.
     async fn target(&self, task: u16, request: Request, origin: Origin) -> Result<(), RpcError> {
         self.ask_from(request, Some(origin)).await?;
-        self.streams_to(task);
+        self.streams.begin(task);
         Ok(())
-    }
-
-    /// Remembers that a client streams to a task.
-    pub(in crate::runtime) fn streams_to(&self, task: u16) {
-        if let Some(streamed) = self.streamed.get(task as usize) {
-            streamed.store(true, Ordering::Release);
-        }
     }
 
     /// Ends the streams that clients have sent to tasks with these joints, and waits until the commands of their arms
@@ -36,12 +28,12 @@ impl Service {
     /// continue.
     pub(in crate::runtime) async fn end_streams(&self, joints: &[u16]) -> Result<(), RpcError> {
         let mut arms = Vec::new();
-        for (task, streamed) in (0u16..).zip(&self.streamed) {
-            let own = self.parts.config.tasks.get(task as usize).map(|config| config.joints.as_slice());
+        for task in 0..self.streams.tasks() {
+            let own = self.facts.config.tasks.get(task as usize).map(|config| config.joints.as_slice());
             let own = own.unwrap_or_default();
-            if own.iter().any(|joint| joints.contains(joint)) && streamed.swap(false, Ordering::AcqRel) {
+            if own.iter().any(|joint| joints.contains(joint)) && self.streams.end(task) {
                 self.ask(Request::Cancel { task: Some(task) }).await?;
-                arms.extend(own.iter().filter_map(|joint| self.locate(*joint)).map(|(arm, _)| arm as u16));
+                arms.extend(own.iter().filter_map(|joint| self.facts.locate(*joint)).map(|(arm, _)| arm as u16));
             }
         }
         arms.sort_unstable();
@@ -55,10 +47,10 @@ impl Service {
     /// Waits until the commands of an arm are at rest, at most for the time that braking needs.
     async fn commands_rest(&self, arm: u16) {
         let limit = Instant::now() + self.braking_limit(arm);
-        let dof = self.parts.config.arms.get(arm as usize).map_or(0, |config| config.dof);
+        let dof = self.facts.config.arms.get(arm as usize).map_or(0, |config| config.dof);
         let mut before: Option<ArmCommand> = None;
         let look = || {
-            let command = self.arm_view(arm as usize)?.command;
+            let command = self.tick.arm_view(arm as usize)?.command;
             let Some(mode) = command.mode else { return Some(()) };
             let last = before.replace(command);
             let of = |values: &dimos_core::joint::Joints| values.iter().take(dof).copied().collect::<Vec<f64>>();
@@ -71,7 +63,7 @@ impl Service {
             };
             rests.then_some(())
         };
-        self.until(limit, look).await;
+        self.tick.until(limit, look).await;
     }
 
     /// Sends the next target of a servo (`positions`) or velocity task, and one of the gripper.
@@ -82,8 +74,8 @@ impl Service {
         gripper: Option<f64>,
         origin: Origin,
     ) -> Result<(), RpcError> {
-        let index = self.task_index(&task)?;
-        let width = self.parts.config.tasks[index as usize].joints.len();
+        let index = self.facts.task_index(&task)?;
+        let width = self.facts.config.tasks[index as usize].joints.len();
         if values.len() != width {
             let what = format!("{task} has {width} joints, the target {} values", values.len());
             return Err(RpcError::new(Code::InvalidParams, what).hint("give one value per joint of the task, in order"));
@@ -115,13 +107,13 @@ impl Service {
 
     /// Starts a task that takes no targets.
     pub(in crate::runtime) async fn start_task(&self, task: &str, origin: Origin) -> Result<Done, RpcError> {
-        let task = self.task_index(task)?;
+        let task = self.facts.task_index(task)?;
         self.target(task, Request::Start { task }, origin).await?;
         Ok(Done {})
     }
 
     async fn steer(&self, task: &str, goal: Goal, origin: Origin) -> Result<Done, RpcError> {
-        let task = self.task_index(task)?;
+        let task = self.facts.task_index(task)?;
         self.target(task, Request::CartesianTarget { task, goal }, origin).await?;
         Ok(Done {})
     }

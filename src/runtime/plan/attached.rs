@@ -9,8 +9,9 @@ use std::time::Duration;
 
 use tokio::sync::oneshot;
 
+use super::PlannerPort;
 use super::planner_link::answer_encoded;
-use super::planner_port::{PlannerPort, registered};
+use super::planner_port::registered;
 use crate::runtime::StartError;
 use crate::runtime::start::robots;
 use dimos_planner::planning::scene::config::PlannerConfig;

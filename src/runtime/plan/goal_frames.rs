@@ -2,7 +2,8 @@
 
 use nalgebra::Isometry3;
 
-use super::planner_port::{PlannerPort, isometry, positions_of};
+use super::PlannerPort;
+use super::planner_port::{isometry, positions_of};
 use super::world_requests::link_pose;
 use crate::runtime::tool::tcp::MAP;
 use dimos_core::sync::lock;
@@ -61,7 +62,7 @@ impl PlannerPort {
                 let Some([holder, link]) = &object.held_by else { return Ok(at) };
                 let scene = self.thread.now();
                 let held = scene.robot(holder).and_then(|index| scene.robots.get(index));
-                let holder = held.ok_or_else(crate::runtime::service::internal)?;
+                let holder = held.ok_or_else(crate::runtime::internal)?;
                 Ok(link_pose(holder, link, moment)? * at)
             }
         }

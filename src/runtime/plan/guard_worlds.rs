@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Condvar, Mutex, Weak};
 use std::time::Duration;
 
-use super::planner_port::PlannerPort;
-use crate::runtime::service::Service;
+use super::PlannerPort;
+use crate::runtime::Service;
 use dimos_control::guard::GuardWorld;
 use dimos_core::sync::lock;
 use dimos_core::telemetry::describe::Names;
@@ -78,7 +78,7 @@ impl GuardWorlds {
             let mut failed = false;
             while let Some(service) = service.upgrade() {
                 let asked = lock(&guard.changes).0;
-                if let Some(port) = &service.parts.planner {
+                if let Some(port) = service.plans.port() {
                     let moment = service.moment(0);
                     port.measured(&moment);
                     if let Err(what) = guard.refresh(port, &moment)

@@ -2,7 +2,7 @@
 
 use nalgebra::Isometry3;
 
-use crate::runtime::service::Service;
+use crate::runtime::Service;
 use dimos_log::display_messages::TFMessage;
 use dimos_log::messages::Header;
 use dimos_rpc::api::{DescriptionReport, TransformReport, TransformsReport};
@@ -14,15 +14,15 @@ impl Service {
     }
 
     pub(in crate::runtime) fn transforms(&self) -> TransformsReport {
-        let arms: Vec<_> = (0..self.parts.names.arms.len()).map(|arm| self.arm_view(arm)).collect();
+        let arms: Vec<_> = (0..self.facts.names.arms.len()).map(|arm| self.tick.arm_view(arm)).collect();
         let measured = |arm: usize| Some(&arms.get(arm)?.as_ref()?.state).filter(|state| state.seq > 0);
-        let positions: Vec<f64> = (self.parts.config.arms.iter().enumerate())
+        let positions: Vec<f64> = (self.facts.config.arms.iter().enumerate())
             .flat_map(|(arm, config)| (0..config.dof).map(move |joint| measured(arm)?.position.get(joint).copied()))
             .map(|position| position.unwrap_or(f64::NAN))
             .collect();
         let models = self.tcp_models();
         let tool = |joint: usize| -> Isometry3<f64> {
-            let name = [self.parts.names.joint(joint as u16)];
+            let name = [self.facts.names.joint(joint as u16)];
             models.iter().flatten().find(|model| model.moves(&name)).and_then(|model| model.tool).unwrap_or_default()
         };
         let moved = self.described().robots.moved(&Header::default(), &positions, measured, tool);

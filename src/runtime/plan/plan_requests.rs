@@ -7,8 +7,9 @@ use std::time::{Duration, Instant};
 use glamx::DAffine3;
 use nalgebra::Isometry3;
 
-use super::planner_port::{PlannerPort, isometry, no_state, positions_of, robot_index, run_blocking};
-use crate::runtime::service::internal;
+use super::PlannerPort;
+use super::planner_port::{isometry, no_state, positions_of, robot_index, run_blocking};
+use crate::runtime::internal;
 use crate::runtime::tool::tcp::TcpModel;
 use dimos_core::trajectory::{Cursor, JointTrajectory, Sample, Spline, TrajectoryPoint};
 use dimos_planner::collision::Stop;

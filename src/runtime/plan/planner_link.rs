@@ -7,10 +7,11 @@ use std::time::Duration;
 
 use serde_json::Value;
 
-use super::planner_port::{PlannerPort, run_blocking};
+use super::planner_port::run_blocking;
+use super::{Attached, PlannerPort, Plans};
 use crate::blueprint::Arm;
-use crate::runtime::service::{Service, internal};
 use crate::runtime::tool::tcp::TcpModel;
+use crate::runtime::{Service, internal};
 use dimos_control::config::CoordinatorConfig;
 use dimos_control::limit::Bounds;
 use dimos_control::task_body::TargetKind;
@@ -35,17 +36,8 @@ const SLOW_QUERY_TIMEOUT: Duration = Duration::from_secs(9);
 /// Timeout for its part of `status`.
 const STATUS_TIMEOUT: Duration = Duration::from_millis(500);
 
-/// A planner in another process.
-pub(in crate::runtime) struct Attached {
-    name: String,
-    robots: Vec<api::RegisteredRobot>,
-    /// The models of the robots, with their present tools.
-    pub(in crate::runtime) models: Mutex<Vec<TcpModel>>,
-    line: Arc<PlannerProxy>,
-}
-
 /// The planner of a run.
-pub(in crate::runtime) enum Planner<'a> {
+pub(super) enum Planner<'a> {
     Own(&'a PlannerPort),
     Attached(Arc<Attached>),
 }
@@ -92,10 +84,10 @@ impl Planner<'_> {
     }
 }
 
-impl Service {
+impl Plans {
     /// Returns the run's planner; an error without one, with data if one has disconnected.
-    pub(in crate::runtime) fn planner(&self) -> Result<Planner<'_>, RpcError> {
-        if let Some(port) = &self.parts.planner {
+    pub(super) fn planner(&self) -> Result<Planner<'_>, RpcError> {
+        if let Some(port) = &self.port {
             return Ok(Planner::Own(port));
         }
         match &*lock(&self.attached) {
@@ -106,6 +98,18 @@ impl Service {
         }
     }
 
+    /// Refuses a motion that is not collision-checked if the run has a planner, also one that has disconnected.
+    pub fn needs_no_plan(&self, arm: &str) -> Result<(), RpcError> {
+        match self.planner() {
+            Ok(_) => Err(RpcError::new(Code::NotPlanned, format!("a direct motion of {arm} is not collision-checked"))
+                .hint("this run has a planner, and a planned motion is checked: plan and execute it; or order it all the same: --direct, in rpc and Python `direct`")),
+            Err(RpcError { code: Code::NoPlanner, data: None, .. }) => Ok(()),
+            Err(gone) => Err(gone),
+        }
+    }
+}
+
+impl Service {
     /// Answers those of the planner's methods that neither make nor execute a plan.
     pub(in crate::runtime) async fn planner_call(&self, call: Call) -> Result<Reply, RpcError> {
         self.planner_call_from(call, Origin::default()).await
@@ -114,7 +118,7 @@ impl Service {
     /// Answers the planner's methods. A plan is executed only if nothing has interrupted its arms since it was
     /// requested.
     pub(in crate::runtime) async fn planner_call_from(&self, call: Call, origin: Origin) -> Result<Reply, RpcError> {
-        let planner = self.planner()?;
+        let planner = self.plans.planner()?;
         let limit = if matches!(call, Call::WorldAdd(_)) { SLOW_QUERY_TIMEOUT } else { QUERY_TIMEOUT };
         match call {
             Call::ExecutePlan(execute) => {
@@ -122,26 +126,23 @@ impl Service {
                 self.refuse_mismatch(&released.trajectory.joint_names)?;
                 // A planner may release a plan that this run has not requested.
                 let plan = execute.plan.unwrap_or(released.plan);
-                let planned = lock(&self.plan_requests).get_mut(&plan).map(|(request, planned)| {
-                    // If it is planned again, it stays as slow.
-                    request.speed = execute.max_speed.map_or(request.speed, |most| request.speed.min(most));
-                    planned.epoch
-                });
+                // If it is planned again, it stays as slow.
+                let planned = self.plans.slow_down(plan, execute.max_speed);
                 let epoch = planned.map_or(origin.epoch, |planned| planned.min(origin.epoch));
                 let origin = Origin { epoch, ..origin };
-                self.end_streams(&self.joints_named(&released.trajectory.joint_names)?).await?;
+                self.end_streams(&self.facts.joints_named(&released.trajectory.joint_names)?).await?;
                 let replan = execute.replan.then_some(execute.presence);
                 let begun = self.execute_released(&planner, released, origin, replan).await?;
-                lock(&self.motions).retraces(begun.motion, execute.retraces_to);
+                self.motions.retraces(begun.motion, execute.retraces_to);
                 Ok(Reply::ExecutePlan(begun))
             }
             Call::Planner(_) => self.planner_report(&planner, limit).await.map(Reply::Planner),
             Call::Plan(plan) => {
                 let plan = self.with_saved_poses(plan).await?;
                 self.refuse_mismatch(&self.joints_of_plan(&plan))?;
-                let number = self.parts.dispatcher.next_id();
+                let number = self.tick.dispatcher().next_id();
                 let begun = planner.answer(Call::Plan(plan.clone()), self.moment(number), limit).await?;
-                self.remember_request(number, plan, origin);
+                self.plans.remember(number, plan, origin);
                 Ok(begun)
             }
             Call::WorldAdd(_) | Call::WorldMove(_) | Call::WorldRemove(_) | Call::Attach(_) | Call::Detach(_) => {
@@ -149,7 +150,7 @@ impl Service {
                     if matches!(call, Call::Attach(_) | Call::Detach(_)) { self.moment(0) } else { Moment::default() };
                 let changed = planner.answer(call, moment, limit).await;
                 // Also after an error or a timeout: the change may have been made.
-                if let Some(guard) = self.parts.guard.clone() {
+                if let Some(guard) = self.plans.guard.clone() {
                     run_blocking(move || guard.wait()).await?;
                 }
                 self.recheck(&planner).await;
@@ -172,9 +173,9 @@ impl Service {
         let execute = api::Execute { trajectory, task, retraces_to: None };
         api::Method::check(&execute).map_err(|what| RpcError::new(Code::InvalidTrajectory, what))?;
         let begun = self.execute_as(execute, origin, Some((plan, replan))).await?;
-        *lock(&self.executed) = Some((plan, begun.motion));
+        *lock(&self.plans.executed) = Some((plan, begun.motion));
         // The world may have changed since the plan was checked.
-        let under_way = lock(&self.motions).under_way().into_iter().find(|motion| motion.number == begun.motion);
+        let under_way = self.motions.under_way().into_iter().find(|motion| motion.number == begun.motion);
         if let Some(motion) = under_way {
             self.recheck_motion(planner, &motion).await;
         }
@@ -183,7 +184,7 @@ impl Service {
 
     /// Cancels the planning of this plan; `None`: of any. Returns whether it was being planned.
     pub(in crate::runtime) async fn cancel_planning(&self, plan: Option<u64>) -> bool {
-        let Ok(planner) = self.planner() else { return false };
+        let Ok(planner) = self.plans.planner() else { return false };
         let cancel = Call::Cancel(api::Cancel { plan, ..Default::default() });
         let cancelled = planner.answer(cancel, Moment::default(), QUERY_TIMEOUT).await;
         matches!(cancelled, Ok(Reply::Cancel(reply)) if reply.planning)
@@ -195,7 +196,7 @@ impl Service {
         &self,
         plan: Option<u64>,
     ) -> Result<(u64, Vec<String>), RpcError> {
-        let planner = self.planner()?;
+        let planner = self.plans.planner()?;
         let answer = |call| planner.answer(call, Moment::default(), QUERY_TIMEOUT);
         let number = match plan {
             Some(number) => number,
@@ -214,7 +215,7 @@ impl Service {
     /// Returns the planner's report, with the progress of its last motion.
     /// Returns the planner's robots.
     pub(in crate::runtime) async fn robots(&self) -> Result<Vec<api::RobotReport>, RpcError> {
-        Ok(self.planner_report(&self.planner()?, QUERY_TIMEOUT).await?.robots)
+        Ok(self.planner_report(&self.plans.planner()?, QUERY_TIMEOUT).await?.robots)
     }
 
     async fn planner_report(&self, planner: &Planner<'_>, limit: Duration) -> Result<PlannerReport, RpcError> {
@@ -223,7 +224,7 @@ impl Service {
         else {
             return Err(internal());
         };
-        let motion = lock(&self.executed).and_then(|(_, motion)| self.motion(motion).ok());
+        let motion = lock(&self.plans.executed).and_then(|(_, motion)| self.motion(motion).ok());
         let (state, error) = match (report.state.as_str(), &motion) {
             ("PLANNING", _) => return Ok(report),
             (_, Some(motion)) if !motion.done => ("EXECUTING", None),
@@ -242,7 +243,7 @@ impl Service {
             error: Some(e.message.clone()),
             ..Default::default()
         };
-        let planner = match self.planner() {
+        let planner = match self.plans.planner() {
             Ok(planner) => planner,
             Err(_) => return None,
         };
@@ -269,10 +270,10 @@ impl Service {
         line: Arc<PlannerProxy>,
     ) -> Result<Registered, RpcError> {
         let has = |whose: String| {
-            RpcError::new(Code::HasPlanner, format!("run {} has a planner already: {whose}", self.parts.run))
+            RpcError::new(Code::HasPlanner, format!("run {} has a planner already: {whose}", self.facts.run))
                 .hint("end that one first: a run has one planner")
         };
-        if self.parts.planner.is_some() {
+        if self.plans.port.is_some() {
             return Err(has("its blueprint's own".into()));
         }
         let mut models = Vec::new();
@@ -281,9 +282,9 @@ impl Service {
             models.extend(TcpModel::registered(robot).map_err(|what| RpcError::new(Code::InvalidParams, what))?);
         }
         let joints = planner.robots.iter().flat_map(|robot| &robot.joints);
-        let mut limits = command_limits(&self.parts.names, &self.parts.config, &self.parts.blueprint.arms);
+        let mut limits = command_limits(&self.facts.names, &self.facts.config, &self.facts.blueprint.arms);
         limits.retain(|joint, _| joints.clone().any(|j| j == joint));
-        let mut attached = lock(&self.attached);
+        let mut attached = lock(&self.plans.attached);
         if let Some(other) = attached.as_ref().filter(|other| !other.line.is_closed()) {
             let process = other.line.pid().map(|pid| format!(" (pid {pid})")).unwrap_or_default();
             return Err(has(format!("{}{process}", other.name)));
@@ -292,20 +293,20 @@ impl Service {
         self.take_planner_tools(&models);
         let models = Mutex::new(models);
         *attached = Some(Arc::new(Attached { name: planner.name, robots: planner.robots, models, line }));
-        *lock(&self.executed) = None;
-        Ok(Registered { run: self.parts.run.clone(), limits })
+        *lock(&self.plans.executed) = None;
+        Ok(Registered { run: self.facts.run.clone(), limits })
     }
 
     /// Checks that this run has the joints of a robot and the task that moves them.
     fn fits(&self, robot: &api::RegisteredRobot) -> Result<(), RpcError> {
-        let all: Vec<&String> = self.parts.names.arms.iter().flat_map(|arm| &arm.joints).collect();
+        let all: Vec<&String> = self.facts.names.arms.iter().flat_map(|arm| &arm.joints).collect();
         let index = |name: &String| {
             let place = all.iter().position(|joint| *joint == name);
             place.ok_or_else(|| RpcError::unknown(Code::InvalidParams, "joint", name, &all))
         };
         let joints = robot.joints.iter().map(index).collect::<Result<Vec<_>, _>>()?;
         let Some(name) = &robot.task else { return Ok(()) };
-        let task = &self.parts.blueprint.tasks[self.task_index(name)? as usize];
+        let task = &self.facts.blueprint.tasks[self.facts.task_index(name)? as usize];
         let has = |joint: &usize| task.joints.contains(joint);
         match (task.spec.takes(TargetKind::Trajectory), joints.iter().all(has)) {
             (true, true) => Ok(()),
@@ -320,16 +321,16 @@ impl Service {
     /// Returns the current state of the run, for a planner.
     pub(in crate::runtime) fn moment(&self, plan: u64) -> Moment {
         let (now, mut positions, mut grippers) = (self.now(), BTreeMap::new(), BTreeMap::new());
-        for (index, arm) in self.parts.names.arms.iter().enumerate() {
+        for (index, arm) in self.facts.names.arms.iter().enumerate() {
             let fresh = |view: &dimos_core::telemetry::ArmSample| {
                 view.state.seq > 0 && now.since(view.state.stamp) <= MAX_STATE_AGE
             };
-            let Some(view) = self.arm_view(index).filter(fresh) else { continue };
+            let Some(view) = self.tick.arm_view(index).filter(fresh) else { continue };
             let commanded = view.command.mode.is_some_and(|mode| mode.is_position());
             let values = if commanded { view.command.values } else { view.state.position };
             let known = arm.joints.iter().cloned().zip(values).filter(|(_, value)| value.is_finite());
             positions.extend(known);
-            let range = self.gripper_info(index).and_then(|info| info.range);
+            let range = self.facts.gripper_info(index).and_then(|info| info.range);
             if let (Some(opening), Some((closed, open))) = (view.state.gripper, range)
                 && open != closed
             {

@@ -2,14 +2,14 @@
 //! run comes with a request, so it works in the run's process and in its own.
 
 use std::collections::BTreeMap;
-use std::sync::Mutex;
+use std::sync::{Arc, Mutex};
 
 use nalgebra::Isometry3;
 
+use super::PlannerPort;
 use super::plan_requests::job;
-use super::recheck::Released;
 use super::world_requests::typed;
-use crate::runtime::service::internal;
+use crate::runtime::internal;
 use crate::runtime::tool::tcp::TcpModel;
 use dimos_core::pose;
 use dimos_core::sync::lock;
@@ -24,16 +24,25 @@ use dimos_rpc::api::{
 use dimos_rpc::api::{Request as Call, WorldAdd, WorldReport};
 use dimos_rpc::{Code, RpcError};
 
-/// A planner.
-pub struct PlannerPort {
-    pub(in crate::runtime) thread: PlannerThread,
-    /// The objects of the world, as they were given.
-    pub(in crate::runtime) objects: Mutex<BTreeMap<String, WorldObject>>,
-    /// The plans that were executed, by number.
-    pub(in crate::runtime) released: Mutex<BTreeMap<u64, Released>>,
-}
-
 impl PlannerPort {
+    /// Returns the planning scene as it was built.
+    pub fn setup(&self) -> &PlanningScene {
+        self.thread.setup()
+    }
+
+    /// Returns the planning scene with the present tools and positions.
+    #[cfg(test)]
+    pub fn now(&self) -> Arc<PlanningScene> {
+        self.thread.now()
+    }
+
+    /// Returns the objects of the world by name, and the version of the world with them, if that is not `known`.
+    pub fn objects_unless(&self, known: Option<u64>) -> Option<(u64, BTreeMap<String, WorldObject>)> {
+        let objects = lock(&self.objects);
+        let version = self.thread.version();
+        (known != Some(version)).then(|| (version, objects.clone()))
+    }
+
     /// Starts the planner thread, for robots within the limits of the coordinator. `solver` replaces the built-in
     /// planner.
     pub fn start(
@@ -51,7 +60,7 @@ impl PlannerPort {
         };
         let setup = setup.within(&limits.iter().map(|(joint, l)| (joint.clone(), bound(l))).collect())?;
         let objects = config.objects.iter().map(|object| (object.name.clone(), typed(object))).collect();
-        let thread = PlannerThread::with(setup, config.timeout, solver.unwrap_or_else(|| std::sync::Arc::new(solve)));
+        let thread = PlannerThread::with(setup, config.timeout, solver.unwrap_or_else(|| Arc::new(solve)));
         let thread = thread.map_err(|e| format!("no planner thread: {e}"))?;
         Ok(Self { thread, objects: Mutex::new(objects), released: Mutex::default() })
     }

@@ -5,11 +5,12 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use super::PlannerPort;
 use super::plan_requests::all_positions;
 use super::planner_link::Planner;
-use super::planner_port::{PlannerPort, run_blocking};
+use super::planner_port::run_blocking;
+use crate::runtime::Service;
 use crate::runtime::motion::motions::UnderWay;
-use crate::runtime::service::Service;
 use dimos_control::request::Request;
 use dimos_core::sync::lock;
 use dimos_core::telemetry::TaskState;
@@ -65,8 +66,8 @@ impl PlannerPort {
 
 impl Service {
     /// Checks the rest of every planned motion that is being executed.
-    pub(in crate::runtime) async fn recheck(&self, planner: &Planner<'_>) {
-        let under_way = lock(&self.motions).under_way();
+    pub(super) async fn recheck(&self, planner: &Planner<'_>) {
+        let under_way = self.motions.under_way();
         for motion in under_way {
             self.recheck_motion(planner, &motion).await;
         }
@@ -74,7 +75,7 @@ impl Service {
 
     /// Returns the progress of a motion [s]; `None`: it has ended, or decelerates already.
     fn elapsed(&self, motion: &UnderWay) -> Option<f64> {
-        let view = self.task_view(motion.task as usize);
+        let view = self.tick.task_view(motion.task as usize);
         match view.state {
             TaskState::Executing if view.motion == motion.number => Some(view.elapsed),
             // The tick has accepted it, and shows it after the next tick.
@@ -83,7 +84,7 @@ impl Service {
         }
     }
 
-    pub(in crate::runtime) async fn recheck_motion(&self, planner: &Planner<'_>, motion: &UnderWay) {
+    pub(super) async fn recheck_motion(&self, planner: &Planner<'_>, motion: &UnderWay) {
         let Some(elapsed) = self.elapsed(motion) else { return };
         let asked = Recheck { plan: motion.plan, elapsed };
         let (free_until, what) = match planner.recheck(&asked, self.moment(0), LIMIT + LIMIT / 2).await {
@@ -93,7 +94,7 @@ impl Service {
             Err(e) => (f64::INFINITY, e.message),
         };
         let Some(elapsed) = self.elapsed(motion) else { return };
-        let tick = self.period().as_secs_f64();
+        let tick = self.facts.period().as_secs_f64();
         let acceleration: Vec<f64> = motion.joints.iter().map(|joint| self.acceleration(*joint)).collect();
         let in_time = rests_before(free_until, &motion.spline, &acceleration, elapsed, tick);
         let ahead = (free_until - elapsed).max(0.0);
@@ -104,8 +105,8 @@ impl Service {
                 "in its way after {ahead:.2} s, closer than the arm can brake along its path: {what}; held at once"
             ),
         };
-        tracing::warn!("motion {} on {}: {text}", motion.number, self.parts.names.task(motion.task));
-        let again = lock(&self.motions).blocked(motion.number, text, in_time);
+        tracing::warn!("motion {} on {}: {text}", motion.number, self.facts.names.task(motion.task));
+        let again = self.motions.blocked(motion.number, text, in_time);
         let _ = self.ask(Request::WayBlocked { task: motion.task, motion: motion.number, in_time }).await;
         if again {
             self.go_around(motion);
@@ -114,8 +115,8 @@ impl Service {
 
     /// Returns the acceleration limit of a joint [rad/s²].
     fn acceleration(&self, joint: u16) -> f64 {
-        let located = self.locate(joint);
-        let limit = located.and_then(|(arm, j)| self.parts.config.arms.get(arm)?.limits.acceleration_max.get(j));
+        let located = self.facts.locate(joint);
+        let limit = located.and_then(|(arm, j)| self.facts.config.arms.get(arm)?.limits.acceleration_max.get(j));
         limit.copied().unwrap_or(0.0)
     }
 }

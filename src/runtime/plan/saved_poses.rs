@@ -6,7 +6,7 @@ use std::path::PathBuf;
 
 use super::planner_port::run_blocking;
 use crate::blueprint::Blueprint;
-use crate::runtime::service::{Service, internal};
+use crate::runtime::{Service, internal};
 use dimos_rpc::api::{self, SavedPose};
 use dimos_rpc::{Code, RpcError};
 
@@ -91,7 +91,7 @@ impl PoseFile {
 
 impl Service {
     fn pose_file(&self) -> Result<PoseFile, RpcError> {
-        PoseFile::of(&self.parts.blueprint)
+        PoseFile::of(&self.facts.blueprint)
     }
 
     /// Returns the saved poses.
@@ -104,20 +104,20 @@ impl Service {
 
     /// Saves the measured joint positions of arms under a name.
     pub(in crate::runtime) async fn save_pose(&self, call: api::PoseSave) -> Result<api::PoseSaved, RpcError> {
-        let robots = self.parts.blueprint.planner.iter().flat_map(|planner| &planner.robots);
+        let robots = self.facts.blueprint.planner.iter().flat_map(|planner| &planner.robots);
         if let Some(robot) = robots.into_iter().find(|robot| robot.named_poses.contains_key(&call.name)) {
             let what = format!("{} has a named pose {} in the blueprint", robot.name, call.name);
             return Err(RpcError::new(Code::InvalidParams, what).hint("choose another name"));
         }
-        let names = &self.parts.names.arms;
+        let names = &self.facts.names.arms;
         let wanted = match call.arms.is_empty() {
             true => (0..names.len() as u16).collect(),
-            false => call.arms.iter().map(|id| self.arm_index(id)).collect::<Result<Vec<u16>, _>>()?,
+            false => call.arms.iter().map(|id| self.facts.arm_index(id)).collect::<Result<Vec<u16>, _>>()?,
         };
         let mut pose = SavedPose::new();
         for arm in wanted {
             let name = names.get(arm as usize).ok_or_else(internal)?;
-            let view = self.arm_view(arm as usize).filter(|view| view.state.seq > 0).ok_or_else(|| {
+            let view = self.tick.arm_view(arm as usize).filter(|view| view.state.seq > 0).ok_or_else(|| {
                 RpcError::new(Code::StartStateUnavailable, format!("{}: no state so far", name.hardware_id))
                     .hint("`dimos status` shows its link")
             })?;

@@ -7,8 +7,9 @@ use std::path::PathBuf;
 use glamx::DAffine3;
 use nalgebra::{Isometry3, Matrix3, Vector3};
 
-use super::planner_port::{PlannerPort, isometry, positions_of, robot_index, run_blocking, spec};
-use crate::runtime::service::internal;
+use super::PlannerPort;
+use super::planner_port::{isometry, positions_of, robot_index, run_blocking, spec};
+use crate::runtime::internal;
 use dimos_core::sync::lock;
 use dimos_planner::collision::pairs;
 use dimos_planner::collision::shape::Placed;

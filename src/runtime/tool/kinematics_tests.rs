@@ -100,7 +100,7 @@ fn models_of_the_shipped_planners_fit_and_nothing_is_said() {
     for blueprint in ["ur5e-planner", "xarm6-planner", "xarm7-planner", "fr3-planner", "yourarm-planner"] {
         let (_folder, run) = run(blueprint, &[]);
         assert_eq!(run.status().arms.remove(0).model_notes, Vec::<String>::new(), "{blueprint}");
-        let compared = run.handle.service.compared();
+        let compared = run.handle.service().compared();
         assert_eq!(compared, [true], "{blueprint}");
         run.stop();
     }
@@ -142,12 +142,12 @@ fn a_small_difference_is_said_and_adds_to_the_padding() {
     let (_folder, run) = run("xarm6-planner", &[("hardware.arm.options.sim.faults", fault)]);
     let notes = run.status().arms.remove(0).model_notes;
     assert!(notes.iter().any(|note| note.ends_with("added to the padding")), "{notes:?}");
-    let paddings = run.handle.service.paddings();
+    let paddings = run.handle.service().paddings();
     let pad = paddings["arm_joint1"];
     assert!((0.005..0.03).contains(&pad), "{paddings:?}");
     plan(&run).unwrap();
-    let planner = run.handle.service.parts.planner.as_ref().unwrap();
-    assert!((planner.thread.now().robots[0].body.apart - pad).abs() < 1e-3, "the planner has it");
+    let planner = run.handle.service().plans.port().unwrap();
+    assert!((planner.now().robots[0].body.apart - pad).abs() < 1e-3, "the planner has it");
     run.stop();
 }
 

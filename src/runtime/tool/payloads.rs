@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use crate::runtime::arm::arm_requests::{order, refused};
-use crate::runtime::service::{Service, internal};
+use crate::runtime::{Service, internal};
 use dimos_control::request::Request;
 use dimos_core::arm::Load;
 use dimos_core::joint::STANDSTILL;
@@ -47,18 +47,18 @@ impl HeldLoads {
 impl Service {
     /// Reads the load that an arm's controller calculates with.
     pub(in crate::runtime) async fn payload(&self, id: &str) -> Result<PayloadReply, RpcError> {
-        let arm = self.arm_index(id)?;
+        let arm = self.facts.arm_index(id)?;
         self.takes_payload(arm)?;
-        let load = order(self.device(arm)?.read_payload()).await;
+        let load = order(self.arms.device(arm)?.read_payload()).await;
         let load = load.map_err(|e| refused(id, "did not report its payload", &e))?;
         Ok(PayloadReply { payload: load.map(LoadReport::from) })
     }
 
     /// Sets the load at an arm's flange: all of it, with the objects that the arm holds.
     pub(in crate::runtime) async fn set_payload(&self, call: api::ArmPayloadSet) -> Result<Reply, RpcError> {
-        let arm = self.arm_index(&call.arm)?;
+        let arm = self.facts.arm_index(&call.arm)?;
         self.takes_payload(arm)?;
-        let held = &mut *self.held_loads.get(arm as usize).ok_or_else(internal)?.lock().await;
+        let held = &mut *self.tools.held.get(arm as usize).ok_or_else(internal)?.lock().await;
         let written = self.write_payload(arm, &call.load()).await?;
         held.objects.clear();
         held.set = Some(call.load());
@@ -67,41 +67,41 @@ impl Service {
     }
 
     fn takes_payload(&self, arm: u16) -> Result<(), RpcError> {
-        if self.parts.connected.get(arm as usize).is_some_and(|connected| connected.has_payload) {
+        if self.facts.connected.get(arm as usize).is_some_and(|connected| connected.has_payload) {
             return Ok(());
         }
-        let what = format!("the controller of {} takes no payload", self.parts.names.arm(arm));
+        let what = format!("the controller of {} takes no payload", self.facts.names.arm(arm));
         Err(RpcError::new(Code::Unsupported, what).hint("its page in docs/arms lists what the adapter supports"))
     }
 
     /// Sets a load at rest. After an error the controller has the load that it had.
     async fn write_payload(&self, arm: u16, load: &Load) -> Result<Written, RpcError> {
-        let most = self.parts.blueprint.arms.get(arm as usize).and_then(|arm| arm.setup.max_payload);
+        let most = self.facts.blueprint.arms.get(arm as usize).and_then(|arm| arm.setup.max_payload);
         load.within(most).map_err(|what| RpcError::new(Code::InvalidParams, what).hint(Load::TOO_HEAVY))?;
         self.rests(arm)?;
-        let name = self.parts.names.arm(arm);
-        if self.phase(arm as usize) == Phase::Led {
+        let name = self.facts.names.arm(arm);
+        if self.tick.phase(arm as usize) == Phase::Led {
             let hint = end_of_lead(&name, self.led_by(arm));
             return Err(RpcError::new(Code::ArmNotReady, format!("{name} is led")).hint(hint));
         }
-        let resets = self.parts.connected.get(arm as usize).is_some_and(|connected| connected.payload_resets);
-        let again = resets && matches!(self.phase(arm as usize), Phase::Activating | Phase::Ready);
+        let resets = self.facts.connected.get(arm as usize).is_some_and(|connected| connected.payload_resets);
+        let again = resets && matches!(self.tick.phase(arm as usize), Phase::Activating | Phase::Ready);
         if again {
             self.ask(Request::PrepareDisable { arm }).await?;
             self.wait_for_rest(&name, arm, Instant::now()).await?;
         }
-        let device = self.device(arm)?;
+        let device = self.arms.device(arm)?;
         let mut actual = order(device.set_payload(*load)).await;
         if matches!(actual, Err(AdapterError::Rejected(_))) {
-            self.until(Instant::now() + SETTLING_TIME, || None::<()>).await;
+            self.tick.until(Instant::now() + SETTLING_TIME, || None::<()>).await;
             self.rests(arm)?;
             actual = order(device.set_payload(*load)).await;
         }
         let ready = if again { self.enable(name.clone(), false).await.map(drop) } else { Ok(()) };
         let actual = actual.map_err(|e| refused(&name, "did not take the payload", &e))?;
         let [x, y, z] = load.center;
-        self.parts
-            .dispatcher
+        self.tick
+            .dispatcher()
             .log(Severity::Info, format!("{name}: payload set to {:.3} kg at {x:.4} {y:.4} {z:.4} m", load.mass));
         // Each load is logged, also one that is soon replaced.
         self.log_details();
@@ -110,16 +110,16 @@ impl Service {
 
     /// Returns an error while an arm moves or executes a motion.
     pub(in crate::runtime) fn rests(&self, arm: u16) -> Result<(), RpcError> {
-        let joints = self.joints_of_arm(arm);
-        let tasks = self.parts.config.tasks.iter().enumerate();
+        let joints = self.facts.joints_of_arm(arm);
+        let tasks = self.facts.config.tasks.iter().enumerate();
         let mut of_arm = tasks.filter(|(_, task)| task.joints.iter().any(|j| joints.contains(j)));
         // A stream at rest does not move the arm.
         let executes = |index| {
-            let view = self.task_view(index);
+            let view = self.tick.task_view(index);
             view.motion > 0 && matches!(view.state, TaskState::Executing | TaskState::Cancelling)
         };
         let busy = of_arm.find(|(index, _)| executes(*index)).map(|(_, task)| &task.name);
-        let (name, speed) = (self.parts.names.arm(arm), self.speed(arm));
+        let (name, speed) = (self.facts.names.arm(arm), self.tick.speed(arm));
         let what = match busy {
             Some(task) => format!("{name} moves: task {task} is executing"),
             None if speed > STANDSTILL => format!("{name} moves at {speed:.2} rad/s"),
@@ -136,7 +136,7 @@ impl Service {
             None => None,
         };
         let Some(arm) = arm else { return self.planner_call(Call::Attach(call)).await };
-        let held = &mut *self.held_loads.get(arm as usize).ok_or_else(internal)?.lock().await;
+        let held = &mut *self.tools.held.get(arm as usize).ok_or_else(internal)?.lock().await;
         self.rests(arm)?;
         let Reply::Attach(attached) = self.planner_call(Call::Attach(call)).await? else { return Err(internal()) };
         let carried = match attached.load {
@@ -158,7 +158,7 @@ impl Service {
 
     /// Detaches an object; the controller no longer carries its mass.
     pub(in crate::runtime) async fn detach(&self, call: api::Detach) -> Result<Reply, RpcError> {
-        for (arm, held) in self.held_loads.iter().enumerate() {
+        for (arm, held) in self.tools.held.iter().enumerate() {
             let held = &mut *held.lock().await;
             if held.objects.contains_key(&call.name) {
                 self.rests(arm as u16)?;
@@ -183,7 +183,7 @@ impl Service {
         match call {
             Call::Attach(attach) if attach.mass.is_some() => self.arm_of_robot(&attach.robot).await,
             Call::Detach(detach) => {
-                for (held, arm) in self.held_loads.iter().zip(0..) {
+                for (held, arm) in self.tools.held.iter().zip(0..) {
                     if held.lock().await.objects.contains_key(&detach.name) {
                         return Ok(Some(arm));
                     }
@@ -203,13 +203,13 @@ impl Service {
         load: Option<Load>,
     ) -> Result<Written, RpcError> {
         if held.objects.is_empty() {
-            let name = self.parts.names.arm(arm);
-            let configured = self.parts.blueprint.arms.get(arm as usize).and_then(|arm| arm.setup.payload);
+            let name = self.facts.names.arm(arm);
+            let configured = self.facts.blueprint.arms.get(arm as usize).and_then(|arm| arm.setup.payload);
             // What was set counts, even if the controller has lost it since: it is set again with the motors.
             held.base = match held.set.or(configured) {
                 Some(set) => set,
                 None => {
-                    let read = order(self.device(arm)?.read_payload()).await;
+                    let read = order(self.arms.device(arm)?.read_payload()).await;
                     read.map_err(|e| refused(&name, "did not report its payload", &e))?.unwrap_or_default()
                 }
             };
@@ -234,7 +234,7 @@ impl Service {
             return Err(internal());
         };
         let joints = report.robots.into_iter().find(|found| found.name == robot).map(|found| found.joints);
-        let arms = self.parts.names.arms.iter();
+        let arms = self.facts.names.arms.iter();
         Ok(joints.and_then(|joints| {
             arms.zip(0..).find(|(arm, _)| joints.iter().any(|j| arm.joints.contains(j))).map(|(_, index)| index)
         }))

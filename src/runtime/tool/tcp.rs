@@ -8,8 +8,8 @@ use std::sync::Arc;
 use glamx::DAffine3;
 use nalgebra::Isometry3;
 
+use crate::runtime::Service;
 use crate::runtime::plan::planner_port::{isometry, spec};
-use crate::runtime::service::Service;
 use dimos_core::sync::lock;
 use dimos_log::tcp_log::TcpChain;
 use dimos_planner::planning::scene::planning_scene::PlannedRobot;
@@ -39,9 +39,9 @@ pub(in crate::runtime) struct TcpModel {
     /// Pose of the tool centre point in the link's frame.
     pub tool: Option<Isometry3<f64>>,
     /// The flange, and the controller's base; `None` if the model does not name its flange.
-    pub(in crate::runtime) flange: Option<Flange>,
+    pub flange: Option<Flange>,
     /// Whether planned motions are made although the model does not fit the arm.
-    pub(in crate::runtime) allows_mismatch: bool,
+    pub allows_mismatch: bool,
 }
 
 /// Where the flange and the base of an arm's controller are in its model.
@@ -168,20 +168,16 @@ impl TcpModel {
 impl Service {
     /// Returns the model of each arm's tool centre point.
     pub(in crate::runtime) fn tcp_models(&self) -> Vec<Option<TcpModel>> {
-        let planned: Vec<TcpModel> = match (&self.parts.planner, &*lock(&self.attached)) {
-            (Some(port), _) => port.thread.now().robots.iter().map(TcpModel::of).collect(),
-            (None, Some(attached)) => lock(&attached.models).clone(),
-            (None, None) => Vec::new(),
-        };
+        let planned = self.plans.models();
         let model = |joints: &Vec<String>| {
             planned.iter().find(|model| model.moves(joints)).cloned().or_else(|| self.tcp_of_task(joints))
         };
-        self.parts.names.arms.iter().map(|arm| model(&arm.joints)).collect()
+        self.facts.names.arms.iter().map(|arm| model(&arm.joints)).collect()
     }
 
     /// Passes the models to the recorder.
     pub(in crate::runtime) fn log_tcps(&self) {
-        let all: Vec<&String> = self.parts.names.arms.iter().flat_map(|arm| &arm.joints).collect();
+        let all: Vec<&String> = self.facts.names.arms.iter().flat_map(|arm| &arm.joints).collect();
         let index = |joint: &String| all.iter().position(|name| *name == joint);
         let chain = |model: TcpModel| {
             let TcpModel { joints, kinematics, with_others, index: link, root, tool, .. } = model;
@@ -190,18 +186,18 @@ impl Service {
             Some(TcpChain { joints, kinematics, link, root, tool })
         };
         let chains = self.tcp_models().into_iter().map(|model| chain(model?)).collect();
-        *lock(&self.logged_tcps) = chains;
+        self.journal.set_tcps(chains);
     }
 
     /// Returns the model of the first task that moves the end effector of an arm with these joints.
     fn tcp_of_task(&self, joints: &[String]) -> Option<TcpModel> {
-        let tools = lock(&self.task_tools);
-        let tasks = self.parts.config.tasks.iter().zip(&self.parts.blueprint.tasks).zip(tools.iter());
+        let tools = lock(&self.tools.of_tasks);
+        let tasks = self.facts.config.tasks.iter().zip(&self.facts.blueprint.tasks).zip(tools.iter());
         { tasks }.find_map(|((config, task), tool)| {
             let (robot, about) = (config.kind.robot.as_ref()?, task.robot.as_ref()?);
             let model = TcpModel {
                 robot: None,
-                joints: config.joints.iter().map(|joint| self.parts.names.joint(*joint)).collect(),
+                joints: config.joints.iter().map(|joint| self.facts.names.joint(*joint)).collect(),
                 kinematics: Arc::new(robot.kinematics.clone()),
                 with_others: None,
                 index: robot.link,
@@ -218,8 +214,8 @@ impl Service {
     /// Returns the pose of each arm's tool centre point at the measured positions.
     pub(in crate::runtime) fn tcp_poses(&self) -> Vec<Option<PoseReport>> {
         let mut measured = BTreeMap::new();
-        for (index, arm) in self.parts.names.arms.iter().enumerate() {
-            let Some(view) = self.arm_view(index).filter(|view| view.state.seq > 0) else { continue };
+        for (index, arm) in self.facts.names.arms.iter().enumerate() {
+            let Some(view) = self.tick.arm_view(index).filter(|view| view.state.seq > 0) else { continue };
             measured.extend(arm.joints.iter().cloned().zip(view.state.position));
         }
         self.tcp_models().iter().map(|model| model.as_ref()?.pose(&measured)).collect()

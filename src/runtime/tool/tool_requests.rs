@@ -4,7 +4,7 @@ use nalgebra::Isometry3;
 
 use super::tcp::TcpModel;
 use crate::runtime::plan::planner_port::{isometry, spec};
-use crate::runtime::service::{Service, internal};
+use crate::runtime::{Service, internal};
 use dimos_control::request::Request;
 use dimos_control::task_robot::FramePose;
 use dimos_core::sync::lock;
@@ -16,13 +16,13 @@ use dimos_rpc::{Code, RpcError};
 impl Service {
     /// Returns an arm's tool centre point.
     pub(in crate::runtime) fn tool(&self, arm: &str) -> Result<ArmToolReply, RpcError> {
-        let tcp = self.tcp_model(self.arm_index(arm)?)?.report();
+        let tcp = self.tcp_model(self.facts.arm_index(arm)?)?.report();
         Ok(ArmToolReply { arm: arm.to_owned(), tcp })
     }
 
     /// Replaces an arm's tool. After an error the arm has the tool that it had.
     pub(in crate::runtime) async fn set_tool(&self, call: api::ArmToolSet) -> Result<Reply, RpcError> {
-        let arm = self.arm_index(&call.arm)?;
+        let arm = self.facts.arm_index(&call.arm)?;
         let model = self.tcp_model(arm)?;
         let tool = call.tool.as_ref().map(isometry);
         self.rests(arm)?;
@@ -43,13 +43,13 @@ impl Service {
             Some(tool) => format!("tool on {} at xyz {:.4?} m, rpy {:.4?} rad", tcp.link, tool.xyz, tool.rpy),
             None => format!("no tool on {}", tcp.link),
         };
-        self.parts.dispatcher.log(Severity::Info, format!("{}: {text}", call.arm));
+        self.tick.dispatcher().log(Severity::Info, format!("{}: {text}", call.arm));
         Ok(Reply::ArmToolSet(ArmToolReply { arm: call.arm, tcp }))
     }
 
     fn tcp_model(&self, arm: u16) -> Result<TcpModel, RpcError> {
         self.tcp_models().into_iter().nth(arm as usize).flatten().ok_or_else(|| {
-            let what = format!("this run has no model of {}: a tool is on a link of one", self.parts.names.arm(arm));
+            let what = format!("this run has no model of {}: a tool is on a link of one", self.facts.names.arm(arm));
             RpcError::new(Code::Unsupported, what).hint("run a planner blueprint of this arm, such as yourarm-planner")
         })
     }
@@ -58,18 +58,14 @@ impl Service {
         let Some(robot) = &model.robot else { return Ok(()) };
         let tool_spec = tool.as_ref().map(spec);
         self.planner_call(Call::ArmToolSet(api::ArmToolSet { arm: robot.clone(), tool: tool_spec })).await?;
-        let attached = lock(&self.attached).clone();
-        if let Some(attached) = attached {
-            let mut models = lock(&attached.models);
-            models.iter_mut().filter(|m| m.robot == model.robot).for_each(|model| model.tool = tool);
-        }
+        self.plans.set_attached_tool(robot, tool);
         Ok(())
     }
 
     /// Returns the tasks that move this link of an arm.
     fn tasks_of(&self, arm: u16, link: &str) -> Vec<u16> {
-        let joints = self.joints_of_arm(arm);
-        let tasks = self.parts.config.tasks.iter().zip(&self.parts.blueprint.tasks).zip(0..);
+        let joints = self.facts.joints_of_arm(arm);
+        let tasks = self.facts.config.tasks.iter().zip(&self.facts.blueprint.tasks).zip(0..);
         let moves = |task: &dimos_control::config::TaskConfig| task.joints.iter().any(|j| joints.contains(j));
         let same = |task: &crate::blueprint::Task| task.robot.as_ref().is_some_and(|robot| robot.link == link);
         tasks.filter(|((config, task), _)| moves(config) && same(task)).map(|(_, index)| index).collect()
@@ -79,17 +75,17 @@ impl Service {
         let pose = tool.as_ref().map_or(FramePose::SAME, FramePose::from);
         for &task in tasks {
             self.ask(Request::Tool { task, tool: pose }).await?;
-            *lock(&self.task_tools).get_mut(task as usize).ok_or_else(internal)? = tool;
+            *lock(&self.tools.of_tasks).get_mut(task as usize).ok_or_else(internal)? = tool;
         }
         Ok(())
     }
 
     /// Gives the tools of an attached planner to the tasks that move the same links. An active task keeps its own.
     pub(in crate::runtime) fn take_planner_tools(&self, models: &[TcpModel]) {
-        for (arm, names) in (0..).zip(&self.parts.names.arms) {
+        for (arm, names) in (0..).zip(&self.facts.names.arms) {
             let Some(model) = models.iter().find(|model| model.moves(&names.joints)) else { continue };
             for task in self.tasks_of(arm, &model.link) {
-                let own = lock(&self.task_tools).get(task as usize).copied().flatten();
+                let own = lock(&self.tools.of_tasks).get(task as usize).copied().flatten();
                 if own == model.tool {
                     continue;
                 }
@@ -99,7 +95,7 @@ impl Service {
                 let tool = model.tool;
                 runtime.spawn(async move {
                     if let Err(error) = me.set_task_tools(&[task], tool).await {
-                        let name = me.parts.names.task(task);
+                        let name = me.facts.names.task(task);
                         tracing::warn!("task {name} keeps its tool, not the planner's: {}", error.message);
                     }
                 });

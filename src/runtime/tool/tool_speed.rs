@@ -2,8 +2,8 @@
 
 use nalgebra::Isometry3;
 
+use crate::runtime::Service;
 use crate::runtime::plan::planner_port::run_blocking;
-use crate::runtime::service::Service;
 use dimos_control::config::ToolLimit;
 use dimos_control::request::Request;
 use dimos_control::task_robot::FramePose;
@@ -53,9 +53,9 @@ impl Service {
             return Ok(motion);
         }
         let bound = |joint: &u16| {
-            let (arm, j) = self.locate(*joint)?;
+            let (arm, j) = self.facts.locate(*joint)?;
             let of = |limits: &[f64], otherwise: f64| limits.get(j).copied().unwrap_or(otherwise);
-            let limits = &self.parts.config.arms.get(arm)?.limits;
+            let limits = &self.facts.config.arms.get(arm)?.limits;
             Some(JointBound {
                 velocity: of(&limits.velocity_max, f64::INFINITY),
                 acceleration: of(&limits.acceleration_max, dimos_core::joint::DEFAULT_ACCELERATION),
@@ -78,7 +78,7 @@ impl Service {
         .await?;
         let Some(slower) = slower else { return Ok(motion) };
         for (arm, part) in moved.iter().zip(fastest).filter(|(_, part)| *part > 1.0) {
-            let (limit, name) = (arm.limit * speed, self.parts.names.arm(arm.arm as u16));
+            let (limit, name) = (arm.limit * speed, self.facts.names.arm(arm.arm as u16));
             let text = format!(
                 "{name}: slowed down, its tool would move at {:.2} m/s and may at most {limit:.2} m/s: {:.1} s instead of \
                  {:.1} s",
@@ -86,17 +86,18 @@ impl Service {
                 slower.duration(),
                 motion.duration()
             );
-            self.parts.dispatcher.log(Severity::Info, text);
+            self.tick.dispatcher().log(Severity::Info, text);
         }
         Ok(slower)
     }
 
     fn moved(&self, joints: &[u16]) -> Vec<Moved> {
-        let limits = self.parts.config.arms.iter().enumerate().filter_map(|(i, arm)| Some((i, arm.tool.as_deref()?)));
+        let limits = self.facts.config.arms.iter().enumerate().filter_map(|(i, arm)| Some((i, arm.tool.as_deref()?)));
         let moved = |(arm, limit): (usize, &ToolLimit)| {
-            let own = |(k, joint): (usize, &u16)| self.locate(*joint).filter(|at| at.0 == arm).map(|at| (k, at.1));
+            let own =
+                |(k, joint): (usize, &u16)| self.facts.locate(*joint).filter(|at| at.0 == arm).map(|at| (k, at.1));
             let joints: Vec<(usize, usize)> = joints.iter().enumerate().filter_map(own).collect();
-            let view = self.arm_view(arm)?;
+            let view = self.tick.arm_view(arm)?;
             let commanded = view.command.mode.is_some_and(|mode| mode.is_position());
             let at = if commanded { view.command.values } else { view.state.position };
             let mut limit = limit.clone();
@@ -115,8 +116,8 @@ impl Service {
 
     /// Returns whether the speed of a tool on this link is limited.
     fn limits_tool_on(&self, arm: usize, link: &str) -> bool {
-        let described = self.parts.blueprint.arms.get(arm).and_then(|arm| arm.tool_robot.as_ref());
-        let limited = self.parts.config.arms.get(arm).is_some_and(|arm| arm.tool.is_some());
+        let described = self.facts.blueprint.arms.get(arm).and_then(|arm| arm.tool_robot.as_ref());
+        let limited = self.facts.config.arms.get(arm).is_some_and(|arm| arm.tool.is_some());
         limited && described.is_some_and(|tool| tool.robot.link == link)
     }
 
