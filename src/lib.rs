@@ -52,6 +52,7 @@ pub mod blueprint;
 pub mod cli;
 pub mod http;
 pub mod metrics;
+pub mod offline;
 pub mod replay;
 pub mod ros_messages;
 pub mod runtime;

@@ -34,6 +34,7 @@ mod tick_clock;
 mod tool_speed;
 
 pub use catalog::Catalog;
+pub use dimos_control::task_spec::{TaskSpec, TaskTable};
 pub use endpoints::{FoxgloveConfig, MetricsConfig, WebOrigin};
 pub use json_schema::{full_schema, json_schema};
 pub use limits::{JointOverride, LimitsEntry};

@@ -20,10 +20,10 @@ use clap::Subcommand;
 use super::arguments::{Target, duration, finite, speed};
 use super::exit::{Exit, Result};
 use super::follow::Signals;
-use super::grip::{GripAction, Objects, Opening, opening};
+use super::grip::{GripAction, Opening, opening};
 use super::output;
 use dimos_hardware::registry::Registry;
-use dimos_rpc::api::{ArmDisable, ArmEnable, ArmReply, ArmReset, Method};
+use dimos_rpc::api::{ArmDisable, ArmEnable, ArmReply, ArmReset, GripObjects, Method};
 
 /// Arguments of `arm`.
 #[derive(Debug, clap::Args)]
@@ -169,9 +169,8 @@ fn gripper(args: &GripperArgs) -> Result {
     let (signals, which) = (Signals::watch(), &args.which);
     let mut client = which.target_run.connect()?;
     let objects = match &args.attach {
-        Some(name) => Objects::Attach(name.clone()),
-        None if args.detach => Objects::Detach,
-        None => Objects::Keep,
+        Some(name) => Some(GripObjects::Attach(name.clone())),
+        None => args.detach.then_some(GripObjects::Detach),
     };
     let (opening, force, speed, timeout) = (args.opening, args.force, args.speed, args.timeout);
     let action = GripAction { opening, force, speed, timeout, objects };

@@ -7,21 +7,20 @@ use std::time::Duration;
 use super::arguments::{self, Target};
 use super::banner;
 use super::exit::{Exit, Failure, Result};
-use super::follow::{Signals, follow};
+use super::follow::Signals;
 use super::goal::{has_planner, plan, show};
+use super::going;
 use super::output::{self, Table, fixed, signed, span};
+use crate::offline::{JointBound, length, thin, time_within};
 use crate::replay::motion::{RecordedMotion, tcp_path};
 use crate::replay::recorded::Recorded;
 use crate::replay::recorded::RecordedError;
 use crate::replay::retrace::{Back, ON_PATH, Retrace, RetraceError, retrace};
 use dimos_core::trajectory::JointTrajectory;
 use dimos_log::replay::LogReader;
-use dimos_planner::planning::search::path::length;
-use dimos_planner::planning::search::thin::thin;
-use dimos_planner::planning::timing::time_within;
-use dimos_planner::planning::timing::topp::JointBound;
 use dimos_rpc::api::{
-    Execute, ExecutePlan, MAX_LINE, Motion, Plan, PlanGoal, Planner, Point, State, Status, Trajectory,
+    Execute, ExecutePlan, ExecuteReply, GoBegun, GoStep, MAX_LINE, Motion, Plan, PlanGoal, Planner, Point, State,
+    Status, Trajectory,
 };
 use dimos_rpc::client::Client;
 use dimos_rpc::report::{ArmReport, StatusReport};
@@ -97,7 +96,7 @@ pub fn run(args: &Args) -> Result {
     }
     let held = (arm.phase != "ready").then(|| not_ready(arm));
     let to = Some(way.time as f64 * 1e-9);
-    let (motion, task) = if planned {
+    let (going, begun) = if planned {
         let request = request(&mut client, name, &joints, &way, args.speed)?;
         let found = plan(&mut client, request, &signals)?;
         if !json {
@@ -107,9 +106,11 @@ pub fn run(args: &Args) -> Result {
             return end;
         }
         signals.check()?;
-        let begun = client.call(ExecutePlan { plan: Some(found.plan), retraces_to: to, ..ExecutePlan::default() })?;
-        output::note(format_args!("motion {} on {}: planned, collision-checked", begun.motion, begun.task));
-        (begun.motion, begun.task)
+        let execute = ExecutePlan { plan: Some(found.plan), retraces_to: to, ..ExecutePlan::default() };
+        let going = going::go(&mut client, GoStep::ExecutePlan(Box::new(execute)))?;
+        let begun = going::begin(&mut client, (going, 0), Some(&signals), false)?.reply;
+        output::note(format_args!("motion {} on {}: planned, collision-checked", begun.motion(), begun.task()));
+        (going, begun)
     } else {
         let trajectory = timed(&mut client, log, name, &way, args.speed)?;
         let duration = trajectory.points.last().map(|point| point.time_from_start);
@@ -117,12 +118,15 @@ pub fn run(args: &Args) -> Result {
             return end;
         }
         signals.check()?;
-        let begun = client.call(Execute { trajectory, task: None, retraces_to: to })?;
-        let (motion, task, duration) = (begun.motion, &begun.task, begun.duration);
-        output::note(format_args!("motion {motion} on {task}: {duration:.2} s, direct, not collision-checked"));
-        (begun.motion, begun.task)
+        let execute = Execute { trajectory, task: None, retraces_to: to };
+        let going = going::go(&mut client, GoStep::Execute(Box::new(execute)))?;
+        let begun = going::begin(&mut client, (going, 0), Some(&signals), false)?.reply;
+        if let GoBegun::Execute(ExecuteReply { motion, task, duration }) = &begun {
+            output::note(format_args!("motion {motion} on {task}: {duration:.2} s, direct, not collision-checked"));
+        }
+        (going, begun)
     };
-    follow(&mut client, motion, &task, &signals, json)
+    going::finish(&mut client, going, &begun, &signals, json)
 }
 
 /// Returns the result if nothing is to move: the arm is held, or `--check`.

@@ -5,8 +5,7 @@ use std::path::Path;
 use serde::Serialize;
 
 use super::text_log::Terminal;
-use crate::runtime::Ended;
-use dimos_control::arm_control::effective;
+use crate::runtime::{Ended, effective_speed};
 use dimos_core::telemetry::texts::percent;
 use dimos_rpc::report::{ArmReport, RealtimeReport, StatusReport};
 
@@ -105,7 +104,7 @@ pub fn cause(arm: &ArmReport) -> Option<String> {
 
 /// Returns that an arm's controller slows its motions, or stops them on their paths; `None` if it does not.
 pub fn slowed(arm: &str, fraction: Option<f64>) -> Option<String> {
-    match effective(fraction) {
+    match effective_speed(fraction) {
         0.0 => Some(format!("{arm} is stopped by its controller (0 % of the speed): motions wait on their paths")),
         fraction if fraction < FULL => {
             Some(format!("{arm} is slowed by its controller to {} of the speed", percent(fraction)))

@@ -27,7 +27,7 @@ pub struct Args {
 
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
-    let cancel = Cancel { arm: args.arm.clone(), task: args.task.clone(), plan: None };
+    let cancel = Cancel { arm: args.arm.clone(), task: args.task.clone(), ..Cancel::default() };
     let (mut client, reply) = Client::urgent(None, || connect(args.target_run.run.as_deref()), &cancel)?;
     if args.target_run.json {
         output::json(&reply);

@@ -4,9 +4,9 @@ use std::path::PathBuf;
 
 use super::arguments::Target;
 use super::exit::{Exit, Failure, Result};
-use super::follow::{Signals, follow};
-use super::{full_speed, output, trajectory_file};
-use dimos_rpc::api::{Execute, ExecutePlan, Planner, Planning, Trajectory};
+use super::follow::Signals;
+use super::{full_speed, going, output, trajectory_file};
+use dimos_rpc::api::{Execute, ExecutePlan, ExecuteReply, GoBegun, GoStep, Planner, Planning, Trajectory};
 use dimos_rpc::client::Client;
 
 /// Arguments of `execute`.
@@ -49,17 +49,16 @@ pub fn run(args: &Args) -> Result {
     let trajectory = args.file.as_deref().map(trajectory_file::read).transpose()?;
     let mut client = args.target_run.connect()?;
     let signals = (!args.no_wait).then(Signals::watch);
-    let begun = match trajectory {
+    let (going, begun) = match trajectory {
         Some(mut trajectory) => {
             let joints = trajectory.joint_names.clone();
             stretch(&mut trajectory, full_speed::limit_of(&mut client, |_| Ok(Some(joints)))?);
             let points = trajectory.points.len();
-            let begun = client.call(Execute { trajectory, task: args.task.clone(), retraces_to: None })?;
-            output::note(format_args!(
-                "motion {} on {}: {points} points, {:.2} s, not collision-checked",
-                begun.motion, begun.task, begun.duration
-            ));
-            begun
+            let execute = Execute { trajectory, task: args.task.clone(), retraces_to: None };
+            begin(&mut client, GoStep::Execute(Box::new(execute)), signals.as_ref(), |begun| {
+                let ExecuteReply { motion, task, duration } = begun;
+                format!("motion {motion} on {task}: {points} points, {duration:.2} s, not collision-checked")
+            })?
         }
         None => {
             // The plan that is judged is the one that is executed.
@@ -69,21 +68,22 @@ pub fn run(args: &Args) -> Result {
                     plan.map_or_else(|| client.call(Planner {}).map(|planner| planner.plan), |plan| Ok(Some(plan)))?;
                 joints_of(client, plan)
             })?;
-            let begun = client.call(ExecutePlan {
+            let execute = ExecutePlan {
                 plan,
                 replan: args.replan,
                 unproven: args.unproven,
                 max_speed: Some(max_speed).filter(|speed| *speed < 1.0),
                 ..ExecutePlan::default()
-            })?;
-            let (motion, task) = (begun.motion, &begun.task);
+            };
             let checked = if args.unproven { "" } else { ", collision-checked" };
-            output::note(format_args!("motion {motion} on {task}: {:.2} s, planned{checked}", begun.duration));
-            begun
+            begin(&mut client, GoStep::ExecutePlan(Box::new(execute)), signals.as_ref(), |begun| {
+                let ExecuteReply { motion, task, duration } = begun;
+                format!("motion {motion} on {task}: {duration:.2} s, planned{checked}")
+            })?
         }
     };
     match signals {
-        Some(signals) => follow(&mut client, begun.motion, &begun.task, &signals, args.target_run.json),
+        Some(signals) => going::finish(&mut client, going, &begun, &signals, args.target_run.json),
         None => {
             if args.target_run.json {
                 output::json(&begun);
@@ -91,6 +91,21 @@ pub fn run(args: &Args) -> Result {
             Ok(Exit::Ok)
         }
     }
+}
+
+/// Begins a motion, and prints what it does.
+fn begin(
+    client: &mut Client,
+    step: GoStep,
+    signals: Option<&Signals>,
+    text: impl FnOnce(&ExecuteReply) -> String,
+) -> Result<(u64, GoBegun)> {
+    let going = going::go(client, step)?;
+    let begun = going::begin(client, (going, 0), signals, false)?.reply;
+    if let GoBegun::Execute(reply) = &begun {
+        output::note(text(reply));
+    }
+    Ok((going, begun))
 }
 
 /// Slows a trajectory to this fraction of its speed.

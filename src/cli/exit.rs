@@ -177,7 +177,9 @@ fn without_params(message: String) -> String {
     let Some((_, what)) = message.strip_prefix("params of ").and_then(|rest| rest.split_once("\": ")) else {
         return message;
     };
-    what.replace("goals[0].", "")
+    // The step of a `go`: `steps[0].plan.`
+    let step = what.strip_prefix("steps[").and_then(|rest| rest.splitn(3, '.').nth(2));
+    step.unwrap_or(what).replace("goals[0].", "")
 }
 
 /// Returns the exit code of a refusal: a name that the run does not know and a mistake in the arguments are usage

@@ -12,7 +12,7 @@ use super::banner;
 use super::exit::{Exit, Failure, Result};
 use super::output::{self, Table, Tone, fixed, signed, toned};
 use dimos_core::telemetry::texts::percent;
-use dimos_rpc::api::{Cancel, Motion, Status};
+use dimos_rpc::api::{Cancel, Going, Motion, Status};
 use dimos_rpc::client::Client;
 use dimos_rpc::report::{Deviation, MotionReport};
 
@@ -29,22 +29,29 @@ const ON_TARGET: f64 = 0.01;
 /// The last signal received while a verb watches for signals; 0 = none.
 pub struct Signals(Arc<AtomicUsize>);
 
-/// Waits for the end of a motion of `task` and prints it. A signal cancels the motion first.
-pub fn follow(client: &mut Client, motion: u64, task: &str, signals: &Signals, json: bool) -> Result {
-    let cancel = Cancel { task: Some(task.to_owned()), ..Cancel::default() };
-    follow_until(client, motion, task, &cancel, signals, json)
+/// Where the reports of a motion are.
+#[derive(Debug, Clone, Copy)]
+pub enum Followed {
+    /// It was requested by itself.
+    Motion,
+    /// In the report of this request `go`.
+    Going(u64),
 }
 
-/// As [`follow`]; a signal sends this request. `title` labels the progress bar.
-pub fn follow_until(
-    client: &mut Client,
-    motion: u64,
-    title: &str,
-    cancel: &Cancel,
-    signals: &Signals,
-    json: bool,
-) -> Result {
-    let (report, cancelled) = watch(client, motion, cancel, title, signals)?;
+impl Followed {
+    fn report(self, client: &mut Client, motion: u64) -> Result<MotionReport> {
+        let steps = match self {
+            Self::Motion => Vec::new(),
+            Self::Going(going) => client.call(Going { going })?.steps,
+        };
+        let reported = steps.into_iter().flat_map(|step| step.motions).find(|report| report.motion == motion);
+        // One that continues another may be new.
+        Ok(reported.map_or_else(|| client.call(Motion { motion }), Ok)?)
+    }
+}
+
+/// Prints the end of a motion, and fails if it did not reach its goal. A signal has cancelled it.
+pub fn end(client: &mut Client, (report, cancelled): (MotionReport, Option<i32>), json: bool) -> Result {
     print(&report, json);
     match cancelled {
         Some(signal) => Ok(Exit::by_signal(signal)),
@@ -67,6 +74,7 @@ pub fn completed(client: &mut Client, report: &MotionReport) -> Result<()> {
 /// Returns its report, and the signal.
 pub fn watch(
     client: &mut Client,
+    followed: Followed,
     motion: u64,
     cancel: &Cancel,
     title: &str,
@@ -83,7 +91,7 @@ pub fn watch(
     let mut cancelled: Option<Instant> = None;
     let (mut motion, mut paused) = (motion, false);
     let report = loop {
-        let report = client.call(Motion { motion })?;
+        let report = followed.report(client, motion)?;
         if let Some(next) = report.next.filter(|_| report.done) {
             let why = report.error.unwrap_or_default();
             bar.suspend(|| output::note(format_args!("motion {motion}: {why}; continued as motion {next}")));

@@ -15,7 +15,7 @@ use super::recorded_path;
 use dimos_core::written;
 use dimos_rpc::api::{
     Cancel, DEFAULT_REFINE, DEFAULT_SPEED, JointPath, PATH_TOLERANCE, Plan, PlanGoal, PlanLevel, PlanSummary, Planner,
-    Planning, PoseSpec,
+    Planning, PlanningReport, PoseSpec,
 };
 use dimos_rpc::client::{Client, ClientError};
 use dimos_rpc::{Code, RpcError};
@@ -85,8 +85,8 @@ pub enum Waypoint {
 pub enum Leg {
     /// To plan and execute.
     Motion(Plan),
-    /// To do at its end.
-    Grip(GripAction),
+    /// To do at its end, with the gripper of this arm.
+    Grip(GripAction, String),
 }
 
 /// Parses a joint position; a name and a list get a hint at what was probably meant.
@@ -259,10 +259,11 @@ impl Goal {
     }
 
     /// Returns the motions and the gripper actions of a motion with both, in order.
-    pub fn legs(&self, robot: &str, search: &Search) -> Vec<Leg> {
+    /// `arm` has the gripper.
+    pub fn legs(&self, robot: &str, arm: &str, search: &Search) -> Vec<Leg> {
         let goes = |waypoint: &Waypoint| matches!(waypoint, Waypoint::Goal(_));
         let leg = |part: &[Waypoint]| match part {
-            [Waypoint::Grip(action)] => Leg::Grip(action.clone()),
+            [Waypoint::Grip(action)] => Leg::Grip(action.clone(), arm.to_owned()),
             part => Leg::Motion(Self { through: part.to_vec(), ..self.clone() }.planned(Some(robot), None, search)),
         };
         self.through.chunk_by(|a, b| goes(a) && goes(b)).map(leg).collect()
@@ -324,13 +325,17 @@ pub struct Planned {
     pub summary: PlanSummary,
 }
 
+impl Planned {
+    /// Returns the plan of a report, if there is one.
+    pub fn of(report: PlanningReport) -> Option<Self> {
+        Some(Self { plan: report.plan, elapsed: report.elapsed, summary: report.summary? })
+    }
+}
+
 /// Requests a plan and waits for it. A signal cancels planning.
 pub fn plan(client: &mut Client, request: Plan, signals: &Signals) -> Result<Planned> {
     let begun = client.call(request)?;
-    let bar = ProgressBar::new_spinner().with_finish(ProgressFinish::AndClear);
-    if let Ok(style) = ProgressStyle::with_template("{spinner} planning {msg}") {
-        bar.set_style(style);
-    }
+    let bar = planning_bar();
     let mut cancelled = false;
     let report = loop {
         let report = client.call(Planning { plan: begun.plan })?;
@@ -349,14 +354,23 @@ pub fn plan(client: &mut Client, request: Plan, signals: &Signals) -> Result<Pla
         let failure = Failure::new(Exit::by_signal(signal), "planning was cancelled: nothing has moved");
         return Err(failure);
     }
-    match report.summary {
-        Some(summary) => Ok(Planned { plan: report.plan, elapsed: report.elapsed, summary }),
-        None => {
-            let why = report.error.unwrap_or_else(|| report.state.to_lowercase());
-            let failure = Failure::new(Exit::Failed, format!("no plan: {why}"));
-            Err(report.hint.into_iter().fold(failure, |failure, hint| failure.hint(hint)))
-        }
+    let no_plan = no_plan(&report);
+    Planned::of(report).ok_or(no_plan)
+}
+
+/// Returns what shows on a terminal that a motion is planned.
+pub fn planning_bar() -> ProgressBar {
+    let bar = ProgressBar::new_spinner().with_finish(ProgressFinish::AndClear);
+    match ProgressStyle::with_template("{spinner} planning {msg}") {
+        Ok(style) => bar.with_style(style),
+        Err(_) => bar,
     }
+}
+
+/// Returns why there is no plan.
+pub fn no_plan(report: &PlanningReport) -> Failure {
+    let why = report.error.clone().unwrap_or_else(|| report.state.to_lowercase());
+    Failure::new(Exit::Failed, format!("no plan: {why}")).maybe_hint(report.hint.clone())
 }
 
 /// Describes how a plan was checked.

@@ -1,21 +1,18 @@
-//! Gripper actions: `arm gripper`, and those between the waypoints of `move --through`. The run judges the outcome.
-//! This awaits and prints it, and attaches an object of the planner's world once it is held.
+//! Gripper actions as typed: `arm gripper`, and those between the waypoints of `move --through`. The run does them.
 
 use std::thread::sleep;
 use std::time::Duration;
 
-use serde_json::json;
-
 use super::arguments::finite;
 use super::exit::{Exit, Failure, Result};
 use super::follow::Signals;
-use super::output;
+use super::going;
 use dimos_core::arm::GripperUnit;
 use dimos_rpc::api::{
-    Attach, Detach, GRASP_REACH, Grip, GripOutcome, GripReport, Gripper, GripperReply, Planner, RobotReport, State,
-    Status, World, WorldObject,
+    self, GoGripper, GoStep, Grip, GripObjects, GripReport, Gripper, GripperReply, RobotReport, State, Status,
+    WorldObject,
 };
-use dimos_rpc::client::Client;
+use dimos_rpc::client::{Client, ClientError};
 use dimos_rpc::report::ArmReport;
 use dimos_yaml::did_you_mean;
 
@@ -110,20 +107,6 @@ pub fn impossible(arm: &ArmReport, to: Opening, force: Option<f64>) -> Option<(S
     }
 }
 
-/// What becomes of objects in the planner's world.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub enum Objects {
-    /// Nothing.
-    #[default]
-    Keep,
-    /// This one is attached to the arm once the gripper holds it.
-    Attach(String),
-    /// All that the arm holds are detached once the fingers are where they were sent.
-    Detach,
-    /// This one: detached if the arm holds it, else attached.
-    Either(String),
-}
-
 /// A gripper action.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GripAction {
@@ -136,13 +119,13 @@ pub struct GripAction {
     /// Time for the outcome.
     pub timeout: Option<Duration>,
     /// Objects to attach or detach.
-    pub objects: Objects,
+    pub objects: Option<GripObjects>,
 }
 
 /// Parses an action between waypoints: `gripper:open`, `gripper:0.03`, `gripper:close:cup`.
 pub fn action(text: &str) -> std::result::Result<GripAction, String> {
     let (position, object) = text.split_once(':').map_or((text, None), |(position, object)| (position, Some(object)));
-    let objects = object.map_or(Objects::Keep, |name| Objects::Either(name.to_owned()));
+    let objects = object.map(|name| GripObjects::Either(name.to_owned()));
     Ok(GripAction { opening: opening(position)?, force: None, speed: None, timeout: None, objects })
 }
 
@@ -154,108 +137,23 @@ impl GripAction {
         Ok(client.call(Gripper { arm: arm.to_owned(), position, force: self.force, speed: self.speed, timeout })?)
     }
 
-    /// Sends the command, waits for its outcome and prints it. Fails if the fingers did not get to their position and
-    /// hold nothing, or if nothing is held that should be attached.
-    pub fn run(&self, client: &mut Client, arm: &str, signals: &Signals, json: bool) -> Result<()> {
-        let objects = self.objects(client, arm)?;
-        signals.check()?;
-        let order = self.send(client, arm)?.order;
-        let report = wait(client, arm, order, signals)?;
-        let done = |what: &str, names: &[String]| {
-            let text = report.text();
-            match json {
-                false if names.is_empty() => output::line(format_args!("{arm}: {text}")),
-                false => output::line(format_args!("{arm}: {text}; {} {what}", names.join(", "))),
-                true => {
-                    let mut value = json!(report);
-                    if !names.is_empty() {
-                        value[what] = json!(names);
-                    }
-                    output::json(&value);
-                }
-            }
-        };
-        let outcome = report.outcome;
-        let failed = |what: String, hint: &str| Failure {
-            data: Some(Box::new(json!(report))),
-            ..Failure::new(Exit::Failed, what).hint(hint)
-        };
-        match (outcome, objects) {
-            (None, _) => {
-                let why = report.error.as_deref().unwrap_or("no outcome");
-                return Err(failed(format!("{arm}: {}: {why}", report.text()), "`dimos state` shows the gripper now"));
-            }
-            (Some(GripOutcome::Blocked), _) => {
-                let what = format!("{arm}: {}, on the way to {:.4} {}", report.text(), report.target, report.unit);
-                return Err(failed(what, "remove what is in the way of the fingers, or command a larger --force"));
-            }
-            (Some(GripOutcome::Holding), Some((Some(robot), names))) => {
-                for name in &names {
-                    let attach = Attach {
-                        name: name.clone(),
-                        robot: robot.clone(),
-                        within: Some(GRASP_REACH),
-                        ..Attach::default()
-                    };
-                    client.call(attach)?;
-                }
-                done("attached", &names);
-            }
-            (Some(GripOutcome::Ordered), Some((Some(_), names))) => {
-                let what = format!("{arm}: {}: {} is not attached", report.text(), names.join(", "));
-                return Err(failed(what, "attach what it holds with `dimos world attach`"));
-            }
-            (Some(_), Some((Some(_), names))) => {
-                let what = format!("{arm}: {}: it holds nothing, {} is not attached", report.text(), names.join(", "));
-                return Err(failed(what, "move the fingers around the object first"));
-            }
-            (Some(_), Some((None, names))) => {
-                for name in &names {
-                    client.call(Detach { name: name.clone() })?;
-                }
-                done("detached", &names);
-            }
-            (Some(_), None) => done("", &[]),
-        }
-        Ok(())
+    /// Returns the request for it.
+    pub fn request(&self, client: &mut Client, arm: &str) -> Result<GoGripper> {
+        let to = api::Opening::Position(self.opening.of(client, arm)?);
+        let (arm, force, speed, objects) = (arm.to_owned(), self.force, self.speed, self.objects.clone());
+        Ok(GoGripper { arm, to, force, speed, timeout: self.timeout.map(|timeout| timeout.as_secs_f64()), objects })
     }
 
-    /// Returns the objects to attach, with the robot of the planner, or to detach; checked before anything moves.
-    fn objects(&self, client: &mut Client, arm: &str) -> Result<Option<(Option<String>, Vec<String>)>> {
-        if self.objects == Objects::Keep {
-            return Ok(None);
-        }
-        let robots = client.call(Planner {})?.robots;
-        let joints = joints_of(client, arm)?;
-        let is_of = |robot: &&RobotReport| robot.name == arm || robot.joints.iter().any(|joint| joints.contains(joint));
-        let Some(robot) = robots.iter().find(is_of).map(|robot| robot.name.clone()) else {
-            let names: Vec<&str> = robots.iter().map(|robot| robot.name.as_str()).collect();
-            let what = format!("the planner has no robot {arm}, only {}", names.join(", "));
-            return Err(Failure::usage(what).hint("objects are attached to the robots of `planner.robots`"));
-        };
-        let world = client.call(World {})?.objects;
-        let ours = |object: &WorldObject| object.held_by.as_ref().is_some_and(|[by, _]| *by == robot);
-        let (Objects::Attach(name) | Objects::Either(name)) = &self.objects else {
-            let held: Vec<String> = world.iter().filter(|object| ours(object)).map(|o| o.name.clone()).collect();
-            return match held.is_empty() {
-                true => Err(Failure::new(Exit::Failed, format!("{arm} holds no object: there is none to detach"))
-                    .hint("`dimos world list` shows what is held")),
-                false => Ok(Some((None, held))),
-            };
-        };
-        match world.iter().find(|object| object.name == *name) {
-            Some(object) if ours(object) && matches!(self.objects, Objects::Either(_)) => {
-                Ok(Some((None, vec![name.clone()])))
-            }
-            Some(object) => match &object.held_by {
-                Some([robot, link]) => {
-                    Err(Failure::new(Exit::Failed, format!("{name} is held already, by {robot} at {link}"))
-                        .hint(format!("dimos world detach {name}")))
-                }
-                None => Ok(Some((Some(robot), vec![name.clone()]))),
-            },
-            None => Err(unknown_object(name, &world)),
-        }
+    /// Lets the run do it, waits for the outcome and prints it. Fails if the fingers did not get to their position and
+    /// hold nothing, or if nothing is held that should be attached.
+    pub fn run(&self, client: &mut Client, arm: &str, signals: &Signals, json: bool) -> Result<()> {
+        let request = self.request(client, arm)?;
+        signals.check()?;
+        let going = going::go(client, GoStep::Gripper(Box::new(request))).map_err(|error| match error {
+            ClientError::Refused(refusal) => going::grip_failure(refusal),
+            other => other.into(),
+        })?;
+        going::grip(client, (going, 0), signals, json)
     }
 }
 
@@ -302,9 +200,9 @@ mod tests {
     #[test]
     fn actions_between_waypoints_have_a_position_and_maybe_an_object() {
         let of = |text: &str| action(text).map(|action| (action.opening, action.objects));
-        assert_eq!(of("open"), Ok((Opening::Open, Objects::Keep)));
-        assert_eq!(of("0.03"), Ok((Opening::Position(0.03), Objects::Keep)));
-        assert_eq!(of("close:cup"), Ok((Opening::Close, Objects::Either("cup".into()))));
+        assert_eq!(of("open"), Ok((Opening::Open, None)));
+        assert_eq!(of("0.03"), Ok((Opening::Position(0.03), None)));
+        assert_eq!(of("close:cup"), Ok((Opening::Close, Some(GripObjects::Either("cup".into())))));
         assert!(of("ajar").unwrap_err().contains("`open` or `close`"));
     }
 }

@@ -23,6 +23,7 @@ mod fetch;
 mod follow;
 mod full_speed;
 mod goal;
+mod going;
 mod grip;
 pub mod job;
 pub mod jog;
@@ -69,8 +70,7 @@ use clap::error::{ContextKind, ContextValue};
 use clap::{ArgMatches, CommandFactory, FromArgMatches, Parser, Subcommand};
 use rustix::process::{Resource, getrlimit};
 
-use crate::blueprint::{self, Catalog};
-use dimos_control::task_spec::{TaskSpec, TaskTable};
+use crate::blueprint::{self, Catalog, TaskSpec, TaskTable};
 use dimos_hardware::registry::{Absent, AdapterSpec};
 use dimos_robot::builtin;
 

@@ -3,14 +3,15 @@
 
 use super::arguments::Target;
 use super::exit::{Exit, Failure, Result};
-use super::follow::{Signals, follow, follow_until};
-use super::goal::{Goal, Leg, Search, checked, has_planner, plan, show};
-use super::grip::{self, Objects};
-use super::{full_speed, output, recorded_path};
+use super::follow::{Followed, Signals, end, watch};
+use super::goal::{Goal, Leg, Search, checked, has_planner};
+use super::grip;
+use super::{full_speed, going, output, recorded_path};
 use dimos_core::telemetry::texts::percent;
 use dimos_rpc::Code;
 use dimos_rpc::api::{
-    Cancel, ExecutePlan, Move, MoveNative, MoveReply, Plan, PlanLevel, Planner, Poses, State, Status, World,
+    Cancel, Go, GoBegun, GoStep, GripObjects, Move, MoveNative, MoveReply, Plan, PlanLevel, Planner, Poses, State,
+    Status, World,
 };
 use dimos_rpc::client::Client;
 
@@ -86,17 +87,20 @@ pub fn run(args: &Args) -> Result {
         return run_legs(args, arm, &mut client, &signals);
     }
     let planned = !args.direct && has_planner(&mut client)?;
-    let (motion, task, reply) = if planned {
+    let json = args.target_run.json;
+    let (going, begun) = if planned {
         let request = args.goal.plan(&mut client, args.arm.as_deref(), &args.search)?;
-        plan_and_begin(args, request, &mut client, &signals)?
+        let request = plans(args, &mut client, [Leg::Motion(request)], &signals)?;
+        let going = client.call(request)?.going;
+        (going, begin_planned(&mut client, (going, 0), &signals, json)?)
     } else {
         begin_direct(args, &mut client, &signals)?
     };
     if !args.no_wait {
-        return follow(&mut client, motion, &task, &signals, args.target_run.json);
+        return going::finish(&mut client, going, &begun, &signals, json);
     }
-    if args.target_run.json {
-        output::json(&reply);
+    if json {
+        output::json(&serde_json::to_value(&begun).unwrap_or_default());
     }
     Ok(Exit::Ok)
 }
@@ -130,10 +134,11 @@ fn move_native(args: &Args, client: &mut Client, signals: &Signals) -> Result {
         return Ok(Exit::Ok);
     }
     let cancel = Cancel { arm: Some(arm.clone()), ..Cancel::default() };
-    follow_until(client, motion, arm, &cancel, signals, args.target_run.json)
+    let ended = watch(client, Followed::Motion, motion, &cancel, arm, signals)?;
+    end(client, ended, args.target_run.json)
 }
 
-/// Executes a motion with gripper actions part by part. Each motion is planned once the action before it has succeeded,
+/// Shows a motion with gripper actions part by part. The run plans each motion once the action before it has succeeded,
 /// so for the fingers and the attached objects as they are then.
 fn run_legs(args: &Args, arm: &str, client: &mut Client, signals: &Signals) -> Result {
     let robots = client.call(Planner {})?.robots;
@@ -145,22 +150,24 @@ fn run_legs(args: &Args, arm: &str, client: &mut Client, signals: &Signals) -> R
         return Err(Failure::usage(format!("{arm} has no named pose {name}: nothing has moved"))
             .hint("`dimos pose list` lists the poses"));
     }
-    let legs = args.goal.legs(arm, &args.search);
     let own = grip::arm_of(client, robot, arm)?;
+    let legs = args.goal.legs(arm, &own, &args.search);
     check_grips(&own, client, &legs)?;
-    for leg in legs {
-        match leg {
-            Leg::Motion(request) => {
-                let (motion, task, _) = plan_and_begin(args, request, client, signals)?;
-                match follow(client, motion, &task, signals, args.target_run.json)? {
-                    Exit::Ok => {}
-                    exit => return Ok(exit),
-                }
-            }
-            Leg::Grip(action) => action.run(client, &own, signals, args.target_run.json).map_err(|failure| {
+    let go = plans(args, client, legs, signals)?;
+    let are_grips: Vec<bool> = go.steps.iter().map(|step| matches!(step, GoStep::Gripper(_))).collect();
+    let (going, json) = (client.call(go)?.going, args.target_run.json);
+    for (step, is_grip) in are_grips.into_iter().enumerate() {
+        if is_grip {
+            going::grip(client, (going, step), signals, json).map_err(|failure| {
                 let what = format!("{}: the motion ends here", failure.what);
                 Failure { what, ..failure }
-            })?,
+            })?;
+            continue;
+        }
+        let begun = begin_planned(client, (going, step), signals, json)?;
+        match going::finish(client, going, &begun, signals, json)? {
+            Exit::Ok => {}
+            exit => return Ok(exit),
         }
     }
     Ok(Exit::Ok)
@@ -171,11 +178,11 @@ fn check_grips(arm: &str, client: &mut Client, legs: &[Leg]) -> Result<()> {
     let report = client.call(Status {})?.arms.into_iter().find(|report| report.hardware_id == arm);
     let objects = client.call(World {})?.objects;
     for leg in legs {
-        let (Leg::Grip(action), Some(report)) = (leg, &report) else { continue };
+        let (Leg::Grip(action, _), Some(report)) = (leg, &report) else { continue };
         if let Some((what, hint)) = grip::impossible(report, action.opening, action.force) {
             return Err(Failure::usage(format!("{what}: nothing has moved")).maybe_hint(hint));
         }
-        if let Objects::Attach(name) | Objects::Either(name) = &action.objects
+        if let Some(GripObjects::Attach(name) | GripObjects::Either(name)) = &action.objects
             && !objects.iter().any(|object| object.name == *name)
         {
             let failure = grip::unknown_object(name, &objects);
@@ -185,31 +192,34 @@ fn check_grips(arm: &str, client: &mut Client, legs: &[Leg]) -> Result<()> {
     Ok(())
 }
 
-type Begun = (u64, String, serde_json::Value);
-
-fn plan_and_begin(args: &Args, request: Plan, client: &mut Client, signals: &Signals) -> Result<Begun> {
-    // The plan of a move is this move's own: `dimos execute` passes it over.
-    let robots: Vec<String> = request.goals.iter().map(|goal| goal.robot.clone()).collect();
-    let speed = request.speed.min(full_speed::limit(client, &robots)?);
-    let request = Plan { by_number: true, speed, ..request };
-    let planned = plan(client, request, signals)?;
-    if !args.target_run.json {
-        show(&planned);
+/// Returns the request for motions that are planned, and for the gripper actions between them.
+fn plans(args: &Args, client: &mut Client, legs: impl IntoIterator<Item = Leg>, signals: &Signals) -> Result<Go> {
+    let mut limit = None;
+    let mut steps = Vec::new();
+    for leg in legs {
+        steps.push(match leg {
+            Leg::Motion(request) => {
+                let robots: Vec<String> = request.goals.iter().map(|goal| goal.robot.clone()).collect();
+                let most = limit.map_or_else(|| full_speed::limit(client, &robots), Ok)?;
+                limit = Some(most);
+                GoStep::Plan(Box::new(Plan { speed: request.speed.min(most), ..request }))
+            }
+            Leg::Grip(action, arm) => GoStep::Gripper(Box::new(action.request(client, &arm)?)),
+        });
     }
     signals.check()?;
-    let begun = client.call(ExecutePlan {
-        plan: Some(planned.plan),
-        replan: args.replan,
-        unproven: args.unproven,
-        ..ExecutePlan::default()
-    })?;
-    let checked = checked(planned.summary.level);
-    output::note(format_args!("motion {} on {}: planned, {checked}", begun.motion, begun.task));
-    let reply = serde_json::to_value(&begun).unwrap_or_default();
-    Ok((begun.motion, begun.task, reply))
+    Ok(Go { steps, replan: args.replan, unproven: args.unproven, ..Go::default() })
 }
 
-fn begin_direct(args: &Args, client: &mut Client, signals: &Signals) -> Result<Begun> {
+/// Waits until a planned motion begins, and prints its plan.
+fn begin_planned(client: &mut Client, at: (u64, usize), signals: &Signals, json: bool) -> Result<GoBegun> {
+    let going::Begun { planned, reply } = going::begin(client, at, Some(signals), !json)?;
+    let checked = planned.map_or("collision-checked", |planned| checked(planned.summary.level));
+    output::note(format_args!("motion {} on {}: planned, {checked}", reply.motion(), reply.task()));
+    Ok(reply)
+}
+
+fn begin_direct(args: &Args, client: &mut Client, signals: &Signals) -> Result<(u64, GoBegun)> {
     if let (Some(arm), Some(file)) = (&args.arm, &args.goal.path) {
         let arms = client.call(State {})?.arms.into_iter();
         let arms = arms.map(|a| (a.hardware_id, a.joints.into_iter().map(|joint| joint.name).collect()));
@@ -217,8 +227,8 @@ fn begin_direct(args: &Args, client: &mut Client, signals: &Signals) -> Result<B
         let path = Some(recorded_path::read(file, &joints, &[], args.goal.tolerance)?);
         let speed = args.search.speed.min(full_speed::limit(client, std::slice::from_ref(arm))?);
         signals.check()?;
-        let begun = client.call(Move { direct: args.direct, path, ..Move::new(arm, [], speed) })?;
-        return Ok(direct(begun, "direct to its first point and along the path"));
+        let request = Move { direct: args.direct, path, ..Move::new(arm, [], speed) };
+        return direct(client, request, signals, "direct to its first point and along the path");
     }
     let target = match (&args.arm, args.goal.joints(), &args.goal.named) {
         (Some(arm), Some(target), _) => Some((arm, target.to_vec())),
@@ -237,15 +247,16 @@ fn begin_direct(args: &Args, client: &mut Client, signals: &Signals) -> Result<B
     let speed = args.search.speed.min(full_speed::limit(client, std::slice::from_ref(arm))?);
     signals.check()?;
     let request = Move { direct: args.direct, ..Move::new(arm.clone(), target, speed) };
-    Ok(direct(client.call(request)?, "direct"))
+    direct(client, request, signals, "direct")
 }
 
-/// Prints what a direct motion does.
-fn direct(begun: MoveReply, how: &str) -> Begun {
-    let MoveReply { motion, task, duration, .. } = &begun;
+/// Begins a direct motion, and prints what it does.
+fn direct(client: &mut Client, request: Move, signals: &Signals, how: &str) -> Result<(u64, GoBegun)> {
+    let going = going::go(client, GoStep::Move(Box::new(request)))?;
+    let begun = going::begin(client, (going, 0), Some(signals), false)?.reply;
+    let GoBegun::Move(MoveReply { motion, task, duration, .. }) = &begun else { return Ok((going, begun)) };
     output::note(format_args!("motion {motion} on {task}: {duration:.2} s, {how}, not collision-checked"));
-    let reply = serde_json::to_value(&begun).unwrap_or_default();
-    (begun.motion, begun.task, reply)
+    Ok((going, begun))
 }
 
 /// Returns the positions of an arm's joints in a saved pose [rad].

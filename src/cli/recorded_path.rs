@@ -7,9 +7,8 @@ use std::path::Path;
 
 use super::exit::{Failure, Result};
 use super::{output, trajectory_file};
+use crate::offline::{thin, unwind};
 use dimos_log::joints::{Places, twice};
-use dimos_planner::planning::search::path::unwind;
-use dimos_planner::planning::search::thin::thin;
 use dimos_rpc::api::{JointPath, MAX_LINE, MAX_PATH};
 use dimos_rpc::client::ClientError;
 use dimos_rpc::{Code, RpcError};

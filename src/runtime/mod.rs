@@ -37,6 +37,7 @@ use std::sync::mpsc::{Receiver, Sender};
 pub use arm::device_lock::DeviceLockError;
 pub use builder::Builder;
 pub use client::dispatch::log_of;
+pub use dimos_control::arm_control::effective as effective_speed;
 pub use handle::Handle;
 pub use options::{Ended, Ending, Options, Record, StartError};
 pub use plan::attached::{AttachedPlanner, LinkEvent};
@@ -57,6 +58,7 @@ use facts::Facts;
 use gripper::Grippers;
 use lifecycle::Lifecycle;
 use log::Journal;
+use motion::going::Goings;
 use motion::motions::Motions;
 use motion::streams::Streams;
 use plan::Plans;
@@ -85,7 +87,6 @@ pub struct Run {
     recorder: Option<Recorder>,
     view: Option<View>,
     metrics: Option<Metrics>,
-    metrics: Option<Metrics>,
     server: Option<Server>,
     handle: Handle,
     endings: (Sender<Ending>, Receiver<Ending>),
@@ -101,6 +102,7 @@ pub(in crate::runtime) struct Service {
     grippers: Grippers,
     tools: Tools,
     motions: Motions,
+    goings: Goings,
     streams: Streams,
     plans: Plans,
     journal: Journal,

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use super::client::asker::asked_by;
+use super::motion::going::CANCELLED;
 use super::{Ending, Service};
 use dimos_control::request::Request;
 use dimos_core::clock::{Clock, Mono, MonotonicClock};
@@ -33,13 +34,18 @@ impl Service {
             let planning = self.cancel_planning(call.plan).await;
             return Ok(Reply::Cancel(api::CancelReply { planning, ..Default::default() }));
         }
+        if let Some(going) = call.going {
+            return self.cancel_going(going).await.map(Reply::Cancel);
+        }
         let arm = call.arm.as_deref().map(|a| self.facts.arm_index(a)).transpose()?;
         let task = call.task.as_deref().map(|t| self.facts.task_index(t)).transpose()?;
         let moves = |joints: &[u16]| arm.is_none_or(|a| joints.iter().any(|j| self.facts.joints_of_arm(a).contains(j)));
+        // First: nothing of them begins after this.
+        self.end_goings(arm, task);
         let mut tasks = BTreeMap::new();
         for (i, config) in self.facts.config.tasks.iter().enumerate() {
             if task.is_none_or(|t| t as usize == i) && moves(&config.joints) {
-                self.motions.end_replanning("cancelled", |planned| usize::from(planned.task) == i);
+                self.motions.end_replanning(CANCELLED, |planned| usize::from(planned.task) == i);
                 let outcome = self.ask(Request::Cancel { task: Some(i as u16) }).await?;
                 tasks.insert(config.name.clone(), outcome.name().to_owned());
             }
@@ -64,8 +70,10 @@ impl Service {
     }
 
     pub(in crate::runtime) async fn answer(&self, call: Call, origin: Origin) -> Result<Reply, RpcError> {
-        let reads =
-            matches!(call, Call::Status(_) | Call::State(_) | Call::TextLog(_) | Call::Motion(_) | Call::Grip(_));
+        let reads = matches!(
+            call,
+            Call::Status(_) | Call::State(_) | Call::TextLog(_) | Call::Motion(_) | Call::Going(_) | Call::Grip(_)
+        );
         if !reads && self.lifecycle.is_closed() {
             let stops = self.lifecycle.accepts_stops();
             match call {
@@ -85,6 +93,8 @@ impl Service {
             Call::Motion(m) => self.motion(m.motion).map(Reply::Motion),
             Call::Move(m) => self.move_arm(m, origin).await,
             Call::Execute(e) => self.execute(e, origin).await,
+            Call::Go(go) => self.go(go, origin).await.map(Reply::Go),
+            Call::Going(going) => self.going(going.going).map(Reply::Going),
             Call::Plan(_)
             | Call::Planning(_)
             | Call::Preview(_)

@@ -27,6 +27,7 @@ use super::lifecycle::Lifecycle;
 use super::log::Journal;
 use super::log::log_file::{attachments, log_device_note, log_path, metadata, no_log, retain, storage};
 use super::log::metrics;
+use super::motion::going::Goings;
 use super::motion::motions::Motions;
 use super::motion::streams::Streams;
 use super::plan::guard_worlds::{GuardEnds, GuardWorlds};
@@ -255,6 +256,7 @@ impl Connected {
             tools: Tools::new(tools, devices.len()),
             arms: ArmLinks::new(devices, arms.serials.clone()),
             motions: Motions::default(),
+            goings: Goings::default(),
             streams: Streams::new(facts.config.tasks.len()),
             plans: Plans::new(planner, guard.clone()),
             journal: Journal::default(),

@@ -16,6 +16,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("view", &["blueprint", "http", "ros_messages"]),
     ("share", &["blueprint", "ros_messages"]),
     ("runtime", ALL),
+    ("offline", &[]),
     ("replay", ALL),
     ("cli", ALL),
 ];
@@ -162,6 +163,21 @@ fn a_module_uses_only_what_stands_above_it() {
         }
     }
     fail_on(&found, "layers (`src/lib.rs`)");
+}
+
+/// The verbs show what the run does; without a run they plan through `offline`.
+#[test]
+fn the_verbs_use_neither_control_nor_the_planner() {
+    let mut found = Vec::new();
+    for source in sources("src").iter().filter(|source| module_of(&source.path) == "cli") {
+        for krate in ["dimos_control", "dimos_planner"] {
+            for (at, _) in source.code.match_indices(krate) {
+                let line = source.code[..at].matches('\n').count() + 1;
+                found.push(format!("{}:{line}: {krate}", source.path));
+            }
+        }
+    }
+    fail_on(&found, "`cli` asks the run, or `offline`");
 }
 
 const ARMS: [&str; 8] = ["franka", "mock", "piper", "remote", "so101", "ur", "xarm", "yourarm"];

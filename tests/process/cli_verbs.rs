@@ -8,7 +8,7 @@ use dimos::rpc::Request;
 use dimos::rpc::api::{Cancel, Gripper};
 use serde_json::Value;
 
-use crate::support::fake_run::{FakeBackend, PLAN, start};
+use crate::support::fake_run::{FakeBackend, GOING, PLAN, start};
 use crate::support::program::eventually;
 
 /// A world of runs; those in it are the only ones that the binary sees.
@@ -198,10 +198,10 @@ fn ctrl_c_cancels_the_motion() {
     let home = Home::new();
     let (_server, run) = start(&home.runs(), "test", FakeBackend { endless: true, ..Default::default() });
     let child = home.spawn("move arm 0.3 -0.2");
-    eventually("the motion is waited for", || run.asked().iter().any(|r| matches!(r, Request::Motion(_))));
+    eventually("the motion is waited for", || run.asked().iter().any(|r| matches!(r, Request::Going(_))));
     let ended = interrupted(child);
     assert!(ended.err.contains("cancelling motion 7"), "{}", ended.err);
-    let cancel = Request::Cancel(Cancel { task: Some("traj_arm".into()), ..Cancel::default() });
+    let cancel = Request::Cancel(Cancel { going: Some(GOING), ..Cancel::default() });
     assert!(run.asked().contains(&cancel));
 }
 
@@ -209,14 +209,17 @@ fn ctrl_c_cancels_the_motion() {
 fn ctrl_c_while_planning_cancels_this_plan_and_no_motion() {
     let home = Home::new();
     let (_server, run) = start(&home.runs(), "test", FakeBackend { plans: true, ..Default::default() });
-    for verb in ["plan", "move"] {
+    for (verb, cancel) in [
+        ("plan", Cancel { plan: Some(PLAN), ..Cancel::default() }),
+        ("move", Cancel { going: Some(GOING), ..Cancel::default() }),
+    ] {
         run.asked.lock().unwrap().clear();
         let child = home.spawn(&format!("{verb} arm 0.3 -0.2"));
-        eventually("it plans", || run.asked().iter().any(|r| matches!(r, Request::Planning(_))));
+        eventually("it plans", || run.asked().iter().any(|r| matches!(r, Request::Planning(_) | Request::Going(_))));
         let ended = interrupted(child);
         assert!(ended.err.contains("planning was cancelled: nothing has moved"), "{}", ended.err);
         let cancels: Vec<_> = run.asked().into_iter().filter(|r| matches!(r, Request::Cancel(_))).collect();
-        assert_eq!(cancels, [Request::Cancel(Cancel { plan: Some(PLAN), ..Cancel::default() })], "{verb}");
+        assert_eq!(cancels, [Request::Cancel(cancel)], "{verb}");
     }
 }
 

@@ -30,6 +30,7 @@ mod foreign_paths;
 #[cfg(feature = "view")]
 mod foxglove;
 mod franka_run;
+mod go;
 mod grip_outcome;
 mod gripper_force;
 mod gripper_joint;

@@ -5,7 +5,7 @@ use std::io::{BufRead, BufReader, Write};
 use std::os::unix::net::UnixStream;
 
 use dimos::rpc::Code;
-use dimos::rpc::api::{ArmEnable, ArmReset, METHODS, Planner, State, Status};
+use dimos::rpc::api::{ArmEnable, ArmReset, Going, METHODS, Planner, State, Status};
 use dimos::rpc::client::Client;
 use dimos::rpc::report::TaskReport;
 use dimos::rpc::server::streams::Stream;
@@ -108,6 +108,8 @@ struct Stage {
     watcher: Client,
     motion: (Value, Value),
     plan: (Value, Value),
+    /// The number of the last `go`.
+    going: u64,
 }
 
 impl Stage {
@@ -134,6 +136,11 @@ impl Stage {
                 if let Some(number) = message.pointer_mut("/params/plan").filter(|p| **p == self.plan.0) {
                     *number = self.plan.1.clone();
                 }
+                if let Some(number) = message.pointer_mut("/params/going") {
+                    *number = self.going.into();
+                    let going = Going { going: self.going };
+                    eventually("it is over", || self.watcher.call(going).unwrap().done);
+                }
                 if message["method"] == "planning" {
                     eventually("planning ends", || self.watcher.call(Planner {}).unwrap().state != "PLANNING");
                 }
@@ -146,6 +153,9 @@ impl Stage {
             }
             if let (Some(shown), Some(number)) = (message.pointer("/result/motion"), real.pointer("/result/motion")) {
                 self.motion = (shown.clone(), number.clone());
+            }
+            if let Some(number) = real.pointer("/result/going").and_then(Value::as_u64) {
+                self.going = number;
             }
             if let (Some(shown), Some(number)) = (message.pointer("/result/plan"), real.pointer("/result/plan")) {
                 self.plan = (shown.clone(), number.clone());
@@ -172,7 +182,7 @@ fn every_example_is_what_a_run_says() {
     home.write("streams.yaml", include_str!("../fixtures/streams.yaml"));
     let _run = home.run("streams.yaml --no-record");
     let watcher = home.client();
-    let mut stage = Stage { home, watcher, motion: (Value::Null, Value::Null), plan: Default::default() };
+    let mut stage = Stage { home, watcher, motion: (Value::Null, Value::Null), plan: Default::default(), going: 0 };
     let examples = examples();
     assert!(examples.len() > 10, "examples are not found");
     let host = Watch::of_processors();

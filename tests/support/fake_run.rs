@@ -16,8 +16,10 @@ use dimos::rpc::{Backend, BoxFuture, Code, Reply, Request, RpcError, Subject};
 #[derive(Default)]
 pub struct FakeBackend {
     pub streams: Streams,
-    /// Everything that was asked, in order.
+    /// Everything that was asked, in order; for a `go`, the requests of its steps.
     pub asked: Mutex<Vec<Request>>,
+    /// The latest `go`.
+    pub going: Mutex<Option<Go>>,
     /// How often `motion` was asked.
     pub polls: AtomicU64,
     /// When set, a motion does not end until it is cancelled.
@@ -38,6 +40,8 @@ pub struct FakeBackend {
 
 /// Number of every plan.
 pub const PLAN: u64 = 5;
+/// Number of every `go`.
+pub const GOING: u64 = 3;
 
 impl FakeBackend {
     pub fn asked(&self) -> Vec<Request> {
@@ -74,9 +78,43 @@ impl FakeBackend {
         }
     }
 
+    /// Answers a request of a step at once.
+    async fn begin(&self, go: Go) -> Result<GoReply, RpcError> {
+        for step in &go.steps {
+            let request = match step.clone() {
+                GoStep::Plan(plan) => Request::Plan(*plan),
+                GoStep::ExecutePlan(execute) => Request::ExecutePlan(*execute),
+                GoStep::Move(direct) => Request::Move(*direct),
+                GoStep::Execute(execute) => Request::Execute(*execute),
+                GoStep::Gripper(gripper) => Request::Gripper(gripper.command(0.04)),
+            };
+            self.call(request).await?;
+        }
+        *self.going.lock().unwrap() = Some(go);
+        Ok(GoReply { going: GOING })
+    }
+
+    fn going(&self) -> GoingReport {
+        let step = self.going.lock().unwrap().as_ref().map(|go| go.steps[0].clone()).expect("a go was asked for");
+        let begun = match step {
+            GoStep::Move(direct) => GoBegun::Move(moves(*direct)),
+            GoStep::Execute(execute) => GoBegun::Execute(executes(*execute)),
+            _ => {
+                let planning = self.planning(PLAN);
+                let done = planning.state != "PLANNING";
+                let error = done.then(|| RpcError::new(Code::NoPlan, "cancelled"));
+                let step = GoStepReport { planning: Some(planning), ..GoStepReport::default() };
+                return GoingReport { going: GOING, done, steps: vec![step], error, ..GoingReport::default() };
+            }
+        };
+        let motion = self.motion(begun.motion());
+        let (phase, done) = (GoPhase::Executing, motion.done);
+        let step = GoStepReport { begun: Some(begun), motions: vec![motion], ..GoStepReport::default() };
+        GoingReport { going: GOING, phase, done, steps: vec![step], ..GoingReport::default() }
+    }
+
     fn planning(&self, plan: u64) -> PlanningReport {
-        let ends =
-            |r: &Request| matches!(r, Request::Cancel(c) if c.task.is_none() && c.plan.is_none_or(|p| p == plan));
+        let ends = |r: &Request| matches!(r, Request::Cancel(c) if c.going.is_some() || c.task.is_none() && c.plan.is_none_or(|p| p == plan));
         let cancelled = self.asked().iter().any(ends);
         PlanningReport {
             plan,
@@ -89,9 +127,28 @@ impl FakeBackend {
     }
 }
 
+fn moves(direct: Move) -> MoveReply {
+    MoveReply {
+        motion: 7,
+        task: "traj_arm".into(),
+        duration: 0.5,
+        joints: vec!["arm_joint1".into(), "arm_joint2".into()],
+        start: vec![0.0, 0.0],
+        target: direct.target,
+        collision_checked: false,
+    }
+}
+
+fn executes(execute: Execute) -> ExecuteReply {
+    let task = execute.task.unwrap_or_else(|| "traj_arm".into());
+    ExecuteReply { motion: 8, task, duration: execute.trajectory.points.last().map_or(0.0, |p| p.time_from_start) }
+}
+
 impl Backend for FakeBackend {
     fn call(&self, request: Request) -> BoxFuture<'_, Result<Reply, RpcError>> {
-        self.asked.lock().unwrap().push(request.clone());
+        if !matches!(request, Request::Go(_)) {
+            self.asked.lock().unwrap().push(request.clone());
+        }
         Box::pin(async move {
             while matches!(request, Request::Planner(_)) && self.holds_planner.load(Ordering::Relaxed) {
                 tokio::time::sleep(Duration::from_millis(5)).await;
@@ -109,20 +166,10 @@ impl Backend for FakeBackend {
                 Request::Move(m) if m.arm != "arm" => {
                     return Err(RpcError::unknown(Code::UnknownArm, "arm", &m.arm, &["arm"]));
                 }
-                Request::Move(m) => Reply::Move(MoveReply {
-                    motion: 7,
-                    task: "traj_arm".into(),
-                    duration: 0.5,
-                    joints: vec!["arm_joint1".into(), "arm_joint2".into()],
-                    start: vec![0.0, 0.0],
-                    target: m.target,
-                    collision_checked: false,
-                }),
-                Request::Execute(e) => Reply::Execute(ExecuteReply {
-                    motion: 8,
-                    task: e.task.unwrap_or_else(|| "traj_arm".into()),
-                    duration: e.trajectory.points.last().map_or(0.0, |p| p.time_from_start),
-                }),
+                Request::Move(m) => Reply::Move(moves(m)),
+                Request::Execute(e) => Reply::Execute(executes(e)),
+                Request::Go(go) => Reply::Go(self.begin(go).await?),
+                Request::Going(_) => Reply::Going(self.going()),
                 Request::Motion(m) => Reply::Motion(self.motion(m.motion)),
                 Request::Cancel(_) => Reply::Cancel(CancelReply {
                     tasks: [("traj_arm".into(), "CANCELLED".into())].into(),

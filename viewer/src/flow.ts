@@ -1,5 +1,13 @@
 // One motion from goal to end: plan, preview, execute, cancel. Nothing moves before `execute` or `moveDirect`.
-import {type MotionReport, type PlanningReport, type Preview, type Quat, RpcError, type Vec3} from './protocol';
+import {
+  type GoingReport,
+  type MotionReport,
+  type PlanningReport,
+  type Preview,
+  type Quat,
+  RpcError,
+  type Vec3,
+} from './protocol';
 import type {Run} from './run';
 import {Signal} from './signal';
 
@@ -22,18 +30,13 @@ export interface PlanRequest {
 
 export type Stage = 'idle' | 'planning' | 'planned' | 'failed' | 'executing' | 'ended';
 
-/** A motion that has begun. */
-interface Begun {
-  motion: number;
-  task?: string;
-}
-
 export class Flow {
   stage: Stage = 'idle';
   /** The arms that move. */
   arms: string[] = [];
   plan: number | null = null;
-  private task = '';
+  /** The number of the motion in the run. */
+  private going: number | null = null;
   preview: Preview | null = null;
   planning: PlanningReport | null = null;
   motion: MotionReport | null = null;
@@ -76,12 +79,7 @@ export class Flow {
   /** Moves the arms along the plan. */
   async execute(): Promise<void> {
     if (this.stage !== 'planned' || this.plan === null) return;
-    this.set('executing', 'starting…');
-    try {
-      await this.follow(await this.run.work.request<Begun>('execute_plan', {plan: this.plan}));
-    } catch (error) {
-      this.fail(error);
-    }
+    await this.go({execute_plan: {plan: this.plan}});
   }
 
   /** Moves the arm in joint space without a plan: not collision-checked. */
@@ -89,9 +87,15 @@ export class Flow {
     if (this.busy) return;
     this.forget();
     this.arms = [arm];
+    await this.go({move: {arm, target, speed, direct: true}});
+  }
+
+  private async go(step: object): Promise<void> {
     this.set('executing', 'starting…');
     try {
-      await this.follow(await this.run.work.request<Begun>('move', {arm, target, speed, direct: true}));
+      const {going} = await this.run.work.request<{going: number}>('go', {steps: [step]});
+      this.going = going;
+      await this.follow(going);
     } catch (error) {
       this.fail(error);
     }
@@ -99,8 +103,8 @@ export class Flow {
 
   /** Ends planning, or decelerates the motion to rest. */
   async cancel(arm: string): Promise<void> {
-    // One task moves all arms of a plan.
-    const own = this.stage === 'executing' && this.task ? {task: this.task} : {arm};
+    // It may move several arms.
+    const own = this.stage === 'executing' && this.going !== null ? {going: this.going} : {arm};
     const params = this.stage === 'planning' && this.plan !== null ? {plan: this.plan} : own;
     const {tasks} = await this.run.watch.request<{tasks: Record<string, string>}>('cancel', params);
     if (!this.busy)
@@ -123,14 +127,15 @@ export class Flow {
     }
   }
 
-  /** Follows a motion to its end. It continues without the page: a lost connection ends only the watching. */
-  private async follow({motion, task}: Begun): Promise<void> {
-    this.task = task ?? '';
+  /** Shows a motion to its end. It continues without the page: a lost connection ends only the watching. */
+  private async follow(going: number): Promise<void> {
+    let report: GoingReport | null = null;
     for (;;) {
       try {
-        this.motion = await this.run.work.request<MotionReport>('motion', {motion});
-        if (this.motion.done) break;
-        this.text = 'moving';
+        report = await this.run.work.request<GoingReport>('going', {going});
+        this.motion = report.steps.at(-1)?.motions?.at(-1) ?? null;
+        if (report.done) break;
+        if (this.motion) this.text = 'moving';
       } catch (error) {
         if (!(error instanceof RpcError) || error.code !== 'LOST') throw error;
         if (this.run.work.state === 'refused') throw error;
@@ -141,6 +146,8 @@ export class Flow {
     }
     // The arms are free for other programs as soon as they are at rest.
     for (const arm of this.arms) await this.run.work.request('release', {arm}).catch(() => {});
+    if (report.error) throw new RpcError(report.error.code, report.error.message, report.error.hint);
+    if (!this.motion) throw new RpcError('INTERNAL', 'the run reports no motion');
     const {state, error, deviation, elapsed} = this.motion;
     if (state !== 'COMPLETED') throw new RpcError(state, error ?? `motion ${state.toLowerCase()}`);
     const worst = Math.max(0, ...(deviation ?? []).map(({target, actual}) => Math.abs(target - actual)));
@@ -148,8 +155,7 @@ export class Flow {
   }
 
   private forget(): void {
-    this.task = '';
-    this.plan = this.preview = this.planning = this.motion = this.error = null;
+    this.plan = this.preview = this.planning = this.motion = this.error = this.going = null;
   }
 
   private set(stage: Stage, text: string): void {

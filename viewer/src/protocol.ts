@@ -241,6 +241,13 @@ export interface MotionReport {
   deviation?: {joint: string; target: number; actual: number}[] | null;
 }
 
+/** Progress or outcome of a motion that the run carries out as a whole. */
+export interface GoingReport {
+  done: boolean;
+  steps: {begun?: {task?: string}; motions?: MotionReport[]}[];
+  error?: {code: string; message: string; hint?: string};
+}
+
 export interface StopReply {
   arms: Record<string, 'confirmed' | 'sent_not_confirmed' | 'not_sent'>;
 }

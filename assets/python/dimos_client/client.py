@@ -6,7 +6,7 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Optional, Union
 
-from .errors import ArmNotReady, MotionFailed, Refused
+from .errors import ArmNotReady, MotionFailed, PlanningFailed, Refused, refusal
 from .planning import Goals, Planning, plan_number, where_to
 from .records import ArmState, Goal, Grip, Plan, Pose, Waypoint, numbers
 
@@ -78,13 +78,32 @@ class Client(Planning):
         if not direct:
             try:
                 self._end_streams(self._streams_to([arm] if isinstance(arm, str) else arm))
-                planned = self._planned(where, speed=speed, seed=seed, timeout=timeout, by_number=True)
-                return self.execute(planned, wait=wait, replan=replan)
+                plan = {**where, "speed": speed, "seed": seed}
+                return self._go({"plan": plan if timeout is None else {**plan, "timeout": timeout}}, wait, replan)
             except Refused as error:
                 if not (error.code == "NO_PLANNER" and error.data is None and joints):
                     raise  # also when a planner was there and has gone
-        begun = self.call("move", arm=arm, target=joints, speed=speed, direct=direct or None)
-        return self.wait(begun["motion"]) if wait else begun
+        return self._go({"move": {"arm": arm, "target": joints, "speed": speed, "direct": direct}}, wait)
+
+    def _go(self, step: dict[str, Any], wait: bool, replan: bool = False) -> dict[str, Any]:
+        """Lets the run carry out a motion as a whole. What it says of the motion: its end, or without `wait` its
+        beginning."""
+        number: int = self.call("go", steps=[step], replan=replan or None)["going"]
+        try:
+            while True:
+                report = self.call("going", going=number)
+                done = report["steps"][0] if report["steps"] else {}
+                if (begun := done.get("begun")) or report["done"]:
+                    break
+                time.sleep(0.01)
+        except BaseException:  # Ctrl-C, too
+            self._urgent("cancel", going=number)
+            raise
+        if begun:
+            return self.wait(begun["motion"]) if wait else dict(begun)
+        if (plan := done.get("planning")) and plan["state"] != "PLANNED":
+            raise PlanningFailed(plan["state"], plan.get("error") or "there is no plan", plan.get("hint"), plan)
+        raise refusal(report["error"])
 
     def _streams_to(self, arms: Collection[str]) -> set[str]:
         """The tasks to which this client streams, and whose joints a planned motion needs."""

@@ -20,12 +20,12 @@ LISTED = 0.6  # s to list the runs of a place
 ANSWERED = 11.0  # s for an answer of the run, whose own limit is 10 s
 OWN = 1 << 32  # numbers of the subscriptions that are served here; a run's own are below
 CLASSES = {
-    "read": "status state text_log motion planner planning preview world grip arm_io arm_payload arm_tool poses "
-    "robot_description transforms subscribe unsubscribe",
+    "read": "status state text_log motion going planner planning preview world grip arm_io arm_payload arm_tool "
+    "poses robot_description transforms subscribe unsubscribe",
     "end": "stop cancel",
     "plan": "plan ik world_add world_move world_remove attach detach register_planner planner_answer",
-    "move": "lease release move move_native execute execute_plan servo velocity chunk twist pose start gripper speed "
-    "arm_disable arm_io_set arm_payload_set arm_tool_set pose_save pose_remove",
+    "move": "lease release go move move_native execute execute_plan servo velocity chunk twist pose start gripper "
+    "speed arm_disable arm_io_set arm_payload_set arm_tool_set pose_save pose_remove",
     "enable": "arm_reset arm_enable arm_teach arm_take_over",
     "own": "shutdown",
 }

@@ -96,6 +96,8 @@ pub enum Code {
     OutOfReach,
     /// The arm has no gripper.
     NoGripper,
+    /// Fingers did not get to their position, or hold nothing that should be attached; or nothing can be detached.
+    GripFailed,
     /// The arm was stopped, held, disabled or disconnected, or another client took its lease, after the motion had been
     /// requested; the message says which.
     Superseded,

@@ -29,4 +29,4 @@ mod wire;
 
 pub use api::{Backend, BoxFuture, Method, Reply, Request};
 pub use error::{Code, RpcError};
-pub use server::lease::Subject;
+pub use server::lease::{Claimant, Subject};

@@ -6,8 +6,7 @@ use serde::Serialize;
 
 use crate::blueprint::{Blueprint, JointSummary, Summary};
 use crate::cli::output::{self, Table};
-use dimos_planner::planning::scene::config::{JointBounds, ObjectConfig, ObjectShape};
-use dimos_planner::planning::scene::planning_scene::{PlannedRobot, PlanningScene};
+use crate::offline::{JointBounds, ObjectConfig, ObjectShape, PlannedRobot, PlanningScene};
 use dimos_robot as robot;
 use dimos_robot::Source;
 use dimos_robot::mesh::Size;

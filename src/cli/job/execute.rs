@@ -8,13 +8,13 @@ use super::step::{Act, Job, Motion, Step};
 use super::times::Times;
 use crate::cli::banner;
 use crate::cli::exit::{Exit, Failure};
-use crate::cli::follow::{Signals, completed, watch};
-use crate::cli::goal::plan;
-use crate::cli::grip::{self, GripAction, Objects, Opening};
+use crate::cli::follow::{Signals, completed};
+use crate::cli::going::{self, NotBegun};
+use crate::cli::grip::{self, GripAction, Opening};
 use crate::cli::output;
 use dimos_rpc::Code;
 use dimos_rpc::api::{
-    ArmEnable, ArmIo, ArmIoSet, ArmReset, Cancel, Detach, ExecutePlan, GripOutcome, Move, Plan, Status, World,
+    ArmEnable, ArmIo, ArmIoSet, ArmReset, Detach, Go, GoStep, GripOutcome, Move, Plan, Status, World,
 };
 use dimos_rpc::client::{Client, ClientError};
 use dimos_rpc::report::ArmReport;
@@ -262,27 +262,24 @@ impl<'r> Runner<'r, '_> {
     fn motion(&mut self, step: &Step, motion: &Motion) -> Outcome {
         let Motion { goal, speed, .. } = motion;
         let title = format!("line {}: {}", step.line, step.text);
-        let (number, task) = if motion.direct {
+        let step = if motion.direct {
             let named = || goal.named.as_ref().and_then(|name| self.names.named(&step.arm, name));
             let target = goal.joints.clone().or_else(named).unwrap_or_default();
-            let begun = self.client.call(Move::direct(step.arm.clone(), target, *speed))?;
-            (begun.motion, begun.task)
+            GoStep::Move(Box::new(Move::direct(step.arm.clone(), target, *speed)))
         } else {
             let (goals, through) = (vec![goal.clone()], motion.through.clone());
-            let request =
-                Plan { goals, speed: *speed, through, blend: motion.blend, by_number: true, ..Plan::default() };
-            let found = plan(self.client, request, self.signals).map_err(|failure| {
-                // Another client's `cancel`, maybe at a waypoint.
-                let cancelled = failure.what.starts_with("no plan: ") && failure.what.ends_with("cancelled");
-                if cancelled { End::Stopped(failure) } else { failure.into() }
-            })?;
-            self.signals.check()?;
-            let (plan, replan) = (Some(found.plan), motion.replan);
-            let begun = self.client.call(ExecutePlan { plan, replan, ..ExecutePlan::default() })?;
-            (begun.motion, begun.task)
+            let plan = Plan { goals, speed: *speed, through, blend: motion.blend, ..Plan::default() };
+            GoStep::Plan(Box::new(plan))
         };
-        let cancel = Cancel { task: Some(task), ..Cancel::default() };
-        let (report, signal) = watch(self.client, number, &cancel, &title, self.signals)?;
+        let go = Go { steps: vec![step], replan: motion.replan && !motion.direct, ..Go::default() };
+        let at = (self.client.call(go)?.going, 0);
+        let begun = going::begin(self.client, at, Some(self.signals), false).map_err(|why| match why {
+            // Another client's `cancel`, maybe at a waypoint.
+            NotBegun::NoPlan(failure) if failure.what.ends_with("cancelled") => End::Stopped(failure),
+            NotBegun::Refused(error) => error.into(),
+            why => Failure::from(why).into(),
+        })?;
+        let (report, signal) = going::follow(self.client, at.0, &begun.reply, &title, self.signals)?;
         if let Some(signal) = signal {
             return Err(End::Signal(signal));
         }
@@ -302,7 +299,7 @@ impl<'r> Runner<'r, '_> {
         timeout: Duration,
     ) -> Outcome {
         let arm = step.arm.clone();
-        let action = GripAction { opening: to, force, speed: None, timeout: Some(timeout), objects: Objects::Keep };
+        let action = GripAction { opening: to, force, speed: None, timeout: Some(timeout), objects: None };
         let order = action.send(self.client, &arm)?.order;
         let report = grip::wait(self.client, &arm, order, self.signals);
         let report = report.map_err(|failure| self.signals.last().map_or_else(|| failure.into(), End::Signal))?;

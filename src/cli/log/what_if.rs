@@ -8,10 +8,10 @@ use std::time::Instant;
 use serde_json::json;
 
 use super::progress;
+use crate::blueprint::TaskTable;
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output::{self, Table, fixed, number};
 use crate::replay::what_if::{Row, WhatIf, what_if};
-use dimos_control::task_spec::TaskTable;
 
 /// Number of events that are printed.
 const SHOWN: usize = 20;

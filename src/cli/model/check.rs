@@ -3,7 +3,7 @@
 use super::{File, has_mistakes};
 use crate::cli::exit::{Exit, Result};
 use crate::cli::output;
-use dimos_planner::planning::scene::planning_scene::{always_touch, whole};
+use crate::offline::always_touching;
 use dimos_robot::urdf::Meshes;
 use dimos_robot::{Loaded, RobotModel, judge};
 use dimos_yaml::{Diag, quote};
@@ -39,8 +39,8 @@ pub(super) fn run(file: &File) -> Result {
 fn touching_links(robot: RobotModel, loaded: &mut Loaded) {
     let allowed = loaded.semantics.disabled_pairs().collect();
     // Errors of shapes were reported with the meshes; others appear only here.
-    let touching = match whole(robot, allowed) {
-        Ok(robot) => always_touch(&robot),
+    let touching = match always_touching(robot, allowed) {
+        Ok(touching) => touching,
         Err(_) if loaded.has_errors() => return,
         Err(why) => return loaded.report(Diag::error(why)),
     };

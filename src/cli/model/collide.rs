@@ -9,9 +9,7 @@ use super::chain::{check_count, group_joints};
 use crate::cli::arguments::finite;
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output::{self, Table};
-use dimos_planner::collision::world::World;
-use dimos_planner::collision::{ExactChecker, Resolution};
-use dimos_planner::planning::scene::planning_scene::{always_touch, whole};
+use crate::offline::Contacts;
 use dimos_robot::RobotModel;
 use dimos_robot::urdf::Meshes;
 
@@ -51,14 +49,9 @@ pub fn run(args: &Args) -> Result {
     let names: Vec<&str> = joints.iter().filter_map(|j| robot.joints.get(*j)).map(|j| j.name.as_str()).collect();
     check_count(&robot.name, &names, &args.positions)?;
     let q = configuration(&robot, &names, &args.positions);
-    let mut body = whole(robot.clone(), loaded.semantics.disabled_pairs().collect()).map_err(Failure::usage)?;
-    let unchecked = always_touch(&body);
-    body.allowed.extend(unchecked.iter().cloned().map(<(String, String)>::from));
-    let mut world = World::new();
-    world.add_robot(body).map_err(|e| Failure::usage(e.to_string()))?;
-    let mut checker = ExactChecker::new(world.snapshot(), Resolution::default()).with_margin(args.within);
-    let mut close: Vec<_> = checker.closer_than_padding(&q).into_iter().map(|(_, contact)| contact).collect();
-    close.sort_by(|a, b| a.distance.total_cmp(&b.distance));
+    let allowed = loaded.semantics.disabled_pairs().collect();
+    let (mut contacts, unchecked) = Contacts::of_model(robot.clone(), allowed, args.within).map_err(Failure::usage)?;
+    let close = contacts.at(&q);
     let touching = close.iter().filter(|contact| contact.distance <= 0.0).count();
     let exit = if touching == 0 { Exit::Ok } else { Exit::Failed };
     if args.file.json {

@@ -10,10 +10,8 @@ use super::chain::Chain;
 use crate::cli::arguments::{angle, finite, length};
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output::{self, Table};
+use crate::offline::{IkSettings, distance, solutions};
 use dimos_core::pose::from_xyz_rpy;
-use dimos_planner::collision::checker::Stop;
-use dimos_planner::planning::ik::{Ik, IkSettings};
-use dimos_planner::planning::search::path::distance;
 use dimos_robot::kinematics::{Kinematics, frame};
 use dimos_robot::urdf::Meshes;
 
@@ -104,11 +102,8 @@ pub fn run(args: &Args) -> Result {
     let (position, rotation) = (args.tolerance, args.tolerance);
     let settings =
         IkSettings { position, rotation, position_only: turn.is_none(), solutions: SOLUTIONS, ..IkSettings::default() };
-    let mut ik = Ik::new(&kinematics, chain.link);
-    match ik.closest(&target, &seed, &settings, |_| true, &Stop::never()) {
-        Ok(found) => {
-            let missing = |ik: &mut Ik<'_>, q: &[f64]| ik.pose(q).translation.distance(target.translation);
-            let error = missing(&mut ik, found.first().map_or(&[], Vec::as_slice));
+    match solutions(&kinematics, chain.link, &target, &seed, &settings) {
+        Ok((found, error)) => {
             show(args, &chain, &found, &seed, error, turn.is_none());
             Ok(Exit::Ok)
         }

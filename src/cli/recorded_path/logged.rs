@@ -8,11 +8,11 @@ use super::steps::{Recording, Steps};
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::log::{STATES, no_states};
 use crate::cli::output;
+use crate::offline::unwind;
 use crate::replay::motion::MAX_GAP;
 use dimos_log::joints::{Places, twice};
 use dimos_log::messages::JointState;
 use dimos_log::replay::{LogReader, Payload, ReplayError, Selection};
-use dimos_planner::planning::search::path::unwind;
 
 /// Reads the positions of these joints. Those of joints that are continuous (`turns`) have no steps of whole turns.
 pub fn read(file: &Path, joints: &[String], turns: &[bool], tolerance: f64) -> Result<Vec<Vec<f64>>> {

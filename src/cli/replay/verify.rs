@@ -2,13 +2,13 @@
 
 use std::path::Path;
 
+use crate::blueprint::TaskTable;
 use crate::cli::exit::Exit;
 use crate::cli::log::progress;
 use crate::cli::output;
 use crate::replay::compare::Difference;
 use crate::replay::recorded::RecordedError;
 use crate::replay::verify::{Finding, Verification, verify_with};
-use dimos_control::task_spec::TaskTable;
 
 /// Verifies a log and prints the result.
 pub fn run(path: &Path, table: &TaskTable, json: bool) -> Result<Exit, RecordedError> {

@@ -13,16 +13,13 @@ use super::super::model::chain::end_of_arm;
 use super::super::model::{self, With};
 use super::super::output;
 use crate::blueprint::{Blueprint, Catalog, Overrides, Summary};
+use crate::offline::{Contacts, IgnoredPair, ObjectConfig, PlannerConfig, PlanningScene, RobotConfig};
 use crate::runtime::tool::kinematics::use_kept;
 use crate::runtime::world_object;
 use crate::view::{Scene, Shown, ShownArm, ShownRobot, Subject, robots, value};
 use dimos_core::joint::JointLimits;
 use dimos_core::pose::to_xyz_rpy;
 use dimos_core::sync::lock;
-use dimos_planner::collision::{ExactChecker, Resolution};
-use dimos_planner::planning::scene::config::{ObjectConfig, PlannerConfig, RobotConfig};
-use dimos_planner::planning::scene::ignored_pairs::IgnoredPair;
-use dimos_planner::planning::scene::planning_scene::PlanningScene;
 use dimos_robot::kinematics::pose;
 use dimos_robot::urdf::Meshes;
 use dimos_robot::{Source, load};
@@ -37,7 +34,7 @@ pub struct Posed {
     shown: Shown,
     objects: Vec<ObjectConfig>,
     /// The robots with a checker of their collisions, or why there is none.
-    setup: std::result::Result<(PlanningScene, Mutex<ExactChecker>), String>,
+    setup: std::result::Result<(PlanningScene, Mutex<Contacts>), String>,
 }
 
 impl Posed {
@@ -132,25 +129,23 @@ impl Posed {
         let arms = arms.into_iter().map(arm).collect();
         let shown = Shown { name, simulated: true, planner: false, robots, arms };
         let checked = setup.map(|setup| {
-            let checker = ExactChecker::new(setup.world.snapshot(), Resolution::default()).with_margin(CLOSE);
-            (setup, Mutex::new(checker))
+            let contacts = Contacts::of_scene(&setup, CLOSE);
+            (setup, Mutex::new(contacts))
         });
         Self { kind, shown, objects, setup: checked }
     }
 
     /// Returns what is close at joint positions, and where the tool centre points are, as JSON.
     fn pose(&self, query: &str) -> std::result::Result<String, String> {
-        let (setup, checker) = self.setup.as_ref().map_err(Clone::clone)?;
+        let (setup, contacts) = self.setup.as_ref().map_err(Clone::clone)?;
         let number = |text: &str| text.parse::<f64>().ok().filter(|q| q.is_finite());
         let q: Option<Vec<f64>> = value(query, "q").unwrap_or_default().split(',').map(number).collect();
         let dof: usize = setup.robots.iter().map(|robot| robot.joints.len()).sum();
         let q =
             q.filter(|q| q.len() == dof).ok_or_else(|| format!("q must be {dof} positions, separated by commas"))?;
-        let mut close = lock(checker).closer_than_padding(&q);
-        close.sort_by(|(_, a), (_, b)| a.distance.total_cmp(&b.distance));
-        let pairs = close
-            .iter()
-            .map(|(_, contact)| json!({"links": [contact.link, contact.other], "distance": contact.distance}));
+        let close = lock(contacts).at(&q);
+        let pairs =
+            close.iter().map(|contact| json!({"links": [contact.link, contact.other], "distance": contact.distance}));
         let mut rest = q.as_slice();
         let tcp = setup.robots.iter().zip(&self.shown.robots).map(|(robot, shown)| {
             let (own, others) = rest.split_at(robot.joints.len().min(rest.len()));

@@ -11,6 +11,7 @@ use serde_json::{Value, json};
 use tokio::sync::oneshot;
 
 use super::asker::asker;
+use super::curb::unless_ended;
 use dimos_control::request::{Envelope, Goal, Motion, Request};
 use dimos_control::task_robot::FramePose;
 use dimos_core::clock::{Clock, Mono, MonotonicClock};
@@ -50,6 +51,9 @@ pub enum SendError {
     /// The tick did not answer.
     #[error("the coordinator did not answer")]
     NoAnswer,
+    /// What it is a part of was ended before.
+    #[error("it was ended before this")]
+    Ended,
 }
 
 impl Dispatcher {
@@ -117,8 +121,26 @@ impl Dispatcher {
         let (sender, receiver) = oneshot::channel();
         // Made before the lock: a stop never waits for the text of another request.
         let note = note(id, MonotonicClock.now());
+        let envelope = Envelope { id, origin, request };
+        match ends_motion {
+            true => self.put(envelope, sender, note, who, 0)?,
+            false => unless_ended(|| self.put(envelope, sender, note, who, RESERVED)).ok_or(SendError::Ended)??,
+        }
+        Ok(receiver)
+    }
+
+    /// Puts a request into the ring if that has more than `least` free slots.
+    fn put(
+        &self,
+        envelope: Envelope,
+        sender: oneshot::Sender<Outcome>,
+        note: Note,
+        who: Option<Arc<Who>>,
+        least: usize,
+    ) -> Result<(), SendError> {
+        let id = envelope.id;
         let mut ring = lock(&self.requests);
-        if ring.slots() <= if ends_motion { 0 } else { RESERVED } {
+        if ring.slots() <= least {
             return Err(SendError::Full);
         }
         lock(&self.waiting).insert(id, sender);
@@ -127,11 +149,11 @@ impl Dispatcher {
             let _ = self.notes.send(Note::Asked { id, who });
         }
         let _ = self.notes.send(note);
-        if ring.push(Envelope { id, origin, request }).is_err() {
+        if ring.push(envelope).is_err() {
             lock(&self.waiting).remove(&id);
             return Err(SendError::Full);
         }
-        Ok(receiver)
+        Ok(())
     }
 
     fn note_stop(&self, arm: Option<u16>, who: Option<Arc<Who>>) {

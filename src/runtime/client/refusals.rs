@@ -35,6 +35,7 @@ impl Service {
         let hint = match error {
             SendError::Full => "send fewer requests at once",
             SendError::NoAnswer => "`dimos status` shows whether the run is alive",
+            SendError::Ended => return RpcError::new(Code::Superseded, error.to_string()),
         };
         RpcError::new(Code::NoAnswer, error.to_string()).hint(hint)
     }

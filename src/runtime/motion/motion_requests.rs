@@ -7,6 +7,7 @@ use serde_json::json;
 
 use super::motions::{Carried, Planned};
 use crate::runtime::client::asker::asker;
+use crate::runtime::client::curb::curb;
 use crate::runtime::plan::planner_port::run_blocking;
 use crate::runtime::{Service, internal};
 use dimos_control::limit::Bounds;
@@ -156,7 +157,10 @@ impl Service {
         self.check_limits(&joints, &spline)?;
         let number = self.tick.dispatcher().next_id();
         let goal = (0..joints.len()).map(|k| spline.goal(k)).collect();
-        let plan = plan.map(|(plan, replan)| Carried { plan, spline: Arc::new(spline.clone()), replan, origin });
+        let plan = plan.map(|(plan, replan)| {
+            let (spline, curb) = (Arc::new(spline.clone()), curb().unwrap_or_default());
+            Carried { plan, spline, replan, origin, curb }
+        });
         let planned = Planned {
             task,
             joints: joints.clone(),

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard};
 
+use crate::runtime::client::curb::Curb;
 use dimos_core::sync::lock;
 use dimos_core::telemetry::{Origin, Reason, TaskState, Who};
 use dimos_core::trajectory::Spline;
@@ -49,6 +50,8 @@ pub struct Carried {
     pub replan: Option<Option<Presence>>,
     /// When and by whom it was requested, also if it is planned again.
     pub origin: Origin,
+    /// Ends planning it again, and the `go` that it is a part of.
+    pub curb: Arc<Curb>,
 }
 
 /// What follows a blocked motion.
@@ -79,6 +82,8 @@ pub struct UnderWay {
     pub replan: Option<Option<Presence>>,
     /// As [`Carried::origin`].
     pub origin: Origin,
+    /// As [`Carried::curb`].
+    pub curb: Arc<Curb>,
     /// As [`Planned::by`].
     pub by: Option<Arc<Who>>,
 }
@@ -158,10 +163,10 @@ impl Motions {
         let all = self.all();
         let going = all.iter().filter(|(_, (_, end))| end.is_none());
         let planned = going.filter_map(|(number, (planned, _))| {
-            let Carried { plan, spline, replan, origin } = planned.plan.clone()?;
+            let Carried { plan, spline, replan, origin, curb } = planned.plan.clone()?;
             let (number, task, joints) = (*number, planned.task, planned.joints.clone());
             let by = planned.by.clone();
-            Some(UnderWay { number, task, joints, plan, spline, replan, origin, by })
+            Some(UnderWay { number, task, joints, plan, spline, replan, origin, curb, by })
         });
         planned.collect()
     }
@@ -202,6 +207,7 @@ impl Motions {
         for (planned, _) in self.all().values_mut().filter(|(planned, _)| is_meant(planned)) {
             if let Some(carried) = &mut planned.plan {
                 carried.replan = None;
+                carried.curb.end(why);
             }
             if planned.next == Some(Next::Planning) {
                 planned.next = Some(Next::None(why.to_owned()));

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use super::motions::UnderWay;
 use crate::runtime::client::asker::asked_by;
+use crate::runtime::client::curb::curbed;
 use crate::runtime::{Service, internal};
 use dimos_core::joint::STANDSTILL;
 use dimos_core::telemetry::{Phase, TaskState};
@@ -76,7 +77,7 @@ impl Service {
         let presence = motion.replan.clone().flatten();
         let execute =
             ExecutePlan { plan: Some(begun.plan), replan: true, unproven, presence, ..ExecutePlan::default() };
-        let execute = self.planner_call_from(Call::ExecutePlan(execute), motion.origin);
+        let execute = curbed(motion.curb.clone(), self.planner_call_from(Call::ExecutePlan(execute), motion.origin));
         let executed = match motion.by.clone() {
             Some(who) => asked_by(who, execute).await?,
             None => execute.await?,

@@ -7,6 +7,7 @@ mod attach;
 mod cartesian;
 mod class;
 mod gateway;
+mod going;
 mod ik;
 mod model;
 mod motion;
@@ -38,6 +39,7 @@ pub use cartesian::*;
 pub use class::Class;
 use dimos_core::telemetry::{Origin, Who};
 pub use gateway::*;
+pub use going::*;
 pub use ik::*;
 pub use model::*;
 pub use motion::*;
@@ -254,8 +256,13 @@ methods! {
         check Execute::valid;
     /// Progress or result of a motion.
     "motion" Motion -> MotionReport, Read;
+    /// Carries out a motion as a whole: plans, executes, follows, grips, attaches, one step after the other. Replies at
+    /// once; `going` reports its progress and its one outcome.
+    "go" Go -> GoReply, Move, needs _p => Need::AtEachStep, check Go::valid;
+    /// Progress or outcome of a request `go`.
+    "going" Going -> GoingReport, Read;
     /// Ends motions by decelerating within limits: those of a task, of an arm, or all. With a plan, ends its planning
-    /// only.
+    /// only; with the number of a `go`, ends that.
     "cancel" Cancel -> CancelReply, End, check Cancel::valid;
     /// Reads or sets the speed override: all motions run at a fraction of their speed, or pause on their paths. Needs
     /// no lease: who watches an arm may slow it down, also one that another client moves.

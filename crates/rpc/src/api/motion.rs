@@ -253,12 +253,18 @@ pub struct Cancel {
     /// Ends only the planning of the plan with this number, and no motion. Excludes `arm` and `task`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<u64>,
+    /// Ends what is being done for the `go` with this number, and nothing else. Excludes the others.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub going: Option<u64>,
 }
 
 impl Cancel {
     pub(crate) fn valid(&self) -> Result<(), String> {
         if self.plan.is_some() && (self.arm.is_some() || self.task.is_some()) {
             return Err("plan excludes arm and task".into());
+        }
+        if self.going.is_some() && (self.plan.is_some() || self.arm.is_some() || self.task.is_some()) {
+            return Err("going excludes arm, task and plan".into());
         }
         Ok(())
     }

@@ -19,6 +19,8 @@ pub(crate) struct Commanded(VecDeque<Begun>);
 enum Begun {
     /// A motion with a number, and what cancels it.
     Motion(u64, Cancel),
+    /// A request `go`.
+    Going(u64),
     /// A task that `start` started, and its arms.
     Task(String, Vec<String>),
 }
@@ -33,6 +35,7 @@ impl Commanded {
             (Request::MoveNative(native), Reply::MoveNative(reply)) => {
                 Begun::Motion(reply.motion, Cancel { arm: Some(native.arm.clone()), ..Cancel::default() })
             }
+            (_, Reply::Go(reply)) => Begun::Going(reply.going),
             (Request::Start(start), _) => Begun::Task(start.task.clone(), arms.to_vec()),
             _ => return,
         };
@@ -47,6 +50,8 @@ impl Commanded {
         for begun in self.0.drain(..) {
             let cancel = match begun {
                 Begun::Motion(motion, cancel) if in_motion(motion, backend).await => cancel,
+                // One that has ended is not cancelled.
+                Begun::Going(going) => Cancel { going: Some(going), ..Cancel::default() },
                 Begun::Task(task, arms) if lessee.holds_all(&arms) => Cancel { task: Some(task), ..Cancel::default() },
                 _ => continue,
             };

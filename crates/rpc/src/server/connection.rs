@@ -28,7 +28,7 @@ use crate::error::{Code, RpcError};
 use crate::server::CALL_TIMEOUT;
 use crate::server::commanded::Commanded;
 use crate::server::connection_limit::Permit;
-use crate::server::lease::{Leases, Lessee, Subject};
+use crate::server::lease::{Leases, Lessee, Subject, may_take_effect};
 use crate::server::line_reader::{Line, read_line, skip_line};
 use crate::server::planner_proxy::PlannerProxy;
 use crate::server::streams::{Subscribe, SubscribeReply, Unsubscribe};
@@ -456,11 +456,6 @@ async fn noting_a_wait<T>(future: impl Future<Output = T>, waited: &mut bool) ->
         poll
     })
     .await
-}
-
-/// Returns whether a request may take effect: it was accepted, or not answered in time.
-fn may_take_effect(result: &Result<Reply, RpcError>) -> bool {
-    result.as_ref().map_or_else(|error| error.code == Code::NoAnswer, |_| true)
 }
 
 /// Waits for the run's answer, at most [`CALL_TIMEOUT`].

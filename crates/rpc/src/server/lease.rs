@@ -12,7 +12,7 @@ use std::time::Instant;
 
 use serde_json::json;
 
-use crate::api::{Backend, ExecutePlan, FaceReport, GatewayReport, Presence, RegisterGateway, Reply, Request};
+use crate::api::{Backend, ExecutePlan, FaceReport, GatewayReport, Go, Presence, RegisterGateway, Reply, Request};
 use crate::error::{Code, RpcError};
 use crate::report::CommanderReport;
 use crate::server::who::Peer;
@@ -41,6 +41,8 @@ pub(crate) enum Need<'a> {
     Lease(Subject<'a>),
     /// The leases of the arms that a plan moves; without a number, the newest plan's.
     Plan(Option<u64>),
+    /// Those of what it moves, when that begins: it gets its [`Claimant`].
+    AtEachStep,
     /// No lease, but no other connection may hold it: the request changes whether the arm accepts motion.
     NoOtherHolder(Subject<'a>),
     /// The same, for the arm whose load the request changes with an object of known mass.
@@ -137,16 +139,59 @@ impl Leases {
         self.lock().values().any(|holder| holder.connection == connection)
     }
 
-    /// Releases the leases of a connection that has ended.
-    pub fn end_connection(&self, connection: u64) {
-        self.lock().retain(|arm, holder| {
+    /// Releases the leases of a connection that has ended; `alive` is what its presence observes.
+    pub fn end_connection(&self, connection: u64, alive: Arc<()>) {
+        let mut held = self.lock();
+        drop(alive);
+        held.retain(|arm, holder| {
             let ends = holder.connection == connection;
             if ends {
                 self.ended(arm, connection);
             }
             !ends
         });
+        drop(held);
         lock(&self.gateway).take_if(|gateway| gateway.connection == connection);
+    }
+
+    /// Takes the leases of arms for a connection: all of them, or none.
+    fn claim(
+        &self,
+        (connection, who): (u64, &Arc<Who>),
+        held: &mut BTreeMap<String, Holder>,
+        arms: &[String],
+        kept: bool,
+    ) -> Result<(), RpcError> {
+        check(connection, arms, held)?;
+        // The tick learns of a lease that a request takes with that request, if it accepts it.
+        if let Some(run) = self.run.as_ref().filter(|_| kept) {
+            arms.iter().try_for_each(|arm| run.lease_taken(arm, connection))?;
+        }
+        for arm in arms {
+            match held.get_mut(arm) {
+                Some(holder) => holder.kept |= kept,
+                None => {
+                    let (who, since) = (who.clone(), Instant::now());
+                    held.insert(arm.clone(), Holder { connection, who, since, kept });
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Keeps the leases of a connection whose request was accepted; else releases those that it took.
+    fn settle(&self, connection: u64, arms: &[String], accepted: bool) {
+        if arms.is_empty() {
+            return;
+        }
+        let mut held = self.lock();
+        for arm in arms {
+            match held.get_mut(arm).filter(|holder| holder.connection == connection) {
+                Some(holder) if accepted => holder.kept = true,
+                Some(Holder { kept: false, .. }) => drop(held.remove(arm)),
+                _ => {}
+            }
+        }
     }
 
     /// Adds the lease holders and the gateway to a `status` reply.
@@ -265,6 +310,10 @@ impl Lessee {
                 let presence = Some(Presence::of(&self.alive));
                 return Ok((Request::ExecutePlan(ExecutePlan { plan: Some(plan), presence, ..execute }), arms));
             }
+            Need::AtEachStep => {
+                let Request::Go(go) = request else { return Ok((request, Vec::new())) };
+                return Ok((Request::Go(Go { claimant: Some(self.claimant()), ..go }), Vec::new()));
+            }
         }
         Ok((request, Vec::new()))
     }
@@ -272,17 +321,7 @@ impl Lessee {
     /// Ends a request that required the leases of these arms: keeps them if it was accepted, otherwise releases those
     /// that it took.
     pub fn settle(&self, arms: &[String], accepted: bool) {
-        if arms.is_empty() {
-            return;
-        }
-        let mut held = self.leases.lock();
-        for arm in arms {
-            match held.get_mut(arm).filter(|holder| holder.connection == self.connection) {
-                Some(holder) if accepted => holder.kept = true,
-                Some(Holder { kept: false, .. }) => drop(held.remove(arm)),
-                _ => {}
-            }
-        }
+        self.leases.settle(self.connection, arms, accepted);
     }
 
     /// Takes the leases of arms: all of them, or none.
@@ -291,22 +330,13 @@ impl Lessee {
     }
 
     fn claim(&self, arms: &[String], kept: bool) -> Result<(), RpcError> {
-        let mut held = self.leases.lock();
-        self.check(arms, &held)?;
-        // The tick learns of a lease that a request takes with that request, if it accepts it.
-        if let Some(run) = self.leases.run.as_ref().filter(|_| kept) {
-            arms.iter().try_for_each(|arm| run.lease_taken(arm, self.connection))?;
-        }
-        for arm in arms {
-            match held.get_mut(arm) {
-                Some(holder) => holder.kept |= kept,
-                None => {
-                    let (connection, who, since) = (self.connection, self.who(), Instant::now());
-                    held.insert(arm.clone(), Holder { connection, who, since, kept });
-                }
-            }
-        }
-        Ok(())
+        self.leases.claim((self.connection, &self.who()), &mut self.leases.lock(), arms, kept)
+    }
+
+    /// Returns what claims leases for this connection later.
+    fn claimant(&self) -> Claimant {
+        let (leases, connection, who) = (self.leases.clone(), self.connection, self.who());
+        Claimant { leases, connection, who, presence: Presence::of(&self.alive) }
     }
 
     /// Releases the leases of arms, as far as this connection holds them; returns the released arms.
@@ -322,23 +352,75 @@ impl Lessee {
     }
 
     fn check(&self, arms: &[String], held: &BTreeMap<String, Holder>) -> Result<(), RpcError> {
-        let other = |arm: &&String| held.get(*arm).is_some_and(|h| h.connection != self.connection);
-        let Some((arm, holder)) = arms.iter().find(other).and_then(|arm| Some((arm, held.get(arm)?))) else {
-            return Ok(());
-        };
-        let CommanderReport { pid, program, held_for } = holder.report();
-        let process = pid.map(|pid| format!(" (pid {pid})")).unwrap_or_default();
-        let text = format!("{arm} is commanded by {program}{process} for {held_for:.1} s");
-        Err(RpcError::new(Code::LeaseHeld, text)
-            .hint("wait until it ends or releases the arm, or end it; `dimos stop` and `dimos cancel` always work")
-            .data(json!({"arm": arm, "pid": pid, "program": program, "held_for": held_for})))
+        check(self.connection, arms, held)
     }
 }
 
 impl Drop for Lessee {
     fn drop(&mut self) {
-        self.leases.end_connection(self.connection);
+        self.leases.end_connection(self.connection, std::mem::take(&mut self.alive));
     }
+}
+
+/// Fails if another connection holds the lease of one of these arms.
+fn check(connection: u64, arms: &[String], held: &BTreeMap<String, Holder>) -> Result<(), RpcError> {
+    let other = |arm: &&String| held.get(*arm).is_some_and(|h| h.connection != connection);
+    let Some((arm, holder)) = arms.iter().find(other).and_then(|arm| Some((arm, held.get(arm)?))) else {
+        return Ok(());
+    };
+    let CommanderReport { pid, program, held_for } = holder.report();
+    let process = pid.map(|pid| format!(" (pid {pid})")).unwrap_or_default();
+    let text = format!("{arm} is commanded by {program}{process} for {held_for:.1} s");
+    Err(RpcError::new(Code::LeaseHeld, text)
+        .hint("wait until it ends or releases the arm, or end it; `dimos stop` and `dimos cancel` always work")
+        .data(json!({"arm": arm, "pid": pid, "program": program, "held_for": held_for})))
+}
+
+/// A connection whose request the run carries out step by step: claims the leases of each step when it begins.
+#[derive(Debug, Clone)]
+pub struct Claimant {
+    leases: Arc<Leases>,
+    connection: u64,
+    who: Arc<Who>,
+    presence: Presence,
+}
+
+impl PartialEq for Claimant {
+    fn eq(&self, other: &Self) -> bool {
+        self.presence == other.presence
+    }
+}
+
+impl Claimant {
+    /// Returns what observes whether the connection is open.
+    pub fn presence(&self) -> &Presence {
+        &self.presence
+    }
+
+    /// Answers a request under the leases of these arms: taken if they are free, kept if it is accepted. Fails if
+    /// another connection holds one, or if this one has ended.
+    pub async fn command<T>(
+        &self,
+        arms: &[String],
+        answer: impl Future<Output = Result<T, RpcError>>,
+    ) -> Result<T, RpcError> {
+        {
+            let mut held = self.leases.lock();
+            // Its leases end under this lock: none is taken after it.
+            if self.presence.is_over() {
+                return Err(RpcError::new(Code::Superseded, "the connection that requested it has ended"));
+            }
+            self.leases.claim((self.connection, &self.who), &mut held, arms, false)?;
+        }
+        let result = answer.await;
+        self.leases.settle(self.connection, arms, may_take_effect(&result));
+        result
+    }
+}
+
+/// Returns whether a request may take effect: it was accepted, or not answered in time.
+pub(crate) fn may_take_effect<T>(result: &Result<T, RpcError>) -> bool {
+    result.as_ref().map_or_else(|error| error.code == Code::NoAnswer, |_| true)
 }
 
 #[cfg(test)]

@@ -65,7 +65,7 @@ impl Turn {
                 let _ = rustix::net::shutdown(&*stream, Shutdown::Both);
             }
             if let Some(permit) = permit {
-                reception.leases.end_connection(permit);
+                reception.leases.end_connection(permit, Arc::default());
                 reception.limit.end_connection(permit);
             }
         }

@@ -148,9 +148,9 @@ mod tests {
     use dimos_core::clock::Mono;
     use dimos_core::joint::{JointLimits, MAX_DOF};
     use dimos_hardware::sim::arm::{PLAYABLE, SimArm, SimOptions};
-    use dimos_planner::planning::scene::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
-    use dimos_planner::planning::scene::planning_scene::PlanningScene;
     use nalgebra::Isometry3;
+
+    use crate::offline::{Contacts, ObjectConfig, ObjectShape, PlannerConfig, PlanningScene, RobotConfig};
 
     /// The arm beside the table of the template's blueprint.
     fn setup(dof: u8, folder: &std::path::Path) -> PlanningScene {
@@ -186,19 +186,19 @@ mod tests {
 
     #[test]
     fn an_arm_of_any_number_of_joints_can_be_planned_for() {
-        use dimos_planner::collision::{CollisionChecker, ExactChecker, Resolution};
         let folder = tempfile::tempdir().unwrap();
         for dof in 1..=MAX_DOF as u8 {
             let setup = setup(dof, folder.path());
             assert_eq!(setup.always_touching, [], "{dof} joints");
             let robot = &setup.robots[0];
-            let mut checker = ExactChecker::new(setup.world.snapshot(), Resolution::default());
+            let mut contacts = Contacts::of_scene(&setup, 0.0);
             let limits = JointLimits::uniform(dof.into(), 170_f64.to_radians(), 1.0);
             let emulated =
                 SimArm::new("acme", &limits, &SimOptions::default(), PLAYABLE, Mono::ZERO).unwrap().joints().0;
             let power_up = ("power-up".to_owned(), emulated[..usize::from(dof)].to_vec());
             for (name, pose) in robot.config.named_poses.clone().into_iter().chain([power_up]) {
-                assert!(checker.is_free(&pose), "{dof} joints: {name} collides: {:?}", checker.contacts(&pose));
+                let touching = contacts.at(&pose);
+                assert!(touching.is_empty(), "{dof} joints: {name} collides: {touching:?}");
             }
             let own = &robot.limits[0];
             assert!((own.lower + 170_f64.to_radians()).abs() < 1e-12 && own.upper == -own.lower);
