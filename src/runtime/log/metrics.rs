@@ -43,12 +43,11 @@ impl Service {
 
     fn figures(&self) -> Figures {
         let pulse = self.tick.pulse();
-        let log = self
-            .facts
-            .log
-            .as_ref()
-            .zip(self.journal.recorder.get())
-            .map(|(path, stats)| LogFigures { written: stats.bytes.load(Relaxed), free: disk_space::free(path).ok() });
+        let log =
+            self.facts.log.as_ref().zip(self.journal.recorder.get()).map(|(path, stats)| LogFigures {
+                written: stats.bytes.load(Relaxed),
+                free: disk_space::free(path).ok(),
+            });
         Figures {
             status: self.status(),
             started: self.wall_seconds() - self.lifecycle.uptime().as_secs_f64(),

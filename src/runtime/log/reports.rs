@@ -300,9 +300,9 @@ impl Service {
 
     /// Returns why a motion was cancelled, if no client asked for that: the run is ending.
     fn shut_down(&self, reason: &Reason) -> Option<String> {
-        let log_ended = self.recorder.get().is_some_and(|stats| stats.failed.load(Relaxed));
+        let log_ended = self.journal.recorder.get().is_some_and(|stats| stats.failed.load(Relaxed));
         let why = if log_ended { "the log has ended, and with it the run" } else { "the run is shutting down" };
-        (*reason == Reason::Cancelled && self.is_closed()).then(|| why.to_owned())
+        (*reason == Reason::Cancelled && self.lifecycle.is_closed()).then(|| why.to_owned())
     }
 
     /// Returns the smallest fraction of the speed at which a controller of these joints runs motions, if below 1.
