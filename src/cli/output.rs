@@ -173,8 +173,8 @@ pub struct Table {
 
 impl Table {
     /// Creates a table with these headings. A leading `>` aligns the column to the right, a leading `~` lets its text
-    /// wrap at blanks on a narrow terminal; all other columns, and the names in them, stay whole. Columns with a `?` are
-    /// left out where they do not fit, the last first.
+    /// wrap at blanks on a narrow terminal; all other columns, and the names in them, stay whole. Columns with a `?`
+    /// are left out where they do not fit, the last first.
     pub fn new(headings: &[&str]) -> Self {
         Self::of_width(headings, columns(io::stdout()))
     }
@@ -345,7 +345,7 @@ mod tests {
             table.lines()[0].split_whitespace().map(str::to_owned).collect::<Vec<_>>().join(" ")
         };
         assert_eq!(joints(74), "JOINT rad rad/s TEXT LAST");
-        assert_eq!(joints(70), "JOINT rad rad/s TEXT");
+        assert_eq!(joints(67), "JOINT rad rad/s TEXT");
         assert_eq!(joints(50), "JOINT rad TEXT", "no column but the optional ones is left out");
     }
 }

@@ -67,7 +67,7 @@ fn a_disk_that_fills_up_ends_the_run_with_a_log_that_is_whole() {
     let Some(disk) = Disk::mount(&home, 64) else { return };
     let log = disk.0.join("run.mcap");
     let run = run(&home, &log, "--set recording.min_free=32MB");
-    let moving = home.start("move arm 2 -0.3 0.6 0 0.8 0 --speed 0.02");
+    let moving = home.start("move arm 2 0 0 0 0 0 0 --speed 0.02");
     moving.until("motion ");
     disk.write("other", 40);
     moving.wait().with(1).says(&["ABORTED: the log has ended, and with it the run"]);

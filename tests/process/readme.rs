@@ -35,10 +35,10 @@ fn start(home: &Home, name: &str, columns: u16) -> (Started, Terminal) {
     (run, terminal)
 }
 
-/// No line is wider than the terminal but one with a path; at 50 columns, prose.
+/// No line is wider than the terminal but one with a path; at 50 columns, prose, and names of logs.
 #[track_caller]
 fn fits(terminal: &Terminal, columns: u16, command: &str) {
-    let is_prose = |line: &String| columns < 80 && !line.trim().contains("  ");
+    let is_prose = |line: &String| columns < 80 && (command == "log list" || !line.trim().contains("  "));
     let wrapped = terminal.wrapped().into_iter().filter(|line| !line.contains('/') && !is_prose(line));
     assert_eq!(wrapped.collect::<Vec<_>>(), [""; 0], "`{command}` at {columns} columns:\n{}", terminal.text());
 }

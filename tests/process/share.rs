@@ -45,6 +45,8 @@ fn verbs_work_from_another_computer_as_they_do_here() {
     shared.there("--run other status").with(2);
     shared.home.dimos(&format!("--at {} status --run other", shared.at)).with(2).says(&["no live run is named"]);
     shared.home.dimos(&format!("--at {} list-adapters", shared.at)).with(2).says(&["works on this computer only"]);
+    // A verb that has ended is no commander that is lost.
+    assert!(!shared.there("logs").with(0).out.contains("is lost"), "{}", shared.run.err());
 }
 
 #[test]

@@ -49,8 +49,8 @@ def moves(robot):
     far = refused(dimos.OutOfLimits, "OUT_OF_LIMITS", lambda: robot.move("arm", [99.0, *READY[1:]]))
     assert far.data["joint"] == "arm_joint1" and far.hint
     refused(dimos.Refused, "INVALID_PARAMS", lambda: robot.move("arm", [math.nan] * 6))
-    message = refused(dimos.Refused, "INVALID_PARAMS", lambda: robot.gripper("arm", "closed"))
-    assert "'closed' is no position of a gripper" in message, message
+    error = refused(dimos.Refused, "INVALID_PARAMS", lambda: robot.gripper("arm", "closed"))
+    assert "'closed' is no position of a gripper" in str(error), error
     points = [{"time_from_start": t, "positions": [READY[0] + 0.05 * t], "velocities": [0.0]} for t in (0, 1)]
     robot.execute({"joint_names": ["arm_joint1"], "points": points})
     begun = robot.move("arm", READY, wait=False)

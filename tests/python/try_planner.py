@@ -44,6 +44,8 @@ def motions_go_around(robot):
 def poses_and_several_goals(robot):
     pose = Pose([0.35, 0.1, 0.3], rpy=[3.14, 0, 0])
     robot.move("arm", pose=pose, speed=1.0)
+    error = refused(dimos.Refused, "INVALID_PARAMS", lambda: robot.move("arm", pose=[0.35, 0.1, 0.3]))
+    assert "must be a Pose" in str(error), error
     line = robot.plan("arm", pose=Pose([0.35, 0.15, 0.3], rpy=[3.14, 0, 0]), linear=True)
     assert line.summary["fraction"] == 1.0, line
     assert not robot.cancel_plan(line), "it is planned already"
