@@ -2,7 +2,7 @@
 # Builds the program for computers with glibc 2.31 or newer (Debian 11, Ubuntu 20.04, Raspberry Pi OS 11), with all arms
 # and the network: target/MACHINE-unknown-linux-gnu/PROFILE/dimos.
 #
-#   packaging/build.sh MACHINE PROFILE         MACHINE: x86_64 or aarch64
+#   packaging/build.sh MACHINE PROFILE [FEATURES]      MACHINE: x86_64 or aarch64; FEATURES: default share, the network
 #
 # Needs cargo, a C compiler, and Python with venv. Fetches once, into target/cross:
 #
@@ -10,8 +10,8 @@
 #   from Debian   rustc-web and its standard libraries for both machines: 125 MB. Not if rustc has both, as after
 #                 rustup target add aarch64-unknown-linux-gnu x86_64-unknown-linux-gnu
 set -eu
-[ $# -eq 2 ] || { sed -n '2,12s/^# \{0,1\}//p' "$0" >&2; exit 2; }
-machine=$1 profile=$2
+[ $# -ge 2 ] || { sed -n '2,12s/^# \{0,1\}//p' "$0" >&2; exit 2; }
+machine=$1 profile=$2 features=${3-share}
 cd "$(dirname "$0")/.."
 target=${CARGO_TARGET_DIR:-target}
 mkdir -p "$target/cross"
@@ -45,5 +45,5 @@ fi
 unset RUSTC_WORKSPACE_WRAPPER RUSTC_WRAPPER
 # No paths of the computer that built it.
 export RUSTFLAGS="--remap-path-prefix=${CARGO_HOME:-$HOME/.cargo}/registry/src/="
-PATH="$cross/python/bin:$PATH" exec cargo zigbuild --profile "$profile" --locked --features share --bin dimos \
+PATH="$cross/python/bin:$PATH" exec cargo zigbuild --profile "$profile" --locked --features "$features" --bin dimos \
     --target "$machine-unknown-linux-gnu.2.31"

@@ -52,14 +52,14 @@ left=$(comm -13 "$work/before" "$work/after" | grep -v -e '^./var/log/' -e '^./v
 root wheel "$base-python"
 wheel=$(only "dimos_arm-*_$machine.whl")
 cp "$wheel" "$work/wheel/tmp/"
-as wheel 'python3 -m venv venv; find venv | sort >before'
+as wheel 'python3 -m venv --without-pip venv; venv/bin/python3 -m ensurepip --default-pip >/dev/null 2>&1; find venv ! -type d | sort >before'
 began=$(now)
 as wheel "venv/bin/pip install --quiet --no-index /tmp/$(basename "$wheel")"
 as wheel 'venv/bin/dimos run -d yourarm-planner >/dev/null
           venv/bin/dimos plan arm 0.3 -0.2 0.5 0 0.4 0 >/dev/null'
 took "$began" "wheel, from nothing to a plan"
 as wheel 'venv/bin/python -c "from dimos_client import Client; print(Client.connect().plan(\"arm\", named=\"home\").duration > 0)" | grep -q True
-          venv/bin/dimos down >/dev/null; venv/bin/pip uninstall --quiet --yes dimos-arm; find venv | sort >after'
+          venv/bin/dimos down >/dev/null; venv/bin/pip uninstall --quiet --yes dimos-arm; find venv ! -type d | sort >after'
 left="$left$(as wheel 'comm -13 before after' | grep -v __pycache__ || true)"
 if [ -n "$left" ]; then
     printf 'error: removed packages leave:\n%s\n' "$left" >&2
