@@ -1,5 +1,5 @@
-//! Who asks: a page in the same browser may belong to another site. Its `Origin` differs, and a name that it resolves to
-//! this computer is not an accepted `Host`.
+//! Who asks: a page in the same browser may belong to another site. Its `Origin` differs, and a name that it resolves
+//! to this computer is not an accepted `Host`.
 
 use std::net::{IpAddr, SocketAddr};
 

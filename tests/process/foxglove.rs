@@ -150,7 +150,7 @@ fn foxgloves_client_reads_a_run_as_it_reads_foxgloves_own_server() {
     assert_eq!((frames("/tf_static"), frames("/tf")[0]), (vec!["base"], "tip"));
     let markers = message("/markers")["markers"].as_array().unwrap();
     let marker = |ns: &str| markers.iter().find(|marker| marker["ns"] == ns).unwrap();
-    assert_eq!(marker("world/table")["scale"], json!({"x": 1.0, "y": 2.0, "z": 0.1}));
+    assert_eq!(marker("world/table")["scale"], json!({"x": 1, "y": 2, "z": 0.1}));
     assert_eq!(marker("world/cup")["mesh_resource"], object);
     assert!(message("/diagnostics")["status"][0]["name"].as_str().unwrap().contains("arm"));
     assert!(!message("/dimos/events")["text"].as_str().unwrap().is_empty());

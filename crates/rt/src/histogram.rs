@@ -67,8 +67,8 @@ impl Histogram {
         Figures { count, p50: quantile(0.5), p99: quantile(0.99), p99_9: quantile(0.999), max: highest as f64 / 1e3 }
     }
 
-    /// Returns how many durations are at most 1, 2, 4, … µs long (2^10, 2^11, … ns, less 1 ns) up to 1 s, and the number
-    /// of all: `([(duration [ns], count)], count)`. No count is ever less than before.
+    /// Returns how many durations are at most 1, 2, 4, … µs long (2^10, 2^11, … ns, less 1 ns) up to 1 s, and the
+    /// number of all: `([(duration [ns], count)], count)`. No count is ever less than before.
     pub fn cumulative(&self) -> (Vec<(u64, u64)>, u64) {
         let (mut below, mut seen) = (Vec::new(), 0);
         for (index, bucket) in self.buckets.iter().enumerate() {

@@ -6,9 +6,9 @@
 //!           ◀─ messages (CDR) ────────┘        ◀── lines of JSON ─────────────────┘
 //! ```
 //!
-//! Each client is one more client of the run's socket. Nothing is queued here: while a client is slow to take a message,
-//! no line of the run is read; the run drops the oldest messages of a stream and counts them, and the client gets their
-//! number.
+//! Each client is one more client of the run's socket. Nothing is queued here: while a client is slow to take a
+//! message, no line of the run is read; the run drops the oldest messages of a stream and counts them, and the client
+//! gets their number.
 
 mod assets;
 mod protocol;

@@ -118,7 +118,7 @@ async fn read_orders(from: &mut SplitStream<Socket>, orders: mpsc::Sender<Order>
 
 /// Who ended a session.
 enum Stopped {
-    /// The client takes nothing any more.
+    /// The client no longer takes anything.
     Client,
     /// The run closed the connection.
     Run,
