@@ -7,7 +7,7 @@
 
 use std::collections::BTreeMap;
 use std::fmt::{self, Debug, Formatter};
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, Weak};
 use std::time::Instant;
 
 use serde_json::json;
@@ -335,7 +335,7 @@ impl Lessee {
 
     /// Returns what claims leases for this connection later.
     fn claimant(&self) -> Claimant {
-        let (leases, connection, who) = (self.leases.clone(), self.connection, self.who());
+        let (leases, connection, who) = (Arc::downgrade(&self.leases), self.connection, self.who());
         Claimant { leases, connection, who, presence: Presence::of(&self.alive) }
     }
 
@@ -379,7 +379,8 @@ fn check(connection: u64, arms: &[String], held: &BTreeMap<String, Holder>) -> R
 /// A connection whose request the run carries out step by step: claims the leases of each step when it begins.
 #[derive(Debug, Clone)]
 pub struct Claimant {
-    leases: Arc<Leases>,
+    /// The run keeps claimants: it must not keep itself alive by them.
+    leases: Weak<Leases>,
     connection: u64,
     who: Arc<Who>,
     presence: Presence,
@@ -404,16 +405,18 @@ impl Claimant {
         arms: &[String],
         answer: impl Future<Output = Result<T, RpcError>>,
     ) -> Result<T, RpcError> {
+        let over = || RpcError::new(Code::Superseded, "the connection that requested it has ended");
+        let leases = self.leases.upgrade().ok_or_else(over)?;
         {
-            let mut held = self.leases.lock();
+            let mut held = leases.lock();
             // Its leases end under this lock: none is taken after it.
             if self.presence.is_over() {
-                return Err(RpcError::new(Code::Superseded, "the connection that requested it has ended"));
+                return Err(over());
             }
-            self.leases.claim((self.connection, &self.who), &mut held, arms, false)?;
+            leases.claim((self.connection, &self.who), &mut held, arms, false)?;
         }
         let result = answer.await;
-        self.leases.settle(self.connection, arms, may_take_effect(&result));
+        leases.settle(self.connection, arms, may_take_effect(&result));
         result
     }
 }
