@@ -32,7 +32,7 @@ pub struct Signals(Arc<AtomicUsize>);
 /// Where the reports of a motion are.
 #[derive(Debug, Clone, Copy)]
 pub enum Followed {
-    /// It was requested by itself.
+    /// It was requested alone.
     Motion,
     /// In the report of this request `go`.
     Going(u64),

@@ -15,9 +15,9 @@ use super::check;
 use super::exit::{Exit, Failure, Result};
 use super::output;
 use crate::blueprint::{self, Catalog, Found, Loaded, Overrides, Source};
+use crate::offline::PlanningScene;
 use answers::Asker;
 use choice::Cell;
-use dimos_planner::planning::scene::planning_scene::PlanningScene;
 use dimos_rpc::run_dir;
 use shipped::Known;
 

@@ -9,7 +9,7 @@ use dimos_rpc::Code;
 use dimos_rpc::api::Class;
 use dimos_rpc::report::{ArmReport, StatusReport};
 
-/// How many durations are at most this long [ns], and the number of all.
+/// How many durations do not exceed this one [ns], and the number of all.
 pub type Durations = (Vec<(u64, u64)>, u64);
 
 /// What the metrics are made of.

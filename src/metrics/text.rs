@@ -1,4 +1,4 @@
-//! The text formats of metrics: OpenMetrics 1.0 and, for clients that want it, the older one of Prometheus. Written
+//! The text formats of metrics: OpenMetrics 1.0 and, for clients that want it, that of Prometheus. Written
 //! here because a library's histogram has a sum, which the run does not measure.
 
 use std::fmt::{Display, Write};
@@ -118,7 +118,7 @@ impl Text {
         }
     }
 
-    /// Adds the buckets of a histogram: how many durations are at most this long [ns], and the number of all.
+    /// Adds the buckets of a histogram: how many durations do not exceed this one [ns], and the number of all.
     pub fn durations(&mut self, (below, all): &(Vec<(u64, u64)>, u64)) {
         for (ns, count) in below {
             self.sample(&[("le", &(*ns as f64 / 1e9).to_string())], count);

@@ -1,4 +1,4 @@
-//! What is shipped, made from the program under test: the tarball, the Debian package installed in a root of its own, the
+//! What is shipped, made from the program under test: the tarball, the Debian package installed in its own root, the
 //! wheel installed in a virtual environment.
 
 use std::ffi::OsStr;

@@ -2,7 +2,7 @@
 
 use super::choice::Robot;
 use crate::blueprint::{self, Catalog, Overrides};
-use dimos_planner::planning::scene::config::RobotConfig;
+use crate::offline::RobotConfig;
 use dimos_robot::builtin::PREFIX;
 
 /// What is known of a model.
