@@ -101,7 +101,9 @@ fn every_verb_goes_on_addressing_one_run() {
     home.dimos("move arm --named home").with(0).says(&["planned, collision-checked"]);
     assert!(home.dimos("world list").with(0).out.contains("table"));
     home.dimos("world add cup --cylinder 0.03 0.1 --at 0.3 0.3 0.4").with(0);
-    home.dimos("world attach cup arm").with(1).says(&["it is not what the gripper holds", "world attach cup arm --within 1"]);
+    home.dimos("world attach cup arm")
+        .with(1)
+        .says(&["it is not what the gripper holds", "world attach cup arm --within 1"]);
     home.dimos("world attach cup arm --within 1").with(0);
     assert!(home.dimos("world list").with(0).out.contains("arm flange"));
     home.dimos("world detach cup").with(0);
