@@ -96,8 +96,8 @@ test('jog moves while a button or key is held, and never longer', async () => {
   await page.mouse.up();
   holder.close();
   assert.ok(Math.abs(joint1() - held) < 1e-3);
-  await page.click('[data-arm=right] .card-head');
-  await text(page, '#jog-missing', /no task of the run moves .* of right; add to tasks/);
+  await page.click('[data-arm=guided] .card-head');
+  await text(page, '#jog-missing', /no task of the run moves .* of guided; add to tasks/);
 });
 
 test('goals of two arms are planned, previewed and executed together', async () => {
@@ -207,8 +207,8 @@ test('an arm is led by hand, its pose is saved, and it is held again; with motor
 test('an arm that was selected just now is jogged as long as the key is held', async () => {
   await page.click('[data-tab=jog]');
   if ((await page.getAttribute('#jog-keys', 'aria-pressed')) !== 'true') await page.click('#jog-keys');
-  await page.click('[data-arm=right] .card-head');
-  await text(page, '#jog-missing', /of right/);
+  await page.click('[data-arm=guided] .card-head');
+  await text(page, '#jog-missing', /of guided/);
   // Both within one task of the page, so that no message of the run comes between.
   await page.evaluate(() => {
     document.querySelector('[data-arm=left] .card-head').click();

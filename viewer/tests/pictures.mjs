@@ -9,7 +9,7 @@ const ARMS = [
   ['ur', 'ur5e-planner', [-0.9, 0.3, 0.2, -0.5, 0, 0]],
   ['franka', 'fr3-planner', [-0.9, 0.2, 0, 0.2, 0, 0, 0]],
   ['piper', 'piper-planner', [-0.9, 0.3, -0.2, 0, 0, 0]],
-  ['so101', 'so101-planner', [-0.9, 0.1, -0.2, 0.1, 0]],
+  ['so101', 'so101-planner', [-0.9, 0.2, -0.3, 0.1, 0]],
 ];
 const SIZE = {width: 1500, height: 780};
 const MOST = 60_000; // bytes

@@ -181,7 +181,9 @@ class Client(Planning):
         span: Optional[list[float]] = self._report(arm).get("gripper_range")
         if isinstance(opening, str):
             if opening not in ("open", "close"):
-                raise Refused("INVALID_PARAMS", f"{opening!r} is no position of a gripper", 'give "open", "close" or a number')
+                raise Refused(
+                    "INVALID_PARAMS", f"{opening!r} is no position of a gripper", 'give "open", "close" or a number'
+                )
             if span is None:
                 raise Refused("UNSUPPORTED", f"{arm} does not say how far it opens", "give a number")
             opening = span[opening == "open"]
