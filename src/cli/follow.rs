@@ -26,10 +26,10 @@ const ON_TARGET: f64 = 0.01;
 /// The last signal received while a verb watches for signals; 0 = none.
 pub struct Signals(Arc<AtomicUsize>);
 
-/// Where the reports of a motion are.
+/// Where the reports of a motion are: in that of a request `go`, or not.
 #[derive(Debug, Clone, Copy)]
 pub enum Followed {
-    /// It was requested by itself.
+    /// It was requested without one.
     Motion,
     /// In the report of this request `go`.
     Going(u64),
