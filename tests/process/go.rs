@@ -68,7 +68,10 @@ impl Cell {
                 watcher.call(Cancel { going: Some(going), ..Cancel::default() }).unwrap();
                 Some(mover)
             }
-            Event::Gone => None,
+            Event::Gone => {
+                drop(mover);
+                None
+            }
         };
         eventually("it is over", || watcher.call(Going { going }).unwrap().done);
         drop(mover);
@@ -99,7 +102,7 @@ impl Cell {
             self.home.dimos("arm reset arm").with(0);
             self.home.dimos("arm enable arm").with(0);
         }
-        self.home.dimos("move arm 0 0 0 0 0 0 --direct --speed 1").with(0);
+        self.home.dimos("move arm 0 0.05 0 0 0 0 --direct --speed 1").with(0);
     }
 }
 
@@ -115,7 +118,7 @@ fn refused<T: std::fmt::Debug>(result: Result<T, ClientError>) -> Code {
 }
 
 fn to(angle: f64, speed: f64) -> GoStep {
-    GoStep::Move(Box::new(Move::direct("arm", [angle, 0.0, 0.0, 0.0, 0.0, 0.0], speed)))
+    GoStep::Move(Box::new(Move::direct("arm", [angle, 0.05, 0.0, 0.0, 0.0, 0.0], speed)))
 }
 
 fn plan(goal: PlanGoal) -> GoStep {
@@ -255,7 +258,7 @@ fn released(request: &Value) -> Value {
 #[test]
 fn a_stop_a_cancel_and_the_end_of_the_client_end_a_motion_that_is_planned() {
     let cell = up("coordinator-yourarm");
-    cell.home.dimos("move arm 0 0 0 0 0 0 --speed 1").with(0);
+    cell.home.dimos("move arm 0 0.05 0 0 0 0 --speed 1").with(0);
     for event in EVENTS {
         let planner = Planner::attach(&cell);
         let mut mover = cell.home.client();
@@ -289,7 +292,7 @@ fn a_stop_a_cancel_and_the_end_of_the_client_end_a_motion_that_is_planned() {
 #[test]
 fn a_stop_a_cancel_and_the_end_of_the_client_come_between_a_plan_and_its_motion() {
     let cell = up("coordinator-yourarm");
-    cell.home.dimos("move arm 0 0 0 0 0 0 --speed 1").with(0);
+    cell.home.dimos("move arm 0 0.05 0 0 0 0 --speed 1").with(0);
     for event in EVENTS {
         let planner = Planner::attach(&cell);
         planner.set(|script| script.planned = true);
@@ -313,7 +316,7 @@ fn a_stop_a_cancel_and_the_end_of_the_client_come_between_a_plan_and_its_motion(
         eventually("it is over", || watcher.call(Going { going }).unwrap().done);
         let report = watcher.call(Going { going }).unwrap();
         assert!(report.steps[0].motions.is_empty(), "{event:?}: {report:?}");
-        assert_eq!(report.error.as_ref().is_some_and(|error| error.hint.is_some()), true, "{report:?}");
+        assert!(report.error.as_ref().is_some_and(|error| error.hint.is_some()), "{report:?}");
         cell.nothing_moves(event);
         assert!(cell.joint1().abs() < 0.01, "{event:?}");
         drop((planner, mover));
@@ -336,7 +339,7 @@ fn a_stop_a_cancel_and_the_end_of_the_client_end_what_follows_a_motion() {
     let cell = up("coordinator-yourarm");
     cell.home.dimos("arm gripper arm open").with(0);
     for event in EVENTS {
-        cell.home.dimos("move arm 0 0 0 0 0 0 --speed 1").with(0);
+        cell.home.dimos("move arm 0 0.05 0 0 0 0 --speed 1").with(0);
         let mut mover = cell.home.client();
         let going = go(&mut mover, vec![to(0.8, 0.15), grip(GripperEnd::Close), to(0.0, 1.0)]);
         eventually("it moves", || cell.joint1() > 0.1);
@@ -363,7 +366,7 @@ fn a_stop_a_cancel_and_the_end_of_the_client_end_what_follows_a_motion() {
 fn a_stop_a_cancel_and_the_end_of_the_client_come_while_fingers_move() {
     let cell = up("coordinator-yourarm");
     cell.home.dimos("arm gripper arm open").with(0);
-    cell.home.dimos("move arm 0 0 0 0 0 0 --speed 1").with(0);
+    cell.home.dimos("move arm 0 0.05 0 0 0 0 --speed 1").with(0);
     for event in EVENTS {
         // They do not begin to move: that this is their end is known after 1 s.
         cell.arm.inject(Fault::new(FaultKind::GripperBlocked).lasting(3.0)).unwrap();
@@ -394,9 +397,9 @@ fn a_stop_a_cancel_and_the_end_of_the_client_come_while_fingers_move() {
 #[test]
 fn a_move_that_is_killed_while_it_plans_moves_nothing() {
     let cell = up("coordinator-yourarm");
-    cell.home.dimos("move arm 0 0 0 0 0 0 --speed 1").with(0);
+    cell.home.dimos("move arm 0 0.05 0 0 0 0 --speed 1").with(0);
     let planner = Planner::attach(&cell);
-    let killed = cell.home.start("move arm 0.5 0 0 0 0 0");
+    let killed = cell.home.start("move arm 0.5 0.05 0 0 0 0");
     eventually("it plans", || planner.0.lock().unwrap().asked_to_plan);
     killed.end(rustix::process::Signal::KILL);
     sleep(Duration::from_millis(300));
@@ -451,7 +454,7 @@ fn one_request_moves_grips_and_attaches_and_has_one_outcome() {
 #[test]
 fn each_step_needs_the_lease_and_one_request_at_a_time_moves_an_arm() {
     let cell = up("coordinator-yourarm");
-    cell.home.dimos("move arm 0 0 0 0 0 0 --speed 1").with(0);
+    cell.home.dimos("move arm 0 0.05 0 0 0 0 --speed 1").with(0);
     let (mut one, mut two) = (cell.home.client(), cell.home.client());
     // Without a motion, no lease is taken.
     assert_eq!(refused(two.call(Go { steps: vec![plan(PlanGoal::default())], ..Go::default() })), Code::InvalidParams);
@@ -465,11 +468,11 @@ fn each_step_needs_the_lease_and_one_request_at_a_time_moves_an_arm() {
     let first = go(&mut one, vec![to(0.8, 0.3)]);
     eventually("it moves", || cell.joint1() > 0.1);
     assert_eq!(refused(one.call(Go { steps: vec![to(0.0, 1.0)], ..Go::default() })), Code::AlreadyExecuting);
-    cell.home.dimos("speed 50").with(0);
+    cell.home.dimos("speed 50%").with(0);
     eventually("it is slower", || one.call(Going { going: first }).unwrap().steps[0].motions[0].speed.is_some());
     let by = one.call(Going { going: first }).unwrap().by.expect("a client asked for it");
     assert_eq!(by.pid, Some(std::process::id() as i32));
-    cell.home.dimos("speed 100").with(0);
+    cell.home.dimos("speed 100%").with(0);
     eventually("it is over", || one.call(Going { going: first }).unwrap().done);
     // At once: its end is known to the run when it is known to its client.
     for angle in [0.1, 0.0] {

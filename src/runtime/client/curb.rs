@@ -1,4 +1,4 @@
-//! Ends what the run carries out on its own: nothing that is sent to the tick for it comes after its end.
+//! Ends a sequence of requests that the run makes: nothing is sent to the tick for it after its end.
 
 use std::future::Future;
 use std::sync::{Arc, Mutex};

@@ -89,7 +89,7 @@ impl Going {
             Some(claimant) => claimant.command(arms, answer).await,
             None => answer.await,
         };
-        // What ended it is the reason, not that its request was no longer sent.
+        // What ended it is the reason, not that its request was not sent.
         reply.map_err(|error| self.check().err().unwrap_or_else(|| error.into()))
     }
 

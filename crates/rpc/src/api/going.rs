@@ -175,7 +175,7 @@ pub struct GoingReport {
     pub going: u64,
     /// What is being done.
     pub phase: GoPhase,
-    /// Whether it is over: nothing of it moves or will move.
+    /// Whether it is over: nothing of it moves, nor will.
     pub done: bool,
     /// Who asked for it; absent: the run itself.
     #[serde(default, skip_serializing_if = "Option::is_none")]
