@@ -18,7 +18,8 @@ use dimos_core::trajectory::JointTrajectory;
 use dimos_log::replay::LogReader;
 use dimos_planner::planning::search::path::length;
 use dimos_planner::planning::search::thin::thin;
-use dimos_planner::planning::timing::time_within;
+use dimos_planner::planning::timing::settings::TimingSettings;
+use dimos_planner::planning::timing::time;
 use dimos_planner::planning::timing::topp::JointBound;
 use dimos_rpc::api::{
     Execute, ExecutePlan, MAX_LINE, Motion, Plan, PlanGoal, Planner, Point, State, Status, Trajectory,
@@ -294,7 +295,8 @@ fn timed(client: &mut Client, log: &Path, arm: &str, way: &Retrace, speed: f64) 
     // Half of the distance is for the straight lines, half for the blends between them.
     let (mut path, mut deviation) = (whole.clone(), DEVIATION);
     while deviation <= FARTHEST / 2.0 {
-        let timed = time_within(&joints, &path, &bounds, &vec![deviation; path.len()], speed, |_, _| true);
+        let settings = TimingSettings { deviation, speed, ..TimingSettings::default() };
+        let timed = time(&joints, &path, &bounds, &settings, |_, _| true);
         let trajectory = request_of(&joints, timed.map_err(|e| fail(e.to_string()))?.trajectory);
         if serde_json::to_string(&trajectory).is_ok_and(|text| text.len() + ENVELOPE <= MAX_LINE) {
             if deviation > DEVIATION {

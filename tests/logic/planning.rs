@@ -10,15 +10,18 @@ use std::time::{Duration, Instant};
 
 use dimos::collision::body::{MeshMode, solids};
 use dimos::collision::world::{Obstacle, Robot};
-use dimos::collision::{CollisionChecker, ExactChecker, Resolution, Solid, Stop, World};
-use dimos::planning::ik::cartesian::{LineSettings, Shortfall, straight_line};
+use dimos::collision::{CheckSettings, CollisionChecker, ExactChecker, Solid, Stop, World};
+use dimos::planning::ik::cartesian::{Shortfall, straight_line};
+use dimos::planning::ik::settings::LineSettings;
+use dimos::planning::search::settings::{PlanSettings, ShortcutSettings};
+use dimos::planning::timing::settings::TimingSettings;
 use dimos::planning::search::level::Level;
 use dimos::planning::search::path::{distance, tidy};
-use dimos::planning::search::path_planner::{PlanError, PlanSettings, plan};
-use dimos::planning::search::shortcut::{ShortcutSettings, shorten};
+use dimos::planning::search::path_planner::{PlanError, plan};
+use dimos::planning::search::shortcut::shorten;
 use dimos::planning::timing::blend::curves;
 use dimos::planning::timing::topp::{JointBound, parameterize};
-use dimos::planning::timing::{TimingSettings, time};
+use dimos::planning::timing::time;
 use dimos::robot::kinematics::Kinematics;
 use dimos::robot::random::Random;
 use dimos::robot::{builtin, urdf};
@@ -42,7 +45,7 @@ fn panda() -> Option<(Arm, Vec<Problem>)> {
 fn checker(arm: &Arm, problem: &Problem) -> (ExactChecker, Arc<Kinematics>) {
     let kinematics = Arc::new(arm.kinematics(problem).unwrap());
     let scene = arm.scene(&kinematics, problem, Shapes::True).unwrap();
-    (ExactChecker::new(scene, Resolution::default()), kinematics)
+    (ExactChecker::new(scene, CheckSettings::default()), kinematics)
 }
 
 #[test]
@@ -172,7 +175,7 @@ fn two_arms() -> ExactChecker {
     for (name, solid) in things {
         world.add(Obstacle { name: name.into(), solid: solid.unwrap(), padding: 0.0 }).unwrap();
     }
-    ExactChecker::new(world.snapshot(), Resolution::default())
+    ExactChecker::new(world.snapshot(), CheckSettings::default())
 }
 
 #[test]
@@ -201,7 +204,7 @@ fn two_arms_are_planned_together_without_any_setting() {
 
 #[test]
 fn a_folded_elbow_cannot_be_reached_from_a_straight_one_and_the_links_in_the_way_are_named() {
-    let mut checker = ExactChecker::new(world_of(&[("arm", 0.0)]).snapshot(), Resolution::default());
+    let mut checker = ExactChecker::new(world_of(&[("arm", 0.0)]).snapshot(), CheckSettings::default());
     for goal in [[0.3, -0.4, 2.3, 0.5, -0.8, 0.2], [-0.8, 0.6, 2.4, -1.0, 0.6, 1.0]] {
         let settings = PlanSettings { level: Level::Fast, ..PlanSettings::default() };
         let found = plan(&mut checker, &[0.0; 6], &[goal.to_vec()], &settings, &Stop::never());
@@ -243,14 +246,14 @@ fn speeds_are_as_high_as_toppras() {
             asked.push(
                 json!({ "s": s, "q": q, "velocity": of(|b| b.velocity), "acceleration": of(|b| b.acceleration) }),
             );
-            let settings = TimingSettings { deviation: 0.1, speed: 1.0 };
+            let settings = TimingSettings { deviation: 0.1, ..TimingSettings::default() };
             let timed = time(&names, &path, &bounds, &settings, |_, _| true).unwrap();
             assert!(
                 timed.excess.velocity <= 1.0 + 1e-6 && timed.excess.acceleration <= 1.0 + 1e-6,
                 "{:?}",
                 timed.excess
             );
-            own.push((parameterize(curve, &bounds).last().unwrap().time, timed.duration));
+            own.push((parameterize(curve, &bounds, settings.corner_intervals).last().unwrap().time, timed.duration));
         }
     }
     assert!(own.len() > 10);

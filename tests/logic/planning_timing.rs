@@ -2,7 +2,8 @@
 
 use dimos::planning::search::path::{distance, tidy};
 use dimos::planning::timing::topp::JointBound;
-use dimos::planning::timing::{Timed, TimingSettings, time};
+use dimos::planning::timing::{Timed, time};
+use dimos::planning::timing::settings::TimingSettings;
 use dimos::robot::random::Random;
 use dimos::trajectory::{Cursor, Sample, Spline};
 
@@ -36,7 +37,7 @@ fn wave(count: usize) -> Vec<Vec<f64>> {
 
 fn timed(path: &[Vec<f64>], bounds: &[JointBound], deviation: f64) -> Timed {
     let names: Vec<String> = NAMES.iter().map(|n| (*n).to_owned()).collect();
-    time(&names, path, bounds, &TimingSettings { deviation, speed: 1.0 }, |_, _| true).unwrap()
+    time(&names, path, bounds, &TimingSettings { deviation, ..TimingSettings::default() }, |_, _| true).unwrap()
 }
 
 /// Distance of a configuration from a path.

@@ -9,6 +9,7 @@ use dimos::control::config::{ArmConfig, TaskKind, ToolLimit};
 use dimos::control::point_to_point::point_to_point;
 use dimos::joint::ControlMode;
 use dimos::joint::JointLimits;
+use dimos::planning::timing::settings::{TimingSettings, ToolTimingSettings};
 use dimos::planning::timing::time_within;
 use dimos::planning::timing::tool_timing::Tools;
 use dimos::planning::timing::topp::JointBound;
@@ -128,7 +129,7 @@ fn direct_motions_and_timed_paths_keep_the_speed_of_the_tool() {
             let bounds = arm.bounds(1.0);
             let (start, goal) = (arm.pose(&mut random), arm.pose(&mut random));
             let direct = point_to_point(&arm.joints, &start, &goal, &arm.limits(), speed).unwrap();
-            if let Some(slower) = arm.tools().slowed(&direct, &bounds, speed) {
+            if let Some(slower) = arm.tools().slowed(&direct, &bounds, speed, &ToolTimingSettings::default()) {
                 shares.push(
                     arm.judge(&slower, &bounds, speed, &format!("direct motion {k}")) / (arm.limit.velocity * speed),
                 );
@@ -139,8 +140,8 @@ fn direct_motions_and_timed_paths_keep_the_speed_of_the_tool() {
             let bounds = arm.bounds(speed);
             let path: Vec<Vec<f64>> = (0..2 + random.below(4)).map(|_| arm.pose(&mut random)).collect();
             let deviation = vec![0.05; path.len()];
-            let timed = time_within(&arm.joints, &path, &bounds, &deviation, 1.0, |_, _| true).unwrap().trajectory;
-            let kept = arm.tools().slowed(&timed, &bounds, speed).unwrap_or(timed);
+            let timed = time_within(&arm.joints, &path, &bounds, &deviation, &TimingSettings::default(), |_, _| true).unwrap().trajectory;
+            let kept = arm.tools().slowed(&timed, &bounds, speed, &ToolTimingSettings::default()).unwrap_or(timed);
             arm.judge(&kept, &bounds, speed, &format!("path {k}"));
         }
         // Not by being slow: most motions that are slowed use nearly the whole limit.
@@ -159,7 +160,7 @@ fn a_slowed_motion_takes_little_longer_than_its_tool_needs() {
     let (mut stretched, mut goal) = (poses.clone().unwrap(), poses.unwrap());
     (stretched[0], goal[0]) = (0.0, 2.4);
     let direct = point_to_point(&arm.joints, &stretched, &goal, &arm.limits(), 1.0).unwrap();
-    let slower = arm.tools().slowed(&direct, &bounds, 1.0).unwrap();
+    let slower = arm.tools().slowed(&direct, &bounds, 1.0, &ToolTimingSettings::default()).unwrap();
     let way = 2.4 * radius(&stretched);
     let least = way / arm.limit.velocity;
     assert!(slower.duration() < least + 0.5, "{:.2} s for {way:.2} m, at least {least:.2} s", slower.duration());

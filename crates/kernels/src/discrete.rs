@@ -75,7 +75,7 @@ struct Standing {
     pairs: u32,
 }
 
-/// Boxes around sixteen obstacles in the world: corners [m]. Boxes that are not there are infinitely far.
+/// Boxes around sixteen obstacles in the world: corners [m]. Unused boxes are at ∞.
 #[derive(Debug, Clone, Copy)]
 struct Boxes {
     low: [Lanes; 3],

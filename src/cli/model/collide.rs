@@ -10,7 +10,7 @@ use crate::cli::arguments::finite;
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output::{self, Table};
 use dimos_planner::collision::world::World;
-use dimos_planner::collision::{ExactChecker, Resolution};
+use dimos_planner::collision::{CheckSettings, ExactChecker};
 use dimos_planner::planning::scene::planning_scene::{always_touch, whole};
 use dimos_robot::RobotModel;
 use dimos_robot::urdf::Meshes;
@@ -56,7 +56,7 @@ pub fn run(args: &Args) -> Result {
     body.allowed.extend(unchecked.iter().cloned().map(<(String, String)>::from));
     let mut world = World::new();
     world.add_robot(body).map_err(|e| Failure::usage(e.to_string()))?;
-    let mut checker = ExactChecker::new(world.snapshot(), Resolution::default()).with_margin(args.within);
+    let mut checker = ExactChecker::new(world.snapshot(), CheckSettings::default()).with_margin(args.within);
     let mut close: Vec<_> = checker.closer_than_padding(&q).into_iter().map(|(_, contact)| contact).collect();
     close.sort_by(|a, b| a.distance.total_cmp(&b.distance));
     let touching = close.iter().filter(|contact| contact.distance <= 0.0).count();

@@ -19,7 +19,7 @@ use crate::view::{Scene, Shown, ShownArm, ShownRobot, Subject, robots, value};
 use dimos_core::joint::JointLimits;
 use dimos_core::pose::to_xyz_rpy;
 use dimos_core::sync::lock;
-use dimos_planner::collision::{ExactChecker, Resolution};
+use dimos_planner::collision::{CheckSettings, ExactChecker};
 use dimos_planner::planning::scene::config::{ObjectConfig, PlannerConfig, RobotConfig};
 use dimos_planner::planning::scene::ignored_pairs::IgnoredPair;
 use dimos_planner::planning::scene::planning_scene::PlanningScene;
@@ -132,7 +132,7 @@ impl Posed {
         let arms = arms.into_iter().map(arm).collect();
         let shown = Shown { name, simulated: true, planner: false, robots, arms };
         let checked = setup.map(|setup| {
-            let checker = ExactChecker::new(setup.world.snapshot(), Resolution::default()).with_margin(CLOSE);
+            let checker = ExactChecker::new(setup.world.snapshot(), CheckSettings::default()).with_margin(CLOSE);
             (setup, Mutex::new(checker))
         });
         Self { kind, shown, objects, setup: checked }

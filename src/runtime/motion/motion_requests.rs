@@ -19,6 +19,7 @@ use dimos_core::telemetry::{Origin, Outcome};
 use dimos_core::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
 use dimos_core::written;
 use dimos_planner::planning::request::joint_path::{JointPath, Outside};
+use dimos_planner::planning::timing::settings::TimingSettings;
 use dimos_planner::planning::timing::time_within;
 use dimos_planner::planning::timing::topp::JointBound;
 use dimos_rpc::api::{self, Reply};
@@ -59,7 +60,7 @@ impl Service {
     pub(in crate::runtime) fn needs_no_plan(&self, arm: &str) -> Result<(), RpcError> {
         match self.planner() {
             Ok(_) => Err(RpcError::new(Code::NotPlanned, format!("a direct motion of {arm} is not collision-checked"))
-                .hint("this run has a planner, and a planned motion is checked: plan and execute it; or order it all the same: --direct, in rpc and Python `direct`")),
+                .hint("this run has a planner, and a planned motion is checked: plan and execute it; to skip the check: --direct, in rpc and Python `direct`")),
             Err(RpcError { code: Code::NoPlanner, data: None, .. }) => Ok(()),
             Err(gone) => Err(gone),
         }
@@ -238,11 +239,11 @@ impl Service {
                 return refuse(what, excess, "limits are the arm's own, narrowed by `limits` in the blueprint");
             }
             for (what, unit, got, most) in [
-                ("as fast as", "rad/s", e.fastest, bounds.velocity),
-                ("with an acceleration of", "rad/s²", e.steepest, bounds.acceleration),
+                ("velocity", "rad/s", e.fastest, bounds.velocity),
+                ("acceleration", "rad/s²", e.steepest, bounds.acceleration),
             ] {
                 if got > most * SLACK + 1e-9 {
-                    let text = format!("{name} would move {what} {got:.3} {unit}, and may {most:.3} {unit}");
+                    let text = format!("{name} exceeds its {what} limit: {got:.3} {unit} (limit {most:.3} {unit})");
                     let slower = if unit == "rad/s" { got / most } else { (got / most).sqrt() };
                     let hint =
                         format!("make the trajectory {slower:.2} times as long, or raise the limit in the blueprint");
@@ -287,7 +288,8 @@ fn along(
     };
     let bounds: Vec<JointBound> = (0..names.len()).map(bound).collect();
     let way = [vec![start], path.points].concat();
-    let timed = time_within(names, &way, &bounds, &deviation, speed, |_, _| true);
+    let settings = TimingSettings { speed, ..TimingSettings::default() };
+    let timed = time_within(names, &way, &bounds, &deviation, &settings, |_, _| true);
     timed.map(|timed| timed.trajectory).map_err(|e| MotionError::NotFound(e.to_string()))
 }
 

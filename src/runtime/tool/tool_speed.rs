@@ -10,6 +10,7 @@ use dimos_control::task_robot::FramePose;
 use dimos_core::joint::MAX_DOF;
 use dimos_core::telemetry::describe::Severity;
 use dimos_core::trajectory::JointTrajectory;
+use dimos_planner::planning::timing::settings::ToolTimingSettings;
 use dimos_planner::planning::timing::tool_timing::slowed;
 use dimos_planner::planning::timing::topp::JointBound;
 use dimos_robot::kinematics::tool_speed::ToolSpeed;
@@ -65,7 +66,7 @@ impl Service {
         let Some(bounds) = joints.iter().map(bound).collect::<Option<Vec<_>>>() else { return Ok(motion) };
         let (motion, slower, moved, fastest) = run_blocking(move || {
             let mut fastest = vec![0.0_f64; moved.len()];
-            let slower = slowed(&motion, &bounds, |q, v| {
+            let slower = slowed(&motion, &bounds, &ToolTimingSettings::default(), |q, v| {
                 let parts = moved.iter_mut().zip(&mut fastest).map(|(arm, fastest)| {
                     let part = arm.part(q, v) / speed;
                     *fastest = fastest.max(part);

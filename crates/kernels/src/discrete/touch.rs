@@ -145,9 +145,9 @@ fn cover_touches<B: Block, C: Squared, const EACH: bool, const SWEPT: bool>(
     touching.lanes
 }
 
-/// Takes the lanes in which a ball touches, of those in which it is `close`: all if it has no parts, otherwise those
-/// in which the ball inside of it does. Returns the lanes in which its parts are to be compared, `None` if no more are
-/// sought. `count`: its number of parts; `open`: of balls that wait.
+/// Decides the lanes in which a bounding ball is `close`. A ball without parts counts as touching; otherwise the ball
+/// inside the solid decides. Returns the lanes whose parts must be compared, `None` once every sought lane is decided.
+/// `count`: number of parts of the ball; `open`: number of balls on the stack.
 #[inline(always)]
 fn settle<B: Block, const EACH: bool, const SWEPT: bool>(
     squared: B,

@@ -186,13 +186,13 @@ mod tests {
 
     #[test]
     fn an_arm_of_any_number_of_joints_can_be_planned_for() {
-        use dimos_planner::collision::{CollisionChecker, ExactChecker, Resolution};
+        use dimos_planner::collision::{CheckSettings, CollisionChecker, ExactChecker};
         let folder = tempfile::tempdir().unwrap();
         for dof in 1..=MAX_DOF as u8 {
             let setup = setup(dof, folder.path());
             assert_eq!(setup.always_touching, [], "{dof} joints");
             let robot = &setup.robots[0];
-            let mut checker = ExactChecker::new(setup.world.snapshot(), Resolution::default());
+            let mut checker = ExactChecker::new(setup.world.snapshot(), CheckSettings::default());
             let limits = JointLimits::uniform(dof.into(), 170_f64.to_radians(), 1.0);
             let emulated =
                 SimArm::new("acme", &limits, &SimOptions::default(), PLAYABLE, Mono::ZERO).unwrap().joints().0;

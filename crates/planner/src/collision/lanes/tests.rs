@@ -10,7 +10,7 @@ use crate::collision::cloud::Cloud;
 use crate::collision::exact::Gap;
 use crate::collision::shape::Mesh;
 use crate::collision::world::{Obstacle, Robot};
-use crate::collision::{CollisionChecker, ExactChecker, Resolution, Solid, World};
+use crate::collision::{CheckSettings, CollisionChecker, ExactChecker, Solid, World};
 use dimos_robot::builtin;
 use dimos_robot::kinematics::Kinematics;
 use dimos_robot::random::Random;
@@ -64,7 +64,7 @@ fn checker(name: &str, text: &str, base: DVec3, random: &mut Random) -> ExactChe
         obstacle.solid.frame.translation += base;
         world.add(obstacle).unwrap();
     }
-    ExactChecker::new(world.snapshot(), Resolution::default())
+    ExactChecker::new(world.snapshot(), CheckSettings::default())
 }
 
 fn random_q(checker: &ExactChecker, random: &mut Random) -> Vec<f64> {

@@ -16,6 +16,7 @@ use crate::collision::body::{MeshMode, solids, solids_of, surface};
 use crate::collision::cloud::Cloud;
 use crate::collision::world::{Obstacle, Robot, World};
 use crate::collision::{Solid, ply};
+use crate::planning::settings::PlannerSettings;
 use dimos_core::joint::DEFAULT_ACCELERATION;
 use dimos_robot::kinematics::tool_speed::ToolSpeed;
 use dimos_robot::kinematics::{Kinematics, KinematicsError, frame};
@@ -61,6 +62,8 @@ pub struct PlanningScene {
     pub robots: Vec<PlannedRobot>,
     /// The initial world. Its robots are those above, in the same order.
     pub world: World,
+    /// Settings of the planner.
+    pub settings: PlannerSettings,
     /// Distance that plans keep from obstacles and other arms [m].
     pub padding: f64,
     /// Pairs of links that touch in every configuration, with the robot's name; they are not checked.
@@ -88,6 +91,7 @@ impl PlanningScene {
         let mut setup = Self {
             robots,
             world,
+            settings: PlannerSettings::default(),
             padding: config.padding,
             always_touching: Vec::new(),
             ignored: Vec::new(),

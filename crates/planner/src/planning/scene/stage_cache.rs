@@ -1,5 +1,5 @@
-//! Checkers of recent requests, for requests in the same world: to lay a world out for collision checks takes longer
-//! than most plans.
+//! Checkers of recent requests, for requests in the same world: building the collision scene takes longer than most
+//! plans.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};

@@ -12,18 +12,15 @@
 use dimos_kernels::states::States;
 
 use super::blend::{Curve, Jet, Piece};
+use super::settings::TimingSettings;
 use super::topp::{GridPoint, JointBound, Pace, speed_grid};
 use super::verify::Excess;
 
-/// Maximum rounds of pace correction.
-const ROUNDS: usize = 5;
-/// Excess above this part of the limits is corrected.
-const CORRECTION_RATIO: f64 = 1.01;
 /// Minimum time between knots [s]: polynomials through closer ones would amplify rounding errors of positions.
 const MIN_KNOT_INTERVAL: f64 = 1e-4;
 
 /// Returns the knots of a curve's motion, to be joined by quintics.
-pub(in crate::planning) fn averaged(curve: &Curve, bounds: &[JointBound]) -> States {
+pub(in crate::planning) fn averaged(curve: &Curve, bounds: &[JointBound], settings: &TimingSettings) -> States {
     let gauge = Gauge::new(curve, bounds);
     // Time from zero to full acceleration.
     let window = bounds.iter().filter(|b| b.jerk.is_finite()).map(|b| b.acceleration / b.jerk).fold(1e-6, f64::max);
@@ -33,7 +30,7 @@ pub(in crate::planning) fn averaged(curve: &Curve, bounds: &[JointBound]) -> Sta
     let windows: &[f64] = if curve.len() > 1 { &[2.0] } else { &[1.0, 2.0] };
     for factor in windows {
         let most = best.as_ref().map_or(f64::INFINITY, |b| b.0);
-        let found = paced(curve, bounds, &gauge, window * factor, most);
+        let found = paced(curve, bounds, &gauge, (window * factor, most), settings);
         let found = found.map(|motion| (motion.needed(&gauge), motion)).filter(|found| found.0 < most);
         best = found.or(best);
     }
@@ -42,8 +39,14 @@ pub(in crate::planning) fn averaged(curve: &Curve, bounds: &[JointBound]) -> Sta
 
 /// Returns the time-optimal motion with paces at which its average approximately keeps the limits; `None` if it takes
 /// longer than `most` [s].
-fn paced(curve: &Curve, bounds: &[JointBound], gauge: &Gauge<'_>, window: f64, most: f64) -> Option<Motion> {
-    let (constraints, speed_grid) = speed_grid(curve, bounds);
+fn paced(
+    curve: &Curve,
+    bounds: &[JointBound],
+    gauge: &Gauge<'_>,
+    (window, most): (f64, f64),
+    settings: &TimingSettings,
+) -> Option<Motion> {
+    let (constraints, speed_grid) = speed_grid(curve, bounds, settings.corner_intervals);
     let mut paces = vec![Pace::FULL; curve.len()];
     let mut slower = vec![1.0; curve.len()];
     let mut rounds = 0;
@@ -56,11 +59,11 @@ fn paced(curve: &Curve, bounds: &[JointBound], gauge: &Gauge<'_>, window: f64, m
         slower.fill(1.0);
         for leg in motion.walk(curve) {
             let factor = gauge.slower(&leg);
-            if factor > CORRECTION_RATIO {
+            if factor > settings.jerk.correction_ratio {
                 slower[leg.sources.0..=leg.sources.1].iter_mut().for_each(|s| *s = f64::max(*s, factor));
             }
         }
-        if rounds == ROUNDS || slower.iter().all(|s| *s <= 1.0) {
+        if rounds == settings.jerk.rounds || slower.iter().all(|s| *s <= 1.0) {
             return Some(motion);
         }
         rounds += 1;
