@@ -273,12 +273,9 @@ fn solve(arm: &Arm, problem: &Problem, arguments: &Arguments) -> Result<Row, Box
     let timeout = matches!(found, Err(PlanError::Timeout(_)));
     let bounds = bounds(kinematics.names(), kinematics.limits())?;
     // As a run does: of the paths of a refinement, that of the quickest motion is executed.
-    let quickest = found
-        .as_ref()
-        .ok()
-        .filter(|_| !arguments.paths_only)
-        .cloned()
-        .map(|plan| plan.quickest(kinematics.names(), &bounds, &TimingSettings::default(), |a, b| checker.motion_looks_free(a, b)).0);
+    let quickest = found.as_ref().ok().filter(|_| !arguments.paths_only).cloned().map(|plan| {
+        plan.quickest(kinematics.names(), &bounds, &TimingSettings::default(), |a, b| checker.motion_looks_free(a, b)).0
+    });
     let mut row = row(problem, found, total, cpu);
     row.setup_us = setup.as_secs_f64() * 1e6;
     row.check_ns = row.path.as_ref().and_then(|path| check_time(&mut checker, path));

@@ -4,10 +4,10 @@ use std::error::Error;
 use std::time::Instant;
 
 use dimos::collision::Stop;
+use dimos::joint::JointBounds;
 use dimos::planning::ik::Ik;
 use dimos::planning::ik::settings::IkSettings;
 use dimos::planning::timing::settings::TimingSettings;
-use dimos::planning::timing::topp::JointBound;
 use dimos::planning::timing::time;
 use dimos::robot::kinematics::Kinematics;
 use dimos::robot::model::RobotModel;
@@ -64,7 +64,7 @@ pub fn timing(repeats: u64, seed: u64) -> Result<(), Box<dyn Error>> {
     ];
     let mut quickest = Vec::new();
     for (what, jerk, deviation, goal) in cases {
-        let bounds = [JointBound { velocity: VELOCITY, acceleration: ACCELERATION, jerk }; 7];
+        let bounds = [JointBounds { velocity: VELOCITY, acceleration: ACCELERATION, jerk, ..JointBounds::NONE }; 7];
         let settings = TimingSettings { deviation, ..TimingSettings::default() };
         let (mut times, mut cpu, mut durations) = (Vec::new(), Vec::new(), Vec::new());
         for path in &paths {

@@ -2,6 +2,7 @@
 //! it, brakes along its path in the coordinator's ticks, and keeps the padding until it is at rest. `DIMOS_BRAKING` is
 //! the number of motions (80), `SEED` repeats a run.
 
+use dimos::joint::{CommandLimits, ControlMode, JointLimits, joints_of};
 use std::collections::VecDeque;
 use std::time::Duration;
 
@@ -12,10 +13,9 @@ use dimos::control::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, TaskC
 use dimos::control::coordinator::{Coordinator, TickTime};
 use dimos::control::request::{Envelope, Motion, Request};
 use dimos::control::task_spec::TaskTable;
-use dimos::joint::{ControlMode, JointLimits, joints_of};
 use dimos::planning::request::ahead::{look_ahead, rests_before};
 use dimos::planning::request::pipeline::{self, Goal, PlannedMotion, solve};
-use dimos::planning::scene::config::{JointBounds, ObjectConfig, ObjectShape};
+use dimos::planning::scene::config::{ObjectConfig, ObjectShape};
 use dimos::planning::scene::planning_scene::{PlanningScene, obstacle};
 use dimos::planning::search::level::Level;
 use dimos::robot::random::Random;
@@ -188,7 +188,7 @@ fn too_close(judge: &ExactChecker, q: &[f64]) -> Option<f64> {
 fn setup() -> PlanningScene {
     let loaded = Run::from_name("yourarm-planner").unwrap().check();
     let setup = PlanningScene::load(loaded.blueprint.unwrap().planner.as_ref().unwrap()).unwrap();
-    let bounds = JointBounds {
+    let bounds = CommandLimits {
         position: [-3.0, 3.0],
         velocity: 3.0,
         acceleration: ACCELERATION,

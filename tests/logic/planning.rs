@@ -11,17 +11,18 @@ use std::time::{Duration, Instant};
 use dimos::collision::body::{MeshMode, solids};
 use dimos::collision::world::{Obstacle, Robot};
 use dimos::collision::{CheckSettings, CollisionChecker, ExactChecker, Solid, Stop, World};
+use dimos::joint::JointBounds;
 use dimos::planning::ik::cartesian::{Shortfall, straight_line};
 use dimos::planning::ik::settings::LineSettings;
-use dimos::planning::search::settings::{PlanSettings, ShortcutSettings};
-use dimos::planning::timing::settings::TimingSettings;
 use dimos::planning::search::level::Level;
 use dimos::planning::search::path::{distance, tidy};
 use dimos::planning::search::path_planner::{PlanError, plan};
+use dimos::planning::search::settings::{PlanSettings, ShortcutSettings};
 use dimos::planning::search::shortcut::shorten;
 use dimos::planning::timing::blend::curves;
-use dimos::planning::timing::topp::{JointBound, parameterize};
+use dimos::planning::timing::settings::TimingSettings;
 use dimos::planning::timing::time;
+use dimos::planning::timing::topp::parameterize;
 use dimos::robot::kinematics::Kinematics;
 use dimos::robot::random::Random;
 use dimos::robot::{builtin, urdf};
@@ -222,11 +223,12 @@ fn speeds_are_as_high_as_toppras() {
     for n in [2, 3, 5, 8] {
         for _ in 0..5 {
             let path: Vec<Vec<f64>> = (0..n).map(|_| (0..6).map(|_| random.between(-1.5, 1.5)).collect()).collect();
-            let bounds: Vec<JointBound> = (0..6)
-                .map(|_| JointBound {
+            let bounds: Vec<JointBounds> = (0..6)
+                .map(|_| JointBounds {
                     velocity: random.between(0.5, 3.0),
                     acceleration: random.between(1.0, 8.0),
                     jerk: f64::INFINITY,
+                    ..JointBounds::NONE
                 })
                 .collect();
             let names: Vec<String> = (0..6).map(|j| format!("j{j}")).collect();
@@ -242,7 +244,7 @@ fn speeds_are_as_high_as_toppras() {
                 }
                 start += piece.length;
             }
-            let of = |f: fn(&JointBound) -> f64| bounds.iter().map(f).collect::<Vec<f64>>();
+            let of = |f: fn(&JointBounds) -> f64| bounds.iter().map(f).collect::<Vec<f64>>();
             asked.push(
                 json!({ "s": s, "q": q, "velocity": of(|b| b.velocity), "acceleration": of(|b| b.acceleration) }),
             );
@@ -272,7 +274,7 @@ fn jerk_stays_within_its_limits_and_speed_scales_the_whole() {
     let names: Vec<String> = (0..7).map(|j| format!("j{j}")).collect();
     for n in [2, 4] {
         let path: Vec<Vec<f64>> = (0..n).map(|_| (0..7).map(|_| random.between(-1.5, 1.5)).collect()).collect();
-        let bounds = [JointBound { velocity: 2.0, acceleration: 5.0, jerk: 40.0 }; 7];
+        let bounds = [JointBounds { velocity: 2.0, acceleration: 5.0, jerk: 40.0, ..JointBounds::NONE }; 7];
         let full = time(&names, &path, &bounds, &TimingSettings::default(), |_, _| true).unwrap();
         let half = TimingSettings { speed: 0.5, ..TimingSettings::default() };
         let half = time(&names, &path, &bounds, &half, |_, _| true).unwrap();

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use dimos::collision::cloud::Cloud;
-use dimos::collision::world::{Obstacle, Robot};
 use dimos::collision::settings::GuardSettings;
+use dimos::collision::world::{Obstacle, Robot};
 use dimos::collision::{CheckSettings, CollisionChecker, ExactChecker, OwnMargins, Scene, Solid, World};
 use dimos::control::config::{ArmConfig, TaskConfig};
 use dimos::control::guard::GuardWorld;

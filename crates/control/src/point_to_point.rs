@@ -5,7 +5,7 @@
 //! the motion exactly.
 
 use dimos_core::double_s::LineLimits;
-use dimos_core::joint::JointLimits;
+use dimos_core::joint::{JointBounds, JointLimits};
 use dimos_core::trajectory::{JointTrajectory, JointValues, TrajectoryPoint};
 
 /// Points closer together than this are merged [s].
@@ -46,7 +46,7 @@ pub fn point_to_point(
     speed: f64,
 ) -> Result<JointTrajectory, MotionError> {
     for (j, joint) in joints.iter().enumerate() {
-        let bounds = super::limit::Bounds::inside(limits.position_lower[j], limits.position_upper[j], 1.0, 1.0);
+        let bounds = JointBounds::inside(limits.position_lower[j], limits.position_upper[j], 1.0, 1.0);
         // A joint that starts outside its limits may stay or move in.
         let (lower, upper) = (bounds.lower.min(start[j]), bounds.upper.max(start[j]));
         let excess = (lower - target[j]).max(target[j] - upper);

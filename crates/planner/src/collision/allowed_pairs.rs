@@ -6,10 +6,10 @@ use std::sync::Arc;
 use dimos_robot::random::Random;
 
 use super::checker::CollisionChecker;
-use super::settings::CheckSettings;
 use super::exact::ExactChecker;
 use super::report::Contact;
 use super::scene::Scene;
+use super::settings::CheckSettings;
 
 /// A pair that touches too often.
 #[derive(Debug, Clone, PartialEq)]

@@ -50,7 +50,7 @@ impl Stop {
     }
 }
 
-/// Which samples of a motion are checked.
+/// A choice of the samples of a motion.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Samples {
     /// All.

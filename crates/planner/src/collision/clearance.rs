@@ -1,9 +1,9 @@
-//! The distance that motions are proven to keep: between their samples, too.
+//! The clearance that motions are proven to keep, between their samples, too.
 
 use super::checker::{CollisionChecker, Stop};
-use super::settings::ClearanceSettings;
 use super::exact::ExactChecker;
 use super::report::Pair;
+use super::settings::ClearanceSettings;
 
 /// A motion: straight from one configuration to another [rad or m].
 pub type Motion = [Vec<f64>; 2];
@@ -26,7 +26,7 @@ enum By {
     Limited,
     /// With solids, however long it takes.
     Solids,
-    /// With solids, and pieces of a motion that are small beside the distance.
+    /// With solids, and pieces of a motion that are small compared to the distance.
     Fine,
 }
 

@@ -10,13 +10,13 @@ use glamx::{DAffine3, DVec3};
 use dimos_robot::model::Limits;
 
 use super::checker::{CollisionChecker, Samples, Stop};
-use super::settings::CheckSettings;
 use super::lanes::InLanes;
 use super::motion::Pieces;
 use super::pairs::general::nearest;
 use super::pairs::{self, Placed, point};
 use super::report::{Contact, Pair};
 use super::scene::{LinkShape, Scene};
+use super::settings::CheckSettings;
 use super::shape::Core;
 
 /// Distance of a pair compared to a margin.
@@ -326,7 +326,6 @@ impl CollisionChecker for ExactChecker {
     fn turns(&self) -> &[bool] {
         self.scene.turns()
     }
-
 
     fn is_free(&mut self, q: &[f64]) -> bool {
         self.first_contact(q).is_none()

@@ -7,7 +7,7 @@
 //! between, so that most motions that look free are proven to be with no more samples. A half that is not is swept
 //! again, with twice as many.
 //!
-//! What is left is checked in pieces, sixteen at a time with covers, down to pieces on which nothing moves far, and
+//! The rest is checked in pieces, sixteen at a time with covers, down to pieces on which nothing moves far, and
 //! then exactly, split in two each time. All pieces of one size are checked before smaller ones, which finds contacts
 //! early.
 
@@ -96,12 +96,12 @@ impl Pieces {
     }
 }
 
-/// What is known of a motion, and how far it is checked.
+/// Prior knowledge of a motion, and depth of its check.
 #[derive(Debug, Clone, Copy)]
 struct Effort {
     /// It looks free.
     looks_free: bool,
-    /// What covers do not prove is checked in pieces.
+    /// Parts that covers do not prove are checked in pieces.
     in_pieces: bool,
 }
 
@@ -143,7 +143,7 @@ impl ExactChecker {
     }
 
     /// Proves the part of a motion that begins at a place and is left after this number of halvings, by sweeping
-    /// covers; where that fails, both halves of it. What touches, and what is short, is checked in pieces.
+    /// covers; where that fails, both halves of it. Parts in contact, and short parts, are checked in pieces.
     fn sweep(
         &mut self,
         p: &mut Pieces,
@@ -223,7 +223,7 @@ impl ExactChecker {
         }
         let (first, last) =
             (p.now.first().map_or(at, |piece| piece.start), p.now.last().map_or(at + part, |p| p.start + size));
-        // What is left may touch at the ends of the motion, where no other piece is.
+        // The rest may touch at the ends of the motion, where no other piece is.
         (last < 1.0 || self.first_touch(to).is_none())
             && (first > 0.0 || self.first_touch(from).is_none())
             && self.check_exactly(p, from, to, size, most, stop)

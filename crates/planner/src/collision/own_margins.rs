@@ -7,9 +7,9 @@ use std::sync::Arc;
 use dimos_kernels::block::Lanes;
 
 use super::allowed_pairs::sample;
-use super::settings::{CheckSettings, GuardSettings};
 use super::exact::ExactChecker;
 use super::scene::Scene;
+use super::settings::{CheckSettings, GuardSettings};
 use super::sweep::Sweep;
 use dimos_robot::random::Random;
 

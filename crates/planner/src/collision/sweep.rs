@@ -1,5 +1,5 @@
 //! Proves pairs apart on pieces of a motion for the collision guard of the tick: with covers alone, in lanes, without
-//! allocating. What covers cannot prove counts as close.
+//! allocating. A pair that covers cannot prove apart counts as close.
 
 use std::sync::Arc;
 
@@ -114,7 +114,7 @@ impl Sweep {
             && let (Some(q), Some(around)) = (q.0.get_mut(piece), around.0.get_mut(piece))
         {
             *q = middle as f32;
-            // What the middle lost by rounding, rounded up.
+            // Rounding error of the middle, rounded up.
             *around = ((half + (middle - f64::from(*q)).abs()) * (1.0 + 1e-6)) as f32;
         }
     }

@@ -11,15 +11,15 @@ use super::search::enclosure::enclosed;
 use super::search::level::Level;
 use super::search::path::{distance, length};
 use super::search::path_planner::{PlanError, plan};
-use super::search::settings::{EnclosureSettings, PlanSettings, RrtSettings};
 use super::search::rrt_connect::{Quantum, Search};
+use super::search::settings::{EnclosureSettings, PlanSettings, RrtSettings};
 use crate::collision::body::{MeshMode, solids};
 use crate::collision::checker::{CollisionChecker, Samples, Stop};
-use crate::collision::settings::CheckSettings;
-use crate::planning::settings::PlannerSettings;
 use crate::collision::report::{Contact, Pair};
+use crate::collision::settings::CheckSettings;
 use crate::collision::world::{Obstacle, Robot, World};
 use crate::collision::{ExactChecker, Solid};
+use crate::planning::settings::PlannerSettings;
 use dimos_robot::kinematics::Kinematics;
 use dimos_robot::model::Limits;
 use dimos_robot::random::Random;
@@ -47,7 +47,8 @@ impl CollisionChecker for Plane {
     }
     fn turns(&self) -> &[bool] {
         &[false; 2]
-    }    fn is_free(&mut self, q: &[f64]) -> bool {
+    }
+    fn is_free(&mut self, q: &[f64]) -> bool {
         self.checks += 1;
         self.posts.iter().all(|(c, r)| distance(c, q) > *r)
     }
@@ -105,7 +106,8 @@ impl CollisionChecker for Walled {
     }
     fn turns(&self) -> &[bool] {
         &[false; 8]
-    }    fn is_free(&mut self, q: &[f64]) -> bool {
+    }
+    fn is_free(&mut self, q: &[f64]) -> bool {
         self.checks += 1;
         !(0.4..0.5).contains(&q[0]) || q[1..4].iter().all(|x| (x - 2.0).abs() < self.window)
     }
@@ -135,7 +137,13 @@ fn a_window_in_a_wall_is_a_way_out_and_a_wall_without_one_encloses() {
     for seed in 0..3 {
         let encloses = |window| {
             let mut walled = Walled { limits, window, checks: 0 };
-            enclosed(&mut walled, &from, std::slice::from_ref(&other), (&EnclosureSettings::default(), seed, true), &Stop::never())
+            enclosed(
+                &mut walled,
+                &from,
+                std::slice::from_ref(&other),
+                (&EnclosureSettings::default(), seed, true),
+                &Stop::never(),
+            )
         };
         // Half a percent of the wall; no joint but the first is held up.
         assert_eq!(encloses(0.5), None, "seed {seed}");
@@ -144,7 +152,7 @@ fn a_window_in_a_wall_is_a_way_out_and_a_wall_without_one_encloses() {
     }
 }
 
-/// What is free are the pipes of a grid of them. Ends of edges are checked together, or not.
+/// Only a grid of pipes is free. Ends of edges are checked together, or not.
 struct Pipes {
     looks: bool,
     checked: usize,

@@ -7,10 +7,10 @@ use glamx::{DAffine3, DVec3};
 
 use super::ik::Ik;
 use super::ik::settings::IkSettings;
-use super::search::settings::PlanSettings;
-use super::timing::settings::TimingSettings;
 use super::search::path::{length, unwind};
 use super::search::path_planner::{Plan, PlanError, plan};
+use super::search::settings::PlanSettings;
+use super::timing::settings::TimingSettings;
 use super::timing::{bounds, time};
 use crate::collision::body::{MeshMode, solids};
 use crate::collision::checker::{CollisionChecker, Stop};

@@ -1,4 +1,4 @@
-//! What covers say of a pair is what its solids say.
+//! Covers and solids of a pair agree.
 
 use std::sync::Arc;
 
@@ -118,7 +118,7 @@ fn a_motion_that_passes_touches_nothing_in_between() {
                 touches += usize::from((0..checker.pairs.len()).any(|pair| checker.gap(pair, 0.0) == Gap::Touch));
             }
             assert!(!passes || touches == 0, "{name}: {from:?} to {to:?}: {touches} contacts");
-            // What does not pass touches somewhere, if only for less than a sample here.
+            // A motion that does not pass touches somewhere, if only for less than a sample here.
             not_free += usize::from(!passes);
             free += usize::from(passes);
         }

@@ -15,7 +15,7 @@ use crate::planning::scene::planning_scene::PlanningScene;
 pub struct Reached {
     /// Positions of the robot's planned joints [rad].
     pub joints: Vec<f64>,
-    /// What touches there; `None`: nothing.
+    /// A contact there, if any.
     pub contact: Option<String>,
 }
 

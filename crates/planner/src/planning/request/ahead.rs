@@ -75,7 +75,10 @@ pub fn look_ahead(
 /// Returns a motion as straight pieces, as long as possible.
 pub(in crate::planning) fn straight_motions(spline: &Spline, settings: &LookAheadSettings) -> Vec<Motion> {
     let way = samples(spline, 0.0, settings.slice);
-    straight_slices(&way, settings.straight).into_iter().map(|(first, end)| [way[first].1.clone(), way[end].1.clone()]).collect()
+    straight_slices(&way, settings.straight)
+        .into_iter()
+        .map(|(first, end)| [way[first].1.clone(), way[end].1.clone()])
+        .collect()
 }
 
 /// Samples a motion from `elapsed` to its end, every `slice` [s, rad].
@@ -93,8 +96,8 @@ fn samples(spline: &Spline, elapsed: f64, slice: f64) -> Vec<(f64, Vec<f64>)> {
     (0..=pieces).map(&mut at).collect()
 }
 
-/// Divides a motion into slices that are straight within `deviation` [rad], as long as possible: index of the first and last sample of each, the last
-/// slice first.
+/// Divides a motion into slices that are straight within `deviation` [rad], as long as possible: index of the first and
+/// last sample of each, the last slice first.
 fn straight_slices(way: &[(f64, Vec<f64>)], deviation: f64) -> Vec<(usize, usize)> {
     let last = way.len() - 1;
     let (mut slices, mut first) = (Vec::new(), 0);

@@ -51,9 +51,7 @@ pub(in crate::planning) fn configurations(
                 robot.body.kinematics.unwind(&mut near, &own, |kind| kind == JointKind::Continuous);
                 vec![near]
             }
-            Some(Goal::Pose(pose)) => {
-                reached(robot, &frame(pose), &own, (settings, false, seed), &mut free, stop)?
-            }
+            Some(Goal::Pose(pose)) => reached(robot, &frame(pose), &own, (settings, false, seed), &mut free, stop)?,
             Some(Goal::Position(place)) => {
                 let target = DAffine3::from_translation(glamx::DVec3::new(place.x, place.y, place.z));
                 reached(robot, &target, &own, (settings, true, seed), &mut free, stop)?

@@ -76,7 +76,12 @@ pub(in crate::planning) fn leg(
         [(_, Goal::Line(target))] => {
             let (path, fraction) = goals::line(stage, &frame(target), stop)?;
             took("search", began.elapsed().as_secs_f64());
-            Ok(Leg { path, fraction: Some(fraction), deviation: stage.settings.blend.line_deviation, clamped: Vec::new() })
+            Ok(Leg {
+                path,
+                fraction: Some(fraction),
+                deviation: stage.settings.blend.line_deviation,
+                clamped: Vec::new(),
+            })
         }
         [(_, Goal::Retrace(given))] => {
             let path = goals::follow(stage, given, stop)?;

@@ -15,7 +15,7 @@ use crate::collision::report::Pair;
 use crate::collision::world::{Robot, World};
 use crate::collision::{CollisionChecker, Stop};
 use crate::planning::scene::ignored_pairs::IgnoredPair;
-use crate::planning::scene::padded::{PaddingException, Near, Padded};
+use crate::planning::scene::padded::{Near, Padded, PaddingException};
 use crate::planning::scene::planning_scene::{PlannedRobot, PlanningScene};
 use crate::planning::scene::stage_cache::Key;
 use crate::planning::search::level::Level;
@@ -23,8 +23,8 @@ use crate::planning::search::path::{Path, distance, length};
 use crate::planning::search::path_planner::{PlanError, digits_outside};
 use crate::planning::settings::PlannerSettings;
 use crate::planning::timing::tool_timing::Tools;
-use crate::planning::timing::topp::JointBound;
 use crate::planning::timing::{TimingError, bounds, time_within};
+use dimos_core::joint::JointBounds;
 use dimos_core::trajectory::{JointTrajectory, JointValues, Spline, TrajectoryPoint};
 use dimos_core::written;
 use dimos_robot::model::Limits;
@@ -130,7 +130,7 @@ pub struct PlannedMotion {
 pub struct PlanFailure {
     /// A sentence without full stop.
     pub what: String,
-    /// What the user can do about it.
+    /// Remedy for the user.
     pub hint: Option<String>,
     /// Whether the request was cancelled.
     pub cancelled: bool,
@@ -177,8 +177,8 @@ pub(in crate::planning) struct Stage<'a> {
 /// Duration of each stage [s], by its name.
 pub(in crate::planning) type StageTimes = BTreeMap<String, f64>;
 
-/// Plans a motion. The same scene, world and request give the same motion unless the timeout is reached. What samples
-/// have in the way may be free: if the level `fast` finds none, proofs are asked.
+/// Plans a motion. The same scene, world and request give the same motion unless the timeout is reached. Samples
+/// may refuse what a proof accepts: if the level `fast` finds no motion, `certified` is tried.
 pub fn solve(
     setup: &PlanningScene,
     world: &World,
@@ -225,7 +225,11 @@ fn attempt(
         Some(_) => contact_at(&mut stage.checker, &stage.start),
         None if level.proves() => {
             let spline = Spline::new(&trajectory).map_err(|e| PlanFailure::new(e.to_string()))?;
-            stage.checker.clearance_along(&straight_motions(&spline, &stage.settings.look_ahead), level == Level::Exact, stop)
+            stage.checker.clearance_along(
+                &straight_motions(&spline, &stage.settings.look_ahead),
+                level == Level::Exact,
+                stop,
+            )
         }
         None => None,
     };
@@ -417,7 +421,7 @@ fn tools(stage: &Stage<'_>) -> Tools {
 }
 
 /// Returns the bounds of the joints.
-pub(in crate::planning) fn bounds_of(stage: &Stage<'_>) -> Result<Vec<JointBound>, PlanFailure> {
+pub(in crate::planning) fn bounds_of(stage: &Stage<'_>) -> Result<Vec<JointBounds>, PlanFailure> {
     bounds(&stage.joints, &stage.limits).map_err(|e| PlanFailure::new(e.to_string()))
 }
 

@@ -163,7 +163,7 @@ fn goals_of_several_arms_touch_nothing_that_is_fixed() {
     assert!(looked > 5 && several > 0, "{looked} {several}");
 }
 
-/// What a hand led at 100 Hz, with the noise of encoders.
+/// A record of hand guiding at 100 Hz, with the noise of encoders.
 fn led(seconds: f64) -> Vec<Vec<f64>> {
     let mut random = Random::new(11);
     let mut at = |t: f64| {

@@ -1,4 +1,4 @@
-//! What is planned with: robots and obstacles as configured and as computed with, joints that are not planned, padding.
+//! The planning scene: robots and obstacles as configured and as computed with, joints that are not planned, padding.
 
 pub mod config;
 pub mod ignored_pairs;

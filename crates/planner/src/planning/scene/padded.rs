@@ -7,12 +7,12 @@ use std::sync::Arc;
 
 use dimos_kernels::block::{LANES, Lanes};
 
+use super::settings::PaddingSettings;
 use crate::collision::allowed_pairs::sample;
 use crate::collision::checker::Samples;
 use crate::collision::clearance::{Clearance, Motion};
 use crate::collision::report::{Contact, Pair};
 use crate::collision::{CollisionChecker, ExactChecker, Scene, Stop};
-use super::settings::PaddingSettings;
 use crate::planning::search::path::between;
 use crate::planning::settings::PlannerSettings;
 use dimos_core::named::named;
@@ -246,7 +246,6 @@ impl CollisionChecker for Padded {
     fn turns(&self) -> &[bool] {
         self.full.turns()
     }
-
 
     fn is_free(&mut self, q: &[f64]) -> bool {
         let Self { full, zones, .. } = self;

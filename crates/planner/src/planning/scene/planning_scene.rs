@@ -7,7 +7,7 @@ use std::sync::Arc;
 use glamx::{DAffine3, DVec3};
 use nalgebra::Isometry3;
 
-use super::config::{CLOUD_RADIUS, JointBounds, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
+use super::config::{CLOUD_RADIUS, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
 use super::ignored_pairs::{IgnoredPair, of_robot};
 use super::stage_cache::StageCache;
 use super::unplanned_joints::{Measured, idle};
@@ -17,7 +17,7 @@ use crate::collision::cloud::Cloud;
 use crate::collision::world::{Obstacle, Robot, World};
 use crate::collision::{Solid, ply};
 use crate::planning::settings::PlannerSettings;
-use dimos_core::joint::DEFAULT_ACCELERATION;
+use dimos_core::joint::{CommandLimits, DEFAULT_ACCELERATION};
 use dimos_robot::kinematics::tool_speed::ToolSpeed;
 use dimos_robot::kinematics::{Kinematics, KinematicsError, frame};
 use dimos_robot::load;
@@ -104,7 +104,7 @@ impl PlanningScene {
 
     /// Adds the limits of the arms that execute the motions, by the coordinator's joint names, so that no plan exceeds
     /// them. The error names a joint whose limits do not overlap.
-    pub fn within(mut self, bounds: &BTreeMap<String, JointBounds>) -> Result<Self, String> {
+    pub fn within(mut self, bounds: &BTreeMap<String, CommandLimits>) -> Result<Self, String> {
         for robot in &mut self.robots {
             robot.narrow(bounds).map_err(|e| format!("robot {:?}: {e}", robot.config.name))?;
         }
@@ -226,7 +226,7 @@ impl PlannedRobot {
         Ok(Self { config, model, joints, end_effector, limits, tcp_velocity: None, rest: posed, body, disabled })
     }
 
-    fn narrow(&mut self, bounds: &BTreeMap<String, JointBounds>) -> Result<(), String> {
+    fn narrow(&mut self, bounds: &BTreeMap<String, CommandLimits>) -> Result<(), String> {
         let mut model = (*self.model).clone();
         for (&index, name) in self.joints.iter().zip(&self.config.coordinator_joints) {
             let (Some(joint), Some(b)) = (model.joints.get_mut(index), bounds.get(name)) else { continue };

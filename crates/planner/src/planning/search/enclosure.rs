@@ -15,14 +15,14 @@ use crate::collision::checker::{CollisionChecker, Stop};
 use crate::collision::report::{Contact, Pair};
 use dimos_robot::random::Random;
 
-/// What encloses a configuration.
+/// An enclosure of a configuration.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Enclosed {
     /// The joint that cannot get to the other end.
     pub joint: usize,
     /// The part of its range that was reached [rad or m].
     pub reached: [f64; 2],
-    /// What touches beyond that, the most frequent pair first.
+    /// Contacts beyond that, the most frequent pair first.
     pub contacts: Vec<Contact>,
 }
 
@@ -72,14 +72,14 @@ pub fn enclosed<C: CollisionChecker>(
     Some(Enclosed { joint, reached, contacts: explored.in_the_way(checker, joint, other > reached[1]) })
 }
 
-/// What can be reached.
+/// The set of configurations that were reached.
 struct Explored {
     settings: EnclosureSettings,
     tree: Tree,
     random: Random,
     /// Where samples are drawn, per joint [rad or m].
     ranges: Vec<[f64; 2]>,
-    /// What was reached, per joint.
+    /// Range that was reached, per joint.
     reached: Vec<[f64; 2]>,
     /// The same after half of the edges.
     halfway: Vec<[f64; 2]>,
@@ -121,7 +121,8 @@ impl Explored {
 
     /// Returns whether no joint gets farther, other than those that have their whole range.
     fn is_pocket(&self) -> bool {
-        let whole = |joint: usize| self.reached[joint][1] - self.reached[joint][0] >= self.settings.whole * self.range(joint);
+        let whole =
+            |joint: usize| self.reached[joint][1] - self.reached[joint][0] >= self.settings.whole * self.range(joint);
         (0..self.reached.len()).all(|joint| whole(joint) || self.still(joint) == [true; 2])
     }
 

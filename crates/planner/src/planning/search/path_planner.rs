@@ -16,9 +16,9 @@ use super::rrt_connect::SearchCount;
 use super::sampled::Sampled;
 use super::settings::{EnclosureSettings, EscapeSettings, PlanSettings};
 use super::shortcut::shorten;
-use crate::planning::timing::topp::JointBound;
-use crate::planning::timing::{Timed, TimingError, time};
 use crate::planning::timing::settings::TimingSettings;
+use crate::planning::timing::{Timed, TimingError, time};
+use dimos_core::joint::JointBounds;
 
 /// A path and statistics of its search.
 #[derive(Debug, Clone, PartialEq)]
@@ -58,7 +58,7 @@ impl Plan {
     pub fn quickest(
         self,
         names: &[String],
-        bounds: &[JointBound],
+        bounds: &[JointBounds],
         settings: &TimingSettings,
         mut free: impl FnMut(&[f64], &[f64]) -> bool,
     ) -> Way {
@@ -126,7 +126,7 @@ pub enum PlanError {
     Enclosed {
         /// "start" or "goal".
         which: &'static str,
-        /// What encloses it; of several goals, the nearest.
+        /// The enclosure; of several goals, that of the nearest.
         enclosed: Enclosed,
     },
     /// Covers touch at the start, or at every goal: only a proof can say whether solids do.
@@ -210,7 +210,13 @@ pub fn plan<C: CollisionChecker>(
                 let found = match found {
                     Ok(found) => found,
                     Err(Halt::TookLong) => {
-                        not_enclosed(checker, &from, &goals, (&settings.enclosure, settings.seed, level.proves()), stop)?;
+                        not_enclosed(
+                            checker,
+                            &from,
+                            &goals,
+                            (&settings.enclosure, settings.seed, level.proves()),
+                            stop,
+                        )?;
                         continue;
                     }
                     Err(Halt::Stopped) if stop.is_cancelled() => return Err(PlanError::Cancelled),
@@ -263,7 +269,7 @@ fn not_enclosed<C: CollisionChecker>(
 ) -> Result<(), PlanError> {
     let to = [start.to_vec()];
     let mut nearest = None;
-    // What both say of a wall between them is plainer of the goal: the start has most of the space as a rule.
+    // A wall between them is clearer from the goal: the start has most of the space as a rule.
     if goals.iter().all(|goal| enclosed(checker, goal, &to, how, stop).map(|e| nearest.get_or_insert(e)).is_some())
         && let Some(enclosed) = nearest
     {

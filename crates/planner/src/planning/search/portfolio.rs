@@ -58,8 +58,8 @@ struct Member {
 }
 
 impl Portfolio {
-    /// Prepares the searches from `start` to any of `goals`; all of them must be free. `level`: that of the settings, or
-    /// one that proves more.
+    /// Prepares the searches from `start` to any of `goals`; all of them must be free. `level`: that of the settings,
+    /// or one that proves more.
     pub fn new(start: &[f64], goals: &[Vec<f64>], settings: &PlanSettings, level: Level) -> Self {
         let PlanSettings { seed, search, portfolio: turns, .. } = *settings;
         // A search is large to move: room for all of them.
@@ -68,7 +68,9 @@ impl Portfolio {
             ranges.reverse();
         }
         for edges in [EdgeCheck::Coarse, EdgeCheck::Exact] {
-            if (level == Level::Fast && edges == EdgeCheck::Exact) || (level == Level::Exact && edges == EdgeCheck::Coarse) {
+            if (level == Level::Fast && edges == EdgeCheck::Exact)
+                || (level == Level::Exact && edges == EdgeCheck::Coarse)
+            {
                 continue;
             }
             for (number, range) in (0..).zip(ranges) {

@@ -7,7 +7,8 @@
 
 use crate::planning::search::path::distance;
 
-/// Norm of a change of direction above which a corner is a reversal, which is not blended: the speed would be zero in it.
+/// Norm of a change of direction above which a corner is a reversal, which is not blended: the speed would be zero in
+/// it.
 pub(in crate::planning) const REVERSAL: f64 = 1.99;
 
 /// A piece of a curve: a line or a blended corner.

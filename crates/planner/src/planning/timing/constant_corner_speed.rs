@@ -1,6 +1,6 @@
 //! The quickest motion along a path that passes each corner at constant speed: double-S profiles on the lines between
-//! them ([`double_s`](dimos_core::double_s)). It keeps velocity, acceleration and jerk limits by construction, and every
-//! speed of a corner follows from its limits in closed form.
+//! them ([`double_s`](dimos_core::double_s)). It keeps velocity, acceleration and jerk limits by construction, and
+//! every speed of a corner follows from its limits in closed form.
 //!
 //! With jerk limits the curvature of a corner rises linearly, stays, and falls, each over a third of it: at constant
 //! speed the jerk is constant in each third. Without, the curvature is constant. So every piece of the motion is a
@@ -13,8 +13,8 @@ use dimos_kernels::states::{Blocks, Eight, JOINTS, States, Station};
 
 use super::blend::REVERSAL;
 use super::settings::CornerSettings;
-use super::topp::JointBound;
 use dimos_core::double_s::{LineLimits, State};
+use dimos_core::joint::JointBounds;
 
 /// Minimum time between points [s]: polynomials through closer ones would amplify rounding errors of positions.
 const MIN_INTERVAL: f64 = 1e-4;
@@ -95,9 +95,9 @@ struct Inverse {
 }
 
 impl Inverse {
-    fn of(bounds: &[JointBound]) -> Self {
-        let list = |of: fn(&JointBound) -> f64| {
-            let block = |bounds: &[JointBound]| {
+    fn of(bounds: &[JointBounds]) -> Self {
+        let list = |of: fn(&JointBounds) -> f64| {
+            let block = |bounds: &[JointBounds]| {
                 let mut block = [0.0; JOINTS];
                 block.iter_mut().zip(bounds).for_each(|(inverse, b)| *inverse = (1.0 + ROUNDING) / of(b));
                 block
@@ -141,7 +141,7 @@ fn difference(from: &[Eight], to: &[Eight], out: &mut [Eight]) -> f64 {
 impl RoundedPath {
     /// Blends the corners of a path without repeated configurations. At configuration `i` the motion stays within
     /// `deviation[i]` [rad, Euclidean] of the path; it rests where that is 0.
-    pub fn new(path: &[Vec<f64>], bounds: &[JointBound], deviation: &[f64], settings: &CornerSettings) -> Self {
+    pub fn new(path: &[Vec<f64>], bounds: &[JointBounds], deviation: &[f64], settings: &CornerSettings) -> Self {
         let blocks = bounds.len().div_ceil(JOINTS);
         let inverse = Inverse::of(bounds);
         let jerk = inverse.jerk.as_flattened().iter().any(|inverse| *inverse > 0.0);
@@ -167,8 +167,7 @@ impl RoundedPath {
         }
         let corners = vec![Corner::default(); path.len()];
         let (joints, settings) = (bounds.len(), *settings);
-        let mut rounded =
-            Self { joints, blocks, configurations, directions, lines, corners, jerk, ramp, settings };
+        let mut rounded = Self { joints, blocks, configurations, directions, lines, corners, jerk, ramp, settings };
         let mut turn = vec![[0.0; JOINTS]; blocks];
         for i in 1..path.len().saturating_sub(1) {
             let length = difference(rounded.direction(i - 1), rounded.direction(i), &mut turn);

@@ -17,7 +17,7 @@ use std::borrow::Cow;
 
 use dimos_kernels::states::{Eight, States};
 
-use dimos_core::joint::DEFAULT_ACCELERATION;
+use dimos_core::joint::{DEFAULT_ACCELERATION, JointBounds};
 use dimos_core::trajectory::{JointTrajectory, JointValues, TrajectoryError, TrajectoryPoint};
 use dimos_robot::model::Limits;
 
@@ -25,7 +25,7 @@ use self::blend::{Curve, curves};
 use self::constant_corner_speed::RoundedPath;
 use self::jerk_limit::averaged;
 use self::settings::{CornerSettings, TimingSettings};
-use self::topp::{GridPoint, JointBound, parameterize};
+use self::topp::{GridPoint, parameterize};
 use self::verify::{Excess, excess};
 use crate::planning::search::path::tidy_indices;
 
@@ -67,7 +67,7 @@ pub enum TimingError {
 
 /// Returns the bounds of joints: the given limits, [`DEFAULT_ACCELERATION`] if there is no acceleration limit, an
 /// infinite jerk if there is no jerk limit.
-pub fn bounds(names: &[String], limits: &[Limits]) -> Result<Vec<JointBound>, TimingError> {
+pub fn bounds(names: &[String], limits: &[Limits]) -> Result<Vec<JointBounds>, TimingError> {
     let bound = |(name, l): (&String, &Limits)| {
         let acceleration = l.acceleration.unwrap_or(DEFAULT_ACCELERATION);
         let jerk = l.jerk.unwrap_or(f64::INFINITY);
@@ -79,7 +79,7 @@ pub fn bounds(names: &[String], limits: &[Limits]) -> Result<Vec<JointBound>, Ti
         if jerk <= 0.0 || jerk.is_nan() {
             return Err(TimingError::Limit(name.clone(), "jerk"));
         }
-        Ok(JointBound { velocity: l.velocity, acceleration, jerk })
+        Ok(JointBounds { lower: l.lower, upper: l.upper, velocity: l.velocity, acceleration, jerk })
     };
     names.iter().zip(limits).map(bound).collect()
 }
@@ -89,7 +89,7 @@ pub fn bounds(names: &[String], limits: &[Limits]) -> Result<Vec<JointBound>, Ti
 pub fn time(
     names: &[String],
     path: &[Vec<f64>],
-    bounds: &[JointBound],
+    bounds: &[JointBounds],
     settings: &TimingSettings,
     free: impl FnMut(&[f64], &[f64]) -> bool,
 ) -> Result<Timed, TimingError> {
@@ -101,7 +101,7 @@ pub fn time(
 pub fn time_within(
     names: &[String],
     path: &[Vec<f64>],
-    bounds: &[JointBound],
+    bounds: &[JointBounds],
     deviation: &[f64],
     settings: &TimingSettings,
     mut free: impl FnMut(&[f64], &[f64]) -> bool,
@@ -136,7 +136,7 @@ pub fn time_within(
 fn variable_is_quicker(
     (rounded, speeds): (&RoundedPath, &[f64]),
     path: &[Vec<f64>],
-    bounds: &[JointBound],
+    bounds: &[JointBounds],
     deviation: &[f64],
     settings: &TimingSettings,
 ) -> bool {
@@ -155,7 +155,7 @@ fn variable_is_quicker(
 fn at_constant_corner_speed(
     names: &[String],
     (path, mut rounded, mut speeds): (&[Vec<f64>], RoundedPath, Vec<f64>),
-    bounds: &[JointBound],
+    bounds: &[JointBounds],
     mut deviation: Vec<f64>,
     settings: &TimingSettings,
     free: &mut impl FnMut(&[f64], &[f64]) -> bool,
@@ -181,7 +181,7 @@ fn at_constant_corner_speed(
     }
     let mut states = rounded.motion(&speeds);
     let excess = slow_down(&mut states, bounds);
-    // What is between the corners was part of the path, and is all that the motion passes besides.
+    // The lines between the corners were part of the path, and complete the motion.
     for i in 0..path.len() - 1 {
         rounded.ends_of_line(i, &mut from, &mut to);
         if !free(&from, &to) {
@@ -195,7 +195,7 @@ fn at_constant_corner_speed(
 fn at_variable_corner_speed(
     names: &[String],
     path: &[Vec<f64>],
-    bounds: &[JointBound],
+    bounds: &[JointBounds],
     mut deviation: Vec<f64>,
     settings: &TimingSettings,
     free: &mut impl FnMut(&[f64], &[f64]) -> bool,
@@ -247,7 +247,7 @@ fn round_corners(
 fn emit(
     names: &[String],
     path: &[Vec<f64>],
-    bounds: &[JointBound],
+    bounds: &[JointBounds],
     curves: &[Curve],
     deviation: Vec<f64>,
     settings: &TimingSettings,
@@ -264,12 +264,12 @@ fn emit(
 }
 
 /// Returns whether the spline through states is quintic: with jerk limits accelerations have no jumps.
-fn is_quintic(bounds: &[JointBound]) -> bool {
+fn is_quintic(bounds: &[JointBounds]) -> bool {
     bounds.iter().any(|b| b.jerk.is_finite())
 }
 
 /// Returns the states of the motion along a curve, before it is slowed down to what its spline needs.
-fn at_variable_speed(curve: &Curve, bounds: &[JointBound], settings: &TimingSettings) -> States {
+fn at_variable_speed(curve: &Curve, bounds: &[JointBounds], settings: &TimingSettings) -> States {
     if is_quintic(bounds) {
         averaged(curve, bounds, settings)
     } else {
@@ -281,7 +281,7 @@ fn at_variable_speed(curve: &Curve, bounds: &[JointBound], settings: &TimingSett
 fn finished(
     names: &[String],
     path: &[Vec<f64>],
-    bounds: &[JointBound],
+    bounds: &[JointBounds],
     (mut states, excess): (States, Excess),
     deviation: Vec<f64>,
     speed: f64,
@@ -313,7 +313,7 @@ fn finished(
         }
     };
     let trajectory = JointTrajectory { joint_names: names.to_vec(), points };
-    // What is wrong is said by the trajectory; that nothing is, is seen faster here.
+    // The trajectory reports errors; this check is faster where there is none.
     if !states.are_finite_and_in_order() {
         trajectory.validate()?;
     }
@@ -341,7 +341,7 @@ fn on_grid(curve: &Curve, grid: &[GridPoint]) -> States {
 }
 
 /// Stretches a motion in time until its spline keeps all bounds; returns the use of the limits afterwards.
-fn slow_down(states: &mut States, bounds: &[JointBound]) -> Excess {
+fn slow_down(states: &mut States, bounds: &[JointBounds]) -> Excess {
     let found = excess(states, bounds, is_quintic(bounds));
     let factor = match found.slower() {
         slower if slower > 1.0 => slower * (1.0 + 1e-9),

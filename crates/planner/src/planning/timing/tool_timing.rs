@@ -11,8 +11,8 @@ use std::ops::Range;
 use dimos_kernels::states::States;
 
 use super::settings::ToolTimingSettings;
-use super::topp::JointBound;
 use super::verify::excess;
+use dimos_core::joint::JointBounds;
 use dimos_core::trajectory::{Cursor, JointTrajectory, JointValues, Sample, Spline, TrajectoryPoint};
 use dimos_robot::kinematics::tool_speed::ToolSpeed;
 
@@ -49,7 +49,7 @@ impl Tools {
     pub fn slowed(
         &mut self,
         motion: &JointTrajectory,
-        bounds: &[JointBound],
+        bounds: &[JointBounds],
         speed: f64,
         settings: &ToolTimingSettings,
     ) -> Option<JointTrajectory> {
@@ -65,7 +65,7 @@ impl Tools {
 /// is not valid stays as it is.
 pub fn slowed(
     motion: &JointTrajectory,
-    bounds: &[JointBound],
+    bounds: &[JointBounds],
     settings: &ToolTimingSettings,
     mut part: impl FnMut(&[f64], &[f64]) -> f64,
 ) -> Option<JointTrajectory> {
@@ -147,12 +147,7 @@ fn mean_around(values: &[f64], half: usize) -> Vec<f64> {
 
 /// Returns the states of a motion whose time runs at these rates, one for each `step` [s] of it; rates from `share` on
 /// count as constant.
-fn warped(
-    spline: &Spline,
-    rates: &[f64],
-    step: f64,
-    (point_interval, share): (f64, f64),
-) -> Option<States> {
+fn warped(spline: &Spline, rates: &[f64], step: f64, (point_interval, share): (f64, f64)) -> Option<States> {
     let mut times = vec![0.0];
     for pair in rates.windows(2) {
         // Exact for a rate that is linear in the given time.
@@ -236,12 +231,12 @@ impl<'a> Walk<'a> {
 mod tests {
     use super::*;
     use crate::planning::timing::settings::TimingSettings;
-use crate::planning::timing::time;
+    use crate::planning::timing::time;
 
     /// A joint of 1 m whose end may have 0.8 m/s near 0, and more elsewhere.
     #[test]
     fn only_where_the_tool_is_too_fast_the_motion_is_slower_and_the_joint_keeps_its_limits() {
-        let bounds = [JointBound { velocity: 3.0, acceleration: 8.0, jerk: 200.0 }];
+        let bounds = [JointBounds { velocity: 3.0, acceleration: 8.0, jerk: 200.0, ..JointBounds::NONE }];
         let path = [vec![-2.5], vec![2.5]];
         let timed = time(&["joint".to_owned()], &path, &bounds, &TimingSettings::default(), |_, _| true).unwrap();
         let (motion, settings) = (timed.trajectory, ToolTimingSettings::default());
@@ -256,6 +251,10 @@ use crate::planning::timing::time;
         }
         assert_eq!((spline.start(0), spline.goal(0)), (-2.5, 2.5));
         assert!(spline.duration() < 1.7 * motion.duration(), "{} after {}", spline.duration(), motion.duration());
-        assert_eq!(slowed(&slower, &bounds, &settings, |q, v| 0.99 * part(q, v)), None, "it keeps the tool's speed now");
+        assert_eq!(
+            slowed(&slower, &bounds, &settings, |q, v| 0.99 * part(q, v)),
+            None,
+            "it keeps the tool's speed now"
+        );
     }
 }

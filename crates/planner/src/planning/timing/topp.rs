@@ -7,17 +7,7 @@
 //! highest `u` that stays below it.
 
 use super::blend::{Curve, Piece};
-
-/// Limits of one joint along the path.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct JointBound {
-    /// Maximum speed [rad/s].
-    pub velocity: f64,
-    /// Maximum acceleration [rad/s²].
-    pub acceleration: f64,
-    /// Maximum jerk [rad/s³]; infinite without a limit.
-    pub jerk: f64,
-}
+use dimos_core::joint::JointBounds;
 
 /// A grid point: position on the curve, and speed.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -49,7 +39,7 @@ impl Pace {
 }
 
 /// Returns the grid of a curve with speeds and times, from rest to rest; a corner has `intervals` of it.
-pub fn parameterize(curve: &Curve, bounds: &[JointBound], intervals: usize) -> Vec<GridPoint> {
+pub fn parameterize(curve: &Curve, bounds: &[JointBounds], intervals: usize) -> Vec<GridPoint> {
     let (constraints, speed_grid) = speed_grid(curve, bounds, intervals);
     let paces = vec![Pace::FULL; curve.len()];
     let speeds = speed_grid.fastest(&constraints, &paces);
@@ -84,7 +74,7 @@ pub(in crate::planning) struct SpeedGrid {
 /// Returns the grid along a curve, and the constraints on `u` in its corners, of `each` intervals.
 pub(in crate::planning) fn speed_grid(
     curve: &Curve,
-    bounds: &[JointBound],
+    bounds: &[JointBounds],
     each: usize,
 ) -> (Vec<Constraint>, SpeedGrid) {
     let corners = curve.iter().filter(|piece| piece.bends).count();
@@ -115,7 +105,7 @@ impl SpeedGrid {
     fn add_corner(
         &mut self,
         (p, piece, start): (usize, &Piece, f64),
-        bounds: &[JointBound],
+        bounds: &[JointBounds],
         intervals: usize,
         constraints: &mut Vec<Constraint>,
     ) {
@@ -225,19 +215,19 @@ fn switches(from: &GridPoint, to: &GridPoint, push: f64, fastest: f64, out: &mut
 }
 
 /// Returns the maximum `u` on a line.
-fn hardest(line: &Piece, bounds: &[JointBound]) -> f64 {
+fn hardest(line: &Piece, bounds: &[JointBounds]) -> f64 {
     let u = line.direction.iter().zip(bounds).map(|(d1, b)| b.acceleration / d1.abs().max(1e-12));
     u.fold(f64::INFINITY, f64::min)
 }
 
 /// Returns the maximum `x` on a line.
-fn fastest(line: &Piece, bounds: &[JointBound]) -> f64 {
+fn fastest(line: &Piece, bounds: &[JointBounds]) -> f64 {
     let speed = line.direction.iter().zip(bounds).map(|(d1, b)| b.velocity / d1.abs().max(1e-12));
     speed.fold(f64::INFINITY, f64::min).powi(2)
 }
 
 /// Returns the maximum `x` at a point of a piece, from the joint speeds and from what no `u` can compensate.
-fn highest(piece: &Piece, at: f64, bounds: &[JointBound]) -> f64 {
+fn highest(piece: &Piece, at: f64, bounds: &[JointBounds]) -> f64 {
     let t = piece.progress(at);
     let (mut speed, mut x, mut cube) = (f64::INFINITY, f64::INFINITY, f64::INFINITY);
     for ((direction, turn), bound) in piece.direction.iter().zip(&piece.turn).zip(bounds) {
