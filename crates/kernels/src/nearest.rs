@@ -11,7 +11,7 @@ const TURN: f32 = std::f32::consts::TAU;
 #[derive(Debug, Clone)]
 pub struct Nodes {
     groups: Vec<Lanes>,
-    /// Which variables repeat after a whole turn.
+    /// Variables that repeat after a whole turn.
     turns: Vec<bool>,
     number: usize,
     width: Width,

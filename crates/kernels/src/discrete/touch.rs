@@ -109,7 +109,7 @@ fn cover_touches<B: Block, C: Squared, const EACH: bool, const SWEPT: bool>(
 ) -> u16 {
     let Some(root) = nodes.first() else { return left };
     let mut touching = Touching::among(left);
-    // For each ball the lanes in which it may be close: what a lane finds does not depend on the others.
+    // For each ball the lanes in which it may be close: the result of a lane does not depend on the others.
     let (mut stack, mut stack_lanes) = ([0; STACK], [0; STACK]);
     stack_lanes[0] = u16::MAX;
     let mut open = 1;
