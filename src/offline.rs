@@ -4,21 +4,22 @@ use glamx::DAffine3;
 
 use dimos_planner::collision::checker::Stop;
 use dimos_planner::collision::world::World;
-use dimos_planner::collision::{ExactChecker, Resolution};
+use dimos_planner::collision::{CheckSettings, ExactChecker};
 use dimos_planner::planning::ik::Ik;
 use dimos_planner::planning::scene::planning_scene::{always_touch, whole};
 use dimos_robot::RobotModel;
 use dimos_robot::kinematics::Kinematics;
 
 pub use dimos_planner::collision::report::Contact;
-pub use dimos_planner::planning::ik::{IkFailure, IkSettings};
-pub use dimos_planner::planning::scene::config::{JointBounds, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
+pub use dimos_planner::planning::ik::IkFailure;
+pub use dimos_planner::planning::ik::settings::IkSettings;
+pub use dimos_planner::planning::scene::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
 pub use dimos_planner::planning::scene::ignored_pairs::IgnoredPair;
 pub use dimos_planner::planning::scene::planning_scene::{PlannedRobot, PlanningScene};
 pub use dimos_planner::planning::search::path::{distance, length, unwind};
 pub use dimos_planner::planning::search::thin::thin;
-pub use dimos_planner::planning::timing::time_within;
-pub use dimos_planner::planning::timing::topp::JointBound;
+pub use dimos_planner::planning::timing::settings::TimingSettings;
+pub use dimos_planner::planning::timing::time;
 
 /// Pairs of links that are allowed to touch, by name.
 pub type Allowed = Vec<(String, String)>;
@@ -29,7 +30,7 @@ pub struct Contacts(ExactChecker);
 impl Contacts {
     /// Checks the robots and objects of a scene; pairs closer than `within` [m] count.
     pub fn of_scene(scene: &PlanningScene, within: f64) -> Self {
-        Self(ExactChecker::new(scene.world.snapshot(), Resolution::default()).with_margin(within))
+        Self(ExactChecker::new(scene.world.snapshot(), CheckSettings::default()).with_margin(within))
     }
 
     /// Checks a robot alone. Returns also the pairs that are not checked: they touch in every configuration. Fails if
@@ -40,7 +41,7 @@ impl Contacts {
         body.allowed.extend(unchecked.iter().cloned().map(<(String, String)>::from));
         let mut world = World::new();
         world.add_robot(body).map_err(|e| e.to_string())?;
-        let checker = ExactChecker::new(world.snapshot(), Resolution::default()).with_margin(within);
+        let checker = ExactChecker::new(world.snapshot(), CheckSettings::default()).with_margin(within);
         Ok((Self(checker), unchecked))
     }
 

@@ -8,6 +8,7 @@ use std::time::Instant;
 use dimos::arm::ArmState;
 use dimos::clock::{Clock, Mono, MonotonicClock};
 use dimos::collision::cloud::Cloud;
+use dimos::collision::settings::GuardSettings;
 use dimos::collision::world::{Obstacle, Robot};
 use dimos::collision::{OwnMargins, Solid, World};
 use dimos::control::config::{ServoParams, TaskKind};
@@ -90,7 +91,7 @@ fn measure(guarded: bool, streams: Streams, number: usize) -> (Ticks, usize) {
     let mut coordinator = Coordinator::new(&config, tasks);
     if guarded {
         let scene = world().snapshot();
-        let own = OwnMargins::of(&scene, 0.002);
+        let own = OwnMargins::of(&scene, 0.002, &GuardSettings::default());
         let arms: Vec<u16> = (0..14).map(|joint| joint / 7).collect();
         let mut world = GuardWorld::new(&scene, (0..14).collect(), &arms, 0.01, &own).expect("a world");
         world.allow_present(|joint| HOME[usize::from(joint % 7)]);

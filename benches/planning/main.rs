@@ -27,10 +27,12 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use clap::Parser;
-use dimos::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
+use dimos::collision::{CheckSettings, CollisionChecker, ExactChecker, Stop};
 use dimos::planning::search::level::Level;
-use dimos::planning::search::path_planner::{Plan, PlanError, PlanSettings, plan};
-use dimos::planning::timing::{TimingSettings, bounds, time};
+use dimos::planning::search::path_planner::{Plan, PlanError, plan};
+use dimos::planning::search::settings::PlanSettings;
+use dimos::planning::timing::settings::TimingSettings;
+use dimos::planning::timing::{bounds, time};
 use dimos_kernels::Width;
 use problems::{Arm, Problem, Shapes, load, packages};
 use serde::Serialize;
@@ -255,7 +257,7 @@ fn solve(arm: &Arm, problem: &Problem, arguments: &Arguments) -> Result<Row, Box
     let scene = arm.scene(&kinematics, problem, arguments.shapes)?;
     let (start, goal) = problem.ends();
     let cpu = cpu_time();
-    let mut checker = ExactChecker::new(scene, Resolution::default());
+    let mut checker = ExactChecker::new(scene, CheckSettings::default());
     let setup = cpu_time().saturating_sub(cpu);
     let settings = PlanSettings {
         seed: arguments.seed,
@@ -271,12 +273,9 @@ fn solve(arm: &Arm, problem: &Problem, arguments: &Arguments) -> Result<Row, Box
     let timeout = matches!(found, Err(PlanError::Timeout(_)));
     let bounds = bounds(kinematics.names(), kinematics.limits())?;
     // As a run does: of the paths of a refinement, that of the quickest motion is executed.
-    let quickest = found
-        .as_ref()
-        .ok()
-        .filter(|_| !arguments.paths_only)
-        .cloned()
-        .map(|plan| plan.quickest(kinematics.names(), &bounds, |a, b| checker.motion_looks_free(a, b)).0);
+    let quickest = found.as_ref().ok().filter(|_| !arguments.paths_only).cloned().map(|plan| {
+        plan.quickest(kinematics.names(), &bounds, &TimingSettings::default(), |a, b| checker.motion_looks_free(a, b)).0
+    });
     let mut row = row(problem, found, total, cpu);
     row.setup_us = setup.as_secs_f64() * 1e6;
     row.check_ns = row.path.as_ref().and_then(|path| check_time(&mut checker, path));

@@ -4,9 +4,11 @@ use std::error::Error;
 use std::time::Instant;
 
 use dimos::collision::Stop;
-use dimos::planning::ik::{Ik, IkSettings};
-use dimos::planning::timing::topp::JointBound;
-use dimos::planning::timing::{TimingSettings, time};
+use dimos::joint::JointBounds;
+use dimos::planning::ik::Ik;
+use dimos::planning::ik::settings::IkSettings;
+use dimos::planning::timing::settings::TimingSettings;
+use dimos::planning::timing::time;
 use dimos::robot::kinematics::Kinematics;
 use dimos::robot::model::RobotModel;
 use dimos::robot::random::Random;
@@ -62,8 +64,8 @@ pub fn timing(repeats: u64, seed: u64) -> Result<(), Box<dyn Error>> {
     ];
     let mut quickest = Vec::new();
     for (what, jerk, deviation, goal) in cases {
-        let bounds = [JointBound { velocity: VELOCITY, acceleration: ACCELERATION, jerk }; 7];
-        let settings = TimingSettings { deviation, speed: 1.0 };
+        let bounds = [JointBounds { velocity: VELOCITY, acceleration: ACCELERATION, jerk, ..JointBounds::NONE }; 7];
+        let settings = TimingSettings { deviation, ..TimingSettings::default() };
         let (mut times, mut cpu, mut durations) = (Vec::new(), Vec::new(), Vec::new());
         for path in &paths {
             let (began, cpu_began) = (Instant::now(), cpu_time());

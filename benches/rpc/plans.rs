@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use dimos::blueprint::names;
 use dimos::collision::world::World;
-use dimos::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
+use dimos::collision::{CheckSettings, CollisionChecker, ExactChecker, Stop};
 use dimos::planning::request::ahead::look_ahead;
 use dimos::planning::request::pipeline::{Goal as PlanningGoal, PlanRequest, solve};
 use dimos::planning::scene::config::{ObjectConfig, ObjectShape};
@@ -164,7 +164,7 @@ fn positions(client: &mut Client, scene: &PlanningScene) -> Result<Vec<Vec<f64>>
 
 /// Returns a checker that keeps all robots at a distance from obstacles and other robots.
 fn checker(world: &World) -> ExactChecker {
-    ExactChecker::new(world.snapshot(), Resolution::default()).with_padding(ROOM)
+    ExactChecker::new(world.snapshot(), CheckSettings::default()).with_padding(ROOM)
 }
 
 /// What plans took [ms].

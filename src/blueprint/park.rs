@@ -4,9 +4,8 @@ use crate::blueprint::arms::Hardware;
 use crate::blueprint::limits::JointOverride;
 use crate::blueprint::resolve::{Checker, Task};
 use crate::blueprint::schema::{HardwareEntry, OnExit};
-use dimos_control::config::POSITION_MARGIN;
 use dimos_control::task_body::TargetKind;
-use dimos_core::joint::JointLimits;
+use dimos_core::joint::{JointLimits, POSITION_MARGIN};
 use dimos_yaml::{Diag, Located, Severity, quote};
 
 /// Checks the pose of an arm; returns it with `on_exit: park`, otherwise nothing.

@@ -16,6 +16,7 @@ use crate::replay::motion::{RecordedMotion, tcp_path};
 use crate::replay::recorded::Recorded;
 use crate::replay::recorded::RecordedError;
 use crate::replay::retrace::{Back, ON_PATH, Retrace, RetraceError, retrace};
+use dimos_core::joint::JointBounds;
 use dimos_core::trajectory::JointTrajectory;
 use dimos_log::replay::LogReader;
 use dimos_rpc::api::{
@@ -290,15 +291,14 @@ fn timed(client: &mut Client, log: &Path, arm: &str, way: &Retrace, speed: f64) 
     let recorded = Recorded::of(log, opened.info().clone()).map_err(|e| Failure::of(Exit::Failed, e))?;
     let config = recorded.config.arms.iter().find(|config| config.name == arm);
     let l = &config.ok_or_else(|| fail(format!("the log has no limits of {arm}")))?.limits;
-    let bound =
-        |j: usize| JointBound { velocity: l.velocity_max[j], acceleration: l.acceleration_max[j], jerk: l.jerk_max[j] };
     let (_, joints, now) = present(client, arm)?;
-    let bounds: Vec<JointBound> = (0..joints.len()).map(bound).collect();
+    let bounds: Vec<JointBounds> = (0..joints.len()).filter_map(|j| l.joint(j)).collect();
     let whole: Vec<Vec<f64>> = std::iter::once(now).chain(way.path.iter().cloned()).collect();
     // Half of the distance is for the straight lines, half for the blends between them.
     let (mut path, mut deviation) = (whole.clone(), DEVIATION);
     while deviation <= FARTHEST / 2.0 {
-        let timed = time_within(&joints, &path, &bounds, &vec![deviation; path.len()], speed, |_, _| true);
+        let settings = TimingSettings { deviation, speed, ..TimingSettings::default() };
+        let timed = time(&joints, &path, &bounds, &settings, |_, _| true);
         let trajectory = request_of(&joints, timed.map_err(|e| fail(e.to_string()))?.trajectory);
         if serde_json::to_string(&trajectory).is_ok_and(|text| text.len() + ENVELOPE <= MAX_LINE) {
             if deviation > DEVIATION {

@@ -162,7 +162,7 @@ pub fn run(args: &Args) -> Result {
     let gateway = Gateway::start(&found.name, folder.lasting(&found), config.clone()).map_err(ClientError::from)?;
     if !is_child {
         // The gateway of a blueprint continues to serve what else it has.
-        if let Some(error) = gateway.face_error() {
+        if let Some(error) = gateway.bridge_error() {
             return Err(ClientError::from(error.clone()).into());
         }
         let endpoints: Vec<String> = config.listen.iter().chain(&config.connect).map(ToString::to_string).collect();

@@ -99,9 +99,9 @@ fn is_reproduced(knots: &[Knot], a: usize, b: usize, dt: f64) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dimos_control::limit::{Bounds, Limiter};
+    use dimos_control::limit::Limiter;
     use dimos_control::point_to_point::point_to_point;
-    use dimos_core::joint::{JointLimits, make_joints};
+    use dimos_core::joint::{JointBounds, JointLimits, make_joints};
     use dimos_core::trajectory::{Cursor, Sample, Spline};
 
     const DT: f64 = 0.01;
@@ -134,7 +134,7 @@ mod tests {
     #[test]
     fn a_motion_within_limits_makes_a_curve_within_limits() {
         let (velocity, acceleration) = (1.5, 4.0);
-        let mut limiter = Limiter::new(Bounds::inside(-2.0, 2.0, velocity, acceleration));
+        let mut limiter = Limiter::new(JointBounds::inside(-2.0, 2.0, velocity, acceleration));
         let mut rows = vec![vec![0.0]; 5];
         for k in 0..600 {
             let target = [0.15, -0.02, 0.09, 0.12][k / 40 % 4] + 0.05 * (k as f64 * 0.3).sin();

@@ -6,8 +6,8 @@ use thiserror::Error;
 
 use crate::blueprint::{Arm, Blueprint};
 use dimos_control::config::CoordinatorConfig;
-use dimos_control::limit::Bounds;
 use dimos_control::task_body::TargetKind;
+use dimos_core::joint::JointBounds;
 use dimos_core::trajectory::{JointTrajectory, Spline, TrajectoryError, TrajectoryPoint};
 
 /// Maximum values in one trajectory: it is checked, logged and held in memory as a whole.
@@ -190,9 +190,9 @@ pub struct LimitCheck {
 /// Checks a motion against the limits of all arms. `joints` are the names of all joints, arm by arm.
 pub fn check(plan: &Plan, config: &CoordinatorConfig, joints: &[String]) -> Result<LimitCheck, TrajectoryError> {
     let limits = config.arms.iter().flat_map(|arm| (0..arm.dof).map(move |j| (&arm.limits, j)));
-    let bounds: Vec<Bounds> = limits
+    let bounds: Vec<JointBounds> = limits
         .map(|(l, j)| {
-            Bounds::inside(l.position_lower[j], l.position_upper[j], l.velocity_max[j], l.acceleration_max[j])
+            JointBounds::inside(l.position_lower[j], l.position_upper[j], l.velocity_max[j], l.acceleration_max[j])
         })
         .collect();
     let mut positions = Vec::new();

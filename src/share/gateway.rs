@@ -62,8 +62,8 @@ pub struct Gateway {
     /// What happens: the clients have changed, or the run has ended.
     news: Receiver<News>,
     control: UnixStream,
-    /// The face to ROS 2, or why it does not serve.
-    ros: Option<Result<ros::Face, RpcError>>,
+    /// The bridge to ROS 2, or why it does not serve.
+    ros: Option<Result<ros::Bridge, RpcError>>,
     /// Declarations; they end with it.
     _declared: Vec<Box<dyn Send>>,
 }
@@ -71,7 +71,7 @@ pub struct Gateway {
 /// What the gateway's loop reacts to.
 enum News {
     Clients,
-    Faces,
+    Bridges,
     RunEnded,
     /// It was killed: its end is not announced.
     RunLost,
@@ -148,15 +148,15 @@ impl Gateway {
         let declared = shared.declare().map_err(|e| failed(e.to_string()))?;
         let changed = || {
             let news = shared.news.clone();
-            move || drop(news.send(News::Faces))
+            move || drop(news.send(News::Bridges))
         };
         let ros = shared
             .config
             .ros
             .as_ref()
-            .map(|config| ros::Face::start((&shared.run, &shared.socket), &shared.config, config, changed()));
+            .map(|config| ros::Bridge::start((&shared.run, &shared.socket), &shared.config, config, changed()));
         let mut gateway = Self { shared, news: received, control, ros, _declared: declared };
-        if let Some(error) = gateway.face_error() {
+        if let Some(error) = gateway.bridge_error() {
             tracing::error!("share: {error}");
         }
         // Where that fails, the end of the connection is news of its own.
@@ -164,12 +164,12 @@ impl Gateway {
         Ok(gateway)
     }
 
-    /// Returns why a face cannot serve; `None`: all can.
-    pub fn face_error(&self) -> Option<&RpcError> {
-        self.ros.as_ref().and_then(|face| face.as_ref().err())
+    /// Returns why a bridge cannot serve; `None`: all can.
+    pub fn bridge_error(&self) -> Option<&RpcError> {
+        self.ros.as_ref().and_then(|bridge| bridge.as_ref().err())
     }
 
-    /// Returns which faces do not serve at present, and why: one may wait for its router.
+    /// Returns which bridges do not serve at present, and why: one may wait for its router.
     pub fn not_serving(&self) -> Vec<String> {
         let down = |face: FaceReport| Some(format!("{} does not serve: {}", face.face, face.reason?));
         self.faces().into_iter().filter_map(down).collect()
@@ -181,8 +181,8 @@ impl Gateway {
             Some(format!("{}{hint}", error.message))
         };
         let config = &self.shared.config;
-        let ros = config.ros.as_ref().zip(self.ros.as_ref()).map(|(config, face)| match face {
-            Ok(face) => face.report(),
+        let ros = config.ros.as_ref().zip(self.ros.as_ref()).map(|(config, bridge)| match bridge {
+            Ok(bridge) => bridge.report(),
             Err(error) => ros::report(config, why(error)),
         });
         ros.into_iter().collect()
@@ -204,7 +204,7 @@ impl Gateway {
                     break;
                 }
                 Ok(News::RunLost) => break,
-                Ok(News::Clients | News::Faces) => {
+                Ok(News::Clients | News::Bridges) => {
                     let _ = self.announce();
                 }
                 Err(RecvTimeoutError::Timeout) => {}

@@ -15,13 +15,13 @@ mod certificates;
 #[cfg(feature = "share")]
 mod class;
 #[cfg(feature = "share")]
+mod connection;
+#[cfg(feature = "share")]
 mod ends;
 #[cfg(feature = "share")]
 mod gateway;
 #[cfg(feature = "share")]
 mod keys;
-#[cfg(feature = "share")]
-mod line;
 #[cfg(feature = "share")]
 mod page;
 #[cfg(feature = "share")]

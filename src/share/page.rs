@@ -16,7 +16,7 @@ use super::class::PAGE;
 use super::place::Place;
 use super::remote::refuse;
 use super::settings::MAX_MESSAGE;
-use super::{keys, line};
+use super::{connection, keys};
 use dimos_rpc::api::Class;
 use dimos_rpc::client::{self, ClientError};
 use dimos_rpc::error::{Code, RpcError};
@@ -142,7 +142,7 @@ impl Page {
         let replies = asked.map_err(|_| lost())?;
         match replies.recv().map(|reply| reply.into_result()) {
             Ok(Ok(file)) => Ok(file.payload().to_bytes().into_owned()),
-            Ok(Err(error)) => Err(line::error_of(error.payload()).unwrap_or_else(lost).into()),
+            Ok(Err(error)) => Err(connection::error_of(error.payload()).unwrap_or_else(lost).into()),
             Err(_) => Err(lost().into()),
         }
     }

@@ -13,7 +13,7 @@ use std::time::Duration;
 use serde_json::json;
 
 use super::place::Place;
-use super::{line, remote_runs};
+use super::{connection, remote_runs};
 use dimos_rpc::client::ClientError;
 use dimos_rpc::error::{Code, RpcError};
 use dimos_rpc::run_dir::{Claim, RunDir};
@@ -90,7 +90,7 @@ fn connect(mut stream: UnixStream, place: &Place, run: &str) {
     let opened = remote_runs::open(place, Some(run), remote_runs::AGAIN_TIMEOUT);
     let served = opened.and_then(|(session, run)| {
         let other = stream.try_clone().map_err(|error| ClientError::Io { run: run.clone(), error })?;
-        line::serve(session, place, &run, other).map_err(|error| ClientError::Io { run, error })
+        connection::serve(session, place, &run, other).map_err(|error| ClientError::Io { run, error })
     });
     let Err(error) = served else { return };
     let refusal = match error {

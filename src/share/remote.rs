@@ -105,7 +105,7 @@ impl Remote {
             queue: Queue { to, waiting: AtomicUsize::new(0) },
             end: watch::Sender::new(None),
         });
-        let line = Line {
+        let connection = Connection {
             remote: remote.clone(),
             session: ways.session.clone(),
             run: ways.run.to_owned(),
@@ -115,7 +115,7 @@ impl Remote {
         let (socket, behalf) = (ways.socket.to_owned(), ways.cancel_at_end);
         std::thread::Builder::new().name("client".into()).spawn(move || {
             let runtime = tokio::runtime::Builder::new_current_thread().enable_io().enable_time().build();
-            let served = runtime.map(|runtime| runtime.block_on(line.serve(requests, &socket, behalf)));
+            let served = runtime.map(|runtime| runtime.block_on(connection.serve(requests, &socket, behalf)));
             if let Err(e) = served {
                 tracing::warn!("share: cannot serve a client: {e}");
             }
@@ -191,7 +191,7 @@ pub(super) fn refuse(query: &Query, error: &RpcError) {
 }
 
 /// One connection to the run.
-struct Line {
+struct Connection {
     remote: Arc<Remote>,
     session: Session,
     run: String,
@@ -200,7 +200,7 @@ struct Line {
     next: u64,
 }
 
-impl Line {
+impl Connection {
     /// Serves until the connection ends, and refuses what is without a reply then.
     async fn serve(mut self, mut requests: Receiver<Request>, socket: &Path, behalf: bool) {
         let mut end = self.remote.end.subscribe();

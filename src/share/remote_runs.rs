@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use zenoh::Session;
 
-use super::line;
+use super::connection;
 use super::page::Page;
 use super::place::Place;
 use super::settings::OPEN_TIMEOUT;
@@ -20,22 +20,22 @@ pub(super) const AGAIN_TIMEOUT: Duration = Duration::from_millis(500);
 /// Returns the runs that a place shares with us: an endpoint, or a name in `places.yaml`.
 pub fn runs(place: &str) -> Result<Vec<LiveRun>, ClientError> {
     let found = find(place)?;
-    let session = line::open(&found, OPEN_TIMEOUT)?;
-    Ok(live(place, line::runs(&session)))
+    let session = connection::open(&found, OPEN_TIMEOUT)?;
+    Ok(live(place, connection::runs(&session)))
 }
 
 /// Connects to the run of this name at a place; without a name, to the one that the place names, or the only one.
 pub fn connect(place: &str, run: Option<&str>) -> Result<Client, ClientError> {
     let found = find(place)?;
     let (session, name) = open(&found, run, OPEN_TIMEOUT)?;
-    line::connect(session, &found, &name)
+    connection::connect(session, &found, &name)
 }
 
 /// Connects to the run of this name again, after a loss: gives up after half a second where nothing answers.
 pub fn connect_again(place: &str, run: &str) -> Result<Client, ClientError> {
     let found = find(place)?;
     let (session, name) = open(&found, Some(run), AGAIN_TIMEOUT)?;
-    line::connect(session, &found, &name)
+    connection::connect(session, &found, &name)
 }
 
 /// Opens the live view of a run at a place, as [`connect`] finds it.
@@ -47,8 +47,8 @@ pub fn page(place: &str, run: Option<&str>) -> Result<Page, ClientError> {
 
 /// Opens a session with a place for one of its runs; returns the run's name.
 pub(super) fn open(place: &Place, run: Option<&str>, timeout: Duration) -> Result<(Session, String), ClientError> {
-    let session = line::open(place, timeout)?;
-    let mut names = line::runs(&session);
+    let session = connection::open(place, timeout)?;
+    let mut names = connection::runs(&session);
     let name = match run.map(str::to_owned).or_else(|| place.run.clone()) {
         Some(name) if names.contains(&name) => name,
         Some(_) | None if names.is_empty() => return Err(nothing(place).into()),

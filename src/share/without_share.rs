@@ -20,12 +20,12 @@ impl Gateway {
         Err(lacking())
     }
 
-    /// Returns why a face does not serve.
-    pub fn face_error(&self) -> Option<&RpcError> {
+    /// Returns why a bridge does not serve.
+    pub fn bridge_error(&self) -> Option<&RpcError> {
         None
     }
 
-    /// Returns which faces do not serve.
+    /// Returns which bridges do not serve.
     pub fn not_serving(&self) -> Vec<String> {
         match *self {}
     }

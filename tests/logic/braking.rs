@@ -2,20 +2,20 @@
 //! it, brakes along its path in the coordinator's ticks, and keeps the padding until it is at rest. `DIMOS_BRAKING` is
 //! the number of motions (80), `SEED` repeats a run.
 
+use dimos::joint::{CommandLimits, ControlMode, JointLimits, joints_of};
 use std::collections::VecDeque;
 use std::time::Duration;
 
 use dimos::arm::{ArmState, Link, Supervision, VelocitySource};
 use dimos::clock::Mono;
-use dimos::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
+use dimos::collision::{CheckSettings, CollisionChecker, ExactChecker, Stop};
 use dimos::control::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, TaskConfig, TaskKind, TrajectoryParams};
 use dimos::control::coordinator::{Coordinator, TickTime};
 use dimos::control::request::{Envelope, Motion, Request};
 use dimos::control::task_spec::TaskTable;
-use dimos::joint::{ControlMode, JointLimits, joints_of};
 use dimos::planning::request::ahead::{look_ahead, rests_before};
 use dimos::planning::request::pipeline::{self, Goal, PlannedMotion, solve};
-use dimos::planning::scene::config::{JointBounds, ObjectConfig, ObjectShape};
+use dimos::planning::scene::config::{ObjectConfig, ObjectShape};
 use dimos::planning::scene::planning_scene::{PlanningScene, obstacle};
 use dimos::planning::search::level::Level;
 use dimos::robot::random::Random;
@@ -188,7 +188,7 @@ fn too_close(judge: &ExactChecker, q: &[f64]) -> Option<f64> {
 fn setup() -> PlanningScene {
     let loaded = Run::from_name("yourarm-planner").unwrap().check();
     let setup = PlanningScene::load(loaded.blueprint.unwrap().planner.as_ref().unwrap()).unwrap();
-    let bounds = JointBounds {
+    let bounds = CommandLimits {
         position: [-3.0, 3.0],
         velocity: 3.0,
         acceleration: ACCELERATION,
@@ -201,7 +201,7 @@ fn setup() -> PlanningScene {
 #[test]
 fn planned_motions_keep_the_jerk_limit_in_what_is_commanded() {
     let (setup, mut random) = (setup(), Random::new(4));
-    let mut checker = ExactChecker::new(setup.world.snapshot(), Resolution::default());
+    let mut checker = ExactChecker::new(setup.world.snapshot(), CheckSettings::default());
     let mut motions = 0;
     while motions < 10 {
         let Some(found) = motion(&setup, &mut checker, &mut random) else { continue };
@@ -231,7 +231,7 @@ fn cancelled_motions_brake_before_an_obstacle_in_their_way() {
     let mut random = Random::new(seed);
     let setup = setup();
     assert!(setup.padding > 0.0);
-    let mut checker = ExactChecker::new(setup.world.snapshot(), Resolution::default());
+    let mut checker = ExactChecker::new(setup.world.snapshot(), CheckSettings::default());
     let (mut held, mut too_late, mut beside, mut nearest) = (0, 0, 0, f64::INFINITY);
     while held < cases {
         let Some(found) = motion(&setup, &mut checker, &mut random) else { continue };
@@ -255,7 +255,7 @@ fn cancelled_motions_brake_before_an_obstacle_in_their_way() {
             while run.task.1 < moment {
                 run.step();
             }
-            let judge = ExactChecker::new(world.snapshot(), Resolution::default()).with_padding(setup.padding);
+            let judge = ExactChecker::new(world.snapshot(), CheckSettings::default()).with_padding(setup.padding);
             // The request takes a few ticks.
             (0..random.below(6)).for_each(|_| run.step());
             run.ask(Request::Cancel { task: Some(0) });

@@ -9,7 +9,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Folders and files whose text is checked.
-const CHECKED: [&str; 11] = [
+const CHECKED: [&str; 12] = [
     "src",
     "crates",
     "tests",
@@ -17,6 +17,7 @@ const CHECKED: [&str; 11] = [
     "blueprints",
     "docs",
     "assets",
+    "viewer/src",
     "README.md",
     "CHANGELOG.md",
     "CONTRIBUTING.md",
@@ -25,7 +26,21 @@ const CHECKED: [&str; 11] = [
 /// Texts of other programs, and the lists themselves.
 const FIXTURES: &str = "tests/fixtures";
 /// File types besides Rust that are checked as a whole.
-const TEXT_TYPES: [&str; 6] = ["md", "py", "yaml", "json", "urdf", "service"];
+const TEXT_TYPES: [&str; 9] = ["md", "py", "yaml", "json", "urdf", "service", "ts", "css", "html"];
+/// Identifiers that a term of the field has replaced, in code of any language.
+const REPLACED: [&str; 11] = [
+    "motion_is_easily_free", // certify_within_budget
+    "look_blocked",          // any_contact_batch
+    "GivenUp",               // PaddingException
+    "give_up",               // relax
+    "give_up_again",         // relax_again
+    "kept_on",               // clearance_along
+    "Looking",               // EdgeCheck::Coarse
+    "JointBound",            // JointBounds
+    "Face",                  // Bridge
+    "rival",                 // conflict
+    "rivals",                // conflicts
+];
 /// Ends a sentence: no phrase continues over it.
 const BREAK: &str = ".";
 
@@ -237,6 +252,18 @@ fn comments_messages_and_documents_use_none_of_the_listed_phrases() {
     assert!(wrong.is_empty(), "{} phrases:\n{}", wrong.len(), wrong.join("\n"));
     let clean: Vec<&String> = pending.iter().filter(|path| !still_pending.contains(path)).collect();
     assert!(clean.is_empty(), "clean now, remove from tests/fixtures/phrases_pending.txt: {clean:?}");
+}
+
+#[test]
+fn code_uses_none_of_the_replaced_identifiers() {
+    let mut wrong = Vec::new();
+    for path in files().into_iter().filter(|path| path.extension().is_some_and(|kind| kind == "rs" || kind == "ts")) {
+        let code = fs::read_to_string(&path).unwrap();
+        let names = code.split(|c: char| !c.is_alphanumeric() && c != '_');
+        let found = names.filter(|name| REPLACED.contains(name)).collect::<BTreeSet<_>>();
+        wrong.extend(found.into_iter().map(|name| format!("{}: {name}", path.display())));
+    }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }
 
 #[test]

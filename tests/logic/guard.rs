@@ -1,6 +1,7 @@
 //! The collision guard of the tick: whatever streams ask, nothing touches, and arms that are in nothing's way move as
 //! without it.
 
+use dimos::collision::settings::GuardSettings;
 use dimos::collision::{OwnMargins, World};
 use dimos::control::config::TaskConfig;
 use dimos::control::request::Request;
@@ -338,7 +339,7 @@ fn a_guarded_run_replays_bit_for_bit() {
     run.states[0].position = joints_of(&HOME);
     let mut world = bench();
     world.add(post()).unwrap();
-    let own = OwnMargins::of(&world.snapshot(), MARGINS.1);
+    let own = OwnMargins::of(&world.snapshot(), MARGINS.1, &GuardSettings::default());
     run.coordinator.set_guard(Some(prepared(&world.snapshot(), &own, &HOME)));
     run.step();
     run.ask(Request::Enabled { arm: 0, outside: false });

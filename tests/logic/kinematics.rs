@@ -4,7 +4,8 @@ use std::collections::HashMap;
 use std::time::Instant;
 
 use dimos::collision::Stop;
-use dimos::planning::ik::{Ik, IkSettings};
+use dimos::planning::ik::Ik;
+use dimos::planning::ik::settings::IkSettings;
 use dimos::robot::kinematics::Kinematics;
 use dimos::robot::model::RobotModel;
 use dimos::robot::random::Random;

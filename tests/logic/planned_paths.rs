@@ -5,8 +5,9 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use dimos::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
-use dimos::planning::search::path_planner::{PlanSettings, plan};
+use dimos::collision::{CheckSettings, CollisionChecker, ExactChecker, Stop};
+use dimos::planning::search::path_planner::plan;
+use dimos::planning::search::settings::PlanSettings;
 use dimos::robot::builtin;
 use dimos::robot::model::JointKind;
 use dimos::robot::random::Random;
@@ -78,7 +79,7 @@ fn judged(python: &Path, name: &str, urdf: &Path, package: Option<(&str, &Path)>
     for index in 0..number {
         let things = obstacles(&mut random);
         let scene = arm.scene(&kinematics, &read(&record(index, &things, [&[], &[]], &ignored)), Shapes::True).unwrap();
-        let mut checker = ExactChecker::new(scene, Resolution::default());
+        let mut checker = ExactChecker::new(scene, CheckSettings::default());
         let ends = (free(&mut checker, &mut random), free(&mut checker, &mut random));
         let (Some(start), Some(goal)) = ends else { continue };
         let mut settings = PlanSettings { seed: index as u64, refine: 4, ..PlanSettings::default() };

@@ -10,15 +10,19 @@ use std::time::{Duration, Instant};
 
 use dimos::collision::body::{MeshMode, solids};
 use dimos::collision::world::{Obstacle, Robot};
-use dimos::collision::{CollisionChecker, ExactChecker, Resolution, Solid, Stop, World};
-use dimos::planning::ik::cartesian::{LineSettings, Shortfall, straight_line};
+use dimos::collision::{CheckSettings, CollisionChecker, ExactChecker, Solid, Stop, World};
+use dimos::joint::JointBounds;
+use dimos::planning::ik::cartesian::{Shortfall, straight_line};
+use dimos::planning::ik::settings::LineSettings;
 use dimos::planning::search::level::Level;
 use dimos::planning::search::path::{distance, tidy};
-use dimos::planning::search::path_planner::{PlanError, PlanSettings, plan};
-use dimos::planning::search::shortcut::{ShortcutSettings, shorten};
+use dimos::planning::search::path_planner::{PlanError, plan};
+use dimos::planning::search::settings::{PlanSettings, ShortcutSettings};
+use dimos::planning::search::shortcut::shorten;
 use dimos::planning::timing::blend::curves;
-use dimos::planning::timing::topp::{JointBound, parameterize};
-use dimos::planning::timing::{TimingSettings, time};
+use dimos::planning::timing::settings::TimingSettings;
+use dimos::planning::timing::time;
+use dimos::planning::timing::topp::parameterize;
 use dimos::robot::kinematics::Kinematics;
 use dimos::robot::random::Random;
 use dimos::robot::{builtin, urdf};
@@ -42,7 +46,7 @@ fn panda() -> Option<(Arm, Vec<Problem>)> {
 fn checker(arm: &Arm, problem: &Problem) -> (ExactChecker, Arc<Kinematics>) {
     let kinematics = Arc::new(arm.kinematics(problem).unwrap());
     let scene = arm.scene(&kinematics, problem, Shapes::True).unwrap();
-    (ExactChecker::new(scene, Resolution::default()), kinematics)
+    (ExactChecker::new(scene, CheckSettings::default()), kinematics)
 }
 
 #[test]
@@ -172,7 +176,7 @@ fn two_arms() -> ExactChecker {
     for (name, solid) in things {
         world.add(Obstacle { name: name.into(), solid: solid.unwrap(), padding: 0.0 }).unwrap();
     }
-    ExactChecker::new(world.snapshot(), Resolution::default())
+    ExactChecker::new(world.snapshot(), CheckSettings::default())
 }
 
 #[test]
@@ -201,7 +205,7 @@ fn two_arms_are_planned_together_without_any_setting() {
 
 #[test]
 fn a_folded_elbow_cannot_be_reached_from_a_straight_one_and_the_links_in_the_way_are_named() {
-    let mut checker = ExactChecker::new(world_of(&[("arm", 0.0)]).snapshot(), Resolution::default());
+    let mut checker = ExactChecker::new(world_of(&[("arm", 0.0)]).snapshot(), CheckSettings::default());
     for goal in [[0.3, -0.4, 2.3, 0.5, -0.8, 0.2], [-0.8, 0.6, 2.4, -1.0, 0.6, 1.0]] {
         let settings = PlanSettings { level: Level::Fast, ..PlanSettings::default() };
         let found = plan(&mut checker, &[0.0; 6], &[goal.to_vec()], &settings, &Stop::never());
@@ -219,11 +223,12 @@ fn speeds_are_as_high_as_toppras() {
     for n in [2, 3, 5, 8] {
         for _ in 0..5 {
             let path: Vec<Vec<f64>> = (0..n).map(|_| (0..6).map(|_| random.between(-1.5, 1.5)).collect()).collect();
-            let bounds: Vec<JointBound> = (0..6)
-                .map(|_| JointBound {
+            let bounds: Vec<JointBounds> = (0..6)
+                .map(|_| JointBounds {
                     velocity: random.between(0.5, 3.0),
                     acceleration: random.between(1.0, 8.0),
                     jerk: f64::INFINITY,
+                    ..JointBounds::NONE
                 })
                 .collect();
             let names: Vec<String> = (0..6).map(|j| format!("j{j}")).collect();
@@ -239,18 +244,18 @@ fn speeds_are_as_high_as_toppras() {
                 }
                 start += piece.length;
             }
-            let of = |f: fn(&JointBound) -> f64| bounds.iter().map(f).collect::<Vec<f64>>();
+            let of = |f: fn(&JointBounds) -> f64| bounds.iter().map(f).collect::<Vec<f64>>();
             asked.push(
                 json!({ "s": s, "q": q, "velocity": of(|b| b.velocity), "acceleration": of(|b| b.acceleration) }),
             );
-            let settings = TimingSettings { deviation: 0.1, speed: 1.0 };
+            let settings = TimingSettings { deviation: 0.1, ..TimingSettings::default() };
             let timed = time(&names, &path, &bounds, &settings, |_, _| true).unwrap();
             assert!(
                 timed.excess.velocity <= 1.0 + 1e-6 && timed.excess.acceleration <= 1.0 + 1e-6,
                 "{:?}",
                 timed.excess
             );
-            own.push((parameterize(curve, &bounds).last().unwrap().time, timed.duration));
+            own.push((parameterize(curve, &bounds, settings.corner_intervals).last().unwrap().time, timed.duration));
         }
     }
     assert!(own.len() > 10);
@@ -269,7 +274,7 @@ fn jerk_stays_within_its_limits_and_speed_scales_the_whole() {
     let names: Vec<String> = (0..7).map(|j| format!("j{j}")).collect();
     for n in [2, 4] {
         let path: Vec<Vec<f64>> = (0..n).map(|_| (0..7).map(|_| random.between(-1.5, 1.5)).collect()).collect();
-        let bounds = [JointBound { velocity: 2.0, acceleration: 5.0, jerk: 40.0 }; 7];
+        let bounds = [JointBounds { velocity: 2.0, acceleration: 5.0, jerk: 40.0, ..JointBounds::NONE }; 7];
         let full = time(&names, &path, &bounds, &TimingSettings::default(), |_, _| true).unwrap();
         let half = TimingSettings { speed: 0.5, ..TimingSettings::default() };
         let half = time(&names, &path, &bounds, &half, |_, _| true).unwrap();

@@ -1,18 +1,19 @@
 //! Trajectories with jerk limits: measured sample by sample, as an arm gets them.
 
+use dimos::joint::JointBounds;
 use dimos::planning::search::path::{distance, tidy};
-use dimos::planning::timing::topp::JointBound;
-use dimos::planning::timing::{Timed, TimingSettings, time};
+use dimos::planning::timing::settings::TimingSettings;
+use dimos::planning::timing::{Timed, time};
 use dimos::robot::random::Random;
 use dimos::trajectory::{Cursor, Sample, Spline};
 
 const NAMES: [&str; 7] = ["a", "b", "c", "d", "e", "f", "g"];
 
 /// Limits of joints that differ.
-fn bounds(jerk: f64) -> Vec<JointBound> {
+fn bounds(jerk: f64) -> Vec<JointBounds> {
     let joint = |j: usize| {
         let part = 1.0 + 0.15 * j as f64;
-        JointBound { velocity: 2.0 * part, acceleration: 5.0 / part, jerk: jerk * part }
+        JointBounds { velocity: 2.0 * part, acceleration: 5.0 / part, jerk: jerk * part, ..JointBounds::NONE }
     };
     (0..7).map(joint).collect()
 }
@@ -34,9 +35,9 @@ fn wave(count: usize) -> Vec<Vec<f64>> {
     (0..count).map(at).collect()
 }
 
-fn timed(path: &[Vec<f64>], bounds: &[JointBound], deviation: f64) -> Timed {
+fn timed(path: &[Vec<f64>], bounds: &[JointBounds], deviation: f64) -> Timed {
     let names: Vec<String> = NAMES.iter().map(|n| (*n).to_owned()).collect();
-    time(&names, path, bounds, &TimingSettings { deviation, speed: 1.0 }, |_, _| true).unwrap()
+    time(&names, path, bounds, &TimingSettings { deviation, ..TimingSettings::default() }, |_, _| true).unwrap()
 }
 
 /// Distance of a configuration from a path.
@@ -93,9 +94,16 @@ fn a_jerk_limit_costs_little_time_where_lines_are_long() {
     for seed in 0..3 {
         let path = walk(30, 3.0, seed);
         for deviation in [0.05, 0.001] {
-            let quickest =
-                timed(&path, &[JointBound { velocity: 2.0, acceleration: 5.0, jerk: f64::INFINITY }; 7], deviation);
-            let smooth = timed(&path, &[JointBound { velocity: 2.0, acceleration: 5.0, jerk: 50.0 }; 7], deviation);
+            let quickest = timed(
+                &path,
+                &[JointBounds { velocity: 2.0, acceleration: 5.0, jerk: f64::INFINITY, ..JointBounds::NONE }; 7],
+                deviation,
+            );
+            let smooth = timed(
+                &path,
+                &[JointBounds { velocity: 2.0, acceleration: 5.0, jerk: 50.0, ..JointBounds::NONE }; 7],
+                deviation,
+            );
             let ratio = smooth.duration / quickest.duration;
             assert!((1.0..1.11).contains(&ratio), "seed {seed}, deviation {deviation}: {ratio}");
         }
@@ -106,7 +114,7 @@ fn a_jerk_limit_costs_little_time_where_lines_are_long() {
 fn a_smooth_curve_is_not_slowed_down_at_each_of_its_short_pieces() {
     // At constant speed in each corner it would take twice as long: 10.7 and 5.7 s.
     for (jerk, most) in [(50.0, 5.6), (f64::INFINITY, 2.1)] {
-        let bounds = [JointBound { velocity: 2.0, acceleration: 5.0, jerk }; 7];
+        let bounds = [JointBounds { velocity: 2.0, acceleration: 5.0, jerk, ..JointBounds::NONE }; 7];
         let duration = timed(&wave(60), &bounds, 1e-3).duration;
         assert!(duration < most, "jerk {jerk}: {duration} s");
     }

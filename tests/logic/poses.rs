@@ -1,13 +1,14 @@
 //! One meaning for a pose: what `state` prints is what a pose goal means, for every robot of every shipped planner
 //! blueprint. A plan to the printed pose moves nothing, also for redundant arms, bases off the origin, and tools.
 
+use dimos::joint::CommandLimits;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use dimos::blueprint::{self, Overrides, find, load};
 use dimos::collision::Stop;
 use dimos::planning::request::pipeline::{Goal, PlanFailure, PlanRequest, PlannedMotion, solve};
-use dimos::planning::scene::config::{JointBounds, PlannerConfig};
+use dimos::planning::scene::config::PlannerConfig;
 use dimos::planning::scene::planning_scene::{PlannedRobot, PlanningScene};
 use dimos::planning::search::level::Level;
 use dimos::pose::{from_xyz_rpy, to_xyz_rpy};
@@ -150,7 +151,7 @@ fn a_printed_pose_at_a_limit_moves_the_arm_just_inside() {
         let robot = &scene.robots[0];
         let (joint, limits) = (&robot.config.coordinator_joints[1], &robot.limits[1]);
         let (rate, wide) = (limits.velocity.min(3.0), 20.0);
-        let bounds = JointBounds {
+        let bounds = CommandLimits {
             tcp_velocity: None,
             position: [start[1] + 0.008, limits.upper],
             velocity: rate,

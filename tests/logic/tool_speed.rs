@@ -7,11 +7,10 @@ use std::collections::HashMap;
 use dimos::blueprint::{Arm, Overrides, find, load};
 use dimos::control::config::{ArmConfig, TaskKind, ToolLimit};
 use dimos::control::point_to_point::point_to_point;
-use dimos::joint::ControlMode;
-use dimos::joint::JointLimits;
+use dimos::joint::{ControlMode, JointBounds, JointLimits};
+use dimos::planning::timing::settings::{TimingSettings, ToolTimingSettings};
 use dimos::planning::timing::time_within;
 use dimos::planning::timing::tool_timing::Tools;
-use dimos::planning::timing::topp::JointBound;
 use dimos::robot::model::RobotModel;
 use dimos::robot::random::Random;
 use dimos::telemetry::{Event, LimitKind};
@@ -74,12 +73,13 @@ impl Limited {
         self.arm.own_limits.clone().with_defaults()
     }
 
-    fn bounds(&self, speed: f64) -> Vec<JointBound> {
+    fn bounds(&self, speed: f64) -> Vec<JointBounds> {
         let l = self.limits();
-        let bound = |j: usize| JointBound {
+        let bound = |j: usize| JointBounds {
             velocity: l.velocity_max[j] * speed,
             acceleration: l.acceleration_max[j] * speed,
             jerk: l.jerk_max[j] * speed,
+            ..JointBounds::NONE
         };
         (0..self.joints.len()).map(bound).collect()
     }
@@ -97,7 +97,7 @@ impl Limited {
     }
 
     /// Checks a motion as it is sampled; returns the tool's top speed [m/s].
-    fn judge(&self, motion: &JointTrajectory, bounds: &[JointBound], speed: f64, what: &str) -> f64 {
+    fn judge(&self, motion: &JointTrajectory, bounds: &[JointBounds], speed: f64, what: &str) -> f64 {
         let spline = Spline::new(motion).unwrap();
         let (mut cursor, mut samples) = (Cursor::default(), vec![Sample::default(); self.joints.len()]);
         let (mut before, mut top, dt) = (None::<Vec<f64>>, 0.0_f64, (spline.duration() / 600.0).max(1e-3));
@@ -128,7 +128,7 @@ fn direct_motions_and_timed_paths_keep_the_speed_of_the_tool() {
             let bounds = arm.bounds(1.0);
             let (start, goal) = (arm.pose(&mut random), arm.pose(&mut random));
             let direct = point_to_point(&arm.joints, &start, &goal, &arm.limits(), speed).unwrap();
-            if let Some(slower) = arm.tools().slowed(&direct, &bounds, speed) {
+            if let Some(slower) = arm.tools().slowed(&direct, &bounds, speed, &ToolTimingSettings::default()) {
                 shares.push(
                     arm.judge(&slower, &bounds, speed, &format!("direct motion {k}")) / (arm.limit.velocity * speed),
                 );
@@ -139,8 +139,10 @@ fn direct_motions_and_timed_paths_keep_the_speed_of_the_tool() {
             let bounds = arm.bounds(speed);
             let path: Vec<Vec<f64>> = (0..2 + random.below(4)).map(|_| arm.pose(&mut random)).collect();
             let deviation = vec![0.05; path.len()];
-            let timed = time_within(&arm.joints, &path, &bounds, &deviation, 1.0, |_, _| true).unwrap().trajectory;
-            let kept = arm.tools().slowed(&timed, &bounds, speed).unwrap_or(timed);
+            let timed = time_within(&arm.joints, &path, &bounds, &deviation, &TimingSettings::default(), |_, _| true)
+                .unwrap()
+                .trajectory;
+            let kept = arm.tools().slowed(&timed, &bounds, speed, &ToolTimingSettings::default()).unwrap_or(timed);
             arm.judge(&kept, &bounds, speed, &format!("path {k}"));
         }
         // Not by being slow: most motions that are slowed use nearly the whole limit.
@@ -159,7 +161,7 @@ fn a_slowed_motion_takes_little_longer_than_its_tool_needs() {
     let (mut stretched, mut goal) = (poses.clone().unwrap(), poses.unwrap());
     (stretched[0], goal[0]) = (0.0, 2.4);
     let direct = point_to_point(&arm.joints, &stretched, &goal, &arm.limits(), 1.0).unwrap();
-    let slower = arm.tools().slowed(&direct, &bounds, 1.0).unwrap();
+    let slower = arm.tools().slowed(&direct, &bounds, 1.0, &ToolTimingSettings::default()).unwrap();
     let way = 2.4 * radius(&stretched);
     let least = way / arm.limit.velocity;
     assert!(slower.duration() < least + 0.5, "{:.2} s for {way:.2} m, at least {least:.2} s", slower.duration());

@@ -2,7 +2,7 @@
 //! Judged from the positions of the emulated joints and a collision checker of its own.
 
 use dimos::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
-use dimos::collision::{CollisionChecker, ExactChecker, Resolution};
+use dimos::collision::{CheckSettings, CollisionChecker, ExactChecker};
 use dimos::hardware::registry::Emulator;
 use dimos::planning::scene::planning_scene::{PlanningScene, obstacle};
 use dimos::rpc::api::{
@@ -88,7 +88,7 @@ impl Cell {
             };
             world.put(obstacle(&config).unwrap()).unwrap();
         }
-        let mut checker = ExactChecker::new(world.snapshot(), Resolution::default());
+        let mut checker = ExactChecker::new(world.snapshot(), CheckSettings::default());
         assert!(checker.is_free(q), "{:?}", checker.contacts(q));
         let near = checker.with_padding(1.0).closer_than_padding(q);
         let own = |name: &str| objects.iter().any(|object| object.name == name);

@@ -277,7 +277,7 @@ fn damaged_logs_give_all_that_is_left_and_say_what_is_missing() {
     }
     home.dimos("log info in/split_empty").with(5).says(&["split_empty_2.mcap is empty"]);
     home.dimos("log info in/split_no_log").with(5).says(&["split_no_log_2.mcap is not an MCAP file"]);
-    // A copy of a copy, however it is made.
+    // A copy that is copied again, by each way of copying.
     home.dimos("log recover out/copy.mcap -o out/copy-2.mcap").with(5).says(&["a.txt"]);
     home.dimos("log export out/copy-2.mcap --rosbag2 out/copy-3").with(5).says(&["a.txt"]);
     home.dimos("log doctor out/copy-3").with(5).shows(&["a.txt"]);

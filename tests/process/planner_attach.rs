@@ -455,7 +455,7 @@ fn a_motion_of_an_attached_planner_obeys_a_world_that_changes() {
     let moving = home.start("move arm 1.4 -0.3 0.6 0 0.8 0 --speed 0.2 --replan");
     eventually("it moves", || home.positions("arm")[0] > 0.1);
     home.dimos("world add late --sphere 0.03 --at 0.17 0.215 0.36").with(0);
-    moving.wait().with(0).says(&["in its way after", "obstacle \"late\"", "continued as motion"]);
+    moving.wait().with(0).says(&["path blocked in", "obstacle \"late\"", "continued as motion"]);
     is_at(&home, &[1.4, -0.3, 0.6, 0.0, 0.8, 0.0]);
     home.dimos("world remove late").with(0);
     let moving = home.start("move arm --named home --speed 0.2");

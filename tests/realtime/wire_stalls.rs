@@ -133,7 +133,7 @@ fn position_case(bed: &Bed, kind: Kind, time: Duration) -> Vec<String> {
     } else if must_hold(&bed.arm, kind, time) {
         verdicts.push(Err(format!("it is {phase} after {time:?} of silence")));
     }
-    // What is lost is waited for in vain, for longer than the stall.
+    // A lost reply is awaited for longer than the stall.
     let lossless = !matches!(kind, Kind::Wire(Stall::Trickle | Stall::Drop));
     if phase == "held" && by_the_stall && lossless && time.as_secs_f64() < bed.bounds.stale_after {
         verdicts.push(Err(format!("held ({cause}) though no state was older than it may be")));

@@ -3,8 +3,9 @@
 use std::sync::Arc;
 
 use dimos::collision::cloud::Cloud;
+use dimos::collision::settings::GuardSettings;
 use dimos::collision::world::{Obstacle, Robot};
-use dimos::collision::{CollisionChecker, ExactChecker, OwnMargins, Resolution, Scene, Solid, World};
+use dimos::collision::{CheckSettings, CollisionChecker, ExactChecker, OwnMargins, Scene, Solid, World};
 use dimos::control::config::{ArmConfig, TaskConfig};
 use dimos::control::guard::GuardWorld;
 use dimos::planning::scene::planning_scene::{always_touch, whole};
@@ -90,8 +91,8 @@ impl Guarded {
             arm.q.copy_from_slice(&home[first..first + arm.dof]);
             first += arm.dof;
         }
-        let checker = ExactChecker::new(world.snapshot(), Resolution::default());
-        let own = OwnMargins::of(&world.snapshot(), MARGINS.1);
+        let checker = ExactChecker::new(world.snapshot(), CheckSettings::default());
+        let own = OwnMargins::of(&world.snapshot(), MARGINS.1, &GuardSettings::default());
         Self { rig, world, own, checker, last: home.to_vec() }
     }
 
@@ -99,7 +100,7 @@ impl Guarded {
     pub fn take_world(&mut self, change: impl FnOnce(&mut World)) {
         change(&mut self.world);
         let scene = self.world.snapshot();
-        self.checker = ExactChecker::new(scene.clone(), Resolution::default());
+        self.checker = ExactChecker::new(scene.clone(), CheckSettings::default());
         let world = prepared(&scene, &self.own, &self.q());
         self.rig.coordinator.set_guard(Some(world));
     }

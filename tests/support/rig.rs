@@ -13,7 +13,7 @@ use dimos::control::config::*;
 use dimos::control::coordinator::{Coordinator, TickTime};
 use dimos::control::request::{Envelope, Motion, Request};
 use dimos::control::task_spec::TaskTable;
-use dimos::joint::{ControlMode, JointLimits, joints_of};
+use dimos::joint::{ControlMode, JointLimits, POSITION_MARGIN, joints_of};
 use dimos::telemetry::{ArmSample, Event, Origin, Outcome, Phase, TaskView};
 use dimos::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
 

@@ -1,4 +1,4 @@
-// What all panels share.
+// State that all panels share.
 import {Flow} from './flow';
 import {History} from './history';
 import {RpcError, type SceneArm, type SceneRobot} from './protocol';

@@ -11,7 +11,7 @@ export function makeView(context: Context, token: string): HTMLElement {
   const canvas = el('div', {class: 'canvas', id: 'view'});
   const stage = new Stage(canvas);
   context.view = new View(stage, context, token);
-  // For tests: what was drawn.
+  // For tests: the objects drawn.
   Object.assign(window, {dimos: {measured: stage.measured, run: context.run, memory: stage.renderer.info.memory}});
   return canvas;
 }

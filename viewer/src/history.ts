@@ -1,4 +1,4 @@
-// What the plots show: the last minutes of each joint, of the tracking error, and of the tick, in buffers that never grow.
+// Data of the plots: the last minutes of each joint, of the tracking error, and of the tick, in buffers that never grow.
 import type {JointState, State} from './protocol';
 
 export const LONGEST = 180; // s that are kept
@@ -100,7 +100,7 @@ export class History {
     this.takeTick(state);
   }
 
-  /** A state whose time is not exactly that of its tick: it tells nothing of lateness. */
+  /** A state whose time is not exactly that of its tick: it says nothing of lateness. */
   takePast(state: JointState): void {
     const names = state.name.join();
     if (names !== this.names) {

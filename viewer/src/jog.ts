@@ -149,7 +149,7 @@ export class Jog {
       this.problem = {text: known.message, hint};
       this.held.clear();
     }
-    // What made the run refuse may need the lease to be mended.
+    // The lease may be the reason of the refusal: release it.
     await run.work.request('release', {arm}, LATE).catch(() => {});
     this.active = run.streaming = false;
     if (this.held.size) void this.run();

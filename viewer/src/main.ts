@@ -60,7 +60,7 @@ async function main(): Promise<void> {
     enabled = !enabled;
     enableActs(enabled);
   }, 100);
-  // For tests: what was drawn, and how long the page's own code took.
+  // For tests: the objects drawn, and how long the page's own code took.
   Object.assign(window, {
     dimos: {measured: stage.measured, run, history: context.history, memory: stage.renderer.info.memory},
   });

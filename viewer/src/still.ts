@@ -1,4 +1,4 @@
-// What is not live, in the form of a run: the panels that show a run also show a log, or a model at joint positions.
+// A log or a model in the form of a run: the panels that show a run also show a log, or a model at joint positions.
 
 import type {Scene} from './protocol';
 import {Run} from './run';

@@ -20,8 +20,6 @@ pub use super::tool_limit::ToolLimit;
 
 /// A step of a command further than this from the one before it is refused [rad].
 pub const JUMP: f64 = 0.2;
-/// Commands stay this far inside the position limits [rad].
-pub const POSITION_MARGIN: f64 = 0.01;
 /// How long an arm only holds after it was enabled.
 pub const ACTIVATION_RAMP: Duration = Duration::from_millis(200);
 

@@ -2,8 +2,8 @@
 //! within the velocity and acceleration limits. A request within limits passes unchanged, bit for bit. A faster one is
 //! followed as closely as the limits allow, without overshoot. A jump is refused.
 
-use super::config::{JUMP, POSITION_MARGIN};
-use dimos_core::joint::braking_speed;
+use super::config::JUMP;
+use dimos_core::joint::{JointBounds, POSITION_MARGIN, braking_speed};
 use dimos_core::telemetry::LimitKind;
 
 /// Highest speed of a joint on its way back into its range [rad/s].
@@ -12,32 +12,6 @@ pub const WAY_BACK: f64 = 0.1;
 const AT_REST: f64 = 1e-6;
 /// Slack for rounding: a command at its limit is not "limited".
 const ROUNDING: f64 = 1e-9;
-
-/// Limits of one joint.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Bounds {
-    /// Lowest commanded position [rad].
-    pub lower: f64,
-    /// Highest commanded position [rad].
-    pub upper: f64,
-    /// Highest speed [rad/s].
-    pub velocity: f64,
-    /// Highest acceleration [rad/s²].
-    pub acceleration: f64,
-}
-
-impl Bounds {
-    /// Creates bounds, with the position range [rad] reduced by the margin.
-    pub fn inside(lower: f64, upper: f64, velocity: f64, acceleration: f64) -> Self {
-        let margin = POSITION_MARGIN.min((upper - lower) / 10.0);
-        Self { lower: lower + margin, upper: upper - margin, velocity, acceleration }
-    }
-
-    /// Returns how far a position is outside the range [rad]; 0 inside.
-    pub fn excess(&self, position: f64) -> f64 {
-        (self.lower - position).max(position - self.upper).max(0.0)
-    }
-}
 
 /// Why a command is refused.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -60,7 +34,7 @@ pub struct Limited {
 /// The limiter of one joint, with its last command.
 #[derive(Debug, Clone, Copy)]
 pub struct Limiter {
-    bounds: Bounds,
+    bounds: JointBounds,
     /// Last commanded position [rad].
     position: f64,
     /// Last commanded velocity [rad/s].
@@ -75,12 +49,12 @@ pub struct Limiter {
 
 impl Limiter {
     /// Creates the limiter of a joint at rest at 0; `seed` it before use.
-    pub fn new(bounds: Bounds) -> Self {
+    pub fn new(bounds: JointBounds) -> Self {
         Self { bounds, position: 0.0, velocity: 0.0, request: None, request_velocity: 0.0, covered: 0.0 }
     }
 
     /// Returns its bounds.
-    pub fn bounds(&self) -> &Bounds {
+    pub fn bounds(&self) -> &JointBounds {
         &self.bounds
     }
 
@@ -208,7 +182,7 @@ impl Limiter {
         let (lower, upper) = self.range();
         let goal = target.clamp(lower, upper);
         let asked = (goal - self.position) / dt;
-        let b = Bounds { velocity: self.velocity_limit() * speed, ..self.bounds };
+        let b = JointBounds { velocity: self.velocity_limit() * speed, ..self.bounds };
         let change = b.acceleration * self.time_to(dt);
         let possible = asked.abs() <= b.velocity * (1.0 + ROUNDING)
             && (asked - self.velocity).abs() <= change * (1.0 + ROUNDING) + ROUNDING
@@ -249,7 +223,7 @@ impl Limiter {
             return Err(Refusal::NonFinite);
         }
         self.forget_request();
-        let b = Bounds { velocity: self.velocity_limit() * speed, ..self.bounds };
+        let b = JointBounds { velocity: self.velocity_limit() * speed, ..self.bounds };
         let change = b.acceleration * self.time_to(dt);
         let slowest = self.speeds_inside(b.lower, b.upper, at.0, dt).0;
         let fastest = self.speeds_inside(b.lower, b.upper, at.1, dt).1;

@@ -6,7 +6,7 @@ use proptest::prelude::*;
 const DT: f64 = 0.01;
 
 fn limiter() -> Limiter {
-    Limiter::new(Bounds::inside(-2.0, 2.0, 1.5, 4.0))
+    Limiter::new(JointBounds::inside(-2.0, 2.0, 1.5, 4.0))
 }
 
 /// What was commanded is reported in the unit of the limit that applied, also of a velocity.
@@ -33,7 +33,7 @@ proptest! {
     fn whether_a_joint_stops_inside_is_whether_its_braking_speed_allows_it(
         v in -8.0..8.0f64, a in 0.1..60.0f64, room in 0.0..20.0f64, share in 0.0..2.0f64, dt in 0.0005..0.05f64,
     ) {
-        let l = Limiter::new(Bounds::inside(-2.0, 2.0, 8.0, a));
+        let l = Limiter::new(JointBounds::inside(-2.0, 2.0, 8.0, a));
         let at_the_limit = v * v / (2.0 * a) * share;
         for room in [room, at_the_limit] {
             prop_assert_eq!(l.stops_inside(v, room, dt), v.abs() <= braking_speed(room, a, dt) + ROUNDING);
@@ -43,9 +43,9 @@ proptest! {
 
 #[test]
 fn a_range_loses_its_margin_or_a_tenth_at_each_end() {
-    let wide = Bounds::inside(-2.0, 1.0, 1.5, 4.0);
+    let wide = JointBounds::inside(-2.0, 1.0, 1.5, 4.0);
     assert_eq!((wide.lower, wide.upper), (-2.0 + POSITION_MARGIN, 1.0 - POSITION_MARGIN));
-    let narrow = Bounds::inside(-0.01, 0.03, 1.5, 4.0);
+    let narrow = JointBounds::inside(-0.01, 0.03, 1.5, 4.0);
     assert!((narrow.lower - -0.006).abs() < 1e-12 && (narrow.upper - 0.026).abs() < 1e-12, "{narrow:?}");
     for (q, excess) in [(-2.5, 0.51), (-1.99, 0.0), (0.3, 0.0), (0.99, 0.0), (1.25, 0.26)] {
         assert!((wide.excess(q) - excess).abs() < 1e-12, "{q}: {}", wide.excess(q));

@@ -1,22 +1,17 @@
-//! A jerk-limited, time-synchronized motion from rest to rest, for `move`. Computed outside the tick.
+//! A direct motion from rest to rest, for `move`: a straight line in joint space. Computed outside the tick.
 //!
-//! Profiles by Ruckig (Berscheid and Kröger, "Jerk-limited real-time trajectory generation with arbitrary target
-//! states", RSS 2021). Between two changes of jerk each joint follows a cubic, so points at all changes, with
-//! positions and velocities, reproduce the motion exactly.
+//! The line is passed with a double-S profile ([`double_s`](dimos_core::double_s)), the one of planned motions. Between
+//! two changes of jerk each joint follows a cubic, so points at all changes, with positions and velocities, reproduce
+//! the motion exactly.
 
-use rsruckig::prelude::{DataArrayOrVec, InputParameter, Ruckig, Synchronization, ThrowErrorHandler, Trajectory};
-
-use dimos_core::joint::JointLimits;
+use dimos_core::double_s::LineLimits;
+use dimos_core::joint::{JointBounds, JointLimits};
 use dimos_core::trajectory::{JointTrajectory, JointValues, TrajectoryPoint};
 
 /// Points closer together than this are merged [s].
 const SAME_TIME: f64 = 1e-6;
 /// Duration of the shortest motion [s], also of one to the present position.
 const SHORTEST: f64 = 0.05;
-
-/// Factor of the jerk for each further attempt if the generator finds nothing, and number of attempts.
-const LESS_JERK: f64 = 0.999;
-const LESS_JERK_TRIES: usize = 3;
 
 /// Why there is no motion.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -35,14 +30,13 @@ pub enum MotionError {
         /// Distance of the target from that range [rad].
         excess: f64,
     },
-    /// The generator found no motion.
+    /// The path has no time parameterization.
     #[error("no motion found: {0}")]
     NotFound(String),
 }
 
-/// Returns the fastest motion from `start` to `target` [rad] with `speed` (0–1] times the joints' velocities, and
-/// accelerations and jerks scaled to match (`speed²`, `speed³`), so that it is the same motion, slower. `start`,
-/// `target` and `limits` have a value for each joint.
+/// Returns the fastest motion on the straight line from `start` to `target` [rad] within the limits, stretched in time
+/// by 1 / `speed` (0–1]. `start`, `target` and `limits` have a value for each joint.
 #[allow(clippy::indexing_slicing, reason = "a value for each joint; not on the tick's path")]
 pub fn point_to_point(
     joints: &[String],
@@ -51,9 +45,8 @@ pub fn point_to_point(
     limits: &JointLimits,
     speed: f64,
 ) -> Result<JointTrajectory, MotionError> {
-    let n = joints.len();
     for (j, joint) in joints.iter().enumerate() {
-        let bounds = super::limit::Bounds::inside(limits.position_lower[j], limits.position_upper[j], 1.0, 1.0);
+        let bounds = JointBounds::inside(limits.position_lower[j], limits.position_upper[j], 1.0, 1.0);
         // A joint that starts outside its limits may stay or move in.
         let (lower, upper) = (bounds.lower.min(start[j]), bounds.upper.max(start[j]));
         let excess = (lower - target[j]).max(target[j] - upper);
@@ -61,76 +54,39 @@ pub fn point_to_point(
             return Err(MotionError::OutOfLimits { joint: joint.clone(), target: target[j], lower, upper, excess });
         }
     }
-    let mut input = InputParameter::<0>::new(Some(n));
-    // A straight line in joint space, if the limits allow one: the expected path of a direct motion.
-    input.synchronization = Synchronization::Phase;
-    for j in 0..n {
-        input.current_position[j] = start[j];
-        input.target_position[j] = target[j];
-        input.max_velocity[j] = limits.velocity_max[j] * speed;
-        input.max_acceleration[j] = limits.acceleration_max[j] * speed * speed;
-        input.max_jerk[j] = limits.jerk_max[j] * speed.powi(3);
-    }
-    let mut generator = Ruckig::<0, ThrowErrorHandler>::new(Some(n), 0.01);
-    let mut found = Trajectory::<0>::new(Some(n));
-    // The generator finds nothing where a distance is exactly at the border between two shapes of profile, such as
-    // 2 a³/j². A little less jerk is on one side of it.
-    let mut result = generator.calculate(&input, &mut found);
-    for _ in 0..LESS_JERK_TRIES {
-        if result.is_ok() {
-            break;
-        }
-        (0..n).for_each(|j| input.max_jerk[j] *= LESS_JERK);
-        result = generator.calculate(&input, &mut found);
-    }
-    // The generator's message is a page of numbers; its first line names the error.
-    let first_line = |e: String| e.split("\\n").next().unwrap_or_default().to_owned();
-    result.map_err(|e| MotionError::NotFound(first_line(format!("{e:?}"))))?;
-    let duration = found.get_duration();
-    if duration < SHORTEST {
-        return Ok(stay(joints, start, target));
-    }
-    let mut times = vec![0.0, duration];
-    for profile in found.get_profiles().iter().flat_map(|section| section.iter()) {
-        // Rest to rest has neither a brake nor an acceleration phase before the seven steps.
-        times.extend(profile.t_sum.iter().filter(|t| **t < duration));
-    }
-    times.sort_by(f64::total_cmp);
-    times.dedup_by(|a, b| (*a - *b).abs() < SAME_TIME);
-    if let Some(last) = times.last_mut() {
-        *last = duration;
-    }
-    let mut points = Vec::with_capacity(times.len());
-    for time in times {
-        let (mut p, mut v, mut a) = (array(n), array(n), array(n));
-        found.at_time(time, &mut Some(&mut p), &mut Some(&mut v), &mut Some(&mut a), &mut None, &mut None);
-        points.push(TrajectoryPoint {
-            time_from_start: time,
-            positions: p.iter().copied().collect(),
-            velocities: v.iter().copied().collect(),
-            accelerations: JointValues::new(),
-        });
-    }
-    // The ends are exactly the requested positions, without rounding errors.
-    for (point, exact) in [(0, start), (points.len() - 1, target)] {
-        points[point].positions.copy_from_slice(exact);
-        points[point].velocities.fill(0.0);
-    }
-    Ok(JointTrajectory { joint_names: joints.to_vec(), points })
-}
-
-fn array(n: usize) -> DataArrayOrVec<f64, 0> {
-    DataArrayOrVec::new(Some(n), 0.0)
-}
-
-fn stay(joints: &[String], start: &[f64], target: &[f64]) -> JointTrajectory {
-    let point = |time_from_start, positions: &[f64]| TrajectoryPoint {
+    let way: JointValues = start.iter().zip(target).map(|(a, b)| b - a).collect();
+    // Along the line the position is 0 at the start and 1 at the target.
+    let most = |limits: &[f64]| way.iter().zip(limits).map(|(d, most)| most / d.abs()).fold(f64::INFINITY, f64::min);
+    let line = LineLimits {
+        speed: most(&limits.velocity_max),
+        acceleration: most(&limits.acceleration_max),
+        jerk: most(&limits.jerk_max),
+    };
+    let point = |time_from_start: f64, at: f64, speed: f64| TrajectoryPoint {
         time_from_start,
-        positions: positions.into(),
-        velocities: JointValues::from_elem(0.0, joints.len()),
+        positions: start.iter().zip(&way).map(|(a, d)| a + d * at).collect(),
+        velocities: way.iter().map(|d| d * speed).collect(),
         accelerations: JointValues::new(),
     };
-    JointTrajectory { joint_names: joints.to_vec(), points: vec![point(0.0, start), point(SHORTEST, target)] }
+    let mut points = vec![point(0.0, 0.0, 0.0)];
+    let mut duration = 0.0;
+    if line.speed.is_finite() {
+        line.travel(0.0, 0.0, 1.0, |state| {
+            if state.time - points.last().map_or(0.0, |last| last.time_from_start) >= SAME_TIME {
+                points.push(point(state.time, state.at, state.speed));
+            }
+            duration = state.time;
+        });
+    }
+    if duration < SHORTEST * speed {
+        points.truncate(1);
+        duration = SHORTEST * speed;
+    } else {
+        // The end, in place of a point just before it.
+        points.truncate((points.len() - 1).max(1));
+    }
+    points.push(TrajectoryPoint { positions: target.into(), ..point(duration, 1.0, 0.0) });
+    Ok(JointTrajectory { joint_names: joints.to_vec(), points }.scaled(speed))
 }
 
 #[cfg(test)]
@@ -160,6 +116,10 @@ mod tests {
             for k in 0..=(spline.duration() / h) as usize {
                 spline.sample(k as f64 * h, &mut cursor, &mut s);
                 for j in 0..6 {
+                    // On the straight line, at the same part of it as the first joint.
+                    let (way, first) = (target[j] - start[j], target[0] - start[0]);
+                    let off = (s[j].position - start[j]) * first - (s[0].position - start[0]) * way;
+                    prop_assert!(off.abs() < 1e-9, "off the line by {off}");
                     prop_assert!(s[j].velocity.abs() <= l.velocity_max[j] * speed * (1.0 + 1e-6));
                     prop_assert!(s[j].acceleration.abs() <= l.acceleration_max[j] * speed * speed * (1.0 + 1e-4) + 1e-6);
                     if let Some(b) = before {
@@ -182,6 +142,19 @@ mod tests {
         let said = point_to_point(&names, &[0.0, 0.0], &[0.0, 3.2], &limits(2), 1.0).unwrap_err().to_string();
         assert!(said.contains("arm_joint2") && said.contains("by 0.2100 rad"), "{said}");
         assert!(point_to_point(&names, &[0.0, 0.0], &[0.0, f64::NAN], &limits(2), 1.0).is_err());
+    }
+
+    /// The joint that takes longest determines the duration if all have the same ratio of their limits.
+    #[test]
+    fn the_duration_is_that_of_the_slowest_joint_and_speed_stretches_it() {
+        let names = dimos_core::joint::make_joints("arm", 3);
+        let l = limits(3);
+        let motion = |target: [f64; 3], speed| point_to_point(&names, &[0.0; 3], &target, &l, speed).unwrap();
+        let (v, a, j) = (l.velocity_max[0], l.acceleration_max[0], l.jerk_max[0]);
+        let expected = 2.0 / v + v / a + a / j;
+        assert!((motion([0.4, -2.0, 1.0], 1.0).duration() - expected).abs() < 1e-9);
+        assert!((motion([0.4, -2.0, 1.0], 0.2).duration() - 5.0 * expected).abs() < 1e-9);
+        assert!((motion([0.0, 1e-9, 0.0], 0.2).duration() - SHORTEST).abs() < 1e-12);
     }
 
     /// At 2 a³/j² the acceleration is reached for an instant.

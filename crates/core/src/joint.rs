@@ -87,6 +87,64 @@ impl ControlMode {
     }
 }
 
+/// Distance that commands keep from the ends of a joint's range [rad].
+pub const POSITION_MARGIN: f64 = 0.01;
+
+/// Limits of one joint, each a number: infinite where there is none. What a description leaves open is resolved before
+/// (`model::Limits` of `dimos-robot`, [`JointLimits::joint`]).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct JointBounds {
+    /// Lowest position [rad or m].
+    pub lower: f64,
+    /// Highest position [rad or m].
+    pub upper: f64,
+    /// Highest speed [rad/s or m/s].
+    pub velocity: f64,
+    /// Highest acceleration [rad/s² or m/s²].
+    pub acceleration: f64,
+    /// Highest jerk [rad/s³ or m/s³].
+    pub jerk: f64,
+}
+
+impl JointBounds {
+    /// No limits.
+    pub const NONE: Self = Self {
+        lower: f64::NEG_INFINITY,
+        upper: f64::INFINITY,
+        velocity: f64::INFINITY,
+        acceleration: f64::INFINITY,
+        jerk: f64::INFINITY,
+    };
+
+    /// Creates the bounds of commands: the range [rad] is reduced by [`POSITION_MARGIN`], a narrow one by less; the
+    /// jerk has no limit.
+    pub fn inside(lower: f64, upper: f64, velocity: f64, acceleration: f64) -> Self {
+        let margin = POSITION_MARGIN.min((upper - lower) / 10.0);
+        Self { lower: lower + margin, upper: upper - margin, velocity, acceleration, ..Self::NONE }
+    }
+
+    /// Returns how far a position is outside the range [rad or m]; 0 inside.
+    pub fn excess(&self, position: f64) -> f64 {
+        (self.lower - position).max(position - self.upper).max(0.0)
+    }
+}
+
+/// Limits of the commands to a joint.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+pub struct CommandLimits {
+    /// Lowest and highest position [rad]: the arm's own limits, narrowed by the blueprint, 0.01 rad inside.
+    pub position: [f64; 2],
+    /// Highest speed [rad/s].
+    pub velocity: f64,
+    /// Highest acceleration [rad/s²].
+    pub acceleration: f64,
+    /// Highest jerk [rad/s³].
+    pub jerk: f64,
+    /// Highest speed of the tool of the joint's arm [m/s]; absent without a limit.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tcp_velocity: Option<f64>,
+}
+
 /// Limits of an arm's joints, one entry per joint.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct JointLimits {
@@ -97,8 +155,10 @@ pub struct JointLimits {
     /// Highest speeds [rad/s].
     pub velocity_max: Vec<f64>,
     /// Highest accelerations [rad/s²]; empty where the arm states none.
+    #[serde(default)]
     pub acceleration_max: Vec<f64>,
     /// Highest jerks [rad/s³]; empty where the arm states none.
+    #[serde(default)]
     pub jerk_max: Vec<f64>,
 }
 
@@ -124,6 +184,19 @@ impl JointLimits {
             acceleration_max: Vec::new(),
             jerk_max: Vec::new(),
         }
+    }
+
+    /// Returns the limits of a joint, with the defaults in place of what the arm does not state; `None` if there is no
+    /// such joint.
+    pub fn joint(&self, joint: usize) -> Option<JointBounds> {
+        let of = |limits: &[f64]| limits.get(joint).copied();
+        Some(JointBounds {
+            lower: of(&self.position_lower)?,
+            upper: of(&self.position_upper)?,
+            velocity: of(&self.velocity_max)?,
+            acceleration: of(&self.acceleration_max).unwrap_or(DEFAULT_ACCELERATION),
+            jerk: of(&self.jerk_max).unwrap_or(DEFAULT_JERK),
+        })
     }
 
     /// The same limits with the defaults in place of what the arm does not state.

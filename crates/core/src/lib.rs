@@ -8,6 +8,7 @@
 pub mod arm;
 pub mod bounded;
 pub mod clock;
+pub mod double_s;
 pub mod joint;
 pub mod message;
 pub mod named;

@@ -1,4 +1,4 @@
-//! Which pairs of links, and of links and obstacles, are proven apart: at sixteen configurations, each with a stretch
+//! Pairs of links, and of links and obstacles, proven apart: at sixteen configurations, each with a stretch
 //! of motion about it.
 //!
 //! A pair is apart in a lane if the balls of both covers are farther from each other than a margin: the pair's padding,
@@ -47,7 +47,7 @@ pub enum Pair {
     Obstacle(usize, usize),
 }
 
-/// What is compared with a link.
+/// The other member of a pair with a link.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Other {
     Link(usize),
@@ -89,7 +89,7 @@ pub struct Stretches<'a> {
     pub q: &'a [Lanes],
     /// Half of the length of each, as a part of the motion.
     pub half: f32,
-    /// Which lanes are used, as bits.
+    /// Lanes in use, as bits.
     pub lanes: u16,
     /// For each pair of the scene, the most that it can approach on the whole motion [m].
     pub reach: &'a [f64],
@@ -307,7 +307,7 @@ fn compare<B: Block>(
     }
 }
 
-/// What balls are compared with: apart beyond `outer`, touching within `inner` [m].
+/// Distances that decide for two balls: apart beyond `outer`, touching within `inner` [m].
 #[derive(Clone, Copy)]
 struct Gap<B> {
     outer: B,

@@ -24,7 +24,7 @@ pub(crate) type Frames = [Lanes; 12];
 /// A frame in registers: columns x, y, z, and the origin.
 type Columns<B> = [[B; 3]; 4];
 
-/// Bodies, prepared: what is zero or one in a joint's frame costs nothing.
+/// Bodies, prepared: entries of a joint's frame that are zero or one cost nothing.
 #[derive(Debug, Clone)]
 pub(crate) struct Prepared(Vec<Step>);
 

@@ -45,7 +45,7 @@ pub struct Discrete {
     rounding: f32,
 }
 
-/// What one body carries.
+/// Links and obstacles of one body.
 #[derive(Debug, Clone)]
 struct Carried {
     body: usize,
@@ -75,7 +75,7 @@ struct Standing {
     pairs: u32,
 }
 
-/// Boxes around sixteen obstacles in the world: corners [m]. Boxes that are not there are infinitely far.
+/// Boxes around sixteen obstacles in the world: corners [m]. Unused boxes are at ∞.
 #[derive(Debug, Clone, Copy)]
 struct Boxes {
     low: [Lanes; 3],
@@ -114,11 +114,11 @@ pub struct Motion<'a> {
     pub pad: f64,
     /// A pair that is likely to touch: it is compared first.
     pub likely: Option<u32>,
-    /// What is to be proven.
+    /// The proof that is asked for.
     pub proof: Proof<'a>,
 }
 
-/// What is proven if nothing touches.
+/// The proof that a check without contact gives.
 #[derive(Debug, Clone, Copy)]
 pub enum Proof<'a> {
     /// Nothing, not even at the samples: numbers are rounded.
@@ -129,7 +129,7 @@ pub enum Proof<'a> {
     Motion {
         /// For each pair of the scene, the most that it can approach on a motion of which this one is a part [m].
         reach: &'a [f64],
-        /// Which part of that motion this one is: 1 for the whole.
+        /// Length of this motion as a part of that one: 1 for the whole.
         part: f64,
         /// The sum of the angles by which all joints turn [rad].
         turn: f64,

@@ -82,7 +82,7 @@ impl Solver {
     }
 }
 
-/// What a search is for.
+/// Target of a search.
 struct Search {
     /// Columns of the rotation of the last joint's frame, and the position of the link.
     target: [[f32; 3]; 4],
@@ -149,7 +149,7 @@ fn descend<B: Block>(solver: &mut Solver, search: &Search, q: &mut [Lanes]) -> u
     arrived
 }
 
-/// What remains to the target.
+/// Remaining error.
 struct Distance<B> {
     linear: Vector<B>,
     angular: Vector<B>,

@@ -11,7 +11,7 @@ const TURN: f32 = std::f32::consts::TAU;
 #[derive(Debug, Clone)]
 pub struct Nodes {
     groups: Vec<Lanes>,
-    /// Which variables repeat after a whole turn.
+    /// Variables that repeat after a whole turn.
     turns: Vec<bool>,
     number: usize,
     width: Width,
@@ -80,7 +80,7 @@ impl Nodes {
         assert!(self.number < MOST, "at most {MOST} nodes");
         let lane = self.number % LANES;
         if lane == 0 {
-            // What is not there is infinitely far, or not a number: never nearest.
+            // Unused lanes hold ∞ or NaN: they are never nearest.
             self.groups.resize(self.groups.len() + self.turns.len(), Lanes::splat(f32::INFINITY));
         }
         let last = self.groups.len() - self.turns.len();

@@ -107,7 +107,7 @@ fn dot<B: Block>(a: &[f32; 3], b: &[B; 3]) -> B {
     b[0].mul_add(B::splat(a[0]), b[1].mul_add(B::splat(a[1]), b[2].mul(B::splat(a[2]))))
 }
 
-/// What has a distance from points. No closures here: they are functions of their own, without the vectors of the
+/// A shape with a distance from points. No closures here: they are functions of their own, without the vectors of the
 /// kernel that calls them.
 pub(crate) trait Squared {
     /// Returns the squared distance of points.

@@ -2,7 +2,7 @@
 
 use std::sync::OnceLock;
 
-/// Which vectors kernels use; always some that this processor has. All give the same bits.
+/// Width of the vectors that kernels use, always one that this processor has. All give the same bits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Width(pub(crate) Vectors);
 
@@ -18,7 +18,7 @@ pub(crate) enum Vectors {
     Portable,
 }
 
-/// What [`Width::prefer`] has set.
+/// The width that [`Width::prefer`] has set.
 static PREFERRED: OnceLock<Width> = OnceLock::new();
 
 impl Width {

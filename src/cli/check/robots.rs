@@ -1,12 +1,13 @@
 //! The planner's robots in `dimos check`. Reads descriptions and shapes like a run.
 
+use dimos_core::joint::CommandLimits;
 use std::collections::BTreeMap;
 
 use serde::Serialize;
 
 use crate::blueprint::{Blueprint, JointSummary, Summary};
 use crate::cli::output::{self, Table};
-use crate::offline::{JointBounds, ObjectConfig, ObjectShape, PlannedRobot, PlanningScene};
+use crate::offline::{ObjectConfig, ObjectShape, PlannedRobot, PlanningScene};
 use dimos_robot as robot;
 use dimos_robot::Source;
 use dimos_robot::mesh::Size;
@@ -92,12 +93,12 @@ pub(super) fn of(blueprint: &Blueprint) -> Result<Vec<Robot>, String> {
 }
 
 /// Returns the commanded limits of a blueprint's joints, as far as they are known without the arms.
-pub(in crate::cli) fn commanded(summary: &Summary) -> BTreeMap<String, JointBounds> {
+pub(in crate::cli) fn commanded(summary: &Summary) -> BTreeMap<String, CommandLimits> {
     let bounds = |joint: &JointSummary| {
         // Position ranges are shown as in the model, beside those of the arm.
         let position = [f64::NEG_INFINITY, f64::INFINITY];
         let velocity = joint.velocity.map_or(f64::INFINITY, |limit| limit.value);
-        JointBounds {
+        CommandLimits {
             position,
             velocity,
             acceleration: joint.acceleration.value,

@@ -42,7 +42,7 @@ impl Service {
         for (_, count) in stopped {
             count.fetch_add(1, Ordering::Relaxed);
         }
-        // The tick refuses it in any case: no client waits for the planner in vain.
+        // The tick refuses it in any case: no client waits for a plan that cannot begin.
         let concerns = |joint| self.facts.locate(joint).is_some_and(|(i, _)| arm.is_none_or(|a| usize::from(a) == i));
         self.motions
             .end_replanning("stopped by an operator", |motion| motion.joints.iter().any(|joint| concerns(*joint)));

@@ -175,7 +175,7 @@ impl Service {
                 found.difference()
             );
             return Err(RpcError::new(Code::ModelMismatch, what).hint(format!(
-                "check `model_path`, `base_link` and `flange_link` of {name}; to plan with it all the same: \
+                "check `model_path`, `base_link` and `flange_link` of {name}; to plan with it anyway: \
                  --set planner.robots.{name}.model_mismatch=allow"
             )));
         }

@@ -3,12 +3,11 @@
 use serde_json::json;
 
 use crate::runtime::Service;
-use dimos_control::limit::Bounds;
 use dimos_control::request::{Motion, Request};
 use dimos_control::task_body::TargetKind;
 use dimos_control::tasks::chunk::curve;
 use dimos_core::clock::Mono;
-use dimos_core::joint::JointLimits;
+use dimos_core::joint::{JointBounds, JointLimits};
 use dimos_core::telemetry::{Origin, Outcome};
 use dimos_core::trajectory::Spline;
 use dimos_rpc::api;
@@ -47,7 +46,7 @@ impl Service {
         let limits = self.limits_of(&config.joints);
         for action in &mut call.actions {
             for ((value, lower), upper) in action.iter_mut().zip(&limits.position_lower).zip(&limits.position_upper) {
-                let bounds = Bounds::inside(*lower, *upper, 1.0, 1.0);
+                let bounds = JointBounds::inside(*lower, *upper, 1.0, 1.0);
                 *value = value.max(bounds.lower).min(bounds.upper);
             }
         }

@@ -10,17 +10,16 @@ use crate::runtime::client::asker::asker;
 use crate::runtime::client::curb::curb;
 use crate::runtime::plan::planner_port::run_blocking;
 use crate::runtime::{Service, internal};
-use dimos_control::limit::Bounds;
 use dimos_control::point_to_point::{MotionError, point_to_point};
 use dimos_control::request::Motion;
 use dimos_control::task_body::TargetKind;
-use dimos_core::joint::JointLimits;
+use dimos_core::joint::{JointBounds, JointLimits};
 use dimos_core::telemetry::{Origin, Outcome};
 use dimos_core::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
 use dimos_core::written;
 use dimos_planner::planning::request::joint_path::{JointPath, Outside};
+use dimos_planner::planning::timing::settings::TimingSettings;
 use dimos_planner::planning::timing::time_within;
-use dimos_planner::planning::timing::topp::JointBound;
 use dimos_rpc::api::{self, Reply};
 use dimos_rpc::{Code, RpcError};
 
@@ -206,7 +205,7 @@ impl Service {
             let Some((arm, j)) = self.facts.locate(joint) else { continue };
             let l = &self.facts.config.arms[arm].limits;
             let bounds =
-                Bounds::inside(l.position_lower[j], l.position_upper[j], l.velocity_max[j], l.acceleration_max[j]);
+                JointBounds::inside(l.position_lower[j], l.position_upper[j], l.velocity_max[j], l.acceleration_max[j]);
             let e = spline.extremes(k);
             let name = self.facts.names.joint(joint);
             let refuse = |what: String, by: f64, hint: &str| {
@@ -221,11 +220,11 @@ impl Service {
                 return refuse(what, excess, "limits are the arm's own, narrowed by `limits` in the blueprint");
             }
             for (what, unit, got, most) in [
-                ("as fast as", "rad/s", e.fastest, bounds.velocity),
-                ("with an acceleration of", "rad/s²", e.steepest, bounds.acceleration),
+                ("velocity", "rad/s", e.fastest, bounds.velocity),
+                ("acceleration", "rad/s²", e.steepest, bounds.acceleration),
             ] {
                 if got > most * SLACK + 1e-9 {
-                    let text = format!("{name} would move {what} {got:.3} {unit}, and may {most:.3} {unit}");
+                    let text = format!("{name} exceeds its {what} limit: {got:.3} {unit} (limit {most:.3} {unit})");
                     let slower = if unit == "rad/s" { got / most } else { (got / most).sqrt() };
                     let hint =
                         format!("make the trajectory {slower:.2} times as long, or raise the limit in the blueprint");
@@ -247,7 +246,7 @@ fn along(
 ) -> Result<JointTrajectory, MotionError> {
     let list = |values: &[f64], j: usize| values.get(j).copied().unwrap_or_default();
     let ranges: Vec<[f64; 2]> = (0..names.len())
-        .map(|j| Bounds::inside(list(&limits.position_lower, j), list(&limits.position_upper, j), 1.0, 1.0))
+        .map(|j| JointBounds::inside(list(&limits.position_lower, j), list(&limits.position_upper, j), 1.0, 1.0))
         .map(|range| [range.lower, range.upper])
         .collect();
     let mut path = JointPath { points: path.points, tolerance: path.tolerance };
@@ -263,14 +262,10 @@ fn along(
     let mut deviation = vec![path.tolerance; path.points.len() + 1];
     // It rests where the path begins.
     deviation.iter_mut().take(2).for_each(|deviation| *deviation = 0.0);
-    let bound = |j| JointBound {
-        velocity: list(&limits.velocity_max, j),
-        acceleration: list(&limits.acceleration_max, j),
-        jerk: list(&limits.jerk_max, j),
-    };
-    let bounds: Vec<JointBound> = (0..names.len()).map(bound).collect();
+    let bounds: Vec<JointBounds> = (0..names.len()).filter_map(|j| limits.joint(j)).collect();
     let way = [vec![start], path.points].concat();
-    let timed = time_within(names, &way, &bounds, &deviation, speed, |_, _| true);
+    let settings = TimingSettings { speed, ..TimingSettings::default() };
+    let timed = time_within(names, &way, &bounds, &deviation, &settings, |_, _| true);
     timed.map(|timed| timed.trajectory).map_err(|e| MotionError::NotFound(e.to_string()))
 }
 

@@ -10,6 +10,7 @@ use crate::runtime::Service;
 use dimos_control::guard::GuardWorld;
 use dimos_core::sync::lock;
 use dimos_core::telemetry::describe::Names;
+use dimos_planner::collision::settings::GuardSettings;
 use dimos_planner::collision::{OwnMargins, Scene};
 use dimos_rpc::api::Moment;
 
@@ -58,7 +59,7 @@ impl GuardWorlds {
             }
         }
         let (scene, _) = port.thread.snapshot();
-        let own = OwnMargins::of(&scene, OWN_MARGIN);
+        let own = OwnMargins::of(&scene, OWN_MARGIN, &GuardSettings::default());
         for ([link, other], distance) in own.overlapping() {
             tracing::info!(
                 "collision guard: {link} and {other} are kept apart to within {:.0} mm only: they are close by design",

@@ -17,7 +17,7 @@ use dimos_planner::planning::ik::reach::Reached;
 use dimos_planner::planning::request::joint_path::JointPath;
 use dimos_planner::planning::request::pipeline::{Goal, PlanRequest, PlannedMotion};
 use dimos_planner::planning::request::planner_thread::{BeginError, Job, Progress};
-use dimos_planner::planning::scene::padded::GivenUp;
+use dimos_planner::planning::scene::padded::PaddingException;
 use dimos_planner::planning::scene::planning_scene::{PlannedRobot, PlanningScene};
 use dimos_planner::planning::search::level::Level;
 use dimos_planner::planning::search::path::length;
@@ -304,10 +304,10 @@ fn summary(job: &Job, found: &PlannedMotion) -> PlanSummary {
         length: length(&found.path),
         duration: found.trajectory.duration(),
         level: level(found.level),
-        clearance: found.clearance.as_ref().map(|kept| kept.distance),
-        closest: found.clearance.as_ref().and_then(|kept| kept.pair.clone()),
+        clearance: found.clearance.as_ref().map(|clearance| clearance.distance),
+        closest: found.clearance.as_ref().and_then(|clearance| clearance.pair.clone()),
         padding: found.padding,
-        padding_given_up: found.given_up.iter().map(given_up).collect(),
+        padding_given_up: found.exceptions.iter().map(exception).collect(),
         goal_clamped: found.clamped.iter().map(clamped).collect(),
         fraction: found.fraction,
         seed: job.request.seed,
@@ -323,8 +323,8 @@ fn level(level: Level) -> PlanLevel {
     }
 }
 
-fn given_up(given_up: &GivenUp) -> api::PaddingGivenUp {
-    let GivenUp { near, link, other, distance, .. } = given_up;
+fn exception(exception: &PaddingException) -> api::PaddingGivenUp {
+    let PaddingException { near, link, other, distance, .. } = exception;
     let (near, link, other) = (near.name().to_owned(), link.clone(), other.clone());
     api::PaddingGivenUp { near, link, other, distance: *distance }
 }

@@ -13,9 +13,8 @@ use crate::blueprint::Arm;
 use crate::runtime::tool::tcp::TcpModel;
 use crate::runtime::{Service, internal};
 use dimos_control::config::CoordinatorConfig;
-use dimos_control::limit::Bounds;
 use dimos_control::task_body::TargetKind;
-use dimos_core::joint::DEFAULT_JERK;
+use dimos_core::joint::{DEFAULT_JERK, JointBounds};
 use dimos_core::sync::lock;
 use dimos_core::telemetry::Origin;
 use dimos_core::telemetry::describe::Names;
@@ -102,7 +101,7 @@ impl Plans {
     pub fn needs_no_plan(&self, arm: &str) -> Result<(), RpcError> {
         match self.planner() {
             Ok(_) => Err(RpcError::new(Code::NotPlanned, format!("a direct motion of {arm} is not collision-checked"))
-                .hint("this run has a planner, and a planned motion is checked: plan and execute it; or order it all the same: --direct, in rpc and Python `direct`")),
+                .hint("this run has a planner, and a planned motion is checked: plan and execute it; to skip the check: --direct, in rpc and Python `direct`")),
             Err(RpcError { code: Code::NoPlanner, data: None, .. }) => Ok(()),
             Err(gone) => Err(gone),
         }
@@ -355,7 +354,7 @@ pub(in crate::runtime) fn command_limits(
             let of = |limits: &[f64]| limits.get(j).copied();
             let (Some(lower), Some(upper)) = (of(&l.position_lower), of(&l.position_upper)) else { continue };
             let (Some(velocity), Some(acceleration)) = (of(&l.velocity_max), of(&l.acceleration_max)) else { continue };
-            let b = Bounds::inside(lower, upper, velocity, acceleration);
+            let b = JointBounds::inside(lower, upper, velocity, acceleration);
             let jerk = of(&l.jerk_max).unwrap_or(DEFAULT_JERK);
             let limits = CommandLimits {
                 position: [b.lower, b.upper],

@@ -15,7 +15,7 @@ use dimos_core::pose;
 use dimos_core::sync::lock;
 use dimos_planner::planning::request::pipeline::solve;
 use dimos_planner::planning::request::planner_thread::{PlannerThread, Solver};
-use dimos_planner::planning::scene::config::{JointBounds, PlannerConfig};
+use dimos_planner::planning::scene::config::PlannerConfig;
 use dimos_planner::planning::scene::planning_scene::PlanningScene;
 use dimos_planner::planning::scene::unplanned_joints::Measured;
 use dimos_rpc::api::{
@@ -51,14 +51,7 @@ impl PlannerPort {
         limits: &BTreeMap<String, CommandLimits>,
         solver: Option<Solver>,
     ) -> Result<Self, String> {
-        let bound = |l: &CommandLimits| JointBounds {
-            position: l.position,
-            velocity: l.velocity,
-            acceleration: l.acceleration,
-            jerk: l.jerk,
-            tcp_velocity: l.tcp_velocity,
-        };
-        let setup = setup.within(&limits.iter().map(|(joint, l)| (joint.clone(), bound(l))).collect())?;
+        let setup = setup.within(limits)?;
         let objects = config.objects.iter().map(|object| (object.name.clone(), typed(object))).collect();
         let thread = PlannerThread::with(setup, config.timeout, solver.unwrap_or_else(|| Arc::new(solve)));
         let thread = thread.map_err(|e| format!("no planner thread: {e}"))?;

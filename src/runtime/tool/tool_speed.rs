@@ -10,8 +10,8 @@ use dimos_control::task_robot::FramePose;
 use dimos_core::joint::MAX_DOF;
 use dimos_core::telemetry::describe::Severity;
 use dimos_core::trajectory::JointTrajectory;
+use dimos_planner::planning::timing::settings::ToolTimingSettings;
 use dimos_planner::planning::timing::tool_timing::slowed;
-use dimos_planner::planning::timing::topp::JointBound;
 use dimos_robot::kinematics::tool_speed::ToolSpeed;
 use dimos_rpc::RpcError;
 
@@ -54,18 +54,12 @@ impl Service {
         }
         let bound = |joint: &u16| {
             let (arm, j) = self.facts.locate(*joint)?;
-            let of = |limits: &[f64], otherwise: f64| limits.get(j).copied().unwrap_or(otherwise);
-            let limits = &self.facts.config.arms.get(arm)?.limits;
-            Some(JointBound {
-                velocity: of(&limits.velocity_max, f64::INFINITY),
-                acceleration: of(&limits.acceleration_max, dimos_core::joint::DEFAULT_ACCELERATION),
-                jerk: of(&limits.jerk_max, dimos_core::joint::DEFAULT_JERK),
-            })
+            self.facts.config.arms.get(arm)?.limits.joint(j)
         };
         let Some(bounds) = joints.iter().map(bound).collect::<Option<Vec<_>>>() else { return Ok(motion) };
         let (motion, slower, moved, fastest) = run_blocking(move || {
             let mut fastest = vec![0.0_f64; moved.len()];
-            let slower = slowed(&motion, &bounds, |q, v| {
+            let slower = slowed(&motion, &bounds, &ToolTimingSettings::default(), |q, v| {
                 let parts = moved.iter_mut().zip(&mut fastest).map(|(arm, fastest)| {
                     let part = arm.part(q, v) / speed;
                     *fastest = fastest.max(part);

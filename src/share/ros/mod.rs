@@ -1,4 +1,4 @@
-//! The face of a run to ROS 2 over rmw_zenoh: a node `dimos` that publishes what the run has, and, where it may
+//! The bridge of a run to ROS 2 over rmw_zenoh: a node `dimos` that publishes what the run has, and, where it may
 //! command, the action `FollowJointTrajectory` of each trajectory task.
 //!
 //! ```text
@@ -13,7 +13,7 @@
 
 mod action;
 mod attachment;
-mod face;
+mod bridge;
 mod follow;
 mod goal;
 mod names;
@@ -22,4 +22,4 @@ mod publish;
 mod services;
 mod types;
 
-pub(super) use face::{Face, report};
+pub(super) use bridge::{Bridge, report};

@@ -68,7 +68,7 @@ impl Services {
             let service = request.of;
             match self.answer(service) {
                 Ok(reply) => request.reply_bytes(reply),
-                // Clients of ROS know no errors: they wait in vain.
+                // A service of ROS has no errors: its client gets no reply.
                 Err(error) => tracing::warn!("share: ros: {service:?}: {error}"),
             }
         }

@@ -1,4 +1,4 @@
-// The page of a log: its arms as they moved, the plans beside what was done, plots, events.
+// The page of a log: its arms as they moved, the plans next to the motions, plots, events.
 import '../files.css';
 import {Context} from '../context';
 import {el, setClass, setText} from '../dom';
@@ -54,7 +54,7 @@ export function logPage(scene: Scene, token: string, app: HTMLElement): void {
       tabs: [['events', 'Events', events(player)]],
     }),
   );
-  // For tests: what is shown.
+  // For tests: the state shown.
   Object.assign(window, {player});
   void story.begin().catch((error) => context.report(error));
   player.seek(0);

@@ -64,7 +64,7 @@ export class Player extends Still {
     let last = performance.now();
     const step = (now: number) => {
       if (!this.playing) return;
-      // What is not read yet is waited for.
+      // Waits for messages that are not read yet.
       const passed = (Math.max(0, now - last) / 1000) * this.rate;
       if (this.block(this.time)) this.time = Math.min(this.source.length, this.time + passed);
       last = now;

@@ -1,4 +1,4 @@
-// What happened in a log besides motion: events, motions that were accepted, objects of the world. Read once; that of a
+// Entries of a log other than joint states: events, motions that were accepted, objects of the world. Read once; that of a
 // live run is read on.
 import type {Vec3, WorldObject} from '../protocol';
 import {Signal} from '../signal';

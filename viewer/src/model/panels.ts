@@ -1,4 +1,4 @@
-// What is known of a model at its joint positions: pairs that touch, tool centre points, limits, pairs never checked.
+// Figures of a model at its joint positions: pairs that touch, tool centre points, limits, pairs never checked.
 import type {Context} from '../context';
 import {el, setText} from '../dom';
 import {angle, angleText, figure} from '../units';

@@ -1,4 +1,4 @@
-// What is planned together: the goals of several arms, or the waypoints before the goal of one.
+// Goals that are planned together: the goals of several arms, or the waypoints before the goal of one.
 import type {Context} from '../context';
 import {button, el, NumberField, setClass} from '../dom';
 import type {GoalEditor} from '../goal';

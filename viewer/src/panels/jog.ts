@@ -188,7 +188,7 @@ export function jogPanel(context: Context): HTMLElement {
   // Also where the pointer left its button, or the button was disabled meanwhile.
   for (const name of ['pointerup', 'pointercancel', 'lostpointercapture'] as const)
     window.addEventListener(name, (event) => jog.release(`pointer ${event.pointerId}`), {capture: true});
-  // What was chosen, where the arm has a task for it, else the other. At once with the selection: a change of mode
+  // The selected mode if the arm has a task for it, else the other. At once with the selection: a change of mode
   // releases what is held, which may be pressed before the next status comes.
   let chosenFor = '';
   const follow = () => {

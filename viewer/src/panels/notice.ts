@@ -1,4 +1,4 @@
-// What went wrong with the last act, and what to do about it.
+// The error of the last action, and its remedy.
 import type {Context} from '../context';
 import {button, el} from '../dom';
 

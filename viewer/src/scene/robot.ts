@@ -243,7 +243,7 @@ export class Robot {
       if ((part as {isURDFCollider?: boolean}).isURDFCollider || part instanceof AxesHelper || part.userData.attached) {
         drop.push(part);
       }
-      // What no joint moves would only tint the arm itself.
+      // A link that no joint moves would only tint the arm itself.
       if ((part as {isURDFVisual?: boolean}).isURDFVisual && !moves(part)) drop.push(part);
       if (part instanceof Mesh) part.material = material;
     });

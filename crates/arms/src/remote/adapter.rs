@@ -155,7 +155,7 @@ impl ManipulatorAdapter for RemoteAdapter {
     }
 
     fn get_limits(&mut self) -> AdapterResult<JointLimits> {
-        Ok(self.last.as_ref().map_or_else(|| limits(self.dof), |d| d.joint_limits()))
+        Ok(self.last.as_ref().map_or_else(|| limits(self.dof), |d| d.limits.clone()))
     }
 
     fn bridging(&self) -> Option<Bridging> {

@@ -355,7 +355,7 @@ pub struct Description {
     #[serde(default)]
     pub after_gap: Option<AfterGap>,
     /// `get_limits` [rad, rad/s, rad/s², rad/s³]
-    pub limits: Limits,
+    pub limits: JointLimits,
     /// Position of its gripper when closed and when open [m or rad].
     #[serde(default)]
     pub gripper_range: Option<(f64, f64)>,
@@ -377,19 +377,6 @@ pub struct Info {
     pub firmware_version: Option<String>,
     #[serde(default)]
     pub serial_number: Option<String>,
-}
-
-/// Joint limits as a peer states them.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-#[allow(missing_docs, reason = "as in JointLimits")]
-pub struct Limits {
-    pub position_lower: Vec<f64>,
-    pub position_upper: Vec<f64>,
-    pub velocity_max: Vec<f64>,
-    #[serde(default)]
-    pub acceleration_max: Vec<f64>,
-    #[serde(default)]
-    pub jerk_max: Vec<f64>,
 }
 
 impl Description {
@@ -422,11 +409,5 @@ impl Description {
         }
         let tolerance = Duration::from_secs_f64(self.gap_tolerance.unwrap_or_default());
         Some(Bridging { tolerance, after: self.after_gap.unwrap_or_default() })
-    }
-
-    /// The limits in this program's words.
-    pub fn joint_limits(&self) -> JointLimits {
-        let Limits { position_lower, position_upper, velocity_max, acceleration_max, jerk_max } = self.limits.clone();
-        JointLimits { position_lower, position_upper, velocity_max, acceleration_max, jerk_max }
     }
 }

@@ -62,7 +62,7 @@ fn the_replies_of_the_sheet_are_understood() {
     let [hello, done, refused, state] = sheet("{ \"id\":")[..] else { panic!("four replies") };
     let description = Description::decode(hello.as_bytes(), super::MODES).unwrap();
     assert_eq!((description.dof, description.info.model.as_str(), description.native_rate), (2, "YA2", 250.0));
-    assert_eq!(description.joint_limits().velocity_max, [2.5, 2.5]);
+    assert_eq!(description.limits.velocity_max, [2.5, 2.5]);
     let reply = |line: &str| Reply::decode(line.as_bytes()).unwrap();
     assert_eq!((reply(done).id, reply(done).trouble("peer")), (2, None));
     let expected = AdapterError::Rejected("peer: write_enable() said no (error 2: collision)".to_owned());

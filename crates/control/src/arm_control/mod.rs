@@ -22,14 +22,14 @@ use super::belief::stalls::Stalls;
 use super::belief::tracking::{Tracking, furthest};
 use super::config::ArmConfig;
 use super::failsafe::{Failsafe, Freshness};
-use super::limit::{Bounds, Limiter, Refusal};
+use super::limit::{Limiter, Refusal};
 use super::rest::{Rest, SETTLED, Start, braking};
 use super::task_body::Demand;
 use super::task_robot::FramePose;
 use super::tool_limit::ToolLimiter;
 use dimos_core::arm::{ArmCommand, ArmState, Link, Topology};
 use dimos_core::clock::Mono;
-use dimos_core::joint::{ControlMode, Joints, MAX_DOF};
+use dimos_core::joint::{ControlMode, JointBounds, Joints, MAX_DOF};
 use dimos_core::telemetry::{Bound, Cause, LedBy, LimitKind, Outcome, Phase};
 
 /// A joint that moves this far while its arm is being enabled is moved by something else [rad]; so is one whose
@@ -109,7 +109,7 @@ impl ArmControl {
         let l = &config.limits;
         let bound = |j: usize| {
             let at = |list: &[f64], otherwise: f64| list.get(j).copied().unwrap_or(otherwise);
-            Bounds::inside(
+            JointBounds::inside(
                 at(&l.position_lower, 0.0),
                 at(&l.position_upper, 0.0),
                 at(&l.velocity_max, 0.0),

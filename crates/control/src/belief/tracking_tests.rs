@@ -1,8 +1,7 @@
 //! When an arm that is away from its setpoints is held.
 
 use super::*;
-use crate::limit::Bounds;
-use dimos_core::joint::joints_of;
+use dimos_core::joint::{JointBounds, joints_of};
 
 const PERIOD: Duration = Duration::from_millis(10);
 const DT: f64 = 0.01;
@@ -17,7 +16,7 @@ fn at(ms: u64) -> Mono {
 }
 
 fn limiters(q: f64) -> Vec<Limiter> {
-    let mut limiter = Limiter::new(Bounds::inside(-3.0, 3.0, 1.0, 4.0));
+    let mut limiter = Limiter::new(JointBounds::inside(-3.0, 3.0, 1.0, 4.0));
     limiter.seed(q);
     vec![limiter; 2]
 }

@@ -69,12 +69,13 @@ impl JointStep {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::limit::{Bounds, Limiter};
+    use crate::limit::Limiter;
+    use dimos_core::joint::JointBounds;
 
     #[test]
     fn it_is_the_way_that_the_limiter_takes() {
         let dt = 0.01;
-        let bounds = Bounds { lower: -10.0, upper: 10.0, velocity: 2.0, acceleration: 7.0 };
+        let bounds = JointBounds { lower: -10.0, upper: 10.0, velocity: 2.0, acceleration: 7.0, ..JointBounds::NONE };
         for k in -40..=40 {
             let velocity = 0.05 * f64::from(k);
             let mut limiter = Limiter::new(bounds);

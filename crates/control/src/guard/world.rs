@@ -8,6 +8,7 @@ use dimos_kernels::block::Lanes;
 
 use super::braking::JointStep;
 use dimos_core::telemetry::{Guarded, Label};
+use dimos_planner::collision::settings::GuardSettings;
 use dimos_planner::collision::{OwnMargins, Scene, Sweep};
 use pieces::{PARTS, Piece};
 
@@ -118,7 +119,7 @@ impl GuardWorld {
         margin: f64,
         own: &OwnMargins,
     ) -> Result<Self, String> {
-        let sweep = Sweep::new(scene);
+        let sweep = Sweep::new(scene, &GuardSettings::default());
         if joints.len() != sweep.dof() {
             return Err(format!("{} of {} joints of its robots are commanded", joints.len(), sweep.dof()));
         }

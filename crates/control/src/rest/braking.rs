@@ -41,13 +41,13 @@ pub fn rest_point(limiters: &[Limiter], dt: f64) -> Joints {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::limit::Bounds;
+    use dimos_core::joint::JointBounds;
 
     const DT: f64 = 0.01;
 
     fn moving(velocities: &[(f64, f64)]) -> Vec<Limiter> {
         let limiter = |(velocity, acceleration): &(f64, f64)| {
-            let mut limiter = Limiter::new(Bounds::inside(-3.0, 3.0, 3.0, *acceleration));
+            let mut limiter = Limiter::new(JointBounds::inside(-3.0, 3.0, 3.0, *acceleration));
             limiter.rewind(0.5, *velocity);
             limiter
         };

@@ -86,13 +86,12 @@ impl Move {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::limit::Bounds;
-    use dimos_core::joint::joints_of;
+    use dimos_core::joint::{JointBounds, joints_of};
 
     const DT: f64 = 0.01;
 
     fn limiters() -> Vec<Limiter> {
-        let mut limiters = vec![Limiter::new(Bounds::inside(-2.0, 2.0, 2.0, 4.0)); 2];
+        let mut limiters = vec![Limiter::new(JointBounds::inside(-2.0, 2.0, 2.0, 4.0)); 2];
         limiters.iter_mut().for_each(|limiter| limiter.seed(0.5));
         limiters
     }

@@ -78,7 +78,7 @@ pub fn positions(
                 }
             }
         }
-        let outside = limiter.bounds().excess(*taken) - crate::config::POSITION_MARGIN;
+        let outside = limiter.bounds().excess(*taken) - dimos_core::joint::POSITION_MARGIN;
         if outside > supervision.outside && !since.outside {
             return Err(Cause::OutsideRange(j as u16, outside));
         }
@@ -89,13 +89,12 @@ pub fn positions(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::limit::Bounds;
     use dimos_core::arm::Commanded;
     use dimos_core::clock::Mono;
-    use dimos_core::joint::joints_of;
+    use dimos_core::joint::{JointBounds, joints_of};
 
     fn limiters() -> Vec<Limiter> {
-        vec![Limiter::new(Bounds::inside(-2.0, 2.0, 2.0, 4.0)); 2]
+        vec![Limiter::new(JointBounds::inside(-2.0, 2.0, 2.0, 4.0)); 2]
     }
 
     fn written(q: [f64; 2], v: f64) -> Issued {

@@ -39,9 +39,9 @@ pub struct Pieces<'a> {
     pub q: &'a [Lanes],
     /// For each variable, how far it gets from there on the piece at most [rad or m].
     pub half: &'a [Lanes],
-    /// Which lanes are used, as bits.
+    /// Lanes in use, as bits.
     pub lanes: u16,
-    /// What is added to the padding of every pair, per lane [m].
+    /// Addition to the padding of every pair, per lane [m].
     pub margin: &'a Lanes,
     /// For each pair of the scene, its padding [m].
     pub pads: &'a [f32],

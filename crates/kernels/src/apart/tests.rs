@@ -52,7 +52,7 @@ fn a_pair_is_apart_beyond_padding_and_motion_and_touches_within_the_padding() {
         assert_eq!(close(&scene, &q, 0.0, 0.5, 0.01), (None, vec![]));
         q.0[3] = 0.9 - 0.01 + 2.0 * rounding;
         assert_eq!(close(&scene, &q, 0.0, 0.5, 0.01).0, Some(0));
-        // What is not a number is not apart.
+        // NaN is never apart.
         q.0[3] = f32::NAN;
         assert_ne!(close(&scene, &q, 0.0, 0.5, 0.01), (None, vec![]));
     }

@@ -3,7 +3,7 @@
 use super::ball::{Ball, Plane, around};
 use super::vector::{Vector, along, bounds};
 
-/// What is inside a closed surface.
+/// Interior of a closed surface.
 #[derive(Clone, Copy)]
 pub enum Inside<'a> {
     /// The surface is convex.

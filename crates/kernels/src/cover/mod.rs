@@ -1,4 +1,4 @@
-//! Covers: trees of balls that contain a solid. What is farther from all balls than a margin is farther from the solid.
+//! Covers: trees of balls that contain a solid. A point farther from all balls than a margin is farther from the solid.
 //!
 //! The proof needs no samples: a solid is halved into boxes, and the ball of each box contains the extreme points of
 //! the part that is in it, hence the part. The ball of a convex solid's part is the one that is least outside of the
@@ -54,7 +54,7 @@ pub struct Place {
     pub rotation: [[f64; 3]; 3],
     /// Position [m].
     pub translation: [f64; 3],
-    /// What is added to every radius [m].
+    /// Addition to every radius [m].
     pub radius: f64,
 }
 

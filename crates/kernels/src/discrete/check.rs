@@ -8,10 +8,10 @@ use super::gap::{Gap, Steps, gap_of, reach_of};
 use super::touch::{Touching, below, covers_touch, near, pair_touches};
 use super::{Buffers, Carried, Discrete, Motion, NO_PAIR, Proof, Standing};
 
-/// Pairs that touched lately and are compared first where each lane counts.
+/// Pairs in contact at recent configurations, which [`check_each`] compares first: this many at most.
 const FREQUENT: usize = 8;
-/// What is skipped for all lanes is farther than this where each lane counts [m]: what is found in one does not depend
-/// on the others, nor on rounding.
+/// Extra distance beyond which [`check_each`] skips a group for all lanes [m]: larger than any rounding error, so that
+/// the verdict of a lane does not depend on the other lanes.
 const ROUNDING: f32 = 1e-5;
 
 /// Returns a pair that touches in any lane of any block.

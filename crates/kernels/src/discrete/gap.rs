@@ -48,7 +48,7 @@ impl<const SWEPT: bool> Gap<SWEPT> {
     }
 }
 
-/// The steps between samples; `SWEPT`: what is between them counts.
+/// The steps between samples; `SWEPT`: the motion between them counts.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Steps<const SWEPT: bool> {
     /// The part of the motion between two samples.

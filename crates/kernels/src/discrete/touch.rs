@@ -109,7 +109,7 @@ fn cover_touches<B: Block, C: Squared, const EACH: bool, const SWEPT: bool>(
 ) -> u16 {
     let Some(root) = nodes.first() else { return left };
     let mut touching = Touching::among(left);
-    // For each ball the lanes in which it may be close: what a lane finds does not depend on the others.
+    // For each ball the lanes in which it may be close: the result of a lane does not depend on the others.
     let (mut stack, mut stack_lanes) = ([0; STACK], [0; STACK]);
     stack_lanes[0] = u16::MAX;
     let mut open = 1;
@@ -145,9 +145,9 @@ fn cover_touches<B: Block, C: Squared, const EACH: bool, const SWEPT: bool>(
     touching.lanes
 }
 
-/// Takes the lanes in which a ball touches, of those in which it is `close`: all if it has no parts, otherwise those
-/// in which the ball inside of it does. Returns the lanes in which its parts are to be compared, `None` if no more are
-/// sought. `count`: its number of parts; `open`: of balls that wait.
+/// Decides the lanes in which a bounding ball is `close`. A ball without parts counts as touching; otherwise the ball
+/// inside the solid decides. Returns the lanes whose parts must be compared, `None` once every sought lane is decided.
+/// `count`: number of parts of the ball; `open`: number of balls on the stack.
 #[inline(always)]
 fn settle<B: Block, const EACH: bool, const SWEPT: bool>(
     squared: B,

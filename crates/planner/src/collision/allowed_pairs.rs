@@ -5,10 +5,11 @@ use std::sync::Arc;
 
 use dimos_robot::random::Random;
 
-use super::checker::{CollisionChecker, Resolution};
+use super::checker::CollisionChecker;
 use super::exact::ExactChecker;
 use super::report::Contact;
 use super::scene::Scene;
+use super::settings::CheckSettings;
 
 /// A pair that touches too often.
 #[derive(Debug, Clone, PartialEq)]
@@ -24,7 +25,7 @@ pub struct SuspectPair {
 /// Returns the pairs that touch at home or in (nearly) all of `samples` random configurations, the most frequent first.
 /// The same seed gives the same result.
 pub fn always_touching(scene: &Arc<Scene>, home: &[f64], samples: usize, seed: u64) -> Vec<SuspectPair> {
-    let mut checker = ExactChecker::new(scene.clone(), Resolution::default());
+    let mut checker = ExactChecker::new(scene.clone(), CheckSettings::default());
     let mut random = Random::new(seed);
     let at_home = checker.contacts(home);
     let mut counts = vec![];

@@ -50,21 +50,7 @@ impl Stop {
     }
 }
 
-/// Resolution of motion checks.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Resolution {
-    /// Maximum motion of any point of the robots between checked configurations [m]: a motion counts as free if nothing
-    /// touches at this resolution.
-    pub motion: f64,
-}
-
-impl Default for Resolution {
-    fn default() -> Self {
-        Self { motion: 1e-4 }
-    }
-}
-
-/// Which samples of a motion are checked.
+/// A choice of the samples of a motion.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Samples {
     /// All.
@@ -86,9 +72,6 @@ pub trait CollisionChecker {
     /// Returns which joints are continuous: a whole turn does not change what is free.
     fn turns(&self) -> &[bool];
 
-    /// Returns the resolution of motion checks.
-    fn resolution(&self) -> Resolution;
-
     /// Returns whether nothing touches at configuration `q` [rad or m].
     fn is_free(&mut self, q: &[f64]) -> bool;
 
@@ -96,27 +79,28 @@ pub trait CollisionChecker {
     /// resolution; `false` if stopped.
     fn motion_is_free(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool;
 
-    /// Same, but gives up where the answer takes long, mostly along a surface: then `false`. For cuts that a path can
-    /// do without. `looks_free`: whether the motion is known to look free; that spares a look.
-    fn motion_is_easily_free(&mut self, from: &[f64], to: &[f64], _looks_free: bool, stop: &Stop) -> bool {
+    /// Same within a budget of exact checks; `false` once it is spent, as on most motions along a surface. For edges
+    /// that a path does not depend on. `looks_free`: whether the motion already passed [`Self::motion_looks_free`],
+    /// which is then not repeated.
+    fn certify_within_budget(&mut self, from: &[f64], to: &[f64], _looks_free: bool, stop: &Stop) -> bool {
         self.motion_is_free(from, to, stop)
     }
 
     /// Returns whether nothing touches at samples of the straight line between two configurations, the first of which
-    /// is known to be free. Quick: nothing is proven between the samples, and what hardly does not touch may count as
-    /// touching.
+    /// is known to be free. A quick check with covers: it proves nothing between the samples, and counts some pairs
+    /// that are a few millimetres apart as touching.
     fn motion_looks_free(&mut self, from: &[f64], to: &[f64]) -> bool {
         self.motion_is_free(from, to, &Stop::never())
     }
 
-    /// Same at some of its samples: a motion looks free if it does so at the first ones and at the rest.
+    /// Same at a subset of the samples: a motion looks free if it does at [`Samples::First`] and [`Samples::Rest`].
     fn motion_looks_free_at(&mut self, samples: Samples, from: &[f64], to: &[f64]) -> bool {
         samples == Samples::Rest || self.motion_looks_free(from, to)
     }
 
-    /// Returns those of `lanes` at whose configurations something looks as if it touched: no motion that ends there
-    /// looks free. `q`: a block per joint [rad or m]. A lane that is not returned says nothing.
-    fn look_blocked(&mut self, _q: &[Lanes], _lanes: u16) -> u16 {
+    /// Returns the lanes of `lanes` whose configurations are in contact according to covers: no motion that ends there
+    /// looks free. A lane that is not returned is undecided. `q`: a block per joint [rad or m].
+    fn any_contact_batch(&mut self, _q: &[Lanes], _lanes: u16) -> u16 {
         0
     }
 

@@ -14,7 +14,7 @@ use dimos_core::sync::lock;
 /// Covers of links that are kept: an object may be held at many places.
 const MOST: usize = 8;
 
-/// What is kept with a solid.
+/// Covers that a solid keeps.
 #[derive(Debug, Default)]
 pub(super) struct Covers {
     /// Of its core.

@@ -9,17 +9,15 @@ use glamx::{DAffine3, DVec3};
 
 use dimos_robot::model::Limits;
 
-use super::checker::{CollisionChecker, Resolution, Samples, Stop};
+use super::checker::{CollisionChecker, Samples, Stop};
 use super::lanes::InLanes;
 use super::motion::Pieces;
 use super::pairs::general::nearest;
 use super::pairs::{self, Placed, point};
 use super::report::{Contact, Pair};
 use super::scene::{LinkShape, Scene};
+use super::settings::CheckSettings;
 use super::shape::Core;
-
-/// Number of exact checks of configurations for a motion that need not be free.
-const EXACT_CHECKS: u64 = 64;
 
 /// Distance of a pair compared to a margin.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -36,7 +34,9 @@ pub(super) enum Gap {
 #[derive(Debug, Clone)]
 pub struct ExactChecker {
     pub(super) scene: Arc<Scene>,
-    pub(super) resolution: Resolution,
+    pub(super) settings: CheckSettings,
+    /// Resolution of the proof under way [m]: finer for small clearances.
+    pub(super) resolution: f64,
     frames: Vec<DAffine3>,
     /// Checked pairs, those of the links that move most first. Pair indices refer to this list.
     pub(super) pairs: Vec<Pair>,
@@ -62,7 +62,7 @@ pub struct ExactChecker {
 
 impl ExactChecker {
     /// Creates a checker of a scene.
-    pub fn new(scene: Arc<Scene>, resolution: Resolution) -> Self {
+    pub fn new(scene: Arc<Scene>, settings: CheckSettings) -> Self {
         let frames = scene.frames();
         let moves = |pair: &Pair| match *pair {
             Pair::Links(a, b) => scene.links[a].moves || scene.links[b].moves,
@@ -82,7 +82,7 @@ impl ExactChecker {
         let link_pairs = pairs.iter().map(link_pair).collect();
         let pieces = Pieces::new(scene.dof(), pairs.len());
         let pads = vec![0.0; pairs.len()];
-        let lanes = InLanes::new(&scene, &pairs);
+        let lanes = InLanes::new(&scene, &pairs, settings.samples_per_rad);
         let mut made = Self {
             pads,
             most_pad: 0.0,
@@ -91,7 +91,8 @@ impl ExactChecker {
             frames,
             pairs,
             link_pairs,
-            resolution,
+            resolution: settings.certification.resolution,
+            settings,
             always: None,
             witness: None,
             pieces,
@@ -326,10 +327,6 @@ impl CollisionChecker for ExactChecker {
         self.scene.turns()
     }
 
-    fn resolution(&self) -> Resolution {
-        self.resolution
-    }
-
     fn is_free(&mut self, q: &[f64]) -> bool {
         self.first_contact(q).is_none()
     }
@@ -338,8 +335,8 @@ impl CollisionChecker for ExactChecker {
         self.check_motion(from, to, stop)
     }
 
-    fn motion_is_easily_free(&mut self, from: &[f64], to: &[f64], looks_free: bool, stop: &Stop) -> bool {
-        self.is_free_within(EXACT_CHECKS, (from, to), looks_free, stop)
+    fn certify_within_budget(&mut self, from: &[f64], to: &[f64], looks_free: bool, stop: &Stop) -> bool {
+        self.is_free_within(self.settings.certification.budget, (from, to), looks_free, stop)
     }
 
     fn motion_looks_free(&mut self, from: &[f64], to: &[f64]) -> bool {
@@ -357,7 +354,7 @@ impl CollisionChecker for ExactChecker {
         found.is_none()
     }
 
-    fn look_blocked(&mut self, q: &[Lanes], lanes: u16) -> u16 {
+    fn any_contact_batch(&mut self, q: &[Lanes], lanes: u16) -> u16 {
         if self.always.is_some() {
             return lanes;
         }

@@ -17,8 +17,6 @@ use super::report::Pair;
 use super::scene::{LinkShape, PlacedObstacle, Scene};
 use super::{cover, shape};
 
-/// Samples of a discrete check of a motion [1/rad], in the norm of all joints: as VAMP has for most arms.
-const SAMPLES_PER_RAD: f64 = 32.0;
 /// A motion that is longer than a number of blocks by less than this part of one is not.
 const ROUNDING: f64 = 1e-4;
 /// Most blocks of samples of one motion.
@@ -31,6 +29,8 @@ pub(super) struct InLanes {
     discrete: Arc<Discrete>,
     buffers: Buffers,
     samples: discrete::Buffers,
+    /// Samples per length of a motion [1/rad].
+    samples_per_rad: f64,
     /// For each entry of a configuration, the number of joints that it moves, each with its multiplier.
     turned: Vec<f64>,
     /// One entry per joint.
@@ -44,8 +44,8 @@ pub(super) struct InLanes {
 }
 
 impl InLanes {
-    /// Prepares a scene; `pairs` are those of the checker.
-    pub fn new(scene: &Scene, pairs: &[Pair]) -> Self {
+    /// Prepares a scene; `pairs` are those of the checker, `samples_per_rad` is that of its settings.
+    pub fn new(scene: &Scene, pairs: &[Pair], samples_per_rad: f64) -> Self {
         let all: Arc<[u32]> = (0..pairs.len() as u32).collect();
         let in_lanes = Arc::new(compile(scene, pairs));
         let mut turned = vec![0.0; scene.dof()];
@@ -59,6 +59,7 @@ impl InLanes {
             scene: in_lanes,
             buffers: Buffers::default(),
             samples: discrete::Buffers::default(),
+            samples_per_rad,
             turned,
             q: vec![Lanes::splat(0.0); scene.dof()],
             close: Vec::new(),
@@ -100,7 +101,7 @@ impl InLanes {
     ) -> (Option<usize>, u64) {
         let length = from.iter().zip(to).map(|(a, b)| (b - a) * (b - a)).sum::<f64>().sqrt();
         // An edge of a search is 1 rad long, more or less by rounding, and gets no block for the rounding.
-        let whole = length * parts * SAMPLES_PER_RAD / LANES as f64 - ROUNDING;
+        let whole = length * parts * self.samples_per_rad / LANES as f64 - ROUNDING;
         let blocks = whole.ceil().clamp(1.0, MOST_BLOCKS) as usize;
         let (blocks, skipped) = match samples {
             Samples::All => (blocks, 0),

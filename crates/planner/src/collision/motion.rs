@@ -7,7 +7,7 @@
 //! between, so that most motions that look free are proven to be with no more samples. A half that is not is swept
 //! again, with twice as many.
 //!
-//! What is left is checked in pieces, sixteen at a time with covers, down to pieces on which nothing moves far, and
+//! The rest is checked in pieces, sixteen at a time with covers, down to pieces on which nothing moves far, and
 //! then exactly, split in two each time. All pieces of one size are checked before smaller ones, which finds contacts
 //! early.
 
@@ -17,19 +17,7 @@ use dimos_kernels::discrete::Proof;
 use super::checker::{Samples, Stop};
 use super::exact::{ExactChecker, Gap};
 use super::report::Pair;
-
-/// A piece is split into this many for the next check in lanes.
-const PARTS: usize = 4;
-/// Pieces on which nothing moves farther than this [m] are not split for lanes any longer: covers are not tighter.
-const LANES_END: f64 = 0.004;
-/// More pieces than these are all checked exactly where covers prove less than half of them free. Fewer are not worth
-/// it: their parts are mostly proven next.
-const MANY: usize = 24;
-/// Pieces that are checked for contacts exactly before all are split.
-const TRIES: usize = 3;
-
-/// A motion that cannot be proven by sweeping is halved this often.
-const HALVINGS: i32 = 3;
+use super::settings::CertificationSettings;
 
 /// A piece of a motion, and its unproven pairs.
 #[derive(Debug, Clone, Copy)]
@@ -108,12 +96,12 @@ impl Pieces {
     }
 }
 
-/// What is known of a motion, and how far it is checked.
+/// Prior knowledge of a motion, and depth of its check.
 #[derive(Debug, Clone, Copy)]
 struct Effort {
     /// It looks free.
     looks_free: bool,
-    /// What covers do not prove is checked in pieces.
+    /// Parts that covers do not prove are checked in pieces.
     in_pieces: bool,
 }
 
@@ -155,7 +143,7 @@ impl ExactChecker {
     }
 
     /// Proves the part of a motion that begins at a place and is left after this number of halvings, by sweeping
-    /// covers; where that fails, both halves of it. What touches, and what is short, is checked in pieces.
+    /// covers; where that fails, both halves of it. Parts in contact, and short parts, are checked in pieces.
     fn sweep(
         &mut self,
         p: &mut Pieces,
@@ -181,7 +169,7 @@ impl ExactChecker {
         if left.is_none() {
             return true;
         }
-        if halved == HALVINGS || touches {
+        if halved == self.settings.certification.sweep_halvings || touches {
             return effort.in_pieces && self.check_in_pieces(p, motion, (at, part), stop);
         }
         !stop.is_over()
@@ -197,6 +185,7 @@ impl ExactChecker {
         (at, part): (f64, f64),
         stop: &Stop,
     ) -> bool {
+        let CertificationSettings { parts, cover_size, max_unproven, .. } = self.settings.certification;
         let most = p.reach.iter().copied().fold(0.0, f64::max);
         let mut size = part / LANES as f64;
         p.clear();
@@ -214,7 +203,7 @@ impl ExactChecker {
             if stop.is_over() {
                 return false;
             }
-            if p.now.len() > MANY && 2 * p.now.len() > checked {
+            if p.now.len() > max_unproven && 2 * p.now.len() > checked {
                 // Covers prove little: contacts too shallow for them are found before the pieces are many.
                 if !self.check_middles(p, from, to, size, stop) {
                     return false;
@@ -226,15 +215,15 @@ impl ExactChecker {
             } else if self.any_touches(p, from, to, size) {
                 return false;
             }
-            if most * size <= LANES_END {
+            if most * size <= cover_size {
                 break;
             }
-            size /= PARTS as f64;
-            p.split(PARTS, size);
+            size /= parts as f64;
+            p.split(parts, size);
         }
         let (first, last) =
             (p.now.first().map_or(at, |piece| piece.start), p.now.last().map_or(at + part, |p| p.start + size));
-        // What is left may touch at the ends of the motion, where no other piece is.
+        // The rest may touch at the ends of the motion, where no other piece is.
         (last < 1.0 || self.first_touch(to).is_none())
             && (first > 0.0 || self.first_touch(from).is_none())
             && self.check_exactly(p, from, to, size, most, stop)
@@ -283,7 +272,7 @@ impl ExactChecker {
     /// covers cannot find, are found before the pieces are many.
     fn any_touches(&mut self, p: &mut Pieces, from: &[f64], to: &[f64], size: f64) -> bool {
         let mut below = u32::MAX;
-        for _ in 0..TRIES {
+        for _ in 0..self.settings.certification.probes {
             let number = |piece: &&Piece| piece.last - piece.first;
             let Some(worst) = p.now.iter().filter(|piece| number(piece) < below).max_by_key(number).copied() else {
                 break;
@@ -309,7 +298,7 @@ impl ExactChecker {
                 return false;
             }
             // The last pieces are below the resolution.
-            if most * size <= self.resolution.motion {
+            if most * size <= self.resolution {
                 return true;
             }
             p.advance();

@@ -7,16 +7,11 @@ use std::sync::Arc;
 use dimos_kernels::block::Lanes;
 
 use super::allowed_pairs::sample;
-use super::checker::Resolution;
 use super::exact::ExactChecker;
 use super::scene::Scene;
+use super::settings::{CheckSettings, GuardSettings};
 use super::sweep::Sweep;
 use dimos_robot::random::Random;
-
-/// Random poses that are checked.
-const POSES: usize = 400;
-/// What is taken off the smallest distance found [m]: other poses may have a little less.
-const SLACK: f32 = 0.001;
 
 /// Distances that the guard keeps between the links of one robot.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -29,14 +24,14 @@ pub struct OwnMargins {
 impl OwnMargins {
     /// Finds the pairs for which covers prove less than `margin` [m] in poses in which they do not touch. The same
     /// scene gives the same result.
-    pub fn of(scene: &Arc<Scene>, margin: f64) -> Self {
+    pub fn of(scene: &Arc<Scene>, margin: f64, settings: &GuardSettings) -> Self {
         let margin = margin as f32;
-        let (mut sweep, mut random) = (Sweep::new(scene), Random::new(1));
-        let mut exact = ExactChecker::new(scene.clone(), Resolution::default());
+        let (mut sweep, mut random) = (Sweep::new(scene, settings), Random::new(1));
+        let mut exact = ExactChecker::new(scene.clone(), CheckSettings::default());
         let own: Vec<u32> = (0..sweep.pairs() as u32).filter(|pair| sweep.is_of_one_robot(*pair as usize)).collect();
         let pads = vec![margin; sweep.pairs()];
         let mut less = BTreeMap::new();
-        for _ in 0..POSES {
+        for _ in 0..settings.poses {
             let q: Vec<f64> = scene.limits().iter().map(|l| sample(l.lower, l.upper, &mut random)).collect();
             for (joint, at) in q.iter().enumerate() {
                 (0..Sweep::PIECES).for_each(|piece| sweep.set(piece, joint, *at, 0.0));
@@ -48,7 +43,7 @@ impl OwnMargins {
                 let apart = exact.pair_index(&link, &other).is_some_and(|index| exact.keeps(index, &q));
                 if let Some(distance) = sweep.distance(pair, margin, &pads).filter(|_| apart) {
                     let least = less.entry([link, other]).or_insert(margin);
-                    *least = least.min(distance - SLACK);
+                    *least = least.min(distance - settings.slack);
                 }
             }
         }

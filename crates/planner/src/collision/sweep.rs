@@ -1,5 +1,5 @@
 //! Proves pairs apart on pieces of a motion for the collision guard of the tick: with covers alone, in lanes, without
-//! allocating. What covers cannot prove counts as close.
+//! allocating. A pair that covers cannot prove apart counts as close.
 
 use std::sync::Arc;
 
@@ -9,14 +9,7 @@ use dimos_kernels::block::{LANES, Lanes};
 use super::lanes::compile;
 use super::report::Pair;
 use super::scene::Scene;
-
-/// Most balls, or pairs of them, that are replaced by their parts for one pair: what is not proven by then takes longer
-/// than a tick has.
-const VISITS: usize = 500;
-/// Deepest overlap that a search for a distance finds [m].
-const DEEPEST: f32 = 0.15;
-/// Scales of that search, each sixteen times as fine as the one before.
-const SCALES: usize = 4;
+use super::settings::GuardSettings;
 
 /// A scene prepared for the tick, with buffers for sixteen pieces of a motion.
 #[derive(Debug)]
@@ -29,6 +22,7 @@ pub struct Sweep {
     q: Vec<Lanes>,
     half: Vec<Lanes>,
     close: Vec<(u32, u16)>,
+    settings: GuardSettings,
 }
 
 impl Sweep {
@@ -36,7 +30,7 @@ impl Sweep {
     pub const PIECES: usize = LANES;
 
     /// Prepares all pairs of a scene that can move. Allocates all that later calls need.
-    pub fn new(scene: &Arc<Scene>) -> Self {
+    pub fn new(scene: &Arc<Scene>, settings: &GuardSettings) -> Self {
         let moves = |pair: &Pair| match *pair {
             Pair::Links(a, b) => scene.links[a].moves || scene.links[b].moves,
             Pair::Obstacle(link, _) => scene.links[link].moves,
@@ -65,6 +59,7 @@ impl Sweep {
             buffers: Buffers::default(),
             q: zero.clone(),
             half: zero,
+            settings: *settings,
         };
         let (pads, none) = (vec![0.0; made.pairs.len()], Lanes::splat(0.0));
         made.close(1, &none, &pads, &[]);
@@ -119,7 +114,7 @@ impl Sweep {
             && let (Some(q), Some(around)) = (q.0.get_mut(piece), around.0.get_mut(piece))
         {
             *q = middle as f32;
-            // What the middle lost by rounding, rounded up.
+            // Rounding error of the middle, rounded up.
             *around = ((half + (middle - f64::from(*q)).abs()) * (1.0 + 1e-6)) as f32;
         }
     }
@@ -128,17 +123,17 @@ impl Sweep {
     /// whose bits are set in `pieces`, each with those pieces. Does not allocate.
     pub fn close(&mut self, pieces: u16, margin: &Lanes, pads: &[f32], pairs: &[u32]) -> &[(u32, u16)] {
         self.close.clear();
-        let asked = Pieces { q: &self.q, half: &self.half, lanes: pieces, margin, pads, visits: VISITS };
+        let asked = Pieces { q: &self.q, half: &self.half, lanes: pieces, margin, pads, visits: self.settings.visits };
         self.lanes.close_on_pieces(&asked, &self.levers, pairs, &mut self.buffers, &mut self.close);
         &self.close
     }
 
     /// Returns the distance of a pair that is proven where all pieces were set to the same [m]: to 0.01 mm, at most
-    /// `top` and at least -0.15; `None` if none is proven. Does not allocate.
+    /// `top` and at least `-deepest` of the settings; `None` if none is proven. Does not allocate.
     pub fn distance(&mut self, pair: u32, top: f32, pads: &[f32]) -> Option<f32> {
         let pad = pads.get(pair as usize).copied()?;
-        let (mut top, mut span) = (top, top + DEEPEST);
-        for _ in 0..SCALES {
+        let (mut top, mut span) = (top, top + self.settings.deepest);
+        for _ in 0..self.settings.scales {
             // Each scale divides one part of the scale before.
             let part = span / Self::PIECES as f32;
             let mut margin = Lanes::splat(0.0);

@@ -6,9 +6,10 @@ use glamx::{DAffine3, DVec3};
 
 use super::allowed_pairs::always_touching;
 use super::body::{MeshMode, of_mesh, solids};
-use super::checker::{CollisionChecker, Resolution, Stop};
+use super::checker::{CollisionChecker, Stop};
 use super::exact::ExactChecker;
 use super::report::Pair;
+use super::settings::CheckSettings;
 use super::shape::Solid;
 use super::world::{Attached, Obstacle, Robot, World, WorldError};
 use nalgebra::Point3;
@@ -47,7 +48,7 @@ fn ball(name: &str, at: DVec3, radius: f64) -> Obstacle {
 }
 
 fn checker(world: &World) -> ExactChecker {
-    ExactChecker::new(world.snapshot(), Resolution::default())
+    ExactChecker::new(world.snapshot(), CheckSettings::default())
 }
 
 fn one_arm(obstacles: &[Obstacle]) -> World {
@@ -81,7 +82,7 @@ fn padding_and_snapshots_hold() {
     assert!(checker(&world).is_free(&[0.0; 3]));
     world.put(Obstacle { padding: 0.02, ..post.clone() }).unwrap();
     assert!(!checker(&world).is_free(&[0.0; 3]));
-    assert!(ExactChecker::new(before, Resolution::default()).is_free(&[0.0; 3]));
+    assert!(ExactChecker::new(before, CheckSettings::default()).is_free(&[0.0; 3]));
     assert_eq!(world.add(post.clone()), Err(WorldError::Taken("post".into())));
     assert_eq!(world.remove("wall").map(|o| o.name), Err(WorldError::Unknown("wall".into())));
     world.move_to("post", DAffine3::from_translation(DVec3::new(0.3, 0.0, 0.1))).unwrap();

@@ -12,6 +12,7 @@ pub mod ik;
 pub mod request;
 pub mod scene;
 pub mod search;
+pub mod settings;
 pub mod timing;
 
 #[cfg(test)]

@@ -6,17 +6,20 @@ use dimos_kernels::block::{LANES, Lanes};
 use glamx::{DAffine3, DVec3};
 
 use super::scene::padded::{Near, Padded};
-use super::search::edges::EdgeCheck;
+use super::search::edges::EdgeValidator;
 use super::search::enclosure::enclosed;
 use super::search::level::Level;
 use super::search::path::{distance, length};
-use super::search::path_planner::{PlanError, PlanSettings, plan};
-use super::search::rrt_connect::{Quantum, RrtSettings, Search};
+use super::search::path_planner::{PlanError, plan};
+use super::search::rrt_connect::{Quantum, Search};
+use super::search::settings::{EnclosureSettings, PlanSettings, RrtSettings};
 use crate::collision::body::{MeshMode, solids};
-use crate::collision::checker::{CollisionChecker, Resolution, Samples, Stop};
+use crate::collision::checker::{CollisionChecker, Samples, Stop};
 use crate::collision::report::{Contact, Pair};
+use crate::collision::settings::CheckSettings;
 use crate::collision::world::{Obstacle, Robot, World};
 use crate::collision::{ExactChecker, Solid};
+use crate::planning::settings::PlannerSettings;
 use dimos_robot::kinematics::Kinematics;
 use dimos_robot::model::Limits;
 use dimos_robot::random::Random;
@@ -44,9 +47,6 @@ impl CollisionChecker for Plane {
     }
     fn turns(&self) -> &[bool] {
         &[false; 2]
-    }
-    fn resolution(&self) -> Resolution {
-        Resolution::default()
     }
     fn is_free(&mut self, q: &[f64]) -> bool {
         self.checks += 1;
@@ -107,9 +107,6 @@ impl CollisionChecker for Walled {
     fn turns(&self) -> &[bool] {
         &[false; 8]
     }
-    fn resolution(&self) -> Resolution {
-        Resolution::default()
-    }
     fn is_free(&mut self, q: &[f64]) -> bool {
         self.checks += 1;
         !(0.4..0.5).contains(&q[0]) || q[1..4].iter().all(|x| (x - 2.0).abs() < self.window)
@@ -140,7 +137,13 @@ fn a_window_in_a_wall_is_a_way_out_and_a_wall_without_one_encloses() {
     for seed in 0..3 {
         let encloses = |window| {
             let mut walled = Walled { limits, window, checks: 0 };
-            enclosed(&mut walled, &from, std::slice::from_ref(&other), (seed, true), &Stop::never())
+            enclosed(
+                &mut walled,
+                &from,
+                std::slice::from_ref(&other),
+                (&EnclosureSettings::default(), seed, true),
+                &Stop::never(),
+            )
         };
         // Half a percent of the wall; no joint but the first is held up.
         assert_eq!(encloses(0.5), None, "seed {seed}");
@@ -149,7 +152,7 @@ fn a_window_in_a_wall_is_a_way_out_and_a_wall_without_one_encloses() {
     }
 }
 
-/// What is free are the pipes of a grid of them. Ends of edges are checked together, or not.
+/// Only a grid of pipes is free. Ends of edges are checked together, or not.
 struct Pipes {
     looks: bool,
     checked: usize,
@@ -159,7 +162,7 @@ fn is_in_pipe(q: impl Iterator<Item = f32>) -> bool {
     q.map(|x| (6.0 * x).cos()).sum::<f32>() < -0.8
 }
 
-impl EdgeCheck for Pipes {
+impl EdgeValidator for Pipes {
     fn is_free(&mut self, from: &[f64], to: &[f64]) -> bool {
         self.checked += 1;
         (1..=16).all(|k| is_in_pipe(from.iter().zip(to).map(|(a, b)| (a + (b - a) * f64::from(k) / 16.0) as f32)))
@@ -198,7 +201,7 @@ fn a_search_that_checks_ends_together_is_the_same_with_fewer_checks() {
 /// Edges are free where the first joint is negative.
 struct LeftOnly;
 
-impl EdgeCheck for LeftOnly {
+impl EdgeValidator for LeftOnly {
     fn is_free(&mut self, from: &[f64], to: &[f64]) -> bool {
         from[0] < 0.0 && to[0] < 0.0
     }
@@ -230,7 +233,7 @@ struct Ends {
     refused: usize,
 }
 
-impl EdgeCheck for Ends {
+impl EdgeValidator for Ends {
     fn is_free(&mut self, _: &[f64], to: &[f64]) -> bool {
         self.plane.is_free(to)
     }
@@ -361,9 +364,9 @@ fn a_pair_is_always_closer_than_the_padding_if_it_is_so_within_the_limits() {
     world.add_robot(pointer(4.0, 4.2)).unwrap();
     let below = DAffine3::from_translation(DVec3::new(0.5 * 4.1_f64.cos(), 0.5 * 4.1_f64.sin(), -0.11));
     world.add(Obstacle { name: "post".into(), solid: Solid::sphere(0.05, below).unwrap(), padding: 0.0 }).unwrap();
-    let mut checker = Padded::new(world.snapshot(), 0.03);
-    checker.give_up(Near::Start, &[4.1]);
-    let near: Vec<Near> = checker.given_up().iter().map(|given_up| given_up.near).collect();
+    let mut checker = Padded::new(world.snapshot(), 0.03, &PlannerSettings::default());
+    checker.relax(Near::Start, &[4.1]);
+    let near: Vec<Near> = checker.exceptions().iter().map(|exception| exception.near).collect();
     assert_eq!(near, [Near::Everywhere]);
 }
 
@@ -377,15 +380,15 @@ fn what_is_within_the_padding_only_is_not_blocked_near_a_start() {
         let solid = Solid::sphere(0.05, at).unwrap();
         world.add(Obstacle { name: name.into(), solid, padding: 0.0 }).unwrap();
     }
-    let mut checker = Padded::new(world.snapshot(), 0.03);
+    let mut checker = Padded::new(world.snapshot(), 0.03, &PlannerSettings::default());
     let q = [Lanes(std::array::from_fn(|lane| [0.0, 1.5, -0.5][lane % 3]))];
     let [near, free, in_the_way] = [0o111111, 0o22222, 0o44444];
-    assert_eq!(checker.look_blocked(&q, u16::MAX) & free, 0);
-    assert_eq!(checker.look_blocked(&q, u16::MAX), near | in_the_way);
-    checker.give_up(Near::Start, &[0.0]);
-    assert!(checker.is_free(&[0.0]), "{:?}", checker.given_up());
-    assert_eq!(checker.look_blocked(&q, u16::MAX), in_the_way);
-    assert_eq!(checker.look_blocked(&q, 0o4), 0o4);
+    assert_eq!(checker.any_contact_batch(&q, u16::MAX) & free, 0);
+    assert_eq!(checker.any_contact_batch(&q, u16::MAX), near | in_the_way);
+    checker.relax(Near::Start, &[0.0]);
+    assert!(checker.is_free(&[0.0]), "{:?}", checker.exceptions());
+    assert_eq!(checker.any_contact_batch(&q, u16::MAX), in_the_way);
+    assert_eq!(checker.any_contact_batch(&q, 0o4), 0o4);
 }
 
 #[test]
@@ -396,7 +399,7 @@ fn a_start_in_slight_contact_is_escaped_and_a_deep_one_is_reported() {
         let at = DAffine3::from_translation(DVec3::new(0.5, 0.1 - overlap, 0.0));
         let solid = Solid::sphere(0.05, at).unwrap();
         world.put(Obstacle { name: "post".into(), solid, padding: 0.0 }).unwrap();
-        let mut checker = ExactChecker::new(world.snapshot(), Resolution::default());
+        let mut checker = ExactChecker::new(world.snapshot(), CheckSettings::default());
         plan(&mut checker, &[0.0], &[vec![-1.0]], &PlanSettings::default(), &Stop::never())
     };
     let found = from(0.002).unwrap();

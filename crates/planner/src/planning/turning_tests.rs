@@ -5,12 +5,16 @@ use std::sync::Arc;
 
 use glamx::{DAffine3, DVec3};
 
-use super::ik::{Ik, IkSettings};
+use super::ik::Ik;
+use super::ik::settings::IkSettings;
 use super::search::path::{length, unwind};
-use super::search::path_planner::{Plan, PlanError, PlanSettings, plan};
-use super::timing::{TimingSettings, bounds, time};
+use super::search::path_planner::{Plan, PlanError, plan};
+use super::search::settings::PlanSettings;
+use super::timing::settings::TimingSettings;
+use super::timing::{bounds, time};
 use crate::collision::body::{MeshMode, solids};
-use crate::collision::checker::{CollisionChecker, Resolution, Stop};
+use crate::collision::checker::{CollisionChecker, Stop};
+use crate::collision::settings::CheckSettings;
 use crate::collision::world::{Obstacle, Robot, World};
 use crate::collision::{ExactChecker, Solid};
 use dimos_robot::RobotModel;
@@ -58,7 +62,7 @@ fn checker(posts: &[(f64, f64)]) -> ExactChecker {
         let solid = Solid::cylinder(0.03, 0.5, at).unwrap();
         world.add(Obstacle { name: format!("post{i}"), solid, padding: 0.0 }).unwrap();
     }
-    ExactChecker::new(world.snapshot(), Resolution::default())
+    ExactChecker::new(world.snapshot(), CheckSettings::default())
 }
 
 fn planned(checker: &mut ExactChecker, start: &[f64], goal: &[f64], seed: u64) -> Result<Plan, PlanError> {

@@ -8,7 +8,7 @@ use glamx::{DAffine3, DMat3, DQuat, DVec3};
 
 use super::Kinematics;
 use super::jacobian::{Column, cholesky, gram, smallest_singular_value, solve};
-use dimos_core::joint::{Joints, MAX_DOF, braking_speed};
+use dimos_core::joint::{JointBounds, Joints, MAX_DOF, braking_speed};
 
 /// Distance from a limit at which a joint counts as being at it [rad or m].
 const LIMIT_TOLERANCE: f64 = 1e-5;
@@ -33,19 +33,6 @@ impl Default for StepSettings {
     fn default() -> Self {
         Self { length: 0.3, threshold: 0.03, damping: 0.03 }
     }
-}
-
-/// Limits of one joint.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct JointBounds {
-    /// Lowest position [rad or m].
-    pub lower: f64,
-    /// Highest position [rad or m].
-    pub upper: f64,
-    /// Maximum speed [rad/s or m/s].
-    pub velocity: f64,
-    /// Maximum acceleration [rad/s² or m/s²].
-    pub acceleration: f64,
 }
 
 /// Position and velocity of the joints; entries past the last joint are zero.

@@ -1,8 +1,9 @@
 use super::jacobian::{Column, manipulability, smallest_singular_value};
-use super::step::{Bound, JointBounds, JointMotion, Step, StepSettings, Stepper, TargetTwist, rotation_between};
+use super::step::{Bound, JointMotion, Step, StepSettings, Stepper, TargetTwist, rotation_between};
 use super::*;
 use crate::random::Random;
 use crate::urdf::from_text;
+use dimos_core::joint::JointBounds;
 
 /// Seven joints: revolute about odd axes, one prismatic, one mimic, one fixed in between.
 const ROBOT: &str = r#"<robot name="r"><link name="base"/><link name="a"/><link name="b"/><link name="c"/><link name="d"/>
@@ -125,7 +126,8 @@ fn no_point_moves_more_than_the_lever_bounds() {
 fn stepper(velocity: f64, acceleration: f64) -> (Stepper, Vec<JointBounds>) {
     let model = robot();
     let kinematics = Kinematics::whole(&model).unwrap();
-    let bound = |l: &Limits| JointBounds { lower: l.lower, upper: l.upper, velocity, acceleration };
+    let bound =
+        |l: &Limits| JointBounds { lower: l.lower, upper: l.upper, velocity, acceleration, jerk: f64::INFINITY };
     let bounds = kinematics.limits().iter().map(bound).collect();
     (Stepper::new(kinematics, model.link_index("tool").unwrap(), StepSettings::default()), bounds)
 }

@@ -13,6 +13,7 @@ use crate::api::planner::PoseSpec;
 use crate::api::{Done, Method};
 use crate::error::RpcError;
 use crate::report::TcpReport;
+pub use dimos_core::joint::CommandLimits;
 
 /// Name of the stream of requests to an attached planner.
 pub const PLANNER_REQUESTS: &str = "planner_requests";
@@ -84,22 +85,6 @@ pub struct Registered {
     pub run: String,
     /// Command limits of each joint.
     pub limits: BTreeMap<String, CommandLimits>,
-}
-
-/// Limits of the commands to a joint.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
-pub struct CommandLimits {
-    /// Lowest and highest position [rad]: the arm's own limits, narrowed by the blueprint, 0.01 rad inside.
-    pub position: [f64; 2],
-    /// Highest speed [rad/s].
-    pub velocity: f64,
-    /// Highest acceleration [rad/s²].
-    pub acceleration: f64,
-    /// Highest jerk [rad/s³].
-    pub jerk: f64,
-    /// Highest speed of the tool of the joint's arm [m/s]; absent without a limit.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub tcp_velocity: Option<f64>,
 }
 
 /// A request to an attached planner: `data` of a message of the stream `planner_requests`.

@@ -1,14 +1,14 @@
 //! Moves an end effector: the common part of the Cartesian tasks. Integrates joint positions from the last *commanded*
 //! ones, so that an arm that sags below its commands does not creep.
 
+use dimos_core::joint::{JointBounds, MAX_DOF};
 use glamx::{DAffine3, DVec3};
 
 use super::params::CartesianParams;
 use crate::task_body::{Claim, Context};
 use crate::task_robot::{FramePose, TaskKinematics};
-use dimos_core::joint::MAX_DOF;
 use dimos_core::telemetry::Bound;
-use dimos_robot::kinematics::step::{Bound as Bounded, JointBounds, JointMotion, StepSettings, Stepper, TargetTwist};
+use dimos_robot::kinematics::step::{Bound as Bounded, JointMotion, StepSettings, Stepper, TargetTwist};
 
 /// Twist of the end effector, in the frame of the model's root.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -47,7 +47,7 @@ impl EndEffector {
             params,
             robot,
             joints: JointMotion::default(),
-            bounds: [JointBounds::default(); MAX_DOF],
+            bounds: [JointBounds::NONE; MAX_DOF],
             velocity: Velocity::default(),
             bound: Bound::None,
         }
@@ -129,6 +129,7 @@ impl EndEffector {
                 upper: own.upper.min(view.upper),
                 velocity: slowed,
                 acceleration,
+                jerk: f64::INFINITY,
             };
         }
         let step = self.stepper.step(&mut self.joints, &TargetTwist { linear, angular, horizon }, &self.bounds, cx.dt);

@@ -1,7 +1,7 @@
 //! Blends from the motion so far into another curve: adds a quintic offset that begins with the difference in position,
 //! velocity and acceleration, and fades to zero.
 
-use dimos_core::joint::Joints;
+use dimos_core::joint::{JointBounds, Joints};
 use dimos_core::trajectory::Sample;
 
 /// Shortest time of a blend [s].
@@ -10,15 +10,6 @@ const SHORTEST: f64 = 0.1;
 const LONGEST: f64 = 5.0;
 /// Step of the search for the time.
 const GROWTH: f64 = 1.15;
-
-/// Limits of the offset of one joint.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Limits {
-    /// [rad/s²]
-    pub acceleration: f64,
-    /// [rad/s³]
-    pub jerk: f64,
-}
 
 /// Offsets that fade over a common time.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -44,8 +35,8 @@ impl Blend {
 
     /// Begins with these differences from the curve, joint by joint. The time is the shortest for which every joint
     /// keeps its limits. `offset_of` returns a joint's difference for a blend of that time, and its
-    /// limits.
-    pub fn begin(joints: usize, offset_of: impl Fn(usize, f64) -> (Sample, Limits)) -> Self {
+    /// acceleration and jerk limits.
+    pub fn begin(joints: usize, offset_of: impl Fn(usize, f64) -> (Sample, JointBounds)) -> Self {
         let mut duration = SHORTEST;
         while duration < LONGEST
             && (0..joints).any(|j| {
@@ -86,7 +77,7 @@ impl Blend {
 }
 
 /// Returns whether an offset that fades over `h` [s] keeps the limits. It may begin with any acceleration.
-fn keeps(offset: &Sample, limits: &Limits, h: f64) -> bool {
+fn keeps(offset: &Sample, limits: &JointBounds, h: f64) -> bool {
     let (p, v, a) = (offset.position / h.powi(3), offset.velocity / h.powi(2), offset.acceleration / h);
     // The jerk is a parabola over the share `s` of the time, so it is largest at an end or at the vertex.
     let c0 = -60.0 * p - 36.0 * v - 9.0 * a;
@@ -113,7 +104,7 @@ mod tests {
     #[test]
     fn an_offset_fades_to_zero_within_its_jerk() {
         let offset = Sample { position: 0.05, velocity: -0.3, acceleration: 0.8 };
-        let limits = Limits { acceleration: 4.0, jerk: 20.0 };
+        let limits = JointBounds { acceleration: 4.0, jerk: 20.0, ..JointBounds::NONE };
         let blend = Blend::begin(1, |_, _| (offset, limits));
         let begin = blend.at(0, 0.0);
         assert_eq!((begin.position, begin.velocity), (offset.position, offset.velocity));

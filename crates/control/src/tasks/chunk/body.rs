@@ -1,14 +1,14 @@
 //! Follows chunks. A chunk replaces the rest of the one before it from its own start on; actions whose time is over are
 //! skipped. At each change of the curve the motion so far is blended into it.
 
-use super::blend::{Blend, Limits};
+use super::blend::Blend;
 use super::curve::SHARE;
 use super::params::ChunkParams;
 use crate::config::JUMP;
 use crate::request::Motion;
 use crate::task_body::{Claim, Context, Step, Target, TaskBody};
 use dimos_core::clock::Mono;
-use dimos_core::joint::{Joints, MAX_DOF};
+use dimos_core::joint::{JointBounds, Joints, MAX_DOF};
 use dimos_core::telemetry::{Outcome, Reason, TaskState};
 use dimos_core::trajectory::{Cursor, MAX_ACTIONS, Sample};
 
@@ -138,7 +138,7 @@ impl ChunkTask {
         let share = ROUNDING * if phase == Phase::Follow { 1.0 - SHARE } else { 1.0 };
         let limits = |j: usize| {
             let view = cx.joints.get(j).map(|&joint| cx.joint(joint)).unwrap_or_default();
-            Limits { acceleration: share * view.acceleration, jerk: share * view.jerk }
+            JointBounds { acceleration: share * view.acceleration, jerk: share * view.jerk, ..JointBounds::NONE }
         };
         let is = |j: usize| last.get(j).copied().unwrap_or_default();
         self.blend = Blend::begin(cx.joints.len(), |j, duration| {

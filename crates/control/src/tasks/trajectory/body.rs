@@ -1,14 +1,13 @@
 //! Executes a trajectory: commands positions along it, from the arm's position until the arm has arrived.
 
 use super::params::TrajectoryParams;
-use crate::config::POSITION_MARGIN;
 use crate::limit::WAY_BACK;
 use crate::path_clock::PathClock;
 use crate::rate::RateLimits;
 use crate::request::Motion;
 use crate::task_body::{Claim, Context, OnCancel, Step, Target, TaskBody};
 use dimos_core::clock::Mono;
-use dimos_core::joint::TICK_STANDSTILL;
+use dimos_core::joint::{POSITION_MARGIN, TICK_STANDSTILL};
 use dimos_core::telemetry::{Outcome, Reason, TaskState, TaskView};
 use dimos_core::trajectory::{Cursor, Sample, smooth_step};
 

@@ -1,4 +1,4 @@
-//! What covers say of a pair is what its solids say.
+//! Covers and solids of a pair agree.
 
 use std::sync::Arc;
 
@@ -10,7 +10,7 @@ use crate::collision::cloud::Cloud;
 use crate::collision::exact::Gap;
 use crate::collision::shape::Mesh;
 use crate::collision::world::{Obstacle, Robot};
-use crate::collision::{CollisionChecker, ExactChecker, Resolution, Solid, World};
+use crate::collision::{CheckSettings, CollisionChecker, ExactChecker, Solid, World};
 use dimos_robot::builtin;
 use dimos_robot::kinematics::Kinematics;
 use dimos_robot::random::Random;
@@ -64,7 +64,7 @@ fn checker(name: &str, text: &str, base: DVec3, random: &mut Random) -> ExactChe
         obstacle.solid.frame.translation += base;
         world.add(obstacle).unwrap();
     }
-    ExactChecker::new(world.snapshot(), Resolution::default())
+    ExactChecker::new(world.snapshot(), CheckSettings::default())
 }
 
 fn random_q(checker: &ExactChecker, random: &mut Random) -> Vec<f64> {
@@ -118,7 +118,7 @@ fn a_motion_that_passes_touches_nothing_in_between() {
                 touches += usize::from((0..checker.pairs.len()).any(|pair| checker.gap(pair, 0.0) == Gap::Touch));
             }
             assert!(!passes || touches == 0, "{name}: {from:?} to {to:?}: {touches} contacts");
-            // What does not pass touches somewhere, if only for less than a sample here.
+            // A motion that does not pass touches somewhere, if only for less than a sample here.
             not_free += usize::from(!passes);
             free += usize::from(passes);
         }

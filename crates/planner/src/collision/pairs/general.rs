@@ -52,7 +52,7 @@ pub fn within(a: &Placed, b: &Placed, reach: f64) -> bool {
             _ => match (sa.as_trimesh(), sb.as_trimesh()) {
                 (Some(mesh), _) => mesh_within(mesh, &pa.inv_mul(pb), sb, support(b, sb), reach),
                 (_, Some(mesh)) => mesh_within(mesh, &pb.inv_mul(pa), sa, support(a, sa), reach),
-                // What parry does not support counts as touching.
+                // A pair that parry does not support counts as touching.
                 _ => true,
             },
         })

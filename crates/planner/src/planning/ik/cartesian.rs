@@ -4,29 +4,9 @@ use glamx::{DAffine3, DQuat};
 
 use dimos_robot::kinematics::Kinematics;
 
-use crate::planning::ik::{Ik, IkSettings};
+use crate::planning::ik::Ik;
+use crate::planning::ik::settings::{IkSettings, LineSettings};
 use crate::planning::search::path::Path;
-
-/// Settings for following a line.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct LineSettings {
-    /// Distance between configurations [m].
-    pub step: f64,
-    /// Rotation between configurations [rad].
-    pub turn: f64,
-    /// Maximum position error of the link between configurations [m].
-    pub deviation: f64,
-    /// Maximum orientation error [rad].
-    pub tilt: f64,
-    /// Maximum step of a joint between configurations [rad or m]; a larger one counts as a jump.
-    pub jump: f64,
-}
-
-impl Default for LineSettings {
-    fn default() -> Self {
-        Self { step: 0.01, turn: 0.05, deviation: 1e-3, tilt: 0.01, jump: 0.35 }
-    }
-}
 
 /// Why a line could not be followed to its end.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -83,7 +63,7 @@ pub fn straight_line(
     let steps = (length / settings.step).max(angle / settings.turn).ceil().max(1.0);
     let mut line = Line { path: vec![start.to_vec()], fraction: 0.0, shortfall: None };
     // Refines the step where the link leaves the line between configurations.
-    let (whole, smallest) = (1.0 / steps, 1.0 / steps / 64.0);
+    let (whole, smallest) = (1.0 / steps, settings.min_part / steps);
     let mut step: f64 = whole;
     while line.fraction < 1.0 && line.shortfall.is_none() {
         let to = if line.fraction + step > 1.0 - 1e-9 { 1.0 } else { line.fraction + step };

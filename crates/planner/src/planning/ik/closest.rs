@@ -5,28 +5,15 @@ use dimos_kernels::block::LANES;
 use dimos_kernels::ik::Until;
 use glamx::DAffine3;
 
-use super::{Ik, IkFailure, IkSettings, settings_met};
+use super::settings::{ClosestSettings, IkSettings};
+use super::{Ik, IkFailure, settings_met};
 use crate::collision::checker::Stop;
 use crate::planning::search::path::distance;
 use dimos_robot::kinematics::jacobian::{cholesky, gram, solve as solve_gram};
 use dimos_robot::random::Random;
 
-/// Standard deviations of the starts around the seed [rad or m].
-const SPREADS: [f64; 4] = [0.1, 0.3, 0.7, 1.5];
-/// Starts per standard deviation.
-const STARTS: usize = 8;
-/// Maximum number of steps towards the seed.
-const STEPS: usize = 40;
-/// Maximum motion of a joint per step [rad or m].
-const MAX_STEP: f64 = 0.3;
-/// Smallest part of a step that is tried.
-const MIN_PART: f64 = 1.0 / 64.0;
-/// A motion shorter than this makes no difference [rad or m].
-const MIN_MOTION: f64 = 1e-6;
-/// Solutions closer to each other than this count as one [rad].
-const SAME: f64 = 0.01;
-/// The same for redundant arms: steps towards the seed from several starts end beside each other.
-const SAME_BRANCH: f64 = 0.3;
+/// Starts per standard deviation: two of them fill the lanes.
+const STARTS: usize = LANES / 2;
 
 impl Ik<'_> {
     /// Same as [`Ik::solve`], but searches for the closest solution to `near` in a bounded number of attempts: for six
@@ -43,7 +30,8 @@ impl Ik<'_> {
         let plain = self.solve(target, near, settings, &mut valid, stop);
         let mut found = plain.as_ref().cloned().unwrap_or_default();
         let mut random = Random::new(settings.seed ^ 0x5EED);
-        for spreads in SPREADS.chunks(LANES / STARTS) {
+        let ClosestSettings { spreads, same, same_branch, .. } = settings.closest;
+        for spreads in spreads.chunks(LANES / STARTS) {
             if stop.is_over() {
                 break;
             }
@@ -58,7 +46,7 @@ impl Ik<'_> {
         found.retain(|q| valid(q));
         found.sort_by(|a, b| distance(near, a).total_cmp(&distance(near, b)));
         let task = if settings.position_only { 3 } else { 6 };
-        let same = if near.len() > task { SAME_BRANCH } else { SAME };
+        let same = if near.len() > task { same_branch } else { same };
         let mut apart: Vec<Vec<f64>> = Vec::new();
         for q in found {
             if !apart.iter().any(|other| distance(other, &q) < same) {
@@ -89,25 +77,26 @@ impl Ik<'_> {
 
     /// Returns the configuration reached from a solution by moving towards `near` with the link at its pose.
     fn approach(&mut self, target: &DAffine3, near: &[f64], from: &[f64], settings: &IkSettings) -> Vec<f64> {
+        let ClosestSettings { steps, max_step, min_part, min_motion, .. } = settings.closest;
         let (mut best, mut part) = (from.to_vec(), 1.0);
-        for _ in 0..STEPS {
+        for _ in 0..steps {
             self.q.clone_from(&best);
             self.error(target, settings);
             let longest = self.free_motion(near, settings);
-            if longest < MIN_MOTION {
+            if longest < min_motion {
                 break;
             }
-            let scale = part * (MAX_STEP / longest).min(1.0);
+            let scale = part * (max_step / longest).min(1.0);
             for ((q, m), l) in self.q.iter_mut().zip(&self.motion).zip(self.kinematics.limits()) {
                 *q = (*q + m * scale).max(l.lower).min(l.upper);
             }
             let error = self.descend(target, settings);
-            if settings_met(&error, settings) && distance(near, &self.q) < distance(near, &best) - MIN_MOTION {
+            if settings_met(&error, settings) && distance(near, &self.q) < distance(near, &best) - min_motion {
                 best.clone_from(&self.q);
                 part = f64::min(1.0, 2.0 * part);
             } else {
                 part *= 0.5;
-                if part < MIN_PART {
+                if part < min_part {
                     break;
                 }
             }

@@ -6,7 +6,8 @@ use dimos_kernels::chain::{Chain, Frame};
 use dimos_kernels::ik::{Solver, Until, lane};
 use glamx::DAffine3;
 
-use super::{Ik, IkSettings, PoseError, settings_met};
+use super::settings::IkSettings;
+use super::{Ik, PoseError, settings_met};
 use crate::collision::allowed_pairs::sample;
 use crate::planning::search::path::distance;
 use dimos_robot::kinematics::Kinematics;

@@ -5,6 +5,7 @@
 
 pub mod cartesian;
 pub mod reach;
+pub mod settings;
 
 mod closest;
 mod lanes;
@@ -18,34 +19,8 @@ use dimos_robot::kinematics::jacobian::{Column, cholesky, gram, solve as solve_g
 use dimos_robot::kinematics::step::rotation_between;
 use dimos_robot::random::Random;
 
+use self::settings::{DescentSettings, IkSettings};
 use crate::planning::search::path::distance;
-
-/// Settings of the search for solutions.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct IkSettings {
-    /// Position tolerance [m].
-    pub position: f64,
-    /// Orientation tolerance [rad].
-    pub rotation: f64,
-    /// Whether the orientation is free.
-    pub position_only: bool,
-    /// Maximum attempts to reach the pose at all, rounded up to whole blocks of 16: the first from the seed, the others
-    /// from random configurations. A sixteenth of them, at least one block, to find further or valid solutions.
-    pub attempts: usize,
-    /// Maximum steps per attempt.
-    pub steps: usize,
-    /// Number of distinct solutions to look for, nearest first. One is whichever is found first, and takes the least
-    /// time.
-    pub solutions: usize,
-    /// Seed of all random numbers.
-    pub seed: u64,
-}
-
-impl Default for IkSettings {
-    fn default() -> Self {
-        Self { position: 1e-6, rotation: 1e-6, position_only: false, attempts: 3200, steps: 60, solutions: 1, seed: 0 }
-    }
-}
 
 /// Why no solution was found.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -160,7 +135,7 @@ impl<'a> Ik<'a> {
                 failure.best.clone_from(&self.q);
             }
             for q in reached.drain(..) {
-                let new = found.len() < wanted && !found.iter().any(|other| distance(other, &q) < 1e-3);
+                let new = found.len() < wanted && !found.iter().any(|other| distance(other, &q) < settings.same);
                 if new && valid(&q) {
                     found.push(q);
                 } else if new {
@@ -235,21 +210,21 @@ impl<'a> Ik<'a> {
 
     /// Descends from `q` until the pose is reached or progress ends; returns the remaining error.
     fn descend(&mut self, target: &DAffine3, settings: &IkSettings) -> PoseError {
+        let DescentSettings { damping, min_damping, max_step, progress, max_idle } = settings.descent;
         let mut error = self.error(target, settings);
         let (mut best, mut idle) = (error.squared(), 0);
         for _ in 0..settings.steps {
-            if settings_met(&error, settings) || idle > 6 {
+            if settings_met(&error, settings) || idle > max_idle {
                 break;
             }
-            // Much damping far away, almost none close by, where the last digits converge quickly.
-            self.aim(&error, 0.02 * error.squared() + 1e-9, settings);
+            self.aim(&error, damping * error.squared() + min_damping, settings);
             let longest = self.motion.iter().fold(0.0, |most: f64, m| most.max(m.abs()));
-            let scale = if longest > 0.7 { 0.7 / longest } else { 1.0 };
+            let scale = if longest > max_step { max_step / longest } else { 1.0 };
             for ((q, m), l) in self.q.iter_mut().zip(&self.motion).zip(self.kinematics.limits()) {
                 *q = (*q + m * scale).max(l.lower).min(l.upper);
             }
             error = self.error(target, settings);
-            idle = if error.squared() < 0.9 * best { 0 } else { idle + 1 };
+            idle = if error.squared() < progress * best { 0 } else { idle + 1 };
             best = best.min(error.squared());
         }
         error

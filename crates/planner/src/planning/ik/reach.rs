@@ -4,22 +4,18 @@ use glamx::DAffine3;
 
 use crate::collision::world::World;
 use crate::collision::{CollisionChecker, Stop};
-use crate::planning::ik::{Ik, IkSettings};
+use crate::planning::ik::Ik;
+use crate::planning::ik::settings::IkSettings;
 use crate::planning::request::ahead::describe_contact;
 use crate::planning::request::pipeline::{PlanFailure, stage};
 use crate::planning::scene::planning_scene::PlanningScene;
-
-/// Tolerance [m, rad]: a picture and a joint goal need no more.
-const TOLERANCE: f64 = 1e-5;
-/// Attempts if the configuration before leads nowhere: few, as the answer is wanted at once.
-const ATTEMPTS: usize = 320;
 
 /// Joint positions that reach a pose.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Reached {
     /// Positions of the robot's planned joints [rad].
     pub joints: Vec<f64>,
-    /// What touches there; `None`: nothing.
+    /// A contact there, if any.
     pub contact: Option<String>,
 }
 
@@ -37,13 +33,9 @@ pub fn reach(
 ) -> Result<Reached, PlanFailure> {
     let mut stage = stage(setup, world, &[robot], positions, 0.0)?;
     let Some(robot) = stage.robots.first() else { return Err(PlanFailure::new("no such robot")) };
-    let settings = IkSettings {
-        position: TOLERANCE,
-        rotation: TOLERANCE,
-        position_only,
-        attempts: ATTEMPTS,
-        ..Default::default()
-    };
+    let drag = &stage.settings.drag;
+    let (position, rotation, attempts) = (drag.tolerance, drag.tolerance, drag.attempts);
+    let settings = IkSettings { position, rotation, position_only, attempts, ..stage.settings.ik };
     let in_root = robot.body.base.inverse() * *target;
     let mut ik = Ik::new(&robot.body.kinematics, robot.tcp());
     let joints = match ik.follow(&in_root, near, &settings) {

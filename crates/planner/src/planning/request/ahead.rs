@@ -2,8 +2,9 @@
 //! motion stops after a cancel.
 
 use super::pipeline::{PlanFailure, PlannedMotion, stage};
+use super::settings::LookAheadSettings;
 use super::start_contact::passes;
-use crate::collision::kept::Motion;
+use crate::collision::clearance::Motion;
 use crate::collision::report::Contact;
 use crate::collision::world::World;
 use crate::collision::{CollisionChecker, Stop};
@@ -12,12 +13,6 @@ use crate::planning::search::path::between;
 use crate::planning::search::path_planner::digits_outside;
 use dimos_core::trajectory::{Cursor, Sample, Spline};
 
-/// Length of the time slices that are checked [s]; within one, the motion is almost straight.
-const PIECE: f64 = 0.02;
-/// Largest deviation from the chord for a slice to count as straight [rad].
-const STRAIGHT: f64 = 5e-5;
-/// Collision checks along a blocked slice to find its contact.
-const SAMPLES: u32 = 32;
 /// Delay of a cancel on its way to the tick, besides two ticks: deceleration begins this much later [s].
 const DELAY: f64 = 0.03;
 /// Slowest joint that counts during deceleration [rad/s]; same value as in the trajectory task.
@@ -47,10 +42,11 @@ pub fn look_ahead(
     let spline = Spline::new(&found.trajectory).map_err(|e| PlanFailure::new(e.to_string()))?;
     let mut stage = stage(setup, world, &found.robots, positions, found.padding)?;
     let checker = &mut stage.checker;
-    checker.give_up_again(&found.given_up);
-    let way = samples(&spline, elapsed);
+    checker.relax_again(&found.exceptions);
+    let settings = &setup.settings.look_ahead;
+    let way = samples(&spline, elapsed, settings.slice);
     // Slices still to check, the earliest last. A slice that is blocked is split in two.
-    let mut stretches = straight_slices(&way);
+    let mut stretches = straight_slices(&way, settings.straight);
     while let Some((first, end)) = stretches.pop() {
         let ((time, from), (_, to)) = (&way[first], &way[end]);
         if passes(checker, found.level, found.escape_path.as_ref(), (from, to), stop) {
@@ -65,8 +61,8 @@ pub fn look_ahead(
             continue;
         }
         let mut q = from.clone();
-        let contact = (0..=SAMPLES).find_map(|k| {
-            between(from, to, f64::from(k) / f64::from(SAMPLES), &mut q);
+        let contact = (0..=settings.samples).find_map(|k| {
+            between(from, to, f64::from(k) / f64::from(settings.samples), &mut q);
             checker.contacts(&q).into_iter().next()
         });
         let what = contact
@@ -77,18 +73,21 @@ pub fn look_ahead(
 }
 
 /// Returns a motion as straight pieces, as long as possible.
-pub(in crate::planning) fn straight_motions(spline: &Spline) -> Vec<Motion> {
-    let way = samples(spline, 0.0);
-    straight_slices(&way).into_iter().map(|(first, end)| [way[first].1.clone(), way[end].1.clone()]).collect()
+pub(in crate::planning) fn straight_motions(spline: &Spline, settings: &LookAheadSettings) -> Vec<Motion> {
+    let way = samples(spline, 0.0, settings.slice);
+    straight_slices(&way, settings.straight)
+        .into_iter()
+        .map(|(first, end)| [way[first].1.clone(), way[end].1.clone()])
+        .collect()
 }
 
-/// Samples a motion from `elapsed` to its end [s, rad].
-fn samples(spline: &Spline, elapsed: f64) -> Vec<(f64, Vec<f64>)> {
+/// Samples a motion from `elapsed` to its end, every `slice` [s, rad].
+fn samples(spline: &Spline, elapsed: f64, slice: f64) -> Vec<(f64, Vec<f64>)> {
     let mut cursor = Cursor::default();
     let mut samples = vec![Sample::default(); spline.joints()];
     let duration = spline.duration();
     let begin = elapsed.clamp(0.0, duration);
-    let pieces = ((duration - begin) / PIECE).ceil().max(1.0) as usize;
+    let pieces = ((duration - begin) / slice).ceil().max(1.0) as usize;
     let mut at = |k: usize| {
         let time = begin + (duration - begin) * k as f64 / pieces as f64;
         spline.sample(time, &mut cursor, &mut samples);
@@ -97,15 +96,15 @@ fn samples(spline: &Spline, elapsed: f64) -> Vec<(f64, Vec<f64>)> {
     (0..=pieces).map(&mut at).collect()
 }
 
-/// Divides a motion into straight slices, as long as possible: index of the first and last sample of each, the last
-/// slice first.
-fn straight_slices(way: &[(f64, Vec<f64>)]) -> Vec<(usize, usize)> {
+/// Divides a motion into slices that are straight within `deviation` [rad], as long as possible: index of the first and
+/// last sample of each, the last slice first.
+fn straight_slices(way: &[(f64, Vec<f64>)], deviation: f64) -> Vec<(usize, usize)> {
     let last = way.len() - 1;
     let (mut slices, mut first) = (Vec::new(), 0);
     while first < last {
         let (mut end, mut step) = (first + 1, 1);
         while step > 0 {
-            if end + step <= last && is_straight(&way[first..=end + step]) {
+            if end + step <= last && is_straight(&way[first..=end + step], deviation) {
                 end += step;
                 step *= 2;
             } else {
@@ -120,7 +119,7 @@ fn straight_slices(way: &[(f64, Vec<f64>)]) -> Vec<(usize, usize)> {
 }
 
 /// Returns whether a slice of a motion is a straight line between its first and its last configuration.
-fn is_straight(way: &[(f64, Vec<f64>)]) -> bool {
+fn is_straight(way: &[(f64, Vec<f64>)], deviation: f64) -> bool {
     let (Some((_, a)), Some((_, b))) = (way.first(), way.last()) else { return true };
     let along: Vec<f64> = a.iter().zip(b).map(|(a, b)| b - a).collect();
     let square: f64 = along.iter().map(|d| d * d).sum();
@@ -128,7 +127,7 @@ fn is_straight(way: &[(f64, Vec<f64>)]) -> bool {
         let dot: f64 = q.iter().zip(a).zip(&along).map(|((q, a), d)| (q - a) * d).sum();
         let part = if square > 0.0 { (dot / square).clamp(0.0, 1.0) } else { 0.0 };
         let off = q.iter().zip(a).zip(&along).map(|((q, a), d)| (q - a - d * part).powi(2)).sum::<f64>();
-        way.len() <= 2 || off <= STRAIGHT * STRAIGHT
+        way.len() <= 2 || off <= deviation * deviation
     })
 }
 

@@ -2,33 +2,24 @@
 
 use super::ahead::describe_contact;
 use super::pipeline::{Goal, PlanFailure, Stage, late};
+use super::settings::GoalSettings;
 use super::start_contact::{EscapePath, passes};
 use crate::collision::report::{Contact, Pair};
 use crate::collision::{CollisionChecker, Stop};
-use crate::planning::ik::cartesian::{LineSettings, straight_line};
-use crate::planning::ik::{Ik, IkSettings};
+use crate::planning::ik::Ik;
+use crate::planning::ik::cartesian::straight_line;
+use crate::planning::ik::settings::IkSettings;
 use crate::planning::scene::padded::{Near, Padded};
 use crate::planning::scene::planning_scene::PlannedRobot;
 use crate::planning::search::level::Level;
 use crate::planning::search::path::{Path, between, distance, length, unwind};
 use crate::planning::search::path_planner::digits_outside;
+use crate::planning::settings::PlannerSettings;
 use dimos_robot::kinematics::frame;
 use dimos_robot::kinematics::step::rotation_between;
 use dimos_robot::model::JointKind;
 use glamx::DAffine3;
 
-/// Number of IK solutions to look for when one robot moves to a pose.
-const SOLUTIONS: usize = 8;
-/// Attempts to find them.
-const ATTEMPTS: usize = 3200;
-/// Tolerance of a pose goal [m, rad].
-const POSE_TOLERANCE: f64 = 1e-5;
-/// Distance [m] and rotation [rad] from the present pose within which a robot that is slightly outside its limits
-/// counts as being at a pose.
-const SAME_PLACE: f64 = 5e-4;
-const SAME_TURN: f64 = 1.7e-3;
-/// Largest distance outside the limits for that [rad]: as for the start of a plan.
-const LIMIT_TOLERANCE: f64 = 0.02;
 /// Configurations checked on the piece of a line that is not free, to find what blocks it.
 const BLOCK_SAMPLES: u32 = 100;
 /// Part of a straight line that counts as complete.
@@ -46,6 +37,7 @@ pub(in crate::planning) fn configurations(
     // One list of configurations per robot; a combination of one from each is a goal of all.
     let mut all: Path = vec![Vec::new()];
     let mut first = 0;
+    let settings = stage.settings;
     for (number, (robot, index)) in stage.robots.iter().zip(&stage.indices).enumerate() {
         let own = stage.start.get(first..first + robot.joints.len()).unwrap_or_default().to_vec();
         first += robot.joints.len();
@@ -59,53 +51,42 @@ pub(in crate::planning) fn configurations(
                 robot.body.kinematics.unwind(&mut near, &own, |kind| kind == JointKind::Continuous);
                 vec![near]
             }
-            Some(Goal::Pose(pose)) => {
-                let settings = IkSettings { seed, ..reach() };
-                reached(robot, &frame(pose), &own, &settings, &mut free, stop)?
-            }
+            Some(Goal::Pose(pose)) => reached(robot, &frame(pose), &own, (settings, false, seed), &mut free, stop)?,
             Some(Goal::Position(place)) => {
                 let target = DAffine3::from_translation(glamx::DVec3::new(place.x, place.y, place.z));
-                let settings = IkSettings { seed, position_only: true, ..reach() };
-                reached(robot, &target, &own, &settings, &mut free, stop)?
+                reached(robot, &target, &own, (settings, true, seed), &mut free, stop)?
             }
             Some(Goal::Line(_) | Goal::Path(_) | Goal::Retrace(_)) | None => vec![own],
         };
         all = all.iter().flat_map(|before| several.iter().map(move |own| [&before[..], own].concat())).collect();
-        all.truncate(SOLUTIONS * SOLUTIONS);
+        all.truncate(settings.goals.solutions * settings.goals.solutions);
     }
     Ok(all)
-}
-
-fn reach() -> IkSettings {
-    IkSettings {
-        position: POSE_TOLERANCE,
-        rotation: POSE_TOLERANCE,
-        attempts: ATTEMPTS,
-        solutions: SOLUTIONS,
-        ..IkSettings::default()
-    }
 }
 
 fn reached(
     robot: &PlannedRobot,
     target: &DAffine3,
     near: &[f64],
-    settings: &IkSettings,
+    (settings, position_only, seed): (&PlannerSettings, bool, u64),
     free: &mut impl FnMut(&[f64], bool) -> bool,
     stop: &Stop,
 ) -> Result<Path, PlanFailure> {
+    let GoalSettings { tolerance, attempts, solutions, .. } = settings.goals;
+    let (position, rotation) = (tolerance, tolerance);
+    let ik_settings = IkSettings { position, rotation, attempts, solutions, position_only, seed, ..settings.ik };
     let in_root = robot.body.base.inverse() * *target;
     let mut ik = Ik::new(&robot.body.kinematics, robot.tcp());
-    if let Some(own) = already_there(robot, &mut ik, &in_root, near, settings) {
+    if let Some(own) = already_there(robot, &mut ik, &in_root, near, (&settings.goals, position_only)) {
         return Ok(vec![own]);
     }
     // Those that keep the padding; otherwise those that touch nothing.
     for padded in [true, false] {
-        if let Ok(several) = ik.solve(&in_root, near, settings, |q| free(q, padded), stop) {
+        if let Ok(several) = ik.solve(&in_root, near, &ik_settings, |q| free(q, padded), stop) {
             return Ok(several);
         }
     }
-    ik.solve(&in_root, near, settings, |_| true, stop).map_err(|failure| {
+    ik.solve(&in_root, near, &ik_settings, |_| true, stop).map_err(|failure| {
         if stop.is_cancelled() {
             return PlanFailure::cancelled();
         }
@@ -121,15 +102,18 @@ fn already_there(
     ik: &mut Ik<'_>,
     target: &DAffine3,
     own: &[f64],
-    settings: &IkSettings,
+    (settings, position_only): (&GoalSettings, bool),
 ) -> Option<Vec<f64>> {
     let inside: Vec<f64> = own.iter().zip(&robot.limits).map(|(q, l)| q.max(l.lower).min(l.upper)).collect();
     let is_inside = inside == own;
-    let (far, turned) = if is_inside { (settings.position, settings.rotation) } else { (SAME_PLACE, SAME_TURN) };
+    let (far, turned) = match is_inside {
+        true => (settings.tolerance, settings.tolerance),
+        false => (settings.near_distance, settings.near_rotation),
+    };
     let is_at = ik.pose(own);
     let turn = rotation_between(&is_at.matrix3, &target.matrix3).length();
-    let there = is_at.translation.distance(target.translation) <= far && (settings.position_only || turn <= turned);
-    (there && (is_inside || distance(&inside, own) <= LIMIT_TOLERANCE)).then_some(inside)
+    let there = is_at.translation.distance(target.translation) <= far && (position_only || turn <= turned);
+    (there && (is_inside || distance(&inside, own) <= settings.limit_tolerance)).then_some(inside)
 }
 
 /// Follows the straight line of the only moving robot's end effector as far as possible; returns the path and the part
@@ -147,14 +131,14 @@ pub(in crate::planning) fn line(
     if let Some(contact) = contacts.first() {
         return Err(PlanFailure::new(format!("the start collides: {contact}")));
     }
+    let settings = stage.settings;
     // The end is known only after following the line.
-    let settings = LineSettings::default();
-    let ahead = straight_line(&kinematics, robot.tcp(), &start, &in_root, &settings, |_, _| true);
+    let ahead = straight_line(&kinematics, robot.tcp(), &start, &in_root, &settings.line, |_, _| true);
     if let Some(goal) = ahead.path.last().filter(|_| ahead.fraction >= COMPLETE) {
-        checker.give_up(Near::Goal, goal);
+        checker.relax(Near::Goal, goal);
     }
     let mut blocked = None;
-    let line = straight_line(&kinematics, robot.tcp(), &start, &in_root, &settings, |a, b| {
+    let line = straight_line(&kinematics, robot.tcp(), &start, &in_root, &settings.line, |a, b| {
         let free = checker.motion_is_free(a, b, stop);
         if !free {
             blocked = Some([a.to_vec(), b.to_vec()]);
@@ -189,9 +173,9 @@ pub(in crate::planning) fn follow(stage: &mut Stage<'_>, given: &Path, stop: &St
         }
     }
     if let Some(goal) = path.last() {
-        checker.give_up(Near::Goal, goal);
+        checker.relax(Near::Goal, goal);
     }
-    let escape_path = EscapePath::of(checker, &path);
+    let escape_path = EscapePath::of(checker, &path, &stage.settings.plan.escape);
     let mut q = stage.start.clone();
     for (k, pair) in path.windows(2).enumerate() {
         let [a, b] = pair else { continue };

@@ -67,7 +67,7 @@ pub(in crate::planning) fn legs_along(
         .map_err(|failure| PlanFailure { what: format!("the approach to the path: {}", failure.what), ..failure })?;
     unwind_all(&mut path.points, approach.path.last().unwrap_or(&stage.start), stage.checker.turns());
     if let Some(last) = path.points.last() {
-        stage.checker.give_up(Near::Goal, last);
+        stage.checker.relax(Near::Goal, last);
     }
     let checker = &mut stage.checker;
     for (i, pair) in path.points.windows(2).enumerate() {

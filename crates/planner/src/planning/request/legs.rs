@@ -5,20 +5,14 @@ use std::time::Instant;
 use super::goals;
 use super::joint_path::legs_along;
 use super::pipeline::{Goal, PlanFailure, PlanRequest, Stage, StageTimes, bounds_of, failure_for};
+use super::settings::BlendSettings;
 use crate::collision::{CollisionChecker, Stop};
 use crate::planning::scene::padded::Near;
 use crate::planning::search::level::Level;
 use crate::planning::search::path::{Path, distance, unwind};
-use crate::planning::search::path_planner::{PlanSettings, plan};
-use crate::planning::timing::TimingSettings;
+use crate::planning::search::path_planner::plan;
+use crate::planning::search::settings::PlanSettings;
 use dimos_robot::kinematics::frame;
-
-/// Maximum deviation at the corners of a straight line or a given path, which are so flat that blending keeps to it,
-/// and at a waypoint [rad].
-const LINE_DEVIATION: f64 = 1e-3;
-const MOST_DEVIATION: f64 = 0.5;
-/// Shortest piece at a waypoint that is blended [rad].
-const SHORTEST_BLENDED: f64 = 0.01;
 
 /// How a way is searched.
 #[derive(Debug, Clone, Copy)]
@@ -82,12 +76,17 @@ pub(in crate::planning) fn leg(
         [(_, Goal::Line(target))] => {
             let (path, fraction) = goals::line(stage, &frame(target), stop)?;
             took("search", began.elapsed().as_secs_f64());
-            Ok(Leg { path, fraction: Some(fraction), deviation: LINE_DEVIATION, clamped: Vec::new() })
+            Ok(Leg {
+                path,
+                fraction: Some(fraction),
+                deviation: stage.settings.blend.line_deviation,
+                clamped: Vec::new(),
+            })
         }
         [(_, Goal::Retrace(given))] => {
             let path = goals::follow(stage, given, stop)?;
             took("search", began.elapsed().as_secs_f64());
-            Ok(Leg { path, fraction: None, deviation: LINE_DEVIATION, clamped: Vec::new() })
+            Ok(Leg { path, fraction: None, deviation: stage.settings.blend.line_deviation, clamped: Vec::new() })
         }
         several if several.iter().any(|(_, goal)| matches!(goal, Goal::Retrace(_))) => {
             Err(PlanFailure::new("a given path is for one robot at a time"))
@@ -100,11 +99,11 @@ pub(in crate::planning) fn leg(
             for goal in &goals {
                 let mut goal = goal.clone();
                 unwind(&mut goal, &stage.start, stage.checker.turns());
-                stage.checker.give_up(Near::Goal, &goal);
+                stage.checker.relax(Near::Goal, &goal);
             }
             took("ik", began.elapsed().as_secs_f64());
             let SearchOptions { seed, level, refine } = search;
-            let settings = PlanSettings { seed, level, refine, ..PlanSettings::default() };
+            let settings = PlanSettings { seed, level, refine, ..stage.settings.plan };
             let start = stage.start.clone();
             let found =
                 plan(&mut stage.checker, &start, &goals, &settings, stop).map_err(|e| failure_for(stage, &e))?;
@@ -115,7 +114,7 @@ pub(in crate::planning) fn leg(
             let (path, clamped) = match bounds_of(stage) {
                 Ok(bounds) => {
                     let Stage { joints, checker, .. } = stage;
-                    found.quickest(joints, &bounds, |a, b| checker.motion_looks_free(a, b))
+                    found.quickest(joints, &bounds, &stage.settings.timing, |a, b| checker.motion_looks_free(a, b))
                 }
                 Err(_) => (found.path, found.clamped),
             };
@@ -125,7 +124,7 @@ pub(in crate::planning) fn leg(
             let used = |joint: usize| Some((stage.joints.get(joint)?.clone(), *path.last()?.get(joint)?));
             let moved = clamped.iter().filter_map(|(joint, asked)| Some((*asked, used(*joint)?)));
             let clamped = moved.map(|(asked, (joint, used))| (joint, asked, used)).collect();
-            Ok(Leg { path, fraction: None, clamped, deviation: TimingSettings::default().deviation })
+            Ok(Leg { path, fraction: None, clamped, deviation: stage.settings.timing.deviation })
         }
     }
 }
@@ -152,8 +151,8 @@ fn waypoint_deviation(stage: &Stage<'_>, before: &[f64], at: &[f64], after: &[f6
     let (to, from) = (distance(before, at).max(1e-12), distance(at, after).max(1e-12));
     let turn: Vec<f64> = before.iter().zip(at).zip(after).map(|((a, b), c)| (c - b) / from - (b - a) / to).collect();
     let size = turn.iter().map(|t| t * t).sum::<f64>().sqrt();
-    // A blend of so short a piece would take longer than a stop.
-    if blend <= 0.0 || size < 1e-9 || to.min(from) < SHORTEST_BLENDED {
+    let BlendSettings { max_deviation, min_piece, .. } = stage.settings.blend;
+    if blend <= 0.0 || size < 1e-9 || to.min(from) < min_piece {
         return 0.0;
     }
     let farthest = |deviation: f64| {
@@ -167,7 +166,7 @@ fn waypoint_deviation(stage: &Stage<'_>, before: &[f64], at: &[f64], after: &[f6
         }
         most
     };
-    let mut deviation = MOST_DEVIATION;
+    let mut deviation = max_deviation;
     for _ in 0..6 {
         let distance = farthest(deviation);
         if distance <= blend {

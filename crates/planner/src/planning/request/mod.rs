@@ -7,6 +7,7 @@ pub(in crate::planning) mod legs;
 pub mod pipeline;
 pub mod planner_thread;
 pub mod revalidate;
+pub mod settings;
 pub mod start_contact;
 
 #[cfg(test)]

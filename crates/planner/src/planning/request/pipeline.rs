@@ -10,20 +10,21 @@ use super::ahead::straight_motions;
 use super::joint_path::JointPath;
 use super::legs::{joined, legs};
 use super::start_contact::{EscapePath, passes};
-use crate::collision::kept::Kept;
+use crate::collision::clearance::Clearance;
 use crate::collision::report::Pair;
 use crate::collision::world::{Robot, World};
 use crate::collision::{CollisionChecker, Stop};
 use crate::planning::scene::ignored_pairs::IgnoredPair;
-use crate::planning::scene::padded::{GivenUp, Near, Padded};
+use crate::planning::scene::padded::{Near, Padded, PaddingException};
 use crate::planning::scene::planning_scene::{PlannedRobot, PlanningScene};
 use crate::planning::scene::stage_cache::Key;
 use crate::planning::search::level::Level;
 use crate::planning::search::path::{Path, distance, length};
 use crate::planning::search::path_planner::{PlanError, digits_outside};
+use crate::planning::settings::PlannerSettings;
 use crate::planning::timing::tool_timing::Tools;
-use crate::planning::timing::topp::JointBound;
 use crate::planning::timing::{TimingError, bounds, time_within};
+use dimos_core::joint::JointBounds;
 use dimos_core::trajectory::{JointTrajectory, JointValues, Spline, TrajectoryPoint};
 use dimos_core::written;
 use dimos_robot::model::Limits;
@@ -32,11 +33,6 @@ use dimos_robot::model::Limits;
 const GOAL_TOLERANCE: f64 = 1e-6;
 /// Configurations closer than this count as the same [rad].
 const SAME_CONFIGURATION: f64 = 1e-3;
-/// Additional padding during the search [m]: between the points of its trajectory, a motion deviates slightly from the
-/// checked path and must still pass a later check.
-const EXTRA_PADDING: f64 = 2e-4;
-/// Part of the padding that a given path keeps: the arm has been there.
-const PATH_PADDING: f64 = 0.5;
 /// Distance at which nothing can touch [m].
 const OUT_OF_REACH: f64 = 1e5;
 /// Duration of the motion of robots that are already at the goal [s].
@@ -112,13 +108,13 @@ pub struct PlannedMotion {
     pub level: Level,
     /// The distance that the whole motion is proven to keep; at a start in contact, that of the contact. `None` if
     /// there is nothing to collide with, if nothing is proven, or if the timeout was reached before it was computed.
-    pub clearance: Option<Kept>,
+    pub clearance: Option<Clearance>,
     /// The escape path, if the start is in contact.
     pub escape_path: Option<EscapePath>,
     /// Padding [m].
     pub padding: f64,
     /// Exceptions from the padding.
-    pub given_up: Vec<GivenUp>,
+    pub exceptions: Vec<PaddingException>,
     /// Pairs of links that were not checked.
     pub ignored: Vec<IgnoredPair>,
     /// Joints of the goal that were moved to their limits: name, requested and used position [rad or m].
@@ -134,7 +130,7 @@ pub struct PlannedMotion {
 pub struct PlanFailure {
     /// A sentence without full stop.
     pub what: String,
-    /// What the user can do about it.
+    /// Remedy for the user.
     pub hint: Option<String>,
     /// Whether the request was cancelled.
     pub cancelled: bool,
@@ -160,6 +156,8 @@ impl PlanFailure {
 
 /// The scene of one request: moving robots are planned, the others are fixed.
 pub(in crate::planning) struct Stage<'a> {
+    /// Settings of the planner.
+    pub settings: &'a PlannerSettings,
     /// The robots that move.
     pub robots: Vec<&'a PlannedRobot>,
     /// Their indices in the scene.
@@ -179,8 +177,8 @@ pub(in crate::planning) struct Stage<'a> {
 /// Duration of each stage [s], by its name.
 pub(in crate::planning) type StageTimes = BTreeMap<String, f64>;
 
-/// Plans a motion. The same scene, world and request give the same motion unless the timeout is reached. What samples
-/// have in the way may be free: if the level `fast` finds none, proofs are asked.
+/// Plans a motion. The same scene, world and request give the same motion unless the timeout is reached. Samples
+/// may refuse what a proof accepts: if the level `fast` finds no motion, `certified` is tried.
 pub fn solve(
     setup: &PlanningScene,
     world: &World,
@@ -204,9 +202,9 @@ fn attempt(
     let mut times = BTreeMap::new();
     let moving: Vec<usize> = request.goals.iter().map(|(robot, _)| *robot).collect();
     let given = request.goals.iter().any(|(_, goal)| matches!(goal, Goal::Retrace(_)));
-    let padding = if given { PATH_PADDING * setup.padding } else { setup.padding };
-    let mut stage = stage(setup, world, &moving, &request.positions, padding + EXTRA_PADDING)?;
-    stage.checker.give_up(Near::Start, &stage.start);
+    let padding = if given { setup.settings.padding.path_ratio * setup.padding } else { setup.padding };
+    let mut stage = stage(setup, world, &moving, &request.positions, padding + setup.settings.padding.extra)?;
+    stage.checker.relax(Near::Start, &stage.start);
     let lap = |times: &mut BTreeMap<String, f64>, name: &str, since: Instant| {
         times.insert(name.to_owned(), since.elapsed().as_secs_f64());
         Instant::now()
@@ -216,7 +214,7 @@ fn attempt(
     let (path, deviation) = joined(&stage, &legs, request.blend);
     let clamped = legs.iter().flat_map(|leg| leg.clamped.iter().cloned()).collect();
     let timing = Instant::now();
-    let escape_path = EscapePath::of(&mut stage.checker, &path);
+    let escape_path = EscapePath::of(&mut stage.checker, &path, &stage.settings.plan.escape);
     let trajectory = match length(&path) < GOAL_TOLERANCE {
         true => rest(&stage.joints, &path),
         false => timed(&mut stage, (&path, &deviation), escape_path.as_ref(), request, stop)?,
@@ -227,15 +225,19 @@ fn attempt(
         Some(_) => contact_at(&mut stage.checker, &stage.start),
         None if level.proves() => {
             let spline = Spline::new(&trajectory).map_err(|e| PlanFailure::new(e.to_string()))?;
-            stage.checker.kept_on(&straight_motions(&spline), level == Level::Exact, stop)
+            stage.checker.clearance_along(
+                &straight_motions(&spline, &stage.settings.look_ahead),
+                level == Level::Exact,
+                stop,
+            )
         }
         None => None,
     };
     lap(&mut times, "clearance", looking);
     // Only one of several goals was reached.
     let reached = |center: &[f64]| path.iter().any(|at| distance(at, center) < SAME_CONFIGURATION);
-    let at_end = |given_up: &&GivenUp| given_up.near != Near::Goal || reached(&given_up.center);
-    let given_up = stage.checker.given_up().iter().filter(at_end).cloned().collect();
+    let at_end = |exception: &&PaddingException| exception.near != Near::Goal || reached(&exception.center);
+    let exceptions = stage.checker.exceptions().iter().filter(at_end).cloned().collect();
     let robots = stage.indices;
     let ignored = setup.ignored_pairs(world, &robots);
     Ok(PlannedMotion {
@@ -246,7 +248,7 @@ fn attempt(
         clearance,
         escape_path,
         padding,
-        given_up,
+        exceptions,
         ignored,
         clamped,
         fraction,
@@ -295,9 +297,9 @@ pub(in crate::planning) fn stage<'a>(
         let several = if indices.len() > 1 { indices.as_slice() } else { &[] };
         let apart = several.iter().map(|own| apart(setup, world, &bodies, (*own, moving), positions, padding));
         let apart = apart.collect::<Result<_, _>>()?;
-        Ok((Padded::new(world.with_robots(bodies).snapshot(), padding), apart))
+        Ok((Padded::new(world.with_robots(bodies).snapshot(), padding, &setup.settings), apart))
     })?;
-    Ok(Stage { robots, indices, joints, limits, start, checker, apart })
+    Ok(Stage { settings: &setup.settings, robots, indices, joints, limits, start, checker, apart })
 }
 
 /// Returns the checker of one moving robot alone with everything that does not move.
@@ -320,7 +322,7 @@ fn apart(
         // Out of reach with what it holds: held objects refer to their robot by its number.
         body.base.translation += DVec3::splat(OUT_OF_REACH);
     }
-    Ok(Padded::new(world.with_robots(bodies).snapshot(), padding))
+    Ok(Padded::new(world.with_robots(bodies).snapshot(), padding, &setup.settings))
 }
 
 /// Converts a path planner's error to a failure with joint names.
@@ -379,9 +381,9 @@ fn rest(joints: &[String], path: &Path) -> JointTrajectory {
 }
 
 /// Returns the deepest contact at a configuration.
-fn contact_at(checker: &mut Padded, q: &[f64]) -> Option<Kept> {
+fn contact_at(checker: &mut Padded, q: &[f64]) -> Option<Clearance> {
     let contact = checker.contacts(q).into_iter().next()?;
-    Some(Kept { distance: contact.distance, pair: Some([contact.link, contact.other]) })
+    Some(Clearance { distance: contact.distance, pair: Some([contact.link, contact.other]) })
 }
 
 /// Times a path within the joints' limits, and verifies the trajectory.
@@ -395,12 +397,12 @@ fn timed(
     let bounds = bounds_of(stage)?;
     let checker = &mut stage.checker;
     let free = |a: &[f64], b: &[f64]| passes(checker, request.level, escape_path, (a, b), stop);
-    let timed = time_within(&stage.joints, path, &bounds, deviation, 1.0, free);
+    let timed = time_within(&stage.joints, path, &bounds, deviation, &stage.settings.timing, free);
     let timed = timed.map_err(|error| {
         let unproven = matches!(error, TimingError::NotFree(..));
         late(stop).unwrap_or_else(|| PlanFailure { unproven, ..PlanFailure::new(error.to_string()) })
     })?;
-    let motion = tools(stage).slowed(&timed.trajectory, &bounds, 1.0).unwrap_or(timed.trajectory);
+    let motion = tools(stage).slowed(&timed.trajectory, &bounds, 1.0, &stage.settings.tool).unwrap_or(timed.trajectory);
     // The same motion in a longer time, as a direct move and the speed override have it.
     Ok(if request.speed < 1.0 { motion.scaled(request.speed) } else { motion })
 }
@@ -419,7 +421,7 @@ fn tools(stage: &Stage<'_>) -> Tools {
 }
 
 /// Returns the bounds of the joints.
-pub(in crate::planning) fn bounds_of(stage: &Stage<'_>) -> Result<Vec<JointBound>, PlanFailure> {
+pub(in crate::planning) fn bounds_of(stage: &Stage<'_>) -> Result<Vec<JointBounds>, PlanFailure> {
     bounds(&stage.joints, &stage.limits).map_err(|e| PlanFailure::new(e.to_string()))
 }
 

@@ -7,7 +7,7 @@ use nalgebra::{Isometry3, Translation3};
 use super::goals::configurations;
 use super::joint_path::JointPath;
 use super::pipeline::{Goal, PlanRequest, PlannedMotion, solve, stage};
-use crate::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
+use crate::collision::{CheckSettings, CollisionChecker, ExactChecker, Stop};
 use crate::planning::scene::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
 use crate::planning::scene::planning_scene::PlanningScene;
 use crate::planning::search::level::Level;
@@ -163,7 +163,7 @@ fn goals_of_several_arms_touch_nothing_that_is_fixed() {
     assert!(looked > 5 && several > 0, "{looked} {several}");
 }
 
-/// What a hand led at 100 Hz, with the noise of encoders.
+/// A record of hand guiding at 100 Hz, with the noise of encoders.
 fn led(seconds: f64) -> Vec<Vec<f64>> {
     let mut random = Random::new(11);
     let mut at = |t: f64| {
@@ -226,7 +226,7 @@ fn a_path_is_refused_where_it_is_not_free_or_leaves_the_limits() {
 
 /// Returns the smallest distance at many places of a motion [m].
 fn closest(scene: &PlanningScene, motion: &PlannedMotion) -> f64 {
-    let mut checker = ExactChecker::new(scene.world.snapshot(), Resolution::default());
+    let mut checker = ExactChecker::new(scene.world.snapshot(), CheckSettings::default());
     let spline = Spline::new(&motion.trajectory).unwrap();
     let (mut cursor, mut at) = (Cursor::default(), vec![Sample::default(); spline.joints()]);
     let mut distance = |k: u32| {

@@ -3,13 +3,7 @@
 use crate::collision::{CollisionChecker, Stop};
 use crate::planning::search::level::Level;
 use crate::planning::search::path::{Path, between, distance, length};
-
-/// Collision checks along one piece of the escape path.
-const SAMPLES: u32 = 8;
-/// Maximum penetration depth of a start [m].
-pub(in crate::planning) const MAX_START_DEPTH: f64 = 0.003;
-/// Maximum increase of the penetration depth [m].
-const DEPTH_TOLERANCE: f64 = 1e-4;
+use crate::planning::search::settings::EscapeSettings;
 
 /// Start of a path in contact, and the length of the path until it is free.
 #[derive(Debug, Clone, PartialEq)]
@@ -17,30 +11,32 @@ pub struct EscapePath {
     start: Vec<f64>,
     depth: f64,
     reach: f64,
+    settings: EscapeSettings,
 }
 
 impl EscapePath {
     /// Returns the escape path of `path`; `None` if its start is free.
-    pub fn of<C: CollisionChecker>(checker: &mut C, path: &Path) -> Option<Self> {
+    pub fn of<C: CollisionChecker>(checker: &mut C, path: &Path, settings: &EscapeSettings) -> Option<Self> {
         let start = path.first().filter(|start| !checker.is_free(start))?.clone();
         let depth = checker.contacts(&start).first().map(|contact| -contact.distance).filter(|depth| *depth >= 0.0)?;
-        if depth > MAX_START_DEPTH + DEPTH_TOLERANCE {
+        if depth > settings.max_depth + settings.depth_tolerance {
             return None;
         }
         let free = path.iter().position(|q| checker.is_free(q))?;
         let reach = length(path.get(..=free)?);
-        Some(Self { start, depth, reach })
+        Some(Self { start, depth, reach, settings: *settings })
     }
 
     /// Returns whether a straight piece is part of the escape path and penetrates no deeper.
     fn allows<C: CollisionChecker>(&self, checker: &mut C, a: &[f64], b: &[f64]) -> bool {
+        let EscapeSettings { depth_tolerance, samples, .. } = self.settings;
         let mut at = a.to_vec();
         let near = |q: &[f64]| distance(&self.start, q) <= self.reach + 1e-9;
         near(a)
             && near(b)
-            && (0..=SAMPLES).all(|k| {
-                between(a, b, f64::from(k) / f64::from(SAMPLES), &mut at);
-                checker.contacts(&at).first().is_none_or(|contact| -contact.distance <= self.depth + DEPTH_TOLERANCE)
+            && (0..=samples).all(|k| {
+                between(a, b, f64::from(k) / f64::from(samples), &mut at);
+                checker.contacts(&at).first().is_none_or(|contact| -contact.distance <= self.depth + depth_tolerance)
             })
     }
 }

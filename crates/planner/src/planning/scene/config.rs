@@ -183,21 +183,6 @@ impl RobotConfig {
     }
 }
 
-/// Limits of one joint as the executing arm enforces them.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct JointBounds {
-    /// Lowest and highest position [rad].
-    pub position: [f64; 2],
-    /// Maximum speed [rad/s].
-    pub velocity: f64,
-    /// Maximum acceleration [rad/s²].
-    pub acceleration: f64,
-    /// Maximum jerk [rad/s³].
-    pub jerk: f64,
-    /// Maximum speed of the arm's tool [m/s]; `None`: no limit.
-    pub tcp_velocity: Option<f64>,
-}
-
 /// An object in the world.
 #[derive(Debug, Clone)]
 pub struct ObjectConfig {

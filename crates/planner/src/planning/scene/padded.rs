@@ -7,27 +7,17 @@ use std::sync::Arc;
 
 use dimos_kernels::block::{LANES, Lanes};
 
+use super::settings::PaddingSettings;
 use crate::collision::allowed_pairs::sample;
 use crate::collision::checker::Samples;
-use crate::collision::kept::{Kept, Motion};
+use crate::collision::clearance::{Clearance, Motion};
 use crate::collision::report::{Contact, Pair};
-use crate::collision::{CollisionChecker, ExactChecker, Resolution, Scene, Stop};
+use crate::collision::{CollisionChecker, ExactChecker, Scene, Stop};
 use crate::planning::search::path::between;
+use crate::planning::settings::PlannerSettings;
 use dimos_core::named::named;
 use dimos_robot::model::Limits;
 use dimos_robot::random::Random;
-
-/// Candidate radii of an exception around a start or goal [rad]: the first that contains a configuration with the full
-/// padding is used.
-const RADII: [f64; 3] = [0.1, 0.3, 1.0];
-/// Configurations tried per candidate radius.
-const TRIES: usize = 100;
-/// Samples over all joints' ranges: a pair closer than the padding in every one of them counts as always closer.
-const POSES: usize = 32;
-/// Part of its distance at the start or goal that a pair keeps around it: while planning, and when the plan is checked
-/// again.
-const DISTANCE_RATIO: f64 = 0.5;
-const REVALIDATION_RATIO: f64 = 0.4;
 
 named! {
     /// Where an exception from the padding applies.
@@ -44,7 +34,7 @@ named! {
 
 /// An exception from the padding: a pair and where it applies.
 #[derive(Debug, Clone, PartialEq)]
-pub struct GivenUp {
+pub struct PaddingException {
     /// Where it applies.
     pub near: Near,
     /// The start or goal configuration [rad].
@@ -74,14 +64,22 @@ pub struct Padded {
     full: ExactChecker,
     bare: ExactChecker,
     zones: Vec<Zone>,
-    given_up: Vec<GivenUp>,
+    exceptions: Vec<PaddingException>,
+    settings: PaddingSettings,
 }
 
 impl Padded {
     /// Creates a checker of a scene with `padding` [m] everywhere.
-    pub fn new(scene: Arc<Scene>, padding: f64) -> Self {
-        let bare = ExactChecker::new(scene, Resolution::default());
-        Self { padding, full: bare.clone().with_padding(padding), bare, zones: Vec::new(), given_up: Vec::new() }
+    pub fn new(scene: Arc<Scene>, padding: f64, settings: &PlannerSettings) -> Self {
+        let bare = ExactChecker::new(scene, settings.check);
+        Self {
+            padding,
+            full: bare.clone().with_padding(padding),
+            bare,
+            zones: Vec::new(),
+            exceptions: Vec::new(),
+            settings: settings.padding,
+        }
     }
 
     /// Returns the padding [m].
@@ -90,8 +88,8 @@ impl Padded {
     }
 
     /// Returns the exceptions.
-    pub fn given_up(&self) -> &[GivenUp] {
-        &self.given_up
+    pub fn exceptions(&self) -> &[PaddingException] {
+        &self.exceptions
     }
 
     /// Returns whether nothing touches, regardless of the padding.
@@ -100,13 +98,13 @@ impl Padded {
     }
 
     /// Returns the distance that motions are proven to keep, regardless of the padding; see
-    /// [`ExactChecker::kept_on`].
-    pub fn kept_on(&mut self, motions: &[Motion], exact: bool, stop: &Stop) -> Option<Kept> {
-        self.bare.kept_on(motions, exact, stop)
+    /// [`ExactChecker::clearance_along`].
+    pub fn clearance_along(&mut self, motions: &[Motion], exact: bool, stop: &Stop) -> Option<Clearance> {
+        self.bare.clearance_along(motions, exact, stop)
     }
 
-    /// Adds exceptions around a start or goal for the pairs that are closer there.
-    pub fn give_up(&mut self, near: Near, center: &[f64]) {
+    /// Adds exceptions from the padding around a start or goal, for the pairs that are closer there.
+    pub fn relax(&mut self, near: Near, center: &[f64]) {
         if self.full.is_free(center) {
             return;
         }
@@ -118,44 +116,44 @@ impl Padded {
         let (always, here): (Vec<_>, Vec<_>) = closer.into_iter().partition(|(pair, _)| self.is_always_closer(*pair));
         for (pair, contact) in always {
             let radius = f64::INFINITY;
-            self.given_up.push(given_up(Near::Everywhere, Vec::new(), radius, &contact));
-            self.relax(pair, 0.0);
+            self.exceptions.push(exception(Near::Everywhere, Vec::new(), radius, &contact));
+            self.set_pad_of_all(pair, 0.0);
         }
         if here.is_empty() {
             return;
         }
         let mut zone = Zone { center: center.to_vec(), radius: 0.0, checker: self.full.clone() };
         for (pair, contact) in &here {
-            zone.checker.set_pad(*pair, DISTANCE_RATIO * contact.distance.max(0.0));
+            zone.checker.set_pad(*pair, self.settings.distance_ratio * contact.distance.max(0.0));
         }
         zone.radius = self.reach(&mut zone);
-        let noted = here.iter().map(|(_, contact)| given_up(near, center.to_vec(), zone.radius, contact));
-        self.given_up.extend(noted);
+        let noted = here.iter().map(|(_, contact)| exception(near, center.to_vec(), zone.radius, contact));
+        self.exceptions.extend(noted);
         self.zones.push(zone);
     }
 
     /// Repeats earlier exceptions in a world that may have changed; pairs added since keep the full padding.
-    pub fn give_up_again(&mut self, before: &[GivenUp]) {
-        for given_up in before.iter().filter(|given_up| given_up.near == Near::Everywhere) {
-            if let Some(pair) = self.full.pair_index(&given_up.link, &given_up.other) {
-                self.relax(pair, 0.0);
+    pub fn relax_again(&mut self, before: &[PaddingException]) {
+        for exception in before.iter().filter(|exception| exception.near == Near::Everywhere) {
+            if let Some(pair) = self.full.pair_index(&exception.link, &exception.other) {
+                self.set_pad_of_all(pair, 0.0);
             }
         }
-        for given_up in before.iter().filter(|given_up| given_up.near != Near::Everywhere) {
-            let Some(pair) = self.full.pair_index(&given_up.link, &given_up.other) else { continue };
-            let at = self.zones.iter().position(|zone| zone.center == given_up.center).unwrap_or(self.zones.len());
+        for exception in before.iter().filter(|exception| exception.near != Near::Everywhere) {
+            let Some(pair) = self.full.pair_index(&exception.link, &exception.other) else { continue };
+            let at = self.zones.iter().position(|zone| zone.center == exception.center).unwrap_or(self.zones.len());
             if at == self.zones.len() {
-                let (center, radius) = (given_up.center.clone(), given_up.radius);
+                let (center, radius) = (exception.center.clone(), exception.radius);
                 self.zones.push(Zone { center, radius, checker: self.full.clone() });
             }
             if let Some(zone) = self.zones.get_mut(at) {
-                zone.checker.set_pad(pair, REVALIDATION_RATIO * given_up.distance.max(0.0));
+                zone.checker.set_pad(pair, self.settings.revalidation_ratio * exception.distance.max(0.0));
             }
         }
-        self.given_up = before.to_vec();
+        self.exceptions = before.to_vec();
     }
 
-    fn relax(&mut self, pair: usize, pad: f64) {
+    fn set_pad_of_all(&mut self, pair: usize, pad: f64) {
         self.full.set_pad(pair, pad);
         self.zones.iter_mut().for_each(|zone| zone.checker.set_pad(pair, pad));
     }
@@ -164,7 +162,7 @@ impl Padded {
     fn is_always_closer(&mut self, pair: usize) -> bool {
         let mut random = Random::new(0);
         let limits = self.full.limits().to_vec();
-        (0..POSES).all(|_| {
+        (0..self.settings.poses).all(|_| {
             let q: Vec<f64> = limits.iter().map(|l| sample(l.lower, l.upper, &mut random)).collect();
             !self.full.keeps(pair, &q)
         })
@@ -174,8 +172,8 @@ impl Padded {
     fn reach(&mut self, zone: &mut Zone) -> f64 {
         let mut random = Random::new(0);
         let limits = self.full.limits().to_vec();
-        for radius in RADII {
-            for _ in 0..TRIES {
+        for radius in self.settings.radii {
+            for _ in 0..self.settings.tries {
                 let away: Vec<f64> = zone.center.iter().map(|_| random.between(-1.0, 1.0)).collect();
                 let length = away.iter().map(|x| x * x).sum::<f64>().sqrt().max(1e-9);
                 let part = radius * random.between(0.2, 1.0) / length;
@@ -186,7 +184,7 @@ impl Padded {
                 }
             }
         }
-        RADII[RADII.len() - 1]
+        self.settings.radii[self.settings.radii.len() - 1]
     }
 
     /// Returns the parts of a motion at which it enters or leaves a zone.
@@ -231,9 +229,9 @@ impl Zone {
     }
 }
 
-fn given_up(near: Near, center: Vec<f64>, radius: f64, contact: &Contact) -> GivenUp {
+fn exception(near: Near, center: Vec<f64>, radius: f64, contact: &Contact) -> PaddingException {
     let (link, other, distance) = (contact.link.clone(), contact.other.clone(), contact.distance);
-    GivenUp { near, center, radius, link, other, distance }
+    PaddingException { near, center, radius, link, other, distance }
 }
 
 impl CollisionChecker for Padded {
@@ -247,10 +245,6 @@ impl CollisionChecker for Padded {
 
     fn turns(&self) -> &[bool] {
         self.full.turns()
-    }
-
-    fn resolution(&self) -> Resolution {
-        self.full.resolution()
     }
 
     fn is_free(&mut self, q: &[f64]) -> bool {
@@ -275,8 +269,8 @@ impl CollisionChecker for Padded {
         !cuts.is_empty() && cuts.windows(2).all(&mut piece_is_free)
     }
 
-    fn motion_is_easily_free(&mut self, from: &[f64], to: &[f64], looks_free: bool, stop: &Stop) -> bool {
-        self.full.motion_is_easily_free(from, to, looks_free, stop)
+    fn certify_within_budget(&mut self, from: &[f64], to: &[f64], looks_free: bool, stop: &Stop) -> bool {
+        self.full.certify_within_budget(from, to, looks_free, stop)
             || (!self.cuts(from, to).is_empty() && self.motion_is_free(from, to, stop))
     }
 
@@ -290,8 +284,8 @@ impl CollisionChecker for Padded {
             || (!self.cuts(from, to).is_empty() && self.motion_is_free(from, to, &Stop::never()))
     }
 
-    fn look_blocked(&mut self, q: &[Lanes], lanes: u16) -> u16 {
-        let blocked = self.full.look_blocked(q, lanes);
+    fn any_contact_batch(&mut self, q: &[Lanes], lanes: u16) -> u16 {
+        let blocked = self.full.any_contact_batch(q, lanes);
         if self.zones.is_empty() {
             return blocked;
         }

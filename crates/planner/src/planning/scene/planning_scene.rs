@@ -7,7 +7,7 @@ use std::sync::Arc;
 use glamx::{DAffine3, DVec3};
 use nalgebra::Isometry3;
 
-use super::config::{CLOUD_RADIUS, JointBounds, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
+use super::config::{CLOUD_RADIUS, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
 use super::ignored_pairs::{IgnoredPair, of_robot};
 use super::stage_cache::StageCache;
 use super::unplanned_joints::{Measured, idle};
@@ -16,7 +16,8 @@ use crate::collision::body::{MeshMode, solids, solids_of, surface};
 use crate::collision::cloud::Cloud;
 use crate::collision::world::{Obstacle, Robot, World};
 use crate::collision::{Solid, ply};
-use dimos_core::joint::DEFAULT_ACCELERATION;
+use crate::planning::settings::PlannerSettings;
+use dimos_core::joint::{CommandLimits, DEFAULT_ACCELERATION};
 use dimos_robot::kinematics::tool_speed::ToolSpeed;
 use dimos_robot::kinematics::{Kinematics, KinematicsError, frame};
 use dimos_robot::load;
@@ -61,6 +62,8 @@ pub struct PlanningScene {
     pub robots: Vec<PlannedRobot>,
     /// The initial world. Its robots are those above, in the same order.
     pub world: World,
+    /// Settings of the planner.
+    pub settings: PlannerSettings,
     /// Distance that plans keep from obstacles and other arms [m].
     pub padding: f64,
     /// Pairs of links that touch in every configuration, with the robot's name; they are not checked.
@@ -88,6 +91,7 @@ impl PlanningScene {
         let mut setup = Self {
             robots,
             world,
+            settings: PlannerSettings::default(),
             padding: config.padding,
             always_touching: Vec::new(),
             ignored: Vec::new(),
@@ -100,7 +104,7 @@ impl PlanningScene {
 
     /// Adds the limits of the arms that execute the motions, by the coordinator's joint names, so that no plan exceeds
     /// them. The error names a joint whose limits do not overlap.
-    pub fn within(mut self, bounds: &BTreeMap<String, JointBounds>) -> Result<Self, String> {
+    pub fn within(mut self, bounds: &BTreeMap<String, CommandLimits>) -> Result<Self, String> {
         for robot in &mut self.robots {
             robot.narrow(bounds).map_err(|e| format!("robot {:?}: {e}", robot.config.name))?;
         }
@@ -222,7 +226,7 @@ impl PlannedRobot {
         Ok(Self { config, model, joints, end_effector, limits, tcp_velocity: None, rest: posed, body, disabled })
     }
 
-    fn narrow(&mut self, bounds: &BTreeMap<String, JointBounds>) -> Result<(), String> {
+    fn narrow(&mut self, bounds: &BTreeMap<String, CommandLimits>) -> Result<(), String> {
         let mut model = (*self.model).clone();
         for (&index, name) in self.joints.iter().zip(&self.config.coordinator_joints) {
             let (Some(joint), Some(b)) = (model.joints.get_mut(index), bounds.get(name)) else { continue };

@@ -1,5 +1,5 @@
-//! Checkers of recent requests, for requests in the same world: to lay a world out for collision checks takes longer
-//! than most plans.
+//! Checkers of recent requests, for requests in the same world: building the collision scene takes longer than most
+//! plans.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
@@ -12,7 +12,7 @@ use dimos_robot::kinematics::Kinematics;
 /// Maximum number of checkers kept: a request, the check of its plan, and that of a motion under way.
 const MAX: usize = 4;
 
-/// What a checker was made of.
+/// Inputs of a checker.
 #[derive(Debug, Clone)]
 pub(in crate::planning) struct Key {
     /// The world, without its robots.

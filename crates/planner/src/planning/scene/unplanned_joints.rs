@@ -1,5 +1,5 @@
 //! Joints of a model that are not planned: a gripper's joint (`gripper_joint`) from the gripper's opening, others where
-//! an arm of the run measures them, or where the blueprint says they stay (`fixed_joints`). What nothing is known of
+//! an arm of the run measures them, or where the blueprint says they stay (`fixed_joints`). An unknown joint
 //! counts at its widest pose, a gripper without a measurement as fully open.
 
 use std::collections::{BTreeMap, HashMap};
@@ -98,8 +98,8 @@ fn carrier(model: &RobotModel, planned: &[usize], joint: usize) -> Option<usize>
     std::iter::successors(Some(joint), above).find_map(|joint| planned.iter().position(|own| *own == joint))
 }
 
-/// Returns the positions of the independent joints that are not planned, by the model's names. What is not measured now
-/// keeps its `last` position, one for each joint of the model; empty before the first.
+/// Returns the positions of the independent joints that are not planned, by the model's names. A joint without a
+/// measurement keeps its `last` position, one for each joint of the model; empty before the first.
 pub(in crate::planning) fn idle(
     config: &RobotConfig,
     model: &RobotModel,

@@ -6,12 +6,9 @@
 use dimos_kernels::block::{LANES, Lanes};
 use dimos_kernels::nearest::Nearest;
 
-use super::edges::EdgeCheck;
+use super::edges::EdgeValidator;
 use super::nearest::{Batch, Tree};
 use super::path::unwind;
-
-/// Ends that are checked together, at least: fewer take as long as their edges.
-const FEWEST: usize = 4;
 
 /// Up to sixteen samples for one tree.
 #[derive(Debug, Clone)]
@@ -87,10 +84,17 @@ impl Candidates {
         q.iter_mut().zip(&self.samples).for_each(|(q, block)| *q = f64::from(block.0[lane]));
     }
 
-    /// Checks the ends of the edges to all samples, from the nodes nearest to them; `way`: see [`aim`]. `at` is scratch
-    /// space for a configuration.
-    pub fn look(&mut self, tree: &Tree, way: (&[bool], f64), at: &mut [f64], check: &mut dyn EdgeCheck) {
-        if self.number < FEWEST {
+    /// Checks the ends of the edges to all samples, from the nodes nearest to them, if they are at least `min_batch`;
+    /// `way`: see [`aim`]. `at` is scratch space for a configuration.
+    pub fn check_ends(
+        &mut self,
+        tree: &Tree,
+        way: (&[bool], f64),
+        min_batch: usize,
+        at: &mut [f64],
+        check: &mut dyn EdgeValidator,
+    ) {
+        if self.number < min_batch {
             return;
         }
         for lane in 0..LANES {

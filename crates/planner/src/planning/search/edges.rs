@@ -1,34 +1,34 @@
-//! How the edges of a search are checked.
+//! How the edges of a search are checked. Few edges become part of a path, so a search validates each edge by a quick
+//! check, and confirms those of a path by a slower one.
 
 use dimos_kernels::block::Lanes;
 
 use crate::collision::checker::{CollisionChecker, Samples, Stop};
 
-/// Checks the edges of a search.
-pub trait EdgeCheck {
-    /// Returns whether an edge may be used; its first configuration is known to be free.
+/// Validates the edges of a search.
+pub trait EdgeValidator {
+    /// Returns whether an edge may be added to a tree; its first configuration is known to be free.
     fn is_free(&mut self, from: &[f64], to: &[f64]) -> bool;
 
-    /// Returns whether an edge that may be used may be part of a path: few become one, so what takes long is left to be
-    /// checked here.
+    /// Returns whether an edge of a tree may be part of a path.
     fn is_confirmed(&mut self, from: &[f64], to: &[f64]) -> bool;
 
-    /// Returns those of `lanes` that no edge can end at. `q`: a block per joint. A lane that is not returned says
-    /// nothing.
+    /// Returns the lanes of `lanes` whose configurations no edge can end at; a lane that is not returned is undecided.
+    /// `q`: a block per joint.
     fn blocked(&mut self, q: &[Lanes], lanes: u16) -> u16;
 }
 
-/// Which edges may be used.
+/// Checks that an edge must pass.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Edges {
-    /// Those that look free at their first samples.
-    Looking,
-    /// Those that look free, once they are part of a path at all samples.
+pub enum EdgeCheck {
+    /// Free at its first samples.
+    Coarse,
+    /// Free at its first samples; as part of a path, at all samples.
     Sampled,
-    /// Those that look free and, once they are part of a path, are easily proven.
-    Checked,
-    /// Those that are proven, also where covers touch.
-    Proven,
+    /// Free at its first samples; as part of a path, proven within a budget.
+    Certified,
+    /// Proven with solids, also where covers touch.
+    Exact,
 }
 
 /// Checks edges with a collision checker.
@@ -36,38 +36,34 @@ pub enum Edges {
 pub struct EdgeChecker<'a, C> {
     /// The checker.
     pub checker: &'a mut C,
-    /// Which edges may be used.
-    pub edges: Edges,
+    /// Checks that an edge must pass.
+    pub edges: EdgeCheck,
     /// Ends a proof.
     pub stop: &'a Stop,
 }
 
-impl<C: CollisionChecker> EdgeCheck for EdgeChecker<'_, C> {
+impl<C: CollisionChecker> EdgeValidator for EdgeChecker<'_, C> {
     fn is_free(&mut self, from: &[f64], to: &[f64]) -> bool {
-        let Self { checker, stop, .. } = self;
         match self.edges {
-            Edges::Looking | Edges::Sampled | Edges::Checked => checker.motion_looks_free_at(Samples::First, from, to),
-            Edges::Proven => checker.motion_is_free(from, to, stop),
+            EdgeCheck::Exact => self.checker.motion_is_free(from, to, self.stop),
+            _ => self.checker.motion_looks_free_at(Samples::First, from, to),
         }
     }
 
     fn is_confirmed(&mut self, from: &[f64], to: &[f64]) -> bool {
-        let Self { checker, stop, .. } = self;
+        let mut is_sampled = || self.checker.motion_looks_free_at(Samples::Rest, from, to);
         match self.edges {
-            Edges::Sampled => checker.motion_looks_free_at(Samples::Rest, from, to),
-            Edges::Checked => {
-                checker.motion_looks_free_at(Samples::Rest, from, to)
-                    && checker.motion_is_easily_free(from, to, true, stop)
-            }
-            Edges::Looking | Edges::Proven => true,
+            EdgeCheck::Sampled => is_sampled(),
+            EdgeCheck::Certified => is_sampled() && self.checker.certify_within_budget(from, to, true, self.stop),
+            EdgeCheck::Coarse | EdgeCheck::Exact => true,
         }
     }
 
     fn blocked(&mut self, q: &[Lanes], lanes: u16) -> u16 {
         match self.edges {
-            Edges::Looking | Edges::Sampled | Edges::Checked => self.checker.look_blocked(q, lanes),
-            // What covers refuse may be proven.
-            Edges::Proven => 0,
+            // A proof may accept what covers refuse.
+            EdgeCheck::Exact => 0,
+            _ => self.checker.any_contact_batch(q, lanes),
         }
     }
 }

@@ -12,5 +12,6 @@ pub mod refine;
 pub mod rrt_connect;
 pub(in crate::planning) mod sampled;
 pub mod sampler;
+pub mod settings;
 pub mod shortcut;
 pub mod thin;

@@ -6,58 +6,19 @@ use crate::collision::checker::{CollisionChecker, Stop};
 use crate::collision::report::Contact;
 use dimos_robot::random::Random;
 
-use super::edges::Edges;
+use super::edges::EdgeCheck;
 use super::enclosure::{Enclosed, enclosed};
 use super::level::Level;
 use super::path::{Path, between, distance, length, unwind};
 use super::portfolio::{Candidate, Halt, Portfolio};
 use super::refine::{cut, refine};
-use super::rrt_connect::{RrtSettings, SearchCount};
+use super::rrt_connect::SearchCount;
 use super::sampled::Sampled;
-use super::shortcut::{ShortcutSettings, shorten};
-use crate::planning::request::start_contact::MAX_START_DEPTH;
-use crate::planning::timing::topp::JointBound;
-use crate::planning::timing::{Timed, TimingError, TimingSettings, time};
-
-/// Settings of the path search.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct PlanSettings {
-    /// Seed of all random numbers.
-    pub seed: u64,
-    /// How motions are checked.
-    pub level: Level,
-    /// Settings of the tree search.
-    pub search: RrtSettings,
-    /// Settings of the shortcutting.
-    pub shortcut: ShortcutSettings,
-    /// Rounds of refinement: more give shorter paths, and take longer.
-    pub refine: u32,
-    /// Ends the refinement after this time, if given: then the path depends on the speed of the machine.
-    pub refine_time: Option<Duration>,
-    /// Maximum violation of a limit at the start [rad or m]; the motion begins by moving back inside.
-    pub limit_tolerance: f64,
-    /// Maximum violation of a limit at the goal [rad or m]; the goal is moved to the limit. Covers rounded limits, such
-    /// as 3.14159 for π.
-    pub goal_tolerance: f64,
-    /// Maximum penetration depth at the start [m]; the motion begins by moving out of contact.
-    pub contact_tolerance: f64,
-}
-
-impl Default for PlanSettings {
-    fn default() -> Self {
-        Self {
-            seed: 0,
-            level: Level::default(),
-            search: RrtSettings::default(),
-            shortcut: ShortcutSettings::default(),
-            refine: 0,
-            refine_time: None,
-            limit_tolerance: 0.02,
-            goal_tolerance: 1e-3,
-            contact_tolerance: MAX_START_DEPTH,
-        }
-    }
-}
+use super::settings::{EnclosureSettings, EscapeSettings, PlanSettings};
+use super::shortcut::shorten;
+use crate::planning::timing::settings::TimingSettings;
+use crate::planning::timing::{Timed, TimingError, time};
+use dimos_core::joint::JointBounds;
 
 /// A path and statistics of its search.
 #[derive(Debug, Clone, PartialEq)]
@@ -93,11 +54,12 @@ pub struct Plan {
 
 impl Plan {
     /// Returns the path of the quickest motion, with what was `clamped`: the shortest path may turn more often than
-    /// others, or by more of the slower joints. `names`, `bounds` and `free` are those of the timing.
+    /// others, or by more of the slower joints. `names`, `bounds`, `settings` and `free` are those of the timing.
     pub fn quickest(
         self,
         names: &[String],
-        bounds: &[JointBound],
+        bounds: &[JointBounds],
+        settings: &TimingSettings,
         mut free: impl FnMut(&[f64], &[f64]) -> bool,
     ) -> Way {
         let mut ways = self.longer;
@@ -105,11 +67,10 @@ impl Plan {
         if ways.len() == 1 {
             return ways.pop().unwrap_or_default();
         }
-        let settings = TimingSettings::default();
         let duration = |timed: Result<Timed, TimingError>| timed.map_or(f64::INFINITY, |timed| timed.duration);
         // Corners that collide are passed closer, which takes longer: the shortest of these times may not be possible,
         // but most often it is, and the checks of all others are spared.
-        let bound = |way: &Way| duration(time(names, &way.0, bounds, &settings, |_, _| true));
+        let bound = |way: &Way| duration(time(names, &way.0, bounds, settings, |_, _| true));
         let mut ways: Vec<(f64, Way)> = ways.into_iter().rev().map(|way| (bound(&way), way)).collect();
         ways.sort_by(|a, b| a.0.total_cmp(&b.0));
         let mut best = (f64::INFINITY, 0);
@@ -117,7 +78,7 @@ impl Plan {
             if *bound >= best.0 {
                 break;
             }
-            let duration = duration(time(names, &way.0, bounds, &settings, &mut free));
+            let duration = duration(time(names, &way.0, bounds, settings, &mut free));
             if duration < best.0 {
                 best = (duration, i);
             }
@@ -165,7 +126,7 @@ pub enum PlanError {
     Enclosed {
         /// "start" or "goal".
         which: &'static str,
-        /// What encloses it; of several goals, the nearest.
+        /// The enclosure; of several goals, that of the nearest.
         enclosed: Enclosed,
     },
     /// Covers touch at the start, or at every goal: only a proof can say whether solids do.
@@ -220,7 +181,7 @@ pub fn plan<C: CollisionChecker>(
             && match settings.level {
                 Level::Fast => checker.motion_looks_free(&from, goal),
                 Level::Certified if !checker.motion_looks_free(&from, goal) => {
-                    checker.motion_is_easily_free(&from, goal, false, stop)
+                    checker.certify_within_budget(&from, goal, false, stop)
                 }
                 Level::Certified | Level::Exact => checker.motion_is_free(&from, goal, stop),
             }
@@ -242,14 +203,20 @@ pub fn plan<C: CollisionChecker>(
                 Level::Certified if covered => Level::Exact,
                 level => level,
             };
-            let mut searches = Portfolio::new(&from, &goals, &settings.search, level, settings.seed);
+            let mut searches = Portfolio::new(&from, &goals, settings, level);
             loop {
                 let found = searches.next(checker, stop);
                 count = searches.count();
                 let found = match found {
                     Ok(found) => found,
                     Err(Halt::TookLong) => {
-                        not_enclosed(checker, &from, &goals, (settings.seed, level.proves()), stop)?;
+                        not_enclosed(
+                            checker,
+                            &from,
+                            &goals,
+                            (&settings.enclosure, settings.seed, level.proves()),
+                            stop,
+                        )?;
                         continue;
                     }
                     Err(Halt::Stopped) if stop.is_cancelled() => return Err(PlanError::Cancelled),
@@ -297,12 +264,12 @@ fn not_enclosed<C: CollisionChecker>(
     checker: &mut C,
     start: &[f64],
     goals: &[Vec<f64>],
-    how: (u64, bool),
+    how: (&EnclosureSettings, u64, bool),
     stop: &Stop,
 ) -> Result<(), PlanError> {
     let to = [start.to_vec()];
     let mut nearest = None;
-    // What both say of a wall between them is plainer of the goal: the start has most of the space as a rule.
+    // A wall between them is clearer from the goal: the start has most of the space as a rule.
     if goals.iter().all(|goal| enclosed(checker, goal, &to, how, stop).map(|e| nearest.get_or_insert(e)).is_some())
         && let Some(enclosed) = nearest
     {
@@ -313,11 +280,6 @@ fn not_enclosed<C: CollisionChecker>(
         None => Ok(()),
     }
 }
-
-/// Smallest and largest number of random cuts of a path.
-const CUTS: (usize, usize) = (10, 256);
-/// A search with more nodes takes longer, and so may the cuts of its path.
-const NODES_PER_CUT: usize = 8;
 
 /// Shortens a path that was found, and checks what is left of it as far as the level asks for; `None` if it cannot be
 /// used. `nodes`: those of the search. Also returns the duration of the checks that the search left out.
@@ -330,16 +292,16 @@ fn finished<C: CollisionChecker>(
 ) -> Option<(Path, Duration)> {
     let turns = checker.turns().to_vec();
     let (rounds, none) = (&settings.shortcut, Duration::ZERO);
-    if matches!(found.edges, Edges::Checked | Edges::Proven) {
+    if matches!(found.edges, EdgeCheck::Certified | EdgeCheck::Exact) {
         // Where covers touch, nothing looks free.
-        let look = found.edges == Edges::Checked;
+        let look = found.edges == EdgeCheck::Certified;
         let mut is_free = |a: &[f64], b: &[f64]| {
-            (!look || checker.motion_looks_free(a, b)) && checker.motion_is_easily_free(a, b, look, stop)
+            (!look || checker.motion_looks_free(a, b)) && checker.certify_within_budget(a, b, look, stop)
         };
         return Some((shorten(&found.path, &turns, rounds, &mut is_free), none));
     }
     // A proof samples all that it needs.
-    let samples_left = found.edges == Edges::Looking && !settings.level.proves();
+    let samples_left = found.edges == EdgeCheck::Coarse && !settings.level.proves();
     let mut sampled = Sampled::default();
     let mut looks_free = |a: &[f64], b: &[f64]| {
         let free = !stop.is_over() && checker.motion_looks_free(a, b);
@@ -349,7 +311,8 @@ fn finished<C: CollisionChecker>(
         free
     };
     let short = shorten(&found.path, &turns, rounds, &mut looks_free);
-    let cuts = (nodes / NODES_PER_CUT).clamp(CUTS.0, CUTS.1);
+    let [fewest, most] = rounds.cuts;
+    let cuts = (nodes / rounds.nodes_per_cut).clamp(fewest, most);
     let short = cut(&short, cuts, &mut Random::new(settings.seed), &mut looks_free).unwrap_or(short);
     if samples_left {
         let began = Instant::now();
@@ -367,7 +330,7 @@ pub(in crate::planning) fn is_proven<C: CollisionChecker>(
     level: Level,
     stop: &Stop,
 ) -> bool {
-    !level.proves() || path.windows(2).all(|edge| checker.motion_is_easily_free(&edge[0], &edge[1], true, stop))
+    !level.proves() || path.windows(2).all(|edge| checker.certify_within_budget(&edge[0], &edge[1], true, stop))
 }
 
 /// Returns the path from the start to a configuration inside the limits and free of contact: usually just the start.
@@ -393,8 +356,8 @@ fn lead_in<C: CollisionChecker>(
     }
     let contacts = checker.contacts(&inside);
     let depth = contacts.first().map_or(0.0, |c| -c.distance);
-    match (depth <= settings.contact_tolerance).then(|| escape(checker, &inside, depth, settings.seed, stop)).flatten()
-    {
+    let way = (&settings.escape, settings.seed);
+    match (depth <= settings.escape.max_depth).then(|| escape(checker, &inside, depth, way, stop)).flatten() {
         Some(free) => {
             lead.push(free);
             Ok(lead)
@@ -404,23 +367,30 @@ fn lead_in<C: CollisionChecker>(
 }
 
 /// Returns a free configuration close by that is reached without deeper penetration.
-fn escape<C: CollisionChecker>(checker: &mut C, from: &[f64], depth: f64, seed: u64, stop: &Stop) -> Option<Vec<f64>> {
+fn escape<C: CollisionChecker>(
+    checker: &mut C,
+    from: &[f64],
+    depth: f64,
+    (settings, seed): (&EscapeSettings, u64),
+    stop: &Stop,
+) -> Option<Vec<f64>> {
+    let EscapeSettings { depth_tolerance, samples, tries, first_step, growth, .. } = *settings;
     let mut random = Random::new(seed);
     let mut at = from.to_vec();
-    for k in 0..200 {
+    for k in 0..tries {
         if stop.is_over() {
             return None;
         }
-        let size = 0.01 + 0.1 * f64::from(k) / 200.0;
+        let size = first_step + growth * f64::from(k) / f64::from(tries);
         let moved: Vec<f64> = from.iter().map(|x| x + random.between(-size, size)).collect();
         let to = clamped(checker, &moved);
-        let deeper =
-            |checker: &mut C, q: &[f64]| checker.contacts(q).first().is_some_and(|c| -c.distance > depth + 1e-4);
+        let deepest = depth + depth_tolerance;
+        let deeper = |checker: &mut C, q: &[f64]| checker.contacts(q).first().is_some_and(|c| -c.distance > deepest);
         let mut passes = |part: f64| {
             between(from, &to, part, &mut at);
             !deeper(checker, &at)
         };
-        if (1..=8).all(|i| passes(f64::from(i) / 8.0)) && checker.is_free(&to) {
+        if (1..=samples).all(|i| passes(f64::from(i) / f64::from(samples))) && checker.is_free(&to) {
             return Some(to);
         }
     }

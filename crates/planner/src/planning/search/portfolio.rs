@@ -4,10 +4,11 @@
 
 use crate::collision::checker::{CollisionChecker, Stop};
 
-use super::edges::{EdgeChecker, Edges};
+use super::edges::{EdgeCheck, EdgeChecker};
 use super::level::Level;
 use super::path::Path;
-use super::rrt_connect::{Quantum, RrtSettings, Search, SearchCount};
+use super::rrt_connect::{Quantum, Search, SearchCount};
+use super::settings::{PlanSettings, PortfolioSettings, RrtSettings};
 
 /// Why a search returned without a path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -26,22 +27,8 @@ pub struct Candidate {
     /// Its configurations.
     pub path: Path,
     /// How its edges were checked.
-    pub edges: Edges,
+    pub edges: EdgeCheck,
 }
-
-/// Edges that each search checks in its first turn; twice as many in each further one.
-const FIRST_QUANTUM: u64 = 256;
-/// The first search gets this many times as many edges: most often it finds the path, and then the others were in vain.
-const MAIN_SHARE: u64 = 16;
-/// With more joints than one arm has, short edges are best: a long one is hardly ever free. The other searches find the
-/// path as often then, and all get the same number of edges.
-const ONE_ARM: usize = 8;
-/// A proven edge takes about as long as this number of edges that look free or not.
-const PROOF_COST: u64 = 4;
-/// After this number of rounds it has taken long.
-const LONG_ROUNDS: u32 = 4;
-/// The turns become no longer after this number of doublings.
-const DOUBLINGS: u32 = 6;
 
 /// The searches.
 #[derive(Debug, Clone)]
@@ -49,7 +36,8 @@ pub struct Portfolio {
     start: Vec<f64>,
     goals: Vec<Vec<f64>>,
     members: Vec<Member>,
-    settings: RrtSettings,
+    search: RrtSettings,
+    turns: PortfolioSettings,
     level: Level,
     turn: usize,
     round: u32,
@@ -64,21 +52,25 @@ struct Member {
     /// Place in the order of the ranges.
     number: u64,
     seed: u64,
-    edges: Edges,
+    edges: EdgeCheck,
     /// Prepared at its first turn.
     search: Option<Search>,
 }
 
 impl Portfolio {
-    /// Prepares the searches from `start` to any of `goals`; all of them must be free.
-    pub fn new(start: &[f64], goals: &[Vec<f64>], settings: &RrtSettings, level: Level, seed: u64) -> Self {
+    /// Prepares the searches from `start` to any of `goals`; all of them must be free. `level`: that of the settings,
+    /// or one that proves more.
+    pub fn new(start: &[f64], goals: &[Vec<f64>], settings: &PlanSettings, level: Level) -> Self {
+        let PlanSettings { seed, search, portfolio: turns, .. } = *settings;
         // A search is large to move: room for all of them.
-        let (mut members, mut ranges) = (Vec::with_capacity(2 * settings.ranges.len()), settings.ranges);
-        if start.len() > ONE_ARM {
+        let (mut members, mut ranges) = (Vec::with_capacity(2 * search.ranges.len()), search.ranges);
+        if start.len() > turns.joints_of_one_arm {
             ranges.reverse();
         }
-        for edges in [Edges::Looking, Edges::Proven] {
-            if (level == Level::Fast && edges == Edges::Proven) || (level == Level::Exact && edges == Edges::Looking) {
+        for edges in [EdgeCheck::Coarse, EdgeCheck::Exact] {
+            if (level == Level::Fast && edges == EdgeCheck::Exact)
+                || (level == Level::Exact && edges == EdgeCheck::Coarse)
+            {
                 continue;
             }
             for (number, range) in (0..).zip(ranges) {
@@ -90,7 +82,8 @@ impl Portfolio {
             start: start.to_vec(),
             goals: goals.to_vec(),
             members,
-            settings: *settings,
+            search,
+            turns,
             level,
             turn: 0,
             round: 0,
@@ -116,15 +109,15 @@ impl Portfolio {
             if stop.is_over() {
                 return Err(Halt::Stopped);
             }
-            let most = &self.settings;
+            let (most, turns) = (&self.search, &self.turns);
             if self.members.is_empty() || count.samples >= most.max_samples || count.nodes >= most.max_nodes {
                 return Err(Halt::Exhausted);
             }
             if self.turn >= self.members.len() {
                 self.turn = 0;
-                self.round = (self.round + 1).min(DOUBLINGS);
+                self.round = (self.round + 1).min(turns.doublings);
             }
-            if self.round == LONG_ROUNDS && !std::mem::replace(&mut self.took_long, true) {
+            if self.round == turns.long_rounds && !std::mem::replace(&mut self.took_long, true) {
                 return Err(Halt::TookLong);
             }
             let Member { range, number, seed, edges, search } = &mut self.members[self.turn];
@@ -133,18 +126,18 @@ impl Portfolio {
                 Search::new(start, goals, (checker.limits(), checker.turns()), most, *range, *seed)
             });
             let checked = *edges;
-            let main_share = if start.len() > ONE_ARM { 1 } else { MAIN_SHARE };
+            let main_share = if start.len() > turns.joints_of_one_arm { 1 } else { turns.main_share };
             let share = if *number == 0 { main_share } else { 1 };
-            let cost = if checked == Edges::Proven { PROOF_COST } else { 1 };
+            let cost = if checked == EdgeCheck::Exact { turns.proof_cost } else { 1 };
             let quantum = Quantum {
-                edges: (FIRST_QUANTUM << self.round) * share / cost,
+                edges: (turns.first_quantum << self.round) * share / cost,
                 samples: most.max_samples - count.samples,
                 nodes: most.max_nodes - count.nodes,
             };
             let mut check = EdgeChecker { checker, edges: checked, stop };
             if let Some(path) = search.run(&mut check, quantum, stop) {
-                if checked == Edges::Looking {
-                    *edges = if self.level.proves() { Edges::Checked } else { Edges::Sampled };
+                if checked == EdgeCheck::Coarse {
+                    *edges = if self.level.proves() { EdgeCheck::Certified } else { EdgeCheck::Sampled };
                 } else {
                     let count = search.count();
                     self.ended.samples += count.samples;

@@ -8,20 +8,12 @@
 use crate::collision::checker::{CollisionChecker, Stop};
 use dimos_robot::random::Random;
 
-use super::edges::{EdgeChecker, Edges};
+use super::edges::{EdgeCheck, EdgeChecker};
 use super::path::{Path, between, distance, length, tidy};
-use super::path_planner::{PlanSettings, is_proven};
-use super::rrt_connect::{Quantum, Search};
+use super::path_planner::is_proven;
+use super::rrt_connect::Search;
+use super::settings::{PlanSettings, RefineSettings, RrtSettings};
 use super::shortcut::{IsFree, shorten};
-
-/// Cuts that are tried in a round.
-const CUTS: usize = 12;
-/// Effort of a round's search: edges, samples, nodes. A path that is worth it is found quickly or with another seed.
-const EFFORT: Quantum = Quantum { edges: 512, samples: 4096, nodes: 4096 };
-/// A path is shorter if it is by this [rad].
-const SHORTER: f64 = 1e-6;
-/// A path is worth keeping beside a longer one if it is shorter than this part of it.
-const DIFFERS: f64 = 0.99;
 
 /// Makes a free path from its first configuration to any of `goals` shorter. Returns the given path and shorter ones,
 /// the shortest last, and the number of rounds, at most `settings.refine`; fewer if stopped.
@@ -33,6 +25,7 @@ pub fn refine<C: CollisionChecker>(
     stop: &Stop,
 ) -> (Vec<Path>, u32) {
     let Some(start) = path.first().cloned() else { return (vec![path], 0) };
+    let RefineSettings { cuts, min_gain, distinct, .. } = settings.refinement;
     let mut all = vec![path];
     let mut random = Random::new(settings.seed);
     for round in 0..settings.refine {
@@ -42,7 +35,7 @@ pub fn refine<C: CollisionChecker>(
             return (all, round);
         }
         let tried = if round % 2 == 0 {
-            cut(best, CUTS, &mut random, &mut |a, b| checker.motion_looks_free(a, b))
+            cut(best, cuts, &mut random, &mut |a, b| checker.motion_looks_free(a, b))
         } else {
             // The longest edges last: with them the path was found, most likely.
             let ranges = &settings.search.ranges;
@@ -50,13 +43,13 @@ pub fn refine<C: CollisionChecker>(
             let search = (&settings.search, range, random.bits());
             another(checker, (&start, goals), length(best), search, settings, stop)
         };
-        let shorter = tried.filter(|tried| length(tried) < length(best) - SHORTER);
+        let shorter = tried.filter(|tried| length(tried) < length(best) - min_gain);
         if let Some(shorter) = shorter
             && is_proven(checker, &shorter, settings.level, stop)
         {
             // Of many that are hardly shorter, the last is enough.
             if let [.., before, last] = &all[..]
-                && length(last) > DIFFERS * length(before)
+                && length(last) > distinct * length(before)
             {
                 all.pop();
             }
@@ -71,7 +64,7 @@ fn another<C: CollisionChecker>(
     checker: &mut C,
     (start, goals): (&[f64], &[Vec<f64>]),
     most: f64,
-    (search, range, seed): (&crate::planning::search::rrt_connect::RrtSettings, f64, u64),
+    (search, range, seed): (&RrtSettings, f64, u64),
     settings: &PlanSettings,
     stop: &Stop,
 ) -> Option<Path> {
@@ -79,8 +72,8 @@ fn another<C: CollisionChecker>(
     let limits = checker.limits().to_vec();
     let mut search = Search::new(start, goals, (&limits, &turns), search, range, seed).shorter_than(most);
     // Only a proof follows.
-    let edges = if settings.level.proves() { Edges::Looking } else { Edges::Sampled };
-    let found = search.run(&mut EdgeChecker { checker, edges, stop }, EFFORT, stop)?;
+    let edges = if settings.level.proves() { EdgeCheck::Coarse } else { EdgeCheck::Sampled };
+    let found = search.run(&mut EdgeChecker { checker, edges, stop }, settings.refinement.effort, stop)?;
     Some(shorten(&found, &turns, &settings.shortcut, &mut |a, b| checker.motion_looks_free(a, b)))
 }
 

@@ -14,41 +14,11 @@ use crate::collision::checker::Stop;
 use dimos_robot::model::Limits;
 
 use super::candidates::{Candidates, aim};
-use super::edges::EdgeCheck;
+use super::edges::EdgeValidator;
 use super::nearest::{Batch, Tree};
 use super::path::{Path, between, distance, tidy, unwind, unwind_all};
 use super::sampler::Sampler;
-
-/// Settings of the search.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct RrtSettings {
-    /// Maximum edge lengths [rad]: one search with each, in turn. Long edges are best in open space, short ones for
-    /// many joints and narrow passages.
-    pub ranges: [f64; 3],
-    /// Radius of a node's domain after its first failure [rad].
-    pub radius: f64,
-    /// α: relative growth of the radius with each success, and reduction with each further failure.
-    pub alpha: f64,
-    /// Minimum radius [rad].
-    pub min_radius: f64,
-    /// Maximum number of samples.
-    pub max_samples: u64,
-    /// Maximum number of nodes in all trees.
-    pub max_nodes: usize,
-}
-
-impl Default for RrtSettings {
-    fn default() -> Self {
-        Self {
-            ranges: [1.0, 0.5, 0.25],
-            radius: 4.0,
-            alpha: 1e-4,
-            min_radius: 1.0,
-            max_samples: 100_000_000,
-            max_nodes: 1_000_000,
-        }
-    }
-}
+use super::settings::RrtSettings;
 
 /// Statistics of a search.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -62,7 +32,7 @@ pub struct SearchCount {
 /// How far a search goes before it pauses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Quantum {
-    /// Edges checked, or samples for [`SAMPLES_PER_EDGE`] each.
+    /// Edges checked, or [samples](RrtSettings::samples_per_edge) for each.
     pub edges: u64,
     /// Samples drawn.
     pub samples: u64,
@@ -70,14 +40,6 @@ pub struct Quantum {
     pub nodes: usize,
 }
 
-/// This number of samples that are not connected takes about as long as the check of an edge.
-const SAMPLES_PER_EDGE: u64 = 64;
-/// The first samples are drawn anywhere between the limits, later ones half in the domains of nodes.
-const ANYWHERE: u64 = 48;
-/// After this number of edges in a row that were not free, the ends of the next ones are checked together.
-const FAILURES: u64 = 8;
-/// Most rounds of looking for samples that are in domains: each gives one, or uses up a batch.
-const ROUNDS: usize = 32;
 /// The stop condition is tested once per this number of samples, and of edges that are checked: a clock takes as long
 /// as a short edge.
 const POLL: u64 = 1024;
@@ -174,7 +136,7 @@ impl Search {
 
     /// Continues for a quantum; returns the path once it is found. After that, begins with the same path: the check may
     /// be another one now.
-    pub fn run(&mut self, check: &mut dyn EdgeCheck, quantum: Quantum, stop: &Stop) -> Option<Path> {
+    pub fn run(&mut self, check: &mut dyn EdgeValidator, quantum: Quantum, stop: &Stop) -> Option<Path> {
         let end = (self.count.samples + quantum.samples, self.count.nodes + quantum.nodes);
         let (began, mut polled) = (self.count.samples, None);
         // Edges that were tried, and those of them that needed a check of their own.
@@ -185,7 +147,7 @@ impl Search {
         }
         loop {
             let samples = self.count.samples;
-            let cost = edges + (samples - began) / SAMPLES_PER_EDGE;
+            let cost = edges + (samples - began) / self.settings.samples_per_edge;
             if cost >= quantum.edges || samples >= end.0 || self.count.nodes >= end.1 {
                 return None;
             }
@@ -239,11 +201,11 @@ impl Search {
 
     /// Draws samples for the tree that grows, up to a number of all samples: one that is in a domain, or sixteen where
     /// edges fail, whose ends are then checked together.
-    fn fill(&mut self, end: u64, check: &mut dyn EdgeCheck) {
-        let together = self.failures >= FAILURES;
+    fn fill(&mut self, end: u64, check: &mut dyn EdgeValidator) {
+        let together = self.failures >= self.settings.batch_after;
         let most = if together { LANES } else { 1 };
         self.candidates[self.side].clear();
-        for _ in 0..ROUNDS {
+        for _ in 0..self.settings.max_draws {
             if self.candidates[self.side].len() == most || self.count.samples >= end {
                 break;
             }
@@ -258,8 +220,8 @@ impl Search {
             }
         }
         if together {
-            let Self { candidates, trees, turns, range, side, at, .. } = self;
-            candidates[*side].look(&trees[*side], (turns, *range), at, check);
+            let Self { candidates, trees, turns, range, side, at, settings, .. } = self;
+            candidates[*side].check_ends(&trees[*side], (turns, *range), settings.min_batch, at, check);
         }
     }
 
@@ -281,7 +243,7 @@ impl Search {
         let tree = &trees[self.side];
         batch.fill(|samples| {
             sampler.fill(samples);
-            if count.samples < ANYWHERE {
+            if count.samples < settings.uniform_samples {
                 return;
             }
             for lane in (1..LANES).step_by(2) {
@@ -294,7 +256,7 @@ impl Search {
 
     /// Adds the current configuration, the end of a free edge, to the tree that grows, and grows the other one towards
     /// it; returns the path if they meet.
-    fn extend(&mut self, nearest: usize, check: &mut dyn EdgeCheck, edges: &mut u64) -> Option<Path> {
+    fn extend(&mut self, nearest: usize, check: &mut dyn EdgeValidator, edges: &mut u64) -> Option<Path> {
         let [first, second] = &mut self.trees;
         let (own, other) = if self.side == 0 { (first, second) } else { (second, first) };
         let added = own.add(&self.at, Some(nearest));
@@ -321,7 +283,7 @@ impl Search {
     }
 
     /// Returns the path through the nodes where the trees met, unless an edge of it is not confirmed.
-    fn joined(&mut self, check: &mut dyn EdgeCheck) -> Option<Path> {
+    fn joined(&mut self, check: &mut dyn EdgeValidator) -> Option<Path> {
         let [from_start, from_goal] = self.met?;
         if !(self.confirm(0, from_start, check) && self.confirm(1, from_goal, check)) {
             self.met = None;
@@ -338,7 +300,7 @@ impl Search {
 
     /// Returns whether all edges from a node up to its root are confirmed; otherwise removes what grew from one that is
     /// not.
-    fn confirm(&mut self, side: usize, node: usize, check: &mut dyn EdgeCheck) -> bool {
+    fn confirm(&mut self, side: usize, node: usize, check: &mut dyn EdgeValidator) -> bool {
         let tree = &self.trees[side];
         let mut is_refused = |i: &usize| {
             let parent = tree.parent(*i);

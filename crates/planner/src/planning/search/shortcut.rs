@@ -2,21 +2,7 @@
 //! Overmars, "Creating high-quality paths for motion planning", 2007; the corners as the subdivision of a B-spline).
 
 use super::path::{Path, between, distance, tidy, unwind, unwind_all};
-
-/// Settings of the shortcutting.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct ShortcutSettings {
-    /// Maximum number of rounds.
-    pub rounds: usize,
-    /// A corner stays if cutting it would move it by no more than this [rad].
-    pub min_change: f64,
-}
-
-impl Default for ShortcutSettings {
-    fn default() -> Self {
-        Self { rounds: 5, min_change: 0.1 }
-    }
-}
+use super::settings::ShortcutSettings;
 
 /// Checks an edge.
 pub type IsFree<'a> = &'a mut dyn FnMut(&[f64], &[f64]) -> bool;

@@ -7,6 +7,10 @@
 
 use crate::planning::search::path::distance;
 
+/// Norm of a change of direction above which a corner is a reversal, which is not blended: the speed would be zero in
+/// it.
+pub(in crate::planning) const REVERSAL: f64 = 1.99;
+
 /// A piece of a curve: a line or a blended corner.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Piece {
@@ -126,9 +130,8 @@ impl Corner {
         let (u1, u2) = (direction(a, b), direction(b, c));
         let turn = distance(&u1, &u2);
         let room = 0.5 * distance(a, b).min(distance(b, c));
-        // A reversal cannot be blended: the curve would have zero speed there.
-        let half =
-            if turn > 1.99 || deviation <= 0.0 { 0.0 } else { (16.0 * deviation / (3.0 * turn.max(1e-9))).min(room) };
+        let sharp = turn > REVERSAL || deviation <= 0.0;
+        let half = if sharp { 0.0 } else { (16.0 * deviation / (3.0 * turn.max(1e-9))).min(room) };
         Self { u1, u2, half }
     }
 

@@ -1,6 +1,6 @@
 //! The quickest motion along a path that passes each corner at constant speed: double-S profiles on the lines between
-//! them ([`double_s`](super::double_s)). It keeps velocity, acceleration and jerk limits by construction, and every
-//! speed of a corner follows from its limits in closed form.
+//! them ([`double_s`](dimos_core::double_s)). It keeps velocity, acceleration and jerk limits by construction, and
+//! every speed of a corner follows from its limits in closed form.
 //!
 //! With jerk limits the curvature of a corner rises linearly, stays, and falls, each over a third of it: at constant
 //! speed the jerk is constant in each third. Without, the curvature is constant. So every piece of the motion is a
@@ -11,26 +11,15 @@
 use dimos_kernels::Width;
 use dimos_kernels::states::{Blocks, Eight, JOINTS, States, Station};
 
-use super::double_s::{LineLimits, State};
-use super::topp::JointBound;
+use super::blend::REVERSAL;
+use super::settings::CornerSettings;
+use dimos_core::double_s::{LineLimits, State};
+use dimos_core::joint::JointBounds;
 
 /// Minimum time between points [s]: polynomials through closer ones would amplify rounding errors of positions.
 const MIN_INTERVAL: f64 = 1e-4;
-/// Shortest time from zero to full acceleration [s], in a motion in which any joint has a jerk limit.
-const MIN_RAMP: f64 = 0.005;
-/// A turn larger than this is a reversal, which cannot be blended: the speed would be zero in it.
-const REVERSAL: f64 = 1.99;
-
 /// Part of the limits left to rounding errors.
 const ROUNDING: f64 = 1e-9;
-/// A corner passed at less than this part of its own speed counts as slowed down by the lines beside it; more than one
-/// in this number of them, and another way to pass corners is worth its computing time.
-const SLOWED: f64 = 0.9;
-const MOST_SLOWED: usize = 8;
-/// A corner that is passed in this many times of what it takes to reach full acceleration is short: a changing speed
-/// gains less there than the change takes.
-const SHORT: f64 = 7.0;
-
 /// A path whose corners are blended, and its limits.
 #[derive(Debug)]
 pub(in crate::planning) struct RoundedPath {
@@ -48,6 +37,7 @@ pub(in crate::planning) struct RoundedPath {
     jerk: bool,
     /// Longest time from zero to full acceleration of a joint [s]; 0 without jerk limits.
     ramp: f64,
+    settings: CornerSettings,
 }
 
 /// A line between two configurations.
@@ -105,9 +95,9 @@ struct Inverse {
 }
 
 impl Inverse {
-    fn of(bounds: &[JointBound]) -> Self {
-        let list = |of: fn(&JointBound) -> f64| {
-            let block = |bounds: &[JointBound]| {
+    fn of(bounds: &[JointBounds]) -> Self {
+        let list = |of: fn(&JointBounds) -> f64| {
+            let block = |bounds: &[JointBounds]| {
                 let mut block = [0.0; JOINTS];
                 block.iter_mut().zip(bounds).for_each(|(inverse, b)| *inverse = (1.0 + ROUNDING) / of(b));
                 block
@@ -151,7 +141,7 @@ fn difference(from: &[Eight], to: &[Eight], out: &mut [Eight]) -> f64 {
 impl RoundedPath {
     /// Blends the corners of a path without repeated configurations. At configuration `i` the motion stays within
     /// `deviation[i]` [rad, Euclidean] of the path; it rests where that is 0.
-    pub fn new(path: &[Vec<f64>], bounds: &[JointBound], deviation: &[f64]) -> Self {
+    pub fn new(path: &[Vec<f64>], bounds: &[JointBounds], deviation: &[f64], settings: &CornerSettings) -> Self {
         let blocks = bounds.len().div_ceil(JOINTS);
         let inverse = Inverse::of(bounds);
         let jerk = inverse.jerk.as_flattened().iter().any(|inverse| *inverse > 0.0);
@@ -170,13 +160,14 @@ impl RoundedPath {
             direction.as_flattened_mut().iter_mut().for_each(|d| *d *= inverse_length);
             let acceleration = 1.0 / most(direction, &inverse.acceleration);
             // Of joints without jerk limits among others: points of the motion have one acceleration.
-            let ramped = |limit: f64| limit.min(acceleration / MIN_RAMP);
+            let ramped = |limit: f64| limit.min(acceleration / settings.min_ramp);
             let jerk = if jerk { ramped(1.0 / most(direction, &inverse.jerk)) } else { f64::INFINITY };
             let limits = LineLimits { speed: 1.0 / most(direction, &inverse.velocity), acceleration, jerk };
             lines.push(Line { length, limits });
         }
         let corners = vec![Corner::default(); path.len()];
-        let mut rounded = Self { joints: bounds.len(), blocks, configurations, directions, lines, corners, jerk, ramp };
+        let (joints, settings) = (bounds.len(), *settings);
+        let mut rounded = Self { joints, blocks, configurations, directions, lines, corners, jerk, ramp, settings };
         let mut turn = vec![[0.0; JOINTS]; blocks];
         for i in 1..path.len().saturating_sub(1) {
             let length = difference(rounded.direction(i - 1), rounded.direction(i), &mut turn);
@@ -279,13 +270,13 @@ impl RoundedPath {
         let (mut slowed, mut time, mut number) = (0, 0.0, 0);
         for (corner, speed) in self.corners.iter().zip(speeds) {
             if corner.half > 0.0 {
-                slowed += usize::from(*speed < SLOWED * corner.speed);
+                slowed += usize::from(*speed < self.settings.slowed * corner.speed);
                 time += 2.0 * corner.half / speed;
                 number += 1;
             }
         }
-        let short = !self.jerk || time <= SHORT * self.ramp * number as f64;
-        MOST_SLOWED * slowed <= number && short && time.is_finite()
+        let short = !self.jerk || time <= self.settings.short * self.ramp * number as f64;
+        self.settings.corners_per_slowed * slowed <= number && short && time.is_finite()
     }
 
     /// Returns the duration at these speeds [s].

@@ -5,25 +5,23 @@
 //! the times at which `s̈` jumps now or jumped a window ago. So the average is evaluated from one of these times to the
 //! next, in exact cubics.
 //!
-//! What is averaged is the time-optimal motion without jerk limits. Its average is faster than the motion where that is
+//! The time-optimal motion without jerk limits is averaged. Its average is faster than the motion where that is
 //! slowest, in a corner: pieces that exceed the limits get a lower pace, in a few rounds; any remaining excess slows
 //! down the whole motion.
 
 use dimos_kernels::states::States;
 
 use super::blend::{Curve, Jet, Piece};
-use super::topp::{GridPoint, JointBound, Pace, speed_grid};
+use super::settings::TimingSettings;
+use super::topp::{GridPoint, Pace, speed_grid};
 use super::verify::Excess;
+use dimos_core::joint::JointBounds;
 
-/// Maximum rounds of pace correction.
-const ROUNDS: usize = 5;
-/// Excess above this part of the limits is corrected.
-const CORRECTION_RATIO: f64 = 1.01;
 /// Minimum time between knots [s]: polynomials through closer ones would amplify rounding errors of positions.
 const MIN_KNOT_INTERVAL: f64 = 1e-4;
 
 /// Returns the knots of a curve's motion, to be joined by quintics.
-pub(in crate::planning) fn averaged(curve: &Curve, bounds: &[JointBound]) -> States {
+pub(in crate::planning) fn averaged(curve: &Curve, bounds: &[JointBounds], settings: &TimingSettings) -> States {
     let gauge = Gauge::new(curve, bounds);
     // Time from zero to full acceleration.
     let window = bounds.iter().filter(|b| b.jerk.is_finite()).map(|b| b.acceleration / b.jerk).fold(1e-6, f64::max);
@@ -33,7 +31,7 @@ pub(in crate::planning) fn averaged(curve: &Curve, bounds: &[JointBound]) -> Sta
     let windows: &[f64] = if curve.len() > 1 { &[2.0] } else { &[1.0, 2.0] };
     for factor in windows {
         let most = best.as_ref().map_or(f64::INFINITY, |b| b.0);
-        let found = paced(curve, bounds, &gauge, window * factor, most);
+        let found = paced(curve, bounds, &gauge, (window * factor, most), settings);
         let found = found.map(|motion| (motion.needed(&gauge), motion)).filter(|found| found.0 < most);
         best = found.or(best);
     }
@@ -42,8 +40,14 @@ pub(in crate::planning) fn averaged(curve: &Curve, bounds: &[JointBound]) -> Sta
 
 /// Returns the time-optimal motion with paces at which its average approximately keeps the limits; `None` if it takes
 /// longer than `most` [s].
-fn paced(curve: &Curve, bounds: &[JointBound], gauge: &Gauge<'_>, window: f64, most: f64) -> Option<Motion> {
-    let (constraints, speed_grid) = speed_grid(curve, bounds);
+fn paced(
+    curve: &Curve,
+    bounds: &[JointBounds],
+    gauge: &Gauge<'_>,
+    (window, most): (f64, f64),
+    settings: &TimingSettings,
+) -> Option<Motion> {
+    let (constraints, speed_grid) = speed_grid(curve, bounds, settings.corner_intervals);
     let mut paces = vec![Pace::FULL; curve.len()];
     let mut slower = vec![1.0; curve.len()];
     let mut rounds = 0;
@@ -56,11 +60,11 @@ fn paced(curve: &Curve, bounds: &[JointBound], gauge: &Gauge<'_>, window: f64, m
         slower.fill(1.0);
         for leg in motion.walk(curve) {
             let factor = gauge.slower(&leg);
-            if factor > CORRECTION_RATIO {
+            if factor > settings.jerk.correction_ratio {
                 slower[leg.sources.0..=leg.sources.1].iter_mut().for_each(|s| *s = f64::max(*s, factor));
             }
         }
-        if rounds == ROUNDS || slower.iter().all(|s| *s <= 1.0) {
+        if rounds == settings.jerk.rounds || slower.iter().all(|s| *s <= 1.0) {
             return Some(motion);
         }
         rounds += 1;
@@ -249,25 +253,21 @@ fn crossing(from: &Knot, jerk: f64, most: f64, at: f64) -> f64 {
 /// Measures how much of the limits a motion along a curve uses.
 struct Gauge<'a> {
     curve: &'a Curve,
-    /// Inverse of each limit.
-    inverse: Vec<JointBound>,
+    /// Inverse of the velocity, acceleration and jerk limit of each joint.
+    inverse: Vec<[f64; 3]>,
     /// For each line, the largest part of each limit that a unit speed, acceleration and jerk of the parameter uses.
     lines: Vec<[f64; 3]>,
 }
 
 impl<'a> Gauge<'a> {
-    fn new(curve: &'a Curve, bounds: &[JointBound]) -> Self {
-        let over = |b: &JointBound| JointBound {
-            velocity: 1.0 / b.velocity,
-            acceleration: 1.0 / b.acceleration,
-            jerk: 1.0 / b.jerk,
-        };
-        let inverse: Vec<JointBound> = bounds.iter().map(over).collect();
+    fn new(curve: &'a Curve, bounds: &[JointBounds]) -> Self {
+        let over = |b: &JointBounds| [1.0 / b.velocity, 1.0 / b.acceleration, 1.0 / b.jerk];
+        let inverse: Vec<[f64; 3]> = bounds.iter().map(over).collect();
         let line = |piece: &Piece| {
-            let most = |limit: fn(&JointBound) -> f64| {
-                piece.direction.iter().zip(&inverse).map(|(d, i)| d.abs() * limit(i)).fold(0.0, f64::max)
+            let most = |limit: usize| {
+                piece.direction.iter().zip(&inverse).map(|(d, i)| d.abs() * i[limit]).fold(0.0, f64::max)
             };
-            [most(|i| i.velocity), most(|i| i.acceleration), most(|i| i.jerk)]
+            [most(0), most(1), most(2)]
         };
         let lines = curve.iter().map(line).collect();
         Self { curve, inverse, lines }
@@ -287,12 +287,14 @@ impl<'a> Gauge<'a> {
             }
             let t = piece.progress(knot.at);
             let (curved, changed) = (t.d1 * v * v, v * (3.0 * t.d1 * a + t.d2 * v * v));
-            for ((direction, turn), inverse) in piece.direction.iter().zip(&piece.turn).zip(&self.inverse) {
+            for ((direction, turn), [velocity, acceleration, jerk]) in
+                piece.direction.iter().zip(&piece.turn).zip(&self.inverse)
+            {
                 let d1 = direction + turn * t.part;
                 see([
-                    (d1 * v).abs() * inverse.velocity,
-                    (d1 * a + turn * curved).abs() * inverse.acceleration,
-                    (d1 * j + turn * changed).abs() * inverse.jerk,
+                    (d1 * v).abs() * velocity,
+                    (d1 * a + turn * curved).abs() * acceleration,
+                    (d1 * j + turn * changed).abs() * jerk,
                 ]);
             }
         }

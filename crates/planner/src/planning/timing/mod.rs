@@ -7,8 +7,8 @@
 
 pub mod blend;
 pub(in crate::planning) mod constant_corner_speed;
-pub(in crate::planning) mod double_s;
 pub(in crate::planning) mod jerk_limit;
+pub mod settings;
 pub mod tool_timing;
 pub mod topp;
 pub mod verify;
@@ -17,34 +17,17 @@ use std::borrow::Cow;
 
 use dimos_kernels::states::{Eight, States};
 
-use dimos_core::joint::DEFAULT_ACCELERATION;
+use dimos_core::joint::{DEFAULT_ACCELERATION, JointBounds};
 use dimos_core::trajectory::{JointTrajectory, JointValues, TrajectoryError, TrajectoryPoint};
 use dimos_robot::model::Limits;
 
 use self::blend::{Curve, curves};
 use self::constant_corner_speed::RoundedPath;
 use self::jerk_limit::averaged;
-use self::topp::{GridPoint, JointBound, parameterize};
+use self::settings::{CornerSettings, TimingSettings};
+use self::topp::{GridPoint, parameterize};
 use self::verify::{Excess, excess};
 use crate::planning::search::path::tidy_indices;
-
-/// Largest distance of a corner's curve from the straight pieces that are checked in its place [rad].
-const SAGITTA: f64 = 2e-4;
-
-/// Settings of the time parameterization.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct TimingSettings {
-    /// Maximum deviation at corners [rad, Euclidean over all joints]; 0: the motion rests at every corner.
-    pub deviation: f64,
-    /// Part of the full speed, above 0 and at most 1: scales the motion in time.
-    pub speed: f64,
-}
-
-impl Default for TimingSettings {
-    fn default() -> Self {
-        Self { deviation: 0.05, speed: 1.0 }
-    }
-}
 
 /// A trajectory and its figures.
 #[derive(Debug, Clone, PartialEq)]
@@ -84,7 +67,7 @@ pub enum TimingError {
 
 /// Returns the bounds of joints: the given limits, [`DEFAULT_ACCELERATION`] if there is no acceleration limit, an
 /// infinite jerk if there is no jerk limit.
-pub fn bounds(names: &[String], limits: &[Limits]) -> Result<Vec<JointBound>, TimingError> {
+pub fn bounds(names: &[String], limits: &[Limits]) -> Result<Vec<JointBounds>, TimingError> {
     let bound = |(name, l): (&String, &Limits)| {
         let acceleration = l.acceleration.unwrap_or(DEFAULT_ACCELERATION);
         let jerk = l.jerk.unwrap_or(f64::INFINITY);
@@ -96,7 +79,7 @@ pub fn bounds(names: &[String], limits: &[Limits]) -> Result<Vec<JointBound>, Ti
         if jerk <= 0.0 || jerk.is_nan() {
             return Err(TimingError::Limit(name.clone(), "jerk"));
         }
-        Ok(JointBound { velocity: l.velocity, acceleration, jerk })
+        Ok(JointBounds { lower: l.lower, upper: l.upper, velocity: l.velocity, acceleration, jerk })
     };
     names.iter().zip(limits).map(bound).collect()
 }
@@ -106,24 +89,24 @@ pub fn bounds(names: &[String], limits: &[Limits]) -> Result<Vec<JointBound>, Ti
 pub fn time(
     names: &[String],
     path: &[Vec<f64>],
-    bounds: &[JointBound],
+    bounds: &[JointBounds],
     settings: &TimingSettings,
     free: impl FnMut(&[f64], &[f64]) -> bool,
 ) -> Result<Timed, TimingError> {
-    time_within(names, path, bounds, &vec![settings.deviation; path.len()], settings.speed, free)
+    time_within(names, path, bounds, &vec![settings.deviation; path.len()], settings, free)
 }
 
 /// Times a path as [`time`] does, with a maximum deviation for each of its configurations [rad, Euclidean over all
-/// joints]. Where it is 0 the motion rests.
+/// joints], in place of that of the settings. Where it is 0 the motion rests.
 pub fn time_within(
     names: &[String],
     path: &[Vec<f64>],
-    bounds: &[JointBound],
+    bounds: &[JointBounds],
     deviation: &[f64],
-    speed: f64,
+    settings: &TimingSettings,
     mut free: impl FnMut(&[f64], &[f64]) -> bool,
 ) -> Result<Timed, TimingError> {
-    let dof = names.len();
+    let (dof, speed) = (names.len(), settings.speed);
     let bad = |q: &Vec<f64>| q.len() != dof || q.iter().any(|x| !x.is_finite());
     if let Some(at) = path.iter().position(bad) {
         return Err(TimingError::Shape(at, dof));
@@ -139,12 +122,12 @@ pub fn time_within(
     }
     let of = |i: &usize| deviation.get(*i).copied().unwrap_or(0.0).max(0.0);
     let deviation: Vec<f64> = kept.iter().map(of).collect();
-    let rounded = RoundedPath::new(&path, bounds, &deviation);
+    let rounded = RoundedPath::new(&path, bounds, &deviation, &settings.corners);
     let speeds = rounded.speeds();
-    if variable_is_quicker((&rounded, &speeds), &path, bounds, &deviation) {
-        at_variable_corner_speed(names, &path, bounds, deviation, speed, &mut free)
+    if variable_is_quicker((&rounded, &speeds), &path, bounds, &deviation, settings) {
+        at_variable_corner_speed(names, &path, bounds, deviation, settings, &mut free)
     } else {
-        at_constant_corner_speed(names, (&path, rounded, speeds), bounds, deviation, speed, &mut free)
+        at_constant_corner_speed(names, (&path, rounded, speeds), bounds, deviation, settings, &mut free)
     }
 }
 
@@ -153,14 +136,15 @@ pub fn time_within(
 fn variable_is_quicker(
     (rounded, speeds): (&RoundedPath, &[f64]),
     path: &[Vec<f64>],
-    bounds: &[JointBound],
+    bounds: &[JointBounds],
     deviation: &[f64],
+    settings: &TimingSettings,
 ) -> bool {
     if rounded.suits(speeds) {
         return false;
     }
     let duration = |curve: &Curve| {
-        let mut states = at_variable_speed(curve, bounds);
+        let mut states = at_variable_speed(curve, bounds, settings);
         slow_down(&mut states, bounds);
         states.duration()
     };
@@ -171,9 +155,9 @@ fn variable_is_quicker(
 fn at_constant_corner_speed(
     names: &[String],
     (path, mut rounded, mut speeds): (&[Vec<f64>], RoundedPath, Vec<f64>),
-    bounds: &[JointBound],
+    bounds: &[JointBounds],
     mut deviation: Vec<f64>,
-    speed: f64,
+    settings: &TimingSettings,
     free: &mut impl FnMut(&[f64], &[f64]) -> bool,
 ) -> Result<Timed, TimingError> {
     let (mut from, mut to) = (path[0].clone(), path[0].clone());
@@ -182,12 +166,12 @@ fn at_constant_corner_speed(
     for (i, deviation) in deviation.iter_mut().enumerate().take(path.len() - 1).skip(1) {
         // In pieces that are as straight as the motion is checked elsewhere.
         let mut is_free = |rounded: &RoundedPath| {
-            let each = rounded.corner(i, SAGITTA, &mut factors, &mut places);
+            let each = rounded.corner(i, settings.corners.sagitta, &mut factors, &mut places);
             let place = |k: usize| &places[k * each..(k + 1) * each].as_flattened()[..names.len()];
             (1..places.len() / each).all(|k| free(place(k - 1), place(k)))
         };
         while !is_free(&rounded) {
-            *deviation = if *deviation > 2e-3 { *deviation * 0.4 } else { 0.0 };
+            *deviation = settings.corners.sharper(*deviation);
             rounded.blend(i, *deviation);
             sharper = true;
         }
@@ -197,31 +181,31 @@ fn at_constant_corner_speed(
     }
     let mut states = rounded.motion(&speeds);
     let excess = slow_down(&mut states, bounds);
-    // What is between the corners was part of the path, and is all that the motion passes besides.
+    // The lines between the corners were part of the path, and complete the motion.
     for i in 0..path.len() - 1 {
         rounded.ends_of_line(i, &mut from, &mut to);
         if !free(&from, &to) {
             return Err(TimingError::NotFree(0.0, states.duration()));
         }
     }
-    finished(names, path, bounds, (states, excess), deviation, speed)
+    finished(names, path, bounds, (states, excess), deviation, settings.speed)
 }
 
 /// Times a path by time-optimal path parameterization, with jerk limits by averaging.
 fn at_variable_corner_speed(
     names: &[String],
     path: &[Vec<f64>],
-    bounds: &[JointBound],
+    bounds: &[JointBounds],
     mut deviation: Vec<f64>,
-    speed: f64,
+    settings: &TimingSettings,
     free: &mut impl FnMut(&[f64], &[f64]) -> bool,
 ) -> Result<Timed, TimingError> {
-    let rounded = round_corners(path, &mut deviation, free);
-    let mut timed = emit(names, path, bounds, &rounded, deviation, speed)?;
+    let rounded = round_corners(path, &mut deviation, &settings.corners, free);
+    let mut timed = emit(names, path, bounds, &rounded, deviation, settings)?;
     if free_throughout(&timed.trajectory, free).is_err() {
         // Between its points the trajectory deviates slightly from a blended curve. Without blending it does not.
         let sharp = vec![0.0; path.len()];
-        timed = emit(names, path, bounds, &curves(path, &sharp), sharp, speed)?;
+        timed = emit(names, path, bounds, &curves(path, &sharp), sharp, settings)?;
         free_throughout(&timed.trajectory, free)?;
     }
     Ok(timed)
@@ -231,20 +215,21 @@ fn at_variable_corner_speed(
 fn round_corners(
     path: &[Vec<f64>],
     deviation: &mut [f64],
+    settings: &CornerSettings,
     free: &mut impl FnMut(&[f64], &[f64]) -> bool,
 ) -> Vec<Curve> {
     let (mut from, mut to) = (path[0].clone(), path[0].clone());
     let mut rounded = curves(path, deviation);
-    for _ in 0..8 {
+    for _ in 0..settings.max_sharpenings {
         let mut blocked = Vec::new();
         for piece in rounded.iter().flatten().filter(|p| p.bends) {
             let mut passes = |k: usize| {
-                let s = piece.length * k as f64 / 8.0;
+                let s = piece.length * k as f64 / settings.pieces as f64;
                 std::mem::swap(&mut from, &mut to);
                 to.iter_mut().zip(piece.jets(s)).for_each(|(q, jet)| *q = jet.q);
                 k == 0 || free(&from, &to)
             };
-            if !(0..=8).all(&mut passes) {
+            if !(0..=settings.pieces).all(&mut passes) {
                 blocked.push(piece.corner);
             }
         }
@@ -252,7 +237,7 @@ fn round_corners(
             break;
         }
         for corner in blocked {
-            deviation[corner] = if deviation[corner] > 2e-3 { deviation[corner] * 0.4 } else { 0.0 };
+            deviation[corner] = settings.sharper(deviation[corner]);
         }
         rounded = curves(path, deviation);
     }
@@ -262,37 +247,41 @@ fn round_corners(
 fn emit(
     names: &[String],
     path: &[Vec<f64>],
-    bounds: &[JointBound],
+    bounds: &[JointBounds],
     curves: &[Curve],
     deviation: Vec<f64>,
-    speed: f64,
+    settings: &TimingSettings,
 ) -> Result<Timed, TimingError> {
     let mut states = States::new(names.len(), 0);
     let mut excess = Excess::default();
     for curve in curves {
-        let mut own = at_variable_speed(curve, bounds);
+        let mut own = at_variable_speed(curve, bounds, settings);
         excess = excess.max(slow_down(&mut own, bounds));
         let start = states.duration();
         states.append(&own, start);
     }
-    finished(names, path, bounds, (states, excess), deviation, speed)
+    finished(names, path, bounds, (states, excess), deviation, settings.speed)
 }
 
 /// Returns whether the spline through states is quintic: with jerk limits accelerations have no jumps.
-fn is_quintic(bounds: &[JointBound]) -> bool {
+fn is_quintic(bounds: &[JointBounds]) -> bool {
     bounds.iter().any(|b| b.jerk.is_finite())
 }
 
 /// Returns the states of the motion along a curve, before it is slowed down to what its spline needs.
-fn at_variable_speed(curve: &Curve, bounds: &[JointBound]) -> States {
-    if is_quintic(bounds) { averaged(curve, bounds) } else { on_grid(curve, &parameterize(curve, bounds)) }
+fn at_variable_speed(curve: &Curve, bounds: &[JointBounds], settings: &TimingSettings) -> States {
+    if is_quintic(bounds) {
+        averaged(curve, bounds, settings)
+    } else {
+        on_grid(curve, &parameterize(curve, bounds, settings.corner_intervals))
+    }
 }
 
 /// Returns the trajectory of states that keep the bounds, at a part of its speed.
 fn finished(
     names: &[String],
     path: &[Vec<f64>],
-    bounds: &[JointBound],
+    bounds: &[JointBounds],
     (mut states, excess): (States, Excess),
     deviation: Vec<f64>,
     speed: f64,
@@ -313,7 +302,7 @@ fn finished(
     };
     let times = states.times().iter();
     let points = match states.in_one_block() {
-        // Without a copy of a copy.
+        // Avoids a second copy.
         Some(rows) => {
             let list = |row: &Eight| JointValues::from_buf_and_len(*row, names.len());
             times.zip(rows).map(|(time, [p, v, a])| point(*time, [list(p), list(v), list(a)])).collect()
@@ -324,7 +313,7 @@ fn finished(
         }
     };
     let trajectory = JointTrajectory { joint_names: names.to_vec(), points };
-    // What is wrong is said by the trajectory; that nothing is, is seen faster here.
+    // The trajectory reports errors; this check is faster where there is none.
     if !states.are_finite_and_in_order() {
         trajectory.validate()?;
     }
@@ -352,7 +341,7 @@ fn on_grid(curve: &Curve, grid: &[GridPoint]) -> States {
 }
 
 /// Stretches a motion in time until its spline keeps all bounds; returns the use of the limits afterwards.
-fn slow_down(states: &mut States, bounds: &[JointBound]) -> Excess {
+fn slow_down(states: &mut States, bounds: &[JointBounds]) -> Excess {
     let found = excess(states, bounds, is_quintic(bounds));
     let factor = match found.slower() {
         slower if slower > 1.0 => slower * (1.0 + 1e-9),

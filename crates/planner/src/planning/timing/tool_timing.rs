@@ -10,20 +10,11 @@ use std::ops::Range;
 
 use dimos_kernels::states::States;
 
-use super::topp::JointBound;
+use super::settings::ToolTimingSettings;
 use super::verify::excess;
+use dimos_core::joint::JointBounds;
 use dimos_core::trajectory::{Cursor, JointTrajectory, JointValues, Sample, Spline, TrajectoryPoint};
 use dimos_robot::kinematics::tool_speed::ToolSpeed;
-
-/// Step of the rate [s], and the number of them at most.
-const STEP: f64 = 0.002;
-const MOST_STEPS: usize = 100_000;
-/// Longest time between points of a motion whose rate changes [s].
-const POINT_INTERVAL: f64 = 0.01;
-/// Share of the tool's speed that is used: between steps it may be faster.
-const SHARE: f64 = 0.997;
-/// Windows that are tried, in times of what the slowest joint needs to reach its speed.
-const WINDOWS: [f64; 6] = [0.12, 0.25, 0.5, 1.0, 2.0, 4.0];
 
 /// The tools of arms that move together, each with a speed limit.
 #[derive(Debug, Clone, Default)]
@@ -55,11 +46,17 @@ impl Tools {
     }
 
     /// Returns the same path with tools that keep their speed at a part of it, 0 to 1; `None` if they do already.
-    pub fn slowed(&mut self, motion: &JointTrajectory, bounds: &[JointBound], speed: f64) -> Option<JointTrajectory> {
+    pub fn slowed(
+        &mut self,
+        motion: &JointTrajectory,
+        bounds: &[JointBounds],
+        speed: f64,
+        settings: &ToolTimingSettings,
+    ) -> Option<JointTrajectory> {
         if self.0.is_empty() {
             return None;
         }
-        slowed(motion, bounds, |q, v| self.part(q, v) / speed)
+        slowed(motion, bounds, settings, |q, v| self.part(q, v) / speed)
     }
 }
 
@@ -68,25 +65,27 @@ impl Tools {
 /// is not valid stays as it is.
 pub fn slowed(
     motion: &JointTrajectory,
-    bounds: &[JointBound],
+    bounds: &[JointBounds],
+    settings: &ToolTimingSettings,
     mut part: impl FnMut(&[f64], &[f64]) -> f64,
 ) -> Option<JointTrajectory> {
+    let ToolTimingSettings { step, max_steps, point_interval, share, windows } = *settings;
     let spline = Spline::new(motion).ok()?;
-    let step = STEP.max(spline.duration() / MOST_STEPS as f64);
+    let step = step.max(spline.duration() / max_steps as f64);
     let steps = (spline.duration() / step).ceil() as usize;
     let step = spline.duration() / steps.max(1) as f64;
     let (mut walk, mut allowed) = (Walk::new(&spline), Vec::with_capacity(steps + 1));
     for i in 0..=steps {
         let (q, v, _) = walk.at(i as f64 * step);
-        allowed.push((SHARE / part(q, v)).min(1.0));
+        allowed.push((share / part(q, v)).min(1.0));
     }
-    if allowed.iter().all(|rate| *rate >= SHARE) {
+    if allowed.iter().all(|rate| *rate >= share) {
         return None;
     }
     let longest = bounds.iter().map(|b| b.velocity / b.acceleration).fold(0.0, f64::max);
-    let warped = WINDOWS.iter().filter_map(|factor| {
+    let warped = windows.iter().filter_map(|factor| {
         let half = ((factor * longest / step) as usize).clamp(2, steps.max(2));
-        let mut states = warped(&spline, &rates(&allowed, half), step)?;
+        let mut states = warped(&spline, &rates(&allowed, half), step, (point_interval, share))?;
         let slower = excess(&states, bounds, true).slower();
         states.stretch(if slower > 1.0 { slower * (1.0 + 1e-9) } else { 1.0 });
         Some(trajectory(motion, &states))
@@ -146,8 +145,9 @@ fn mean_around(values: &[f64], half: usize) -> Vec<f64> {
     means
 }
 
-/// Returns the states of a motion whose time runs at these rates, one for each `step` [s] of it.
-fn warped(spline: &Spline, rates: &[f64], step: f64) -> Option<States> {
+/// Returns the states of a motion whose time runs at these rates, one for each `step` [s] of it; rates from `share` on
+/// count as constant.
+fn warped(spline: &Spline, rates: &[f64], step: f64, (point_interval, share): (f64, f64)) -> Option<States> {
     let mut times = vec![0.0];
     for pair in rates.windows(2) {
         // Exact for a rate that is linear in the given time.
@@ -173,8 +173,8 @@ fn warped(spline: &Spline, rates: &[f64], step: f64) -> Option<States> {
     // At the points of the given motion its acceleration may bend; between them the rate does where it changes.
     for pair in spline.times().windows(2) {
         push(pair[0])?;
-        let steady = |t: f64| rates.get((t / step) as usize).is_some_and(|rate| *rate >= SHARE);
-        let pieces = ((pair[1] - pair[0]) / POINT_INTERVAL).ceil() as usize;
+        let steady = |t: f64| rates.get((t / step) as usize).is_some_and(|rate| *rate >= share);
+        let pieces = ((pair[1] - pair[0]) / point_interval).ceil() as usize;
         let is_steady =
             (0..=4 * pieces).all(|k| steady(pair[0] + (pair[1] - pair[0]) * k as f64 / (4 * pieces) as f64));
         for k in (1..pieces).filter(|_| !is_steady) {
@@ -230,17 +230,18 @@ impl<'a> Walk<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::planning::timing::{TimingSettings, time};
+    use crate::planning::timing::settings::TimingSettings;
+    use crate::planning::timing::time;
 
     /// A joint of 1 m whose end may have 0.8 m/s near 0, and more elsewhere.
     #[test]
     fn only_where_the_tool_is_too_fast_the_motion_is_slower_and_the_joint_keeps_its_limits() {
-        let bounds = [JointBound { velocity: 3.0, acceleration: 8.0, jerk: 200.0 }];
+        let bounds = [JointBounds { velocity: 3.0, acceleration: 8.0, jerk: 200.0, ..JointBounds::NONE }];
         let path = [vec![-2.5], vec![2.5]];
         let timed = time(&["joint".to_owned()], &path, &bounds, &TimingSettings::default(), |_, _| true).unwrap();
-        let motion = timed.trajectory;
+        let (motion, settings) = (timed.trajectory, ToolTimingSettings::default());
         let part = |q: &[f64], v: &[f64]| v[0].abs() / if q[0].abs() < 0.3 { 0.8 } else { 3.2 };
-        let slower = slowed(&motion, &bounds, part).unwrap();
+        let slower = slowed(&motion, &bounds, &settings, part).unwrap();
         let spline = Spline::new(&slower).unwrap();
         let mut walk = Walk::new(&spline);
         for k in 0..=(spline.duration() / 1e-3) as usize {
@@ -250,6 +251,10 @@ mod tests {
         }
         assert_eq!((spline.start(0), spline.goal(0)), (-2.5, 2.5));
         assert!(spline.duration() < 1.7 * motion.duration(), "{} after {}", spline.duration(), motion.duration());
-        assert_eq!(slowed(&slower, &bounds, |q, v| 0.99 * part(q, v)), None, "it keeps the tool's speed now");
+        assert_eq!(
+            slowed(&slower, &bounds, &settings, |q, v| 0.99 * part(q, v)),
+            None,
+            "it keeps the tool's speed now"
+        );
     }
 }

@@ -7,17 +7,7 @@
 //! highest `u` that stays below it.
 
 use super::blend::{Curve, Piece};
-
-/// Limits of one joint along the path.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct JointBound {
-    /// Maximum speed [rad/s].
-    pub velocity: f64,
-    /// Maximum acceleration [rad/s²].
-    pub acceleration: f64,
-    /// Maximum jerk [rad/s³]; infinite without a limit.
-    pub jerk: f64,
-}
+use dimos_core::joint::JointBounds;
 
 /// A grid point: position on the curve, and speed.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -48,13 +38,9 @@ impl Pace {
     pub const FULL: Self = Self { x: 1.0, acceleration: 1.0 };
 }
 
-/// Grid intervals of a corner. A line is one interval: the bounds of `u` are the same all along it, so the time-optimal
-/// motion accelerates, cruises and decelerates.
-const CORNER_INTERVALS: usize = 8;
-
-/// Returns the grid of a curve with speeds and times, from rest to rest.
-pub fn parameterize(curve: &Curve, bounds: &[JointBound]) -> Vec<GridPoint> {
-    let (constraints, speed_grid) = speed_grid(curve, bounds);
+/// Returns the grid of a curve with speeds and times, from rest to rest; a corner has `intervals` of it.
+pub fn parameterize(curve: &Curve, bounds: &[JointBounds], intervals: usize) -> Vec<GridPoint> {
+    let (constraints, speed_grid) = speed_grid(curve, bounds, intervals);
     let paces = vec![Pace::FULL; curve.len()];
     let speeds = speed_grid.fastest(&constraints, &paces);
     speed_grid.timed(&speeds, &paces)
@@ -85,11 +71,15 @@ pub(in crate::planning) struct SpeedGrid {
     intervals: Vec<Interval>,
 }
 
-/// Returns the grid along a curve, and the constraints on `u` in its corners.
-pub(in crate::planning) fn speed_grid(curve: &Curve, bounds: &[JointBound]) -> (Vec<Constraint>, SpeedGrid) {
+/// Returns the grid along a curve, and the constraints on `u` in its corners, of `each` intervals.
+pub(in crate::planning) fn speed_grid(
+    curve: &Curve,
+    bounds: &[JointBounds],
+    each: usize,
+) -> (Vec<Constraint>, SpeedGrid) {
     let corners = curve.iter().filter(|piece| piece.bends).count();
-    let intervals = corners * CORNER_INTERVALS + curve.len() - corners;
-    let mut constraints = Vec::with_capacity(corners * CORNER_INTERVALS * bounds.len() * 2);
+    let intervals = corners * each + curve.len() - corners;
+    let mut constraints = Vec::with_capacity(corners * each * bounds.len() * 2);
     let mut speed_grid =
         SpeedGrid { points: Vec::with_capacity(intervals + 1), intervals: Vec::with_capacity(intervals) };
     let mut start = 0.0;
@@ -100,7 +90,7 @@ pub(in crate::planning) fn speed_grid(curve: &Curve, bounds: &[JointBound]) -> (
             None => speed_grid.points.push(GridPoint { x: entry, ..GridPoint::default() }),
         }
         if piece.bends {
-            speed_grid.add_corner(p, piece, start, bounds, &mut constraints);
+            speed_grid.add_corner((p, piece, start), bounds, each, &mut constraints);
         } else {
             let (at, most) = (piece.length, fastest(piece, bounds));
             speed_grid.intervals.push(Interval::Line { push: hardest(piece, bounds), most });
@@ -114,15 +104,14 @@ pub(in crate::planning) fn speed_grid(curve: &Curve, bounds: &[JointBound]) -> (
 impl SpeedGrid {
     fn add_corner(
         &mut self,
-        p: usize,
-        piece: &Piece,
-        start: f64,
-        bounds: &[JointBound],
+        (p, piece, start): (usize, &Piece, f64),
+        bounds: &[JointBounds],
+        intervals: usize,
         constraints: &mut Vec<Constraint>,
     ) {
-        let step = piece.length / CORNER_INTERVALS as f64;
+        let step = piece.length / intervals as f64;
         let mut here = piece.progress(0.0);
-        for k in 1..=CORNER_INTERVALS {
+        for k in 1..=intervals {
             let at = step * k as f64;
             let there = piece.progress(at);
             let first = constraints.len();
@@ -226,19 +215,19 @@ fn switches(from: &GridPoint, to: &GridPoint, push: f64, fastest: f64, out: &mut
 }
 
 /// Returns the maximum `u` on a line.
-fn hardest(line: &Piece, bounds: &[JointBound]) -> f64 {
+fn hardest(line: &Piece, bounds: &[JointBounds]) -> f64 {
     let u = line.direction.iter().zip(bounds).map(|(d1, b)| b.acceleration / d1.abs().max(1e-12));
     u.fold(f64::INFINITY, f64::min)
 }
 
 /// Returns the maximum `x` on a line.
-fn fastest(line: &Piece, bounds: &[JointBound]) -> f64 {
+fn fastest(line: &Piece, bounds: &[JointBounds]) -> f64 {
     let speed = line.direction.iter().zip(bounds).map(|(d1, b)| b.velocity / d1.abs().max(1e-12));
     speed.fold(f64::INFINITY, f64::min).powi(2)
 }
 
 /// Returns the maximum `x` at a point of a piece, from the joint speeds and from what no `u` can compensate.
-fn highest(piece: &Piece, at: f64, bounds: &[JointBound]) -> f64 {
+fn highest(piece: &Piece, at: f64, bounds: &[JointBounds]) -> f64 {
     let t = piece.progress(at);
     let (mut speed, mut x, mut cube) = (f64::INFINITY, f64::INFINITY, f64::INFINITY);
     for ((direction, turn), bound) in piece.direction.iter().zip(&piece.turn).zip(bounds) {

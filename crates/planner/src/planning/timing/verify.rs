@@ -3,7 +3,7 @@
 use dimos_kernels::Width;
 use dimos_kernels::states::{JOINTS, States};
 
-use super::topp::JointBound;
+use dimos_core::joint::JointBounds;
 
 /// The largest part of each limit that a trajectory uses: above 1 it exceeds the limit.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -51,7 +51,7 @@ const NEGLIGIBLE: f64 = 1e-6;
 /// Measures the curve through states: quintic, or cubic, as in `Spline`. The values are upper bounds, exact where the
 /// acceleration is constant, or linear without a change of its sign ([`States::most`]). If these exceed a limit, they
 /// are the extremes of cubics, and quintics are sampled in quarters of each segment.
-pub fn excess(states: &States, bounds: &[JointBound], quintic: bool) -> Excess {
+pub fn excess(states: &States, bounds: &[JointBounds], quintic: bool) -> Excess {
     let most = upper_bounds(states, bounds, quintic);
     if most.slower() <= 1.0 + NEGLIGIBLE {
         return most;
@@ -78,7 +78,7 @@ pub fn excess(states: &States, bounds: &[JointBound], quintic: bool) -> Excess {
 }
 
 /// Returns the parts of a joint's limits that these are.
-fn part_of([velocity, acceleration, jerk]: [f64; 3], bound: &JointBound) -> Excess {
+fn part_of([velocity, acceleration, jerk]: [f64; 3], bound: &JointBounds) -> Excess {
     Excess {
         velocity: velocity / bound.velocity,
         acceleration: acceleration / bound.acceleration,
@@ -121,7 +121,7 @@ fn of_quintic(d: f64, [v0, v1]: [f64; 2], [a0, a1]: [f64; 2], h: f64, inverse: f
 }
 
 /// Returns upper bounds of what the spline through states uses.
-fn upper_bounds(states: &States, bounds: &[JointBound], quintic: bool) -> Excess {
+fn upper_bounds(states: &States, bounds: &[JointBounds], quintic: bool) -> Excess {
     let mut all = Excess::default();
     for (block, bounds) in bounds.chunks(JOINTS).enumerate() {
         let most = states.most(block, quintic, Width::widest());
@@ -154,7 +154,8 @@ mod tests {
                 accelerations: if quintic { states.values(k, 2).into() } else { Default::default() },
             };
             let points = states.times().iter().enumerate().map(point).collect();
-            let limits = vec![JointBound { velocity: 2.0, acceleration: 30.0, jerk: 500.0 }; joints];
+            let limits =
+                vec![JointBounds { velocity: 2.0, acceleration: 30.0, jerk: 500.0, ..JointBounds::NONE }; joints];
             let most = upper_bounds(&states, &limits, quintic);
             let names = (0..joints).map(|j| format!("j{j}")).collect();
             let spline = Spline::new(&JointTrajectory { joint_names: names, points }).unwrap();

@@ -51,7 +51,7 @@ impl Job {
     }
 }
 
-/// What the thread gets for a request: its own copies of the scene and the world.
+/// Input of the thread for a request: its own copies of the scene and the world.
 pub(in crate::planning) struct WorkItem {
     pub id: u64,
     pub setup: Arc<PlanningScene>,

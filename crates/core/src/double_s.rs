@@ -4,7 +4,7 @@
 
 /// Limits along a line.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(in crate::planning) struct LineLimits {
+pub struct LineLimits {
     /// Maximum speed [rad/s].
     pub speed: f64,
     /// Maximum acceleration [rad/s²].
@@ -15,7 +15,7 @@ pub(in crate::planning) struct LineLimits {
 
 /// State at the end of a phase of constant jerk.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(in crate::planning) struct State {
+pub struct State {
     /// Time from the start of the line [s].
     pub time: f64,
     /// Position from the start of the line [rad].
@@ -31,11 +31,13 @@ const STEPS: usize = 60;
 
 impl LineLimits {
     /// Change of speed [rad/s] from which the full acceleration is reached.
+    #[inline]
     fn full(&self) -> f64 {
         self.acceleration * self.acceleration / self.jerk
     }
 
     /// Returns the time to change the speed by `change` [s].
+    #[inline]
     fn time(&self, change: f64) -> f64 {
         if change >= self.full() {
             change / self.acceleration + self.acceleration / self.jerk
@@ -45,11 +47,13 @@ impl LineLimits {
     }
 
     /// Returns the distance to change between two speeds [rad].
+    #[inline]
     pub fn distance(&self, a: f64, b: f64) -> f64 {
         0.5 * (a + b) * self.time((b - a).abs())
     }
 
     /// Returns the highest speed, at most `most`, that is reached from `from` within `length`.
+    #[inline]
     pub fn reached(&self, from: f64, most: f64, length: f64) -> f64 {
         if most <= from || self.distance(from, most) <= length {
             return most;
@@ -154,56 +158,76 @@ impl LineLimits {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dimos_robot::random::Random;
+    use proptest::prelude::*;
 
-    /// Random limits, speeds and lengths that are possible.
-    fn cases() -> impl Iterator<Item = (LineLimits, f64, f64, f64)> {
-        let mut random = Random::new(11);
-        (0..2000).map(move |k| {
-            let jerk = if k % 4 == 0 { f64::INFINITY } else { random.between(1.0, 500.0) };
-            let limits = LineLimits { speed: random.between(0.2, 4.0), acceleration: random.between(0.5, 20.0), jerk };
-            let from = random.between(0.0, limits.speed);
-            let length = random.between(1e-4, 3.0);
-            let to = limits.reached(from, limits.speed, length) * random.between(0.0, 1.0);
-            let back = limits.reached(to, limits.speed, length);
-            (limits, from.min(back), to, length)
-        })
+    /// Limits, the speeds at both ends of a line, and its length: the line is long enough for them.
+    fn line() -> impl Strategy<Value = (LineLimits, f64, f64, f64)> {
+        let jerk = prop_oneof![1 => Just(f64::INFINITY), 3 => 1.0..500.0];
+        (0.2..4.0, 0.5..20.0, jerk, 0.0..1.0, 1e-4..3.0, 0.0..1.0).prop_map(
+            |(speed, acceleration, jerk, from, length, to): (f64, f64, f64, f64, f64, f64)| {
+                let limits = LineLimits { speed, acceleration, jerk };
+                let from = from * speed;
+                let to = limits.reached(from, speed, length) * to;
+                (limits, from.min(limits.reached(to, speed, length)), to, length)
+            },
+        )
     }
 
-    #[test]
-    fn a_line_ends_where_and_as_fast_as_asked_within_its_limits() {
-        for (limits, from, to, length) in cases() {
-            let what = format!("{limits:?} from {from} to {to} over {length}");
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(2000))]
+
+        #[test]
+        fn a_line_ends_where_and_as_fast_as_asked_within_its_limits((limits, from, to, length) in line()) {
             let mut last = State { speed: from, ..State::default() };
+            let mut wrong = None;
             limits.travel(from, to, length, |s| {
                 let dt = s.time - last.time;
-                assert!(dt >= 0.0 && s.at >= last.at - 1e-9, "{what}: back to {s:?} from {last:?}");
-                assert!(s.speed <= limits.speed * (1.0 + 1e-9) && s.speed >= -1e-9, "{what}: {s:?}");
-                assert!(s.acceleration.abs() <= limits.acceleration * (1.0 + 1e-9), "{what}: {s:?}");
+                let mut see = |right: bool, what: &str| {
+                    if !right {
+                        wrong.get_or_insert(format!("{what}: {s:?} from {last:?}"));
+                    }
+                };
+                see(dt >= 0.0 && s.at >= last.at - 1e-9, "back");
+                see(s.speed <= limits.speed * (1.0 + 1e-9) && s.speed >= -1e-9, "speed limit");
+                see(s.acceleration.abs() <= limits.acceleration * (1.0 + 1e-9), "acceleration limit");
                 if limits.jerk.is_finite() {
                     // Constant jerk: position and speed follow from the accelerations.
                     let (a0, a1) = (last.acceleration, s.acceleration);
-                    assert!((a1 - a0).abs() <= limits.jerk * dt * (1.0 + 1e-9) + 1e-9, "{what}: jerk");
-                    assert!((last.speed + 0.5 * dt * (a0 + a1) - s.speed).abs() < 1e-6, "{what}: speed of {s:?}");
-                    let at = last.at + dt * (last.speed + dt * (2.0 * a0 + a1) / 6.0);
-                    assert!((at - s.at).abs() < 1e-6, "{what}: {at} for {s:?}");
+                    see((a1 - a0).abs() <= limits.jerk * dt * (1.0 + 1e-9) + 1e-9, "jerk limit");
+                    see((last.speed + 0.5 * dt * (a0 + a1) - s.speed).abs() < 1e-6, "speed");
+                    see((last.at + dt * (last.speed + dt * (2.0 * a0 + a1) / 6.0) - s.at).abs() < 1e-6, "position");
                 } else {
-                    assert!((s.speed - last.speed).abs() <= limits.acceleration * dt + 1e-9, "{what}: {s:?}");
-                    assert!((last.at + 0.5 * dt * (last.speed + s.speed) - s.at).abs() < 1e-6, "{what}: {s:?}");
+                    see((s.speed - last.speed).abs() <= limits.acceleration * dt + 1e-9, "acceleration");
+                    see((last.at + 0.5 * dt * (last.speed + s.speed) - s.at).abs() < 1e-6, "position");
                 }
                 last = s;
             });
-            assert!((last.at - length).abs() < 1e-6 && (last.speed - to).abs() < 1e-9, "{what}: {last:?}");
+            prop_assert!(wrong.is_none(), "{limits:?} from {from} to {to} over {length}: {wrong:?}");
+            prop_assert!((last.at - length).abs() < 1e-6 && (last.speed - to).abs() < 1e-9, "{last:?}");
         }
-    }
 
-    #[test]
-    fn no_slower_profile_is_chosen_than_one_that_peaks_a_little_higher_would_allow() {
-        for (limits, from, to, length) in cases() {
+        #[test]
+        fn no_slower_profile_is_chosen_than_one_that_peaks_a_little_higher_would_allow(
+            (limits, from, to, length) in line()
+        ) {
             let peak = limits.peak(from, to, length);
             let higher = peak + 1e-6;
             let fits = limits.distance(from, higher) + limits.distance(higher, to) <= length;
-            assert!(higher > limits.speed || !fits || peak <= from.max(to), "{limits:?} {from} {to} {length}: {peak}");
+            prop_assert!(higher > limits.speed || !fits || peak <= from.max(to), "{peak}");
+        }
+    }
+
+    /// Closed forms of the duration from rest to rest: speed limit reached, only the acceleration limit, neither.
+    #[test]
+    fn from_rest_to_rest_the_duration_is_that_of_the_closed_form() {
+        let limits = LineLimits { speed: 1.5, acceleration: 4.0, jerk: 40.0 };
+        let (v, a, j) = (limits.speed, limits.acceleration, limits.jerk);
+        for (length, duration) in [
+            (2.0, 2.0 / v + v / a + a / j),
+            (0.3, a / j + ((a / j) * (a / j) + 4.0 * 0.3 / a).sqrt()),
+            (0.01, 4.0 * (0.01 / (2.0 * j)).cbrt()),
+        ] {
+            assert!((limits.duration(0.0, 0.0, length) - duration).abs() < 1e-6, "{length}");
         }
     }
 }

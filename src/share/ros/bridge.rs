@@ -1,4 +1,4 @@
-//! The face itself: joins the router of ROS when it is there, and serves.
+//! The bridge itself: joins the router of ROS when it is there, and serves.
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -24,13 +24,13 @@ use dimos_rpc::error::{Code, RpcError};
 const QUEUE: usize = 32;
 /// Period of the check whether the router is there.
 const PERIOD: Duration = Duration::from_millis(200);
-/// Name of this face in reports.
-const FACE: &str = "ros";
+/// Name of this bridge in reports.
+const BRIDGE: &str = "ros";
 /// What the run shows as the commander of an arm.
 const COMMANDER: &str = "ROS 2";
 
-/// The face of a run to ROS 2. Ends when dropped.
-pub struct Face {
+/// The bridge of a run to ROS 2. Ends when dropped.
+pub struct Bridge {
     core: Arc<Core>,
 }
 
@@ -54,8 +54,8 @@ struct Open {
     actions: Vec<Arc<Action>>,
 }
 
-impl Face {
-    /// Starts the face of a run. It serves once the router is there, also when that comes later. `changed` is called
+impl Bridge {
+    /// Starts the bridge of a run. It serves once the router is there, also when that comes later. `changed` is called
     /// when its report changes.
     pub fn start(
         (run, socket): (&str, &Path),
@@ -94,7 +94,7 @@ impl Face {
                 changed();
             }
         };
-        std::thread::Builder::new().name("ros-face".into()).spawn(serve).map_err(|e| failed(e.to_string()))?;
+        std::thread::Builder::new().name("ros-bridge".into()).spawn(serve).map_err(|e| failed(e.to_string()))?;
         Ok(Self { core })
     }
 
@@ -104,7 +104,7 @@ impl Face {
     }
 }
 
-impl Drop for Face {
+impl Drop for Bridge {
     fn drop(&mut self) {
         self.core.ended.store(true, Ordering::Release);
         let Some(open) = lock(&self.core.open).take() else { return };
@@ -113,11 +113,11 @@ impl Drop for Face {
     }
 }
 
-/// Returns the report of a face. `down`: why it does not serve.
+/// Returns the report of a bridge. `down`: why it does not serve.
 pub fn report(config: &RosConfig, down: Option<String>) -> FaceReport {
     let namespace = if config.namespace.is_empty() { String::new() } else { format!("/{}", config.namespace) };
     FaceReport {
-        face: FACE.into(),
+        face: BRIDGE.into(),
         name: format!("{namespace}/{}", super::names::NODE),
         serves: down.is_none(),
         command: config.command,
@@ -130,13 +130,13 @@ fn no_router(config: &RosConfig) -> String {
 }
 
 impl Core {
-    /// Serves until the face ends.
+    /// Serves until the bridge ends.
     fn serve(&self, session: Session, changed: &impl Fn()) -> zenoh::Result<()> {
         let node = Arc::new(Node::new(session, &self.config)?);
         let actions = self.declare(&node)?;
         {
             let mut open = lock(&self.open);
-            // Nothing may be left open by a face that has ended meanwhile.
+            // Nothing may be left open by a bridge that has ended meanwhile.
             if self.ended.load(Ordering::Acquire) {
                 node.close();
                 return Ok(());
