@@ -11,7 +11,7 @@ use super::follow::Signals;
 use super::goal::{has_planner, plan, show};
 use super::going;
 use super::output::{self, Table, fixed, signed, span};
-use crate::offline::{JointBound, length, thin, time_within};
+use crate::offline::{TimingSettings, length, thin, time};
 use crate::replay::motion::{RecordedMotion, tcp_path};
 use crate::replay::recorded::Recorded;
 use crate::replay::recorded::RecordedError;
