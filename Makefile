@@ -1,4 +1,4 @@
-# run install dist arm64 viewer check test test-fast package verified · test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants ·
+# run install dist arm64 test-arm64 viewer check test test-fast package verified · test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants ·
 # bench bench-quick bench-page bench-share screenshots jitter soak lies lies-wire pauses
 
 PYTHON ?= python3
@@ -28,7 +28,7 @@ PAGE := viewer/dist/index.html
 PAGE_SOURCES := $(wildcard viewer/*.json viewer/*.mjs) $(shell find viewer/src -type f 2>/dev/null)
 NODE := $(if $(wildcard viewer/package.json),$(shell command -v npm))
 
-.PHONY: run demo install dist arm64 shipped viewer viewer-if-possible check lint scripts spelling licences test test-fast package verified test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants bench bench-quick bench-page bench-share screenshots jitter soak lies lies-wire pauses
+.PHONY: run demo install dist arm64 test-arm64 shipped viewer viewer-if-possible check lint scripts spelling licences test test-fast package verified test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants bench bench-quick bench-page bench-share screenshots jitter soak lies lies-wire pauses
 
 # Builds the program to try it, not optimized, and starts a shipped blueprint; its arms are simulated. Ends with Ctrl-C.
 run: WHAT = run coordinator-yourarm
@@ -53,6 +53,10 @@ dist: viewer
 # The program for aarch64, and an emulator that runs it here, for tests. Its profile compiles sooner and runs slower.
 arm64:
 	packaging/emulated.sh quick
+
+# The other processor computes the same bits. Not part of `make test`: it compiles everything once more.
+test-arm64: arm64
+	cargo test --locked $(WITH) --test process other_machine -- --nocapture
 
 # The optimized program without debug information, and its debug file.
 shipped: viewer

@@ -1,4 +1,4 @@
-//! The program for aarch64, run by an emulator of that processor (`make arm64`): what it prints, plans and commands is
+//! The program for aarch64, run by an emulator of that processor (`make test-arm64`): what it prints, plans and commands is
 //! equal in every bit to what the program under test does. Another compiler made it, with another C library.
 
 use std::path::{Path, PathBuf};
@@ -11,7 +11,7 @@ use rustix::process::Signal;
 use serde_json::{Value, json};
 
 use crate::support::program::{Ended, Home, Started, TIMEOUT, UP};
-use crate::support::skip::skip;
+use crate::support::skip::{skip, skip_optional};
 
 /// Plans of all arms together; `DIMOS_PLANS=1000` is what the figures are about.
 const PLANS: usize = 20;
@@ -37,7 +37,7 @@ fn machines() -> Option<[Machine; 2]> {
     let built = ours.ancestors().nth(2).unwrap().join("cross/dimos-aarch64");
     let theirs = std::env::var_os("DIMOS_AARCH64").map_or(built, PathBuf::from);
     if !theirs.exists() {
-        skip("dimos for aarch64 (make arm64)");
+        skip_optional("dimos for aarch64 (make test-arm64)");
         return None;
     }
     Some([ours, theirs].map(|program| Machine { home: Home::new(), program }))

@@ -16,6 +16,11 @@ pub fn skip_tool(tool: &str) {
     skip(&format!("{tool} (make test-tools)"));
 }
 
+/// [`skip`] for what takes long to build: a run of all tests does without it.
+pub fn skip_optional(what: &str) {
+    println!("SKIPPED: {what}");
+}
+
 /// [`skip`] for what needs a privilege. A process without that privilege skips it even with `DIMOS_NO_SKIP=1`: no
 /// installation helps there.
 #[track_caller]
