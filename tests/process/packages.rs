@@ -1,5 +1,5 @@
-//! What is shipped, made from the program under test: the tarball, the Debian package installed in its own root, the
-//! wheel installed in a virtual environment.
+//! What is shipped, made from the program under test: the tarball, the Debian package in a root and in a Debian base,
+//! the wheel in a virtual environment.
 
 use std::ffi::OsStr;
 use std::fs;

@@ -100,7 +100,7 @@ impl Service {
         let ahead = (free_until - elapsed).max(0.0);
         let text = match (in_time, free_until.is_finite()) {
             (true, false) => format!("the world has changed, and {what}: the arm slows down"),
-            (true, true) => format!("path blocked in {ahead:.2} s: {what}; the arm stops before it"),
+            (true, true) => format!("path blocked in {ahead:.2} s: {what}; the arm rests before it"),
             (false, _) => format!(
                 "path blocked in {ahead:.2} s, closer than the arm can brake along its path: {what}; held at once"
             ),
