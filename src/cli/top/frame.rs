@@ -215,10 +215,12 @@ mod tests {
         for part in ["SIMULATED", "-1.2346", "held: stopped by an operator", "dimos arm reset a_rather_long_arm_0"] {
             assert!(text.contains(part), "no {part:?} in\n{text}");
         }
-        for rows in [1, 8, 14, 24, 60] {
+        let least = with(&runs, 80, false).len();
+        assert!(least < all.len(), "without joints there are fewer");
+        for rows in [1, 8, least - 1, least, all.len(), 60] {
             let shown = lines(&runs, 80, rows);
             assert!(shown.len() <= rows, "{rows}: {shown:#?}");
-            assert_eq!(shown.last().unwrap().text().contains("more lines"), rows < 14, "{rows}: {shown:#?}");
+            assert_eq!(shown.last().unwrap().text().contains("more lines"), rows < least, "{rows}: {shown:#?}");
         }
     }
 }
