@@ -42,10 +42,24 @@ fn comments(text: &str) -> Vec<String> {
     all.filter(|c| !c.starts_with(" =====") && !c.starts_with(" |    ")).collect()
 }
 
+/// Whether two values are equal; the last bit of a number may differ, as it does between two C libraries.
+fn same(ours: &str, theirs: &str) -> bool {
+    let close = |(a, b): (&str, &str)| match (a.parse::<f64>(), b.parse::<f64>()) {
+        _ if a == b => true,
+        (Ok(a), Ok(b)) => (a - b).abs() <= f64::EPSILON * b.abs(),
+        _ => false,
+    };
+    let count = |text: &str| text.split_whitespace().count();
+    count(ours) == count(theirs) && ours.split_whitespace().zip(theirs.split_whitespace()).all(close)
+}
+
 /// The first place where two trees differ.
 fn difference(ours: &Tree, theirs: &Tree, path: &str) -> Option<String> {
     let path = format!("{path}/{}", theirs.name);
-    if ours.name != theirs.name || ours.attributes != theirs.attributes || ours.text != theirs.text {
+    let pairs = || ours.attributes.iter().zip(&theirs.attributes);
+    let attributes = ours.attributes.len() == theirs.attributes.len()
+        && pairs().all(|((name, a), (other, b))| name == other && (a == b || same(a, b)));
+    if ours.name != theirs.name || !attributes || ours.text != theirs.text {
         let show = |t: &Tree| format!("<{} {:?}> {:?}", t.name, t.attributes, t.text);
         return Some(format!("{path}:\n  ours   {}\n  theirs {}", show(ours), show(theirs)));
     }
