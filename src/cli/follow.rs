@@ -20,6 +20,9 @@ use dimos_rpc::report::{Deviation, MotionReport};
 const POLL_PERIOD: Duration = Duration::from_millis(20);
 /// Maximum wait for a cancelled motion to end.
 const REST_TIMEOUT: Duration = Duration::from_secs(10);
+/// Largest width of the progress bar, and the columns that the text behind it takes.
+const BAR: usize = 40;
+const BAR_TEXT: usize = 24;
 /// Final error below which a joint counts as on target [rad].
 const ON_TARGET: f64 = 0.01;
 
@@ -78,7 +81,10 @@ pub fn watch(
     signals: &Signals,
 ) -> Result<(MotionReport, Option<i32>)> {
     let bar = ProgressBar::new(1000).with_finish(ProgressFinish::AndClear);
-    if let Ok(style) = ProgressStyle::with_template("{prefix} [{bar:40}] {percent:>3} % {msg}") {
+    // What is left beside the title, and the text behind the bar.
+    let room = output::columns(std::io::stderr())
+        .map_or(BAR, |columns| usize::from(columns).saturating_sub(title.chars().count() + BAR_TEXT).clamp(4, BAR));
+    if let Ok(style) = ProgressStyle::with_template(&format!("{{prefix}} [{{bar:{room}}}] {{percent:>3}} % {{msg}}")) {
         bar.set_style(style.progress_chars("=> "));
     }
     bar.set_prefix(title.to_owned());
@@ -183,7 +189,7 @@ pub fn show_deviation(deviation: &[Deviation]) {
     if deviation.is_empty() {
         return;
     }
-    let mut table = Table::new(&["JOINT", ">TARGET rad", ">REACHED rad", ">OFF BY rad", ">OFF BY deg"]);
+    let mut table = Table::new(&["JOINT", ">TARGET rad", ">REACHED rad", ">OFF BY rad", ">?OFF BY deg"]);
     for joint in deviation {
         let off = joint.error();
         let tone = if off.abs() <= ON_TARGET { Tone::Good } else { Tone::Warning };

@@ -65,7 +65,7 @@ fn n10_what_a_role_does_not_include_is_forbidden_by_name_and_reaches_no_run() {
     cell.as_user("alice", "move arm 0.2 0 0 0 0 0").with(0);
     let before = cell.home.positions("arm");
     let refused = cell.as_user("bob", "move arm 0.5 0 0 0 0 0").with(1);
-    refused.says(&["[FORBIDDEN]", "user bob has the role observer here", "`move`", "hint: "]);
+    refused.says(&["[FORBIDDEN]", "user bob has the role observer here", "`go`", "hint: "]);
     assert_eq!(cell.home.positions("arm"), before);
     cell.as_user("bob", "state").with(0);
     cell.as_user("alice", "arm reset arm").with(1).says(&["[FORBIDDEN]", "share.remote_enable"]);

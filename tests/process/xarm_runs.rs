@@ -195,7 +195,7 @@ fn a_gripper_that_only_opens_and_closes_is_ordered_and_not_measured() {
     let home = Home::new();
     let run = home.run("coordinator-lite6 --sim --no-record --set hardware.arm.options.gripper=lite6");
     assert!(!home.dimos("state").with(0).out.contains("gripper"), "nothing is known before the first order");
-    home.dimos("status").with(0).shows(&["gripper only opens (1) and closes (0); nothing measures its fingers"]);
+    home.dimos("status -v").with(0).shows(&["gripper only opens (1) and closes (0); nothing measures its fingers"]);
     let closed = home.dimos("arm gripper arm close --json").with(0).json();
     assert_eq!((&closed["outcome"], &closed["unit"]), (&json!("ordered"), &json!("on_off")), "{closed}");
     home.dimos("state").with(0).shows(&["gripper  closed (as ordered)"]);

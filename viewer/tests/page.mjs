@@ -147,6 +147,7 @@ test('at rest Escape leaves what is open or typed, and stops nothing', async () 
   await page.focus('#sliders .value');
   await page.keyboard.press('Escape');
   await until('it is held', () => run.arm().phase === 'held');
+  await until('the page has released the arm', () => !run.arm().commander);
   run.dimos('arm', 'reset', 'arm');
   run.dimos('arm', 'enable', 'arm');
 });
