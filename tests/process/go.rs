@@ -3,10 +3,10 @@
 
 use std::io::{BufRead, BufReader, ErrorKind, Write};
 use std::os::unix::net::UnixStream;
-use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::{Arc, Mutex};
 use std::thread::sleep;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use dimos::arms::yourarm::emulator::wire::Request;
 use dimos::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
@@ -104,7 +104,7 @@ impl Cell {
             self.home.dimos("arm reset arm").with(0);
             self.home.dimos("arm enable arm").with(0);
         }
-        self.home.dimos("move arm 0 0.05 0 0 0 0 --direct --speed 1").with(0);
+        self.home.dimos("move arm 0 0.05 0 0 0 0 --direct --speed 0.3").with(0);
     }
 }
 
@@ -257,19 +257,26 @@ fn released(request: &Value) -> Value {
     json!({"plan": request["params"]["plan"], "trajectory": trajectory, "task": "traj_arm"})
 }
 
-/// Plays a scenario; again, if this computer was stalled: that holds arms.
+/// Plays a scenario; a failure counts unless this computer was stalled: a state of this arm is stale after 50 ms.
 fn judged(scenario: impl Fn()) {
-    Watch::of_processors().unless_stalled(|| {
-        let played = catch_unwind(AssertUnwindSafe(&scenario));
-        played.map_err(|panic| panic.downcast_ref::<String>().cloned().unwrap_or_default())
-    });
+    let watch = Watch::of_processors();
+    for _ in 0..5 {
+        let began = Instant::now();
+        let Err(why) = catch_unwind(AssertUnwindSafe(&scenario)) else { return };
+        let longest = watch.longest_since(began);
+        if longest < Duration::from_millis(30) {
+            resume_unwind(why);
+        }
+        println!("not judged: this computer was stalled for {longest:?}");
+    }
+    panic!("this computer was stalled in each attempt");
 }
 
 #[test]
 fn a_stop_a_cancel_and_the_end_of_the_client_end_a_motion_that_is_planned() {
     judged(|| {
         let cell = up("coordinator-yourarm");
-        cell.home.dimos("move arm 0 0.05 0 0 0 0 --speed 1").with(0);
+        cell.home.dimos("move arm 0 0.05 0 0 0 0 --speed 0.3").with(0);
         for event in EVENTS {
             let planner = Planner::attach(&cell);
             let mut mover = cell.home.client();
@@ -305,7 +312,7 @@ fn a_stop_a_cancel_and_the_end_of_the_client_end_a_motion_that_is_planned() {
 fn a_stop_a_cancel_and_the_end_of_the_client_come_between_a_plan_and_its_motion() {
     judged(|| {
         let cell = up("coordinator-yourarm");
-        cell.home.dimos("move arm 0 0.05 0 0 0 0 --speed 1").with(0);
+        cell.home.dimos("move arm 0 0.05 0 0 0 0 --speed 0.3").with(0);
         for event in EVENTS {
             let planner = Planner::attach(&cell);
             planner.set(|script| script.planned = true);
@@ -354,7 +361,7 @@ fn a_stop_a_cancel_and_the_end_of_the_client_end_what_follows_a_motion() {
         let cell = up("coordinator-yourarm");
         cell.home.dimos("arm gripper arm open").with(0);
         for event in EVENTS {
-            cell.home.dimos("move arm 0 0.05 0 0 0 0 --speed 1").with(0);
+            cell.home.dimos("move arm 0 0.05 0 0 0 0 --speed 0.3").with(0);
             let mut mover = cell.home.client();
             let going = go(&mut mover, vec![to(0.8, 0.15), grip(GripperEnd::Close), to(0.0, 1.0)]);
             eventually("it moves", || cell.joint1() > 0.1);
@@ -385,7 +392,7 @@ fn a_stop_a_cancel_and_the_end_of_the_client_come_while_fingers_move() {
     judged(|| {
         let cell = up("coordinator-yourarm");
         cell.home.dimos("arm gripper arm open").with(0);
-        cell.home.dimos("move arm 0 0.05 0 0 0 0 --speed 1").with(0);
+        cell.home.dimos("move arm 0 0.05 0 0 0 0 --speed 0.3").with(0);
         for event in EVENTS {
             // They do not begin to move: that this is their end is known after 1 s.
             cell.arm.inject(Fault::new(FaultKind::GripperBlocked).lasting(3.0)).unwrap();
@@ -418,7 +425,7 @@ fn a_stop_a_cancel_and_the_end_of_the_client_come_while_fingers_move() {
 fn a_move_that_is_killed_while_it_plans_moves_nothing() {
     judged(|| {
         let cell = up("coordinator-yourarm");
-        cell.home.dimos("move arm 0 0.05 0 0 0 0 --speed 1").with(0);
+        cell.home.dimos("move arm 0 0.05 0 0 0 0 --speed 0.3").with(0);
         let planner = Planner::attach(&cell);
         let killed = cell.home.start("move arm 0.5 0.05 0 0 0 0");
         eventually("it plans", || planner.0.lock().unwrap().asked_to_plan);
@@ -480,7 +487,7 @@ fn one_request_moves_grips_and_attaches_and_has_one_outcome() {
 fn each_step_needs_the_lease_and_one_request_at_a_time_moves_an_arm() {
     judged(|| {
         let cell = up("coordinator-yourarm");
-        cell.home.dimos("move arm 0 0.05 0 0 0 0 --speed 1").with(0);
+        cell.home.dimos("move arm 0 0.05 0 0 0 0 --speed 0.3").with(0);
         let (mut one, mut two) = (cell.home.client(), cell.home.client());
         // Without a motion, no lease is taken.
         assert_eq!(
