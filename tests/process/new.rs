@@ -17,8 +17,9 @@ fn arms(home: &Home, adapter: &str) -> Vec<String> {
 
 /// `dimos new ARM`, with no gripper, on a table where there is a built-in model of it.
 fn write(home: &Home, arm: &str, row: &Value) -> Ended {
-    let model =
-        if builtin::text(arm).is_some() { format!("{arm} --tool 0 0 0.1 --table 0") } else { "none".to_owned() };
+    // The SO-101's has its jaw for a joint: its blueprint says so, `new` does not.
+    let is_known = builtin::text(arm).is_some() && arm != "so101";
+    let model = if is_known { format!("{arm} --tool 0 0 0.1 --table 0") } else { "none".to_owned() };
     let dof = &row["dof"];
     let joints = if model == "none" && dof["min"] != dof["max"] { " --joints 6" } else { "" };
     home.dimos(&format!("new {arm} --arm {arm} --address sim --gripper none --model {model}{joints}"))

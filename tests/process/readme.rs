@@ -94,7 +94,9 @@ fn readme_at(columns: u16) {
     shows(&home, "world add part --sphere 0.01 --at 0.243 0 0.2", columns);
     let commands = every_day();
     assert!(commands.len() >= 8, "{commands:?}");
-    for command in commands.into_iter().filter(|command| !command.starts_with("run ") && *command != "view") {
+    // These last until somebody ends them.
+    let lasts = |command: &str| command.starts_with("run ") || matches!(command, "view" | "top");
+    for command in commands.into_iter().filter(|command| !lasts(command)) {
         shows(&home, command, columns);
     }
     run.end(Signal::INT).with(130);

@@ -70,12 +70,14 @@ impl Cell {
 
         let stem = model.as_deref().unwrap_or(row.name);
         let has_gripper = gripper.is_some_and(|gripper| gripper != json!(NONE) && gripper != json!(false));
+        let fitting = fitting(&row, &options)?;
+        // A built-in model may have its jaw for a joint: its blueprint says which joints are the arm's.
         let default = default_model(stem, has_gripper);
+        let fits = planned(&default, path)?.is_none_or(|robot| fitting.contains(&robot.joints.len()));
+        let default = if fits { default } else { NONE.to_owned() };
         let text = "Model to plan with: builtin:NAME, a .urdf or .xacro file, or none".to_owned();
         let question = Question { option: "--model", text, default: &default };
         let mut robot = asker.ask(&question, args.model.as_deref(), |text| planned(text, path))?;
-
-        let fitting = fitting(&row, &options)?;
         let joints = joints(args, asker, &row, robot.as_ref(), &fitting)?;
         if let Some(robot) = &mut robot {
             robot.flange = flange(&row, &options, joints, robot);
@@ -261,7 +263,11 @@ fn joints(args: &Args, asker: &Asker, row: &AdapterSpec, robot: Option<&Robot>, 
     let of_model = robot.map(|robot| robot.joints.len().to_string());
     match (fitting, &of_model, &args.joints) {
         (_, Some(count), None) => {
-            let hint = "give the model of this arm, or --model none";
+            let built_in = format!("{}-planner", row.name);
+            let hint = match crate::blueprint::names().contains(&built_in) {
+                true => format!("give --model none, or begin with the built-in blueprint {built_in}"),
+                false => "give the model of this arm, or --model none".to_owned(),
+            };
             read(count).map_err(|f| Failure { what: format!("--model: {}, as its model has", f.what), ..f }.hint(hint))
         }
         ([only], None, None) => Ok(*only),

@@ -84,7 +84,7 @@ impl Service {
         let then = self.what_follows(&call).await?;
         let arm = [call.arm.clone()];
         let command = Call::Gripper(call.command(self.position_of(&call)?));
-        let Reply::Gripper(sent) = going.command(&arm, Box::pin(self.answer(command, *origin))).await? else {
+        let Reply::Gripper(sent) = going.command(&arm, Box::pin(self.answer_counted(command, *origin))).await? else {
             return Err(internal().into());
         };
         let asked = Grip { arm: call.arm.clone(), order: Some(sent.order) };

@@ -162,7 +162,7 @@ impl Service {
 
     /// Begins a motion and waits for its end, and for that of those that continue it around an obstacle.
     async fn move_step(&self, going: &Going, arms: &[String], call: Call, origin: Origin) -> Result<(), Failed> {
-        let begun = match going.command(arms, Box::pin(self.answer(call, origin))).await? {
+        let begun = match going.command(arms, Box::pin(self.answer_counted(call, origin))).await? {
             Reply::Move(reply) => GoBegun::Move(reply),
             Reply::Execute(reply) | Reply::ExecutePlan(reply) => GoBegun::Execute(reply),
             _ => return Err(internal().into()),
