@@ -1,5 +1,6 @@
-//! The program for aarch64, run by an emulator of that processor (`make test-arm64`): what it prints, plans and commands
-//! is equal in every bit to what the program under test does. Another compiler made it, with another C library.
+//! The program for aarch64, run by an emulator of that processor (`make test-arm64`): what it prints, plans and
+//! commands is equal in every bit to what the program under test does. Another compiler made it, with another C
+//! library.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
