@@ -211,12 +211,12 @@ impl Service {
         }
     }
 
-    /// Returns the planner's report, with the progress of its last motion.
     /// Returns the planner's robots.
     pub(in crate::runtime) async fn robots(&self) -> Result<Vec<api::RobotReport>, RpcError> {
         Ok(self.planner_report(&self.plans.planner()?, QUERY_TIMEOUT).await?.robots)
     }
 
+    /// Returns the planner's report, with the progress of its last motion.
     async fn planner_report(&self, planner: &Planner<'_>, limit: Duration) -> Result<PlannerReport, RpcError> {
         let Reply::Planner(mut report) =
             planner.answer(Call::Planner(api::Planner {}), Moment::default(), limit).await?
