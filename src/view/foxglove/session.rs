@@ -320,8 +320,11 @@ impl Session<'_> {
                 let message = ros_messages::transforms(transforms, stamp);
                 return self.publish(Topic::Tf, stamp, encoded(&message)).await;
             }
-            // A run without a planner has no world.
-            Asked::World => return self.objects(read::<WorldReport>(line.result).unwrap_or_default()).await,
+            Asked::World => match read::<WorldReport>(line.result) {
+                Some(world) => return self.objects(world).await,
+                // Without a planner, or while it does not answer, nothing new is known: what is shown stays.
+                None => self.world = Some(self.world.take().unwrap_or_default()),
+            },
             Asked::Stream(stream) => {
                 let number = read::<SubscribeReply>(line.result).map(|reply| reply.subscription);
                 self.streams.insert(stream.name(), number);
