@@ -11,6 +11,8 @@ use dimos_robot::RobotModel;
 use dimos_robot::kinematics::Kinematics;
 
 pub use dimos_planner::collision::report::Contact;
+pub use dimos_planner::planning::curve::fit::fit;
+pub use dimos_planner::planning::curve::settings::FitSettings;
 pub use dimos_planner::planning::ik::IkFailure;
 pub use dimos_planner::planning::ik::settings::IkSettings;
 pub use dimos_planner::planning::scene::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};

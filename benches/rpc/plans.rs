@@ -306,6 +306,7 @@ fn under_way(cell: &mut Cell, goals: &[Vec<f64>], number: usize, changed: bool) 
             refine: 0,
             through: Vec::new(),
             blend: 0.0,
+            tcp_speed: None,
             by_number: false,
         };
         let deadline = Stop::new(Some(Instant::now() + Duration::from_secs(5)), None);

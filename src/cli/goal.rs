@@ -14,7 +14,7 @@ use super::output::{self, fixed};
 use super::recorded_path;
 use dimos_core::written;
 use dimos_rpc::api::{
-    Cancel, DEFAULT_REFINE, DEFAULT_SPEED, JointPath, PATH_TOLERANCE, Plan, PlanGoal, PlanLevel, PlanSummary, Planner,
+    Cancel, DEFAULT_REFINE, DEFAULT_SPEED, JointPath, MAX_TCP_SPEED, PATH_TOLERANCE, Plan, PlanGoal, PlanLevel, PlanSummary, Planner,
     Planning, PlanningReport, PoseSpec,
 };
 use dimos_rpc::client::{Client, ClientError};
@@ -42,6 +42,9 @@ pub struct Goal {
     /// Orientation as a quaternion x, y, z, w
     #[arg(long, value_names = ["X", "Y", "Z", "W"], num_args = 4, value_parser = coordinate, allow_negative_numbers = true, requires = "tcp", conflicts_with = "rpy")]
     pub quat: Option<Vec<f64>>,
+    /// Reach --pose or --by on the arc of a circle that passes x, y, z [m], along the same axes
+    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = length, allow_negative_numbers = true, requires = "tcp", conflicts_with = "linear")]
+    pub via: Option<Vec<f64>>,
     /// Frame of --pose or --by: map (default), base, tool, or an object of the world
     #[arg(long, value_name = "FRAME", requires = "tcp")]
     pub frame: Option<String>,
@@ -55,7 +58,7 @@ pub struct Goal {
     pub several: Vec<PlanGoal>,
     /// One motion through these waypoints; the last is the goal. Each is a named pose (named:1 if its name is a
     /// number), joints as 0.1,-0.3,0.6,0,0.8,0, or pose:x,y,z,r,p,y (also with x,y,z or a quaternion, and @FRAME);
-    /// line:… is reached on a straight line. With `move` also gripper:open, gripper:close or gripper:0.03, where the
+    /// line:… is reached on a straight line, arc:x,y,z/… on a circle through x,y,z. With `move` also gripper:open, gripper:close or gripper:0.03, where the
     /// arm waits for the outcome
     #[arg(long, value_name = "WAYPOINT", num_args = 2.., value_parser = waypoint, allow_negative_numbers = true, conflicts_with_all = ["joints", "tcp", "named", "several"], group = "goal")]
     pub through: Vec<Waypoint>,
@@ -99,6 +102,13 @@ fn position(text: &str) -> std::result::Result<f64, String> {
     })
 }
 
+/// Parses the speed of a tool.
+fn tcp_speed(text: &str) -> std::result::Result<f64, String> {
+    let speed = finite(text)?;
+    let allowed = speed > 0.0 && speed <= MAX_TCP_SPEED;
+    if allowed { Ok(speed) } else { Err(format!("must be above 0 and at most {MAX_TCP_SPEED} m/s")) }
+}
+
 /// Parses the tolerance of a path.
 fn tolerance(text: &str) -> std::result::Result<f64, String> {
     let tolerance = finite(text)?;
@@ -133,10 +143,18 @@ fn waypoint(text: &str) -> std::result::Result<Waypoint, String> {
             (planned.pose, planned.frame) = pose_in_frame(list).map_err(numbers)?;
             planned.linear = kind == "line";
         }
+        Some(("arc", both)) => {
+            let form = "must be arc:x,y,z/x,y,z,r,p,y: a place on the circle, and the pose at its end";
+            let (via, list) = both.split_once('/').ok_or(form)?;
+            let via = numbers(via)?;
+            via.iter().copied().try_for_each(written::length)?;
+            planned.via = Some(<[f64; 3]>::try_from(via).map_err(|_| form)?);
+            (planned.pose, planned.frame) = pose_in_frame(list)?;
+        }
         Some(("named", name)) => planned.named = Some(name.to_owned()),
         Some(("gripper", action)) => return grip::action(action).map(Waypoint::Grip),
         Some(_) => {
-            return Err("must be a name, joints as 0.1,-0.3,…, pose:x,y,z,…, line:x,y,z,… or gripper:close".into());
+            return Err("must be a name, joints as 0.1,-0.3,…, pose:x,y,z,…, line:x,y,z,…, arc:… or gripper:close".into());
         }
         // Of an arm with one joint.
         None if text.contains(',') || finite(text).is_ok() => planned.joints = Some(numbers(text)?),
@@ -193,6 +211,9 @@ pub struct Search {
     /// Move the tool centre point on a straight line to --pose or by --by; waypoints of --through have line: for that
     #[arg(long, requires = "tcp", conflicts_with = "through")]
     pub linear: bool,
+    /// Highest speed of the tool centre point and the flange in this motion [m/s], kept where no joint is slower
+    #[arg(long, value_name = "M/S", value_parser = tcp_speed)]
+    pub tcp_speed: Option<f64>,
     /// Seed of the search: the same request with the same seed gives the same plan
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
@@ -239,6 +260,7 @@ impl Goal {
             named: self.named.clone(),
             path,
             linear: search.linear,
+            via: self.via.as_deref().and_then(|via| via.try_into().ok()),
             retrace: None,
         }]
     }
@@ -301,6 +323,7 @@ impl Goal {
             timeout: search.timeout.map(|t| t.as_secs_f64()),
             through,
             blend: self.blend,
+            tcp_speed: search.tcp_speed,
             by_number: false,
         }
     }

@@ -7,7 +7,7 @@ use std::path::Path;
 
 use super::exit::{Failure, Result};
 use super::{output, trajectory_file};
-use crate::offline::{thin, unwind};
+use crate::offline::{FitSettings, fit, thin, unwind};
 use dimos_log::joints::{Places, twice};
 use dimos_rpc::api::{JointPath, MAX_LINE, MAX_PATH};
 use dimos_rpc::client::ClientError;
@@ -37,9 +37,7 @@ pub fn read(file: &Path, joints: &[String], turns: &[bool], tolerance: f64) -> R
         _ if file.is_dir() => logged::read(file, joints, turns, tolerance)?,
         _ => written(file, joints, turns)?,
     };
-    // Half of the tolerance is for the straight lines, half for the blends between them.
-    let points = thin(&rows, tolerance / 2.0);
-    let points: Vec<Vec<f64>> = points.iter().map(|row| row.iter().map(|q| rounded(*q)).collect()).collect();
+    let points = waypoints(&rows, tolerance);
     let (path, count) = (file.display(), points.len());
     let fits = serde_json::to_string(&points).is_ok_and(|text| text.len() + ENVELOPE <= MAX_LINE);
     if !(2..=MAX_PATH).contains(&count) || !fits {
@@ -55,6 +53,21 @@ pub fn read(file: &Path, joints: &[String], turns: &[bool], tolerance: f64) -> R
         rows.len()
     ));
     Ok(JointPath { points, tolerance: tolerance / 2.0 })
+}
+
+/// Returns the fewest positions of a record through which the smooth curve stays within `tolerance` [rad] of it. The
+/// run's curve may pass them within half of that.
+fn waypoints(rows: &[Vec<f64>], tolerance: f64) -> Vec<Vec<f64>> {
+    let mut points = Vec::new();
+    for part in [2.0, 4.0, 8.0, 16.0, 32.0, 64.0] {
+        points = thin(rows, tolerance / part);
+        points.iter_mut().flatten().for_each(|q| *q = rounded(*q));
+        let curve = fit(&points, tolerance / 2.0, &FitSettings::default());
+        if points.len() == rows.len() || curve.is_none_or(|curve| curve.farthest(rows) <= tolerance) {
+            break;
+        }
+    }
+    points
 }
 
 /// Returns a position to 1e-7 rad, which is finer than any encoder and half as long in a request.

@@ -153,6 +153,7 @@ fn motion(setup: &PlanningScene, checker: &mut ExactChecker, random: &mut Random
         refine: 0,
         through: Vec::new(),
         blend: 0.0,
+        tcp_speed: None,
         by_number: false,
     };
     let stop = Stop::new(Some(std::time::Instant::now() + Duration::from_secs(2)), None);

@@ -24,6 +24,7 @@ mod conformance;
 mod conformance_finds_faults;
 mod conformance_pushed;
 mod coordinator;
+mod curves;
 mod device_speed;
 mod device_stops;
 mod device_streams;

@@ -12,7 +12,8 @@ use dimos::collision::body::{MeshMode, solids};
 use dimos::collision::world::{Obstacle, Robot};
 use dimos::collision::{CheckSettings, CollisionChecker, ExactChecker, Solid, Stop, World};
 use dimos::joint::JointBounds;
-use dimos::planning::ik::cartesian::{Shortfall, straight_line};
+use dimos::planning::curve::tool_path::ToolPath;
+use dimos::planning::ik::cartesian::{Shortfall, follow};
 use dimos::planning::ik::settings::LineSettings;
 use dimos::planning::search::level::Level;
 use dimos::planning::search::path::{distance, tidy};
@@ -318,7 +319,7 @@ fn straight_lines_are_straight_and_end_where_they_must() {
     target.translation.y += 0.2;
     target.translation.z -= 0.05;
     let settings = LineSettings::default();
-    let line = straight_line(&kinematics, tip, &start, &target, &settings, |_, _| true);
+    let line = follow(&kinematics, tip, &start, &ToolPath::line(from, target), &settings, |_, _| true);
     assert_eq!((line.fraction, line.shortfall), (1.0, None));
     let along = (target.translation - from.translation).normalize();
     for pair in line.path.windows(2) {
@@ -331,13 +332,13 @@ fn straight_lines_are_straight_and_end_where_they_must() {
     }
     let mut far = from;
     far.translation.x += 2.0;
-    let line = straight_line(&kinematics, tip, &start, &far, &settings, |_, _| true);
+    let line = follow(&kinematics, tip, &start, &ToolPath::line(from, far), &settings, |_, _| true);
     assert!(line.fraction > 0.05 && line.fraction < 0.9 && line.shortfall.is_some(), "{line:?}");
     let mut left = 5;
     let free = |_: &[f64], _: &[f64]| {
         left -= 1;
         left >= 0
     };
-    let line = straight_line(&kinematics, tip, &start, &target, &settings, free);
+    let line = follow(&kinematics, tip, &start, &ToolPath::line(from, target), &settings, free);
     assert_eq!((line.path.len(), line.shortfall), (6, Some(Shortfall::NotFree)));
 }

@@ -61,6 +61,7 @@ fn plan(
         refine: 0,
         through: Vec::new(),
         blend: 0.0,
+        tcp_speed: None,
         by_number: false,
     };
     solve(scene, &scene.world, &request, &Stop::new(Some(Instant::now() + Duration::from_secs(20)), None))

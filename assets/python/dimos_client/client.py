@@ -58,6 +58,8 @@ class Client(Planning):
         by: Optional[Pose] = None,
         frame: Optional[str] = None,
         linear: bool = False,
+        via: Optional[Sequence[float]] = None,
+        tcp_speed: Optional[float] = None,
         through: Sequence[Waypoint] = (),
         blend: float = 0.0,
         direct: bool = False,
@@ -70,8 +72,9 @@ class Client(Planning):
         planned around obstacles, and after `replan` planned again when the world changes; `direct` moves straight in
         joint space, not collision-checked. Without a planner it is direct: `collision_checked` in the result says
         which. Ends this client's own streams to the arm."""
-        where = where_to(arm, Goal(target, named, pose, linear, frame, by), through, blend)
-        plain = isinstance(arm, str) and target is not None and not (named or pose or by or frame or linear)
+        goal = Goal(target, named, pose, linear, frame, by, via)
+        where = where_to(arm, goal, through, blend, tcp_speed)
+        plain = isinstance(arm, str) and target is not None and goal == Goal(target) and tcp_speed is None
         joints = numbers(target) if plain and target is not None else []
         if direct and not joints:
             raise Refused("INVALID_PARAMS", "a direct motion goes to joint positions", "give `target`")

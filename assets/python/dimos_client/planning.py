@@ -27,6 +27,8 @@ class Planning(Streams):
         by: Optional[Pose] = None,
         frame: Optional[str] = None,
         linear: bool = False,
+        via: Optional[Sequence[float]] = None,
+        tcp_speed: Optional[float] = None,
         through: Sequence[Waypoint] = (),
         blend: float = 0.0,
         speed: float = 0.5,
@@ -37,12 +39,12 @@ class Planning(Streams):
     ) -> Plan:
         """Plans a collision-free motion from where the arm is, and waits for the plan; moves nothing. The goal is one
         of `target` (joints [rad]), a `named` pose, a `pose` of the tool centre point, or a motion `by` a pose from
-        where that is; both in `frame`, on a straight line if `linear`. Or one motion `through` waypoints, of which the
-        last is the goal; it passes them within `blend` [m], or stops at each.
+        where that is; both in `frame`, on a straight line if `linear`, on an arc through the place `via`. Or one motion `through` waypoints, of which the
+        last is the goal; it passes them within `blend` [m], or stops at each. No tool is faster than `tcp_speed` [m/s].
         Several arms move together: `plan({"left": Goal(named="home"), "right": Goal(named="home")})`.
         `level`: "certified" proves the plan free of contact, "exact" also finds its clearance to 0.5 mm, "fast" checks
         samples only: `execute` takes such a plan with `unproven`. `refine`: rounds that look for a shorter path."""
-        where = where_to(arm, Goal(target, named, pose, linear, frame, by), through, blend)
+        where = where_to(arm, Goal(target, named, pose, linear, frame, by, via), through, blend, tcp_speed)
         return self._planned(where, speed=speed, seed=seed, timeout=timeout, level=level, refine=refine)
 
     def _planned(self, where: dict[str, Any], **settings: Any) -> Plan:
@@ -156,18 +158,21 @@ def plan_number(plan: Union[Plan, int, None]) -> Optional[int]:
 
 def is_given(goal: Goal) -> bool:
     """Whether anything of a goal is given."""
-    given = (goal.joints, goal.named, goal.pose, goal.by, goal.frame)
+    given = (goal.joints, goal.named, goal.pose, goal.by, goal.frame, goal.via)
     return goal.linear or any(one is not None for one in given)
 
 
-def where_to(arm: Goals, goal: Goal, through: Sequence[Waypoint], blend: float) -> dict[str, Any]:
-    """The parameters of `plan` that say where."""
+def where_to(
+    arm: Goals, goal: Goal, through: Sequence[Waypoint], blend: float, tcp_speed: Optional[float]
+) -> dict[str, Any]:
+    """The parameters of `plan` that say where, and how fast the tool is."""
+    most = {} if tcp_speed is None else {"tcp_speed": tcp_speed}
     if not through:
-        return {"goals": [goal.params(name) for name, goal in goals_of(arm, goal).items()]}
+        return {"goals": [goal.params(name) for name, goal in goals_of(arm, goal).items()], **most}
     if not isinstance(arm, str) or is_given(goal):
         raise Refused("INVALID_PARAMS", "waypoints are for one arm, and the last is its goal", "give no other goal")
     way = [waypoint(at).params(arm) for at in through]
-    return {"goals": way[-1:], "through": way[:-1], "blend": blend}
+    return {"goals": way[-1:], "through": way[:-1], "blend": blend, **most}
 
 
 def waypoint(at: Waypoint) -> Goal:

@@ -77,6 +77,7 @@ class Goal:
     linear: bool = False  # the tool centre point moves to `pose` on a straight line
     frame: Optional[str] = None  # of `pose` or `by`: "map" (default), "base", "tool", or an object of the world
     by: Optional[Pose] = None  # a motion of the tool centre point from where it is, along the axes of `frame`
+    via: Optional[Sequence[float]] = None  # a place [m] on the arc of a circle to `pose` or `by`, along the same axes
 
     def params(self, arm: str) -> dict[str, Any]:
         """The goal as a parameter of `plan`."""
@@ -94,6 +95,8 @@ class Goal:
             goal[key] = pose.params()
         if self.linear:
             goal["linear"] = True
+        if self.via is not None:
+            goal["via"] = numbers(self.via)
         if self.frame is not None:
             goal["frame"] = self.frame
         return goal

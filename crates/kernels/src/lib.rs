@@ -21,6 +21,7 @@ pub mod halton;
 pub mod ik;
 pub mod nearest;
 pub mod obstacle;
+pub mod path_clock;
 pub mod states;
 pub mod support;
 pub mod trig;

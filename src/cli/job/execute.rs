@@ -268,7 +268,8 @@ impl<'r> Runner<'r, '_> {
             GoStep::Move(Box::new(Move::direct(step.arm.clone(), target, *speed)))
         } else {
             let (goals, through) = (vec![goal.clone()], motion.through.clone());
-            let plan = Plan { goals, speed: *speed, through, blend: motion.blend, ..Plan::default() };
+            let Motion { blend, tcp_speed, .. } = *motion;
+            let plan = Plan { goals, speed: *speed, through, blend, tcp_speed, ..Plan::default() };
             GoStep::Plan(Box::new(plan))
         };
         let go = Go { steps: vec![step], replan: motion.replan && !motion.direct, ..Go::default() };

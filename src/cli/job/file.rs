@@ -14,7 +14,7 @@ use crate::cli::output;
 use dimos_core::arm::channel;
 use dimos_core::bounded;
 use dimos_core::written;
-use dimos_rpc::api::{Attach, DEFAULT_SPEED, PlanGoal, PoseSpec};
+use dimos_rpc::api::{Attach, DEFAULT_SPEED, MAX_TCP_SPEED, PlanGoal, PoseSpec};
 use dimos_yaml as yaml;
 use dimos_yaml::{Diag, Kind, Label, NodeId, Tree, did_you_mean, quote};
 
@@ -255,6 +255,7 @@ impl Reader {
             goal: PlanGoal::default(),
             blend: 0.0,
             speed: self.speed,
+            tcp_speed: None,
             direct: self.direct,
             replan: self.replan,
         };
@@ -265,6 +266,7 @@ impl Reader {
         self.group(node, &keys::MOTION)?;
         self.arm(node, arm);
         motion.speed = self.at(node, "speed", speed).unwrap_or(motion.speed);
+        motion.tcp_speed = self.tcp_speed(node)?;
         motion.direct = self.at(node, "direct", flag).unwrap_or(motion.direct);
         motion.replan = self.at(node, "replan", flag).unwrap_or(motion.replan);
         motion.goal = self.goal(node)?;
@@ -281,11 +283,18 @@ impl Reader {
             return self.wrong(node, "needs one of named, joints, pose, by", None);
         }
         let is_pose = self.tree.get(node, "pose").or(self.tree.get(node, "by")).is_some();
-        for key in ["frame", "linear"] {
+        for key in ["frame", "linear", "via"] {
             if let Some((at, _)) = self.tree.entry(node, key).filter(|_| !is_pose) {
                 return self.wrong(at, format!("`{key}` needs a pose"), None);
             }
         }
+        let via = match self.tree.entry(node, "via") {
+            Some((at, _)) if self.at(node, "linear", flag).unwrap_or(false) => {
+                return self.wrong(at, "`via` is on a circle, `linear` on a straight line", Some("leave one out"));
+            }
+            Some(_) => Some(self.array::<3>(node, "via")?),
+            None => None,
+        };
         Some(PlanGoal {
             named: self.at(node, "named", word),
             joints: self.tree.get(node, "joints").and_then(|joints| self.numbers(joints)),
@@ -293,8 +302,22 @@ impl Reader {
             by: self.tree.get(node, "by").and_then(|by| self.pose(by)),
             frame: self.at(node, "frame", word),
             linear: self.at(node, "linear", flag).unwrap_or(false),
+            via,
             ..PlanGoal::default()
         })
+    }
+
+    /// Reads the speed of the tool; `None` if it is wrong.
+    #[expect(clippy::option_option, reason = "wrong, or not given")]
+    fn tcp_speed(&mut self, node: NodeId) -> Option<Option<f64>> {
+        let speed = self.at(node, "tcp_speed", finite);
+        match speed.filter(|speed| !(*speed > 0.0 && *speed <= MAX_TCP_SPEED)) {
+            None => Some(speed),
+            Some(_) => {
+                let at = self.tree.get(node, "tcp_speed").unwrap_or(node);
+                self.wrong(at, format!("must be above 0 and at most {MAX_TCP_SPEED} m/s"), None)
+            }
+        }
     }
 
     fn pose(&mut self, node: NodeId) -> Option<PoseSpec> {
@@ -320,6 +343,7 @@ impl Reader {
             goal: PlanGoal::default(),
             blend: 0.0,
             speed: self.speed,
+            tcp_speed: None,
             direct: false,
             replan: self.replan,
         };
@@ -328,6 +352,7 @@ impl Reader {
             self.group(node, &keys::THROUGH)?;
             self.arm(node, arm);
             motion.speed = self.at(node, "speed", speed).unwrap_or(motion.speed);
+            motion.tcp_speed = self.tcp_speed(node)?;
             motion.replan = self.at(node, "replan", flag).unwrap_or(motion.replan);
             motion.blend = self.at(node, "blend", finite).unwrap_or(0.0);
             if !(0.0..=1.0).contains(&motion.blend) {

@@ -97,7 +97,9 @@ pub static MOTION: Group = Group {
         ("by", Keys(&POSE)),
         ("frame", Text),
         ("linear", Flag),
+        ("via", Numbers(3)),
         ("speed", Speed),
+        ("tcp_speed", Number),
         ("direct", Flag),
         ("replan", Flag),
         ("arm", Text),
@@ -106,12 +108,12 @@ pub static MOTION: Group = Group {
 };
 /// A waypoint that is not just a name.
 pub static WAYPOINT: Group = Group {
-    keys: &[("named", Text), ("joints", Numbers(0)), ("pose", Keys(&POSE)), ("frame", Text), ("linear", Flag)],
+    keys: &[("named", Text), ("joints", Numbers(0)), ("pose", Keys(&POSE)), ("frame", Text), ("linear", Flag), ("via", Numbers(3))],
     required: &[],
 };
 /// `through`.
 pub static THROUGH: Group = Group {
-    keys: &[("waypoints", Waypoints(&WAYPOINT)), ("blend", Number), ("speed", Speed), ("replan", Flag), ("arm", Text)],
+    keys: &[("waypoints", Waypoints(&WAYPOINT)), ("blend", Number), ("speed", Speed), ("tcp_speed", Number), ("replan", Flag), ("arm", Text)],
     required: &["waypoints"],
 };
 /// A pose.

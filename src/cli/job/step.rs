@@ -76,6 +76,8 @@ pub struct Motion {
     pub blend: f64,
     /// Fraction of the highest speed.
     pub speed: f64,
+    /// Highest speed of the tool [m/s].
+    pub tcp_speed: Option<f64>,
     /// Whether it is straight in joint space, without a planner.
     pub direct: bool,
     /// Whether it is planned again if an obstacle blocks it.

@@ -18,6 +18,8 @@ use dimos_core::telemetry::{Origin, Outcome};
 use dimos_core::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
 use dimos_core::written;
 use dimos_planner::planning::request::joint_path::{JointPath, Outside};
+use dimos_planner::planning::curve::{self, fit::fit, settings::CurveSettings};
+use dimos_planner::planning::search::path::{distance, length};
 use dimos_planner::planning::timing::settings::TimingSettings;
 use dimos_planner::planning::timing::time_within;
 use dimos_rpc::api::{self, Reply};
@@ -259,14 +261,28 @@ fn along(
             excess: (lower - position).max(position - upper),
         }
     })?;
-    let mut deviation = vec![path.tolerance; path.points.len() + 1];
-    // It rests where the path begins.
-    deviation.iter_mut().take(2).for_each(|deviation| *deviation = 0.0);
     let bounds: Vec<JointBounds> = (0..names.len()).filter_map(|j| limits.joint(j)).collect();
-    let way = [vec![start], path.points].concat();
-    let settings = TimingSettings { speed, ..TimingSettings::default() };
-    let timed = time_within(names, &way, &bounds, &deviation, &settings, |_, _| true);
-    timed.map(|timed| timed.trajectory).map_err(|e| MotionError::NotFound(e.to_string()))
+    let straight = |way: &[Vec<f64>], deviation: f64| {
+        let timed = time_within(names, way, &bounds, &vec![deviation; way.len()], &TimingSettings::default(), |_, _| true);
+        timed.map(|timed| timed.trajectory).map_err(|e| MotionError::NotFound(e.to_string()))
+    };
+    let settings = CurveSettings::default();
+    let curve = fit(&path.points, path.tolerance, &settings.fit).filter(|curve| curve.stays_inside(&ranges));
+    let along = curve.and_then(|curve| curve::motion::along(names, &curve, &bounds, |_, _| 0.0, &settings.clock));
+    let along = match along {
+        Some(along) => Some(along),
+        None if length(&path.points) > 0.0 => Some(straight(&path.points, path.tolerance)?),
+        None => None,
+    };
+    // It rests where the path begins.
+    let first = path.points.first().cloned().unwrap_or_default();
+    let approach = if distance(&start, &first) > 0.0 { Some(straight(&[start, first], 0.0)?) } else { None };
+    let whole = match (approach, along) {
+        (Some(approach), Some(along)) => Some(curve::motion::after(approach, along)),
+        (approach, along) => approach.or(along),
+    };
+    let whole = whole.ok_or_else(|| MotionError::NotFound("the path does not move".into()))?;
+    Ok(if speed < 1.0 { whole.scaled(speed) } else { whole })
 }
 
 /// Returns the limits, with velocities [rad/s] and accelerations [rad/s²] of at most these.

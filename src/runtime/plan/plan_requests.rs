@@ -39,9 +39,10 @@ impl PlannerPort {
         let positions = all_positions(&scene, moment)?;
         let waypoint = |goal| Ok(vec![self.goal_of(&scene, goal, moment)?]);
         let through = plan.through.iter().map(waypoint).collect::<Result<Vec<_>, RpcError>>()?;
-        let api::Plan { speed, seed, refine, blend, by_number, .. } = *plan;
+        let api::Plan { speed, seed, refine, blend, tcp_speed, by_number, .. } = *plan;
         let level = Level::of_name(plan.level.name()).ok_or_else(internal)?;
-        let request = PlanRequest { goals, positions, speed, seed, level, refine, through, blend, by_number };
+        let request =
+            PlanRequest { goals, positions, speed, seed, level, refine, through, blend, tcp_speed, by_number };
         let id = moment.plan;
         self.thread.begin(id, request, plan.timeout.map(Duration::from_secs_f64)).map_err(|why| {
             let error = RpcError::new(Code::Planning, why.to_string());
@@ -81,12 +82,24 @@ impl PlannerPort {
                 let unknown = || RpcError::unknown(Code::InvalidParams, "pose", name, &names);
                 joints(config.named_poses.get(name).ok_or_else(unknown)?)?
             }
-            // On a line, any orientation is the present one.
-            (_, _, Some(pose)) if goal.linear && any_turn => {
-                let now = self.tcp_in_map(robot, moment)?;
-                Goal::Line(Isometry3::from_parts(pose.translation, now.rotation))
+            (_, _, Some(pose)) if goal.linear || goal.via.is_some() => {
+                // On a line or an arc, any orientation is the present one.
+                let turn = if any_turn { self.tcp_in_map(robot, moment)?.rotation } else { pose.rotation };
+                let to = Isometry3::from_parts(pose.translation, turn);
+                match goal.via {
+                    Some(xyz) => {
+                        let place = |_: &api::PoseSpec| api::PoseSpec { xyz, rpy: None, quat: None };
+                        let via = api::PlanGoal {
+                            pose: goal.pose.as_ref().map(place),
+                            by: goal.by.as_ref().map(place),
+                            ..goal.clone()
+                        };
+                        let via = self.goal_pose(robot, &via, moment)?.ok_or_else(internal)?;
+                        Goal::Arc { via: via.translation.vector, to }
+                    }
+                    None => Goal::Line(to),
+                }
             }
-            (_, _, Some(pose)) if goal.linear => Goal::Line(pose),
             (_, _, Some(pose)) if any_turn => Goal::Position(pose.translation.vector),
             (_, _, Some(pose)) => Goal::Pose(pose),
             _ => return Err(internal()),

@@ -5,9 +5,11 @@
 //!  scene: robots and obstacles ─────┐
 //!  request: a goal ─▶ ik ─▶ search: straight line │ RRT-Connect ─▶ shortcut ─▶ path
 //!                                                                               │
-//!  request: trajectory ◀─ verify ◀─ timing: constant_corner_speed │ blend, topp ◀┘
+//!  request: trajectory ◀─ verify ◀─ timing: constant_corner_speed │ blend, topp ◀┤
+//!                                 └ curve: clock ◀─ line │ arc │ recorded path ◀──┘
 //! ```
 
+pub mod curve;
 pub mod ik;
 pub mod request;
 pub mod scene;

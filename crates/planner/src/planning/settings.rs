@@ -1,5 +1,6 @@
 //! All settings of the planner. Each folder has those of its concern; a scene holds them, and passes them down.
 
+use super::curve::settings::CurveSettings;
 use super::ik::settings::{DragSettings, IkSettings, LineSettings};
 use super::request::settings::{BlendSettings, GoalSettings, LookAheadSettings};
 use super::scene::settings::PaddingSettings;
@@ -26,6 +27,8 @@ pub struct PlannerSettings {
     pub plan: PlanSettings,
     /// Deviation at corners.
     pub blend: BlendSettings,
+    /// Curves and their clock.
+    pub curve: CurveSettings,
     /// Time parameterization.
     pub timing: TimingSettings,
     /// Speed limits of tools.

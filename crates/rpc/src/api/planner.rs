@@ -81,6 +81,10 @@ pub struct PlanGoal {
     /// Whether the tool centre point moves there on a straight line.
     #[serde(default)]
     pub linear: bool,
+    /// Place [m] that its tool centre point passes on the way to `pose` or `by`, on the arc of a circle; as those, along
+    /// the axes of `frame`, and with `by` from its present place.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub via: Option<[f64; 3]>,
 }
 
 /// Parameters of `plan`.
@@ -111,6 +115,10 @@ pub struct Plan {
     /// How far away its tool centre point may pass them, 0–1 [m]; 0: it stops at each.
     #[serde(default)]
     pub blend: f64,
+    /// Highest speed of tool centre points and flanges in this motion, above 0 and at most 10 [m/s], beside
+    /// `limits.tcp_velocity`. Where no joint is slower the tool keeps it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tcp_speed: Option<f64>,
     /// Whether only its number selects this plan: `execute_plan` and `preview` without a number pass it over. For a
     /// motion that is planned and executed in one step.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
@@ -122,7 +130,7 @@ impl Default for Plan {
         let (goals, through, speed) = (Vec::new(), Vec::new(), default_speed());
         let level = PlanLevel::default();
         let (refine, timeout) = (DEFAULT_REFINE, None);
-        Self { goals, speed, seed: 0, level, refine, timeout, through, blend: 0.0, by_number: false }
+        Self { goals, speed, seed: 0, level, refine, timeout, through, blend: 0.0, tcp_speed: None, by_number: false }
     }
 }
 
@@ -170,6 +178,8 @@ impl PlanLevel {
 pub const MAX_RETRACE: usize = 2000;
 /// Farthest that a waypoint may be passed [m].
 const MAX_BLEND: f64 = 1.0;
+/// Highest speed of a tool [m/s].
+pub const MAX_TCP_SPEED: f64 = 10.0;
 
 impl PlanGoal {
     fn valid(&self, field: &str) -> Result<(), String> {
@@ -194,6 +204,10 @@ impl PlanGoal {
         if self.linear && !is_pose {
             return Err(format!("{field}: linear needs a pose"));
         }
+        if self.via.is_some() && (self.linear || !is_pose) {
+            return Err(format!("{field}: via needs a pose, and is not on a straight line: leave out linear"));
+        }
+        finite(&format!("{field}.via"), self.via.as_ref().map_or(&[], |via| via.as_slice()))?;
         if self.frame.is_some() && !is_pose {
             return Err(format!("{field}: frame needs a pose"));
         }
@@ -236,6 +250,9 @@ impl Plan {
             return Err(format!("blend is {} m, must be within 0–{MAX_BLEND}", self.blend));
         }
         valid_speed(self.speed)?;
+        if let Some(speed) = self.tcp_speed.filter(|speed| !(*speed > 0.0 && *speed <= MAX_TCP_SPEED)) {
+            return Err(format!("tcp_speed is {speed} m/s, must be above 0 and at most {MAX_TCP_SPEED} m/s"));
+        }
         match self.timeout {
             Some(timeout) if !(timeout > 0.0 && timeout <= 3600.0) => {
                 Err(format!("timeout is {timeout}, must be above 0 and at most 3600 s"))

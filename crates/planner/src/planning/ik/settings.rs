@@ -99,7 +99,7 @@ impl Default for ClosestSettings {
     }
 }
 
-/// Settings for following a straight line.
+/// Settings for following a line or an arc.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LineSettings {
     /// Distance between configurations [m].
@@ -114,11 +114,38 @@ pub struct LineSettings {
     pub jump: f64,
     /// Smallest part of a step that is tried where the link leaves the line.
     pub min_part: f64,
+    /// Tolerance of configurations on the line [m, rad]: small, because the third derivatives of the curve through them
+    /// count.
+    pub tolerance: f64,
+    /// Maximum position error of the link on the smooth curve through the configurations [m].
+    pub curve_deviation: f64,
+    /// Maximum orientation error there [rad].
+    pub curve_tilt: f64,
+    /// How often the step is halved until the curve keeps to that.
+    pub halvings: u32,
+}
+
+impl LineSettings {
+    /// Returns the settings of the inverse kinematics along a line.
+    pub fn ik(&self) -> IkSettings {
+        IkSettings { position: self.tolerance, rotation: self.tolerance, ..IkSettings::default() }
+    }
 }
 
 impl Default for LineSettings {
     fn default() -> Self {
-        Self { step: 0.01, turn: 0.05, deviation: 1e-3, tilt: 0.01, jump: 0.35, min_part: 1.0 / 64.0 }
+        Self {
+            step: 0.01,
+            turn: 0.05,
+            deviation: 1e-3,
+            tilt: 0.01,
+            jump: 0.35,
+            min_part: 1.0 / 64.0,
+            tolerance: 1e-9,
+            curve_deviation: 1e-4,
+            curve_tilt: 1e-3,
+            halvings: 3,
+        }
     }
 }
 

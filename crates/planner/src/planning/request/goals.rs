@@ -7,8 +7,10 @@ use super::start_contact::{EscapePath, passes};
 use crate::collision::report::{Contact, Pair};
 use crate::collision::{CollisionChecker, Stop};
 use crate::planning::ik::Ik;
-use crate::planning::ik::cartesian::straight_line;
-use crate::planning::ik::settings::IkSettings;
+use crate::planning::curve::joint_curve::JointCurve;
+use crate::planning::curve::tool_path::ToolPath;
+use crate::planning::ik::cartesian::{Line, follow as follow_tool, smooth};
+use crate::planning::ik::settings::{IkSettings, LineSettings};
 use crate::planning::scene::padded::{Near, Padded};
 use crate::planning::scene::planning_scene::PlannedRobot;
 use crate::planning::search::level::Level;
@@ -56,7 +58,7 @@ pub(in crate::planning) fn configurations(
                 let target = DAffine3::from_translation(glamx::DVec3::new(place.x, place.y, place.z));
                 reached(robot, &target, &own, (settings, true, seed), &mut free, stop)?
             }
-            Some(Goal::Line(_) | Goal::Path(_) | Goal::Retrace(_)) | None => vec![own],
+            Some(Goal::Line(_) | Goal::Arc { .. } | Goal::Path(_) | Goal::Retrace(_)) | None => vec![own],
         };
         all = all.iter().flat_map(|before| several.iter().map(move |own| [&before[..], own].concat())).collect();
         all.truncate(settings.goals.solutions * settings.goals.solutions);
@@ -116,29 +118,54 @@ fn already_there(
     (there && (is_inside || distance(&inside, own) <= settings.limit_tolerance)).then_some(inside)
 }
 
-/// Follows the straight line of the only moving robot's end effector as far as possible; returns the path and the part
-/// followed.
+/// Follows the line or arc of the only moving robot's end effector to its end; returns the path, the part followed, and
+/// the smooth curve through the path.
 pub(in crate::planning) fn line(
     stage: &mut Stage<'_>,
-    target: &DAffine3,
+    goal: &Goal,
     stop: &Stop,
-) -> Result<(Path, f64), PlanFailure> {
+) -> Result<(Path, f64, Option<JointCurve>), PlanFailure> {
     let Some(robot) = stage.robots.first().copied() else { return Err(PlanFailure::new("no robot moves")) };
-    let in_root = robot.body.base.inverse() * *target;
-    let kinematics = robot.body.kinematics.clone();
+    let (kinematics, into_root) = (robot.body.kinematics.clone(), robot.body.base.inverse());
     let (checker, start) = (&mut stage.checker, stage.start.clone());
     let contacts = checker.contacts(&start);
     if let Some(contact) = contacts.first() {
         return Err(PlanFailure::new(format!("the start collides: {contact}")));
     }
-    let settings = stage.settings;
-    // The end is known only after following the line.
-    let ahead = straight_line(&kinematics, robot.tcp(), &start, &in_root, &settings.line, |_, _| true);
+    let mut ik = Ik::new(&kinematics, robot.tcp());
+    let from = ik.pose(&start);
+    let (way, kind, key) = match goal {
+        Goal::Arc { via, to } => {
+            let via = into_root.transform_point3(glamx::DVec3::new(via.x, via.y, via.z));
+            let way = ToolPath::arc(from, via, into_root * frame(to)).map_err(|error| {
+                PlanFailure::new(error.to_string()).hint("a circle passes three different places; make a full one of two arcs")
+            })?;
+            (way, "arc", "--via")
+        }
+        Goal::Line(to) => (ToolPath::line(from, into_root * frame(to)), "straight line", "--linear (in a waypoint: line:)"),
+        _ => return Err(PlanFailure::new("this goal is reached on no line")),
+    };
+    // The end is known only after following the line, and with it how dense its configurations must be.
+    let mut settings = stage.settings.line;
+    let (mut ahead, mut curve) = (Line { path: Path::new(), fraction: 0.0, shortfall: None }, None);
+    for halvings in 0..=stage.settings.line.halvings {
+        let part = 0.5_f64.powi(halvings.cast_signed());
+        let LineSettings { step, turn, .. } = stage.settings.line;
+        settings = LineSettings { step: step * part, turn: turn * part, ..settings };
+        ahead = follow_tool(&kinematics, robot.tcp(), &start, &way, &settings, |_, _| true);
+        if ahead.fraction < COMPLETE {
+            break;
+        }
+        curve = smooth(&kinematics, robot.tcp(), &ahead.path, &way, &settings);
+        if curve.is_some() {
+            break;
+        }
+    }
     if let Some(goal) = ahead.path.last().filter(|_| ahead.fraction >= COMPLETE) {
         checker.relax(Near::Goal, goal);
     }
     let mut blocked = None;
-    let line = straight_line(&kinematics, robot.tcp(), &start, &in_root, &settings.line, |a, b| {
+    let line = follow_tool(&kinematics, robot.tcp(), &start, &way, &settings, |a, b| {
         let free = checker.motion_is_free(a, b, stop);
         if !free {
             blocked = Some([a.to_vec(), b.to_vec()]);
@@ -146,18 +173,17 @@ pub(in crate::planning) fn line(
         free
     });
     if line.fraction >= COMPLETE {
-        return Ok((line.path, 1.0));
+        return Ok((line.path, 1.0, curve));
     }
     if let Some(failure) = late(stop) {
         return Err(failure);
     }
-    let mut ik = Ik::new(&kinematics, robot.tcp());
-    let contact = blocked.and_then(|[a, b]| describe_block(checker, &mut ik, (&a, &b), &ahead.path, &in_root));
+    let contact = blocked.and_then(|[a, b]| describe_block(checker, &mut ik, (&a, &b), &ahead.path, &way));
     let reason = line.shortfall.map_or_else(String::new, |shortfall| format!(": {shortfall}"));
     let reason = contact.map_or(reason, |contact| format!(": {contact}"));
     let part = 100.0 * line.fraction;
-    Err(PlanFailure::new(format!("only {part:.1} % of the straight line is possible{reason}"))
-        .hint("omit --linear (in a waypoint: line:) for any collision-free path, or choose a closer pose"))
+    Err(PlanFailure::new(format!("only {part:.1} % of the {kind} is possible{reason}"))
+        .hint(format!("omit {key} for any collision-free path, or choose a closer pose")))
 }
 
 /// Follows given configurations straight in joint space, from the stage's start; fails where they are blocked.
@@ -204,7 +230,7 @@ fn describe_block(
     ik: &mut Ik<'_>,
     (a, b): (&[f64], &[f64]),
     whole: &Path,
-    target: &DAffine3,
+    way: &ToolPath,
 ) -> Option<String> {
     let mut q = a.to_vec();
     let first = (0..=BLOCK_SAMPLES).find_map(|k| {
@@ -212,7 +238,7 @@ fn describe_block(
         checker.contacts(&q).into_iter().next()
     })?;
     let start = ik.pose(whole.first()?).translation;
-    let (along, length) = (ik.pose(&q).translation.distance(start), target.translation.distance(start));
+    let (along, length) = (ik.pose(&q).translation.distance(start), way.at(1.0).translation.distance(start));
     let of_pair = |contact: &Contact| contact.pair == first.pair;
     let mut least = first.distance;
     for q in whole {

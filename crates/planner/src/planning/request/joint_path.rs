@@ -3,6 +3,7 @@
 use super::legs::{Leg, SearchOptions, leg};
 use super::pipeline::{Goal, PlanFailure, Stage, StageTimes, failure_for, late};
 use crate::collision::{CollisionChecker, Stop};
+use crate::planning::curve::fit::fit;
 use crate::planning::scene::padded::Near;
 use crate::planning::search::path::{Path, between, unwind_all};
 use crate::planning::search::path_planner::PlanError;
@@ -88,6 +89,8 @@ pub(in crate::planning) fn legs_along(
         let what = format!("the path is not free at its waypoint {to} of {of}: {what} (padding {padding:.4} m)");
         return Err(PlanFailure::new(what).hint("a path is followed as it is: correct the world, or lead it elsewhere"));
     }
-    let way = Leg { path: path.points, fraction: None, clamped: Vec::new(), deviation: path.tolerance };
+    let curve = fit(&path.points, path.tolerance, &stage.settings.curve.fit);
+    let curve = curve.filter(|curve| curve.stays_inside(&limits));
+    let way = Leg { path: path.points, fraction: None, clamped: Vec::new(), deviation: path.tolerance, curve };
     Ok([approach, way])
 }

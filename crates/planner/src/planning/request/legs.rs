@@ -7,12 +7,12 @@ use super::joint_path::legs_along;
 use super::pipeline::{Goal, PlanFailure, PlanRequest, Stage, StageTimes, bounds_of, failure_for};
 use super::settings::BlendSettings;
 use crate::collision::{CollisionChecker, Stop};
+use crate::planning::curve::joint_curve::JointCurve;
 use crate::planning::scene::padded::Near;
 use crate::planning::search::level::Level;
 use crate::planning::search::path::{Path, distance, unwind};
 use crate::planning::search::path_planner::plan;
 use crate::planning::search::settings::PlanSettings;
-use dimos_robot::kinematics::frame;
 
 /// How a way is searched.
 #[derive(Debug, Clone, Copy)]
@@ -31,6 +31,8 @@ pub(in crate::planning) struct Leg {
     pub clamped: Vec<(String, f64, f64)>,
     /// Maximum deviation at its corners [rad].
     pub deviation: f64,
+    /// The smooth curve along it, if it is not made of straight lines.
+    pub curve: Option<JointCurve>,
 }
 
 /// Plans the way through all waypoints to the goals.
@@ -73,25 +75,22 @@ pub(in crate::planning) fn leg(
     let began = Instant::now();
     let mut took = |name: &str, time: f64| *times.entry(name.to_owned()).or_default() += time;
     match goals {
-        [(_, Goal::Line(target))] => {
-            let (path, fraction) = goals::line(stage, &frame(target), stop)?;
+        [(_, Goal::Line(_) | Goal::Arc { .. })] => {
+            let (path, fraction, curve) = goals::line(stage, &goals[0].1, stop)?;
             took("search", began.elapsed().as_secs_f64());
-            Ok(Leg {
-                path,
-                fraction: Some(fraction),
-                deviation: stage.settings.blend.line_deviation,
-                clamped: Vec::new(),
-            })
+            let deviation = stage.settings.blend.line_deviation;
+            Ok(Leg { path, fraction: Some(fraction), deviation, clamped: Vec::new(), curve })
         }
         [(_, Goal::Retrace(given))] => {
             let path = goals::follow(stage, given, stop)?;
             took("search", began.elapsed().as_secs_f64());
-            Ok(Leg { path, fraction: None, deviation: stage.settings.blend.line_deviation, clamped: Vec::new() })
+            let deviation = stage.settings.blend.line_deviation;
+            Ok(Leg { path, fraction: None, clamped: Vec::new(), deviation, curve: None })
         }
         several if several.iter().any(|(_, goal)| matches!(goal, Goal::Retrace(_))) => {
             Err(PlanFailure::new("a given path is for one robot at a time"))
         }
-        several if several.iter().any(|(_, goal)| matches!(goal, Goal::Line(_) | Goal::Path(_))) => {
+        several if several.iter().any(|(_, goal)| matches!(goal, Goal::Line(_) | Goal::Arc { .. } | Goal::Path(_))) => {
             Err(PlanFailure::new("a straight line or a path is planned for one robot at a time"))
         }
         wanted => {
@@ -124,7 +123,7 @@ pub(in crate::planning) fn leg(
             let used = |joint: usize| Some((stage.joints.get(joint)?.clone(), *path.last()?.get(joint)?));
             let moved = clamped.iter().filter_map(|(joint, asked)| Some((*asked, used(*joint)?)));
             let clamped = moved.map(|(asked, (joint, used))| (joint, asked, used)).collect();
-            Ok(Leg { path, fraction: None, clamped, deviation: stage.settings.timing.deviation })
+            Ok(Leg { path, fraction: None, clamped, deviation: stage.settings.timing.deviation, curve: None })
         }
     }
 }
@@ -157,14 +156,7 @@ fn waypoint_deviation(stage: &Stage<'_>, before: &[f64], at: &[f64], after: &[f6
     }
     let farthest = |deviation: f64| {
         let blended: Vec<f64> = at.iter().zip(&turn).map(|(q, t)| q + t / size * deviation).collect();
-        let (mut first, mut most) = (0, 0.0_f64);
-        for robot in &stage.robots {
-            let own = first..first + robot.joints.len();
-            first = own.end;
-            let place = |q: &[f64]| robot.tcp_pose(q.get(own.clone()).unwrap_or_default()).translation;
-            most = most.max(place(at).distance(place(&blended)));
-        }
-        most
+        passed(stage, at, &blended)
     };
     let mut deviation = max_deviation;
     for _ in 0..6 {
@@ -175,4 +167,16 @@ fn waypoint_deviation(stage: &Stage<'_>, before: &[f64], at: &[f64], after: &[f6
         deviation *= 0.99 * blend / distance;
     }
     deviation
+}
+
+/// Returns the largest distance of an end effector between two configurations [m].
+pub(in crate::planning) fn passed(stage: &Stage<'_>, a: &[f64], b: &[f64]) -> f64 {
+    let (mut first, mut most) = (0, 0.0_f64);
+    for robot in &stage.robots {
+        let own = first..first + robot.joints.len();
+        first = own.end;
+        let place = |q: &[f64]| robot.tcp_pose(q.get(own.clone()).unwrap_or_default()).translation;
+        most = most.max(place(a).distance(place(b)));
+    }
+    most
 }

@@ -1,6 +1,7 @@
 //! A request from its goals to a verified trajectory, and the thread that plans.
 
 pub mod ahead;
+mod curve_timing;
 pub(in crate::planning) mod goals;
 pub mod joint_path;
 pub(in crate::planning) mod legs;
@@ -12,3 +13,5 @@ pub mod start_contact;
 
 #[cfg(test)]
 mod request_tests;
+#[cfg(test)]
+mod curve_tests;

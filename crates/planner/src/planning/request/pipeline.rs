@@ -8,7 +8,8 @@ use nalgebra::{Isometry3, Vector3};
 
 use super::ahead::straight_motions;
 use super::joint_path::JointPath;
-use super::legs::{joined, legs};
+use super::curve_timing::along_curves;
+use super::legs::{Leg, joined, legs};
 use super::start_contact::{EscapePath, passes};
 use crate::collision::clearance::Clearance;
 use crate::collision::report::Pair;
@@ -49,6 +50,13 @@ pub enum Goal {
     Position(Vector3<f64>),
     /// Pose of the end effector in the frame `map`, reached on a straight line.
     Line(Isometry3<f64>),
+    /// Pose of the end effector in the frame `map`, reached on the arc of a circle through a place [m].
+    Arc {
+        /// The place on the way.
+        via: Vector3<f64>,
+        /// The pose.
+        to: Isometry3<f64>,
+    },
     /// A path to follow, after an approach to its first configuration.
     Path(JointPath),
     /// Joint positions [rad] to pass, straight in joint space; the last are the goal. Nothing is searched.
@@ -74,6 +82,8 @@ pub struct PlanRequest {
     pub through: Vec<Vec<(usize, Goal)>>,
     /// How far away an end effector may pass them [m]; 0: the motion rests at each.
     pub blend: f64,
+    /// Highest speed of an end effector and its flange [m/s], beside that of the robot.
+    pub tcp_speed: Option<f64>,
     /// Whether only its number selects the plan.
     pub by_number: bool,
 }
@@ -90,6 +100,7 @@ impl PlanRequest {
             refine: 0,
             through: Vec::new(),
             blend: 0.0,
+            tcp_speed: None,
             by_number: false,
         }
     }
@@ -217,7 +228,7 @@ fn attempt(
     let escape_path = EscapePath::of(&mut stage.checker, &path, &stage.settings.plan.escape);
     let trajectory = match length(&path) < GOAL_TOLERANCE {
         true => rest(&stage.joints, &path),
-        false => timed(&mut stage, (&path, &deviation), escape_path.as_ref(), request, stop)?,
+        false => timed(&mut stage, (&legs, &path, &deviation), escape_path.as_ref(), request, stop)?,
     };
     let looking = lap(&mut times, "timing", timing);
     let level = request.level;
@@ -389,12 +400,16 @@ fn contact_at(checker: &mut Padded, q: &[f64]) -> Option<Clearance> {
 /// Times a path within the joints' limits, and verifies the trajectory.
 fn timed(
     stage: &mut Stage<'_>,
-    (path, deviation): (&Path, &[f64]),
+    (legs, path, deviation): (&[Leg], &Path, &[f64]),
     escape_path: Option<&EscapePath>,
     request: &PlanRequest,
     stop: &Stop,
 ) -> Result<JointTrajectory, PlanFailure> {
     let bounds = bounds_of(stage)?;
+    let mut tools = tools(stage, request.tcp_speed);
+    if let Some(motion) = along_curves(stage, legs, (&bounds, &mut tools), (escape_path, request), stop) {
+        return Ok(if request.speed < 1.0 { motion.scaled(request.speed) } else { motion });
+    }
     let checker = &mut stage.checker;
     let free = |a: &[f64], b: &[f64]| passes(checker, request.level, escape_path, (a, b), stop);
     let timed = time_within(&stage.joints, path, &bounds, deviation, &stage.settings.timing, free);
@@ -402,19 +417,20 @@ fn timed(
         let unproven = matches!(error, TimingError::NotFree(..));
         late(stop).unwrap_or_else(|| PlanFailure { unproven, ..PlanFailure::new(error.to_string()) })
     })?;
-    let motion = tools(stage).slowed(&timed.trajectory, &bounds, 1.0, &stage.settings.tool).unwrap_or(timed.trajectory);
+    let motion = tools.slowed(&timed.trajectory, &bounds, 1.0, &stage.settings.tool).unwrap_or(timed.trajectory);
     // The same motion in a longer time, as a direct move and the speed override have it.
     Ok(if request.speed < 1.0 { motion.scaled(request.speed) } else { motion })
 }
 
-/// Returns the tools of the moving robots whose speed is limited.
-fn tools(stage: &Stage<'_>) -> Tools {
+/// Returns the tools of the moving robots whose speed is limited, at most to `most` [m/s].
+fn tools(stage: &Stage<'_>, most: Option<f64>) -> Tools {
     let (mut tools, mut first) = (Tools::default(), 0);
     for robot in &stage.robots {
         let joints = first..first + robot.joints.len();
         first = joints.end;
-        if let Some((speed, limit)) = robot.tool_speed() {
-            tools.push(joints, speed, limit);
+        let limit = robot.tcp_velocity.into_iter().chain(most).reduce(f64::min);
+        if let Some(limit) = limit {
+            tools.push(joints, robot.tool_speed(), limit);
         }
     }
     tools

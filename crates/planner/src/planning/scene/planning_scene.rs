@@ -258,12 +258,11 @@ impl PlannedRobot {
         self.model.links.len()
     }
 
-    /// Returns what measures the speed of its tool and its flange, and their limit [m/s]; `None` without one.
-    pub fn tool_speed(&self) -> Option<(ToolSpeed, f64)> {
-        let limit = self.tcp_velocity?;
+    /// Returns what measures the speed of its tool and its flange.
+    pub fn tool_speed(&self) -> ToolSpeed {
         let flange = self.config.flange_link.as_ref().and_then(|link| self.model.link_index(link));
         let links = flange.into_iter().chain([self.tcp()]).collect();
-        Some((ToolSpeed::new((*self.body.kinematics).clone(), links), limit))
+        ToolSpeed::new((*self.body.kinematics).clone(), links)
     }
 
     /// Returns the pose of the tool centre point in the frame `map` at these positions of the planned joints [rad].

@@ -293,7 +293,17 @@ fn finished(
         }
     }
     states.stretch(1.0 / speed);
-    let quintic = is_quintic(bounds);
+    let trajectory = trajectory_of(names, &states, is_quintic(bounds))?;
+    let excess = excess.stretched(1.0 / speed);
+    Ok(Timed { trajectory, duration: states.duration(), deviation, excess })
+}
+
+/// Returns the trajectory of states, with accelerations if it is quintic.
+pub(in crate::planning) fn trajectory_of(
+    names: &[String],
+    states: &States,
+    quintic: bool,
+) -> Result<JointTrajectory, TimingError> {
     let point = |time_from_start: f64, [positions, velocities, accelerations]: [JointValues; 3]| TrajectoryPoint {
         time_from_start,
         positions,
@@ -317,8 +327,7 @@ fn finished(
     if !states.are_finite_and_in_order() {
         trajectory.validate()?;
     }
-    let excess = excess.stretched(1.0 / speed);
-    Ok(Timed { trajectory, duration: states.duration(), deviation, excess })
+    Ok(trajectory)
 }
 
 /// Returns the grid points themselves.
@@ -352,7 +361,7 @@ fn slow_down(states: &mut States, bounds: &[JointBounds]) -> Excess {
 }
 
 /// Checks the motion as it will be sampled: from each point to the middle of its segment, and on to the next.
-fn free_throughout(
+pub(in crate::planning) fn free_throughout(
     trajectory: &JointTrajectory,
     free: &mut impl FnMut(&[f64], &[f64]) -> bool,
 ) -> Result<(), TimingError> {

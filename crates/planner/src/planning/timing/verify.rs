@@ -50,29 +50,35 @@ const NEGLIGIBLE: f64 = 1e-6;
 
 /// Measures the curve through states: quintic, or cubic, as in `Spline`. The values are upper bounds, exact where the
 /// acceleration is constant, or linear without a change of its sign ([`States::most`]). If these exceed a limit, they
-/// are the extremes of cubics, and quintics are sampled in quarters of each segment.
+/// are the extremes themselves.
 pub fn excess(states: &States, bounds: &[JointBounds], quintic: bool) -> Excess {
     let most = upper_bounds(states, bounds, quintic);
     if most.slower() <= 1.0 + NEGLIGIBLE {
         return most;
     }
+    (1..states.times().len()).map(|end| of_piece(states, bounds, end, quintic)).fold(Excess::default(), Excess::max)
+}
+
+/// Measures each quintic between two states: the extremes of its velocity, acceleration and jerk.
+pub fn excess_of_cells(states: &States, bounds: &[JointBounds]) -> Vec<Excess> {
+    (1..states.times().len()).map(|end| of_piece(states, bounds, end, true)).collect()
+}
+
+/// Measures the piece that ends at a state.
+fn of_piece(states: &States, bounds: &[JointBounds], end: usize, quintic: bool) -> Excess {
+    let h = states.times()[end] - states.times()[end - 1];
+    let inverse = 1.0 / h;
     let mut all = Excess::default();
     for (j, bound) in bounds.iter().enumerate() {
-        let mut most = [0.0; 3];
-        for (i, times) in states.times().windows(2).enumerate() {
-            let h = times[1] - times[0];
-            let inverse = 1.0 / h;
-            let [positions, speeds, accelerations] =
-                [0, 1, 2].map(|which| [states.values(i, which)[j], states.values(i + 1, which)[j]]);
-            let d = (positions[1] - positions[0]) * inverse;
-            let used = if quintic {
-                of_quintic(d, speeds, accelerations, h, inverse)
-            } else {
-                of_cubic(d, speeds, h, inverse)
-            };
-            most.iter_mut().zip(used).for_each(|(m, u)| *m = larger(*m, u));
-        }
-        all = all.max(part_of(most, bound));
+        let [positions, speeds, accelerations] =
+            [0, 1, 2].map(|which| [states.values(end - 1, which)[j], states.values(end, which)[j]]);
+        let d = (positions[1] - positions[0]) * inverse;
+        let used = if quintic {
+            of_quintic(d, speeds, accelerations, h, inverse)
+        } else {
+            of_cubic(d, speeds, h, inverse)
+        };
+        all = all.max(part_of(used, bound));
     }
     all
 }
@@ -109,15 +115,43 @@ fn of_quintic(d: f64, [v0, v1]: [f64; 2], [a0, a1]: [f64; 2], h: f64, inverse: f
     let c2 = 30.0 * rise - 12.0 * change - 4.5 * c1 + 1.5 * b1;
     let c3 = -60.0 * rise + 28.0 * change + 6.0 * c1 - 4.0 * b1;
     let c4 = 30.0 * rise - 15.0 * change - 2.5 * c1 + 2.5 * b1;
-    let speed = |x: f64| (v0 + x * (c1 + x * (c2 + x * (c3 + x * c4)))).abs();
-    let acceleration = |x: f64| (c1 + x * (2.0 * c2 + x * (3.0 * c3 + x * 4.0 * c4))).abs();
-    let jerk = |x: f64| (2.0 * c2 + x * (6.0 * c3 + x * 12.0 * c4)).abs();
-    let most = |ends: f64, f: &dyn Fn(f64) -> f64| larger(larger(ends, f(0.25)), larger(f(0.5), f(0.75)));
-    [
-        most(larger(v0.abs(), v1.abs()), &speed),
-        most(larger(c1.abs(), b1.abs()), &acceleration) * inverse,
-        most(larger(jerk(0.0), jerk(1.0)), &jerk) * inverse * inverse,
-    ]
+    let speed = |x: f64| v0 + x * (c1 + x * (c2 + x * (c3 + x * c4)));
+    let acceleration = |x: f64| c1 + x * (2.0 * c2 + x * (3.0 * c3 + x * 4.0 * c4));
+    let jerk = |x: f64| 2.0 * c2 + x * (6.0 * c3 + x * 12.0 * c4);
+    // Each has its extremes at the ends and where the next derivative is zero; between two zeros of the jerk the
+    // acceleration has one zero at most.
+    let turn = -c3 / (4.0 * c4);
+    let turn = if turn > 0.0 && turn < 1.0 { turn } else { 0.0 };
+    let mut most = [larger(v0.abs(), v1.abs()), larger(c1.abs(), b1.abs()), larger(jerk(0.0).abs(), jerk(1.0).abs())];
+    most[2] = larger(most[2], jerk(turn).abs());
+    let mut from = 0.0;
+    let mut see = |to: f64| {
+        most[1] = larger(most[1], acceleration(to).abs());
+        if let Some(still) = zero_between(acceleration, from, to) {
+            most[0] = larger(most[0], speed(still).abs());
+        }
+        from = to;
+    };
+    for pair in [[0.0, turn], [turn, 1.0]] {
+        if let Some(x) = zero_between(jerk, pair[0], pair[1]) {
+            see(x);
+        }
+    }
+    see(1.0);
+    [most[0], most[1] * inverse, most[2] * inverse * inverse]
+}
+
+/// Returns where a function that is monotonic between two places is zero, if its signs there differ.
+fn zero_between(f: impl Fn(f64) -> f64, mut low: f64, mut high: f64) -> Option<f64> {
+    let negative = f(low) < 0.0;
+    if negative == (f(high) < 0.0) {
+        return None;
+    }
+    for _ in 0..52 {
+        let middle = 0.5 * (low + high);
+        if (f(middle) < 0.0) == negative { low = middle } else { high = middle }
+    }
+    Some(0.5 * (low + high))
 }
 
 /// Returns upper bounds of what the spline through states uses.

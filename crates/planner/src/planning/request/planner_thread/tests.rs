@@ -43,6 +43,7 @@ fn turn(from: f64, to: f64, seed: u64) -> PlanRequest {
         refine: 0,
         through: Vec::new(),
         blend: 0.0,
+        tcp_speed: None,
         by_number: false,
     }
 }
