@@ -4,7 +4,7 @@
 
 use super::joint_curve::JointCurve;
 use super::settings::FitSettings;
-use crate::planning::search::path::{Path, distance};
+use crate::planning::search::path::{Path, between, distance};
 
 /// Diagonals of the equations beside the main one: a B-spline overlaps three others.
 const BAND: usize = 3;
@@ -46,6 +46,20 @@ pub fn fit(configurations: &[Vec<f64>], tolerance: f64, settings: &FitSettings) 
         last.clone_from(goal);
     }
     JointCurve::through(&path)
+}
+
+/// Returns places on the straight lines through configurations, at most `spacing` apart [rad].
+pub fn dense(configurations: &[Vec<f64>], spacing: f64) -> Path {
+    let mut places: Path = configurations.first().cloned().into_iter().collect();
+    for pair in configurations.windows(2) {
+        let parts = (distance(&pair[0], &pair[1]) / spacing).ceil().max(1.0) as usize;
+        places.extend((1..=parts).map(|k| {
+            let mut q = pair[1].clone();
+            between(&pair[0], &pair[1], k as f64 / parts as f64, &mut q);
+            q
+        }));
+    }
+    places
 }
 
 /// Configurations to pass, at places along the polyline through them [rad].

@@ -78,21 +78,42 @@ pub struct JoinSettings {
     pub rounds: usize,
     /// Blends that are tried, in parts of what was asked for, before the motion rests.
     pub parts: [f64; 3],
+    /// Distance of the places on straight lines that a smooth curve passes [rad].
+    pub fit_spacing: f64,
+    /// Parts of the deviation from straight lines that are tried for a smooth curve along them.
+    pub fit_shares: [f64; 3],
 }
 
 impl Default for JoinSettings {
     fn default() -> Self {
-        Self { samples: 24, spacing: 0.1, share: 0.97, rounds: 24, parts: [1.0, 0.5, 0.25] }
+        Self {
+            samples: 24,
+            spacing: 0.1,
+            share: 0.97,
+            rounds: 24,
+            parts: [1.0, 0.5, 0.25],
+            fit_spacing: 0.02,
+            fit_shares: [1.0, 0.5, 0.25],
+        }
     }
 }
 
 /// Settings of curves.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CurveSettings {
+    /// Rounds of refinement from which on the time along a planned path is refined, too.
+    pub refine_rounds: u32,
     /// Their clock.
     pub clock: ClockSettings,
     /// Curves through recorded configurations.
     pub fit: FitSettings,
     /// Several curves that become one.
     pub join: JoinSettings,
+}
+
+impl Default for CurveSettings {
+    fn default() -> Self {
+        let (clock, fit, join) = (ClockSettings::default(), FitSettings::default(), JoinSettings::default());
+        Self { refine_rounds: 16, clock, fit, join }
+    }
 }

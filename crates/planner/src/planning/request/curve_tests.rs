@@ -5,10 +5,11 @@ use nalgebra::{Isometry3, Translation3, Vector3};
 use super::joint_path::JointPath;
 use super::pipeline::{Goal, PlanRequest, PlannedMotion, solve};
 use crate::collision::Stop;
-use crate::planning::scene::config::{PlannerConfig, RobotConfig};
+use crate::planning::scene::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
 use crate::planning::scene::planning_scene::PlanningScene;
 use dimos_core::trajectory::{Cursor, Sample, Spline};
 use dimos_robot::kinematics::pose;
+use dimos_robot::random::Random;
 
 const START: [f64; 6] = [0.2, -0.4, 0.9, 0.1, 0.8, 0.2];
 
@@ -123,4 +124,53 @@ fn a_tool_keeps_the_speed_that_was_asked_for() {
     assert!(fastest <= 0.1001, "{fastest} m/s");
     let share = steady as f64 * 1e-3 / motion.trajectory.duration();
     assert!(share > 0.8 && motion.trajectory.duration() < 3.4, "{share} of {}", motion.trajectory.duration());
+}
+
+#[test]
+fn rounds_of_refinement_make_a_path_with_corners_quicker() {
+    let at = |turn| vec![turn, -0.3, 0.6, 0.0, 0.8, 0.0];
+    let middle = tcp(&scene(), &at(0.0)).translation;
+    let wall = ObjectShape::Box([0.1, 0.02, 0.4]);
+    let wall = ObjectConfig { name: "wall".into(), shape: wall, pose: middle.into(), padding: 0.0 };
+    let robots = vec![RobotConfig::yourarm()];
+    let scene = PlanningScene::load(&PlannerConfig { robots, objects: vec![wall], ..PlannerConfig::default() }).unwrap();
+    let mut gains = Vec::new();
+    for seed in 0..12 {
+        let [plain, refined] = [15, 16].map(|refine| {
+            let request = PlanRequest { refine, seed, ..PlanRequest::new(at(-0.9), Goal::Joints(at(0.9))) };
+            planned(&scene, &request).trajectory.duration()
+        });
+        gains.push(refined / plain);
+    }
+    gains.sort_by(f64::total_cmp);
+    assert!(gains[0] < 0.98 && gains[6] < 0.996 && gains[11] <= 1.0, "{gains:?}");
+}
+
+/// A line that cannot be followed from one posture can be from another at the same pose: the hint has it.
+#[test]
+fn a_line_that_cannot_be_followed_says_where_and_from_which_posture_it_can() {
+    let scene = scene();
+    let limits = &scene.robots[0].limits;
+    let mut random = Random::new(2);
+    let (mut failed, mut followed) = (0, 0);
+    for _ in 0..300 {
+        let start: Vec<f64> = limits.iter().map(|l| random.between(0.7 * l.lower, 0.7 * l.upper)).collect();
+        let way = [0; 3].map(|_| random.between(-0.2, 0.2));
+        let ask = |start: &[f64]| {
+            let to = by(&tcp(&scene, start), way);
+            solve(&scene, &scene.world, &PlanRequest::new(start.to_vec(), Goal::Line(to)), &Stop::never())
+        };
+        let Err(failure) = ask(&start) else { continue };
+        if failure.what.starts_with("the start collides") {
+            continue;
+        }
+        failed += 1;
+        assert!(failure.what.contains("% of the straight line is possible: after 0."), "{failure:?}");
+        let hint = failure.hint.unwrap();
+        let Some((_, rest)) = hint.split_once("move to ") else { continue };
+        let numbers = rest.strip_suffix(" first").unwrap().split(' ').map(|q| q.parse().unwrap());
+        ask(&numbers.collect::<Vec<f64>>()).unwrap();
+        followed += 1;
+    }
+    assert!(failed > 20 && followed > 5, "{followed} of {failed}");
 }

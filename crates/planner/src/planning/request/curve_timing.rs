@@ -5,9 +5,11 @@ use super::legs::{Leg, passed};
 use super::pipeline::{PlanRequest, Stage};
 use super::start_contact::{EscapePath, passes};
 use crate::collision::Stop;
+use crate::planning::curve::fit::{dense, fit};
 use crate::planning::curve::join::{joined, rounded};
 use crate::planning::curve::joint_curve::JointCurve;
 use crate::planning::curve::motion::{after, along};
+use crate::planning::curve::settings::CurveSettings;
 use crate::planning::search::path::length;
 use crate::planning::timing::tool_timing::Tools;
 use crate::planning::timing::{free_throughout, time_within};
@@ -17,8 +19,8 @@ use dimos_core::trajectory::JointTrajectory;
 /// A leg shorter than this is no motion [rad].
 const NO_MOTION: f64 = 1e-9;
 
-/// Returns the motion along legs; `None` if none of them is a curve, or the motion along it is not free: the motion
-/// along the straight pieces between their configurations may be.
+/// Returns the motion along legs; `None` if all are made of straight lines and none is to be refined, or the motion
+/// along a curve is not free: the motion along the straight pieces between its configurations may be.
 pub(in crate::planning) fn along_curves(
     stage: &mut Stage<'_>,
     legs: &[Leg],
@@ -27,7 +29,9 @@ pub(in crate::planning) fn along_curves(
     stop: &Stop,
 ) -> Option<JointTrajectory> {
     let legs: Vec<&Leg> = legs.iter().filter(|leg| length(&leg.path) > NO_MOTION).collect();
-    if !legs.iter().any(|leg| leg.curve.is_some()) {
+    let is_curved = legs.iter().any(|leg| leg.curve.is_some());
+    let refined = request.refine >= stage.settings.curve.refine_rounds;
+    if !is_curved && (!refined || legs.len() > 1 && request.blend > 0.0) {
         return None;
     }
     let settings = &stage.settings.curve;
@@ -50,25 +54,49 @@ pub(in crate::planning) fn along_curves(
     let mut whole: Option<JointTrajectory> = None;
     for leg in legs {
         let own = match &leg.curve {
-            Some(curve) => motion(stage, curve, bounds, tools)?,
-            None => {
-                let deviation = vec![leg.deviation; leg.path.len()];
-                let checker = &mut stage.checker;
-                let free = |a: &[f64], b: &[f64]| passes(checker, request.level, escape_path, (a, b), stop);
-                let timing = &stage.settings.timing;
-                let timed = time_within(&stage.joints, &leg.path, bounds, &deviation, timing, free).ok()?;
-                tools.slowed(&timed.trajectory, bounds, 1.0, &stage.settings.tool).unwrap_or(timed.trajectory)
-            }
+            Some(curve) => motion(stage, curve, bounds, tools)
+                .filter(|motion| is_free(stage, motion, (escape_path, request), stop))?,
+            None => along_lines(stage, leg, (bounds, tools), (escape_path, request), refined, stop)?,
         };
-        if leg.curve.is_some() && !is_free(stage, &own, (escape_path, request), stop) {
-            return None;
-        }
         whole = Some(match whole {
             Some(before) => after(before, own),
             None => own,
         });
     }
     whole
+}
+
+/// Returns the motion along straight lines whose corners are rounded; if it is to be refined, the quickest of several
+/// that stay as close to the lines.
+fn along_lines(
+    stage: &mut Stage<'_>,
+    leg: &Leg,
+    (bounds, tools): (&[JointBounds], &mut Tools),
+    (escape_path, request): (Option<&EscapePath>, &PlanRequest),
+    refined: bool,
+    stop: &Stop,
+) -> Option<JointTrajectory> {
+    let deviation = vec![leg.deviation; leg.path.len()];
+    let checker = &mut stage.checker;
+    let free = |a: &[f64], b: &[f64]| passes(checker, request.level, escape_path, (a, b), stop);
+    let timed = time_within(&stage.joints, &leg.path, bounds, &deviation, &stage.settings.timing, free).ok()?;
+    let slowed = tools.slowed(&timed.trajectory, bounds, 1.0, &stage.settings.tool);
+    let mut best = slowed.unwrap_or(timed.trajectory);
+    if !refined {
+        return Some(best);
+    }
+    let CurveSettings { join, fit: fitting, .. } = &stage.settings.curve;
+    let dense = dense(&leg.path, join.fit_spacing);
+    // A joint's share of the deviation, which is that of all joints together.
+    let share = leg.deviation / (stage.joints.len() as f64).sqrt();
+    let fitted = join.fit_shares.iter().filter_map(|part| fit(&dense, part * share, fitting));
+    for curve in rounded(&leg.path, &deviation, join).into_iter().chain(fitted).collect::<Vec<_>>() {
+        let quicker = motion(stage, &curve, bounds, tools).filter(|motion| motion.duration() < best.duration());
+        if let Some(quicker) = quicker.filter(|motion| is_free(stage, motion, (escape_path, request), stop)) {
+            best = quicker;
+        }
+    }
+    Some(best)
 }
 
 fn motion(

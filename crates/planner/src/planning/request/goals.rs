@@ -17,7 +17,7 @@ use crate::planning::search::level::Level;
 use crate::planning::search::path::{Path, between, distance, length, unwind};
 use crate::planning::search::path_planner::digits_outside;
 use crate::planning::settings::PlannerSettings;
-use dimos_robot::kinematics::frame;
+use dimos_robot::kinematics::{Kinematics, frame};
 use dimos_robot::kinematics::step::rotation_between;
 use dimos_robot::model::JointKind;
 use glamx::DAffine3;
@@ -179,11 +179,37 @@ pub(in crate::planning) fn line(
         return Err(failure);
     }
     let contact = blocked.and_then(|[a, b]| describe_block(checker, &mut ik, (&a, &b), &ahead.path, &way));
-    let reason = line.shortfall.map_or_else(String::new, |shortfall| format!(": {shortfall}"));
+    let at = if way.length() > 1e-3 { format!("after {:.3} m ", line.fraction * way.length()) } else { String::new() };
+    let reason = line.shortfall.map_or_else(String::new, |shortfall| format!(": {at}{shortfall}"));
     let reason = contact.map_or(reason, |contact| format!(": {contact}"));
     let part = 100.0 * line.fraction;
-    Err(PlanFailure::new(format!("only {part:.1} % of the {kind} is possible{reason}"))
-        .hint(format!("omit {key} for any collision-free path, or choose a closer pose")))
+    let failure = PlanFailure::new(format!("only {part:.1} % of the {kind} is possible{reason}"));
+    let posture = other_posture(checker, &mut ik, (&kinematics, robot.tcp()), (&start, &way), stage.settings, stop);
+    Err(match posture {
+        Some(q) => {
+            let q: Vec<String> = q.iter().map(|q| format!("{q:.4}")).collect();
+            failure.hint(format!("from another posture at the same pose it is possible: move to {} first", q.join(" ")))
+        }
+        None => failure.hint(format!("omit {key} for any collision-free path, or choose a closer pose")),
+    })
+}
+
+/// Returns the posture at the start's pose, nearest to the start, from which a whole line or arc is free.
+fn other_posture(
+    checker: &mut Padded,
+    ik: &mut Ik<'_>,
+    (kinematics, link): (&Kinematics, usize),
+    (start, way): (&[f64], &ToolPath),
+    settings: &PlannerSettings,
+    stop: &Stop,
+) -> Option<Vec<f64>> {
+    let GoalSettings { postures, attempts, .. } = settings.goals;
+    let search = IkSettings { attempts, solutions: postures, ..settings.line.ik() };
+    let all = ik.solve(&way.at(0.0), start, &search, |q| checker.is_free(q), stop).ok()?;
+    all.into_iter().find(|q| {
+        let free = |a: &[f64], b: &[f64]| !stop.is_over() && checker.motion_is_free(a, b, stop);
+        follow_tool(kinematics, link, q, way, &settings.line, free).fraction >= COMPLETE
+    })
 }
 
 /// Follows given configurations straight in joint space, from the stage's start; fails where they are blocked.

@@ -7,7 +7,9 @@ use super::joint_path::legs_along;
 use super::pipeline::{Goal, PlanFailure, PlanRequest, Stage, StageTimes, bounds_of, failure_for};
 use super::settings::BlendSettings;
 use crate::collision::{CollisionChecker, Stop};
+use crate::planning::curve::fit::{dense, fit};
 use crate::planning::curve::joint_curve::JointCurve;
+use crate::planning::curve::settings::CurveSettings;
 use crate::planning::scene::padded::Near;
 use crate::planning::search::level::Level;
 use crate::planning::search::path::{Path, distance, unwind};
@@ -85,7 +87,9 @@ pub(in crate::planning) fn leg(
             let path = goals::follow(stage, given, stop)?;
             took("search", began.elapsed().as_secs_f64());
             let deviation = stage.settings.blend.line_deviation;
-            Ok(Leg { path, fraction: None, clamped: Vec::new(), deviation, curve: None })
+            let CurveSettings { fit: fitting, join, .. } = &stage.settings.curve;
+            let curve = fit(&dense(&path, join.fit_spacing), deviation, fitting);
+            Ok(Leg { path, fraction: None, clamped: Vec::new(), deviation, curve })
         }
         several if several.iter().any(|(_, goal)| matches!(goal, Goal::Retrace(_))) => {
             Err(PlanFailure::new("a given path is for one robot at a time"))

@@ -7,6 +7,8 @@ pub struct GoalSettings {
     pub solutions: usize,
     /// Attempts to find them.
     pub attempts: usize,
+    /// Postures at the start's pose that are tried for a line that cannot be followed from the present one.
+    pub postures: usize,
     /// Tolerance of a pose goal [m, rad].
     pub tolerance: f64,
     /// Largest violation of limits at which a robot may count as being at its goal [rad]: as for the start of a plan.
@@ -22,6 +24,7 @@ impl Default for GoalSettings {
         Self {
             solutions: 8,
             attempts: 3200,
+            postures: 16,
             tolerance: 1e-5,
             limit_tolerance: 0.02,
             near_distance: 5e-4,
