@@ -14,8 +14,8 @@ use super::output::{self, fixed};
 use super::recorded_path;
 use dimos_core::written;
 use dimos_rpc::api::{
-    Cancel, DEFAULT_REFINE, DEFAULT_SPEED, JointPath, MAX_TCP_SPEED, PATH_TOLERANCE, Plan, PlanGoal, PlanLevel, PlanSummary, Planner,
-    Planning, PlanningReport, PoseSpec,
+    Cancel, DEFAULT_REFINE, DEFAULT_SPEED, JointPath, MAX_TCP_SPEED, PATH_TOLERANCE, Plan, PlanGoal, PlanLevel,
+    PlanSummary, Planner, Planning, PlanningReport, PoseSpec,
 };
 use dimos_rpc::client::{Client, ClientError};
 use dimos_rpc::{Code, RpcError};
@@ -58,8 +58,8 @@ pub struct Goal {
     pub several: Vec<PlanGoal>,
     /// One motion through these waypoints; the last is the goal. Each is a named pose (named:1 if its name is a
     /// number), joints as 0.1,-0.3,0.6,0,0.8,0, or pose:x,y,z,r,p,y (also with x,y,z or a quaternion, and @FRAME);
-    /// line:… is reached on a straight line, arc:x,y,z/… on a circle through x,y,z. With `move` also gripper:open, gripper:close or gripper:0.03, where the
-    /// arm waits for the outcome
+    /// line:… is reached on a straight line, arc:x,y,z/… on a circle through x,y,z. With `move` also gripper:open,
+    /// gripper:close or gripper:0.03, where the arm waits for the outcome
     #[arg(long, value_name = "WAYPOINT", num_args = 2.., value_parser = waypoint, allow_negative_numbers = true, conflicts_with_all = ["joints", "tcp", "named", "several"], group = "goal")]
     pub through: Vec<Waypoint>,
     /// Follow the path of a motion that was led or recorded: .csv or .json as for `execute`, or a log (.mcap). Its
@@ -154,7 +154,9 @@ fn waypoint(text: &str) -> std::result::Result<Waypoint, String> {
         Some(("named", name)) => planned.named = Some(name.to_owned()),
         Some(("gripper", action)) => return grip::action(action).map(Waypoint::Grip),
         Some(_) => {
-            return Err("must be a name, joints as 0.1,-0.3,…, pose:x,y,z,…, line:x,y,z,…, arc:… or gripper:close".into());
+            return Err(
+                "must be a name, joints as 0.1,-0.3,…, pose:x,y,z,…, line:x,y,z,…, arc:… or gripper:close".into()
+            );
         }
         // Of an arm with one joint.
         None if text.contains(',') || finite(text).is_ok() => planned.joints = Some(numbers(text)?),

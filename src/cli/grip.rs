@@ -9,8 +9,8 @@ use super::follow::Signals;
 use super::going;
 use dimos_core::arm::GripperUnit;
 use dimos_rpc::api::{
-    self, GoGripper, GoStep, Grip, GripObjects, GripReport, Gripper, GripperReply, RobotReport, State, Status,
-    WorldObject,
+    self, GoGripper, GoStep, Grip, GripObjects, GripReport, Gripper, GripperEnd, GripperReply, RobotReport, State,
+    Status, WorldObject,
 };
 use dimos_rpc::client::{Client, ClientError};
 use dimos_rpc::report::ArmReport;
@@ -38,6 +38,16 @@ pub fn opening(text: &str) -> std::result::Result<Opening, String> {
         "open" => Ok(Opening::Open),
         "close" => Ok(Opening::Close),
         _ => finite(text).map(Opening::Position).map_err(|e| format!("{e}; give m or rad, `open` or `close`")),
+    }
+}
+
+impl From<Opening> for api::Opening {
+    fn from(opening: Opening) -> Self {
+        match opening {
+            Opening::Position(position) => Self::Position(position),
+            Opening::Open => Self::End(GripperEnd::Open),
+            Opening::Close => Self::End(GripperEnd::Close),
+        }
     }
 }
 

@@ -79,7 +79,8 @@ fn asked(name: &str, scene: &mut PlanningScene, each: usize, asked: &mut Asked) 
         };
         let start: Vec<f64> = home.iter().zip(&robot.limits).map(inside).collect();
         let from = pose(&robot.tcp_pose(&start));
-        let mut direction = || Vector3::new(random.between(-1.0, 1.0), random.between(-1.0, 1.0), random.between(-1.0, 1.0));
+        let mut direction =
+            || Vector3::new(random.between(-1.0, 1.0), random.between(-1.0, 1.0), random.between(-1.0, 1.0));
         let (along, across) = (direction(), direction());
         let far = random.between(0.1, 0.5);
         let (to, via) = (by(&from, along.normalize() * far), by(&from, along.normalize() * 0.5 * far + 0.2 * across));
@@ -93,10 +94,7 @@ fn asked(name: &str, scene: &mut PlanningScene, each: usize, asked: &mut Asked) 
             let line = follow(&robot.body.kinematics, robot.tcp(), &start, way, &settings, |_, _| true);
             (line.fraction == 1.0).then_some(line.path)
         };
-        let goals = [
-            ("line", Goal::Line(to), &line),
-            ("arc", Goal::Arc { via: via.translation.vector, to }, &arc),
-        ];
+        let goals = [("line", Goal::Line(to), &line), ("arc", Goal::Arc { via: via.translation.vector, to }, &arc)];
         for (k, (kind, goal, way)) in goals.into_iter().enumerate() {
             if found[k] >= each || way.length() > 0.8 {
                 continue;
@@ -114,7 +112,12 @@ fn asked(name: &str, scene: &mut PlanningScene, each: usize, asked: &mut Asked) 
             let size: Vec<f64> = start.iter().map(|_| random.between(-0.3, 0.3)).collect();
             let at = |k: usize| {
                 let u = k as f64 / (count - 1) as f64;
-                start.iter().zip(&size).enumerate().map(|(j, (q, a))| q + a * ((4.0 * u + j as f64).sin() - (j as f64).sin())).collect()
+                start
+                    .iter()
+                    .zip(&size)
+                    .enumerate()
+                    .map(|(j, (q, a))| q + a * ((4.0 * u + j as f64).sin() - (j as f64).sin()))
+                    .collect()
             };
             let points: Vec<Vec<f64>> = (0..count).map(at).collect();
             let goal = Goal::Path(JointPath { points: points.clone(), tolerance: 0.005 });

@@ -46,6 +46,7 @@ mod log_verbs;
 mod metrics;
 mod moved_by_others;
 mod new;
+mod on_path;
 mod onto;
 mod orders;
 mod other_machine;

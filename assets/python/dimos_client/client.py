@@ -64,13 +64,15 @@ class Client(Planning):
         blend: float = 0.0,
         direct: bool = False,
         replan: bool = False,
+        on_path: Sequence[Mapping[str, Any]] = (),
         seed: int = 0,
         timeout: Optional[float] = None,
     ) -> dict[str, Any]:
         """Moves an arm to `target` [rad], a `named` pose, a `pose`, `by` a pose or `through` waypoints, or several arms
         together, with all keywords of `plan`; `speed`: 0.01–1 of the limits. With a planner in the run the motion is
         planned around obstacles, and after `replan` planned again when the world changes; `direct` moves straight in
-        joint space, not collision-checked. Without a planner it is direct: `collision_checked` in the result says
+        joint space, not collision-checked. `on_path`: what is done at places of the path, as {"distance": 0.3,
+        "gripper": {"arm": "arm", "to": "open"}}, {"waypoint": 1, "output": {...}} or {..., "speed": 0.5}. Without a planner it is direct: `collision_checked` in the result says
         which. Ends this client's own streams to the arm."""
         goal = Goal(target, named, pose, linear, frame, by, via)
         where = where_to(arm, goal, through, blend, tcp_speed)
@@ -82,16 +84,18 @@ class Client(Planning):
             try:
                 self._end_streams(self._streams_to([arm] if isinstance(arm, str) else arm))
                 plan = {**where, "speed": speed, "seed": seed}
-                return self._go({"plan": plan if timeout is None else {**plan, "timeout": timeout}}, wait, replan)
+                return self._go({"plan": plan if timeout is None else {**plan, "timeout": timeout}}, wait, replan, on_path)
             except Refused as error:
                 if not (error.code == "NO_PLANNER" and error.data is None and joints):
                     raise  # also when a planner was there and has gone
         return self._go({"move": {"arm": arm, "target": joints, "speed": speed, "direct": direct}}, wait)
 
-    def _go(self, step: dict[str, Any], wait: bool, replan: bool = False) -> dict[str, Any]:
+    def _go(
+        self, step: dict[str, Any], wait: bool, replan: bool = False, on_path: Sequence[Mapping[str, Any]] = ()
+    ) -> dict[str, Any]:
         """Lets the run carry out a motion as a whole. What it says of the motion: its end, or without `wait` its
         beginning."""
-        number: int = self.call("go", steps=[step], replan=replan or None)["going"]
+        number: int = self.call("go", steps=[step], replan=replan or None, on_path=list(on_path) or None)["going"]
         try:
             while True:
                 report = self.call("going", going=number)

@@ -1,8 +1,8 @@
 //! The fastest clock of a path: the rate `r(x)` at which a given motion `q(x)` runs so that it takes the least time and
 //! every joint keeps its velocity, acceleration and jerk limits.
 //!
-//! With `b = r²`, `q̇ = q'·√b`, `q̈ = q''·b + q'·b'/2` and `q⃛ = √b·(q'''·b + 3/2·q''·b' + q'·b''/2)`: the first two are
-//! linear in `b` (Verscheure et al., "Time-optimal path tracking for robots: a convex optimization approach", 2009),
+//! With `b = r²`, `q̇ = q'·√b`, `q̈ = q''·b + q'·b'/2` and `q⃛ = √b·(q'''·b + 3/2·q''·b' + q'·b''/2)`: the first two
+//! are linear in `b` (Verscheure et al., "Time-optimal path tracking for robots: a convex optimization approach", 2009),
 //! the third is not convex, but nearly so. `b` is a quadratic B-spline, so its second derivative is constant in a cell.
 //! The duration `∫1/√b dx` is minimized with logarithmic barriers by Newton's method (Boyd and Vandenberghe, "Convex
 //! Optimization", 2004, chapter 11); a limit at one place concerns three neighbouring coefficients, so a step is the
@@ -100,7 +100,8 @@ impl PathClock<'_> {
                 let mut length = 1.0;
                 let found = (0..40).find_map(|_| {
                     trial.iter_mut().zip(&b).zip(&step).for_each(|((t, b), s)| *t = b + length * s);
-                    let reached = self.objective(&bases, &trial, weight).filter(|v| *v <= value + 0.1 * length * descent);
+                    let reached =
+                        self.objective(&bases, &trial, weight).filter(|v| *v <= value + 0.1 * length * descent);
                     length *= 0.5;
                     reached
                 });

@@ -272,7 +272,8 @@ impl<'r> Runner<'r, '_> {
             let plan = Plan { goals, speed: *speed, through, blend, tcp_speed, ..Plan::default() };
             GoStep::Plan(Box::new(plan))
         };
-        let go = Go { steps: vec![step], replan: motion.replan && !motion.direct, ..Go::default() };
+        let (replan, on_path) = (motion.replan && !motion.direct, motion.on_path.clone());
+        let go = Go { steps: vec![step], replan, on_path, ..Go::default() };
         let at = (self.client.call(go)?.going, 0);
         let begun = going::begin(self.client, at, Some(self.signals), false).map_err(|why| match why {
             // Another client's `cancel`, maybe at a waypoint.

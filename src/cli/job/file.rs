@@ -14,7 +14,7 @@ use crate::cli::output;
 use dimos_core::arm::channel;
 use dimos_core::bounded;
 use dimos_core::written;
-use dimos_rpc::api::{Attach, DEFAULT_SPEED, MAX_TCP_SPEED, PlanGoal, PoseSpec};
+use dimos_rpc::api::{ArmIoSet, Attach, DEFAULT_SPEED, GoGripper, MAX_TCP_SPEED, OnPath, PlanGoal, PoseSpec};
 use dimos_yaml as yaml;
 use dimos_yaml::{Diag, Kind, Label, NodeId, Tree, did_you_mean, quote};
 
@@ -258,6 +258,7 @@ impl Reader {
             tcp_speed: None,
             direct: self.direct,
             replan: self.replan,
+            on_path: Vec::new(),
         };
         if self.tree.text(node).is_some() {
             motion.goal.named = Some(self.parsed(node, word)?);
@@ -270,6 +271,7 @@ impl Reader {
         motion.direct = self.at(node, "direct", flag).unwrap_or(motion.direct);
         motion.replan = self.at(node, "replan", flag).unwrap_or(motion.replan);
         motion.goal = self.goal(node)?;
+        motion.on_path = self.acts(node, &motion)?;
         if motion.direct && motion.goal.joints.is_none() && motion.goal.named.is_none() {
             return self.wrong(node, "a direct motion needs `joints` or a named pose", Some("leave out `direct`"));
         }
@@ -305,6 +307,54 @@ impl Reader {
             via,
             ..PlanGoal::default()
         })
+    }
+
+    /// Reads the acts at places of a motion's path.
+    fn acts(&mut self, motion: NodeId, of: &Motion) -> Option<Vec<OnPath>> {
+        let Some((key, list)) = self.tree.entry(motion, "on_path") else { return Some(Vec::new()) };
+        if of.direct || of.replan {
+            return self.wrong(key, "acts on a path belong to one planned path", Some("leave out `direct`, `replan`"));
+        }
+        let items = self.tree.items(list).to_vec();
+        if items.is_empty() {
+            return self.wrong(list, "expected a list of acts", Some("[{distance: 0.1, gripper: open}]"));
+        }
+        items.into_iter().map(|item| self.act_on_path(item)).collect()
+    }
+
+    fn act_on_path(&mut self, node: NodeId) -> Option<OnPath> {
+        self.group(node, &keys::ON_PATH)?;
+        let count = |keys: &[&str]| keys.iter().filter(|key| self.tree.get(node, key).is_some()).count();
+        if count(&["distance", "waypoint"]) != 1 || count(&["gripper", "output", "speed"]) != 1 {
+            let hint =
+                "{distance: 0.1, gripper: open}, {waypoint: 2, output: {do0: high}}, {distance: 0.2, speed: 50%}";
+            return self.wrong(node, "needs a place (distance [m] or waypoint) and an act", Some(hint));
+        }
+        let mut act = OnPath {
+            distance: self.at(node, "distance", finite),
+            waypoint: self.at(node, "waypoint", times).map(|number| number as usize),
+            speed: self.at(node, "speed", speed),
+            ..OnPath::default()
+        };
+        if let Some(gripper) = self.tree.get(node, "gripper") {
+            let (mut arm, mut force, mut to) = (String::new(), None, Some(gripper));
+            if self.tree.text(gripper).is_none() {
+                self.group(gripper, &keys::FINGERS)?;
+                self.arm(gripper, &mut arm);
+                (force, to) = (self.at(gripper, "force", finite), self.tree.get(gripper, "to"));
+            }
+            let Some(to) = to else {
+                return self.wrong(gripper, "the key `to` is missing", Some("to: open, close, or m or rad"));
+            };
+            let to = self.parsed(to, opening)?.into();
+            act.gripper = Some(GoGripper { arm, to, force, speed: None, timeout: None, objects: None });
+        }
+        if let Some(output) = self.tree.get(node, "output") {
+            let mut arm = String::new();
+            let Act::Output(outputs) = self.output(output, &mut arm)? else { return None };
+            act.output = Some(ArmIoSet { arm, outputs });
+        }
+        Some(act)
     }
 
     /// Reads the speed of the tool; `None` if it is wrong.
@@ -346,6 +396,7 @@ impl Reader {
             tcp_speed: None,
             direct: false,
             replan: self.replan,
+            on_path: Vec::new(),
         };
         let mut list = node;
         if self.tree.items(node).is_empty() {
@@ -360,6 +411,7 @@ impl Reader {
                 return self.wrong(blend, "must be within 0–1 m", None);
             }
             list = self.tree.get(node, "waypoints").unwrap_or(node);
+            motion.on_path = self.acts(node, &motion)?;
         }
         let mut goals = Vec::new();
         for item in self.tree.items(list).to_vec() {

@@ -35,6 +35,8 @@ pub enum Value {
     Steps,
     /// Two or more of these.
     Waypoints(&'static Group),
+    /// One or more of these.
+    Acts(&'static Group),
     /// Keys.
     Keys(&'static Group),
     /// One of these.
@@ -102,18 +104,47 @@ pub static MOTION: Group = Group {
         ("tcp_speed", Number),
         ("direct", Flag),
         ("replan", Flag),
+        ("on_path", Acts(&ON_PATH)),
         ("arm", Text),
     ],
     required: &[],
 };
+/// An act at a place of the path.
+pub static ON_PATH: Group = Group {
+    keys: &[
+        ("distance", Number),
+        ("waypoint", Times),
+        ("gripper", Either(&[Opening, Keys(&FINGERS)])),
+        ("output", Outputs),
+        ("speed", Speed),
+    ],
+    required: &[],
+};
+/// `gripper` at a place of the path.
+pub static FINGERS: Group = Group { keys: &[("to", Opening), ("force", Number), ("arm", Text)], required: &["to"] };
 /// A waypoint that is not just a name.
 pub static WAYPOINT: Group = Group {
-    keys: &[("named", Text), ("joints", Numbers(0)), ("pose", Keys(&POSE)), ("frame", Text), ("linear", Flag), ("via", Numbers(3))],
+    keys: &[
+        ("named", Text),
+        ("joints", Numbers(0)),
+        ("pose", Keys(&POSE)),
+        ("frame", Text),
+        ("linear", Flag),
+        ("via", Numbers(3)),
+    ],
     required: &[],
 };
 /// `through`.
 pub static THROUGH: Group = Group {
-    keys: &[("waypoints", Waypoints(&WAYPOINT)), ("blend", Number), ("speed", Speed), ("tcp_speed", Number), ("replan", Flag), ("arm", Text)],
+    keys: &[
+        ("waypoints", Waypoints(&WAYPOINT)),
+        ("blend", Number),
+        ("speed", Speed),
+        ("tcp_speed", Number),
+        ("replan", Flag),
+        ("on_path", Acts(&ON_PATH)),
+        ("arm", Text),
+    ],
     required: &["waypoints"],
 };
 /// A pose.

@@ -124,6 +124,12 @@ impl Names {
             let hint = "run a planner blueprint; or write `direct: true`: not collision-checked";
             return say("this run has no planner".to_owned(), hint);
         }
+        for act in &motion.on_path {
+            if act.waypoint.is_some_and(|number| number > motion.through.len()) {
+                let what = format!("on_path: the motion has {} waypoints before its goal", motion.through.len());
+                return say(what, "waypoints are counted from 1");
+            }
+        }
         let count = arm.position_limits.len();
         for goal in motion.through.iter().chain([&motion.goal]) {
             match goal {
@@ -182,6 +188,11 @@ fn name_arm(step: &mut Step, arm: &str) {
     match &mut step.act {
         Act::Move(motion) => {
             motion.through.iter_mut().chain([&mut motion.goal]).for_each(|goal| goal.robot.clone_from(&step.arm));
+            let grips =
+                motion.on_path.iter_mut().filter_map(|act| act.gripper.as_mut().map(|gripper| &mut gripper.arm));
+            grips.filter(|own| own.is_empty()).for_each(|own| own.clone_from(&step.arm));
+            let outputs = motion.on_path.iter_mut().filter_map(|act| act.output.as_mut().map(|output| &mut output.arm));
+            outputs.filter(|own| own.is_empty()).for_each(|own| own.clone_from(&step.arm));
         }
         Act::Attach(attach) => attach.robot.clone_from(&step.arm),
         Act::Repeat { steps, .. } => steps.iter_mut().for_each(|step| name_arm(step, arm)),

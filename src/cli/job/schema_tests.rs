@@ -40,6 +40,7 @@ fn value(of: &Value) -> Json {
             let point = json!({"anyOf": [value(&Value::Text), group(point)]});
             json!({"type": "array", "items": point, "minItems": 2})
         }
+        Value::Acts(keys) => json!({"type": "array", "items": group(keys), "minItems": 1}),
         Value::Keys(keys) => group(keys),
         Value::Either(values) => json!({"anyOf": values.iter().map(value).collect::<Vec<_>>()}),
     }

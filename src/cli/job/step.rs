@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use crate::cli::grip::Opening;
-use dimos_rpc::api::{Attach, PlanGoal};
+use dimos_rpc::api::{Attach, OnPath, PlanGoal};
 use dimos_yaml::{NodeId, Tree};
 
 /// A job that can be run.
@@ -82,4 +82,6 @@ pub struct Motion {
     pub direct: bool,
     /// Whether it is planned again if an obstacle blocks it.
     pub replan: bool,
+    /// What is done at places of its path.
+    pub on_path: Vec<OnPath>,
 }

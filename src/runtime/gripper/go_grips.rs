@@ -54,7 +54,7 @@ impl Service {
     }
 
     /// Returns the commanded position [m or rad].
-    fn position_of(&self, call: &GoGripper) -> Result<f64, RpcError> {
+    pub(in crate::runtime) fn position_of(&self, call: &GoGripper) -> Result<f64, RpcError> {
         let end = match call.to {
             Opening::Position(position) => return Ok(position),
             Opening::End(end) => end,

@@ -4,16 +4,22 @@ use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
 use super::going::{Going, POLL_PERIOD};
+use super::on_path::Acts;
 use crate::runtime::{Service, internal};
 use dimos_control::request::Request;
 use dimos_core::telemetry::{Origin, TaskState};
 use dimos_rpc::api::{
-    EndedBy, ExecutePlan, GoBegun, GoPhase, GoStep, Plan, PlanGoal, Planning, Reply, Request as Call, RobotReport,
+    EndedBy, ExecutePlan, GoBegun, GoPhase, GoStep, OnPath, Plan, PlanGoal, PlanSummary, Planning, Reply,
+    Request as Call, RobotReport,
 };
+use dimos_rpc::report::MotionReport;
 use dimos_rpc::{Backend, Code, RpcError, Subject};
 
 /// Time for a `cancel` to reach the motion itself.
 const CANCEL_TIMEOUT: Duration = Duration::from_millis(100);
+/// An act on a path is close [s], and then looked for this often: a part of the shortest tick.
+const SOON: f64 = 0.1;
+const ACT_PERIOD: Duration = Duration::from_micros(500);
 /// Longest that an ending run is waited for to end a motion.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(3);
 
@@ -93,38 +99,48 @@ impl Service {
         Ok(())
     }
 
-    /// Carries out a step. `replan` and `unproven` are those of the request.
+    /// Carries out a step. `replan` and `unproven` are those of the request; acts come with their indices in it.
     pub(in crate::runtime) async fn carry_out_step(
         &self,
         going: &Going,
         step: GoStep,
         (replan, unproven): (bool, bool),
+        acts: Vec<(usize, OnPath)>,
         origin: &mut Origin,
     ) -> Result<(), Failed> {
+        let mut none = Acts::default();
         match step {
             GoStep::Plan(plan) => {
-                let (plan, joints) = self.plan_step(going, *plan, *origin).await?;
+                for (_, act) in &acts {
+                    if let Some(gripper) = &act.gripper {
+                        self.check_grip(gripper).await?;
+                    }
+                }
+                let (plan, summary) = self.plan_step(going, *plan, *origin).await?;
+                let mut acts = self.acts_of(acts, plan, &summary).await?;
                 let execute = ExecutePlan { plan: Some(plan), replan, unproven, ..ExecutePlan::default() };
-                self.execute_step(going, execute, &joints, *origin).await
+                let done = self.execute_step(going, execute, &summary.joints, &mut acts, *origin).await;
+                self.restore_speed(&mut acts, *origin).await;
+                done
             }
             GoStep::ExecutePlan(execute) => {
                 let (_, joints) = self.plan_and_its_joints(execute.plan).await?;
-                self.execute_step(going, *execute, &joints, *origin).await
+                self.execute_step(going, *execute, &joints, &mut none, *origin).await
             }
             GoStep::Move(direct) => {
                 let arms = [direct.arm.clone()];
-                self.move_step(going, &arms, Call::Move(*direct), *origin).await
+                self.move_step(going, &arms, Call::Move(*direct), &mut none, *origin).await
             }
             GoStep::Execute(execute) => {
                 let arms = self.arms_of(Subject::Joints(&execute.trajectory.joint_names));
-                self.move_step(going, &arms, Call::Execute(*execute), *origin).await
+                self.move_step(going, &arms, Call::Execute(*execute), &mut none, *origin).await
             }
             GoStep::Gripper(gripper) => self.grip_step(going, *gripper, origin).await,
         }
     }
 
-    /// Makes a plan. Returns its number and the joints that it moves.
-    async fn plan_step(&self, going: &Going, plan: Plan, origin: Origin) -> Result<(u64, Vec<String>), Failed> {
+    /// Makes a plan. Returns its number and its figures.
+    async fn plan_step(&self, going: &Going, plan: Plan, origin: Origin) -> Result<(u64, PlanSummary), Failed> {
         going.check()?;
         // It is this request's own: `execute_plan` without a number passes it over.
         let request = Call::Plan(Plan { by_number: true, ..plan });
@@ -136,7 +152,7 @@ impl Service {
             going.step(GoPhase::Planning, |step| step.planning = Some(report.clone()));
             if report.state != "PLANNING" {
                 if let Some(summary) = report.summary {
-                    return Ok((begun.plan, summary.joints));
+                    return Ok((begun.plan, summary));
                 }
                 return Err(going.check().err().filter(|_| going.is_client_gone()).unwrap_or_else(|| report.into()));
             }
@@ -153,15 +169,23 @@ impl Service {
         going: &Going,
         execute: ExecutePlan,
         joints: &[String],
+        acts: &mut Acts,
         origin: Origin,
     ) -> Result<(), Failed> {
         let arms = self.arms_of(Subject::Joints(joints));
         let execute = ExecutePlan { presence: going.presence(), ..execute };
-        self.move_step(going, &arms, Call::ExecutePlan(execute), origin).await
+        self.move_step(going, &arms, Call::ExecutePlan(execute), acts, origin).await
     }
 
     /// Begins a motion and waits for its end, and for that of those that continue it around an obstacle.
-    async fn move_step(&self, going: &Going, arms: &[String], call: Call, origin: Origin) -> Result<(), Failed> {
+    async fn move_step(
+        &self,
+        going: &Going,
+        arms: &[String],
+        call: Call,
+        acts: &mut Acts,
+        origin: Origin,
+    ) -> Result<(), Failed> {
         let begun = match going.command(arms, Box::pin(self.answer_counted(call, origin))).await? {
             Reply::Move(reply) => GoBegun::Move(reply),
             Reply::Execute(reply) | Reply::ExecutePlan(reply) => GoBegun::Execute(reply),
@@ -179,6 +203,7 @@ impl Service {
                     None => step.motions.push(report.clone()),
                 }
             });
+            let wait = self.act_on_path(going, &report, acts, origin).await?;
             match report.next.filter(|_| report.done) {
                 Some(next) => {
                     motion = next;
@@ -197,7 +222,31 @@ impl Service {
             if self.lifecycle.is_closed() && closed.get_or_insert_with(Instant::now).elapsed() > SHUTDOWN_TIMEOUT {
                 return Err(RpcError::new(Code::ShuttingDown, "the run ends").into());
             }
-            tokio::time::sleep(POLL_PERIOD).await;
+            tokio::time::sleep(wait).await;
         }
+    }
+
+    /// Does the acts on the path of a motion that are due; one that is refused ends the motion. Returns when to look
+    /// again.
+    async fn act_on_path(
+        &self,
+        going: &Going,
+        report: &MotionReport,
+        acts: &mut Acts,
+        origin: Origin,
+    ) -> Result<Duration, Failed> {
+        let task = self.facts.task_index(&report.task)?;
+        let view = self.tick.task_view(task.into());
+        let completed = report.state == TaskState::Completed.name();
+        // Before its first tick, and after its end, the task has another motion's figures.
+        if !completed && (report.done || view.motion != report.motion) {
+            return Ok(POLL_PERIOD);
+        }
+        if let Err(failed) = self.do_acts(going, acts, (&view, completed), origin).await {
+            self.ask(Request::Cancel { task: Some(task) }).await?;
+            return Err(failed);
+        }
+        let soon = acts.until(&view, self.tick.speed_override().fraction).is_some_and(|left| left < SOON);
+        Ok(if soon { ACT_PERIOD } else { POLL_PERIOD })
     }
 }

@@ -172,12 +172,14 @@ impl Service {
     }
 
     async fn carry_out(&self, going: &Going, go: Go, mut origin: Origin) {
-        let Go { steps, replan, unproven, .. } = go;
+        let Go { steps, replan, unproven, on_path, .. } = go;
         let mut ended = Failed { by: EndedBy::Goal, error: None };
-        for step in steps {
+        for (index, step) in steps.into_iter().enumerate() {
+            let acts = on_path.iter().enumerate().filter(|(_, act)| act.step == index);
+            let acts = acts.map(|(number, act)| (number, act.clone())).collect();
             going.update(|report| report.steps.push(GoStepReport::default()));
             going.step(GoPhase::Planning, |_| {});
-            if let Err(failed) = self.carry_out_step(going, step, (replan, unproven), &mut origin).await {
+            if let Err(failed) = self.carry_out_step(going, step, (replan, unproven), acts, &mut origin).await {
                 ended = failed;
                 break;
             }

@@ -5,6 +5,7 @@ pub(in crate::runtime) mod go_steps;
 pub(in crate::runtime) mod going;
 pub(in crate::runtime) mod motion_requests;
 pub(in crate::runtime) mod motions;
+pub(in crate::runtime) mod on_path;
 pub(in crate::runtime) mod replan;
 pub(in crate::runtime) mod stream_requests;
 pub(in crate::runtime) mod streams;

@@ -17,8 +17,8 @@ use dimos_core::joint::{JointBounds, JointLimits};
 use dimos_core::telemetry::{Origin, Outcome};
 use dimos_core::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
 use dimos_core::written;
-use dimos_planner::planning::request::joint_path::{JointPath, Outside};
 use dimos_planner::planning::curve::{self, fit::fit, settings::CurveSettings};
+use dimos_planner::planning::request::joint_path::{JointPath, Outside};
 use dimos_planner::planning::search::path::{distance, length};
 use dimos_planner::planning::timing::settings::TimingSettings;
 use dimos_planner::planning::timing::time_within;
@@ -263,7 +263,8 @@ fn along(
     })?;
     let bounds: Vec<JointBounds> = (0..names.len()).filter_map(|j| limits.joint(j)).collect();
     let straight = |way: &[Vec<f64>], deviation: f64| {
-        let timed = time_within(names, way, &bounds, &vec![deviation; way.len()], &TimingSettings::default(), |_, _| true);
+        let timed =
+            time_within(names, way, &bounds, &vec![deviation; way.len()], &TimingSettings::default(), |_, _| true);
         timed.map(|timed| timed.trajectory).map_err(|e| MotionError::NotFound(e.to_string()))
     };
     let settings = CurveSettings::default();

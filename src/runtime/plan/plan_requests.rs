@@ -316,6 +316,7 @@ fn summary(job: &Job, found: &PlannedMotion) -> PlanSummary {
         waypoints: found.path.len(),
         length: length(&found.path),
         duration: found.trajectory.duration(),
+        passes: found.passes.clone(),
         level: level(found.level),
         clearance: found.clearance.as_ref().map(|clearance| clearance.distance),
         closest: found.clearance.as_ref().and_then(|clearance| clearance.pair.clone()),

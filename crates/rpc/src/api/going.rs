@@ -4,6 +4,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::on_path::{self, OnPath};
 use crate::api::{Execute, ExecutePlan, ExecuteReply, GripReport, Gripper, Move, MoveReply, Plan, PlanningReport};
 use crate::error::RpcError;
 use crate::report::{MotionReport, PoseReport};
@@ -26,6 +27,9 @@ pub struct Go {
     /// Required for plans of the level `fast`: they are not proven to be free.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub unproven: bool,
+    /// What is done at places of the planned paths, while the arm moves. An act that is refused ends the motion.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub on_path: Vec<OnPath>,
     /// The requesting connection, if any: each step needs its leases.
     #[serde(skip)]
     pub claimant: Option<Claimant>,
@@ -115,7 +119,8 @@ impl Go {
                 GoStep::Gripper(gripper) => ("gripper", gripper.command(0.0).valid().and(gripper.to.valid())),
             };
             valid.map_err(|what| format!("steps[{index}].{name}.{what}"))
-        })
+        })?;
+        on_path::valid(&self.on_path, &self.steps, self.replan)
     }
 }
 
@@ -211,6 +216,18 @@ pub struct GoStepReport {
     /// Objects that were detached.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub detached: Vec<String>,
+    /// Acts on its path that were done, in order.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub acts: Vec<ActDone>,
+}
+
+/// An act on a path that was done.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct ActDone {
+    /// Its index in `on_path`.
+    pub on_path: usize,
+    /// Where it was asked for: time along the path [s].
+    pub elapsed: f64,
 }
 
 /// How a motion of a step began: the reply to `move`, or to `execute` and `execute_plan`.

@@ -81,8 +81,8 @@ pub struct PlanGoal {
     /// Whether the tool centre point moves there on a straight line.
     #[serde(default)]
     pub linear: bool,
-    /// Place [m] that its tool centre point passes on the way to `pose` or `by`, on the arc of a circle; as those, along
-    /// the axes of `frame`, and with `by` from its present place.
+    /// Place [m] that its tool centre point passes on the way to `pose` or `by`, on the arc of a circle; as those,
+    /// along the axes of `frame`, and with `by` from its present place.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub via: Option<[f64; 3]>,
 }
@@ -312,6 +312,9 @@ pub struct PlanSummary {
     pub length: f64,
     /// Duration of the motion [s].
     pub duration: f64,
+    /// When it passes the waypoints of `through` [s].
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub passes: Vec<f64>,
     /// How it was checked.
     #[serde(default)]
     pub level: PlanLevel,

@@ -1,8 +1,8 @@
 //! One curve along several, which passes the places where they meet at a distance instead of resting there.
 //!
 //! Before a meeting place the first curve slows down to a stop while the second starts, and both motions are added: the
-//! direction turns by the smooth step `3x² − 2x³`, as in the corners of a path ([`blend`](crate::planning::timing::blend)),
-//! but between curves of any shape.
+//! direction turns by the smooth step `3x² − 2x³`, as in the corners of a path
+//! ([`blend`](crate::planning::timing::blend)), but between curves of any shape.
 
 use super::joint_curve::JointCurve;
 use super::settings::JoinSettings;
@@ -24,9 +24,8 @@ pub fn rounded(path: &[Vec<f64>], deviation: &[f64], settings: &JoinSettings) ->
             continue;
         }
         // Next to a corner as dense as in it, and twice as far apart from one to the next.
-        let spacing = |corner: Option<&Piece>| {
-            corner.map_or(settings.spacing, |corner| corner.length / settings.samples as f64)
-        };
+        let spacing =
+            |corner: Option<&Piece>| corner.map_or(settings.spacing, |corner| corner.length / settings.samples as f64);
         let [mut before, mut after] = [spacing(i.checked_sub(1).map(|i| &pieces[i])), spacing(pieces.get(i + 1))];
         let (mut from, mut ends) = (0.0, vec![piece.length]);
         while from + before + after < ends[ends.len() - 1] {

@@ -6,7 +6,7 @@ use dimos_robot::kinematics::step::rotation_between;
 
 /// Turns smaller than this have no axis [rad], and lengths no direction [m].
 const SMALL: f64 = 1e-9;
-/// Three points are in line if the middle one is closer than this part of their distance to the line through the others.
+/// Three points are in line if one is closer than this part of their distance to the line through the others.
 const IN_LINE: f64 = 1e-6;
 
 /// Why three points are not on one circle that can be followed.

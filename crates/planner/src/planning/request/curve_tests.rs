@@ -133,7 +133,8 @@ fn rounds_of_refinement_make_a_path_with_corners_quicker() {
     let wall = ObjectShape::Box([0.1, 0.02, 0.4]);
     let wall = ObjectConfig { name: "wall".into(), shape: wall, pose: middle.into(), padding: 0.0 };
     let robots = vec![RobotConfig::yourarm()];
-    let scene = PlanningScene::load(&PlannerConfig { robots, objects: vec![wall], ..PlannerConfig::default() }).unwrap();
+    let scene =
+        PlanningScene::load(&PlannerConfig { robots, objects: vec![wall], ..PlannerConfig::default() }).unwrap();
     let mut gains = Vec::new();
     for seed in 0..12 {
         let [plain, refined] = [15, 16].map(|refine| {

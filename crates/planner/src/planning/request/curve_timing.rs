@@ -1,5 +1,5 @@
-//! The motion along the legs of a request of which some are curves: each in its own time, or, where waypoints are passed
-//! at a distance, all in one.
+//! The motion along the legs of a request of which some are curves: each in its own time, or, where waypoints are
+//! passed at a distance, all in one.
 
 use super::legs::{Leg, passed};
 use super::pipeline::{PlanRequest, Stage};
@@ -99,12 +99,7 @@ fn along_lines(
     Some(best)
 }
 
-fn motion(
-    stage: &Stage<'_>,
-    curve: &JointCurve,
-    bounds: &[JointBounds],
-    tools: &mut Tools,
-) -> Option<JointTrajectory> {
+fn motion(stage: &Stage<'_>, curve: &JointCurve, bounds: &[JointBounds], tools: &mut Tools) -> Option<JointTrajectory> {
     let part = |q: &[f64], v: &[f64]| tools.part(q, v);
     let motion = along(&stage.joints, curve, bounds, part, &stage.settings.curve.clock)?;
     Some(tools.slowed(&motion, bounds, 1.0, &stage.settings.tool).unwrap_or(motion))

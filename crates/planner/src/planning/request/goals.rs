@@ -6,9 +6,9 @@ use super::settings::GoalSettings;
 use super::start_contact::{EscapePath, passes};
 use crate::collision::report::{Contact, Pair};
 use crate::collision::{CollisionChecker, Stop};
-use crate::planning::ik::Ik;
 use crate::planning::curve::joint_curve::JointCurve;
 use crate::planning::curve::tool_path::ToolPath;
+use crate::planning::ik::Ik;
 use crate::planning::ik::cartesian::{Line, follow as follow_tool, smooth};
 use crate::planning::ik::settings::{IkSettings, LineSettings};
 use crate::planning::scene::padded::{Near, Padded};
@@ -17,8 +17,8 @@ use crate::planning::search::level::Level;
 use crate::planning::search::path::{Path, between, distance, length, unwind};
 use crate::planning::search::path_planner::digits_outside;
 use crate::planning::settings::PlannerSettings;
-use dimos_robot::kinematics::{Kinematics, frame};
 use dimos_robot::kinematics::step::rotation_between;
+use dimos_robot::kinematics::{Kinematics, frame};
 use dimos_robot::model::JointKind;
 use glamx::DAffine3;
 
@@ -138,11 +138,14 @@ pub(in crate::planning) fn line(
         Goal::Arc { via, to } => {
             let via = into_root.transform_point3(glamx::DVec3::new(via.x, via.y, via.z));
             let way = ToolPath::arc(from, via, into_root * frame(to)).map_err(|error| {
-                PlanFailure::new(error.to_string()).hint("a circle passes three different places; make a full one of two arcs")
+                PlanFailure::new(error.to_string())
+                    .hint("a circle passes three different places; make a full one of two arcs")
             })?;
             (way, "arc", "--via")
         }
-        Goal::Line(to) => (ToolPath::line(from, into_root * frame(to)), "straight line", "--linear (in a waypoint: line:)"),
+        Goal::Line(to) => {
+            (ToolPath::line(from, into_root * frame(to)), "straight line", "--linear (in a waypoint: line:)")
+        }
         _ => return Err(PlanFailure::new("this goal is reached on no line")),
     };
     // The end is known only after following the line, and with it how dense its configurations must be.

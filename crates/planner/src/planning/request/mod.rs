@@ -12,6 +12,6 @@ pub mod settings;
 pub mod start_contact;
 
 #[cfg(test)]
-mod request_tests;
-#[cfg(test)]
 mod curve_tests;
+#[cfg(test)]
+mod request_tests;

@@ -73,11 +73,8 @@ fn of_piece(states: &States, bounds: &[JointBounds], end: usize, quintic: bool) 
         let [positions, speeds, accelerations] =
             [0, 1, 2].map(|which| [states.values(end - 1, which)[j], states.values(end, which)[j]]);
         let d = (positions[1] - positions[0]) * inverse;
-        let used = if quintic {
-            of_quintic(d, speeds, accelerations, h, inverse)
-        } else {
-            of_cubic(d, speeds, h, inverse)
-        };
+        let used =
+            if quintic { of_quintic(d, speeds, accelerations, h, inverse) } else { of_cubic(d, speeds, h, inverse) };
         all = all.max(part_of(used, bound));
     }
     all

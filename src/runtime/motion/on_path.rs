@@ -1,0 +1,119 @@
+//! Acts at places of a path: when the path's clock passes them, to the tick.
+
+use super::go_steps::Failed;
+use super::going::Going;
+use crate::runtime::{Service, internal};
+use dimos_core::telemetry::{Origin, TaskView};
+use dimos_rpc::api::{ActDone, OnPath, PlanSummary, Preview, Reply, Request as Call, Speed};
+use dimos_rpc::{Code, RpcError};
+
+/// Samples of a motion for distances along its path, at most, and per second.
+const SAMPLES: f64 = 20_000.0;
+const RATE: f64 = 1000.0;
+
+/// Acts of a step that are still to be done, in order of time.
+#[derive(Default)]
+pub struct Acts {
+    /// Time along the path [s], index in the request, and what is done.
+    left: Vec<(f64, usize, OnPath)>,
+    /// The speed before an act changed it.
+    speed: Option<f64>,
+}
+
+impl Acts {
+    /// Returns the time until the next act if the path's clock continues at this rate [s].
+    pub fn until(&self, view: &TaskView, rate: f64) -> Option<f64> {
+        self.left.first().map(|(time, ..)| (time - view.elapsed) / rate.max(1e-3))
+    }
+}
+
+impl Service {
+    /// Returns the acts of a step with the times at which the plan's motion passes their places.
+    pub(in crate::runtime) async fn acts_of(
+        &self,
+        acts: Vec<(usize, OnPath)>,
+        plan: u64,
+        summary: &PlanSummary,
+    ) -> Result<Acts, RpcError> {
+        if acts.is_empty() {
+            return Ok(Acts::default());
+        }
+        let hz = RATE.min(SAMPLES / summary.duration.max(1.0)).floor().max(1.0);
+        let asked = Call::Preview(Preview { plan: Some(plan), hz: Some(hz) });
+        let Reply::Preview(preview) = self.planner_call(asked).await? else { return Err(internal()) };
+        let places = preview.end_effectors.values().next().map(Vec::as_slice).unwrap_or_default();
+        let times: Vec<f64> = preview.trajectory.points.iter().map(|point| point.time_from_start).collect();
+        let mut covered = vec![0.0];
+        for pair in places.windows(2) {
+            let [a, b] = pair else { continue };
+            let step = a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt();
+            covered.push(covered.last().copied().unwrap_or(0.0) + step);
+        }
+        let whole = covered.last().copied().unwrap_or(0.0);
+        let time_of = |index: usize, act: &OnPath| match (act.distance, act.waypoint) {
+            (Some(distance), _) if distance <= whole + 1e-6 => {
+                let at = covered.partition_point(|covered| *covered < distance).min(covered.len() - 1);
+                Ok(times.get(at).copied().unwrap_or(summary.duration))
+            }
+            (Some(distance), _) => {
+                let what = format!("on_path[{index}]: the tool's path is {whole:.4} m long, not {distance} m");
+                Err(RpcError::new(Code::InvalidParams, what).hint("nothing has moved; `dimos plan` shows a motion"))
+            }
+            (None, Some(waypoint)) => summary.passes.get(waypoint - 1).copied().ok_or_else(internal),
+            (None, None) => Err(internal()),
+        };
+        let timed = acts.into_iter().map(|(index, act)| Ok((time_of(index, &act)?, index, act)));
+        let mut left = timed.collect::<Result<Vec<_>, RpcError>>()?;
+        left.sort_by(|a, b| a.0.total_cmp(&b.0));
+        Ok(Acts { left, speed: None })
+    }
+
+    /// Does what is to be done before the next tick; all that is left when the motion `is_over`. What was asked for
+    /// now is part of the next tick, which commands a place that is one period farther.
+    pub(in crate::runtime) async fn do_acts(
+        &self,
+        going: &Going,
+        acts: &mut Acts,
+        (view, is_over): (&TaskView, bool),
+        origin: Origin,
+    ) -> Result<(), Failed> {
+        let speed = self.tick.speed_override();
+        let ahead = view.elapsed + speed.fraction * self.facts.period().as_secs_f64();
+        while acts.left.first().is_some_and(|(time, ..)| is_over || *time <= ahead) {
+            let (_, index, act) = acts.left.remove(0);
+            let call = match (&act.gripper, act.output, act.speed) {
+                (Some(gripper), ..) => {
+                    let arm = [gripper.arm.clone()];
+                    let command = Call::Gripper(gripper.command(self.position_of(gripper)?));
+                    Some((arm.to_vec(), command))
+                }
+                (None, Some(output), _) => Some((vec![output.arm.clone()], Call::ArmIoSet(output))),
+                // After the end there is no speed to change.
+                (None, None, Some(_)) if is_over => None,
+                (None, None, fraction) => {
+                    acts.speed = acts.speed.or(Some(speed.fraction));
+                    Some((Vec::new(), Call::Speed(Speed { fraction, paused: None })))
+                }
+            };
+            if let Some((arms, call)) = call {
+                going.command(&arms, Box::pin(self.answer_counted(call, origin))).await?;
+            }
+            let elapsed = view.elapsed;
+            going.update(|report| {
+                if let Some(step) = report.steps.last_mut() {
+                    step.acts.push(ActDone { on_path: index, elapsed });
+                }
+            });
+        }
+        Ok(())
+    }
+
+    /// Sets the speed to what it was before acts changed it.
+    pub(in crate::runtime) async fn restore_speed(&self, acts: &mut Acts, origin: Origin) {
+        if let Some(fraction) = acts.speed.take() {
+            let call = Call::Speed(Speed { fraction: Some(fraction), paused: None });
+            // The run may be at its end.
+            let _ = self.answer_counted(call, origin).await;
+        }
+    }
+}
