@@ -98,8 +98,18 @@ fn place(
 ) -> Option<(String, NodeId)> {
     let given = entry.address.as_ref().filter(|given| given.value != SIM && row.transport != "memory")?;
     let full = (row.address.check)(given).ok().filter(|full| !full.is_empty())?;
-    // Names of hosts and interfaces in any case; those of files as they are.
-    let full = if full.contains('/') { full } else { full.to_ascii_lowercase() };
+    // Names of hosts and interfaces in any case; files by what their links lead to.
+    let full = if full.contains('/') { linked(&full) } else { full.to_ascii_lowercase() };
+    let device = |place: &str| place.rsplit_once('@').filter(|_| place.contains('/')).map(|(file, _)| file.to_owned());
+    let on_device = |other: &&Entry| {
+        let place = other.place.as_ref().map(|(place, _)| place);
+        place.is_some_and(|place| *place != full && device(place).is_some() && device(place) == device(&full))
+    };
+    if let Some((_, first)) = others.iter().find(on_device).and_then(|other| other.place.as_ref()) {
+        let diag = Diag::error(format!("the arms on the line {} have two rates", quote(given)));
+        let first = checker.tree.label(*first).with_text("first used here");
+        checker.error(given.at, diag.hint("a line has one rate: give all its arms that").also(first));
+    }
     let same = others.iter().filter(|other| other.place.as_ref().is_some_and(|(place, _)| *place == full));
     let is_beside = |other: &Entry| line.zip(other.line).is_some_and(|(own, line)| own.is_beside(&line));
     match { same.clone() }.find(|other| !is_beside(other)) {
@@ -118,6 +128,12 @@ fn place(
 }
 
 /// Reports an arm at the address of `other`. `line`: both could be on one line, with other numbers.
+/// Returns the address of a line, PATH@RATE, with the file that links lead to.
+fn linked(full: &str) -> String {
+    let (file, rate) = full.rsplit_once('@').map_or((full, String::new()), |(file, rate)| (file, format!("@{rate}")));
+    std::fs::canonicalize(file).map_or_else(|_| full.to_owned(), |file| format!("{}{rate}", file.display()))
+}
+
 fn same_place(
     checker: &mut Checker<'_>,
     entry: &HardwareEntry,

@@ -4,6 +4,7 @@ mod assets;
 pub(super) mod chain;
 mod check;
 mod collide;
+mod dynamics;
 mod fk;
 mod ik;
 mod info;
@@ -37,6 +38,8 @@ enum Verb {
     Fk(fk::Args),
     /// Inverse kinematics: joint positions for a pose of a link
     Ik(ik::Args),
+    /// Efforts of a motion, of gravity, and the mass matrix at joint positions
+    Dynamics(dynamics::Args),
     /// Distances of links at joint positions: what touches, what is close
     Collide(collide::Args),
     /// Assets of a blueprint: list, fetch, clean
@@ -149,6 +152,7 @@ pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
         Verb::Check(file) => check::run(file),
         Verb::Expand(file) => expand(file),
         Verb::Fk(args) => fk::run(args),
+        Verb::Dynamics(args) => dynamics::run(args),
         Verb::Ik(args) => ik::run(args),
         Verb::Collide(args) => collide::run(args),
         Verb::Assets(args) => assets::run(args, catalog),

@@ -28,6 +28,7 @@ mod curves;
 mod device_speed;
 mod device_stops;
 mod device_streams;
+mod dynamics;
 mod english;
 mod faults;
 mod follow;

@@ -63,4 +63,14 @@ fn two_arms_on_one_port_need_their_own_numbers_and_a_fast_line() {
     check([port; 2], "{first_id: 248}").with(2).says(&["two.yaml:8:25", "1 to 252"]);
     let slow = "/dev/ttyACM7@500000";
     check([slow; 2], "{first_id: 7}").with(2).says(&["117 % of the line's time (limit 80 %)"]);
+    check([port, slow], "{first_id: 7}").with(2).says(&["two.yaml:6:14", "have two rates", "first used here"]);
+    // The same line by another name.
+    home.write("port", "");
+    let [file, link] = ["port", "by-id"].map(|name| home.path().join(name));
+    std::os::unix::fs::symlink(&file, &link).unwrap();
+    let [file, link] = [file, link].map(|path| path.display().to_string());
+    check([&file, &link], "{first_id: 7}").with(0);
+    check([&file, &link], "{}").with(2).says(&["two arms have the address"]);
+    let slow = format!("{link}@500000");
+    check([&format!("{file}@500000"), &slow], "{first_id: 7}").with(2).says(&["117 % of the line's time"]);
 }

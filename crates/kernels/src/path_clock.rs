@@ -2,11 +2,11 @@
 //! every joint keeps its velocity, acceleration and jerk limits.
 //!
 //! With `b = r²`, `q̇ = q'·√b`, `q̈ = q''·b + q'·b'/2` and `q⃛ = √b·(q'''·b + 3/2·q''·b' + q'·b''/2)`: the first two
-//! are linear in `b` (Verscheure et al., "Time-optimal path tracking for robots: a convex optimization approach", 2009),
-//! the third is not convex, but nearly so. `b` is a quadratic B-spline, so its second derivative is constant in a cell.
-//! The duration `∫1/√b dx` is minimized with logarithmic barriers by Newton's method (Boyd and Vandenberghe, "Convex
-//! Optimization", 2004, chapter 11); a limit at one place concerns three neighbouring coefficients, so a step is the
-//! solution of a system with five diagonals.
+//! are linear in `b` (Verscheure et al., "Time-optimal path tracking for robots: a convex optimization approach",
+//! 2009), the third is not convex, but nearly so. `b` is a quadratic B-spline: its second derivative is constant in a
+//! cell. The duration `∫1/√b dx` is minimized with logarithmic barriers by Newton's method (Boyd and Vandenberghe,
+//! "Convex Optimization", 2004, chapter 11); a limit at one place concerns three neighbouring coefficients, so a step
+//! is the solution of a system with five diagonals.
 //!
 //! At a rest `q' = q'' = 0`: where the given motion rests, its clock does not, and nothing is singular.
 

@@ -1,5 +1,5 @@
-//! Owns robot descriptions (URDF, xacro, SRDF, meshes, packages) and their kinematics. Never knows other robots,
-//! obstacles or time. Used by the planner, the control and the log.
+//! Owns robot descriptions (URDF, xacro, SRDF, meshes, packages), their kinematics and dynamics. Never knows other
+//! robots, obstacles or time. Used by the planner, the control and the log.
 //!
 //! Robot descriptions: URDF, xacro, SRDF and mesh files as plain data.
 //!
@@ -16,6 +16,7 @@
 
 pub mod builtin;
 pub mod calibrated;
+pub mod dynamics;
 mod encoding;
 pub mod interchange;
 mod joint_limits;

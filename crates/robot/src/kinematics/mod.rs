@@ -22,7 +22,7 @@ use crate::model::{Joint, JointKind, Limits, RobotModel};
 
 /// Motion of a body relative to its parent.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Motion {
+pub(crate) enum Motion {
     /// Rotation about z.
     Turn,
     /// Translation along z.
@@ -31,15 +31,16 @@ enum Motion {
 
 /// Links that move as one.
 #[derive(Debug, Clone, PartialEq)]
-struct Body {
-    parent: usize,
+pub(crate) struct Body {
+    /// Index of the body that it moves relative to.
+    pub(crate) parent: usize,
     /// Frame at joint position zero, in the parent body's frame; its z is the joint's axis.
-    origin: DAffine3,
-    motion: Motion,
+    pub(crate) origin: DAffine3,
+    pub(crate) motion: Motion,
     /// `position = multiplier · q[variable] + offset`.
-    variable: usize,
-    multiplier: f64,
-    offset: f64,
+    pub(crate) variable: usize,
+    pub(crate) multiplier: f64,
+    pub(crate) offset: f64,
 }
 
 /// Why kinematics cannot be built from a model.
@@ -64,9 +65,9 @@ pub struct Kinematics {
     limits: Vec<Limits>,
     kinds: Vec<JointKind>,
     /// `bodies[0]` is the root and has no joint; only its frame is used.
-    bodies: Vec<Body>,
+    pub(crate) bodies: Vec<Body>,
     /// For every link of the model: its body, and its frame in the body's frame.
-    links: Vec<(usize, DAffine3)>,
+    pub(crate) links: Vec<(usize, DAffine3)>,
 }
 
 impl Kinematics {

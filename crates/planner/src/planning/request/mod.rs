@@ -10,6 +10,7 @@ pub mod planner_thread;
 pub mod revalidate;
 pub mod settings;
 pub mod start_contact;
+mod waypoint_times;
 
 #[cfg(test)]
 mod curve_tests;

@@ -11,6 +11,7 @@ use super::curve_timing::along_curves;
 use super::joint_path::JointPath;
 use super::legs::{Leg, joined, legs};
 use super::start_contact::{EscapePath, passes};
+use super::waypoint_times::times_at_waypoints;
 use crate::collision::clearance::Clearance;
 use crate::collision::report::Pair;
 use crate::collision::world::{Robot, World};
@@ -26,7 +27,7 @@ use crate::planning::settings::PlannerSettings;
 use crate::planning::timing::tool_timing::Tools;
 use crate::planning::timing::{TimingError, bounds, time_within};
 use dimos_core::joint::JointBounds;
-use dimos_core::trajectory::{Cursor, JointTrajectory, JointValues, Sample, Spline, TrajectoryPoint};
+use dimos_core::trajectory::{JointTrajectory, JointValues, Spline, TrajectoryPoint};
 use dimos_core::written;
 use dimos_robot::model::Limits;
 
@@ -36,9 +37,6 @@ const GOAL_TOLERANCE: f64 = 1e-6;
 const SAME_CONFIGURATION: f64 = 1e-3;
 /// Distance at which nothing can touch [m].
 const OUT_OF_REACH: f64 = 1e5;
-/// Step in which passes of waypoints are searched [s], and its largest number.
-const PASS_STEP: f64 = 0.002;
-const MAX_PASS_STEPS: f64 = 20_000.0;
 /// Duration of the motion of robots that are already at the goal [s].
 const STATIONARY_DURATION: f64 = 0.1;
 
@@ -427,32 +425,6 @@ fn timed(
     let motion = tools.slowed(&timed.trajectory, &bounds, 1.0, &stage.settings.tool).unwrap_or(timed.trajectory);
     // The same motion in a longer time, as a direct move and the speed override have it.
     Ok(if request.speed < 1.0 { motion.scaled(request.speed) } else { motion })
-}
-
-/// Returns when a motion is nearest to the ends of its legs but the last [s], in their order.
-fn times_at_waypoints(trajectory: &JointTrajectory, legs: &[Leg]) -> Vec<f64> {
-    let Ok(spline) = Spline::new(trajectory) else { return Vec::new() };
-    let (mut cursor, mut samples) = (Cursor::default(), vec![Sample::default(); spline.joints()]);
-    let step = PASS_STEP.max(spline.duration() / MAX_PASS_STEPS);
-    let mut from = 0.0;
-    let mut pass = |leg: &Leg| {
-        let end = leg.path.last()?;
-        let mut apart = |time: f64| {
-            spline.sample(time, &mut cursor, &mut samples);
-            samples.iter().zip(end).map(|(sample, q)| (sample.position - q).powi(2)).sum::<f64>().sqrt()
-        };
-        let steps = ((spline.duration() - from) / step).ceil() as usize;
-        let all: Vec<f64> = (0..=steps).map(|k| apart(from + step * k as f64)).collect();
-        let least = all.iter().copied().fold(f64::INFINITY, f64::min);
-        // A path may come there once more: the first time counts.
-        let near = all.iter().position(|distance| *distance <= least + SAME_CONFIGURATION)?;
-        let beyond = all.iter().skip(near).position(|distance| *distance > least + SAME_CONFIGURATION);
-        let until = beyond.map_or(all.len(), |count| near + count);
-        let first = all.get(near..until)?.iter().enumerate().min_by(|a, b| a.1.total_cmp(b.1))?.0;
-        from = (from + step * (near + first) as f64).min(spline.duration());
-        Some(from)
-    };
-    legs.split_last().map_or(&[][..], |(_, before)| before).iter().filter_map(&mut pass).collect()
 }
 
 /// Returns the tools of the moving robots whose speed is limited, at most to `most` [m/s].
