@@ -13,6 +13,9 @@ use crate::support::wire::watch::Watch;
 
 /// Of each arm.
 const TRIALS: u64 = 30;
+/// Trials that once found something: the stop of an arm that answered with false readings was taken for that of a
+/// silent one.
+const KEPT: [(&str, u64); 2] = [("so101", 58), ("so101", 99)];
 /// Repetitions of a case in which this computer was stalled for longer than [`SPOILT`] [s].
 const REPETITIONS: usize = 4;
 const SPOILT: f64 = 0.02;
@@ -51,9 +54,13 @@ fn lies_on_the_wire_move_no_arm() {
     let only = std::env::var("DIMOS_WIRE_ARM").ok();
     let arms: Vec<Arm> = all.into_iter().filter(|arm| only.as_ref().is_none_or(|only| only == arm.name)).collect();
     let trials = number("DIMOS_WIRE_LIES").unwrap_or(TRIALS);
-    let seeds = number("DIMOS_WIRE_LIE").map_or(0..trials, |seed| seed..seed + 1);
+    let one = number("DIMOS_WIRE_LIE");
+    let seeds = |arm: Arm| -> Vec<u64> {
+        let kept = KEPT.iter().filter(|(name, seed)| *name == arm.name && *seed >= trials).map(|(_, seed)| *seed);
+        one.map_or_else(|| (0..trials).chain(kept).collect(), |seed| vec![seed])
+    };
     let broken: Vec<String> = std::thread::scope(|scope| {
-        let play = |arm: Arm| (arm, seeds.clone());
+        let play = |arm: Arm| (arm, seeds(arm).into_iter());
         let threads: Vec<_> =
             arms.into_iter().map(play).map(|(arm, seeds)| scope.spawn(move || self::play(arm, seeds))).collect();
         threads.into_iter().flat_map(|thread| thread.join().unwrap()).collect()

@@ -204,6 +204,11 @@ pub fn so101() -> NewDecoder {
                 let each = goals.chunks_exact(usize::from(*size) + 1).take(5);
                 Some(What::Position(each.map(|goal| angle([goal[1], goal[2]])).collect()))
             }
+            // The same in motion: acceleration, goal, time and speed.
+            [0x83, 41, size, goals @ .., _] => {
+                let each = goals.chunks_exact(usize::from(*size) + 1).take(5);
+                Some(What::Position(each.map(|goal| angle([goal[2], goal[3]])).collect()))
+            }
             [0x83, 40, 1, torques @ .., _] => Some(What::Enable(torques.get(1) == Some(&1))),
             _ => None,
         };

@@ -111,7 +111,8 @@ pub fn trial(arm: Arm, seed: u64) -> (String, Vec<String>) {
         }
     };
     let config = bed.run.config().arms[0].clone();
-    let mut judge = Judge::new(0, &config, &bed.truth(), arm.rounding + 1e-4, super::arms::PERIOD);
+    // What is read is rounded, and what is written.
+    let mut judge = Judge::new(0, &config, &bed.truth(), 2.0 * arm.rounding + 1e-4, super::arms::PERIOD);
     judge.late = LATE;
     let since = super::now();
     let (watched, done) = (Mutex::new(Watched { judge, active: false, placed: true }), AtomicBool::new(false));

@@ -208,7 +208,7 @@ impl ArmControl {
     /// within them, and that counts as written.
     pub(super) fn hear_again(&mut self) {
         let commanded = self.command.mode.is_some_and(ControlMode::is_position);
-        if !self.feedback.freshness().fresh && commanded && !self.is_starting() {
+        if !self.feedback.is_heard() && commanded && !self.is_starting() {
             self.note_unheard();
         }
         if self.command.unheard.is_none() || !self.feedback.is_usable() {

@@ -35,6 +35,8 @@ pub struct Feedback {
     agreement: Agreement,
     /// Whether position and velocity contradicted each other since the last reset.
     contradicted: bool,
+    /// Whether the arm has lately sent readings that were rejected.
+    answers: bool,
     stillness: Stillness,
     estimator: VelocityEstimator,
     freshness: Freshness,
@@ -56,6 +58,7 @@ impl Feedback {
             plausibility: Plausibility::new(own, &l.position_lower, &l.position_upper, supervision.topology, read),
             agreement: Agreement::new(own),
             contradicted: false,
+            answers: false,
             stillness: Stillness::new(config.dof, supervision.accuracy),
             estimator: VelocityEstimator::default(),
             freshness: Freshness::default(),
@@ -82,6 +85,11 @@ impl Feedback {
     pub fn rejected_step(&self, time: f64) -> Option<(u16, f64)> {
         let rejected = self.rejected.as_ref().filter(|_| self.plausibility.rejected_for() >= Some(time))?;
         furthest(rejected.position.iter().zip(&self.state.position).map(|(now, before)| now - before))
+    }
+
+    /// Returns whether the arm is heard: what it says may be false, but its line works, and with it the commands.
+    pub fn is_heard(&self) -> bool {
+        self.freshness.fresh || self.answers
     }
 
     /// Returns whether the state is fresh and plausible.
@@ -145,6 +153,7 @@ impl Feedback {
             }
         }
         self.freshness = self.age(now, stalls);
+        self.answers = self.rejected.as_ref().is_some_and(|read| now.since(read.stamp) <= self.max_age);
         verdict
     }
 
