@@ -12,7 +12,7 @@ use dimos::joint::JointLimits;
 use dimos::robot::random::Random;
 
 use super::arms::{Arm, Bed, Setup, World, furthest};
-use super::lock;
+use super::{What, lock};
 use crate::support::motion_judge::Judge;
 
 /// When a lie begins.
@@ -46,6 +46,8 @@ pub(super) enum Act {
 
 /// How much later than in virtual time a wrong motion may be noticed, or a stop be sent, on a busy computer [s].
 pub(super) const LATE: f64 = 0.06;
+/// Setpoints of an honest trial's motion, at least.
+const SEEN: usize = 20;
 /// Time between two readings of the true joints.
 const LOOK: Duration = Duration::from_millis(2);
 
@@ -134,6 +136,11 @@ pub fn trial(arm: Arm, seed: u64) -> (String, Vec<String>) {
         trial.script(occasion, act);
     });
     let mut failures = trial.failures;
+    // A decoder that misses what is sent in motion would find nothing wrong.
+    let seen = bed.gate.sent().iter().filter(|one| matches!(one.what, What::Position(_) | What::Velocity(_))).count();
+    if honest && seen < SEEN {
+        failures.push(format!("only {seen} setpoints of a motion are judged"));
+    }
     failures.extend(bed.bounds.neighbours(&bed.gate.sent(), since).err());
     let found = lock(&watched).judge.found.clone();
     failures.extend(
