@@ -1,5 +1,5 @@
 # run install dist arm64 test-arm64 viewer check test test-fast package verified · test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants ·
-# bench bench-quick bench-page bench-share screenshots jitter soak lies lies-wire pauses
+# bench bench-quick bench-page bench-share screenshots jitter soak lies lies-wire pauses curves
 
 PYTHON ?= python3
 # Most tests wait rather than compute. More at a time than this and whole runs no longer keep their time.
@@ -28,7 +28,7 @@ PAGE := viewer/dist/index.html
 PAGE_SOURCES := $(wildcard viewer/*.json viewer/*.mjs) $(shell find viewer/src -type f 2>/dev/null)
 NODE := $(if $(wildcard viewer/package.json),$(shell command -v npm))
 
-.PHONY: run demo install dist arm64 test-arm64 shipped viewer viewer-if-possible check lint scripts spelling licences test test-fast package verified test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants bench bench-quick bench-page bench-share screenshots jitter soak lies lies-wire pauses
+.PHONY: run demo install dist arm64 test-arm64 shipped viewer viewer-if-possible check lint scripts spelling licences test test-fast package verified test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants bench bench-quick bench-page bench-share screenshots jitter soak lies lies-wire pauses curves
 
 # Builds the program to try it, not optimized, and starts a shipped blueprint; its arms are simulated. Ends with Ctrl-C.
 run: WHAT = run coordinator-yourarm
@@ -249,3 +249,7 @@ lies-wire:
 pauses:
 	DIMOS_PAUSES=200 cargo test --release --locked --test logic pauses:: -- --nocapture
 	DIMOS_WIRE_PAUSES=25 cargo test --locked --test realtime pauses_on_the_wire -- --nocapture
+
+# Lines, arcs and recorded paths of six arms, 54 of each, beside the shortest durations that CasADi finds: 15 minutes.
+curves: .venv/readers-installed
+	DIMOS_CURVES=9 cargo test --locked --test logic curves:: -- --nocapture
