@@ -1,5 +1,5 @@
-"""Efforts, gravity and mass matrices of robots by Pinocchio. Mimic joints are joints of their own there; what they do is
-folded into their leaders here."""
+"""Efforts, gravity and mass matrices of robots by Pinocchio. Mimic joints are joints of their own there; what they do
+is folded into their leaders here."""
 
 import json
 import sys

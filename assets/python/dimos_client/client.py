@@ -71,9 +71,10 @@ class Client(Planning):
         """Moves an arm to `target` [rad], a `named` pose, a `pose`, `by` a pose or `through` waypoints, or several arms
         together, with all keywords of `plan`; `speed`: 0.01–1 of the limits. With a planner in the run the motion is
         planned around obstacles, and after `replan` planned again when the world changes; `direct` moves straight in
-        joint space, not collision-checked. `on_path`: what is done at places of the path, as {"distance": 0.3,
-        "gripper": {"arm": "arm", "to": "open"}}, {"waypoint": 1, "output": {...}} or {..., "speed": 0.5}. Without a planner it is direct: `collision_checked` in the result says
-        which. Ends this client's own streams to the arm."""
+        joint space, not collision-checked. Without a planner it is direct: `collision_checked` in the result says
+        which. `on_path`: what is done at places of the path, as {"distance": 0.3, "gripper": {"arm": "arm",
+        "to": "open"}}, {"waypoint": 1, "output": {...}} or {..., "speed": 0.5}. Ends this client's own streams to the
+        arm."""
         goal = Goal(target, named, pose, linear, frame, by, via)
         where = where_to(arm, goal, through, blend, tcp_speed)
         plain = isinstance(arm, str) and target is not None and goal == Goal(target) and tcp_speed is None
@@ -84,7 +85,9 @@ class Client(Planning):
             try:
                 self._end_streams(self._streams_to([arm] if isinstance(arm, str) else arm))
                 plan = {**where, "speed": speed, "seed": seed}
-                return self._go({"plan": plan if timeout is None else {**plan, "timeout": timeout}}, wait, replan, on_path)
+                return self._go(
+                    {"plan": plan if timeout is None else {**plan, "timeout": timeout}}, wait, replan, on_path
+                )
             except Refused as error:
                 if not (error.code == "NO_PLANNER" and error.data is None and joints):
                     raise  # also when a planner was there and has gone

@@ -39,8 +39,9 @@ class Planning(Streams):
     ) -> Plan:
         """Plans a collision-free motion from where the arm is, and waits for the plan; moves nothing. The goal is one
         of `target` (joints [rad]), a `named` pose, a `pose` of the tool centre point, or a motion `by` a pose from
-        where that is; both in `frame`, on a straight line if `linear`, on an arc through the place `via`. Or one motion `through` waypoints, of which the
-        last is the goal; it passes them within `blend` [m], or stops at each. No tool is faster than `tcp_speed` [m/s].
+        where that is; both in `frame`, on a straight line if `linear`, on an arc through the place `via`. Or one motion
+        `through` waypoints, of which the last is the goal; it passes them within `blend` [m], or stops at each. No tool
+        is faster than `tcp_speed` [m/s].
         Several arms move together: `plan({"left": Goal(named="home"), "right": Goal(named="home")})`.
         `level`: "certified" proves the plan free of contact, "exact" also finds its clearance to 0.5 mm, "fast" checks
         samples only: `execute` takes such a plan with `unproven`. `refine`: rounds that look for a shorter path."""
