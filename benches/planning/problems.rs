@@ -173,7 +173,8 @@ impl Problem {
         let words = |values: &[f64]| values.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
         let mut text = format!("P {} {} {} {}\n", self.problem, self.index, words(&self.start), words(&self.goal));
         for thing in &self.obstacles {
-            let (a, b, c) = DQuat::from_array(thing.quat_xyzw).normalize().to_euler(glamx::EulerRot::XYZ);
+            // VAMP's angles are about the fixed axes x, y, z: about z first, if the axes turn along.
+            let (c, b, a) = DQuat::from_array(thing.quat_xyzw).normalize().to_euler(glamx::EulerRot::ZYX);
             let place = format!("{} {}", words(&thing.position), words(&[a, b, c]));
             let line = match (thing.kind.as_str(), thing.size.as_slice()) {
                 ("sphere", [r]) => format!("S {place} {r}"),

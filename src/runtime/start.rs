@@ -54,7 +54,7 @@ use dimos_log::files;
 use dimos_log::notes::{self, NoteReceiver, Notes};
 use dimos_log::recorder::{Notice, Recorder, RecorderConfig};
 use dimos_planner::planning::scene::config::PlannerConfig;
-use dimos_planner::planning::scene::planning_scene::PlanningScene;
+use dimos_planner::planning::scene::planning_scene::{PlanningScene, fixed_contacts};
 use dimos_robot::calibrated::Places;
 use dimos_rpc::report::StatusReport;
 use dimos_rpc::run_dir::Claim;
@@ -381,7 +381,15 @@ pub(in crate::runtime) fn robots(config: &PlannerConfig) -> Result<PlanningScene
             "robot {robot}: {a} and {b} touch in every configuration: they are not checked against each other"
         );
     }
+    warn_of_fixed_contacts(&fixed_contacts(&setup.world));
     Ok(setup)
+}
+
+/// Warns of pairs in contact that no motion changes.
+pub(in crate::runtime) fn warn_of_fixed_contacts(pairs: &[[String; 2]]) {
+    for [a, b] in pairs {
+        tracing::warn!("{a} and {b} touch, and no planned joint moves them: they are not checked against each other");
+    }
 }
 
 /// Returns the watchdog's work at each check that finds the tick alive.

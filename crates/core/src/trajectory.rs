@@ -52,7 +52,7 @@ pub enum TrajectoryError {
     #[error("joint {0:?} is named twice")]
     DuplicateJoint(String),
     /// Fewer than two points.
-    #[error("the trajectory has {0} point(s); a motion needs at least 2")]
+    #[error("the trajectory has {}; a motion needs at least 2", if *.0 == 1 { "1 point" } else { "no points" })]
     TooFewPoints(usize),
     /// A point has the wrong number of values.
     #[error("point {point}: {given} {what} for {joints} joints")]

@@ -2,9 +2,9 @@
 //! allocation.
 //!
 //! The recursive Newton-Euler algorithm in the frames of the bodies (Luh, Walker and Paul, "On-line computational
-//! scheme for mechanical manipulators", 1980; Featherstone, "Rigid Body Dynamics Algorithms", 2008, chapter 5): velocities and
-//! accelerations from the root outwards, forces back. Gravity is an acceleration of the root the other way. Mimic
-//! joints are folded into their leaders. Friction, rotors and springs are not part of it.
+//! scheme for mechanical manipulators", 1980; Featherstone, "Rigid Body Dynamics Algorithms", 2008, chapter 5):
+//! velocities and accelerations from the root outwards, forces back. Gravity is an acceleration of the root the other
+//! way. Mimic joints are folded into their leaders. Friction, rotors and springs are not part of it.
 
 use glamx::{DAffine3, DMat3, DVec3};
 use nalgebra::Isometry3;

@@ -102,7 +102,18 @@ impl Mesh {
         if mesh.triangles.is_empty() {
             return Err("no triangles".to_owned());
         }
+        if !mesh.triangles.iter().any(|triangle| mesh.has_area(*triangle)) {
+            return Err("no triangle has an area: its corners are on a line".to_owned());
+        }
         Ok(mesh)
+    }
+
+    /// Returns whether a triangle is more than a line: its height is larger than what rounding makes of zero.
+    fn has_area(&self, triangle: [u32; 3]) -> bool {
+        let corner = |i: u32| self.vertices.get(i as usize).map_or_else(Vector3::zeros, |vertex| vertex.coords);
+        let [a, b, c] = triangle.map(corner);
+        let (one, two) = (b - a, c - a);
+        one.cross(&two).norm() > 1e-7 * one.norm() * two.norm()
     }
 
     /// Returns the extents of the bounding box along x, y, z [m].

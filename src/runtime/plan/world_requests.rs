@@ -10,12 +10,13 @@ use nalgebra::{Isometry3, Matrix3, Vector3};
 use super::PlannerPort;
 use super::planner_port::{isometry, positions_of, robot_index, run_blocking, spec};
 use crate::runtime::internal;
+use crate::runtime::start::warn_of_fixed_contacts;
 use dimos_core::sync::lock;
 use dimos_planner::collision::pairs;
 use dimos_planner::collision::shape::Placed;
 use dimos_planner::collision::world::{Attached, Obstacle, World};
 use dimos_planner::planning::scene::config::{MAX_OBJECTS, ObjectConfig, ObjectShape};
-use dimos_planner::planning::scene::planning_scene::{PlannedRobot, obstacle};
+use dimos_planner::planning::scene::planning_scene::{PlannedRobot, fixed_contacts, obstacle};
 use dimos_robot::kinematics::{frame, pose};
 use dimos_rpc::api::{self, AttachReply, Done, LoadReport, Moment, ShapeSpec, WorldObject};
 use dimos_rpc::{Code, RpcError};
@@ -124,7 +125,10 @@ impl PlannerPort {
             let error = RpcError::new(Code::TooLarge, format!("the world has {MAX_OBJECTS} objects already"));
             return Err(error.hint("remove some with `dimos world remove`, or describe several by one mesh"));
         }
-        self.thread.world(|world| world.put(made)).map_err(|e| wrong(e.to_string()))?;
+        let put = |world: &mut World| world.put(made).map(|()| fixed_contacts(world));
+        let mut touching = self.thread.world(put).map_err(|e| wrong(e.to_string()))?;
+        touching.retain(|pair| pair.contains(&object.name));
+        warn_of_fixed_contacts(&touching);
         objects.insert(object.name.clone(), object);
         Ok(Done {})
     }

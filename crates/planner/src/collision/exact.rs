@@ -42,8 +42,6 @@ pub struct ExactChecker {
     pub(super) pairs: Vec<Pair>,
     /// Index of a pair of links in the scene, parallel to `pairs`.
     pub(super) link_pairs: Vec<usize>,
-    /// Pairs that never move and touch: no configuration is free.
-    pub(super) always: Option<Pair>,
     /// The pair that touched last: likely to touch again.
     pub(super) witness: Option<usize>,
     pub(super) pieces: Pieces,
@@ -56,7 +54,7 @@ pub struct ExactChecker {
     pub(super) pads: Vec<f64>,
     /// The largest of them.
     pub(super) most_pad: f64,
-    /// Pairs that never move relative to the world.
+    /// Pairs in contact that no joint moves: no motion changes that, so they are not checked.
     still: Vec<Pair>,
 }
 
@@ -93,7 +91,6 @@ impl ExactChecker {
             link_pairs,
             resolution: settings.certification.resolution,
             settings,
-            always: None,
             witness: None,
             pieces,
             lanes,
@@ -101,8 +98,13 @@ impl ExactChecker {
             scene: scene.clone(),
         };
         made.place(&vec![0.0; scene.dof()]);
-        made.always = made.still.iter().copied().find(|pair| made.gap_of(*pair, 0.0, 0.0) == Gap::Touch);
+        made.still = made.still.iter().copied().filter(|pair| made.gap_of(*pair, 0.0, 0.0) == Gap::Touch).collect();
         made
+    }
+
+    /// Returns the pairs in contact that no joint moves, by name: they are not checked.
+    pub fn fixed_contacts(&self) -> Vec<[String; 2]> {
+        self.still.iter().filter_map(|pair| self.scene.names(*pair)).collect()
     }
 
     /// Returns the scene.
@@ -306,6 +308,15 @@ fn outside(p: DVec3, frame: &DAffine3, half: DVec3) -> f64 {
 }
 
 impl Scene {
+    /// Returns the names of a pair's members.
+    fn names(&self, pair: Pair) -> Option<[String; 2]> {
+        let link = |l: usize| self.links.get(l).map(|link| link.name.clone());
+        Some(match pair {
+            Pair::Links(a, b) => [link(a)?, link(b)?],
+            Pair::Obstacle(l, o) => [link(l)?, self.obstacles.get(o)?.name.clone()],
+        })
+    }
+
     /// Returns every pair that must not touch.
     pub fn all_pairs(&self) -> impl Iterator<Item = Pair> + '_ {
         let obstacle = move |l: usize| (0..self.obstacles.len()).map(move |o| Pair::Obstacle(l, o));
@@ -344,9 +355,6 @@ impl CollisionChecker for ExactChecker {
     }
 
     fn motion_looks_free_at(&mut self, samples: Samples, from: &[f64], to: &[f64]) -> bool {
-        if self.always.is_some() {
-            return false;
-        }
         let pads = (&self.pads[..], self.most_pad);
         let (found, looked) = self.lanes.touching(samples, (from, to), pads, self.witness, Proof::None, 1.0);
         self.checks += looked;
@@ -355,17 +363,11 @@ impl CollisionChecker for ExactChecker {
     }
 
     fn any_contact_batch(&mut self, q: &[Lanes], lanes: u16) -> u16 {
-        if self.always.is_some() {
-            return lanes;
-        }
         self.checks += u64::from(lanes.count_ones());
         self.lanes.touching_lanes(q, (&self.pads, self.most_pad), lanes)
     }
 
     fn first_contact(&mut self, q: &[f64]) -> Option<Pair> {
-        if self.always.is_some() {
-            return self.always;
-        }
         self.first_touch(q).map(|i| self.pairs[i])
     }
 
@@ -386,10 +388,9 @@ impl CollisionChecker for ExactChecker {
 
     fn contacts(&mut self, q: &[f64]) -> Vec<Contact> {
         self.place(q);
-        let moving = self.pairs.iter().zip(&self.pads).map(|(pair, pad)| (*pair, *pad));
-        let all = moving.chain(self.still.iter().map(|pair| (*pair, 0.0)));
-        let touching = all.filter(|(pair, pad)| self.gap_of(*pair, *pad, 0.0) == Gap::Touch);
-        let mut contacts: Vec<Contact> = touching.filter_map(|(pair, _)| self.contact(pair)).collect();
+        let all = self.pairs.iter().zip(&self.pads);
+        let touching = all.filter(|(pair, pad)| self.gap_of(**pair, **pad, 0.0) == Gap::Touch);
+        let mut contacts: Vec<Contact> = touching.filter_map(|(pair, _)| self.contact(*pair)).collect();
         contacts.sort_by(|a, b| a.distance.total_cmp(&b.distance));
         contacts
     }

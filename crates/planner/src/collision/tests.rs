@@ -251,13 +251,27 @@ fn fork() -> Mesh {
 }
 
 #[test]
+fn what_no_joint_moves_is_not_checked_and_named() {
+    let table = Solid::cuboid(DVec3::new(2.0, 2.0, 0.1), DAffine3::from_translation(DVec3::Z * -0.05)).unwrap();
+    let mut robot = arm("", DVec3::ZERO);
+    robot.solids[0] = vec![Solid::cuboid(DVec3::splat(0.1), DAffine3::from_translation(DVec3::Z * 0.05)).unwrap()];
+    let mut world = World::new();
+    world.add_robot(robot).unwrap();
+    world.add(Obstacle { name: "table".into(), solid: table, padding: 0.0 }).unwrap();
+    let mut checker = checker(&world).with_padding(0.003);
+    assert_eq!(checker.fixed_contacts(), [["base".to_owned(), "table".to_owned()]]);
+    assert!(checker.is_free(&[0.0; 3]), "{:?}", checker.contacts(&[0.0; 3]));
+    assert!(checker.motion_is_free(&[0.0; 3], &[0.5, 0.2, 0.1], &Stop::never()));
+}
+
+#[test]
 fn a_decomposition_contains_the_mesh_and_leaves_its_gap_free() {
     let touched = |mode: MeshMode, at: DVec3| {
         let mut robot = arm("", DVec3::ZERO);
-        robot.solids = vec![of_mesh(&fork(), mode, DAffine3::IDENTITY).unwrap(), vec![], vec![], vec![]];
+        robot.solids = vec![vec![], of_mesh(&fork(), mode, DAffine3::IDENTITY).unwrap(), vec![], vec![]];
         let mut world = World::new();
         world.add_robot(robot).unwrap();
-        world.add(ball("ball", at, 0.002)).unwrap();
+        world.add(ball("ball", DVec3::Z * 0.1 + at, 0.002)).unwrap();
         !checker(&world).contacts(&[0.0; 3]).is_empty()
     };
     let between = DVec3::new(0.2, 0.25, 0.0);

@@ -253,8 +253,11 @@ fn attempt(
     let reached = |center: &[f64]| path.iter().any(|at| distance(at, center) < SAME_CONFIGURATION);
     let at_end = |exception: &&PaddingException| exception.near != Near::Goal || reached(&exception.center);
     let exceptions = stage.checker.exceptions().iter().filter(at_end).cloned().collect();
+    let fixed = stage.checker.fixed_contacts();
     let robots = stage.indices;
-    let ignored = setup.ignored_pairs(world, &robots);
+    let mut ignored = setup.ignored_pairs(world, &robots);
+    let reason = "touch, and no planned joint moves them";
+    ignored.extend(fixed.into_iter().map(|links| IgnoredPair { links, reason: reason.to_owned() }));
     Ok(PlannedMotion {
         robots,
         path,

@@ -92,6 +92,11 @@ impl Padded {
         &self.exceptions
     }
 
+    /// Returns the pairs in contact that no planned joint moves, by name: they are not checked.
+    pub fn fixed_contacts(&self) -> Vec<[String; 2]> {
+        self.bare.fixed_contacts()
+    }
+
     /// Returns whether nothing touches, regardless of the padding.
     pub fn touches_nothing(&mut self, q: &[f64]) -> bool {
         self.bare.is_free(q)

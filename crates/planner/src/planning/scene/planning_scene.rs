@@ -15,7 +15,7 @@ use crate::collision::allowed_pairs::always_touching;
 use crate::collision::body::{MeshMode, solids, solids_of, surface};
 use crate::collision::cloud::Cloud;
 use crate::collision::world::{Obstacle, Robot, World};
-use crate::collision::{Solid, ply};
+use crate::collision::{CheckSettings, ExactChecker, Solid, ply};
 use crate::planning::settings::PlannerSettings;
 use dimos_core::joint::{CommandLimits, DEFAULT_ACCELERATION};
 use dimos_robot::kinematics::tool_speed::ToolSpeed;
@@ -148,6 +148,11 @@ pub fn always_touch(robot: &Robot) -> Vec<[String; 2]> {
     let suspects = always_touching(&alone.snapshot(), &home, SAMPLES, 0).into_iter();
     let always = suspects.filter(|suspect| suspect.share > ALWAYS_RATIO);
     always.map(|suspect| [suspect.contact.link, suspect.contact.other]).collect()
+}
+
+/// Returns the pairs in contact of a world that no planned joint moves, by name: they are not checked.
+pub fn fixed_contacts(world: &World) -> Vec<[String; 2]> {
+    ExactChecker::new(world.snapshot(), CheckSettings::default()).fixed_contacts()
 }
 
 /// Builds a robot with all independent joints planned, alone in the world.
