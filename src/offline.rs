@@ -13,7 +13,7 @@ use dimos_robot::kinematics::Kinematics;
 pub use dimos_planner::collision::report::Contact;
 pub use dimos_planner::planning::ik::IkFailure;
 pub use dimos_planner::planning::ik::settings::IkSettings;
-pub use dimos_planner::planning::scene::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
+pub use dimos_planner::planning::scene::config::{GripperJoint, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
 pub use dimos_planner::planning::scene::ignored_pairs::IgnoredPair;
 pub use dimos_planner::planning::scene::planning_scene::{PlannedRobot, PlanningScene};
 pub use dimos_planner::planning::search::path::{distance, length, unwind};
