@@ -142,11 +142,11 @@ fn what_is_missing_or_wrong_is_named_and_nothing_is_written() {
     // All that is missing is named at once, also before the arm is known.
     let every = ["--address", "--gripper", "--model", "--tool", "--table"];
     for (given, missing) in [
-        ("", &[&["--arm"], &every[..]].concat()[..]),
-        ("--arm xarm6", &every),
-        ("--arm xarm6 --address sim --model xarm6", &["--gripper", "--tool", "--table"]),
-        ("--arm so101", &["--address", "--model", "--tool", "--table"]),
-        ("--arm mock --gripper none", &["--model", "--joints"]),
+        ("", [&["--arm"][..], &every].concat()),
+        ("--arm xarm6", every.to_vec()),
+        ("--arm xarm6 --address sim --model xarm6", vec!["--gripper", "--tool", "--table"]),
+        ("--arm so101", vec!["--address", "--model", "--tool", "--table"]),
+        ("--arm mock --gripper none", vec!["--model", "--joints"]),
     ] {
         let refused = home.dimos(&format!("new cell {given}")).with(2).says(&["these options are missing", "hint: "]);
         let named: Vec<&str> =

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 
 use crate::blueprint::{Blueprint, MetricsConfig};
-use crate::metrics::{Bound, Figures, LogFigures, Metrics, PlannerFigures};
+use crate::metrics::{Bound, Figures, LogFigures, Metrics};
 use crate::runtime::plan::PlannerPort;
 use crate::runtime::{Service, StartError};
 use dimos_core::sync::lock;
@@ -61,17 +61,6 @@ impl Service {
             log,
             planner: self.plans.port().map(PlannerPort::figures),
             counts: lock(&self.journal.counts).clone(),
-        }
-    }
-}
-
-impl PlannerPort {
-    /// Returns how the planner's requests have ended.
-    pub(in crate::runtime) fn figures(&self) -> PlannerFigures {
-        let tally = self.thread.tally();
-        PlannerFigures {
-            ended: [("PLANNED", tally.found), ("FAILED", tally.failed), ("CANCELLED", tally.cancelled)],
-            durations: tally.durations(),
         }
     }
 }

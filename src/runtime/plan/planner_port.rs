@@ -10,6 +10,7 @@ use nalgebra::Isometry3;
 use super::PlannerPort;
 use super::plan_requests::job;
 use super::world_requests::typed;
+use crate::metrics::PlannerFigures;
 use crate::runtime::internal;
 use crate::runtime::tool::tcp::TcpModel;
 use dimos_core::pose;
@@ -71,6 +72,15 @@ impl PlannerPort {
     /// Returns how long ago the run last sent the positions of its arms; `None`: not yet.
     pub(in crate::runtime) fn age(&self) -> Option<Duration> {
         lock(&self.measured).map(|at| at.elapsed())
+    }
+
+    /// Returns how the planner's requests have ended.
+    pub(in crate::runtime) fn figures(&self) -> PlannerFigures {
+        let tally = self.thread.tally();
+        PlannerFigures {
+            ended: [("PLANNED", tally.found), ("FAILED", tally.failed), ("CANCELLED", tally.cancelled)],
+            durations: tally.durations(),
+        }
     }
 
     /// Answers one of the planner's methods, except `execute_plan`: see [`release`](Self::release).
