@@ -4,7 +4,7 @@
 use std::io::IsTerminal;
 use std::path::Path;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 use serde_json::json;
 
@@ -21,6 +21,7 @@ use crate::runtime::tool::kinematics::use_kept;
 use crate::runtime::{AttachedPlanner, Ending, LinkEvent, bind_metrics};
 use crate::share::Relay;
 use crate::view::{self, Shown, View};
+use dimos_core::clock;
 use dimos_rpc::api::{State, Status};
 use dimos_rpc::client::{self, Client, ClientError};
 use dimos_rpc::report::{ArmReport, StatusReport};
@@ -214,7 +215,7 @@ impl Attached {
         };
         let planner = AttachedPlanner::start(&name, &config, &run.socket, on_event)
             .map_err(|e| Failure::new(Exit::Failed, e.to_string()).hint(e.hint()))?;
-        let started = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_secs_f64();
+        let started = clock::wall_now() as f64 * 1e-9;
         let figures = planner.figures(AttachedFigures {
             planner: name.clone(),
             blueprint: blueprint.name.clone(),

@@ -1,4 +1,5 @@
-//! Checks the names in a job against a run, or a blueprint, before anything moves: arms, poses, inputs, outputs, objects.
+//! Checks the names in a job against a run, or a blueprint, before anything moves: arms, poses, inputs, outputs,
+//! objects.
 
 use std::collections::BTreeMap;
 
