@@ -15,7 +15,7 @@ pub use dimos_planner::planning::curve::fit::fit;
 pub use dimos_planner::planning::curve::settings::FitSettings;
 pub use dimos_planner::planning::ik::IkFailure;
 pub use dimos_planner::planning::ik::settings::IkSettings;
-pub use dimos_planner::planning::scene::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
+pub use dimos_planner::planning::scene::config::{GripperJoint, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
 pub use dimos_planner::planning::scene::ignored_pairs::IgnoredPair;
 pub use dimos_planner::planning::scene::planning_scene::{PlannedRobot, PlanningScene};
 pub use dimos_planner::planning::search::path::{distance, length, unwind};

@@ -15,11 +15,13 @@ use super::run::Args;
 use super::run_record::RunRecord;
 use super::text_log::Terminal;
 use crate::blueprint::Blueprint;
+use crate::metrics::{AttachedFigures, Bound, Metrics};
 use crate::offline::RobotConfig;
 use crate::runtime::tool::kinematics::use_kept;
-use crate::runtime::{AttachedPlanner, Ending, LinkEvent};
+use crate::runtime::{AttachedPlanner, Ending, LinkEvent, bind_metrics};
 use crate::share::Relay;
 use crate::view::{self, Shown, View};
+use dimos_core::clock;
 use dimos_rpc::api::{State, Status};
 use dimos_rpc::client::{self, Client, ClientError};
 use dimos_rpc::report::{ArmReport, StatusReport};
@@ -34,6 +36,7 @@ pub struct Attached {
     arms: Vec<ArmReport>,
     planner: AttachedPlanner,
     view: Option<View>,
+    metrics: Option<Metrics>,
     /// The way to a run on another computer.
     _relay: Option<Relay>,
     /// Its name among the planners; released when it ends.
@@ -190,10 +193,8 @@ impl Attached {
         // The arms are connected in the run: their dimensions are those that were kept.
         let mut blueprint = blueprint.clone();
         use_kept(&mut blueprint).iter().for_each(|line| terminal.note(format!("  model      {line}")));
-        if blueprint.metrics.is_some() {
-            terminal.note("  metrics    those of the run; an attached planner serves none");
-        }
         let blueprint = &blueprint;
+        let bound = bind(blueprint, &run, terminal)?;
         let config = blueprint.planner.clone().unwrap_or_default();
         let (terminal, json) = (terminal.clone(), args.json);
         let on_event = {
@@ -214,6 +215,18 @@ impl Attached {
         };
         let planner = AttachedPlanner::start(&name, &config, &run.socket, on_event)
             .map_err(|e| Failure::new(Exit::Failed, e.to_string()).hint(e.hint()))?;
+        let started = clock::wall_now() as f64 * 1e-9;
+        let figures = planner.figures(AttachedFigures {
+            planner: name.clone(),
+            blueprint: blueprint.name.clone(),
+            run: run.name.clone(),
+            started,
+            ..AttachedFigures::default()
+        });
+        let metrics = bound.map(|bound| bound.serve(move |form| Some(figures()?.text(form)))).transpose();
+        let metrics = metrics.map_err(|e| {
+            Failure::new(Exit::Failed, format!("the metrics cannot be served: {e}")).hint("see ulimit -u")
+        })?;
         let reports = Client::connect(&run.name, &run.socket)
             .and_then(|mut client| Ok((client.call(Status {})?, client.call(State {})?)));
         let view = reports.as_ref().ok().filter(|_| !args.no_view).and_then(|(status, state)| {
@@ -223,7 +236,7 @@ impl Attached {
         });
         let arms = reports.map(|(status, _)| status.arms).unwrap_or_default();
         let (blueprint, ending) = (blueprint.name.clone(), channel());
-        Ok(Self { name, blueprint, run, arms, planner, view, _relay: relay, _claim: claim, ending })
+        Ok(Self { name, blueprint, run, arms, planner, view, metrics, _relay: relay, _claim: claim, ending })
     }
 
     /// Returns the URL of its live view, with the token, if it serves one.
@@ -282,9 +295,12 @@ impl Attached {
         let pid = std::process::id();
         if json {
             let robots: Vec<&str> = self.planner.robots().iter().map(|robot| robot.name.as_str()).collect();
-            return terminal.json(
-                &json!({"event": "attached", "planner": self.name, "run": self.run.name, "pid": pid, "robots": robots}),
-            );
+            let mut event =
+                json!({"event": "attached", "planner": self.name, "run": self.run.name, "pid": pid, "robots": robots});
+            if let Some(metrics) = &self.metrics {
+                event["metrics"] = json!(metrics.url());
+            }
+            return terminal.json(&event);
         }
         terminal.note(format_args!("planner {}  (pid {pid}, dimos {})", self.name, crate::VERSION));
         let place = self.run.at.as_ref().map(|place| format!(" at {place}")).unwrap_or_default();
@@ -301,8 +317,23 @@ impl Attached {
             let line = url.map_or_else(|| banner::view_without_token(view.address()), str::to_owned);
             terminal.private(format_args!("  view       {line}"));
         }
+        if let Some(metrics) = &self.metrics {
+            terminal.note(format_args!("  metrics    {}", metrics.url()));
+        }
         terminal.note("Press Ctrl-C to detach; the run continues. In another terminal: dimos plan");
     }
+}
+
+/// Takes the address of the planner's metrics, unless its run serves its own there: one blueprint may start both.
+fn bind(blueprint: &Blueprint, run: &LiveRun, terminal: &Terminal) -> Result<Option<Bound>> {
+    let Some(config) = &blueprint.metrics else { return Ok(None) };
+    let status = connect_to(run).and_then(|mut client| client.call(Status {}));
+    let of_run = status.ok().and_then(|status| status.metrics).filter(|_| run.at.is_none());
+    if of_run.is_some_and(|url| url == format!("http://{}/metrics", config.listen)) {
+        terminal.note("  metrics    that address is the run's: --set metrics.listen=127.0.0.1:PORT");
+        return Ok(None);
+    }
+    Ok(bind_metrics(blueprint)?)
 }
 
 /// Maximum time for a planner to end after SIGTERM.

@@ -53,9 +53,14 @@ impl Followed {
 /// Prints the end of a motion, and fails if it did not reach its goal. A signal has cancelled it.
 pub fn end(client: &mut Client, (report, cancelled): (MotionReport, Option<i32>), json: bool) -> Result {
     print(&report, json);
+    verdict(client, &report, cancelled)
+}
+
+/// Fails if a motion did not reach its goal. A signal has cancelled it.
+pub fn verdict(client: &mut Client, report: &MotionReport, cancelled: Option<i32>) -> Result {
     match cancelled {
         Some(signal) => Ok(Exit::by_signal(signal)),
-        None => completed(client, &report).map(|()| Exit::Ok),
+        None => completed(client, report).map(|()| Exit::Ok),
     }
 }
 

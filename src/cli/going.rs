@@ -2,22 +2,24 @@
 //! cancels it.
 
 use std::thread::sleep;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use serde_json::json;
 
 use super::arguments::connect;
 use super::exit::{Exit, Failure, Result};
-use super::follow::{Followed, Signals, end, watch};
+use super::follow::{Followed, Signals, end, verdict, watch};
 use super::goal::{Planned, no_plan, planning_bar, show};
 use super::output;
-use dimos_rpc::api::{Cancel, Go, GoBegun, GoStep, GoStepReport, Going, GoingReport};
+use dimos_rpc::api::{Cancel, Go, GoBegun, GoOutcome, GoStep, GoStepReport, Going, GoingReport};
 use dimos_rpc::client::{Client, ClientError};
 use dimos_rpc::report::MotionReport;
 use dimos_rpc::{Code, RpcError};
 
 /// Poll period.
 const POLL_PERIOD: Duration = Duration::from_millis(20);
+/// Maximum wait for the outcome of a request whose last motion has ended.
+const OUTCOME_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Why a step did not begin to move.
 pub enum NotBegun {
@@ -116,10 +118,30 @@ pub fn follow(
     watch(client, Followed::Going(going), begun.motion(), &cancel, title, signals)
 }
 
-/// As [`follow`]; prints the end, and fails if the motion did not get to its goal.
+/// As [`follow`]; prints the end, and fails if the motion did not get to its goal. As JSON it is the outcome of the
+/// request, if this was its last motion.
 pub fn finish(client: &mut Client, going: u64, begun: &GoBegun, signals: &Signals, json: bool) -> Result {
-    let ended = follow(client, going, begun, begun.task(), signals)?;
-    end(client, ended, json)
+    let (report, cancelled) = follow(client, going, begun, begun.task(), signals)?;
+    let outcome = if json { outcome(client, going, report.motion)? } else { None };
+    let Some(outcome) = outcome else { return end(client, (report, cancelled), json) };
+    output::json(&outcome);
+    verdict(client, &report, cancelled)
+}
+
+/// Returns the outcome of a request whose motion has ended; `None` if it continues with another step.
+fn outcome(client: &mut Client, going: u64, motion: u64) -> Result<Option<GoOutcome>> {
+    let began = Instant::now();
+    while began.elapsed() < OUTCOME_TIMEOUT {
+        let GoingReport { steps, outcome, .. } = client.call(Going { going })?;
+        if outcome.is_some() {
+            return Ok(outcome.filter(|outcome| outcome.motion.as_ref().is_some_and(|last| last.motion == motion)));
+        }
+        if steps.last().is_none_or(|step| step.motions.last().is_none_or(|last| last.motion != motion)) {
+            break;
+        }
+        sleep(POLL_PERIOD);
+    }
+    Ok(None)
 }
 
 /// Waits for the outcome of a step that grips, and prints it. A signal ends the whole; the fingers continue.

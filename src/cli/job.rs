@@ -8,6 +8,7 @@ mod names;
 mod schema_tests;
 mod step;
 mod times;
+mod without_run;
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -18,6 +19,7 @@ use super::arguments::Target;
 use super::exit::{Exit, Failure, Result};
 use super::follow::{Signals, held};
 use super::output;
+use crate::blueprint::Catalog;
 use dimos_rpc::api::{Lease, World};
 use execute::{End, Runner};
 use names::Names;
@@ -47,16 +49,19 @@ pub struct Args {
     /// Check the file, and its names if a run is live; move nothing
     #[arg(long)]
     pub check: bool,
+    /// Check it against this blueprint, without a run: arms, joints and their limits
+    #[arg(long, value_name = "BLUEPRINT", requires = "check", conflicts_with = "run")]
+    pub blueprint: Option<String>,
     /// Which run
     #[command(flatten)]
     pub target_run: Target,
 }
 
 /// Runs the verb.
-pub fn run(args: &Args) -> Result {
+pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
     let mut job = Job::read(&args.job)?;
     if args.check {
-        return check(args, &mut job);
+        return check(args, &mut job, catalog);
     }
     // A mistake in the file is reported without a run, too; with one, together with names that it does not know.
     let mut client = args.target_run.connect().or_else(|failure| job.verdict().and(Err(failure)))?;
@@ -130,13 +135,16 @@ pub fn run(args: &Args) -> Result {
 }
 
 /// Checks a job without running it.
-fn check(args: &Args, job: &mut Job) -> Result {
-    match args.target_run.connect_if_live()? {
-        Some(mut client) => Names::of(&mut client)?.check(job)?,
-        None => {
-            job.verdict()?;
-            output::note("no run is live: the names of arms, poses, inputs and objects were not checked");
-        }
+fn check(args: &Args, job: &mut Job, catalog: Catalog<'_>) -> Result {
+    if let Some(blueprint) = &args.blueprint {
+        Names::of_blueprint(blueprint, catalog)?.check(job)?;
+        output::note("saved poses, objects, grippers, inputs and outputs are a run's: they were not checked");
+    } else if let Some(mut client) = args.target_run.connect_if_live()? {
+        Names::of(&mut client)?.check(job)?;
+    } else {
+        without_run::doubt_positions(job);
+        job.verdict()?;
+        output::note("no run is live: the names of arms, poses, inputs and objects were not checked");
     }
     let count = |steps: &[Step]| {
         let mut all = Vec::new();

@@ -413,7 +413,7 @@ fn built_in(cli: &Cli, catalog: Catalog<'_>) -> exit::Result {
         Command::Preview(args) => preview::run(args),
         Command::Execute(args) => execute::run(args),
         Command::World(args) => world::run(args),
-        Command::Do(args) => job::run(args),
+        Command::Do(args) => job::run(args, catalog),
         Command::BackOut(args) => back_out::run(args),
         Command::Cancel(args) => cancel::run(args),
         Command::Pose(args) => pose::run(args),

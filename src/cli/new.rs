@@ -30,7 +30,7 @@ comments say what to look at next. Nothing is connected.
 
   dimos new my-cell
   dimos new my-cell --arm xarm6 --address 192.168.1.185     asks four questions
-  dimos new so101 --arm so101 --address /dev/ttyACM0 --model none
+  dimos new so101 --arm so101 --address /dev/ttyACM0 --model so101 --tool none --table 0
   dimos new ur5e --arm ur5e --address sim --model ur5e --tool 0 0 0.12 --table 0")]
 pub struct Args {
     /// Name of the blueprint, which is written to NAME.yaml
@@ -76,7 +76,7 @@ pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
     if path.exists() && !args.force {
         return Err(exists(&path));
     }
-    let cell = Cell::ask(args, &path, &Asker::new(), catalog.adapters)?;
+    let cell = Cell::ask(args, &path, &Asker::new(), catalog)?;
     let mut known = cell.robot.as_ref().map_or_else(Known::default, |robot| Known::of(robot, catalog));
     let mut text = text::of(&cell, &path, &known);
     let mut loaded = load(&path, &name, &text, catalog);

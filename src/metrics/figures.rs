@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use super::planner::PlannerFigures;
 use super::text::{Form, Kind, Text};
 use dimos_core::arm::Link;
 use dimos_core::telemetry::{Event, Phase, TaskState};
@@ -25,6 +26,8 @@ pub struct Figures {
     pub compute: Durations,
     /// The log; `None` without one.
     pub log: Option<LogFigures>,
+    /// What its own planner has done; `None` without one.
+    pub planner: Option<PlannerFigures>,
     /// What has happened.
     pub counts: Counts,
 }
@@ -82,6 +85,7 @@ impl Figures {
         self.tick(&mut text);
         self.arms(&mut text);
         self.events(&mut text);
+        self.planner.iter().for_each(|planner| planner.write(&mut text));
         self.log(&mut text);
         text.end()
     }

@@ -1,7 +1,8 @@
-//! Metrics of a run for Prometheus and others: `GET /metrics` at the address in the blueprint. One thread of ordinary
-//! priority answers; it reads what `status` reads, and nothing of the tick.
+//! Metrics of a run, or of a planner attached to one, for Prometheus and others: `GET /metrics` at the address in the
+//! blueprint. One thread of ordinary priority answers; it reads what `status` reads, and nothing of the tick.
 
 mod figures;
+mod planner;
 mod text;
 
 use std::borrow::Cow;
@@ -16,6 +17,7 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 
 pub use figures::{Counts, Figures, LogFigures};
+pub use planner::{AttachedFigures, PlannerFigures};
 pub use text::Form;
 
 use crate::http::{self, Reply, Request};
@@ -45,12 +47,12 @@ impl Bound {
         Ok(Self(listener))
     }
 
-    /// Starts to answer with what `figures` returns; `None`: the run has ended.
-    pub fn serve(self, figures: impl Fn() -> Option<Figures> + Send + Sync + 'static) -> io::Result<Metrics> {
+    /// Starts to answer with what `text` returns; `None`: the run has ended.
+    pub fn serve(self, text: impl Fn(Form) -> Option<String> + Send + Sync + 'static) -> io::Result<Metrics> {
         let at = self.0.local_addr()?;
         let runtime = tokio::runtime::Builder::new_current_thread().enable_io().enable_time().build()?;
         let (end, ended) = watch::channel(false);
-        let answer = Arc::new(move |request: &Request| answer(at, request, &figures));
+        let answer = Arc::new(move |request: &Request| answer(at, request, &text));
         let serving = move || {
             if let Err(error) = runtime.block_on(serve(self.0, answer, ended)) {
                 tracing::warn!("the metrics have ended: {error}");
@@ -104,7 +106,7 @@ async fn connection(mut stream: TcpStream, answer: Arc<Answer>) {
     let _ = http::send(&mut stream, reply).await;
 }
 
-fn answer(at: SocketAddr, request: &Request, figures: &impl Fn() -> Option<Figures>) -> Reply {
+fn answer(at: SocketAddr, request: &Request, text: &impl Fn(Form) -> Option<String>) -> Reply {
     if !http::is_own(at, request.header("host"), request.header("origin")) {
         return Reply::text(403, "metrics are served to programs, by the IP address of this computer or localhost");
     }
@@ -115,12 +117,12 @@ fn answer(at: SocketAddr, request: &Request, figures: &impl Fn() -> Option<Figur
         return Reply::text(404, "there is no such page: metrics are at /metrics");
     }
     let form = Form::accepted(request.header("accept"));
-    match figures() {
-        Some(figures) => Reply {
+    match text(form) {
+        Some(text) => Reply {
             status: 200,
             kind: form.content_type(),
             headers: "",
-            body: Cow::Owned(figures.text(form).into_bytes()),
+            body: Cow::Owned(text.into_bytes()),
             keep: false,
         },
         None => Reply::text(503, "the run has ended"),

@@ -39,6 +39,7 @@ pub use builder::Builder;
 pub use client::dispatch::log_of;
 pub use dimos_control::arm_control::effective as effective_speed;
 pub use handle::Handle;
+pub use log::metrics::bind as bind_metrics;
 pub use options::{Ended, Ending, Options, Record, StartError};
 pub use plan::attached::{AttachedPlanner, LinkEvent};
 #[cfg(feature = "view")]

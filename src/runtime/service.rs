@@ -181,6 +181,10 @@ impl Backend for Service {
         self.note_lease_taken(arm, client)
     }
 
+    fn refused(&self, method: &'static str, error: &RpcError) {
+        self.count_refusal(method, error);
+    }
+
     fn handled(&self) -> BoxFuture<'_, ()> {
         Box::pin(self.tick.next_tick())
     }

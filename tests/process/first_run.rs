@@ -61,7 +61,7 @@ fn a_move_ends_at_its_goal_and_replay_shows_it() {
         assert!((is - should).abs() <= 0.01, "{is} for {should}");
     }
     let report = home.dimos("move arm 0 0 0 0 0 0 --speed 1 --json").with(0).json();
-    assert_eq!(report["state"], "COMPLETED");
+    assert_eq!((&report["state"], &report["ended_by"]), (&"COMPLETED".into(), &"goal".into()), "{report}");
     for joint in report["deviation"].as_array().unwrap() {
         let off = joint["actual"].as_f64().unwrap() - joint["target"].as_f64().unwrap();
         assert!(off.abs() < 0.01, "{joint}");

@@ -2,11 +2,13 @@
 //! `promtool`.
 
 use std::collections::BTreeMap;
-use std::io::{Read, Write};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
+use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
+use dimos::rpc::api::{Lease, Move};
 use rustix::process::Signal;
 use serde_json::Value;
 
@@ -150,6 +152,107 @@ fn what_a_run_does_is_counted_and_read_by_prometheus() {
     let _silent: Vec<TcpStream> = (0..8).map(|_| TcpStream::connect(address).unwrap()).collect();
     assert_eq!(status_of(&request(address, &get).0), 200);
     assert_eq!(run.end(Signal::INT).code, Some(130));
+}
+
+/// What is refused before the run is asked: an arm that another client commands, and wrong parameters.
+#[test]
+fn refusals_for_leases_and_parameters_are_counted() {
+    let home = Home::new();
+    home.write("cell.yaml", BLUEPRINT);
+    let run = Started::of(home.as_typed("run --no-record cell.yaml").stdin(Stdio::null()));
+    run.until("Press Ctrl-C");
+    let url = home.status()["metrics"].as_str().unwrap().to_owned();
+    let address = url.strip_prefix("http://").unwrap().strip_suffix("/metrics").unwrap();
+    let mut commander = home.client();
+    commander.call(Lease { arm: Some("left".into()) }).unwrap();
+    home.dimos("move left 0.1 0").with(1).says(&["[LEASE_HELD]"]);
+    home.dimos("move left 0.1 0").with(1).says(&["[LEASE_HELD]"]);
+    home.dimos("arm disable left").with(1).says(&["[LEASE_HELD]"]);
+    let mut other = home.client();
+    other.call(Lease { arm: None }).unwrap_err();
+    other.call(Move::new("left", [], 7.0)).unwrap_err();
+    let mut socket = UnixStream::connect(home.path().join("run/dimos/cell.sock")).unwrap();
+    socket.write_all(b"{\"id\": 1, \"method\": \"made_up\"}\n").unwrap();
+    let mut reply = String::new();
+    BufReader::new(socket).read_line(&mut reply).unwrap();
+    assert!(reply.contains("UNKNOWN_METHOD"), "{reply}");
+    let text = request(address, &format!("GET /metrics HTTP/1.1\r\nHost: {address}")).1;
+    let refused: Vec<&str> = text.lines().filter_map(|l| l.strip_prefix("dimos_commands_refused_total")).collect();
+    let wanted = [
+        "{method=\"arm_disable\",code=\"LEASE_HELD\"} 1",
+        "{method=\"lease\",code=\"LEASE_HELD\"} 1",
+        "{method=\"move\",code=\"INVALID_PARAMS\"} 1",
+        "{method=\"move\",code=\"LEASE_HELD\"} 2",
+    ];
+    assert_eq!(refused, wanted, "{text}");
+    run.end(Signal::INT);
+}
+
+/// Of the run's own planner, and of one that is attached from another process.
+#[test]
+fn plans_are_counted_in_the_process_that_plans() {
+    let Some(python) = python_with(&["prometheus_client"]) else { return };
+    let (home, own) = (Home::new(), "metrics: {listen: '127.0.0.1:0'}\n");
+    home.write("both.yaml", &format!("include: [yourarm-planner]\n{own}"));
+    home.write("planner.yaml", &format!("name: lab\ninclude: [yourarm-planner]\n{own}"));
+    let plan_and_read = |address: &str| {
+        home.dimos("plan arm 0.3 -0.3 0.6 0 0.8 0").with(0);
+        home.dimos("plan arm --pose 3 0 0.3").with(1);
+        let (_, text) = request(address, &format!("GET /metrics HTTP/1.1\r\nHost: {address}"));
+        let all = samples(&parsed(&python, &text), "");
+        for (outcome, count) in [("PLANNED", 1.0), ("FAILED", 1.0), ("CANCELLED", 0.0)] {
+            assert_eq!(all[&format!("dimos_plans_total outcome={outcome}")], count, "{text}");
+        }
+        assert_eq!(all["dimos_planning_seconds_bucket le=+Inf"], 2.0, "{text}");
+        all
+    };
+    let address = |url: &str| url.strip_prefix("http://").unwrap().strip_suffix("/metrics").unwrap().to_owned();
+    let run = home.run("both.yaml --no-record");
+    let of_run = plan_and_read(&address(home.status()["metrics"].as_str().unwrap()));
+    assert!(of_run.contains_key("dimos_ticks_total "), "{of_run:?}");
+    run.end(Signal::INT).with(130);
+
+    let run = home.run("coordinator-yourarm --no-record");
+    let planner = home.start("run planner.yaml");
+    planner.until("Press Ctrl-C");
+    let said = planner.err();
+    let url = said.lines().find_map(|line| line.trim().strip_prefix("metrics ")).unwrap_or_else(|| panic!("{said}"));
+    let at = address(url.trim());
+    let of_planner = plan_and_read(&at);
+    let info = "dimos_planner_info blueprint=lab,planner=lab,run=coordinator-yourarm";
+    assert_eq!((of_planner[info], of_planner["dimos_planner_attached "]), (1.0, 1.0));
+    assert!((0.0..5.0).contains(&of_planner["dimos_planner_state_age_seconds "]), "{of_planner:?}");
+    assert_eq!(of_planner["dimos_planner_lost_runs_total "], 0.0);
+    run.end(Signal::INT).with(130);
+    planner.until("the run is gone");
+    let text = request(&at, &format!("GET /metrics HTTP/1.1\r\nHost: {at}")).1;
+    assert!(
+        text.contains("dimos_planner_attached 0\n") && text.contains("dimos_planner_lost_runs_total 1\n"),
+        "{text}"
+    );
+    planner.end(Signal::INT).with(130);
+}
+
+/// One blueprint may start the run and, beside it, the planner: that finds its address taken by the run.
+#[test]
+fn an_attached_planner_leaves_the_runs_address_to_the_run() {
+    let home = Home::new();
+    let free = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    let metrics = format!("metrics: {{listen: '{free}'}}\n");
+    home.write("cell.yaml", &format!("include: [coordinator-yourarm]\n{metrics}"));
+    home.write("lab.yaml", &format!("include: [yourarm-planner]\n{metrics}"));
+    let run = home.run("cell.yaml --no-record");
+    let planner = home.start("run lab.yaml");
+    planner.until("Press Ctrl-C");
+    let says = "that address is the run's: --set metrics.listen=127.0.0.1:PORT";
+    assert!(planner.err().contains(says), "{}", planner.err());
+    planner.end(Signal::INT).with(130);
+    let taken = TcpListener::bind("127.0.0.1:0").unwrap();
+    let at = taken.local_addr().unwrap();
+    home.dimos(&format!("run lab.yaml --set metrics.listen={at}"))
+        .with(1)
+        .says(&[&format!("the metrics cannot be served at {at}"), "hint: another run may have it"]);
+    run.end(Signal::INT).with(130);
 }
 
 #[test]

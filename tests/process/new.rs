@@ -17,8 +17,7 @@ fn arms(home: &Home, adapter: &str) -> Vec<String> {
 
 /// `dimos new ARM`, with no gripper, on a table where there is a built-in model of it.
 fn write(home: &Home, arm: &str, row: &Value) -> Ended {
-    // The SO-101's has its jaw for a joint: its blueprint says so, `new` does not.
-    let is_known = builtin::text(arm).is_some() && arm != "so101";
+    let is_known = builtin::text(arm).is_some();
     let model = if is_known { format!("{arm} --tool 0 0 0.1 --table 0") } else { "none".to_owned() };
     let dof = &row["dof"];
     let joints = if model == "none" && dof["min"] != dof["max"] { " --joints 6" } else { "" };
@@ -105,6 +104,32 @@ fn it_asks_on_a_terminal_and_a_wrong_answer_is_asked_for_again() {
     assert!(!home.path().join("other.yaml").exists());
 }
 
+/// The jaw of the SO-101 is a joint of its model, and none of the arm.
+#[test]
+fn the_so101_is_planned_with_its_jaw_where_it_is() {
+    let (home, terminal) = (Home::new(), Terminal::new(100, 50));
+    let asked = terminal.start(&home, "new cell --arm so101 --address sim");
+    for question in ["Model to plan with: builtin:NAME, a .urdf or .xacro file, or none [builtin:so101]", "from tcp"] {
+        terminal.until(question);
+        terminal.keys("\r");
+    }
+    terminal.until("Height of the table");
+    terminal.keys("0\r");
+    asked.wait().with(0);
+    let text = std::fs::read_to_string(home.path().join("cell.yaml")).unwrap();
+    for line in [
+        "      model_path: builtin:so101\n",
+        "      end_effector_link: tcp #",
+        "      joint_names: [joint1, joint2, joint3, joint4, joint5]\n",
+        "      gripper_joint: {joint: jaw_joint, closed: -0.174533, open: 1.74533}",
+        "named_poses: {home: [0.0, -0.8, ",
+    ] {
+        assert!(text.contains(line), "no {line:?} in\n{text}");
+    }
+    home.dimos("check cell.yaml").with(0).shows(&["no mistakes"]);
+    try_out(&home, "cell.yaml");
+}
+
 #[test]
 fn what_is_missing_or_wrong_is_named_and_nothing_is_written() {
     let home = Home::new();
@@ -113,6 +138,22 @@ fn what_is_missing_or_wrong_is_named_and_nothing_is_written() {
         let rest: Vec<&str> = all.into_iter().filter(|option| *option != missing).collect();
         let option = missing.split(' ').next().unwrap();
         home.dimos(&format!("new cell {}", rest.join(" "))).with(2).says(&[option, "is missing", "hint: "]);
+    }
+    // All that is missing is named at once, also before the arm is known.
+    let every = ["--address", "--gripper", "--model", "--tool", "--table"];
+    for (given, missing) in [
+        ("", [&["--arm"][..], &every].concat()),
+        ("--arm xarm6", every.to_vec()),
+        ("--arm xarm6 --address sim --model xarm6", vec!["--gripper", "--tool", "--table"]),
+        ("--arm so101", vec!["--address", "--model", "--tool", "--table"]),
+        ("--arm mock --gripper none", vec!["--model", "--joints"]),
+    ] {
+        let refused = home.dimos(&format!("new cell {given}")).with(2).says(&["these options are missing", "hint: "]);
+        let named: Vec<&str> =
+            refused.err.lines().filter_map(|line| line.strip_prefix("  --")?.split(' ').next()).collect();
+        let missing: Vec<&str> = missing.iter().map(|option| &option[2..]).collect();
+        assert_eq!(named, missing, "{given}: {}", refused.err);
+        assert!(refused.err.lines().all(|line| line.chars().count() <= 110), "{}", refused.err);
     }
     for (wrong, said) in [
         ("--arm xarm6 --address 10.0.0.1:x", "--address: "),

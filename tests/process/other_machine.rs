@@ -32,10 +32,12 @@ struct Machine {
     program: PathBuf,
 }
 
-/// This machine and the emulated one. Nothing where that is missing.
+/// This machine and the emulated one. Nothing where that is missing. `DIMOS_HERE` and `DIMOS_AARCH64` name other
+/// programs of theirs.
 fn machines() -> Option<[Machine; 2]> {
-    let ours = PathBuf::from(env!("CARGO_BIN_EXE_dimos"));
-    let built = ours.ancestors().nth(2).unwrap().join("cross/dimos-aarch64");
+    let tested = PathBuf::from(env!("CARGO_BIN_EXE_dimos"));
+    let built = tested.ancestors().nth(2).unwrap().join("cross/dimos-aarch64");
+    let ours = std::env::var_os("DIMOS_HERE").map_or(tested, PathBuf::from);
     let theirs = std::env::var_os("DIMOS_AARCH64").map_or(built, PathBuf::from);
     if !theirs.exists() {
         skip_optional("dimos for aarch64 (make test-arm64)");

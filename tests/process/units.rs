@@ -90,6 +90,34 @@ fn shell_files_requests_and_python() {
     run.end(rustix::process::Signal::INT).with(130);
 }
 
+/// A job is checked without a run, too: by the limits of a blueprint's arms, or of no arm.
+#[test]
+fn a_job_in_degrees_is_found_without_a_run() {
+    let home = Home::new();
+    let job = |steps: &str| home.write("job.yaml", &format!("steps:\n{steps}"));
+    job("  - move: home\n  - move: {joints: [0, 90, 0, 0, 0, 0]}\n");
+    home.dimos("do job.yaml --check").with(2).says(&[
+        "job.yaml:3:5",
+        "joint 2 at 90 rad is more than a turn",
+        DEGREES,
+        "--blueprint NAME",
+    ]);
+    let by = |blueprint: &str| home.dimos(&format!("do job.yaml --check --blueprint {blueprint}"));
+    by("yourarm-planner").with(2).says(&["job.yaml:3:5", "arm_joint2 at 90 rad is outside its limits", DEGREES]);
+    // Within a turn, and outside the limits of this arm; joints that another arm has.
+    job("  - move: {joints: [0, 6, 0, 0, 0, 0]}\n  - through: [{joints: [0, 0]}, home]\n");
+    home.dimos("do job.yaml --check").with(0).says(&["no run is live"]);
+    by("yourarm-planner").with(2).says(&["arm_joint2 at 6 rad", "rad", "arm has 6 joints, the goal 2 values"]);
+    job("  - move: home\n  - move: {joints: [0, 0.3, 0, 0, 0, 0]}\n  - gripper: {to: open, arm: rarm}\n");
+    by("yourarm-planner").with(2).says(&["the blueprint has no arm", "did you mean `arm`?"]);
+    by("coordinator-yourarm").with(2).says(&["this blueprint has no planner"]);
+    job("  - move: home\n  - move: {joints: [0, 0.3, 0, 0, 0, 0]}\n  - gripper: open\n");
+    let sound = by("yourarm-planner").with(0).says(&["they were not checked"]);
+    assert_eq!(sound.out, "job.yaml: 3 steps, no mistakes\n");
+    by("no-such").with(2);
+    home.dimos("do job.yaml --blueprint yourarm-planner").with(2).says(&["--check"]);
+}
+
 /// What the Python client says of a pose in degrees and of an obstacle in millimetres.
 fn python(home: &Home) -> String {
     const PROGRAM: &str = "

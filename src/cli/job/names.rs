@@ -1,4 +1,5 @@
-//! Checks the names in a job against a run before anything moves: arms, poses, inputs, outputs, objects.
+//! Checks the names in a job against a run, or a blueprint, before anything moves: arms, poses, inputs, outputs,
+//! objects.
 
 use std::collections::BTreeMap;
 
@@ -16,17 +17,19 @@ use dimos_yaml::{NodeId, did_you_mean, quote};
 /// How far beyond a limit a goal is left to the planner [rad].
 const BEYOND: f64 = 0.05;
 
-/// What a run has.
+/// What a run has, or a blueprint.
 pub struct Names {
+    /// Whether it is a run; of a blueprint, less is known.
+    pub(super) is_live: bool,
     /// Its arms.
     pub arms: Vec<ArmReport>,
     /// Whether it has a planner.
     pub planner: bool,
     /// Joints of each arm, in order.
-    joints: BTreeMap<String, Vec<String>>,
-    robots: Vec<RobotReport>,
-    poses: BTreeMap<String, dimos_rpc::api::SavedPose>,
-    objects: Vec<String>,
+    pub(super) joints: BTreeMap<String, Vec<String>>,
+    pub(super) robots: Vec<RobotReport>,
+    pub(super) poses: BTreeMap<String, dimos_rpc::api::SavedPose>,
+    pub(super) objects: Vec<String>,
 }
 
 /// A mistake: where, what, hint.
@@ -43,7 +46,7 @@ impl Names {
         let objects = objects.into_iter().map(|object| object.name).collect();
         let own = |arm: ArmStateReport| (arm.hardware_id, arm.joints.into_iter().map(|joint| joint.name).collect());
         let joints = client.call(State {})?.arms.into_iter().map(own).collect();
-        Ok(Self { joints, arms, planner, robots, poses, objects })
+        Ok(Self { is_live: true, joints, arms, planner, robots, poses, objects })
     }
 
     /// Returns an arm.
@@ -51,7 +54,7 @@ impl Names {
         self.arms.iter().find(|arm| arm.hardware_id == name)
     }
 
-    /// Gives every step of a job its arm, and reports the names that the run does not know.
+    /// Gives every step of a job its arm, and reports the names that are not known.
     pub fn check(&self, job: &mut Job) -> Result<()> {
         if let ("", [only]) = (job.arm.as_str(), self.arms.as_slice()) {
             job.arm.clone_from(&only.hardware_id);
@@ -66,17 +69,22 @@ impl Names {
         job.verdict()
     }
 
+    fn whose(&self) -> &'static str {
+        if self.is_live { "run" } else { "blueprint" }
+    }
+
     fn mistake(&self, step: &Step) -> Option<Mistake> {
         let say = |what: String, hint: Option<String>| Some((step.at, what, hint));
+        let whose = self.whose();
         let unknown = |kind: &str, name: &str, known: &mut dyn Iterator<Item = &str>| {
-            say(format!("the run has no {kind} {}", quote(name)), did_you_mean(name, known, "it has"))
+            say(format!("the {whose} has no {kind} {}", quote(name)), did_you_mean(name, known, "it has"))
         };
         match &step.act {
             Act::Repeat { .. } | Act::Wait(_) => return None,
             Act::Attach(_) | Act::Detach(_) if !self.planner => {
-                return say("this run has no planner, which knows objects".to_owned(), None);
+                return say(format!("this {whose} has no planner, which knows objects"), None);
             }
-            Act::Attach(Attach { name, .. }) | Act::Detach(name) if !self.objects.contains(name) => {
+            Act::Attach(Attach { name, .. }) | Act::Detach(name) if self.is_live && !self.objects.contains(name) => {
                 return unknown("object", name, &mut self.objects.iter().map(String::as_str));
             }
             Act::Detach(_) => return None,
@@ -85,7 +93,7 @@ impl Names {
         let names = &mut self.arms.iter().map(|arm| arm.hardware_id.as_str());
         if step.arm.is_empty() {
             let all: Vec<&str> = names.collect();
-            return say(format!("which arm? the run has {}", all.join(", ")), Some("name it: `arm: …`".into()));
+            return say(format!("which arm? the {whose} has {}", all.join(", ")), Some("name it: `arm: …`".into()));
         }
         let Some(arm) = self.arm(&step.arm) else { return unknown("arm", &step.arm, names) };
         let levels = |kind: &str| {
@@ -105,6 +113,7 @@ impl Names {
         };
         match &step.act {
             Act::Move(motion) => self.motion(step, motion, arm),
+            _ if !self.is_live => None,
             Act::Gripper { to, force, object, .. } => {
                 let wrong = grip::impossible(arm, *to, *force).map(|(what, hint)| (step.at, what, hint));
                 wrong.or_else(|| match object.is_some() && arm.gripper_range.is_none() {
@@ -122,7 +131,7 @@ impl Names {
         let say = |what: String, hint: &str| Some((step.at, what, Some(hint.to_owned())));
         if !motion.direct && !self.planner {
             let hint = "run a planner blueprint; or write `direct: true`: not collision-checked";
-            return say("this run has no planner".to_owned(), hint);
+            return say(format!("this {} has no planner", self.whose()), hint);
         }
         for act in &motion.on_path {
             if act.waypoint.is_some_and(|number| number > motion.through.len()) {
@@ -146,7 +155,7 @@ impl Names {
                     let name = name.map_or("a joint", String::as_str);
                     return say(format!("{name} at {position} rad is outside its limits"), &hint);
                 }
-                PlanGoal { named: Some(name), .. } if self.named(&step.arm, name).is_none() => {
+                PlanGoal { named: Some(name), .. } if self.is_live && self.named(&step.arm, name).is_none() => {
                     let robots = self.robots.iter().filter(|robot| robot.name == step.arm);
                     let names = robots.flat_map(|robot| robot.named_poses.keys()).chain(self.poses.keys());
                     let hint = did_you_mean(name, names.map(String::as_str), "it has");

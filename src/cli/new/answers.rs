@@ -1,5 +1,7 @@
-//! Questions with their options: an option answers its question; on a terminal the others are asked.
+//! Questions with their options: an option answers its question; on a terminal the others are asked, elsewhere all that
+//! are missing are named at once.
 
+use std::cell::RefCell;
 use std::io::{self, IsTerminal, Write};
 
 use crate::cli::ask;
@@ -14,6 +16,8 @@ const MAX_WRONG: usize = 5;
 pub struct Asker {
     /// Watched while a person is asked.
     person: Option<Signals>,
+    /// Options without an answer, and their questions.
+    missing: RefCell<Vec<(&'static str, String)>>,
 }
 
 /// A question.
@@ -30,7 +34,29 @@ impl Asker {
     /// Asks if stdin and stderr are a terminal.
     pub fn new() -> Self {
         let is_asked = io::stdin().is_terminal() && io::stderr().is_terminal();
-        Self { person: is_asked.then(Signals::watch) }
+        Self { person: is_asked.then(Signals::watch), missing: RefCell::default() }
+    }
+
+    /// Notes that an option is missing, if no person is asked.
+    pub fn miss(&self, option: &'static str, text: impl Into<String>) {
+        if self.person.is_none() {
+            self.missing.borrow_mut().push((option, text.into()));
+        }
+    }
+
+    /// Fails if options are missing.
+    pub fn complete(&self) -> Result<()> {
+        let missing = self.missing.borrow();
+        let what = match missing.as_slice() {
+            [] => return Ok(()),
+            [(option, text)] => format!("{option} is missing: {text}"),
+            several => {
+                let line = |(option, text): &(&str, String)| format!("\n  {option:9}  {text}");
+                format!("these options are missing:{}", several.iter().map(line).collect::<String>())
+            }
+        };
+        let hint = "stdin is not a terminal, so that all answers must be options: `dimos new --help` shows them";
+        Err(Failure::usage(what).hint(hint))
     }
 
     /// Prints what helps to answer, if a person is asked.
@@ -40,21 +66,21 @@ impl Asker {
         }
     }
 
-    /// Returns the answer: of the option if it is given, otherwise of the person. The error of `read` is that of a
-    /// wrong answer; a person gets it, and may answer again.
+    /// Returns the answer: of the option if it is given, otherwise of the person; `None`: the option is missing. The
+    /// error of `read` is that of a wrong answer; a person gets it, and may answer again.
     pub fn ask<T>(
         &self,
         question: &Question<'_>,
         given: Option<&str>,
         read: impl Fn(&str) -> std::result::Result<T, Failure>,
-    ) -> Result<T> {
+    ) -> Result<Option<T>> {
         let option = question.option;
         if let Some(given) = given {
-            return read(given).map_err(|f| Failure { what: format!("{option}: {}", f.what), ..f });
+            return read(given).map(Some).map_err(|f| Failure { what: format!("{option}: {}", f.what), ..f });
         }
         let Some(signals) = &self.person else {
-            let hint = "stdin is not a terminal, so that all answers must be options: `dimos new --help` shows them";
-            return Err(Failure::usage(format!("{option} is missing: {}", question.text)).hint(hint));
+            self.miss(option, &question.text);
+            return Ok(None);
         };
         let default = question.default;
         let prompt = if default.is_empty() { String::new() } else { format!(" [{default}]") };
@@ -62,7 +88,7 @@ impl Asker {
             let _ = write!(io::stderr(), "{}{prompt}: ", question.text);
             let answer = ask::line(signals).ok_or_else(|| ask::interrupted(signals))?;
             match read(if answer.is_empty() { default } else { &answer }) {
-                Ok(value) => return Ok(value),
+                Ok(value) => return Ok(Some(value)),
                 Err(failure) => output::failure(&failure),
             }
         }

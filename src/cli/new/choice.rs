@@ -5,13 +5,15 @@ use std::path::{Path, PathBuf};
 use schemars::SchemaGenerator;
 use serde_json::{Map, Value, json};
 
-use super::Args;
 use super::answers::{Asker, Question};
+use super::{Args, shipped};
+use crate::blueprint::Catalog;
 use crate::cli::adapter::choice::joints as joints_of_row;
 use crate::cli::arguments::length;
 use crate::cli::exit::{Failure, Result};
 use crate::cli::model::chain::end_of_arm;
 use crate::cli::model::robot as checked_robot;
+use crate::offline::GripperJoint;
 use dimos_hardware::registry::{AdapterConfig, AdapterSpec, Registry, SIM};
 use dimos_robot::builtin;
 use dimos_robot::{self as robot, Source};
@@ -50,18 +52,23 @@ pub struct Robot {
     pub joints: Vec<String>,
     /// All links.
     pub links: Vec<String>,
+    /// The joint of the model that the gripper drives, where a built-in blueprint names it.
+    pub gripper_joint: Option<GripperJoint>,
     /// The tool centre point in the frame of the end [m].
     pub tool: Option<[f64; 3]>,
 }
 
 impl Cell {
     /// Asks what the options do not answer. `path`: where the blueprint is to be.
-    pub fn ask(args: &Args, path: &Path, asker: &Asker, registry: &Registry) -> Result<Self> {
+    pub fn ask(args: &Args, path: &Path, asker: &Asker, catalog: Catalog<'_>) -> Result<Self> {
+        let registry = catalog.adapters;
         if args.arm.is_none() {
             asker.explain(arms(registry));
         }
         let question = Question { option: "--arm", text: "Which arm".into(), default: "" };
-        let (row, model) = asker.ask(&question, args.arm.as_deref(), |text| arm(registry, text))?;
+        let Some((row, model)) = asker.ask(&question, args.arm.as_deref(), |text| arm(registry, text))? else {
+            return Err(nothing_without_an_arm(args, asker));
+        };
         let address = address(args, asker, &row)?;
         let mut options = Map::new();
         model.iter().for_each(|model| drop(options.insert("model".into(), json!(model))));
@@ -71,32 +78,52 @@ impl Cell {
         let stem = model.as_deref().unwrap_or(row.name);
         let has_gripper = gripper.is_some_and(|gripper| gripper != json!(NONE) && gripper != json!(false));
         let fitting = fitting(&row, &options)?;
-        // A built-in model may have its jaw for a joint: its blueprint says which joints are the arm's.
+        let read = |text: &str| planned(text, path, catalog);
         let default = default_model(stem, has_gripper);
-        let fits = planned(&default, path)?.is_none_or(|robot| fitting.contains(&robot.joints.len()));
+        let fits = read(&default)?.is_none_or(|robot| fitting.contains(&robot.joints.len()));
         let default = if fits { default } else { NONE.to_owned() };
         let text = "Model to plan with: builtin:NAME, a .urdf or .xacro file, or none".to_owned();
         let question = Question { option: "--model", text, default: &default };
-        let mut robot = asker.ask(&question, args.model.as_deref(), |text| planned(text, path))?;
+        let robot = asker.ask(&question, args.model.as_deref(), read)?;
+        // What the default model would be asked is missing, too.
+        let mut robot = robot.map_or_else(|| read(&default), Ok)?;
         let joints = joints(args, asker, &row, robot.as_ref(), &fitting)?;
+        let mut table = None;
         if let Some(robot) = &mut robot {
             robot.flange = flange(&row, &options, joints, robot);
             let given = Some(args.tool.join(" ")).filter(|tool| !tool.is_empty());
             let text = format!("Tool centre point from {}: x y z [m], or none", robot.end);
             let question = Question { option: "--tool", text, default: NONE };
-            robot.tool = asker.ask(&question, given.as_deref(), tool)?;
-        }
-        let mut table = None;
-        if robot.is_some() {
+            robot.tool = asker.ask(&question, given.as_deref(), tool)?.flatten();
             let text = "Height of the table above the arm's base [m], or none".to_owned();
             let question = Question { option: "--table", text, default: NONE };
-            table = asker.ask(&question, args.table.as_deref(), height)?;
-        } else if args.tool.iter().chain(&args.table).any(|text| text != NONE) {
+            table = asker.ask(&question, args.table.as_deref(), height)?.flatten();
+        }
+        asker.complete()?;
+        if robot.is_none() && args.tool.iter().chain(&args.table).any(|text| text != NONE) {
             let what = "--tool and --table are for planning, which needs a model";
             return Err(Failure::usage(what).hint("give --model, or omit them"));
         }
         Ok(Self { row, address, options, joints, robot, table })
     }
+}
+
+/// Returns an error that names all that is missing where not even the arm is known.
+fn nothing_without_an_arm(args: &Args, asker: &Asker) -> Failure {
+    let is_planned = args.model.as_deref() != Some(NONE);
+    for (option, text, is_missing) in [
+        ("--address", "Its address, or sim; of an arm that has one", args.address.is_none()),
+        ("--gripper", "Its gripper, or none; of an arm that has a choice", args.gripper.is_none()),
+        ("--model", "Model to plan with, or none", args.model.is_none()),
+        ("--tool", "Tool centre point, or none; with a model", args.tool.is_empty() && is_planned),
+        ("--table", "Height of the table, or none; with a model", args.table.is_none() && is_planned),
+    ] {
+        if is_missing {
+            asker.miss(option, text);
+        }
+    }
+    let left_out = || Failure::usage("--arm is missing").hint("`dimos list-adapters` lists them");
+    asker.complete().err().unwrap_or_else(left_out)
 }
 
 /// Returns the arms for a person: each adapter with its models.
@@ -141,7 +168,8 @@ fn address(args: &Args, asker: &Asker, row: &AdapterSpec) -> Result<String> {
     };
     let (form, sim) = (row.address.form, if row.emulate.is_some() { SIM } else { "" });
     let text = format!("Its address: {form}, or sim while you have none");
-    asker.ask(&Question { option: "--address", text, default: sim }, args.address.as_deref(), read)
+    let question = Question { option: "--address", text, default: sim };
+    Ok(asker.ask(&question, args.address.as_deref(), read)?.unwrap_or_default())
 }
 
 /// Returns the option `gripper` of an adapter that has one.
@@ -171,7 +199,7 @@ fn gripper(args: &Args, asker: &Asker, row: &AdapterSpec) -> Result<Option<Value
         }
     };
     let text = format!("Its gripper: {}", shown.join(", "));
-    asker.ask(&Question { option: "--gripper", text, default }, args.gripper.as_deref(), read).map(Some)
+    asker.ask(&Question { option: "--gripper", text, default }, args.gripper.as_deref(), read)
 }
 
 /// Returns the values that an option of an adapter may have by its schema, and its default.
@@ -208,8 +236,8 @@ fn default_model(stem: &str, gripper: bool) -> String {
     known.map_or_else(|| NONE.to_owned(), |name| format!("{}{name}", builtin::PREFIX))
 }
 
-/// Reads a model.
-fn planned(text: &str, blueprint: &Path) -> Result<Option<Robot>> {
+/// Reads a model. Of a built-in one, a built-in blueprint may know which joint is no joint of the arm.
+fn planned(text: &str, blueprint: &Path, catalog: Catalog<'_>) -> Result<Option<Robot>> {
     if text == NONE {
         return Ok(None);
     }
@@ -217,7 +245,9 @@ fn planned(text: &str, blueprint: &Path) -> Result<Option<Robot>> {
     let or_hint = || Some("builtin:NAME, a .urdf or .xacro file, or none".to_owned());
     let (model, _) = checked_robot(robot::load(&Source::new(&file)), Path::new(&file))
         .map_err(|failure| Failure { hint: failure.hint.clone().or_else(or_hint), ..failure })?;
-    let end = end_of_arm(&model);
+    let known = shipped::with_gripper_joint(&file, catalog);
+    let end = known.as_ref().and_then(|known| model.link_index(&known.end_effector_link));
+    let end = end.unwrap_or_else(|| end_of_arm(&model));
     let name = |link: usize| model.links.get(link).map(|link| link.name.clone()).unwrap_or_default();
     let between = model.independent_of(&model.path(0, end));
     let joints: Vec<String> = between.iter().filter_map(|joint| Some(model.joints.get(*joint)?.name.clone())).collect();
@@ -231,7 +261,8 @@ fn planned(text: &str, blueprint: &Path) -> Result<Option<Robot>> {
         false => file,
     };
     let links = model.links.iter().map(|link| link.name.clone()).collect();
-    Ok(Some(Robot { path, base: name(0), end: name(end), flange: None, joints, links, tool: None }))
+    let gripper_joint = known.and_then(|known| known.gripper_joint);
+    Ok(Some(Robot { path, base: name(0), end: name(end), flange: None, joints, links, gripper_joint, tool: None }))
 }
 
 fn config(row: &AdapterSpec, options: &Map<String, Value>, dof: usize) -> AdapterConfig {
@@ -263,11 +294,7 @@ fn joints(args: &Args, asker: &Asker, row: &AdapterSpec, robot: Option<&Robot>, 
     let of_model = robot.map(|robot| robot.joints.len().to_string());
     match (fitting, &of_model, &args.joints) {
         (_, Some(count), None) => {
-            let built_in = format!("{}-planner", row.name);
-            let hint = match crate::blueprint::names().contains(&built_in) {
-                true => format!("give --model none, or begin with the built-in blueprint {built_in}"),
-                false => "give the model of this arm, or --model none".to_owned(),
-            };
+            let hint = "give the model of this arm, or --model none";
             read(count).map_err(|f| Failure { what: format!("--model: {}, as its model has", f.what), ..f }.hint(hint))
         }
         ([only], None, None) => Ok(*only),
@@ -276,7 +303,8 @@ fn joints(args: &Args, asker: &Asker, row: &AdapterSpec, robot: Option<&Robot>, 
         }
         _ => {
             let question = Question { option: "--joints", text: format!("Number of joints: {known}"), default: "" };
-            asker.ask(&question, args.joints.as_deref(), read)
+            let least = fitting.first().copied().unwrap_or_default();
+            Ok(asker.ask(&question, args.joints.as_deref(), read)?.unwrap_or(least))
         }
     }
 }

@@ -8,6 +8,7 @@ use serde_json::{Map, Value};
 
 use super::choice::{Cell, Robot};
 use super::shipped::Known;
+use crate::offline::GripperJoint;
 use dimos_hardware::registry::SIM;
 
 /// The arm's name in the blueprint.
@@ -148,6 +149,12 @@ planner:
         robot.joints.first().map_or("", |name| name),
         names.first().map_or("", |name| name),
     );
+    if let Some(GripperJoint { joint, closed, open }) = &robot.gripper_joint {
+        let joint = scalar(joint);
+        text += &format!(
+            "      gripper_joint: {{joint: {joint}, closed: {closed}, open: {open}}} # planned for where it is\n"
+        );
+    }
     if !known.exclusions.is_empty() {
         let pairs = known.exclusions.iter().map(|[a, b]| format!("[{}, {}]", scalar(a), scalar(b)));
         text += &format!(

@@ -84,7 +84,8 @@ impl Service {
         let then = self.what_follows(&call).await?;
         let arm = [call.arm.clone()];
         let command = Call::Gripper(call.command(self.position_of(&call)?));
-        let Reply::Gripper(sent) = going.command(&arm, Box::pin(self.answer_counted(command, *origin))).await? else {
+        let (method, answer) = (command.method(), Box::pin(self.answer_counted(command, *origin)));
+        let Reply::Gripper(sent) = going.command(&arm, method, answer).await? else {
             return Err(internal().into());
         };
         let asked = Grip { arm: call.arm.clone(), order: Some(sent.order) };
@@ -107,14 +108,15 @@ impl Service {
             Then::Attach(robot, name) => {
                 let within = Some(GRASP_REACH);
                 let attach = Attach { name: name.clone(), robot, within, ..Attach::default() };
-                self.attach(attach).await?;
+                Box::pin(self.answer_counted(Call::Attach(attach), *origin)).await?;
                 going.step(GoPhase::Gripping, |step| step.attached.push(name));
             }
             Then::Detach(names) => {
                 for name in names {
-                    let detach = Detach { name: name.clone() };
-                    let arms = self.arms_of_load(&Call::Detach(detach.clone())).await?;
-                    going.command(&arms, Box::pin(self.detach(detach))).await?;
+                    let detach = Call::Detach(Detach { name: name.clone() });
+                    let arms = self.arms_of_load(&detach).await?;
+                    let (method, answer) = (detach.method(), Box::pin(self.answer_counted(detach, *origin)));
+                    going.command(&arms, method, answer).await?;
                     going.step(GoPhase::Gripping, |step| step.detached.push(name));
                 }
             }

@@ -1,10 +1,11 @@
-//! What the metrics of a run are made of.
+//! What the metrics of a run, and of an attached planner, are made of.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 
 use crate::blueprint::{Blueprint, MetricsConfig};
 use crate::metrics::{Bound, Figures, LogFigures, Metrics};
+use crate::runtime::plan::PlannerPort;
 use crate::runtime::{Service, StartError};
 use dimos_core::sync::lock;
 use dimos_core::telemetry::Origin;
@@ -13,7 +14,7 @@ use dimos_rpc::RpcError;
 use dimos_rpc::api::{Reply, Request};
 
 /// Takes the address of the metrics, if the blueprint has them: before an arm is connected.
-pub(in crate::runtime) fn bind(blueprint: &Blueprint) -> Result<Option<Bound>, StartError> {
+pub fn bind(blueprint: &Blueprint) -> Result<Option<Bound>, StartError> {
     let bind = |config: &MetricsConfig| {
         Bound::at(config.listen).map_err(|error| {
             let hint = "another run may have it: --set metrics.listen=127.0.0.1:PORT";
@@ -26,7 +27,7 @@ pub(in crate::runtime) fn bind(blueprint: &Blueprint) -> Result<Option<Bound>, S
 /// Serves the metrics of a run.
 pub(in crate::runtime) fn serve(bound: Bound, service: &Arc<Service>) -> Result<Metrics, StartError> {
     let run = Arc::downgrade(service);
-    let served = bound.serve(move || Some(run.upgrade()?.figures()));
+    let served = bound.serve(move |form| Some(run.upgrade()?.figures().text(form)));
     let served =
         served.map_err(|error| StartError::other(format!("the metrics cannot be served: {error}"), "see ulimit -u"))?;
     let _ = service.journal.metrics.set(served.url().to_owned());
@@ -37,8 +38,12 @@ impl Service {
     /// Answers a request, and counts a refusal.
     pub(in crate::runtime) async fn answer_counted(&self, call: Request, origin: Origin) -> Result<Reply, RpcError> {
         let method = call.method();
-        let answer = self.answer(call, origin).await;
-        answer.inspect_err(|error| lock(&self.journal.counts).refused(method, &error.code))
+        self.answer(call, origin).await.inspect_err(|error| self.count_refusal(method, error))
+    }
+
+    /// Counts a request that was refused.
+    pub(in crate::runtime) fn count_refusal(&self, method: &'static str, error: &RpcError) {
+        lock(&self.journal.counts).refused(method, &error.code);
     }
 
     fn figures(&self) -> Figures {
@@ -54,6 +59,7 @@ impl Service {
             lateness: pulse.lateness.cumulative(),
             compute: pulse.compute.cumulative(),
             log,
+            planner: self.plans.port().map(PlannerPort::figures),
             counts: lock(&self.journal.counts).clone(),
         }
     }

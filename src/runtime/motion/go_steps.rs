@@ -144,7 +144,8 @@ impl Service {
         going.check()?;
         // It is this request's own: `execute_plan` without a number passes it over.
         let request = Call::Plan(Plan { by_number: true, ..plan });
-        let Reply::Plan(begun) = self.planner_call_from(request, origin).await? else { return Err(internal().into()) };
+        let begun = Box::pin(self.answer_counted(request, origin)).await?;
+        let Reply::Plan(begun) = begun else { return Err(internal().into()) };
         let mut ends = false;
         loop {
             let asked = Call::Planning(Planning { plan: begun.plan });
@@ -186,7 +187,8 @@ impl Service {
         acts: &mut Acts,
         origin: Origin,
     ) -> Result<(), Failed> {
-        let begun = match going.command(arms, Box::pin(self.answer_counted(call, origin))).await? {
+        let (method, answer) = (call.method(), Box::pin(self.answer_counted(call, origin)));
+        let begun = match going.command(arms, method, answer).await? {
             Reply::Move(reply) => GoBegun::Move(reply),
             Reply::Execute(reply) | Reply::ExecutePlan(reply) => GoBegun::Execute(reply),
             _ => return Err(internal().into()),

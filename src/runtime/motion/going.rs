@@ -78,15 +78,16 @@ impl Going {
         }
     }
 
-    /// Answers a request of a step under the leases of these arms.
+    /// Answers a request of a step, for this method, under the leases of these arms.
     pub async fn command(
         &self,
         arms: &[String],
+        method: &'static str,
         answer: impl Future<Output = Result<Reply, RpcError>>,
     ) -> Result<Reply, Failed> {
         self.check()?;
         let reply = match &self.claimant {
-            Some(claimant) => claimant.command(arms, answer).await,
+            Some(claimant) => claimant.command(arms, method, answer).await,
             None => answer.await,
         };
         // What ended it is the reason, not that its request was not sent.

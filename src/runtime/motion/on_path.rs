@@ -96,7 +96,8 @@ impl Service {
                 }
             };
             if let Some((arms, call)) = call {
-                going.command(&arms, Box::pin(self.answer_counted(call, origin))).await?;
+                let (method, answer) = (call.method(), Box::pin(self.answer_counted(call, origin)));
+                going.command(&arms, method, answer).await?;
             }
             let elapsed = view.elapsed;
             going.update(|report| {

@@ -3,6 +3,8 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::Ordering::Relaxed;
+use std::sync::atomic::{AtomicBool, AtomicU64};
 use std::sync::mpsc::{Sender, channel};
 use std::thread::JoinHandle;
 use std::time::Duration;
@@ -12,6 +14,7 @@ use tokio::sync::oneshot;
 use super::PlannerPort;
 use super::planner_link::answer_encoded;
 use super::planner_port::registered;
+use crate::metrics::AttachedFigures;
 use crate::runtime::StartError;
 use crate::runtime::start::robots;
 use dimos_planner::planning::scene::config::PlannerConfig;
@@ -37,6 +40,8 @@ pub enum LinkEvent {
 /// An attached planner. Shuts down when dropped.
 pub struct AttachedPlanner {
     robots: Vec<RegisteredRobot>,
+    link: Arc<Link>,
+    port: Arc<PlannerPort>,
     stop: Option<oneshot::Sender<()>>,
     thread: Option<JoinHandle<()>>,
 }
@@ -53,7 +58,8 @@ impl AttachedPlanner {
         let setup = robots(config)?;
         let robots = registered(&setup);
         let registration = RegisterPlanner { name: name.to_owned(), robots: robots.clone() };
-        let process = Process { config: config.clone(), registration, socket: socket.to_owned() };
+        let link = Arc::<Link>::default();
+        let process = Process { config: config.clone(), registration, socket: socket.to_owned(), link: link.clone() };
         let runtime = tokio::runtime::Builder::new_current_thread().enable_io().enable_time().build();
         let runtime = runtime.map_err(|e| StartError::other(e, "see ulimit -n"))?;
         let (stop, stopped) = oneshot::channel();
@@ -70,7 +76,7 @@ impl AttachedPlanner {
         });
         let thread = thread.map_err(|e| StartError::other(e, "see ulimit -u"))?;
         match begun.recv() {
-            Ok(Ok(())) => Ok(Self { robots, stop: Some(stop), thread: Some(thread) }),
+            Ok(Ok(port)) => Ok(Self { robots, link, port, stop: Some(stop), thread: Some(thread) }),
             Ok(Err(error)) => Err(error),
             Err(_) => Err(StartError::other("the planner's thread ended: a defect of the program", "see `dimos logs`")),
         }
@@ -80,6 +86,30 @@ impl AttachedPlanner {
     pub fn robots(&self) -> &[RegisteredRobot] {
         &self.robots
     }
+
+    /// Returns a function for the present figures of its metrics; `of` has those that do not change.
+    pub fn figures(&self, of: AttachedFigures) -> impl Fn() -> Option<AttachedFigures> + Send + Sync + use<> {
+        let (link, port) = (self.link.clone(), Arc::downgrade(&self.port));
+        move || {
+            let port = port.upgrade()?;
+            Some(AttachedFigures {
+                attached: !link.is_lost.load(Relaxed),
+                lost: link.lost.load(Relaxed),
+                age: port.age().map(|age| age.as_secs_f64()),
+                plans: port.figures(),
+                ..of.clone()
+            })
+        }
+    }
+}
+
+/// The connection to the run.
+#[derive(Debug, Default)]
+struct Link {
+    /// Whether it is lost now.
+    is_lost: AtomicBool,
+    /// How often it was lost.
+    lost: AtomicU64,
 }
 
 impl Drop for AttachedPlanner {
@@ -97,6 +127,7 @@ struct Process {
     config: PlannerConfig,
     registration: RegisterPlanner,
     socket: PathBuf,
+    link: Arc<Link>,
 }
 
 impl Process {
@@ -104,7 +135,7 @@ impl Process {
     async fn live(
         self,
         setup: PlanningScene,
-        ready: &Sender<Result<(), StartError>>,
+        ready: &Sender<Result<Arc<PlannerPort>, StartError>>,
         mut report: impl FnMut(LinkEvent),
     ) {
         let begun = async {
@@ -122,7 +153,7 @@ impl Process {
             Err(error) => return drop(ready.send(Err(error))),
         };
         let limits = end.registered.limits.clone();
-        let _ = ready.send(Ok(()));
+        let _ = ready.send(Ok(port.clone()));
         loop {
             let answering = port.clone();
             let lost = end.serve(move |asked| {
@@ -132,8 +163,11 @@ impl Process {
             let lost = lost.await;
             // Numbers of plans are not valid in the next run.
             port.thread.forget();
+            self.link.lost.fetch_add(1, Relaxed);
+            self.link.is_lost.store(true, Relaxed);
             report(LinkEvent::Fault(format!("the run is gone ({lost})")));
             end = self.again(&limits, &mut report).await;
+            self.link.is_lost.store(false, Relaxed);
             port.thread.forget();
             report(LinkEvent::Back);
         }

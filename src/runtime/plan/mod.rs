@@ -13,6 +13,7 @@ pub(in crate::runtime) mod world_requests;
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
+use std::time::Instant;
 
 use nalgebra::Isometry3;
 
@@ -31,6 +32,8 @@ const REMEMBERED: usize = 64;
 /// A planner.
 pub struct PlannerPort {
     thread: PlannerThread,
+    /// When the run last sent the positions of its arms.
+    measured: Mutex<Option<Instant>>,
     /// The objects of the world, as they were given.
     objects: Mutex<BTreeMap<String, WorldObject>>,
     /// The plans that were executed, by number.

@@ -3,12 +3,14 @@
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
 
 use nalgebra::Isometry3;
 
 use super::PlannerPort;
 use super::plan_requests::job;
 use super::world_requests::typed;
+use crate::metrics::PlannerFigures;
 use crate::runtime::internal;
 use crate::runtime::tool::tcp::TcpModel;
 use dimos_core::pose;
@@ -55,13 +57,30 @@ impl PlannerPort {
         let objects = config.objects.iter().map(|object| (object.name.clone(), typed(object))).collect();
         let thread = PlannerThread::with(setup, config.timeout, solver.unwrap_or_else(|| Arc::new(solve)));
         let thread = thread.map_err(|e| format!("no planner thread: {e}"))?;
-        Ok(Self { thread, objects: Mutex::new(objects), released: Mutex::default() })
+        Ok(Self { thread, measured: Mutex::default(), objects: Mutex::new(objects), released: Mutex::default() })
     }
 
     /// Takes the positions of the joints that are not planned.
     pub(in crate::runtime) fn measured(&self, moment: &Moment) {
         let Moment { positions, grippers, paddings, .. } = moment.clone();
+        if !positions.is_empty() {
+            *lock(&self.measured) = Some(Instant::now());
+        }
         self.thread.measured(&Measured { positions, grippers, paddings });
+    }
+
+    /// Returns how long ago the run last sent the positions of its arms; `None`: not yet.
+    pub(in crate::runtime) fn age(&self) -> Option<Duration> {
+        lock(&self.measured).map(|at| at.elapsed())
+    }
+
+    /// Returns how the planner's requests have ended.
+    pub(in crate::runtime) fn figures(&self) -> PlannerFigures {
+        let tally = self.thread.tally();
+        PlannerFigures {
+            ended: [("PLANNED", tally.found), ("FAILED", tally.failed), ("CANCELLED", tally.cancelled)],
+            durations: tally.durations(),
+        }
     }
 
     /// Answers one of the planner's methods, except `execute_plan`: see [`release`](Self::release).

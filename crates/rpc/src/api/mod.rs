@@ -89,6 +89,11 @@ pub trait Backend: Send + Sync + 'static {
         let _ = (arm, client);
         Ok(())
     }
+    /// Called when a request is refused before the run is asked: another connection holds an arm that it moves, or its
+    /// parameters are wrong.
+    fn refused(&self, method: &'static str, error: &RpcError) {
+        let _ = (method, error);
+    }
     /// Waits until the run has handled what was passed to it before.
     fn handled(&self) -> BoxFuture<'_, ()> {
         Box::pin(std::future::ready(()))

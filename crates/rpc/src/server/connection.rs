@@ -21,8 +21,8 @@ use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::{sleep, timeout};
 
 use crate::api::{
-    Backend, Done, Lease, LeaseReply, MAX_ANSWER, MAX_LINE, MAX_SUBSCRIPTIONS, Method, OnBehalfOf, PlannerAnswer,
-    RegisterGateway, RegisterPlanner, Registered, Release, Reply, Request, read_params,
+    Backend, Done, Lease, LeaseReply, MAX_ANSWER, MAX_LINE, MAX_SUBSCRIPTIONS, METHODS, Method, OnBehalfOf,
+    PlannerAnswer, RegisterGateway, RegisterPlanner, Registered, Release, Reply, Request, read_params,
 };
 use crate::error::{Code, RpcError};
 use crate::server::CALL_TIMEOUT;
@@ -284,7 +284,13 @@ impl Connection {
             }
             _ => match Request::read(&method, params) {
                 Ok(request) => self.request(id, method, request).await,
-                Err(error) => self.reply::<Done>(&id, Err(error)).await,
+                Err(error) => {
+                    // Not under names that a client makes up.
+                    if let Some(known) = METHODS.iter().find(|known| **known == method) {
+                        self.backend.refused(known, &error);
+                    }
+                    self.reply::<Done>(&id, Err(error)).await
+                }
             },
         }
     }

@@ -12,7 +12,9 @@ use std::time::Instant;
 
 use serde_json::json;
 
-use crate::api::{Backend, ExecutePlan, FaceReport, GatewayReport, Go, Presence, RegisterGateway, Reply, Request};
+use crate::api::{
+    Backend, ExecutePlan, FaceReport, GatewayReport, Go, Lease, Method, Presence, RegisterGateway, Reply, Request,
+};
 use crate::error::{Code, RpcError};
 use crate::report::CommanderReport;
 use crate::server::who::Peer;
@@ -127,6 +129,13 @@ impl Leases {
     fn ended(&self, arm: &str, connection: u64) {
         if let Some(run) = &self.run {
             run.lease_ended(arm, connection);
+        }
+    }
+
+    /// Reports to the run what it was not asked for.
+    fn refused(&self, method: &'static str, error: &RpcError) {
+        if let Some(run) = &self.run {
+            run.refused(method, error);
         }
     }
 
@@ -290,6 +299,11 @@ impl Lessee {
     ///
     /// Returns the request and the leased arms; afterwards call [`settle`](Self::settle) with them.
     pub async fn admit(&self, request: Request, backend: &dyn Backend) -> Result<(Request, Vec<String>), RpcError> {
+        let method = request.method();
+        self.admitted(request, backend).await.inspect_err(|error| self.leases.refused(method, error))
+    }
+
+    async fn admitted(&self, request: Request, backend: &dyn Backend) -> Result<(Request, Vec<String>), RpcError> {
         match request.need() {
             Need::Nothing => {}
             Need::Lease(subject) => {
@@ -326,7 +340,7 @@ impl Lessee {
 
     /// Takes the leases of arms: all of them, or none.
     pub fn take(&self, arms: &[String]) -> Result<(), RpcError> {
-        self.claim(arms, true)
+        self.claim(arms, true).inspect_err(|error| self.leases.refused(Lease::NAME, error))
     }
 
     fn claim(&self, arms: &[String], kept: bool) -> Result<(), RpcError> {
@@ -398,11 +412,12 @@ impl Claimant {
         &self.presence
     }
 
-    /// Answers a request under the leases of these arms: taken if they are free, kept if it is accepted. Fails if
-    /// another connection holds one, or if this one has ended.
+    /// Answers a request for this method under the leases of these arms: taken if they are free, kept if it is
+    /// accepted. Fails if another connection holds one, or if this one has ended.
     pub async fn command<T>(
         &self,
         arms: &[String],
+        method: &'static str,
         answer: impl Future<Output = Result<T, RpcError>>,
     ) -> Result<T, RpcError> {
         let over = || RpcError::new(Code::Superseded, "the connection that requested it has ended");
@@ -413,7 +428,8 @@ impl Claimant {
             if self.presence.is_over() {
                 return Err(over());
             }
-            leases.claim((self.connection, &self.who), &mut held, arms, false)?;
+            let claimed = leases.claim((self.connection, &self.who), &mut held, arms, false);
+            claimed.inspect_err(|error| leases.refused(method, error))?;
         }
         let result = answer.await;
         leases.settle(self.connection, arms, may_take_effect(&result));

@@ -1,6 +1,7 @@
 //! The planner thread: plans one request at a time, accepts a cancel at any time, keeps the newest plans. A panic or a
 //! hang fails only that request; a hung thread is abandoned and replaced.
 
+mod tally;
 #[cfg(test)]
 mod tests;
 mod worker;
@@ -23,6 +24,7 @@ use crate::planning::scene::unplanned_joints::Measured;
 use dimos_core::sync::lock;
 use worker::{Shared, WorkItem, Worker};
 
+pub use tally::Tally;
 pub use worker::{Job, Progress, Solver};
 
 /// Maximum number of plans kept.
@@ -172,6 +174,7 @@ impl PlannerThread {
         let Progress::Planning(since) = job.progress else { return };
         let failure = PlanFailure::new("the planner did not end at its timeout: a bug in the planner");
         job.progress = Progress::Failed(failure, since.elapsed());
+        lock(&self.shared.tally).count(&job.progress);
         let mut worker = lock(&self.worker);
         let hanging = worker.hanging + 1;
         let fresh = (hanging < MAX_HANGING).then(|| Worker::start(&self.shared, &self.solver, hanging));
@@ -224,6 +227,12 @@ impl PlannerThread {
     pub fn job(&self, id: u64) -> Option<Job> {
         self.abandon_hung_request();
         lock(&self.shared.jobs).iter().rev().find(|job| job.id == id).cloned()
+    }
+
+    /// Returns how requests have ended since the start.
+    pub fn tally(&self) -> Tally {
+        self.abandon_hung_request();
+        lock(&self.shared.tally).clone()
     }
 
     /// Returns the newest request.

@@ -8,6 +8,7 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use super::Tally;
 use crate::collision::Stop;
 use crate::collision::world::World;
 use crate::planning::request::pipeline::{PlanFailure, PlanRequest, PlannedMotion};
@@ -66,6 +67,8 @@ pub(in crate::planning) struct Shared {
     pub jobs: Mutex<VecDeque<Job>>,
     /// Cancels the request that is being planned.
     pub cancel: Mutex<Option<Arc<AtomicBool>>>,
+    /// How requests have ended.
+    pub tally: Mutex<Tally>,
 }
 
 /// The thread that plans.
@@ -100,6 +103,7 @@ fn run(solver: &Solver, shared: &Shared, work: &Receiver<WorkItem>) {
             Err(_) => Progress::Failed(PlanFailure::new("the planner panicked: a bug in the planner"), took),
         };
         if let Some(job) = lock(&shared.jobs).iter_mut().find(|job| job.id == item.id && job.is_planning()) {
+            lock(&shared.tally).count(&progress);
             job.progress = progress;
         }
     }
