@@ -5,7 +5,7 @@ use std::sync::Arc;
 use glamx::{DAffine3, DVec3};
 
 use super::allowed_pairs::always_touching;
-use super::body::{MeshMode, of_mesh, solids};
+use super::body::{MeshMode, of_mesh, solids, surface};
 use super::checker::{CollisionChecker, Stop};
 use super::exact::ExactChecker;
 use super::report::Pair;
@@ -262,6 +262,29 @@ fn what_no_joint_moves_is_not_checked_and_named() {
     assert_eq!(checker.fixed_contacts(), [["base".to_owned(), "table".to_owned()]]);
     assert!(checker.is_free(&[0.0; 3]), "{:?}", checker.contacts(&[0.0; 3]));
     assert!(checker.motion_is_free(&[0.0; 3], &[0.5, 0.2, 0.1], &Stop::never()));
+}
+
+#[test]
+fn what_is_between_the_fingers_of_a_fork_is_not_in_it() {
+    // A box of 10 cm × 20 cm × 10 cm about the centre of the fork's bounding box, 5 cm from each finger.
+    let corner = |i: u32| {
+        let sign = |bit: u32| if i >> bit & 1 == 0 { -1.0 } else { 1.0 };
+        Point3::new(0.2 + 0.05 * sign(0), 0.25 + 0.1 * sign(1), 0.1 + 0.05 * sign(2))
+    };
+    let quads = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
+    let triangles = quads.iter().flat_map(|q: &[u32; 4]| [[q[0], q[1], q[2]], [q[0], q[2], q[3]]]).collect();
+    let block = Mesh { vertices: (0..8).map(corner).collect(), triangles };
+    let free = |shift: f64| {
+        let mut robot = arm("", DVec3::ZERO);
+        robot.solids = vec![vec![], of_mesh(&fork(), MeshMode::Triangles, DAffine3::IDENTITY).unwrap(), vec![], vec![]];
+        let mut world = World::new();
+        world.add_robot(robot).unwrap();
+        let solid = surface(&block, DAffine3::from_translation(DVec3::X * shift)).unwrap();
+        world.add(Obstacle { name: "block".into(), solid, padding: 0.0 }).unwrap();
+        checker(&world).is_free(&[0.0; 3])
+    };
+    assert!(free(0.0) && free(0.04));
+    assert!(!free(0.06) && !free(-0.06), "it is in a finger");
 }
 
 #[test]

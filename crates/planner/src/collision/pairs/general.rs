@@ -209,10 +209,15 @@ fn cloud_and_other<'a>(a: &'a Placed<'a>, b: &'a Placed<'a>) -> Option<(CloudRef
     }
 }
 
-/// Returns whether a closed mesh contains the centre of the other core, which its surface alone would not touch.
+/// Returns whether a closed mesh contains the other core, which its surface alone would not touch: then it contains any
+/// point of it. The centre of another mesh may be none: that of a fork is between its fingers.
 fn holds(mesh: &Placed, other: &Placed) -> bool {
     let Placed::Mesh(frame, mesh) = mesh else { return false };
-    mesh.is_closed() && mesh.holds(super::point::local(other.ball().0, frame))
+    let point = match other {
+        Placed::Mesh(frame, other) => other.surface().vertices().first().map(|vertex| frame.transform_point3(*vertex)),
+        _ => Some(other.ball().0),
+    };
+    mesh.is_closed() && point.is_some_and(|point| mesh.holds(super::point::local(point, frame)))
 }
 
 fn pose(frame: &DAffine3) -> DPose3 {
