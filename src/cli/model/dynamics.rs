@@ -17,7 +17,7 @@ use dimos_robot::urdf::Meshes;
 The joints are all independent ones of the description; mimic joints are folded into their leaders. Friction, rotors and \
 springs are not part of it. The mass matrix is printed with --json.
 
-  dimos model dynamics builtin:ur5e --q 0 -1.57 1.57 0 0 0 --payload 2 0 0 0.05")]
+  dimos model dynamics builtin:ur5e --q 0 -1 1 0 0 0 --payload 2 0 0 0.05")]
 pub struct Args {
     #[command(flatten)]
     file: File,
