@@ -30,7 +30,7 @@ comments say what to look at next. Nothing is connected.
 
   dimos new my-cell
   dimos new my-cell --arm xarm6 --address 192.168.1.185     asks four questions
-  dimos new so101 --arm so101 --address /dev/ttyACM0 --model so101 --tool none --table 0
+  dimos new so101 --arm so101 --address sim --model so101 --tool none --table 0
   dimos new ur5e --arm ur5e --address sim --model ur5e --tool 0 0 0.12 --table 0")]
 pub struct Args {
     /// Name of the blueprint, which is written to NAME.yaml
