@@ -4,6 +4,7 @@ mod execute;
 mod file;
 mod keys;
 mod names;
+mod on_path;
 #[cfg(test)]
 mod schema_tests;
 mod step;

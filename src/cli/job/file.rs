@@ -14,7 +14,7 @@ use crate::cli::output;
 use dimos_core::arm::channel;
 use dimos_core::bounded;
 use dimos_core::written;
-use dimos_rpc::api::{ArmIoSet, Attach, DEFAULT_SPEED, GoGripper, MAX_TCP_SPEED, OnPath, PlanGoal, PoseSpec};
+use dimos_rpc::api::{Attach, DEFAULT_SPEED, MAX_TCP_SPEED, PlanGoal, PoseSpec};
 use dimos_yaml as yaml;
 use dimos_yaml::{Diag, Kind, Label, NodeId, Tree, did_you_mean, quote};
 
@@ -82,8 +82,8 @@ impl Job {
 }
 
 /// Reads the nodes of a job.
-struct Reader {
-    tree: Tree,
+pub(super) struct Reader {
+    pub(super) tree: Tree,
     direct: bool,
     replan: bool,
     speed: f64,
@@ -91,7 +91,7 @@ struct Reader {
 }
 
 impl Reader {
-    fn wrong<T>(&mut self, at: NodeId, what: impl Into<String>, hint: Option<&str>) -> Option<T> {
+    pub(super) fn wrong<T>(&mut self, at: NodeId, what: impl Into<String>, hint: Option<&str>) -> Option<T> {
         let label = self.tree.label(at);
         self.tree.report(Diag::error(what).at(label).maybe_hint(hint.map(str::to_owned)));
         None
@@ -102,7 +102,7 @@ impl Reader {
     }
 
     /// Reports unknown keys of a group; `None` if it is no group.
-    fn group(&mut self, node: NodeId, group: &Group) -> Option<()> {
+    pub(super) fn group(&mut self, node: NodeId, group: &Group) -> Option<()> {
         let known = group.names();
         if !matches!(self.tree.node(node).map(|n| &n.kind), Some(Kind::Map(_))) {
             let hint = format!("its keys: {}", known.join(", "));
@@ -119,7 +119,7 @@ impl Reader {
     }
 
     /// Reads a scalar with a parser of the command line.
-    fn parsed<T>(&mut self, node: NodeId, parse: fn(&str) -> std::result::Result<T, String>) -> Option<T> {
+    pub(super) fn parsed<T>(&mut self, node: NodeId, parse: fn(&str) -> std::result::Result<T, String>) -> Option<T> {
         let text = self.text(node).unwrap_or_default();
         match parse(&text) {
             Ok(value) => Some(value),
@@ -128,7 +128,12 @@ impl Reader {
     }
 
     /// The same for the value of a key, if the key is there.
-    fn at<T>(&mut self, map: NodeId, key: &str, parse: fn(&str) -> std::result::Result<T, String>) -> Option<T> {
+    pub(super) fn at<T>(
+        &mut self,
+        map: NodeId,
+        key: &str,
+        parse: fn(&str) -> std::result::Result<T, String>,
+    ) -> Option<T> {
         self.tree.get(map, key).and_then(|node| self.parsed(node, parse))
     }
 
@@ -245,7 +250,7 @@ impl Reader {
         }
     }
 
-    fn arm(&mut self, map: NodeId, arm: &mut String) {
+    pub(super) fn arm(&mut self, map: NodeId, arm: &mut String) {
         *arm = self.at(map, "arm", word).unwrap_or_default();
     }
 
@@ -307,54 +312,6 @@ impl Reader {
             via,
             ..PlanGoal::default()
         })
-    }
-
-    /// Reads the acts at places of a motion's path.
-    fn acts(&mut self, motion: NodeId, of: &Motion) -> Option<Vec<OnPath>> {
-        let Some((key, list)) = self.tree.entry(motion, "on_path") else { return Some(Vec::new()) };
-        if of.direct || of.replan {
-            return self.wrong(key, "acts on a path belong to one planned path", Some("leave out `direct`, `replan`"));
-        }
-        let items = self.tree.items(list).to_vec();
-        if items.is_empty() {
-            return self.wrong(list, "expected a list of acts", Some("[{distance: 0.1, gripper: open}]"));
-        }
-        items.into_iter().map(|item| self.act_on_path(item)).collect()
-    }
-
-    fn act_on_path(&mut self, node: NodeId) -> Option<OnPath> {
-        self.group(node, &keys::ON_PATH)?;
-        let count = |keys: &[&str]| keys.iter().filter(|key| self.tree.get(node, key).is_some()).count();
-        if count(&["distance", "waypoint"]) != 1 || count(&["gripper", "output", "speed"]) != 1 {
-            let hint =
-                "{distance: 0.1, gripper: open}, {waypoint: 2, output: {do0: high}}, {distance: 0.2, speed: 50%}";
-            return self.wrong(node, "needs a place (distance [m] or waypoint) and an act", Some(hint));
-        }
-        let mut act = OnPath {
-            distance: self.at(node, "distance", finite),
-            waypoint: self.at(node, "waypoint", times).map(|number| number as usize),
-            speed: self.at(node, "speed", speed),
-            ..OnPath::default()
-        };
-        if let Some(gripper) = self.tree.get(node, "gripper") {
-            let (mut arm, mut force, mut to) = (String::new(), None, Some(gripper));
-            if self.tree.text(gripper).is_none() {
-                self.group(gripper, &keys::FINGERS)?;
-                self.arm(gripper, &mut arm);
-                (force, to) = (self.at(gripper, "force", finite), self.tree.get(gripper, "to"));
-            }
-            let Some(to) = to else {
-                return self.wrong(gripper, "the key `to` is missing", Some("to: open, close, or m or rad"));
-            };
-            let to = self.parsed(to, opening)?.into();
-            act.gripper = Some(GoGripper { arm, to, force, speed: None, timeout: None, objects: None });
-        }
-        if let Some(output) = self.tree.get(node, "output") {
-            let mut arm = String::new();
-            let Act::Output(outputs) = self.output(output, &mut arm)? else { return None };
-            act.output = Some(ArmIoSet { arm, outputs });
-        }
-        Some(act)
     }
 
     /// Reads the speed of the tool; `None` if it is wrong.
@@ -458,7 +415,7 @@ impl Reader {
         Some(Act::Input { input, high, timeout: self.at(node, "timeout", duration) })
     }
 
-    fn output(&mut self, node: NodeId, arm: &mut String) -> Option<Act> {
+    pub(super) fn output(&mut self, node: NodeId, arm: &mut String) -> Option<Act> {
         let mut outputs = BTreeMap::new();
         for (key, value) in self.tree.entries(node).to_vec() {
             let name = self.text(key).unwrap_or_default();
@@ -519,7 +476,7 @@ fn level(text: &str) -> std::result::Result<bool, String> {
     }
 }
 
-fn times(text: &str) -> std::result::Result<u64, String> {
+pub(super) fn times(text: &str) -> std::result::Result<u64, String> {
     match text.parse::<u64>() {
         Ok(times) if times >= 1 && times as f64 <= MAX_TIMES => Ok(times),
         _ => Err("must be a number of times, 1 or more".into()),

@@ -7,7 +7,7 @@ use super::start_contact::{EscapePath, passes};
 use crate::collision::report::{Contact, Pair};
 use crate::collision::{CollisionChecker, Stop};
 use crate::planning::curve::joint_curve::JointCurve;
-use crate::planning::curve::tool_path::ToolPath;
+use crate::planning::curve::tool_path::{ArcError, ToolPath};
 use crate::planning::ik::Ik;
 use crate::planning::ik::cartesian::{Line, follow as follow_tool, smooth};
 use crate::planning::ik::settings::{IkSettings, LineSettings};
@@ -138,8 +138,10 @@ pub(in crate::planning) fn line(
         Goal::Arc { via, to } => {
             let via = into_root.transform_point3(glamx::DVec3::new(via.x, via.y, via.z));
             let way = ToolPath::arc(from, via, into_root * frame(to)).map_err(|error| {
-                PlanFailure::new(error.to_string())
-                    .hint("a circle passes three different places; make a full one of two arcs")
+                PlanFailure::new(error.to_string()).hint(match error {
+                    ArcError::Same => "a circle passes three different places; make a full one of two arcs",
+                    ArcError::InLine => "choose a via point beside the line",
+                })
             })?;
             (way, "arc", "--via")
         }
