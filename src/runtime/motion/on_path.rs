@@ -16,8 +16,8 @@ const RATE: f64 = 1000.0;
 pub struct Acts {
     /// Time along the path [s], index in the request, and what is done.
     left: Vec<(f64, usize, OnPath)>,
-    /// The speed before an act changed it.
-    speed: Option<f64>,
+    /// The speed before acts changed it, and what they made of it.
+    speed: Option<[f64; 2]>,
 }
 
 impl Acts {
@@ -91,8 +91,12 @@ impl Service {
                 // After the end there is no speed to change.
                 (None, None, Some(_)) if is_over => None,
                 (None, None, fraction) => {
-                    acts.speed = acts.speed.or(Some(speed.fraction));
-                    Some((Vec::new(), Call::Speed(Speed { fraction, paused: None })))
+                    let now = self.tick.speed_override().fraction;
+                    let [before, set] = acts.speed.unwrap_or([now; 2]);
+                    // Somebody else has changed it since: that stays. Nor is it ever raised above what it was before.
+                    let fraction = fraction.filter(|_| set == now).map(|fraction| fraction.min(before));
+                    acts.speed = fraction.map(|fraction| [before, fraction]).or(acts.speed);
+                    fraction.map(|_| (Vec::new(), Call::Speed(Speed { fraction, paused: None })))
                 }
             };
             if let Some((arms, call)) = call {
@@ -109,9 +113,10 @@ impl Service {
         Ok(())
     }
 
-    /// Sets the speed to what it was before acts changed it.
+    /// Sets the speed to what it was before acts changed it, unless somebody else has changed it since.
     pub(in crate::runtime) async fn restore_speed(&self, acts: &mut Acts, origin: Origin) {
-        if let Some(fraction) = acts.speed.take() {
+        let now = self.tick.speed_override().fraction;
+        if let Some([fraction, _]) = acts.speed.take().filter(|[_, set]| *set == now) {
             let call = Call::Speed(Speed { fraction: Some(fraction), paused: None });
             // The run may be at its end.
             let _ = self.answer_counted(call, origin).await;

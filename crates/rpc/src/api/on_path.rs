@@ -27,7 +27,8 @@ pub struct OnPath {
     /// Sets outputs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub output: Option<ArmIoSet>,
-    /// Fraction of the speed of all motions, 0.01–1, until the end of this one.
+    /// Fraction of the speed of all motions, 0.01–1, until the end of this one; never above what it was before, and
+    /// not if somebody else has changed it meanwhile.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub speed: Option<f64>,
 }

@@ -10,6 +10,7 @@ use crate::planning::curve::join::{joined, rounded};
 use crate::planning::curve::joint_curve::JointCurve;
 use crate::planning::curve::motion::{after, along};
 use crate::planning::curve::settings::CurveSettings;
+use crate::planning::search::level::Level;
 use crate::planning::search::path::length;
 use crate::planning::timing::tool_timing::Tools;
 use crate::planning::timing::{free_throughout, time_within};
@@ -112,6 +113,8 @@ fn is_free(
     stop: &Stop,
 ) -> bool {
     let checker = &mut stage.checker;
-    let mut free = |a: &[f64], b: &[f64]| passes(checker, request.level, escape_path, (a, b), stop);
+    // Lines and given paths are proven at every level.
+    let level = if request.level.proves() { request.level } else { Level::Certified };
+    let mut free = |a: &[f64], b: &[f64]| passes(checker, level, escape_path, (a, b), stop);
     free_throughout(motion, &mut free).is_ok()
 }
