@@ -121,7 +121,7 @@ impl Bed {
                 "trajectory" if tasks.get(t).is_some_and(|v| v.state == TaskState::Executing) => continue,
                 "trajectory" => {
                     let joints = self.config.tasks[t].joints.clone();
-                    let motion = Motion { id: self.sent + 1, joints, spline: self.motion.clone() };
+                    let motion = Motion { id: self.sent + 1, joints, spline: self.motion.clone(), until: None };
                     Request::Execute { task, motion: Box::new(motion) }
                 }
                 "servo" => Request::Servo { task, target: swing(tick as f64 / 100.0).0 },

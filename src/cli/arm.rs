@@ -79,6 +79,8 @@ Exit code 0: the fingers are where they were sent, or hold an object. 1: blocked
     Io(parts::IoArgs),
     /// Show the load at the flange, or set it: the arm must be at rest
     Payload(parts::PayloadArgs),
+    /// Make the present force and torque zero, for --until and `state`: the arm must be at rest
+    Tare(ArmArgs),
     /// Show the tool centre point, whose pose is the arm's, or set it: the arm must be at rest
     Tool(tool::Args),
 }
@@ -142,6 +144,7 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
         Action::Teach(args) => teach::run(args),
         Action::Io(args) => parts::io(args),
         Action::Payload(args) => parts::payload(args),
+        Action::Tare(which) => parts::tare(which),
         Action::Tool(args) => tool::run(args),
         Action::Kinematics(args) => kinematics::run(args, registry),
         Action::FindPort(args) => find_port::run(args, registry),

@@ -11,7 +11,7 @@ use super::exit::{Exit, Failure, Result};
 use super::follow::{Followed, Signals, end, verdict, watch};
 use super::goal::{Planned, no_plan, planning_bar, show};
 use super::output;
-use dimos_rpc::api::{Cancel, Go, GoBegun, GoOutcome, GoStep, GoStepReport, Going, GoingReport};
+use dimos_rpc::api::{Cancel, Go, GoBegun, GoOutcome, GoStep, GoStepReport, Going, GoingReport, Until};
 use dimos_rpc::client::{Client, ClientError};
 use dimos_rpc::report::MotionReport;
 use dimos_rpc::{Code, RpcError};
@@ -128,8 +128,36 @@ pub fn finish(client: &mut Client, going: u64, begun: &GoBegun, signals: &Signal
     verdict(client, &report, cancelled)
 }
 
+/// As [`finish`], for a motion that awaits conditions: prints which has ended it, and fails if none of those has that
+/// were awaited.
+pub fn finish_until(
+    client: &mut Client,
+    (going, until): (u64, &Until),
+    begun: &GoBegun,
+    signals: &Signals,
+    json: bool,
+) -> Result {
+    let (report, cancelled) = follow(client, going, begun, begun.task(), signals)?;
+    let Some(outcome) = outcome(client, going, report.motion)? else {
+        return end(client, (report, cancelled), json);
+    };
+    match json {
+        true => output::json(&outcome),
+        false => {
+            let how = report.error.as_deref().unwrap_or("its goal came first");
+            output::line(format_args!("motion {}: {how}, after {:.2} s", report.motion, report.elapsed));
+        }
+    }
+    verdict(client, &report, cancelled)?;
+    match cancelled {
+        Some(signal) => Ok(Exit::by_signal(signal)),
+        None if until.is_awaited(outcome.ended_by) => Ok(Exit::Ok),
+        None => Ok(Exit::Failed),
+    }
+}
+
 /// Returns the outcome of a request whose motion has ended; `None` if it continues with another step.
-fn outcome(client: &mut Client, going: u64, motion: u64) -> Result<Option<GoOutcome>> {
+pub fn outcome(client: &mut Client, going: u64, motion: u64) -> Result<Option<GoOutcome>> {
     let began = Instant::now();
     while began.elapsed() < OUTCOME_TIMEOUT {
         let GoingReport { steps, outcome, .. } = client.call(Going { going })?;

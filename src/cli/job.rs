@@ -9,6 +9,7 @@ mod on_path;
 mod schema_tests;
 mod step;
 mod times;
+mod until;
 mod without_run;
 
 use std::collections::BTreeSet;

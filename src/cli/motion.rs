@@ -11,7 +11,7 @@ use dimos_core::telemetry::texts::percent;
 use dimos_rpc::Code;
 use dimos_rpc::api::{
     Cancel, Go, GoBegun, GoStep, GripObjects, Move, MoveNative, MoveReply, Plan, PlanLevel, Planner, Poses, State,
-    Status, World,
+    Status, Until, World,
 };
 use dimos_rpc::client::Client;
 
@@ -35,6 +35,7 @@ its goal is given as joint positions.
   dimos move arm --pose 0.3 0.1 0.4 --rpy 0 1.57 0
   dimos move arm --named home
   dimos move --goal left=named:home --goal right=0.5,-0.3,0.6,0,0.8,0
+  dimos move arm --by 0 0 -0.1 --frame tool --linear --until force=5
   dimos move arm --through above grasp gripper:close above place gripper:open"
 )]
 pub struct Args {
@@ -57,6 +58,10 @@ pub struct Args {
     /// If an obstacle blocks the motion, stop, plan again and continue
     #[arg(long, conflicts_with_all = ["direct", "no_wait", "path"])]
     pub replan: bool,
+    /// End the motion before its goal: force=N, torque=NM, input=di0[:low], distance=M or time=S; repeat for more.
+    /// Exit code 1 if the goal came first
+    #[arg(long, value_name = "KEY=VALUE", conflicts_with_all = ["native", "replan", "no_wait", "several"])]
+    pub until: Vec<String>,
     /// Execute a plan of --level fast, which is not proven free of contact
     #[arg(long, conflicts_with = "direct")]
     pub unproven: bool,
@@ -78,6 +83,7 @@ pub fn run(args: &Args) -> Result {
         return Err(Failure::usage("a plan of --level fast is not proven free of contact: nothing has moved")
             .hint("leave --level out, or add --unproven"));
     }
+    let until = until(args)?;
     let mut client = args.target_run.connect()?;
     let signals = Signals::watch();
     if args.native {
@@ -91,13 +97,16 @@ pub fn run(args: &Args) -> Result {
     let (going, begun) = if planned {
         let request = args.goal.plan(&mut client, args.arm.as_deref(), &args.search)?;
         let request = plans(args, &mut client, [Leg::Motion(request)], &signals)?;
-        let going = client.call(request)?.going;
+        let going = client.call(Go { until: until.clone(), ..request })?.going;
         (going, begin_planned(&mut client, (going, 0), &signals, json)?)
     } else {
-        begin_direct(args, &mut client, &signals)?
+        begin_direct(args, &mut client, &until, &signals)?
     };
     if !args.no_wait {
-        return going::finish(&mut client, going, &begun, &signals, json);
+        return match until.first() {
+            Some(until) => going::finish_until(&mut client, (going, until), &begun, &signals, json),
+            None => going::finish(&mut client, going, &begun, &signals, json),
+        };
     }
     if json {
         output::json(&serde_json::to_value(&begun).unwrap_or_default());
@@ -219,7 +228,20 @@ fn begin_planned(client: &mut Client, at: (u64, usize), signals: &Signals, json:
     Ok(reply)
 }
 
-fn begin_direct(args: &Args, client: &mut Client, signals: &Signals) -> Result<(u64, GoBegun)> {
+/// Returns the conditions of the motion: none or one.
+fn until(args: &Args) -> Result<Vec<Until>> {
+    if args.until.is_empty() {
+        return Ok(Vec::new());
+    }
+    if args.goal.has_grips() {
+        let failure = Failure::usage("--until is about one motion, and this has several parts");
+        return Err(failure.hint("a job has `until` at each of its motions: docs/jobs.md"));
+    }
+    let until = Until::parse(&args.until).map_err(|what| Failure::usage(format!("--until: {what}")))?;
+    Ok(vec![until])
+}
+
+fn begin_direct(args: &Args, client: &mut Client, until: &[Until], signals: &Signals) -> Result<(u64, GoBegun)> {
     if let (Some(arm), Some(file)) = (&args.arm, &args.goal.path) {
         let arms = client.call(State {})?.arms.into_iter();
         let arms = arms.map(|a| (a.hardware_id, a.joints.into_iter().map(|joint| joint.name).collect()));
@@ -228,7 +250,7 @@ fn begin_direct(args: &Args, client: &mut Client, signals: &Signals) -> Result<(
         let speed = args.search.speed.min(full_speed::limit(client, std::slice::from_ref(arm))?);
         signals.check()?;
         let request = Move { direct: args.direct, path, ..Move::new(arm, [], speed) };
-        return direct(client, request, signals, "direct to its first point and along the path");
+        return direct(client, request, (until, signals), "direct to its first point and along the path");
     }
     let target = match (&args.arm, args.goal.joints(), &args.goal.named) {
         (Some(arm), Some(target), _) => Some((arm, target.to_vec())),
@@ -247,12 +269,18 @@ fn begin_direct(args: &Args, client: &mut Client, signals: &Signals) -> Result<(
     let speed = args.search.speed.min(full_speed::limit(client, std::slice::from_ref(arm))?);
     signals.check()?;
     let request = Move { direct: args.direct, ..Move::new(arm.clone(), target, speed) };
-    direct(client, request, signals, "direct")
+    direct(client, request, (until, signals), "direct")
 }
 
 /// Begins a direct motion, and prints what it does.
-fn direct(client: &mut Client, request: Move, signals: &Signals, how: &str) -> Result<(u64, GoBegun)> {
-    let going = going::go(client, GoStep::Move(Box::new(request)))?;
+fn direct(
+    client: &mut Client,
+    request: Move,
+    (until, signals): (&[Until], &Signals),
+    how: &str,
+) -> Result<(u64, GoBegun)> {
+    let steps = vec![GoStep::Move(Box::new(request))];
+    let going = client.call(Go { steps, until: until.to_vec(), ..Go::default() })?.going;
     let begun = going::begin(client, (going, 0), Some(signals), false)?.reply;
     let GoBegun::Move(MoveReply { motion, task, duration, .. }) = &begun else { return Ok((going, begun)) };
     output::note(format_args!("motion {motion} on {task}: {duration:.2} s, {how}, not collision-checked"));

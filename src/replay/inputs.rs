@@ -267,7 +267,7 @@ pub(super) fn values(list: &[f64], first: usize, dof: usize) -> Option<Joints> {
     list.get(first..first + dof).map(dimos_core::joint::joints_of)
 }
 
-/// Reads a state besides joint values. Skips efforts, pose and wrench, which no tick uses.
+/// Reads a state besides joint values. Skips efforts and pose, which no tick uses.
 fn read_input(input: &ArmInput, state: &mut ArmState) -> Result<(), String> {
     *state = ArmState {
         seq: input.seq,
@@ -293,6 +293,8 @@ fn read_input(input: &ArmInput, state: &mut ArmState) -> Result<(), String> {
         }),
         refused: input.refused,
         speed_fraction: input.speed_fraction.first().copied(),
+        wrench: input.wrench.first_chunk().copied(),
+        inputs: input.inputs.first().copied(),
         ..ArmState::default()
     };
     Ok(())

@@ -8,6 +8,7 @@ use dimos_core::clock::Mono;
 use dimos_core::joint::{Joints, joints_of};
 use dimos_core::telemetry::{LedBy, Origin};
 use dimos_core::trajectory::{JointTrajectory, Spline};
+use dimos_core::until::Until;
 
 /// A message of `/dimos/requests`.
 #[derive(Debug, Deserialize)]
@@ -26,6 +27,8 @@ enum LoggedRequest {
         task: u16,
         motion: u64,
         trajectory: JointTrajectory,
+        #[serde(default)]
+        until: Option<Until>,
     },
     Cancel {
         task: Option<u16>,
@@ -146,8 +149,9 @@ pub fn read(json: &str, joints: &[String]) -> Result<(u64, Contents), String> {
 
 fn request(logged: LoggedRequest, joints: &[String]) -> Result<Request, String> {
     Ok(match logged {
-        LoggedRequest::Execute { task, motion, trajectory } => {
-            Request::Execute { task, motion: along(motion, &trajectory, joints)? }
+        LoggedRequest::Execute { task, motion, trajectory, until } => {
+            let motion = along(motion, &trajectory, joints)?;
+            Request::Execute { task, motion: Box::new(Motion { until, ..*motion }) }
         }
         LoggedRequest::Chunk { task, start, trajectory } => {
             Request::Chunk { task, start: Mono(start), motion: along(0, &trajectory, joints)? }
@@ -195,7 +199,7 @@ fn along(id: u64, trajectory: &JointTrajectory, joints: &[String]) -> Result<Box
     let index = |name: &String| joints.iter().position(|j| j == name).map(|j| j as u16);
     let found: Option<Vec<u16>> = trajectory.joint_names.iter().map(index).collect();
     let joints = found.ok_or("the trajectory has a joint that no arm has")?;
-    Ok(Box::new(Motion { id, joints, spline }))
+    Ok(Box::new(Motion { id, joints, spline, until: None }))
 }
 
 /// JSON has no infinities and no NaN: values that were not finite are null. The tick rejects the request all the same.
@@ -285,11 +289,17 @@ mod tests {
         let names = ["a".to_owned(), "b".to_owned()];
         let (_, request) = read(&logged.to_string(), &names).unwrap();
         let Ok((None, Request::Execute { task: 1, motion })) = request else { panic!("{request:?}") };
-        assert_eq!(*motion, Motion { id: 5, joints: vec![1, 0], spline: Spline::new(&trajectory).unwrap() });
+        assert_eq!(
+            *motion,
+            Motion { id: 5, joints: vec![1, 0], spline: Spline::new(&trajectory).unwrap(), until: None }
+        );
         let chunk = json!({"id": 9, "request": {"chunk": {"task": 1, "start": 7, "trajectory": trajectory}}});
         let (_, request) = read(&chunk.to_string(), &names).unwrap();
         let Ok((None, Request::Chunk { task: 1, start: Mono(7), motion })) = request else { panic!("{request:?}") };
-        assert_eq!(*motion, Motion { id: 0, joints: vec![1, 0], spline: Spline::new(&trajectory).unwrap() });
+        assert_eq!(
+            *motion,
+            Motion { id: 0, joints: vec![1, 0], spline: Spline::new(&trajectory).unwrap(), until: None }
+        );
         let (_, unknown) = read(&logged.to_string(), &names[..1]).unwrap();
         assert!(unknown.unwrap_err().contains("joint"));
     }

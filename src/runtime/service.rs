@@ -120,6 +120,7 @@ impl Service {
             Call::Grip(g) => self.grip(&g).map(Reply::Grip),
             Call::ArmPayload(p) => self.payload(&p.arm).await.map(Reply::ArmPayload),
             Call::ArmPayloadSet(p) => self.set_payload(p).await,
+            Call::ArmTare(t) => self.tare(&t.arm).await,
             Call::ArmTool(t) => self.tool(&t.arm).map(Reply::ArmTool),
             Call::ArmToolSet(t) => self.set_tool(t).await,
             Call::ArmIo(io) => self.io(&io.arm).await.map(Reply::ArmIo),

@@ -86,7 +86,7 @@ impl Virtual {
         run.ask(Request::Enabled { arm: 0, outside: false });
         (0..30).for_each(|_| run.step());
         let joints = (0..DOF as u16).collect();
-        let motion = Box::new(Motion { id: 7, joints, spline: Spline::new(&found.trajectory).unwrap() });
+        let motion = Box::new(Motion { id: 7, joints, spline: Spline::new(&found.trajectory).unwrap(), until: None });
         run.ask(Request::Execute { task: 0, motion });
         run.step();
         assert_eq!(run.task.0, TaskState::Executing);

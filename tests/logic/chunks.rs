@@ -31,7 +31,7 @@ fn circle(t: f64) -> [f64; 6] {
 fn chunk(rig: &Rig, start: Mono, actions: &[Vec<f64>]) -> Request {
     let names: Vec<String> = (0..6).map(|j| format!("j{j}")).collect();
     let spline = Spline::new(&curve(&names, actions, PERIOD, &rig.config.arms[0].limits)).unwrap();
-    Request::Chunk { task: 0, start, motion: Box::new(Motion { id: 7, joints: (0..6).collect(), spline }) }
+    Request::Chunk { task: 0, start, motion: Box::new(Motion { id: 7, joints: (0..6).collect(), spline, until: None }) }
 }
 
 /// The commands of an arm, and what they stand for.

@@ -88,7 +88,7 @@ fn chunk(rig: &Rig, ahead: f64) -> Request {
     let actions: Vec<Vec<f64>> = (0..=20).map(|k| vec![0.005 * f64::from(k); 6]).collect();
     let spline = Spline::new(&curve(&names, &actions, 0.05, &rig.config.arms[0].limits)).unwrap();
     let start = rig.now.after(Duration::from_secs_f64(ahead));
-    Request::Chunk { task: 3, start, motion: Box::new(Motion { id: 7, joints: (0..6).collect(), spline }) }
+    Request::Chunk { task: 3, start, motion: Box::new(Motion { id: 7, joints: (0..6).collect(), spline, until: None }) }
 }
 
 fn motions(rig: &Rig) -> Vec<Request> {

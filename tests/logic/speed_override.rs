@@ -20,7 +20,7 @@ fn long_motion(id: u64) -> Box<Motion> {
     };
     let target = [1.8, -1.2, 0.9, 0.3, -0.6, 1.5];
     let trajectory = point_to_point(&make_joints("arm", 6), &[0.0; 6], &target, &limits, 1.0).unwrap();
-    Box::new(Motion { id, joints: (0..6).collect(), spline: Spline::new(&trajectory).unwrap() })
+    Box::new(Motion { id, joints: (0..6).collect(), spline: Spline::new(&trajectory).unwrap(), until: None })
 }
 
 fn rig(tasks: Vec<dimos::control::config::TaskConfig>) -> Rig {
@@ -140,7 +140,7 @@ fn a_pause_takes_effect_also_where_the_path_needs_all_of_the_acceleration() {
         point(2.0 * top + 1.0, rise + V_MAX * 0.4 + 0.4, 0.0, 0.0),
     ];
     let spline = Spline::new(&JointTrajectory { joint_names: vec!["j0".into()], points }).unwrap();
-    rig.execute(0, Box::new(Motion { id: 7, joints: vec![0], spline }));
+    rig.execute(0, Box::new(Motion { id: 7, joints: vec![0], spline, until: None }));
     rig.run(10);
     rig.ask(Request::Pause { on: true });
     let took = rig.run_until(5.0, |rig| rig.speed(0) == 0.0);

@@ -166,7 +166,7 @@ fn log_topics() {
     (0..20).for_each(|_| run.step());
     // What a run notes of its first request, if that is a trajectory.
     let trajectory = Arc::new(motion.clone());
-    run.notes.send(Note::Execute { id: 1, stamp, origin: None, task: 0, motion: 1, trajectory }).unwrap();
+    run.notes.send(Note::Execute { id: 1, stamp, origin: None, task: 0, motion: 1, trajectory, until: None }).unwrap();
     run.execute(0, &motion);
     (0..20).for_each(|_| run.step());
     run.finish();

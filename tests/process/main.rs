@@ -91,8 +91,9 @@ mod superseded;
 mod teach;
 mod top;
 mod units;
-mod ur_runs;
 #[cfg(feature = "view")]
+mod until;
+mod ur_runs;
 mod view;
 mod waypoints;
 mod who;

@@ -63,7 +63,15 @@ fn record(path: &Path) {
     };
     let trajectory = JointTrajectory { joint_names: make_joints("right", 6), points: vec![point(0.0), point(1.25)] };
     notes
-        .send(Note::Execute { id: 2, stamp, origin: None, task: 0, motion: 3, trajectory: Arc::new(trajectory) })
+        .send(Note::Execute {
+            id: 2,
+            stamp,
+            origin: None,
+            task: 0,
+            motion: 3,
+            trajectory: Arc::new(trajectory),
+            until: None,
+        })
         .unwrap();
     for tick in 0..200 {
         sample(tick).into_iter().for_each(|s| ring.push(s).unwrap());

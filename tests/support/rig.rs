@@ -109,7 +109,7 @@ pub fn motion(id: u64, joints: &[u16], points: &[(f64, &[f64])]) -> Box<Motion> 
     });
     let names = joints.iter().map(|j| format!("j{j}")).collect();
     let given = JointTrajectory { joint_names: names, points: points.collect() };
-    Box::new(Motion { id, joints: joints.to_vec(), spline: Spline::new(&given).unwrap() })
+    Box::new(Motion { id, joints: joints.to_vec(), spline: Spline::new(&given).unwrap(), until: None })
 }
 
 /// Moves all joints from one position to another [rad].

@@ -243,7 +243,8 @@ impl Trial {
                     return;
                 }
                 let spline = Spline::new(&curve(&names, &points, 1.0 / 30.0, &l)).unwrap();
-                let motion = Box::new(Motion { id: self.next_motion(), joints: (0..dof as u16).collect(), spline });
+                let motion =
+                    Box::new(Motion { id: self.next_motion(), joints: (0..dof as u16).collect(), spline, until: None });
                 for j in 0..dof {
                     self.judges[0].request(j, here[j], peak(j));
                     self.judges[0].request(j, goal[j], peak(j));

@@ -157,7 +157,7 @@ impl VirtualRun {
         let all: Vec<&String> = self.names.arms.iter().flat_map(|a| &a.joints).collect();
         let index = |name| all.iter().position(|j| *j == name).unwrap() as u16;
         let joints = trajectory.joint_names.iter().map(index).collect();
-        let motion = Motion { id: self.next_id, joints, spline: Spline::new(trajectory).unwrap() };
+        let motion = Motion { id: self.next_id, joints, spline: Spline::new(trajectory).unwrap(), until: None };
         let logged = json!({"execute": {"task": task, "motion": motion.id, "trajectory": trajectory}});
         self.send_logged(Request::Execute { task, motion: Box::new(motion) }, None, logged);
     }

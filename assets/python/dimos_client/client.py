@@ -65,6 +65,7 @@ class Client(Planning):
         direct: bool = False,
         replan: bool = False,
         on_path: Sequence[Mapping[str, Any]] = (),
+        until: Optional[Mapping[str, Any]] = None,
         seed: int = 0,
         timeout: Optional[float] = None,
     ) -> dict[str, Any]:
@@ -73,8 +74,9 @@ class Client(Planning):
         planned around obstacles, and after `replan` planned again when the world changes; `direct` moves straight in
         joint space, not collision-checked. Without a planner it is direct: `collision_checked` in the result says
         which. `on_path`: what is done at places of the path, as {"distance": 0.3, "gripper": {"arm": "arm",
-        "to": "open"}}, {"waypoint": 1, "output": {...}} or {..., "speed": 0.5}. Ends this client's own streams to the
-        arm."""
+        "to": "open"}}, {"waypoint": 1, "output": {...}} or {..., "speed": 0.5}. `until`: what ends the motion before
+        its goal, as {"force": 5}, {"input": "di0"} or {"time": 2}; the result then has `ended_by` and `value`, and
+        `Refused` (NOT_MET) is raised if the goal came first. Ends this client's own streams to the arm."""
         goal = Goal(target, named, pose, linear, frame, by, via)
         where = where_to(arm, goal, through, blend, tcp_speed)
         plain = isinstance(arm, str) and target is not None and goal == Goal(target) and tcp_speed is None
@@ -85,20 +87,28 @@ class Client(Planning):
             try:
                 self._end_streams(self._streams_to([arm] if isinstance(arm, str) else arm))
                 plan = {**where, "speed": speed, "seed": seed}
-                return self._go(
-                    {"plan": plan if timeout is None else {**plan, "timeout": timeout}}, wait, replan, on_path
-                )
+                step = {"plan": plan if timeout is None else {**plan, "timeout": timeout}}
+                return self._go(step, wait, replan, on_path, until)
             except Refused as error:
                 if not (error.code == "NO_PLANNER" and error.data is None and joints):
                     raise  # also when a planner was there and has gone
-        return self._go({"move": {"arm": arm, "target": joints, "speed": speed, "direct": direct}}, wait)
+        move = {"arm": arm, "target": joints, "speed": speed, "direct": direct}
+        return self._go({"move": move}, wait, until=until)
 
     def _go(
-        self, step: dict[str, Any], wait: bool, replan: bool = False, on_path: Sequence[Mapping[str, Any]] = ()
+        self,
+        step: dict[str, Any],
+        wait: bool,
+        replan: bool = False,
+        on_path: Sequence[Mapping[str, Any]] = (),
+        until: Optional[Mapping[str, Any]] = None,
     ) -> dict[str, Any]:
         """Lets the run carry out a motion as a whole. What it says of the motion: its end, or without `wait` its
         beginning."""
-        number: int = self.call("go", steps=[step], replan=replan or None, on_path=list(on_path) or None)["going"]
+        conditions = None if until is None else [until]
+        number: int = self.call(
+            "go", steps=[step], replan=replan or None, on_path=list(on_path) or None, until=conditions
+        )["going"]
         try:
             while True:
                 report = self.call("going", going=number)
@@ -109,6 +119,13 @@ class Client(Planning):
         except BaseException:  # Ctrl-C, too
             self._urgent("cancel", going=number)
             raise
+        if begun and wait and until is not None:
+            self.wait(begun["motion"])
+            while not (report := self.call("going", going=number))["done"]:
+                time.sleep(0.01)
+            if error := report.get("error"):
+                raise refusal(error)
+            return dict(report["outcome"])
         if begun:
             return self.wait(begun["motion"]) if wait else dict(begun)
         if (plan := done.get("planning")) and plan["state"] != "PLANNED":

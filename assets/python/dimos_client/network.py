@@ -25,7 +25,7 @@ CLASSES = {
     "end": "stop cancel",
     "plan": "plan ik world_add world_move world_remove attach detach register_planner planner_answer",
     "move": "lease release go move move_native execute execute_plan servo velocity chunk twist pose start gripper "
-    "speed arm_disable arm_io_set arm_payload_set arm_tool_set pose_save pose_remove",
+    "speed arm_disable arm_io_set arm_payload_set arm_tare arm_tool_set pose_save pose_remove",
     "enable": "arm_reset arm_enable arm_teach arm_take_over",
     "own": "shutdown",
 }

@@ -6,6 +6,7 @@ use dimos_core::clock::Mono;
 use dimos_core::joint::Joints;
 use dimos_core::telemetry::{LedBy, Origin};
 use dimos_core::trajectory::Spline;
+use dimos_core::until::Until;
 
 /// A request with its id. `Event::Request` with the same id has the outcome.
 #[derive(Debug)]
@@ -175,6 +176,8 @@ pub struct Motion {
     pub joints: Vec<u16>,
     /// The trajectory of these joints.
     pub spline: Spline,
+    /// What ends it before its goal.
+    pub until: Option<Until>,
 }
 
 /// Requested pose or twist of an end effector.

@@ -12,6 +12,7 @@ use super::task_robot::FramePose;
 use super::task_spec::TaskSpec;
 use dimos_core::clock::Mono;
 use dimos_core::telemetry::{Outcome, Reason, TaskState, TaskView};
+use dimos_core::until::Sensed;
 
 /// Shortest time between two commands to a gripper that follows another one.
 const GRIPPER_PERIOD: Duration = Duration::from_millis(50);
@@ -27,6 +28,8 @@ pub struct Tick<'a> {
     pub speed: SpeedOverride,
     /// All joints of all arms.
     pub views: &'a [JointView],
+    /// What each arm feels.
+    pub sensed: &'a [Sensed],
 }
 
 /// A task of a coordinator.
@@ -206,6 +209,7 @@ impl Task {
             granted: self.granted,
             motion: self.motion.as_deref(),
             views: tick.views,
+            sensed: tick.sensed,
         };
         (cx, self.body.as_mut(), &mut self.claims)
     }

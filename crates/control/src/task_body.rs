@@ -8,6 +8,7 @@ use super::task_robot::FramePose;
 use dimos_core::clock::Mono;
 use dimos_core::joint::Joints;
 use dimos_core::telemetry::{Cause, Outcome, Reason, TaskState, TaskView};
+use dimos_core::until::Sensed;
 
 /// State and limits of a joint, as a task sees them.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -69,12 +70,19 @@ pub struct Context<'a> {
     pub motion: Option<&'a Motion>,
     /// All joints of all arms.
     pub views: &'a [JointView],
+    /// What each arm feels.
+    pub sensed: &'a [Sensed],
 }
 
 impl Context<'_> {
     /// Returns the view of a joint; zeros for an index that does not exist.
     pub fn joint(&self, joint: u16) -> JointView {
         self.views.get(joint as usize).copied().unwrap_or_default()
+    }
+
+    /// Returns what an arm feels; nothing is known of one that does not exist.
+    pub fn sensed(&self, arm: u16) -> Sensed {
+        self.sensed.get(usize::from(arm)).copied().unwrap_or_default()
     }
 }
 

@@ -238,7 +238,7 @@ pub struct ArmState {
     pub gripper_force: Option<f64>,
     /// Pose of the arm's end by its controller, where it states one.
     pub pose: Option<ControllerPose>,
-    /// Force and torque at the sensor [N, N, N, Nm, Nm, Nm], where there is one.
+    /// Force and torque at the sensor [N, N, N, Nm, Nm, Nm], where there is one, less what was tared.
     pub wrench: Option<[f64; 6]>,
     /// The mode the arm is in.
     pub mode: ControlMode,
@@ -270,6 +270,9 @@ pub struct ArmState {
     /// `ArmCommand::seq` of the newest setpoint that the adapter, or the last check before it, refused; 0 = none.
     #[serde(default)]
     pub refused: u64,
+    /// Levels of the digital inputs, bit i is input i; `None`: they are not read with every state.
+    #[serde(default)]
+    pub inputs: Option<u32>,
 }
 
 impl Default for ArmState {
@@ -299,6 +302,7 @@ impl Default for ArmState {
             speed_fraction: None,
             commanded: None,
             refused: 0,
+            inputs: None,
         }
     }
 }

@@ -17,4 +17,5 @@ pub mod random;
 pub mod sync;
 pub mod telemetry;
 pub mod trajectory;
+pub mod until;
 pub mod written;

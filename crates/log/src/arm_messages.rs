@@ -12,7 +12,11 @@ pub(super) fn input_differs(a: &ArmState, b: &ArmState) -> bool {
     let values = |s: &ArmState| (s.gripper, s.gripper_force, s.pose, s.wrench, s.effort.is_some(), s.velocity_source);
     let flags = |s: &ArmState| (s.seq, s.stamp, s.mode, s.enabled, s.error, s.link, s.self_held, s.written);
     let more = |s: &ArmState| (s.interference, s.own_delay_ns, s.stop_input_open, s.device_ns, s.refused, s.commanded);
-    values(a) != values(b) || flags(a) != flags(b) || more(a) != more(b) || a.speed_fraction != b.speed_fraction
+    values(a) != values(b)
+        || flags(a) != flags(b)
+        || more(a) != more(b)
+        || a.speed_fraction != b.speed_fraction
+        || a.inputs != b.inputs
 }
 
 /// Returns whether two commands differ in the fields of `ArmOutput`, except for counters that change on their own.
@@ -50,6 +54,7 @@ pub(super) fn input(header: &Header, tick: u64, s: &ArmState) -> ArmInput {
         commanded_velocity: of_joints(s, |commanded| &commanded.velocity),
         refused: s.refused,
         speed_fraction: s.speed_fraction.into_iter().collect(),
+        inputs: s.inputs.into_iter().collect(),
     }
 }
 

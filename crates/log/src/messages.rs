@@ -325,6 +325,8 @@ message! {
         refused: u64,
         /// Fraction of its speed at which the arm's controller runs motions, 0 to 1; empty if not reported.
         speed_fraction: Vec<f64>,
+        /// Levels of the digital inputs, bit i is input i; empty if they were not read with the state.
+        inputs: Vec<u32>,
     }
 }
 

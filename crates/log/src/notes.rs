@@ -13,6 +13,7 @@ use dimos_core::joint::MAX_DOF;
 use dimos_core::telemetry::describe::Severity;
 use dimos_core::telemetry::{Origin, Who};
 use dimos_core::trajectory::JointTrajectory;
+use dimos_core::until::Until;
 
 /// Maximum memory of queued notes [bytes]: minutes of requests, dozens of the longest trajectories.
 const MAX_QUEUED: usize = 64 << 20;
@@ -55,6 +56,8 @@ pub enum Note {
         motion: u64,
         /// The trajectory.
         trajectory: Arc<JointTrajectory>,
+        /// What ends it before its goal.
+        until: Option<Until>,
     },
     /// A line of text.
     Log {

@@ -9,6 +9,7 @@ use serde_json::json;
 use dimos_core::clock::Mono;
 use dimos_core::telemetry::Origin;
 use dimos_core::trajectory::JointTrajectory;
+use dimos_core::until::Until;
 
 /// Maximum number of pending requests. The tick answers within a period; an older one has lost its answer.
 const MAX_PENDING: usize = 64;
@@ -23,13 +24,18 @@ pub(super) struct Execute {
     pub task: u16,
     pub motion: u64,
     pub trajectory: Arc<JointTrajectory>,
+    pub until: Option<Until>,
 }
 
 impl Execute {
     /// Returns the request as received.
     pub fn whole(&self) -> String {
-        let Self { task, motion, trajectory, .. } = self;
-        json!({"execute": {"task": task, "motion": motion, "trajectory": **trajectory}}).to_string()
+        let Self { task, motion, trajectory, until, .. } = self;
+        let mut execute = json!({"task": task, "motion": motion, "trajectory": **trajectory});
+        if let (Some(until), Some(fields)) = (until, execute.as_object_mut()) {
+            fields.insert("until".into(), json!(until));
+        }
+        json!({ "execute": execute }).to_string()
     }
 
     /// Returns the part that the tick checked, and the number of points left out.

@@ -303,8 +303,8 @@ where
         let Some(log) = &mut self.log else { return Ok(()) };
         match note {
             Note::Request { id, stamp, origin, json } => self.ticks.request(log, (id, stamp, origin), &json),
-            Note::Execute { id, stamp, origin, task, motion, trajectory } => {
-                match self.executes.asked(id, Execute { stamp, origin, task, motion, trajectory }) {
+            Note::Execute { id, stamp, origin, task, motion, trajectory, until } => {
+                match self.executes.asked(id, Execute { stamp, origin, task, motion, trajectory, until }) {
                     Some((id, execute)) => {
                         self.ticks.request(log, (id, execute.stamp, execute.origin), &execute.whole())
                     }

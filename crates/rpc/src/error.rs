@@ -85,6 +85,8 @@ pub enum Code {
     ArmLatched,
     /// The fault that latched the arm is still present.
     StillFaulted,
+    /// A motion reached its goal, or a limit of distance or time, before what was awaited.
+    NotMet,
     /// The task does not support the request.
     WrongTask,
     /// A number is not finite.

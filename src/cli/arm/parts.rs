@@ -7,7 +7,7 @@ use super::super::exit::{Exit, Result};
 use super::super::output;
 use super::ArmArgs;
 use dimos_core::arm::GripperUnit;
-use dimos_rpc::api::{AnalogReport, ArmIo, ArmIoSet, ArmPayload, ArmPayloadSet, IoReport, LoadReport};
+use dimos_rpc::api::{AnalogReport, ArmIo, ArmIoSet, ArmPayload, ArmPayloadSet, ArmTare, IoReport, LoadReport};
 use dimos_rpc::report::{ArmReport, JointStatusReport};
 
 /// Arguments of `arm io`.
@@ -69,6 +69,18 @@ pub fn payload_text(load: &LoadReport) -> String {
         false => format!(", inertia {} kg·m²", load.inertia.map(|v| output::fixed(v, 5)).join(" ")),
     };
     format!("{} kg, centre {x} {y} {z} m{inertia}", output::fixed(load.mass, 3))
+}
+
+/// Runs `arm tare`.
+pub fn tare(which: &ArmArgs) -> Result {
+    let reply = which.target_run.connect()?.call(ArmTare { arm: which.arm.clone() })?;
+    if which.target_run.json {
+        output::json(&reply);
+    } else {
+        let [fx, fy, fz, tx, ty, tz] = reply.wrench.map(|value| output::fixed(value, 2));
+        output::line(format_args!("{}: zero is now {fx} {fy} {fz} N, {tx} {ty} {tz} Nm", which.arm));
+    }
+    Ok(Exit::Ok)
 }
 
 /// Runs `arm io`.

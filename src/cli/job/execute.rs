@@ -273,7 +273,8 @@ impl<'r> Runner<'r, '_> {
             GoStep::Plan(Box::new(plan))
         };
         let (replan, on_path) = (motion.replan && !motion.direct, motion.on_path.clone());
-        let go = Go { steps: vec![step], replan, on_path, ..Go::default() };
+        let until = motion.until.iter().cloned().collect();
+        let go = Go { steps: vec![step], replan, on_path, until, ..Go::default() };
         let at = (self.client.call(go)?.going, 0);
         let begun = going::begin(self.client, at, Some(self.signals), false).map_err(|why| match why {
             // Another client's `cancel`, maybe at a waypoint.
@@ -290,7 +291,16 @@ impl<'r> Runner<'r, '_> {
         let by_others = report.error.as_deref().is_some_and(|why| {
             why == "cancelled" || ["task ", "the run ", "the log "].iter().any(|start| why.starts_with(start))
         });
-        result.map_err(|failure| if by_others { End::Stopped(failure) } else { failure.into() })
+        result.map_err(|failure| if by_others { End::Stopped(failure) } else { End::from(failure) })?;
+        let Some(until) = &motion.until else { return Ok(()) };
+        match going::outcome(self.client, at.0, report.motion)? {
+            Some(outcome) if until.is_awaited(outcome.ended_by) => Ok(()),
+            _ => {
+                let how = report.error.as_deref().unwrap_or("the goal came first");
+                let what = format!("the motion did not end as awaited: {how}");
+                Err(Failure::new(Exit::Failed, what).into())
+            }
+        }
     }
 
     fn gripper(

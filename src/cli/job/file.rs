@@ -264,6 +264,7 @@ impl Reader {
             direct: self.direct,
             replan: self.replan,
             on_path: Vec::new(),
+            until: None,
         };
         if self.tree.text(node).is_some() {
             motion.goal.named = Some(self.parsed(node, word)?);
@@ -277,6 +278,7 @@ impl Reader {
         motion.replan = self.at(node, "replan", flag).unwrap_or(motion.replan);
         motion.goal = self.goal(node)?;
         motion.on_path = self.acts(node, &motion)?;
+        motion.until = self.until(node, &motion)?;
         if motion.direct && motion.goal.joints.is_none() && motion.goal.named.is_none() {
             return self.wrong(node, "a direct motion needs `joints` or a named pose", Some("leave out `direct`"));
         }
@@ -354,6 +356,7 @@ impl Reader {
             direct: false,
             replan: self.replan,
             on_path: Vec::new(),
+            until: None,
         };
         let mut list = node;
         if self.tree.items(node).is_empty() {
@@ -369,6 +372,7 @@ impl Reader {
             }
             list = self.tree.get(node, "waypoints").unwrap_or(node);
             motion.on_path = self.acts(node, &motion)?;
+            motion.until = self.until(node, &motion)?;
         }
         let mut goals = Vec::new();
         for item in self.tree.items(list).to_vec() {
@@ -468,7 +472,7 @@ fn flag(text: &str) -> std::result::Result<bool, String> {
     text.parse().map_err(|_| "must be true or false".into())
 }
 
-fn level(text: &str) -> std::result::Result<bool, String> {
+pub(super) fn level(text: &str) -> std::result::Result<bool, String> {
     match text {
         "high" | "1" | "true" => Ok(true),
         "low" | "0" | "false" => Ok(false),
@@ -483,7 +487,7 @@ pub(super) fn times(text: &str) -> std::result::Result<u64, String> {
     }
 }
 
-fn digital_input(text: &str) -> std::result::Result<String, String> {
+pub(super) fn digital_input(text: &str) -> std::result::Result<String, String> {
     match channel(text, "di") {
         Some(_) => Ok(text.to_owned()),
         None => Err("must be a digital input: di0, di1, …".into()),

@@ -105,6 +105,7 @@ pub static MOTION: Group = Group {
         ("direct", Flag),
         ("replan", Flag),
         ("on_path", Acts(&ON_PATH)),
+        ("until", Keys(&UNTIL)),
         ("arm", Text),
     ],
     required: &[],
@@ -117,6 +118,18 @@ pub static ON_PATH: Group = Group {
         ("gripper", Either(&[Opening, Keys(&FINGERS)])),
         ("output", Outputs),
         ("speed", Speed),
+    ],
+    required: &[],
+};
+/// What ends a motion before its goal.
+pub static UNTIL: Group = Group {
+    keys: &[
+        ("force", Number),
+        ("torque", Number),
+        ("input", Input),
+        ("is", Level),
+        ("distance", Number),
+        ("time", Time),
     ],
     required: &[],
 };
@@ -143,6 +156,7 @@ pub static THROUGH: Group = Group {
         ("tcp_speed", Number),
         ("replan", Flag),
         ("on_path", Acts(&ON_PATH)),
+        ("until", Keys(&UNTIL)),
         ("arm", Text),
     ],
     required: &["waypoints"],

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use crate::cli::grip::Opening;
-use dimos_rpc::api::{Attach, OnPath, PlanGoal};
+use dimos_rpc::api::{Attach, OnPath, PlanGoal, Until};
 use dimos_yaml::{NodeId, Tree};
 
 /// A job that can be run.
@@ -84,4 +84,6 @@ pub struct Motion {
     pub replan: bool,
     /// What is done at places of its path.
     pub on_path: Vec<OnPath>,
+    /// What ends it before its goal.
+    pub until: Option<Until>,
 }

@@ -92,8 +92,8 @@ impl Dispatcher {
         origin: Option<Origin>,
         trajectory: Arc<JointTrajectory>,
     ) -> Result<Outcome, SendError> {
-        let number = motion.id;
-        let note = |id, stamp| Note::Execute { id, stamp, origin, task, motion: number, trajectory };
+        let (number, until) = (motion.id, motion.until);
+        let note = |id, stamp| Note::Execute { id, stamp, origin, task, motion: number, trajectory, until };
         answer(self.push(Request::Execute { task, motion }, origin, note)?).await
     }
 

@@ -285,7 +285,7 @@ impl Service {
             Some(Next::None(why)) => report.error = report.error.map(|error| format!("{error}; no way around: {why}")),
             None => {}
         }
-        if end.state == TaskState::Completed {
+        if end.state == TaskState::Completed && end.reason == Reason::None {
             (report.progress, report.remaining) = (1.0, 0.0);
         }
         let all = planned.joints.iter().zip(&planned.goal).zip(&end.actual);

@@ -55,7 +55,7 @@ impl Service {
         let spline = Spline::new(&trajectory).map_err(|e| RpcError::new(Code::InvalidTrajectory, e.to_string()))?;
         self.check_limits(&config.joints, &spline)?;
         let log = json!({"chunk": {"task": task, "start": start.0, "trajectory": trajectory}});
-        let motion = Box::new(Motion { id: 0, joints: config.joints.clone(), spline });
+        let motion = Box::new(Motion { id: 0, joints: config.joints.clone(), spline, until: None });
         let sent = self.tick.dispatcher().ask(Request::Chunk { task, start, motion }, Some(origin), log);
         self.outcome(sent.await)?;
         self.streams.begin(task);

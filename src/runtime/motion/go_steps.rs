@@ -5,12 +5,13 @@ use std::time::{Duration, Instant};
 
 use super::going::{Going, POLL_PERIOD};
 use super::on_path::Acts;
+use super::until::awaiting;
 use crate::runtime::{Service, internal};
 use dimos_control::request::Request;
 use dimos_core::telemetry::{Origin, TaskState};
 use dimos_rpc::api::{
     EndedBy, ExecutePlan, GoBegun, GoPhase, GoStep, OnPath, Plan, PlanGoal, PlanSummary, Planning, Reply,
-    Request as Call, RobotReport,
+    Request as Call, RobotReport, Until,
 };
 use dimos_rpc::report::MotionReport;
 use dimos_rpc::{Backend, Code, RpcError, Subject};
@@ -29,6 +30,18 @@ pub struct Failed {
     pub by: EndedBy,
     /// Why.
     pub error: Option<RpcError>,
+}
+
+/// What a request asks of one of its steps.
+pub struct Asked<'a> {
+    /// As in the request.
+    pub replan: bool,
+    /// As in the request.
+    pub unproven: bool,
+    /// Acts on its path, with their indices in the request.
+    pub acts: Vec<(usize, OnPath)>,
+    /// What ends its motion before the goal.
+    pub until: Option<&'a Until>,
 }
 
 impl Service {
@@ -99,17 +112,17 @@ impl Service {
         Ok(())
     }
 
-    /// Carries out a step. `replan` and `unproven` are those of the request; acts come with their indices in it.
+    /// Carries out a step, and returns what has ended it.
     pub(in crate::runtime) async fn carry_out_step(
         &self,
         going: &Going,
         step: GoStep,
-        (replan, unproven): (bool, bool),
-        acts: Vec<(usize, OnPath)>,
+        asked: Asked<'_>,
         origin: &mut Origin,
-    ) -> Result<(), Failed> {
+    ) -> Result<EndedBy, Failed> {
+        let Asked { replan, unproven, acts, until } = asked;
         let mut none = Acts::default();
-        match step {
+        let ended = match step {
             GoStep::Plan(plan) => {
                 for (_, act) in &acts {
                     if let Some(gripper) = &act.gripper {
@@ -119,24 +132,44 @@ impl Service {
                 let (plan, summary) = self.plan_step(going, *plan, *origin).await?;
                 let mut acts = self.acts_of(acts, plan, &summary).await?;
                 let execute = ExecutePlan { plan: Some(plan), replan, unproven, ..ExecutePlan::default() };
-                let done = self.execute_step(going, execute, &summary.joints, &mut acts, *origin).await;
+                let done = self.execute_step(going, execute, &summary.joints, (&mut acts, until), *origin).await;
                 self.restore_speed(&mut acts, *origin).await;
                 done
             }
             GoStep::ExecutePlan(execute) => {
                 let (_, joints) = self.plan_and_its_joints(execute.plan).await?;
-                self.execute_step(going, *execute, &joints, &mut none, *origin).await
+                self.execute_step(going, *execute, &joints, (&mut none, until), *origin).await
             }
             GoStep::Move(direct) => {
                 let arms = [direct.arm.clone()];
-                self.move_step(going, &arms, Call::Move(*direct), &mut none, *origin).await
+                let judged = self.judged(until, going, None).await?;
+                let call = awaiting(judged, self.move_step(going, &arms, Call::Move(*direct), &mut none, *origin));
+                call.await
             }
             GoStep::Execute(execute) => {
                 let arms = self.arms_of(Subject::Joints(&execute.trajectory.joint_names));
-                self.move_step(going, &arms, Call::Execute(*execute), &mut none, *origin).await
+                let judged = self.judged(until, going, None).await?;
+                let call = awaiting(judged, self.move_step(going, &arms, Call::Execute(*execute), &mut none, *origin));
+                call.await
             }
-            GoStep::Gripper(gripper) => self.grip_step(going, *gripper, origin).await,
-        }
+            GoStep::Gripper(gripper) => self.grip_step(going, *gripper, origin).await.map(|()| EndedBy::Goal),
+        }?;
+        self.ended_as_awaited(until, ended)
+    }
+
+    /// Returns the conditions of a step as the tick judges them.
+    async fn judged(
+        &self,
+        until: Option<&Until>,
+        going: &Going,
+        plan: Option<u64>,
+    ) -> Result<Option<dimos_core::until::Until>, Failed> {
+        let Some(until) = until else { return Ok(None) };
+        let covered = match plan.filter(|_| until.distance.is_some()) {
+            Some(plan) => Some(self.covered_by(plan).await?),
+            None => None,
+        };
+        Ok(Some(self.until_of(until, going.arms(), covered.as_ref())?))
     }
 
     /// Makes a plan. Returns its number and its figures.
@@ -170,15 +203,17 @@ impl Service {
         going: &Going,
         execute: ExecutePlan,
         joints: &[String],
-        acts: &mut Acts,
+        (acts, until): (&mut Acts, Option<&Until>),
         origin: Origin,
-    ) -> Result<(), Failed> {
+    ) -> Result<EndedBy, Failed> {
         let arms = self.arms_of(Subject::Joints(joints));
+        let judged = self.judged(until, going, execute.plan).await?;
         let execute = ExecutePlan { presence: going.presence(), ..execute };
-        self.move_step(going, &arms, Call::ExecutePlan(execute), acts, origin).await
+        awaiting(judged, self.move_step(going, &arms, Call::ExecutePlan(execute), acts, origin)).await
     }
 
-    /// Begins a motion and waits for its end, and for that of those that continue it around an obstacle.
+    /// Begins a motion and waits for its end, and for that of those that continue it around an obstacle. Returns what has
+    /// ended it.
     async fn move_step(
         &self,
         going: &Going,
@@ -186,7 +221,7 @@ impl Service {
         call: Call,
         acts: &mut Acts,
         origin: Origin,
-    ) -> Result<(), Failed> {
+    ) -> Result<EndedBy, Failed> {
         let (method, answer) = (call.method(), Box::pin(self.answer_counted(call, origin)));
         let begun = match going.command(arms, method, answer).await? {
             Reply::Move(reply) => GoBegun::Move(reply),
@@ -212,7 +247,7 @@ impl Service {
                     continue;
                 }
                 None if !report.done => {}
-                None if report.state == TaskState::Completed.name() => return Ok(()),
+                None if report.state == TaskState::Completed.name() => return Ok(self.cause_of_end(motion).0),
                 None => return Err(Failed { by: self.cause_of_end(motion).0, error: None }),
             }
             // The `cancel` that ended this was of another arm of it, or came before the motion was known.

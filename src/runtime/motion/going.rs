@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use super::go_steps::Failed;
+use super::go_steps::{Asked, Failed};
 use crate::runtime::client::asker::{asked_by, asker};
 use crate::runtime::client::curb::{Curb, curbed};
 use crate::runtime::{Service, internal};
@@ -58,6 +58,11 @@ impl Going {
     /// begins.
     pub fn is_client_gone(&self) -> bool {
         self.claimant.as_ref().is_some_and(|claimant| claimant.presence().is_over())
+    }
+
+    /// Returns the arms that it may move.
+    pub fn arms(&self) -> &[u16] {
+        &self.arms
     }
 
     /// Returns the presence of that connection.
@@ -116,6 +121,7 @@ impl Service {
     /// Begins to carry out a request `go`.
     pub(in crate::runtime) async fn go(&self, mut go: Go, origin: Origin) -> Result<GoReply, RpcError> {
         let arms = self.check_steps(&mut go.steps).await?;
+        self.check_until(&go.until, &arms).await?;
         let number = self.tick.dispatcher().next_id();
         let by = asker();
         let report = GoingReport { going: number, by: by.as_deref().cloned(), ..GoingReport::default() };
@@ -173,16 +179,21 @@ impl Service {
     }
 
     async fn carry_out(&self, going: &Going, go: Go, mut origin: Origin) {
-        let Go { steps, replan, unproven, on_path, .. } = go;
+        let Go { steps, replan, unproven, on_path, until, .. } = go;
         let mut ended = Failed { by: EndedBy::Goal, error: None };
         for (index, step) in steps.into_iter().enumerate() {
             let acts = on_path.iter().enumerate().filter(|(_, act)| act.step == index);
             let acts = acts.map(|(number, act)| (number, act.clone())).collect();
             going.update(|report| report.steps.push(GoStepReport::default()));
             going.step(GoPhase::Planning, |_| {});
-            if let Err(failed) = self.carry_out_step(going, step, (replan, unproven), acts, &mut origin).await {
-                ended = failed;
-                break;
+            let until = until.iter().find(|until| until.step == index);
+            let asked = Asked { replan, unproven, acts, until };
+            match self.carry_out_step(going, step, asked, &mut origin).await {
+                Ok(by) => ended.by = by,
+                Err(failed) => {
+                    ended = failed;
+                    break;
+                }
             }
         }
         // A refusal after a stop has that cause.
@@ -210,6 +221,8 @@ impl Service {
             None => return (EndedBy::Other, None),
         };
         match reason {
+            Reason::None => (EndedBy::Goal, None),
+            Reason::Until(condition, value) => (condition.into(), Some(value)),
             Reason::Cancelled | Reason::StreamEnded => (EndedBy::Cancelled, None),
             Reason::Preempted(..) => (EndedBy::Replaced, None),
             Reason::WayBlocked | Reason::Guarded(_) | Reason::ArmHeld(_, Cause::WayBlocked) => (EndedBy::Blocked, None),

@@ -9,3 +9,4 @@ pub(in crate::runtime) mod on_path;
 pub(in crate::runtime) mod replan;
 pub(in crate::runtime) mod stream_requests;
 pub(in crate::runtime) mod streams;
+pub(in crate::runtime) mod until;

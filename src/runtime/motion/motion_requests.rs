@@ -6,6 +6,7 @@ use std::time::Duration;
 use serde_json::json;
 
 use super::motions::{Carried, Planned};
+use super::until::awaited;
 use crate::runtime::client::asker::asker;
 use crate::runtime::client::curb::curb;
 use crate::runtime::plan::planner_port::run_blocking;
@@ -175,7 +176,7 @@ impl Service {
             by: asker(),
         };
         self.motions.plan(number, planned);
-        let motion = Box::new(Motion { id: number, joints, spline });
+        let motion = Box::new(Motion { id: number, joints, spline, until: awaited() });
         let sent = self.tick.dispatcher().execute(task, motion, Some(origin), Arc::new(trajectory));
         let result = self.outcome(sent.await);
         if result.is_err() {

@@ -27,7 +27,44 @@ impl Acts {
     }
 }
 
+/// The way that a tool covers along a plan.
+pub struct Covered {
+    /// Times along the path [s], and the way until then [m].
+    times: Vec<f64>,
+    ways: Vec<f64>,
+}
+
+impl Covered {
+    /// Returns the time along the path at which the tool has covered a way [m, s]; fails if it never does. `what` asks.
+    pub fn time_of(&self, what: &str, distance: f64) -> Result<f64, RpcError> {
+        let whole = self.ways.last().copied().unwrap_or(0.0);
+        if distance > whole + 1e-6 {
+            let what = format!("{what}: the tool's path is {whole:.4} m long, not {distance} m");
+            let error = RpcError::new(Code::InvalidParams, what);
+            return Err(error.hint("nothing has moved; `dimos plan` shows a motion"));
+        }
+        let at = self.ways.partition_point(|covered| *covered < distance).min(self.ways.len() - 1);
+        self.times.get(at).or(self.times.last()).copied().ok_or_else(internal)
+    }
+}
+
 impl Service {
+    /// Returns the way that the tool covers along a plan that takes this long [s].
+    pub(in crate::runtime) async fn covered(&self, plan: u64, duration: f64) -> Result<Covered, RpcError> {
+        let hz = RATE.min(SAMPLES / duration.max(1.0)).floor().max(1.0);
+        let asked = Call::Preview(Preview { plan: Some(plan), hz: Some(hz) });
+        let Reply::Preview(preview) = self.planner_call(asked).await? else { return Err(internal()) };
+        let places = preview.end_effectors.values().next().map(Vec::as_slice).unwrap_or_default();
+        let times: Vec<f64> = preview.trajectory.points.iter().map(|point| point.time_from_start).collect();
+        let mut ways = vec![0.0];
+        for pair in places.windows(2) {
+            let [a, b] = pair else { continue };
+            let step = a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt();
+            ways.push(ways.last().copied().unwrap_or(0.0) + step);
+        }
+        Ok(Covered { times, ways })
+    }
+
     /// Returns the acts of a step with the times at which the plan's motion passes their places.
     pub(in crate::runtime) async fn acts_of(
         &self,
@@ -38,27 +75,9 @@ impl Service {
         if acts.is_empty() {
             return Ok(Acts::default());
         }
-        let hz = RATE.min(SAMPLES / summary.duration.max(1.0)).floor().max(1.0);
-        let asked = Call::Preview(Preview { plan: Some(plan), hz: Some(hz) });
-        let Reply::Preview(preview) = self.planner_call(asked).await? else { return Err(internal()) };
-        let places = preview.end_effectors.values().next().map(Vec::as_slice).unwrap_or_default();
-        let times: Vec<f64> = preview.trajectory.points.iter().map(|point| point.time_from_start).collect();
-        let mut covered = vec![0.0];
-        for pair in places.windows(2) {
-            let [a, b] = pair else { continue };
-            let step = a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt();
-            covered.push(covered.last().copied().unwrap_or(0.0) + step);
-        }
-        let whole = covered.last().copied().unwrap_or(0.0);
+        let covered = self.covered(plan, summary.duration).await?;
         let time_of = |index: usize, act: &OnPath| match (act.distance, act.waypoint) {
-            (Some(distance), _) if distance <= whole + 1e-6 => {
-                let at = covered.partition_point(|covered| *covered < distance).min(covered.len() - 1);
-                Ok(times.get(at).copied().unwrap_or(summary.duration))
-            }
-            (Some(distance), _) => {
-                let what = format!("on_path[{index}]: the tool's path is {whole:.4} m long, not {distance} m");
-                Err(RpcError::new(Code::InvalidParams, what).hint("nothing has moved; `dimos plan` shows a motion"))
-            }
+            (Some(distance), _) => covered.time_of(&format!("on_path[{index}]"), distance),
             (None, Some(waypoint)) => summary.passes.get(waypoint - 1).copied().ok_or_else(internal),
             (None, None) => Err(internal()),
         };

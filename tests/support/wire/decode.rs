@@ -19,9 +19,9 @@ enum Front {
 }
 
 /// A decoder from a function that examines the front.
-fn by(look: impl Fn(&[u8]) -> Front + Send + Sync + Clone + 'static) -> NewDecoder {
+fn by(look: impl FnMut(&[u8]) -> Front + Send + Sync + Clone + 'static) -> NewDecoder {
     Arc::new(move || -> Decoder {
-        let (look, mut bytes) = (look.clone(), VecDeque::new());
+        let (mut look, mut bytes) = (look.clone(), VecDeque::new());
         Box::new(move |new, found| {
             bytes.extend(new);
             loop {
@@ -186,11 +186,13 @@ pub fn template() -> NewDecoder {
     })
 }
 
-/// Feetech's bus servos: a goal for each servo in one packet to all. Positions begin with the middle of a turn, 4096 to
-/// a turn; homing offsets are zero where a test begins.
+/// Feetech's bus servos: a goal for each servo in one packet to all, or in one to each, which then counts with the last
+/// goals of the others. Positions begin with the middle of a turn, 4096 to a turn; homing offsets are zero where a test
+/// begins.
 pub fn so101() -> NewDecoder {
-    by(|bytes| {
-        let Some([0xFF, 0xFF, _, length]) = bytes.first_chunk::<4>() else {
+    let mut goals = [None; 5];
+    by(move |bytes| {
+        let Some([0xFF, 0xFF, id, length]) = bytes.first_chunk::<4>() else {
             return if matches!(bytes, [] | [0xFF] | [0xFF, 0xFF, ..]) && bytes.len() < 4 {
                 Front::More
             } else {
@@ -199,16 +201,27 @@ pub fn so101() -> NewDecoder {
         };
         let Some(body) = bytes.get(4..4 + usize::from(*length)) else { return Front::More };
         let angle = |b: [u8; 2]| (f64::from(u16::from_le_bytes(b)) - 2048.0) / 4096.0 * std::f64::consts::TAU;
+        let mut take = |id: u8, goal: &[u8]| {
+            if let (Some(of), [low, high, ..]) = (goals.get_mut(usize::from(id).wrapping_sub(1)), goal) {
+                *of = Some(angle([*low, *high]));
+            }
+        };
+        // In motion the acceleration, register 41, is before the goal.
+        let is_goal = match body {
+            [0x83, first @ 41..=42, size, servos @ .., _] => {
+                for servo in servos.chunks_exact(usize::from(*size) + 1) {
+                    take(servo[0], &servo[1 + usize::from(42 - first)..]);
+                }
+                true
+            }
+            [0x03, first @ 41..=42, goal @ .., _] => {
+                take(*id, &goal[usize::from(42 - first)..]);
+                *id <= 5
+            }
+            _ => false,
+        };
         let what = match body {
-            [0x83, 42, size, goals @ .., _] => {
-                let each = goals.chunks_exact(usize::from(*size) + 1).take(5);
-                Some(What::Position(each.map(|goal| angle([goal[1], goal[2]])).collect()))
-            }
-            // The same in motion: acceleration, goal, time and speed.
-            [0x83, 41, size, goals @ .., _] => {
-                let each = goals.chunks_exact(usize::from(*size) + 1).take(5);
-                Some(What::Position(each.map(|goal| angle([goal[2], goal[3]])).collect()))
-            }
+            _ if is_goal => goals.iter().copied().collect::<Option<Vec<f64>>>().map(What::Position),
             [0x83, 40, 1, torques @ .., _] => Some(What::Enable(torques.get(1) == Some(&1))),
             _ => None,
         };

@@ -22,6 +22,10 @@ const SLOW: u16 = 200;
 /// A joint that is this near to the end of its range is back [counts]: it rests beside its goal, under load.
 const NEAR: i32 = SEAM_MARGIN * 3 / 4;
 
+/// A servo whose joint is behind its seam sees its goal most of a turn away, and does all it can [0.1 %]: less is a false
+/// reading. One in overload has a fifth of its torque.
+const FIGHTS: i32 = 100;
+
 /// What a servo is to be given.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Order {
@@ -52,7 +56,8 @@ impl Seams {
     /// Returns what joint `j` is to be given, if anything.
     pub fn order(&mut self, j: usize, servo: &Servo, range: Range) -> Option<Order> {
         let (turns, crossed) = (self.turns.get(j)?, self.crossed.get_mut(j)?);
-        if !servo.on || !(*crossed || turns.crossed()) {
+        let fights = servo.load.abs() >= FIGHTS.min(i32::from(servo.torque_limit) / 2);
+        if !servo.on || !(*crossed || (turns.crossed() && fights)) {
             *crossed &= servo.on;
             return None;
         }

@@ -76,6 +76,9 @@ impl Model {
         let noise = f64::from(random.within(-1, 1));
         self.servo.position = ((self.at + noise).round() as i32).rem_euclid(4096);
         self.servo.velocity = self.velocity.round() as i32;
+        // Its own load, and what its motor does to get to the goal: never the short way.
+        let duty = 7.0 * (f64::from(self.servo.goal) - self.at.rem_euclid(4096.0));
+        self.servo.load = if self.servo.on { duty.clamp(-1000.0, 1000.0) as i32 } else { 0 };
     }
 }
 
@@ -192,6 +195,36 @@ fn no_goal_moves_at_a_seam_in_ten_thousand_states_and_pushes() {
         }
     }
     assert!(crossings > 500 && refused > 300 && enabled > 5_000, "{crossings} {refused} {enabled}");
+}
+
+/// A reading that slips over the seam, with or without a velocity, is none of a joint that rests: its motor does nothing.
+#[test]
+fn a_reading_that_slips_over_the_seam_gives_no_goal() {
+    let mut random = Random(0x9E37_79B9_7F4A_7C15);
+    for n in 0..3_000 {
+        let (low, high) = (random.below(1500), 2500 + random.below(1595));
+        let range = Calibration::parse(&file(low, high, 0), 1).unwrap().0[WRIST];
+        let mut watch = Watch { seams: Seams::default(), range, now: 1_000_000_000 };
+        let goal = random.within(range.low, range.high);
+        let droop = f64::from(random.within(-14, 14));
+        let servo = Servo { on: true, goal, position: goal, torque_limit: 1000, ..Servo::default() };
+        let mut model = Model { at: f64::from(goal) - droop, velocity: 0.0, servo, droop };
+        watch.pass(&mut model, None, 20, &mut random);
+        let (slip, shown) = (f64::from(random.within(-40, 40)), random.below(3));
+        let mut slipped = 0.0;
+        for _ in 0..400 {
+            model.pass(None, &mut random);
+            slipped += slip;
+            let truth = model.servo;
+            model.servo.position = ((model.at + slipped).round() as i32).rem_euclid(4096);
+            if shown > 0 {
+                model.servo.velocity += (slip * 100.0) as i32;
+            }
+            let order = watch.read(&mut model);
+            assert_eq!(order, None, "{n}: {slip} counts per reading, {} of {range:?}", model.servo.position);
+            model.servo = Servo { position: truth.position, velocity: truth.velocity, ..model.servo };
+        }
+    }
 }
 
 /// An arm whose wrist has its seam inside its travel: `offset` counts from half a turn.

@@ -268,7 +268,7 @@ impl Bench {
         let joint_names = (0..DOF).map(|j| j.to_string()).collect();
         let given = JointTrajectory { joint_names, points: vec![point(0.0, 0.0), point(2.0, 0.3)] };
         let spline = Spline::new(&given).map_err(|e| e.to_string())?;
-        Ok(Box::new(Motion { id: self.next_id, joints: (0..DOF as u16).collect(), spline }))
+        Ok(Box::new(Motion { id: self.next_id, joints: (0..DOF as u16).collect(), spline, until: None }))
     }
 
     /// A chunk of the next second of the swing.
@@ -282,7 +282,7 @@ impl Bench {
         let actions: Vec<Vec<f64>> = (0..30).map(action).collect();
         let limits = JointLimits::uniform(DOF, 2.9, 2.0).with_defaults();
         let spline = Spline::new(&curve(&names, &actions, period, &limits)).map_err(|e| e.to_string())?;
-        Ok(Box::new(Motion { id: self.next_id, joints: (0..DOF as u16).collect(), spline }))
+        Ok(Box::new(Motion { id: self.next_id, joints: (0..DOF as u16).collect(), spline, until: None }))
     }
 
     /// Runs the task of higher priority for this time [s].

@@ -23,6 +23,7 @@ use super::task_leader::gripper_target;
 use dimos_core::arm::ArmState;
 use dimos_core::clock::Mono;
 use dimos_core::telemetry::{ArmSample, Bound, Cause, Event, Origin, Phase, Reason, TaskState};
+use dimos_core::until::Sensed;
 
 use interruptions::Watched;
 pub use tick_output::{TickOutput, TickTime};
@@ -54,6 +55,7 @@ pub struct Coordinator {
     /// The arm of each joint.
     arm_of: Vec<u16>,
     joints: Vec<JointView>,
+    sensed: Vec<Sensed>,
     overruns_in_a_row: u32,
     stalls: Stalls,
     speed: SpeedOverride,
@@ -86,6 +88,7 @@ impl Coordinator {
             period_ns: Duration::from_secs_f64(1.0 / config.rate).as_nanos().max(1) as u64,
             arbiter: Arbiter::new(&priorities, arm_of.clone(), arms.len()),
             joints: vec![JointView::default(); arm_of.len()],
+            sensed: vec![Sensed::default(); config.arms.len()],
             guard: Guard::new(arms.len()),
             epoch: 0,
             watched: vec![Watched::default(); arms.len()],
@@ -165,6 +168,9 @@ impl Coordinator {
                 let (phase, cause) = (arm.failsafe.phase(), arm.failsafe.cause());
                 self.output.report(Event::Arm(i as u16, phase, cause));
             }
+            if let Some(sensed) = self.sensed.get_mut(i) {
+                *sensed = Sensed { wrench: arm.state().wrench, inputs: arm.state().inputs };
+            }
             let fault = arm.not_to_follow();
             let droop = if arm.config().supervision.droop > 0.0 { arm.rest_tolerance() } else { 0.0 };
             let views = self.joints.iter_mut().skip(arm.first()).zip(arm.limiters());
@@ -197,7 +203,7 @@ impl Coordinator {
         for i in 0..self.arms.len() {
             let Some((arm, at)) = self.arms.get(i).and_then(|arm| Some((arm, arm.resumed()?))) else { continue };
             let (joints, tolerance) = (arm.first()..arm.first() + arm.config().dof, arm.rest_tolerance());
-            let tick = Tick { now, dt: self.step, speed: self.speed, views: &self.joints };
+            let tick = Tick { now, dt: self.step, speed: self.speed, views: &self.joints, sensed: &self.sensed };
             for t in 0..self.tasks.len() {
                 let Some(task) = self.tasks.get_mut(t).filter(|task| task.is_active()) else { continue };
                 if !task.moving_joints().iter().any(|joint| joints.contains(&usize::from(*joint))) {
@@ -297,7 +303,7 @@ impl Coordinator {
 
     fn compute(&mut self, now: Mono) {
         self.speed.advance(self.step);
-        let tick = Tick { now, dt: self.step, speed: self.speed, views: &self.joints };
+        let tick = Tick { now, dt: self.step, speed: self.speed, views: &self.joints, sensed: &self.sensed };
         for (t, task) in self.tasks.iter_mut().enumerate() {
             let before = (task.state, task.reason);
             let motion = task.compute(&tick);

@@ -213,7 +213,7 @@ impl Coordinator {
             Some(arm) => self.still_valid(*arm, origin),
             None => Ok(()),
         });
-        let tick = Tick { now, dt: self.step, speed: self.speed, views: &self.joints };
+        let tick = Tick { now, dt: self.step, speed: self.speed, views: &self.joints, sensed: &self.sensed };
         let t = self.tasks.get_mut(task as usize).ok_or(Outcome::WrongTask(task))?;
         // That the arm is elsewhere says more.
         t.check_start(&tick, target)?;

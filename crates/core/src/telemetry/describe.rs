@@ -213,7 +213,7 @@ fn request(id: u64, outcome: Outcome, names: &Names) -> Described {
 
 fn task_changed(task: u16, state: TaskState, reason: Reason, names: &Names) -> Described {
     let severity = match (state, reason) {
-        (_, Reason::None | Reason::Cancelled | Reason::StreamEnded) => Severity::Info,
+        (_, Reason::None | Reason::Cancelled | Reason::StreamEnded | Reason::Until(..)) => Severity::Info,
         (_, Reason::Approaching | Reason::InStep) => Severity::Info,
         (_, Reason::ArmHeld(_, Cause::Operator | Cause::StopInput | Cause::Shutdown)) => Severity::Warn,
         (_, Reason::WayBlocked | Reason::LeaseEnded(_)) => Severity::Warn,
@@ -239,7 +239,8 @@ fn task_changed(task: u16, state: TaskState, reason: Reason, names: &Names) -> D
             d.values = vec![value];
         }
         Reason::Preempted(_, joint) | Reason::NonFinite(joint) => d.joint = Some(names.joint(joint)),
-        Reason::Guarded(arm) | Reason::LeaseEnded(arm) => d.arm = Some(names.arm(arm)),
+        Reason::Guarded(arm) | Reason::LeaseEnded(arm) | Reason::Unsensed(arm, _) => d.arm = Some(names.arm(arm)),
+        Reason::Until(_, value) => d.values = vec![value],
         Reason::ArmHeld(arm, cause) | Reason::LeaderLost(arm, cause) => {
             d.arm = Some(names.arm(arm));
             d.values = code(cause);

@@ -12,6 +12,7 @@ use serde::{Deserialize, Serialize};
 use crate::arm::{ArmCommand, ArmState};
 use crate::clock::Mono;
 use crate::named::named;
+use crate::until::Condition;
 
 pub use interruption::{Interruption, Origin};
 pub use label::Label;
@@ -298,6 +299,11 @@ pub enum Reason {
     Gap(u16, f64, f64),
     /// The client that sent its targets released the lease of the arm, or disconnected: the arm.
     LeaseEnded(u16),
+    /// A condition that was awaited ended it before its goal: the condition, what was measured [N, Nm, m, s, or 1 for a
+    /// high input].
+    Until(Condition, f64),
+    /// A condition that was awaited could not be judged any longer: the arm that it is about, the condition.
+    Unsensed(u16, Condition),
 }
 
 /// Two things that the collision guard keeps apart.

@@ -2,6 +2,7 @@
 
 use super::describe::Names;
 use super::{Age, Bound, Cause, Guarded, Interruption, Outcome, Reason};
+use crate::until::Condition;
 
 /// Returns what the collision guard keeps apart as text.
 pub(super) fn apart(pair: &Guarded) -> String {
@@ -109,9 +110,21 @@ pub fn reason_text(reason: &Reason, names: &Names) -> String {
             names.joint(joint),
             angle(by)
         ),
+        Reason::Until(condition, value) => until_text(condition, value),
+        Reason::Unsensed(arm, condition) => {
+            format!("the {} of {} is no longer known, and was awaited", condition.name(), names.arm(arm))
+        }
         Reason::LeaseEnded(arm) => {
             format!("the client that sent it has disconnected, or released {}", names.arm(arm))
         }
+    }
+}
+
+/// Returns which condition ended a motion, and what was measured.
+pub fn until_text(condition: Condition, value: f64) -> String {
+    match condition {
+        Condition::Input => format!("ended by an input: {}", if value > 0.5 { "high" } else { "low" }),
+        _ => format!("ended by {}: {value:.3} {}", condition.name(), condition.unit()),
     }
 }
 

@@ -151,6 +151,8 @@ enum Order {
     SetOutput(OutputValue, SyncSender<AdapterResult<()>>),
     ReadPayload(SyncSender<AdapterResult<Option<Load>>>),
     SetPayload(Load, SyncSender<AdapterResult<Option<Load>>>),
+    Tare(SyncSender<AdapterResult<[f64; 6]>>),
+    WatchInputs(SyncSender<AdapterResult<()>>),
     TakeOver(SyncSender<AdapterResult<()>>),
     Lead(Way, u32, SyncSender<AdapterResult<()>>),
     Finish { disable: bool, reply: SyncSender<AdapterResult<()>> },
@@ -247,6 +249,17 @@ impl Device {
     /// if the controller reports another load. Repeated whenever the motors are enabled.
     pub fn set_payload(&self, load: Load) -> Answer<Option<Load>> {
         self.order(|reply| Order::SetPayload(load, reply))
+    }
+
+    /// Makes the present wrench zero until the next tare or the end of the run, and returns what was measured [N, N, N,
+    /// Nm, Nm, Nm]. `Unsupported` for an arm without a wrench; `Rejected` while none is known.
+    pub fn tare(&self) -> Answer<[f64; 6]> {
+        self.order(Order::Tare)
+    }
+
+    /// Reads the digital inputs with every state from now on. `Unsupported` for an arm without any.
+    pub fn watch_inputs(&self) -> Answer<()> {
+        self.order(Order::WatchInputs)
     }
 
     /// Lets the arm be led, by a hand or by its own controller; the answer comes when that begins. `lead_seq` is that

@@ -10,6 +10,7 @@ mod slow_readings;
 #[cfg(test)]
 mod tests;
 mod tick_monitor;
+mod wrench;
 
 pub use lead::Way;
 
@@ -106,6 +107,11 @@ pub(super) struct Worker {
     clearing: Option<(SyncSender<AdapterResult<()>>, Mono)>,
     /// The load to set whenever the motors are enabled.
     payload: Option<Load>,
+    /// The wrench as measured, and what is subtracted from it.
+    measured_wrench: Option<wrench::Wrench>,
+    tare: wrench::Wrench,
+    /// A motion awaits an input: they are read with every state.
+    watches_inputs: bool,
     last_read: Mono,
     next_read: Mono,
     read_time: f64,
@@ -160,6 +166,9 @@ impl Worker {
             lead: lead::Lead::default(),
             clearing: None,
             payload,
+            measured_wrench: None,
+            tare: wrench::Wrench::default(),
+            watches_inputs: false,
             last_read: Mono::ZERO,
             next_read: Mono::ZERO,
             read_time: 0.0,
@@ -290,6 +299,14 @@ impl Worker {
             }
             Order::SetPayload(load, reply) => {
                 let _ = reply.send(self.set_payload(adapter, &load));
+            }
+            Order::Tare(reply) => {
+                let _ = reply.send(self.take_tare(adapter));
+            }
+            Order::WatchInputs(reply) => {
+                let read = self.while_connected(adapter, slow_readings::read_io).map(drop);
+                self.watches_inputs |= read.is_ok();
+                let _ = reply.send(read);
             }
             Order::Lead(way, lead_seq, reply) => {
                 self.expect_nothing(self.ordered_power);

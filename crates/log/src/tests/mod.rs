@@ -81,6 +81,7 @@ fn state(arm: u16, tick: u64) -> ArmState {
             .then(|| Commanded { position: joints_of(&[x, 0.1 + 0.2, -0.0]), velocity: joints_of(&[0.0, x, 1.0]) }),
         refused: tick / 3,
         speed_fraction: (arm == 0 && tick > 4).then_some(0.25),
+        inputs: (arm == 0 && tick > 5).then_some(0b101),
     }
 }
 
@@ -199,6 +200,7 @@ fn with_values(input: &ArmInput, states: Option<&JointState>, skip: usize, dof: 
         }),
         refused: input.refused,
         speed_fraction: input.speed_fraction.first().copied(),
+        inputs: input.inputs.first().copied(),
     }
 }
 

@@ -5,6 +5,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::on_path::{self, OnPath};
+use super::until::{self, Until};
 use crate::api::{Execute, ExecutePlan, ExecuteReply, GripReport, Gripper, Move, MoveReply, Plan, PlanningReport};
 use crate::error::RpcError;
 use crate::report::{MotionReport, PoseReport};
@@ -30,6 +31,9 @@ pub struct Go {
     /// What is done at places of the planned paths, while the arm moves. An act that is refused ends the motion.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub on_path: Vec<OnPath>,
+    /// What ends motions before their goals, at most one entry per step.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub until: Vec<Until>,
     /// The requesting connection, if any: each step needs its leases.
     #[serde(skip)]
     pub claimant: Option<Claimant>,
@@ -120,7 +124,8 @@ impl Go {
             };
             valid.map_err(|what| format!("steps[{index}].{name}.{what}"))
         })?;
-        on_path::valid(&self.on_path, &self.steps, self.replan)
+        on_path::valid(&self.on_path, &self.steps, self.replan)?;
+        until::valid(&self.until, &self.steps, self.replan)
     }
 }
 
@@ -266,7 +271,8 @@ pub struct GoOutcome {
     pub motion: Option<MotionReport>,
     /// What ended it.
     pub ended_by: EndedBy,
-    /// What was measured of the cause: for `gap`, the distance of the joint from its path [rad]; absent for others.
+    /// What was measured of the cause: for `gap`, the distance of the joint from its path [rad]; for a condition of
+    /// `until`, N, Nm, m, s, or 1 for a high and 0 for a low input; absent for others.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub value: Option<f64>,
     /// Pose of the tool centre point at the end; absent if none is known, or if several arms have moved.
@@ -278,8 +284,18 @@ pub struct GoOutcome {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum EndedBy {
-    /// All steps succeeded.
+    /// All steps succeeded. With `until`: the goal came before what was awaited.
     Goal,
+    /// The force that was awaited.
+    Force,
+    /// The torque that was awaited.
+    Torque,
+    /// The input that was awaited.
+    Input,
+    /// The distance of `until`.
+    Distance,
+    /// The time of `until`.
+    Time,
     /// An operator's stop.
     Stop,
     /// A `cancel`.

@@ -17,6 +17,7 @@ mod planner;
 mod poses;
 pub mod schema;
 mod text;
+mod until;
 mod world;
 
 use std::future::Future;
@@ -49,6 +50,7 @@ pub use parts::*;
 pub use planner::*;
 pub use poses::*;
 pub use text::*;
+pub use until::Until;
 pub use world::*;
 
 /// Maximum length of a request line, including its newline [bytes].
@@ -302,6 +304,8 @@ methods! {
     /// Sets the load at an arm's flange, and reads it back. The arm must be at rest.
     "arm_payload_set" ArmPayloadSet -> PayloadReply, Move, needs p => Need::no_other_of(&p.arm),
         check ArmPayloadSet::valid;
+    /// Makes the present force and torque at an arm zero, for `until`, `state` and the log. The arm must be at rest.
+    "arm_tare" ArmTare -> TareReply, Move, needs p => Need::no_other_of(&p.arm);
     /// The robots of the run in one URDF, and the transforms in it that do not change.
     "robot_description" RobotDescription -> DescriptionReport, Read;
     /// The poses of the robots' links and tool centre points after the last tick.

@@ -87,6 +87,21 @@ pub struct ArmPayloadSet {
     pub inertia: [f64; 6],
 }
 
+/// Parameters of `arm_tare`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ArmTare {
+    /// The arm's `hardware_id`.
+    pub arm: String,
+}
+
+/// Reply to `arm_tare`.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+pub struct TareReply {
+    /// What is zero now: force and torque as the arm's controller reports them [N, N, N, Nm, Nm, Nm].
+    pub wrench: [f64; 6],
+}
+
 /// Reply to `arm_payload` and `arm_payload_set`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct PayloadReply {

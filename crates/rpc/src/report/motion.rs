@@ -86,7 +86,7 @@ pub struct MotionReport {
     /// Fraction of its speed at which the controller of an arm runs it, if that slows the motion.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub speed_fraction: Option<f64>,
-    /// Why it did not reach its goal.
+    /// Why it did not reach its goal; also if a condition has ended it that was awaited (`COMPLETED`).
     pub error: Option<String>,
     /// Whether an obstacle blocked it and it is being replanned; meanwhile it is not done.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]

@@ -21,17 +21,22 @@ const MODEL: usize = 3;
 const ID: usize = 5;
 const LOWEST: usize = 9;
 const PHASE: usize = 18;
+const PROPORTIONAL: usize = 21;
 const OFFSET: usize = 31;
 const RAM: usize = 40;
 const TORQUE: usize = 40;
 const GOAL: usize = 42;
 const GOAL_SPEED: usize = 46;
+const TORQUE_LIMIT: usize = 48;
 const LOCK: usize = 55;
 const READ_ONLY: std::ops::Range<usize> = 56..80;
 /// Phase bit: positions count turns instead of beginning again after one.
 const ALL_TURNS: u8 = 0x10;
 /// Torque value that makes the present position the middle of the turn.
 const MAKE_MIDDLE: u8 = 128;
+/// Duty cycle for a count of distance, with a proportional part of 16 [0.1 %]: a load of a third of the stall torque
+/// leaves 50 counts.
+const DUTY_PER_COUNT: i32 = 7;
 /// Counts of a turn, and the largest homing offset.
 const TURN: i32 = 4096;
 const MAX_OFFSET: i32 = 2047;
@@ -208,6 +213,18 @@ impl Servos {
         }
     }
 
+    /// Duty cycle of a servo's motor [0.1 %], with its sign in bit 10: what its proportional part makes of the distance to
+    /// its goal, which does not know the way over the end of the turn.
+    fn load(&self, servo: usize) -> u16 {
+        if !self.arm.motor(servo) {
+            return 0;
+        }
+        let away = i32::from(self.word(servo, GOAL)) - self.position(servo).0;
+        let duty = away * i32::from(self.byte(servo, PROPORTIONAL)) * DUTY_PER_COUNT / 16;
+        let size = (duty.abs()).min(i32::from(self.word(servo, TORQUE_LIMIT))).min(1000) as u16;
+        if duty < 0 { size | 0x400 } else { size }
+    }
+
     /// The error bits of a servo.
     fn error(&self, servo: usize) -> u8 {
         self.arm.error_of(servo) as u8
@@ -232,11 +249,12 @@ impl Servos {
         set(56, &with_sign(shown).to_le_bytes());
         let speed = velocity * f64::from(TURN) / TAU;
         set(58, &with_sign(speed.round() as i32).to_le_bytes());
+        let [low, high] = self.load(servo).to_le_bytes();
         set(
             60,
             &[
-                0,
-                0,
+                low,
+                high,
                 self.voltage,
                 SimArm::temperature(servo) as u8,
                 u8::from(self.held.iter().any(|(held, ..)| *held == servo)),

@@ -151,7 +151,12 @@ impl Controller {
         Ok(Self {
             model,
             software: options.software(model),
-            build: Build { model, reach: Reach(options.kinematics(model)), tool: pose(&options.tcp_offset) },
+            build: Build {
+                model,
+                reach: Reach(options.kinematics(model)),
+                tool: pose(&options.tcp_offset),
+                surface: options.surface,
+            },
             serial: options.serial.clone(),
             arm,
             mode: POWER_OFF,

@@ -151,7 +151,10 @@ const OUTPUTS: &[(&str, Source)] = &[
     ("target_TCP_pose", |f| Value::V6(f.pose)),
     ("actual_TCP_speed", |_| Value::V6([0.0; 6])),
     ("target_TCP_speed", |_| Value::V6([0.0; 6])),
-    ("actual_TCP_force", |_| Value::V6([0.5, -0.25, -4.0, 0.01, 0.02, -0.03])),
+    ("actual_TCP_force", |f| {
+        let touched = f.controller.build.surface.map_or(0.0, |surface| surface.force(f.pose[2]));
+        Value::V6([0.5, -0.25, -4.0 + touched, 0.01, 0.02, -0.03])
+    }),
     ("ft_raw_wrench", |_| Value::V6([0.5, -0.25, -4.0, 0.01, 0.02, -0.03])),
     ("tcp_force_scalar", |_| Value::F64(4.0)),
     (TCP_OFFSET, |f| Value::V6(vector(&f.controller.build.tool))),

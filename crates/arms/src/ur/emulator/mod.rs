@@ -108,10 +108,31 @@ pub struct SimOptions {
     /// How much of that speed the limits of the controller leave, as in reduced mode, 0 to 1.
     #[schemars(range(min = 0, max = 1))]
     pub speed_scaling: f64,
+    /// A surface below the tool; `null` for none.
+    pub surface: Option<Surface>,
     /// Faults, and when they begin (seconds after the first connection).
     pub faults: Vec<Fault>,
     /// What the controller does otherwise than its documents say.
     pub controller: arm::ControllerOptions,
+}
+
+/// A horizontal surface that yields like a spring where the tool's centre point presses on it. It does not hold the arm
+/// up.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Surface {
+    /// Its height in the arm's base frame [m].
+    pub height: f64,
+    /// Its stiffness, 1 to 1000000 [N/m].
+    #[schemars(range(min = 1, max = 1_000_000))]
+    pub stiffness: f64,
+}
+
+impl Surface {
+    /// Returns the force on the tool that is at this height [N].
+    pub(super) fn force(&self, height: f64) -> f64 {
+        self.stiffness * (self.height - height).max(0.0)
+    }
 }
 
 impl Default for SimOptions {
@@ -128,6 +149,7 @@ impl Default for SimOptions {
             remote_control: true,
             speed_slider: 1.0,
             speed_scaling: 1.0,
+            surface: None,
             faults: Vec::new(),
             controller: arm::ControllerOptions::default(),
         }
@@ -150,6 +172,10 @@ impl SimOptions {
             return wrong("kinematics", "one entry per joint");
         }
         arm::check_range("speed_scaling", self.speed_scaling, 0.0..=1.0, "")?;
+        if let Some(surface) = self.surface {
+            arm::check_range("surface.height", surface.height, -10.0..=10.0, "m")?;
+            arm::check_range("surface.stiffness", surface.stiffness, 1.0..=1e6, "N/m")?;
+        }
         self.common().check("ur", limits, PLAYABLE)
     }
 

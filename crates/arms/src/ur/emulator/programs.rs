@@ -2,6 +2,7 @@
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 
+use super::Surface;
 use super::controller::Registers;
 use super::ours::{self, Ours};
 use super::points::Points;
@@ -22,6 +23,7 @@ pub(super) struct Build {
     pub model: Model,
     pub reach: Reach,
     pub tool: Isometry3<f64>,
+    pub surface: Option<Surface>,
 }
 
 /// A running program.

@@ -28,6 +28,10 @@ pub struct TrajectoryTask {
     /// Time along the trajectory.
     clock: PathClock,
     slowing: bool,
+    /// Why it slows down, other than for a cancel.
+    ended: Option<Reason>,
+    /// When the arm began to follow it; `None`: it has not.
+    began: Option<Mono>,
     /// Whether the arm has begun to follow it.
     begun: bool,
     /// Whether its last point was commanded.
@@ -51,6 +55,8 @@ impl TrajectoryTask {
             cursor: Cursor::default(),
             clock: PathClock::default(),
             slowing: false,
+            ended: None,
+            began: None,
             begun: false,
             at_end: false,
             settling: 0.0,
@@ -79,6 +85,7 @@ impl TrajectoryTask {
         self.cursor = Cursor::default();
         self.clock.start(cx.speed);
         (self.slowing, self.begun, self.at_end, self.settling) = (false, false, false, 0.0);
+        (self.ended, self.began) = (None, None);
         self.samples.clear();
         self.samples.resize(motion.joints.len(), Sample::default());
         self.last = TaskView { motion: motion.id, ..TaskView::default() };
@@ -116,6 +123,27 @@ impl TrajectoryTask {
             if outside && sample.velocity.abs() > WAY_BACK {
                 self.clock.limit(WAY_BACK / sample.velocity.abs());
             }
+        }
+    }
+
+    /// Slows down if a condition that is awaited is met, or can no longer be judged.
+    fn judge_until(&mut self, cx: &Context<'_>, motion: &Motion) {
+        let Some(until) = motion.until.as_ref().filter(|_| !self.slowing) else { return };
+        let time = cx.now.seconds_since(*self.began.get_or_insert(cx.now));
+        let ended = match until.met(&cx.sensed(until.arm), self.clock.elapsed(), time) {
+            Ok(None) => return,
+            Ok(Some((condition, value))) => Reason::Until(condition, value),
+            Err(condition) => Reason::Unsensed(until.arm, condition),
+        };
+        (self.slowing, self.ended) = (true, Some(ended));
+    }
+
+    /// Returns how it ends after it has slowed down.
+    fn ended(&self) -> Step {
+        match self.ended {
+            Some(reason @ Reason::Until(..)) => Step::End(TaskState::Completed, reason),
+            Some(reason) => Step::End(TaskState::Aborted, reason),
+            None => Step::End(TaskState::Aborted, Reason::Cancelled),
         }
     }
 
@@ -160,7 +188,7 @@ impl TaskBody for TrajectoryTask {
         let granted = cx.granted;
         if !granted {
             if self.slowing {
-                return Step::End(TaskState::Aborted, Reason::Cancelled);
+                return self.ended();
             }
             if !self.begun {
                 // The offsets change while the arm decelerates and changes its mode for the motion.
@@ -175,6 +203,7 @@ impl TaskBody for TrajectoryTask {
             if let Some(reason) = self.off_path(cx, motion) {
                 return Step::End(TaskState::Aborted, reason);
             }
+            self.judge_until(cx, motion);
             if self.slowing {
                 // Before the step: the first command after a cancel is slower already.
                 self.clock.slow_down(cx.dt * braking_slowdown(cx, motion, &self.samples, self.clock.rate()));
@@ -187,7 +216,7 @@ impl TaskBody for TrajectoryTask {
         if self.slowing {
             // An arm that its controller has stopped on its way needs no deceleration.
             if self.clock.rate() <= 0.0 || self.clock.elapsed() >= duration || cx.dt == 0.0 {
-                return Step::End(TaskState::Aborted, Reason::Cancelled);
+                return self.ended();
             }
         } else if granted && !self.clock.runs_at(cx.speed) {
             self.clock.approach(cx.speed, rate_limits(cx, motion, &self.samples, self.clock.rate()), cx.dt);

@@ -58,7 +58,7 @@ impl Worker {
 
     pub(super) fn read_all(&mut self, adapter: &mut dyn ManipulatorAdapter) -> AdapterResult<()> {
         adapter.read_joints(&mut self.reading)?;
-        self.read_stop_input(adapter)?;
+        self.read_inputs(adapter)?;
         let all = self.whole_state_at_once;
         let turn = self.turn;
         self.turn = (turn + 1) % TURNS;
@@ -87,7 +87,7 @@ impl Worker {
             self.hold_gripper(adapter);
         }
         if all || turn == 3 {
-            self.state.wrench = adapter.force_torque().map_or(Ok(None), |sensor| sensor.read_force_torque())?;
+            self.read_wrench(adapter)?;
         }
         if all || turn == 4 {
             self.state.pose = adapter.cartesian().map_or(Ok(None), |poses| poses.read_cartesian_position())?;

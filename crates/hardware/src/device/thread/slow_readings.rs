@@ -85,11 +85,15 @@ impl Worker {
         }
     }
 
-    /// Reads the stop input. An error counts as no state: the arm is held.
-    pub(super) fn read_stop_input(&mut self, adapter: &mut dyn ManipulatorAdapter) -> AdapterResult<()> {
-        let Some(stop) = self.config.setup.stop_input else { return Ok(()) };
+    /// Reads the inputs, if one of them stops the arm or is awaited. An error counts as no state: the arm is held.
+    pub(super) fn read_inputs(&mut self, adapter: &mut dyn ManipulatorAdapter) -> AdapterResult<()> {
+        let stop = self.config.setup.stop_input;
+        if stop.is_none() && !self.watches_inputs {
+            return Ok(());
+        }
         let io = read_io(adapter)?;
-        self.state.stop_input_open = stop.is_open(&io);
+        self.state.stop_input_open = stop.is_some_and(|stop| stop.is_open(&io));
+        self.state.inputs = Some(io.digital_inputs).filter(|_| self.watches_inputs);
         self.slow.take_io(Some(io), self.config.clock.now());
         Ok(())
     }
