@@ -41,6 +41,9 @@ file 644 README.md "$root/share/doc/dimos"
 file 644 docs/*.md docs/foxglove-layout.json "$root/share/doc/dimos/docs"
 file 644 docs/arms/*.md "$root/share/doc/dimos/docs/arms"
 install -m 644 LICENSE "$root/share/doc/dimos/copyright"
+# The licences of what is linked into the program ask for their texts beside it.
+python3 packaging/notices.py | gzip -9n >"$root/share/doc/dimos/THIRD-PARTY-NOTICES.gz"
+chmod 644 "$root/share/doc/dimos/THIRD-PARTY-NOTICES.gz"
 
 # Units, users and devices are the system's: none for a user's own prefix.
 case $prefix in

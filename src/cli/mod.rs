@@ -86,6 +86,9 @@ Your own arm:  dimos new";
 const NO_SAFETY_FUNCTION: &str = "\
 `stop` is an operational stop, not a safety function. Use the arm's own rated stop to protect people.";
 
+/// What is linked into the program, and the parts of the page: `packaging/notices.py --list` writes it.
+const LICENCES: &str = include_str!("../../assets/licences.txt");
+
 fn after_help() -> String {
     let codes = exit::Exit::ALL.iter().map(|(exit, meaning)| format!("\n  {:<3}  {meaning}", *exit as u8));
     format!("{START_WITH}\n\nExit codes:{}\n\n{NO_SAFETY_FUNCTION}", codes.collect::<String>())
@@ -99,6 +102,9 @@ struct Cli {
     /// May also follow the verb
     #[arg(long, value_name = "PLACE")]
     at: Option<String>,
+    /// List what is shipped in this program, with licences; the packages have the texts
+    #[arg(long)]
+    licenses: bool,
     #[command(subcommand)]
     command: Command,
 }
@@ -334,6 +340,9 @@ fn answer(catalog: Catalog<'_>) -> ExitCode {
     complete::answer(catalog);
     set_threads_of_the_network();
     let typed = typed::as_parsed(std::env::args_os());
+    if typed.len() == 2 && typed.last().is_some_and(|word| word == "--licenses") {
+        return licenses();
+    }
     let json = typed.iter().take_while(|word| *word != "--").any(|word| word == "--json");
     let parsed = command().try_get_matches_from(&typed).map_err(|mut error| {
         if let Some(hint) = typed::pose_hint(&typed) {
@@ -370,6 +379,15 @@ fn answer(catalog: Catalog<'_>) -> ExitCode {
     }
 }
 
+/// Prints the parts of this program and their licences.
+fn licenses() -> ExitCode {
+    output::line(format_args!("dimos {}: Apache-2.0\n{}", crate::VERSION, LICENCES.trim_end()));
+    match output::finish() {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => ExitCode::from(failure.exit as u8),
+    }
+}
+
 /// Sets how many threads the network has, unless the user has, or a program that embeds this one runs threads already.
 fn set_threads_of_the_network() {
     let (name, value) = crate::share::THREADS;
@@ -395,6 +413,9 @@ fn usage_failure(error: &clap::Error) -> exit::Failure {
 }
 
 fn built_in(cli: &Cli, catalog: Catalog<'_>) -> exit::Result {
+    if cli.licenses {
+        return Err(exit::Failure::usage("--licenses is given alone").hint("dimos --licenses"));
+    }
     if cli.at.is_some() && !cli.command.talks_to_runs() {
         let failure = exit::Failure::usage("this verb works on this computer only");
         return Err(failure.hint("omit --at; through ssh it works there"));

@@ -42,6 +42,7 @@ mod kernels;
 mod leader_follower;
 mod leases;
 mod library;
+mod licences;
 mod log_verbs;
 mod metrics;
 mod moved_by_others;
