@@ -216,6 +216,9 @@ pub struct Search {
     /// Highest speed of the tool centre point and the flange in this motion [m/s], kept where no joint is slower
     #[arg(long, value_name = "M/S", value_parser = tcp_speed)]
     pub tcp_speed: Option<f64>,
+    /// Let the end effector and what it holds touch this obstacle: for --until force=N; repeat for more
+    #[arg(long, value_name = "OBJECT")]
+    pub touch: Vec<String>,
     /// Seed of the search: the same request with the same seed gives the same plan
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
@@ -327,6 +330,7 @@ impl Goal {
             through,
             blend: self.blend,
             tcp_speed: search.tcp_speed,
+            touch: search.touch.clone(),
             by_number: false,
         }
     }

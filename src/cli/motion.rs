@@ -49,11 +49,11 @@ pub struct Args {
     #[command(flatten)]
     pub search: Search,
     /// Move straight in joint space even if the run has a planner: not collision-checked
-    #[arg(long, conflicts_with = "several")]
+    #[arg(long, conflicts_with_all = ["several", "touch"])]
     pub direct: bool,
     /// Let the arm's own controller move to --pose: not collision-checked; with a planner in the run only with
     /// --direct. --frame controller gives the pose in the controller's own frame
-    #[arg(long, requires = "pose", conflicts_with_all = ["joints", "named", "by", "several", "through", "path", "linear", "via", "tcp_speed", "replan"])]
+    #[arg(long, requires = "pose", conflicts_with_all = ["joints", "named", "by", "several", "through", "path", "linear", "via", "tcp_speed", "touch", "replan"])]
     pub native: bool,
     /// If an obstacle blocks the motion, stop, plan again and continue
     #[arg(long, conflicts_with_all = ["direct", "no_wait", "path"])]

@@ -154,6 +154,7 @@ fn motion(setup: &PlanningScene, checker: &mut ExactChecker, random: &mut Random
         through: Vec::new(),
         blend: 0.0,
         tcp_speed: None,
+        touch: Vec::new(),
         by_number: false,
     };
     let stop = Stop::new(Some(std::time::Instant::now() + Duration::from_secs(2)), None);

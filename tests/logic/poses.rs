@@ -62,6 +62,7 @@ fn plan(
         through: Vec::new(),
         blend: 0.0,
         tcp_speed: None,
+        touch: Vec::new(),
         by_number: false,
     };
     solve(scene, &scene.world, &request, &Stop::new(Some(Instant::now() + Duration::from_secs(20)), None))

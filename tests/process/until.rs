@@ -81,6 +81,20 @@ fn a_tool_that_touches_ends_its_motion_at_the_force() {
          tcp_speed: 0.02, until: {force: 8, time: 20s}}\n  - move: {by: {xyz: [0, 0, 0.03]}, linear: true}\n",
     );
     home.dimos("do touch.yaml").with(0);
+    // What the planner knows to be there is touched where that is said, by the tool alone.
+    let at = outcome(&home, "state", 0)["arms"][0]["pose"]["xyz"].clone();
+    home.dimos(&format!("world add table --box 0.2 0.2 0.1 --at {} {} {}", at[0], at[1], top - 0.05)).with(0);
+    home.dimos("move arm --by 0 0 0.03 --linear --touch table").with(0);
+    let blocked = home.dimos(&format!("{down} --until force=8")).with(1);
+    assert!(blocked.err.contains("table"), "{}", blocked.err);
+    let unknown = home.dimos(&format!("{down} --until force=8 --touch tabel")).with(1);
+    assert!(unknown.err.contains("is not in the world"), "{}", unknown.err);
+    // The forearm must not.
+    let forearm = home.dimos(&format!("{down} --until force=8 --touch table")).with(1);
+    assert!(forearm.err.contains("arm/link3"), "{}", forearm.err);
+    home.dimos("move arm --by 0 0 -0.07 --linear --tcp-speed 0.02 --until force=8 --touch table").with(0);
+    home.dimos("move arm --by 0 0 0.05 --linear --touch table").with(0);
+
     home.write("nothing.yaml", "steps:\n  - move: {by: {xyz: [0, 0, 0.02]}, linear: true, until: {force: 8}}\n");
     let nothing = home.dimos("do nothing.yaml").with(1);
     assert!(nothing.err.contains("the goal came first"), "{}", nothing.err);

@@ -66,6 +66,7 @@ class Client(Planning):
         replan: bool = False,
         on_path: Sequence[Mapping[str, Any]] = (),
         until: Optional[Mapping[str, Any]] = None,
+        touch: Sequence[str] = (),
         seed: int = 0,
         timeout: Optional[float] = None,
     ) -> dict[str, Any]:
@@ -76,7 +77,7 @@ class Client(Planning):
         which. `on_path`: what is done at places of the path, as {"distance": 0.3, "gripper": {"arm": "arm",
         "to": "open"}}, {"waypoint": 1, "output": {...}} or {..., "speed": 0.5}. `until`: what ends the motion before
         its goal, as {"force": 5}, {"input": "di0"} or {"time": 2}; the result then has `ended_by` and `value`, and
-        `Refused` (NOT_MET) is raised if the goal came first. Ends this client's own streams to the arm."""
+        `Refused` (NOT_MET) is raised if the goal came first. `touch`: obstacles that the end effector may touch. Ends this client's own streams to the arm."""
         goal = Goal(target, named, pose, linear, frame, by, via)
         where = where_to(arm, goal, through, blend, tcp_speed)
         plain = isinstance(arm, str) and target is not None and goal == Goal(target) and tcp_speed is None
@@ -86,7 +87,7 @@ class Client(Planning):
         if not direct:
             try:
                 self._end_streams(self._streams_to([arm] if isinstance(arm, str) else arm))
-                plan = {**where, "speed": speed, "seed": seed}
+                plan = {**where, "speed": speed, "seed": seed, **({"touch": list(touch)} if touch else {})}
                 step = {"plan": plan if timeout is None else {**plan, "timeout": timeout}}
                 return self._go(step, wait, replan, on_path, until)
             except Refused as error:

@@ -269,7 +269,8 @@ impl<'r> Runner<'r, '_> {
         } else {
             let (goals, through) = (vec![goal.clone()], motion.through.clone());
             let Motion { blend, tcp_speed, .. } = *motion;
-            let plan = Plan { goals, speed: *speed, through, blend, tcp_speed, ..Plan::default() };
+            let touch = motion.touch.clone();
+            let plan = Plan { goals, speed: *speed, through, blend, tcp_speed, touch, ..Plan::default() };
             GoStep::Plan(Box::new(plan))
         };
         let (replan, on_path) = (motion.replan && !motion.direct, motion.on_path.clone());

@@ -261,6 +261,7 @@ impl Reader {
             blend: 0.0,
             speed: self.speed,
             tcp_speed: None,
+            touch: Vec::new(),
             direct: self.direct,
             replan: self.replan,
             on_path: Vec::new(),
@@ -279,6 +280,7 @@ impl Reader {
         motion.goal = self.goal(node)?;
         motion.on_path = self.acts(node, &motion)?;
         motion.until = self.until(node, &motion)?;
+        motion.touch = self.touch(node)?;
         if motion.direct && motion.goal.joints.is_none() && motion.goal.named.is_none() {
             return self.wrong(node, "a direct motion needs `joints` or a named pose", Some("leave out `direct`"));
         }
@@ -353,6 +355,7 @@ impl Reader {
             blend: 0.0,
             speed: self.speed,
             tcp_speed: None,
+            touch: Vec::new(),
             direct: false,
             replan: self.replan,
             on_path: Vec::new(),
@@ -373,6 +376,7 @@ impl Reader {
             list = self.tree.get(node, "waypoints").unwrap_or(node);
             motion.on_path = self.acts(node, &motion)?;
             motion.until = self.until(node, &motion)?;
+            motion.touch = self.touch(node)?;
         }
         let mut goals = Vec::new();
         for item in self.tree.items(list).to_vec() {
@@ -464,7 +468,7 @@ impl Reader {
     }
 }
 
-fn word(text: &str) -> std::result::Result<String, String> {
+pub(super) fn word(text: &str) -> std::result::Result<String, String> {
     if matches!(text, "" | "~" | "null") { Err("must be a name".into()) } else { Ok(text.to_owned()) }
 }
 

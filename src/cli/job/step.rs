@@ -78,6 +78,8 @@ pub struct Motion {
     pub speed: f64,
     /// Highest speed of the tool [m/s].
     pub tcp_speed: Option<f64>,
+    /// Obstacles that the end effector may touch.
+    pub touch: Vec<String>,
     /// Whether it is straight in joint space, without a planner.
     pub direct: bool,
     /// Whether it is planned again if an obstacle blocks it.

@@ -8,6 +8,12 @@ use dimos_rpc::api::Until;
 use dimos_yaml::NodeId;
 
 impl Reader {
+    /// Reads the obstacles that a motion may touch.
+    pub(super) fn touch(&mut self, motion: NodeId) -> Option<Vec<String>> {
+        let Some(list) = self.tree.get(motion, "touch") else { return Some(Vec::new()) };
+        self.tree.items(list).to_vec().into_iter().map(|item| self.parsed(item, super::file::word)).collect()
+    }
+
     /// Reads the conditions of a motion; the outer `None`: they are wrong.
     #[expect(clippy::option_option, reason = "wrong, or not given")]
     pub(super) fn until(&mut self, motion: NodeId, of: &Motion) -> Option<Option<Until>> {

@@ -212,8 +212,8 @@ impl Service {
         awaiting(judged, self.move_step(going, &arms, Call::ExecutePlan(execute), acts, origin)).await
     }
 
-    /// Begins a motion and waits for its end, and for that of those that continue it around an obstacle. Returns what has
-    /// ended it.
+    /// Begins a motion and waits for its end, and for that of those that continue it around an obstacle. Returns what
+    /// has ended it.
     async fn move_step(
         &self,
         going: &Going,

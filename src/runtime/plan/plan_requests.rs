@@ -41,8 +41,9 @@ impl PlannerPort {
         let through = plan.through.iter().map(waypoint).collect::<Result<Vec<_>, RpcError>>()?;
         let api::Plan { speed, seed, refine, blend, tcp_speed, by_number, .. } = *plan;
         let level = Level::of_name(plan.level.name()).ok_or_else(internal)?;
+        let touch = plan.touch.clone();
         let request =
-            PlanRequest { goals, positions, speed, seed, level, refine, through, blend, tcp_speed, by_number };
+            PlanRequest { goals, positions, speed, seed, level, refine, through, blend, tcp_speed, touch, by_number };
         let id = moment.plan;
         self.thread.begin(id, request, plan.timeout.map(Duration::from_secs_f64)).map_err(|why| {
             let error = RpcError::new(Code::Planning, why.to_string());

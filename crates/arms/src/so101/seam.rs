@@ -22,7 +22,7 @@ const SLOW: u16 = 200;
 /// A joint that is this near to the end of its range is back [counts]: it rests beside its goal, under load.
 const NEAR: i32 = SEAM_MARGIN * 3 / 4;
 
-/// A servo whose joint is behind its seam sees its goal most of a turn away, and does all it can [0.1 %]: less is a false
+/// A servo whose joint is behind its seam sees its goal nearly a turn off, and does all it can [0.1 %]: less is a false
 /// reading. One in overload has a fifth of its torque.
 const FIGHTS: i32 = 100;
 

@@ -319,7 +319,9 @@ impl Scene {
 
     /// Returns every pair that must not touch.
     pub fn all_pairs(&self) -> impl Iterator<Item = Pair> + '_ {
-        let obstacle = move |l: usize| (0..self.obstacles.len()).map(move |o| Pair::Obstacle(l, o));
+        let checked = move |l: usize, o: &usize| !self.touch.contains(&(l, *o));
+        let obstacle =
+            move |l: usize| (0..self.obstacles.len()).filter(move |o| checked(l, o)).map(move |o| Pair::Obstacle(l, o));
         let links = self.pairs.iter().map(|p| Pair::Links(p.a, p.b));
         (0..self.links.len()).flat_map(obstacle).chain(links)
     }

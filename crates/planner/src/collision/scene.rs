@@ -98,6 +98,8 @@ pub struct Scene {
     pub(super) links: Vec<LinkShape>,
     pub(super) pairs: Vec<LinkPair>,
     pub(super) obstacles: Vec<PlacedObstacle>,
+    /// Links and obstacles, by index, that may touch.
+    pub(super) touch: Vec<(usize, usize)>,
     pub(super) limits: Vec<Limits>,
     turns: Vec<bool>,
     joint_names: Vec<String>,
@@ -147,6 +149,10 @@ impl Scene {
         }
         scene.make_pairs(world, &origins);
         scene.obstacles = world.obstacles().iter().map(place).collect();
+        for (l, link) in scene.links.iter().enumerate() {
+            let touched = world.obstacles().iter().enumerate().filter(|(_, o)| world.may_touch(&link.name, &o.name));
+            scene.touch.extend(touched.map(|(o, _)| (l, o)));
+        }
         scene
     }
 
@@ -259,7 +265,7 @@ impl Scene {
     }
 }
 
-fn full_name(robot: &str, name: &str) -> String {
+pub(super) fn full_name(robot: &str, name: &str) -> String {
     if robot.is_empty() { name.to_owned() } else { format!("{robot}/{name}") }
 }
 

@@ -75,6 +75,41 @@ fn contacts_report_names_and_depth() {
 }
 
 #[test]
+fn an_end_effector_and_what_it_holds_touch_only_what_they_may() {
+    let posts = [ball("post", DVec3::new(0.95, 0.08, 0.1), 0.05), ball("wall", DVec3::new(0.95, -0.08, 0.1), 0.05)];
+    let mut world = one_arm(&posts);
+    world.add(ball("middle", DVec3::new(0.6, 0.06, 0.1), 0.05)).unwrap();
+    let held = Solid::sphere(0.06, DAffine3::from_translation(DVec3::new(0.15, 0.0, 0.0))).unwrap();
+    let held = Attached {
+        name: "cup".into(),
+        robot: 0,
+        link: "l3".into(),
+        solids: vec![held],
+        touch_links: vec![],
+        padding: 0.0,
+    };
+    world.attach(held).unwrap();
+    let tip = world.robots()[0].model.link_index("l3").unwrap();
+    let touching = |world: &World| -> Vec<[String; 2]> {
+        let contacts = checker(world).contacts(&[0.0; 3]).into_iter();
+        contacts.map(|contact| [contact.link, contact.other]).collect()
+    };
+    let all = ["l3 post", "l3 wall", "cup post", "cup wall", "l2 middle"];
+    let expect = |world: &World, left: &[&str]| {
+        let mut found: Vec<String> = touching(world).iter().map(|pair| pair.join(" ")).collect();
+        found.sort();
+        let mut left: Vec<String> = left.iter().map(|pair| (*pair).to_owned()).collect();
+        left.sort();
+        assert_eq!(found, left);
+    };
+    expect(&world, &all);
+    let posts = ["post".to_owned(), "middle".to_owned()];
+    expect(&world.letting_touch(0, tip, &posts), &["l3 wall", "cup wall", "l2 middle"]);
+    let from_forearm = world.robots()[0].model.link_index("l2").unwrap();
+    expect(&world.letting_touch(0, from_forearm, &posts), &["l3 wall", "cup wall"]);
+}
+
+#[test]
 fn padding_and_snapshots_hold() {
     let post = ball("post", DVec3::new(0.95, 0.11, 0.1), 0.05);
     let mut world = one_arm(std::slice::from_ref(&post));

@@ -8,7 +8,7 @@ use glamx::DAffine3;
 use dimos_robot::kinematics::Kinematics;
 use dimos_robot::model::RobotModel;
 
-use super::scene::Scene;
+use super::scene::{Scene, full_name};
 use super::shape::Solid;
 
 /// A robot in a world.
@@ -105,6 +105,8 @@ pub struct World {
     obstacles: Vec<Obstacle>,
     attached: Vec<Attached>,
     version: Version,
+    /// Links that may touch an obstacle, by name: see [`World::letting_touch`].
+    touch: Vec<[String; 2]>,
 }
 
 fn check_padding(padding: f64) -> Result<(), WorldError> {
@@ -185,7 +187,32 @@ impl World {
 
     /// Returns the same world with its robots replaced one by one.
     pub fn with_robots(&self, robots: Vec<Robot>) -> Self {
-        Self { robots, obstacles: self.obstacles.clone(), attached: self.attached.clone(), version: self.version }
+        Self { robots, ..self.clone() }
+    }
+
+    /// Returns the same world, in which the links at and beyond the rigid body of a robot's `tip` (an index in its
+    /// model), and what they hold, may touch these obstacles.
+    pub fn letting_touch(&self, robot: usize, tip: usize, obstacles: &[String]) -> Self {
+        let Some(own) = self.robots.get(robot) else { return self.clone() };
+        let body = own.kinematics.body_of(tip);
+        let is_outer = |link: usize| {
+            let parent = |link: &usize| own.model.parent_joint(*link).map(|joint| joint.parent);
+            std::iter::successors(Some(link), parent).any(|link| own.kinematics.body_of(link) == body)
+        };
+        let links = own.model.links.iter().enumerate().filter(|(link, _)| is_outer(*link)).map(|(_, link)| &link.name);
+        let holds = |held: &&Attached| held.robot == robot && own.model.link_index(&held.link).is_some_and(is_outer);
+        let outer = links.chain(self.attached.iter().filter(holds).map(|held| &held.name));
+        let named = |link: &String| full_name(&own.name, link);
+        let mut world = self.clone();
+        for link in outer.map(named) {
+            world.touch.extend(obstacles.iter().map(|obstacle| [link.clone(), obstacle.clone()]));
+        }
+        world
+    }
+
+    /// Returns whether a link, by its name in a scene, may touch an obstacle.
+    pub(super) fn may_touch(&self, link: &str, obstacle: &str) -> bool {
+        self.touch.iter().any(|[own, other]| own == link && other == obstacle)
     }
 
     /// Returns the version of its obstacles and held objects; robots do not count.

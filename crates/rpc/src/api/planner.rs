@@ -119,6 +119,9 @@ pub struct Plan {
     /// `limits.tcp_velocity`. Where no joint is slower the tool keeps it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tcp_speed: Option<f64>,
+    /// Obstacles that the end effectors of its robots may touch, with what they hold: for a motion that ends by a force.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub touch: Vec<String>,
     /// Whether only its number selects this plan: `execute_plan` and `preview` without a number pass it over. For a
     /// motion that is planned and executed in one step.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
@@ -130,7 +133,8 @@ impl Default for Plan {
         let (goals, through, speed) = (Vec::new(), Vec::new(), default_speed());
         let level = PlanLevel::default();
         let (refine, timeout) = (DEFAULT_REFINE, None);
-        Self { goals, speed, seed: 0, level, refine, timeout, through, blend: 0.0, tcp_speed: None, by_number: false }
+        let (blend, tcp_speed, touch) = (0.0, None, Vec::new());
+        Self { goals, speed, seed: 0, level, refine, timeout, through, blend, tcp_speed, touch, by_number: false }
     }
 }
 

@@ -213,8 +213,8 @@ impl Servos {
         }
     }
 
-    /// Duty cycle of a servo's motor [0.1 %], with its sign in bit 10: what its proportional part makes of the distance to
-    /// its goal, which does not know the way over the end of the turn.
+    /// Duty cycle of a servo's motor [0.1 %], with its sign in bit 10: what its proportional part makes of the distance
+    /// to its goal, which does not know the way over the end of the turn.
     fn load(&self, servo: usize) -> u16 {
         if !self.arm.motor(servo) {
             return 0;

@@ -31,7 +31,7 @@ pub fn reach(
     near: &[f64],
     stop: &Stop,
 ) -> Result<Reached, PlanFailure> {
-    let mut stage = stage(setup, world, &[robot], positions, 0.0)?;
+    let mut stage = stage(setup, world, &[robot], positions, 0.0, &[])?;
     let Some(robot) = stage.robots.first() else { return Err(PlanFailure::new("no such robot")) };
     let drag = &stage.settings.drag;
     let (position, rotation, attempts) = (drag.tolerance, drag.tolerance, drag.attempts);

@@ -40,7 +40,7 @@ pub fn look_ahead(
     stop: &Stop,
 ) -> Result<Option<Blocked>, PlanFailure> {
     let spline = Spline::new(&found.trajectory).map_err(|e| PlanFailure::new(e.to_string()))?;
-    let mut stage = stage(setup, world, &found.robots, positions, found.padding)?;
+    let mut stage = stage(setup, world, &found.robots, positions, found.padding, &found.touch)?;
     let checker = &mut stage.checker;
     checker.relax_again(&found.exceptions);
     let settings = &setup.settings.look_ahead;

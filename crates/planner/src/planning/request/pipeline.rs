@@ -85,6 +85,8 @@ pub struct PlanRequest {
     pub blend: f64,
     /// Highest speed of an end effector and its flange [m/s], beside that of the robot.
     pub tcp_speed: Option<f64>,
+    /// Obstacles that the end effectors, and what they hold, may touch.
+    pub touch: Vec<String>,
     /// Whether only its number selects the plan.
     pub by_number: bool,
 }
@@ -102,6 +104,7 @@ impl PlanRequest {
             through: Vec::new(),
             blend: 0.0,
             tcp_speed: None,
+            touch: Vec::new(),
             by_number: false,
         }
     }
@@ -125,6 +128,8 @@ pub struct PlannedMotion {
     pub escape_path: Option<EscapePath>,
     /// Padding [m].
     pub padding: f64,
+    /// Obstacles that the end effectors may touch: they were not checked against those.
+    pub touch: Vec<String>,
     /// Exceptions from the padding.
     pub exceptions: Vec<PaddingException>,
     /// Pairs of links that were not checked.
@@ -217,7 +222,13 @@ fn attempt(
     let moving: Vec<usize> = request.goals.iter().map(|(robot, _)| *robot).collect();
     let given = request.goals.iter().any(|(_, goal)| matches!(goal, Goal::Retrace(_)));
     let padding = if given { setup.settings.padding.path_ratio * setup.padding } else { setup.padding };
-    let mut stage = stage(setup, world, &moving, &request.positions, padding + setup.settings.padding.extra)?;
+    let unknown = |name: &&String| !world.obstacles().iter().any(|obstacle| obstacle.name == **name);
+    if let Some(name) = request.touch.iter().find(unknown) {
+        let failure = PlanFailure::new(format!("{name:?} may be touched, and is not in the world"));
+        return Err(failure.hint("`dimos world list` lists the obstacles"));
+    }
+    let padded = padding + setup.settings.padding.extra;
+    let mut stage = stage(setup, world, &moving, &request.positions, padded, &request.touch)?;
     stage.checker.relax(Near::Start, &stage.start);
     let lap = |times: &mut BTreeMap<String, f64>, name: &str, since: Instant| {
         times.insert(name.to_owned(), since.elapsed().as_secs_f64());
@@ -259,6 +270,7 @@ fn attempt(
     let reason = "touch, and no planned joint moves them";
     ignored.extend(fixed.into_iter().map(|links| IgnoredPair { links, reason: reason.to_owned() }));
     Ok(PlannedMotion {
+        touch: request.touch.clone(),
         robots,
         path,
         trajectory,
@@ -283,6 +295,7 @@ pub(in crate::planning) fn stage<'a>(
     moving: &[usize],
     positions: &[Vec<f64>],
     padding: f64,
+    touch: &[String],
 ) -> Result<Stage<'a>, PlanFailure> {
     let (mut robots, mut indices, mut fixed) = (Vec::new(), Vec::new(), Vec::new());
     let (mut joints, mut limits, mut start) = (Vec::new(), Vec::new(), Vec::new());
@@ -306,6 +319,7 @@ pub(in crate::planning) fn stage<'a>(
         moving: indices.clone(),
         fixed,
         padding,
+        touch: touch.to_vec(),
     };
     let (checker, apart) = setup.staged.get(key, || {
         let body = |(index, robot): (usize, &PlannedRobot)| match moving.contains(&index) {
@@ -313,10 +327,14 @@ pub(in crate::planning) fn stage<'a>(
             false => robot.fixed_at(&positions[index]).map_err(PlanFailure::new),
         };
         let bodies = setup.robots.iter().enumerate().map(body).collect::<Result<Vec<_>, _>>()?;
+        let mut world = world.with_robots(bodies.clone());
+        for (index, robot) in indices.iter().zip(&robots).filter(|_| !touch.is_empty()) {
+            world = world.letting_touch(*index, robot.end_effector, touch);
+        }
         let several = if indices.len() > 1 { indices.as_slice() } else { &[] };
-        let apart = several.iter().map(|own| apart(setup, world, &bodies, (*own, moving), positions, padding));
+        let apart = several.iter().map(|own| apart(setup, &world, &bodies, (*own, moving), positions, padding));
         let apart = apart.collect::<Result<_, _>>()?;
-        Ok((Padded::new(world.with_robots(bodies).snapshot(), padding, &setup.settings), apart))
+        Ok((Padded::new(world.snapshot(), padding, &setup.settings), apart))
     })?;
     Ok(Stage { settings: &setup.settings, robots, indices, joints, limits, start, checker, apart })
 }

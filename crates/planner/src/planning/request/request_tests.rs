@@ -143,7 +143,7 @@ fn goals_of_several_arms_touch_nothing_that_is_fixed() {
     let mut random = Random::new(4);
     let (mut looked, mut several) = (0, 0);
     for _ in 0..200 {
-        let mut stage = stage(&scene, &scene.world, &[0, 1], &home, 0.0).unwrap();
+        let mut stage = stage(&scene, &scene.world, &[0, 1], &home, 0.0, &[]).unwrap();
         let known: Vec<f64> = scene.robots[0].limits.iter().map(|l| random.between(l.lower, l.upper)).collect();
         if !stage.checker.is_free(&[known.clone(), known.clone()].concat()) {
             continue;

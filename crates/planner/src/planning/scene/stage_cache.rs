@@ -25,6 +25,8 @@ pub(in crate::planning) struct Key {
     pub fixed: Vec<Vec<f64>>,
     /// Padding [m].
     pub padding: f64,
+    /// Obstacles that the moving robots' end effectors may touch.
+    pub touch: Vec<String>,
 }
 
 impl PartialEq for Key {
@@ -34,6 +36,7 @@ impl PartialEq for Key {
             && self.moving == other.moving
             && self.fixed == other.fixed
             && self.padding == other.padding
+            && self.touch == other.touch
             && self.robots.len() == other.robots.len()
             && self.robots.iter().zip(&other.robots).all(same)
     }

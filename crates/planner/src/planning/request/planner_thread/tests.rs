@@ -44,6 +44,7 @@ fn turn(from: f64, to: f64, seed: u64) -> PlanRequest {
         through: Vec::new(),
         blend: 0.0,
         tcp_speed: None,
+        touch: Vec::new(),
         by_number: false,
     }
 }
