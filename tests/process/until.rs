@@ -1,5 +1,5 @@
-//! Motions that end before their goal: at a force, an input, a distance, a time; judged by what a UR's emulator, on whose
-//! springy surface the tool presses, and yourarm's emulator received.
+//! Motions that end before their goal: at a force, an input, a distance, a time; judged by what a UR's emulator, on
+//! whose springy surface the tool presses, and yourarm's emulator received.
 
 use dimos::arms::yourarm::emulator::wire::Request;
 use dimos::arms::yourarm::emulator::{SimOptions, YourArmEmulator};

@@ -197,7 +197,7 @@ fn no_goal_moves_at_a_seam_in_ten_thousand_states_and_pushes() {
     assert!(crossings > 500 && refused > 300 && enabled > 5_000, "{crossings} {refused} {enabled}");
 }
 
-/// A reading that slips over the seam, with or without a velocity, is none of a joint that rests: its motor does nothing.
+/// A reading that slips over the seam, with or without a velocity, is false: the motor of a joint that is there works.
 #[test]
 fn a_reading_that_slips_over_the_seam_gives_no_goal() {
     let mut random = Random(0x9E37_79B9_7F4A_7C15);

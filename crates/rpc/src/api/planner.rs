@@ -119,7 +119,7 @@ pub struct Plan {
     /// `limits.tcp_velocity`. Where no joint is slower the tool keeps it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tcp_speed: Option<f64>,
-    /// Obstacles that the end effectors of its robots may touch, with what they hold: for a motion that ends by a force.
+    /// Obstacles that the end effectors of its robots and what they hold may touch: for a motion that ends by a force.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub touch: Vec<String>,
     /// Whether only its number selects this plan: `execute_plan` and `preview` without a number pass it over. For a
