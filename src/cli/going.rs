@@ -52,6 +52,8 @@ pub struct Begun {
     pub planned: Option<Planned>,
     /// What the run replied.
     pub reply: GoBegun,
+    /// The force to expect at most [N].
+    pub peak: Option<f64>,
 }
 
 /// Requests one step.
@@ -82,7 +84,7 @@ pub fn begin(
             bar.suspend(|| show(planned));
         }
         if let Some(reply) = report.begun {
-            return Ok(Begun { planned, reply });
+            return Ok(Begun { planned, reply, peak: report.peak });
         }
         if done {
             bar.finish_and_clear();

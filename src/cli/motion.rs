@@ -1,7 +1,7 @@
 //! `dimos move ARM …`: moves one arm or several together to joint positions, a pose or a named pose. With a planner in
 //! the run the motion is planned and collision-free; without one it is direct.
 
-use super::arguments::Target;
+use super::arguments::{Target, finite};
 use super::exit::{Exit, Failure, Result};
 use super::follow::{Followed, Signals, end, watch};
 use super::goal::{Goal, Leg, Search, checked, has_planner};
@@ -62,6 +62,9 @@ pub struct Args {
     /// Exit code 1 if the goal came first
     #[arg(long, value_name = "KEY=VALUE", conflicts_with_all = ["native", "replan", "no_wait", "several"])]
     pub until: Vec<String>,
+    /// Print the force to expect at most, for this stiffness of what is touched [N/mm]
+    #[arg(long, value_name = "N/MM", value_parser = finite, requires = "until", conflicts_with = "direct")]
+    pub stiffness: Option<f64>,
     /// Execute a plan of --level fast, which is not proven free of contact
     #[arg(long, conflicts_with = "direct")]
     pub unproven: bool,
@@ -222,7 +225,10 @@ fn plans(args: &Args, client: &mut Client, legs: impl IntoIterator<Item = Leg>, 
 
 /// Waits until a planned motion begins, and prints its plan.
 fn begin_planned(client: &mut Client, at: (u64, usize), signals: &Signals, json: bool) -> Result<GoBegun> {
-    let going::Begun { planned, reply } = going::begin(client, at, Some(signals), !json)?;
+    let going::Begun { planned, reply, peak } = going::begin(client, at, Some(signals), !json)?;
+    if let Some(peak) = peak {
+        output::note(format_args!("  force: {peak:.1} N at most, if what is touched is no stiffer than given"));
+    }
     let checked = planned.map_or("collision-checked", |planned| checked(planned.summary.level));
     output::note(format_args!("motion {} on {}: planned, {checked}", reply.motion(), reply.task()));
     Ok(reply)
@@ -237,8 +243,9 @@ fn until(args: &Args) -> Result<Vec<Until>> {
         let failure = Failure::usage("--until is about one motion, and this has several parts");
         return Err(failure.hint("a job has `until` at each of its motions: docs/jobs.md"));
     }
-    let until = Until::parse(&args.until).map_err(|what| Failure::usage(format!("--until: {what}")))?;
-    Ok(vec![until])
+    let until = Until::parse(&args.until).map(|until| Until { stiffness: args.stiffness.or(until.stiffness), ..until });
+    let until = until.and_then(|until| until.valid().map(|()| until));
+    Ok(vec![until.map_err(|what| Failure::usage(format!("--until: {what}")))?])
 }
 
 fn begin_direct(args: &Args, client: &mut Client, until: &[Until], signals: &Signals) -> Result<(u64, GoBegun)> {

@@ -45,7 +45,10 @@ fn a_tool_that_touches_ends_its_motion_at_the_force() {
     let tared = outcome(&home, "arm tare arm", 0);
     assert_eq!(tared["wrench"][2], -4.0);
     let down = "move arm --by 0 0 -0.15 --linear --tcp-speed 0.02";
-    let ended = outcome(&home, &format!("{down} --until force=8"), 0);
+    let begun = home.dimos(&format!("{down} --until force=8 --stiffness 4 --json")).with(0);
+    let said = begun.err.split("force: ").nth(1).and_then(|text| text.split(' ').next()).unwrap();
+    let most: f64 = said.parse().unwrap();
+    let ended: Value = serde_json::from_str(begun.out.trim()).unwrap();
     assert_eq!((&ended["ended_by"], &ended["state"]), (&"force".into(), &"COMPLETED".into()), "{ended}");
     let value = ended["value"].as_f64().unwrap();
     assert!((8.0..10.0).contains(&value), "{ended}");
@@ -53,6 +56,7 @@ fn a_tool_that_touches_ends_its_motion_at_the_force() {
     // 2 mm at 8 N; 20 mm/s for some periods, and to brake.
     let deep = 1e3 * (top - height(&home));
     assert!((1.9..5.0).contains(&deep), "{deep} mm");
+    assert!(4.0 * deep <= most && most < 30.0, "{} N of {most}", 4.0 * deep);
 
     // Back, and farther than the limit of time allows.
     home.dimos("move arm --by 0 0 0.05 --linear").with(0);

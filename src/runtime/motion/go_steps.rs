@@ -165,11 +165,15 @@ impl Service {
         plan: Option<u64>,
     ) -> Result<Option<dimos_core::until::Until>, Failed> {
         let Some(until) = until else { return Ok(None) };
-        let covered = match plan.filter(|_| until.distance.is_some()) {
+        let covered = match plan.filter(|_| until.distance.is_some() || until.stiffness.is_some()) {
             Some(plan) => Some(self.covered_by(plan).await?),
             None => None,
         };
-        Ok(Some(self.until_of(until, going.arms(), covered.as_ref())?))
+        let judged = self.until_of(until, going.arms(), covered.as_ref())?;
+        if let Some(peak) = covered.and_then(|covered| self.peak(until, judged.arm, &covered)) {
+            going.step(GoPhase::Planning, |step| step.peak = Some(peak));
+        }
+        Ok(Some(judged))
     }
 
     /// Makes a plan. Returns its number and its figures.

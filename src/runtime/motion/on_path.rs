@@ -32,6 +32,10 @@ pub struct Covered {
     /// Times along the path [s], and the way until then [m].
     times: Vec<f64>,
     ways: Vec<f64>,
+    /// Its highest speed [m/s].
+    pub fastest: f64,
+    /// Longest time to rest from a place of the path [s].
+    pub braking: f64,
 }
 
 impl Covered {
@@ -62,7 +66,21 @@ impl Service {
             let step = a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt();
             ways.push(ways.last().copied().unwrap_or(0.0) + step);
         }
-        Ok(Covered { times, ways })
+        let speed = |(times, ways): (&[f64], &[f64])| match (times, ways) {
+            ([t0, t1], [w0, w1]) if t1 > t0 => (w1 - w0) / (t1 - t0),
+            _ => 0.0,
+        };
+        let fastest = times.windows(2).zip(ways.windows(2)).map(speed).fold(0.0, f64::max);
+        let joints = self.facts.joints_named(&preview.trajectory.joint_names)?;
+        let mut braking = 0.0_f64;
+        for point in &preview.trajectory.points {
+            for (joint, velocity) in joints.iter().zip(point.velocities.iter().flatten()) {
+                let bound =
+                    self.facts.locate(*joint).and_then(|(arm, j)| self.facts.config.arms.get(arm)?.limits.joint(j));
+                braking = bound.map_or(braking, |bound| braking.max(velocity.abs() / bound.acceleration));
+            }
+        }
+        Ok(Covered { times, ways, fastest, braking })
     }
 
     /// Returns the acts of a step with the times at which the plan's motion passes their places.

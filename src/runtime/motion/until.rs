@@ -33,7 +33,8 @@ impl Service {
             let unsupported = |what: String, hint: &str| Err(RpcError::new(Code::Unsupported, what).hint(hint));
             let feels = self.tick.arm_view(arm.into()).is_some_and(|view| view.state.wrench.is_some());
             if (one.force.is_some() || one.torque.is_some()) && !feels {
-                let hint = "enable the arm or its sensor; one that reports none can await `time`, `distance`, `input`";
+                let hint =
+                    "`options.force_torque: true` reads it where there is one; others await time, distance, input";
                 return unsupported(format!("{name} reports no force at present: `until` cannot be judged"), hint);
             }
             if let Some((input, _)) = one.level() {
@@ -79,6 +80,21 @@ impl Service {
             distance,
             time: until.time,
         })
+    }
+
+    /// Returns the force to expect at most [N], if the stiffness is given: the threshold, the way of the tool until the
+    /// force is read and answered, and its way to rest.
+    pub(in crate::runtime) fn peak(&self, until: &Until, arm: u16, covered: &Covered) -> Option<f64> {
+        let (force, stiffness) = (until.force?, until.stiffness?);
+        let (arm, connected) = (usize::from(arm), self.facts.connected.get(usize::from(arm))?);
+        // An arm that does not send its whole state at once is asked for its force in every sixth reading.
+        let readings = if connected.info.whole_state_at_once { 1.0 } else { 6.0 };
+        let late = readings * connected.read_period.as_secs_f64()
+            + connected.write_period.as_secs_f64()
+            + self.facts.period().as_secs_f64()
+            + self.facts.config.arms.get(arm)?.supervision.lag;
+        let speed = self.tick.speed_override().fraction * covered.fastest;
+        Some(force + stiffness * 1e3 * speed * (late + covered.braking / 2.0))
     }
 
     /// Fails if a motion has ended otherwise than awaited: the next step would begin elsewhere than it should.

@@ -221,6 +221,9 @@ pub struct GoStepReport {
     /// Objects that were detached.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub detached: Vec<String>,
+    /// With `stiffness` in `until`: the force to expect at most [N].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub peak: Option<f64>,
     /// Acts on its path that were done, in order.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub acts: Vec<ActDone>,

@@ -35,6 +35,10 @@ pub struct Until {
     /// Time since the motion began [s].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub time: Option<f64>,
+    /// Stiffness of what is touched and of what touches it, together [N/mm]: the report of the step then has the `peak`
+    /// of the force that is to be expected. Of a planned motion.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stiffness: Option<f64>,
 }
 
 #[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde asks")]
@@ -52,6 +56,7 @@ impl Until {
                 "force" => &mut until.force,
                 "torque" => &mut until.torque,
                 "distance" => &mut until.distance,
+                "stiffness" => &mut until.stiffness,
                 "time" => &mut until.time,
                 "input" if until.input.is_none() => {
                     until.input = Some(value.to_owned());
@@ -94,13 +99,17 @@ impl Until {
     /// Checks the values alone.
     pub fn valid(&self) -> Result<(), String> {
         let numbers = [("force", self.force, "N"), ("torque", self.torque, "Nm"), ("distance", self.distance, "m")];
-        for (key, value, unit) in numbers.into_iter().chain([("time", self.time, "s")]) {
+        let more = [("time", self.time, "s"), ("stiffness", self.stiffness, "N/mm")];
+        for (key, value, unit) in numbers.into_iter().chain(more) {
             if let Some(value) = value.filter(|value| !(*value > 0.0 && value.is_finite())) {
                 return Err(format!("{key} is {value}, must be above 0 {unit}"));
             }
         }
         if let Some(time) = self.time.filter(|time| *time > MAX_DURATION) {
             return Err(format!("time is {time} s, may be {MAX_DURATION} s"));
+        }
+        if self.stiffness.is_some() && self.force.is_none() {
+            return Err("stiffness is about a force: add `force`".to_owned());
         }
         if let (Some(text), None) = (&self.input, self.level()) {
             return Err(format!("input is {text:?}, must be a digital input such as di0 or di0:low"));
@@ -136,8 +145,8 @@ pub(crate) fn valid(until: &[Until], steps: &[GoStep], replan: bool) -> Result<(
         }
         match steps.get(one.step) {
             None | Some(GoStep::Gripper(_)) => return wrong("its step is no motion".to_owned()),
-            Some(GoStep::Move(_) | GoStep::Execute(_)) if one.distance.is_some() => {
-                return wrong("distance is known of a planned motion only: use time".to_owned());
+            Some(GoStep::Move(_) | GoStep::Execute(_)) if one.distance.is_some() || one.stiffness.is_some() => {
+                return wrong("distance and stiffness are for planned motions: use time".to_owned());
             }
             Some(_) => {}
         }
