@@ -14,6 +14,7 @@ mod built_in_arms;
 mod changed_world;
 mod clearances;
 mod cli_verbs;
+mod compliant;
 mod crate_examples;
 mod daemon;
 #[cfg(feature = "view")]
@@ -68,6 +69,7 @@ mod python_run;
 mod readers;
 mod readme;
 mod remote_peers;
+mod remote_setpoints;
 mod remote_shim;
 mod ros;
 mod rpc_page;

@@ -12,7 +12,11 @@ pub(super) fn input_differs(a: &ArmState, b: &ArmState) -> bool {
     let values = |s: &ArmState| (s.gripper, s.gripper_force, s.pose, s.wrench, s.effort.is_some(), s.velocity_source);
     let flags = |s: &ArmState| (s.seq, s.stamp, s.mode, s.enabled, s.error, s.link, s.self_held, s.written);
     let more = |s: &ArmState| (s.interference, s.own_delay_ns, s.stop_input_open, s.device_ns, s.refused, s.commanded);
-    values(a) != values(b) || flags(a) != flags(b) || more(a) != more(b) || a.speed_fraction != b.speed_fraction
+    values(a) != values(b)
+        || flags(a) != flags(b)
+        || more(a) != more(b)
+        || a.speed_fraction != b.speed_fraction
+        || (a.effort_kind, a.missing) != (b.effort_kind, b.missing)
 }
 
 /// Returns whether two commands differ in the fields of `ArmOutput`, except for counters that change on their own.
@@ -20,7 +24,7 @@ pub(super) fn output_differs(a: &ArmCommand, b: &ArmCommand) -> bool {
     let limits = |c: &ArmCommand| [c.gripper_force, c.gripper_speed].map(|value| value.map(f64::to_bits));
     let gripper = |c: &ArmCommand| (c.gripper.to_bits(), limits(c), c.gripper_seq);
     let parts = |c: &ArmCommand| (c.mode, gripper(c), c.stop_seq, c.start_seq);
-    parts(a) != parts(b)
+    parts(a) != parts(b) || a.gains != b.gains
 }
 
 /// Returns what a tick read of an arm, except joint values.
@@ -50,6 +54,8 @@ pub(super) fn input(header: &Header, tick: u64, s: &ArmState) -> ArmInput {
         commanded_velocity: of_joints(s, |commanded| &commanded.velocity),
         refused: s.refused,
         speed_fraction: s.speed_fraction.into_iter().collect(),
+        effort_kind: s.effort_kind.name().into(),
+        missing: s.missing.iter().map(|joint| joint as u8).collect(),
     }
 }
 
@@ -59,7 +65,12 @@ fn of_joints(s: &ArmState, list: fn(&Commanded) -> &Joints) -> Vec<f64> {
 }
 
 /// Returns what a tick commands an arm, except joint values.
-pub(super) fn output(header: &Header, tick: u64, c: &ArmCommand) -> ArmOutput {
+pub(super) fn output(header: &Header, tick: u64, c: &ArmCommand, dof: usize) -> ArmOutput {
+    let of_mode = c.gains.filter(|_| c.mode == Some(ControlMode::Impedance));
+    let gains = |which: usize| {
+        let list = of_mode.as_ref().and_then(|gains| gains.get(which));
+        list.map_or_else(Vec::new, |list| list.iter().take(dof).copied().collect())
+    };
     ArmOutput {
         header: header.clone(),
         tick,
@@ -72,6 +83,8 @@ pub(super) fn output(header: &Header, tick: u64, c: &ArmCommand) -> ArmOutput {
         start_seq: c.start_seq,
         gripper_force: c.gripper_force.into_iter().collect(),
         gripper_speed: c.gripper_speed.into_iter().collect(),
+        stiffness: gains(0),
+        damping: gains(1),
     }
 }
 

@@ -198,17 +198,24 @@ impl Service {
             let (s, known, gripper) = (&view.state, view.state.seq > 0, self.facts.gripper_info(i));
             let joints = arm.joints.iter().enumerate().map(|(j, name)| JointReport {
                 name: name.clone(),
-                position: s.position.get(j).copied().filter(|_| known),
-                velocity: s.velocity.get(j).copied().filter(|_| s.velocity_source != VelocitySource::Absent),
+                position: s.position.get(j).copied().filter(|_| known && !s.missing.contains(j)),
+                velocity: s
+                    .velocity
+                    .get(j)
+                    .copied()
+                    .filter(|_| s.velocity_source != VelocitySource::Absent && !s.missing.contains(j)),
                 velocity_source: s.velocity_source.name().to_owned(),
-                effort: s.effort.and_then(|e| e.get(j).copied()),
+                effort: s.effort.and_then(|e| e.get(j).copied()).filter(|_| !s.missing.contains(j)),
                 command: view.command.mode.and_then(|_| view.command.values.get(j).copied()),
+                commanded_effort: view.command.mode.and(view.command.effort).and_then(|e| e.get(j).copied()),
             });
             Some(ArmStateReport {
                 hardware_id: arm.hardware_id.clone(),
                 simulated: !arm.is_real(),
                 age_ms: self.age_ms(s),
                 speed_fraction: s.speed_fraction,
+                effort_kind: Some(s.effort_kind.name().to_owned())
+                    .filter(|kind| s.effort.is_some() && !kind.is_empty()),
                 joints: joints.collect(),
                 gripper: s.gripper,
                 gripper_unit: gripper.map(|gripper| gripper.unit.name().to_owned()),

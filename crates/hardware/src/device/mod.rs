@@ -27,8 +27,8 @@ pub use thread::Way;
 
 use crate::adapter::{AdapterError, AdapterResult, ManipulatorAdapter, ManipulatorInfo, Reduction};
 use dimos_core::arm::{
-    ArmCommand, ArmState, Bridging, FactoryKinematics, GripperInfo, IoInfo, IoState, Load, OutputValue, StopInput,
-    Supervision,
+    ArmCommand, ArmState, Bridging, EffortLimits, FactoryKinematics, GripperInfo, Impedance, IoInfo, IoState, Load,
+    OutputValue, SetpointFields, StopInput, Supervision,
 };
 use dimos_core::clock::Clock;
 use dimos_core::joint::{JointLimits, Joints};
@@ -82,6 +82,10 @@ pub struct Setup {
     pub gravity: Option<[f64; 3]>,
     /// Highest speed of the tool [m/s], if it is limited: the blueprint's, or the vendor's.
     pub tool_velocity: Option<f64>,
+    /// Highest efforts beside the arm's own control; `None`: none is written.
+    pub efforts: Option<EffortLimits>,
+    /// Gains in impedance mode; `None`: none are written.
+    pub impedance: Option<Impedance>,
 }
 
 impl DeviceConfig {
@@ -129,6 +133,10 @@ pub struct Connected {
     pub bridging: Option<Bridging>,
     /// What the settings of its controller leave of its limits, if it reports them.
     pub reduction: Option<Reduction>,
+    /// What it takes of setpoints, if it says so itself.
+    pub setpoint: Option<SetpointFields>,
+    /// How it is held in impedance mode, if it says so itself.
+    pub impedance: Option<Impedance>,
     /// Whether it streams its state.
     pub streams: bool,
     /// Whether its controller takes the load at the flange.
