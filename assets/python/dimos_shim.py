@@ -107,7 +107,7 @@ class Arm:  # the adapter, called from one thread only
             began = time.monotonic()
             self.read("read_joint_positions", *(READS if self.quick else [next(self.turns)]))
             spent.append(time.monotonic() - began)
-        self.slower(1.0 / max(statistics.median(spent), 1e-6), "its calls take so long")
+        self.slower(1.0 / max(statistics.median(spent), 1e-6), "its calls take that long")
 
     def slower(self, rate: float, why: str) -> None:
         if rate < 0.9 * self.rate:
@@ -119,7 +119,7 @@ class Arm:  # the adapter, called from one thread only
         now = time.monotonic()
         self.cycles = [*self.cycles[-19:], now - began] if commanded else []
         if len(self.cycles) == 20:
-            self.slower(1.0 / max(statistics.median(self.cycles), 1e-6), "its calls take so long")
+            self.slower(1.0 / max(statistics.median(self.cycles), 1e-6), "its calls take that long")
         self.news, self.reads = self.news + (self.state["read_joint_positions"] != before), self.reads + 1
         if now - self.since >= 2.0:
             if self.news >= 10 and self.news < 0.6 * self.reads:  # it moved, and most reads brought nothing new

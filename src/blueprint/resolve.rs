@@ -131,7 +131,7 @@ pub struct Arm {
     pub tcp_velocity: Option<f64>,
     /// What the speed of its tool is computed with, if a model is known.
     pub tool_robot: Option<ToolRobot>,
-    /// What its adapter hands on of setpoints besides positions, as far as that is known before it is connected.
+    /// What its adapter passes on of setpoints besides positions, as far as that is known before it is connected.
     pub setpoint: SetpointFields,
     /// What it is commanded beside positions; `None`: nothing.
     pub effort: Option<ArmEffort>,

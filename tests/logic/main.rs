@@ -31,6 +31,7 @@ mod device_streams;
 mod dynamics;
 mod english;
 mod faults;
+mod feed_forward;
 mod follow;
 mod follow_ends;
 mod gaps;

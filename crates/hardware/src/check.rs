@@ -28,7 +28,7 @@ pub struct Checked {
     pub tool: ToolFacts,
     /// What it takes of its line, if other arms may be on it.
     pub line: Option<LineShare>,
-    /// What its adapter hands on of setpoints besides positions.
+    /// What its adapter passes on of setpoints besides positions.
     pub setpoint: SetpointFields,
     /// How it is held in impedance mode, if it has that.
     pub impedance: Option<Impedance>,
@@ -94,7 +94,7 @@ impl Checked {
         Self { line: Some(line), ..self }
     }
 
-    /// Says what its adapter hands on of setpoints besides positions.
+    /// Says what its adapter passes on of setpoints besides positions.
     pub fn setpoint(self, fields: SetpointFields) -> Self {
         Self { setpoint: fields, ..self }
     }

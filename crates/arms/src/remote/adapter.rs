@@ -276,7 +276,7 @@ impl ManipulatorAdapter for RemoteAdapter {
         self.command(mode, positions, velocity, More::default())
     }
 
-    /// Hands on what the peer takes of the setpoint.
+    /// Passes on what the peer takes of the setpoint.
     fn write_setpoint(&mut self, setpoint: &Setpoint) -> AdapterResult<()> {
         let (fields, dof, mode) = (self.setpoint_fields().unwrap_or_default(), self.dof, self.mode);
         if mode != setpoint.mode && self.session.is_some() {

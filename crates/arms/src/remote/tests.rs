@@ -283,7 +283,7 @@ fn a_peer_of_version_1_connects_and_gets_positions_alone() {
         let lists = heard.recv_timeout(Duration::from_secs(10)).unwrap();
         match version {
             1 => assert_eq!((taken, lists), (0, vec!["values".to_owned()])),
-            _ => assert_eq!((taken, lists), (4, ["efforts", "values", "velocities"].map(str::to_owned).to_vec())),
+            _ => assert_eq!((taken, lists), (5, ["efforts", "values", "velocities"].map(str::to_owned).to_vec())),
         }
     }
 }

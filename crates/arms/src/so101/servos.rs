@@ -47,11 +47,15 @@ impl So101Adapter {
                 (status.id, data)
             })
         };
-        let patience = if self.missing.is_empty() { CYCLE } else { WITHOUT };
-        let result = self.bus.line.gather_some(frame, patience, SERVOS, scan, |(id, data)| {
+        let timeout = if self.missing.is_empty() { CYCLE } else { WITHOUT };
+        let result = self.bus.line.gather_some(frame, timeout, SERVOS, scan, |(id, data)| {
             let slot = id.checked_sub(first).map(usize::from).and_then(|servo| servos.get_mut(servo));
             slot.is_some_and(|slot| slot.replace(Servo::decode(&data).unwrap_or_default()).is_none())
         });
+        if let Err(AdapterError::Timeout(text)) = &result {
+            let first = self.bus.servo(first);
+            return Err(AdapterError::Timeout(format!("{text}; {first} did not")));
+        }
         result?;
         let missing = (0..SERVOS).filter(|servo| servos.get(*servo).is_some_and(Option::is_none));
         self.missing = JointSet::of(missing);

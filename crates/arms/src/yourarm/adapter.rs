@@ -311,7 +311,7 @@ impl ManipulatorAdapter for YourArmAdapter {
         self.set_point(&Command::VelocityJoints(joints)) // the controller checks the mode
     }
 
-    /// Hands on all that a setpoint has. What it does not have is not sent: zero would be a command.
+    /// Passes on all that a setpoint has. What it does not have is not sent: zero would be a command.
     fn write_setpoint(&mut self, setpoint: &Setpoint) -> AdapterResult<()> {
         if setpoint.mode == ControlMode::Position {
             return self.write_joint_positions(setpoint.position.get(..DOF).unwrap_or_default(), 1.0);

@@ -10,6 +10,7 @@
 mod details;
 pub mod gripper;
 mod health;
+mod history;
 mod identity;
 mod plausible;
 mod thread;
@@ -22,6 +23,7 @@ use std::time::Duration;
 
 pub use details::Details;
 pub use health::{Episode, Health, Note};
+pub use history::History;
 pub use identity::Identity;
 pub use thread::Way;
 
@@ -30,7 +32,7 @@ use dimos_core::arm::{
     ArmCommand, ArmState, Bridging, EffortLimits, FactoryKinematics, GripperInfo, Impedance, IoInfo, IoState, Load,
     OutputValue, SetpointFields, StopInput, Supervision,
 };
-use dimos_core::clock::Clock;
+use dimos_core::clock::{Clock, Mono};
 use dimos_core::joint::{JointLimits, Joints};
 use dimos_rt::due::Due;
 use dimos_rt::heartbeat::Heartbeat;
@@ -204,6 +206,12 @@ impl Device {
     /// Returns the event that wakes the thread for a new command.
     pub fn wake(&self) -> Wake {
         self.wake.clone()
+    }
+
+    /// Returns the joint positions at a time within the last 2 s [rad or m], between two states if need be; `None`: they
+    /// are not known.
+    pub fn joints_at(&self, time: Mono) -> Option<Joints> {
+        self.health.history.at(time)
     }
 
     /// Returns the thread's counters, and its texts for status and log.

@@ -35,7 +35,7 @@ pub(super) struct Joint {
     pub hand: f64,
     /// Where it stops when it falls [rad]; `None`: friction holds it.
     pub rest: Option<f64>,
-    /// How far above the target that was commanded it comes to rest: below it under its weight [rad].
+    /// How far above the target that was commanded it stops: below it under its weight [rad].
     pub sag: f64,
     /// What drives it in impedance mode, and the effort beside its position control.
     pub force: Drive,

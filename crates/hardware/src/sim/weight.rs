@@ -55,7 +55,7 @@ impl Joint {
         self.travel(h);
     }
 
-    /// Moves the place where the position control comes to rest: below its target by what the weight takes, without the
+    /// Moves the place where the position control stops: below its target by what the weight takes, without the
     /// effort that is commanded beside it [Nm].
     pub(super) fn settle(&mut self, gravity: f64, effort: f64, stiffness: f64) {
         let sag = (effort - gravity) / stiffness;

@@ -14,7 +14,9 @@ use super::messages::{ArmInput, JointState};
 use super::notes::{Notes, channel};
 use super::recorder::{Note, Notice, Recorder, RecorderConfig};
 use super::replay::{Entry, LogReader, Payload, ReplayError, Selection};
-use dimos_core::arm::{ArmCommand, ArmState, Commanded, ControllerPose, Interference, Link, Pose, VelocitySource};
+use dimos_core::arm::{
+    ArmCommand, ArmState, Commanded, ControllerPose, EffortKind, Interference, JointSet, Link, Pose, VelocitySource,
+};
 use dimos_core::clock::{Mono, WallOffset};
 use dimos_core::joint::{ControlMode, MAX_DOF, joints_of, make_joints};
 use dimos_core::telemetry::describe::{ArmNames, Names, Severity};
@@ -81,6 +83,8 @@ fn state(arm: u16, tick: u64) -> ArmState {
             .then(|| Commanded { position: joints_of(&[x, 0.1 + 0.2, -0.0]), velocity: joints_of(&[0.0, x, 1.0]) }),
         refused: tick / 3,
         speed_fraction: (arm == 0 && tick > 4).then_some(0.25),
+        effort_kind: if arm == 0 { EffortKind::FromCurrent } else { EffortKind::Unstated },
+        missing: if tick == 11 { JointSet::of([1]) } else { JointSet::NONE },
     }
 }
 
@@ -199,6 +203,8 @@ fn with_values(input: &ArmInput, states: Option<&JointState>, skip: usize, dof: 
         }),
         refused: input.refused,
         speed_fraction: input.speed_fraction.first().copied(),
+        effort_kind: EffortKind::of_name(&input.effort_kind).unwrap(),
+        missing: JointSet::of(input.missing.iter().map(|joint| usize::from(*joint))),
     }
 }
 

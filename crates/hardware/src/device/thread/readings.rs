@@ -204,5 +204,6 @@ impl Worker {
         self.state.velocity = self.reading.velocity.unwrap_or_default();
         self.state.velocity_source =
             if self.reading.velocity.is_some() { VelocitySource::Measured } else { VelocitySource::Absent };
+        self.health.history.take(&self.state);
     }
 }
