@@ -1,5 +1,6 @@
 //! What an arm is commanded beside positions: the limits of its efforts, and what is fed forward to it, with the model
-//! that this is computed with: that of `model_path`, else a robot of the planner, of a Cartesian task, or a built-in one.
+//! that this is computed with: that of `model_path`, else a robot of the planner or of a Cartesian task, or a built-in
+//! one.
 
 use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 

@@ -165,8 +165,8 @@ pub struct HardwareEntry {
     #[serde(default)]
     pub mounting: Option<Located<MountingEntry>>,
     /// Efforts that are computed in every tick and commanded with the positions, of an arm that takes them: `gravity`
-    /// holds its weight, and with `payload` that of the load; `dynamics` also moves its masses. Not for an arm whose own
-    /// controller compensates gravity.
+    /// holds its weight, and with `payload` that of the load; `dynamics` also moves its masses. Not for an arm whose
+    /// own controller compensates gravity.
     #[serde(default)]
     #[schemars(with = "FeedForward")]
     pub feed_forward: Option<Located<FeedForward>>,

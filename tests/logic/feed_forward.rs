@@ -64,7 +64,7 @@ fn a_blueprint_gives_limits_model_load_and_the_direction_of_gravity() {
     let named = effort("remote", "feed_forward: gravity, model_path: 'builtin:yourarm', limits: {effort: 60}", "");
     assert!(close(gravity(&named, POSE), upright), "the same model by its name");
     let planner = "planner:\n  robots:\n    - {name: arm, model_path: 'builtin:yourarm', end_effector_link: flange, \
-                   joint_prefix: arm_, base_pose: {xyz: [0, 0, 1], rpy: [3.141592653589793, 0, 0]}}\n";
+                   joint_names: [joint1, joint2, joint3, joint4, joint5, joint6], joint_prefix: arm_, base_pose: {xyz: [0, 0, 1], rpy: [3.141592653589793, 0, 0]}}\n";
     let placed = effort("yourarm", "feed_forward: gravity, limits: {effort: 60}", planner);
     assert!(close(gravity(&placed, POSE), gravity(&hung, POSE)), "by where the planner has its base");
 }
@@ -74,7 +74,7 @@ fn what_cannot_be_fed_forward_is_said_with_its_reason() {
     let soft = "tasks:\n  - {name: soft, type: compliant, joint_names: {hardware: arm}}\n";
     for (adapter, own, more, says) in [
         ("so101", "feed_forward: gravity", "", "is given no efforts"),
-        ("ur", "feed_forward: gravity", "", "refused: "),
+        ("ur", "feed_forward: gravity", "", "refused by dimos: servoj has none"),
         ("mock", "feed_forward: gravity, limits: {effort: 9}", "", "no model of arm is known"),
         ("yourarm", "model_path: 'builtin:yourarm'", "", "`model_path` has no use without `feed_forward`"),
         ("yourarm", "limits: {effort: -1}", "", "must be above 0, not -1"),
@@ -91,7 +91,7 @@ fn what_cannot_be_fed_forward_is_said_with_its_reason() {
         assert!(said.contains(says), "{adapter} {own}: {said}");
     }
     let planner = "planner:\n  robots:\n    - {name: arm, model_path: 'builtin:yourarm', end_effector_link: flange, \
-                   joint_prefix: arm_}\n";
+                   joint_names: [joint1, joint2, joint3, joint4, joint5, joint6], joint_prefix: arm_}\n";
     let own = "feed_forward: gravity, limits: {effort: 60}, mounting: {rpy: [1.5707963, 0, 0]}";
     let said = load("yourarm", own, planner).render(false);
     assert!(said.contains("gravity is 90.0° from where `base_pose` of the planner has it"), "{said}");
@@ -110,7 +110,9 @@ fn fed(feed_forward: FeedForward, (max, rate): (f64, f64)) -> (Rig, Dynamics) {
     let limits = EffortLimits { max: [max; MAX_DOF], rate: [rate; MAX_DOF] };
     let arm = ArmConfig { effort: Some(Box::new(EffortConfig { limits, feed_forward, ..config })), ..arm("arm", 6) };
     let mut rig = Rig::new(100.0, vec![arm], vec![task("t", trajectory(), 0..6, 10)]);
-    rig.make_ready();
+    rig.run(2);
+    rig.ask(Request::Enabled { arm: 0, outside: false });
+    rig.run_for(0.3);
     (rig, dynamics)
 }
 

@@ -14,7 +14,7 @@ mod built_in_arms;
 mod changed_world;
 mod clearances;
 mod cli_verbs;
-mod compliant;
+mod compliant_task;
 mod crate_examples;
 mod daemon;
 #[cfg(feature = "view")]

@@ -208,8 +208,8 @@ impl Device {
         self.wake.clone()
     }
 
-    /// Returns the joint positions at a time within the last 2 s [rad or m], between two states if need be; `None`: they
-    /// are not known.
+    /// Returns the joint positions at a time within the last 2 s [rad or m], between two states if need be; `None`:
+    /// they are not known.
     pub fn joints_at(&self, time: Mono) -> Option<Joints> {
         self.health.history.at(time)
     }

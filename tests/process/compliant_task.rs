@@ -1,5 +1,5 @@
-//! `docs/examples/compliant.rs` and `feed_forward`, judged at an arm with a weight: by what its emulator receives, and by
-//! where its joints are.
+//! `docs/examples/compliant.rs` and `feed_forward`, judged at an arm with a weight: by what its emulator receives, and
+//! by where its joints are.
 
 use std::path::Path;
 use std::time::Duration;
