@@ -13,6 +13,7 @@ import ctypes
 import enum
 import errno
 import importlib
+import inspect
 import itertools
 import json
 import math
@@ -22,6 +23,7 @@ import platform
 import select
 import signal
 import socket
+import statistics
 import struct
 import sys
 import time
@@ -30,7 +32,19 @@ from typing import Any, Callable, Optional
 
 SILENCE, LONGEST = 0.5, 16384  # a commanded arm is stopped after this time without a request [s]; bytes of a line
 FEEDBACK = ["read_joint_velocities", "read_joint_efforts"]
-EXTRAS = ["modes", "gripper_range", "gripper_unit", "holds_when_disabled", "gap_tolerance", "after_gap"]
+EXTRAS = ["modes", "gripper_range", "gripper_unit", "holds_when_disabled", "gap_tolerance", "after_gap", "impedance"]
+# Parameters that `write_setpoint` of an adapter may have besides `position` and `mode`: their names in a command.
+FIELDS = {
+    "velocity": "velocities",
+    "acceleration": "accelerations",
+    "effort": "efforts",
+    "stiffness": "stiffness",
+    "damping": "damping",
+    "at": "at",
+    "expires": "valid",
+}
+# What more an adapter may know of a state: its method, its name in the state.
+MORE = {"missing_joints": "missing", "read_device_time": "device_time"}
 READS = [
     "read_error",
     "read_enabled",
@@ -71,7 +85,13 @@ def control_modes() -> Any:
 
 class Arm:  # the adapter, called from one thread only
     def __init__(self, adapter: Any, modes: Any, dof: Optional[int], hz: float) -> None:
-        self.adapter, self.modes, self.hz = adapter, modes, hz
+        self.adapter, self.modes, self.hz, self.rate = adapter, modes, hz, hz
+        takes = inspect.signature(getattr(adapter, "write_setpoint", lambda: None)).parameters
+        every = any(parameter.kind is parameter.VAR_KEYWORD for parameter in takes.values())
+        self.takes = [name for name in [*FIELDS, "mode"] if every or name in takes]
+        self.follows = bool(takes)
+        self.cycles: list[float] = []  # durations of the last ones with a command [s]
+        self.news, self.reads, self.since = 0, 0, time.monotonic()
         self.state: dict[str, Any] = {}
         self.measured: set[str] = set()
         self.commanded, self.held, self.turns, self.due = False, True, itertools.cycle(READS[:-2]), 0.0
@@ -79,6 +99,32 @@ class Arm:  # the adapter, called from one thread only
         self.dof, began = dof or adapter.get_dof(), time.monotonic()
         self.read(*READS)
         self.quick = time.monotonic() - began < 0.5 / hz  # else one read besides the positions per cycle, in turn
+        self.measure()
+
+    def measure(self) -> None:  # how many states per second the SDK can deliver
+        spent = []
+        for _ in range(3):
+            began = time.monotonic()
+            self.read("read_joint_positions", *(READS if self.quick else [next(self.turns)]))
+            spent.append(time.monotonic() - began)
+        self.slower(1.0 / max(statistics.median(spent), 1e-6), "its calls take that long")
+
+    def slower(self, rate: float, why: str) -> None:
+        if rate < 0.9 * self.rate:
+            self.rate = max(rate, 0.1)
+            said = f"the arm delivers {self.rate:.1f} states per second instead of {self.hz:g}: {why}"
+            print(f"{said}; --hz {max(math.floor(self.rate), 1)} says so from the start", flush=True)
+
+    def watch(self, before: Any, began: float, commanded: bool) -> None:  # the rate while the arm is commanded
+        now = time.monotonic()
+        self.cycles = [*self.cycles[-19:], now - began] if commanded else []
+        if len(self.cycles) == 20:
+            self.slower(1.0 / max(statistics.median(self.cycles), 1e-6), "its calls take that long")
+        self.news, self.reads = self.news + (self.state["read_joint_positions"] != before), self.reads + 1
+        if now - self.since >= 2.0:
+            if self.news >= 10 and self.news < 0.6 * self.reads:  # it moved, and most reads brought nothing new
+                self.slower(self.news / (now - self.since), "its SDK has no newer ones")
+            self.news, self.reads, self.since = 0, 0, now
 
     def lost(self) -> bool:
         return hasattr(self.adapter, "is_connected") and not self.adapter.is_connected()
@@ -95,21 +141,24 @@ class Arm:  # the adapter, called from one thread only
                     self.measured.add(name)
             self.state[name] = answer
 
-    def call(self, name: str, *args: Any) -> None:
+    def call(self, name: str, *args: Any, **more: Any) -> None:
         name, args = (name, args) if hasattr(self.adapter, name) else INSTEAD.get(name, (name, args))
-        answer = getattr(self.adapter, name)(*args)
+        answer = getattr(self.adapter, name)(*args, **more)
         if answer is not None and not answer:
             code, text = (0, "") if self.lost() else self.adapter.read_error()
             raise RuntimeError(f"{name}() said no" + (f" (error {code}: {text})" if code else ""))
 
-    def hello(self, **_: Any) -> dict[str, Any]:
+    def hello(self, version: int = 1, **_: Any) -> dict[str, Any]:
         self.held = True
         if self.lost():
             self.call("connect")
         return {
-            "version": 1,
+            "version": min(version, 2),
             "dof": self.dof,
-            "native_rate": self.hz,
+            "native_rate": self.rate,
+            "asked_rate": self.hz if self.rate < self.hz else None,
+            "fields": [name for name in self.takes if name in FIELDS],
+            "effort_kind": getattr(self.adapter, "effort_kind", None),
             "info": vars(self.adapter.get_info()),
             "limits": vars(self.adapter.get_limits()),
             "parts": [k for k, v in self.state.items() if v is not None],
@@ -139,20 +188,34 @@ class Arm:  # the adapter, called from one thread only
 
     # One command, one reading, timed when the SDK returned the positions.
     def cycle(self, command: Optional[dict[str, Any]] = None) -> dict[str, Any]:
-        refused = DISABLED if command and self.held else None
+        refused, began = DISABLED if command and self.held else None, time.monotonic()
         if command and not refused:
-            planned, self.commanded = [command["velocity"]] if command["mode"] != "velocity" else [], True
+            self.commanded = True
             try:
-                self.call("write_joint_positions" if planned else "write_joint_velocities", command["values"], *planned)
+                self.command(**command)
             except Exception as e:
                 refused = str(e) or repr(e)
         time.sleep(0.0 if command else max(0.0, self.due - time.monotonic()))  # asked early: wait for a new state
         if time.monotonic() >= self.due:
+            before = self.state.get("read_joint_positions")
             self.read("read_joint_positions")
             self.state["time"], self.due = time.monotonic_ns(), time.monotonic() + 0.5 / self.hz
             self.read(*READS if self.quick else [next(self.turns)])
+            self.state.update({k: getattr(self.adapter, m)() for m, k in MORE.items() if hasattr(self.adapter, m)})
+            self.watch(before, began, command is not None)
         unknown = [name for name in FEEDBACK if not self.quick or name not in self.measured]
         return {"state": {**self.state, "held": self.held, **dict.fromkeys(unknown)}, "refused": refused}
+
+    def command(self, mode: str, values: list[float], velocity: float, **more: Any) -> None:
+        if mode == "velocity":
+            self.call("write_joint_velocities", values)
+        elif mode == "position" or not self.follows:
+            self.call("write_joint_positions", values, velocity)
+        else:  # what is not commanded is None, never zero
+            given = {name: more.get(FIELDS[name]) for name in self.takes if name in FIELDS}
+            if "mode" in self.takes:
+                given["mode"] = self.modes[mode.upper()]
+            self.call("write_setpoint", position=values, **given)
 
     def reply(self, line: bytes) -> bytes:
         request = json.loads(line)

@@ -54,6 +54,7 @@ impl Bed {
         let limits = JointLimits::uniform(DOF, 3.0, 3.0).with_defaults();
         let arm = |i| ArmConfig {
             tool: None,
+            effort: None,
             name: format!("arm{i}"),
             dof: DOF,
             limits: limits.clone(),

@@ -217,6 +217,8 @@ fn arm(
         line: checked.line,
         tcp_velocity: None,
         tool_robot: None,
+        setpoint: checked.setpoint,
+        effort: None,
     }
 }
 

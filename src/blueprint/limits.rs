@@ -22,6 +22,10 @@ pub struct LimitsEntry {
     pub acceleration: Option<Located<PerJoint>>,
     /// Highest jerk [rad/s³], in the same forms. Default: the arm's own, else 20.
     pub jerk: Option<Located<PerJoint>>,
+    /// Highest effort of commands [Nm, N for a linear joint], in the same forms. Default: that of the arm's model.
+    pub effort: Option<Located<PerJoint>>,
+    /// Highest change of that effort [Nm/s, N/s], in the same forms. Default: all of `effort` within 0.1 s.
+    pub effort_rate: Option<Located<PerJoint>>,
     /// Highest speed of tool centre point and flange [m/s]. Default: the vendor's, in the arm's page.
     #[schemars(extend("exclusiveMinimum" = 0))]
     pub tcp_velocity: Option<Located<f64>>,
@@ -166,6 +170,12 @@ pub struct JointOverride {
     pub acceleration: Option<f64>,
     /// Highest jerk [rad/s³].
     pub jerk: Option<f64>,
+    /// Highest effort of commands [Nm or N].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub effort: Option<f64>,
+    /// Highest change of that [Nm/s or N/s].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub effort_rate: Option<f64>,
 }
 
 /// Checks the limits of an arm against its own, and returns them per joint.
@@ -202,12 +212,14 @@ pub(super) fn resolve(
     type Top<'e> =
         (&'e str, &'e str, &'e Option<Located<PerJoint>>, &'e [f64], fn(&mut JointOverride) -> &mut Option<f64>);
     let none: &[f64] = &[];
-    let tops: [Top<'_>; 3] = [
+    let tops: [Top<'_>; 5] = [
         ("speed", "rad/s", &entry.velocity, own.map_or(none, |o| &o.velocity_max), |o| &mut o.velocity),
         ("acceleration", "rad/s²", &entry.acceleration, own.map_or(none, |o| &o.acceleration_max), |o| {
             &mut o.acceleration
         }),
         ("jerk", "rad/s³", &entry.jerk, own.map_or(none, |o| &o.jerk_max), |o| &mut o.jerk),
+        ("effort", "Nm", &entry.effort, none, |o| &mut o.effort),
+        ("rate of the effort", "Nm/s", &entry.effort_rate, none, |o| &mut o.effort_rate),
     ];
     for (what, unit, given, own, slot) in tops {
         let Some(given) = given else { continue };

@@ -9,6 +9,7 @@ mod arms;
 mod assets;
 mod catalog;
 mod endpoints;
+mod feed_forward;
 mod include;
 mod json_schema;
 mod limits;

@@ -74,6 +74,8 @@ pub(super) fn resolve(checker: &mut Checker<'_>, entry: &HardwareEntry, arm: &Ch
         max_payload,
         gravity: entry.mounting.as_ref().and_then(|mounting| gravity(checker, mounting)),
         tool_velocity: None, // resolved with the arm's model
+        efforts: None,
+        impedance: arm.impedance,
     }
 }
 

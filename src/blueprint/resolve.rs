@@ -8,6 +8,7 @@ use crate::assets::{Asset, Cache};
 use crate::blueprint::assets::Assets;
 use crate::blueprint::catalog::Catalog;
 use crate::blueprint::endpoints::MetricsConfig;
+use crate::blueprint::feed_forward::{self, ArmEffort};
 use crate::blueprint::limits::JointOverride;
 use crate::blueprint::planner::{ViewBackend, ViewConfig};
 use crate::blueprint::schema::{
@@ -21,7 +22,7 @@ use crate::blueprint::{
 };
 use dimos_control::task_leader::LeaderJoint;
 use dimos_control::task_spec::TaskSpec;
-use dimos_core::arm::Supervision;
+use dimos_core::arm::{SetpointFields, Supervision};
 use dimos_core::joint::{JointLimits, LONGEST_NAME, may_be_in_name};
 use dimos_hardware::check::{LineShare, ToolFacts};
 use dimos_hardware::device::Setup;
@@ -130,6 +131,10 @@ pub struct Arm {
     pub tcp_velocity: Option<f64>,
     /// What the speed of its tool is computed with, if a model is known.
     pub tool_robot: Option<ToolRobot>,
+    /// What its adapter passes on of setpoints besides positions, as far as that is known before it is connected.
+    pub setpoint: SetpointFields,
+    /// What it is commanded beside positions; `None`: nothing.
+    pub effort: Option<ArmEffort>,
 }
 
 impl Arm {
@@ -258,6 +263,7 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
     let guard = guard(&mut checker, file.guard.as_ref(), planner.is_some());
     task_robots::resolve(&mut checker, &file.tasks, &mut tasks, planner.as_ref(), &hardware);
     tool_speed::resolve(&mut checker, &file.hardware, &mut hardware, &tasks, planner.as_ref());
+    feed_forward::resolve(&mut checker, &file.hardware, &mut hardware, &tasks, planner.as_ref());
     task_leaders::resolve(&mut checker, &file.tasks, &mut tasks, &hardware);
     let assets = assets::resolved(&checker, &file.tasks, file.planner.as_ref());
     let view = file.view.or_else(|| file.planner.and_then(|p| p.value.visualization));

@@ -14,6 +14,7 @@ use crate::blueprint::planner::{PlannerEntry, ViewConfig};
 use crate::blueprint::share::ShareEntry;
 use crate::blueprint::size::Size;
 use crate::blueprint::tick_clock::TickClock;
+use dimos_control::config::FeedForward;
 use dimos_yaml::range::{self, tick_rate};
 use dimos_yaml::{Keyed, Located, Raw};
 
@@ -163,6 +164,17 @@ pub struct HardwareEntry {
     /// Default: the controller keeps its own setting, from the factory upright.
     #[serde(default)]
     pub mounting: Option<Located<MountingEntry>>,
+    /// Efforts that are computed in every tick and commanded with the positions, of an arm that takes them: `gravity`
+    /// holds its weight, and with `payload` that of the load; `dynamics` also moves its masses. Not for an arm whose
+    /// own controller compensates gravity.
+    #[serde(default)]
+    #[schemars(with = "FeedForward")]
+    pub feed_forward: Option<Located<FeedForward>>,
+    /// The `.urdf` or `.xacro` file, or `builtin:NAME`, with the masses of its links. Default: that of its robot in
+    /// `planner`, of a Cartesian task with its joints, or the built-in one. `base_pose` of the planner or `mounting`
+    /// gives the direction of gravity.
+    #[serde(default)]
+    pub model_path: Option<Located<String>>,
     /// The adapter's own options.
     #[serde(default)]
     #[schemars(with = "Option<serde_json::Map<String, serde_json::Value>>")]

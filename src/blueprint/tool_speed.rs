@@ -9,7 +9,7 @@ use crate::blueprint::schema::HardwareEntry;
 use crate::blueprint::task_robots::of_planner;
 use dimos_control::config::ToolLimit;
 use dimos_core::written;
-use dimos_planner::planning::scene::config::PlannerConfig;
+use dimos_planner::planning::scene::config::{PlannerConfig, RobotConfig};
 use dimos_robot::builtin::PREFIX;
 use dimos_robot::{Source, load};
 use dimos_yaml::{Diag, Located};
@@ -74,13 +74,24 @@ fn robot(arm: &Arm, joints: &[usize], tasks: &[Task], planner: Option<&PlannerCo
     let planned = planned.find(|robot| arm.joints.iter().all(|joint| robot.coordinator_joints.contains(joint)));
     if let Some(planned) = planned {
         links.extend(planned.flange_link.clone());
-        return Some(ToolRobot {
-            robot: TaskRobot { tool: planned.tool, ..of_planner(planned, &arm.joints, None) },
-            links,
-        });
+        return known_robot(arm, joints, tasks, Some(planned)).map(|robot| ToolRobot { robot, links });
+    }
+    links.extend(arm.tool.model.map(|(_, flange)| flange.to_owned()));
+    known_robot(arm, joints, tasks, None).map(|robot| ToolRobot { robot, links })
+}
+
+/// Returns the model of an arm that is known: that of its planning robot, of a Cartesian task with its `joints`, or the
+/// built-in one.
+pub(super) fn known_robot(
+    arm: &Arm,
+    joints: &[usize],
+    tasks: &[Task],
+    planned: Option<&RobotConfig>,
+) -> Option<TaskRobot> {
+    if let Some(planned) = planned {
+        return Some(TaskRobot { tool: planned.tool, ..of_planner(planned, &arm.joints, None) });
     }
     let of_task = tasks.iter().filter(|task| task.joints == joints).find_map(|task| task.robot.clone());
-    links.extend(arm.tool.model.map(|(_, flange)| flange.to_owned()));
     let built_in = || {
         let (name, flange) = arm.tool.model?;
         let source = Source { path: format!("{PREFIX}{name}").into(), ..Source::default() };
@@ -97,7 +108,7 @@ fn robot(arm: &Arm, joints: &[usize], tasks: &[Task], planner: Option<&PlannerCo
             fixed: BTreeMap::new(),
         })
     };
-    of_task.or_else(built_in).map(|robot| ToolRobot { robot, links })
+    of_task.or_else(built_in)
 }
 
 impl Arm {

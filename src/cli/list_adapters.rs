@@ -4,7 +4,8 @@ use serde_json::json;
 
 use super::exit::{Exit, Result};
 use super::output::{self, Table};
-use dimos_core::joint::{JointLimits, MAX_DOF};
+use dimos_core::joint::MAX_DOF;
+use dimos_hardware::check::Checked;
 use dimos_hardware::registry::{Absent, AdapterConfig, AdapterSpec, Registry, Teach};
 
 /// Arguments of `list-adapters`.
@@ -60,11 +61,13 @@ fn lines(registry: &Registry) -> Vec<String> {
         lines.push(format!("  units on the wire: {}", row.wire_units));
         lines.push(format!("  modes: {}", modes(row).join(", ")));
         // The limits of an adapter for any number of joints are those of no arm.
-        if let Some((dof, limits)) = limits(row).filter(|_| row.dof.1 < MAX_DOF) {
+        let checked = checked(row);
+        if let Some((dof, Checked { limits, .. })) = checked.as_ref().filter(|_| row.dof.1 < MAX_DOF) {
             let fastest = limits.velocity_max.iter().copied().fold(0.0, f64::max);
-            let joints = if dof == 1 { "joint" } else { "joints" };
+            let joints = if *dof == 1 { "joint" } else { "joints" };
             lines.push(format!("  limits: {dof} {joints}, up to {fastest:.2} rad/s ({:.0}°/s)", fastest.to_degrees()));
         }
+        lines.extend(checked.iter().flat_map(|(_, checked)| setpoints(checked)));
         lines.push(format!("  options: {}", options(row).join(", ")));
     }
     for absent in registry.absent() {
@@ -93,15 +96,40 @@ fn modes(row: &AdapterSpec) -> Vec<&'static str> {
     row.modes.iter().map(|mode| mode.name()).collect()
 }
 
-/// Returns the limits for the most joints and no options.
-fn limits(row: &AdapterSpec) -> Option<(usize, JointLimits)> {
+/// Returns what its arm is given of setpoints besides positions, and why not the rest.
+fn setpoints(checked: &Checked) -> Vec<String> {
+    let fields = checked.setpoint.named();
+    let taken: Vec<&str> = fields.iter().filter(|(_, field)| field.is_taken()).map(|(name, _)| *name).collect();
+    let mut lines =
+        vec![format!("  setpoints: {}", ["position"].into_iter().chain(taken).collect::<Vec<_>>().join(", "))];
+    for (names, objection) in objections(checked) {
+        lines.push(format!("    without {}: {objection}", names.join(", ")));
+    }
+    lines
+}
+
+/// Returns the fields that it is not given, by reason.
+fn objections(checked: &Checked) -> Vec<(Vec<&'static str>, String)> {
+    let mut reasons: Vec<(Vec<&'static str>, String)> = Vec::new();
+    for (name, field) in checked.setpoint.named() {
+        let Some(objection) = field.objection() else { continue };
+        match reasons.iter_mut().find(|(_, reason)| *reason == objection) {
+            Some((names, _)) => names.push(name),
+            None => reasons.push((vec![name], objection)),
+        }
+    }
+    reasons
+}
+
+/// Returns what is known of an arm with the most joints and no options.
+fn checked(row: &AdapterSpec) -> Option<(usize, Checked)> {
     let config = |dof| AdapterConfig {
         hardware_id: row.name.to_owned(),
         address: String::new(),
         dof,
         options: serde_json::Value::Null,
     };
-    (row.dof.0..=row.dof.1).rev().find_map(|dof| Some((dof, (row.check)(&config(dof)).ok()?.limits)))
+    (row.dof.0..=row.dof.1).rev().find_map(|dof| Some((dof, (row.check)(&config(dof)).ok()?)))
 }
 
 /// Returns the names of its options.
@@ -112,6 +140,12 @@ fn options(row: &AdapterSpec) -> Vec<String> {
 }
 
 fn to_json(row: &AdapterSpec) -> serde_json::Value {
+    let checked = checked(row);
+    let fields = checked.iter().flat_map(|(_, checked)| checked.setpoint.named());
+    let setpoint = fields.map(|(name, field)| {
+        let said = json!({"taken": field.is_taken(), "objection": field.objection()});
+        (name.to_owned(), said)
+    });
     json!({
         "name": row.name,
         "about": row.about,
@@ -126,7 +160,8 @@ fn to_json(row: &AdapterSpec) -> serde_json::Value {
         "holds_when_disabled": row.holds_when_disabled,
         "teach": teach(row),
         "options": options(row),
-        "limits": limits(row).map(|(dof, limits)| json!({
+        "setpoint": setpoint.collect::<serde_json::Map<_, _>>(),
+        "limits": checked.as_ref().map(|(dof, Checked { limits, .. })| json!({
             "dof": dof,
             "position_lower": limits.position_lower,
             "position_upper": limits.position_upper,

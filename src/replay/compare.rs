@@ -145,12 +145,17 @@ impl<'a> Comparison<'a> {
             }
             let (command, wanted) = (&now.command, &then.output);
             if let Some(mode) = command.mode {
-                let (what, column) = column(mode, logged);
                 let absent = [f64::NAN; dimos_core::joint::MAX_DOF];
-                let then = values(column, first, dof).unwrap_or(absent);
-                let mut pairs = then.iter().zip(&command.values).take(dof).enumerate();
-                if let Some(found) = pairs.find_map(|(j, (then, now))| joint(what, *then, *now, j)) {
-                    return Some(found);
+                let effort = command.effort.unwrap_or(absent);
+                let (what, column) = column(mode, logged);
+                for (what, column, now) in
+                    [(what, column, &command.values), ("effort command", &logged.commands.effort[..], &effort)]
+                {
+                    let then = values(column, first, dof).unwrap_or(absent);
+                    let mut pairs = then.iter().zip(now).take(dof).enumerate();
+                    if let Some(found) = pairs.find_map(|(j, (then, now))| joint(what, *then, *now, j)) {
+                        return Some(found);
+                    }
                 }
             }
             first += dof;
@@ -219,7 +224,6 @@ impl<'a> Comparison<'a> {
 fn column(mode: ControlMode, logged: &LoggedTick) -> (&'static str, &[f64]) {
     match mode {
         ControlMode::Velocity => ("velocity command", &logged.commands.velocity),
-        ControlMode::Torque => ("torque command", &logged.commands.effort),
         _ => ("position command", &logged.commands.position),
     }
 }

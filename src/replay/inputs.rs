@@ -7,7 +7,7 @@ use super::requests;
 use dimos_control::coordinator::TickTime;
 use dimos_control::guard::Verdict;
 use dimos_control::request::{Envelope, Request};
-use dimos_core::arm::{ArmState, Commanded, Interference, Link, VelocitySource};
+use dimos_core::arm::{ArmState, Commanded, EffortKind, Interference, JointSet, Link, VelocitySource};
 use dimos_core::clock::Mono;
 use dimos_core::joint::{ControlMode, Joints, MAX_DOF};
 use dimos_core::telemetry::describe::Names;
@@ -237,6 +237,7 @@ impl Assembler {
             let column = |list: &[f64]| values(list, first, dof).filter(|_| known).unwrap_or([0.0; MAX_DOF]);
             state.position = column(&self.states.position);
             arm.velocity = column(&self.states.velocity);
+            state.effort = state.effort.and(values(&self.states.effort, first, dof));
             if state.velocity_source == VelocitySource::Measured {
                 state.velocity = arm.velocity;
             }
@@ -267,7 +268,7 @@ pub(super) fn values(list: &[f64], first: usize, dof: usize) -> Option<Joints> {
     list.get(first..first + dof).map(dimos_core::joint::joints_of)
 }
 
-/// Reads a state besides joint values. Skips efforts and pose, which no tick uses.
+/// Reads a state besides joint values. Skips the pose, which no tick uses.
 fn read_input(input: &ArmInput, state: &mut ArmState) -> Result<(), String> {
     *state = ArmState {
         seq: input.seq,
@@ -295,6 +296,9 @@ fn read_input(input: &ArmInput, state: &mut ArmState) -> Result<(), String> {
         speed_fraction: input.speed_fraction.first().copied(),
         wrench: input.wrench.first_chunk().copied(),
         inputs: input.inputs.first().copied(),
+        effort: input.has_effort.then_some([0.0; MAX_DOF]), // filled in with the joint values
+        effort_kind: EffortKind::of_name(&input.effort_kind).unwrap_or_default(),
+        missing: JointSet::of(input.missing.iter().map(|joint| usize::from(*joint))),
         ..ArmState::default()
     };
     Ok(())

@@ -60,6 +60,13 @@ impl Handle {
         self.service.state()
     }
 
+    /// Returns the joint positions of an arm at a time within the last 2 s [s since the Unix epoch], as in
+    /// [`StateReport::stamp`]: interpolated between measured states, never beyond them [rad or m]. An error if there is
+    /// no such arm, or nothing is known of that time.
+    pub fn joints_at(&self, arm: &str, stamp: f64) -> Result<Vec<f64>, RpcError> {
+        self.service.joints_at(arm, stamp)
+    }
+
     /// Moves an arm from its present position to joint positions [rad], directly: not collision-checked; refused if the
     /// run has a planner (call [`Move::direct`] then). `speed` is a fraction of the velocity and acceleration limits,
     /// 0.01–1. Returns when the motion begins; [`wait`](Self::wait) waits for its end. An error if a limit is exceeded,

@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 
 use super::arm::ArmLinks;
 use super::arm::arms::{self, Arms, BroughtUp, Slots, full_address};
-use super::arm::control_config::{coordinator_config, names_of, tasks, tools};
+use super::arm::control_config::{coordinator_config, efforts, names_of, tasks, tools};
 use super::arm::device_lock::is_this_computer;
 use super::arm::wires::wires;
 use super::client::dispatch::{Dispatcher, OutcomeThread};
@@ -168,7 +168,8 @@ impl Prepared {
         }
         let kinematics = self.calibrate(&connected)?;
         let tools = tools(&self.blueprint).map_err(wrong_model)?;
-        let config = coordinator_config(&self.blueprint, &connected, std::mem::take(&mut self.task_configs), tools);
+        let added = (tools, efforts(&self.blueprint, &connected)?);
+        let config = coordinator_config(&self.blueprint, &connected, std::mem::take(&mut self.task_configs), added);
         let planner = self.blueprint.planner.as_ref().zip(self.robots.take()).map(|(planner, setup)| {
             let limits = command_limits(&self.names, &config, &self.blueprint.arms);
             PlannerPort::start(planner, setup, &limits, self.options.solver.take()).map_err(|what| {

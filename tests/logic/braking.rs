@@ -35,6 +35,7 @@ fn config() -> CoordinatorConfig {
     let limits = JointLimits { acceleration_max: vec![ACCELERATION; DOF], ..JointLimits::uniform(DOF, 3.2, 1.0) };
     let arm = ArmConfig {
         tool: None,
+        effort: None,
         name: "arm".into(),
         dof: DOF,
         limits: limits.with_defaults(),

@@ -177,6 +177,7 @@ fn stream(arm: &Limited, mode: &str, rate: f64, fraction: f64, seed: u64) -> usi
         limits: limits.with_defaults(),
         modes: vec![ControlMode::ServoPosition, ControlMode::Velocity],
         tool: Some(Box::new(arm.limit.clone())),
+        effort: None,
         ..rig::arm("arm", arm.joints.len())
     };
     let kind: TaskKind = if mode == "velocity" { rig::velocity() } else { rig::servo() };

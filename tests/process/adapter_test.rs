@@ -92,6 +92,7 @@ fn the_small_motion_stays_small_and_leaves_the_arm_as_it_was() {
                 target
             }
             Request::ServoJoints(target) => target,
+            Request::Setpoint(setpoint) => setpoint.joints,
             Request::VelocityJoints(_) | Request::MoveCartesian(..) | Request::Gripper(_) | Request::Grip(..) => {
                 panic!("{request:?}")
             }
@@ -117,9 +118,9 @@ fn the_lag_of_an_arm_is_measured_by_a_small_stream() {
     let test = home.start(&format!("{line} --allow-motion --yes"));
     test.until("lag of joint 2");
     test.end(Signal::INT).with(130);
-    let streamed = |request: &Request| match request {
-        Request::ServoJoints(target) => target.iter().zip(START).all(|(a, b)| (a - b).abs() < 2.01),
-        other => !other.moves(),
+    let streamed = |request: &Request| match request.setpoint() {
+        Some(target) => target.iter().zip(START).all(|(a, b)| (a - b).abs() < 2.01),
+        None => !request.moves(),
     };
     let asked = requests(&emulator);
     assert!(asked.iter().all(streamed), "{asked:?}");

@@ -14,6 +14,7 @@ mod built_in_arms;
 mod changed_world;
 mod clearances;
 mod cli_verbs;
+mod compliant_task;
 mod crate_examples;
 mod daemon;
 #[cfg(feature = "view")]
@@ -69,6 +70,7 @@ mod python_run;
 mod readers;
 mod readme;
 mod remote_peers;
+mod remote_setpoints;
 mod remote_shim;
 mod ros;
 mod rpc_page;

@@ -58,7 +58,8 @@ fn acts_on_a_path_are_done_within_a_tick_of_their_place() {
     let (mut gripper, mut output) = (None, None);
     for received in arm.trace() {
         match received.request {
-            Request::ServoJoints(degrees) => {
+            request if request.setpoint().is_some() => {
+                let degrees = request.setpoint().unwrap();
                 let q: Vec<f64> = degrees.iter().map(|angle| f64::from(*angle).to_radians()).collect();
                 let now = scene.robots[0].tcp_pose(&q).translation;
                 let step = last.map_or(0.0, |last| now.distance(last));
@@ -96,10 +97,8 @@ fn a_job_acts_at_its_waypoints() {
     arm.record();
     home.dimos("do job.yaml").with(0);
     let trace = arm.trace();
-    let turned = trace.iter().position(|received| match received.request {
-        Request::ServoJoints(degrees) => degrees[4] < 0.78_f32.to_degrees(),
-        _ => false,
-    });
+    let is_turned = |degrees: [f32; 6]| degrees[4] < 0.78_f32.to_degrees();
+    let turned = trace.iter().position(|received| received.request.setpoint().is_some_and(is_turned));
     let acts: Vec<usize> = trace
         .iter()
         .enumerate()
@@ -110,7 +109,7 @@ fn a_job_acts_at_its_waypoints() {
         .collect();
     assert!(matches!(trace[acts[0]].request, Request::SetDigital(1, true)), "{acts:?}");
     let setpoints = |range: std::ops::Range<usize>| {
-        trace[range].iter().filter(|received| matches!(received.request, Request::ServoJoints(_))).count()
+        trace[range].iter().filter(|received| received.request.setpoint().is_some()).count()
     };
     let (turned, gripper) = (turned.unwrap(), acts[1]);
     let apart = setpoints(turned.min(gripper)..turned.max(gripper));

@@ -25,10 +25,7 @@ fn up(home: &Home, arm: &YourArmEmulator, stop_input: &str, arguments: &str) -> 
 
 /// Setpoints of joint 1 that the controller received [deg], and when.
 fn set_points(trace: &[Received]) -> Vec<(Mono, f64)> {
-    let first = |r: &Received| match r.request {
-        Request::ServoJoints([first, ..]) => Some((r.at, f64::from(first))),
-        _ => None,
-    };
+    let first = |r: &Received| r.request.setpoint().map(|[first, ..]| (r.at, f64::from(first)));
     trace.iter().filter_map(first).collect()
 }
 

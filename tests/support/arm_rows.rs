@@ -59,6 +59,7 @@ pub fn rows() -> &'static [Row] {
                 let limits = checked.limits.with_defaults();
                 let arm = ArmConfig {
                     tool: None,
+                    effort: None,
                     name: "arm".to_owned(),
                     dof,
                     own_velocity: limits.velocity_max.clone(),

@@ -294,6 +294,7 @@ pub fn state() -> StateReport {
         velocity: Some(-0.01),
         velocity_source: source.into(),
         effort: None,
+        commanded_effort: None,
         command: Some(position),
     };
     StateReport {
@@ -304,6 +305,7 @@ pub fn state() -> StateReport {
             simulated: true,
             age_ms: Some(2.5),
             speed_fraction: None,
+            effort_kind: None,
             joints: vec![joint(1, 1.5, "measured"), joint(2, -0.25, "estimated")],
             gripper: Some(0.04),
             gripper_unit: Some("m".into()),

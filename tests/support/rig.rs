@@ -70,6 +70,7 @@ pub fn arm(name: &str, dof: usize) -> ArmConfig {
     limits.acceleration_max = vec![A_MAX; dof];
     ArmConfig {
         tool: None,
+        effort: None,
         name: name.to_owned(),
         dof,
         limits,

@@ -32,6 +32,7 @@ const START: (Mono, u64) = (Mono(1_000_000_000), 1_795_270_590_000_000_000);
 pub fn one_arm(dof: usize) -> CoordinatorConfig {
     let arm = ArmConfig {
         tool: None,
+        effort: None,
         name: "arm".into(),
         dof,
         limits: JointLimits::uniform(dof, 3.0, 2.0).with_defaults(),

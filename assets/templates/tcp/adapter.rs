@@ -257,6 +257,7 @@ impl ManipulatorAdapter for AcmeAdapter {
             valid: None,
             commanded: None,      // YOUR ARM: what the controller itself commands, if it reports that
             speed_fraction: None, // YOUR ARM: at which part of its speed the controller runs motions, if it reports that
+            ..JointReading::default()  // YOUR ARM: what efforts are (`effort_kind`), motors that are lost (`missing`)
         };
         Ok(())
     }

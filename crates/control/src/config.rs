@@ -2,10 +2,12 @@
 
 use std::time::Duration;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use dimos_core::arm::{GripperInfo, Supervision};
+use dimos_core::arm::{EffortLimits, GripperInfo, Impedance, Supervision};
 use dimos_core::joint::{ControlMode, JointLimits};
+use dimos_robot::dynamics::Dynamics;
 
 pub use super::task_config::{TaskConfig, TaskKind};
 pub use super::task_leader::LeaderJoint;
@@ -86,6 +88,38 @@ pub struct ArmConfig {
     /// The speed limit of its tool, if it has one and a model of the arm is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tool: Option<Box<ToolLimit>>,
+    /// What it is commanded beside positions; `None`: nothing.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub effort: Option<Box<EffortConfig>>,
+}
+
+/// What an arm is commanded beside positions.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct EffortConfig {
+    /// Limits of efforts.
+    pub limits: EffortLimits,
+    /// What is fed forward.
+    #[serde(default)]
+    pub feed_forward: FeedForward,
+    /// What that is computed with: the arm with all that it carries, its gravity, and its joints in their order.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub dynamics: Option<Dynamics>,
+    /// How it is held in impedance mode, if it has that.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub impedance: Option<Impedance>,
+}
+
+/// Efforts that an arm is given before its own control finds them from an error.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum FeedForward {
+    /// None.
+    #[default]
+    None,
+    /// Those that hold the arm against gravity.
+    Gravity,
+    /// Those of its motion: also inertia, centrifugal and Coriolis forces.
+    Dynamics,
 }
 
 impl ArmConfig {
@@ -105,6 +139,7 @@ impl ArmConfig {
             write_period: period,
             supervision: Supervision::default(),
             tool: None,
+            effort: None,
         }
     }
 

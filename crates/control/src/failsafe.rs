@@ -46,6 +46,7 @@ pub fn trouble(state: &ArmState, freshness: Freshness) -> Option<Cause> {
         Link::Stale => Some(Cause::Stale(freshness.age)),
         Link::Up if !freshness.fresh => Some(Cause::Stale(freshness.age)),
         Link::Up if state.stop_input_open => Some(Cause::StopInput),
+        Link::Up if !state.missing.is_empty() => state.missing.first().map(|joint| Cause::JointLost(joint as u16)),
         Link::Up if state.interference == Interference::Identity => Some(Cause::IdentityChanged),
         Link::Up if state.interference == Interference::Mode => Some(Cause::ModeChanged),
         Link::Up if state.interference == Interference::Power => Some(Cause::PowerChanged),

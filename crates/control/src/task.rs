@@ -6,7 +6,9 @@ use super::arm_control::effective;
 use super::config::TaskConfig;
 use super::request::Motion;
 use super::speed_override::SpeedOverride;
-use super::task_body::{Claim, Context, Demand, JointView, OnCancel, OnLoss, Step, Target, TargetKind, TaskBody};
+use super::task_body::{
+    Claim, Compliance, Context, Demand, JointView, OnCancel, OnLoss, Step, Target, TargetKind, TaskBody,
+};
 use super::task_leader::LeaderJoint;
 use super::task_robot::FramePose;
 use super::task_spec::TaskSpec;
@@ -118,6 +120,11 @@ impl Task {
     /// Returns whether it takes this kind of target.
     pub fn takes(&self, kind: TargetKind) -> bool {
         self.takes.contains(&kind)
+    }
+
+    /// Returns how a joint that it has claimed yields; `None`: its demand is another one.
+    pub fn compliance(&self, joint: u16) -> Option<Compliance> {
+        (self.demand == Demand::Impedance).then(|| self.body.compliance(joint))
     }
 
     /// Returns whether it applies the speed override itself.

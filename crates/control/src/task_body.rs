@@ -17,6 +17,8 @@ pub struct JointView {
     pub position: f64,
     /// Measured or estimated velocity [rad/s].
     pub velocity: f64,
+    /// Measured effort [Nm or N]; `None`: the arm reports none, or the joint's motor does not answer.
+    pub effort: Option<f64>,
     /// Last commanded position [rad].
     pub commanded: f64,
     /// Last commanded velocity [rad/s], in the time that passes here: a controller that slows its arm has its own.
@@ -25,6 +27,10 @@ pub struct JointView {
     pub lower: f64,
     /// Highest commanded position [rad].
     pub upper: f64,
+    /// Effort of the last command beside the arm's own control [Nm or N]; `None`: none was commanded.
+    pub commanded_effort: Option<f64>,
+    /// Highest effort of commands [Nm or N]; `None`: the arm is commanded none.
+    pub effort_limit: Option<f64>,
     /// Acceleration limit [rad/s²].
     pub acceleration: f64,
     /// Velocity limit [rad/s].
@@ -96,6 +102,28 @@ pub enum Demand {
     Positions,
     /// Joint velocities [rad/s].
     Velocities,
+    /// Joint positions [rad or m] that the arm yields from, as [`TaskBody::compliance`] says.
+    Impedance,
+}
+
+/// How a joint yields in impedance mode. Its effort is `stiffness * (claimed - position) + damping * (velocity of the
+/// claims - velocity) + effort`, plus what the arm is fed forward. With stiffness 0 the joint is commanded by its
+/// effort alone.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Compliance {
+    /// Stiffness [Nm/rad or N/m]; `None`: that with which the arm holds. Above the arm's highest, it is that one.
+    pub stiffness: Option<f64>,
+    /// Damping [Nm·s/rad or N·s/m]; `None`: that with which the arm holds.
+    pub damping: Option<f64>,
+    /// Effort [Nm or N], within the arm's limits of efforts and their rate.
+    pub effort: f64,
+}
+
+impl Compliance {
+    /// Returns whether it is made of numbers.
+    pub fn is_finite(&self) -> bool {
+        self.effort.is_finite() && [self.stiffness, self.damping].iter().flatten().all(|gain| gain.is_finite())
+    }
 }
 
 /// Request of a task to one joint.
@@ -103,7 +131,7 @@ pub enum Demand {
 pub struct Claim {
     /// Index over all arms' joints.
     pub joint: u16,
-    /// [rad] or [rad/s], by the task's demand.
+    /// [rad], [m] or [rad/s], by the task's demand.
     pub value: f64,
 }
 
@@ -220,6 +248,13 @@ pub trait TaskBody: std::fmt::Debug + Send {
 
     /// Claims joints of the task for this tick, each at most once. Called while the task is active.
     fn compute(&mut self, cx: &Context<'_>, claims: &mut Vec<Claim>) -> Step;
+
+    /// Returns how a joint that it has claimed in this tick yields. Called for types whose demand is
+    /// [`Demand::Impedance`].
+    fn compliance(&self, joint: u16) -> Compliance {
+        let _ = joint;
+        Compliance::default()
+    }
 
     /// The task has ended: discards its target.
     fn end(&mut self);

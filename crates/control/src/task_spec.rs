@@ -54,6 +54,7 @@ impl TaskSpec {
             Demand::Nothing => &[],
             Demand::Positions => &[ControlMode::ServoPosition, ControlMode::Position],
             Demand::Velocities => &[ControlMode::Velocity],
+            Demand::Impedance => &[ControlMode::Impedance],
         }
     }
 }

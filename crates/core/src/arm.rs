@@ -5,8 +5,10 @@ mod controller_pose;
 mod factory_kinematics;
 mod gripper;
 mod io;
+mod joint_set;
 mod joint_status;
 mod load;
+mod setpoint;
 pub mod test_dh;
 
 use std::time::Duration;
@@ -21,8 +23,10 @@ pub use controller_pose::ControllerPose;
 pub use factory_kinematics::{Dh, FactoryKinematics};
 pub use gripper::{ForceUnit, GripperInfo, GripperUnit};
 pub use io::{AnalogUnit, IoInfo, IoState, MAX_ANALOG, MAX_DIGITAL, OutputValue, StopInput, channel};
+pub use joint_set::{EffortKind, JointSet};
 pub use joint_status::JointStatus;
 pub use load::{Load, UPRIGHT};
+pub use setpoint::{EffortLimits, Field, Impedance, Setpoint, SetpointFields};
 
 /// Figures with which an arm's measurements and its motion are checked: the adapter's row, overridden by the blueprint.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -96,17 +100,6 @@ named! {
         /// The joint turns without end.
         Endless = "endless",
     }
-}
-
-/// A setpoint of all joints.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Setpoint {
-    /// Positions [rad].
-    pub position: Joints,
-    /// Velocities of the setpoints at that time [rad/s].
-    pub velocity: Joints,
-    /// Time of the tick that made it.
-    pub at: Mono,
 }
 
 /// Where a stop is to bring the arm to rest. Made from setpoints; after silence, which of them reached the arm is
@@ -230,8 +223,14 @@ pub struct ArmState {
     pub velocity: Joints,
     /// Whether and how the velocities are known.
     pub velocity_source: VelocitySource,
-    /// Joint torques [Nm], where the arm reports them.
+    /// Joint efforts [Nm or N], where the arm reports them.
     pub effort: Option<Joints>,
+    /// Where they come from.
+    #[serde(default)]
+    pub effort_kind: EffortKind,
+    /// Joints that this state lacks: their motors do not answer. Their positions are the last known ones.
+    #[serde(default)]
+    pub missing: JointSet,
     /// Gripper position [m, or rad for a rotary gripper], where there is a gripper.
     pub gripper: Option<f64>,
     /// Measured force of the gripper, in its force unit, where it measures one.
@@ -285,6 +284,8 @@ impl Default for ArmState {
             velocity: [0.0; MAX_DOF],
             velocity_source: VelocitySource::Absent,
             effort: None,
+            effort_kind: EffortKind::Unstated,
+            missing: JointSet::NONE,
             gripper: None,
             gripper_force: None,
             pose: None,
@@ -340,6 +341,15 @@ pub struct ArmCommand {
     /// Velocities of position setpoints [rad/s].
     #[serde(default)]
     pub velocity: Joints,
+    /// Accelerations of position setpoints [rad/s²].
+    #[serde(default)]
+    pub acceleration: Joints,
+    /// Efforts beside the arm's own control [Nm or N]; `None`: not commanded.
+    #[serde(default)]
+    pub effort: Option<Joints>,
+    /// Stiffness [Nm/rad or N/m] and damping [Nm·s/rad or N·s/m] in impedance mode; `None`: not commanded.
+    #[serde(default)]
+    pub gains: Option<[Joints; 2]>,
     /// Where the arm is at rest after braking from this command within its limits [rad]; `None`: nothing was commanded
     /// since the motors came on.
     #[serde(default)]
@@ -380,6 +390,9 @@ impl Default for ArmCommand {
             led: false,
             lead_seq: 0,
             velocity: [0.0; MAX_DOF],
+            acceleration: [0.0; MAX_DOF],
+            effort: None,
+            gains: None,
             rest: None,
             unheard: None,
         }

@@ -18,8 +18,8 @@ use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
 use dimos_core::arm::{
-    Bridging, Commanded, ControllerPose, FactoryKinematics, ForceUnit, GripperInfo, GripperUnit, Pose, Setpoint,
-    StopPoint,
+    Bridging, Commanded, ControllerPose, EffortKind, FactoryKinematics, ForceUnit, GripperInfo, GripperUnit, Impedance,
+    JointSet, Pose, Setpoint, SetpointFields, StopPoint,
 };
 use dimos_core::clock::Mono;
 use dimos_core::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
@@ -98,12 +98,17 @@ pub struct JointReading {
     pub stamp: Option<Mono>,
     /// The same time on the device's own clock, from its own zero [ns], if it reports that: for the log.
     pub device_ns: Option<u64>,
-    /// Joint positions [rad].
+    /// Joint positions [rad or m].
     pub position: Joints,
-    /// Joint velocities [rad/s], if the device has them.
+    /// Joint velocities [rad/s or m/s], if the device has them.
     pub velocity: Option<Joints>,
-    /// Joint torques [Nm], if the device has them.
+    /// Joint efforts [Nm or N], if the device has them.
     pub effort: Option<Joints>,
+    /// Where the efforts come from.
+    pub effort_kind: EffortKind,
+    /// Joints whose motors do not answer: their entries above do not count. An arm of which some motors answer is
+    /// reachable; with all missing, a read is an error.
+    pub missing: JointSet,
     /// Whether the device confirms that the positions are measured: `Some(false)` means not yet, `None` that the device
     /// cannot tell. Without a confirmation, exactly zero on all joints counts as missing when the motors are to be
     /// enabled.
@@ -195,6 +200,17 @@ pub trait ManipulatorAdapter: Send {
         None
     }
 
+    /// Returns what the arm takes of setpoints, if it says so itself; `None`: what its row says holds. Known once
+    /// connected.
+    fn setpoint_fields(&self) -> Option<SetpointFields> {
+        None
+    }
+    /// Returns how the arm is held in impedance mode, if it says so itself; `None`: what its row says holds. Known once
+    /// connected.
+    fn impedance(&self) -> Option<Impedance> {
+        None
+    }
+
     /// Returns what the settings of the arm's controller, such as a reduced mode, leave of its limits, in words and
     /// beyond [`get_limits`](Self::get_limits), which has them too; `None`: nothing is known of them. Known once
     /// connected.
@@ -245,6 +261,7 @@ pub trait ManipulatorAdapter: Send {
         let mut buffer = [0.0; MAX_DOF];
         let slice = buffer.get_mut(..dof).unwrap_or_default();
         (reading.stamp, reading.device_ns, reading.commanded) = (None, None, None);
+        (reading.effort_kind, reading.missing) = (EffortKind::Unstated, JointSet::NONE);
         self.read_joint_positions(slice)?;
         reading.position = buffer;
         let mut buffer = [0.0; MAX_DOF];
@@ -272,10 +289,31 @@ pub trait ManipulatorAdapter: Send {
     fn write_joint_velocities(&mut self, _velocities: &[f64]) -> AdapterResult<()> {
         Err(AdapterError::Unsupported)
     }
-    /// Commands joint positions that a tick made, with their velocities. By default
-    /// [`write_joint_positions`](Self::write_joint_positions).
+    /// Commands a setpoint of a tick: positions, and what else the arm takes of it. What the row says is taken must
+    /// reach the arm; what is `None` must not be sent as zero. By default
+    /// [`write_joint_positions`](Self::write_joint_positions), in the modes of positions. In velocity mode,
+    /// [`write_joint_velocities`](Self::write_joint_velocities) is called instead.
     fn write_setpoint(&mut self, setpoint: &Setpoint) -> AdapterResult<()> {
-        self.write_joint_positions(setpoint.position.get(..self.get_dof()).unwrap_or_default(), 1.0)
+        match setpoint.mode {
+            ControlMode::Position | ControlMode::ServoPosition => {
+                self.write_joint_positions(setpoint.position.get(..self.get_dof()).unwrap_or_default(), 1.0)
+            }
+            _ => Err(AdapterError::Unsupported),
+        }
+    }
+    /// Returns whether the device answers each command with its state, as motors in MIT mode and EtherCAT drives do:
+    /// [`exchange`](Self::exchange) is then called instead of `write_setpoint` and `read_joints`. Never changes while
+    /// the arm is connected.
+    fn exchanges(&self) -> bool {
+        false
+    }
+    /// Commands a setpoint, and takes the state that answers it; without one, asks for the state in a way that commands
+    /// nothing. An error of the command is the error. By default one after the other.
+    fn exchange(&mut self, setpoint: Option<&Setpoint>, reading: &mut JointReading) -> AdapterResult<()> {
+        if let Some(setpoint) = setpoint {
+            self.write_setpoint(setpoint)?;
+        }
+        self.read_joints(reading)
     }
     /// Stops all motion at once with the device's own stop; the motors stay powered. An operational stop. An arm whose
     /// controller only takes goals is given `rest` as its goal; no adapter makes a goal from a measurement, which may

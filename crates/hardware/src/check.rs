@@ -8,7 +8,7 @@ use serde::de::DeserializeOwned;
 
 use super::adapter::{AdapterError, AdapterResult};
 use super::registry::AdapterConfig;
-use dimos_core::arm::Topology;
+use dimos_core::arm::{Impedance, SetpointFields, Topology};
 use dimos_core::joint::JointLimits;
 use dimos_core::message::Message;
 
@@ -28,6 +28,10 @@ pub struct Checked {
     pub tool: ToolFacts,
     /// What it takes of its line, if other arms may be on it.
     pub line: Option<LineShare>,
+    /// What its adapter passes on of setpoints besides positions.
+    pub setpoint: SetpointFields,
+    /// How it is held in impedance mode, if it has that.
+    pub impedance: Option<Impedance>,
 }
 
 /// What an arm takes of a line that several arms may share.
@@ -88,6 +92,16 @@ impl Checked {
     /// Says what the arm takes of its line.
     pub fn line(self, line: LineShare) -> Self {
         Self { line: Some(line), ..self }
+    }
+
+    /// Says what its adapter passes on of setpoints besides positions.
+    pub fn setpoint(self, fields: SetpointFields) -> Self {
+        Self { setpoint: fields, ..self }
+    }
+
+    /// Says how it is held in impedance mode.
+    pub fn impedance(self, impedance: Impedance) -> Self {
+        Self { impedance: Some(impedance), ..self }
     }
 
     /// Says how each joint's reading counts turns.

@@ -11,7 +11,7 @@ use crate::check::{Checked, ConfigError};
 use crate::service::OpenService;
 use crate::sim::faults::Fault;
 use crate::wire::Wire;
-use dimos_core::arm::{AfterGap, Topology};
+use dimos_core::arm::{AfterGap, Setpoint, Topology};
 use dimos_core::joint::{ControlMode, Joints};
 use dimos_core::named::named;
 use dimos_yaml as yaml;
@@ -108,6 +108,10 @@ pub struct Truth {
     pub motor_switches: Option<u32>,
     /// Temperatures of the joints' drives [°C].
     pub temperatures: Option<Joints>,
+    /// Efforts of the joints' motors [Nm].
+    pub efforts: Option<Joints>,
+    /// The last setpoint that arrived whole, with what it had besides positions.
+    pub setpoint: Option<Setpoint>,
     /// Position of its gripper, in the unit of the adapter [m or rad].
     pub gripper_position: Option<f64>,
     /// Largest force that its gripper was given, in the unit of the adapter's force; `None` without force control.

@@ -17,6 +17,7 @@ pub(super) fn input_differs(a: &ArmState, b: &ArmState) -> bool {
         || more(a) != more(b)
         || a.speed_fraction != b.speed_fraction
         || a.inputs != b.inputs
+        || (a.effort_kind, a.missing) != (b.effort_kind, b.missing)
 }
 
 /// Returns whether two commands differ in the fields of `ArmOutput`, except for counters that change on their own.
@@ -24,7 +25,7 @@ pub(super) fn output_differs(a: &ArmCommand, b: &ArmCommand) -> bool {
     let limits = |c: &ArmCommand| [c.gripper_force, c.gripper_speed].map(|value| value.map(f64::to_bits));
     let gripper = |c: &ArmCommand| (c.gripper.to_bits(), limits(c), c.gripper_seq);
     let parts = |c: &ArmCommand| (c.mode, gripper(c), c.stop_seq, c.start_seq);
-    parts(a) != parts(b)
+    parts(a) != parts(b) || a.gains != b.gains
 }
 
 /// Returns what a tick read of an arm, except joint values.
@@ -55,6 +56,8 @@ pub(super) fn input(header: &Header, tick: u64, s: &ArmState) -> ArmInput {
         refused: s.refused,
         speed_fraction: s.speed_fraction.into_iter().collect(),
         inputs: s.inputs.into_iter().collect(),
+        effort_kind: s.effort_kind.name().into(),
+        missing: s.missing.iter().map(|joint| joint as u8).collect(),
     }
 }
 
@@ -64,7 +67,12 @@ fn of_joints(s: &ArmState, list: fn(&Commanded) -> &Joints) -> Vec<f64> {
 }
 
 /// Returns what a tick commands an arm, except joint values.
-pub(super) fn output(header: &Header, tick: u64, c: &ArmCommand) -> ArmOutput {
+pub(super) fn output(header: &Header, tick: u64, c: &ArmCommand, dof: usize) -> ArmOutput {
+    let of_mode = c.gains.filter(|_| c.mode == Some(ControlMode::Impedance));
+    let gains = |which: usize| {
+        let list = of_mode.as_ref().and_then(|gains| gains.get(which));
+        list.map_or_else(Vec::new, |list| list.iter().take(dof).copied().collect())
+    };
     ArmOutput {
         header: header.clone(),
         tick,
@@ -77,6 +85,8 @@ pub(super) fn output(header: &Header, tick: u64, c: &ArmCommand) -> ArmOutput {
         start_seq: c.start_seq,
         gripper_force: c.gripper_force.into_iter().collect(),
         gripper_speed: c.gripper_speed.into_iter().collect(),
+        stiffness: gains(0),
+        damping: gains(1),
     }
 }
 

@@ -327,6 +327,10 @@ message! {
         speed_fraction: Vec<f64>,
         /// Levels of the digital inputs, bit i is input i; empty if they were not read with the state.
         inputs: Vec<u32>,
+        /// Where its efforts come from: measured, from_current, or empty if it does not say.
+        effort_kind: String,
+        /// Joints whose motors do not answer, counted from 0: their values are the last known ones.
+        missing: Vec<u8>,
     }
 }
 
@@ -395,5 +399,9 @@ message! {
         gripper_force: Vec<f64>,
         /// Speed of the gripper command, as a fraction of the gripper's top speed; empty: the device's own.
         gripper_speed: Vec<f64>,
+        /// Stiffness of the joints in impedance mode [Nm/rad or N/m]; otherwise empty.
+        stiffness: Vec<f64>,
+        /// Damping of the joints in impedance mode [Nm·s/rad or N·s/m]; otherwise empty.
+        damping: Vec<f64>,
     }
 }

@@ -279,7 +279,10 @@ impl TickLog {
         message.header = self.header(tick);
         self.column(&mut message.position, |arm| values(arm, ControlMode::is_position));
         self.column(&mut message.velocity, |arm| values(arm, |mode| mode == ControlMode::Velocity));
-        self.column(&mut message.effort, |arm| values(arm, |mode| mode == ControlMode::Torque));
+        self.column(&mut message.effort, |arm| {
+            let command = &arm.pending.as_ref()?.command;
+            command.effort.filter(|_| command.mode.is_some())
+        });
         self.commands = message;
         let message = &self.commands;
         if message.position.is_empty() && message.velocity.is_empty() && message.effort.is_empty() {
@@ -316,7 +319,11 @@ impl TickLog {
         }
         arm.state = Some(*state);
         if fresh || arm.command.is_none_or(|last| output_differs(&last, &sample.command)) {
-            log.publish(&format!("/dimos/outputs/{id}"), time, &output(&header, tick.tick, &sample.command))?;
+            log.publish(
+                &format!("/dimos/outputs/{id}"),
+                time,
+                &output(&header, tick.tick, &sample.command, names.joints.len()),
+            )?;
         }
         arm.command = Some(sample.command);
         if let (true, Some(opening)) = (is_new, state.gripper) {

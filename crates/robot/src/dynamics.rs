@@ -6,8 +6,11 @@
 //! velocities and accelerations from the root outwards, forces back. Gravity is an acceleration of the root the other
 //! way. Mimic joints are folded into their leaders. Friction, rotors and springs are not part of it.
 
+mod stored;
+
 use glamx::{DAffine3, DMat3, DVec3};
 use nalgebra::Isometry3;
+use serde::{Deserialize, Serialize};
 
 use crate::kinematics::{Kinematics, Motion, frame};
 use crate::model::{Inertial, RobotModel};
@@ -43,7 +46,7 @@ impl Inertia {
 }
 
 /// What is known of a body during a computation, in its frame.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct State {
     /// Orientation in the parent's frame, and place there [m].
     turn: DMat3,
@@ -58,7 +61,8 @@ struct State {
 }
 
 /// Dynamics of the joints of a [`Kinematics`]; reuses its buffers.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(try_from = "stored::Stored", into = "stored::Stored")]
 pub struct Dynamics {
     kinematics: Kinematics,
     inertias: Vec<Inertia>,
@@ -81,6 +85,10 @@ impl Dynamics {
                 *sum = sum.plus(moved(inertial, place));
             }
         }
+        Self::of_inertias(kinematics, inertias)
+    }
+
+    fn of_inertias(kinematics: Kinematics, inertias: Vec<Inertia>) -> Self {
         let (states, dof) = (vec![State::default(); inertias.len()], kinematics.dof());
         let upwards = -DVec3::from_array(GRAVITY);
         Self { kinematics, inertias, states, upwards, load: None, unit: vec![0.0; dof], column: vec![0.0; dof] }
@@ -200,6 +208,14 @@ impl Dynamics {
     }
 }
 
+/// What was computed last is no part of it.
+impl PartialEq for Dynamics {
+    fn eq(&self, other: &Self) -> bool {
+        let of = |it: &Self| (it.upwards, it.load);
+        self.kinematics == other.kinematics && self.inertias == other.inertias && of(self) == of(other)
+    }
+}
+
 /// Returns an inertia that is given in a link's frame in that of its body.
 fn moved(inertial: &Inertial, place: &DAffine3) -> Inertia {
     let at: DAffine3 = *place * frame(&inertial.origin);
@@ -268,6 +284,22 @@ mod tests {
         arm.mass_matrix(&[angle, 0.2], &mut mass);
         let expected = [0.1 + 2.0 * 0.25 + 3.0 * 1.44, 0.0, 0.0, 3.0];
         assert!(mass.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-12), "{mass:?}");
+    }
+
+    #[test]
+    fn it_comes_out_of_a_log_as_it_went_in() {
+        let mut arm = arm();
+        arm.set_gravity([0.0, -9.8, 0.1]);
+        arm.set_load(2, Some(&point_mass(1.5, [0.0, 0.01, 0.1])));
+        let text = serde_json::to_string(&arm).unwrap();
+        let mut read: Dynamics = serde_json::from_str(&text).unwrap();
+        assert_eq!(read, arm);
+        let (mut before, mut after) = ([0.0; 2], [0.0; 2]);
+        arm.inverse(&[0.7, 0.2], &[2.0, 0.5], &[0.3, -1.0], &mut before);
+        read.inverse(&[0.7, 0.2], &[2.0, 0.5], &[0.3, -1.0], &mut after);
+        assert_eq!(after, before);
+        let short = text.replacen("\"inertias\":[[", "\"inertias\":[[0,0,0,0,0,0,0,0,0,0,0,0,0],[", 1);
+        assert!(serde_json::from_str::<Dynamics>(&short).is_err(), "one inertia too many");
     }
 
     #[test]

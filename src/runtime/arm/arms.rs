@@ -96,7 +96,11 @@ pub fn bring_up(
             tick_period: period,
             native_rate: arm.adapter.native_rate,
             supervision: arm.supervision,
-            setup: Setup { tool_velocity: arm.tcp_velocity, ..arm.setup },
+            setup: Setup {
+                tool_velocity: arm.tcp_velocity,
+                efforts: arm.effort.as_ref().map(|effort| effort.limits),
+                ..arm.setup
+            },
             beat: beat.clone(),
             pace: arms.pace.clone().filter(|_| clocks),
             clock: Arc::new(MonotonicClock),
@@ -224,7 +228,7 @@ fn effective_limits(arm: &Arm, own: &JointLimits) -> Result<JointLimits, StartEr
             *old = if higher { old.max(new) } else { old.min(new) };
         }
     };
-    for (j, JointOverride { position_lower, position_upper, velocity, acceleration, jerk }) in
+    for (j, JointOverride { position_lower, position_upper, velocity, acceleration, jerk, .. }) in
         arm.limits.iter().enumerate()
     {
         narrow(&mut limits.position_lower, j, *position_lower, true);

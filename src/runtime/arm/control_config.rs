@@ -1,7 +1,10 @@
 //! The coordinator's configuration: names and limits of a blueprint, and what its arms report.
 
 use crate::blueprint::Blueprint;
-use dimos_control::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, TaskConfig, TaskKind, ToolLimit};
+use crate::runtime::StartError;
+use dimos_control::config::{
+    ArmConfig, CONFIG_VERSION, CoordinatorConfig, EffortConfig, TaskConfig, TaskKind, ToolLimit,
+};
 use dimos_control::task::Task;
 use dimos_control::task_spec::{TaskSpec, TaskTable};
 use dimos_core::joint::{JointLimits, MAX_DOF};
@@ -59,19 +62,41 @@ pub(in crate::runtime) fn tools(blueprint: &Blueprint) -> Result<Vec<Option<Tool
     blueprint.arms.iter().map(limit).collect()
 }
 
+/// Returns what the arms are commanded beside positions. An arm that takes no efforts, as only it knows, is an error.
+pub(in crate::runtime) fn efforts(
+    blueprint: &Blueprint,
+    connected: &[(device::Connected, JointLimits)],
+) -> Result<Vec<Option<EffortConfig>>, StartError> {
+    let effort = |(arm, (said, _)): (&crate::blueprint::Arm, &(device::Connected, JointLimits))| {
+        let id = &arm.hardware_id;
+        let objection = said.setpoint.and_then(|fields| fields.effort.objection()).filter(|_| arm.effort.is_some());
+        if let Some(objection) = objection {
+            let what = format!("the arm takes no efforts ({objection})");
+            let hint = format!("remove `feed_forward` and the limits of efforts from `hardware.{id}`");
+            return Err(StartError::Hardware { arm: id.clone(), what, hint });
+        }
+        let config = arm.effort_config(said.impedance.or(arm.setup.impedance));
+        config.map_err(|what| {
+            let hint = format!("see `hardware.{id}.feed_forward` and `hardware.{id}.model_path`");
+            StartError::other(format!("{id}: {what}"), hint)
+        })
+    };
+    blueprint.arms.iter().zip(connected).map(effort).collect()
+}
+
 /// Returns the configuration of arms with their effective limits, and of tasks.
 pub(in crate::runtime) fn coordinator_config(
     blueprint: &Blueprint,
     connected: &[(device::Connected, JointLimits)],
     tasks: Vec<TaskConfig>,
-    tools: Vec<Option<ToolLimit>>,
+    (tools, efforts): (Vec<Option<ToolLimit>>, Vec<Option<EffortConfig>>),
 ) -> CoordinatorConfig {
-    let arms = blueprint.arms.iter().zip(connected).zip(tools);
+    let arms = blueprint.arms.iter().zip(connected).zip(tools.into_iter().zip(efforts));
     CoordinatorConfig {
         version: CONFIG_VERSION,
         rate: blueprint.coordinator.tick_rate,
         arms: arms
-            .map(|((arm, (said, limits)), tool)| ArmConfig {
+            .map(|((arm, (said, limits)), (tool, effort))| ArmConfig {
                 name: arm.hardware_id.clone(),
                 dof: arm.joints.len().min(MAX_DOF),
                 limits: limits.clone(),
@@ -83,6 +108,7 @@ pub(in crate::runtime) fn coordinator_config(
                 write_period: said.write_period,
                 supervision: arm.supervision,
                 tool: tool.map(Box::new),
+                effort: effort.map(Box::new),
             })
             .collect(),
         tasks,

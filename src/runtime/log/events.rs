@@ -70,9 +70,10 @@ impl Service {
             let velocities = s.velocity_source != VelocitySource::Absent;
             for (j, name) in arm.joints.iter().enumerate() {
                 out.name.push(name.clone());
-                out.position.push(s.position.get(j).copied().filter(|_| s.seq > 0));
-                out.velocity.push(s.velocity.get(j).copied().filter(|_| velocities));
-                out.effort.push(s.effort.and_then(|e| e.get(j).copied()));
+                let there = !s.missing.contains(j);
+                out.position.push(s.position.get(j).copied().filter(|_| s.seq > 0 && there));
+                out.velocity.push(s.velocity.get(j).copied().filter(|_| velocities && there));
+                out.effort.push(s.effort.and_then(|e| e.get(j).copied()).filter(|_| there));
             }
         }
         out

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering::{Acquire, Relaxed};
+use std::time::Duration;
 
 use crate::runtime::Service;
 use crate::runtime::motion::motions::{End, NATIVE, Next};
@@ -198,17 +199,24 @@ impl Service {
             let (s, known, gripper) = (&view.state, view.state.seq > 0, self.facts.gripper_info(i));
             let joints = arm.joints.iter().enumerate().map(|(j, name)| JointReport {
                 name: name.clone(),
-                position: s.position.get(j).copied().filter(|_| known),
-                velocity: s.velocity.get(j).copied().filter(|_| s.velocity_source != VelocitySource::Absent),
+                position: s.position.get(j).copied().filter(|_| known && !s.missing.contains(j)),
+                velocity: s
+                    .velocity
+                    .get(j)
+                    .copied()
+                    .filter(|_| s.velocity_source != VelocitySource::Absent && !s.missing.contains(j)),
                 velocity_source: s.velocity_source.name().to_owned(),
-                effort: s.effort.and_then(|e| e.get(j).copied()),
+                effort: s.effort.and_then(|e| e.get(j).copied()).filter(|_| !s.missing.contains(j)),
                 command: view.command.mode.and_then(|_| view.command.values.get(j).copied()),
+                commanded_effort: view.command.mode.and(view.command.effort).and_then(|e| e.get(j).copied()),
             });
             Some(ArmStateReport {
                 hardware_id: arm.hardware_id.clone(),
                 simulated: !arm.is_real(),
                 age_ms: self.age_ms(s),
                 speed_fraction: s.speed_fraction,
+                effort_kind: Some(s.effort_kind.name().to_owned())
+                    .filter(|kind| s.effort.is_some() && !kind.is_empty()),
                 joints: joints.collect(),
                 gripper: s.gripper,
                 gripper_unit: gripper.map(|gripper| gripper.unit.name().to_owned()),
@@ -222,6 +230,22 @@ impl Service {
             })
         });
         StateReport { tick: self.tick.last_tick(), stamp: self.wall_seconds(), arms: arms.collect() }
+    }
+
+    /// Returns the joint positions of an arm at a time [s since the Unix epoch].
+    pub fn joints_at(&self, arm: &str, stamp: f64) -> Result<Vec<f64>, RpcError> {
+        let index = self.facts.blueprint.arms.iter().position(|own| own.hardware_id == arm);
+        let found = index.and_then(|index| Some((self.arms.get(index)?, self.facts.blueprint.arms.get(index)?)));
+        let Some((device, own)) = found else {
+            return Err(RpcError::new(Code::UnknownArm, format!("the run has no arm {arm:?}")));
+        };
+        let ago = self.wall_seconds() - stamp;
+        let time = (0.0..60.0).contains(&ago).then(|| self.now().before(Duration::from_secs_f64(ago)));
+        let joints = time.and_then(|time| device.joints_at(time)).ok_or_else(|| {
+            RpcError::new(Code::InvalidParams, format!("{arm}: nothing is known of its joints at {stamp:.3} s"))
+                .hint("the states of the last 2 s are known")
+        })?;
+        Ok(joints.into_iter().take(own.joints.len()).collect())
     }
 
     pub(in crate::runtime) fn wall_seconds(&self) -> f64 {

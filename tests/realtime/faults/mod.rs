@@ -65,10 +65,7 @@ fn played(home: &Home, log: &str, topics: &str) -> (Vec<Value>, Ended) {
 
 /// Setpoints in a trace [deg].
 fn setpoints(trace: &[Received]) -> Vec<(Mono, [f64; 6])> {
-    let one = |r: &Received| match r.request {
-        Request::ServoJoints(degrees) => Some((r.at, degrees.map(f64::from))),
-        _ => None,
-    };
+    let one = |r: &Received| r.request.setpoint().map(|degrees| (r.at, degrees.map(f64::from)));
     trace.iter().filter_map(one).collect()
 }
 

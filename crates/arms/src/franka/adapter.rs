@@ -12,7 +12,7 @@ use super::gripper::{FORCES, Hand, RANGE};
 use super::protocol::{DOF, PORT};
 use super::session::{LinkCounts, Session};
 use super::{HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, check};
-use dimos_core::arm::{Commanded, ControllerPose, Load, Pose, StopPoint};
+use dimos_core::arm::{Commanded, ControllerPose, EffortKind, Load, Pose, StopPoint};
 use dimos_core::joint::{ControlMode, JointLimits, joints_of};
 use dimos_hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo,
@@ -225,9 +225,10 @@ impl ManipulatorAdapter for FrankaAdapter {
             position: joints_of(&state.q),
             velocity: Some(joints_of(&state.dq)),
             effort: Some(joints_of(&state.tau)),
+            effort_kind: EffortKind::Measured,
             valid: session.positions_are_proven().then_some(true),
             commanded: Some(Commanded { position: joints_of(&state.q_d), velocity: joints_of(&state.dq_d) }),
-            speed_fraction: None,
+            ..JointReading::default()
         };
         Ok(())
     }

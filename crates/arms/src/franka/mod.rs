@@ -33,7 +33,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use dimos_core::arm::{AfterGap, Topology};
+use dimos_core::arm::{AfterGap, Field, SetpointFields, Topology};
 use dimos_core::joint::ControlMode;
 use dimos_hardware::check::{Checked, ConfigError, ToolFacts, in_range};
 use dimos_hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
@@ -144,6 +144,20 @@ impl Default for Options {
     }
 }
 
+/// What a motion generator of joint positions has besides them. Torques have a controller of their own, which would
+/// take the place of the robot's position control.
+const SETPOINT: SetpointFields = SetpointFields {
+    velocity: Field::Refused("a generator of joint positions takes those alone: FCI documentation"),
+    acceleration: Field::Refused("the command has no accelerations: FCI documentation"),
+    effort: Field::Withheld("torques replace the robot's own control, and an external controller is not written yet"),
+    at: Field::Refused("the command has the number of a state, no time: FCI documentation"),
+    expires: Field::Refused("the command has no such value: FCI documentation"),
+    ..SetpointFields::each_as(Field::Withheld(
+        "the robot sets its joint impedance at rest, not per setpoint; an external controller is not \
+        written yet",
+    ))
+};
+
 /// Returns the limits of the configured model.
 fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("franka", SPEC.dof)?;
@@ -173,5 +187,5 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
         model: Some((options.model.option(), "flange")),
         ..ToolFacts::default()
     };
-    Ok(Checked::new(limits).digital_inputs(0).max_payload(PAYLOAD).tool(tool))
+    Ok(Checked::new(limits).digital_inputs(0).max_payload(PAYLOAD).tool(tool).setpoint(SETPOINT))
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::device::{Device, GRIPPER_DEFAULT_FORCE, GRIPPER_FORCE, GRIPPER_MAX};
 use super::options::Options;
 use super::{MODES, NATIVE_RATE, check, limits};
-use dimos_core::arm::{IoInfo, IoState, JointStatus, Load, StopPoint};
+use dimos_core::arm::{EffortKind, IoInfo, IoState, JointStatus, Load, Setpoint, StopPoint};
 use dimos_core::clock::{Clock, MonotonicClock};
 use dimos_core::joint::{ControlMode, JointLimits, MAX_DOF};
 use dimos_hardware::adapter::{
@@ -134,6 +134,7 @@ impl ManipulatorAdapter for MockArm {
         fill(reading.position.get_mut(..self.dof).unwrap_or_default(), &position);
         reading.velocity = self.options.velocity_feedback.then(|| self.device.arm.joints().1);
         reading.effort = self.options.effort_feedback.then(|| self.device.arm.efforts());
+        reading.effort_kind = if self.options.effort_feedback { EffortKind::Measured } else { EffortKind::Unstated };
         reading.stamp = Some(self.device.arm.now());
         reading.device_ns = Some(self.device.arm.uptime().as_nanos() as u64);
         reading.valid = Some(position == self.device.arm.joints().0);
@@ -164,7 +165,7 @@ impl ManipulatorAdapter for MockArm {
         let result = match self.device.arm.mode() {
             ControlMode::Position => self.device.arm.move_to(positions, velocity),
             ControlMode::ServoPosition => self.device.arm.servo(positions),
-            _ => return Err(AdapterError::Rejected("joint positions in velocity mode".into())),
+            mode => return Err(AdapterError::Rejected(format!("joint positions in {} mode", mode.name()))),
         };
         result.map_err(|refusal| self.device.arm.rejected(refusal))
     }
@@ -177,6 +178,19 @@ impl ManipulatorAdapter for MockArm {
             return Err(AdapterError::Rejected(format!("joint velocities in {} mode", mode.name())));
         }
         self.device.arm.velocity(velocities).map_err(|refusal| self.device.arm.rejected(refusal))
+    }
+
+    fn write_setpoint(&mut self, setpoint: &Setpoint) -> AdapterResult<()> {
+        if setpoint.mode == ControlMode::Position {
+            return self.write_joint_positions(setpoint.position.get(..self.dof).unwrap_or_default(), 1.0);
+        }
+        self.check_joints(setpoint.position.get(..self.dof).unwrap_or_default())?;
+        self.device.write_motion()?;
+        if self.device.arm.mode() != setpoint.mode {
+            let (wanted, mode) = (setpoint.mode.name(), self.device.arm.mode().name());
+            return Err(AdapterError::Rejected(format!("a setpoint for {wanted} in {mode} mode")));
+        }
+        self.device.arm.follow(setpoint).map_err(|refusal| self.device.arm.rejected(refusal))
     }
 
     fn write_stop(&mut self, _rest: &StopPoint) -> AdapterResult<Stop> {

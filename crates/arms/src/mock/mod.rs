@@ -11,7 +11,7 @@ pub use options::Options;
 
 use std::time::Duration;
 
-use dimos_core::arm::{AfterGap, Topology};
+use dimos_core::arm::{AfterGap, Impedance, SetpointFields, Topology};
 use dimos_core::joint::{ControlMode, JointLimits, MAX_DOF};
 use dimos_hardware::check::{Checked, ConfigError};
 use dimos_hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
@@ -19,7 +19,11 @@ use dimos_hardware::sim::io::SimIo;
 use std::f64::consts::PI;
 
 /// The modes of the mock arm.
-const MODES: &[ControlMode] = &[ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity];
+const MODES: &[ControlMode] =
+    &[ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity, ControlMode::Impedance];
+
+/// How it is held in impedance mode, and what it takes at most [Nm/rad, Nm·s/rad].
+const IMPEDANCE: Impedance = Impedance::uniform((100.0, 5.0), (1000.0, 100.0));
 
 /// How often the mock arm can deliver its state [Hz].
 const NATIVE_RATE: f64 = 1000.0;
@@ -59,7 +63,8 @@ pub const SPEC: AdapterSpec = AdapterSpec {
 fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("a mock arm", SPEC.dof)?;
     config.options::<Options>()?.check(config.dof)?;
-    Ok(Checked::new(limits(config.dof)).digital_inputs(SimIo::INFO.digital_inputs))
+    let checked = Checked::new(limits(config.dof)).digital_inputs(SimIo::INFO.digital_inputs);
+    Ok(checked.setpoint(SetpointFields::ALL).impedance(IMPEDANCE))
 }
 
 /// ±2π rad, π rad/s, 10 rad/s², 100 rad/s³ for every joint.

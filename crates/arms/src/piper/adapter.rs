@@ -18,7 +18,7 @@ use super::protocol::{self, DOF, WireJoints, millidegrees, radians};
 use super::session::{ESTOP, Session};
 use super::wire::{Wire, WireCounts};
 use super::{Follow, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, check};
-use dimos_core::arm::{ControllerPose, ForceUnit, JointStatus, Pose, StopPoint};
+use dimos_core::arm::{ControllerPose, EffortKind, ForceUnit, JointStatus, Pose, StopPoint};
 use dimos_core::clock::{Clock, MonotonicClock};
 use dimos_core::joint::{ControlMode, JointLimits, Joints, joints_of};
 use dimos_hardware::adapter::{
@@ -203,13 +203,12 @@ impl ManipulatorAdapter for PiperAdapter {
         self.arm.whole()?;
         *reading = JointReading {
             stamp: Some(self.arm.feedback.joints_at),
-            device_ns: None,
             position: joints_of(&self.arm.feedback.joints.map(radians)),
             velocity: self.velocities(),
             effort: self.efforts(),
+            effort_kind: EffortKind::FromCurrent,
             valid: self.arm.valid(),
-            commanded: None,
-            speed_fraction: None,
+            ..JointReading::default()
         };
         Ok(())
     }

@@ -30,7 +30,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
-use dimos_core::arm::{AfterGap, Topology};
+use dimos_core::arm::{AfterGap, Field, SetpointFields, Topology};
 use dimos_core::joint::ControlMode;
 use dimos_hardware::adapter_util::{above_zero, fraction};
 use dimos_hardware::check::{Checked, ConfigError, ToolFacts};
@@ -81,6 +81,14 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     wire: Some(messages::WIRE),
 };
 
+/// What a setpoint has besides positions. MOVE J has nothing else; the frames of MIT mode have more.
+const SETPOINT: SetpointFields = SetpointFields {
+    acceleration: Field::Refused("no frame has accelerations of a setpoint: CAN protocol V2"),
+    at: Field::Refused("no frame has a time: CAN protocol V2"),
+    expires: Field::Refused("no frame has a time: CAN protocol V2"),
+    ..SetpointFields::each_as(Field::Withheld("MIT mode (frames 0x15A to 0x15F) has it and is not written yet"))
+};
+
 /// All arms of a model have the same limits; a connected one may have been given narrower ones.
 fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("piper", SPEC.dof)?;
@@ -88,7 +96,7 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     options.sim.check(options.model, emulator::PLAYABLE)?;
     let model = (options.model == Model::Piper).then_some(("piper", "link6"));
     let tool = ToolFacts { model, ..ToolFacts::default() };
-    Ok(Checked::new(options.model.limits()).digital_inputs(0).max_payload(0.0).tool(tool))
+    Ok(Checked::new(options.model.limits()).digital_inputs(0).max_payload(0.0).tool(tool).setpoint(SETPOINT))
 }
 
 /// Which gripper is fitted.

@@ -7,10 +7,12 @@ use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
 use super::address::Address;
-use super::protocol::{Act, Command, Description, Measured, WirePose};
+use super::protocol::{Act, Command, Description, Measured, More, WirePose};
 use super::session::Session;
-use super::{MODES, NATIVE_RATE, check, limits, same_modes};
-use dimos_core::arm::{Bridging, ControllerPose, GripperUnit, Pose, StopPoint};
+use super::{NATIVE_RATE, USUAL_MODES, check, limits, same_modes};
+use dimos_core::arm::{
+    Bridging, ControllerPose, EffortKind, Field, GripperUnit, Impedance, Pose, Setpoint, SetpointFields, StopPoint,
+};
 use dimos_core::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
 use dimos_hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo,
@@ -72,14 +74,21 @@ impl RemoteAdapter {
         self.with(|session| session.recent().map(|state| state.map(of)))?
     }
 
+    /// Where the efforts of the arm come from, if its peer says so.
+    fn effort_kind(&self) -> Option<EffortKind> {
+        self.last.as_ref()?.effort_kind
+    }
+
     /// Whether the peer of this connection, or of the previous one, has the part.
     fn has_part(&self, name: &str) -> bool {
         self.last.as_ref().is_some_and(|description| description.parts.iter().any(|part| part == name))
     }
 
     /// Sends a command unless the newest state shows that the arm would refuse it.
-    fn command(&mut self, mode: ControlMode, values: &[f64], velocity: f64) -> AdapterResult<()> {
-        if values.len() != self.dof || !values.iter().all(|value| value.is_finite()) {
+    fn command(&mut self, mode: ControlMode, values: &[f64], velocity: f64, more: More<'_>) -> AdapterResult<()> {
+        // Text cannot say what is no number.
+        let whole = |list: &[f64]| list.len() == self.dof && list.iter().all(|value| value.is_finite());
+        if !whole(values) || !more.lists().all(whole) {
             return Err(AdapterError::Rejected(format!("expected {} finite values, one per joint", self.dof)));
         }
         self.with(Session::take_up)?;
@@ -93,7 +102,7 @@ impl RemoteAdapter {
         if enabled == Some(false) {
             return Err(AdapterError::Rejected("the motors are disabled".into()));
         }
-        let sent = self.session()?.command(Command { mode, velocity, values });
+        let sent = self.session()?.command(Command { mode, velocity, values, more });
         // A refusal leaves the connection as it is.
         sent.inspect_err(|error| {
             if !matches!(error, AdapterError::Rejected(_) | AdapterError::Busy) {
@@ -144,7 +153,7 @@ impl ManipulatorAdapter for RemoteAdapter {
             firmware_version: said.and_then(|d| d.info.firmware_version.clone()),
             serial_number: said.and_then(|d| d.info.serial_number.clone()),
             native_rate: said.map_or(NATIVE_RATE, |d| d.native_rate),
-            modes: said.and_then(|d| d.modes.as_deref()).map_or(MODES, same_modes),
+            modes: said.and_then(|d| d.modes.as_deref()).map_or(USUAL_MODES, same_modes),
             holds_when_disabled: said.and_then(|d| d.holds_when_disabled).unwrap_or(false),
             whole_state_at_once: true,
         }
@@ -160,6 +169,20 @@ impl ManipulatorAdapter for RemoteAdapter {
 
     fn bridging(&self) -> Option<Bridging> {
         self.last.as_ref()?.bridging()
+    }
+
+    fn setpoint_fields(&self) -> Option<SetpointFields> {
+        self.last.as_ref().map(Description::setpoint_fields)
+    }
+
+    fn impedance(&self) -> Option<Impedance> {
+        self.last.as_ref()?.impedance()
+    }
+
+    fn connection_warning(&self) -> Option<&'static str> {
+        let said = self.last.as_ref()?;
+        said.asked_rate.filter(|asked| *asked > said.native_rate)?;
+        Some("its server process delivers fewer states than its --hz asks for, as it says in its own output")
     }
 
     // --- Mode ---
@@ -213,13 +236,13 @@ impl ManipulatorAdapter for RemoteAdapter {
         }
         *reading = JointReading {
             stamp: Some(stamp),
-            device_ns: None,
+            device_ns: state.device_time,
             position: state.position.joints,
             velocity: state.velocity.map(|values| values.joints),
             effort: state.effort.map(|values| values.joints),
-            valid: None,
-            commanded: None,
-            speed_fraction: None,
+            effort_kind: self.effort_kind().filter(|_| state.effort.is_some()).unwrap_or_default(),
+            missing: state.lost(),
+            ..JointReading::default()
         };
         Ok(())
     }
@@ -247,10 +270,32 @@ impl ManipulatorAdapter for RemoteAdapter {
 
     fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()> {
         let mode = self.mode;
-        if mode == ControlMode::Velocity && self.session.is_some() {
-            return Err(AdapterError::Rejected("joint positions in velocity mode".into()));
+        if matches!(mode, ControlMode::Velocity | ControlMode::Impedance) && self.session.is_some() {
+            return Err(AdapterError::Rejected(format!("joint positions in {} mode", mode.name())));
         }
-        self.command(mode, positions, velocity)
+        self.command(mode, positions, velocity, More::default())
+    }
+
+    /// Passes on what the peer takes of the setpoint.
+    fn write_setpoint(&mut self, setpoint: &Setpoint) -> AdapterResult<()> {
+        let (fields, dof, mode) = (self.setpoint_fields().unwrap_or_default(), self.dof, self.mode);
+        if mode != setpoint.mode && self.session.is_some() {
+            let what = format!("a setpoint for {} in {} mode", setpoint.mode.name(), mode.name());
+            return Err(AdapterError::Rejected(what));
+        }
+        fn list(field: Field, of: Option<&Joints>, dof: usize) -> Option<&[f64]> {
+            of.filter(|_| field.is_taken())?.get(..dof)
+        }
+        let more = More {
+            velocities: list(fields.velocity, Some(&setpoint.velocity), dof),
+            accelerations: list(fields.acceleration, setpoint.acceleration.as_ref(), dof),
+            efforts: list(fields.effort, setpoint.effort.as_ref(), dof),
+            stiffness: list(fields.stiffness, setpoint.stiffness.as_ref(), dof),
+            damping: list(fields.damping, setpoint.damping.as_ref(), dof),
+            at: fields.at.is_taken().then_some(setpoint.at.0),
+            valid: setpoint.valid_for().filter(|_| fields.expires.is_taken()),
+        };
+        self.command(mode, setpoint.position.get(..dof).unwrap_or_default(), 1.0, more)
     }
 
     fn write_joint_velocities(&mut self, velocities: &[f64]) -> AdapterResult<()> {
@@ -262,7 +307,7 @@ impl ManipulatorAdapter for RemoteAdapter {
         if mode != ControlMode::Velocity {
             return Err(AdapterError::Rejected(format!("joint velocities in {} mode", mode.name())));
         }
-        self.command(mode, velocities, 1.0)
+        self.command(mode, velocities, 1.0, More::default())
     }
 
     fn write_stop(&mut self, rest: &StopPoint) -> AdapterResult<Stop> {

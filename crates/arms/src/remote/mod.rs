@@ -20,14 +20,18 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use address::Address;
-use dimos_core::arm::{AfterGap, Topology};
+use dimos_core::arm::{AfterGap, SetpointFields, Topology};
 use dimos_core::joint::{ControlMode, JointLimits, MAX_DOF};
 use dimos_hardware::check::{Checked, ConfigError};
 use dimos_hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
 use dimos_hardware::sim::arm::SimOptions;
 
 /// All modes that the protocol knows.
-const MODES: &[ControlMode] = &[ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity];
+const MODES: &[ControlMode] =
+    &[ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity, ControlMode::Impedance];
+
+/// Those of a peer that does not name its own.
+const USUAL_MODES: &[ControlMode] = &[ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity];
 
 /// Maximum rate of states [Hz]; the peer reports the rate of its arm.
 const NATIVE_RATE: f64 = 1000.0;
@@ -73,7 +77,8 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("a remote arm", SPEC.dof)?;
     let (sim, limits) = (config.options::<Options>()?.sim, limits(config.dof));
     sim.check("remote", &limits, emulator::PLAYABLE)?;
-    Ok(Checked::new(limits).digital_inputs(0).max_payload(0.0))
+    // What the server's `hello` says; until then the protocol has all of it.
+    Ok(Checked::new(limits).digital_inputs(0).max_payload(0.0).setpoint(SetpointFields::ALL))
 }
 
 /// Nominal limits: ±2π rad, π rad/s. The peer states the real ones.
@@ -83,8 +88,8 @@ fn limits(dof: usize) -> JointLimits {
 
 /// The subset of [`MODES`] with the same modes as `given`, whatever their order.
 fn same_modes(given: &[ControlMode]) -> &'static [ControlMode] {
-    use ControlMode::{Position, ServoPosition, Velocity};
-    const SUBSETS: [&[ControlMode]; 8] = [
+    use ControlMode::{Impedance, Position, ServoPosition, Velocity};
+    const SUBSETS: [&[ControlMode]; 16] = [
         &[],
         &[Position],
         &[ServoPosition],
@@ -92,10 +97,18 @@ fn same_modes(given: &[ControlMode]) -> &'static [ControlMode] {
         &[Velocity],
         &[Position, Velocity],
         &[ServoPosition, Velocity],
+        USUAL_MODES,
+        &[Impedance],
+        &[Position, Impedance],
+        &[ServoPosition, Impedance],
+        &[Position, ServoPosition, Impedance],
+        &[Velocity, Impedance],
+        &[Position, Velocity, Impedance],
+        &[ServoPosition, Velocity, Impedance],
         MODES,
     ];
     let bits = MODES.iter().enumerate().map(|(i, mode)| usize::from(given.contains(mode)) << i);
-    SUBSETS.get(bits.sum::<usize>()).copied().unwrap_or(MODES)
+    SUBSETS.get(bits.sum::<usize>()).copied().unwrap_or(USUAL_MODES)
 }
 
 /// What a blueprint may set of a remote arm.

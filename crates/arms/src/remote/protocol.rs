@@ -9,12 +9,13 @@ use std::time::Duration;
 use serde::de::{Deserializer, Error as _, SeqAccess, Visitor};
 use serde::{Deserialize, Serialize};
 
-use dimos_core::arm::{AfterGap, Bridging, GripperUnit, Pose};
+use dimos_core::arm::{AfterGap, Bridging, EffortKind, Field, GripperUnit, Impedance, JointSet, Pose, SetpointFields};
 use dimos_core::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
 use dimos_hardware::adapter::AdapterError;
 
-/// The version of the protocol.
-pub const VERSION: u32 = 1;
+/// The version of the protocol, and the oldest that a peer may have: without setpoints that have more than positions.
+pub const VERSION: u32 = 2;
+pub const OLDEST: u32 = 1;
 /// Longest line [bytes].
 pub const MAX_LINE: usize = 16 * 1024;
 /// Longest text that is kept of a reply [bytes].
@@ -97,6 +98,42 @@ pub struct Command<'a> {
     pub values: &'a [f64],
     /// Fraction of the top speed, where the device plans its way.
     pub velocity: f64,
+    /// Since version 2: what else a setpoint has, as far as the peer takes it.
+    #[serde(flatten)]
+    pub more: More<'a>,
+}
+
+/// What a setpoint has besides positions, one value per joint. What is absent is not commanded.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
+pub struct More<'a> {
+    /// Velocities [rad/s].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub velocities: Option<&'a [f64]>,
+    /// Accelerations [rad/s²].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub accelerations: Option<&'a [f64]>,
+    /// Efforts beside the arm's own control [Nm].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub efforts: Option<&'a [f64]>,
+    /// Stiffness [Nm/rad].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub stiffness: Option<&'a [f64]>,
+    /// Damping [Nm·s/rad].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub damping: Option<&'a [f64]>,
+    /// Time of the tick that made it [ns on this program's steady clock].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub at: Option<u64>,
+    /// How long it holds from then on [s].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub valid: Option<f64>,
+}
+
+impl<'a> More<'a> {
+    /// Returns its lists.
+    pub fn lists(&self) -> impl Iterator<Item = &'a [f64]> {
+        [self.velocities, self.accelerations, self.efforts, self.stiffness, self.damping].into_iter().flatten()
+    }
 }
 
 /// A cycle: asks for the state, and commands something or nothing. Allocates nothing once `out` has its size.
@@ -202,6 +239,12 @@ pub struct Measured {
     /// Force [N] and torque [Nm].
     #[serde(default, rename = "read_force_torque")]
     pub wrench: Option<[f64; 6]>,
+    /// Joints whose motors do not answer, counted from 0: their values do not count.
+    #[serde(default)]
+    pub missing: Option<Values>,
+    /// The device's own time of the measurement, on its own clock [ns].
+    #[serde(default)]
+    pub device_time: Option<u64>,
 }
 
 /// State and mode codes, where the device has them.
@@ -240,6 +283,12 @@ impl WirePose {
 }
 
 impl Measured {
+    /// The joints whose motors do not answer.
+    pub fn lost(&self) -> JointSet {
+        let numbers = self.missing.iter().flat_map(|list| list.joints.iter().take(list.length));
+        JointSet::of(numbers.filter(|number| **number >= 0.0).map(|number| *number as usize))
+    }
+
     /// Says which list has not one value per joint.
     pub fn check(&self, dof: usize) -> Result<(), String> {
         let lists = [("position", Some(self.position)), ("velocity", self.velocity), ("effort", self.effort)];
@@ -354,6 +403,18 @@ pub struct Description {
     /// What it does beyond that; it rests at its last setpoint where it does not say.
     #[serde(default)]
     pub after_gap: Option<AfterGap>,
+    /// What it takes of setpoints besides positions, by the names of [`SetpointFields`]; nothing before version 2.
+    #[serde(default)]
+    pub fields: Vec<String>,
+    /// How it is held in impedance mode, if it has that.
+    #[serde(default)]
+    pub impedance: Option<Gains>,
+    /// Where its efforts come from.
+    #[serde(default)]
+    pub effort_kind: Option<EffortKind>,
+    /// The rate at which its process was asked to deliver states [Hz], where it found that it delivers fewer.
+    #[serde(default)]
+    pub asked_rate: Option<f64>,
     /// `get_limits` [rad, rad/s, rad/s², rad/s³]
     pub limits: JointLimits,
     /// Position of its gripper when closed and when open [m or rad].
@@ -365,6 +426,21 @@ pub struct Description {
     /// The names of the reads that answer something: which optional parts there are.
     #[serde(default)]
     pub parts: Vec<String>,
+}
+
+/// Stiffness [Nm/rad] and damping [Nm·s/rad] in impedance mode, one value per joint.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+pub struct Gains {
+    /// With which it is held where nothing else is commanded.
+    pub stiffness: Vec<f64>,
+    /// The same.
+    pub damping: Vec<f64>,
+    /// The highest; those above where it does not say.
+    #[serde(default)]
+    pub stiffness_max: Vec<f64>,
+    /// The same.
+    #[serde(default)]
+    pub damping_max: Vec<f64>,
 }
 
 /// What the arm is.
@@ -392,7 +468,22 @@ impl Description {
         }
         let unusable = |own: &Vec<ControlMode>| own.is_empty() || own.iter().any(|mode| !modes.contains(mode));
         if description.modes.as_ref().is_some_and(unusable) {
-            return Err("its description: modes must be some of position, servo_position, velocity".to_owned());
+            return Err(
+                "its description: modes must be some of position, servo_position, velocity, impedance".to_owned()
+            );
+        }
+        let gains = description.impedance.as_ref();
+        let compliant = description.modes.iter().flatten().any(|mode| *mode == ControlMode::Impedance);
+        if compliant && gains.is_none() {
+            return Err("its description: the mode impedance needs stiffness and damping in `impedance`".to_owned());
+        }
+        let usable = |list: &Vec<f64>| list.iter().all(|gain| gain.is_finite() && *gain >= 0.0);
+        let whole = |list: &&Vec<f64>| list.len() == dof && usable(list);
+        let most = |list: &&Vec<f64>| list.is_empty() || whole(list);
+        if gains.is_some_and(|g| {
+            ![&g.stiffness, &g.damping].iter().all(whole) || ![&g.stiffness_max, &g.damping_max].iter().all(most)
+        }) {
+            return Err(format!("its description: impedance must have {dof} values each, none below 0"));
         }
         let needed = [&limits.position_lower, &limits.position_upper, &limits.velocity_max];
         let optional = [&limits.acceleration_max, &limits.jerk_max];
@@ -400,6 +491,40 @@ impl Description {
             return Err(format!("its description: limits must have {dof} values each"));
         }
         Ok(description)
+    }
+
+    /// What it takes of setpoints.
+    pub fn setpoint_fields(&self) -> SetpointFields {
+        if self.version < VERSION {
+            return SetpointFields::each_as(Field::Withheld("its server process speaks version 1 of the protocol"));
+        }
+        let field = |name: &str| match self.fields.iter().any(|own| own == name) {
+            true => Field::Taken,
+            false => Field::Refused("its server process does not take it (`fields` of its hello)"),
+        };
+        SetpointFields {
+            velocity: field("velocity"),
+            acceleration: field("acceleration"),
+            effort: field("effort"),
+            stiffness: field("stiffness"),
+            damping: field("damping"),
+            at: field("at"),
+            expires: field("expires"),
+        }
+    }
+
+    /// How it is held in impedance mode.
+    pub fn impedance(&self) -> Option<Impedance> {
+        let gains = self.impedance.as_ref()?;
+        let joints = |list: &[f64], otherwise: &[f64]| {
+            dimos_core::joint::joints_of(if list.is_empty() { otherwise } else { list })
+        };
+        Some(Impedance {
+            stiffness: joints(&gains.stiffness, &[]),
+            damping: joints(&gains.damping, &[]),
+            stiffness_max: joints(&gains.stiffness_max, &gains.stiffness),
+            damping_max: joints(&gains.damping_max, &gains.damping),
+        })
     }
 
     /// What it says of gaps in its commands.

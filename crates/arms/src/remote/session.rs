@@ -375,11 +375,12 @@ fn introduction(link: &mut Link) -> AdapterResult<Description> {
             (Ok(reply), _) if reply.trouble(&peer).is_some() => {
                 Err(reply.trouble(&peer).unwrap_or(AdapterError::Unsupported))
             }
-            _ if version.as_ref().is_ok_and(|version| *version != protocol::VERSION) => {
+            _ if version.as_ref().is_ok_and(|version| !(protocol::OLDEST..=protocol::VERSION).contains(version)) => {
                 Err(AdapterError::Rejected(format!(
-                    "{peer} speaks version {} of the protocol, this program version {}\n\
+                    "{peer} speaks version {} of the protocol, this program versions {} to {}\n\
                      hint: use the dimos_shim.py that came with this program",
                     version.unwrap_or_default(),
+                    protocol::OLDEST,
                     protocol::VERSION
                 )))
             }

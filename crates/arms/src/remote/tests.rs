@@ -8,9 +8,10 @@ use super::SPEC;
 use super::address::Address;
 use super::emulator::wire;
 use super::link::Link;
-use super::protocol::{self, Act, Command, Description, Reply, WirePose};
+use super::protocol::{self, Act, Command, Description, More, Reply, WirePose};
 use super::session::Session;
-use dimos_core::arm::StopPoint;
+use dimos_core::arm::{JointSet, Setpoint, StopPoint};
+use dimos_core::clock::Mono;
 use dimos_core::joint::{ControlMode, joints_of};
 use dimos_hardware::adapter::{AdapterError, JointReading, ManipulatorAdapter, Stop};
 use dimos_hardware::registry::{AdapterConfig, Emulator};
@@ -43,7 +44,15 @@ fn the_requests_of_the_sheet_are_these() {
     assert!(same(mode, &written(|out| protocol::act(3, &Act::Mode(ControlMode::ServoPosition), out))));
     assert_eq!(first, written(|out| protocol::cycle(4, None, out)));
     let (values, velocity) = (&[0.1, -0.30000000000000004][..], 1.0);
-    let ours = Command { mode: ControlMode::ServoPosition, values, velocity };
+    let more = More {
+        velocities: Some(&[0.5, 0.0]),
+        accelerations: Some(&[0.0, -1.0]),
+        efforts: Some(&[2.5, -0.25]),
+        at: Some(81_234_000_000_000),
+        valid: Some(0.02),
+        ..More::default()
+    };
+    let ours = Command { mode: ControlMode::ServoPosition, values, velocity, more };
     assert_eq!(command, written(|out| protocol::cycle(5, Some(ours), out)));
     // The double reads the same out of them, to the last bit.
     let scanned = |line: &str| match wire::scan(format!("{line}\n").as_bytes()) {
@@ -52,7 +61,10 @@ fn the_requests_of_the_sheet_are_these() {
     };
     assert_eq!(scanned(hello).what, "hello");
     let request = scanned(command);
-    assert_eq!((request.id, request.command.unwrap().values.as_slice()), (5, values));
+    let read = request.command.unwrap();
+    assert_eq!((request.id, read.values.as_slice(), read.at, read.valid), (5, values, more.at, more.valid));
+    assert_eq!(read.list("efforts"), Ok(Some(vec![2.5, -0.25])));
+    assert_eq!(read.list("stiffness"), Ok(None), "what is not commanded is not sent");
     assert_eq!(wire::scan(command.as_bytes()), Scan::More);
     assert_eq!(wire::scan(b"GET /\n"), Scan::Take(6, Err("a line that is not JSON")));
 }
@@ -73,6 +85,7 @@ fn the_replies_of_the_sheet_are_understood() {
     assert_eq!((measured.time, measured.enabled, measured.gripper), (81_234_567_890_123, Some(true), Some(0.04)));
     assert_eq!(measured.pose.map(WirePose::pose).unwrap().rpy, [0.0, 1.5, -3.0]);
     assert_eq!((measured.check(2), reply.refused), (Ok(()), None));
+    assert_eq!((measured.lost(), measured.device_time), (JointSet::of([1]), Some(1_250_000_000)));
     assert!(measured.check(3).unwrap_err().contains("2 values for 3 joints"));
 }
 
@@ -233,6 +246,49 @@ fn a_stop_has_its_point_of_rest_only_where_the_peer_takes_one() {
 }
 
 #[test]
+fn a_peer_of_version_1_connects_and_gets_positions_alone() {
+    let [hello, .., state] = sheet("{ \"id\":")[..] else { panic!("four replies") };
+    for version in [1, 2, 3] {
+        let mut hello: serde_json::Value = serde_json::from_str(hello).unwrap();
+        hello["version"] = version.into();
+        let mut state: serde_json::Value = serde_json::from_str(state).unwrap();
+        let (said, heard) = std::sync::mpsc::channel();
+        let address = scripted(move |request| {
+            let reply = match request.what.as_str() {
+                "hello" => &mut hello,
+                "cycle" => &mut state,
+                _ => &mut serde_json::json!({}),
+            };
+            reply["id"] = request.id.into();
+            if let Some(command) = &request.command {
+                drop(said.send(command.lists.keys().cloned().collect::<Vec<_>>()));
+            }
+            format!("{reply}\n")
+        });
+        let mut arm = crate::create("remote", &address.to_string(), 2).unwrap();
+        let connected = arm.connect();
+        if version == 3 {
+            let error = connected.unwrap_err().to_string();
+            assert!(error.contains("version 3 of the protocol, this program versions 1 to 2"), "{error}");
+            continue;
+        }
+        connected.unwrap();
+        arm.set_control_mode(ControlMode::ServoPosition).unwrap();
+        let taken = arm.setpoint_fields().unwrap().named().iter().filter(|(_, field)| field.is_taken()).count();
+        let setpoint = Setpoint {
+            effort: Some(joints_of(&[1.0, 2.0])),
+            ..Setpoint::new(ControlMode::ServoPosition, joints_of(&[0.1, -0.3]), Mono(7))
+        };
+        until("room", || arm.write_setpoint(&setpoint).is_ok());
+        let lists = heard.recv_timeout(Duration::from_secs(10)).unwrap();
+        match version {
+            1 => assert_eq!((taken, lists), (0, vec!["values".to_owned()])),
+            _ => assert_eq!((taken, lists), (5, ["efforts", "values", "velocities"].map(str::to_owned).to_vec())),
+        }
+    }
+}
+
+#[test]
 fn a_second_client_is_refused_and_the_first_one_goes_on() {
     let (emulator, mut arm) = served(3);
     arm.connect().unwrap();
@@ -262,6 +318,11 @@ fn wrong_configurations_are_refused() {
     }
     let modes = [ControlMode::Velocity, ControlMode::Position];
     assert_eq!(super::same_modes(&modes), [ControlMode::Position, ControlMode::Velocity]);
+    for bits in 0..16usize {
+        let given: Vec<_> =
+            super::MODES.iter().enumerate().filter(|(i, _)| bits >> i & 1 == 1).map(|(_, m)| *m).collect();
+        assert_eq!(super::same_modes(&given), given);
+    }
 }
 
 #[test]

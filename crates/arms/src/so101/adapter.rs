@@ -11,7 +11,7 @@ use super::calibration::{Calibration, Range};
 use super::protocol::{SERVOS, Servo, TURN, register};
 use super::seam::Seams;
 use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, TOP_SPEED, check, limits};
-use dimos_core::arm::{Commanded, StopPoint};
+use dimos_core::arm::{Commanded, JointSet, StopPoint};
 use dimos_core::clock::Mono;
 use dimos_core::joint::{ControlMode, JointLimits, Joints, joints_of};
 use dimos_hardware::adapter::{
@@ -39,6 +39,10 @@ pub struct So101Adapter {
     mode: ControlMode,
     /// The last state of all servos, and when it was asked for.
     pub(super) state: Option<([Servo; SERVOS], Mono)>,
+    /// What was last heard of each servo.
+    pub(super) heard: [Option<Servo>; SERVOS],
+    /// The servos, counted from the base, that did not answer when the others did.
+    pub(super) missing: JointSet,
     /// The seams of the encoders.
     pub(super) seams: Seams,
     /// The goals that servos had before they were taken back because of an overload [counts], until another setpoint.
@@ -65,6 +69,8 @@ impl So101Adapter {
             firmware: (0, 0),
             mode: MODES.first().copied().unwrap_or_default(),
             state: None,
+            heard: [None; SERVOS],
+            missing: JointSet::NONE,
             seams: Seams::default(),
             relieved: [None; SERVOS],
             gripper_goal: None,
@@ -146,6 +152,7 @@ impl ManipulatorAdapter for So101Adapter {
         self.bus.line.close();
         (self.state, self.gripper_goal, self.gripper_speed) = (None, None, 0);
         (self.seams, self.relieved) = (Seams::default(), [None; SERVOS]);
+        (self.heard, self.missing) = ([None; SERVOS], JointSet::NONE);
     }
 
     fn is_connected(&self) -> bool {
@@ -208,15 +215,13 @@ impl ManipulatorAdapter for So101Adapter {
         let goal = |j, range: Range| servos.get(j).map_or(0.0, |servo| range.angle(self.seams.goal(j, servo)));
         let on = servos.iter().take(DOF).all(|servo| servo.on);
         *reading = JointReading {
-            stamp: None,
-            device_ns: None,
             position: self.positions(),
             velocity: Some(self.angles(|j, _| velocity(servos.get(j)))),
-            effort: None,
             // Counts of absolute encoders: 0 rad is the middle of a range, not what a servo sends unmeasured.
             valid: Some(true),
+            missing: JointSet::of(self.missing.iter().filter(|servo| *servo < DOF)),
             commanded: on.then(|| Commanded { position: self.angles(goal), ..Commanded::default() }),
-            speed_fraction: None,
+            ..JointReading::default()
         };
         Ok(())
     }

@@ -37,7 +37,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use calibration::Calibration;
-use dimos_core::arm::{AfterGap, Topology};
+use dimos_core::arm::{AfterGap, Field, SetpointFields, Topology};
 use dimos_core::joint::{ControlMode, JointLimits};
 use dimos_hardware::check::{Checked, ConfigError, LineShare};
 use dimos_hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
@@ -106,6 +106,20 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     wire: Some(messages::WIRE),
 };
 
+/// What a servo takes besides its goal: register 46 is a top speed and register 41 an acceleration of its own way
+/// there; both are at their highest for setpoints.
+const SETPOINT: SetpointFields = SetpointFields {
+    velocity: Field::Refused("register 46 is a top speed, not that of a setpoint: STS3215 memory table"),
+    acceleration: Field::Refused("register 41 is that of its own ramp, not of a setpoint: STS3215 memory table"),
+    effort: Field::Refused("register 48 limits the torque, and none adds to it: STS3215 memory table"),
+    at: Field::Refused("no register has a time: STS3215 memory table"),
+    expires: Field::Refused("no register has a time: STS3215 memory table"),
+    ..SetpointFields::each_as(Field::Refused(
+        "registers 21 to 23 are gains of its own loop, without unit: STS3215 \
+        memory table",
+    ))
+};
+
 /// Checks the number of joints, the options and the calibration file; returns the joint limits.
 fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("so101", SPEC.dof)?;
@@ -118,7 +132,7 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     let baud = SerialAddress::parse(&config.address, BAUD).map_or(BAUD, |address| address.baud);
     let load = f64::from(CYCLE_BITS) * NATIVE_RATE / f64::from(baud);
     let line = LineShare { numbers: (first, first + SERVOS as u8 - 1), option: "first_id", load };
-    Ok(Checked::new(limits(&options.calibration()?)).digital_inputs(0).max_payload(0.0).line(line))
+    Ok(Checked::new(limits(&options.calibration()?)).digital_inputs(0).max_payload(0.0).line(line).setpoint(SETPOINT))
 }
 
 /// Returns the joint limits of a calibrated arm in SI units.

@@ -41,6 +41,9 @@ impl Gripper for So101Adapter {
 
     fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
         let position = self.recent()?.get(DOF).map_or(0, |servo| servo.position);
+        if self.missing.contains(DOF) {
+            return Ok(None);
+        }
         Ok(Some(f64::from(position - self.range(DOF).low) * TAU / TURN))
     }
 

@@ -6,12 +6,16 @@ use std::time::Duration;
 use super::SPEC;
 use super::adapter::So101Adapter;
 use super::protocol::{self, Instruction, MAX_DATA, MAX_INSTRUCTION, SERVOS, STATE, Servo, TURN, register};
+use dimos_core::arm::JointSet;
 use dimos_core::clock::{Clock, MonotonicClock};
 use dimos_hardware::adapter::{AdapterError, AdapterResult};
 use dimos_hardware::transport::request_reply::Retry;
 
-/// Longest wait for the state of all servos. All attempts together stay below `stale_after`.
-const CYCLE: Retry = Retry { each: Duration::from_millis(30), times: 3 };
+/// Longest wait for the state of all servos. All attempts together stay below `stale_after`: a servo that answers none
+/// of them, while others answer, is lost before the state of all is old.
+const CYCLE: Retry = Retry { each: Duration::from_millis(25), times: 3 };
+/// The same while one is lost: it is waited for no longer than that.
+const WITHOUT: Retry = Retry::once(Duration::from_millis(25));
 /// A state answers further questions for this time.
 const STATE_AGE: Duration = Duration::from_millis(5);
 /// How often torque and goals are written until the servos show them: nothing acknowledges a write to all.
@@ -28,7 +32,7 @@ impl So101Adapter {
         self.bus.line.tell(protocol::encode(write, &mut frame))
     }
 
-    /// Asks for the state of all servos.
+    /// Asks for the state of all servos. One that is lost has the state that it had last: `missing` names it.
     pub(super) fn fetch(&mut self) -> AdapterResult<[Servo; SERVOS]> {
         self.state = None;
         let asked = MonotonicClock.now();
@@ -43,15 +47,26 @@ impl So101Adapter {
                 (status.id, data)
             })
         };
-        let result = self.bus.line.gather(frame, CYCLE, SERVOS, scan, |(id, data)| {
+        let timeout = if self.missing.is_empty() { CYCLE } else { WITHOUT };
+        let result = self.bus.line.gather_some(frame, timeout, SERVOS, scan, |(id, data)| {
             let slot = id.checked_sub(first).map(usize::from).and_then(|servo| servos.get_mut(servo));
             slot.is_some_and(|slot| slot.replace(Servo::decode(&data).unwrap_or_default()).is_none())
         });
-        if let (Err(AdapterError::Timeout(text)), Some(missing)) = (&result, servos.iter().position(Option::is_none)) {
-            let missing = self.bus.servo(first + missing as u8);
-            return Err(AdapterError::Timeout(format!("{text}; {missing} did not")));
+        if let Err(AdapterError::Timeout(text)) = &result {
+            let first = self.bus.servo(first);
+            return Err(AdapterError::Timeout(format!("{text}; {first} did not")));
         }
         result?;
+        let missing = (0..SERVOS).filter(|servo| servos.get(*servo).is_some_and(Option::is_none));
+        self.missing = JointSet::of(missing);
+        for (servo, heard) in servos.iter_mut().zip(&self.heard) {
+            *servo = servo.or(*heard);
+        }
+        if let Some(unknown) = servos.iter().position(Option::is_none) {
+            let unknown = self.bus.servo(first + unknown as u8);
+            return Err(AdapterError::Timeout(format!("{unknown} did not answer, and the others did")));
+        }
+        self.heard = servos;
         let servos = servos.map(Option::unwrap_or_default);
         self.seams.take(&servos, asked);
         self.state = Some((servos, asked));
@@ -79,7 +94,9 @@ impl So101Adapter {
     ) -> AdapterResult<bool> {
         for _ in 0..WRITES {
             self.write(address, values)?;
-            if self.fetch()?.iter().enumerate().all(|(j, servo)| shown(j, servo)) {
+            let servos = self.fetch()?;
+            // What a lost one has taken is not known, and keeps nothing from the others.
+            if servos.iter().enumerate().all(|(j, servo)| self.missing.contains(j) || shown(j, servo)) {
                 return Ok(true);
             }
         }
@@ -106,10 +123,18 @@ impl So101Adapter {
 
     /// Switches all motors on or off until the servos show it.
     pub(super) fn write_torque(&mut self, on: bool) -> AdapterResult<()> {
-        if self.confirmed(register::TORQUE, [[u8::from(on)]; SERVOS], |_, servo| servo.on == on)? {
+        let shown = self.confirmed(register::TORQUE, [[u8::from(on)]; SERVOS], |_, servo| servo.on == on)?;
+        let what = if on { "on" } else { "off" };
+        if let Some(lost) = self.missing.first() {
+            let lost = self.bus.servo(self.bus.first() + lost as u8);
+            return Err(AdapterError::Protocol(format!(
+                "so101: {lost} does not answer: whether its motor is {what} is not known\nhint: check its cable, or \
+                 switch the power of the arm off"
+            )));
+        }
+        if shown {
             return Ok(());
         }
-        let what = if on { "on" } else { "off" };
         Err(AdapterError::Protocol(format!("so101: not all motors can be switched {what}")))
     }
 

@@ -7,9 +7,9 @@ use serde_json::json;
 use super::adapter::So101Adapter;
 use super::emulator::{Servos, start};
 use super::{DOF, SPEC};
-use dimos_core::arm::{GripperUnit, StopPoint};
+use dimos_core::arm::{GripperUnit, JointSet, StopPoint};
 use dimos_core::joint::{ControlMode, joints_of};
-use dimos_hardware::adapter::{AdapterError, Gripper, ManipulatorAdapter, Stop};
+use dimos_hardware::adapter::{AdapterError, Gripper, JointReading, ManipulatorAdapter, Stop};
 use dimos_hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos_hardware::sim::faults::{Fault, FaultKind};
 use dimos_hardware::sim::serial_server::SerialServer;
@@ -63,6 +63,36 @@ fn a_lost_a_damaged_and_a_late_answer_cost_no_reading() {
         servos.inject(fault).unwrap();
         assert_eq!(positions(&mut adapter), start, "{:?}", fault.kind);
     }
+}
+
+#[test]
+fn a_lost_servo_loses_its_joint_only_and_no_motor_is_said_to_be_off_that_is_not_heard() {
+    let (mut adapter, servos) = arm(json!({}));
+    adapter.connect().unwrap();
+    adapter.activate().unwrap();
+    let before = positions(&mut adapter);
+    servos.with(|servos, _| servos.plug(2, 0));
+    let mut reading = JointReading::default();
+    until(|| adapter.read_joints(&mut reading).is_ok() && !reading.missing.is_empty());
+    assert_eq!(reading.missing, JointSet::of([2]), "its cable is off");
+    assert_eq!(reading.position[..DOF], before, "what is missing is where it was heard last");
+    // The others follow a stop, and the line stays open.
+    let mut rest = before;
+    rest[0] += 0.05;
+    let stop = StopPoint { position: Some(joints_of(&rest)) };
+    assert_eq!(adapter.write_stop(&stop), Ok(Stop::Confirmed));
+    until(|| adapter.read_joints(&mut reading).is_ok() && (reading.position[0] - rest[0]).abs() < 3e-3);
+    assert!(adapter.is_connected());
+    let unknown = adapter.write_enable(false).unwrap_err().to_string();
+    assert!(unknown.contains("servo 3 (elbow_flex) does not answer"), "{unknown}");
+    servos.with(|servos, _| servos.plug(2, 3));
+    until(|| adapter.read_joints(&mut reading).is_ok() && reading.missing.is_empty());
+    adapter.write_enable(false).unwrap();
+    // The gripper's servo is none of the joints.
+    servos.with(|servos, _| servos.plug(DOF, 0));
+    until(|| adapter.read_gripper_position() == Ok(None));
+    adapter.read_joints(&mut reading).unwrap();
+    assert!(reading.missing.is_empty(), "{:?}", reading.missing);
 }
 
 #[test]

@@ -190,13 +190,13 @@ impl ManipulatorAdapter for UrAdapter {
             device_ns: Some((state.time * 1e9) as u64),
             position: joints_of(&state.position),
             velocity: Some(joints_of(&state.velocity)),
-            // Motor currents are not torques.
-            effort: None,
+            // No effort: motor currents are not torques.
             valid: session.positions_are_proven().then_some(true),
             commanded: session
                 .enabled()
                 .then(|| Commanded { position: joints_of(&state.target), velocity: joints_of(&state.target_velocity) }),
             speed_fraction: Some(session.speed_fraction()),
+            ..JointReading::default()
         };
         Ok(())
     }

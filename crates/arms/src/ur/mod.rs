@@ -46,7 +46,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use address::Address;
-use dimos_core::arm::{AfterGap, Topology};
+use dimos_core::arm::{AfterGap, Field, SetpointFields, Topology};
 use dimos_core::joint::{ControlMode, JointLimits};
 use dimos_hardware::check::{Checked, ConfigError, ToolFacts, in_range};
 use dimos_hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
@@ -153,6 +153,16 @@ impl Options {
     }
 }
 
+/// What `servoj` has besides positions: gain and lookahead time of its own law, without a unit of stiffness.
+const SETPOINT: SetpointFields = SetpointFields {
+    velocity: Field::Refused("servoj does not use its argument v: URScript manual"),
+    acceleration: Field::Refused("servoj does not use its argument a: URScript manual"),
+    effort: Field::Withheld("servoj has none; direct_torque of PolyScope 5.23 and newer has, and is not used"),
+    at: Field::Refused("servoj has no time of a setpoint: URScript manual"),
+    expires: Field::Withheld("the program on the controller counts its own cycles without a setpoint"),
+    ..SetpointFields::each_as(Field::Refused("servoj has a gain without unit, 100 to 2000: URScript manual"))
+};
+
 /// Returns the limits of the configured model.
 fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("ur", SPEC.dof)?;
@@ -168,6 +178,7 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
         .digital_inputs(io::DIGITAL)
         .max_payload(io::max_payload(options.model))
         .topology((0..DOF).map(topology).collect())
+        .setpoint(SETPOINT)
         .tool(ToolFacts {
             velocity: Some(TOOL_SPEED),
             is_setting: true,

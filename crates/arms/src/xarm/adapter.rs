@@ -19,7 +19,7 @@ use super::protocol::report::Motion;
 use super::report_validity::{measured, pose};
 use super::session::Session;
 use super::{HOLDS_WHEN_DISABLED, MODES, MODES_WITHOUT_VELOCITY, Options, check, model_of};
-use dimos_core::arm::{ControllerPose, JointStatus, StopPoint};
+use dimos_core::arm::{ControllerPose, EffortKind, JointStatus, StopPoint};
 use dimos_core::joint::{ControlMode, JointLimits, joints_of};
 use dimos_hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, HandGuiding, JointMonitor, JointReading,
@@ -274,9 +274,9 @@ impl ManipulatorAdapter for XArmAdapter {
             position: self.only(&motion.position),
             velocity: motion.velocity.map(|velocity| self.only(&velocity)),
             effort: session.device.torques.then(|| self.only(&motion.torque)),
+            effort_kind: EffortKind::FromCurrent,
             valid: measured(motion, self.model, &stated(motion, session.condition())),
-            commanded: None,
-            speed_fraction: None,
+            ..JointReading::default()
         };
         Ok(())
     }

@@ -48,7 +48,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use address::Address;
-use dimos_core::arm::{AfterGap, Topology};
+use dimos_core::arm::{AfterGap, Field, SetpointFields, Topology};
 use dimos_core::joint::ControlMode;
 use dimos_hardware::adapter_util::fraction;
 use dimos_hardware::check::{Checked, ConfigError, ToolFacts};
@@ -138,6 +138,16 @@ impl Default for Options {
     }
 }
 
+/// What `servo_j` has besides positions. Its slots for speed, acceleration and time are ignored by the firmware
+/// (developer manual, register 29), and there is no mode with torques: mode 6 is a planned one (register 19).
+const SETPOINT: SetpointFields = SetpointFields {
+    velocity: Field::Refused("servo_j (register 29) ignores its speed: UFACTORY's developer manual"),
+    acceleration: Field::Refused("servo_j (register 29) ignores its acceleration: UFACTORY's developer manual"),
+    at: Field::Refused("servo_j (register 29) ignores its time: UFACTORY's developer manual"),
+    expires: Field::Refused("servo_j (register 29) has no such value: UFACTORY's developer manual"),
+    ..SetpointFields::each_as(Field::Refused("no mode of the control box takes torques: UFACTORY's developer manual"))
+};
+
 /// Returns the limits of the configured model.
 fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     let options: Options = config.options()?;
@@ -149,7 +159,7 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
         model: Some((model.option(), "link_eef")),
         ..ToolFacts::default()
     };
-    Ok(Checked::new(limits).digital_inputs(0).max_payload(model.payload()).tool(tool))
+    Ok(Checked::new(limits).digital_inputs(0).max_payload(model.payload()).tool(tool).setpoint(SETPOINT))
 }
 
 /// Returns the model of options and number of joints, or why they conflict.

@@ -11,7 +11,9 @@ use std::time::Duration;
 use super::frame::{self, MAX_FRAME, Reply, Status};
 use super::protocol::{self, Command, DOF, Hello, Mode, WireJoints};
 use super::{GRIPPER_FORCE, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, check, limits};
-use dimos_core::arm::{AnalogUnit, ControllerPose, IoInfo, IoState, JointStatus, Load, Pose, StopPoint};
+use dimos_core::arm::{
+    AnalogUnit, ControllerPose, EffortKind, IoInfo, IoState, JointSet, JointStatus, Load, Pose, Setpoint, StopPoint,
+};
 use dimos_core::clock::{Clock, Mono, MonotonicClock};
 use dimos_core::joint::{ControlMode, JointLimits, Joints, joints_of};
 use dimos_hardware::adapter::{
@@ -223,6 +225,7 @@ impl ManipulatorAdapter for YourArmAdapter {
             ControlMode::Position => Mode::Position,
             ControlMode::ServoPosition => Mode::Servo,
             ControlMode::Velocity => Mode::Velocity,
+            ControlMode::Impedance => Mode::Impedance,
             _ => return Err(AdapterError::Unsupported),
         };
         self.command(&Command::SetMode(wire))?; // refused while the arm moves
@@ -239,6 +242,7 @@ impl ManipulatorAdapter for YourArmAdapter {
             Mode::Position => ControlMode::Position,
             Mode::Servo => ControlMode::ServoPosition,
             Mode::Velocity => ControlMode::Velocity,
+            Mode::Impedance => ControlMode::Impedance,
         }
     }
 
@@ -268,6 +272,8 @@ impl ManipulatorAdapter for YourArmAdapter {
             position: from_degrees(&self.state.positions),
             velocity: Some(from_degrees(&self.state.velocities)),
             effort: Some(joints_of(&self.state.torques)),
+            effort_kind: EffortKind::Measured,
+            missing: JointSet::NONE, // name the joints whose motors do not answer, if yours can be lost one by one
             valid: None,
             commanded: None,
             speed_fraction: None,
@@ -303,6 +309,27 @@ impl ManipulatorAdapter for YourArmAdapter {
     fn write_joint_velocities(&mut self, velocities: &[f64]) -> AdapterResult<()> {
         let joints = to_degrees(velocities)?;
         self.set_point(&Command::VelocityJoints(joints)) // the controller checks the mode
+    }
+
+    /// Passes on all that a setpoint has. What it does not have is not sent: zero would be a command.
+    fn write_setpoint(&mut self, setpoint: &Setpoint) -> AdapterResult<()> {
+        if setpoint.mode == ControlMode::Position {
+            return self.write_joint_positions(setpoint.position.get(..DOF).unwrap_or_default(), 1.0);
+        }
+        let plain = |values: &Joints| finite(values.get(..DOF).unwrap_or_default());
+        let degrees = |values: &Joints| to_degrees(values.get(..DOF).unwrap_or_default());
+        let gains = match (&setpoint.stiffness, &setpoint.damping) {
+            (Some(stiffness), Some(damping)) => Some([plain(stiffness)?, plain(damping)?]),
+            _ => None,
+        };
+        self.set_point(&Command::Setpoint(protocol::Setpoint {
+            time_us: setpoint.at.0 / 1000,
+            valid_ms: setpoint.valid_for().map_or(0, |seconds| (seconds * 1000.0).ceil().clamp(1.0, 65_000.0) as u16),
+            joints: [degrees(&setpoint.position)?, degrees(&setpoint.velocity)?],
+            acceleration: setpoint.acceleration.as_ref().map(degrees).transpose()?,
+            torque: setpoint.effort.as_ref().map(plain).transpose()?,
+            gains,
+        }))
     }
 
     fn write_stop(&mut self, _rest: &StopPoint) -> AdapterResult<Stop> {

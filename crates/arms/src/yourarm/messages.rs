@@ -7,7 +7,7 @@ use dimos_hardware::transport::tcp::Endpoint;
 use dimos_hardware::wire::{Message, Place, Wire};
 
 /// Names by opcode, as on the sheet.
-const NAMES: [(u8, &str); 21] = [
+const NAMES: [(u8, &str); 22] = [
     (0x01, "HELLO"),
     (0x02, "GET_STATE"),
     (0x03, "SET_MODE"),
@@ -18,6 +18,7 @@ const NAMES: [(u8, &str); 21] = [
     (0x11, "SERVO_JOINTS"),
     (0x12, "VELOCITY_JOINTS"),
     (0x13, "MOVE_CARTESIAN"),
+    (0x14, "SETPOINT"),
     (0x20, "GRIPPER"),
     (0x21, "SET_PAYLOAD"),
     (0x22, "GET_PAYLOAD"),

@@ -21,17 +21,19 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use dimos_core::arm::{AfterGap, Topology};
+use dimos_core::arm::{AfterGap, Impedance, SetpointFields, Topology};
 use dimos_core::joint::{ControlMode, JointLimits};
 use dimos_hardware::adapter_util::fraction;
 use dimos_hardware::check::{Checked, ConfigError, ToolFacts};
 use dimos_hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec, Teach};
-use dimos_hardware::sim::arm::SimOptions;
+use dimos_hardware::sim::arm::{ControllerOptions, SimOptions, check_range};
+use dimos_hardware::sim::faults::Fault;
 use dimos_hardware::sim::io::PLAYABLE;
 use dimos_hardware::transport::tcp::Endpoint;
 
 /// The modes of the arm, in the order of their numbers on the wire.
-const MODES: &[ControlMode] = &[ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity];
+const MODES: &[ControlMode] =
+    &[ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity, ControlMode::Impedance];
 
 /// Rate of the controller's measurements [Hz].
 const NATIVE_RATE: f64 = 500.0;
@@ -45,6 +47,9 @@ const PAYLOAD: f64 = 5.0;
 const GRIPPER_MAX: f64 = 0.08;
 /// Smallest and largest force of the gripper [N].
 const GRIPPER_FORCE: (f64, f64) = (1.0, 60.0);
+
+/// How it is held in impedance mode, and what it takes at most (§3 of the sheet) [Nm/rad, Nm·s/rad].
+const IMPEDANCE: Impedance = Impedance::uniform((150.0, 8.0), (500.0, 50.0));
 
 /// YourArm's row in the adapter table.
 pub const SPEC: AdapterSpec = AdapterSpec {
@@ -101,9 +106,12 @@ const JERK: f64 = 100.0;
 fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("yourarm", SPEC.dof)?;
     let (options, limits) = (config.options::<Options>()?, limits());
-    options.sim.check("yourarm", &limits, PLAYABLE)?;
+    options.sim.kit().check("yourarm", &limits, PLAYABLE)?;
+    check_range("servo_stiffness", options.sim.servo_stiffness, 0.0..=MAX_SERVO_STIFFNESS, "Nm/rad")?;
     let tool = ToolFacts { model: Some(("yourarm", "flange")), ..ToolFacts::default() };
-    Ok(Checked::new(limits).digital_inputs(protocol::DIGITAL).max_payload(PAYLOAD).tool(tool))
+    let checked = Checked::new(limits).digital_inputs(protocol::DIGITAL).max_payload(PAYLOAD).tool(tool);
+    // SETPOINT has all of it.
+    Ok(checked.setpoint(SetpointFields::ALL).impedance(IMPEDANCE))
 }
 
 /// Returns the joint limits in SI units.
@@ -126,11 +134,57 @@ pub struct Options {
     /// Whether to use the gripper.
     pub gripper: bool,
     /// Settings of the emulator.
-    pub sim: SimOptions,
+    pub sim: Sim,
 }
 
 impl Default for Options {
     fn default() -> Self {
-        Self { speed_scale: 1.0, gripper: true, sim: SimOptions::default() }
+        Self { speed_scale: 1.0, gripper: true, sim: Sim::default() }
+    }
+}
+
+/// Largest stiffness of the emulated position control [Nm/rad].
+const MAX_SERVO_STIFFNESS: f64 = 1e5;
+
+/// Settings of the emulator of a YourArm.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Sim {
+    /// Joint positions at power-up [rad], one per joint; empty for the arm's default pose.
+    pub initial_positions: Vec<f64>,
+    /// Lag of the joints behind their servo setpoints, 0 to 0.5 [s].
+    #[schemars(range(min = 0, max = 0.5))]
+    pub lag: f64,
+    /// Droop of the joints below their targets at rest under load, 0 to 0.2 [rad].
+    #[schemars(range(min = 0, max = 0.2))]
+    pub droop: f64,
+    /// Faults, and when they begin (seconds after the first connection).
+    pub faults: Vec<Fault>,
+    /// What the controller does otherwise than its documents say.
+    pub controller: ControllerOptions,
+    /// Stiffness of the position control [Nm/rad] of an arm with the masses of `builtin:yourarm`, which it sags under
+    /// by its weight / stiffness; 0: its weight is nothing.
+    #[schemars(range(min = 0, max = 100000))]
+    pub servo_stiffness: f64,
+}
+
+impl Default for Sim {
+    fn default() -> Self {
+        Self::from(SimOptions::default())
+    }
+}
+
+impl From<SimOptions> for Sim {
+    fn from(kit: SimOptions) -> Self {
+        let SimOptions { initial_positions, lag, droop, faults, controller } = kit;
+        Self { initial_positions, lag, droop, faults, controller, servo_stiffness: 0.0 }
+    }
+}
+
+impl Sim {
+    /// Returns those that all emulators have.
+    fn kit(&self) -> SimOptions {
+        let Self { initial_positions, lag, droop, faults, controller, .. } = self.clone();
+        SimOptions { initial_positions, lag, droop, faults, controller }
     }
 }

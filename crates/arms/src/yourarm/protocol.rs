@@ -17,6 +17,7 @@ pub type WireJoints = [f64; DOF];
 
 /// What the controller can be asked.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[expect(clippy::large_enum_variant, reason = "one at a time, and boxing it would allocate in every cycle")]
 pub enum Command {
     /// Who are you?
     Hello,
@@ -41,6 +42,8 @@ pub enum Command {
     ServoJoints(WireJoints),
     /// Joint velocities [deg/s]; the arm stops when no other follows within 200 ms.
     VelocityJoints(WireJoints),
+    /// Next setpoint with all that it has.
+    Setpoint(Setpoint),
     /// Plans and makes a move to a pose.
     MoveCartesian {
         /// Speed [% of the top speed].
@@ -72,6 +75,23 @@ pub enum Command {
     SetAnalog(u8, f64),
 }
 
+/// A setpoint with all that it has; what is `None` is not on the wire.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Setpoint {
+    /// The client's time when it was made [µs].
+    pub time_us: u64,
+    /// How long it holds [ms], at most 65 s; 0: until the next one.
+    pub valid_ms: u16,
+    /// Positions [deg] and velocities [deg/s].
+    pub joints: [WireJoints; 2],
+    /// Accelerations [deg/s²].
+    pub acceleration: Option<WireJoints>,
+    /// Torques [Nm].
+    pub torque: Option<WireJoints>,
+    /// Stiffness [Nm/rad] and damping [Nm·s/rad].
+    pub gains: Option<[WireJoints; 2]>,
+}
+
 impl Command {
     /// The command's number on the wire.
     pub fn opcode(&self) -> u8 {
@@ -85,6 +105,7 @@ impl Command {
             Self::MoveJoints { .. } => 0x10,
             Self::ServoJoints(_) => 0x11,
             Self::VelocityJoints(_) => 0x12,
+            Self::Setpoint(_) => 0x14,
             Self::MoveCartesian { .. } => 0x13,
             Self::Gripper(_) => 0x20,
             Self::Grip(..) => 0x25,
@@ -112,6 +133,7 @@ impl Command {
             Self::MoveJoints { .. } => "MOVE_JOINTS",
             Self::ServoJoints(_) => "SERVO_JOINTS",
             Self::VelocityJoints(_) => "VELOCITY_JOINTS",
+            Self::Setpoint(_) => "SETPOINT",
             Self::MoveCartesian { .. } => "MOVE_CARTESIAN",
             Self::Gripper(_) => "GRIPPER",
             Self::Grip(..) => "GRIP",
@@ -139,6 +161,8 @@ pub enum Mode {
     Servo = 1,
     /// Keeps velocities.
     Velocity = 2,
+    /// Moves by stiffness, damping and torques.
+    Impedance = 3,
 }
 
 impl Mode {
@@ -147,6 +171,7 @@ impl Mode {
             0 => Some(Self::Position),
             1 => Some(Self::Servo),
             2 => Some(Self::Velocity),
+            3 => Some(Self::Impedance),
             _ => None,
         }
     }
@@ -172,6 +197,7 @@ pub fn encode<'a>(command: &Command, sequence: u16, frame: &'a mut [u8; MAX_FRAM
             out.floats(joints);
         }
         Command::ServoJoints(joints) | Command::VelocityJoints(joints) => out.floats(joints),
+        Command::Setpoint(setpoint) => put_setpoint(&mut out, setpoint),
         Command::MoveCartesian { speed, pose } => {
             out.floats(&[*speed]);
             out.floats(pose);
@@ -185,6 +211,23 @@ pub fn encode<'a>(command: &Command, sequence: u16, frame: &'a mut [u8; MAX_FRAM
         }
     }
     out.finish(command.opcode(), sequence)
+}
+
+/// Flags of SETPOINT: which lists follow the velocities.
+const ACCELERATION: u8 = 1;
+const TORQUE: u8 = 2;
+const GAINS: u8 = 4;
+
+fn put_setpoint(out: &mut Writer<'_>, setpoint: &Setpoint) {
+    let has = |flag: u8, there: bool| if there { flag } else { 0 };
+    let flags = has(ACCELERATION, setpoint.acceleration.is_some())
+        | has(TORQUE, setpoint.torque.is_some())
+        | has(GAINS, setpoint.gains.is_some());
+    out.put(&[flags]);
+    out.put(&setpoint.valid_ms.to_le_bytes());
+    out.put(&setpoint.time_us.to_le_bytes());
+    let lists = setpoint.joints.iter().chain(&setpoint.acceleration).chain(&setpoint.torque);
+    lists.chain(setpoint.gains.iter().flatten()).for_each(|list| out.floats(list));
 }
 
 // --- Replies: status u8, then data; a refusal carries the controller's error code (u16) ---

@@ -4,6 +4,32 @@ use crate::yourarm::golden::{self, JOINTS, POSE, bytes};
 use dimos_hardware::transport::tcp::Scan;
 use proptest::prelude::*;
 
+const VELOCITIES: WireJoints = [1.0, -2.0, 3.0, -4.0, 5.0, -6.0];
+
+#[test]
+fn setpoints_have_what_they_command_and_nothing_else() {
+    let bare = Setpoint {
+        time_us: 1,
+        valid_ms: 0,
+        joints: [JOINTS, VELOCITIES],
+        acceleration: None,
+        torque: None,
+        gains: None,
+    };
+    let full = Setpoint {
+        time_us: 123_456_789,
+        valid_ms: 40,
+        acceleration: Some([0.5, -0.5, 1.0, -1.0, 2.0, -2.0]),
+        torque: Some([8.0, -7.0, 6.0, -5.0, 4.0, -3.0]),
+        gains: Some([[100.0, 90.0, 80.0, 70.0, 60.0, 50.0], [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]]),
+        ..bare
+    };
+    let mut frame = [0; MAX_FRAME];
+    assert_eq!(encode(&Command::Setpoint(full), 23, &mut frame), bytes(golden::SETPOINT));
+    assert_eq!(encode(&Command::Setpoint(bare), 24, &mut frame), bytes(golden::SETPOINT_BARE));
+    assert_eq!(encode(&Command::SetMode(Mode::Impedance), 25, &mut frame), bytes(golden::SET_MODE_IMPEDANCE));
+}
+
 #[test]
 fn commands_are_the_golden_bytes() {
     let mut frame = [0; MAX_FRAME];

@@ -8,7 +8,7 @@ use crate::rest::written::Issued;
 use crate::rest::{Gap, Start, braking};
 use dimos_core::arm::{AfterGap, ArmState, Link};
 use dimos_core::clock::Mono;
-use dimos_core::joint::{ControlMode, MAX_DOF};
+use dimos_core::joint::{ControlMode, Joints, MAX_DOF};
 use dimos_core::telemetry::{Cause, Phase};
 
 /// A slowed arm is waited for after a gap as if it had this fraction of its speed, or more.
@@ -43,6 +43,7 @@ impl ArmControl {
     pub(super) fn start(&mut self, mode: ControlMode, now: Mono) {
         if !matches!(self.rest.start, Start::Taking(..)) {
             self.rest.start = Start::Taking(now, mode);
+            self.too_fast_since = None;
         }
     }
 
@@ -71,7 +72,8 @@ impl ArmControl {
                     return;
                 }
                 let since = Since {
-                    written: self.rest.last_written(),
+                    // Hands and gravity have moved a compliant one.
+                    written: self.rest.last_written().filter(|last| last.mode != ControlMode::Impedance),
                     inexact: if self.rest.by_velocity { super::MAX_CORRECTION } else { 0.0 },
                     acknowledged: self.rest.acknowledged,
                     outside: self.rest.outside,
@@ -129,6 +131,7 @@ impl ArmControl {
                 // In position mode the joints are to rest at the last setpoint; in velocity mode they continue.
                 limiter.rewind(*q, if mode.is_position() { 0.0 } else { *v });
             }
+            self.efforts.iter_mut().for_each(|efforts| efforts.rewind(last.effort.as_ref()));
             self.tracking.pause();
             return;
         }
@@ -165,24 +168,38 @@ impl ArmControl {
         }
     }
 
-    /// Keeps the command that leaves the tick, to know later what was written.
-    pub fn issue(&mut self, now: Mono, dt: f64) {
+    /// Completes the command that leaves the tick, and keeps it to know later what was written. `report` gets the joint
+    /// and the effort whenever a limit begins to change one.
+    pub fn issue(&mut self, now: Mono, dt: f64, report: impl FnMut(usize, f64)) {
         let Some(mode) = self.command.mode else { return };
-        let mut issued = Issued { seq: self.command.seq, at: now, position: [0.0; MAX_DOF], velocity: [0.0; MAX_DOF] };
+        let mut issued = Issued { seq: self.command.seq, at: now, mode, ..Issued::default() };
         let out = issued.position.iter_mut().zip(&mut issued.velocity);
         for (((q, v), limiter), pace) in out.zip(&self.limiters).zip(&mut self.pace) {
             (*q, *v, *pace) = (limiter.position(), limiter.velocity(), limiter.covered() / dt);
         }
         self.rest.by_velocity = !mode.is_position();
-        self.rest.written.issue(issued);
         let speed = self.speed_fraction();
         self.command.velocity = std::array::from_fn(|j| self.commanded_velocity(j));
+        self.command.acceleration = self.commanded_acceleration(speed);
+        self.add_efforts(mode, now, dt, report);
+        issued.effort = self.command.effort;
+        self.rest.written.issue(issued);
         self.command.rest = Some(braking::rest_point(&self.limiters, dt));
         if self.rest.gap.is_none() {
             let velocities = (!mode.is_position()).then(|| self.command.values.map(|v| v * speed));
             self.tracking.pass(now, speed);
             self.tracking.push(now, &issued.position, velocities.as_ref());
         }
+    }
+
+    /// Returns the accelerations of the last command [rad/s²], in the time that passes here.
+    fn commanded_acceleration(&self, speed: f64) -> Joints {
+        let mut accelerations = [0.0; MAX_DOF];
+        for ((out, limiter), before) in accelerations.iter_mut().zip(&self.limiters).zip(&self.before) {
+            let covered = limiter.covered();
+            *out = if covered > 0.0 { (limiter.velocity() - before.velocity()) / covered * speed * speed } else { 0.0 };
+        }
+        accelerations
     }
 
     /// The arm is no longer commanded while setpoints do not reach it: it rests at the last one that did.

@@ -56,6 +56,9 @@ impl ArmControl {
             self.hold(mode, dt);
             return Routed::Refused(j, refusal);
         }
+        if let Some(efforts) = &mut self.efforts {
+            (0..self.config.dof).for_each(|j| efforts.ask(j, ask(j).and_then(|ask| ask.compliance)));
+        }
         let own = self.own_time(dt);
         if own == 0.0 {
             self.stays(mode, dt);
@@ -178,6 +181,7 @@ impl ArmControl {
             let ask = ask(j)?;
             let refusal = match mode {
                 ControlMode::Velocity => (!ask.value.is_finite()).then_some(Refusal::NonFinite),
+                _ if ask.compliance.is_some_and(|compliance| !compliance.is_finite()) => Some(Refusal::NonFinite),
                 _ => limiter.refuses(ask.value, ask.new_task),
             };
             Some((j, refusal?))
@@ -190,6 +194,10 @@ impl ArmControl {
         match demand {
             Demand::Velocities => velocity,
             Demand::Positions => self.config.position_mode(),
+            Demand::Impedance => {
+                let complies = self.efforts.as_ref().is_some_and(|efforts| efforts.comply());
+                Some(ControlMode::Impedance).filter(|mode| complies && self.config.modes.contains(mode))
+            }
             Demand::Nothing => self.command.mode.or_else(|| self.config.position_mode()).or(velocity),
         }
     }

@@ -37,6 +37,11 @@ impl ArmControl {
         }
         let from = before.position();
         let to = if braking { from + velocity * dt } else { limiter.position() };
+        if mode == ControlMode::Impedance {
+            // It may be anywhere between where it is pushed and where it is commanded.
+            let (middle, spread) = (0.5 * (from + measured), 0.5 * (from - measured).abs());
+            return JointStep { from: middle, to: middle + (to - from), velocity, decrease, spread };
+        }
         JointStep { from, to, velocity, decrease, spread: 0.0 }
     }
 
@@ -132,6 +137,15 @@ mod tests {
             arm.before.copy_from_slice(&arm.limiters);
         }
         assert!(arm.was_at_rest());
+    }
+
+    #[test]
+    fn a_joint_that_yields_may_be_anywhere_between_its_reading_and_its_setpoint() {
+        let mut arm = arm(ControlMode::Impedance, (0.5, 0.4), (0.504, 0.4));
+        see(&mut arm, 1, [0.1, 0.5]);
+        let step = arm.step(0, false, DT);
+        let expected = JointStep { from: 0.3, to: 0.304, velocity: 0.4, decrease: 5.0 * DT, spread: 0.2 };
+        assert!(close(step, expected), "{step:?}");
     }
 
     #[test]

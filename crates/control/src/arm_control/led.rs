@@ -6,11 +6,6 @@ use crate::rest::Relief;
 use dimos_core::clock::Mono;
 use dimos_core::telemetry::{Cause, LedBy, Outcome, Phase};
 
-/// A joint that the arm's controller moves may have this much more than its velocity limit.
-const OVERSPEED: f64 = 1.1;
-/// Time above that [s]: one velocity may be an estimate from noisy positions.
-const TOO_FAST_FOR: f64 = 0.008;
-
 impl ArmControl {
     /// The arm will be led. It must be at rest; its own controller may only start from within its range.
     pub fn lead(&mut self, by: LedBy, arm: u16, now: Mono) -> Outcome {
@@ -28,7 +23,7 @@ impl ArmControl {
             self.command.lead_seq = self.command.lead_seq.wrapping_add(1);
             self.rest.forget_written();
             self.command.rest = None;
-            self.led_too_fast = None;
+            self.too_fast_since = None;
         }
         outcome
     }
@@ -78,15 +73,7 @@ impl ArmControl {
         if let Some((joint, position, _)) = self.out_of_range() {
             return Some(Cause::LedOutOfRange(joint as u16, position));
         }
-        let velocities = self.feedback.state().velocity.iter().zip(&self.limiters).enumerate();
-        let too_fast = { velocities }.find(|(_, (v, limiter))| v.abs() > OVERSPEED * limiter.bounds().velocity);
-        let Some((joint, (velocity, _))) = too_fast else {
-            self.led_too_fast = None;
-            return None;
-        };
-        let stamp = self.feedback.state().stamp;
-        let since = *self.led_too_fast.get_or_insert(stamp);
-        (stamp.seconds_since(since) >= TOO_FAST_FOR).then_some(Cause::LedTooFast(joint as u16, *velocity))
+        self.too_fast().map(|(joint, velocity)| Cause::LedTooFast(joint, velocity))
     }
 
     /// Returns the first joint outside its range, its position, and how far outside it is [rad].

@@ -8,6 +8,7 @@
 //! ```
 
 mod delivery;
+mod effort;
 mod follow;
 mod guarded;
 mod led;
@@ -24,7 +25,7 @@ use super::config::ArmConfig;
 use super::failsafe::{Failsafe, Freshness};
 use super::limit::{Limiter, Refusal};
 use super::rest::{Rest, SETTLED, Start, braking};
-use super::task_body::Demand;
+use super::task_body::{Compliance, Demand};
 use super::task_robot::FramePose;
 use super::tool_limit::ToolLimiter;
 use dimos_core::arm::{ArmCommand, ArmState, Link, Topology};
@@ -41,6 +42,13 @@ const ENABLING_REJECTED: f64 = 0.008;
 const DRIFT: f64 = 0.05;
 const MAX_CORRECTION: f64 = 0.05;
 
+/// A joint that something else than setpoints moves (the arm's controller, or in impedance mode a hand) may have this
+/// much more than its velocity limit.
+const OVERSPEED: f64 = 1.1;
+/// Time above that [s]: one velocity may be an estimate from noisy positions.
+const TOO_FAST_FOR: f64 = 0.008;
+
+use effort::Efforts;
 pub use own_time::effective;
 
 /// One arm inside the tick.
@@ -73,8 +81,10 @@ pub struct ArmControl {
     resumed: Option<Mono>,
     /// Positions that velocities may still be corrected by measurements [rad].
     correction: f64,
-    /// When the first of the readings was measured in which the arm's own controller moves a joint too fast.
-    led_too_fast: Option<Mono>,
+    /// When the first of the readings was measured in which something else than setpoints moves a joint too fast.
+    too_fast_since: Option<Mono>,
+    /// What it is commanded beside positions; `None`: nothing.
+    efforts: Option<Box<Efforts>>,
 }
 
 /// Request to one joint in this tick.
@@ -88,6 +98,8 @@ pub struct JointRequest {
     pub speed: f64,
     /// The request does not slow down with the arm's controller alone: its task moves other arms, too.
     pub shared: bool,
+    /// In impedance mode: what the task asks beside the position; `None`: the joint is held as the arm holds.
+    pub compliance: Option<Compliance>,
 }
 
 /// Result of an arm's requests.
@@ -128,6 +140,7 @@ impl ArmControl {
             feedback: Feedback::new(&config),
             tracking: Tracking::new(&config, period),
             rest: Rest::new(&config, period),
+            efforts: Efforts::new(config.effort.as_deref()),
             config,
             first,
             failsafe: Failsafe::default(),
@@ -136,7 +149,7 @@ impl ArmControl {
             started_at: Mono::ZERO,
             resumed: None,
             correction: 0.0,
-            led_too_fast: None,
+            too_fast_since: None,
         }
     }
 
@@ -168,6 +181,8 @@ impl ArmControl {
             LimitKind::Velocity => Bound::Velocity(joint as u16),
             LimitKind::Acceleration => Bound::Acceleration(joint as u16),
             LimitKind::Tool => Bound::Tool,
+            // No effort limits a motion.
+            LimitKind::Effort => return None,
         })
     }
 
@@ -336,6 +351,11 @@ impl ArmControl {
                 (by.abs() > limit).then_some(Cause::MovedWhileActivating(joint, by))
             }
             Phase::Ready if supervised && self.rest.gap.is_none() && !self.is_starting() => {
+                if state.mode == ControlMode::Impedance {
+                    // It yields: what may not be is that it is pushed, or jumps back, too fast.
+                    self.tracking.pause();
+                    return self.too_fast().map(|(joint, velocity)| Cause::TooFast(joint, velocity));
+                }
                 self.tracking.supervise(state, dt)
             }
             Phase::Led => {
@@ -410,6 +430,7 @@ impl ArmControl {
         self.rest.enter(held, self.failsafe.cause(), braking, foreign);
         self.before.copy_from_slice(&self.limiters);
         self.tool_was_limited = std::mem::take(&mut self.tool_limited);
+        self.efforts.iter_mut().for_each(|efforts| efforts.ask_nothing());
         match phase {
             Phase::Unknown | Phase::Disabled => {
                 self.command.mode = None;

@@ -4,7 +4,9 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use crate::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, LeaderJoint, TaskConfig, TaskKind};
+use crate::config::{
+    ArmConfig, CONFIG_VERSION, CoordinatorConfig, EffortConfig, FeedForward, LeaderJoint, TaskConfig, TaskKind,
+};
 use crate::coordinator::{Coordinator, TickTime};
 use crate::request::{Envelope, Goal, Motion, Request};
 use crate::task::Task;
@@ -12,7 +14,7 @@ use crate::task_body::{Demand, TargetKind};
 use crate::task_robot::TaskKinematics;
 use crate::task_spec::{TaskSpec, TaskTable};
 use crate::tasks::chunk::curve;
-use dimos_core::arm::{ArmState, Link, Supervision, VelocitySource};
+use dimos_core::arm::{ArmState, EffortLimits, Impedance, Link, Supervision, VelocitySource};
 use dimos_core::clock::Mono;
 use dimos_core::joint::{ControlMode, JointLimits, Joints, MAX_DOF, joints_of};
 use dimos_core::telemetry::{Event, Outcome, Phase, TaskState};
@@ -335,13 +337,24 @@ impl Bench {
     }
 }
 
+/// An arm that yields, and is fed nothing forward.
+fn effort() -> EffortConfig {
+    EffortConfig {
+        limits: EffortLimits { max: [20.0; MAX_DOF], rate: [200.0; MAX_DOF] },
+        feed_forward: FeedForward::None,
+        dynamics: None,
+        impedance: Some(Impedance::uniform((100.0, 10.0), (500.0, 50.0))),
+    }
+}
+
 fn config(spec: &TaskSpec, robot: &TaskKinematics) -> CoordinatorConfig {
     let arm = ArmConfig {
         tool: None,
+        effort: Some(Box::new(effort())),
         name: "arm".to_owned(),
         dof: DOF,
         limits: JointLimits::uniform(DOF, 2.9, 2.0).with_defaults(),
-        modes: vec![ControlMode::ServoPosition, ControlMode::Velocity],
+        modes: vec![ControlMode::ServoPosition, ControlMode::Velocity, ControlMode::Impedance],
         gripper: false,
         gripper_info: Default::default(),
         own_velocity: Vec::new(),

@@ -38,6 +38,9 @@ fn claims(bench: &mut Bench) -> Result<(), String> {
             if !claim.value.is_finite() {
                 return Err(format!("it claims {} for joint {joint}", claim.value));
             }
+            if task.compliance(joint).is_some_and(|compliance| !compliance.is_finite()) {
+                return Err(format!("the compliance of joint {joint} is not finite: {:?}", task.compliance(joint)));
+            }
             seen += 1;
         }
     }

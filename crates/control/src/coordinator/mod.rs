@@ -22,7 +22,7 @@ use super::task_body::JointView;
 use super::task_leader::gripper_target;
 use dimos_core::arm::ArmState;
 use dimos_core::clock::Mono;
-use dimos_core::telemetry::{ArmSample, Bound, Cause, Event, Origin, Phase, Reason, TaskState};
+use dimos_core::telemetry::{ArmSample, Bound, Cause, Event, LimitKind, Origin, Phase, Reason, TaskState};
 use dimos_core::until::Sensed;
 
 use interruptions::Watched;
@@ -178,12 +178,15 @@ impl Coordinator {
                 *view = JointView {
                     position: arm.state().position.get(j).copied().unwrap_or_default(),
                     velocity: arm.state().velocity.get(j).copied().unwrap_or_default(),
+                    effort: measured_effort(arm.state(), j),
                     commanded: limiter.position(),
                     commanded_velocity: arm.commanded_velocity(j),
                     lower: limiter.bounds().lower,
                     upper: limiter.bounds().upper,
                     acceleration: limiter.bounds().acceleration,
                     velocity_limit: limiter.bounds().velocity,
+                    commanded_effort: commanded_effort(arm, j),
+                    effort_limit: arm.config().effort.as_ref().and_then(|own| own.limits.max.get(j).copied()),
                     jerk: arm.config().limits.jerk_max.get(j).copied().unwrap_or(dimos_core::joint::DEFAULT_JERK),
                     tracking_error: arm.tracking_error(j),
                     droop,
@@ -349,7 +352,8 @@ impl Coordinator {
                     let task = tasks.get(task as usize)?;
                     let speed = if task.applies_speed() { 1.0 } else { pace };
                     let new_task = arbiter.winner_changed(first + j);
-                    Some(JointRequest { value, new_task, speed, shared: task.shares_time })
+                    let compliance = task.compliance((first + j) as u16);
+                    Some(JointRequest { value, new_task, speed, shared: task.shares_time, compliance })
                 },
                 self.step,
                 time.now,
@@ -379,7 +383,13 @@ impl Coordinator {
         }
         self.guard();
         let dt = self.period;
-        self.arms.iter_mut().for_each(|arm| arm.issue(time.now, dt));
+        let output = &mut self.output;
+        for arm in &mut self.arms {
+            let first = arm.first();
+            arm.issue(time.now, dt, |j, asked| {
+                output.report(Event::Limited((first + j) as u16, LimitKind::Effort, asked));
+            });
+        }
     }
 
     /// Ends the task whose request was refused with a fault, and holds the arm.
@@ -421,4 +431,15 @@ impl Coordinator {
             }
         }
     }
+}
+
+/// Returns the measured effort of a joint, if the arm reports it and its motor answers.
+fn measured_effort(state: &ArmState, joint: usize) -> Option<f64> {
+    state.effort.filter(|_| !state.missing.contains(joint)).and_then(|effort| effort.get(joint).copied())
+}
+
+/// Returns the effort that the last command has for a joint.
+fn commanded_effort(arm: &ArmControl, joint: usize) -> Option<f64> {
+    let command = arm.command();
+    command.effort.filter(|_| command.mode.is_some()).and_then(|effort| effort.get(joint).copied())
 }

@@ -47,7 +47,7 @@ impl TickOutput {
     /// Creates the output of this many arms, tasks and joints, with room for all that one tick reports and retires.
     pub(super) fn new(arms: usize, tasks: usize, joints: usize) -> Self {
         // Each request has an outcome and may change a task; arms, tasks and joints report a few events at most.
-        let events = 2 * REQUESTS_PER_TICK + 6 * (arms + tasks) + joints;
+        let events = 2 * REQUESTS_PER_TICK + 6 * (arms + tasks) + 2 * joints;
         // Each task may end the motion that it has, and each request one more.
         let motions = 2 * tasks + REQUESTS_PER_TICK;
         Self {
@@ -84,7 +84,7 @@ mod tests {
         };
         assert_eq!(room(2, 0, 0), (12, 0));
         assert_eq!(room(0, 3, 0), (18, 6));
-        assert_eq!(room(2, 3, 13), (12 + 18 + 13, 6));
+        assert_eq!(room(2, 3, 13), (12 + 18 + 26, 6));
     }
 
     #[test]

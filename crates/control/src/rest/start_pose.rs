@@ -98,7 +98,7 @@ mod tests {
     }
 
     fn written(q: [f64; 2], v: f64) -> Issued {
-        Issued { seq: 9, at: Mono(1), position: joints_of(&q), velocity: joints_of(&[v, 0.0]) }
+        Issued { seq: 9, at: Mono(1), position: joints_of(&q), velocity: joints_of(&[v, 0.0]), ..Issued::default() }
     }
 
     fn take(read: [f64; 2], written: Option<&Issued>, acknowledged: bool) -> Result<[f64; 2], Cause> {

@@ -5,7 +5,7 @@
 use std::time::Duration;
 
 use dimos_core::clock::Mono;
-use dimos_core::joint::{Joints, MAX_DOF};
+use dimos_core::joint::{ControlMode, Joints, MAX_DOF};
 
 /// Two setpoints at their regular distance are no gap, even if one between them was lost [periods].
 const PERIODS: u32 = 2;
@@ -21,6 +21,17 @@ pub struct Issued {
     pub position: Joints,
     /// Commanded velocities [rad/s].
     pub velocity: Joints,
+    /// The mode of all that.
+    pub mode: ControlMode,
+    /// Efforts beside the arm's own control [Nm or N].
+    pub effort: Option<Joints>,
+}
+
+impl Default for Issued {
+    fn default() -> Self {
+        let (position, velocity, mode) = ([0.0; MAX_DOF], [0.0; MAX_DOF], ControlMode::default());
+        Self { seq: 0, at: Mono::ZERO, position, velocity, mode, effort: None }
+    }
 }
 
 /// The commands of the last ticks of one arm, and the newest of them that was written.
@@ -38,7 +49,7 @@ impl Written {
     pub fn new(tick: Duration, write: Duration, tolerance: Duration) -> Self {
         let limit = tolerance.max(PERIODS * tick.max(write));
         let kept = (limit.as_nanos() / tick.as_nanos().max(1)) as usize + 4;
-        let none = Issued { seq: 0, at: Mono::ZERO, position: [0.0; MAX_DOF], velocity: [0.0; MAX_DOF] };
+        let none = Issued::default();
         // Time stamps lie on the tick's grid; a period is rounded to ns.
         Self { issued: vec![none; kept.min(4096)], next: 0, last: none, limit: limit + Duration::from_micros(1) }
     }
@@ -92,7 +103,7 @@ mod tests {
         let at = |k: u64| Mono(k * 10_000_000);
         let issue = |w: &mut Written, k: u64| {
             let position = dimos_core::joint::joints_of(&[k as f64]);
-            w.issue(Issued { seq: k, at: at(k), position, velocity: [0.0; MAX_DOF] });
+            w.issue(Issued { seq: k, at: at(k), position, ..Issued::default() });
         };
         for k in 1..50 {
             written.report(k - 1);

@@ -268,6 +268,7 @@ fn code(cause: Cause) -> Vec<f64> {
         | Cause::PositionJump(_, by)
         | Cause::MovedWhileActivating(_, by)
         | Cause::LedTooFast(_, by)
+        | Cause::TooFast(_, by)
         | Cause::LedOutOfRange(_, by)
         | Cause::TurnLost(_, by)
         | Cause::ReadingInconsistent(_, by)
@@ -285,6 +286,7 @@ fn unit(kind: LimitKind) -> &'static str {
         LimitKind::Velocity => "rad/s",
         LimitKind::Acceleration => "rad/s²",
         LimitKind::Tool => "m/s",
+        LimitKind::Effort => "Nm",
     }
 }
 

@@ -166,6 +166,10 @@ pub enum Cause {
     LedTooFast(u16, f64),
     /// The arm's controller moved a joint (counted from 0) to this position, outside its range [rad].
     LedOutOfRange(u16, f64),
+    /// A joint moved at this velocity in impedance mode, beyond 1.1 times its limit [rad/s].
+    TooFast(u16, f64),
+    /// A joint no longer answers: its motor is lost.
+    JointLost(u16),
     /// The arm is in a mode that this run did not order.
     ModeChanged,
     /// The motors were enabled, and not by this run.
@@ -221,6 +225,8 @@ impl Cause {
             Self::SetpointRefused => "setpoint_refused",
             Self::MovedWhileActivating(..) => "moved_while_activating",
             Self::LedTooFast(..) => "led_too_fast",
+            Self::TooFast(..) => "too_fast",
+            Self::JointLost(_) => "joint_lost",
             Self::LedOutOfRange(..) => "led_out_of_range",
             Self::ModeChanged => "mode_changed",
             Self::PowerChanged => "power_changed",
@@ -351,6 +357,8 @@ named! {
         Acceleration = "acceleration",
         /// Velocity of all joints reduced: the tool would be too fast.
         Tool = "tool speed",
+        /// Effort reduced.
+        Effort = "effort",
     }
 }
 
@@ -368,7 +376,7 @@ pub enum Event {
     ModeConflict(u16, u16, u16),
     /// An arm changed its phase.
     Arm(u16, Phase, Cause),
-    /// A joint's commands began to be limited: joint, limit, commanded value [rad, rad/s or rad/s²].
+    /// A joint's commands began to be limited: joint, limit, commanded value [rad, rad/s, rad/s² or Nm].
     Limited(u16, LimitKind, f64),
     /// Periods were skipped: number, lateness of the tick [ns].
     Overrun(u32, u64),

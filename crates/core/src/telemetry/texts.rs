@@ -205,6 +205,13 @@ pub fn cause_text(cause: Cause) -> String {
         Cause::LedOutOfRange(joint, position) => {
             format!("the controller moved joint {} to {position:.4} rad, outside its range", joint + 1)
         }
+        Cause::TooFast(joint, velocity) => format!(
+            "joint {} moved at {velocity:.3} rad/s, beyond 1.1 times its velocity limit, in impedance mode",
+            joint + 1
+        ),
+        Cause::JointLost(joint) => {
+            format!("joint {} no longer answers: its motor is without power, or its cable is loose", joint + 1)
+        }
         Cause::MovedWhileActivating(joint, by) => {
             format!("joint {} moved by {} while the arm was being enabled", joint + 1, angle(by))
         }

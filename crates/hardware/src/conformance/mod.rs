@@ -17,6 +17,7 @@ mod lifecycle;
 mod lost;
 mod motion;
 mod parts;
+mod setpoints;
 mod speed;
 mod stale;
 mod stops;
@@ -88,6 +89,7 @@ pub fn checks() -> impl Iterator<Item = &'static Check> {
         gripper::CHECKS,
         streamed_state::CHECKS,
         motion::CHECKS,
+        setpoints::CHECKS,
         speed::CHECKS,
         stops::CHECKS,
         faults::CHECKS,

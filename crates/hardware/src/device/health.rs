@@ -4,8 +4,8 @@ use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Mutex, OnceLock};
 
-use super::Details;
 use super::identity::Identity;
+use super::{Details, History};
 use crate::adapter::{AdapterError, AdapterResult, RobotState};
 use dimos_core::clock::Mono;
 use dimos_core::sync::lock;
@@ -63,6 +63,8 @@ pub struct Health {
     pub stop_sent: AtomicU32,
     /// Moving average of the time between states [ns]. An average of rates would give short intervals too much weight.
     interval_ns: AtomicU64,
+    /// Joint positions of the last 2 s.
+    pub(super) history: History,
     text: Mutex<Text>,
     identity: Mutex<Identity>,
     /// Whether another arm answers than the one of the run.

@@ -10,6 +10,7 @@
 mod details;
 pub mod gripper;
 mod health;
+mod history;
 mod identity;
 mod plausible;
 mod thread;
@@ -22,15 +23,16 @@ use std::time::Duration;
 
 pub use details::Details;
 pub use health::{Episode, Health, Note};
+pub use history::History;
 pub use identity::Identity;
 pub use thread::Way;
 
 use crate::adapter::{AdapterError, AdapterResult, ManipulatorAdapter, ManipulatorInfo, Reduction};
 use dimos_core::arm::{
-    ArmCommand, ArmState, Bridging, FactoryKinematics, GripperInfo, IoInfo, IoState, Load, OutputValue, StopInput,
-    Supervision,
+    ArmCommand, ArmState, Bridging, EffortLimits, FactoryKinematics, GripperInfo, Impedance, IoInfo, IoState, Load,
+    OutputValue, SetpointFields, StopInput, Supervision,
 };
-use dimos_core::clock::Clock;
+use dimos_core::clock::{Clock, Mono};
 use dimos_core::joint::{JointLimits, Joints};
 use dimos_rt::due::Due;
 use dimos_rt::heartbeat::Heartbeat;
@@ -82,6 +84,10 @@ pub struct Setup {
     pub gravity: Option<[f64; 3]>,
     /// Highest speed of the tool [m/s], if it is limited: the blueprint's, or the vendor's.
     pub tool_velocity: Option<f64>,
+    /// Highest efforts beside the arm's own control; `None`: none is written.
+    pub efforts: Option<EffortLimits>,
+    /// Gains in impedance mode; `None`: none are written.
+    pub impedance: Option<Impedance>,
 }
 
 impl DeviceConfig {
@@ -129,6 +135,10 @@ pub struct Connected {
     pub bridging: Option<Bridging>,
     /// What the settings of its controller leave of its limits, if it reports them.
     pub reduction: Option<Reduction>,
+    /// What it takes of setpoints, if it says so itself.
+    pub setpoint: Option<SetpointFields>,
+    /// How it is held in impedance mode, if it says so itself.
+    pub impedance: Option<Impedance>,
     /// Whether it streams its state.
     pub streams: bool,
     /// Whether its controller takes the load at the flange.
@@ -198,6 +208,12 @@ impl Device {
     /// Returns the event that wakes the thread for a new command.
     pub fn wake(&self) -> Wake {
         self.wake.clone()
+    }
+
+    /// Returns the joint positions at a time within the last 2 s [rad or m], between two states if need be; `None`:
+    /// they are not known.
+    pub fn joints_at(&self, time: Mono) -> Option<Joints> {
+        self.health.history.at(time)
     }
 
     /// Returns the thread's counters, and its texts for status and log.

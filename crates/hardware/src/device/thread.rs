@@ -62,6 +62,8 @@ pub(super) struct Worker {
     due: Arc<Due>,
     state: ArmState,
     reading: JointReading,
+    /// `reading` has answered a setpoint, and is to be taken.
+    exchanged: bool,
     codes: Option<RobotState>,
     last: ArmCommand,
     /// The arm has not taken the newest stop yet. Kept until it does, across reconnects.
@@ -148,6 +150,7 @@ impl Worker {
             health,
             state,
             reading: JointReading::default(),
+            exchanged: false,
             codes: None,
             last: ArmCommand::default(),
             stop_pending: false,
@@ -231,7 +234,7 @@ impl Worker {
             self.stop(adapter);
             self.begin_to_lead(adapter);
             self.discard_if_stale(adapter);
-            if self.connected && (arrived || self.config.clock.now() >= self.next_read) {
+            if self.connected && (arrived || self.exchanged || self.config.clock.now() >= self.next_read) {
                 self.read(adapter);
                 // The read may have taken the acknowledgement that the command waits for.
                 if self.connected && self.resend {

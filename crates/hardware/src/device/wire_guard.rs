@@ -3,9 +3,9 @@
 
 use std::time::Duration;
 
-use dimos_core::arm::{ArmCommand, ArmState, Supervision};
+use dimos_core::arm::{ArmCommand, ArmState, EffortLimits, Impedance, Supervision};
 use dimos_core::clock::Mono;
-use dimos_core::joint::{ControlMode, JointLimits, Joints};
+use dimos_core::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
 
 /// Maximum time that one step may cover where the arm's controller bridges less, in periods.
 const PERIODS: u32 = 2;
@@ -17,6 +17,7 @@ const ROUNDING: (f64, f64) = (1e-6, 1e-6);
 struct Last {
     mode: ControlMode,
     values: Joints,
+    effort: Option<Joints>,
     at: Mono,
     start_seq: u32,
 }
@@ -31,6 +32,9 @@ pub struct WireGuard {
     /// The longer of the tick's and the arm's own period.
     period: Duration,
     supervision: Supervision,
+    /// Without limits, no effort is written; without gains, no gain.
+    efforts: Option<EffortLimits>,
+    impedance: Option<Impedance>,
 }
 
 impl WireGuard {
@@ -39,12 +43,24 @@ impl WireGuard {
     pub fn new(dof: usize, period: Duration, supervision: Supervision) -> Self {
         Self {
             last: None,
-            velocity: [0.0; dimos_core::joint::MAX_DOF],
-            acceleration: [0.0; dimos_core::joint::MAX_DOF],
+            velocity: [0.0; MAX_DOF],
+            acceleration: [0.0; MAX_DOF],
             dof,
             period,
             supervision,
+            efforts: None,
+            impedance: None,
         }
+    }
+
+    /// Sets the limits of efforts, and those of gains.
+    pub fn set_efforts(&mut self, efforts: Option<EffortLimits>, impedance: Option<Impedance>) {
+        (self.efforts, self.impedance) = (efforts, impedance);
+    }
+
+    /// Returns the longest time without a setpoint.
+    pub fn longest_gap(&self) -> Duration {
+        (PERIODS * self.period).max(self.supervision.gap_tolerance)
     }
 
     /// Sets the period: the longer of the tick's and the arm's own for setpoints.
@@ -71,7 +87,8 @@ impl WireGuard {
 
     /// Records a setpoint that was written, or may have been.
     pub fn wrote(&mut self, command: &ArmCommand, mode: ControlMode) {
-        self.last = Some(Last { mode, values: command.values, at: command.at, start_seq: command.start_seq });
+        let ArmCommand { values, effort, at, start_seq, .. } = *command;
+        self.last = Some(Last { mode, values, effort, at, start_seq });
     }
 
     /// Returns whether a command continues the last setpoint, rather than to begin a start.
@@ -89,10 +106,13 @@ impl WireGuard {
         age: Duration,
         read_period: Duration,
     ) -> bool {
-        match self.last.filter(|last| last.start_seq == command.start_seq && last.mode == mode) {
+        let last = self.last.filter(|last| last.start_seq == command.start_seq && last.mode == mode);
+        if !self.gains_are_within(command, mode) || !self.effort_is_within(command, last.as_ref()) {
+            return false;
+        }
+        match last {
             Some(last) => {
-                let most = (PERIODS * self.period).max(self.supervision.gap_tolerance);
-                let time = command.at.since(last.at).clamp(Duration::ZERO, most).as_secs_f64();
+                let time = command.at.since(last.at).clamp(Duration::ZERO, self.longest_gap()).as_secs_f64();
                 let limits = if mode == ControlMode::Velocity { &self.acceleration } else { &self.velocity };
                 self.within(&command.values, &last.values, |j| {
                     limits.get(j).copied().unwrap_or_default() * time * (1.0 + ROUNDING.0) + ROUNDING.1
@@ -101,12 +121,38 @@ impl WireGuard {
             None if age > 2 * read_period => false,
             None if mode == ControlMode::Velocity => {
                 let time = (PERIODS * self.period).as_secs_f64();
-                self.within(&command.values, &[0.0; dimos_core::joint::MAX_DOF], |j| {
+                self.within(&command.values, &[0.0; MAX_DOF], |j| {
                     self.acceleration.get(j).copied().unwrap_or_default() * time + ROUNDING.1
                 })
             }
             None => self.starts_at(command, state),
         }
+    }
+
+    /// Returns whether the efforts are within their limits, and change no faster than these allow. A start may begin
+    /// with any of them: an arm that is held against its weight needs them at once.
+    fn effort_is_within(&self, command: &ArmCommand, last: Option<&Last>) -> bool {
+        let Some(effort) = &command.effort else { return true };
+        let Some(limits) = &self.efforts else { return false };
+        let most = |list: &Joints, j: usize, time: f64| {
+            list.get(j).copied().unwrap_or_default() * time * (1.0 + ROUNDING.0) + ROUNDING.1
+        };
+        let steady = last.is_none_or(|last| {
+            let time = command.at.since(last.at).clamp(Duration::ZERO, self.longest_gap()).as_secs_f64();
+            // What was not commanded before begins at zero.
+            self.within(effort, &last.effort.unwrap_or([0.0; MAX_DOF]), |j| most(&limits.rate, j, time))
+        });
+        steady && self.within(effort, &[0.0; MAX_DOF], |j| most(&limits.max, j, 1.0))
+    }
+
+    /// Returns whether there are gains in impedance mode only, and within those that the arm takes.
+    fn gains_are_within(&self, command: &ArmCommand, mode: ControlMode) -> bool {
+        let Some([stiffness, damping]) = &command.gains else { return mode != ControlMode::Impedance };
+        let Some(most) = self.impedance.as_ref().filter(|_| mode == ControlMode::Impedance) else { return false };
+        let within = |list: &Joints, most: &Joints| {
+            list.iter().zip(most).take(self.dof).all(|(gain, most)| (0.0..=*most).contains(gain))
+        };
+        within(stiffness, &most.stiffness_max) && within(damping, &most.damping_max)
     }
 
     /// Returns whether the first setpoint is at the measured position or at what the arm's controller commands itself,
@@ -184,6 +230,43 @@ mod tests {
         assert!(admits(&g, 100, 0.1) && !admits(&g, 100, 0.3));
         g.wrote(&command(100, 1.0, 1), velocity);
         assert!(admits(&g, 110, 1.1) && !admits(&g, 110, 1.11));
+    }
+
+    #[test]
+    fn efforts_keep_their_limits_and_their_rate_and_none_is_written_without_limits() {
+        let (mut g, servo) = (guard(), ControlMode::ServoPosition);
+        let with = |ms, effort: Option<f64>, start| ArmCommand {
+            effort: effort.map(|effort| joints_of(&[effort])),
+            ..command(ms, 0.0, start)
+        };
+        let admits = |g: &WireGuard, ms, effort| g.admits(&with(ms, effort, 1), servo, &state(0.0), Duration::ZERO, P);
+        assert!(admits(&g, 100, None) && !admits(&g, 100, Some(0.0)), "no limits are known");
+        g.set_efforts(Some(EffortLimits { max: [20.0; MAX_DOF], rate: [200.0; MAX_DOF] }), None);
+        assert!(admits(&g, 100, Some(-20.0)) && !admits(&g, 100, Some(20.1)) && !admits(&g, 100, Some(f64::NAN)));
+        g.wrote(&with(100, Some(5.0), 1), servo);
+        assert!(admits(&g, 110, Some(7.0)) && !admits(&g, 110, Some(7.1)) && !admits(&g, 110, Some(2.9)));
+        assert!(admits(&g, 900, Some(9.0)) && !admits(&g, 900, Some(9.1)), "regardless of the length of the gap");
+        let starts = g.admits(&with(110, Some(-15.0), 2), servo, &state(0.0), Duration::ZERO, P);
+        assert!(starts, "a start carries its weight at once");
+        g.wrote(&with(100, None, 1), servo);
+        assert!(admits(&g, 110, Some(2.0)) && !admits(&g, 110, Some(2.1)), "what was not commanded begins at zero");
+    }
+
+    #[test]
+    fn gains_belong_to_impedance_mode_and_are_within_those_of_the_arm() {
+        let mut g = guard();
+        let admits = |g: &WireGuard, gains: Option<(f64, f64)>, mode| {
+            let gains = gains.map(|(stiffness, damping)| [joints_of(&[stiffness]), joints_of(&[damping])]);
+            g.admits(&ArmCommand { gains, ..command(100, 0.0, 1) }, mode, &state(0.0), Duration::ZERO, P)
+        };
+        let (servo, impedance) = (ControlMode::ServoPosition, ControlMode::Impedance);
+        assert!(!admits(&g, Some((1.0, 1.0)), impedance), "the arm's are not known");
+        g.set_efforts(None, Some(Impedance::uniform((100.0, 2.0), (500.0, 5.0))));
+        assert!(admits(&g, Some((500.0, 0.0)), impedance) && !admits(&g, None, impedance));
+        for wrong in [(501.0, 1.0), (-1.0, 1.0), (1.0, 5.1), (f64::NAN, 1.0)] {
+            assert!(!admits(&g, Some(wrong), impedance), "{wrong:?}");
+        }
+        assert!(!admits(&g, Some((1.0, 1.0)), servo) && admits(&g, None, servo));
     }
 
     /// Of rad or rad/s: more than the rounding of a sum, less than any resolution of an arm.

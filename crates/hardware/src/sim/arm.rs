@@ -10,6 +10,8 @@ use crate::adapter::AdapterResult;
 use crate::registry::Truth;
 use crate::sim::faults::{FaultKind, FaultScript};
 use crate::sim::plant::{Drive, Plant};
+use crate::sim::weight::Masses;
+use dimos_core::arm::Setpoint;
 use dimos_core::clock::Mono;
 use dimos_core::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
 
@@ -114,6 +116,8 @@ pub trait HasArm {
             motors_on: Some(arm.enabled()),
             motor_switches: Some(arm.switches()),
             temperatures: Some(std::array::from_fn(SimArm::temperature)),
+            efforts: Some(arm.efforts()),
+            setpoint: arm.setpoint(),
             ..Truth::default()
         };
         self.complete(&mut truth);
@@ -148,6 +152,9 @@ pub struct SimArm {
     velocity_until: Option<Mono>,
     /// The goal of a servo [rad], and when it arrived.
     goal: Option<(Joints, Mono)>,
+    /// The last setpoint of [`SimArm::follow`], and until when it holds in impedance mode.
+    setpoint: Option<Setpoint>,
+    setpoint_until: Option<Mono>,
     script: FaultScript,
     misreadings: Memory,
     /// Whether setpoints are reported instead of measurements.
@@ -188,6 +195,8 @@ impl SimArm {
             velocity_timeout: None,
             velocity_until: None,
             goal: None,
+            setpoint: None,
+            setpoint_until: None,
             script: FaultScript::new(&options.faults),
             misreadings: Memory::default(),
             reports_commanded: options.controller.reports_commanded,
@@ -200,6 +209,12 @@ impl SimArm {
     /// Replaces the joints.
     pub fn with_plant(mut self, plant: Plant) -> Self {
         self.plant = plant;
+        self
+    }
+
+    /// Gives the joints masses.
+    pub fn with_masses(mut self, masses: Masses) -> Self {
+        self.plant = self.plant.with_masses(masses);
         self
     }
 
@@ -246,6 +261,13 @@ impl SimArm {
             self.pass(until);
             self.velocity_until = None;
             if self.plant.drive() == Drive::Velocity {
+                self.plant.stop();
+            }
+        }
+        if let Some(until) = self.setpoint_until.filter(|until| *until < now) {
+            self.pass(until);
+            self.setpoint_until = None;
+            if self.plant.drive() == Drive::Compliant {
                 self.plant.stop();
             }
         }
@@ -340,6 +362,11 @@ impl SimArm {
     /// Returns the true joint torques [Nm].
     pub fn efforts(&self) -> Joints {
         self.plant.efforts()
+    }
+
+    /// Returns the last setpoint of [`SimArm::follow`].
+    pub fn setpoint(&self) -> Option<Setpoint> {
+        self.setpoint
     }
 
     /// Returns the time up to which the arm was advanced.

@@ -4,7 +4,9 @@ use std::time::Duration;
 
 use super::{Refusal, STREAM, SimArm};
 use crate::sim::faults::FaultKind;
-use dimos_core::joint::ControlMode;
+use crate::sim::weight::Drive;
+use dimos_core::arm::Setpoint;
+use dimos_core::joint::{ControlMode, MAX_DOF};
 
 impl SimArm {
     /// Changes the mode; only while the arm is at rest.
@@ -89,7 +91,43 @@ impl SimArm {
     pub fn servo(&mut self, target: &[f64]) -> Result<(), Refusal> {
         self.may_move(ControlMode::ServoPosition)?;
         self.within(target)?;
+        self.plant.assist(&[]);
         self.plant.servo(target);
+        Ok(())
+    }
+
+    /// Follows a setpoint with all that it has, in servo or impedance mode: efforts add to those of the arm's own
+    /// control, and in impedance mode take the place of it, with stiffness and damping. When it has expired, an arm in
+    /// impedance mode decelerates and holds.
+    pub fn follow(&mut self, setpoint: &Setpoint) -> Result<(), Refusal> {
+        let joints = setpoint.position.get(..self.dof()).unwrap_or_default();
+        if self.mode != ControlMode::Impedance {
+            self.servo(joints)?;
+            self.setpoint = Some(*setpoint);
+            self.plant.assist(setpoint.effort.as_ref().map_or(&[], |effort| &effort[..]));
+            return Ok(());
+        }
+        self.ready()?;
+        self.within(joints)?;
+        let (Some(stiffness), Some(damping)) = (setpoint.stiffness, setpoint.damping) else {
+            return Err(Refusal::WrongMode);
+        };
+        let effort = setpoint.effort.unwrap_or_default();
+        let mut drives = [Drive::default(); MAX_DOF];
+        for (i, drive) in drives.iter_mut().enumerate() {
+            let of = |list: &[f64; MAX_DOF]| list.get(i).copied().unwrap_or_default();
+            *drive = Drive {
+                position: of(&setpoint.position),
+                velocity: of(&setpoint.velocity),
+                stiffness: of(&stiffness),
+                damping: of(&damping),
+                effort: of(&effort),
+            };
+        }
+        self.plant.comply(&drives);
+        self.setpoint = Some(*setpoint);
+        self.setpoint_until =
+            setpoint.valid_for().map(|time| self.advanced_to.after(Duration::from_secs_f64(time.clamp(0.0, 60.0))));
         Ok(())
     }
 
@@ -110,7 +148,7 @@ impl SimArm {
     /// moves at a fraction of the top speed. With `direct`, every goal is followed. A goal that arrives while the
     /// motors are off is kept for [`SimArm::resume_goal`].
     pub fn take_goal(&mut self, goal: &[f64], speed: f64, direct: bool) {
-        let mut joints = [0.0; dimos_core::joint::MAX_DOF];
+        let mut joints = [0.0; MAX_DOF];
         joints.iter_mut().zip(goal).for_each(|(joint, value)| *joint = *value);
         let (pause, step) =
             self.goal.replace((joints, self.advanced_to)).map_or((f64::MAX, f64::MAX), |(before, at)| {

@@ -5,6 +5,7 @@
 //! |---|---|
 //! | [`arm`] | [`SimArm`](arm::SimArm): joints with a motor each, modes, error, E-stop line, uptime; its options `sim` |
 //! | [`plant`] | how the joints move: limits, lag, droop under load, falling without power, blocked and sagging joints |
+//! | [`weight`] | masses: joints sag under them, and move by forces in impedance mode |
 //! | [`gripper`] | a gripper with a finite speed |
 //! | [`io`] | digital and analogue inputs and outputs |
 //! | [`reach`] | end-effector poses and inverse kinematics |
@@ -46,3 +47,4 @@ pub mod tcp_server;
 mod tcp_session;
 pub mod tool_device;
 pub mod trace;
+pub mod weight;

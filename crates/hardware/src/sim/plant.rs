@@ -5,6 +5,7 @@
 
 use crate::sim::delay::DelayLine;
 use crate::sim::plant_joint::{CREDIT, Joint, braking_speed};
+use crate::sim::weight::{self, Masses};
 use dimos_core::joint::{JointLimits, Joints, MAX_DOF};
 
 /// The step of integration [s].
@@ -18,6 +19,8 @@ const FRICTION: f64 = 0.5;
 const HEADROOM: f64 = 2.0;
 /// Largest first-order part of a lag [s]; the rest is dead time.
 const FIRST_ORDER: f64 = 0.02;
+/// Inertia of a joint in impedance mode of an arm without masses [kg·m²].
+const MASSLESS: f64 = 0.05;
 /// Weight of the newest setpoint in the pace at which a reference continues without setpoints.
 const PACE_GAIN: f64 = 0.1;
 
@@ -45,6 +48,8 @@ pub enum Drive {
     Velocity,
     /// Motors on, gravity compensated: gives way to a hand.
     Guided,
+    /// Moves by stiffness, damping and efforts.
+    Compliant,
 }
 
 /// Up to [`MAX_DOF`] joints with their motors.
@@ -79,6 +84,8 @@ pub struct Plant {
     bridges: f64,
     /// The joint that a hand pushes against its motor, and how far it yields [rad].
     nudged: Option<(usize, f64)>,
+    /// Its masses, if it has any.
+    masses: Option<Masses>,
 }
 
 impl Plant {
@@ -115,6 +122,29 @@ impl Plant {
             braking: 0.0,
             bridges: 0.0,
             nudged: None,
+            masses: None,
+        }
+    }
+
+    /// Gives it masses: it sags under them, and its efforts are those that hold them.
+    pub fn with_masses(self, masses: Masses) -> Self {
+        Self { masses: Some(masses), ..self }
+    }
+
+    /// Moves by stiffness, damping and efforts from now on; no effect while disabled.
+    pub fn comply(&mut self, drives: &[weight::Drive]) {
+        self.delayed.clear();
+        if self.drive == Drive::Disabled {
+            return;
+        }
+        self.drive = Drive::Compliant;
+        self.active_mut().iter_mut().zip(drives).for_each(|(joint, drive)| joint.force = *drive);
+    }
+
+    /// Adds efforts [Nm] to those of the position control; missing ones are 0.
+    pub fn assist(&mut self, efforts: &[f64]) {
+        for (i, joint) in self.active_mut().iter_mut().enumerate() {
+            joint.force = weight::Drive { effort: efforts.get(i).copied().unwrap_or(0.0), ..weight::Drive::default() };
         }
     }
 
@@ -188,9 +218,21 @@ impl Plant {
         self.joints.map(|joint| joint.velocity)
     }
 
-    /// Returns the joint torques [Nm]: friction only.
+    /// Returns the joint torques [Nm]: friction, and with masses what holds them.
     pub fn efforts(&self) -> Joints {
-        self.joints.map(|joint| joint.velocity * FRICTION)
+        let mut efforts = self.joints.map(|joint| joint.velocity * FRICTION);
+        let Some(masses) = self.masses else { return efforts };
+        let gravity = (masses.gravity)(&self.positions());
+        for (i, (effort, joint)) in efforts.iter_mut().zip(&self.joints).enumerate() {
+            let held = gravity.get(i).copied().unwrap_or_default();
+            *effort = match self.drive {
+                // Brakes hold it.
+                Drive::Disabled => 0.0,
+                Drive::Compliant => joint.force.total(joint.position, joint.velocity),
+                _ => *effort + held,
+            };
+        }
+        efforts
     }
 
     /// Returns what drives the joints.
@@ -395,7 +437,8 @@ impl Plant {
                 Drive::Velocity => (-joint.velocity_max, joint.velocity_max, 0.0, 0.0),
                 _ => (joint.lower, joint.upper, if i < loaded { droop } else { 0.0 }, joint.position),
             };
-            joint.target = if value.is_finite() { (value - below).clamp(low, high) } else { stay };
+            let sag = if drive == Drive::Velocity { 0.0 } else { joint.sag };
+            joint.target = if value.is_finite() { (value - below + sag).clamp(low, high) } else { stay };
         }
         true
     }
@@ -406,8 +449,10 @@ impl Plant {
             _ if !joint.on => fallen(joint),
             Drive::Servo if self.bridges > 0.0 && joint.pace != 0.0 => false,
             Drive::Disabled | Drive::Stop | Drive::Guided => true,
-            Drive::Position | Drive::Servo => joint.position == joint.target,
+            // The weight may change where it rests.
+            Drive::Position | Drive::Servo => joint.position == joint.target && self.masses.is_none(),
             Drive::Velocity => joint.target == 0.0,
+            Drive::Compliant => false,
         };
         self.sag <= 0.0
             && self.active().iter().all(|joint| joint.velocity == 0.0 && joint.hand == 0.0 && arrived(joint))
@@ -418,7 +463,14 @@ impl Plant {
         let pause = self.since_setpoint > 1.5 * self.interval;
         let (braking, bridges, since) = (self.braking, self.bridges, self.since_setpoint - 0.5 * self.average);
         let (drive, tracking, speed, fall) = (self.drive, self.tracking, self.speed, self.fall);
-        for joint in self.active_mut() {
+        let masses = self.masses;
+        let gravity =
+            masses.map_or([0.0; MAX_DOF], |masses| (masses.gravity)(&self.joints.map(|joint| joint.position)));
+        let inertia = masses.map_or([MASSLESS; MAX_DOF], |masses| masses.inertia);
+        for ((joint, gravity), inertia) in self.active_mut().iter_mut().zip(gravity).zip(inertia) {
+            if let Some(masses) = masses.filter(|_| matches!(drive, Drive::Position | Drive::Servo)) {
+                joint.settle(gravity, joint.force.effort, masses.stiffness);
+            }
             if joint.blocked {
                 joint.velocity = 0.0;
                 continue;
@@ -429,6 +481,10 @@ impl Plant {
                     joint.travel(h);
                 }
                 (Drive::Disabled, _) => joint.fall(fall, h),
+                (Drive::Compliant, _) => {
+                    let force = joint.force;
+                    joint.swing(&force, gravity, inertia, h);
+                }
                 (Drive::Stop | Drive::Guided, _) => {
                     let deceleration = if braking > 0.0 { braking } else { joint.acceleration };
                     joint.accelerate(0.0, deceleration, h);

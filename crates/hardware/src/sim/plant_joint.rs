@@ -1,5 +1,7 @@
 //! One joint of a [`super::plant::Plant`].
 
+use super::weight::Drive;
+
 /// Maximum idle time that an ideal joint may make up for in one jump [s].
 pub(super) const CREDIT: f64 = 0.1;
 /// Part of the acceleration that a joint plans to brake with; the rest is needed to stop after a whole number of steps.
@@ -33,6 +35,10 @@ pub(super) struct Joint {
     pub hand: f64,
     /// Where it stops when it falls [rad]; `None`: friction holds it.
     pub rest: Option<f64>,
+    /// How far above the target that was commanded it stops: below it under its weight [rad].
+    pub sag: f64,
+    /// What drives it in impedance mode, and the effort beside its position control.
+    pub force: Drive,
 }
 
 /// Returns the speed from which a joint can still stop within `distance` [rad], braking at `acceleration` [rad/s²] in

@@ -202,6 +202,31 @@ impl<L: ByteLink> RequestReply<L> {
         })
     }
 
+    /// The same, where some devices may be lost: with a reply of any of them the line works. Returns how many have
+    /// answered; an error if none has.
+    pub fn gather_some<T>(
+        &mut self,
+        command: &[u8],
+        timeout: Retry,
+        devices: usize,
+        scan: impl FnMut(&[u8]) -> Scan<T>,
+        mut take: impl FnMut(T) -> bool,
+    ) -> AdapterResult<usize> {
+        let mut answered = 0;
+        let result = self.gather(command, timeout, devices, scan, |reply| {
+            let new = take(reply);
+            answered += usize::from(new);
+            new
+        });
+        match result {
+            Err(AdapterError::Timeout(_)) if answered > 0 && self.link.is_some() => {
+                self.lost = 0;
+                Ok(answered)
+            }
+            result => result.map(|()| answered),
+        }
+    }
+
     /// Makes up to `times` attempts, as long as replies are missing. Closes the connection after several consecutive
     /// failures, and when it breaks.
     fn attempt<T>(&mut self, times: u32, mut make: impl FnMut(&mut L, Bus) -> AdapterResult<T>) -> AdapterResult<T> {
@@ -380,5 +405,19 @@ mod tests {
         let (result, heard) = collect(&mut line);
         let error = result.unwrap_err().to_string();
         assert!(error.contains("2 of 3 devices answered") && heard == [1, 3], "{error}");
+    }
+
+    #[test]
+    fn a_line_works_as_long_as_any_device_answers() {
+        let (mut line, once) = (RequestReply::half_duplex(false), Retry::once(Duration::ZERO));
+        line.open(Line { silent: Some(2), ..Line::default() });
+        for _ in 0..2 * LOST_AFTER {
+            assert_eq!(line.gather_some(b"?", once, 3, device, |_| true), Ok(2));
+        }
+        for _ in 0..LOST_AFTER {
+            let none = line.gather_some(b"!", once, 3, device, |_| true);
+            assert!(matches!(none, Err(AdapterError::Timeout(_))), "{none:?}");
+        }
+        assert!(!line.is_open());
     }
 }

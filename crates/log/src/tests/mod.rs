@@ -14,7 +14,9 @@ use super::messages::{ArmInput, JointState};
 use super::notes::{Notes, channel};
 use super::recorder::{Note, Notice, Recorder, RecorderConfig};
 use super::replay::{Entry, LogReader, Payload, ReplayError, Selection};
-use dimos_core::arm::{ArmCommand, ArmState, Commanded, ControllerPose, Interference, Link, Pose, VelocitySource};
+use dimos_core::arm::{
+    ArmCommand, ArmState, Commanded, ControllerPose, EffortKind, Interference, JointSet, Link, Pose, VelocitySource,
+};
 use dimos_core::clock::{Mono, WallOffset};
 use dimos_core::joint::{ControlMode, MAX_DOF, joints_of, make_joints};
 use dimos_core::telemetry::describe::{ArmNames, Names, Severity};
@@ -82,6 +84,8 @@ fn state(arm: u16, tick: u64) -> ArmState {
         refused: tick / 3,
         speed_fraction: (arm == 0 && tick > 4).then_some(0.25),
         inputs: (arm == 0 && tick > 5).then_some(0b101),
+        effort_kind: if arm == 0 { EffortKind::FromCurrent } else { EffortKind::Unstated },
+        missing: if tick == 11 { JointSet::of([1]) } else { JointSet::NONE },
     }
 }
 
@@ -201,6 +205,8 @@ fn with_values(input: &ArmInput, states: Option<&JointState>, skip: usize, dof: 
         refused: input.refused,
         speed_fraction: input.speed_fraction.first().copied(),
         inputs: input.inputs.first().copied(),
+        effort_kind: EffortKind::of_name(&input.effort_kind).unwrap(),
+        missing: JointSet::of(input.missing.iter().map(|joint| usize::from(*joint))),
     }
 }
 

@@ -30,6 +30,9 @@ pub struct ArmStateReport {
     /// absent if it reports none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub speed_fraction: Option<f64>,
+    /// Where its efforts come from: `measured` by sensors, `from_current` of the motors; absent if it does not say.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub effort_kind: Option<String>,
     /// Its joints, in order.
     pub joints: Vec<JointReport>,
     /// Gripper position [`gripper_unit`].
@@ -65,16 +68,19 @@ pub struct ArmStateReport {
 pub struct JointReport {
     /// Its name.
     pub name: String,
-    /// Position [rad]; absent before the first state.
+    /// Position [rad, or m for a linear joint]; absent before the first state, and while its motor does not answer.
     pub position: Option<f64>,
-    /// Velocity [rad/s].
+    /// Velocity [rad/s or m/s].
     pub velocity: Option<f64>,
     /// Source of the velocity: `measured`, `estimated`, `absent`.
     pub velocity_source: String,
-    /// Torque [Nm]; absent if the arm does not report it.
+    /// Effort [Nm, or N for a linear joint]; absent if the arm does not report it.
     pub effort: Option<f64>,
-    /// Commanded value [rad or rad/s, by the arm's mode].
+    /// Commanded value [rad, m, rad/s or m/s, by the arm's mode].
     pub command: Option<f64>,
+    /// Effort that is commanded beside the arm's own control [Nm or N]; absent if none is.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub commanded_effort: Option<f64>,
 }
 
 /// A pose: of what, in which frame.

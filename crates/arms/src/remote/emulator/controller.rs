@@ -2,12 +2,12 @@
 
 use serde_json::{Map, Value, json};
 
-use super::super::{MODES, NATIVE_RATE, SPEC};
+use super::super::{MODES, NATIVE_RATE, SPEC, USUAL_MODES};
 use super::wire::{self, Command, Request};
 use super::{PLAYABLE, SILENCE_TIMEOUT};
-use dimos_core::arm::AfterGap;
+use dimos_core::arm::{AfterGap, EffortKind, Setpoint, SetpointFields};
 use dimos_core::clock::Mono;
-use dimos_core::joint::{ControlMode, JointLimits, Joints};
+use dimos_core::joint::{ControlMode, JointLimits, Joints, joints_of};
 use dimos_hardware::adapter::{AdapterError, AdapterResult};
 use dimos_hardware::registry::Truth;
 use dimos_hardware::sim::arm::{Delivery, HasArm, Measured, SimArm, SimOptions};
@@ -19,6 +19,9 @@ use dimos_hardware::transport::Scan;
 /// Highest acceleration [rad/s²] and jerk [rad/s³] of every joint.
 const ACCELERATION: f64 = 10.0;
 const JERK: f64 = 100.0;
+/// Stiffness [Nm/rad] and damping [Nm·s/rad] with which it is held in impedance mode, and the highest of both.
+const STIFFNESS: (f64, f64) = (100.0, 1000.0);
+const DAMPING: (f64, f64) = (5.0, 100.0);
 /// Widest opening of the gripper [m], and its speed [m/s].
 const GRIPPER: (f64, f64) = (0.08, 0.1);
 
@@ -81,23 +84,30 @@ impl Controller {
     /// Executes a request; returns the content of the reply.
     fn answer(&mut self, request: &Request) -> AdapterResult<Map<String, Value>> {
         let content = match request.what.as_str() {
-            "hello" => self.hello(),
+            "hello" => self.hello(request.version.unwrap_or(1)),
             "cycle" => self.cycle(request.command.as_ref())?,
             method => self.act(method, &request.arguments).map(|()| json!({}))?,
         };
         Ok(content.as_object().cloned().unwrap_or_default())
     }
 
-    fn hello(&mut self) -> Value {
+    /// The description, in the client's version if that is older.
+    fn hello(&mut self, version: u64) -> Value {
         self.arm.client_came();
         self.held = Some("it has to be enabled first");
         let (dof, gap_tolerance) = (self.arm.claimed_dof(), self.gap_tolerance);
+        let each = |value: f64| vec![value; dof];
+        let fields: Vec<&str> = SetpointFields::ALL.named().iter().map(|(name, _)| *name).collect();
         json!({
-            "version": 1,
+            "version": version.min(2),
             "dof": dof,
+            "fields": fields,
+            "impedance": { "stiffness": each(STIFFNESS.0), "damping": each(DAMPING.0),
+                "stiffness_max": each(STIFFNESS.1), "damping_max": each(DAMPING.1) },
+            "effort_kind": EffortKind::Measured,
             "info": { "vendor": "dimos", "model": "simulated", "firmware_version": null, "serial_number": null },
             "native_rate": NATIVE_RATE,
-            "modes": MODES,
+            "modes": if version < 2 { USUAL_MODES } else { MODES },
             "holds_when_disabled": SPEC.holds_when_disabled,
             "limits": lists(&self.limits, dof),
             "gripper_range": [0.0, GRIPPER.0],
@@ -205,13 +215,41 @@ impl Controller {
         if values.len() != dof || !values.iter().all(|value| value.is_finite()) {
             return Err(AdapterError::Rejected(format!("expected {dof} finite values, one per joint")));
         }
+        let whole = self.setpoint(command, mode).map_err(AdapterError::Rejected)?;
         self.commanded = true;
         match mode {
             ControlMode::Velocity => self.arm.velocity(values),
-            ControlMode::ServoPosition => self.arm.servo(values),
+            ControlMode::ServoPosition | ControlMode::Impedance => self.arm.follow(&whole),
             _ => self.arm.move_to(values, command.velocity),
         }
         .map_err(|refusal| self.arm.rejected(refusal))
+    }
+}
+
+impl Controller {
+    /// A command as a setpoint, with all that it has.
+    fn setpoint(&self, command: &Command, mode: ControlMode) -> Result<Setpoint, String> {
+        let dof = self.arm.dof();
+        let list = |name: &str| -> Result<Option<Joints>, String> {
+            match command.list(name)? {
+                Some(list) if list.len() != dof => Err(format!("{name} has {} values for {dof} joints", list.len())),
+                list => Ok(list.map(|list| joints_of(&list))),
+            }
+        };
+        let at = command.at.map_or(self.arm.now(), Mono);
+        let (stiffness, damping) = (list("stiffness")?, list("damping")?);
+        if mode == ControlMode::Impedance && (stiffness.is_none() || damping.is_none()) {
+            return Err("impedance mode needs stiffness and damping".to_owned());
+        }
+        Ok(Setpoint {
+            velocity: list("velocities")?.unwrap_or_default(),
+            acceleration: list("accelerations")?,
+            effort: list("efforts")?,
+            stiffness,
+            damping,
+            expires: command.valid.map(|valid| at.after(std::time::Duration::from_secs_f64(valid.clamp(0.0, 60.0)))),
+            ..Setpoint::new(mode, joints_of(&command.values), at)
+        })
     }
 }
 

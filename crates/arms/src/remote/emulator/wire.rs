@@ -20,6 +20,8 @@ pub struct Request {
     pub arguments: Vec<Value>,
     /// The command of a cycle.
     pub command: Option<Command>,
+    /// The client's version of the protocol, in a hello.
+    pub version: Option<u64>,
 }
 
 /// The command of a cycle.
@@ -31,6 +33,21 @@ pub struct Command {
     pub values: Vec<f64>,
     /// Fraction of the top speed.
     pub velocity: f64,
+    /// Since version 2: lists by their names on the sheet, as far as they came.
+    pub lists: Map<String, Value>,
+    /// The client's time [ns], and how long it holds [s].
+    pub at: Option<u64>,
+    /// The same.
+    pub valid: Option<f64>,
+}
+
+impl Command {
+    /// One of its lists; an error for what is no list of numbers.
+    pub fn list(&self, name: &str) -> Result<Option<Vec<f64>>, String> {
+        let Some(list) = self.lists.get(name) else { return Ok(None) };
+        let numbers = list.as_array().and_then(|list| list.iter().map(Value::as_f64).collect::<Option<Vec<_>>>());
+        numbers.map(Some).ok_or_else(|| format!("{name} is no list of numbers"))
+    }
 }
 
 /// Finds a line at the front of what has arrived: a request, or what to tell a client that speaks something else.
@@ -52,6 +69,14 @@ fn understand(request: &Value) -> Option<Request> {
             mode: command.get("mode")?.as_str()?.to_owned(),
             values: command.get("values")?.as_array()?.iter().map(Value::as_f64).collect::<Option<_>>()?,
             velocity: command.get("velocity")?.as_f64()?,
+            lists: command
+                .as_object()?
+                .iter()
+                .filter(|(_, v)| v.is_array())
+                .map(|(k, v)| (k.clone(), v.clone()))
+                .collect(),
+            at: command.get("at").and_then(Value::as_u64),
+            valid: command.get("valid").and_then(Value::as_f64),
         }),
     };
     let arguments = request.get("args").and_then(Value::as_array).cloned().unwrap_or_default();
@@ -60,6 +85,7 @@ fn understand(request: &Value) -> Option<Request> {
         what: request.get("do")?.as_str()?.to_owned(),
         arguments,
         command,
+        version: request.get("version").and_then(Value::as_u64),
     })
 }
 

@@ -2,14 +2,21 @@
 //! passed in, and there is no I/O.
 
 use super::super::{GRIPPER_MAX, PLAYABLE, limits, protocol::DOF};
+use super::Sim;
 use super::kinematics::Links;
-use super::wire::{self, Frame, Report, Request, put_drives, put_floats, put_hello, put_io, put_report, reply, status};
+use super::masses;
+use super::wire::{
+    self, Frame, Report, Request, SetpointRequest, put_drives, put_floats, put_hello, put_io, put_report, reply, status,
+};
+use dimos_core::arm::Setpoint;
+use std::time::Duration;
+
 use dimos_core::clock::Mono;
 use dimos_core::joint::{ControlMode, Joints, joints_of};
 use dimos_core::pose;
 use dimos_hardware::adapter::AdapterResult;
 use dimos_hardware::registry::Truth;
-use dimos_hardware::sim::arm::{Delivery, HasArm, Refusal, SimArm, SimOptions};
+use dimos_hardware::sim::arm::{Delivery, HasArm, Refusal, SimArm};
 use dimos_hardware::sim::faults::FaultKind;
 use dimos_hardware::sim::gripper::Gripper;
 use dimos_hardware::sim::io::SimIo;
@@ -38,7 +45,10 @@ const OFFSETS: [f32; DOF] = [1.5, -2.0, 0.0, 0.25, 10.0, -0.5];
 /// Error of a drive whose motor has lost its power.
 const DRIVE_OFF: u16 = 7;
 /// The modes, by their numbers on the wire.
-const MODES: [ControlMode; 3] = [ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity];
+const MODES: [ControlMode; 4] =
+    [ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity, ControlMode::Impedance];
+/// Highest stiffness [Nm/rad] and damping [Nm·s/rad] of a setpoint.
+const GAINS: [f32; 2] = [500.0, 50.0];
 
 /// A request as it came over the wire.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -68,9 +78,12 @@ pub struct Controller {
 
 impl Controller {
     /// A controller that was just switched on: disabled, in position mode.
-    pub fn new(options: &SimOptions, now: Mono) -> AdapterResult<Self> {
-        let options = options.clone().starting_at(&INITIAL);
-        let arm = SimArm::new("yourarm", &limits(), &options, PLAYABLE, now)?;
+    pub fn new(options: &Sim, now: Mono) -> AdapterResult<Self> {
+        let arm = SimArm::new("yourarm", &limits(), &options.kit().starting_at(&INITIAL), PLAYABLE, now)?;
+        let arm = match options.servo_stiffness > 0.0 {
+            true => arm.with_masses(masses::of(options.servo_stiffness)),
+            false => arm,
+        };
         Ok(Self {
             serial: "YA6-00042".to_owned(),
             arm: arm.with_velocity_timeout(VELOCITY_TIMEOUT),
@@ -162,6 +175,7 @@ impl Controller {
             Request::MoveJoints(speed, degrees) => arm.move_to(&radians(degrees), f64::from(speed) / 100.0),
             Request::ServoJoints(degrees) => arm.servo(&radians(degrees)),
             Request::VelocityJoints(degrees) => arm.velocity(&radians(degrees)),
+            Request::Setpoint(setpoint) => follow(arm, &setpoint),
             Request::MoveCartesian(speed, [x, y, z, roll, pitch, yaw]) => {
                 arm.may_move(ControlMode::Position)?;
                 let [x, y, z] = [x, y, z].map(|mm| f64::from(mm) / 1000.0);
@@ -235,6 +249,36 @@ impl Controller {
         self.reported = Some(report);
         report
     }
+}
+
+/// Follows a setpoint in servo or impedance mode.
+fn follow(arm: &mut SimArm, wire: &SetpointRequest) -> Result<(), Refusal> {
+    let beyond =
+        |torques: [f32; DOF]| torques.iter().zip(RATED_TORQUE).any(|(torque, most)| f64::from(torque.abs()) > most);
+    let beyond_gains = wire.gains.is_some_and(|gains| {
+        gains.iter().zip(GAINS).any(|(list, most)| list.iter().any(|gain| !(0.0..=most).contains(gain)))
+    });
+    if wire.torques.is_some_and(beyond) || beyond_gains {
+        return Err(Refusal::OutOfRange);
+    }
+    let mode = arm.mode();
+    if mode != ControlMode::ServoPosition && mode != ControlMode::Impedance {
+        return Err(Refusal::WrongMode);
+    }
+    let joints = |list: [f32; DOF]| joints_of(&list.map(f64::from));
+    let at = Mono(wire.time_us.saturating_mul(1000));
+    let [stiffness, damping] = wire.gains.map_or([None, None], |gains| gains.map(|list| Some(joints(list))));
+    arm.follow(&Setpoint {
+        position: joints_of(&radians(wire.joints)),
+        velocity: joints_of(&radians(wire.velocities)),
+        acceleration: wire.accelerations.map(|list| joints_of(&radians(list))),
+        effort: wire.torques.map(joints),
+        stiffness,
+        damping,
+        mode,
+        at,
+        expires: (wire.valid_ms > 0).then(|| at.after(Duration::from_millis(wire.valid_ms.into()))),
+    })
 }
 
 fn status_of(refusal: Refusal) -> u8 {

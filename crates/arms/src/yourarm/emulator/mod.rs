@@ -5,8 +5,10 @@
 
 mod controller;
 mod kinematics;
+mod masses;
 pub mod wire;
 
+pub use super::Sim;
 use super::protocol::PORT;
 use controller::Controller;
 pub use controller::Received;
@@ -32,10 +34,15 @@ impl YourArmEmulator {
 
     /// Starts an emulator on a free loopback port.
     pub fn with(options: &SimOptions) -> AdapterResult<Self> {
+        Self::of(&Sim::from(options.clone()))
+    }
+
+    /// Starts an emulator with all its settings on a free loopback port.
+    pub fn of(options: &Sim) -> AdapterResult<Self> {
         Self::listen(options, &EmulatorAddress::InProcess)
     }
 
-    fn listen(options: &SimOptions, place: &EmulatorAddress) -> AdapterResult<Self> {
+    fn listen(options: &Sim, place: &EmulatorAddress) -> AdapterResult<Self> {
         let address = place.tcp(PORT)?;
         let mut controller = Controller::new(options, MonotonicClock.now())?;
         if let Some(number) = place.number() {

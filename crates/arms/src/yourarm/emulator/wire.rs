@@ -41,6 +41,8 @@ pub enum Request {
     VelocityJoints([f32; 6]),
     /// 0x13: speed [%], target [mm, deg].
     MoveCartesian(f32, [f32; 6]),
+    /// 0x14
+    Setpoint(SetpointRequest),
     /// 0x20: opening [mm].
     Gripper(f32),
     /// 0x25: opening [mm], largest force [N].
@@ -65,13 +67,41 @@ pub enum Request {
     SetAnalog(u8, f32),
 }
 
+/// A setpoint with all that it has.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SetpointRequest {
+    /// How long it holds [ms]; 0: until the next one.
+    pub valid_ms: u16,
+    /// The client's time [µs].
+    pub time_us: u64,
+    /// Positions [deg].
+    pub joints: [f32; 6],
+    /// Velocities [deg/s].
+    pub velocities: [f32; 6],
+    /// Accelerations [deg/s²].
+    pub accelerations: Option<[f32; 6]>,
+    /// Torques [Nm].
+    pub torques: Option<[f32; 6]>,
+    /// Stiffness [Nm/rad] and damping [Nm·s/rad].
+    pub gains: Option<[[f32; 6]; 2]>,
+}
+
 impl Request {
+    /// The positions of a setpoint [deg], with or without more.
+    pub fn setpoint(&self) -> Option<[f32; 6]> {
+        match self {
+            Self::ServoJoints(joints) | Self::Setpoint(SetpointRequest { joints, .. }) => Some(*joints),
+            _ => None,
+        }
+    }
+
     /// Whether it asks for motion.
     pub fn moves(&self) -> bool {
         matches!(
             self,
             Self::MoveJoints(..)
                 | Self::ServoJoints(_)
+                | Self::Setpoint(_)
                 | Self::VelocityJoints(_)
                 | Self::MoveCartesian(..)
                 | Self::Gripper(_)
@@ -122,7 +152,7 @@ fn understand(opcode: u8, payload: &[u8]) -> Result<Request, u8> {
             [1] => Ok(Request::GetState(true)),
             _ => Err(status::MALFORMED),
         },
-        0x03 => one_byte(payload).filter(|mode| *mode <= 2).map(Request::SetMode).ok_or(status::MALFORMED),
+        0x03 => one_byte(payload).filter(|mode| *mode <= 3).map(Request::SetMode).ok_or(status::MALFORMED),
         0x04 => one_byte(payload).filter(|on| *on <= 1).map(|on| Request::Enable(on == 1)).ok_or(status::MALFORMED),
         0x05 => empty(Request::ClearError),
         0x06 => empty(Request::Stop),
@@ -135,6 +165,7 @@ fn understand(opcode: u8, payload: &[u8]) -> Result<Request, u8> {
         }
         0x11 => floats(payload).map(Request::ServoJoints),
         0x12 => floats(payload).map(Request::VelocityJoints),
+        0x14 => setpoint(payload).map(Request::Setpoint),
         0x20 => floats::<1>(payload).map(|[opening]| Request::Gripper(opening)),
         0x25 => floats::<2>(payload).map(|[opening, force]| Request::Grip(opening, force)),
         0x21 => floats(payload).map(Request::SetPayload),
@@ -154,6 +185,28 @@ fn understand(opcode: u8, payload: &[u8]) -> Result<Request, u8> {
         }
         _ => Err(status::UNKNOWN_COMMAND),
     }
+}
+
+/// Flags, how long, when, and then list after list.
+fn setpoint(payload: &[u8]) -> Result<SetpointRequest, u8> {
+    let (&[flags, v0, v1, t0, t1, t2, t3, t4, t5, t6, t7], mut rest) =
+        payload.split_first_chunk::<11>().ok_or(status::MALFORMED)?;
+    if flags > 7 {
+        return Err(status::MALFORMED);
+    }
+    let mut list = || -> Result<[f32; 6], u8> {
+        let (bytes, others) = rest.split_at_checked(24).ok_or(status::MALFORMED)?;
+        rest = others;
+        floats(bytes)
+    };
+    let (joints, velocities) = (list()?, list()?);
+    let accelerations = if flags & 1 == 1 { Some(list()?) } else { None };
+    let torques = if flags & 2 == 2 { Some(list()?) } else { None };
+    let gains = if flags & 4 == 4 { Some([list()?, list()?]) } else { None };
+    let time_us = [t7, t6, t5, t4, t3, t2, t1, t0].iter().fold(0, |sum, byte| sum << 8 | u64::from(*byte));
+    let valid_ms = u16::from(v0) + 256 * u16::from(v1);
+    let request = SetpointRequest { valid_ms, time_us, joints, velocities, accelerations, torques, gains };
+    if rest.is_empty() { Ok(request) } else { Err(status::MALFORMED) }
 }
 
 fn one_byte(payload: &[u8]) -> Option<u8> {
@@ -313,6 +366,36 @@ mod tests {
     }
 
     #[test]
+    fn setpoints_are_read_from_the_golden_bytes() {
+        let bare = SetpointRequest {
+            valid_ms: 0,
+            time_us: 1,
+            joints: JOINTS.map(|v| v as f32),
+            velocities: [1.0, -2.0, 3.0, -4.0, 5.0, -6.0],
+            accelerations: None,
+            torques: None,
+            gains: None,
+        };
+        let full = SetpointRequest {
+            valid_ms: 40,
+            time_us: 123_456_789,
+            accelerations: Some([0.5, -0.5, 1.0, -1.0, 2.0, -2.0]),
+            torques: Some([8.0, -7.0, 6.0, -5.0, 4.0, -3.0]),
+            gains: Some([[100.0, 90.0, 80.0, 70.0, 60.0, 50.0], [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]]),
+            ..bare
+        };
+        for (golden, sequence, request) in [(golden::SETPOINT, 23, full), (golden::SETPOINT_BARE, 24, bare)] {
+            let frame = bytes(golden);
+            let expected = Frame { opcode: 0x14, sequence, request: Ok(Request::Setpoint(request)) };
+            assert_eq!(scan(&frame), Scan::Take(frame.len(), expected));
+            let payload = &frame[8..frame.len() - 2];
+            assert_eq!(understand(0x14, &payload[..payload.len() - 1]), Err(status::MALFORMED));
+            assert_eq!(understand(0x14, &[payload, &[0]].concat()), Err(status::MALFORMED));
+        }
+        assert_eq!(understand(0x03, &[4]), Err(status::MALFORMED));
+    }
+
+    #[test]
     fn replies_are_the_golden_bytes() {
         let frame = |opcode, sequence| Frame { opcode, sequence, request: Err(0) };
         let mut out = Vec::new();
@@ -363,7 +446,7 @@ mod tests {
     #[test]
     fn what_is_not_on_the_sheet_is_refused() {
         assert_eq!(understand(0x77, &[]), Err(status::UNKNOWN_COMMAND));
-        assert_eq!(understand(0x03, &[3]), Err(status::MALFORMED));
+        assert_eq!(understand(0x14, &[]), Err(status::MALFORMED));
         assert_eq!(understand(0x06, &[0]), Err(status::MALFORMED));
         assert_eq!(understand(0x31, &[0, 2]), Err(status::MALFORMED));
         assert_eq!(understand(0x32, &[]), Err(status::MALFORMED));

@@ -111,11 +111,7 @@ impl Worker {
             ControlMode::Velocity => {
                 adapter.write_joint_velocities(command.values.get(..self.config.dof).unwrap_or_default())
             }
-            _ => adapter.write_setpoint(&Setpoint {
-                position: command.values,
-                velocity: command.velocity,
-                at: command.at,
-            }),
+            _ => self.write_setpoint(adapter, command, mode),
         };
         // A setpoint without an acknowledgement may have reached the arm: the next one continues from it.
         if matches!(written, Ok(()) | Err(AdapterError::Timeout(_))) {
@@ -126,6 +122,33 @@ impl Worker {
         self.in_flight = 0;
         self.health.writes.fetch_add(1, Relaxed);
         Ok(())
+    }
+
+    /// Writes a setpoint; an arm that answers it with its state is not asked for that.
+    fn write_setpoint(
+        &mut self,
+        adapter: &mut dyn ManipulatorAdapter,
+        command: &ArmCommand,
+        mode: ControlMode,
+    ) -> AdapterResult<()> {
+        let [stiffness, damping] = command.gains.map_or([None, None], |gains| gains.map(Some));
+        let setpoint = Setpoint {
+            position: command.values,
+            velocity: command.velocity,
+            acceleration: Some(command.acceleration),
+            effort: command.effort,
+            stiffness,
+            damping,
+            mode,
+            at: command.at,
+            expires: Some(command.at.after(self.guard.longest_gap())),
+        };
+        if !adapter.exchanges() {
+            return adapter.write_setpoint(&setpoint);
+        }
+        let exchanged = adapter.exchange(Some(&setpoint), &mut self.reading);
+        self.exchanged = exchanged.is_ok();
+        exchanged
     }
 
     /// Returns whether the arm has refused a change of mode for longer than [`MODE_TIMEOUT`].

@@ -65,6 +65,8 @@ impl Worker {
         if let Some(bridging) = bridging {
             self.guard.set_gap_tolerance(bridging.tolerance);
         }
+        let impedance = adapter.impedance();
+        self.guard.set_efforts(self.config.setup.efforts, impedance.or(self.config.setup.impedance));
         let read_period = self.config.read_period();
         let gripper = adapter.gripper().map(|gripper| gripper.info());
         let io = adapter.io().map(|io| io.get_io());
@@ -80,6 +82,8 @@ impl Worker {
             kinematics: adapter.factory_kinematics(),
             bridging,
             reduction,
+            setpoint: adapter.setpoint_fields(),
+            impedance,
             streams: adapter.state_fd().is_some(),
             has_payload,
             payload_resets,
@@ -146,6 +150,10 @@ impl Worker {
             if !self.connected {
                 return Err(AdapterError::NotConnected);
             }
+        }
+        if let Some(joint) = self.state.missing.first() {
+            let what = format!("joint {} does not answer\nhint: check the power and the cable of its motor", joint + 1);
+            return Err(AdapterError::Rejected(what));
         }
         if let Some(stop) = self.config.setup.stop_input.filter(|_| self.state.stop_input_open) {
             let what = format!("the stop input di{} is open\nhint: close it, then enable the arm again", stop.input);

@@ -7,6 +7,7 @@ use super::{ENABLED_TURN, ERROR_TURN, MAX_FAILURES, TURNS, Worker};
 use crate::adapter::{AdapterError, AdapterResult, ManipulatorAdapter};
 use dimos_core::arm::{Interference, Link, VelocitySource};
 use dimos_core::clock::Mono;
+use dimos_core::joint::Joints;
 
 /// Consecutive readings that contradict the orders before they count as interference: a single one may have been
 /// measured before the order.
@@ -57,7 +58,13 @@ impl Worker {
     }
 
     pub(super) fn read_all(&mut self, adapter: &mut dyn ManipulatorAdapter) -> AdapterResult<()> {
-        adapter.read_joints(&mut self.reading)?;
+        if !std::mem::take(&mut self.exchanged) {
+            match adapter.exchanges() {
+                true => adapter.exchange(None, &mut self.reading)?,
+                false => adapter.read_joints(&mut self.reading)?,
+            }
+        }
+        self.fill_in_missing()?;
         self.read_inputs(adapter)?;
         let all = self.whole_state_at_once;
         let turn = self.turn;
@@ -157,6 +164,27 @@ impl Worker {
         }
     }
 
+    /// Keeps the last position of joints that the reading lacks, at rest: the others still count.
+    fn fill_in_missing(&mut self) -> AdapterResult<()> {
+        let (missing, dof) = (self.reading.missing, self.config.dof);
+        if missing.is_empty() {
+            return Ok(());
+        }
+        if (0..dof).all(|joint| missing.contains(joint)) {
+            return Err(AdapterError::Timeout("none of its joints answers".to_owned()));
+        }
+        for joint in missing.iter() {
+            let last = self.state.position.get(joint).copied().unwrap_or_default();
+            self.reading.position.get_mut(joint).into_iter().for_each(|q| *q = last);
+            let of = |list: &mut Option<Joints>, value: f64| {
+                list.as_mut().and_then(|list| list.get_mut(joint)).into_iter().for_each(|slot| *slot = value);
+            };
+            of(&mut self.reading.velocity, 0.0);
+            of(&mut self.reading.effort, f64::NAN);
+        }
+        Ok(())
+    }
+
     pub(super) fn take_reading(&mut self, began: Mono) {
         let stamp = self.reading.stamp.unwrap_or(began);
         if self.state.seq != 0 && self.reading.stamp == Some(self.state.stamp) {
@@ -169,11 +197,13 @@ impl Worker {
         self.state.stamp = stamp;
         self.state.device_ns = self.reading.device_ns;
         self.state.position = self.reading.position;
-        self.state.effort = self.reading.effort;
+        (self.state.effort, self.state.effort_kind) = (self.reading.effort, self.reading.effort_kind);
+        self.state.missing = self.reading.missing;
         self.state.commanded = self.reading.commanded;
         self.state.speed_fraction = self.reading.speed_fraction;
         self.state.velocity = self.reading.velocity.unwrap_or_default();
         self.state.velocity_source =
             if self.reading.velocity.is_some() { VelocitySource::Measured } else { VelocitySource::Absent };
+        self.health.history.take(&self.state);
     }
 }
