@@ -205,6 +205,10 @@ impl Service {
                     None => step.motions.push(report.clone()),
                 }
             });
+            if let Some(lost) = self.lost_grip(going).filter(|_| !report.done) {
+                self.ask(Request::Cancel { task: Some(self.facts.task_index(&report.task)?) }).await?;
+                return Err(lost);
+            }
             let wait = self.act_on_path(going, &report, acts, origin).await?;
             match report.next.filter(|_| report.done) {
                 Some(next) => {

@@ -66,7 +66,7 @@ impl Worker {
             self.guard.set_gap_tolerance(bridging.tolerance);
         }
         let read_period = self.config.read_period();
-        let gripper = adapter.gripper().map(|gripper| gripper.info());
+        let gripper = self.gripper_info(adapter);
         let io = adapter.io().map(|io| io.get_io());
         let has_payload = adapter.payload().is_some();
         let payload_resets = adapter.payload().is_some_and(|payload| payload.resets_controller());
