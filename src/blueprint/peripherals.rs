@@ -124,7 +124,10 @@ fn arms_own(checker: &mut Checker<'_>, arm: &HardwareEntry, part: Part, at: Node
     let also = checker.tree.label(at).with_text("and here another one");
     let node = checker.tree.nearest(options.at, part.name());
     let diag = Diag::error(format!("the arm has a {} by its own option", part.text()));
-    checker.error(node, diag.also(also).hint(format!("set `options.{part}: none`, or remove the other one", part = part.name())));
+    checker.error(
+        node,
+        diag.also(also).hint(format!("set `options.{part}: none`, or remove the other one", part = part.name())),
+    );
 }
 
 fn row(checker: &mut Checker<'_>, part: Part, given: &Located<PeripheralEntry>) -> Option<PeripheralSpec> {

@@ -100,8 +100,8 @@ pub struct ArmArgs {
 struct GripperArgs {
     #[command(flatten)]
     which: ArmArgs,
-    /// Opening [m], angle [rad] of a rotary gripper, `open`, or `close`; `dimos status` shows the range. `home` activates
-    /// a gripper with its own connection: its fingers move to their ends
+    /// Opening [m], angle [rad] of a rotary gripper, `open`, or `close`; `dimos status` shows the range. `home`
+    /// activates a gripper with its own connection: its fingers move to their ends
     #[arg(value_name = "POSITION", value_parser = act, allow_negative_numbers = true)]
     act: Act,
     /// Largest force [N, Nm or %; `dimos status` shows unit and range]; default: the one set in the arm

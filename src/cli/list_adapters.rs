@@ -155,7 +155,7 @@ fn to_json(row: &AdapterSpec) -> serde_json::Value {
     })
 }
 
-/// A gripper or a sensor with its own connection; `part` tells it from an arm.
+/// A gripper or a sensor with its own connection; an arm has no `part`.
 fn peripheral(row: &PeripheralSpec) -> serde_json::Value {
     json!({
         "name": row.name,

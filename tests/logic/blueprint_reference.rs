@@ -73,7 +73,12 @@ const SECTIONS: [Section; 10] = [
     section("`hardware[].stop_input`", "", "/$defs/StopInputEntry", keys::<StopInputEntry>),
     section("`hardware[].payload`", "", "/$defs/PayloadEntry", keys::<PayloadEntry>),
     section("`hardware[].mounting`", "", "/$defs/MountingEntry", keys::<MountingEntry>),
-    section("`hardware[].gripper` and `hardware[].force_torque`", "", "/$defs/PeripheralEntry", keys::<PeripheralEntry>),
+    section(
+        "`hardware[].gripper` and `hardware[].force_torque`",
+        "",
+        "/$defs/PeripheralEntry",
+        keys::<PeripheralEntry>,
+    ),
     section("`tasks[]`", TASKS, "/$defs/TaskEntry", keys::<TaskEntry>),
 ];
 /// Those behind the parameters of the task types.
@@ -111,9 +116,8 @@ pub fn reference<'a>(catalog: impl Into<Catalog<'a>>) -> String {
     for (entry, name, about, form) in arms.chain(peripherals) {
         let title = format!("`options` of `{name}`");
         let rules = schema.pointer(&format!("/$defs/{entry}/allOf")).and_then(Value::as_array);
-        let is_its = |rule: &&Value| {
-            rule.pointer("/if/properties/adapter_type/const").and_then(Value::as_str) == Some(name)
-        };
+        let is_its =
+            |rule: &&Value| rule.pointer("/if/properties/adapter_type/const").and_then(Value::as_str) == Some(name);
         let rule = rules.into_iter().flatten().find(is_its);
         let options = rule.and_then(|rule| rule.pointer("/then/properties/options/anyOf/0"));
         if let Some(options) = options.map(|options| follow(options, &schema)) {

@@ -28,9 +28,8 @@ fn every_peripheral_passes_its_suite() {
     let mut failures = Vec::new();
     std::thread::scope(|scope| {
         let checks = registry.peripherals().iter().flat_map(|row| CHECKS.iter().map(move |check| (row, check)));
-        let all: Vec<_> = checks
-            .map(|(row, check)| scope.spawn(move || (row.name, run(row, &options(row.name), check))))
-            .collect();
+        let all: Vec<_> =
+            checks.map(|(row, check)| scope.spawn(move || (row.name, run(row, &options(row.name), check)))).collect();
         for one in all {
             if let (name, Err(what)) = one.join().unwrap() {
                 failures.push(format!("{name}: {what}"));
@@ -42,7 +41,10 @@ fn every_peripheral_passes_its_suite() {
 }
 
 fn loaded(hardware: &str, overrides: &Overrides) -> Loaded {
-    let text = format!("hardware:\n  - {{hardware_id: arm, joints: {{prefix: arm, count: 6}}, {hardware}}}\n");
+    let text = format!(
+        "hardware:\n  - {{hardware_id: arm, joints: {{prefix: arm, count: 6}}, {hardware}}}\n\
+         tasks: [{{name: traj_arm, type: trajectory, joint_names: {{hardware: arm}}}}]\n"
+    );
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("cell.yaml");
     std::fs::write(&path, text).unwrap();
@@ -77,7 +79,10 @@ fn mistakes_in_a_peripheral_are_found_where_they_are() {
     let both = "adapter_type: xarm, address: 192.0.2.7, options: {gripper: xarm}, \
                 gripper: {adapter_type: robotiq_2f85, address: sim}";
     let said = mistakes(both);
-    assert!(said.contains("the arm has a gripper by its own option") && said.contains("`options.gripper: none`"), "{said}");
+    assert!(
+        said.contains("the arm has a gripper by its own option") && said.contains("`options.gripper: none`"),
+        "{said}"
+    );
     let same = "adapter_type: ur, address: 192.0.2.7, gripper: {adapter_type: robotiq_2f85, address: /dev/ttyUSB0}, \
                 force_torque: {adapter_type: robotiq_ft300, address: /dev/ttyUSB0@115200}";
     let said = mistakes(same);

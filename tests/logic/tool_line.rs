@@ -142,7 +142,7 @@ fn grips(address: &str) -> Result<(), AdapterError> {
     gripper.connect()?;
     gripper.home()?;
     let limit = Instant::now() + Duration::from_secs(20);
-    let mut until = |gripper: &mut Robotiq2F, is_so: fn(&mut Robotiq2F) -> bool| {
+    let until = |gripper: &mut Robotiq2F, is_so: fn(&mut Robotiq2F) -> bool| {
         while !is_so(gripper) {
             assert!(Instant::now() < limit, "{address}");
             gripper.read()?;

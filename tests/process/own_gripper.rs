@@ -67,7 +67,9 @@ fn nothing_moves_at_the_start_and_homing_is_an_act_of_its_own() {
 fn verbs_outcomes_waypoints_and_attached_objects_are_as_with_an_arms_own() {
     let (home, gripper, _run) = cell(json!({"sim": {"homed": true}}), "--no-record");
     home.dimos("arm gripper arm open").with(0).shows(&["arm: gripper open at 0.0850 m, after 0."]);
-    home.dimos("status -v").with(0).shows(&["gripper 0.0000 m closed, 0.0850 m open; force 20 to 235 N; speed control"]);
+    home.dimos("status -v")
+        .with(0)
+        .shows(&["gripper 0.0000 m closed, 0.0850 m open; force 20 to 235 N; speed control"]);
     home.dimos("arm gripper arm 0.04 --speed 1").with(0).shows(&["gripper reached 0.04"]);
     home.dimos("arm gripper arm close --force 100").with(0).shows(&["gripper closed at 0.0000 m"]);
     assert!((gripper.truth().gripper_force.unwrap() - 100.0).abs() < 1.0);
@@ -88,7 +90,7 @@ fn verbs_outcomes_waypoints_and_attached_objects_are_as_with_an_arms_own() {
     gripper.with(|fingers, _| fingers.put_object(0.0));
     home.dimos("arm gripper arm 0.02").with(0);
     gripper.inject(Fault::new(FaultKind::GripperBlocked).lasting(60.0)).unwrap();
-    home.dimos("arm gripper arm open").with(1).says(&["gripper blocked at 0.02", "on the way to 0.0850 m"]);
+    home.dimos("arm gripper arm open").with(1).says(&["gripper blocked at 0.0", "on the way to 0.0850 m"]);
 }
 
 #[test]
@@ -99,8 +101,12 @@ fn a_lost_gripper_refuses_its_acts_and_its_arm_continues() {
     eventually("it moves", || home.status()["tasks"][0]["state"] == "EXECUTING");
     gripper.inject(Fault::new(FaultKind::PowerLoss).lasting(6.0)).unwrap();
     eventually("it is named", || own(&home)["link"] == "faulted");
-    home.dimos("status").with(0).shows(&["! the gripper of arm (robotiq_2f85 at ", "is lost: ", "hint: check its cable"]);
-    home.dimos("arm gripper arm open").with(1).says(&["the gripper of arm is lost", "hint: ", "dimos arm reset arm"]);
+    home.dimos("status").with(0).shows(&[
+        "! the gripper of arm (robotiq_2f85 at ",
+        "is lost: ",
+        "hint: check its cable",
+    ]);
+    home.dimos("arm gripper arm open --no-wait").with(1).says(&["the gripper of arm is lost", "dimos arm reset arm"]);
     home.dimos("arm gripper arm home").with(1).says(&["is lost"]);
     let still_lost = home.dimos("arm reset arm").with(0);
     assert!((still_lost.out.clone() + &still_lost.err).contains("its gripper is still lost"), "{}", still_lost.err);
@@ -142,12 +148,28 @@ fn an_arm_that_loses_what_it_holds_is_held_and_a_motion_that_needs_the_gripper_e
 #[test]
 fn sim_starts_its_emulator_and_a_device_that_is_not_there_ends_the_start() {
     let home = Home::new();
-    home.write("cell.yaml", &BLUEPRINT.replace("address: sim, options", "address: /dev/ttyUSB77, options"));
-    home.dimos("check cell.yaml").with(0).shows(&["gripper: robotiq_2f85 at /dev/ttyUSB77"]);
+    home.write("cell.yaml", &BLUEPRINT.replace("address: sim, options", "address: /dev/pts/7777, options"));
+    home.dimos("check cell.yaml").with(0).shows(&["gripper: robotiq_2f85 at /dev/pts/7777"]);
     let failed = home.dimos("run cell.yaml --no-record --duration 1s").with(3);
-    failed.says(&["arm: gripper robotiq_2f85: cannot open serial device /dev/ttyUSB77", "no such device"]);
+    failed.says(&["arm: gripper robotiq_2f85: cannot open serial device /dev/pts/7777", "no such device"]);
     let _run = home.run("cell.yaml --no-record --sim");
     home.dimos("arm gripper arm home").with(0);
     home.dimos("arm gripper arm close").with(0);
     home.dimos("arm gripper arm open").with(0).shows(&["open at 0.0850 m"]);
+}
+
+#[test]
+fn the_kit_emulates_and_tests_a_gripper_without_a_run() {
+    let home = Home::new();
+    let emulated = home.start("adapter emulate robotiq_2f85 --pty --link gripper");
+    emulated.until("hardware[].gripper: {adapter_type: robotiq_2f85, address: ");
+    let path = home.path().join("gripper").display().to_string();
+    let tested = home.dimos(&format!("adapter test robotiq_2f85 --address {path}")).with(0);
+    tested.shows(&["passed  reads", "Robotiq 2F: not homed, position unknown", " 0 failed"]);
+    let suite = home.dimos("adapter test robotiq_2f85 --address sim --json").with(0).json();
+    assert!(suite["passed"] == true && suite["checks"].as_array().unwrap().len() >= 8, "{suite}");
+    home.dimos("adapter test robotiq_2f85").with(2).says(&["needs --address", "sim for its emulator"]);
+    home.dimos("adapter emulate robotiq_ft300 --fault list").with(0).shows(&["power_loss"]);
+    let listed = home.dimos("list-adapters").with(0).out;
+    assert!(listed.contains("AT AN ARM") && listed.contains("in a blueprint: hardware[].force_torque"), "{listed}");
 }

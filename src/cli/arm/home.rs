@@ -41,7 +41,9 @@ pub fn run(args: &GripperArgs) -> Result {
         match gripper.condition.as_deref() {
             Some("homing") => {}
             Some("ready") => break,
-            Some("not_homed") => return Err(failed("homing was ended".to_owned()).hint("the arm was stopped meanwhile")),
+            Some("not_homed") => {
+                return Err(failed("homing was ended".to_owned()).hint("the arm was stopped meanwhile"));
+            }
             _ => {
                 let (what, hint) = gripper.attention(&which.arm).unwrap_or_default();
                 return Err(Failure::new(Exit::Failed, format!("not homed: {what}")).hint(hint));

@@ -113,7 +113,11 @@ impl Service {
         let peripherals = self.reset_peripherals(arm).await?;
         if peripherals.is_some() {
             // The tick must read that the loss is acknowledged.
-            self.tick.until(self.next_report(arm), || self.tick.seen(arm, |view| view.state.interference != Interference::Tool)).await;
+            self.tick
+                .until(self.next_report(arm), || {
+                    self.tick.seen(arm, |view| view.state.interference != Interference::Tool)
+                })
+                .await;
         }
         if count() == stops {
             self.ask(Request::Reset { arm }).await?;
@@ -127,7 +131,8 @@ impl Service {
         }
         let mut reply = self.phase_of(id, arm);
         // The state is read once more before the arm is enabled.
-        let notes: Vec<String> = cause.map(|cause| format!("was held: {cause}")).into_iter().chain(peripherals).collect();
+        let notes: Vec<String> =
+            cause.map(|cause| format!("was held: {cause}")).into_iter().chain(peripherals).collect();
         reply.note = Some(notes.join("; ")).filter(|text| !text.is_empty());
         Ok(Reply::ArmReset(reply))
     }

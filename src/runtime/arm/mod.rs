@@ -41,11 +41,7 @@ pub(in crate::runtime) struct ArmLinks {
 }
 
 impl ArmLinks {
-    pub fn new(
-        devices: Vec<Arc<Device>>,
-        peripherals: Vec<Arc<ArmPeripherals>>,
-        serials: Arc<SerialLocks>,
-    ) -> Self {
+    pub fn new(devices: Vec<Arc<Device>>, peripherals: Vec<Arc<ArmPeripherals>>, serials: Arc<SerialLocks>) -> Self {
         let arms = devices.len();
         Self {
             devices,

@@ -81,7 +81,8 @@ pub fn start(
             clock: std::sync::Arc::new(MonotonicClock),
             notes: Box::new(notes.clone()),
         };
-        let thread = |e| StartError::other(format!("no thread for the {}: {e}", config_name(peripheral)), "see ulimit -u");
+        let thread =
+            |e| StartError::other(format!("no thread for the {}: {e}", config_name(peripheral)), "see ulimit -u");
         let (device, port) = PeripheralDevice::spawn(config, device).map_err(thread)?;
         match peripheral.row.part {
             Part::Gripper => ports.gripper = Some(port),
@@ -137,9 +138,10 @@ impl Service {
         let lost = self.arms.gripper(arm)?.lost()?;
         let name = self.facts.names.arm(arm as u16);
         let what = format!("the gripper of {name} is lost: {lost}");
-        Some(RpcError::new(Code::DeviceRefused, what).hint(format!(
-            "check its cable and supply, then: dimos arm reset {name}"
-        )))
+        Some(
+            RpcError::new(Code::DeviceRefused, what)
+                .hint(format!("check its cable and supply, then: dimos arm reset {name}")),
+        )
     }
 
     /// Begins to home an arm's gripper.

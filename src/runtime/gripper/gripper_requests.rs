@@ -46,7 +46,9 @@ impl Service {
         if self.arms.gripper(arm.into()).is_some() {
             // The arm's next state has the position of one that has just become ready.
             let view = || self.tick.arm_view(arm as usize);
-            self.tick.until(Instant::now() + POSITION_LIMIT, || view().filter(|view| view.state.gripper.is_some())).await;
+            self.tick
+                .until(Instant::now() + POSITION_LIMIT, || view().filter(|view| view.state.gripper.is_some()))
+                .await;
         }
         let from = self.tick.arm_view(arm as usize).map(|view| view.state.gripper);
         let info = self.facts.gripper_info(arm.into()).unwrap_or_default();

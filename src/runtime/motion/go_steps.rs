@@ -194,9 +194,18 @@ impl Service {
             _ => return Err(internal().into()),
         };
         let mut motion = begun.motion();
-        let (mut begun, mut ended, mut closed) = (Some(begun), None, None);
+        let (mut begun, mut ended, mut closed, mut lost) = (Some(begun), None, None, None::<Failed>);
         loop {
-            let report = self.motion(motion)?;
+            let mut report = self.motion(motion)?;
+            if !report.done && lost.is_none() {
+                lost = self.lost_grip(going);
+                if lost.is_some() {
+                    self.ask(Request::Cancel { task: Some(self.facts.task_index(&report.task)?) }).await?;
+                }
+            }
+            if let Some(failed) = lost.as_ref().filter(|_| report.done) {
+                report.error = failed.error.as_ref().map(|error| error.message.clone());
+            }
             let phase = if report.replanning { GoPhase::Replanning } else { GoPhase::Executing };
             going.step(phase, |step| {
                 step.begun = begun.take().or(step.begun.take());
@@ -205,10 +214,6 @@ impl Service {
                     None => step.motions.push(report.clone()),
                 }
             });
-            if let Some(lost) = self.lost_grip(going).filter(|_| !report.done) {
-                self.ask(Request::Cancel { task: Some(self.facts.task_index(&report.task)?) }).await?;
-                return Err(lost);
-            }
             let wait = self.act_on_path(going, &report, acts, origin).await?;
             match report.next.filter(|_| report.done) {
                 Some(next) => {
@@ -217,6 +222,7 @@ impl Service {
                 }
                 None if !report.done => {}
                 None if report.state == TaskState::Completed.name() => return Ok(()),
+                None if lost.is_some() => return lost.map_or(Ok(()), Err),
                 None => return Err(Failed { by: self.cause_of_end(motion).0, error: None }),
             }
             // The `cancel` that ended this was of another arm of it, or came before the motion was known.

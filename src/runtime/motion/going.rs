@@ -209,7 +209,8 @@ impl Service {
     /// Returns the arms whose grippers are needed from a step on.
     fn grips_from(&self, steps: &[GoStep], on_path: &[OnPath], index: usize) -> Vec<u16> {
         let of_step = |step: &GoStep| if let GoStep::Gripper(grip) = step { Some(grip.arm.clone()) } else { None };
-        let acts = on_path.iter().filter(|act| act.step >= index).filter_map(|act| Some(act.gripper.as_ref()?.arm.clone()));
+        let later = on_path.iter().filter(|act| act.step >= index);
+        let acts = later.filter_map(|act| Some(act.gripper.as_ref()?.arm.clone()));
         let arms = steps.iter().skip(index).filter_map(of_step).chain(acts);
         arms.filter_map(|arm| self.facts.arm_index(&arm).ok()).collect()
     }

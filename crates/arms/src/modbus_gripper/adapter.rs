@@ -125,7 +125,7 @@ impl Peripheral for ModbusGripper {
             _ if self.homing => Condition::Homing,
             _ => Condition::NotHomed,
         };
-        self.position = is_homed.then(|| closed + share * (open - closed));
+        self.position = is_homed.then_some(closed + share * (open - closed));
         self.holds = holds.map(|(holds, _)| holds);
         Ok(())
     }

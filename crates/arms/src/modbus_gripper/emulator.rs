@@ -73,7 +73,9 @@ impl Fingers {
 
     /// Returns the contents of a register; `None` if the map has no such.
     fn contents(&self, table: Table, register: u16) -> Option<u16> {
-        let has = |flag: &Option<Flag>| flag.as_ref().filter(|flag| (flag.table, flag.register) == (table, register)).cloned();
+        let has = |flag: &Option<Flag>| {
+            flag.as_ref().filter(|flag| (flag.table, flag.register) == (table, register)).cloned()
+        };
         let said = |flag: Flag, so: bool| {
             let other = (0..=u16::MAX).find(|contents| !flag.holds(*contents)).unwrap_or_default();
             if so { flag.is.first().copied().unwrap_or_default() } else { other }
@@ -95,7 +97,8 @@ impl Fingers {
     fn is_writable(&self, register: u16) -> bool {
         let options = &self.options;
         let writes = options.then.iter().chain(&options.home).map(|write| write.register);
-        let values = options.force.map(|force| force.register).into_iter().chain(options.speed.map(|speed| speed.register));
+        let values =
+            options.force.map(|force| force.register).into_iter().chain(options.speed.map(|speed| speed.register));
         writes.chain(values).chain([self.needed.target.register]).any(|known| known == register)
     }
 }

@@ -1,5 +1,5 @@
-//! Any gripper on Modbus, by its registers in the blueprint: where its position is read and where it is sent, and as far
-//! as it has them force, speed, a report of what it holds, faults and homing.
+//! Any gripper on Modbus, by its registers in the blueprint: where its position is read and where it is sent, and as
+//! far as it has them force, speed, a report of what it holds, faults and homing.
 
 pub mod adapter;
 pub mod emulator;
@@ -220,7 +220,7 @@ impl Options {
         if options.speed.is_some_and(|speed| !(0.01..=1.0).contains(&speed.default)) {
             return wrong("speed.default", "a fraction of the top speed, 0.01 to 1");
         }
-        if options.homed.is_some() != !options.home.is_empty() {
+        if options.homed.is_some() == options.home.is_empty() {
             return wrong("home", "`home` and `homed` belong together: what is written, and when it is done");
         }
         check_script("modbus_gripper", &options.sim.faults, emulator::PLAYABLE).map_err(|error| error.within("sim"))?;

@@ -56,7 +56,9 @@ fn a_gripper_by_its_registers_is_homed_moves_and_holds() {
     gripper.write_gripper_position(0.0).unwrap();
     until(&mut gripper, "held", |gripper| gripper.read_gripper_holds() == Ok(Some(true)));
     assert_eq!((gripper.get_gripper_force_unit(), gripper.has_gripper_speed()), (ForceUnit::Percent, false));
-    assert!(gripper.write_gripper_position(0.1).is_err() && gripper.write_gripper_position_with_force(0.0, 10.0).is_err());
+    assert!(
+        gripper.write_gripper_position(0.1).is_err() && gripper.write_gripper_position_with_force(0.0, 10.0).is_err()
+    );
 }
 
 #[test]

@@ -12,8 +12,8 @@ use dimos_hardware::transport::line::LineAddress;
 use dimos_hardware::transport::modbus::{Framing, ModbusClient, Table};
 use dimos_hardware::transport::request_reply::Retry;
 
-/// Timeout of the connection, and of a telegram; the line and the gripper take 16 ms for one. Telegrams may be repeated:
-/// they state what is wanted.
+/// Timeout of the connection, and of a telegram; the line and the gripper take 16 ms for one. Telegrams may be
+/// repeated: they state what is wanted.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(2);
 const RETRY: Retry = Retry { each: Duration::from_millis(100), times: 2 };
 /// Positions this far outside the range are within it: they are rounded in files [m].
@@ -162,9 +162,8 @@ impl Gripper for Robotiq2F {
     fn read_gripper_holds(&mut self) -> AdapterResult<Option<bool>> {
         let known = self.status.filter(|status| status.condition() == Condition::Ready);
         let known = known.filter(|status| self.target.is_none_or(|target| target == status.requested));
-        Ok(known.map(|status| {
-            status.goes && matches!(status.fingers, Fingers::StoppedOpening | Fingers::StoppedClosing)
-        }))
+        Ok(known
+            .map(|status| status.goes && matches!(status.fingers, Fingers::StoppedOpening | Fingers::StoppedClosing)))
     }
 
     fn has_gripper_speed(&self) -> bool {

@@ -1,5 +1,5 @@
-//! Robotiq's force/torque sensors FT 300 and FT 300-S on Modbus RTU: forces and torques are read, nothing is written but
-//! the end of a stream that another program has begun.
+//! Robotiq's force/torque sensors FT 300 and FT 300-S on Modbus RTU: forces and torques are read, nothing is written
+//! but the end of a stream that another program has begun.
 
 use std::time::Duration;
 

@@ -39,11 +39,7 @@ pub const CHECKS: &[PeripheralCheck] = &[
     check("comes_back", "it connects again after a loss of power", comes_back),
 ];
 
-const fn check(
-    name: &'static str,
-    about: &'static str,
-    run: fn(&mut Bench) -> Result<(), String>,
-) -> PeripheralCheck {
+const fn check(name: &'static str, about: &'static str, run: fn(&mut Bench) -> Result<(), String>) -> PeripheralCheck {
     PeripheralCheck { name, about, run }
 }
 

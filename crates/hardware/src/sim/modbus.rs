@@ -90,7 +90,8 @@ fn execute(request: &[u8], now: Mono, device: &mut impl Registers) -> Result<Vec
         Some([high, low]) => Ok(u16::from(*high) * 256 + u16::from(*low)),
         _ => Err(NO_VALUE),
     };
-    let words = |bytes: &[u8]| bytes.chunks(2).map(|pair| pair.iter().fold(0, |v, b| v * 256 + u16::from(*b))).collect();
+    let words =
+        |bytes: &[u8]| bytes.chunks(2).map(|pair| pair.iter().fold(0, |v, b| v * 256 + u16::from(*b))).collect();
     let read = |device: &mut dyn FnMut(u16, u16) -> Result<Vec<u16>, u8>, first: u16, count: u16, function: u8| {
         if count == 0 || count > MOST {
             return Err(NO_VALUE);

@@ -216,7 +216,8 @@ fn a_lost_one_is_named_refuses_and_comes_back() {
     assert!(!bench.port.is_missed(), "it held nothing");
     assert_eq!(bench.notes(), ["gripper: no state: unplugged"]);
     let refused = bench.grip(0.01).unwrap_err().to_string();
-    let expected = "the gripper is lost: no state: unplugged\nhint: check its cable and supply, then: dimos arm reset left";
+    let expected =
+        "the gripper is lost: no state: unplugged\nhint: check its cable and supply, then: dimos arm reset left";
     assert_eq!(refused, expected);
     assert!(bench.order(Order::Home).is_err() && bench.order(Order::Reset).is_err());
     bench.fingers.change(|fingers| fingers.pulled = false);
