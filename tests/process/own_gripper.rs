@@ -99,20 +99,20 @@ fn a_lost_gripper_refuses_its_acts_and_its_arm_continues() {
     home.dimos("move arm --named home --speed 1").with(0);
     let moving = home.start("move arm --named up --speed 0.3");
     eventually("it moves", || home.status()["tasks"][0]["state"] == "EXECUTING");
-    gripper.inject(Fault::new(FaultKind::PowerLoss).lasting(6.0)).unwrap();
+    gripper.inject(Fault::new(FaultKind::PowerLoss).lasting(20.0)).unwrap();
     eventually("it is named", || own(&home)["link"] == "faulted");
     home.dimos("status").with(0).shows(&[
         "! the gripper of arm (robotiq_2f85 at ",
         "is lost: ",
         "hint: check its cable",
     ]);
-    home.dimos("arm gripper arm open --no-wait").with(1).says(&["the gripper of arm is lost", "dimos arm reset arm"]);
+    let moved = moving.wait().with(0);
+    assert!(moved.out.contains("COMPLETED"), "{}", moved.out);
+    assert_eq!((&home.status()["arms"][0]["phase"], &own(&home)["link"]), (&json!("ready"), &json!("faulted")));
+    home.dimos("arm gripper arm open").with(1).says(&["the gripper of arm is lost", "hint: ", "dimos arm reset arm"]);
     home.dimos("arm gripper arm home").with(1).says(&["is lost"]);
     let still_lost = home.dimos("arm reset arm").with(0);
     assert!((still_lost.out.clone() + &still_lost.err).contains("its gripper is still lost"), "{}", still_lost.err);
-    let moved = moving.wait().with(0);
-    assert!(moved.out.contains("COMPLETED"), "{}", moved.out);
-    assert_eq!(home.status()["arms"][0]["phase"], "ready");
     // A motion that needs it is refused before it begins.
     home.dimos("move arm --through home gripper:close up").with(1).says(&["the gripper of arm is lost"]);
     eventually("it is back", || own(&home)["link"] == "up");
