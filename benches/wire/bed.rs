@@ -57,6 +57,7 @@ impl Arm {
             native_rate: 250.0,
             supervision: dimos::arm::Supervision::default(),
             setup: dimos::hardware::device::Setup::default(),
+            peripherals: Default::default(),
             beat: beat.clone(),
             pace: None,
             clock: Arc::new(MonotonicClock),

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use crate::blueprint::resolve::{Arm, Checker};
 use crate::blueprint::schema::{HardwareEntry, Joints, OnExit};
-use crate::blueprint::{limits, park, parts};
+use crate::blueprint::{limits, park, parts, peripherals};
 use dimos_core::arm::{Supervision, Topology};
 use dimos_core::joint::{MAX_DOF, make_joints};
 use dimos_hardware::check::{Checked, LineShare};
@@ -51,16 +51,18 @@ pub(super) fn resolve(checker: &mut Checker<'_>, hardware: &[Located<HardwareEnt
     let known = whole && !hardware.is_empty();
     let mut found = Hardware { arms: Vec::new(), entries: Vec::new(), ids_known: known, joints_known: known };
     let mut named_at: Vec<(String, NodeId)> = Vec::new();
+    let mut places = peripherals::Places::new();
     for entry in hardware {
         let (id, duplicate) = id(checker, entry, &found.entries);
         let (joints, joints_known) = joints(checker, entry, duplicate, &mut named_at);
         let adapter = adapter(checker, entry);
         found.ids_known &= !id.is_empty();
         found.joints_known &= joints_known;
-        let mut line = None;
+        let (mut line, own) = (None, peripherals::resolve(checker, entry, &mut places));
         match adapter {
             Some(row) => {
-                let arm = arm(checker, entry, row, &id, &joints, joints_known);
+                let arm = Arm { peripherals: own, ..arm(checker, entry, row, &id, &joints, joints_known) };
+                peripherals::warn_of_emulators(checker, entry, &arm);
                 line = arm.line;
                 found.arms.push(arm);
             }
@@ -210,6 +212,7 @@ fn arm(
         park_pose,
         supervision: supervision(entry, &row, simulated, topology),
         setup,
+        peripherals: Vec::new(),
         options,
         own_limits: own.unwrap_or_default(),
         limits,

@@ -25,6 +25,8 @@ pub fn full_schema<'a>(catalog: impl Into<Catalog<'a>>) -> Value {
     // One generator for all: it distinguishes types of the same name.
     let options: Vec<(&str, Value)> =
         adapters.rows().iter().map(|row| (row.name, (row.options.schema)(&mut generator).to_value())).collect();
+    let own: Vec<(&str, Value)> =
+        adapters.peripherals().iter().map(|row| (row.name, (row.options.schema)(&mut generator).to_value())).collect();
     let params: Vec<(&str, Value)> =
         tasks.rows().map(|row| (row.name, (row.params.schema)(&mut generator).to_value())).collect();
     let mut schema = generator.into_root_schema_for::<BlueprintFile>().to_value();
@@ -36,6 +38,15 @@ pub fn full_schema<'a>(catalog: impl Into<Catalog<'a>>) -> Value {
         {
             adapter.insert("enum".to_owned(), json!(names));
         }
+    }
+    if let Some(peripheral) = schema.pointer_mut("/$defs/PeripheralEntry") {
+        let names: Vec<&str> = own.iter().map(|(name, _)| *name).collect();
+        if let Some(adapter) = peripheral.pointer_mut("/properties/adapter_type").and_then(Value::as_object_mut)
+            && !names.is_empty()
+        {
+            adapter.insert("enum".to_owned(), json!(names));
+        }
+        join(peripheral, "adapter_type", "options", own);
     }
     if let Some(task) = schema.pointer_mut("/$defs/TaskEntry") {
         join(task, "type", "params", params);

@@ -192,11 +192,13 @@ fn use_address(tree: &mut Tree, root: NodeId, arm: &str, address: &str) {
     }
 }
 
-/// `--sim`: sets the address of every arm to its emulator. A real arm without an emulator is an error.
+/// `--sim`: sets the address of every arm and peripheral to its emulator. A real arm without an emulator is an error.
 fn simulate(tree: &mut Tree, root: NodeId, adapters: &Registry) {
     let source = tree.add_source("--sim", "--sim");
     let hardware = tree.get(root, "hardware").map(|list| tree.items(list).to_vec()).unwrap_or_default();
     for entry in hardware {
+        let own: Vec<NodeId> = ["gripper", "force_torque"].iter().filter_map(|part| tree.get(entry, part)).collect();
+        own.into_iter().for_each(|own| tree.put_text(own, "address", SIM, (source, 0..5)));
         let name = tree.get(entry, "adapter_type").and_then(|node| tree.text(node));
         let Some(row) = name.and_then(|name| adapters.get(name)) else { continue };
         if row.emulate.is_some() {

@@ -10,6 +10,7 @@ use crate::blueprint::catalog::Catalog;
 use crate::blueprint::endpoints::MetricsConfig;
 use crate::blueprint::feed_forward::{self, ArmEffort};
 use crate::blueprint::limits::JointOverride;
+use crate::blueprint::peripherals::ArmPeripheral;
 use crate::blueprint::planner::{ViewBackend, ViewConfig};
 use crate::blueprint::schema::{
     BlueprintFile, CoordinatorConfig, GuardConfig, HardwareType, OnExit, RecordingConfig, RpcConfig,
@@ -26,6 +27,7 @@ use dimos_core::arm::{SetpointFields, Supervision};
 use dimos_core::joint::{JointLimits, LONGEST_NAME, may_be_in_name};
 use dimos_hardware::check::{LineShare, ToolFacts};
 use dimos_hardware::device::Setup;
+use dimos_hardware::peripheral::Part;
 use dimos_hardware::registry::AdapterSpec;
 use dimos_planner::planning::scene::config::PlannerConfig;
 use dimos_robot::Source;
@@ -117,6 +119,8 @@ pub struct Arm {
     pub supervision: Supervision,
     /// What is set of its optional parts.
     pub setup: Setup,
+    /// Its gripper and its sensor, where they have their own connections.
+    pub peripherals: Vec<ArmPeripheral>,
     /// The adapter's own options: an object.
     pub options: Value,
     /// The arm's own limits, from its adapter.
@@ -141,6 +145,11 @@ impl Arm {
     /// Returns whether commands reach a device: it is neither an emulator nor an arm in memory.
     pub fn is_real(&self) -> bool {
         !self.simulated && self.adapter.transport != "memory"
+    }
+
+    /// Returns whether it may have a gripper.
+    pub fn has_gripper(&self) -> bool {
+        self.adapter.gripper || self.peripherals.iter().any(|own| own.row.part == Part::Gripper)
     }
 }
 

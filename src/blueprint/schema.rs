@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use crate::blueprint::endpoints::MetricsConfig;
 use crate::blueprint::limits::LimitsEntry;
 use crate::blueprint::parts::{MountingEntry, PayloadEntry, StopInputEntry};
+use crate::blueprint::peripherals::PeripheralEntry;
 use crate::blueprint::planner::{PlannerEntry, ViewConfig};
 use crate::blueprint::share::ShareEntry;
 use crate::blueprint::size::Size;
@@ -175,6 +176,12 @@ pub struct HardwareEntry {
     /// gives the direction of gravity.
     #[serde(default)]
     pub model_path: Option<Located<String>>,
+    /// A gripper with its own connection, such as a Robotiq. Default: the arm's own, if it has one.
+    #[serde(default)]
+    pub gripper: Option<Located<PeripheralEntry>>,
+    /// A force/torque sensor with its own connection. Default: the arm's own, if it has one.
+    #[serde(default)]
+    pub force_torque: Option<Located<PeripheralEntry>>,
     /// The adapter's own options.
     #[serde(default)]
     #[schemars(with = "Option<serde_json::Map<String, serde_json::Value>>")]

@@ -3,6 +3,7 @@
 use serde::Serialize;
 use serde_json::Value;
 
+use crate::blueprint::peripherals::ArmPeripheral;
 use crate::blueprint::resolve::{Arm, Blueprint};
 use crate::blueprint::schema::{CoordinatorConfig, OnExit};
 use dimos_core::joint::{DEFAULT_ACCELERATION, DEFAULT_JERK};
@@ -48,6 +49,19 @@ pub struct JointSummary {
     pub jerk: Limit,
 }
 
+/// A gripper or a sensor with its own connection.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PeripheralSummary {
+    /// The part of the arm that it is: `gripper` or `force_torque`.
+    pub part: &'static str,
+    /// The adapter's name.
+    pub adapter: String,
+    /// Address.
+    pub address: String,
+    /// Whether it is an emulator.
+    pub simulated: bool,
+}
+
 /// An arm.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ArmSummary {
@@ -76,6 +90,9 @@ pub struct ArmSummary {
     pub tcp_velocity: Option<Limit>,
     /// Whether a model of the arm is known, so that this limit is kept.
     pub tcp_velocity_is_kept: bool,
+    /// Its gripper and its sensor, where they have their own connections.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub peripherals: Vec<PeripheralSummary>,
     /// Its joints.
     pub joints: Vec<JointSummary>,
 }
@@ -162,7 +179,17 @@ fn arm(arm: &Arm) -> ArmSummary {
             from: if arm.tool.velocity == Some(value) { Origin::Adapter } else { Origin::Blueprint },
         }),
         tcp_velocity_is_kept: matches!(arm.tool_limit(), Ok(Some(_))),
+        peripherals: arm.peripherals.iter().map(peripheral).collect(),
         joints: (0..arm.joints.len()).map(|joint| joint_summary(arm, joint)).collect(),
+    }
+}
+
+fn peripheral(own: &ArmPeripheral) -> PeripheralSummary {
+    PeripheralSummary {
+        part: own.row.part.name(),
+        adapter: own.row.name.to_owned(),
+        address: own.address.clone(),
+        simulated: own.is_simulated(),
     }
 }
 

@@ -145,7 +145,8 @@ fn check_grippers(checker: &mut Checker<'_>, pos: &TaskPos<'_>, arms: &[usize], 
         return checker.error(at, diag.hint("make one task per arm"));
     }
     let entries = arms.iter().chain([&leader]).filter_map(|arm| hardware.entries.get(*arm));
-    if let Some(entry) = { entries }.find(|entry| entry.adapter.is_some_and(|row| !row.gripper)) {
+    let lacks = |entry: &&Entry| hardware.arms.iter().any(|arm| arm.hardware_id == entry.id && !arm.has_gripper());
+    if let Some(entry) = { entries }.find(lacks) {
         let diag = Diag::error(format!("{} has no gripper", quote(&entry.id)));
         checker.error(at, diag.hint("leave `gripper` out"));
     }

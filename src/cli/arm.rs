@@ -6,6 +6,7 @@ mod bus;
 mod calibrate;
 mod configure;
 mod find_port;
+mod home;
 mod kinematics;
 mod live_table;
 pub(super) mod parts;
@@ -61,6 +62,7 @@ enum Action {
     #[command(after_help = "\
 Exit code 0: the fingers are where they were sent, or hold an object. 1: blocked, or no outcome within --timeout.
 
+  dimos arm gripper arm home                  # where it needs that: once
   dimos arm gripper arm close --force 20
   dimos arm gripper arm close --attach cup    # cup is part of the arm then
   dimos arm gripper arm open --detach")]
@@ -100,9 +102,10 @@ pub struct ArmArgs {
 struct GripperArgs {
     #[command(flatten)]
     which: ArmArgs,
-    /// Opening [m], angle [rad] of a rotary gripper, `open`, or `close`; `dimos status` shows the range
-    #[arg(value_name = "POSITION", value_parser = opening, allow_negative_numbers = true)]
-    opening: Opening,
+    /// Opening [m], angle [rad] of a rotary gripper, `open`, or `close`; `dimos status` shows the range. `home`
+    /// activates a gripper with its own connection: its fingers move to their ends
+    #[arg(value_name = "POSITION", value_parser = act, allow_negative_numbers = true)]
+    act: Act,
     /// Largest force [N, Nm or %; `dimos status` shows unit and range]; default: the one set in the arm
     #[arg(long, value_name = "FORCE", value_parser = finite, allow_negative_numbers = true)]
     force: Option<f64>,
@@ -121,6 +124,20 @@ struct GripperArgs {
     /// Return when the command was sent
     #[arg(long)]
     no_wait: bool,
+}
+
+/// What a gripper does.
+#[derive(Debug, Clone, Copy)]
+enum Act {
+    /// It is homed.
+    Home,
+    /// It goes to a position.
+    To(Opening),
+}
+
+/// Parses a position, `open`, `close` or `home`.
+fn act(text: &str) -> std::result::Result<Act, String> {
+    if text == "home" { Ok(Act::Home) } else { opening(text).map(Act::To) }
 }
 
 /// Runs the verb.
@@ -169,13 +186,14 @@ fn phase(which: &ArmArgs, request: impl Method<Reply = ArmReply>) -> Result<Stri
 }
 
 fn gripper(args: &GripperArgs) -> Result {
+    let Act::To(opening) = args.act else { return home::run(args) };
     let (signals, which) = (Signals::watch(), &args.which);
     let mut client = which.target_run.connect()?;
     let objects = match &args.attach {
         Some(name) => Some(GripObjects::Attach(name.clone())),
         None => args.detach.then_some(GripObjects::Detach),
     };
-    let (opening, force, speed, timeout) = (args.opening, args.force, args.speed, args.timeout);
+    let (force, speed, timeout) = (args.force, args.speed, args.timeout);
     let action = GripAction { opening, force, speed, timeout, objects };
     if !args.no_wait {
         return action.run(&mut client, &which.arm, &signals, which.target_run.json).map(|()| Exit::Ok);

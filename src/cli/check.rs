@@ -154,6 +154,10 @@ fn print(summary: &Summary) {
             table.row(cells);
         }
         table.print();
+        for own in &arm.peripherals {
+            let place = if own.simulated { "SIMULATED".to_owned() } else { format!("at {}", own.address) };
+            output::wrapped(format_args!("  {}: {} {place}", own.part, own.adapter));
+        }
         if let Some(Limit { value, from }) = arm.tcp_velocity {
             let kept = if arm.tcp_velocity_is_kept { from.name() } else { "not kept: no model of the arm is known" };
             output::wrapped(format_args!("  tool: at most {value:.3} m/s ({kept})"));

@@ -70,7 +70,7 @@ fn candidates(parent: &str, verb: &str, arg: Arg) -> Arg {
         ("named", _) => arg.add(of(named_poses)),
         ("through", _) => arg.add(of(waypoints)),
         ("several", _) => arg.add(of(goals)),
-        ("opening", _) => arg.add(of(|| ["open", "close"].map(str::to_owned).into())),
+        ("act", _) => arg.add(of(|| ["open", "close", "home"].map(str::to_owned).into())),
         ("joint", _) => arg.add(of(joints)),
         ("address", "run" | "check") => {
             arg.add(of(|| TYPED.get().map_or_else(BTreeSet::new, |typed| typed.arms.clone())))

@@ -1,4 +1,4 @@
-//! `dimos list-adapters`: the arms that this program supports.
+//! `dimos list-adapters`: the arms that this program supports, and grippers and sensors with their own connections.
 
 use serde_json::json;
 
@@ -6,7 +6,8 @@ use super::exit::{Exit, Result};
 use super::output::{self, Table};
 use dimos_core::joint::MAX_DOF;
 use dimos_hardware::check::Checked;
-use dimos_hardware::registry::{Absent, AdapterConfig, AdapterSpec, Registry, Teach};
+use dimos_hardware::peripheral::PeripheralSpec;
+use dimos_hardware::registry::{Absent, AdapterConfig, AdapterSpec, OptionsSpec, Registry, Teach};
 
 /// Arguments of `list-adapters`.
 #[derive(Debug, clap::Args)]
@@ -28,7 +29,9 @@ pub struct Args {
 /// Runs the verb.
 pub fn run(args: &Args, registry: &Registry) -> Result {
     if args.json {
-        output::json(&registry.rows().iter().map(to_json).chain(registry.absent().map(lacking)).collect::<Vec<_>>());
+        let peripherals = registry.peripherals().iter().map(peripheral);
+        let rows = registry.rows().iter().map(to_json).chain(registry.absent().map(lacking)).chain(peripherals);
+        output::json(&rows.collect::<Vec<_>>());
         return Ok(Exit::Ok);
     }
     lines(registry).iter().for_each(output::wrapped);
@@ -55,6 +58,15 @@ fn lines(registry: &Registry) -> Vec<String> {
         table.row([absent.name.to_owned(), "not in this build".to_owned()].into_iter().chain(nothing));
     }
     let mut lines = table.lines();
+    if !registry.peripherals().is_empty() {
+        let mut table = Table::new(&["AT AN ARM", "LEVEL", "PART", ">RATE Hz"]);
+        for row in registry.peripherals() {
+            let rate = format!("{:.0}", row.native_rate);
+            table.row([row.name.to_owned(), row.level.name().to_owned(), row.part.text().to_owned(), rate]);
+        }
+        lines.push(String::new());
+        lines.extend(table.lines());
+    }
     for row in registry.rows() {
         lines.extend([String::new(), format!("{}: {}", row.name, row.about)]);
         lines.push(format!("  address: {}", row.address.form));
@@ -68,7 +80,13 @@ fn lines(registry: &Registry) -> Vec<String> {
             lines.push(format!("  limits: {dof} {joints}, up to {fastest:.2} rad/s ({:.0}°/s)", fastest.to_degrees()));
         }
         lines.extend(checked.iter().flat_map(|(_, checked)| setpoints(checked)));
-        lines.push(format!("  options: {}", options(row).join(", ")));
+        lines.push(format!("  options: {}", options(&row.options).join(", ")));
+    }
+    for row in registry.peripherals() {
+        lines.extend([String::new(), format!("{}: {}", row.name, row.about)]);
+        lines.push(format!("  in a blueprint: hardware[].{}", row.part.name()));
+        lines.push(format!("  address: {}", row.address.form));
+        lines.push(format!("  options: {}", options(&row.options).join(", ")));
     }
     for absent in registry.absent() {
         lines.extend([String::new(), format!("{}: {}", absent.name, absent.about)]);
@@ -133,8 +151,8 @@ fn checked(row: &AdapterSpec) -> Option<(usize, Checked)> {
 }
 
 /// Returns the names of its options.
-fn options(row: &AdapterSpec) -> Vec<String> {
-    let schema = (row.options.schema)(&mut schemars::SchemaGenerator::default());
+fn options(spec: &OptionsSpec) -> Vec<String> {
+    let schema = (spec.schema)(&mut schemars::SchemaGenerator::default());
     let properties = schema.get("properties").and_then(|properties| properties.as_object());
     properties.map(|properties| properties.keys().cloned().collect()).unwrap_or_default()
 }
@@ -159,7 +177,7 @@ fn to_json(row: &AdapterSpec) -> serde_json::Value {
         "address": {"form": row.address.form, "required": row.address.required},
         "holds_when_disabled": row.holds_when_disabled,
         "teach": teach(row),
-        "options": options(row),
+        "options": options(&row.options),
         "setpoint": setpoint.collect::<serde_json::Map<_, _>>(),
         "limits": checked.as_ref().map(|(dof, Checked { limits, .. })| json!({
             "dof": dof,
@@ -168,6 +186,21 @@ fn to_json(row: &AdapterSpec) -> serde_json::Value {
             "velocity_max": limits.velocity_max,
         })),
         "gripper": row.gripper,
+        "emulator": row.emulate.is_some(),
+    })
+}
+
+/// A gripper or a sensor with its own connection; an arm has no `part`.
+fn peripheral(row: &PeripheralSpec) -> serde_json::Value {
+    json!({
+        "name": row.name,
+        "about": row.about,
+        "part": row.part.name(),
+        "in_this_build": true,
+        "level": row.level.name(),
+        "native_rate_hz": row.native_rate,
+        "address": {"form": row.address.form, "required": row.address.required},
+        "options": options(&row.options),
         "emulator": row.emulate.is_some(),
     })
 }
@@ -187,6 +220,7 @@ mod tests {
         let lines = lines(&dimos_arms::registry().lacking(&[absent]));
         assert!(lines.iter().any(|line| line.starts_with("servobot  not in this build")), "{lines:?}");
         assert_eq!(lines.last().unwrap(), "  not in this build: build with --features servobot");
+        assert!(lines.iter().any(|line| line.starts_with("robotiq_2f85  emulated  gripper")), "{lines:?}");
         let rows = dimos_arms::registry();
         let listed = |name: &str| lines.iter().any(|line| line.starts_with(&format!("{name}: ")));
         assert!(rows.rows().iter().all(|row| listed(row.name)) && listed("servobot"), "{lines:?}");

@@ -296,6 +296,9 @@ pub(super) fn trouble(r: &StatusReport) -> Vec<String> {
         if let Some(error) = &arm.error {
             lines.push(format!("{name} reports error {}: {}", error.code, error.text));
         }
+        for (what, hint) in arm.peripherals.iter().filter_map(|own| own.attention(name)) {
+            lines.extend([what, format!("  hint: {hint}")]);
+        }
         if arm.stop_pending {
             lines.push(format!("{name}: a stop is pending; it is sent after the reconnect"));
         }
@@ -384,6 +387,11 @@ fn print_arms(arms: &[ArmReport], verbose: bool) {
         let name = &arm.hardware_id;
         let standing = banner::standing(arm.simulated, &arm.address);
         output::wrapped(format_args!("  {name}: {standing}, {}; at exit: {}", arm.adapter, at_exit(arm)));
+        for own in &arm.peripherals {
+            let place = if own.simulated { "SIMULATED".to_owned() } else { format!("at {}", own.address) };
+            let condition = own.condition.as_deref().unwrap_or("lost").replace('_', " ");
+            output::wrapped(format_args!("  {name}: {} {} {place}: {condition}", own.part_text(), own.adapter));
+        }
         if let Some(codes) = arm.device_state.as_ref().filter(|_| verbose) {
             let (state, mode) = (codes.state, codes.mode);
             output::wrapped(format_args!("  {name}: device state {state}, mode {mode} (the vendor's numbers)"));

@@ -105,8 +105,18 @@ impl Service {
             | Call::WorldAdd(_)
             | Call::WorldMove(_)
             | Call::WorldRemove(_) => self.planner_call_from(call, origin).await,
-            Call::Attach(attach) => self.attach(attach).await,
-            Call::Detach(detach) => self.detach(detach).await,
+            Call::Attach(attach) => {
+                let (name, robot) = (attach.name.clone(), attach.robot.clone());
+                let reply = self.attach(attach).await?;
+                self.note_attached(name, &robot).await?;
+                Ok(reply)
+            }
+            Call::Detach(detach) => {
+                let name = detach.name.clone();
+                let reply = self.detach(detach).await?;
+                self.note_detached(&name);
+                Ok(reply)
+            }
             Call::Cancel(c) => self.cancel(c).await,
             Call::Speed(speed) => self.set_speed(speed).await.map(Reply::Speed),
             Call::Stop(s) => self.stop(s).await,
@@ -117,6 +127,7 @@ impl Service {
             Call::MoveNative(m) => self.move_native(m, origin).await,
             Call::ArmDisable(a) => self.disable(a.arm, a.now).await,
             Call::Gripper(g) => self.gripper(g, origin).await,
+            Call::GripperHome(g) => self.home_gripper(g).await,
             Call::Grip(g) => self.grip(&g).map(Reply::Grip),
             Call::ArmPayload(p) => self.payload(&p.arm).await.map(Reply::ArmPayload),
             Call::ArmPayloadSet(p) => self.set_payload(p).await,

@@ -255,7 +255,7 @@ impl Connected {
             tick: TickLink::new(dispatcher.clone(), pulse.clone(), ends.arm_views, ends.task_views),
             grippers: Grippers::new(devices.len()),
             tools: Tools::new(tools, devices.len()),
-            arms: ArmLinks::new(devices, arms.serials.clone()),
+            arms: ArmLinks::new(devices, arms.peripherals.clone(), arms.serials.clone()),
             motions: Motions::default(),
             goings: Goings::default(),
             streams: Streams::new(facts.config.tasks.len()),

@@ -10,7 +10,7 @@ use dimos::blueprint::schema::{AssetEntry, BlueprintFile, CountedJoints, Hardwar
 use dimos::blueprint::share::{IdentityEntry, RosEntry, ShareEntry};
 use dimos::blueprint::{
     Catalog, CoordinatorConfig, FoxgloveConfig, GuardConfig, LimitsEntry, MetricsConfig, MountingEntry, PayloadEntry,
-    RecordingConfig, RpcConfig, StopInputEntry, full_schema, json_schema,
+    PeripheralEntry, RecordingConfig, RpcConfig, StopInputEntry, full_schema, json_schema,
 };
 use dimos::control::task_spec::{TaskSpec, TaskTable};
 use dimos::hardware::registry::Registry;
@@ -64,7 +64,7 @@ const fn section(title: &'static str, first: &'static str, pointer: &'static str
 const ARMS: &str = "A list of arms, merged by `hardware_id` when blueprints are included.";
 const TASKS: &str = "A list of tasks, merged by `name` when blueprints are included.";
 
-const SECTIONS: [Section; 9] = [
+const SECTIONS: [Section; 10] = [
     section("Top level", "", "", keys::<BlueprintFile>),
     section("`coordinator`", "", "/$defs/CoordinatorConfig", keys::<CoordinatorConfig>),
     section("`hardware[]`", ARMS, "/$defs/HardwareEntry", keys::<HardwareEntry>),
@@ -73,6 +73,12 @@ const SECTIONS: [Section; 9] = [
     section("`hardware[].stop_input`", "", "/$defs/StopInputEntry", keys::<StopInputEntry>),
     section("`hardware[].payload`", "", "/$defs/PayloadEntry", keys::<PayloadEntry>),
     section("`hardware[].mounting`", "", "/$defs/MountingEntry", keys::<MountingEntry>),
+    section(
+        "`hardware[].gripper` and `hardware[].force_torque`",
+        "",
+        "/$defs/PeripheralEntry",
+        keys::<PeripheralEntry>,
+    ),
     section("`tasks[]`", TASKS, "/$defs/TaskEntry", keys::<TaskEntry>),
 ];
 /// Those behind the parameters of the task types.
@@ -104,17 +110,19 @@ pub fn reference<'a>(catalog: impl Into<Catalog<'a>>) -> String {
     write_sections(&mut page, &SECTIONS, &schema);
     write_params(&mut page, catalog.tasks, &schema);
     write_sections(&mut page, &SECTIONS_AFTER_TASKS, &schema);
-    for row in catalog.adapters.rows() {
-        let title = format!("`options` of `{}`", row.name);
-        let rules = schema.pointer("/$defs/HardwareEntry/allOf").and_then(Value::as_array);
-        let rule = rules
-            .into_iter()
-            .flatten()
-            .find(|rule| rule.pointer("/if/properties/adapter_type/const").and_then(Value::as_str) == Some(row.name));
+    let arms = catalog.adapters.rows().iter().map(|row| ("HardwareEntry", row.name, row.about, row.address.form));
+    let peripherals = catalog.adapters.peripherals().iter();
+    let peripherals = peripherals.map(|row| ("PeripheralEntry", row.name, row.about, row.address.form));
+    for (entry, name, about, form) in arms.chain(peripherals) {
+        let title = format!("`options` of `{name}`");
+        let rules = schema.pointer(&format!("/$defs/{entry}/allOf")).and_then(Value::as_array);
+        let is_its =
+            |rule: &&Value| rule.pointer("/if/properties/adapter_type/const").and_then(Value::as_str) == Some(name);
+        let rule = rules.into_iter().flatten().find(is_its);
         let options = rule.and_then(|rule| rule.pointer("/then/properties/options/anyOf/0"));
         if let Some(options) = options.map(|options| follow(options, &schema)) {
-            let form = format!("{}. Address: `{}`.", row.about.trim_end_matches('.'), row.address.form);
-            write_section(&mut page, &title, &form, &[], options, &schema);
+            let first = format!("{}. Address: `{form}`.", about.trim_end_matches('.'));
+            write_section(&mut page, &title, &first, &[], options, &schema);
         }
     }
     page.truncate(page.trim_end().len());

@@ -79,6 +79,7 @@ pub(crate) fn spawn(
         native_rate,
         supervision: Supervision { accept_zero_pose: true, ..Supervision::default() },
         setup: dimos::hardware::device::Setup::default(),
+        peripherals: Default::default(),
         beat: beat.clone(),
         pace: None,
         clock,

@@ -54,6 +54,7 @@ mod older_logs;
 mod pages;
 mod path_rules;
 mod pauses;
+mod peripherals;
 mod piper_rest;
 mod planned_paths;
 mod planning;

@@ -303,6 +303,7 @@ fn a_healthy_device_thread_does_not_allocate() {
         native_rate: 500.0,
         supervision: dimos::arm::Supervision::default(),
         setup: dimos::hardware::device::Setup::default(),
+        peripherals: Default::default(),
         beat: beat.clone(),
         pace: None,
         clock: Arc::new(MonotonicClock),

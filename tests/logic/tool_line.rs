@@ -1,16 +1,22 @@
 //! A device at an arm's tool flange, behind the arm's RS-485: it is reached like one at a serial line of this computer.
 //! The arms are emulated, the device is one that speaks Modbus RTU.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
+use dimos::arms::robotiq;
+use dimos::arms::robotiq::adapter::Robotiq2F;
+use dimos::arms::robotiq::emulator::{AtTool, Fingers};
 use dimos::arms::ur::adapter::UrAdapter;
 use dimos::arms::ur::emulator::UrEmulator;
 use dimos::arms::xarm::emulator::XArmEmulator;
-use dimos::hardware::adapter::{AdapterError, ManipulatorAdapter};
+use dimos::clock::{Clock, MonotonicClock};
+use dimos::hardware::adapter::{AdapterError, Gripper, ManipulatorAdapter};
+use dimos::hardware::peripheral::{Condition, Peripheral};
 use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::tool_device::ToolDevice;
 use dimos::hardware::transport::Scan;
 use dimos::hardware::transport::line::{Line, LineAddress};
+use dimos::hardware::transport::modbus::Framing;
 use dimos::hardware::transport::request_reply::{RequestReply, Retry};
 use serde_json::{Value, json};
 
@@ -128,4 +134,42 @@ fn settings_that_a_tool_does_not_have_are_mistakes_of_the_blueprint() {
     }
     let cb3 = wrong(json!({"model": "ur5", "tool_line": {}})).unwrap();
     assert!(cb3.contains("has no RS-485 at its tool"), "{cb3}");
+}
+
+/// Homes and closes a gripper at `address`.
+fn grips(address: &str) -> Result<(), AdapterError> {
+    let mut gripper = Robotiq2F::new(&config(0, address, json!({})))?;
+    gripper.connect()?;
+    gripper.home()?;
+    let limit = Instant::now() + Duration::from_secs(20);
+    let until = |gripper: &mut Robotiq2F, is_so: fn(&mut Robotiq2F) -> bool| {
+        while !is_so(gripper) {
+            assert!(Instant::now() < limit, "{address}");
+            gripper.read()?;
+        }
+        Ok::<(), AdapterError>(())
+    };
+    until(&mut gripper, |gripper| gripper.condition() == Condition::Ready)?;
+    gripper.write_gripper_position(0.05)?;
+    until(&mut gripper, |gripper| matches!(gripper.read_gripper_position(), Ok(Some(at)) if (at - 0.05).abs() < 4e-4))
+}
+
+#[test]
+fn a_gripper_at_the_tool_of_either_arm_is_reached_by_its_address() {
+    let gripper = || AtTool(Fingers::new(&robotiq::Options::default(), Framing::Rtu), || MonotonicClock.now());
+    let xarm = XArmEmulator::start(&config(6, "", json!({})), &EmulatorAddress::InProcess).unwrap();
+    xarm.fit_tool(gripper(), 2_000_000);
+    let control: u16 = xarm.address().split(':').nth(1).unwrap().parse().unwrap();
+    grips(&format!("xarm:127.0.0.1:{}@2000000", control + 1)).unwrap();
+
+    let options = json!({"tool_line": {"voltage": 24}});
+    let ur = UrEmulator::start(&config(6, "", options.clone()), &EmulatorAddress::InProcess).unwrap();
+    ur.fit_tool(gripper(), 115_200);
+    let address = format!("ur:{}", ur.tool_line().unwrap());
+    assert!(Robotiq2F::new(&config(0, &address, json!({}))).unwrap().waits_for_arm());
+    assert!(matches!(grips(&address), Err(AdapterError::Timeout(_))), "the arm is not enabled");
+    let mut arm = UrAdapter::new(&config(6, &ur.address(), options)).unwrap();
+    arm.connect().unwrap();
+    arm.activate().unwrap();
+    grips(&address).unwrap();
 }

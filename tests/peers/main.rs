@@ -10,6 +10,7 @@ mod franka_sim;
 mod lerobot_bus;
 mod piper_kernel;
 mod piper_sdk;
+mod robotiq;
 mod ur_control;
 mod ur_rtde;
 mod viewer;

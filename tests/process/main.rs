@@ -52,6 +52,7 @@ mod on_path;
 mod onto;
 mod orders;
 mod other_machine;
+mod own_gripper;
 mod packages;
 mod page_commands;
 mod park;

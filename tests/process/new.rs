@@ -48,7 +48,7 @@ fn every_arm_of_the_table_passes_check_and_one_of_each_adapter_runs() {
     let rows = rows.as_array().unwrap();
     assert!(rows.len() >= 8, "{rows:?}");
     let mut models = 0;
-    for row in rows {
+    for row in rows.iter().filter(|row| row["part"].is_null()) {
         let adapter = row["name"].as_str().unwrap();
         let arms = arms(&home, adapter);
         for arm in &arms {

@@ -1,6 +1,6 @@
 //! Owns the arms: a folder each, with adapter, protocol, emulator and a row of the table. No arm uses another. Used by
 //! the run; what an adapter needs is in `dimos-hardware`. A new arm is one folder, a feature and a row here; `mock` and
-//! `yourarm` are always there.
+//! `yourarm` are always there, as are the peripherals: grippers and sensors with their own connections.
 
 #![cfg_attr(
     not(test),
@@ -10,15 +10,18 @@
 #![allow(rustdoc::broken_intra_doc_links, reason = "units are in brackets: [rad]")]
 
 use dimos_hardware::adapter::{AdapterError, AdapterResult, ManipulatorAdapter};
+use dimos_hardware::peripheral::PeripheralSpec;
 use dimos_hardware::registry::{Absent, AdapterConfig, AdapterSpec, Emulator, EmulatorAddress, Registry, SIM};
 
 #[cfg(feature = "franka")]
 pub mod franka;
 pub mod mock;
+pub mod modbus_gripper;
 #[cfg(feature = "piper")]
 pub mod piper;
 #[cfg(feature = "remote")]
 pub mod remote;
+pub mod robotiq;
 #[cfg(feature = "so101")]
 pub mod so101;
 #[cfg(feature = "ur")]
@@ -45,6 +48,9 @@ pub const TABLE: &[AdapterSpec] = &[
     remote::SPEC,
 ];
 
+/// The peripherals: devices at an arm with their own connections.
+pub const PERIPHERALS: &[PeripheralSpec] = &[robotiq::SPEC, modbus_gripper::SPEC, robotiq::ft300::SPEC];
+
 /// Adapters that this build lacks because their cargo feature is off.
 pub const ABSENT: &[Absent] = &[
     #[cfg(not(feature = "xarm"))]
@@ -68,7 +74,7 @@ const fn lacking(name: &'static str, about: &'static str, remedy: &'static str) 
 
 /// Returns the table of the built-in adapters.
 pub fn registry() -> Registry {
-    Registry::default().with(TABLE).lacking(ABSENT)
+    Registry::default().with(TABLE).with_peripherals(PERIPHERALS).lacking(ABSENT)
 }
 
 /// Returns the names of the built-in adapters.

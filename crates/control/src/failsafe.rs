@@ -52,6 +52,7 @@ pub fn trouble(state: &ArmState, freshness: Freshness) -> Option<Cause> {
         Link::Up if state.interference == Interference::Power => Some(Cause::PowerChanged),
         Link::Up if state.interference == Interference::Stop => Some(Cause::StoppedElsewhere),
         Link::Up if state.interference == Interference::Limits => Some(Cause::LimitsChanged),
+        Link::Up if state.interference == Interference::Tool => Some(Cause::ToolLost),
         Link::Up if state.self_held => Some(Cause::HeartbeatLost),
         Link::Up => None,
     }

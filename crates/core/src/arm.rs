@@ -166,6 +166,8 @@ named! {
         Identity = "identity",
         /// The controller's limits have become narrower than those of the run.
         Limits = "limits",
+        /// A gripper with its own connection is lost, with what it holds.
+        Tool = "tool",
     }
 }
 

@@ -18,6 +18,7 @@ pub mod adapter_util;
 pub mod check;
 pub mod conformance;
 pub mod device;
+pub mod peripheral;
 pub mod registry;
 pub mod service;
 pub mod sim;

@@ -8,6 +8,7 @@ use serde::de::DeserializeOwned;
 
 use crate::adapter::{AdapterError, AdapterResult, ManipulatorAdapter};
 use crate::check::{Checked, ConfigError};
+use crate::peripheral::PeripheralSpec;
 use crate::service::OpenService;
 use crate::sim::faults::Fault;
 use crate::wire::Wire;
@@ -234,10 +235,11 @@ pub struct Absent {
 /// The address that starts the emulator.
 pub const SIM: &str = "sim";
 
-/// An adapter table: rows of arms, and adapters that a build lacks.
+/// An adapter table: rows of arms and of their peripherals, and adapters that a build lacks.
 #[derive(Debug, Clone, Default)]
 pub struct Registry {
     rows: Vec<AdapterSpec>,
+    peripherals: Vec<PeripheralSpec>,
     absent: Vec<Absent>,
 }
 
@@ -247,6 +249,23 @@ impl Registry {
         self.rows.retain(|row| !more.iter().any(|m| m.name == row.name));
         self.rows.extend_from_slice(more);
         self
+    }
+
+    /// Adds peripherals, which replace rows of the same name.
+    pub fn with_peripherals(mut self, more: &[PeripheralSpec]) -> Self {
+        self.peripherals.retain(|row| !more.iter().any(|m| m.name == row.name));
+        self.peripherals.extend_from_slice(more);
+        self
+    }
+
+    /// Returns the rows of peripherals, in table order.
+    pub fn peripherals(&self) -> &[PeripheralSpec] {
+        &self.peripherals
+    }
+
+    /// Returns the peripheral of a name.
+    pub fn peripheral(&self, name: &str) -> Option<&PeripheralSpec> {
+        self.peripherals.iter().find(|row| row.name == name)
     }
 
     /// Adds adapters that this build lacks.

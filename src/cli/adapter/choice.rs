@@ -61,15 +61,20 @@ impl Choice {
         Err(Failure { hint: refusal.hint, ..Failure::usage(refusal.what) })
     }
 
-    fn with_dof(&self, address: &str, dof: usize) -> Result<AdapterConfig> {
+    /// Returns the options that were asked for: an object.
+    pub fn options(&self) -> Result<Value> {
         let mut options = Map::new();
         let model = self.model.iter().map(|model| ("model", model.as_str()));
         for (path, text) in self.options.iter().map(|(path, text)| (path.as_str(), text.as_str())).chain(model) {
             let value = serde_yaml::from_str(text).map_err(|e| Failure::usage(format!("--option {path}: {e}")))?;
             set(&mut options, path, value).map_err(Failure::usage)?;
         }
+        Ok(Value::Object(options))
+    }
+
+    fn with_dof(&self, address: &str, dof: usize) -> Result<AdapterConfig> {
         let (hardware_id, address) = (self.name.clone(), address.to_owned());
-        Ok(AdapterConfig { hardware_id, address, dof, options: Value::Object(options) })
+        Ok(AdapterConfig { hardware_id, address, dof, options: self.options()? })
     }
 }
 

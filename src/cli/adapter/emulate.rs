@@ -14,6 +14,7 @@ use super::super::exit::{Exit, Failure, Result};
 use super::super::follow::Signals;
 use super::super::output::{self, Table};
 use super::choice::{Choice, not_started};
+use super::peripheral;
 use crate::blueprint;
 use dimos_core::bounded;
 use dimos_core::clock::{Clock, Mono, MonotonicClock};
@@ -22,7 +23,7 @@ use dimos_hardware::sim::events::{self, SimEvent};
 use dimos_hardware::sim::faults::{Fault, FaultKind};
 
 /// How often the joints are shown.
-const LOOK: Duration = Duration::from_millis(100);
+pub(super) const LOOK: Duration = Duration::from_millis(100);
 
 /// The option of a gripper, and its value for an arm without one.
 const GRIPPER: &str = "gripper";
@@ -63,6 +64,9 @@ pub struct Args {
 
 /// Runs the verb.
 pub fn run(args: &Args, registry: &Registry) -> Result {
+    if let Some(peripheral) = registry.peripheral(&args.choice.name) {
+        return peripheral::run(args, peripheral);
+    }
     let row = args.choice.row(registry)?;
     if args.fault.iter().any(|text| text == "list") {
         return list_faults(args, &row);
@@ -104,16 +108,16 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
 }
 
 /// A symbolic link to a pseudo-terminal; removed when it is dropped, unless another one has replaced it.
-struct Link {
+pub(super) struct Link {
     path: PathBuf,
     device: String,
     /// The address by way of the link.
-    address: String,
+    pub(super) address: String,
 }
 
 impl Link {
     /// Makes the link. One that is there already is replaced, any other file is not.
-    fn to(address: &str, path: &Path) -> Result<Self> {
+    pub(super) fn to(address: &str, path: &Path) -> Result<Self> {
         let failed = |what: String| Failure::usage(format!("--link {}: {what}", path.display()));
         let (scheme, device) = match address.find("/dev/") {
             Some(at) => address.split_at(at),
@@ -203,7 +207,7 @@ fn start(args: &Args, row: &AdapterSpec, place: &EmulatorAddress) -> Result<(Box
 }
 
 /// A fault script: one fault as `key=value,…`, or a file with a list.
-fn script(text: &str) -> Result<Vec<Fault>> {
+pub(super) fn script(text: &str) -> Result<Vec<Fault>> {
     let wrong = |what: String| Failure::usage(format!("--fault {text}: {what}"));
     if !text.contains('=') || Path::new(text).is_file() {
         let hint = "one fault, like at=2,kind=stall,duration=0.5, or a YAML or JSON file with a list of such";

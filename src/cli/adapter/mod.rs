@@ -4,6 +4,7 @@ pub(super) mod choice;
 pub mod emulate;
 mod first_day;
 pub mod new;
+mod peripheral;
 pub mod replay;
 mod report;
 pub mod test;

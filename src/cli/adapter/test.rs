@@ -14,6 +14,7 @@ use super::super::follow::Signals;
 use super::super::output;
 use super::choice::{Choice, not_started};
 use super::first_day;
+use super::peripheral;
 use super::report::{Arm, Limits, Report, Row};
 use crate::runtime::arm::device_lock::{self, DeviceLock};
 use dimos_core::joint::ControlMode;
@@ -78,6 +79,9 @@ pub(super) struct Bench {
 
 /// Runs the verb.
 pub fn run(args: &Args, registry: &Registry) -> Result {
+    if let Some(peripheral) = registry.peripheral(&args.choice.name) {
+        return peripheral::test(args, peripheral);
+    }
     let row = args.choice.row(registry)?;
     if args.first_day {
         return first_day::run(args, &row);

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use crate::runtime::client::dispatch::log_of;
 use crate::runtime::{Service, internal};
 use dimos_control::request::Request;
-use dimos_core::arm::Link;
+use dimos_core::arm::{Interference, Link};
 use dimos_core::joint::STANDSTILL;
 use dimos_core::message::Message;
 use dimos_core::telemetry::texts::cause_text;
@@ -110,6 +110,15 @@ impl Service {
             self.tick.next_tick().await;
             self.tick.until(self.next_report(arm), || self.tick.seen(arm, |view| view.state.error == 0)).await;
         }
+        let peripherals = self.reset_peripherals(arm).await?;
+        if peripherals.is_some() {
+            // The tick must read that the loss is acknowledged.
+            self.tick
+                .until(self.next_report(arm), || {
+                    self.tick.seen(arm, |view| view.state.interference != Interference::Tool)
+                })
+                .await;
+        }
         if count() == stops {
             self.ask(Request::Reset { arm }).await?;
         }
@@ -122,7 +131,9 @@ impl Service {
         }
         let mut reply = self.phase_of(id, arm);
         // The state is read once more before the arm is enabled.
-        reply.note = cause.map(|cause| format!("was held: {cause}"));
+        let notes: Vec<String> =
+            cause.map(|cause| format!("was held: {cause}")).into_iter().chain(peripherals).collect();
+        reply.note = Some(notes.join("; ")).filter(|text| !text.is_empty());
         Ok(Reply::ArmReset(reply))
     }
 

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::device_lock::{self, DeviceLock, DeviceLockError};
+use super::peripherals::{self, ArmPeripherals};
 use super::serial_locks::SerialLocks;
 use crate::blueprint::{Arm, Blueprint, JointOverride, OnExit, TickClock};
 use crate::runtime::StartError;
@@ -30,6 +31,8 @@ const RELEASE_LIMIT: Duration = Duration::from_secs(2);
 pub struct Arms {
     /// Their device threads, in the blueprint's order.
     pub devices: Vec<Arc<Device>>,
+    /// Per arm, its peripherals. Their threads end after those of the arms.
+    pub peripherals: Vec<Arc<ArmPeripherals>>,
     /// Raised with each new state of the arm that clocks the ticks.
     pub pace: Option<Wake>,
     disable: Vec<bool>,
@@ -70,6 +73,7 @@ pub fn bring_up(
     let period = Duration::from_secs_f64(1.0 / blueprint.coordinator.tick_rate);
     let mut arms = Arms {
         devices: Vec::new(),
+        peripherals: Vec::new(),
         pace: None,
         disable: Vec::new(),
         _emulators: Vec::new(),
@@ -83,6 +87,11 @@ pub fn bring_up(
         let address = config.address;
         let (state_writer, state_reader) = slot(ArmState::default());
         let (command_writer, command_reader) = slot(ArmCommand::default());
+        let (own, ports) = {
+            let (emulators, locks, note) = (&mut arms._emulators, &mut arms._locks, note.clone());
+            peripherals::start(arm, is_closed, (emulators, locks), move |what| note(index, what))?
+        };
+        arms.peripherals.push(Arc::new(own));
         let note = note.clone();
         let clocks = blueprint.coordinator.clock == TickClock::Device(arm.hardware_id.clone());
         if clocks {
@@ -101,6 +110,7 @@ pub fn bring_up(
                 efforts: arm.effort.as_ref().map(|effort| effort.limits),
                 ..arm.setup
             },
+            peripherals: ports,
             beat: beat.clone(),
             pace: arms.pace.clone().filter(|_| clocks),
             clock: Arc::new(MonotonicClock),
@@ -114,10 +124,14 @@ pub fn bring_up(
         slots.states.push(state_reader);
         slots.commands.push(command_writer);
     }
+    let mut own: Vec<_> = arms.peripherals.iter().map(|own| own.connect()).collect();
     let answers: Vec<_> = arms.devices.iter().map(|d| d.connect()).collect();
     let limit = Instant::now() + CONNECT_LIMIT;
     let results: Vec<_> =
         answers.into_iter().map(|a| a.wait(limit.saturating_duration_since(Instant::now()))).collect();
+    for (arm, answers) in blueprint.arms.iter().zip(&mut own) {
+        peripherals::connected(arm, answers, limit)?;
+    }
     let mut connected = Vec::new();
     for (arm, result) in blueprint.arms.iter().zip(results) {
         let brought = result.map_err(|e| hardware(arm, &e)).and_then(|c| {
@@ -299,6 +313,7 @@ impl Arms {
             }
         }
         self.devices.clear();
+        self.peripherals.drain(..).for_each(|own| own.finish());
         troubles
     }
 }

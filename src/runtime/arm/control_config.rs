@@ -101,7 +101,7 @@ pub(in crate::runtime) fn coordinator_config(
                 dof: arm.joints.len().min(MAX_DOF),
                 limits: limits.clone(),
                 modes: said.info.modes.to_vec(),
-                gripper: arm.adapter.gripper,
+                gripper: arm.has_gripper(),
                 gripper_info: said.gripper.unwrap_or_default(),
                 own_velocity: said.limits.velocity_max.clone(),
                 read_period: said.read_period,

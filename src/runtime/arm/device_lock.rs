@@ -119,7 +119,10 @@ fn canonical_addresses(address: &str) -> BTreeSet<String> {
         return BTreeSet::from([device_file(path)]);
     }
     let text = text.to_ascii_lowercase();
-    let Some((host, port)) = host_and_port(text.strip_prefix("tcp:").unwrap_or(&text)) else {
+    // A line at the tool of an arm: `xarm:HOST:PORT@RATE`. A host may have such a name.
+    let of_tool = ["ur:", "xarm:"].iter().find_map(|kind| text.strip_prefix(kind)).filter(|rest| rest.contains(':'));
+    let of_tool = of_tool.map(|rest| rest.split('@').next().unwrap_or(rest));
+    let Some((host, port)) = host_and_port(of_tool.or(text.strip_prefix("tcp:")).unwrap_or(&text)) else {
         return BTreeSet::from([text]);
     };
     let ips = match host.parse::<IpAddr>() {

@@ -9,6 +9,7 @@ pub(in crate::runtime) mod lead_requests;
 pub(in crate::runtime) mod model_check;
 pub(in crate::runtime) mod park;
 pub(in crate::runtime) mod part_requests;
+pub(in crate::runtime) mod peripherals;
 pub(in crate::runtime) mod serial_locks;
 pub(in crate::runtime) mod wires;
 
@@ -16,15 +17,17 @@ use std::sync::atomic::{AtomicBool, AtomicU64};
 use std::sync::{Arc, Mutex};
 
 use super::internal;
-use dimos_hardware::device::{Details, Device};
+use dimos_hardware::device::{Details, Device, PeripheralDevice};
 use dimos_rpc::RpcError;
 use late_stops::LateStops;
 use model_check::Checked;
+use peripherals::ArmPeripherals;
 use serial_locks::SerialLocks;
 
 /// The arms as requests see them: their devices, and what has been done to them. Lists are per arm.
 pub(in crate::runtime) struct ArmLinks {
     devices: Vec<Arc<Device>>,
+    peripherals: Vec<Arc<ArmPeripherals>>,
     serials: Arc<SerialLocks>,
     /// Number of stops that clients have ordered.
     stops: Vec<AtomicU64>,
@@ -38,10 +41,11 @@ pub(in crate::runtime) struct ArmLinks {
 }
 
 impl ArmLinks {
-    pub fn new(devices: Vec<Arc<Device>>, serials: Arc<SerialLocks>) -> Self {
+    pub fn new(devices: Vec<Arc<Device>>, peripherals: Vec<Arc<ArmPeripherals>>, serials: Arc<SerialLocks>) -> Self {
         let arms = devices.len();
         Self {
             devices,
+            peripherals,
             serials,
             stops: (0..arms).map(|_| AtomicU64::new(0)).collect(),
             natives: (0..arms).map(|_| AtomicBool::default()).collect(),
@@ -59,6 +63,11 @@ impl ArmLinks {
     /// Returns the device of an arm.
     pub fn get(&self, arm: usize) -> Option<&Arc<Device>> {
         self.devices.get(arm)
+    }
+
+    /// Returns an arm's gripper, if that has its own connection.
+    pub fn gripper(&self, arm: usize) -> Option<&PeripheralDevice> {
+        self.peripherals.get(arm)?.gripper()
     }
 
     /// Returns whether an arm's stop still waits for the connection.

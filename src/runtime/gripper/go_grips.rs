@@ -33,6 +33,7 @@ impl Service {
         let arm = self.facts.arm_index(&call.arm)?;
         let refused = |outcome| Err(self.refusal(&outcome).unwrap_or_else(internal));
         let Some(info) = self.facts.gripper_info(arm.into()) else { return refused(Outcome::NoGripper(arm)) };
+        self.check_gripper(arm)?;
         let (to, within) = (self.position_of(call)?, |[low, high]: [f64; 2], value: f64| {
             (low - SAME_POSITION..=high + SAME_POSITION).contains(&value)
         });

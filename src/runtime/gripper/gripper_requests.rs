@@ -17,6 +17,8 @@ use dimos_hardware::adapter::AdapterError;
 use dimos_rpc::api::{self, GripReport, Reply};
 use dimos_rpc::{Code, RpcError};
 
+/// Timeout for the position of a gripper that is ready.
+const POSITION_LIMIT: Duration = Duration::from_millis(300);
 /// Default time for an outcome [s].
 const TIMEOUT: f64 = 20.0;
 
@@ -40,6 +42,14 @@ impl Service {
     /// Commands a gripper, and waits for the arm's answer to this order.
     pub(in crate::runtime) async fn gripper(&self, call: api::Gripper, origin: Origin) -> Result<Reply, RpcError> {
         let arm = self.facts.arm_index(&call.arm)?;
+        self.check_gripper(arm)?;
+        if self.arms.gripper(arm.into()).is_some() {
+            // The arm's next state has the position of one that has just become ready.
+            let view = || self.tick.arm_view(arm as usize);
+            self.tick
+                .until(Instant::now() + POSITION_LIMIT, || view().filter(|view| view.state.gripper.is_some()))
+                .await;
+        }
         let from = self.tick.arm_view(arm as usize).map(|view| view.state.gripper);
         let info = self.facts.gripper_info(arm.into()).unwrap_or_default();
         // One that nothing measures has no position before its first order: it is taken to be at the other end.
@@ -131,7 +141,12 @@ impl Service {
             report.elapsed = now.since(*began).as_secs_f64();
             (report.position, report.force) = (view.state.gripper.unwrap_or(report.position), view.state.gripper_force);
             match self.observe(arm, report.order, judge, &view) {
-                Ok(outcome) => report.outcome = outcome,
+                Ok(outcome) => {
+                    report.outcome = outcome;
+                    if outcome.is_some() {
+                        self.note_grip(arm, outcome == Some(api::GripOutcome::Holding));
+                    }
+                }
                 Err(error) => report.error = Some(error),
             }
             if report.outcome.is_some() {
@@ -167,6 +182,9 @@ impl Service {
         }
         if self.lifecycle.is_closed() {
             return Err("the run is shutting down".into());
+        }
+        if let Some(lost) = self.gripper_is_lost(arm) {
+            return Err(lost.message);
         }
         match (state.link, state.gripper) {
             (Link::Up, Some(position)) => {

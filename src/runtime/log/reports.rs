@@ -136,6 +136,7 @@ impl Service {
             gripper_has_speed: gripper.is_some_and(|gripper| gripper.has_speed),
             gripper_force_unit: gripper.map(|gripper| gripper.force_unit.name().to_owned()),
             gripper_force: view.state.gripper_force,
+            peripherals: self.peripheral_reports(index),
             io: io.zip(health.details().io).map(|(info, state)| self.io_report(index, &info, &state)),
             joints: self.joint_status(index, &health.details()),
             payload: health.details().payload.map(LoadReport::from),

@@ -233,9 +233,18 @@ impl Service {
             _ => return Err(internal().into()),
         };
         let mut motion = begun.motion();
-        let (mut begun, mut ended, mut closed) = (Some(begun), None, None);
+        let (mut begun, mut ended, mut closed, mut lost) = (Some(begun), None, None, None::<Failed>);
         loop {
-            let report = self.motion(motion)?;
+            let mut report = self.motion(motion)?;
+            if !report.done && lost.is_none() {
+                lost = self.lost_grip(going);
+                if lost.is_some() {
+                    self.ask(Request::Cancel { task: Some(self.facts.task_index(&report.task)?) }).await?;
+                }
+            }
+            if let Some(failed) = lost.as_ref().filter(|_| report.done) {
+                report.error = failed.error.as_ref().map(|error| error.message.clone());
+            }
             let phase = if report.replanning { GoPhase::Replanning } else { GoPhase::Executing };
             going.step(phase, |step| {
                 step.begun = begun.take().or(step.begun.take());
@@ -252,6 +261,10 @@ impl Service {
                 }
                 None if !report.done => {}
                 None if report.state == TaskState::Completed.name() => return Ok(self.cause_of_end(motion).0),
+                None if lost.is_some() => {
+                    let by = self.cause_of_end(motion).0;
+                    return lost.map_or(Ok(by), Err);
+                }
                 None => return Err(Failed { by: self.cause_of_end(motion).0, error: None }),
             }
             // The `cancel` that ended this was of another arm of it, or came before the motion was known.

@@ -13,7 +13,8 @@ use dimos_control::request::Request;
 use dimos_core::sync::lock;
 use dimos_core::telemetry::{Cause, Origin, Phase, Reason, Who};
 use dimos_rpc::api::{
-    self, CancelReply, EndedBy, Go, GoOutcome, GoPhase, GoReply, GoStepReport, GoingReport, Presence, Reply,
+    self, CancelReply, EndedBy, Go, GoOutcome, GoPhase, GoReply, GoStep, GoStepReport, GoingReport, OnPath, Presence,
+    Reply,
 };
 use dimos_rpc::{Claimant, Code, RpcError};
 
@@ -34,6 +35,8 @@ pub struct Going {
     pub curb: Arc<Curb>,
     by: Option<Arc<Who>>,
     report: Mutex<GoingReport>,
+    /// The arms whose grippers it still needs.
+    grips: Mutex<Vec<u16>>,
 }
 
 /// The latest requests `go`, by number.
@@ -125,8 +128,8 @@ impl Service {
         let number = self.tick.dispatcher().next_id();
         let by = asker();
         let report = GoingReport { going: number, by: by.as_deref().cloned(), ..GoingReport::default() };
-        let going =
-            Going { number, arms, claimant: go.claimant.take(), curb: Arc::default(), by, report: report.into() };
+        let (claimant, curb, grips) = (go.claimant.take(), Arc::default(), Mutex::default());
+        let going = Going { number, arms, claimant, curb, by, report: report.into(), grips };
         let going = Arc::new(going);
         self.keep_going(&going).await?;
         let started = self.start_going(going.clone(), go, origin);
@@ -181,7 +184,8 @@ impl Service {
     async fn carry_out(&self, going: &Going, go: Go, mut origin: Origin) {
         let Go { steps, replan, unproven, on_path, until, .. } = go;
         let mut ended = Failed { by: EndedBy::Goal, error: None };
-        for (index, step) in steps.into_iter().enumerate() {
+        for (index, step) in steps.iter().cloned().enumerate() {
+            *lock(&going.grips) = self.grips_from(&steps, &on_path, index);
             let acts = on_path.iter().enumerate().filter(|(_, act)| act.step == index);
             let acts = acts.map(|(number, act)| (number, act.clone())).collect();
             going.update(|report| report.steps.push(GoStepReport::default()));
@@ -211,6 +215,21 @@ impl Service {
         };
         let outcome = GoOutcome { motion, ended_by: ended.by, value, pose };
         finish(going, ended, outcome);
+    }
+
+    /// Returns the arms whose grippers are needed from a step on.
+    fn grips_from(&self, steps: &[GoStep], on_path: &[OnPath], index: usize) -> Vec<u16> {
+        let of_step = |step: &GoStep| if let GoStep::Gripper(grip) = step { Some(grip.arm.clone()) } else { None };
+        let later = on_path.iter().filter(|act| act.step >= index);
+        let acts = later.filter_map(|act| Some(act.gripper.as_ref()?.arm.clone()));
+        let arms = steps.iter().skip(index).filter_map(of_step).chain(acts);
+        arms.filter_map(|arm| self.facts.arm_index(&arm).ok()).collect()
+    }
+
+    /// Returns why what is still to be done cannot be: a gripper that it needs is lost.
+    pub(in crate::runtime) fn lost_grip(&self, going: &Going) -> Option<Failed> {
+        let lost = lock(&going.grips).iter().find_map(|arm| self.gripper_is_lost((*arm).into()))?;
+        Some(Failed { by: EndedBy::Grip, error: Some(lost) })
     }
 
     /// Returns what ended a motion, and what was measured of that.

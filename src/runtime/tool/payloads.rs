@@ -229,7 +229,7 @@ impl Service {
     }
 
     /// Returns the arm of a planning robot; `None` if it has no joints of an arm.
-    async fn arm_of_robot(&self, robot: &str) -> Result<Option<u16>, RpcError> {
+    pub(in crate::runtime) async fn arm_of_robot(&self, robot: &str) -> Result<Option<u16>, RpcError> {
         let Reply::Planner(report) = self.planner_call(Call::Planner(api::Planner {})).await? else {
             return Err(internal());
         };

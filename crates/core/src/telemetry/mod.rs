@@ -180,6 +180,8 @@ pub enum Cause {
     IdentityChanged,
     /// The limits of the arm's controller have become narrower than those of the run.
     LimitsChanged,
+    /// A gripper with its own connection is lost, with what it holds.
+    ToolLost,
     /// The arm's stop input is open.
     StopInput,
     /// Something appeared in the way of its motion, and it could not rest before it.
@@ -232,6 +234,7 @@ impl Cause {
             Self::PowerChanged => "power_changed",
             Self::IdentityChanged => "identity_changed",
             Self::LimitsChanged => "limits_changed",
+            Self::ToolLost => "tool_lost",
             Self::StoppedElsewhere => "stopped_elsewhere",
             Self::StopInput => "stop_input",
             Self::WayBlocked => "way_blocked",

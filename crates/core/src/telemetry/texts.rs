@@ -219,6 +219,7 @@ pub fn cause_text(cause: Cause) -> String {
         Cause::StoppedElsewhere => "the panel or another program stopped the arm".into(),
         Cause::IdentityChanged => "another arm answers than the one with which the run began".into(),
         Cause::LimitsChanged => "the limits of its controller have become narrower than those of the run".into(),
+        Cause::ToolLost => "its gripper is lost, with what it holds".into(),
         Cause::PowerChanged => "the panel or another program enabled the motors".into(),
         Cause::StopInput => "the stop input is open".into(),
         Cause::WayBlocked => "it could not rest before what is in its way".into(),

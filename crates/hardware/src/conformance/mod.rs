@@ -17,6 +17,7 @@ mod lifecycle;
 mod lost;
 mod motion;
 mod parts;
+pub mod peripheral;
 mod setpoints;
 mod speed;
 mod stale;

@@ -12,6 +12,7 @@ pub mod gripper;
 mod health;
 mod history;
 mod identity;
+pub mod peripheral;
 mod plausible;
 mod thread;
 mod wire_guard;
@@ -25,6 +26,7 @@ pub use details::Details;
 pub use health::{Episode, Health, Note};
 pub use history::History;
 pub use identity::Identity;
+pub use peripheral::{PeripheralConfig, PeripheralDevice, Ports};
 pub use thread::Way;
 
 use crate::adapter::{AdapterError, AdapterResult, ManipulatorAdapter, ManipulatorInfo, Reduction};
@@ -60,6 +62,8 @@ pub struct DeviceConfig {
     pub supervision: Supervision,
     /// What the blueprint sets of the arm's optional parts.
     pub setup: Setup,
+    /// Its gripper and its sensor, where they have their own connections.
+    pub peripherals: Ports,
     /// The tick's heartbeat.
     pub beat: Arc<Heartbeat>,
     /// Raised with each new state, if this arm clocks the ticks.
@@ -190,6 +194,9 @@ impl Device {
         let wake = Wake::new()?;
         let health = Arc::new(Health::default());
         let hardware_id = config.hardware_id.clone();
+        if let Some(gripper) = &config.peripherals.gripper {
+            gripper.answer_to(health.clone());
+        }
         let due = Arc::new(Due::default());
         let shared = thread::Shared { wake: wake.clone(), health: health.clone(), due: due.clone() };
         let worker = thread::Worker::new(config, states, commands, shared);

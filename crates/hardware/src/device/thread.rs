@@ -5,6 +5,7 @@ mod connection;
 mod lead;
 mod limits;
 mod payload;
+mod peripherals;
 mod readings;
 mod slow_readings;
 #[cfg(test)]

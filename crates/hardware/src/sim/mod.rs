@@ -15,6 +15,8 @@
 //! | [`peer`] | the user at the other end of a connection within this computer |
 //! | [`serial_server`] | a pseudo-terminal; requests as over TCP ([`stream`]) |
 //! | [`can_server`] | a bus in memory, a CAN interface, or a serial CAN adapter; the arm streams its state |
+//! | [`modbus`] | registers behind Modbus RTU or TCP |
+//! | [`peripheral_server`] | a gripper or a sensor with its own connection: on a pseudo-terminal or a TCP port |
 //! | [`trace`] | received bytes, for tests |
 //! | [`events`] | clients and faults, as `dimos adapter emulate` shows them |
 //!
@@ -34,8 +36,10 @@ pub mod faults;
 pub mod gripper;
 pub mod io;
 pub mod misreading;
+pub mod modbus;
 pub mod options;
 pub mod peer;
+pub mod peripheral_server;
 pub mod plant;
 mod plant_joint;
 pub mod reach;

@@ -6,6 +6,7 @@ pub mod device_time;
 mod incoming;
 pub mod line;
 pub mod measured;
+pub mod modbus;
 pub mod pty;
 pub mod request_reply;
 pub mod serial;

@@ -244,6 +244,23 @@ impl Gripper {
     }
 }
 
+/// Parameters of `gripper_home`.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct GripperHome {
+    /// The arm's `hardware_id`.
+    pub arm: String,
+}
+
+/// Reply to `gripper_home`.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+pub struct GripperHomeReply {
+    /// The arm's `hardware_id`.
+    pub arm: String,
+    /// The gripper's condition now: `homing`. `peripherals` in `status` shows the end.
+    pub condition: String,
+}
+
 /// Parameters of `grip`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]

@@ -293,6 +293,9 @@ methods! {
     "arm_disable" ArmDisable -> ArmReply, Move, needs p => Need::no_other_of(&p.arm);
     /// Commands a gripper. Replies when the command was sent; `grip` reports its outcome.
     "gripper" Gripper -> GripperReply, Move, needs p => Need::of_arm(&p.arm), check Gripper::valid;
+    /// Homes a gripper that has its own connection, if it needs that: its fingers move. Replies when that has begun;
+    /// `status` shows the end.
+    "gripper_home" GripperHome -> GripperHomeReply, Move, needs p => Need::of_arm(&p.arm);
     /// Progress or outcome of a gripper command.
     "grip" Grip -> GripReport, Read;
     /// Levels of an arm's digital and analogue inputs and outputs.

@@ -82,6 +82,9 @@ pub struct ArmReport {
     /// Measured force of its gripper [`gripper_force_unit`]; absent if it measures none.
     #[serde(default)]
     pub gripper_force: Option<f64>,
+    /// Its gripper and its force/torque sensor, where they have their own connections.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub peripherals: Vec<PeripheralReport>,
     /// Its digital and analogue inputs and outputs, as read last; absent without any.
     #[serde(default)]
     pub io: Option<IoReport>,
@@ -113,6 +116,55 @@ pub struct ArmReport {
     pub holds_when_disabled: bool,
     /// Counters of the device thread: `reads`, `read_errors`, `writes`, …
     pub counters: BTreeMap<String, u64>,
+}
+
+/// A gripper or a sensor with its own connection in `status`.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+pub struct PeripheralReport {
+    /// The part of the arm that it is: `gripper` or `force_torque`.
+    pub part: String,
+    /// Its adapter's name.
+    pub adapter: String,
+    /// Its address.
+    pub address: String,
+    /// Whether it is an emulator.
+    pub simulated: bool,
+    /// State of the connection: `up`, or `faulted` while it is lost.
+    pub link: String,
+    /// Whether it can be used: `ready`, `not_homed`, `homing` or `fault`; absent while it is lost.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub condition: Option<String>,
+    /// Why it is lost, or what fault it reports.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub trouble: Option<String>,
+    /// Measured rate of new states [Hz].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub measured_rate_hz: Option<f64>,
+    /// Nominal rate of new states [Hz].
+    pub native_rate_hz: f64,
+}
+
+impl PeripheralReport {
+    /// Returns the part with its words apart.
+    pub fn part_text(&self) -> &'static str {
+        if self.part == "force_torque" { "force/torque sensor" } else { "gripper" }
+    }
+
+    /// Returns what needs attention, and what to do. `arm`: the arm's `hardware_id`.
+    pub fn attention(&self, arm: &str) -> Option<(String, String)> {
+        let (part, adapter, address) = (self.part_text(), &self.adapter, &self.address);
+        let home = || format!("dimos arm gripper {arm} home, which moves its fingers");
+        let trouble = self.trouble.as_deref().unwrap_or("unknown");
+        match self.condition.as_deref() {
+            None => Some((
+                format!("the {part} of {arm} ({adapter} at {address}) is lost: {trouble}"),
+                format!("check its cable and supply, then: dimos arm reset {arm}"),
+            )),
+            Some("not_homed") => Some((format!("the {part} of {arm} is not homed"), home())),
+            Some("fault") => Some((format!("the {part} of {arm} reports {trouble}"), home())),
+            Some(_) => None,
+        }
+    }
 }
 
 /// Condition of one joint in `status`; null: the device does not report it.

@@ -19,7 +19,10 @@ impl Worker {
     /// Takes the newest command and returns the previous one.
     pub(super) fn take_command(&mut self) -> ArmCommand {
         let command = self.commands.read();
-        self.stop_pending |= command.stop_seq != self.last.stop_seq;
+        if command.stop_seq != self.last.stop_seq {
+            self.stop_pending = true;
+            self.stop_peripherals();
+        }
         if self.last.led && !command.led {
             self.lead.end("the arm was stopped");
         }
@@ -85,7 +88,8 @@ impl Worker {
         };
         // Another client changed the mode: do not change it back. The next state reports it.
         let foreign = self.ordered_mode == Some(mode) && adapter.get_control_mode() != mode;
-        if foreign || self.state.interference != Interference::None {
+        // An arm that has lost its gripper decelerates as any other.
+        if foreign || !matches!(self.state.interference, Interference::None | Interference::Tool) {
             return Ok(());
         }
         if adapter.get_control_mode() != mode {
@@ -199,6 +203,11 @@ impl Worker {
 
     /// Commands the gripper and answers the request. A refusal does not affect the joints.
     pub(super) fn move_gripper(&mut self, adapter: &mut dyn ManipulatorAdapter, command: &ArmCommand) {
+        if !self.state.self_held
+            && let Some(gripper) = &mut self.config.peripherals.gripper
+        {
+            return gripper.command(command); // its thread answers
+        }
         let result = if self.state.self_held {
             Err(AdapterError::Rejected("the arm is held; `arm enable` makes it ready again".to_owned()))
         } else {
@@ -229,7 +238,8 @@ impl Worker {
     /// Holds a gripper that continues to move after a stop of the joints, with the force of its last command.
     pub(super) fn hold_gripper(&mut self, adapter: &mut dyn ManipulatorAdapter) {
         let now = self.config.clock.now();
-        let (Some(position), Some(gripper)) = (self.state.gripper, adapter.gripper()) else { return };
+        let own = adapter.gripper().filter(|_| self.config.peripherals.gripper.is_none());
+        let (Some(position), Some(gripper)) = (self.state.gripper, own) else { return };
         let Some(here) = self.gripper_stop.observe(position, gripper.get_gripper_unit(), now) else { return };
         // Closed may be the larger position of a rotary jaw.
         let (a, b) = gripper.get_gripper_range().unwrap_or((f64::MIN, f64::MAX));

@@ -68,7 +68,7 @@ impl Worker {
         let impedance = adapter.impedance();
         self.guard.set_efforts(self.config.setup.efforts, impedance.or(self.config.setup.impedance));
         let read_period = self.config.read_period();
-        let gripper = adapter.gripper().map(|gripper| gripper.info());
+        let gripper = self.gripper_info(adapter);
         let io = adapter.io().map(|io| io.get_io());
         let has_payload = adapter.payload().is_some();
         let payload_resets = adapter.payload().is_some_and(|payload| payload.resets_controller());

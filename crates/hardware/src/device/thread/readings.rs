@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use super::{ENABLED_TURN, ERROR_TURN, MAX_FAILURES, TURNS, Worker};
 use crate::adapter::{AdapterError, AdapterResult, ManipulatorAdapter};
+use crate::device::Ports;
 use dimos_core::arm::{Interference, Link, VelocitySource};
 use dimos_core::clock::Mono;
 use dimos_core::joint::Joints;
@@ -82,7 +83,9 @@ impl Worker {
         if all || turn == ENABLED_TURN {
             self.state.enabled = adapter.read_enabled()?;
         }
-        if all || turn == 2 {
+        let Ports { gripper, force_torque } = &self.config.peripherals;
+        let (own_gripper, own_sensor) = (gripper.is_none(), force_torque.is_none());
+        if own_gripper && (all || turn == 2) {
             let gripper = adapter.gripper();
             (self.state.gripper, self.state.gripper_force) = match gripper {
                 Some(gripper) => {
@@ -93,8 +96,9 @@ impl Worker {
             };
             self.hold_gripper(adapter);
         }
-        if all || turn == 3 {
-            self.read_wrench(adapter)?;
+        if own_sensor && (all || turn == 3) {
+            let measured = adapter.force_torque().map_or(Ok(None), |sensor| sensor.read_force_torque())?;
+            self.set_wrench(measured);
         }
         if all || turn == 4 {
             self.state.pose = adapter.cartesian().map_or(Ok(None), |poses| poses.read_cartesian_position())?;
@@ -102,6 +106,7 @@ impl Worker {
         if all || turn == 5 {
             self.read_codes(adapter)?;
         }
+        self.read_peripherals();
         self.read_slowly(adapter)?;
         self.state.mode = adapter.get_control_mode();
         self.compare_with_orders();
@@ -136,7 +141,7 @@ impl Worker {
 
     /// Returns whether another program or person, or another arm, was seen.
     fn is_taken_over(&self) -> bool {
-        !matches!(self.state.interference, Interference::None | Interference::Limits)
+        !matches!(self.state.interference, Interference::None | Interference::Limits | Interference::Tool)
     }
 
     /// Compares which arm answers with the one of the run: another one gets nothing until it is accepted.
@@ -152,6 +157,7 @@ impl Worker {
     pub(super) fn compare_with_orders(&mut self) {
         self.compare_identity();
         self.hold_for_limits();
+        self.hold_for_peripherals();
         if !self.state.enabled {
             self.guard.forget();
         }

@@ -64,6 +64,7 @@ impl Slow {
 impl Worker {
     /// Returns an error if the arm lacks a part that the blueprint uses.
     pub(super) fn check_parts(&self, adapter: &mut dyn ManipulatorAdapter) -> AdapterResult<()> {
+        self.check_peripherals(adapter)?;
         let setup = &self.config.setup;
         if adapter.payload().is_none() && (setup.payload.is_some() || setup.gravity.is_some()) {
             let what =

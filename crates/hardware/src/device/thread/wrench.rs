@@ -7,12 +7,10 @@ use crate::adapter::{AdapterError, AdapterResult, ManipulatorAdapter};
 pub type Wrench = [f64; 6];
 
 impl Worker {
-    /// Reads the wrench, if the arm has one.
-    pub(super) fn read_wrench(&mut self, adapter: &mut dyn ManipulatorAdapter) -> AdapterResult<()> {
-        let measured = adapter.force_torque().map_or(Ok(None), |sensor| sensor.read_force_torque())?;
+    /// Takes what the arm's own sensor or that with its own connection has measured.
+    pub(super) fn set_wrench(&mut self, measured: Option<Wrench>) {
         self.measured_wrench = measured;
         self.state.wrench = measured.map(|measured| less(&measured, &self.tare));
-        Ok(())
     }
 
     /// Makes the present wrench zero. Returns what was measured.
@@ -20,16 +18,23 @@ impl Worker {
         if !self.connected {
             return Err(AdapterError::NotConnected);
         }
-        if adapter.force_torque().is_none() {
-            return Err(AdapterError::Unsupported);
+        match (adapter.force_torque(), &mut self.config.peripherals.force_torque) {
+            (_, Some(own)) => {
+                let measured = own.state().wrench;
+                self.set_wrench(measured);
+            }
+            (Some(sensor), None) => {
+                let measured = sensor.read_force_torque()?;
+                self.set_wrench(measured);
+            }
+            (None, None) => return Err(AdapterError::Unsupported),
         }
-        self.read_wrench(adapter)?;
         let Some(measured) = self.measured_wrench.filter(|wrench| wrench.iter().all(|value| value.is_finite())) else {
             let what = "it reports no force at present\nhint: enable the arm, or switch its sensor on";
             return Err(AdapterError::Rejected(what.to_owned()));
         };
         self.tare = measured;
-        self.state.wrench = Some(less(&measured, &self.tare));
+        self.set_wrench(Some(measured));
         Ok(measured)
     }
 }

@@ -76,6 +76,7 @@ impl Bench {
             native_rate: 1000.0,
             supervision: Supervision { accept_zero_pose: true, ..Supervision::default() },
             setup: Setup::default(),
+            peripherals: Default::default(),
             beat: beat.clone(),
             pace: None,
             clock: Arc::new(clock.clone()),
