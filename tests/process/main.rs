@@ -53,6 +53,7 @@ mod onto;
 mod orders;
 mod other_machine;
 mod own_gripper;
+mod own_sensor;
 mod packages;
 mod page_commands;
 mod park;

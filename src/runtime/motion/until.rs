@@ -7,6 +7,7 @@ use super::on_path::Covered;
 use crate::runtime::arm::arm_requests::{order, refused};
 use crate::runtime::{Service, internal};
 use dimos_core::until;
+use dimos_hardware::peripheral::Part;
 use dimos_rpc::api::{EndedBy, Reply, Request as Call, TareReply, Until};
 use dimos_rpc::{Code, RpcError};
 
@@ -87,9 +88,11 @@ impl Service {
     pub(in crate::runtime) fn peak(&self, until: &Until, arm: u16, covered: &Covered) -> Option<f64> {
         let (force, stiffness) = (until.force?, until.stiffness?);
         let (arm, connected) = (usize::from(arm), self.facts.connected.get(usize::from(arm))?);
+        let own = self.facts.blueprint.arms.get(arm)?.peripherals.iter().find(|own| own.row.part == Part::ForceTorque);
         // An arm that does not send its whole state at once is asked for its force in every sixth reading.
-        let readings = if connected.info.whole_state_at_once { 1.0 } else { 6.0 };
-        let late = readings * connected.read_period.as_secs_f64()
+        let readings = if connected.info.whole_state_at_once || own.is_some() { 1.0 } else { 6.0 };
+        let late = own.map_or(0.0, |sensor| 1.0 / sensor.row.native_rate)
+            + readings * connected.read_period.as_secs_f64()
             + connected.write_period.as_secs_f64()
             + self.facts.period().as_secs_f64()
             + self.facts.config.arms.get(arm)?.supervision.lag;

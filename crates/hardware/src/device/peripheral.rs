@@ -23,7 +23,7 @@ use super::{Answer, Health, Note};
 use crate::adapter::AdapterResult;
 use crate::peripheral::{Condition, Part, Peripheral, PeripheralInfo};
 use dimos_core::arm::Link;
-use dimos_core::clock::Clock;
+use dimos_core::clock::{Clock, Mono};
 use dimos_core::sync::lock;
 use dimos_rt::slot::slot;
 use dimos_rt::wake::Wake;
@@ -55,6 +55,8 @@ pub struct PeripheralState {
     pub holds: Option<bool>,
     /// Force and torque [N, N, N, Nm, Nm, Nm].
     pub wrench: Option<[f64; 6]>,
+    /// When all that was read.
+    pub at: Mono,
 }
 
 /// Commands for a gripper.

@@ -257,6 +257,7 @@ impl Worker {
         if let Some(sensor) = device.force_torque() {
             self.state.wrench = sensor.read_force_torque()?;
         }
+        self.state.at = self.config.clock.now();
         Ok(())
     }
 

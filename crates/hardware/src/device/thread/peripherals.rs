@@ -3,6 +3,10 @@
 use super::Worker;
 use crate::adapter::{AdapterError, AdapterResult, ManipulatorAdapter};
 use dimos_core::arm::{GripperInfo, Interference};
+use std::time::Duration;
+
+/// A force that was measured longer ago is not known: a tool may press on while its sensor is silent.
+const FORCE_IS_KNOWN: Duration = Duration::from_millis(100);
 
 impl Worker {
     /// Returns an error if the arm itself has a part that also has its own connection.
@@ -36,8 +40,9 @@ impl Worker {
             self.health.set_gripper_holds(state.holds);
         }
         if let Some(sensor) = &mut self.config.peripherals.force_torque {
-            let measured = sensor.state().wrench;
-            self.set_wrench(measured);
+            let state = sensor.state();
+            let is_recent = self.config.clock.now().since(state.at) <= FORCE_IS_KNOWN;
+            self.set_wrench(state.wrench.filter(|_| is_recent));
         }
     }
 

@@ -18,16 +18,13 @@ impl Worker {
         if !self.connected {
             return Err(AdapterError::NotConnected);
         }
-        match (adapter.force_torque(), &mut self.config.peripherals.force_torque) {
-            (_, Some(own)) => {
-                let measured = own.state().wrench;
-                self.set_wrench(measured);
-            }
-            (Some(sensor), None) => {
+        match adapter.force_torque() {
+            _ if self.config.peripherals.force_torque.is_some() => self.read_peripherals(),
+            Some(sensor) => {
                 let measured = sensor.read_force_torque()?;
                 self.set_wrench(measured);
             }
-            (None, None) => return Err(AdapterError::Unsupported),
+            None => return Err(AdapterError::Unsupported),
         }
         let Some(measured) = self.measured_wrench.filter(|wrench| wrench.iter().all(|value| value.is_finite())) else {
             let what = "it reports no force at present\nhint: enable the arm, or switch its sensor on";
