@@ -1,4 +1,4 @@
-# run install dist arm64 test-arm64 viewer check test test-fast package verified · test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants ·
+# run install dist arm64 test-arm64 viewer check test test-fast package verified · test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny advisories mutants ·
 # bench bench-quick bench-page bench-share screenshots jitter soak lies lies-wire pauses curves
 
 PYTHON ?= python3
@@ -28,7 +28,7 @@ PAGE := viewer/dist/index.html
 PAGE_SOURCES := $(wildcard viewer/*.json viewer/*.mjs) $(shell find viewer/src -type f 2>/dev/null)
 NODE := $(if $(wildcard viewer/package.json),$(shell command -v npm))
 
-.PHONY: run demo install dist arm64 test-arm64 shipped viewer viewer-if-possible check lint scripts spelling licences test test-fast package verified test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny mutants bench bench-quick bench-page bench-share screenshots jitter soak lies lies-wire pauses curves
+.PHONY: run demo install dist arm64 test-arm64 shipped viewer viewer-if-possible check lint scripts spelling licences test test-fast package verified test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny advisories mutants bench bench-quick bench-page bench-share screenshots jitter soak lies lies-wire pauses curves
 
 # Builds the program to try it, not optimized, and starts a shipped blueprint; its arms are simulated. Ends with Ctrl-C.
 run: WHAT = run coordinator-yourarm
@@ -110,6 +110,15 @@ licences:
 # Licences, sources and duplicates of all crates (deny.toml).
 deny:
 	cargo deny --all-features check bans licenses sources
+
+# Dependencies against a copy of RustSec's database: make advisories DB=../advisory-db. Not part of CI: new ones appear
+# without a change here.
+advisories:
+	@[ -e "$(DB)" ] || { echo "error: no advisory database: DB=$(DB)" >&2; \
+	echo "hint: git clone https://github.com/RustSec/advisory-db, then make advisories DB=advisory-db" >&2; exit 1; }
+	@cargo audit --version >/dev/null 2>&1 || { echo "error: no cargo-audit" >&2; \
+	echo "hint: cargo install --locked cargo-audit" >&2; exit 1; }
+	cargo audit --no-fetch --stale --db $(DB)
 
 # Installs nothing: tests whose tools are missing are skipped.
 test: viewer-if-possible

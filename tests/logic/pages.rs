@@ -142,6 +142,27 @@ fn every_fault_has_its_row_and_every_test_of_a_fault_is_in_it() {
 }
 
 #[test]
+fn every_way_in_has_a_test_that_exists_or_says_that_nothing_bars_it() {
+    let mut sources = files("src", ".rs");
+    sources.append(&mut files("crates", ".rs"));
+    sources.append(&mut files("tests", ".rs"));
+    let page = std::fs::read_to_string(root().join("docs/threat-model.md")).unwrap();
+    let rows: Vec<&str> = page.lines().filter(|line| line.starts_with("| ")).skip(1).collect();
+    assert!(rows.len() >= 14, "{rows:?}");
+    let exists = |name: &str| {
+        let (path, function) = name.split_once("::").unwrap_or((name, ""));
+        sources.get(path).is_some_and(|text| functions(text).any(|f| f == function))
+    };
+    let wrong = |row: &&str| {
+        let tests = row.trim_end_matches(" |").rsplit(" | ").next().unwrap_or_default();
+        let named: Vec<&str> = tests.split('`').skip(1).step_by(2).collect();
+        tests != "nothing bars it" && (named.is_empty() || !named.into_iter().all(exists))
+    };
+    let wrong: Vec<&str> = rows.into_iter().filter(wrong).collect();
+    assert!(wrong.is_empty(), "{wrong:#?}");
+}
+
+#[test]
 fn f30_only_the_clock_reads_the_wall_clock() {
     let readers: Vec<String> = files("src", ".rs")
         .into_iter()
