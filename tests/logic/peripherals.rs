@@ -63,7 +63,7 @@ fn mistakes_in_a_peripheral_are_found_where_they_are() {
     assert_eq!(at("{adapter_type: robotiq_2f85, address: /dev/ttyUSB0, options: {force: 60}}"), "");
     assert_eq!(at("{adapter_type: robotiq_2f85, address: \"ur:192.0.2.7\"}"), "");
     for (gripper, found) in [
-        ("{adapter_type: robotiq_2f58, address: sim}", "did you mean `robotiq_2f85`"),
+        ("{adapter_type: robotik_2f85, address: sim}", "did you mean `robotiq_2f85`"),
         ("{adapter_type: ur, address: sim}", "is an arm, not a gripper"),
         ("{adapter_type: robotiq_ft300, address: sim}", "is a force/torque sensor, not a gripper"),
         ("{adapter_type: robotiq_2f85}", "needs an address"),

@@ -15,7 +15,7 @@ struct Arm {
 }
 
 /// Arms whose brakes are released by an order only.
-const WITH_BRAKES: &[&str] = &["coordinator-ur5e", "ur5e-planner", "keyboard-teleop-ur5e"];
+const WITH_BRAKES: &[&str] = &["coordinator-ur5e", "ur5e-planner", "ur5e-robotiq", "keyboard-teleop-ur5e"];
 
 /// Runs a blueprint: everything that it promises, and what its log contains.
 fn exercise(blueprint: &str, arms: &[Arm]) {

@@ -38,7 +38,7 @@ fn peers_that_are_something_else_end_the_start_with_one_clear_line() {
     let reading = r#"{"id":2,"state":{"time":1,"read_joint_positions":[0,0,0,0,0]}}"#;
     let cases: &[(&[&str], &str)] = &[
         (&["HTTP/1.1 400 Bad Request"], "does not speak this protocol"),
-        (&[r#"{"id":1,"version":2,"dof":6}"#], "speaks version 2 of the protocol, this program version 1"),
+        (&[r#"{"id":1,"version":3,"dof":6}"#], "speaks version 3 of the protocol, this program versions 1 to 2"),
         (&[&DESCRIPTION.replace("\"dof\":6", "\"dof\":7").replace("1]", "1,1]")], "expected 6 joints, the arm says 7"),
         (&[&DESCRIPTION.replace("\"V\"", "null")], "its description"),
         (&[&DESCRIPTION.replace("[-1,-1,-1,-1,-1,-1]", "[]")], "limits must have 6 values each"),

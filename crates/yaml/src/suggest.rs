@@ -33,7 +33,7 @@ pub fn did_you_mean<'a>(word: &str, candidates: impl IntoIterator<Item = &'a str
     if let Some(near) = closest(word, all.iter().copied()) {
         return Some(format!("did you mean `{near}`?"));
     }
-    let (shown, rest) = all.split_at(all.len().min(20));
+    let (shown, rest) = all.split_at(all.len().min(30));
     let list = shown.join(", ");
     match (shown.is_empty(), rest.len()) {
         (true, _) => None,

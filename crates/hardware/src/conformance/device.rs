@@ -91,7 +91,7 @@ const CYCLES: u32 = 600;
 
 fn no_allocation(context: &mut Context) -> Result<(), String> {
     let Some(allocations) = context.allocations else { return context.skip("no counting allocator") };
-    let servo = context.row.modes.contains(&ControlMode::ServoPosition);
+    let servo = context.modes().contains(&ControlMode::ServoPosition);
     context.ready(if servo { ControlMode::ServoPosition } else { ControlMode::Position })?;
     let hold = context.positions()?;
     let mut reading = JointReading::default();
@@ -131,7 +131,7 @@ fn modes(context: &mut Context) -> Result<(), String> {
     let start = context.positions()?;
     for &mode in ControlMode::ALL {
         let result = context.set_mode(mode);
-        if context.row.modes.contains(&mode) {
+        if context.modes().contains(&mode) {
             require(result.is_ok(), || format!("{}: {result:?}", mode.name()))?;
             let now = context.adapter.get_control_mode();
             require(now == mode, || format!("set to {}, reports {}", mode.name(), now.name()))?;
@@ -159,7 +159,7 @@ fn optional_parts(context: &mut Context) -> Result<(), String> {
         require(pose.xyz.iter().all(|v| v.abs() < 20.0), || format!("{:?} is not in metres", pose.xyz))?;
         require(pose.rpy.iter().all(|v| v.abs() < 7.0), || format!("{:?} is not in rad", pose.rpy))?;
     }
-    if !context.row.modes.contains(&ControlMode::Velocity) {
+    if !adapter.get_info().modes.contains(&ControlMode::Velocity) {
         let result = adapter.write_joint_velocities(&vec![0.0; dof]);
         require(result == Err(AdapterError::Unsupported), || {
             format!("no velocity mode, but writing gives {result:?}")

@@ -176,7 +176,8 @@ fn commands_reach_the_fingers_and_are_answered_where_the_arm_asks() {
     let mut bench = Bench::connected();
     bench.fingers.change(|fingers| fingers.position = 0.03);
     bench.run(2);
-    assert_eq!(bench.port.state(), PeripheralState { position: Some(0.03), holds: Some(false), ..Default::default() });
+    let state = bench.port.state();
+    assert_eq!((state.position, state.holds, state.at), (Some(0.03), Some(false), bench.clock.now()));
     assert_eq!(bench.grip(0.02), Ok(()));
     assert_eq!(lock(&bench.fingers.0).commands, [(0.02, Some(5.0))]);
     bench.fingers.change(|fingers| fingers.condition = Condition::NotHomed);
