@@ -222,6 +222,7 @@ fn arm(
         tool_robot: None,
         setpoint: checked.setpoint,
         effort: None,
+        body: None,
     }
 }
 

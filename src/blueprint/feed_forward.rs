@@ -36,22 +36,22 @@ pub struct ArmEffort {
 
 /// A model whose weight is computed.
 #[derive(Debug, Clone, PartialEq)]
-struct Weighed {
-    robot: TaskRobot,
+pub(super) struct Weighed {
+    pub(super) robot: TaskRobot,
     /// Link of the flange, where the load is.
-    flange: Option<String>,
+    pub(super) flange: Option<String>,
     /// Gravity in the frame of the model's root [m/s²].
-    gravity: [f64; 3],
-    load: Option<Load>,
+    pub(super) gravity: [f64; 3],
+    pub(super) load: Option<Load>,
 }
 
 /// Where the model of an arm may be found.
 #[derive(Clone, Copy)]
-struct KnownRobots<'a> {
+pub(super) struct KnownRobots<'a> {
     /// Its joints among those of all arms.
-    joints: &'a [usize],
-    tasks: &'a [Task],
-    planner: Option<&'a PlannerConfig>,
+    pub(super) joints: &'a [usize],
+    pub(super) tasks: &'a [Task],
+    pub(super) planner: Option<&'a PlannerConfig>,
 }
 
 /// Sets what every arm is commanded beside positions.
@@ -88,7 +88,8 @@ fn of_arm(
     let at = wanted.map(|given| given.at).or(limit);
     if at.is_none() && task.is_none() {
         let unused = entry.model_path.as_ref().map(|given| given.at);
-        if let Some(unused) = unused {
+        let has_body = ["sim", "physics"].iter().try_fold(&arm.options, |options, key| options.get(key)).is_some();
+        if let Some(unused) = unused.filter(|_| !has_body) {
             let diag = Diag::error("`model_path` has no use without `feed_forward`");
             checker.error(unused, diag.hint("add `feed_forward: gravity` or `feed_forward: dynamics`, or remove it"));
         }
@@ -179,7 +180,7 @@ fn check(checker: &mut Checker<'_>, at: NodeId, arm: &Arm, robot: &Weighed, mode
 }
 
 /// Returns the model of an arm, how gravity acts on it, and its load; `None`: none is known.
-fn robot(
+pub(super) fn robot(
     checker: &mut Checker<'_>,
     entry: &Located<HardwareEntry>,
     arm: &Arm,
@@ -271,7 +272,7 @@ impl Weighed {
     }
 }
 
-fn inertial(load: &Load) -> Inertial {
+pub(super) fn inertial(load: &Load) -> Inertial {
     let [xx, xy, xz, yy, yz, zz] = load.inertia;
     let [x, y, z] = load.center;
     let origin = nalgebra::Isometry3::translation(x, y, z);

@@ -22,6 +22,8 @@ pub struct Overrides {
     pub address: Vec<(String, String)>,
     /// `--sim`: replaces every arm by its emulator. An error if the adapter of a real arm has none.
     pub sim: bool,
+    /// `--sim=physics`: with `sim`, the emulators of arms have bodies with mass.
+    pub physics: bool,
 }
 
 /// A loaded blueprint and its diagnostics.
@@ -160,7 +162,7 @@ fn read_blueprint(
         use_address(tree, root, arm, address);
     }
     if overrides.sim {
-        simulate(tree, root, catalog.adapters);
+        simulate(tree, root, catalog.adapters, overrides.physics);
     }
     let missing = if incomplete { Missing::Ignore } else { Missing::Report };
     let (file, lost) = read::<BlueprintFile>(tree, root, missing);
@@ -193,7 +195,7 @@ fn use_address(tree: &mut Tree, root: NodeId, arm: &str, address: &str) {
 }
 
 /// `--sim`: sets the address of every arm and peripheral to its emulator. A real arm without an emulator is an error.
-fn simulate(tree: &mut Tree, root: NodeId, adapters: &Registry) {
+fn simulate(tree: &mut Tree, root: NodeId, adapters: &Registry, physics: bool) {
     let source = tree.add_source("--sim", "--sim");
     let hardware = tree.get(root, "hardware").map(|list| tree.items(list).to_vec()).unwrap_or_default();
     for entry in hardware {
@@ -203,6 +205,9 @@ fn simulate(tree: &mut Tree, root: NodeId, adapters: &Registry) {
         let Some(row) = name.and_then(|name| adapters.get(name)) else { continue };
         if row.emulate.is_some() {
             tree.put_text(entry, "address", SIM, (source, 0..5));
+            if physics && row.transport != "memory" {
+                has_body(tree, root, entry);
+            }
         } else if row.address.required {
             let at = tree.get(entry, "adapter_type").map(|node| tree.label(node));
             let diag =
@@ -211,6 +216,15 @@ fn simulate(tree: &mut Tree, root: NodeId, adapters: &Registry) {
             let diag = at.into_iter().fold(diag, |diag, at| diag.also(at.with_text("this arm")));
             tree.report(diag.hint("run without --sim, or use `adapter_type: mock` for this arm"));
         }
+    }
+}
+
+/// Gives the emulator of an arm a body with mass, unless the blueprint has given it one.
+fn has_body(tree: &mut Tree, root: NodeId, entry: NodeId) {
+    let given = ["options", "sim", "physics"].iter().try_fold(entry, |node, key| tree.get(node, key));
+    let id = tree.get(entry, "hardware_id").and_then(|node| tree.text(node)).map(str::to_owned);
+    if let Some(id) = id.filter(|_| given.is_none()) {
+        yaml::set(tree, root, &format!("hardware.{id}.options.sim.physics={{}}"), &RULES);
     }
 }
 

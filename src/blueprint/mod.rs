@@ -17,6 +17,7 @@ mod load;
 mod park;
 mod parts;
 mod peripherals;
+mod physics;
 pub mod planner;
 mod planner_check;
 mod planner_files;

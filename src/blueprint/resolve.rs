@@ -11,6 +11,7 @@ use crate::blueprint::endpoints::MetricsConfig;
 use crate::blueprint::feed_forward::{self, ArmEffort};
 use crate::blueprint::limits::JointOverride;
 use crate::blueprint::peripherals::ArmPeripheral;
+use crate::blueprint::physics::{self, ArmBody};
 use crate::blueprint::planner::{ViewBackend, ViewConfig};
 use crate::blueprint::schema::{
     BlueprintFile, CoordinatorConfig, GuardConfig, HardwareType, OnExit, RecordingConfig, RpcConfig,
@@ -139,6 +140,8 @@ pub struct Arm {
     pub setpoint: SetpointFields,
     /// What it is commanded beside positions; `None`: nothing.
     pub effort: Option<ArmEffort>,
+    /// The body behind its emulator; `None`: joints without mass.
+    pub body: Option<ArmBody>,
 }
 
 impl Arm {
@@ -273,6 +276,7 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
     task_robots::resolve(&mut checker, &file.tasks, &mut tasks, planner.as_ref(), &hardware);
     tool_speed::resolve(&mut checker, &file.hardware, &mut hardware, &tasks, planner.as_ref());
     feed_forward::resolve(&mut checker, &file.hardware, &mut hardware, &tasks, planner.as_ref());
+    physics::resolve(&mut checker, &file.hardware, &mut hardware, &tasks, planner.as_ref());
     task_leaders::resolve(&mut checker, &file.tasks, &mut tasks, &hardware);
     let assets = assets::resolved(&checker, &file.tasks, file.planner.as_ref());
     let view = file.view.or_else(|| file.planner.and_then(|p| p.value.visualization));

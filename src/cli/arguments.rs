@@ -67,16 +67,31 @@ pub struct Changes {
     /// Change a field of the blueprint: coordinator.tick_rate=250, hardware.arm.limits.velocity=0.5 (repeatable)
     #[arg(long, value_name = "PATH=VALUE", value_parser = setting)]
     pub set: Vec<(String, String)>,
-    /// Simulate all arms, whatever addresses the blueprint has
-    #[arg(long, conflicts_with = "address")]
-    pub sim: bool,
+    /// Simulate all arms, whatever addresses the blueprint has; --sim=physics: with masses, gravity and contacts
+    #[arg(long, value_name = "KIND", num_args = 0..=1, require_equals = true, default_missing_value = "wire")]
+    #[arg(conflicts_with = "address")]
+    pub sim: Option<Simulation>,
+}
+
+/// What `--sim` simulates.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Simulation {
+    /// The controllers of the arms, and joints that obey them.
+    Wire,
+    /// Also the bodies of the arms, by MuJoCo.
+    Physics,
 }
 
 impl Changes {
     /// Returns the changes as overrides of the blueprint.
     pub fn overrides(&self) -> Overrides {
         let set = self.set.iter().map(|(path, value)| format!("{path}={value}")).collect();
-        Overrides { set, address: self.address.clone(), sim: self.sim }
+        Overrides {
+            set,
+            address: self.address.clone(),
+            sim: self.sim.is_some(),
+            physics: self.sim == Some(Simulation::Physics),
+        }
     }
 }
 

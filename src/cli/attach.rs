@@ -155,7 +155,9 @@ fn mismatch(run: &StatusReport, args: &Args, blueprint: &Blueprint) -> Mismatch 
             Some(its) if its.adapter != arm.adapter_type => {
                 mismatch.differs.push(format!("{id} is of type {}, not {}", its.adapter, arm.adapter_type));
             }
-            Some(its) if args.changes.sim && !its.simulated => mismatch.differs.push(format!("{id} is not simulated")),
+            Some(its) if args.changes.sim.is_some() && !its.simulated => {
+                mismatch.differs.push(format!("{id} is not simulated"))
+            }
             Some(its) => {
                 let asked = args.changes.address.iter().rfind(|(arm, _)| arm == id).map(|(_, address)| address);
                 if let Some(asked) = asked.filter(|asked| **asked != its.address) {

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use serde_json::json;
 
-use super::arguments::{Changes, duration};
+use super::arguments::{Changes, Simulation, duration};
 use super::exit::{Exit, Result};
 use super::run;
 use super::text_log::Terminal;
@@ -71,7 +71,7 @@ pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
         duration: args.duration,
         json: args.json,
         // A program that embeds this one may have another blueprint of that name.
-        changes: Changes { sim: true, ..Changes::default() },
+        changes: Changes { sim: Some(Simulation::Wire), ..Changes::default() },
         // A run that has arms of these names is another one.
         standalone: true,
         demo: true,

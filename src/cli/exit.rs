@@ -142,7 +142,11 @@ impl From<anyhow::Error> for Failure {
 
 impl From<StartError> for Failure {
     fn from(error: StartError) -> Self {
-        let exit = if matches!(error, StartError::Hardware { .. }) { Exit::Hardware } else { Exit::Failed };
+        let exit = match error {
+            StartError::Hardware { .. } => Exit::Hardware,
+            StartError::Blueprint { .. } => Exit::Usage,
+            StartError::Other { .. } => Exit::Failed,
+        };
         Self::new(exit, error.to_string()).hint(error.hint())
     }
 }

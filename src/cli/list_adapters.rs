@@ -220,7 +220,8 @@ mod tests {
         let lines = lines(&dimos_arms::registry().lacking(&[absent]));
         assert!(lines.iter().any(|line| line.starts_with("servobot  not in this build")), "{lines:?}");
         assert_eq!(lines.last().unwrap(), "  not in this build: build with --features servobot");
-        assert!(lines.iter().any(|line| line.starts_with("robotiq_2f85  emulated  gripper")), "{lines:?}");
+        let gripper = lines.iter().find(|line| line.starts_with("robotiq_2f85 ")).unwrap();
+        assert_eq!(gripper.split_whitespace().collect::<Vec<_>>(), ["robotiq_2f85", "emulated", "gripper", "50"]);
         let rows = dimos_arms::registry();
         let listed = |name: &str| lines.iter().any(|line| line.starts_with(&format!("{name}: ")));
         assert!(rows.rows().iter().all(|row| listed(row.name)) && listed("servobot"), "{lines:?}");

@@ -508,7 +508,7 @@ mod tests {
         let args: run::Args = read("a --set x.y=1 --set z= --duration 1m30s --record f.mcap --name n --sim").unwrap();
         assert_eq!(args.changes.set, [("x.y".into(), "1".into()), ("z".into(), String::new())]);
         assert_eq!(args.duration, Some(std::time::Duration::from_secs(90)));
-        assert_eq!((args.blueprint.as_str(), args.name.as_deref(), args.changes.sim), ("a", Some("n"), true));
+        assert_eq!((args.blueprint.as_str(), args.name.as_deref(), args.changes.sim.is_some()), ("a", Some("n"), true));
         for wrong in [
             "",
             "a --set x",

@@ -233,7 +233,7 @@ fn a_simulated_arm_may_be_silent_for_250_ms() {
     let stale_after = |sim: bool, set: &[&str]| {
         let set = set.iter().map(|&s| s.to_owned()).collect();
         let address = vec![("arm".to_owned(), "192.168.1.185".to_owned())];
-        let overrides = Overrides { set, sim, address };
+        let overrides = Overrides { set, sim, address, physics: false };
         let loaded = load(&find("coordinator-xarm7").unwrap(), &overrides, &dimos::arms::registry());
         loaded.blueprint.unwrap().arms[0].supervision.stale_after.as_millis()
     };

@@ -24,6 +24,7 @@ mod judge;
 pub mod kinematics;
 mod load;
 pub mod mesh;
+pub mod mjcf;
 pub mod model;
 pub mod packages;
 pub mod random;

@@ -172,7 +172,15 @@ fn configure(all: &[Arm], index: usize, is_closed: bool, arms: &mut Arms) -> Res
     };
     match arm.adapter.emulate {
         Some(emulate) if arm.address == SIM => {
-            let emulator = emulate(&config, &EmulatorAddress::InProcess).map_err(|e| unfit(arm, &e))?;
+            let mut whole = config.clone();
+            let has_body = embody(arm, &mut whole.options)?;
+            let emulator = emulate(&whole, &EmulatorAddress::InProcess).map_err(|error| match &error {
+                AdapterError::Rejected(_) if has_body => {
+                    let (what, hint) = Message::of(&error).or_hint("run with --sim: joints without mass".to_owned());
+                    StartError::Blueprint { what: format!("{}: {what}", arm.hardware_id), hint }
+                }
+                error => unfit(arm, error),
+            })?;
             config.address = emulator.address();
             arms._emulators.push(emulator);
         }
@@ -203,6 +211,18 @@ fn configure(all: &[Arm], index: usize, is_closed: bool, arms: &mut Arms) -> Res
         }
     }
     Ok(config)
+}
+
+/// Gives the emulator of an arm its body, if it has one. Returns whether it has.
+fn embody(arm: &Arm, options: &mut serde_json::Value) -> Result<bool, StartError> {
+    let scene = arm.scene().map_err(|what| {
+        let hint = format!("see `hardware.{}.model_path`, or run with --sim: joints without mass", arm.hardware_id);
+        StartError::Blueprint { what: format!("{} has no body: {what}", arm.hardware_id), hint }
+    })?;
+    let place = options.pointer_mut("/sim/physics").and_then(|physics| physics.as_object_mut());
+    let Some((place, scene)) = place.zip(scene) else { return Ok(false) };
+    place.insert("scene".to_owned(), serde_json::json!(scene));
+    Ok(true)
 }
 
 /// Returns the complete address of an arm's device.

@@ -29,6 +29,7 @@ use dimos_hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, O
 use dimos_hardware::sim::arm::{ControllerOptions, SimOptions, check_range};
 use dimos_hardware::sim::faults::Fault;
 use dimos_hardware::sim::io::PLAYABLE;
+use dimos_hardware::sim::physics::PhysicsOptions;
 use dimos_hardware::transport::tcp::Endpoint;
 
 /// The modes of the arm, in the order of their numbers on the wire.
@@ -162,6 +163,9 @@ pub struct Sim {
     pub faults: Vec<Fault>,
     /// What the controller does otherwise than its documents say.
     pub controller: ControllerOptions,
+    /// A body with mass, by MuJoCo: `{}`, or with a seed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub physics: Option<PhysicsOptions>,
     /// Stiffness of the position control [Nm/rad] of an arm with the masses of `builtin:yourarm`, which it sags under
     /// by its weight / stiffness; 0: its weight is nothing.
     #[schemars(range(min = 0, max = 100000))]
@@ -176,15 +180,15 @@ impl Default for Sim {
 
 impl From<SimOptions> for Sim {
     fn from(kit: SimOptions) -> Self {
-        let SimOptions { initial_positions, lag, droop, faults, controller } = kit;
-        Self { initial_positions, lag, droop, faults, controller, servo_stiffness: 0.0 }
+        let SimOptions { initial_positions, lag, droop, faults, controller, physics } = kit;
+        Self { initial_positions, lag, droop, faults, controller, physics, servo_stiffness: 0.0 }
     }
 }
 
 impl Sim {
     /// Returns those that all emulators have.
     fn kit(&self) -> SimOptions {
-        let Self { initial_positions, lag, droop, faults, controller, .. } = self.clone();
-        SimOptions { initial_positions, lag, droop, faults, controller }
+        let Self { initial_positions, lag, droop, faults, controller, physics, .. } = self.clone();
+        SimOptions { initial_positions, lag, droop, faults, controller, physics }
     }
 }

@@ -234,19 +234,19 @@ impl Context {
         self.until("the motors to come on", Self::enabled)
     }
 
-    /// Returns the modes of the arm, as its adapter knows them now.
-    pub fn modes(&self) -> &'static [ControlMode] {
-        self.adapter.get_info().modes
+    /// Returns whether the arm has a mode, by its row and by what its adapter knows now.
+    pub fn has_mode(&self, mode: ControlMode) -> bool {
+        self.row.modes.contains(&mode) && self.adapter.get_info().modes.contains(&mode)
     }
 
     /// Returns the first mode of the arm.
     pub fn first_mode(&self) -> ControlMode {
-        self.modes().first().copied().unwrap_or_default()
+        self.row.modes.iter().copied().find(|mode| self.has_mode(*mode)).unwrap_or_default()
     }
 
     /// Returns a mode for joint positions; `None` if it has none.
     pub fn position_mode(&self) -> Option<ControlMode> {
-        [ControlMode::ServoPosition, ControlMode::Position].into_iter().find(|mode| self.modes().contains(mode))
+        [ControlMode::ServoPosition, ControlMode::Position].into_iter().find(|mode| self.has_mode(*mode))
     }
 
     /// Moves from `start` to `goal` [rad] in a position mode: by setpoints during half a second, or by one target.

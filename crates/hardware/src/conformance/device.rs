@@ -91,7 +91,7 @@ const CYCLES: u32 = 600;
 
 fn no_allocation(context: &mut Context) -> Result<(), String> {
     let Some(allocations) = context.allocations else { return context.skip("no counting allocator") };
-    let servo = context.modes().contains(&ControlMode::ServoPosition);
+    let servo = context.has_mode(ControlMode::ServoPosition);
     context.ready(if servo { ControlMode::ServoPosition } else { ControlMode::Position })?;
     let hold = context.positions()?;
     let mut reading = JointReading::default();
@@ -131,7 +131,7 @@ fn modes(context: &mut Context) -> Result<(), String> {
     let start = context.positions()?;
     for &mode in ControlMode::ALL {
         let result = context.set_mode(mode);
-        if context.modes().contains(&mode) {
+        if context.has_mode(mode) {
             require(result.is_ok(), || format!("{}: {result:?}", mode.name()))?;
             let now = context.adapter.get_control_mode();
             require(now == mode, || format!("set to {}, reports {}", mode.name(), now.name()))?;

@@ -97,7 +97,7 @@ fn when_enabled(context: &mut Context) -> Result<(), String> {
 }
 
 fn in_motion(context: &mut Context) -> Result<(), String> {
-    if !context.modes().contains(&ControlMode::Position) || !context.prepare(Fault::new(FaultKind::Disconnect)) {
+    if !context.has_mode(ControlMode::Position) || !context.prepare(Fault::new(FaultKind::Disconnect)) {
         return context.skip("no planned moves, or its emulator cannot cut the connection");
     }
     context.ready(ControlMode::Position)?;
@@ -128,7 +128,7 @@ fn set_off(context: &mut Context) -> Result<(), String> {
 
 fn while_streaming(context: &mut Context) -> Result<(), String> {
     let servo = ControlMode::ServoPosition;
-    if !context.modes().contains(&servo) || !context.prepare(Fault::new(FaultKind::Disconnect)) {
+    if !context.has_mode(servo) || !context.prepare(Fault::new(FaultKind::Disconnect)) {
         return context.skip("it has no servo mode, or its emulator cannot cut the connection");
     }
     context.ready(servo)?;

@@ -62,7 +62,7 @@ fn arrives(context: &mut Context, unit: GripperUnit, target: f64) -> Result<(), 
 /// A command that writes the goals of all servos again makes a slow motion a fast one.
 fn moves_no_joint(context: &mut Context) -> Result<(), String> {
     let Some((info, from)) = ready(context)? else { return context.skip("it has no gripper") };
-    if !context.modes().contains(&ControlMode::Position) {
+    if !context.has_mode(ControlMode::Position) {
         return context.skip("it has no position mode");
     }
     slow_move(context, |context| context.command_gripper(target(&info, from)))

@@ -39,7 +39,7 @@ fn commands(context: &mut Context) -> Result<(), String> {
         context.until("the motors to come on after activate", Context::enabled)?;
     }
     context.activate()?;
-    if context.modes().contains(&ControlMode::Position) {
+    if context.has_mode(ControlMode::Position) {
         context.set_mode(ControlMode::Position).map_err(|e| format!("set_control_mode: {e}"))?;
         let start = context.positions()?;
         let near = context.nearby(&start)?;

@@ -20,7 +20,7 @@ pub const CHECKS: &[Check] = &[
 ];
 
 fn planned_moves_arrive(context: &mut Context) -> Result<(), String> {
-    if !context.modes().contains(&ControlMode::Position) {
+    if !context.has_mode(ControlMode::Position) {
         return context.skip("it has no position mode");
     }
     context.ready(ControlMode::Position)?;
@@ -34,7 +34,7 @@ fn planned_moves_arrive(context: &mut Context) -> Result<(), String> {
 }
 
 fn set_points_are_followed(context: &mut Context) -> Result<(), String> {
-    if !context.modes().contains(&ControlMode::ServoPosition) {
+    if !context.has_mode(ControlMode::ServoPosition) {
         return context.skip("it has no servo mode");
     }
     context.ready(ControlMode::ServoPosition)?;
@@ -45,7 +45,7 @@ fn set_points_are_followed(context: &mut Context) -> Result<(), String> {
 
 /// An adapter with the same mistake in both directions agrees with itself. The emulator's true positions reveal it.
 fn own_joints(context: &mut Context) -> Result<(), String> {
-    if !context.modes().contains(&ControlMode::Position) || context.true_positions().is_none() {
+    if !context.has_mode(ControlMode::Position) || context.true_positions().is_none() {
         return context.skip("its emulator has no true positions");
     }
     context.leave_out_calibration()?;
@@ -67,7 +67,7 @@ fn own_joints(context: &mut Context) -> Result<(), String> {
 }
 
 fn velocities_are_kept(context: &mut Context) -> Result<(), String> {
-    if !context.modes().contains(&ControlMode::Velocity) {
+    if !context.has_mode(ControlMode::Velocity) {
         return context.skip("it has no velocity mode");
     }
     context.ready(ControlMode::Velocity)?;
@@ -85,7 +85,7 @@ fn velocities_are_kept(context: &mut Context) -> Result<(), String> {
 /// Velocities are compared with the differences of positions: an arm may have no velocity mode.
 fn measured(context: &mut Context) -> Result<(), String> {
     // A planned motion is smooth; between setpoints an arm may slow down.
-    let planned = context.modes().contains(&ControlMode::Position).then_some(ControlMode::Position);
+    let planned = context.has_mode(ControlMode::Position).then_some(ControlMode::Position);
     let Some(mode) = planned.or(context.position_mode()) else { return context.skip("it has no position mode") };
     context.ready(mode)?;
     if context.joints()?.velocity.is_none() {
@@ -195,7 +195,8 @@ fn disabled_arms(context: &mut Context) -> Result<(), String> {
 }
 
 fn nonsense(context: &mut Context) -> Result<(), String> {
-    for mode in context.modes().iter().filter(|mode| mode.is_position() || **mode == ControlMode::Velocity) {
+    let modes = context.row.modes.iter().filter(|mode| mode.is_position() || **mode == ControlMode::Velocity);
+    for mode in modes.filter(|mode| context.has_mode(**mode)).collect::<Vec<_>>() {
         context.ready(*mode)?;
         let start = context.positions()?;
         let mut not_finite = start.clone();

@@ -36,7 +36,7 @@ const STEP: f64 = 0.01;
 const MISSING: f64 = 0.25;
 
 fn planned_speed(context: &mut Context) -> Result<(), String> {
-    if !context.modes().contains(&ControlMode::Position) {
+    if !context.has_mode(ControlMode::Position) {
         return context.skip("it has no position mode");
     }
     slow_move(context, |_| Ok(()))
@@ -96,7 +96,7 @@ pub fn slow_move(
 
 /// An arm that limits its setpoints to less than the `velocity_max` that it states falls behind its trajectories.
 fn fast_stream(context: &mut Context) -> Result<(), String> {
-    if !context.modes().contains(&ControlMode::ServoPosition) {
+    if !context.has_mode(ControlMode::ServoPosition) {
         return context.skip("it has no servo mode");
     }
     context.ready(ControlMode::ServoPosition)?;

@@ -69,7 +69,7 @@ pub fn set_off(context: &mut Context) -> Result<Vec<f64>, String> {
 }
 
 fn stop_ends_motion(context: &mut Context) -> Result<(), String> {
-    if !context.modes().contains(&ControlMode::Position) {
+    if !context.has_mode(ControlMode::Position) {
         return context.skip("it has no position mode");
     }
     context.ready(ControlMode::Position)?;
@@ -82,7 +82,7 @@ fn stop_ends_motion(context: &mut Context) -> Result<(), String> {
 }
 
 fn stop_ends_streaming(context: &mut Context) -> Result<(), String> {
-    if !context.modes().contains(&ControlMode::ServoPosition) {
+    if !context.has_mode(ControlMode::ServoPosition) {
         return context.skip("it has no servo mode");
     }
     context.ready(ControlMode::ServoPosition)?;
@@ -104,7 +104,7 @@ fn stop_ends_streaming(context: &mut Context) -> Result<(), String> {
 }
 
 fn stop_ends_velocity(context: &mut Context) -> Result<(), String> {
-    if !context.modes().contains(&ControlMode::Velocity) {
+    if !context.has_mode(ControlMode::Velocity) {
         return context.skip("it has no velocity mode");
     }
     context.ready(ControlMode::Velocity)?;
@@ -127,7 +127,7 @@ fn stop_ends_velocity(context: &mut Context) -> Result<(), String> {
 }
 
 fn stop_is_no_fault(context: &mut Context) -> Result<(), String> {
-    if !context.modes().contains(&ControlMode::Position) {
+    if !context.has_mode(ControlMode::Position) {
         return context.skip("it has no position mode");
     }
     context.ready(ControlMode::Position)?;

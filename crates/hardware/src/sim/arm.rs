@@ -9,6 +9,7 @@ pub use super::options::{ControllerOptions, SimOptions, check_pose, check_range}
 use crate::adapter::AdapterResult;
 use crate::registry::Truth;
 use crate::sim::faults::{FaultKind, FaultScript};
+use crate::sim::physics::Body;
 use crate::sim::plant::{Drive, Plant};
 use crate::sim::weight::Masses;
 use dimos_core::arm::Setpoint;
@@ -133,6 +134,10 @@ pub struct SimArm {
     name: &'static str,
     playable: &'static [FaultKind],
     plant: Plant,
+    /// Its body, if it has mass; the plant is then where the controller commands it to be.
+    body: Option<Body>,
+    /// The error when a joint of the body does not follow.
+    collision: Option<u16>,
     limits: JointLimits,
     /// How far outside its limits a target may be [rad].
     tolerance: f64,
@@ -177,12 +182,20 @@ impl SimArm {
     ) -> AdapterResult<Self> {
         options.check(name, limits, playable)?;
         let options = options.clone().starting_at(&asymmetric_pose(limits));
+        let mut plant = Plant::lagging(limits, &options.initial_positions, options.lag)
+            .drooping(options.droop)
+            .as_controlled(options.controller.deceleration, options.controller.gap_tolerance);
+        let started = |physics| Body::start(physics, &options.initial_positions, options.droop);
+        let body = options.physics.as_ref().map(started).transpose()?;
+        if body.is_some() {
+            plant.as_reference();
+        }
         Ok(Self {
             name,
             playable,
-            plant: Plant::lagging(limits, &options.initial_positions, options.lag)
-                .drooping(options.droop)
-                .as_controlled(options.controller.deceleration, options.controller.gap_tolerance),
+            plant,
+            body,
+            collision: None,
             limits: limits.clone(),
             tolerance: ROUNDING,
             mode: ControlMode::Position,
@@ -214,13 +227,21 @@ impl SimArm {
 
     /// Gives the joints masses.
     pub fn with_masses(mut self, masses: Masses) -> Self {
-        self.plant = self.plant.with_masses(masses);
+        if self.body.is_none() {
+            self.plant = self.plant.with_masses(masses);
+        }
         self
     }
 
     /// Stops the arm in velocity mode when no velocity arrives within `timeout` [s].
     pub fn with_velocity_timeout(mut self, timeout: f64) -> Self {
         self.velocity_timeout = Some(Duration::from_secs_f64(timeout));
+        self
+    }
+
+    /// Sets the error of a joint that does not follow because something is in its way.
+    pub fn colliding_as(mut self, error: u16) -> Self {
+        self.collision = Some(error);
         self
     }
 
@@ -239,7 +260,10 @@ impl SimArm {
     /// Lets joints whose motors are off fall at `speed` [rad/s], each to its position in `rest` [rad]; a joint without
     /// one stays where it is. Before this call, brakes or supports hold the arm.
     pub fn falls(&mut self, speed: f64, rest: &[Option<f64>]) {
-        self.plant.falls(speed, rest);
+        match &mut self.body {
+            Some(body) => body.falls = speed > 0.0,
+            None => self.plant.falls(speed, rest),
+        }
     }
 
     /// Lets only the first joints droop: a gripper after them carries no load.
@@ -278,8 +302,19 @@ impl SimArm {
     }
 
     fn pass(&mut self, to: Mono) {
-        self.plant.advance(to.seconds_since(self.advanced_to).max(0.0));
+        let dt = to.seconds_since(self.advanced_to).max(0.0);
         self.advanced_to = to.max(self.advanced_to);
+        let Some(body) = &mut self.body else { return self.plant.advance(dt) };
+        body.advance(&mut self.plant, dt);
+        if let Some((joint, code)) = body.take_blocked().zip(self.collision).filter(|_| self.error == 0) {
+            // It holds where it was stopped, not where it was to go.
+            (0..self.limits.position_lower.len()).for_each(|joint| {
+                let at = self.body.as_ref().and_then(|body| body.joint(joint));
+                at.into_iter().for_each(|(q, v, _)| self.plant.place(joint, q, v));
+            });
+            self.plant.come_to_rest();
+            self.fail_joint(joint, code);
+        }
     }
 
     /// A client has connected. The first connection is time zero of the script.
@@ -356,12 +391,24 @@ impl SimArm {
 
     /// Returns the true joint positions [rad] and velocities [rad/s].
     pub fn joints(&self) -> (Joints, Joints) {
-        (self.plant.positions(), self.plant.velocities())
+        let (mut positions, mut velocities) = (self.plant.positions(), self.plant.velocities());
+        for (joint, (q, v)) in positions.iter_mut().zip(&mut velocities).enumerate() {
+            if let Some((position, velocity, _)) = self.body.as_ref().and_then(|body| body.joint(joint)) {
+                (*q, *v) = (position, velocity);
+            }
+        }
+        (positions, velocities)
     }
 
     /// Returns the true joint torques [Nm].
     pub fn efforts(&self) -> Joints {
-        self.plant.efforts()
+        let mut efforts = self.plant.efforts();
+        for (joint, out) in efforts.iter_mut().enumerate() {
+            if let Some((_, _, effort)) = self.body.as_ref().and_then(|body| body.joint(joint)) {
+                *out = effort;
+            }
+        }
+        efforts
     }
 
     /// Returns the last setpoint of [`SimArm::follow`].

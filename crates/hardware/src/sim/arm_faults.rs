@@ -71,6 +71,9 @@ impl SimArm {
 
     /// Returns how the response or report that is due now is delivered.
     pub fn delivery(&mut self) -> Delivery {
+        if self.body.as_ref().is_some_and(|body| body.ended().is_some()) {
+            return Delivery::Silent;
+        }
         let t = self.script_time();
         let left = |fault: &Fault| fault.left(t);
         if let Some(fault) = self.take_fault(FaultKind::PowerLoss) {

@@ -6,6 +6,7 @@
 //! | [`arm`] | [`SimArm`](arm::SimArm): joints with a motor each, modes, error, E-stop line, uptime; its options `sim` |
 //! | [`plant`] | how the joints move: limits, lag, droop under load, falling without power, blocked and sagging joints |
 //! | [`weight`] | masses: joints sag under them, and move by forces in impedance mode |
+//! | [`physics`] | a body with mass, friction and contacts behind the arm, by MuJoCo |
 //! | [`gripper`] | a gripper with a finite speed |
 //! | [`io`] | digital and analogue inputs and outputs |
 //! | [`reach`] | end-effector poses and inverse kinematics |
@@ -40,6 +41,7 @@ pub mod modbus;
 pub mod options;
 pub mod peer;
 pub mod peripheral_server;
+pub mod physics;
 pub mod plant;
 mod plant_joint;
 pub mod reach;

@@ -6,6 +6,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::faults::{Fault, FaultKind, check_script};
+use super::physics::PhysicsOptions;
 use crate::check::ConfigError;
 use dimos_core::joint::JointLimits;
 
@@ -34,6 +35,9 @@ pub struct SimOptions {
     pub faults: Vec<Fault>,
     /// What the controller does otherwise than its documents say.
     pub controller: ControllerOptions,
+    /// A body with mass, by MuJoCo: `{}`, or with a seed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub physics: Option<PhysicsOptions>,
 }
 
 /// Where an emulated controller differs from its documents: what `dimos adapter test --first-day` must find.
@@ -68,6 +72,7 @@ impl Default for SimOptions {
             droop: 0.0,
             faults: Vec::new(),
             controller: ControllerOptions::default(),
+            physics: None,
         }
     }
 }

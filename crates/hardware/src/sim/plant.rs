@@ -358,6 +358,32 @@ impl Plant {
         self.sag = amount.max(0.0);
     }
 
+    /// Puts a joint (index from 0) where it is [rad], moving at `velocity` [rad/s]: something else moves it.
+    pub fn place(&mut self, joint: usize, position: f64, velocity: f64) {
+        let driven = self.drive == Drive::Compliant;
+        if let Some(joint) = self.active_mut().get_mut(joint) {
+            joint.position = position;
+            joint.velocity = if driven { velocity } else { 0.0 };
+            joint.target = position;
+        }
+    }
+
+    /// Puts all joints at rest where they are placed: the controller gives up what it was doing.
+    pub fn come_to_rest(&mut self) {
+        self.stop();
+        self.active_mut().iter_mut().for_each(|joint| joint.velocity = 0.0);
+    }
+
+    /// Returns what drives a joint (index from 0) beside its position control, or in impedance mode.
+    pub fn force(&self, joint: usize) -> weight::Drive {
+        self.active().get(joint).map_or_else(weight::Drive::default, |joint| joint.force)
+    }
+
+    /// Takes its weight and its falling away: it is then only where the controller commands the arm to be.
+    pub fn as_reference(&mut self) {
+        (self.droop, self.fall, self.sag, self.masses) = (0.0, 0.0, 0.0, None);
+    }
+
     /// Blocks a joint (index from 0), or frees it.
     pub fn block(&mut self, joint: usize, blocked: bool) {
         if let Some(joint) = self.active_mut().get_mut(joint) {

@@ -31,6 +31,8 @@ const GUIDING: u8 = 3;
 pub(super) const REFLEX: u8 = 4;
 pub(super) const USER_STOPPED: u8 = 5;
 const RECOVERING: u8 = 6;
+/// The error of a joint that something stops.
+const JOINT_REFLEX: u16 = 7;
 /// A recovery takes this many cycles.
 const RECOVERY: u32 = 30;
 /// A joint that was moved by hand by more than this has a new desired position [rad].
@@ -141,7 +143,7 @@ impl Control {
     pub fn new(model: Model, options: &SimOptions, now: Mono) -> AdapterResult<Self> {
         let common = options.common().starting_at(&POSE);
         let limits = super::limits(model);
-        let arm = SimArm::new("franka", &limits, &common, PLAYABLE, now)?.without_modes();
+        let arm = SimArm::new("franka", &limits, &common, PLAYABLE, now)?.without_modes().colliding_as(JOINT_REFLEX);
         let (positions, _) = arm.joints();
         let mut control = Self {
             model,

@@ -39,6 +39,7 @@ use dimos_hardware::check::ConfigError;
 use dimos_hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, Truth};
 use dimos_hardware::sim::arm;
 use dimos_hardware::sim::faults::{Fault, FaultKind};
+use dimos_hardware::sim::physics::PhysicsOptions;
 use dimos_hardware::sim::tcp_server::{Port, TcpServer, emulator_ports};
 use dimos_rt::histogram::{self, Histogram};
 
@@ -106,6 +107,9 @@ pub struct SimOptions {
     pub faults: Vec<Fault>,
     /// What the controller does otherwise than its documents say.
     pub controller: arm::ControllerOptions,
+    /// A body with mass, by MuJoCo: `{}`, or with a seed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub physics: Option<PhysicsOptions>,
 }
 
 impl Default for SimOptions {
@@ -123,6 +127,7 @@ impl Default for SimOptions {
             hand_in_desk: false,
             faults: Vec::new(),
             controller: arm::ControllerOptions::default(),
+            physics: None,
         }
     }
 }
@@ -144,8 +149,8 @@ impl SimOptions {
     }
 
     fn common(&self) -> arm::SimOptions {
-        let Self { initial_positions, lag, droop, faults, controller, .. } = self.clone();
-        arm::SimOptions { initial_positions, lag, droop, faults, controller }
+        let Self { initial_positions, lag, droop, faults, controller, physics, .. } = self.clone();
+        arm::SimOptions { initial_positions, lag, droop, faults, controller, physics }
     }
 }
 

@@ -44,6 +44,7 @@ pub(super) mod state {
     pub use dimos_hardware::sim::arm::ESTOP;
     pub const NO_SOLUTION: u16 = 2;
     pub const LIMIT: u16 = 4;
+    pub const COLLISION: u16 = 7;
     pub const OTHER: u16 = 10;
 }
 
@@ -101,7 +102,7 @@ impl Controller {
         let arm = SimArm::new("piper", &stops(model), &options.common().starting_at(&INITIAL), playable, now)?;
         Ok(Self {
             // Its limits are its own, in units of the wire.
-            arm: arm.without_modes().with_tolerance(f64::INFINITY),
+            arm: arm.without_modes().with_tolerance(f64::INFINITY).colliding_as(state::COLLISION),
             gripper: Gripper::new(gripper.stroke().unwrap_or_default(), GRIPPER_SPEED),
             has_gripper: gripper != GripperKind::None,
             gripper_on: false,

@@ -28,6 +28,7 @@ use dimos_hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, Truth};
 use dimos_hardware::sim::arm::{self, HasArm};
 use dimos_hardware::sim::can_server::{CanController, CanServer};
 use dimos_hardware::sim::faults::{Fault, FaultKind};
+use dimos_hardware::sim::physics::PhysicsOptions;
 use dimos_hardware::transport::can::CanFrame;
 
 /// The faults that the emulator can play on any bus.
@@ -81,6 +82,9 @@ pub struct SimOptions {
     pub faults: Vec<Fault>,
     /// What the controller does otherwise than its documents say.
     pub controller: arm::ControllerOptions,
+    /// A body with mass, by MuJoCo: `{}`, or with a seed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub physics: Option<PhysicsOptions>,
 }
 
 impl Default for SimOptions {
@@ -93,6 +97,7 @@ impl Default for SimOptions {
             droop: 0.0,
             faults: Vec::new(),
             controller: arm::ControllerOptions::default(),
+            physics: None,
         }
     }
 }
@@ -109,8 +114,8 @@ impl SimOptions {
 
     /// What all emulated arms have.
     fn common(&self) -> arm::SimOptions {
-        let Self { initial_positions, lag, droop, faults, controller, .. } = self.clone();
-        arm::SimOptions { initial_positions, lag, droop, faults, controller }
+        let Self { initial_positions, lag, droop, faults, controller, physics, .. } = self.clone();
+        arm::SimOptions { initial_positions, lag, droop, faults, controller, physics }
     }
 }
 

@@ -16,6 +16,7 @@ use dimos_hardware::check::ConfigError;
 use dimos_hardware::registry::{AdapterConfig, EmulatorAddress};
 use dimos_hardware::sim::arm;
 use dimos_hardware::sim::faults::{Fault, FaultKind};
+use dimos_hardware::sim::physics::PhysicsOptions;
 use dimos_hardware::sim::serial_server::SerialServer;
 pub use servos::Servos;
 
@@ -70,6 +71,9 @@ pub struct SimOptions {
     pub faults: Vec<Fault>,
     /// What the controller does otherwise than its documents say.
     pub controller: arm::ControllerOptions,
+    /// A body with mass, by MuJoCo: `{}`, or with a seed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub physics: Option<PhysicsOptions>,
 }
 
 impl Default for SimOptions {
@@ -84,14 +88,15 @@ impl Default for SimOptions {
             voltage: 12.0,
             faults: Vec::new(),
             controller: arm::ControllerOptions::default(),
+            physics: None,
         }
     }
 }
 
 impl SimOptions {
     fn common(&self) -> arm::SimOptions {
-        let Self { initial_positions, lag, droop, faults, controller, .. } = self.clone();
-        arm::SimOptions { initial_positions, lag, droop, faults, controller }
+        let Self { initial_positions, lag, droop, faults, controller, physics, .. } = self.clone();
+        arm::SimOptions { initial_positions, lag, droop, faults, controller, physics }
     }
 
     /// Returns an error for values that the emulator cannot have.

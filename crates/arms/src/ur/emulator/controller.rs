@@ -29,6 +29,8 @@ pub(super) const RUNNING: i32 = 7;
 const PROTECTED: Duration = Duration::from_secs(5);
 /// A program makes at most this many steps at once: a real controller is never late.
 const STEPS: u32 = 10;
+/// A protective stop: a joint is not where its path is.
+const DEVIATES: u16 = 153;
 /// Number of registers of a type.
 pub(super) const REGISTERS: usize = 48;
 /// Messages that are kept for clients of the primary interface.
@@ -147,7 +149,7 @@ impl Controller {
     /// A controller that was started some time ago; its arm has no power.
     pub fn new(model: Model, options: &SimOptions, now: Mono) -> AdapterResult<Self> {
         let common = options.common().starting_at(&POSE);
-        let arm = SimArm::new("ur", &limits(model), &common, PLAYABLE, now)?.without_modes();
+        let arm = SimArm::new("ur", &limits(model), &common, PLAYABLE, now)?.without_modes().colliding_as(DEVIATES);
         Ok(Self {
             model,
             software: options.software(model),

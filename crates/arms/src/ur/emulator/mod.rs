@@ -36,6 +36,7 @@ use dimos_hardware::check::ConfigError;
 use dimos_hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, Truth};
 use dimos_hardware::sim::arm;
 use dimos_hardware::sim::faults::{Fault, FaultKind};
+use dimos_hardware::sim::physics::PhysicsOptions;
 use dimos_hardware::sim::tcp_server::{Port, TcpServer, cannot_listen, emulator_ports};
 use dimos_hardware::sim::tool_device::ToolDevice;
 use dimos_hardware::transport::line::UR_TOOL_PORT;
@@ -114,6 +115,9 @@ pub struct SimOptions {
     pub faults: Vec<Fault>,
     /// What the controller does otherwise than its documents say.
     pub controller: arm::ControllerOptions,
+    /// A body with mass, by MuJoCo: `{}`, or with a seed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub physics: Option<PhysicsOptions>,
 }
 
 /// A horizontal surface that yields like a spring where the tool's centre point presses on it. It does not hold the arm
@@ -152,6 +156,7 @@ impl Default for SimOptions {
             surface: None,
             faults: Vec::new(),
             controller: arm::ControllerOptions::default(),
+            physics: None,
         }
     }
 }
@@ -191,8 +196,8 @@ impl SimOptions {
     }
 
     fn common(&self) -> arm::SimOptions {
-        let Self { initial_positions, lag, droop, faults, controller, .. } = self.clone();
-        arm::SimOptions { initial_positions, lag, droop, faults, controller }
+        let Self { initial_positions, lag, droop, faults, controller, physics, .. } = self.clone();
+        arm::SimOptions { initial_positions, lag, droop, faults, controller, physics }
     }
 }
 

@@ -32,6 +32,8 @@ const SLICE: Duration = Duration::from_millis(20);
 pub(super) const SERVO: u8 = 1;
 /// Positions this close to a limit count as inside [rad]: the vendor's client allows as much.
 pub(super) const TOLERANCE: f64 = 0.00175;
+/// The error of a joint that takes more current than its motion needs.
+const COLLISION: u16 = 31;
 /// What the force/torque sensor feels of the tool [N, Nm].
 const TOOL_WEIGHT: [f32; 6] = [0.3, -0.2, -4.9, 0.01, 0.02, 0.0];
 /// States, as reported. While it is ready, 1 or 2 is reported by whether it moves.
@@ -116,7 +118,8 @@ impl Controller<SimArm> {
         let identity = introduce(model);
         let mut limits = identity.limits().unwrap_or_else(|| model.limits());
         limits.acceleration_max.iter_mut().for_each(|a| *a = ACCELERATION);
-        let arm = SimArm::new("xarm", &limits, &options.common().starting_at(at_home(model)), PLAYABLE, now)?;
+        let common = options.common().starting_at(at_home(model));
+        let arm = SimArm::new("xarm", &limits, &common, PLAYABLE, now)?.colliding_as(COLLISION);
         // Its modes are its own.
         let arm = arm.without_modes().with_tolerance(TOLERANCE);
         let slow = options.slow_replies.clone();

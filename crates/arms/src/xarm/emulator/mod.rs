@@ -49,6 +49,7 @@ use dimos_hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, Truth};
 use dimos_hardware::sim::arm::{self, HasArm, SimArm};
 use dimos_hardware::sim::faults::{Fault, FaultKind};
 use dimos_hardware::sim::peer;
+use dimos_hardware::sim::physics::PhysicsOptions;
 use dimos_hardware::sim::tcp_server::{ATTEMPTS, Port, TcpServer, cannot_listen, ports_in_a_row};
 use dimos_hardware::sim::tool_device::ToolDevice;
 pub use kinematics::Links;
@@ -97,6 +98,9 @@ pub struct SimOptions {
     pub faults: Vec<Fault>,
     /// What the controller does otherwise than its documents say.
     pub controller: arm::ControllerOptions,
+    /// A body with mass, by MuJoCo: `{}`, or with a seed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub physics: Option<PhysicsOptions>,
 }
 
 impl Default for SimOptions {
@@ -113,6 +117,7 @@ impl Default for SimOptions {
             droop: 0.0,
             faults: Vec::new(),
             controller: arm::ControllerOptions::default(),
+            physics: None,
         }
     }
 }
@@ -145,8 +150,8 @@ impl SimOptions {
 
     /// What all emulated arms have.
     fn common(&self) -> arm::SimOptions {
-        let Self { initial_positions, lag, droop, faults, controller, .. } = self.clone();
-        arm::SimOptions { initial_positions, lag, droop, faults, controller }
+        let Self { initial_positions, lag, droop, faults, controller, physics, .. } = self.clone();
+        arm::SimOptions { initial_positions, lag, droop, faults, controller, physics }
     }
 
     fn firmware(&self) -> Result<[u16; 3], ConfigError> {

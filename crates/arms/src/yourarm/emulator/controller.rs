@@ -42,6 +42,8 @@ const TORQUE_PER_AMPERE: f64 = 10.0;
 const SUPPLY: f64 = 48.0;
 /// Encoder offsets of this arm's factory calibration [deg].
 const OFFSETS: [f32; DOF] = [1.5, -2.0, 0.0, 0.25, 10.0, -0.5];
+/// Error of a joint that something stops.
+const COLLISION: u16 = 2;
 /// Error of a drive whose motor has lost its power.
 const DRIVE_OFF: u16 = 7;
 /// The modes, by their numbers on the wire.
@@ -80,6 +82,7 @@ impl Controller {
     /// A controller that was just switched on: disabled, in position mode.
     pub fn new(options: &Sim, now: Mono) -> AdapterResult<Self> {
         let arm = SimArm::new("yourarm", &limits(), &options.kit().starting_at(&INITIAL), PLAYABLE, now)?;
+        let arm = arm.colliding_as(COLLISION);
         let arm = match options.servo_stiffness > 0.0 {
             true => arm.with_masses(masses::of(options.servo_stiffness)),
             false => arm,
