@@ -254,6 +254,38 @@ impl Arm {
     }
 }
 
+impl Arm {
+    /// Returns what the weight of the arm is computed with, without a load, and the link of its flange. The error says
+    /// what is not known.
+    pub fn unloaded_dynamics(&self) -> Result<(Dynamics, usize), String> {
+        let known = self.effort.as_ref().and_then(|effort| effort.robot.clone()).or_else(|| self.placed_robot());
+        let known = known.ok_or("no model of it is known")?;
+        let model = load(&known.robot.source).into_model()?;
+        let weightless = massless(&model);
+        if !weightless.is_empty() {
+            return Err(format!("the model has no mass of {}", weightless.join(", ")));
+        }
+        let named = known.flange.clone().or_else(|| self.tool.model.map(|(_, flange)| flange.to_owned()));
+        let flange = named.as_ref().and_then(|flange| model.link_index(flange));
+        let flange = flange.ok_or("the model has no flange: name it by `flange_link` of the robot in `planner`")?;
+        Ok((Weighed { load: None, ..known }.dynamics()?, flange))
+    }
+
+    /// Returns its model as the planner or its mounting has placed it.
+    fn placed_robot(&self) -> Option<Weighed> {
+        if let Some(body) = &self.body {
+            return Some(body.robot.clone());
+        }
+        let robot = self.tool_robot.as_ref()?.robot.clone();
+        let down = Vector3::from(GRAVITY);
+        let mounted = self.setup.gravity.map(|unit| Vector3::from(unit) * down.norm());
+        let placed = robot.base.as_ref().map(|(_, pose)| pose.rotation.inverse() * down);
+        let turned = robot.base.as_ref().map_or(UnitQuaternion::identity(), |(link, _)| base_in_root(&robot, link));
+        let gravity = (turned * mounted.or(placed).unwrap_or(down)).into();
+        Some(Weighed { flange: Some(robot.link.clone()), gravity, load: None, robot })
+    }
+}
+
 impl Weighed {
     /// Reads the model, and compiles it for the tick.
     fn dynamics(&self) -> Result<Dynamics, String> {

@@ -17,7 +17,7 @@ use crate::blueprint::schema::HardwareEntry;
 /// The body of an arm.
 #[derive(Debug, Clone)]
 pub struct ArmBody {
-    robot: Weighed,
+    pub(super) robot: Weighed,
     objects: Vec<ObjectConfig>,
 }
 

@@ -7,6 +7,7 @@ mod calibrate;
 mod configure;
 mod find_port;
 mod home;
+mod identify;
 mod kinematics;
 mod live_table;
 pub(super) mod parts;

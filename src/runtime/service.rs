@@ -130,6 +130,7 @@ impl Service {
             Call::GripperHome(g) => self.home_gripper(g).await,
             Call::Grip(g) => self.grip(&g).map(Reply::Grip),
             Call::ArmPayload(p) => self.payload(&p.arm).await.map(Reply::ArmPayload),
+            Call::ArmPayloadFind(p) => self.find_payload(&p).map(Reply::ArmPayloadFind),
             Call::ArmPayloadSet(p) => self.set_payload(p).await,
             Call::ArmTare(t) => self.tare(&t.arm).await,
             Call::ArmTool(t) => self.tool(&t.arm).map(Reply::ArmTool),

@@ -5,6 +5,7 @@ use serde_json::Value;
 
 use crate::support::program::{Home, Started, eventually};
 use crate::support::python::python_with;
+use crate::support::skip::skip_optional;
 
 /// The cause and the error of an arm that is held.
 fn held(home: &Home) -> (Value, Value) {
@@ -103,4 +104,56 @@ fn the_same_seed_is_the_same_body_and_without_mujoco_the_pip_line_is_said() {
     home.dimos("adapter emulate ur --option sim.physics.seed=1")
         .with(2)
         .says(&["physics need a model", "--sim=physics"]);
+}
+
+/// Loads a YourArm, whose body differs from its model by the seed.
+fn carrying(home: &Home, load: &str, seed: u64) -> Started {
+    let blueprint = "name: carries\ninclude: [yourarm-planner]\nhardware:\n  - {hardware_id: arm, payload: LOAD}\n";
+    home.write("carries.yaml", &blueprint.replace("LOAD", load));
+    run(home, "carries.yaml", &format!("--set hardware.arm.options.sim.physics.seed={seed}")).unwrap()
+}
+
+/// Identifies the load; returns what was found.
+fn identify(home: &Home, more: &str) -> Value {
+    let identifying = home.start(&format!("arm payload arm --identify --json {more}"));
+    (1..=10).for_each(|place| identifying.until(&format!("place {place} of 10 measured")));
+    identifying.wait().with(0).json()
+}
+
+const LOAD: &str = "{mass: 1.2, center: [0.02, -0.01, 0.06]}";
+
+/// Checks a load that was found, and prints it.
+fn is_found(seed: u64, found: &Value) {
+    println!("seed {seed}: {found}");
+    let (mass, center) = (found["mass"].as_f64().unwrap(), found["center"].as_array().unwrap());
+    assert!((mass / 1.2 - 1.0).abs() < 0.03, "seed {seed}: {found}");
+    let off = center.iter().zip([0.02, -0.01, 0.06]).map(|(found, is)| (found.as_f64().unwrap() - is).abs());
+    assert!(off.fold(0.0, f64::max) < 5e-3, "seed {seed}: {found}");
+}
+
+#[test]
+fn the_load_of_an_arm_is_found_from_what_it_bears() {
+    if python_with(&["mujoco"]).is_none() {
+        return;
+    }
+    let home = Home::new();
+    let _run = carrying(&home, LOAD, 0);
+    is_found(0, &identify(&home, ""));
+}
+
+/// `DIMOS_SEEDS=20`: the number of bodies, each measured without its load and with it.
+#[test]
+fn the_load_of_an_arm_whose_masses_are_not_its_models_is_found_by_comparison() {
+    let Some(seeds) = std::env::var("DIMOS_SEEDS").ok().and_then(|seeds| seeds.parse().ok()) else {
+        return skip_optional("bodies that are not their models (DIMOS_SEEDS=20)");
+    };
+    for seed in 1..=seeds {
+        let home = Home::new();
+        let empty = carrying(&home, "{mass: 0}", seed);
+        identify(&home, "--save empty.json");
+        home.dimos("down").with(0);
+        drop(empty);
+        let _run = carrying(&home, LOAD, seed);
+        is_found(seed, &identify(&home, "--unloaded empty.json"));
+    }
 }

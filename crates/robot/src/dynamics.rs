@@ -6,7 +6,10 @@
 //! velocities and accelerations from the root outwards, forces back. Gravity is an acceleration of the root the other
 //! way. Mimic joints are folded into their leaders. Friction, rotors and springs are not part of it.
 
+mod load;
 mod stored;
+
+pub use load::{FoundLoad, RestingEffort, find_load};
 
 use glamx::{DAffine3, DMat3, DVec3};
 use nalgebra::Isometry3;

@@ -123,7 +123,10 @@ impl Writer {
 
     fn inertial(&mut self, inertial: &Inertial) {
         let turn = inertial.origin.rotation.to_rotation_matrix();
-        let i = turn.matrix() * inertial.inertia * turn.matrix().transpose();
+        let mut i = turn.matrix() * inertial.inertia * turn.matrix().transpose();
+        if i.symmetric_eigenvalues().min() < LEAST.1 {
+            i += Matrix3::from_diagonal_element(LEAST.1); // a point mass
+        }
         let at = inertial.origin.translation.vector;
         let (xx, yy, zz) = (i[(0, 0)], i[(1, 1)], i[(2, 2)]);
         let (xy, xz, yz) = (i[(0, 1)], i[(0, 2)], i[(1, 2)]);

@@ -1,6 +1,7 @@
 //! `dimos arm io|payload ARM`: the optional parts of an arm.
 
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 
 use super::super::arguments::{finite, length};
 use super::super::exit::{Exit, Result};
@@ -29,7 +30,16 @@ fn assignment(text: &str) -> std::result::Result<(String, f64), String> {
 #[derive(Debug, clap::Args)]
 pub struct PayloadArgs {
     #[command(flatten)]
-    which: ArmArgs,
+    pub(super) which: ArmArgs,
+    /// Find the load: the arm moves to ten places around this one, and its efforts show it
+    #[arg(long, conflicts_with = "mass")]
+    identify: bool,
+    /// With --identify: write the places and efforts to this file
+    #[arg(long, value_name = "FILE", requires = "identify")]
+    pub(super) save: Option<PathBuf>,
+    /// With --identify: go to the places of this file, which was saved without the load; only the difference counts
+    #[arg(long, value_name = "FILE", requires = "identify")]
+    pub(super) unloaded: Option<PathBuf>,
     /// Set the mass of everything at the flange [kg]
     #[arg(long, value_name = "KG", value_parser = finite, allow_negative_numbers = true)]
     mass: Option<f64>,
@@ -43,6 +53,9 @@ pub struct PayloadArgs {
 
 /// Runs `arm payload`.
 pub fn payload(args: &PayloadArgs) -> Result {
+    if args.identify {
+        return super::identify::run(args);
+    }
     let (mut client, arm) = (args.which.target_run.connect()?, args.which.arm.clone());
     let reply = match args.mass {
         None => client.call(ArmPayload { arm })?,

@@ -36,7 +36,7 @@ pub(super) const OF_VERBS: &[(&str, &[&str])] = &[
     ("arm reset", &["dimos arm reset arm"]),
     ("arm full-speed", &["dimos arm full-speed arm"]),
     ("arm io", &["dimos arm io arm", "dimos arm io arm --set do0=1"]),
-    ("arm payload", &["dimos arm payload arm", "dimos arm payload arm --mass 0.8 --center 0 0 0.06"]),
+    ("arm payload", &["dimos arm payload arm --mass 0.8 --center 0 0 0.06", "dimos arm payload arm --identify"]),
     ("arm tare", &["dimos arm tare arm"]),
     ("arm tool", &["dimos arm tool arm", "dimos arm tool arm --xyz 0 0 0.12"]),
     ("arm find-port", &["dimos arm find-port", "dimos arm find-port --ask so101"]),

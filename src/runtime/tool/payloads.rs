@@ -11,6 +11,7 @@ use dimos_core::joint::STANDSTILL;
 use dimos_core::telemetry::describe::Severity;
 use dimos_core::telemetry::{Phase, TaskState};
 use dimos_hardware::adapter::AdapterError;
+use dimos_robot::dynamics::{RestingEffort, find_load};
 use dimos_rpc::api::{self, AttachReply, LoadReport, PayloadReply, Reply, Request as Call};
 use dimos_rpc::report::end_of_lead;
 use dimos_rpc::{Code, RpcError};
@@ -64,6 +65,27 @@ impl Service {
         held.set = Some(call.load());
         written.ready?;
         Ok(Reply::ArmPayloadSet(PayloadReply { payload: written.payload }))
+    }
+
+    /// Finds the load at an arm's flange from its efforts at rest.
+    pub(in crate::runtime) fn find_payload(&self, call: &api::ArmPayloadFind) -> Result<api::FoundPayload, RpcError> {
+        let arm = self.facts.arm_index(&call.arm)?;
+        let own = self.facts.blueprint.arms.get(arm as usize).ok_or_else(internal)?;
+        let unknown = |what: String| {
+            let what = format!("the weight of {} cannot be computed: {what}", call.arm);
+            RpcError::new(Code::Unsupported, what)
+                .hint("a model with the masses of its links: `model_path` in the blueprint")
+        };
+        let (mut dynamics, flange) = own.unloaded_dynamics().map_err(unknown)?;
+        let of = |list: &[api::RestingEffort]| -> Vec<RestingEffort> {
+            let one =
+                |at: &api::RestingEffort| RestingEffort { position: at.position.clone(), effort: at.effort.clone() };
+            list.iter().map(one).collect()
+        };
+        let unloaded = Some(of(&call.unloaded)).filter(|list| !list.is_empty());
+        let found = find_load(&mut dynamics, flange, &of(&call.loaded), unloaded.as_deref());
+        let found = found.map_err(|what| RpcError::new(Code::InvalidParams, what))?;
+        Ok(api::FoundPayload { mass: found.mass, center: found.center, residual: found.residual })
     }
 
     fn takes_payload(&self, arm: u16) -> Result<(), RpcError> {

@@ -154,7 +154,7 @@ impl Body {
         Ok(body)
     }
 
-    /// Ends the process; returns its exit code, and the last line that it wrote about that.
+    /// Ends the process; returns its exit code, and the last lines that it wrote about that.
     fn last_words(&mut self) -> (Option<i32>, String) {
         self.to = None;
         let began = Instant::now();
@@ -168,7 +168,9 @@ impl Body {
         let _ = self.child.kill();
         let mut text = String::new();
         let _ = self.child.stderr.take().map(|mut errors| errors.read_to_string(&mut text));
-        (status.and_then(|status| status.code()), text.trim().lines().last().unwrap_or("it is silent").to_owned())
+        let mut lines: Vec<&str> = text.trim().lines().rev().take(2).collect();
+        lines.reverse();
+        (status.and_then(|status| status.code()), lines.join("; "))
     }
 
     /// Sends a line and returns the next one that comes.

@@ -307,6 +307,8 @@ methods! {
     /// Sets the load at an arm's flange, and reads it back. The arm must be at rest.
     "arm_payload_set" ArmPayloadSet -> PayloadReply, Move, needs p => Need::no_other_of(&p.arm),
         check ArmPayloadSet::valid;
+    /// Finds the load at an arm's flange from its efforts at rest, with the arm's model. Sets nothing.
+    "arm_payload_find" ArmPayloadFind -> FoundPayload, Read, check ArmPayloadFind::valid;
     /// Makes the present force and torque at an arm zero, for `until`, `state` and the log. The arm must be at rest.
     "arm_tare" ArmTare -> TareReply, Move, needs p => Need::no_other_of(&p.arm);
     /// The robots of the run in one URDF, and the transforms in it that do not change.

@@ -102,6 +102,52 @@ pub struct TareReply {
     pub wrench: [f64; 6],
 }
 
+/// Parameters of `arm_payload_find`: efforts of the arm at rest, with the load and, if known, without it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ArmPayloadFind {
+    /// The arm's `hardware_id`.
+    pub arm: String,
+    /// Places and efforts with the load, 1 to 200. Friction is left out if each place is reached from both sides and
+    /// its efforts are the mean.
+    pub loaded: Vec<RestingEffort>,
+    /// The same places without the load: then errors of the model do not count.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub unloaded: Vec<RestingEffort>,
+}
+
+/// Efforts of an arm at rest.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct RestingEffort {
+    /// Positions of its joints [rad or m].
+    pub position: Vec<f64>,
+    /// Efforts of its joints [Nm or N].
+    pub effort: Vec<f64>,
+}
+
+impl ArmPayloadFind {
+    pub(crate) fn valid(&self) -> Result<(), String> {
+        match (self.loaded.len(), self.unloaded.len()) {
+            (1..=200, 0) => Ok(()),
+            (loaded @ 1..=200, unloaded) if loaded == unloaded => Ok(()),
+            (loaded, 0) => Err(format!("{loaded} places, may be 1 to 200")),
+            (loaded, unloaded) => Err(format!("{loaded} places with the load and {unloaded} without it")),
+        }
+    }
+}
+
+/// Reply to `arm_payload_find`.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+pub struct FoundPayload {
+    /// Mass of all at the flange beyond the arm's model [kg].
+    pub mass: f64,
+    /// Its centre in the flange frame [m]; null below 20 g.
+    pub center: Option<[f64; 3]>,
+    /// What is left of each joint's efforts, root mean square [Nm or N].
+    pub residual: Vec<f64>,
+}
+
 /// Reply to `arm_payload` and `arm_payload_set`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct PayloadReply {

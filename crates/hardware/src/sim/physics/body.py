@@ -17,7 +17,7 @@ STEP = 0.001  # s
 BANDWIDTH = 60.0  # of the position control of a drive that compensates gravity [rad/s]
 DAMPING = 0.9  # of that control, relative to critical
 INTEGRAL = 3.0  # of that control [1/s]
-ROTOR = 0.1  # inertia of a rotor behind its gear, as a part of that of the joint
+ROTOR = (0.1, 0.02)  # inertia of a rotor behind its gear, as parts of that of its joint and of the heaviest one
 FRICTION = 0.02  # Coulomb friction, as a part of the highest weight of the joint
 VISCOUS = 0.2  # viscous friction: inertia of the joint in this time [1/s]
 POSES = 64  # in which weights and inertias are examined
@@ -37,13 +37,14 @@ class Body:
         self.efforts = np.array([effort if effort > 0.0 else np.inf for effort in efforts])
         self.thought = mujoco.MjData(self.known)
         inertia, weight = self.look_around(ids)
+        rotor = ROTOR[0] * inertia + ROTOR[1] * inertia.max()
         for model in (self.known, self.model):
-            model.dof_armature[self.v] = ROTOR * inertia
+            model.dof_armature[self.v] = rotor
         self.vary(np.random.RandomState(seed) if seed else None, inertia, weight)
         self.data = mujoco.MjData(self.model)
         self.data.qpos[self.q] = position
         mujoco.mj_forward(self.model, self.data)
-        inertia = (1.0 + ROTOR) * inertia
+        inertia = inertia + rotor
         self.compensates = droop == 0.0
         if self.compensates:
             self.stiffness = inertia * BANDWIDTH**2
@@ -76,10 +77,13 @@ class Body:
         model.dof_damping[self.v] = VISCOUS * inertia
         if random is None:
             return
-        by = random.uniform(0.9, 1.1, model.nbody)
+        # What the arm carries is what the blueprint says.
+        arm = np.array([model.body(body).name != "payload" for body in range(model.nbody)])
+        by = np.where(arm, random.uniform(0.9, 1.1, model.nbody), 1.0)
         model.body_mass[:] *= by
         model.body_inertia[:] *= by[:, None]
-        model.body_ipos[:] += random.uniform(-0.01, 0.01, (model.nbody, 3)) * (model.body_mass[:, None] > 0.0)
+        moved = (arm & (model.body_mass > 0.0))[:, None]
+        model.body_ipos[:] += random.uniform(-0.01, 0.01, (model.nbody, 3)) * moved
         joints = len(self.v)
         model.dof_damping[self.v] *= random.uniform(0.5, 1.5, joints)
         model.dof_frictionloss[self.v] = FRICTION * weight * random.uniform(0.5, 1.5, joints)
