@@ -1,6 +1,6 @@
 //! The part of a solid in a box: its surface as polygons, cut at the box, and the corners of the box that are inside.
 
-use super::ball::{Ball, Plane, around};
+use super::ball::{Ball, FIELD_STEPS, Plane, STEPS, around, shallowest};
 use super::vector::{Vector, along, bounds};
 
 /// Interior of a closed surface.
@@ -10,8 +10,22 @@ pub enum Inside<'a> {
     Convex,
     /// Whether a point is inside.
     Test(&'a dyn Fn([f64; 3]) -> bool),
+    /// How deep a point is inside.
+    Depth(&'a dyn Fn([f64; 3]) -> Depth),
     /// Nothing: the surface is open.
     Nothing,
+}
+
+/// A point and the surface of a solid.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Depth {
+    /// Distance from the surface, if the point is known to be inside; otherwise negative: all around the point that is
+    /// closer than this is inside [m].
+    pub depth: f64,
+    /// Direction in which the depth decreases; a unit vector.
+    pub outwards: [f64; 3],
+    /// Whether the point may be inside.
+    pub may_be_inside: bool,
 }
 
 /// A part of a solid and the ball that contains it.
@@ -24,7 +38,8 @@ pub(super) struct Cell {
     pub ball: Ball,
     /// How far the ball's surface is outside of the solid at most [m].
     pub overshoot: f64,
-    convex: bool,
+    /// Whether it is known how deep its ball's centre is inside.
+    has_depth: bool,
 }
 
 impl Cell {
@@ -43,6 +58,7 @@ impl Cell {
         let is_inside = |p: &Vector| match inside {
             Inside::Convex => planes.iter().all(|plane| plane.depth(*p) >= 0.0),
             Inside::Test(test) => test(*p),
+            Inside::Depth(depth) => depth(*p).may_be_inside,
             Inside::Nothing => false,
         };
         let points: Vec<Vector> = polygons.iter().flatten().copied().chain(corners.filter(is_inside)).collect();
@@ -50,13 +66,20 @@ impl Cell {
             return None;
         }
         let (low, high) = bounds(points.iter().copied());
-        let (ball, overshoot) = around(&points, planes);
-        Some(Self { polygons, low, high, ball, overshoot, convex: !planes.is_empty() })
+        let (ball, overshoot) = match inside {
+            Inside::Depth(depth) => around(&points, FIELD_STEPS, |at| {
+                let Depth { depth, outwards, .. } = depth(at);
+                (depth, outwards)
+            }),
+            _ => around(&points, STEPS, |at| shallowest(at, planes)),
+        };
+        let has_depth = !planes.is_empty() || matches!(inside, Inside::Depth(_));
+        Some(Self { polygons, low, high, ball, overshoot, has_depth })
     }
 
-    /// Returns the ball as a node of a tree, and the ball about its centre that is inside a convex solid.
+    /// Returns the ball as a node of a tree, and the ball about its centre that is inside the solid, if one is known.
     pub fn node(&self) -> super::Node {
-        super::node(&self.ball, if self.convex { self.ball.radius - self.overshoot } else { super::NONE })
+        super::node(&self.ball, if self.has_depth { self.ball.radius - self.overshoot } else { super::NONE })
     }
 
     /// Halves the box across its longest side.

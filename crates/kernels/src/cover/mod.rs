@@ -10,7 +10,7 @@ mod vector;
 
 use std::collections::BinaryHeap;
 
-pub use cell::Inside;
+pub use cell::{Depth, Inside};
 
 use ball::{Ball, Plane};
 use cell::Cell;
@@ -20,6 +20,8 @@ use vector::{Vector, bounds, cross, direction, dot, sub};
 const OVERSHOOT: f64 = 0.002;
 /// Largest number of balls that are not halved further, per solid.
 const LEAVES: usize = 192;
+/// The same of a solid that need not be convex: a pair of such links is close to each other in more places.
+const LEAVES_OF_MESH: usize = 640;
 /// Points per leaf of a cloud.
 const POINTS: usize = 4;
 /// Rounding to single precision [relative to a coordinate].
@@ -71,8 +73,8 @@ impl Tree {
         let Some(root) = Cell::new(polygons, low, high, &planes, inside) else { return Self::default() };
         nodes.push(root.node());
         let mut open = BinaryHeap::from([Open { at: 0, cell: root }]);
-        let mut leaves = 1;
-        while leaves < LEAVES && open.peek().is_some_and(|worst| worst.cell.overshoot > OVERSHOOT) {
+        let (mut leaves, most) = (1, if matches!(inside, Inside::Depth(_)) { LEAVES_OF_MESH } else { LEAVES });
+        while leaves < most && open.peek().is_some_and(|worst| worst.cell.overshoot > OVERSHOOT) {
             let Some(Open { at, cell }) = open.pop() else { break };
             let first = nodes.len();
             for part in cell.halves(&planes, inside).into_iter().flatten() {

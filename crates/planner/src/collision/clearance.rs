@@ -1,5 +1,7 @@
 //! The clearance that motions are proven to keep, between their samples, too.
 
+use std::collections::HashMap;
+
 use super::checker::{CollisionChecker, Stop};
 use super::exact::ExactChecker;
 use super::report::Pair;
@@ -39,12 +41,15 @@ impl ExactChecker {
             return None;
         }
         let (pads, most_pad, fine) = (self.pads.clone(), self.most_pad, self.settings.clearance.fine);
+        // The same configurations are checked with many distances, and triangles take long.
+        self.known = self.scene.has_surfaces().then(HashMap::new);
         let mut clearance = self.search_clearance(motions, exact, stop);
         if let Some(coarse) = clearance.as_mut().filter(|clearance| clearance.distance < fine)
             && let Some(fine) = self.refined(motions, coarse, stop)
         {
             *coarse = fine;
         }
+        self.known = None;
         (self.pads, self.most_pad, self.resolution) = (pads, most_pad, self.settings.certification.resolution);
         clearance
     }

@@ -8,7 +8,9 @@ use glamx::DVec3;
 use parry3d_f64::shape::ConvexPolyhedron;
 
 use super::ball;
-use super::shape::{Core, Solid};
+use super::field::Field;
+use super::outline::{cuboid, prism};
+use super::shape::{Core, Mesh, Solid};
 use dimos_core::sync::lock;
 
 /// Covers of links that are kept: an object may be held at many places.
@@ -85,26 +87,16 @@ fn known(solids: &[Solid]) -> (Arc<Tree>, Ball) {
     (tree, ball)
 }
 
-/// Number of sides of the prism that replaces a cylinder in its cover: 0.5 % wider.
-const SIDES: usize = 32;
-
 fn of(core: &Core) -> Tree {
     match core {
         Core::Point => Tree::of_point(),
         Core::Segment { half } => Tree::of_segment(*half),
-        Core::Box { half } => {
-            let corner = |k: usize| DVec3::new(sign(k), sign(k >> 1), sign(k >> 2)) * *half;
-            of_hull(&(0..8).map(corner).collect::<Vec<_>>())
-        }
-        Core::Cylinder { half, radius } => {
-            let outside = radius / (std::f64::consts::PI / SIDES as f64).cos();
-            let side = |k: usize| {
-                let (sin, cos) = (std::f64::consts::TAU * (k / 2) as f64 / SIDES as f64).sin_cos();
-                DVec3::new(outside * cos, outside * sin, half * sign(k))
-            };
-            of_hull(&(0..2 * SIDES).map(side).collect::<Vec<_>>())
-        }
-        Core::Hull(hull) => of_polyhedron(hull.polyhedron()),
+        Core::Box { half } => cuboid(*half).as_ref().map(of_polyhedron).unwrap_or_default(),
+        Core::Cylinder { half, radius } => prism(*half, *radius).as_ref().map(of_polyhedron).unwrap_or_default(),
+        Core::Hull(hull) => match hull.surface() {
+            Some(mesh) => of_mesh(mesh),
+            None => of_polyhedron(hull.polyhedron()),
+        },
         Core::Mesh(mesh) => {
             let inside = |p: [f64; 3]| mesh.holds(DVec3::from_array(p));
             let triangles = mesh.surface().triangles().map(|t| [t.a, t.b, t.c].map(|p| p.to_array()));
@@ -114,12 +106,12 @@ fn of(core: &Core) -> Tree {
     }
 }
 
-fn sign(bit: usize) -> f64 {
-    if bit & 1 == 1 { 1.0 } else { -1.0 }
-}
-
-fn of_hull(points: &[DVec3]) -> Tree {
-    ConvexPolyhedron::from_convex_hull(points).as_ref().map(of_polyhedron).unwrap_or_default()
+/// Covers the solid within a mesh: what cannot be reached from outside through its openings.
+fn of_mesh(mesh: &Mesh) -> Tree {
+    let field = Field::new(mesh.triangles());
+    let depth = |p: [f64; 3]| field.depth(DVec3::from_array(p));
+    let triangles = mesh.triangles().all().iter().map(|corners| corners.map(|p| p.to_array()));
+    Tree::of_triangles(triangles, Inside::Depth(&depth))
 }
 
 fn of_polyhedron(polyhedron: &ConvexPolyhedron) -> Tree {

@@ -141,7 +141,7 @@ fn a_window_in_a_wall_is_a_way_out_and_a_wall_without_one_encloses() {
                 &mut walled,
                 &from,
                 std::slice::from_ref(&other),
-                (&EnclosureSettings::default(), seed, true),
+                (&EnclosureSettings::default(), seed),
                 &Stop::never(),
             )
         };
@@ -353,6 +353,7 @@ fn pointer(lower: f64, upper: f64) -> Robot {
         base: DAffine3::IDENTITY,
         padding: 0.0,
         apart: 0.0,
+        proven: Vec::new(),
         allowed: vec![],
     }
 }
