@@ -113,6 +113,7 @@ fn measure(scene: &PlanningScene, given: &Given, seed: u64, goals: usize) -> Vec
             Ok(motion) if std::env::var_os("DIMOS_EACH").is_some() => {
                 let clearance = motion.clearance.map(|kept| (kept.distance, kept.pair));
                 println!("  {took:9.2} ms: {:?} {clearance:?}", motion.times);
+                for (n,t) in &dimos_planner::collision::exact::DBG { let (n,t)=(n.swap(0,std::sync::atomic::Ordering::Relaxed),t.swap(0,std::sync::atomic::Ordering::Relaxed)); print!("   {n} x {:.1}us", t as f64/1e3/n.max(1) as f64);} println!();
             }
             Ok(_) => {}
             Err(failure) => println!("  {took:.1} ms: {}", failure.what),

@@ -10,22 +10,23 @@ pub enum Inside<'a> {
     Convex,
     /// Whether a point is inside.
     Test(&'a dyn Fn([f64; 3]) -> bool),
-    /// How deep a point is inside.
-    Depth(&'a dyn Fn([f64; 3]) -> Depth),
+    /// How deep points are inside.
+    Depth(&'a dyn Depth),
     /// Nothing: the surface is open.
     Nothing,
 }
 
-/// A point and the surface of a solid.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Depth {
-    /// Distance from the surface, if the point is known to be inside; otherwise negative: all around the point that is
-    /// closer than this is inside [m].
-    pub depth: f64,
-    /// Direction in which the depth decreases; a unit vector.
-    pub outwards: [f64; 3],
-    /// Whether the point may be inside.
-    pub may_be_inside: bool,
+/// How deep points are inside of a solid.
+pub trait Depth {
+    /// Returns about how deep a point is inside [m], 0 outside, and the direction in which that decreases, a unit vector
+    /// or zero. Balls are chosen by it.
+    fn depth(&self, p: [f64; 3]) -> (f64, [f64; 3]);
+
+    /// Returns the radius of a ball about a point that is proven to be inside [m]; negative if none is.
+    fn proven(&self, p: [f64; 3]) -> f64;
+
+    /// Returns whether a point may be inside.
+    fn may_be_inside(&self, p: [f64; 3]) -> bool;
 }
 
 /// A part of a solid and the ball that contains it.
@@ -38,8 +39,8 @@ pub(super) struct Cell {
     pub ball: Ball,
     /// How far the ball's surface is outside of the solid at most [m].
     pub overshoot: f64,
-    /// Whether it is known how deep its ball's centre is inside.
-    has_depth: bool,
+    /// Radius of the ball about the same centre that is inside the solid [m]; negative if none is known.
+    inner: f64,
 }
 
 impl Cell {
@@ -58,7 +59,7 @@ impl Cell {
         let is_inside = |p: &Vector| match inside {
             Inside::Convex => planes.iter().all(|plane| plane.depth(*p) >= 0.0),
             Inside::Test(test) => test(*p),
-            Inside::Depth(depth) => depth(*p).may_be_inside,
+            Inside::Depth(solid) => solid.may_be_inside(*p),
             Inside::Nothing => false,
         };
         let points: Vec<Vector> = polygons.iter().flatten().copied().chain(corners.filter(is_inside)).collect();
@@ -67,19 +68,20 @@ impl Cell {
         }
         let (low, high) = bounds(points.iter().copied());
         let (ball, overshoot) = match inside {
-            Inside::Depth(depth) => around(&points, FIELD_STEPS, |at| {
-                let Depth { depth, outwards, .. } = depth(at);
-                (depth, outwards)
-            }),
+            Inside::Depth(solid) => around(&points, FIELD_STEPS, |at| solid.depth(at)),
             _ => around(&points, STEPS, |at| shallowest(at, planes)),
         };
-        let has_depth = !planes.is_empty() || matches!(inside, Inside::Depth(_));
-        Some(Self { polygons, low, high, ball, overshoot, has_depth })
+        let inner = match inside {
+            Inside::Depth(solid) => solid.proven(ball.center),
+            _ if planes.is_empty() => super::NONE,
+            _ => ball.radius - overshoot,
+        };
+        Some(Self { polygons, low, high, ball, overshoot, inner })
     }
 
     /// Returns the ball as a node of a tree, and the ball about its centre that is inside the solid, if one is known.
     pub fn node(&self) -> super::Node {
-        super::node(&self.ball, if self.has_depth { self.ball.radius - self.overshoot } else { super::NONE })
+        super::node(&self.ball, self.inner)
     }
 
     /// Halves the box across its longest side.

@@ -44,7 +44,9 @@ impl ExactChecker {
         // The same configurations are checked with many distances, and triangles take long.
         self.known = self.scene.has_surfaces().then(HashMap::new);
         let mut clearance = self.search_clearance(motions, exact, stop);
-        if let Some(coarse) = clearance.as_mut().filter(|clearance| clearance.distance < fine)
+        // Triangles take longer than all else of a request: only the level `exact` measures with them.
+        let by_covers = self.known.is_some() && !exact;
+        if let Some(coarse) = clearance.as_mut().filter(|clearance| clearance.distance < fine && !by_covers)
             && let Some(fine) = self.refined(motions, coarse, stop)
         {
             *coarse = fine;
@@ -79,7 +81,7 @@ impl ExactChecker {
             }
             let mut least = self.clearance_of(motion, (0.0, clearance.distance), By::Covers, stop);
             let by = if exact { By::Solids } else { By::Limited };
-            if exact || least.0 < near {
+            if exact || (least.0 < near && self.known.is_none()) {
                 let high = if exact { clearance.distance } else { clearance.distance.min(2.0 * near) };
                 least = match self.keeps_on(motion, high, by, stop) {
                     true if high < clearance.distance => (high, least.1),

@@ -162,6 +162,10 @@ impl ExactChecker {
     /// Returns the current distance of a pair, by index, beyond its padding; remembers the distance if
     /// [`Self::known`] does, for later checks of the same configuration with another padding.
     pub(super) fn gap_once(&mut self, pair: usize, margin: f64) -> Gap {
+        let t=std::time::Instant::now(); let g=self.gap_once2(pair,margin); 
+        let k = match g { Gap::Far=>0, Gap::Close=>1, Gap::Touch=>2 };
+        DBG[k].0.fetch_add(1,std::sync::atomic::Ordering::Relaxed); DBG[k].1.fetch_add(t.elapsed().as_nanos() as u64,std::sync::atomic::Ordering::Relaxed); g }
+    fn gap_once2(&mut self, pair: usize, margin: f64) -> Gap {
         let pad = self.pads[pair];
         let Some(known) = self.known.as_ref() else { return self.gap(pair, margin) };
         let key = (pair as u32, self.placed);
@@ -342,6 +346,8 @@ impl ExactChecker {
     }
 }
 
+/// debug
+pub static DBG: [(std::sync::atomic::AtomicU64,std::sync::atomic::AtomicU64);3] = [const {(std::sync::atomic::AtomicU64::new(0),std::sync::atomic::AtomicU64::new(0))};3];
 /// Returns the closest points of two cores, and what they are measured by.
 fn measured(a: &Placed, b: &Placed) -> (Nearest, Measured) {
     let rough = |placed: &Placed| matches!(placed, Placed::Hull(_, hull) if hull.is_rough());

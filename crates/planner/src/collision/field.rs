@@ -1,10 +1,12 @@
-//! How deep points are within a mesh, whether or not it is closed. A grid of cells is flooded from outside; what is not
-//! reached, past the cells that the surface passes, is inside. Gaps narrower than a cell let nothing in, so that a mesh
-//! with cracks has an inside; one that is open has none.
+//! How deep points are within meshes, whether or not they are closed. A grid of cells is flooded from outside; what is not
+//! reached, past the cells that surfaces pass, is inside. Gaps narrower than a cell let nothing in, so that a mesh with
+//! cracks has an inside, and so has what several meshes enclose together; one that is open has none. The depth is the
+//! distance from what was flooded, so that surfaces within the solid do not count.
 
 use dimos_kernels::cover::Depth;
 use glamx::DVec3;
 
+use super::distance_transform::distances;
 use super::triangles::{Triangle, Triangles};
 
 /// Size of a cell, at least [m] …
@@ -21,10 +23,12 @@ enum Cell {
     Outside,
 }
 
-/// The field of a mesh.
+/// The field of meshes.
 #[derive(Debug)]
 pub(super) struct Field<'a> {
     triangles: &'a Triangles,
+    /// Distance of the middle of each cell from that of the nearest one outside [cells].
+    distances: Vec<f32>,
     low: DVec3,
     size: f64,
     number: [usize; 3],
@@ -40,11 +44,12 @@ impl<'a> Field<'a> {
         let low = middle - half - DVec3::splat(1.5 * size);
         let number = (half * (2.0 / size)).to_array().map(|cells| cells.ceil() as usize + 3);
         let cells = vec![Cell::Inside; number.iter().product()];
-        let mut made = Self { triangles, low, size, number, cells };
+        let mut made = Self { triangles, distances: Vec::new(), low, size, number, cells };
         for triangle in triangles.all() {
             made.mark(*triangle);
         }
         made.flood();
+        made.distances = distances(made.number, |cell| made.cells[cell] == Cell::Outside);
         made
     }
 
@@ -105,13 +110,44 @@ impl<'a> Field<'a> {
         }
     }
 
-    /// Returns how deep a point is inside. In the cells that the surface passes it counts as outside.
-    pub fn depth(&self, p: DVec3) -> Depth {
-        let cell = self.place(p).map_or(Cell::Outside, |place| self.cells[self.index(place)]);
-        let away = self.triangles.closest(p) - p;
-        let sign = if cell == Cell::Inside { 1.0 } else { -1.0 };
-        let outwards = (away * sign).normalize_or_zero().to_array();
-        Depth { depth: sign * away.length(), outwards, may_be_inside: cell != Cell::Outside }
+    pub fn share(&self) -> String { let n=|c| self.cells.iter().filter(|x| **x==c).count(); format!("in {} surf {} out {} size {:.4}", n(Cell::Inside), n(Cell::Surface), n(Cell::Outside), self.size) }
+    fn cell(&self, p: DVec3) -> Cell {
+        self.place(p).map_or(Cell::Outside, |place| self.cells[self.index(place)])
+    }
+}
+
+impl Depth for Field<'_> {
+    fn depth(&self, p: [f64; 3]) -> (f64, [f64; 3]) {
+        // Between the middles of eight cells.
+        let at = (DVec3::from_array(p) - self.low) / self.size - DVec3::splat(0.5);
+        let Some([x, y, z]) = self.place(self.low + at * self.size) else { return (0.0, [0.0; 3]) };
+        if x + 1 >= self.number[0] || y + 1 >= self.number[1] || z + 1 >= self.number[2] {
+            return (0.0, [0.0; 3]);
+        }
+        let part = at - at.floor();
+        let (mut depth, mut slope) = (0.0, DVec3::ZERO);
+        for corner in 0..8 {
+            let up = [corner & 1, corner >> 1 & 1, corner >> 2 & 1];
+            let value = f64::from(self.distances[self.index([x + up[0], y + up[1], z + up[2]])]);
+            let (mut weight, mut sign) = ([0.0; 3], [0.0; 3]);
+            for axis in 0..3 {
+                (weight[axis], sign[axis]) = if up[axis] == 1 { (part[axis], 1.0) } else { (1.0 - part[axis], -1.0) };
+            }
+            depth += value * weight[0] * weight[1] * weight[2];
+            slope.x += value * sign[0] * weight[1] * weight[2];
+            slope.y += value * sign[1] * weight[0] * weight[2];
+            slope.z += value * sign[2] * weight[0] * weight[1];
+        }
+        (depth * self.size, (-slope).normalize_or_zero().to_array())
+    }
+
+    fn proven(&self, p: [f64; 3]) -> f64 {
+        let p = DVec3::from_array(p);
+        if self.cell(p) == Cell::Inside { self.triangles.closest(p).distance(p) } else { -1.0 }
+    }
+
+    fn may_be_inside(&self, p: [f64; 3]) -> bool {
+        self.cell(DVec3::from_array(p)) != Cell::Outside
     }
 }
 
@@ -129,13 +165,14 @@ mod tests {
         let open = whole.iter().copied().filter(|t| t.iter().any(|p| p.z < 0.04));
         for (kind, triangles) in [(true, Triangles::new(cracked)), (false, Triangles::new(open))] {
             let field = Field::new(&triangles);
-            let Depth { depth, outwards, may_be_inside } = field.depth(DVec3::new(0.02, 0.01, 0.0));
-            assert_eq!(may_be_inside, kind);
-            assert!((depth.abs() - 0.01).abs() < 1e-9 && (depth > 0.0) == kind, "{depth}");
-            assert!(!kind || (outwards[0] - 1.0).abs() < 1e-9, "{outwards:?}");
-            for outside in [DVec3::X * 0.036, DVec3::Y, DVec3::new(0.1, 0.1, 0.1)] {
-                let Depth { depth, may_be_inside, .. } = field.depth(outside);
-                assert!(depth < 0.0 && !may_be_inside, "{outside}");
+            let within = [0.02, 0.01, 0.0];
+            assert_eq!(field.may_be_inside(within), kind);
+            let (depth, outwards) = field.depth(within);
+            assert!(if kind { (depth - 0.01).abs() < 2.0 * CELL && outwards[0] > 0.99 } else { depth == 0.0 }, "{depth}");
+            assert!(if kind { (field.proven(within) - 0.01).abs() < 1e-9 } else { field.proven(within) < 0.0 });
+            for outside in [[0.036, 0.0, 0.0], [0.0, 1.0, 0.0], [0.1; 3]] {
+                assert!(field.depth(outside).0 == 0.0 && field.proven(outside) < 0.0, "{outside:?}");
+                assert!(!field.may_be_inside(outside), "{outside:?}");
             }
         }
     }

@@ -14,6 +14,7 @@ pub mod checker;
 pub mod clearance;
 pub mod cloud;
 mod cover;
+mod distance_transform;
 pub mod exact;
 mod field;
 mod lanes;

@@ -25,8 +25,8 @@ pub struct ProvenApart {
     pub distance: f64,
 }
 
-/// Distances that are tried, the largest first [m]. A pair that keeps the first does not stay close: it is checked.
-const TRIED: [f64; 9] = [5e-3, 3e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5];
+/// Distances that are tried, the largest first [m].
+const TRIED: [f64; 12] = [0.05, 0.02, 0.01, 5e-3, 3e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5];
 /// Most comparisons of disks for one pair: a tenth of a second.
 const BUDGET: usize = 60_000;
 /// Addition to the limits of the middle joint on both sides [rad]: an arm may rest slightly outside.
@@ -149,10 +149,16 @@ impl LinkMotion {
         let keeps = |reach: f64, mut budget: usize| self.middle.is_apart(&one, &other, reach, &mut budget);
         // Most pairs touch somewhere: then nothing else is tried.
         if !keeps(least, BUDGET) {
+            if std::env::var_os("DBG").is_some() {
+                let mut b = BUDGET;
+                let r = self.middle.is_apart(&one, &other, least, &mut b);
+                let mut b2 = 100 * BUDGET;
+                let r2 = self.middle.is_apart(&one, &other, least, &mut b2);
+                eprintln!("{:?} not: {r} left {b} / {r2} {b2} {:?}", self.links, matches!(self.middle, Middle::Fixed(_)));
+            }
             return None;
         }
-        let kept = TRIED.into_iter().find(|tried| *tried == least || keeps(*tried, BUDGET / TRIED.len()));
-        kept.filter(|kept| *kept < TRIED[0])
+        TRIED.into_iter().find(|tried| *tried == least || keeps(*tried, BUDGET / TRIED.len()))
     }
 }
 

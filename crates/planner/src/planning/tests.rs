@@ -81,6 +81,7 @@ impl CollisionChecker for Plane {
             distance: distance(c, q) - r,
             on_link: DVec3::ZERO,
             on_other: DVec3::ZERO,
+            by: Measured::Shapes,
         };
         deep.map(contact).collect()
     }
