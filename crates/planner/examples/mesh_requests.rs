@@ -91,8 +91,8 @@ fn free(checker: &mut ExactChecker, random: &mut Random) -> Option<Vec<f64>> {
 
 /// Returns the time that this thread has computed [ms]: other programs do not count.
 fn computed() -> f64 {
-    let about = std::fs::read_to_string("/proc/thread-self/schedstat").unwrap_or_default();
-    about.split_whitespace().next().and_then(|ns| ns.parse::<f64>().ok()).map_or(f64::NAN, |ns| ns * 1e-6)
+    let at = rustix::time::clock_gettime(rustix::time::ClockId::ThreadCPUTime);
+    at.tv_sec as f64 * 1e3 + at.tv_nsec as f64 * 1e-6
 }
 
 /// Plans between random configurations; returns the times of all requests [ms].
@@ -113,7 +113,6 @@ fn measure(scene: &PlanningScene, given: &Given, seed: u64, goals: usize) -> Vec
             Ok(motion) if std::env::var_os("DIMOS_EACH").is_some() => {
                 let clearance = motion.clearance.map(|kept| (kept.distance, kept.pair));
                 println!("  {took:9.2} ms: {:?} {clearance:?}", motion.times);
-                for (n,t) in &dimos_planner::collision::exact::DBG { let (n,t)=(n.swap(0,std::sync::atomic::Ordering::Relaxed),t.swap(0,std::sync::atomic::Ordering::Relaxed)); print!("   {n} x {:.1}us", t as f64/1e3/n.max(1) as f64);} println!();
             }
             Ok(_) => {}
             Err(failure) => println!("  {took:.1} ms: {}", failure.what),

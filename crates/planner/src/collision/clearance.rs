@@ -42,7 +42,7 @@ impl ExactChecker {
         }
         let (pads, most_pad, fine) = (self.pads.clone(), self.most_pad, self.settings.clearance.fine);
         // The same configurations are checked with many distances, and triangles take long.
-        self.known = self.scene.has_surfaces().then(HashMap::new);
+        self.known = self.has_surfaces.then(HashMap::new);
         let mut clearance = self.search_clearance(motions, exact, stop);
         // Triangles take longer than all else of a request: only the level `exact` measures with them.
         let by_covers = self.known.is_some() && !exact;

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, OnceLock, Weak};
 
-use dimos_kernels::cover::{Depth, Inside, Place, Tree};
+use dimos_kernels::cover::{Inside, Place, Tree};
 use glamx::{DAffine3, DVec3};
 use parry3d_f64::shape::ConvexPolyhedron;
 
@@ -162,15 +162,7 @@ fn of(core: &Core) -> Tree {
 fn of_mesh(triangles: &Triangles) -> Tree {
     let field = Field::new(triangles);
     let corners = triangles.all().iter().map(|corners| corners.map(|p| p.to_array()));
-    let t = std::time::Instant::now();
-    let tree = Tree::of_triangles(corners, Inside::Depth(&field));
-    if std::env::var_os("DBG").is_some() {
-        let mut l: Vec<f64> = tree.nodes.iter().filter(|n| n.count == 0).map(|n| f64::from(n.radius) - field.depth(n.center.map(f64::from)).0).collect();
-        l.sort_by(f64::total_cmp);
-        let no = tree.nodes.iter().filter(|n| n.count == 0 && n.inner < 0.0).count();
-        eprintln!("cover: {} triangles {} leaves, over p50 {:.1} p90 {:.1} max {:.1} mm, without inner {no} field {} {:?}", triangles.all().len(), l.len(), 1e3*l[l.len()/2], 1e3*l[l.len()*9/10], 1e3*l[l.len()-1], field.share(), t.elapsed());
-    }
-    tree
+    Tree::of_triangles(corners, Inside::Depth(&field))
 }
 
 fn of_polyhedron(polyhedron: &ConvexPolyhedron) -> Tree {

@@ -17,7 +17,7 @@ use super::pairs::general::{Nearest, distance_up_to, nearest};
 use super::pairs::{self, Placed, point};
 use super::report::{Contact, Measured, Pair};
 use super::scene::{LinkShape, Scene};
-use super::settings::CheckSettings;
+use super::settings::{CertificationSettings, CheckSettings};
 use super::shape::Core;
 
 /// Distance of a pair compared to a margin.
@@ -57,6 +57,8 @@ pub struct ExactChecker {
     pub(super) most_pad: f64,
     /// Pairs in contact that no joint moves: no motion changes that, so they are not checked.
     still: Vec<Pair>,
+    /// Whether triangles decide about any link.
+    pub(super) has_surfaces: bool,
     /// Hash of the configuration that all frames are at.
     placed: u64,
     /// While a clearance is searched: for pairs and configurations, the distance and the most that was searched [m].
@@ -91,6 +93,7 @@ impl ExactChecker {
             most_pad: 0.0,
             exact_checks_left: u64::MAX,
             still,
+            has_surfaces: scene.has_surfaces(),
             placed: 0,
             known: None,
             frames,
@@ -162,10 +165,6 @@ impl ExactChecker {
     /// Returns the current distance of a pair, by index, beyond its padding; remembers the distance if
     /// [`Self::known`] does, for later checks of the same configuration with another padding.
     pub(super) fn gap_once(&mut self, pair: usize, margin: f64) -> Gap {
-        let t=std::time::Instant::now(); let g=self.gap_once2(pair,margin); 
-        let k = match g { Gap::Far=>0, Gap::Close=>1, Gap::Touch=>2 };
-        DBG[k].0.fetch_add(1,std::sync::atomic::Ordering::Relaxed); DBG[k].1.fetch_add(t.elapsed().as_nanos() as u64,std::sync::atomic::Ordering::Relaxed); g }
-    fn gap_once2(&mut self, pair: usize, margin: f64) -> Gap {
         let pad = self.pads[pair];
         let Some(known) = self.known.as_ref() else { return self.gap(pair, margin) };
         let key = (pair as u32, self.placed);
@@ -217,6 +216,11 @@ impl ExactChecker {
             }
         }
         best
+    }
+
+    /// Returns whether a pair touches at the current configuration, without padding.
+    pub(super) fn touches(&self, pair: Pair) -> bool {
+        self.gap_of(pair, 0.0, 0.0) == Gap::Touch
     }
 
     fn gap_of(&self, pair: Pair, pad: f64, margin: f64) -> Gap {
@@ -346,8 +350,6 @@ impl ExactChecker {
     }
 }
 
-/// debug
-pub static DBG: [(std::sync::atomic::AtomicU64,std::sync::atomic::AtomicU64);3] = [const {(std::sync::atomic::AtomicU64::new(0),std::sync::atomic::AtomicU64::new(0))};3];
 /// Returns the closest points of two cores, and what they are measured by.
 fn measured(a: &Placed, b: &Placed) -> (Nearest, Measured) {
     let rough = |placed: &Placed| matches!(placed, Placed::Hull(_, hull) if hull.is_rough());
@@ -442,7 +444,9 @@ impl CollisionChecker for ExactChecker {
     }
 
     fn certify_within_budget(&mut self, from: &[f64], to: &[f64], looks_free: bool, stop: &Stop) -> bool {
-        self.is_free_within(self.settings.certification.budget, (from, to), looks_free, stop)
+        let CertificationSettings { budget, mesh_budget, .. } = self.settings.certification;
+        let budget = if self.has_surfaces { mesh_budget } else { budget };
+        self.is_free_within(budget, (from, to), looks_free, stop)
     }
 
     fn motion_looks_free(&mut self, from: &[f64], to: &[f64]) -> bool {

@@ -110,7 +110,6 @@ impl<'a> Field<'a> {
         }
     }
 
-    pub fn share(&self) -> String { let n=|c| self.cells.iter().filter(|x| **x==c).count(); format!("in {} surf {} out {} size {:.4}", n(Cell::Inside), n(Cell::Surface), n(Cell::Outside), self.size) }
     fn cell(&self, p: DVec3) -> Cell {
         self.place(p).map_or(Cell::Outside, |place| self.cells[self.index(place)])
     }

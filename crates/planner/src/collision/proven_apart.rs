@@ -149,13 +149,6 @@ impl LinkMotion {
         let keeps = |reach: f64, mut budget: usize| self.middle.is_apart(&one, &other, reach, &mut budget);
         // Most pairs touch somewhere: then nothing else is tried.
         if !keeps(least, BUDGET) {
-            if std::env::var_os("DBG").is_some() {
-                let mut b = BUDGET;
-                let r = self.middle.is_apart(&one, &other, least, &mut b);
-                let mut b2 = 100 * BUDGET;
-                let r2 = self.middle.is_apart(&one, &other, least, &mut b2);
-                eprintln!("{:?} not: {r} left {b} / {r2} {b2} {:?}", self.links, matches!(self.middle, Middle::Fixed(_)));
-            }
             return None;
         }
         TRIED.into_iter().find(|tried| *tried == least || keeps(*tried, BUDGET / TRIED.len()))

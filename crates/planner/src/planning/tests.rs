@@ -15,7 +15,7 @@ use super::search::rrt_connect::{Quantum, Search};
 use super::search::settings::{EnclosureSettings, PlanSettings, RrtSettings};
 use crate::collision::body::{MeshMode, solids};
 use crate::collision::checker::{CollisionChecker, Samples, Stop};
-use crate::collision::report::{Contact, Pair};
+use crate::collision::report::{Contact, Measured, Pair};
 use crate::collision::settings::CheckSettings;
 use crate::collision::world::{Obstacle, Robot, World};
 use crate::collision::{ExactChecker, Solid};
