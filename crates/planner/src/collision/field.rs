@@ -18,6 +18,8 @@ const MOST: f64 = 160.0;
 enum Cell {
     /// Not reached from outside.
     Inside,
+    /// The same, but through a wide opening: it is hollow, so that what is there touches nothing.
+    Hollow,
     /// The surface passes it.
     Surface,
     Outside,
@@ -35,21 +37,45 @@ pub(super) struct Field<'a> {
     cells: Vec<Cell>,
 }
 
+/// Openings narrower than twice this let nothing in where meshes would have no inside otherwise [m]: links are often open
+/// where they meet.
+const OPENING: f64 = 0.04;
+/// Size of a cell of that flood, at least [m].
+const COARSE: f64 = 2.5e-3;
+
 impl<'a> Field<'a> {
     /// Floods a grid around triangles.
     pub fn new(triangles: &'a Triangles) -> Self {
+        let mut made = Self::marked(triangles, CELL, 1.5);
+        made.flood(|_| true);
+        if !made.cells.contains(&Cell::Inside) {
+            // As far as balls of that radius get from outside.
+            let reach = OPENING / size_of(triangles, COARSE);
+            made = Self::marked(triangles, COARSE, reach + 2.5);
+            let gaps = distances(made.number, |cell| made.cells[cell] == Cell::Surface);
+            made.flood(|cell| f64::from(gaps[cell]) > reach);
+            let away = distances(made.number, |cell| made.cells[cell] == Cell::Outside);
+            for (cell, away) in made.cells.iter_mut().zip(&away) {
+                if *cell == Cell::Inside {
+                    *cell = if f64::from(*away) > reach { Cell::Hollow } else { Cell::Outside };
+                }
+            }
+        }
+        made.distances = distances(made.number, |cell| made.cells[cell] == Cell::Outside);
+        made
+    }
+
+    /// Marks the surface in cells of at least a size; `beyond`: cells beyond the triangles, for the flood.
+    fn marked(triangles: &'a Triangles, least: f64, beyond: f64) -> Self {
         let (middle, half) = triangles.bounds();
-        let size = (2.0 * half.max_element() / MOST).max(CELL);
-        // One more on each side, for the flood.
-        let low = middle - half - DVec3::splat(1.5 * size);
-        let number = (half * (2.0 / size)).to_array().map(|cells| cells.ceil() as usize + 3);
+        let size = size_of(triangles, least);
+        let low = middle - half - DVec3::splat(beyond * size);
+        let number = (half * (2.0 / size)).to_array().map(|cells| (cells + 2.0 * beyond).ceil() as usize + 1);
         let cells = vec![Cell::Inside; number.iter().product()];
         let mut made = Self { triangles, distances: Vec::new(), low, size, number, cells };
         for triangle in triangles.all() {
             made.mark(*triangle);
         }
-        made.flood();
-        made.distances = distances(made.number, |cell| made.cells[cell] == Cell::Outside);
         made
     }
 
@@ -88,7 +114,8 @@ impl<'a> Field<'a> {
         }
     }
 
-    fn flood(&mut self) {
+    /// Floods the cells that are open, from a corner of the grid on.
+    fn flood(&mut self, is_open: impl Fn(usize) -> bool) {
         let mut open = vec![[0, 0, 0]];
         self.cells[0] = Cell::Outside;
         while let Some(at) = open.pop() {
@@ -101,7 +128,7 @@ impl<'a> Field<'a> {
                         _ => continue,
                     }
                     let index = self.index(next);
-                    if self.cells[index] == Cell::Inside {
+                    if self.cells[index] == Cell::Inside && is_open(index) {
                         self.cells[index] = Cell::Outside;
                         open.push(next);
                     }
@@ -113,6 +140,10 @@ impl<'a> Field<'a> {
     fn cell(&self, p: DVec3) -> Cell {
         self.place(p).map_or(Cell::Outside, |place| self.cells[self.index(place)])
     }
+}
+
+fn size_of(triangles: &Triangles, least: f64) -> f64 {
+    (2.0 * triangles.bounds().1.max_element() / MOST).max(least)
 }
 
 impl Depth for Field<'_> {

@@ -13,7 +13,8 @@ const FLAT: f64 = 1e-12;
 pub(super) fn apart_by_plane(plane: &Triangle, other: &Triangle, reach: f64) -> bool {
     let normal = (plane[1] - plane[0]).cross(plane[2] - plane[0]);
     let squared = normal.length_squared();
-    let [a, b, c] = other.map(|p| normal.dot(p - plane[0]));
+    let height = |p: DVec3| normal.dot(p - plane[0]);
+    let (a, b, c) = (height(other[0]), height(other[1]), height(other[2]));
     let least = if a > 0.0 && b > 0.0 && c > 0.0 {
         a.min(b).min(c)
     } else if a < 0.0 && b < 0.0 && c < 0.0 {
@@ -62,7 +63,8 @@ pub(super) fn closest_points(one: &Triangle, two: &Triangle) -> [DVec3; 2] {
 /// Returns where an edge of a triangle goes through another.
 fn pierces(edges: &Triangle, through: &Triangle) -> Option<DVec3> {
     let normal = (through[1] - through[0]).cross(through[2] - through[0]);
-    let heights = edges.map(|p| normal.dot(p - through[0]));
+    let height = |p: DVec3| normal.dot(p - through[0]);
+    let heights = [height(edges[0]), height(edges[1]), height(edges[2])];
     (0..3).find_map(|i| {
         let (a, b) = (heights[i], heights[(i + 1) % 3]);
         if a * b > 0.0 || a == b {

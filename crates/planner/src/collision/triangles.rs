@@ -11,7 +11,7 @@ use super::triangle_pair::{apart_by_plane, closest_point, closest_points, distan
 pub type Triangle = [DVec3; 3];
 
 /// Triangles per leaf.
-const LEAF: usize = 4;
+const LEAF: usize = 2;
 
 /// Triangles, sorted so that each node of the tree is a range of them.
 #[derive(Debug, Clone, PartialEq)]
@@ -126,8 +126,14 @@ impl Triangles {
             let (one, two) = (&self.nodes[i as usize], &others.nodes[j as usize]);
             let Some([(i, j), (k, l)]) = halves((one, i), (two, j)) else {
                 for two in others.leaf(two) {
-                    let two = two.map(|p| pose.transform_point3(p));
+                    let two = [0, 1, 2].map(|i| pose.transform_point3(two[i]));
+                    let (low, high) = (two[0].min(two[1]).min(two[2]), two[0].max(two[1]).max(two[2]));
                     for one in self.leaf(one) {
+                        // Most are apart along an axis.
+                        let (bottom, top) = (one[0].min(one[1]).min(one[2]), one[0].max(one[1]).max(one[2]));
+                        if (bottom - high).max(low - top).max_element() > best {
+                            continue;
+                        }
                         if !apart_by_plane(one, &two, best) && !apart_by_plane(&two, one, best) {
                             best = best.min(distance_squared(one, &two).sqrt());
                         }
