@@ -51,7 +51,7 @@ impl Default for CertificationSettings {
         Self {
             resolution: 1e-4,
             budget: 64,
-            mesh_budget: 12,
+            mesh_budget: 4,
             sweep_halvings: 3,
             parts: 4,
             cover_size: 0.004,
