@@ -1,7 +1,8 @@
 //! How deep points are within meshes, whether or not they are closed. A grid of cells is flooded from outside; what is not
 //! reached, past the cells that surfaces pass, is inside. Gaps narrower than a cell let nothing in, so that a mesh with
-//! cracks has an inside, and so has what several meshes enclose together; one that is open has none. The depth is the
-//! distance from what was flooded, so that surfaces within the solid do not count.
+//! cracks has an inside, and so has what several meshes enclose together. What is open, as links often are where they meet,
+//! is hollow: it counts for the choice of a cover, but nothing touches there. The depth is the distance from what was
+//! flooded, so that surfaces within the solid do not count.
 
 use dimos_kernels::cover::Depth;
 use glamx::DVec3;
@@ -187,23 +188,38 @@ mod tests {
     use super::super::shape::Core;
     use super::*;
 
+    /// A box of these half extents without its lid.
+    fn without_lid(half: DVec3) -> Triangles {
+        let whole = outline(&Core::Box { half }).unwrap().into_iter();
+        Triangles::new(whole.filter(|t| t.iter().any(|p| p.z < 0.9 * half.z)))
+    }
+
     #[test]
-    fn a_box_with_a_crack_has_an_inside_and_one_without_a_lid_has_none() {
-        let half = DVec3::new(0.03, 0.04, 0.05);
-        let whole = outline(&Core::Box { half }).unwrap();
-        let cracked = whole.iter().map(|t| t.map(|p| p + DVec3::X * if p.x < 0.0 { -2e-4 } else { 0.0 }));
-        let open = whole.iter().copied().filter(|t| t.iter().any(|p| p.z < 0.04));
-        for (kind, triangles) in [(true, Triangles::new(cracked)), (false, Triangles::new(open))] {
-            let field = Field::new(&triangles);
-            let within = [0.02, 0.01, 0.0];
-            assert_eq!(field.may_be_inside(within), kind);
-            let (depth, outwards) = field.depth(within);
-            assert!(if kind { (depth - 0.01).abs() < 2.0 * CELL && outwards[0] > 0.99 } else { depth == 0.0 }, "{depth}");
-            assert!(if kind { (field.proven(within) - 0.01).abs() < 1e-9 } else { field.proven(within) < 0.0 });
-            for outside in [[0.036, 0.0, 0.0], [0.0, 1.0, 0.0], [0.1; 3]] {
-                assert!(field.depth(outside).0 == 0.0 && field.proven(outside) < 0.0, "{outside:?}");
-                assert!(!field.may_be_inside(outside), "{outside:?}");
-            }
+    fn a_box_with_a_crack_has_an_inside() {
+        let whole = outline(&Core::Box { half: DVec3::new(0.03, 0.04, 0.05) }).unwrap().into_iter();
+        let cracked = whole.map(|t| t.map(|p| p + DVec3::X * if p.x < 0.0 { -2e-4 } else { 0.0 }));
+        let triangles = Triangles::new(cracked);
+        let field = Field::new(&triangles);
+        let within = [0.02, 0.01, 0.0];
+        let (depth, outwards) = field.depth(within);
+        assert!(field.may_be_inside(within) && (depth - 0.01).abs() < 2.0 * CELL && outwards[0] > 0.99, "{depth}");
+        assert!((field.proven(within) - 0.01).abs() < 1e-9);
+        for outside in [[0.036, 0.0, 0.0], [0.0, 1.0, 0.0], [0.1; 3]] {
+            assert!(field.depth(outside).0 == 0.0 && field.proven(outside) < 0.0, "{outside:?}");
+            assert!(!field.may_be_inside(outside), "{outside:?}");
         }
+    }
+
+    #[test]
+    fn a_narrow_box_without_a_lid_is_hollow_and_a_wide_one_is_nothing_but_its_surface() {
+        let triangles = without_lid(DVec3::new(0.03, 0.03, 0.1));
+        let field = Field::new(&triangles);
+        let within = [0.0, 0.01, -0.02];
+        // A cover is chosen as if it was solid, but nothing touches within.
+        assert!(field.may_be_inside(within) && field.proven(within) < 0.0);
+        assert!((field.depth(within).0 - 0.02).abs() < 3.0 * COARSE, "{:?}", field.depth(within));
+        let triangles = without_lid(DVec3::new(0.1, 0.1, 0.1));
+        let field = Field::new(&triangles);
+        assert!(!field.may_be_inside([0.0; 3]) && field.depth([0.0; 3]).0 == 0.0 && field.proven([0.0; 3]) < 0.0);
     }
 }

@@ -16,8 +16,8 @@ use crate::collision::proven_apart::{LinkMotion, Middle, ProvenApart, candidates
 use crate::collision::shape::{Core, Mesh};
 use crate::collision::world::Robot;
 
-/// Of the files and of how proofs are made: another one makes all of them again.
-const VERSION: u32 = 1;
+/// Of the files and of how proofs are made: a new version replaces all of them.
+const VERSION: u32 = 2;
 
 /// A proof, or that none was found.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -167,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pair_that_stays_close_is_proven_once_and_a_changed_mesh_is_proven_anew() {
+    fn a_pair_that_stays_close_is_proven_once_and_a_changed_mesh_is_proven_again() {
         let (folder, proofs) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
         let names = || {
             let mut all: Vec<_> = fs::read_dir(proofs.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
@@ -185,14 +185,14 @@ mod tests {
         let text = fs::read_to_string(&file).unwrap();
         fs::write(&file, text.replace("0.0005", "0.0004")).unwrap();
         assert_eq!(of(&close)[0].distance, 4e-4);
-        // One that is damaged, or of another version, is made anew.
-        for other in ["", "{", &text.replace("\"version\":1", "\"version\":0"), &text.replace("0.0005", "-1.0")] {
+        // One that is damaged, or of another version, is replaced.
+        for other in ["", "{", &text.replace("\"version\":2", "\"version\":0"), &text.replace("0.0005", "-1.0")] {
             fs::write(&file, other).unwrap();
             assert_eq!(of(&close), found, "{other}");
             assert_eq!(fs::read_to_string(&file).unwrap(), text);
         }
-        // Farther away it does not stay close, which is kept too; in contact nothing is proven.
-        assert_eq!(of(&robot(folder.path(), 0.02)), []);
+        // That nothing is proven is kept, too.
+        assert_eq!(of(&robot(folder.path(), 0.021)), [ProvenApart { links: [0, 2], distance: 0.02 }]);
         assert_eq!(of(&robot(folder.path(), -1e-3)), []);
         assert_eq!(names().len(), 3);
         // Without a folder, and with one that cannot be written, the proof is the same.
