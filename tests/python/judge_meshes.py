@@ -6,7 +6,8 @@ Reads one question as JSON and prints one answer. `robot` is the name of a robot
     installed: whether the packages are
     describe: writes it, and names its joints
     goals:    configurations of `joints` in which nothing touches, `number` of them
-    walk:     each of `motions`, a list of configurations, in steps on which no point moves farther than `step` [m]
+    walk:     each of `motions`, a list of configurations, in steps on which no point moves farther than `step` [m],
+              or in larger ones where these were more than `most`
 """
 
 import json
@@ -160,19 +161,19 @@ class Judge:
                 found.append(q.tolist())
         return found
 
-    def walk(self, motion, step, reach):
-        """Where something touches on a motion, if it does, and the number of configurations."""
-        looks = 0
+    def walk(self, motion, step, reach, most):
+        """Where something touches on a motion, if it does, and the number of configurations, about `most` of them."""
+        places = []
         for a, b in zip(map(np.array, motion), map(np.array, motion[1:])):
             # No point is farther from any joint than the reach.
             parts = max(1, math.ceil(np.abs(b - a).sum() * reach / step))
-            for k in range(parts + 1):
-                looks += 1
-                q = a + (b - a) * (k / parts)
-                pair = self.touching(q)
-                if pair:
-                    return [pair, q.tolist()], looks
-        return None, looks
+            places += [a + (b - a) * (k / parts) for k in range(parts)]
+        places = [*places[:: max(1, len(places) // most)], np.array(motion[-1])]
+        for q in places:
+            pair = self.touching(q)
+            if pair:
+                return [pair, q.tolist()], len(places)
+        return None, len(places)
 
 
 def answer(question):
@@ -184,7 +185,7 @@ def answer(question):
     judge = Judge(question)
     if question["what"] == "goals":
         return judge.goals(question["number"], question["limits"], question["seed"])
-    walked = [judge.walk(motion, question["step"], question["reach"]) for motion in question["motions"]]
+    walked = [judge.walk(motion, question["step"], question["reach"], question["most"]) for motion in question["motions"]]
     return {"touching": [found for found, _ in walked if found], "looks": sum(looks for _, looks in walked)}
 
 
