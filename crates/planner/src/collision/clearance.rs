@@ -34,7 +34,8 @@ enum By {
 
 impl ExactChecker {
     /// Returns the distance that motions keep, regardless of the padding; they must be proven free. It may be some
-    /// millimetres less than the true one, 0.5 mm if `exact`, a part of it if below 1 mm; at most 0.2 m. `None` if
+    /// millimetres less than the true one, 0.5 mm if `exact`, a part of it if below 1 mm; at most 0.2 m. Links that
+    /// triangles decide about are measured by covers unless `exact`: then 0 may stand for some millimetres. `None` if
     /// nothing can collide, or if stopped.
     pub fn clearance_along(&mut self, motions: &[Motion], exact: bool, stop: &Stop) -> Option<Clearance> {
         if self.pairs.is_empty() {
