@@ -1,5 +1,5 @@
-//! Robots of PyPI with their own meshes, judged by Pinocchio and coal on triangles: what is free there is not refused, and
-//! motions hold.
+//! Robots of PyPI with their own meshes, judged by Pinocchio and coal on triangles: what is free there is not refused,
+//! and motions hold.
 //!
 //! `DIMOS_MESHES=200`: that many goals per robot, in steps of 1 mm.
 
@@ -41,7 +41,7 @@ const BLAMED: [&str; 5] = ["collides", "enclosed", "deep", "touches", "too close
 /// No point of any robot is farther from a joint's axis [m].
 const REACH: f64 = 1.5;
 
-/// A robot, and what its judge is told of it.
+/// A robot, and the description of it that its judge gets.
 struct Judged {
     name: &'static str,
     scene: PlanningScene,
@@ -108,7 +108,12 @@ fn object(kind: &str, size: &[f64], [x, y, z]: [f64; 3]) -> ObjectConfig {
         [radius, length] => ObjectShape::Cylinder([radius, length]),
         _ => ObjectShape::Sphere(size[0]),
     };
-    ObjectConfig { name: format!("{kind} at {x}"), shape, pose: nalgebra::Isometry3::translation(x, y, z), padding: 0.0 }
+    ObjectConfig {
+        name: format!("{kind} at {x}"),
+        shape,
+        pose: nalgebra::Isometry3::translation(x, y, z),
+        padding: 0.0,
+    }
 }
 
 /// Returns configurations along a motion as it is timed.

@@ -5,7 +5,8 @@
 //! cargo run --release -p dimos-planner --example mesh_requests -- arm.urdf tool0 --package arm_description=DIR
 //! ```
 //!
-//! `--joints a,b`: the planned ones, otherwise all; `--goals N` per world, `--worlds N`, `--level LEVEL`, `--proofs DIR`.
+//! `--joints a,b`: the planned ones, otherwise all; `--goals N` per world, `--worlds N`, `--level LEVEL`, `--proofs
+//! DIR`.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;

@@ -18,8 +18,8 @@ pub enum Inside<'a> {
 
 /// How deep points are inside of a solid.
 pub trait Depth {
-    /// Returns about how deep a point is inside [m], 0 outside, and the direction in which that decreases, a unit vector
-    /// or zero. Balls are chosen by it.
+    /// Returns about how deep a point is inside [m], 0 outside, and the direction in which that decreases, a unit
+    /// vector or zero. Balls are chosen by it.
     fn depth(&self, p: [f64; 3]) -> (f64, [f64; 3]);
 
     /// Returns the radius of a ball about a point that is proven to be inside [m]; negative if none is.

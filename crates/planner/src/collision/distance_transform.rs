@@ -1,11 +1,11 @@
-//! Distance of each cell of a grid from the nearest marked one, an axis at a time (Felzenszwalb and Huttenlocher, "Distance
-//! transforms of sampled functions", 2012).
+//! Distance of each cell of a grid from the nearest marked one, an axis at a time (Felzenszwalb and Huttenlocher,
+//! "Distance transforms of sampled functions", 2012).
 
 /// More than any squared distance [cells²]; exact, as all squared distances are.
 const FAR: f32 = 4e6;
 
-/// Returns the distance of the middle of each cell from that of the nearest marked one [cells]. `number`: cells along each
-/// axis; the last one is that of neighbours in memory.
+/// Returns the distance of the middle of each cell from that of the nearest marked one [cells]. `number`: cells along
+/// each axis; the last one is that of neighbours in memory.
 pub(super) fn distances(number: [usize; 3], is_marked: impl Fn(usize) -> bool) -> Vec<f32> {
     let [x, y, z] = number;
     let mut all: Vec<f32> = (0..x * y * z).map(|cell| if is_marked(cell) { 0.0 } else { FAR }).collect();

@@ -1,8 +1,8 @@
-//! How deep points are within meshes, whether or not they are closed. A grid of cells is flooded from outside; what is not
-//! reached, past the cells that surfaces pass, is inside. Gaps narrower than a cell let nothing in, so that a mesh with
-//! cracks has an inside, and so has what several meshes enclose together. What is open, as links often are where they meet,
-//! is hollow: it counts for the choice of a cover, but nothing touches there. The depth is the distance from what was
-//! flooded, so that surfaces within the solid do not count.
+//! How deep points are within meshes, whether or not they are closed. A grid of cells is flooded from outside; what is
+//! not reached, past the cells that surfaces pass, is inside. Gaps narrower than a cell let nothing in, so that a mesh
+//! with cracks has an inside, and so has what several meshes enclose together. What is open, as links often are where
+//! they meet, is hollow: it counts for the choice of a cover, but nothing touches there. The depth is the distance
+//! from what was flooded, so that surfaces within the solid do not count.
 
 use dimos_kernels::cover::Depth;
 use glamx::DVec3;
@@ -38,8 +38,8 @@ pub(super) struct Field<'a> {
     cells: Vec<Cell>,
 }
 
-/// Openings narrower than twice this let nothing in where meshes would have no inside otherwise [m]: links are often open
-/// where they meet.
+/// Openings narrower than twice this let nothing in where meshes would have no inside otherwise [m]: links are often
+/// open where they meet.
 const OPENING: f64 = 0.04;
 /// Size of a cell of that flood, at least [m].
 const COARSE: f64 = 2.5e-3;

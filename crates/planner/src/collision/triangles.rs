@@ -50,9 +50,9 @@ impl Triangles {
             return;
         }
         let center = |t: &Triangle| t[0] + t[1] + t[2];
-        let (low, high) = part.iter().fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(low, high), t| {
-            (low.min(center(t)), high.max(center(t)))
-        });
+        let (low, high) = part
+            .iter()
+            .fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(low, high), t| (low.min(center(t)), high.max(center(t))));
         let axis = (high - low).max_position();
         let middle = part.len() / 2;
         part.select_nth_unstable_by(middle, |a, b| center(a)[axis].total_cmp(&center(b)[axis]));

@@ -153,9 +153,7 @@ fn convex_within(pose: &DPose3, a: &dyn SupportMap, b: &dyn SupportMap, reach: f
 fn surface_distance(at: &DAffine3, mesh: &Mesh, other: &Placed, enough: f64, cutoff: f64) -> f64 {
     let (triangles, into) = (mesh.triangles(), at.inverse());
     match other {
-        Placed::Mesh(frame, other) => {
-            triangles.distance_from(other.triangles(), &(into * *frame), enough, cutoff)
-        }
+        Placed::Mesh(frame, other) => triangles.distance_from(other.triangles(), &(into * *frame), enough, cutoff),
         Placed::Point(p) => {
             let p = into.transform_point3(*p);
             triangles.closest(p).distance(p).min(cutoff)
@@ -252,9 +250,7 @@ fn holds(mesh: &Placed, other: &Placed) -> bool {
     let Placed::Mesh(frame, mesh) = mesh else { return false };
     let point = match other {
         Placed::Mesh(frame, other) => other.surface().vertices().first().map(|vertex| frame.transform_point3(*vertex)),
-        Placed::Hull(frame, other) => {
-            other.polyhedron().points().first().map(|vertex| frame.transform_point3(*vertex))
-        }
+        Placed::Hull(frame, other) => other.polyhedron().points().first().map(|vertex| frame.transform_point3(*vertex)),
         _ => Some(other.ball().0),
     };
     mesh.is_closed() && point.is_some_and(|point| mesh.holds(super::point::local(point, frame)))

@@ -120,8 +120,8 @@ mod tests {
 
     use super::*;
     use crate::collision::body::{MeshMode, solids};
-    use dimos_robot::kinematics::Kinematics;
     use dimos_robot::Source;
+    use dimos_robot::kinematics::Kinematics;
 
     /// A box of these extents as triangles, as an OBJ file.
     fn cuboid([x, y, z]: [f64; 3]) -> String {
@@ -140,7 +140,9 @@ mod tests {
             fs::write(folder.join(format!("{name}.obj")), cuboid(size)).unwrap();
         }
         let link = |name: &str| {
-            format!("<link name=\"{name}\"><collision><geometry><mesh filename=\"{name}.obj\"/></geometry></collision></link>")
+            format!(
+                "<link name=\"{name}\"><collision><geometry><mesh filename=\"{name}.obj\"/></geometry></collision></link>"
+            )
         };
         let joint = |parent: &str, child: &str, at: f64, axis: &str| {
             format!(
@@ -170,7 +172,8 @@ mod tests {
     fn a_pair_that_stays_close_is_proven_once_and_a_changed_mesh_is_proven_again() {
         let (folder, proofs) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
         let names = || {
-            let mut all: Vec<_> = fs::read_dir(proofs.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+            let mut all: Vec<_> =
+                fs::read_dir(proofs.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
             all.sort();
             all
         };

@@ -88,11 +88,7 @@ struct Explored {
 }
 
 impl Explored {
-    fn new<C: CollisionChecker>(
-        checker: &C,
-        from: &[f64],
-        (settings, seed): (&EnclosureSettings, u64),
-    ) -> Self {
+    fn new<C: CollisionChecker>(checker: &C, from: &[f64], (settings, seed): (&EnclosureSettings, u64)) -> Self {
         let mut tree = Tree::new(checker.turns());
         tree.add(from, None);
         let pi = std::f64::consts::PI;
