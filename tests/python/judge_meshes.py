@@ -185,7 +185,8 @@ def answer(question):
     judge = Judge(question)
     if question["what"] == "goals":
         return judge.goals(question["number"], question["limits"], question["seed"])
-    walked = [judge.walk(motion, question["step"], question["reach"], question["most"]) for motion in question["motions"]]
+    how = [question[key] for key in ["step", "reach", "most"]]
+    walked = [judge.walk(motion, *how) for motion in question["motions"]]
     return {"touching": [found for found, _ in walked if found], "looks": sum(looks for _, looks in walked)}
 
 
