@@ -135,6 +135,7 @@ impl Arm {
             base: DAffine3::IDENTITY,
             padding: 0.0,
             apart: 0.0,
+            proven: Vec::new(),
             allowed: self.allowed.clone(),
         }
     }

@@ -115,9 +115,9 @@ pub struct RobotEntry {
     /// Allowed collision pairs of links: `[[finger_left, finger_right]]`.
     #[serde(default)]
     pub collision_exclusion_pairs: Vec<(String, String)>,
-    /// Collision geometry of links with meshes, by link name: `{left_finger: decomposition}`. `hull` (default) is one
-    /// convex hull, which fills cavities; `decomposition` is several convex parts; `triangles` is the exact mesh, which
-    /// is slow.
+    /// Collision geometry of links with meshes, by link name: `{left_finger: hull}`. `mesh` (default) is the mesh: its
+    /// convex hull first, triangles where only the hull touches. `hull` is one convex hull, which fills cavities;
+    /// `decomposition` is several convex parts; `triangles` is the mesh without the hull, which is slow.
     #[serde(default)]
     pub collision_shapes: Keyed<Located<MeshMode>>,
     /// Whether Collada collision meshes are accepted; they are converted to triangles when read. STL and OBJ are always

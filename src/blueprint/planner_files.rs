@@ -31,6 +31,7 @@ pub(super) fn resolve(
         padding: typed.padding,
         robots: robots.map(|(robot, described)| self::robot(checker, robot, described, hardware)).collect(),
         objects: typed.world.0.iter().map(|(name, entry)| object(checker, &name.value, entry)).collect(),
+        proofs: None,
     }
 }
 

@@ -2,6 +2,8 @@
 
 pub(super) mod robots;
 
+use std::path::PathBuf;
+
 use serde_json::json;
 
 use super::arguments::Changes;
@@ -38,7 +40,19 @@ pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
 /// Finds and reads a blueprint; its mistakes are in the result.
 pub fn load(name: &str, overrides: &Overrides, catalog: Catalog<'_>) -> Result<Loaded> {
     let found = blueprint::find(name).map_err(|e| Failure::usage(e.message).hint(e.hint))?;
-    Ok(blueprint::load(&found, overrides, catalog))
+    let mut loaded = blueprint::load(&found, overrides, catalog);
+    if let Some(planner) = loaded.blueprint.as_mut().and_then(|blueprint| blueprint.planner.as_mut()) {
+        planner.proofs = proofs();
+    }
+    Ok(loaded)
+}
+
+/// Returns the folder of proofs that pairs of links stay apart: `$XDG_CACHE_HOME/dimos/proofs` or
+/// `~/.cache/dimos/proofs`.
+fn proofs() -> Option<PathBuf> {
+    let absolute = |name: &str| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
+    let caches = absolute("XDG_CACHE_HOME").or_else(|| Some(absolute("HOME")?.join(".cache")))?;
+    Some(caches.join("dimos/proofs"))
 }
 
 /// Same for a run: also downloads missing assets, and then checks what depends on them.

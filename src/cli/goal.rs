@@ -423,7 +423,7 @@ pub fn show(planned: &Planned) {
             output::wrapped(format_args!("  begins in contact: {a} and {b}, {} m deep", fixed(-depth, 4)));
         }
         (Some(clearance), Some([a, b])) if clearance < 1e-6 => {
-            output::wrapped(format_args!("  proven free of contact; {a} comes within 1 mm of {b}"));
+            output::wrapped(format_args!("  proven free of contact; {a} comes close to {b}"));
         }
         (Some(clearance), Some([a, b])) => {
             output::wrapped(format_args!(

@@ -44,7 +44,7 @@ const FILES: &[(&str, &str)] = &[
     ("$XDG_STATE_HOME/dimos/RUN-TIME.mcap", "log of a run; ~/.local/state without the variable"),
     ("$XDG_STATE_HOME/dimos/RUN-TIME.log", "text log of a run that was started with --daemon"),
     ("$XDG_STATE_HOME/dimos/RUN.json", "record of the latest run of that name: how it ended"),
-    ("$XDG_CACHE_HOME/dimos", "downloaded robot descriptions; ~/.cache without the variable"),
+    ("$XDG_CACHE_HOME/dimos", "downloaded robot descriptions, proofs about links; ~/.cache without the variable"),
     ("$XDG_CONFIG_HOME/dimos/places.yaml", "names of places on other computers, for --at"),
     ("./blueprints, $XDG_CONFIG_HOME/dimos/blueprints", "blueprints that are run by name"),
 ];

@@ -159,6 +159,7 @@ fn world_of(arms: &[(&str, f64)]) -> World {
             base: DAffine3::from_translation(DVec3::Y * *y),
             padding: 0.0,
             apart: 0.0,
+            proven: Vec::new(),
             allowed: vec![],
         };
         world.add_robot(robot).unwrap();

@@ -8,6 +8,7 @@ mod feetech_sdk;
 mod franka;
 mod franka_sim;
 mod lerobot_bus;
+mod meshes;
 mod physics;
 mod piper_kernel;
 mod piper_sdk;

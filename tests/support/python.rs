@@ -23,7 +23,15 @@ pub fn python_with(packages: &[&str]) -> Option<PathBuf> {
 /// What a script of `tests/readers` says to some JSON; nothing where its Python packages are not installed.
 pub fn ask_python(script: &str, module: &str, question: &serde_json::Value) -> Option<serde_json::Value> {
     let python = python_with(&[module])?;
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/readers").join(script);
+    Some(answer(&python, &Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/readers").join(script), question))
+}
+
+/// What a script of `tests/python` says to some JSON.
+pub fn ask(python: &Path, script: &str, question: &serde_json::Value) -> serde_json::Value {
+    answer(python, &Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python").join(script), question)
+}
+
+fn answer(python: &Path, script: &Path, question: &serde_json::Value) -> serde_json::Value {
     let mut child = Command::new(python).arg(script).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
     let mut input = child.stdin.take().unwrap();
     let text = question.to_string();
@@ -31,7 +39,7 @@ pub fn ask_python(script: &str, module: &str, question: &serde_json::Value) -> O
     let output = child.wait_with_output().unwrap();
     writer.join().unwrap();
     assert!(output.status.success(), "the script failed");
-    Some(serde_json::from_slice(&output.stdout).unwrap())
+    serde_json::from_slice(&output.stdout).unwrap()
 }
 
 /// What Pinocchio and coal say of paths (`tests/python/recheck_paths.py`): problems, and the rows that the benchmark

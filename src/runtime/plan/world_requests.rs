@@ -276,7 +276,7 @@ mod tests {
             padding: 0.0,
         };
         let (robots, timeout) = (vec![robot], Duration::from_secs(1));
-        let config = PlannerConfig { timeout, padding: 0.0, robots, objects: vec![ball] };
+        let config = PlannerConfig { timeout, padding: 0.0, robots, objects: vec![ball], proofs: None };
         let setup = PlanningScene::load(&config).unwrap();
         let joints = setup.robots[0].config.coordinator_joints.iter();
         let moment = Moment {

@@ -3,7 +3,9 @@
 use super::vector::{Vector, along, bounds, direction, distance, dot, sub};
 
 /// Steps of the descent: the centre is within about 1 % of the best one.
-const STEPS: usize = 60;
+pub(super) const STEPS: usize = 60;
+/// Steps where the depth of a point in a solid takes long to compute.
+pub(super) const FIELD_STEPS: usize = 20;
 
 /// A ball.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -28,16 +30,19 @@ impl Plane {
 
 /// Returns the ball around points whose surface is least far outside of a convex solid, and how far that is at most;
 /// without planes, the smallest ball and its radius. The points may be any whose convex hull contains what is covered.
+/// `depth`: how deep a point is inside, and the direction in which that decreases.
 ///
-/// Minimizes `max |x − p| − min depth(x)`, which is convex, by subgradients.
-pub(super) fn around(points: &[Vector], planes: &[Plane]) -> (Ball, f64) {
+/// Minimizes `max |x − p| − depth(x)`, which is convex if the solid is, by subgradients.
+pub(super) fn around(points: &[Vector], steps: usize, depth: impl Fn(Vector) -> (f64, Vector)) -> (Ball, f64) {
     let (low, high) = bounds(points.iter().copied());
     let mut at = std::array::from_fn(|i| 0.5 * (low[i] + high[i]));
     let mut size = 0.25 * distance(low, high);
     let mut best = (Ball { center: at, radius: f64::INFINITY }, f64::INFINITY);
-    for _ in 0..STEPS {
+    // The steps shrink to the same size.
+    let shrink = 0.9_f64.powf(STEPS as f64 / steps as f64);
+    for _ in 0..steps {
         let (radius, far) = farthest(at, points);
-        let (depth, normal) = shallowest(at, planes);
+        let (depth, normal) = depth(at);
         if radius - depth < best.1 {
             best = (Ball { center: at, radius }, radius - depth);
         }
@@ -46,7 +51,7 @@ pub(super) fn around(points: &[Vector], planes: &[Plane]) -> (Ball, f64) {
             break;
         }
         at = along(at, size, direction(down));
-        size *= 0.9;
+        size *= shrink;
     }
     best
 }
@@ -64,7 +69,7 @@ fn farthest(from: Vector, points: &[Vector]) -> (f64, Vector) {
 }
 
 /// Returns the depth of a point in a convex solid and the normal of the nearest plane; zero without planes.
-fn shallowest(at: Vector, planes: &[Plane]) -> (f64, Vector) {
+pub(super) fn shallowest(at: Vector, planes: &[Plane]) -> (f64, Vector) {
     let mut least = (f64::INFINITY, [0.0; 3]);
     for plane in planes {
         let depth = plane.depth(at);

@@ -1,6 +1,6 @@
 //! The part of a solid in a box: its surface as polygons, cut at the box, and the corners of the box that are inside.
 
-use super::ball::{Ball, Plane, around};
+use super::ball::{Ball, FIELD_STEPS, Plane, STEPS, around, shallowest};
 use super::vector::{Vector, along, bounds};
 
 /// Interior of a closed surface.
@@ -10,8 +10,23 @@ pub enum Inside<'a> {
     Convex,
     /// Whether a point is inside.
     Test(&'a dyn Fn([f64; 3]) -> bool),
+    /// How deep points are inside.
+    Depth(&'a dyn Depth),
     /// Nothing: the surface is open.
     Nothing,
+}
+
+/// How deep points are inside of a solid.
+pub trait Depth {
+    /// Returns about how deep a point is inside [m], 0 outside, and the direction in which that decreases, a unit
+    /// vector or zero. Balls are chosen by it.
+    fn depth(&self, p: [f64; 3]) -> (f64, [f64; 3]);
+
+    /// Returns the radius of a ball about a point that is proven to be inside [m]; negative if none is.
+    fn proven(&self, p: [f64; 3]) -> f64;
+
+    /// Returns whether a point may be inside.
+    fn may_be_inside(&self, p: [f64; 3]) -> bool;
 }
 
 /// A part of a solid and the ball that contains it.
@@ -24,7 +39,8 @@ pub(super) struct Cell {
     pub ball: Ball,
     /// How far the ball's surface is outside of the solid at most [m].
     pub overshoot: f64,
-    convex: bool,
+    /// Radius of the ball about the same centre that is inside the solid [m]; negative if none is known.
+    inner: f64,
 }
 
 impl Cell {
@@ -43,6 +59,7 @@ impl Cell {
         let is_inside = |p: &Vector| match inside {
             Inside::Convex => planes.iter().all(|plane| plane.depth(*p) >= 0.0),
             Inside::Test(test) => test(*p),
+            Inside::Depth(solid) => solid.may_be_inside(*p),
             Inside::Nothing => false,
         };
         let points: Vec<Vector> = polygons.iter().flatten().copied().chain(corners.filter(is_inside)).collect();
@@ -50,13 +67,21 @@ impl Cell {
             return None;
         }
         let (low, high) = bounds(points.iter().copied());
-        let (ball, overshoot) = around(&points, planes);
-        Some(Self { polygons, low, high, ball, overshoot, convex: !planes.is_empty() })
+        let (ball, overshoot) = match inside {
+            Inside::Depth(solid) => around(&points, FIELD_STEPS, |at| solid.depth(at)),
+            _ => around(&points, STEPS, |at| shallowest(at, planes)),
+        };
+        let inner = match inside {
+            Inside::Depth(solid) => solid.proven(ball.center),
+            _ if planes.is_empty() => super::NONE,
+            _ => ball.radius - overshoot,
+        };
+        Some(Self { polygons, low, high, ball, overshoot, inner })
     }
 
-    /// Returns the ball as a node of a tree, and the ball about its centre that is inside a convex solid.
+    /// Returns the ball as a node of a tree, and the ball about its centre that is inside the solid, if one is known.
     pub fn node(&self) -> super::Node {
-        super::node(&self.ball, if self.convex { self.ball.radius - self.overshoot } else { super::NONE })
+        super::node(&self.ball, self.inner)
     }
 
     /// Halves the box across its longest side.

@@ -10,7 +10,7 @@ mod vector;
 
 use std::collections::BinaryHeap;
 
-pub use cell::Inside;
+pub use cell::{Depth, Inside};
 
 use ball::{Ball, Plane};
 use cell::Cell;
@@ -18,8 +18,12 @@ use vector::{Vector, bounds, cross, direction, dot, sub};
 
 /// A part is not halved further if its ball is outside of the solid by no more than this [m].
 const OVERSHOOT: f64 = 0.002;
+/// The same of a solid that need not be convex: what covers do not prove is for its triangles [m].
+const OVERSHOOT_OF_MESH: f64 = 0.001;
 /// Largest number of balls that are not halved further, per solid.
 const LEAVES: usize = 192;
+/// The same of a solid that need not be convex.
+const LEAVES_OF_MESH: usize = 1600;
 /// Points per leaf of a cloud.
 const POINTS: usize = 4;
 /// Rounding to single precision [relative to a coordinate].
@@ -71,8 +75,10 @@ impl Tree {
         let Some(root) = Cell::new(polygons, low, high, &planes, inside) else { return Self::default() };
         nodes.push(root.node());
         let mut open = BinaryHeap::from([Open { at: 0, cell: root }]);
+        let is_mesh = matches!(inside, Inside::Depth(_));
+        let (most, overshoot) = if is_mesh { (LEAVES_OF_MESH, OVERSHOOT_OF_MESH) } else { (LEAVES, OVERSHOOT) };
         let mut leaves = 1;
-        while leaves < LEAVES && open.peek().is_some_and(|worst| worst.cell.overshoot > OVERSHOOT) {
+        while leaves < most && open.peek().is_some_and(|worst| worst.cell.overshoot > overshoot) {
             let Some(Open { at, cell }) = open.pop() else { break };
             let first = nodes.len();
             for part in cell.halves(&planes, inside).into_iter().flatten() {

@@ -20,8 +20,10 @@ const SAME_CENTER: f64 = 1e-6;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum MeshMode {
-    /// The convex hull of each mesh: contains the mesh, fast.
+    /// The mesh: its convex hull first, which is fast, and triangle by triangle where only the hull touches.
     #[default]
+    Mesh,
+    /// The convex hull of each mesh alone: what touches it only there counts, too.
     Hull,
     /// Convex hulls of parts of each mesh: together they contain the mesh, but not the space between fingers, which a
     /// single hull fills. The decomposition takes a moment; more parts are slower.
@@ -114,7 +116,11 @@ fn with_capsules(shapes: &[Shape]) -> Vec<(usize, Shape)> {
 /// Returns the solids of a mesh: one, unless it is decomposed.
 pub fn of_mesh(mesh: &mesh::Mesh, mode: MeshMode, frame: DAffine3) -> Result<Vec<Solid>, ShapeError> {
     match mode {
-        MeshMode::Hull => Ok(vec![Solid::hull(&vertices(mesh), frame)?]),
+        MeshMode::Mesh => {
+            let own = Mesh::new(vertices(mesh), mesh.triangles.clone())?;
+            Ok(vec![Solid::hull_of(Arc::new(own), frame)?])
+        }
+        MeshMode::Hull => Ok(vec![Solid::rough_hull(&vertices(mesh), frame)?]),
         MeshMode::Decomposition => decomposed(&vertices(mesh), &mesh.triangles, frame),
         MeshMode::Triangles => Ok(vec![surface(mesh, frame)?]),
     }
@@ -133,9 +139,9 @@ fn vertices(mesh: &mesh::Mesh) -> Vec<DVec3> {
 /// Decomposition", 2016), each the hull of the surface it covers. Falls back to the hull of the whole mesh.
 fn decomposed(vertices: &[DVec3], triangles: &[[u32; 3]], frame: DAffine3) -> Result<Vec<Solid>, ShapeError> {
     // Rejects meshes that are not usable at all.
-    let whole = Solid::hull(vertices, frame)?;
+    let whole = Solid::rough_hull(vertices, frame)?;
     let parts = VHACD::decompose(&VHACDParameters::default(), vertices, triangles, true);
     let hulls = parts.compute_exact_convex_hulls(vertices, triangles);
-    let hulls = hulls.iter().map(|(points, _)| Solid::hull(points, frame)).collect::<Result<Vec<_>, _>>();
+    let hulls = hulls.iter().map(|(points, _)| Solid::rough_hull(points, frame)).collect::<Result<Vec<_>, _>>();
     Ok(hulls.ok().filter(|hulls| hulls.len() > 1).unwrap_or_else(|| vec![whole]))
 }

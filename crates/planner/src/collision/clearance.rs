@@ -1,5 +1,7 @@
 //! The clearance that motions are proven to keep, between their samples, too.
 
+use std::collections::HashMap;
+
 use super::checker::{CollisionChecker, Stop};
 use super::exact::ExactChecker;
 use super::report::Pair;
@@ -32,19 +34,25 @@ enum By {
 
 impl ExactChecker {
     /// Returns the distance that motions keep, regardless of the padding; they must be proven free. It may be some
-    /// millimetres less than the true one, 0.5 mm if `exact`, a part of it if below 1 mm; at most 0.2 m. `None` if
+    /// millimetres less than the true one, 0.5 mm if `exact`, a part of it if below 1 mm; at most 0.2 m. Links that
+    /// triangles decide about are measured by covers unless `exact`: then 0 may stand for some millimetres. `None` if
     /// nothing can collide, or if stopped.
     pub fn clearance_along(&mut self, motions: &[Motion], exact: bool, stop: &Stop) -> Option<Clearance> {
         if self.pairs.is_empty() {
             return None;
         }
         let (pads, most_pad, fine) = (self.pads.clone(), self.most_pad, self.settings.clearance.fine);
+        // The same configurations are checked with many distances, and triangles take long.
+        self.known = self.has_surfaces.then(HashMap::new);
         let mut clearance = self.search_clearance(motions, exact, stop);
-        if let Some(coarse) = clearance.as_mut().filter(|clearance| clearance.distance < fine)
+        // Triangles take longer than all else of a request: only the level `exact` measures with them.
+        let by_covers = self.known.is_some() && !exact;
+        if let Some(coarse) = clearance.as_mut().filter(|clearance| clearance.distance < fine && !by_covers)
             && let Some(fine) = self.refined(motions, coarse, stop)
         {
             *coarse = fine;
         }
+        self.known = None;
         (self.pads, self.most_pad, self.resolution) = (pads, most_pad, self.settings.certification.resolution);
         clearance
     }
@@ -74,7 +82,7 @@ impl ExactChecker {
             }
             let mut least = self.clearance_of(motion, (0.0, clearance.distance), By::Covers, stop);
             let by = if exact { By::Solids } else { By::Limited };
-            if exact || least.0 < near {
+            if exact || (least.0 < near && self.known.is_none()) {
                 let high = if exact { clearance.distance } else { clearance.distance.min(2.0 * near) };
                 least = match self.keeps_on(motion, high, by, stop) {
                     true if high < clearance.distance => (high, least.1),

@@ -1,14 +1,17 @@
 //! Covers of solids and of links, for the checks in lanes: each is made once, when it is first needed.
 
 use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock, Weak};
 
 use dimos_kernels::cover::{Inside, Place, Tree};
-use glamx::DVec3;
+use glamx::{DAffine3, DVec3};
 use parry3d_f64::shape::ConvexPolyhedron;
 
 use super::ball;
+use super::field::Field;
+use super::outline::{cuboid, outline, prism};
 use super::shape::{Core, Solid};
+use super::triangles::Triangles;
 use dimos_core::sync::lock;
 
 /// Covers of links that are kept: an object may be held at many places.
@@ -21,6 +24,8 @@ pub(super) struct Covers {
     own: OnceLock<Arc<Tree>>,
     /// Of links whose first solid it is.
     links: Mutex<VecDeque<LinkCover>>,
+    /// Of what it and other meshes enclose together, it being the first.
+    merged: Mutex<VecDeque<Merged>>,
 }
 
 #[derive(Debug)]
@@ -46,10 +51,22 @@ impl PartialEq for Part {
     }
 }
 
+/// The cover of several meshes, each given by where its own covers are kept and by its frame.
+#[derive(Debug)]
+struct Merged {
+    meshes: Vec<(Weak<Covers>, DAffine3)>,
+    tree: Arc<Tree>,
+}
+
 impl Solid {
     /// Returns balls that contain the core, in its own frame: without `radius`.
     pub fn cover(&self) -> &Arc<Tree> {
         self.covers.own.get_or_init(|| Arc::new(of(&self.core)))
+    }
+
+    /// Returns whether triangles decide about it.
+    fn is_mesh(&self) -> bool {
+        matches!(&self.core, Core::Hull(hull) if hull.surface().is_some())
     }
 }
 
@@ -71,7 +88,17 @@ fn known(solids: &[Solid]) -> (Arc<Tree>, Ball) {
         radius: solid.radius,
     };
     let part = |solid: &Solid| Part { tree: solid.cover().clone(), place: place(solid) };
-    let parts: Vec<Part> = solids.iter().map(part).collect();
+    let (meshes, mut others): (Vec<&Solid>, Vec<&Solid>) = solids.iter().partition(|solid| solid.is_mesh());
+    let mut parts = Vec::new();
+    match meshes.first() {
+        // What several meshes enclose together is inside of none of them.
+        Some(one) if meshes.len() > 1 && meshes.iter().all(|mesh| mesh.radius == one.radius) => {
+            let place = place(&Solid::clone(one).at(DAffine3::IDENTITY));
+            parts.push(Part { tree: merged(&meshes), place });
+        }
+        _ => others = solids.iter().collect(),
+    }
+    parts.extend(others.into_iter().map(part));
     let mut links = lock(&first.covers.links);
     if let Some(known) = links.iter().find(|known| known.parts == parts) {
         return (known.tree.clone(), known.ball);
@@ -85,26 +112,43 @@ fn known(solids: &[Solid]) -> (Arc<Tree>, Ball) {
     (tree, ball)
 }
 
-/// Number of sides of the prism that replaces a cylinder in its cover: 0.5 % wider.
-const SIDES: usize = 32;
+/// Returns the cover of meshes of one link, in its frame.
+fn merged(meshes: &[&Solid]) -> Arc<Tree> {
+    let Some(first) = meshes.first() else { return Arc::default() };
+    let mut known = lock(&first.covers.merged);
+    let is = |solid: &Solid, (covers, frame): &(Weak<Covers>, DAffine3)| {
+        covers.as_ptr() == Arc::as_ptr(&solid.covers) && *frame == solid.frame
+    };
+    let same = |one: &&Merged| {
+        one.meshes.len() == meshes.len() && one.meshes.iter().zip(meshes).all(|(own, solid)| is(solid, own))
+    };
+    if let Some(known) = known.iter().find(same) {
+        return known.tree.clone();
+    }
+    let of_solid = |solid: &&Solid| {
+        let frame = solid.frame;
+        let triangles = outline(&solid.core).unwrap_or_default().into_iter();
+        triangles.map(move |corners| corners.map(|p| frame.transform_point3(p)))
+    };
+    let tree = Arc::new(of_mesh(&Triangles::new(meshes.iter().flat_map(of_solid))));
+    if known.len() == MOST {
+        known.pop_front();
+    }
+    let meshes = meshes.iter().map(|solid| (Arc::downgrade(&solid.covers), solid.frame)).collect();
+    known.push_back(Merged { meshes, tree: tree.clone() });
+    tree
+}
 
 fn of(core: &Core) -> Tree {
     match core {
         Core::Point => Tree::of_point(),
         Core::Segment { half } => Tree::of_segment(*half),
-        Core::Box { half } => {
-            let corner = |k: usize| DVec3::new(sign(k), sign(k >> 1), sign(k >> 2)) * *half;
-            of_hull(&(0..8).map(corner).collect::<Vec<_>>())
-        }
-        Core::Cylinder { half, radius } => {
-            let outside = radius / (std::f64::consts::PI / SIDES as f64).cos();
-            let side = |k: usize| {
-                let (sin, cos) = (std::f64::consts::TAU * (k / 2) as f64 / SIDES as f64).sin_cos();
-                DVec3::new(outside * cos, outside * sin, half * sign(k))
-            };
-            of_hull(&(0..2 * SIDES).map(side).collect::<Vec<_>>())
-        }
-        Core::Hull(hull) => of_polyhedron(hull.polyhedron()),
+        Core::Box { half } => cuboid(*half).as_ref().map(of_polyhedron).unwrap_or_default(),
+        Core::Cylinder { half, radius } => prism(*half, *radius).as_ref().map(of_polyhedron).unwrap_or_default(),
+        Core::Hull(hull) => match hull.surface() {
+            Some(mesh) => of_mesh(mesh.triangles()),
+            None => of_polyhedron(hull.polyhedron()),
+        },
         Core::Mesh(mesh) => {
             let inside = |p: [f64; 3]| mesh.holds(DVec3::from_array(p));
             let triangles = mesh.surface().triangles().map(|t| [t.a, t.b, t.c].map(|p| p.to_array()));
@@ -114,12 +158,11 @@ fn of(core: &Core) -> Tree {
     }
 }
 
-fn sign(bit: usize) -> f64 {
-    if bit & 1 == 1 { 1.0 } else { -1.0 }
-}
-
-fn of_hull(points: &[DVec3]) -> Tree {
-    ConvexPolyhedron::from_convex_hull(points).as_ref().map(of_polyhedron).unwrap_or_default()
+/// Covers the solid within meshes: what cannot be reached from outside through their openings.
+fn of_mesh(triangles: &Triangles) -> Tree {
+    let field = Field::new(triangles);
+    let corners = triangles.all().iter().map(|corners| corners.map(|p| p.to_array()));
+    Tree::of_triangles(corners, Inside::Depth(&field))
 }
 
 fn of_polyhedron(polyhedron: &ConvexPolyhedron) -> Tree {

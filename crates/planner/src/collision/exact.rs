@@ -1,6 +1,7 @@
 //! The exact checker: every solid against every other, in double precision, with bounding balls of links to exclude
 //! most.
 
+use std::collections::HashMap;
 use std::sync::Arc;
 
 use dimos_kernels::block::Lanes;
@@ -12,11 +13,11 @@ use dimos_robot::model::Limits;
 use super::checker::{CollisionChecker, Samples, Stop};
 use super::lanes::InLanes;
 use super::motion::Pieces;
-use super::pairs::general::nearest;
+use super::pairs::general::{Nearest, distance_up_to, nearest};
 use super::pairs::{self, Placed, point};
-use super::report::{Contact, Pair};
+use super::report::{Contact, Measured, Pair};
 use super::scene::{LinkShape, Scene};
-use super::settings::CheckSettings;
+use super::settings::{CertificationSettings, CheckSettings};
 use super::shape::Core;
 
 /// Distance of a pair compared to a margin.
@@ -56,6 +57,12 @@ pub struct ExactChecker {
     pub(super) most_pad: f64,
     /// Pairs in contact that no joint moves: no motion changes that, so they are not checked.
     still: Vec<Pair>,
+    /// Whether triangles decide about any link.
+    pub(super) has_surfaces: bool,
+    /// Hash of the configuration that all frames are at.
+    placed: u64,
+    /// While a clearance is searched: for pairs and configurations, the distance and the most that was searched [m].
+    pub(super) known: Option<HashMap<(u32, u64), (f64, f64)>>,
 }
 
 impl ExactChecker {
@@ -86,6 +93,9 @@ impl ExactChecker {
             most_pad: 0.0,
             exact_checks_left: u64::MAX,
             still,
+            has_surfaces: scene.has_surfaces(),
+            placed: 0,
+            known: None,
             frames,
             pairs,
             link_pairs,
@@ -139,11 +149,78 @@ impl ExactChecker {
     pub(super) fn place(&mut self, q: &[f64]) {
         self.checks += 1;
         self.scene.forward(q, &mut self.frames);
+        if self.known.is_some() {
+            // FNV-1a, a number at a time.
+            self.placed = q.iter().fold(0xcbf2_9ce4_8422_2325, |hash: u64, x| {
+                (hash ^ x.to_bits()).wrapping_mul(0x0000_0100_0000_01b3).rotate_left(23)
+            });
+        }
     }
 
     /// Returns the current distance of a pair, by index, beyond its padding.
     pub(super) fn gap(&self, pair: usize, margin: f64) -> Gap {
         self.gap_of(self.pairs[pair], self.pads[pair], margin)
+    }
+
+    /// Returns the current distance of a pair, by index, beyond its padding; remembers the distance if
+    /// [`Self::known`] does, for later checks of the same configuration with another padding.
+    pub(super) fn gap_once(&mut self, pair: usize, margin: f64) -> Gap {
+        let pad = self.pads[pair];
+        let Some(known) = self.known.as_ref() else { return self.gap(pair, margin) };
+        let key = (pair as u32, self.placed);
+        let found = known.get(&key).copied().filter(|(distance, cutoff)| distance < cutoff || pad + margin < *cutoff);
+        let distance = found.map_or_else(
+            || {
+                let cutoff = (pad + margin) * 1.5 + self.settings.clearance.near;
+                let distance = self.distance_up_to(self.pairs[pair], cutoff);
+                if let Some(known) = self.known.as_mut() {
+                    known.insert(key, (distance, cutoff));
+                }
+                distance
+            },
+            |(distance, _)| distance,
+        );
+        match distance - pad {
+            d if d <= 0.0 => Gap::Touch,
+            d if d <= margin => Gap::Close,
+            _ => Gap::Far,
+        }
+    }
+
+    /// Returns the current distance of a pair, at most `cutoff` [m]; 0 or less if it touches.
+    fn distance_up_to(&self, pair: Pair, cutoff: f64) -> f64 {
+        let least = self.least_distance(pair);
+        if least >= cutoff {
+            return cutoff;
+        }
+        let mut best = cutoff;
+        let mut see = |one: &super::Solid, f: &DAffine3, other: &Placed, radius: f64| {
+            let (placed, radii) = (one.place(f), one.radius + radius);
+            if pairs::gap(&placed, other) - radii < best {
+                let cores = distance_up_to(&placed.decisive(), &other.decisive(), best + radii);
+                best = best.min(cores - radii);
+            }
+        };
+        match pair {
+            Pair::Links(a, b) => {
+                let (first, second) = (&self.scene.links[a], &self.scene.links[b]);
+                let (f, g) = (&self.frames[first.frame], &self.frames[second.frame]);
+                for one in &first.solids {
+                    second.solids.iter().for_each(|two| see(one, f, &two.place(g), two.radius));
+                }
+            }
+            Pair::Obstacle(link, obstacle) => {
+                let (link, standing) = (&self.scene.links[link], &self.scene.obstacles[obstacle]);
+                let f = &self.frames[link.frame];
+                link.solids.iter().for_each(|one| see(one, f, &standing.placed(), standing.solid.radius));
+            }
+        }
+        best
+    }
+
+    /// Returns whether a pair touches at the current configuration, without padding.
+    pub(super) fn touches(&self, pair: Pair) -> bool {
+        self.gap_of(pair, 0.0, 0.0) == Gap::Touch
     }
 
     fn gap_of(&self, pair: Pair, pad: f64, margin: f64) -> Gap {
@@ -239,13 +316,13 @@ impl ExactChecker {
         let link = &scene.links[l];
         let mut best: Option<Contact> = None;
         let mut see = |one: &super::Solid, other: &Placed, radius: f64| {
-            let found = nearest(&one.place(&self.frames[link.frame]), other);
+            let (found, by) = measured(&one.place(&self.frames[link.frame]), other);
             let distance = found.distance - one.radius - radius;
             if best.as_ref().is_none_or(|b| distance < b.distance) {
                 let towards = (found.b - found.a).normalize_or_zero() * found.distance.signum();
                 let (on_link, on_other) = (found.a + towards * one.radius, found.b - towards * radius);
                 let (link, other) = (link.name.clone(), name.clone());
-                best = Some(Contact { pair, link, other, distance, on_link, on_other });
+                best = Some(Contact { pair, link, other, distance, on_link, on_other, by });
             }
         };
         for one in &link.solids {
@@ -273,8 +350,28 @@ impl ExactChecker {
     }
 }
 
-/// Returns the distance of two cores beyond their radii.
+/// Returns the closest points of two cores, and what they are measured by.
+fn measured(a: &Placed, b: &Placed) -> (Nearest, Measured) {
+    let rough = |placed: &Placed| matches!(placed, Placed::Hull(_, hull) if hull.is_rough());
+    let by = if rough(a) || rough(b) { Measured::Hull } else { Measured::Shapes };
+    if !(a.has_surface() || b.has_surface()) {
+        return (nearest(a, b), by);
+    }
+    let found = nearest(&a.decisive(), &b.decisive());
+    if found.distance > 0.0 {
+        return (found, by);
+    }
+    // How deep triangles are in each other is not known: no deeper than their hulls.
+    let hulls = nearest(a, b);
+    (Nearest { distance: hulls.distance.min(0.0), ..hulls }, if by == Measured::Hull { by } else { Measured::Depth })
+}
+
+/// Returns the distance of two cores beyond their radii: that of triangles, where a hull has some.
 fn gap_of_cores(a: &Placed, b: &Placed, radii: f64, margin: f64) -> Gap {
+    gap_of_these(&a.decisive(), &b.decisive(), radii, margin)
+}
+
+fn gap_of_these(a: &Placed, b: &Placed, radii: f64, margin: f64) -> Gap {
     use Placed::{Cylinder, Point, Segment};
     let closed_form = matches!(
         (a, b),
@@ -349,7 +446,9 @@ impl CollisionChecker for ExactChecker {
     }
 
     fn certify_within_budget(&mut self, from: &[f64], to: &[f64], looks_free: bool, stop: &Stop) -> bool {
-        self.is_free_within(self.settings.certification.budget, (from, to), looks_free, stop)
+        let CertificationSettings { budget, mesh_budget, .. } = self.settings.certification;
+        let budget = if self.has_surfaces { mesh_budget } else { budget };
+        self.is_free_within(budget, (from, to), looks_free, stop)
     }
 
     fn motion_looks_free(&mut self, from: &[f64], to: &[f64]) -> bool {

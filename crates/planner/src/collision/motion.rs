@@ -282,7 +282,7 @@ impl ExactChecker {
             self.place(&p.q);
             for k in worst.first..worst.last {
                 let pair = p.pairs_now[k as usize] as usize;
-                if self.gap(pair, 0.0) == Gap::Touch {
+                if self.gap_once(pair, 0.0) == Gap::Touch {
                     self.witness = Some(pair);
                     return true;
                 }
@@ -322,7 +322,7 @@ impl ExactChecker {
             let first = p.pairs_next.len() as u32;
             for k in piece.first..piece.last {
                 let pair = p.pairs_now[k as usize];
-                match self.gap(pair as usize, 0.5 * size * p.reach[pair as usize]) {
+                match self.gap_once(pair as usize, 0.5 * size * p.reach[pair as usize]) {
                     Gap::Far => {}
                     Gap::Close => p.pairs_next.push(pair),
                     Gap::Touch => {

@@ -9,6 +9,7 @@ use dimos_robot::kinematics::Kinematics;
 use dimos_robot::model::{Limits, RobotModel};
 
 use super::cover;
+use super::proven_apart::ProvenApart;
 use super::shape::{Core, Placed, Solid};
 use super::world::{Robot, World};
 
@@ -250,6 +251,16 @@ impl Scene {
         &self.obstacles
     }
 
+    /// Returns whether any link is decided by triangles.
+    pub(super) fn has_surfaces(&self) -> bool {
+        let has = |solid: &Solid| match &solid.core {
+            Core::Hull(hull) => hull.surface().is_some(),
+            Core::Mesh(_) => true,
+            _ => false,
+        };
+        self.links.iter().any(|link| link.solids.iter().any(has))
+    }
+
     /// Returns a buffer for [`Scene::forward`].
     pub fn frames(&self) -> Vec<DAffine3> {
         vec![DAffine3::IDENTITY; self.frames]
@@ -294,7 +305,7 @@ fn may_touch(world: &World, a: &Origin, b: &Origin) -> bool {
 }
 
 /// Why two links of a robot are never checked against each other.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Unchecked {
     /// No joint that moves is between them.
     Fixed,
@@ -302,6 +313,8 @@ pub enum Unchecked {
     Neighbours,
     /// The pair is allowed.
     Allowed,
+    /// They are proven to keep this distance at every configuration [m].
+    Apart(f64),
 }
 
 /// Returns why two links of a robot, by index, are never checked against each other; `None` if they are.
@@ -313,8 +326,11 @@ pub fn unchecked(robot: &Robot, a: usize, b: usize) -> Option<Unchecked> {
         Some(Unchecked::Fixed)
     } else if parent(a) == Some(b) || parent(b) == Some(a) {
         Some(Unchecked::Neighbours)
+    } else if robot.allowed.iter().any(is) {
+        Some(Unchecked::Allowed)
     } else {
-        robot.allowed.iter().any(is).then_some(Unchecked::Allowed)
+        let own = |pair: &&ProvenApart| pair.links == [a, b] || pair.links == [b, a];
+        robot.proven.iter().find(own).map(|pair| Unchecked::Apart(pair.distance))
     }
 }
 

@@ -31,6 +31,8 @@ pub struct CertificationSettings {
     pub resolution: f64,
     /// Exact checks of configurations that a motion is worth that need not be free.
     pub budget: u64,
+    /// The same where triangles decide: each takes many times as long.
+    pub mesh_budget: u64,
     /// Times that a motion is halved to be proven by swept covers.
     pub sweep_halvings: i32,
     /// Parts of a piece that is split for the next check with covers.
@@ -49,6 +51,7 @@ impl Default for CertificationSettings {
         Self {
             resolution: 1e-4,
             budget: 64,
+            mesh_budget: 4,
             sweep_halvings: 3,
             parts: 4,
             cover_size: 0.004,

@@ -10,6 +10,7 @@ use parry3d_f64::shape::{ConvexPolyhedron, SupportMap, TriMesh, TriMeshFlags};
 
 use super::cloud::Cloud;
 use super::cover::Covers;
+use super::triangles::Triangles;
 
 /// Why a shape is not usable.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -65,7 +66,14 @@ pub struct Hull {
     vertices: Vertices,
     middle: DVec3,
     half: DVec3,
+    /// The mesh in it, which decides where only the hull touches.
+    surface: Option<Arc<Mesh>>,
+    /// Whether it is used in place of a mesh that it is larger than.
+    rough: bool,
 }
+
+/// A closed mesh that fills its hull but for this part of the volume is convex.
+const FILLED: f64 = 1e-6;
 
 impl Hull {
     /// Creates the hull of points [m].
@@ -78,13 +86,42 @@ impl Hull {
         let corners: Vec<[f64; 3]> = polyhedron.points().iter().map(|p| p.to_array()).collect();
         let vertices = Vertices::new(&corners, Width::widest()).ok_or(ShapeError::Flat(points.len()))?;
         let (middle, half) = bounds(polyhedron.points().iter().copied());
-        Ok(Self { polyhedron, vertices, middle, half })
+        Ok(Self { polyhedron, vertices, middle, half, surface: None, rough: false })
+    }
+
+    /// Creates the hull of a mesh that decides where only the hull touches; a convex one is its hull.
+    pub fn of_mesh(mesh: Arc<Mesh>) -> Result<Self, ShapeError> {
+        let hull = Self::new(mesh.surface.vertices())?;
+        let (points, triangles) = hull.polyhedron.to_trimesh();
+        let (whole, own) = (volume(&points, &triangles), volume(mesh.surface.vertices(), mesh.surface.indices()));
+        let is_convex = mesh.closed && (whole.abs() - own.abs()).abs() <= FILLED * whole.abs();
+        Ok(Self { surface: Some(mesh).filter(|_| !is_convex), ..hull })
+    }
+
+    /// Returns whether it is used in place of a mesh: what touches it may not touch the mesh.
+    pub fn is_rough(&self) -> bool {
+        self.rough
+    }
+
+    /// Returns the mesh in it, if that decides where the hull touches.
+    pub fn surface(&self) -> Option<&Arc<Mesh>> {
+        self.surface.as_ref()
     }
 
     /// Returns parry's representation.
     pub fn polyhedron(&self) -> &ConvexPolyhedron {
         &self.polyhedron
     }
+}
+
+/// Returns the volume within triangles [m³]; its sign is that of their orientation.
+fn volume(points: &[DVec3], triangles: &[[u32; 3]]) -> f64 {
+    let middle = points.first().copied().unwrap_or_default();
+    let part = |corners: &[u32; 3]| {
+        let [a, b, c] = corners.map(|i| points[i as usize] - middle);
+        a.dot(b.cross(c)) / 6.0
+    };
+    triangles.iter().map(part).sum()
 }
 
 /// The same vertex as the polyhedron's, found several times faster.
@@ -98,6 +135,7 @@ impl SupportMap for Hull {
 #[derive(Debug, Clone)]
 pub struct Mesh {
     surface: TriMesh,
+    triangles: Triangles,
     closed: bool,
     middle: DVec3,
     half: DVec3,
@@ -118,7 +156,13 @@ impl Mesh {
         let mut surface = TriMesh::with_flags(vertices, triangles, merge).map_err(|e| bad(&e.to_string()))?;
         let closed =
             is_closed(surface.indices()) && surface.set_flags(surface.flags() | TriMeshFlags::ORIENTED).is_ok();
-        Ok(Self { surface, closed, middle, half })
+        let triangles = Triangles::new(surface.triangles().map(|t| [t.a, t.b, t.c]));
+        Ok(Self { surface, triangles, closed, middle, half })
+    }
+
+    /// Returns its triangles as a tree of boxes.
+    pub fn triangles(&self) -> &Triangles {
+        &self.triangles
     }
 
     /// Returns parry's representation.
@@ -204,6 +248,17 @@ impl Solid {
         Self::of(Core::Hull(Arc::new(Hull::new(points)?)), 0.0, frame)
     }
 
+    /// Creates the convex hull of a mesh, or of a part of it, in place of the mesh.
+    pub fn rough_hull(points: &[DVec3], frame: DAffine3) -> Result<Self, ShapeError> {
+        let hull = Hull { rough: true, ..Hull::new(points)? };
+        Self::of(Core::Hull(Arc::new(hull)), 0.0, frame)
+    }
+
+    /// Creates a solid from a mesh: its hull first, and triangle by triangle where only the hull touches.
+    pub fn hull_of(mesh: Arc<Mesh>, frame: DAffine3) -> Result<Self, ShapeError> {
+        Self::of(Core::Hull(Arc::new(Hull::of_mesh(mesh)?)), 0.0, frame)
+    }
+
     /// Creates a solid from a mesh.
     pub fn mesh(mesh: Arc<Mesh>, frame: DAffine3) -> Result<Self, ShapeError> {
         Self::of(Core::Mesh(mesh), 0.0, frame)
@@ -265,6 +320,19 @@ pub enum Placed<'a> {
 }
 
 impl Placed<'_> {
+    /// Returns whether it is a hull that is not decided by the hull alone.
+    pub fn has_surface(&self) -> bool {
+        matches!(self, Self::Hull(_, hull) if hull.surface.is_some())
+    }
+
+    /// Returns the mesh of a hull that is not decided by the hull alone; otherwise the core itself.
+    pub fn decisive(&self) -> Self {
+        match self {
+            Self::Hull(frame, Hull { surface: Some(mesh), .. }) => Self::Mesh(*frame, mesh),
+            other => *other,
+        }
+    }
+
     /// Returns a bounding box, for cores that have a frame: its frame and half extents.
     pub fn guard(&self) -> Option<(DAffine3, DVec3)> {
         let around = |f: &DAffine3, middle: DVec3, half: DVec3| {

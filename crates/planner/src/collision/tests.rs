@@ -38,6 +38,7 @@ fn arm(name: &str, base: DVec3) -> Robot {
         base: DAffine3::from_translation(base),
         padding: 0.0,
         apart: 0.0,
+        proven: Vec::new(),
         allowed: vec![],
     }
 }

@@ -8,6 +8,7 @@ use glamx::DAffine3;
 use dimos_robot::kinematics::Kinematics;
 use dimos_robot::model::RobotModel;
 
+use super::proven_apart::ProvenApart;
 use super::scene::{Scene, full_name};
 use super::shape::Solid;
 
@@ -31,6 +32,8 @@ pub struct Robot {
     pub apart: f64,
     /// Allowed collision pairs, by link name: exclusion pairs and those of the SRDF.
     pub allowed: Vec<(String, String)>,
+    /// Pairs of its links that are proven apart: they are not checked.
+    pub proven: Vec<ProvenApart>,
 }
 
 /// An obstacle.

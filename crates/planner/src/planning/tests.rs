@@ -15,7 +15,7 @@ use super::search::rrt_connect::{Quantum, Search};
 use super::search::settings::{EnclosureSettings, PlanSettings, RrtSettings};
 use crate::collision::body::{MeshMode, solids};
 use crate::collision::checker::{CollisionChecker, Samples, Stop};
-use crate::collision::report::{Contact, Pair};
+use crate::collision::report::{Contact, Measured, Pair};
 use crate::collision::settings::CheckSettings;
 use crate::collision::world::{Obstacle, Robot, World};
 use crate::collision::{ExactChecker, Solid};
@@ -81,6 +81,7 @@ impl CollisionChecker for Plane {
             distance: distance(c, q) - r,
             on_link: DVec3::ZERO,
             on_other: DVec3::ZERO,
+            by: Measured::Shapes,
         };
         deep.map(contact).collect()
     }
@@ -141,7 +142,7 @@ fn a_window_in_a_wall_is_a_way_out_and_a_wall_without_one_encloses() {
                 &mut walled,
                 &from,
                 std::slice::from_ref(&other),
-                (&EnclosureSettings::default(), seed, true),
+                (&EnclosureSettings::default(), seed),
                 &Stop::never(),
             )
         };
@@ -353,6 +354,7 @@ fn pointer(lower: f64, upper: f64) -> Robot {
         base: DAffine3::IDENTITY,
         padding: 0.0,
         apart: 0.0,
+        proven: Vec::new(),
         allowed: vec![],
     }
 }

@@ -54,6 +54,7 @@ fn checker(posts: &[(f64, f64)]) -> ExactChecker {
         base: DAffine3::IDENTITY,
         padding: 0.0,
         apart: 0.0,
+        proven: Vec::new(),
         allowed: vec![("l1".into(), "l3".into())],
     };
     world.add_robot(robot).unwrap();

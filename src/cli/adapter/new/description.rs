@@ -180,6 +180,7 @@ mod tests {
             padding: 0.0,
             robots: vec![robot],
             objects: vec![table],
+            proofs: None,
         })
         .unwrap()
     }

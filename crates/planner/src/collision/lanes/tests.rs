@@ -57,6 +57,7 @@ fn checker(name: &str, text: &str, base: DVec3, random: &mut Random) -> ExactChe
         base: DAffine3::from_translation(base),
         padding: 0.0,
         apart: 0.0,
+        proven: Vec::new(),
         allowed: vec![],
     };
     world.add_robot(robot).unwrap();

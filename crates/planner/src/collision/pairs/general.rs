@@ -2,12 +2,14 @@
 //! closest points and penetration depths, for reports rather than during planning.
 
 use glamx::{DAffine3, DPose3, DQuat, DVec3};
-use parry3d_f64::bounding_volume::BoundingVolume;
 use parry3d_f64::query::gjk::{self, CsoPoint, GJKResult, VoronoiSimplex};
 use parry3d_f64::query::{self, ClosestPoints};
-use parry3d_f64::shape::{Ball, ConvexPolyhedron, Cuboid, Cylinder, Segment, Shape, SupportMap, TriMesh};
+use parry3d_f64::shape::{Ball, ConvexPolyhedron, Cuboid, Cylinder, Segment, Shape, SupportMap, Triangle};
 
-use super::super::shape::Placed;
+use super::super::shape::{Mesh, Placed};
+use super::super::triangle_pair::distance_squared;
+use super::super::triangles::gap_to_box;
+use super::segment_box;
 
 /// Closest points of two cores.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -43,18 +45,17 @@ pub fn within(a: &Placed, b: &Placed, reach: f64) -> bool {
         let (ball, radius) = other.ball();
         return cloud.0.any_within(cloud.1, ball, radius, reach, |p| super::within(&Placed::Point(p), other, reach));
     }
-    if holds(a, b) || holds(b, a) {
-        return true;
+    if let (Placed::Mesh(frame, mesh), other) | (other, Placed::Mesh(frame, mesh)) = (a, b) {
+        // Where surfaces cross, rounding separates no triangles.
+        return surface_distance(frame, mesh, other, reach, reach + 2.0 * CROSSING) <= reach + CROSSING
+            || holds(a, b)
+            || holds(b, a);
     }
     with_shape(a, |pa, sa| {
         with_shape(b, |pb, sb| match (support(a, sa), support(b, sb)) {
             (Some(ma), Some(mb)) => convex_within(&pa.inv_mul(pb), ma, mb, reach),
-            _ => match (sa.as_trimesh(), sb.as_trimesh()) {
-                (Some(mesh), _) => mesh_within(mesh, &pa.inv_mul(pb), sb, support(b, sb), reach),
-                (_, Some(mesh)) => mesh_within(mesh, &pb.inv_mul(pa), sa, support(a, sa), reach),
-                // A pair that parry does not support counts as touching.
-                _ => true,
-            },
+            // A pair that parry does not support counts as touching.
+            _ => true,
         })
     })
 }
@@ -65,6 +66,9 @@ const STARTS: [DVec3; 4] = [DVec3::X, DVec3::Y, DVec3::Z, DVec3::new(0.36, -0.48
 const PROVEN: f64 = 1e-6;
 /// The same for the best of several answers: at curved surfaces none is better.
 const BELIEVED: f64 = 1e-5;
+
+/// Distance of crossing surfaces that rounding makes of zero [m].
+const CROSSING: f64 = 1e-9;
 
 /// Returns how far two convex shapes are apart along a direction: a lower bound of their distance [m].
 fn separation(pose: &DPose3, a: &dyn SupportMap, b: &dyn SupportMap, direction: DVec3) -> f64 {
@@ -145,20 +149,45 @@ fn convex_within(pose: &DPose3, a: &dyn SupportMap, b: &dyn SupportMap, reach: f
     }
 }
 
-/// Returns whether a mesh is within `reach` [m] of another shape, whose pose is in the mesh's frame.
-fn mesh_within(mesh: &TriMesh, pose: &DPose3, other: &dyn Shape, map: Option<&dyn SupportMap>, reach: f64) -> bool {
-    let near = other.compute_aabb(pose).loosened(reach + BELIEVED);
-    let mut near = mesh.bvh().intersect_aabb(&near).map(|i| mesh.triangle(i));
-    if let Some(map) = map {
-        return near.any(|triangle| convex_within(pose, &triangle, map, reach));
+/// Returns the distance of the triangles of a mesh from another core, at most `cutoff` [m]; ends at any up to `enough`.
+fn surface_distance(at: &DAffine3, mesh: &Mesh, other: &Placed, enough: f64, cutoff: f64) -> f64 {
+    let (triangles, into) = (mesh.triangles(), at.inverse());
+    match other {
+        Placed::Mesh(frame, other) => triangles.distance_from(other.triangles(), &(into * *frame), enough, cutoff),
+        Placed::Point(p) => {
+            let p = into.transform_point3(*p);
+            triangles.closest(p).distance(p).min(cutoff)
+        }
+        Placed::Segment(a, b) => {
+            let [a, b] = [*a, *b].map(|p| into.transform_point3(p));
+            let apart = |middle, half| segment_box::distance(a, b, &DAffine3::from_translation(middle), half);
+            triangles.distance(apart, |triangle, _| distance_squared(triangle, &[a, b, b]).sqrt(), enough, cutoff)
+        }
+        _ => with_shape(other, |pose_of_other, shape| {
+            let (Some(map), Some((guard, size))) = (support(other, shape), other.guard()) else { return 0.0 };
+            let (guard, pose_of_other) = (into * guard, pose(at).inv_mul(pose_of_other));
+            let apart = |middle, half| gap_to_box(middle, half, &guard, size);
+            let distance = |[a, b, c]: &[DVec3; 3], best: f64| {
+                let triangle = Triangle::new(*a, *b, *c);
+                match convex_within(&pose_of_other, &triangle, map, best) {
+                    true => convex_closest(&pose_of_other, &triangle, map).map_or(0.0, |found| found.distance()),
+                    false => best,
+                }
+            };
+            triangles.distance(apart, distance, enough, cutoff)
+        }),
     }
-    let Some(other) = other.as_trimesh() else { return true };
-    let back = pose.inverse();
-    near.any(|triangle| {
-        let box_around = triangle.compute_aabb(&back).loosened(reach + BELIEVED);
-        let mut others = other.bvh().intersect_aabb(&box_around);
-        others.any(|i| convex_within(pose, &triangle, &other.triangle(i), reach))
-    })
+}
+
+/// Returns the distance of two cores, at most `cutoff` [m]; 0 if they overlap.
+pub fn distance_up_to(a: &Placed, b: &Placed, cutoff: f64) -> f64 {
+    match (a, b) {
+        (Placed::Mesh(frame, mesh), other) | (other, Placed::Mesh(frame, mesh)) => {
+            let distance = surface_distance(frame, mesh, other, 0.0, cutoff);
+            if distance <= CROSSING || holds(a, b) || holds(b, a) { 0.0 } else { distance }
+        }
+        _ => super::distance(a, b).min(cutoff),
+    }
 }
 
 /// Returns the closest points of two cores, or their penetration depth.
@@ -182,6 +211,12 @@ pub fn nearest(a: &Placed, b: &Placed) -> Nearest {
 /// The same for cores that overlap, and for meshes.
 fn nearest_of_any(a: &Placed, b: &Placed) -> Nearest {
     let inside = holds(a, b) || holds(b, a);
+    if let (Placed::Mesh(f, one), Placed::Mesh(g, two)) = (a, b)
+        && let Some([p, q]) = one.triangles().nearest(two.triangles(), &(f.inverse() * *g))
+    {
+        let sign = if inside { -1.0 } else { 1.0 };
+        return Nearest { distance: sign * p.distance(q), a: f.transform_point3(p), b: f.transform_point3(q) };
+    }
     with_hull(a, |pa, sa| {
         with_hull(b, |pb, sb| {
             let touching = |at: DVec3| Nearest { distance: 0.0, a: at, b: at };
@@ -215,6 +250,7 @@ fn holds(mesh: &Placed, other: &Placed) -> bool {
     let Placed::Mesh(frame, mesh) = mesh else { return false };
     let point = match other {
         Placed::Mesh(frame, other) => other.surface().vertices().first().map(|vertex| frame.transform_point3(*vertex)),
+        Placed::Hull(frame, other) => other.polyhedron().points().first().map(|vertex| frame.transform_point3(*vertex)),
         _ => Some(other.ball().0),
     };
     mesh.is_closed() && point.is_some_and(|point| mesh.holds(super::point::local(point, frame)))

@@ -170,7 +170,7 @@ mod tests {
     use glamx::DVec3;
 
     use super::*;
-    use crate::collision::report::Pair;
+    use crate::collision::report::{Measured, Pair};
 
     #[test]
     fn a_distance_that_is_hardly_too_small_does_not_look_like_the_padding() {
@@ -181,6 +181,7 @@ mod tests {
             distance,
             on_link: DVec3::ZERO,
             on_other: DVec3::ZERO,
+            by: Measured::Shapes,
         };
         for (distance, text) in [
             (0.002, "link \"tip\" is 0.0020 m from obstacle \"post\", closer than the padding of 0.0030 m"),

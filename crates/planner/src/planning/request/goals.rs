@@ -286,5 +286,6 @@ fn describe_block(
         }
         least => format!("{:.4} m deep", -least),
     };
-    Some(format!("{place}link {link:?} would come too close to {kind} {other:?}, on the whole line {closest}"))
+    let note = first.note();
+    Some(format!("{place}link {link:?} would come too close to {kind} {other:?}, on the whole line {closest}{note}"))
 }

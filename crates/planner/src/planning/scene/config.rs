@@ -25,6 +25,8 @@ pub struct PlannerConfig {
     pub robots: Vec<RobotConfig>,
     /// Objects in the world at the start.
     pub objects: Vec<ObjectConfig>,
+    /// Folder of proofs that pairs of links stay apart; without one they are made at every start.
+    pub proofs: Option<PathBuf>,
 }
 
 /// A planned robot.

@@ -50,6 +50,8 @@ pub(in crate::planning) fn of_robot(
                 None => continue,
                 Some(Unchecked::Fixed) => "fixed to each other".to_owned(),
                 Some(Unchecked::Neighbours) => "neighbours".to_owned(),
+                // A bound, not the distance itself.
+                Some(Unchecked::Apart(distance)) => format!("proven apart: at least {:.2} mm", distance * 1e3),
                 Some(Unchecked::Allowed) => match disabled.iter().find(|(pair, _)| is(pair)) {
                     Some((_, reason)) => format!("SRDF: {reason}"),
                     None if always.iter().any(is) => "touch in every configuration".to_owned(),

@@ -2,6 +2,7 @@
 //! builds collision geometry.
 
 use std::collections::{BTreeMap, HashMap};
+use std::path::Path;
 use std::sync::Arc;
 
 use glamx::{DAffine3, DVec3};
@@ -9,6 +10,7 @@ use nalgebra::Isometry3;
 
 use super::config::{CLOUD_RADIUS, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
 use super::ignored_pairs::{IgnoredPair, of_robot};
+use super::proofs;
 use super::stage_cache::StageCache;
 use super::unplanned_joints::{Measured, idle};
 use crate::collision::allowed_pairs::always_touching;
@@ -98,6 +100,7 @@ impl PlanningScene {
             staged: StageCache::default(),
         };
         setup.allow_always_touching_pairs();
+        setup.prove_apart(config.proofs.as_deref());
         setup.ignored = setup.robots.iter().map(|robot| setup.ignored_of(robot)).collect();
         Ok(setup)
     }
@@ -121,6 +124,14 @@ impl PlanningScene {
         let own = |(name, pair): &(String, [String; 2])| (*name == robot.config.name).then(|| pair.clone());
         let always: Vec<[String; 2]> = self.always_touching.iter().filter_map(own).collect();
         of_robot(robot, &always, &robot.disabled)
+    }
+
+    /// Proves pairs of links that stay close, or finds them proven in the folder of earlier proofs.
+    fn prove_apart(&mut self, folder: Option<&Path>) {
+        for robot in &mut self.robots {
+            robot.body.proven = proofs::of_robot(&robot.body, &robot.config.joints, folder);
+        }
+        self.world = self.world.with_robots(self.robots.iter().map(|robot| robot.body.clone()).collect());
     }
 
     /// Allows pairs of links that touch in every configuration: checking them would forbid all motion. They are
@@ -166,6 +177,7 @@ pub fn whole(model: RobotModel, allowed: Vec<(String, String)>) -> Result<Robot,
         padding: 0.0,
         apart: 0.0,
         allowed,
+        proven: Vec::new(),
     })
 }
 
@@ -215,6 +227,7 @@ impl PlannedRobot {
             padding: 0.0,
             apart: 0.0,
             allowed: config.exclusions.iter().cloned().chain(semantics.disabled_pairs()).collect(),
+            proven: Vec::new(),
         };
         let outside = |pose: &[f64]| pose.iter().zip(&limits).position(|(q, l)| !(l.lower..=l.upper).contains(q));
         for (name, pose) in &config.named_poses {

@@ -36,22 +36,22 @@ impl Enclosed {
 
 fn named(contact: &Contact) -> String {
     let kind = if matches!(contact.pair, Pair::Links(..)) { "link" } else { "obstacle" };
-    format!("link {:?} and {kind} {:?}", contact.link, contact.other)
+    format!("link {:?} and {kind} {:?}{}", contact.link, contact.other, contact.note())
 }
 
-/// Returns what encloses `from`, if nothing leads to any of `others`. `exact`: where covers touch, what they cover may
-/// be free. The same settings and seed explore the same way.
+/// Returns what encloses `from`, if nothing leads to any of `others`. Where covers touch, solids decide. The same
+/// settings and seed explore the same way.
 pub fn enclosed<C: CollisionChecker>(
     checker: &mut C,
     from: &[f64],
     others: &[Vec<f64>],
-    (settings, seed, exact): (&EnclosureSettings, u64, bool),
+    (settings, seed): (&EnclosureSettings, u64),
     stop: &Stop,
 ) -> Option<Enclosed> {
     if from.len() > settings.max_joints {
         return None;
     }
-    let mut explored = Explored::new(checker, from, (settings, seed, exact));
+    let mut explored = Explored::new(checker, from, (settings, seed));
     explored.grow(checker, others, settings.edges / 2, stop)?;
     explored.halfway.clone_from(&explored.reached);
     explored.grow(checker, others, settings.edges / 2, stop)?;
@@ -85,16 +85,10 @@ struct Explored {
     halfway: Vec<[f64; 2]>,
     sample: Vec<f64>,
     at: Vec<f64>,
-    /// Whether solids decide where covers touch.
-    exact: bool,
 }
 
 impl Explored {
-    fn new<C: CollisionChecker>(
-        checker: &C,
-        from: &[f64],
-        (settings, seed, exact): (&EnclosureSettings, u64, bool),
-    ) -> Self {
+    fn new<C: CollisionChecker>(checker: &C, from: &[f64], (settings, seed): (&EnclosureSettings, u64)) -> Self {
         let mut tree = Tree::new(checker.turns());
         tree.add(from, None);
         let pi = std::f64::consts::PI;
@@ -103,7 +97,7 @@ impl Explored {
         let ranges = ranges.map(|(l, q)| [finite(l.lower, q - pi), finite(l.upper, q + pi)]).collect();
         let reached: Vec<[f64; 2]> = from.iter().map(|q| [*q; 2]).collect();
         let (halfway, random, sample, at) = (reached.clone(), Random::new(seed), from.to_vec(), from.to_vec());
-        Self { settings: *settings, tree, random, ranges, reached, halfway, sample, at, exact }
+        Self { settings: *settings, tree, random, ranges, reached, halfway, sample, at }
     }
 
     /// Returns the range of a joint [rad or m].
@@ -157,7 +151,7 @@ impl Explored {
             unwind(&mut self.sample, node, &turns);
             between(node, &self.sample, (self.settings.step / far).min(1.0), &mut self.at);
             let free = checker.motion_looks_free(node, &self.at)
-                || (self.exact && checker.is_free(&self.at) && checker.motion_is_free(node, &self.at, stop));
+                || (checker.is_free(&self.at) && checker.motion_is_free(node, &self.at, stop));
             if free {
                 for ([low, high], q) in self.reached.iter_mut().zip(&self.at) {
                     (*low, *high) = (low.min(*q), high.max(*q));
@@ -213,7 +207,7 @@ impl Explored {
             self.draw_anywhere(number % 2 == 1);
             self.sample[joint] = at;
             let q = &self.sample;
-            !(stop.is_over() || checker.motion_looks_free(q, q) || self.exact && checker.is_free(q))
+            !(stop.is_over() || checker.motion_looks_free(q, q) || checker.is_free(q))
         })
     }
 

@@ -210,13 +210,8 @@ pub fn plan<C: CollisionChecker>(
                 let found = match found {
                     Ok(found) => found,
                     Err(Halt::TookLong) => {
-                        not_enclosed(
-                            checker,
-                            &from,
-                            &goals,
-                            (&settings.enclosure, settings.seed, level.proves()),
-                            stop,
-                        )?;
+                        // Whatever the level: where only covers touch, nothing is enclosed.
+                        not_enclosed(checker, &from, &goals, (&settings.enclosure, settings.seed), stop)?;
                         continue;
                     }
                     Err(Halt::Stopped) if stop.is_cancelled() => return Err(PlanError::Cancelled),
@@ -264,7 +259,7 @@ fn not_enclosed<C: CollisionChecker>(
     checker: &mut C,
     start: &[f64],
     goals: &[Vec<f64>],
-    how: (&EnclosureSettings, u64, bool),
+    how: (&EnclosureSettings, u64),
     stop: &Stop,
 ) -> Result<(), PlanError> {
     let to = [start.to_vec()];

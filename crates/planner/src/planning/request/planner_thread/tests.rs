@@ -18,6 +18,7 @@ fn object(name: &str, size: [f64; 3], at: [f64; 3]) -> ObjectConfig {
 
 fn yourarm(objects: Vec<ObjectConfig>) -> PlanningScene {
     PlanningScene::load(&PlannerConfig {
+        proofs: None,
         timeout: Duration::from_secs(60),
         padding: 0.003,
         robots: vec![RobotConfig::yourarm()],
