@@ -83,7 +83,7 @@ impl<'a> Field<'a> {
     fn place(&self, p: DVec3) -> Option<[usize; 3]> {
         let at = ((p - self.low) / self.size).floor();
         let fits = |i: usize| at[i] >= 0.0 && at[i] < self.number[i] as f64;
-        (fits(0) && fits(1) && fits(2)).then(|| [at.x as usize, at.y as usize, at.z as usize])
+        (fits(0) && fits(1) && fits(2)).then_some([at.x as usize, at.y as usize, at.z as usize])
     }
 
     fn index(&self, [x, y, z]: [usize; 3]) -> usize {

@@ -129,8 +129,8 @@ fn widen(radii: &mut [f64], corners: &[DVec3; 3], (low, height): (f64, f64), mor
     }
 }
 
-/// Returns the distance from the z axis of the farthest point of a triangle between two heights; the distance is convex,
-/// so that it is largest at a corner of that part. Negative if there is no such point.
+/// Returns the distance from the z axis of the farthest point of a triangle between two heights; the distance is
+/// convex, so that it is largest at a corner of that part. Negative if there is no such point.
 fn farthest_between(corners: &[DVec3; 3], bottom: f64, top: f64) -> f64 {
     let mut most = f64::NEG_INFINITY;
     let mut see = |p: DVec3| most = f64::max(most, p.x.hypot(p.y));

@@ -78,8 +78,8 @@ impl Triangles {
         &self.all[node.first as usize..(node.first + node.count) as usize]
     }
 
-    /// Returns the distance of the triangles from something, at most `cutoff` [m]. `apart` returns a lower bound for the
-    /// box around some triangles, given by its middle and half extents, `distance` that of a triangle, up to what is
+    /// Returns the distance of the triangles from something, at most `cutoff` [m]. `apart` returns a lower bound for
+    /// the box around some triangles, given by its middle and half extents, `distance` that of a triangle, up to what is
     /// asked for. Ends at any distance up to `enough`.
     pub fn distance(
         &self,
@@ -109,8 +109,8 @@ impl Triangles {
         best
     }
 
-    /// Returns the distance from others, which are at a pose in this frame, at most `cutoff` [m]. Ends at any distance up
-    /// to `enough`.
+    /// Returns the distance from others, which are at a pose in this frame, at most `cutoff` [m]. Ends at any distance
+    /// up to `enough`.
     pub fn distance_from(&self, others: &Self, pose: &DAffine3, enough: f64, cutoff: f64) -> f64 {
         let mut best = cutoff;
         if self.nodes.is_empty() || others.nodes.is_empty() {
@@ -258,8 +258,8 @@ impl Turned {
     }
 }
 
-/// Returns a lower bound of the distance of a box along the axes of a mesh from another box, given by its frame and half
-/// extents in the mesh's frame [m].
+/// Returns a lower bound of the distance of a box along the axes of a mesh from another box, given by its frame and
+/// half extents in the mesh's frame [m].
 pub(super) fn gap_to_box(middle: DVec3, half: DVec3, frame: &DAffine3, other: DVec3) -> f64 {
     box_box::gap(&DAffine3::from_translation(middle), half, frame, other)
 }
