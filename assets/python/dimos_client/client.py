@@ -77,7 +77,8 @@ class Client(Planning):
         which. `on_path`: what is done at places of the path, as {"distance": 0.3, "gripper": {"arm": "arm",
         "to": "open"}}, {"waypoint": 1, "output": {...}} or {..., "speed": 0.5}. `until`: what ends the motion before
         its goal, as {"force": 5}, {"input": "di0"} or {"time": 2}; the result then has `ended_by` and `value`, and
-        `Refused` (NOT_MET) is raised if the goal came first. `touch`: obstacles that the end effector may touch. Ends this client's own streams to the arm."""
+        `Refused` (NOT_MET) is raised if the goal came first. `touch`: obstacles that the end effector may touch.
+        Ends this client's own streams to the arm."""
         goal = Goal(target, named, pose, linear, frame, by, via)
         where = where_to(arm, goal, through, blend, tcp_speed)
         plain = isinstance(arm, str) and target is not None and goal == Goal(target) and tcp_speed is None

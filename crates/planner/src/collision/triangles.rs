@@ -79,8 +79,8 @@ impl Triangles {
     }
 
     /// Returns the distance of the triangles from something, at most `cutoff` [m]. `apart` returns a lower bound for
-    /// the box around some triangles, given by its middle and half extents, `distance` that of a triangle, up to what is
-    /// asked for. Ends at any distance up to `enough`.
+    /// the box around some triangles, given by its middle and half extents; `distance` that of a triangle, up to what
+    /// is asked for. Ends at any distance up to `enough`.
     pub fn distance(
         &self,
         apart: impl Fn(DVec3, DVec3) -> f64,
