@@ -154,7 +154,7 @@ class Judge:
     def goals(self, number, limits, seed):
         random = np.random.default_rng(seed)
         low, high = np.array(limits).T
-        found = []
+        found: list = []
         while len(found) < number:
             q = random.uniform(low, high)
             if self.touching(q) is None:
