@@ -203,9 +203,14 @@ fn simulate(tree: &mut Tree, root: NodeId, adapters: &Registry, physics: bool) {
         own.into_iter().for_each(|own| tree.put_text(own, "address", SIM, (source, 0..5)));
         let name = tree.get(entry, "adapter_type").and_then(|node| tree.text(node));
         let Some(row) = name.and_then(|name| adapters.get(name)) else { continue };
+        if physics && row.transport == "memory" {
+            let at = tree.get(entry, "adapter_type").map(|node| tree.label(node));
+            let diag = Diag::warning(format!("{} has no body: its joints follow without mass", quote(row.name)));
+            tree.report(at.into_iter().fold(diag, Diag::at));
+        }
         if row.emulate.is_some() {
             tree.put_text(entry, "address", SIM, (source, 0..5));
-            if physics && row.transport != "memory" {
+            if physics {
                 has_body(tree, root, entry);
             }
         } else if row.address.required {

@@ -1,7 +1,16 @@
 //! MuJoCo behind the wires of the emulators: arms arrive, hold their weight, droop as their drives do, fall without
 //! brakes, and a blocked one reports what its vendor's does.
 
-use serde_json::Value;
+use std::io::Write;
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+use dimos::robot::Source;
+use dimos::robot::dynamics::GRAVITY;
+use dimos::robot::mjcf::{Fixture, mjcf};
+use dimos::robot::model::Geometry;
+use nalgebra::Isometry3;
+use serde_json::{Value, json};
 
 use crate::support::program::{Home, Started, eventually};
 use crate::support::python::python_with;
@@ -91,7 +100,7 @@ fn an_arm_without_brakes_droops_and_falls() {
 }
 
 #[test]
-fn the_same_seed_is_the_same_body_and_without_mujoco_the_pip_line_is_said() {
+fn without_mujoco_the_pip_line_is_said() {
     let home = Home::new();
     let bare = home.path().join("python");
     home.write("python", "#!/bin/sh\nexec python3 -S -I \"$@\"\n");
@@ -104,6 +113,50 @@ fn the_same_seed_is_the_same_body_and_without_mujoco_the_pip_line_is_said() {
     home.dimos("adapter emulate ur --option sim.physics.seed=1")
         .with(2)
         .says(&["physics need a model", "--sim=physics"]);
+}
+
+/// What a body with this seed answers to half a second of steps: it leans against the wall.
+fn answers(python: &Path, seed: u64) -> String {
+    let source = Source { path: "builtin:yourarm".into(), ..Source::default() };
+    let model = dimos::robot::load(&source).into_model().unwrap();
+    let wall = Fixture {
+        name: "wall".into(),
+        geometry: Geometry::Box { size: [0.1, 1.0, 1.0].into() },
+        pose: Isometry3::translation(0.3, 0.0, 0.3),
+    };
+    let joints: Vec<String> = (1..=6).map(|number| format!("joint{number}")).collect();
+    let scene = mjcf(&model, GRAVITY, &[wall]).unwrap();
+    let first = json!({
+        "mjcf": scene, "joints": joints, "efforts": [60, 60, 40, 15, 15, 10], "droop": 0.0, "seed": seed,
+        "position": [0.0, -0.3, 0.6, 0.0, 0.8, 0.0],
+    });
+    let none = [0.0; 6];
+    let mut lines = vec![first.to_string()];
+    for step in 0..500 {
+        let reference = [0.0, -0.3 + 4e-4 * f64::from(step), 0.6, 0.0, 0.8, 0.0];
+        let steps: Vec<f64> = reference.into_iter().chain([0.0, 0.4, 0.0, 0.0, 0.0, 0.0]).collect();
+        let (mode, damping) = ([1; 6], none);
+        let line = json!({"steps": steps, "mode": mode, "effort": none, "stiffness": none, "damping": damping});
+        lines.push(line.to_string());
+    }
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("crates/hardware/src/sim/physics/body.py");
+    let mut child = Command::new(python).arg(script).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+    let mut input = child.stdin.take().unwrap();
+    let writer = std::thread::spawn(move || input.write_all((lines.join("\n") + "\n").as_bytes()).unwrap());
+    let output = child.wait_with_output().unwrap();
+    writer.join().unwrap();
+    String::from_utf8(output.stdout).unwrap()
+}
+
+#[test]
+fn a_seed_is_one_body_in_every_bit_and_links_press_on_what_is_in_their_way() {
+    let Some(python) = python_with(&["mujoco"]) else { return };
+    let [once, again, other] = [4, 4, 5].map(|seed| answers(&python, seed));
+    assert_eq!(once.lines().count(), 501, "{once}");
+    assert!(once == again && once != other);
+    let last: Value = serde_json::from_str(once.lines().last().unwrap()).unwrap();
+    let pressed = last["contacts"].as_array().unwrap();
+    assert!(pressed.iter().any(|pair| pair[1] == "wall" && pair[2].as_f64().unwrap() > 1.0), "{last}");
 }
 
 /// Loads a YourArm, whose body differs from its model by the seed.

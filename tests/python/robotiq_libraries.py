@@ -74,8 +74,7 @@ def pymodbus(address):
     # One register, and three of them, which are read back.
     assert not client.write_register(1002, 0xFFFF, device_id=9).isError()
     assert not client.write_registers(1000, [0x0900, 120], device_id=9).isError()
-    wait("there", lambda: status()[2] >> 8 == 120)
-    assert status()[0] >> 14 == 3
+    wait("there", lambda: status()[2] >> 8 == 120 and status()[0] >> 14 == 3)
     assert client.read_holding_registers(1000, count=3, device_id=9).registers == [0x0900, 120, 0xFFFF]
     assert client.read_input_registers(3000, count=1, device_id=9).isError()
     assert client.read_coils(0, count=1, device_id=9).isError()

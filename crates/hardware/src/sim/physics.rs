@@ -227,6 +227,10 @@ impl Body {
             wrong => {
                 let what = wrong.err().map_or("it answers for other joints".to_owned(), |error| error.to_string());
                 let (_, text) = self.last_words();
+                let _ = writeln!(
+                    io::stderr(),
+                    "warning: the physics of an emulated arm ended, it is silent: {what}: {text}"
+                );
                 self.ended = Some(format!("{what}: {text}"));
                 return;
             }
