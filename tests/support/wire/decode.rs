@@ -73,6 +73,10 @@ pub fn yourarm() -> NewDecoder {
             (0x10, [_, _, _, _, target @ ..]) => Some(What::Planned(radians(floats(target, f32::from_le_bytes)))),
             (0x11, target) => Some(What::Position(radians(floats(target, f32::from_le_bytes)))),
             (0x12, target) => Some(What::Velocity(radians(floats(target, f32::from_le_bytes)))),
+            // Flags, validity and time, then positions and what is beside them.
+            (0x14, [_, _, _, _, _, _, _, _, _, _, _, rest @ ..]) if rest.len() >= 48 => {
+                Some(What::Position(radians(floats(&rest[..24], f32::from_le_bytes))))
+            }
             _ => None,
         };
         Front::Frame(frame.len(), what)
