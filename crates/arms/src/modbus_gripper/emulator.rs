@@ -8,27 +8,17 @@ use dimos_core::clock::Mono;
 use dimos_hardware::adapter::AdapterResult;
 use dimos_hardware::registry::{AdapterConfig, EmulatorAddress, Truth};
 use dimos_hardware::sim::arm::Delivery;
-use dimos_hardware::sim::faults::FaultKind;
+use dimos_hardware::sim::faults::{FaultKind, joined};
 use dimos_hardware::sim::gripper::Gripper;
 use dimos_hardware::sim::modbus::{self, NO_REGISTER, Registers};
-use dimos_hardware::sim::peripheral_server::{Emulated, PeripheralServer, WireFaults};
+use dimos_hardware::sim::peripheral_server::{Emulated, PeripheralServer, WIRE_FAULTS, WireFaults};
 use dimos_hardware::sim::stream::Controller;
 use dimos_hardware::transport::Scan;
 use dimos_hardware::transport::line::LineAddress;
 use dimos_hardware::transport::modbus::{Framing, Table};
 
 /// The faults that it can play.
-pub const PLAYABLE: &[FaultKind] = &[
-    FaultKind::Stall,
-    FaultKind::Silent,
-    FaultKind::Disconnect,
-    FaultKind::PowerLoss,
-    FaultKind::Garbage,
-    FaultKind::Corrupt,
-    FaultKind::Truncated,
-    FaultKind::Object,
-    FaultKind::GripperBlocked,
-];
+pub const PLAYABLE: &[FaultKind] = &joined::<9>(&WIRE_FAULTS, &[FaultKind::Object, FaultKind::GripperBlocked]);
 /// Time to open fully, and to be homed [s].
 const OPENING_TIME: f64 = 0.5;
 const HOMING_TIME: f64 = 1.0;

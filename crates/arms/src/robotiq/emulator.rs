@@ -6,10 +6,10 @@ use dimos_core::clock::Mono;
 use dimos_hardware::adapter::{AdapterError, AdapterResult};
 use dimos_hardware::registry::{AdapterConfig, EmulatorAddress, Truth};
 use dimos_hardware::sim::arm::Delivery;
-use dimos_hardware::sim::faults::FaultKind;
+use dimos_hardware::sim::faults::{FaultKind, joined};
 use dimos_hardware::sim::gripper::Gripper;
 use dimos_hardware::sim::modbus::{self, NO_REGISTER, Registers};
-use dimos_hardware::sim::peripheral_server::{Emulated, PeripheralServer, WireFaults};
+use dimos_hardware::sim::peripheral_server::{Emulated, PeripheralServer, WIRE_FAULTS, WireFaults};
 use dimos_hardware::sim::stream::Controller;
 use dimos_hardware::sim::tool_device::ToolDevice;
 use dimos_hardware::transport::Scan;
@@ -17,18 +17,8 @@ use dimos_hardware::transport::line::LineAddress;
 use dimos_hardware::transport::modbus::Framing;
 
 /// The faults that it can play.
-pub const PLAYABLE: &[FaultKind] = &[
-    FaultKind::Stall,
-    FaultKind::Silent,
-    FaultKind::Disconnect,
-    FaultKind::PowerLoss,
-    FaultKind::Garbage,
-    FaultKind::Corrupt,
-    FaultKind::Truncated,
-    FaultKind::ErrorCode,
-    FaultKind::Object,
-    FaultKind::GripperBlocked,
-];
+pub const PLAYABLE: &[FaultKind] =
+    &joined::<10>(&WIRE_FAULTS, &[FaultKind::ErrorCode, FaultKind::Object, FaultKind::GripperBlocked]);
 /// Port of Modbus TCP.
 const PORT: u16 = 502;
 /// Opening of the open gripper [m], and its own positions when open and closed.

@@ -8,7 +8,7 @@ use super::misreading::Memory;
 pub use super::options::{ControllerOptions, SimOptions, check_pose, check_range};
 use crate::adapter::AdapterResult;
 use crate::registry::Truth;
-use crate::sim::faults::{FaultKind, FaultScript};
+use crate::sim::faults::{FaultKind, FaultScript, joined};
 use crate::sim::physics::Body;
 use crate::sim::plant::{Drive, Plant};
 use crate::sim::weight::Masses;
@@ -49,15 +49,8 @@ pub const PLAYABLE: &[FaultKind] = &[
 ];
 
 /// Returns [`PLAYABLE`] and more kinds; `N` is how many all are.
-#[allow(clippy::indexing_slicing, reason = "computed when compiled")]
 pub const fn playable_and<const N: usize>(more: &[FaultKind]) -> [FaultKind; N] {
-    let mut all = [FaultKind::Stall; N];
-    let mut i = 0;
-    while i < N {
-        all[i] = if i < PLAYABLE.len() { PLAYABLE[i] } else { more[i - PLAYABLE.len()] };
-        i += 1;
-    }
-    all
+    joined(PLAYABLE, more)
 }
 
 /// Why the arm refuses a command.

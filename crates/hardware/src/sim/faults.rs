@@ -299,6 +299,18 @@ impl FaultScript {
     }
 }
 
+/// Returns some kinds and more of them; `N` is how many all are.
+#[allow(clippy::indexing_slicing, reason = "computed when compiled")]
+pub const fn joined<const N: usize>(some: &[FaultKind], more: &[FaultKind]) -> [FaultKind; N] {
+    let mut all = [FaultKind::Stall; N];
+    let mut i = 0;
+    while i < N {
+        all[i] = if i < some.len() { some[i] } else { more[i - some.len()] };
+        i += 1;
+    }
+    all
+}
+
 /// Refuses a script with kinds that the simulated arm `name` cannot play. The error names the entry of `faults`.
 pub fn check_script(name: &str, faults: &[Fault], playable: &[FaultKind]) -> Result<(), ConfigError> {
     let unknown = faults.iter().enumerate().find(|(_, fault)| !playable.contains(&fault.kind));
