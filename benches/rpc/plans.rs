@@ -14,7 +14,6 @@ use dimos::planning::request::ahead::look_ahead;
 use dimos::planning::request::pipeline::{Goal as PlanningGoal, PlanRequest, solve};
 use dimos::planning::scene::config::{ObjectConfig, ObjectShape};
 use dimos::planning::scene::planning_scene::{PlanningScene, obstacle};
-use dimos::planning::search::level::Level;
 use dimos::robot::kinematics::pose;
 use dimos::robot::random::Random;
 use dimos::rpc::api::{
@@ -297,18 +296,8 @@ fn write_ply(file: &Path, points: &[[f64; 3]]) -> std::io::Result<()> {
 fn under_way(cell: &mut Cell, goals: &[Vec<f64>], number: usize, changed: bool) -> Result<Vec<f64>, String> {
     let mut times = Vec::new();
     for (k, q) in goals.iter().take(number).enumerate() {
-        let request = PlanRequest {
-            goals: vec![(0, PlanningGoal::Joints(q.clone()))],
-            positions: cell.start.clone(),
-            speed: 1.0,
-            seed: 0,
-            level: Level::default(),
-            refine: 0,
-            through: Vec::new(),
-            blend: 0.0,
-            tcp_speed: None,
-            by_number: false,
-        };
+        let goal = PlanningGoal::Joints(q.clone());
+        let request = PlanRequest { positions: cell.start.clone(), ..PlanRequest::new(Vec::new(), goal) };
         let deadline = Stop::new(Some(Instant::now() + Duration::from_secs(5)), None);
         let Ok(motion) = solve(&cell.scene, &cell.world, &request, &deadline) else { continue };
         let elapsed = 0.1 * motion.trajectory.duration();

@@ -82,6 +82,17 @@ fn each_mistake_is_found_by_the_check_for_it() {
         (Wrong::<GRIPPER_REVERSED>::WIRED, "gripper_is_the_arms_own"),
         (Wrong::<CLAIMS_TO_HOLD>::BUS, "disabled_arms_do_not_move"),
         (Wrong::<ONE_VELOCITY_REVERSED>::SERVOS, "velocities_are_those_of_motion"),
+        (Wrong::<GRAVITY_REVERSED>::BLIND, "gravity_is_carried"),
+        (Wrong::<VELOCITIES_TENFOLD>::WIRED, "setpoints_arrive_whole"),
+        (Wrong::<A_TENTH_OF_THE_GAINS>::BLIND, "gravity_is_carried"),
+        (Wrong::<EFFORTS_TENFOLD>::WIRED, "efforts_are_those_of_the_arm"),
+        (Wrong::<IGNORES_PAYLOAD>::WIRED, "payload_is_felt"),
+        (Wrong::<DROPS_EFFORTS>::BLIND, "gravity_is_carried"),
+        (Wrong::<EFFORTS_REMAIN>::BLIND, "gravity_is_carried"),
+        (Wrong::<GAINS_AT_ONCE>::BLIND, "gains_ramp"),
+        (Wrong::<KEEPS_FIRST_GAINS>::BLIND, "gains_ramp"),
+        (Wrong::<EFFORTS_SHIFTED>::WIRED, "efforts_are_those_of_the_arm"),
+        (Wrong::<PAYLOAD_IN_GRAMS>::WIRED, "payload_is_felt"),
     ];
     std::thread::scope(|scope| {
         for (row, name) in cases {
@@ -124,6 +135,11 @@ fn without_a_mistake_the_same_checks_pass() {
         (Wrong::<NO_MISTAKE>::WIRED, "joint_status_is_read"),
         (Wrong::<NO_MISTAKE>::WIRED, "gripper_is_the_arms_own"),
         (Wrong::<NO_MISTAKE>::BUS, "disabled_arms_do_not_move"),
+        (Wrong::<NO_MISTAKE>::BLIND, "gravity_is_carried"),
+        (Wrong::<NO_MISTAKE>::BLIND, "gains_ramp"),
+        (Wrong::<NO_MISTAKE>::WIRED, "efforts_are_those_of_the_arm"),
+        (Wrong::<NO_MISTAKE>::WIRED, "setpoints_arrive_whole"),
+        (Wrong::<NO_MISTAKE>::WIRED, "payload_is_felt"),
     ];
     std::thread::scope(|scope| {
         for (row, name) in cases {

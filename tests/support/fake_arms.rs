@@ -54,6 +54,8 @@ pub const YOURARM: AdapterSpec = AdapterSpec {
     wire_units: "deg, mm",
     native_rate: 100.0,
     accuracy: 0.005,
+    resolution: 1e-9,
+    error_code: 2,
     lag: 0.05,
     stale_after: std::time::Duration::from_millis(50),
     droop: 0.0,

@@ -12,7 +12,7 @@ use crate::peripheral::PeripheralSpec;
 use crate::service::OpenService;
 use crate::sim::faults::Fault;
 use crate::wire::Wire;
-use dimos_core::arm::{AfterGap, Setpoint, Topology};
+use dimos_core::arm::{AfterGap, Load, Setpoint, Topology};
 use dimos_core::joint::{ControlMode, Joints};
 use dimos_core::named::named;
 use dimos_yaml as yaml;
@@ -113,6 +113,8 @@ pub struct Truth {
     pub efforts: Option<Joints>,
     /// The last setpoint that arrived whole, with what it had besides positions.
     pub setpoint: Option<Setpoint>,
+    /// The load at the flange that its controller was told of.
+    pub load: Option<Load>,
     /// Position of its gripper, in the unit of the adapter [m or rad].
     pub gripper_position: Option<f64>,
     /// Largest force that its gripper was given, in the unit of the adapter's force; `None` without force control.
@@ -182,6 +184,10 @@ pub struct AdapterSpec {
     pub native_rate: f64,
     /// Maximum position error of a joint at rest under load [rad].
     pub accuracy: f64,
+    /// Smallest step of its position readings [rad].
+    pub resolution: f64,
+    /// An error code of the device that stops it: the conformance suite plays it.
+    pub error_code: u16,
     /// Largest distance of a joint below its setpoint under load, beyond `accuracy` [rad].
     pub droop: f64,
     /// Furthest that the setpoint of a held joint is taken back towards the joint [rad]; 0: the arm's own stop takes

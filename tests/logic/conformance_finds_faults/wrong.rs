@@ -1,11 +1,11 @@
 //! An adapter with one mistake, around one that has none.
 
-use dimos::arm::{JointStatus, StopPoint};
+use dimos::arm::{JointStatus, Load, Setpoint, SetpointFields, StopPoint};
 use dimos::arms::{mock, so101, xarm, yourarm};
 use dimos::clock::{Clock, MonotonicClock};
 use dimos::hardware::adapter::*;
 use dimos::hardware::registry::{AdapterConfig, AdapterSpec};
-use dimos::joint::ControlMode;
+use dimos::joint::{ControlMode, Joints};
 
 use crate::support::delegate::delegate;
 
@@ -40,6 +40,11 @@ pub struct Wrong<const MISTAKE: u8> {
     ordered: bool,
     /// The next reading is to be the last once more.
     repeat: bool,
+    /// The last effort, and the first gains, that were passed on.
+    effort: Option<Joints>,
+    gains: Option<(Joints, Joints)>,
+    /// The load that was set.
+    load: Option<Load>,
     /// The last setpoint that was passed on [rad], and when.
     passed: Option<([f64; 6], f64)>,
 }
@@ -59,6 +64,8 @@ impl<const MISTAKE: u8> Wrong<MISTAKE> {
         ..yourarm::SPEC
     };
 
+    /// Around the same, whose emulator does not say which setpoints it received.
+    pub const BLIND: AdapterSpec = AdapterSpec { emulate: Some(parts::blind), ..Self::WIRED };
     /// Around an arm that streams its state.
     pub const PUSHED: AdapterSpec = AdapterSpec {
         name: "wrong",
@@ -89,6 +96,9 @@ impl<const MISTAKE: u8> Wrong<MISTAKE> {
             late: false,
             ordered: false,
             repeat: false,
+            effort: None,
+            gains: None,
+            load: None,
             passed: None,
         }
     }
@@ -248,6 +258,13 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
         if let Some(velocity) = reading.velocity.as_mut().filter(|_| MISTAKE == ONE_VELOCITY_REVERSED) {
             velocity[2] = -velocity[2];
         }
+        if let Some(effort) = reading.effort.as_mut() {
+            match MISTAKE {
+                EFFORTS_TENFOLD => *effort = effort.map(|value| -10.0 * value),
+                EFFORTS_SHIFTED => effort[..6].rotate_left(1),
+                _ => {}
+            }
+        }
         if MISTAKE == RESTAMPS_STATES {
             reading.stamp = Some(MonotonicClock.now());
         }
@@ -317,6 +334,37 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
             }
             _ => self.inner.write_stop(rest),
         }
+    }
+
+    fn setpoint_fields(&self) -> Option<SetpointFields> {
+        self.inner.setpoint_fields()
+    }
+
+    fn write_setpoint(&mut self, setpoint: &Setpoint) -> AdapterResult<()> {
+        let mut passed = *setpoint;
+        let times = |list: Option<Joints>, factor: f64| list.map(|list| list.map(|value| factor * value));
+        let gains = passed.stiffness.zip(passed.damping);
+        match MISTAKE {
+            GRAVITY_REVERSED => passed.effort = times(passed.effort, -1.0),
+            VELOCITIES_TENFOLD => passed.velocity = passed.velocity.map(|value| -10.0 * value),
+            A_TENTH_OF_THE_GAINS => {
+                (passed.stiffness, passed.damping) = (times(passed.stiffness, 0.1), times(passed.damping, 0.1));
+            }
+            DROPS_EFFORTS => passed.effort = None,
+            EFFORTS_REMAIN => passed.effort = passed.effort.or(self.effort),
+            GAINS_AT_ONCE => passed.stiffness = passed.stiffness.map(|list| list.map(|value| (value / 100.0).ceil() * 100.0)),
+            KEEPS_FIRST_GAINS => {
+                let (stiffness, damping) = self.gains.or(gains).unzip();
+                (passed.stiffness, passed.damping) = (stiffness, damping);
+            }
+            _ => {}
+        }
+        (self.effort, self.gains) = (passed.effort, self.gains.or(gains));
+        self.inner.write_setpoint(&passed)
+    }
+
+    fn payload(&mut self) -> Option<&mut dyn Payload> {
+        if self.inner.payload().is_some() { Some(self) } else { None }
     }
 
     fn gripper(&mut self) -> Option<&mut dyn Gripper> {

@@ -59,6 +59,8 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     wire_units: "rad, m",
     native_rate: NATIVE_RATE,
     accuracy: 0.005,
+    resolution: 1e-9,
+    error_code: 2,
     lag: 0.045,
     stale_after: Duration::from_millis(50),
     // libfranka's impedance control has an integral part; its stop rests where the arm is.

@@ -39,6 +39,8 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     wire_units: "rad, m",
     native_rate: NATIVE_RATE,
     accuracy: 0.001,
+    resolution: 1e-9,
+    error_code: 2,
     lag: 0.02,
     stale_after: Duration::from_millis(50),
     // Its plant rests where it is sent, and its own stop where it is.

@@ -58,6 +58,8 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     wire_units: "0.001 deg, 0.001 mm",
     native_rate: NATIVE_RATE,
     accuracy: 0.01,
+    resolution: 1.75e-5, // 0.001 deg
+    error_code: 2,
     lag: 0.05,
     stale_after: Duration::from_millis(50),
     droop: 0.0,

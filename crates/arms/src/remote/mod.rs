@@ -47,6 +47,8 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     wire_units: "rad, m",
     native_rate: NATIVE_RATE,
     accuracy: 0.02,
+    resolution: 1e-6,
+    error_code: 2,
     lag: 0.1,
     stale_after: Duration::from_millis(200),
     // What the server's `hello` says; nothing is assumed of an arm that is not known.

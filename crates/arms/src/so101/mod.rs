@@ -76,6 +76,8 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     wire_units: "counts",
     native_rate: NATIVE_RATE,
     accuracy: 0.03,
+    resolution: std::f64::consts::TAU / 4096.0,
+    error_code: 2,
     // Recorded (30 Hz): it follows 0.10 to 0.13 s late.
     lag: 0.13,
     stale_after: Duration::from_millis(100),

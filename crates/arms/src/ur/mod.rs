@@ -77,6 +77,8 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     wire_units: "rad, m",
     native_rate: NATIVE_RATE,
     accuracy: 0.002,
+    resolution: 1e-9,
+    error_code: 2,
     lag: 0.07,
     stale_after: Duration::from_millis(50),
     // The controller corrects its position with an integral part, and stopj rests where it decelerates to.

@@ -79,6 +79,8 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     wire_units: "rad, mm",
     native_rate: NATIVE_RATE,
     accuracy: 0.002,
+    resolution: 1e-6, // rad in f32
+    error_code: 2,
     lag: 0.05,
     stale_after: Duration::from_millis(50),
     // Positions are controlled with an integral part, and state 4 rests where the arm is.

@@ -63,6 +63,8 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     wire_units: "deg, mm",
     native_rate: NATIVE_RATE,
     accuracy: 0.002,
+    resolution: 1e-6, // degrees in f32
+    error_code: 2,
     lag: 0.03,
     stale_after: Duration::from_millis(50),
     // yourarm-protocol.md: setpoints up to two periods apart are interpolated, then the arm returns to the last one;
@@ -166,8 +168,8 @@ pub struct Sim {
     /// A body with mass, by MuJoCo: `{}`, or with a seed.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub physics: Option<PhysicsOptions>,
-    /// Stiffness of the position control [Nm/rad] of an arm with the masses of `builtin:yourarm`, which it sags under
-    /// by its weight / stiffness; 0: its weight is nothing.
+    /// Stiffness of the position control [Nm/rad]: the arm, which has the masses of `builtin:yourarm`, sags by its
+    /// weight / stiffness; 0: its control has an integral part, and the arm does not sag.
     #[schemars(range(min = 0, max = 100000))]
     pub servo_stiffness: f64,
 }

@@ -18,6 +18,9 @@ const WAIT_TIMEOUT: Duration = Duration::from_secs(10);
 /// [s].
 const FAULT_AT: f64 = 1.0;
 
+/// Time by which a stop and the reading after it may be late, beside the lag of the arm [s].
+const LATE: f64 = 0.04;
+
 /// Maximum wait for room for a setpoint.
 const ROOM: Duration = Duration::from_secs(1);
 
@@ -169,7 +172,30 @@ impl Context {
 
     /// Returns how far a joint at rest may seem to move [rad]: rounding, or the noise of a real encoder.
     pub fn rest(&self) -> f64 {
-        if self.real { 0.002 } else { 1e-6 }
+        (1.5 * self.row.resolution).max(if self.real { 0.002 } else { 1e-6 })
+    }
+
+    /// Returns how far a joint may move that is held [rad].
+    pub fn holding(&self) -> f64 {
+        self.rest().max(1e-3)
+    }
+
+    /// Returns how far a joint may move whose motor begins to hold it, or is stopped [rad].
+    pub fn settling(&self) -> f64 {
+        (self.row.accuracy + self.row.resolution).max(0.005)
+    }
+
+    /// Returns how far from its target a joint may be that has arrived [rad].
+    pub fn arrival(&self) -> f64 {
+        (self.row.accuracy + self.row.droop + self.row.resolution).max(1e-3)
+    }
+
+    /// Returns how far a joint may go on after a stop at `speed` [rad/s], from the row's lag and the acceleration limits
+    /// [rad].
+    pub fn coasting(&mut self, speed: f64) -> Result<f64, String> {
+        let limits = self.limits()?.with_defaults();
+        let slowest = limits.acceleration_max.iter().copied().fold(f64::INFINITY, f64::min);
+        Ok(speed * (self.row.lag + LATE) + 0.5 * speed * speed / slowest + self.holding())
     }
 
     /// Prepares a fault; `false` if the emulator cannot play it. Must come first in a check. Faults begin in the order
@@ -259,7 +285,7 @@ impl Context {
         } else {
             self.command(goal, 0.5)?;
         }
-        self.until("the last setpoint", |context| Ok(farthest(&context.positions()?, goal) < 1e-3))
+        self.until("the last setpoint", |context| Ok(farthest(&context.positions()?, goal) < context.arrival()))
     }
 
     /// Returns what is true of the emulated arm; nothing is known of a real one.
@@ -371,7 +397,9 @@ impl Context {
     pub fn nearby(&mut self, from: &[f64]) -> Result<Vec<f64>, String> {
         let limits = self.limits()?;
         let range = limits.position_lower.iter().zip(&limits.position_upper);
-        let step = |i: usize| 0.02 * (i + 1) as f64 / from.len().max(6) as f64 * 6.0;
+        // So large that an arm which has arrived has moved.
+        let least = (1.5 * self.arrival()).clamp(0.02, 0.1);
+        let step = |i: usize| least * (i + 1) as f64 / from.len().max(6) as f64 * 6.0;
         Ok(from
             .iter()
             .zip(range)
@@ -419,6 +447,13 @@ impl Context {
             Ok(still)
         })?;
         Ok(last)
+    }
+
+    /// Waits until a planned move has brought all joints to rest at `goal` [rad].
+    pub fn arrive(&mut self, what: &str, goal: &[f64]) -> Result<(), String> {
+        self.until(what, |context| Ok(farthest(&context.positions()?, goal) < context.arrival()))?;
+        let (rest, most) = (self.standstill()?, self.arrival());
+        require(farthest(&rest, goal) < most, || format!("{what}: it rests at {rest:?}, and was sent to {goal:?}"))
     }
 
     /// Checks for a third of a second that no joint moves by more than `most` [rad].

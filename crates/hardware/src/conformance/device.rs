@@ -39,7 +39,8 @@ fn reads_agree(context: &mut Context) -> Result<(), String> {
     require(rest.iter().all(|v| *v == 0.0), || "entries past dof are not zero".into())?;
     let velocities = context.adapter.read_joint_velocities(&mut buffer).map_err(|e| e.to_string())?;
     require(velocities == reading.velocity.is_some(), || "the two disagree on having velocities".into())?;
-    let still = if context.real { 0.05 } else { 1e-3 };
+    // A velocity may be the difference of two positions.
+    let still = (2.0 * context.row.resolution * context.row.native_rate).max(if context.real { 0.05 } else { 1e-3 });
     require(!velocities || buffer.iter().all(|v| v.abs() < still), || format!("velocities at rest: {buffer:?}"))?;
     let efforts = context.adapter.read_joint_efforts(&mut buffer).map_err(|e| e.to_string())?;
     require(efforts == reading.effort.is_some(), || "the two disagree on having torques".into())?;
@@ -140,7 +141,7 @@ fn modes(context: &mut Context) -> Result<(), String> {
             require(result.is_ok(), || format!("{}: {result:?}", mode.name()))?;
             let now = context.adapter.get_control_mode();
             require(now == mode, || format!("set to {}, reports {}", mode.name(), now.name()))?;
-            context.stays(&start, 1e-3)?;
+            context.stays(&start, context.holding())?;
         } else {
             require(result == Err(AdapterError::Unsupported), || format!("{}: {result:?}", mode.name()))?;
         }

@@ -93,7 +93,7 @@ fn when_enabled(context: &mut Context) -> Result<(), String> {
     let start = context.positions()?;
     cut(context)?;
     reconnect(context)?;
-    context.stays(&start, 0.005)
+    context.stays(&start, context.settling())
 }
 
 fn in_motion(context: &mut Context) -> Result<(), String> {
@@ -111,7 +111,7 @@ fn in_motion(context: &mut Context) -> Result<(), String> {
     let continued = farthest(&context.positions()?, &here) > 0.002;
     context.stop()?;
     let stopped = context.standstill()?;
-    context.stays(&stopped, 1e-3)?;
+    context.stays(&stopped, context.holding())?;
     context.found(if continued {
         "the arm continues its move without a client; a stop after reconnecting ends it"
     } else {
@@ -145,9 +145,9 @@ fn while_streaming(context: &mut Context) -> Result<(), String> {
     require(refused == Err(AdapterError::NotConnected), || format!("a setpoint after the cut: {refused:?}"))?;
     let here = reconnect(context)?;
     let off = farthest(&here, &point);
-    require(off < 0.02, || format!("it is {off:.4} rad from its last setpoint"))?;
+    require(off < 0.02 + context.row.accuracy, || format!("it is {off:.4} rad from its last setpoint"))?;
     // 0.1 rad/s for as long as its controller bridges a gap.
-    context.stays(&here, 0.005 + 0.1 * context.row.gap_tolerance.as_secs_f64())
+    context.stays(&here, context.settling() + 0.1 * context.row.gap_tolerance.as_secs_f64())
 }
 
 fn in_error(context: &mut Context) -> Result<(), String> {
@@ -161,7 +161,7 @@ fn in_error(context: &mut Context) -> Result<(), String> {
     let (error, start) = (context.error()?, context.standstill()?);
     cut(context)?;
     reconnect(context)?;
-    context.stays(&start, 0.005)?;
+    context.stays(&start, context.settling())?;
     let after = context.error()?;
     require(after == error, || format!("reconnecting turned the error {error:?} into {after:?}"))
 }
@@ -174,7 +174,7 @@ fn power(context: &mut Context) -> Result<(), String> {
     cut(context)?;
     let start = reconnect(context)?;
     if context.row.holds_when_disabled {
-        context.stays(&start, 0.005)?;
+        context.stays(&start, context.settling())?;
     }
     require(!context.enabled()?, || "the motors are on after a loss of power".into())
 }

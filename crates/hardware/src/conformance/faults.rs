@@ -9,8 +9,6 @@ use crate::adapter::{AdapterError, JointReading};
 use crate::sim::faults::{Fault, FaultKind};
 use dimos_core::clock::{Clock, MonotonicClock};
 
-/// The error code that is injected.
-const CODE: u16 = 2;
 /// How long readings are checked after a damaged packet: many periods of any arm.
 const OBSERVATION_TIME: Duration = Duration::from_millis(500);
 
@@ -26,7 +24,7 @@ pub const CHECKS: &[Check] = &[
 ];
 
 fn errors(context: &mut Context) -> Result<(), String> {
-    if !context.prepare(Fault::new(FaultKind::ErrorCode).code(CODE)) {
+    if !context.prepare(Fault::new(FaultKind::ErrorCode).code(context.row.error_code)) {
         return context.skip("its emulator cannot be in error");
     }
     context.ready(context.first_mode())?;
@@ -35,21 +33,24 @@ fn errors(context: &mut Context) -> Result<(), String> {
     context.trigger_faults()?;
     context.until("the error", |context| Ok(context.error()?.0 != 0))?;
     let (code, text) = context.error()?;
-    require(code == i32::from(CODE) && !text.is_empty(), || format!("error {code}, text {text:?}"))?;
+    require(code == i32::from(context.row.error_code) && !text.is_empty(), || format!("error {code}, text {text:?}"))?;
     let start = context.positions()?;
     let refused = context.adapter.write_joint_positions(&start, 0.1);
     let is_fault = matches!(refused, Err(AdapterError::Fault { .. }));
     require(is_fault, || format!("motion in error: expected AdapterError::Fault, it answers {refused:?}"))?;
     context.clear_errors().map_err(|e| format!("write_clear_errors: {e}"))?;
     context.until("the error to be cleared", |context| Ok(context.error()?.0 == 0))?;
-    context.stays(&start, 0.005)?;
+    // The motors of an arm in error may be off: without brakes it falls.
+    if context.row.holds_when_disabled || context.enabled()? {
+        context.stays(&start, context.settling())?;
+    }
     context.activate()
 }
 
 /// Where each drive reports its own error, all of them are read.
 fn last_joint(context: &mut Context) -> Result<(), String> {
     let joint = context.config.dof;
-    if !context.prepare(Fault { joint, ..Fault::new(FaultKind::ErrorCode).code(CODE) }) {
+    if !context.prepare(Fault { joint, ..Fault::new(FaultKind::ErrorCode).code(context.row.error_code) }) {
         return context.skip("its emulator cannot be in error");
     }
     context.ready(context.first_mode())?;
@@ -60,7 +61,7 @@ fn last_joint(context: &mut Context) -> Result<(), String> {
 }
 
 fn clearing(context: &mut Context) -> Result<(), String> {
-    if !context.prepare(Fault::new(FaultKind::ErrorCode).code(CODE)) {
+    if !context.prepare(Fault::new(FaultKind::ErrorCode).code(context.row.error_code)) {
         return context.skip("its emulator cannot be in error");
     }
     context.connect()?;
@@ -90,7 +91,7 @@ fn estop(context: &mut Context) -> Result<(), String> {
     if !context.row.holds_when_disabled {
         start = context.standstill()?; // an arm without brakes has fallen
     }
-    context.stays(&start, 0.005)
+    context.stays(&start, context.settling())
 }
 
 fn noise(context: &mut Context) -> Result<(), String> {
@@ -114,14 +115,14 @@ fn survives(context: &mut Context, kind: FaultKind) -> Result<(), String> {
     let began = MonotonicClock.now();
     context.trigger_faults()?;
     // The damage may affect the next reading, or one of the streamed states.
-    let mut failures = 0;
+    let (mut failures, most) = (0, context.holding());
     let mut reading = JointReading::default();
     while MonotonicClock.now().since(began) < OBSERVATION_TIME {
         match context.adapter.read_joints(&mut reading) {
             Ok(()) => {
                 let position = reading.position.get(..start.len()).unwrap_or_default();
                 let moved = farthest(position, &start);
-                require(moved < 1e-3, || format!("a damaged packet was accepted: {moved} rad off"))?;
+                require(moved < most, || format!("a damaged packet was accepted: {moved} rad off"))?;
             }
             Err(_) => failures += 1,
         }
@@ -129,5 +130,5 @@ fn survives(context: &mut Context, kind: FaultKind) -> Result<(), String> {
         std::thread::sleep(Duration::from_millis(2));
     }
     require(context.adapter.is_connected(), || "the connection was closed".into())?;
-    context.stays(&start, 1e-3)
+    context.stays(&start, context.holding())
 }

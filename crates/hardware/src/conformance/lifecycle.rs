@@ -74,7 +74,7 @@ fn activation_holds(context: &mut Context) -> Result<(), String> {
     context.connect()?;
     let start = context.positions()?;
     context.activate()?;
-    context.stays(&start, 0.005)
+    context.stays(&start, context.settling())
 }
 
 /// A servo goes to its old goal when its motor comes on, unless the goal is set to where the joint is before.
@@ -105,7 +105,7 @@ fn enabling_displaced(context: &mut Context) -> Result<(), String> {
     })?;
     let displaced = context.standstill()?;
     context.activate()?;
-    context.stays(&displaced, 0.005)
+    context.stays(&displaced, context.settling())
 }
 
 fn leaving_moves_nothing(context: &mut Context) -> Result<(), String> {
@@ -123,7 +123,7 @@ fn leaving_moves_nothing(context: &mut Context) -> Result<(), String> {
     // An adapter may say that an arm is not enabled before it is activated again: the emulator has the motors.
     let on = if context.emulator.is_some() { before.motors_on != Some(false) } else { context.enabled()? };
     require(on, || "disconnect switched the motors off: an arm without brakes falls".into())?;
-    context.stays(&start, 0.005)
+    context.stays(&start, context.settling())
 }
 
 fn connects_twice(context: &mut Context) -> Result<(), String> {

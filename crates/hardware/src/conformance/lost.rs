@@ -45,7 +45,7 @@ fn commands(context: &mut Context) -> Result<(), String> {
         let near = context.nearby(&start)?;
         context.trigger_faults()?;
         if context.command(&near, 0.5).is_ok() {
-            context.until("a planned move", |context| Ok(farthest(&context.positions()?, &near) < 1e-3))?;
+            context.arrive("a planned move", &near)?;
         }
         set_off(context)?;
         context.trigger_faults()?;

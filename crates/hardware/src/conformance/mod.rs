@@ -23,6 +23,7 @@ mod speed;
 mod stale;
 mod stops;
 mod streamed_state;
+mod torque;
 
 pub use context::{Context, Subject};
 
@@ -92,6 +93,7 @@ pub fn checks() -> impl Iterator<Item = &'static Check> {
         motion::CHECKS,
         setpoints::CHECKS,
         speed::CHECKS,
+        torque::CHECKS,
         stops::CHECKS,
         faults::CHECKS,
         stale::CHECKS,

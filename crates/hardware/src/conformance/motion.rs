@@ -28,7 +28,7 @@ fn planned_moves_arrive(context: &mut Context) -> Result<(), String> {
     let target = context.nearby(&start)?;
     for goal in [&target, &start] {
         context.command(goal, 0.5)?;
-        context.until("arrival", |context| Ok(farthest(&context.positions()?, goal) < 1e-3))?;
+        context.arrive("arrival", goal)?;
     }
     Ok(())
 }
@@ -55,13 +55,13 @@ fn own_joints(context: &mut Context) -> Result<(), String> {
     for goal in [&target, &start] {
         let read = context.positions()?;
         let found = context.true_positions().unwrap_or_default();
-        require(farthest(&read, &found) < 1e-3, || format!("read {read:?}, the arm is at {found:?}"))?;
+        require(farthest(&read, &found) < context.holding(), || format!("read {read:?}, the arm is at {found:?}"))?;
         context.command(goal, 0.5)?;
-        context.until("arrival", |context| Ok(farthest(&context.positions()?, goal) < 1e-3))?;
+        context.arrive("arrival", goal)?;
         // A coarse encoder shows the arrival before it.
         context.standstill()?;
         let found = context.true_positions().unwrap_or_default();
-        require(farthest(goal, &found) < 1e-3, || format!("sent to {goal:?}, the arm is at {found:?}"))?;
+        require(farthest(goal, &found) < context.arrival(), || format!("sent to {goal:?}, the arm is at {found:?}"))?;
     }
     Ok(())
 }
@@ -188,10 +188,10 @@ fn disabled_arms(context: &mut Context) -> Result<(), String> {
     let result = context.adapter.write_joint_positions(&target, 0.1);
     require(result.is_err(), || "a command without power is accepted".into())?;
     if holds {
-        context.stays(&start, 1e-3)?;
+        context.stays(&start, context.holding())?;
     }
     context.adapter.write_enable(true).map_err(|e| format!("write_enable: {e}"))?;
-    if holds { context.stays(&start, 0.005) } else { Ok(()) }
+    if holds { context.stays(&start, context.settling()) } else { Ok(()) }
 }
 
 fn nonsense(context: &mut Context) -> Result<(), String> {
@@ -211,7 +211,7 @@ fn nonsense(context: &mut Context) -> Result<(), String> {
                 require(result.is_err(), || format!("{}: {values:?} is accepted", mode.name()))?;
             }
         }
-        context.stays(&start, 1e-3)?;
+        context.stays(&start, context.holding())?;
     }
     Ok(())
 }

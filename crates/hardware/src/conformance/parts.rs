@@ -37,7 +37,7 @@ fn guiding(context: &mut Context) -> Result<(), String> {
     context.ready(context.position_mode().unwrap_or(context.first_mode()))?;
     let start = context.positions()?;
     context.trigger_faults()?;
-    context.stays(&start, 0.005)?;
+    context.stays(&start, context.settling())?;
     for by_stop in [true, false] {
         context.until("the guiding to begin", |context| match context.adapter.hand_guiding() {
             Some(arm) => match arm.begin_hand_guiding() {
@@ -52,11 +52,11 @@ fn guiding(context: &mut Context) -> Result<(), String> {
         let here = context.standstill()?;
         if !by_stop {
             context.activate()?;
-            return context.stays(&here, 0.005);
+            return context.stays(&here, context.settling());
         }
         context.stop()?;
         context.trigger_faults()?;
-        context.stays(&here, 0.005)?;
+        context.stays(&here, context.settling())?;
         context.activate()?;
     }
     Ok(())
@@ -213,7 +213,7 @@ fn payload(context: &mut Context) -> Result<(), String> {
         context.activate()?;
         context.set_mode(mode).map_err(|e| e.to_string())?;
     }
-    context.stays(&rest, 2.0 * context.row.accuracy.max(1e-4))?;
+    context.stays(&rest, context.settling())?;
     let same = context.adapter.get_control_mode() == mode;
     require(same, || format!("it is in {} mode afterwards", context.adapter.get_control_mode().name()))?;
     require(context.enabled()?, || "its motors are off afterwards".into())?;

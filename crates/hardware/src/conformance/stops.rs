@@ -43,9 +43,6 @@ const SLOW: f64 = 0.1;
 const SPEED: f64 = 0.1;
 /// Minimum remaining travel of the gripper for a stop to reach it in motion [m; see `in_unit`].
 const GRIPPER_ROOM: f64 = 0.02;
-/// Maximum travel after a stop at `SPEED` [rad].
-const COASTING: f64 = 0.008;
-
 fn stop_at_rest(context: &mut Context) -> Result<(), String> {
     context.connect()?;
     let start = context.positions()?;
@@ -55,7 +52,7 @@ fn stop_at_rest(context: &mut Context) -> Result<(), String> {
     for _ in 0..3 {
         context.stop()?;
     }
-    context.stays(&start, 0.005)?;
+    context.stays(&start, context.settling())?;
     require(context.enabled()?, || "write_stop switched the motors off".into())
 }
 
@@ -78,7 +75,7 @@ fn stop_ends_motion(context: &mut Context) -> Result<(), String> {
     let stopped = context.standstill()?;
     require(farthest(&stopped, &far) > 0.01, || "it moved to its target in spite of the stop".into())?;
     require(context.enabled()?, || "the motors are off".into())?;
-    context.stays(&stopped, 1e-3)
+    context.stays(&stopped, context.holding())
 }
 
 fn stop_ends_streaming(context: &mut Context) -> Result<(), String> {
@@ -98,9 +95,10 @@ fn stop_ends_streaming(context: &mut Context) -> Result<(), String> {
     context.stop()?;
     let stopped = context.standstill()?;
     let off = farthest(&stopped, &point(1.0));
-    require(off < 0.02, || format!("it is {off:.4} rad from where it was stopped"))?;
+    let most = context.coasting(SPEED)? + context.row.accuracy + context.row.droop;
+    require(off < most, || format!("it is {off:.4} rad from where it was stopped"))?;
     require(context.enabled()?, || "the motors are off".into())?;
-    context.stays(&stopped, 1e-3)
+    context.stays(&stopped, context.holding())
 }
 
 fn stop_ends_velocity(context: &mut Context) -> Result<(), String> {
@@ -121,9 +119,10 @@ fn stop_ends_velocity(context: &mut Context) -> Result<(), String> {
     let here = context.positions()?;
     let stopped = context.standstill()?;
     let coasted = farthest(&stopped, &here);
-    require(coasted < COASTING, || format!("it moved {coasted:.4} rad after the stop"))?;
+    let most = context.coasting(SPEED)?;
+    require(coasted < most, || format!("it moved {coasted:.4} rad after the stop"))?;
     require(context.enabled()?, || "the motors are off".into())?;
-    context.stays(&stopped, 1e-3)
+    context.stays(&stopped, context.holding())
 }
 
 fn stop_is_no_fault(context: &mut Context) -> Result<(), String> {
@@ -142,7 +141,7 @@ fn stop_is_no_fault(context: &mut Context) -> Result<(), String> {
     context.activate()?;
     context.set_mode(ControlMode::Position).map_err(|e| format!("set_control_mode: {e}"))?;
     context.command(&start, 0.5)?;
-    context.until("arrival", |context| Ok(farthest(&context.positions()?, &start) < 1e-3))
+    context.arrive("arrival", &start)
 }
 
 /// Holds the gripper as the device thread does after a stop that does not affect it.
@@ -231,7 +230,7 @@ fn stop_in_error(context: &mut Context) -> Result<(), String> {
         let fine = matches!(result, Ok(_) | Err(AdapterError::Fault { .. } | AdapterError::Rejected(_)));
         require(fine && context.adapter.is_connected(), || format!("write_stop in error: {result:?}"))?;
     }
-    context.stays(&start, 1e-3)?;
+    context.stays(&start, context.holding())?;
     let after = context.error()?;
     require(after == error, || format!("write_stop turned the error {error:?} into {after:?}"))
 }

@@ -476,7 +476,9 @@ impl Plant {
             Drive::Servo if self.bridges > 0.0 && joint.pace != 0.0 => false,
             Drive::Disabled | Drive::Stop | Drive::Guided => true,
             // The weight may change where it rests.
-            Drive::Position | Drive::Servo => joint.position == joint.target && self.masses.is_none(),
+            Drive::Position | Drive::Servo => {
+                joint.position == joint.target && !self.masses.is_some_and(|masses| masses.sags())
+            }
             Drive::Velocity => joint.target == 0.0,
             Drive::Compliant => false,
         };
@@ -490,11 +492,13 @@ impl Plant {
         let (braking, bridges, since) = (self.braking, self.bridges, self.since_setpoint - 0.5 * self.average);
         let (drive, tracking, speed, fall) = (self.drive, self.tracking, self.speed, self.fall);
         let masses = self.masses;
-        let gravity =
-            masses.map_or([0.0; MAX_DOF], |masses| (masses.gravity)(&self.joints.map(|joint| joint.position)));
         let inertia = masses.map_or([MASSLESS; MAX_DOF], |masses| masses.inertia);
+        // Where the arm is held by its own control, its weight moves it only if that control gives way.
+        let weighs = masses.filter(|masses| drive == Drive::Compliant || masses.sags());
+        let gravity =
+            weighs.map_or([0.0; MAX_DOF], |masses| (masses.gravity)(&self.joints.map(|joint| joint.position)));
         for ((joint, gravity), inertia) in self.active_mut().iter_mut().zip(gravity).zip(inertia) {
-            if let Some(masses) = masses.filter(|_| matches!(drive, Drive::Position | Drive::Servo)) {
+            if let Some(masses) = masses.filter(|masses| masses.sags() && matches!(drive, Drive::Position | Drive::Servo)) {
                 joint.settle(gravity, joint.force.effort, masses.stiffness);
             }
             if joint.blocked {

@@ -17,7 +17,7 @@ pub struct Masses {
     pub gravity: fn(&Joints) -> Joints,
     /// Inertia of each joint about its axis, that of its motor included [kg·m²].
     pub inertia: Joints,
-    /// Stiffness of the arm's own position control, without an integral part [Nm/rad].
+    /// Stiffness of the arm's own position control [Nm/rad]; infinite: it has an integral part, and does not sag.
     pub stiffness: f64,
 }
 
@@ -40,6 +40,13 @@ impl Drive {
     /// Returns the effort of the motor of a joint at a position [rad] and velocity [rad/s].
     pub fn total(&self, position: f64, velocity: f64) -> f64 {
         self.stiffness * (self.position - position) + self.damping * (self.velocity - velocity) + self.effort
+    }
+}
+
+impl Masses {
+    /// Returns whether the arm sags under its own position control.
+    pub(super) fn sags(&self) -> bool {
+        self.stiffness.is_finite()
     }
 }
 

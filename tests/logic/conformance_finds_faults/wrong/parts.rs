@@ -1,6 +1,47 @@
 //! Optional parts of a wrong arm: condition of its drives, gripper, force sensor.
 
 use super::*;
+use dimos::hardware::registry::{Emulator, EmulatorAddress, Truth};
+use dimos::hardware::sim::faults::Fault;
+
+/// An emulator that does not say which setpoints arrived.
+struct Blind(Box<dyn Emulator>);
+
+impl Emulator for Blind {
+    fn address(&self) -> String {
+        self.0.address()
+    }
+    fn inject(&self, fault: Fault) -> Result<(), String> {
+        self.0.inject(fault)
+    }
+    fn truth(&self) -> Truth {
+        Truth { setpoint: None, ..self.0.truth() }
+    }
+}
+
+/// Starts one.
+pub fn blind(config: &AdapterConfig, address: &EmulatorAddress) -> AdapterResult<Box<dyn Emulator>> {
+    Ok(Box::new(Blind((yourarm::SPEC.emulate.unwrap())(config, address)?)))
+}
+
+impl<const MISTAKE: u8> Payload for Wrong<MISTAKE> {
+    fn read_payload(&mut self) -> AdapterResult<Option<Load>> {
+        let load = self.inner.payload().ok_or(AdapterError::Unsupported)?.read_payload()?;
+        Ok(if matches!(MISTAKE, IGNORES_PAYLOAD | PAYLOAD_IN_GRAMS) { self.load.or(load) } else { load })
+    }
+    fn write_payload(&mut self, load: &Load) -> AdapterResult<()> {
+        self.load = Some(*load);
+        let payload = self.inner.payload().ok_or(AdapterError::Unsupported)?;
+        match MISTAKE {
+            IGNORES_PAYLOAD => Ok(()),
+            PAYLOAD_IN_GRAMS => payload.write_payload(&Load { mass: 1e-3 * load.mass, ..*load }),
+            _ => payload.write_payload(load),
+        }
+    }
+    fn write_mounting(&mut self, gravity: [f64; 3]) -> AdapterResult<()> {
+        self.inner.payload().ok_or(AdapterError::Unsupported)?.write_mounting(gravity)
+    }
+}
 
 impl<const MISTAKE: u8> JointMonitor for Wrong<MISTAKE> {
     fn read_joint_status(&mut self, joints: &mut [JointStatus]) -> AdapterResult<()> {

@@ -10,6 +10,7 @@ use super::hand::Hand;
 use super::wire;
 use super::{PLAYABLE, SimOptions};
 use crate::franka::model::{JointRange, Model};
+use dimos_core::arm::Load;
 use dimos_core::clock::Mono;
 use dimos_hardware::adapter::AdapterResult;
 use dimos_hardware::registry::Truth;
@@ -397,6 +398,11 @@ impl HasArm for Control {
     fn complete(&self, truth: &mut Truth) {
         truth.motors_on = None; // the controller releases and applies the brakes
         truth.gripper_position = Some(self.hand.width());
+        // With an end effector of Desk it counts both.
+        let ([mass, x, y, z, inertia @ ..], [of_tool, ..]) = (self.load, self.tool);
+        let [xx, xy, xz, _, yy, yz, _, _, zz] = inertia;
+        let load = Load { mass, center: [x, y, z], inertia: [xx, xy, xz, yy, yz, zz] };
+        truth.load = (of_tool == 0.0).then_some(load);
     }
 
     /// The cycle advances the arm.

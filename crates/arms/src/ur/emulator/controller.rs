@@ -11,8 +11,10 @@ use super::rtde::Rtde;
 use super::{PLAYABLE, SimOptions, limits};
 use crate::ur::DOF;
 use crate::ur::model::Model;
+use dimos_core::arm::Load;
 use dimos_core::clock::Mono;
 use dimos_hardware::adapter::AdapterResult;
+use dimos_hardware::registry::Truth;
 use dimos_hardware::sim::arm::{ESTOP, HasArm, SimArm};
 use dimos_hardware::sim::faults::FaultKind;
 use dimos_hardware::sim::reach::Chain;
@@ -429,6 +431,11 @@ impl Controller {
 impl HasArm for Controller {
     fn arm(&mut self) -> &mut SimArm {
         &mut self.arm
+    }
+
+    fn complete(&self, truth: &mut Truth) {
+        let (mass, center, inertia) = self.payload;
+        truth.load = Some(Load { mass, center, inertia });
     }
 
     fn advance(&mut self, now: Mono) {

@@ -7,6 +7,7 @@ use nalgebra::Isometry3;
 use super::super::model::VELOCITY;
 use super::line::Line;
 use super::move_request::MoveRequest;
+use dimos_core::arm::Load;
 use dimos_core::clock::Mono;
 use dimos_core::joint::Joints;
 use dimos_hardware::registry::Truth;
@@ -263,6 +264,8 @@ impl HasArm for super::controller::Controller<SimArm> {
     fn complete(&self, truth: &mut Truth) {
         truth.gripper_position = Some(self.tool.opening());
         truth.gripper_force = self.tool.force();
+        let [mass, x, y, z] = self.settings.load.map(f64::from);
+        truth.load = Some(Load { mass, center: [x, y, z].map(|mm| mm / 1000.0), inertia: [0.0; 6] });
     }
 
     fn advance(&mut self, now: Mono) {

@@ -8,7 +8,7 @@ use super::masses;
 use super::wire::{
     self, Frame, Report, Request, SetpointRequest, put_drives, put_floats, put_hello, put_io, put_report, reply, status,
 };
-use dimos_core::arm::Setpoint;
+use dimos_core::arm::{Load, Setpoint};
 use std::time::Duration;
 
 use dimos_core::clock::Mono;
@@ -83,10 +83,8 @@ impl Controller {
     pub fn new(options: &Sim, now: Mono) -> AdapterResult<Self> {
         let arm = SimArm::new("yourarm", &limits(), &options.kit().starting_at(&INITIAL), PLAYABLE, now)?;
         let arm = arm.colliding_as(COLLISION);
-        let arm = match options.servo_stiffness > 0.0 {
-            true => arm.with_masses(masses::of(options.servo_stiffness)),
-            false => arm,
-        };
+        let stiffness = if options.servo_stiffness > 0.0 { options.servo_stiffness } else { f64::INFINITY };
+        let arm = arm.with_masses(masses::of(stiffness));
         Ok(Self {
             serial: "YA6-00042".to_owned(),
             arm: arm.with_velocity_timeout(VELOCITY_TIMEOUT),
@@ -307,6 +305,8 @@ impl HasArm for Controller {
         truth.temperatures = Some(joints_of(&self.drives().map(|([celsius, ..], _)| celsius.into())));
         truth.gripper_position = Some(self.gripper.position);
         truth.gripper_force = Some(self.gripper.max_force);
+        let [mass, x, y, z, inertia @ ..] = self.load.map(f64::from);
+        truth.load = Some(Load { mass, center: [x, y, z].map(|mm| mm / 1000.0), inertia });
     }
 
     fn advance(&mut self, now: Mono) {
