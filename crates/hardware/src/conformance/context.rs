@@ -10,7 +10,7 @@ use crate::registry::{AdapterConfig, AdapterSpec, Emulator, EmulatorAddress, Tru
 use crate::sim::faults::Fault;
 use dimos_core::arm::StopPoint;
 use dimos_core::clock::{Clock, MonotonicClock};
-use dimos_core::joint::{ControlMode, JointLimits};
+use dimos_core::joint::{ControlMode, JointLimits, joints_of};
 
 /// Maximum wait for an expected event.
 const WAIT_TIMEOUT: Duration = Duration::from_secs(10);
@@ -127,6 +127,8 @@ pub struct Context {
     /// Finding of the check, for the report.
     pub(super) found: Option<String>,
     faults: VecDeque<Fault>,
+    /// The last setpoint of a stream [rad].
+    streamed: Option<Vec<f64>>,
 }
 
 impl Context {
@@ -143,7 +145,8 @@ impl Context {
         let adapter = (row.create)(&config).map_err(|e| format!("cannot be made: {e}"))?;
         let (allocations, real) = (subject.allocations, subject.real);
         let faults = VecDeque::new();
-        Ok(Self { row, config, emulator, adapter, allocations, real, skipped: None, found: None, faults })
+        let (skipped, found, streamed) = (None, None, None);
+        Ok(Self { row, config, emulator, adapter, allocations, real, skipped, found, faults, streamed })
     }
 
     /// Takes the arm without the option `calibration`: a calibration is of a real arm, and the emulated one is as the
@@ -180,14 +183,21 @@ impl Context {
         self.rest().max(1e-3)
     }
 
+    /// Returns how far below their setpoints joints rest [rad]: as the row says of a real arm, and as the emulated one is
+    /// told to.
+    pub fn droop(&self) -> f64 {
+        let told = self.config.options.pointer("/sim/droop").and_then(serde_json::Value::as_f64);
+        if self.real { self.row.droop } else { told.unwrap_or(0.0) }
+    }
+
     /// Returns how far a joint may move whose motor begins to hold it, or is stopped [rad].
     pub fn settling(&self) -> f64 {
-        (self.row.accuracy + self.row.resolution).max(0.005)
+        (self.row.accuracy + self.row.resolution + self.droop()).max(0.005)
     }
 
     /// Returns how far from its target a joint may be that has arrived [rad].
     pub fn arrival(&self) -> f64 {
-        (self.row.accuracy + self.row.droop + self.row.resolution).max(1e-3)
+        (self.row.accuracy + self.row.resolution + self.droop()).max(1e-3)
     }
 
     /// Returns how far a joint may go on after a stop at `speed` [rad/s], from the row's lag and the acceleration limits
@@ -375,6 +385,7 @@ impl Context {
     /// Commands joint positions.
     pub fn command(&mut self, positions: &[f64], speed: f64) -> Result<(), String> {
         let adapter = &mut self.adapter;
+        self.streamed = (adapter.get_control_mode() == ControlMode::ServoPosition).then(|| positions.to_vec());
         when_there_is_room(|| adapter.write_joint_positions(positions, speed))
             .map_err(|e| format!("write_joint_positions: {e}"))
     }
@@ -382,13 +393,17 @@ impl Context {
     /// Commands velocities.
     pub fn command_velocities(&mut self, velocities: &[f64]) -> Result<(), String> {
         let adapter = &mut self.adapter;
+        self.streamed = None;
         when_there_is_room(|| adapter.write_joint_velocities(velocities))
             .map_err(|e| format!("write_joint_velocities: {e}"))
     }
 
-    /// Stops.
+    /// Stops: a stream where its last setpoint is, everything else where it is found to come to rest.
     pub fn stop(&mut self) -> Result<(), String> {
-        let rest = rest_point(&mut *self.adapter);
+        let rest = match self.streamed.take() {
+            Some(last) => StopPoint { position: Some(joints_of(&last)) },
+            None => rest_point(&mut *self.adapter),
+        };
         self.adapter.write_stop(&rest).map(drop).map_err(|e| format!("write_stop: {e}"))
     }
 

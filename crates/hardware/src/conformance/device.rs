@@ -134,7 +134,7 @@ fn no_allocation(context: &mut Context) -> Result<(), String> {
 fn modes(context: &mut Context) -> Result<(), String> {
     context.connect()?;
     context.activate()?;
-    let start = context.positions()?;
+    let start = context.standstill()?;
     for &mode in ControlMode::ALL {
         let result = context.set_mode(mode);
         if context.has_mode(mode) {

@@ -145,7 +145,7 @@ fn while_streaming(context: &mut Context) -> Result<(), String> {
     require(refused == Err(AdapterError::NotConnected), || format!("a setpoint after the cut: {refused:?}"))?;
     let here = reconnect(context)?;
     let off = farthest(&here, &point);
-    require(off < 0.02 + context.row.accuracy, || format!("it is {off:.4} rad from its last setpoint"))?;
+    require(off < 0.02 + context.settling(), || format!("it is {off:.4} rad from its last setpoint"))?;
     // 0.1 rad/s for as long as its controller bridges a gap.
     context.stays(&here, context.settling() + 0.1 * context.row.gap_tolerance.as_secs_f64())
 }

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use super::Check;
 use super::Needs::Faults;
 use super::context::{Context, farthest, pause, require, rest_point};
-use super::stops::set_off;
+use super::stops::{SLOW, set_off};
 use crate::adapter::{JointReading, Stop};
 use crate::sim::faults::{Fault, FaultKind};
 use dimos_core::joint::ControlMode;
@@ -21,9 +21,8 @@ pub const CHECKS: &[Check] = &[
     Check::new(Faults, "a_lost_answer_holds_no_arm", "one lost answer costs less than stale_after", answers),
 ];
 
-/// How long a stopped arm is observed, and how far it may move meanwhile [rad].
-const OBSERVATION_TIME: Duration = Duration::from_millis(300);
-const COASTING: f64 = 0.01;
+/// How long a stopped arm is observed: without the stop it moves on for longer than it coasts.
+const OBSERVATION_TIME: Duration = Duration::from_millis(600);
 /// How often an answer is lost.
 const TRIES: usize = 5;
 
@@ -54,7 +53,9 @@ fn commands(context: &mut Context) -> Result<(), String> {
             let here = context.positions()?;
             pause(&mut *context.adapter, OBSERVATION_TIME);
             let moved = farthest(&context.positions()?, &here);
-            require(moved < COASTING, || format!("a stop is confirmed, but the arm moves on by {moved:.3} rad"))?;
+            let fastest = context.limits()?.velocity_max.iter().copied().fold(0.0, f64::max);
+            let most = context.coasting(SLOW * fastest)? + context.droop();
+            require(moved < most, || format!("a stop is confirmed, but the arm moves on by {moved:.3} rad"))?;
         }
         context.stop()?;
         context.standstill()?;

@@ -198,7 +198,7 @@ fn nonsense(context: &mut Context) -> Result<(), String> {
     let modes = context.row.modes.iter().filter(|mode| mode.is_position() || **mode == ControlMode::Velocity);
     for mode in modes.filter(|mode| context.has_mode(**mode)).collect::<Vec<_>>() {
         context.ready(*mode)?;
-        let start = context.positions()?;
+        let start = context.standstill()?;
         let mut not_finite = start.clone();
         for bad in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
             not_finite.iter_mut().take(1).for_each(|value| *value = bad);

@@ -150,13 +150,13 @@ fn stream_fast(context: &mut Context, from: &[f64], to: &[f64], time: f64) -> Re
         context.command(&between(from, to, part), 1.0)?;
         pause(&mut *context.adapter, Duration::from_secs_f64(STEP));
     }
-    let reached = context.positions()?;
+    let (reached, most) = (context.positions()?, context.droop());
     let tops = context.limits()?.velocity_max;
     for (i, (((a, b), reached), top)) in from.iter().zip(to).zip(&reached).zip(&tops).enumerate() {
         let (way, missing) = ((b - a).abs(), (b - reached).abs());
         let peak = PI / 2.0 * way / time;
         // A joint with a short range does not get fast.
-        require(peak < 0.6 * FAST * top || missing <= MISSING * way, || {
+        require(peak < 0.6 * FAST * top || missing <= MISSING * way + most, || {
             format!(
                 "joint {} was {missing:.3} rad from the last of its setpoints, which were up to {peak:.2} rad/s fast; its \
                  velocity_max is {top:.2} rad/s",

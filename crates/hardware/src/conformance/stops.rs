@@ -38,7 +38,7 @@ pub const CHECKS: &[Check] = &[
 /// How long an arm does not answer [s]: longer than any check.
 const SILENCE: f64 = 60.0;
 /// Speed of the planned move that is stopped, as a fraction of the top speed.
-const SLOW: f64 = 0.1;
+pub(super) const SLOW: f64 = 0.1;
 /// Speed of the stream that is stopped [rad/s].
 const SPEED: f64 = 0.1;
 /// Minimum remaining travel of the gripper for a stop to reach it in motion [m; see `in_unit`].
@@ -95,7 +95,7 @@ fn stop_ends_streaming(context: &mut Context) -> Result<(), String> {
     context.stop()?;
     let stopped = context.standstill()?;
     let off = farthest(&stopped, &point(1.0));
-    let most = context.coasting(SPEED)? + context.row.accuracy + context.row.droop;
+    let most = context.coasting(SPEED)? + context.settling();
     require(off < most, || format!("it is {off:.4} rad from where it was stopped"))?;
     require(context.enabled()?, || "the motors are off".into())?;
     context.stays(&stopped, context.holding())
