@@ -148,6 +148,11 @@ impl Judge {
         }
     }
 
+    /// Returns whether the last motion is over, and nothing may move.
+    pub fn rests(&self) -> bool {
+        self.resting
+    }
+
     /// A joint may be asked to go to a position, at a speed [rad, rad/s].
     pub fn request(&mut self, joint: usize, to: f64, speed: f64) {
         (self.low[joint], self.high[joint]) = (self.low[joint].min(to), self.high[joint].max(to));

@@ -53,9 +53,9 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     modes: MODES,
     wire_units: "counts",
     native_rate: NATIVE_RATE,
-    accuracy: 0.03, // servos droop under load
+    accuracy: 0.03,     // servos droop under load
     resolution: 1.6e-3, // YOUR ARM: the smallest step of its positions [rad]
-    error_code: 2,     // YOUR ARM: any error that stops it
+    error_code: 2,      // YOUR ARM: any error that stops it
     lag: 0.05,
     stale_after: Duration::from_millis(100),
     // YOUR ARM: with the source of each: see docs/adding-an-arm.md. These assume nothing.

@@ -41,7 +41,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     native_rate: NATIVE_RATE,
     accuracy: 0.01,
     resolution: 1e-5, // YOUR ARM: the smallest step of its positions [rad]
-    error_code: 2,     // YOUR ARM: any error that stops it
+    error_code: 2,    // YOUR ARM: any error that stops it
     lag: 0.05,
     stale_after: Duration::from_millis(100),
     // YOUR ARM: with the source of each: see docs/adding-an-arm.md. These assume nothing.

@@ -352,7 +352,9 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
             }
             DROPS_EFFORTS => passed.effort = None,
             EFFORTS_REMAIN => passed.effort = passed.effort.or(self.effort),
-            GAINS_AT_ONCE => passed.stiffness = passed.stiffness.map(|list| list.map(|value| (value / 100.0).ceil() * 100.0)),
+            GAINS_AT_ONCE => {
+                passed.stiffness = passed.stiffness.map(|list| list.map(|value| (value / 100.0).ceil() * 100.0))
+            }
             KEEPS_FIRST_GAINS => {
                 let (stiffness, damping) = self.gains.or(gains).unzip();
                 (passed.stiffness, passed.damping) = (stiffness, damping);

@@ -141,11 +141,16 @@ pub fn trial(arm: Arm, seed: u64) -> (String, Vec<String>) {
     if honest && arm.name != "franka" && seen < SEEN {
         failures.push(format!("only {seen} setpoints of a motion are judged"));
     }
+    if std::env::var_os("DIMOS_WIRE_LIE").is_some() {
+        for one in bed.gate.sent() {
+            println!("{:.4} {:?} at {:.4?}", one.at.seconds_since(since), one.what, one.truth);
+        }
+    }
     failures.extend(bed.bounds.neighbours(&bed.gate.sent(), since).err());
     let found = lock(&watched).judge.found.clone();
-    failures.extend(
-        found.into_iter().map(|v| format!("rule {}, {:.3} s, joint {}: {}", v.rule.name(), v.at, v.joint + 1, v.text)),
-    );
+    failures.extend(found.into_iter().map(|v| {
+        format!("rule {}, {:.3} s, joint {}: {}; most {:.4} beyond", v.rule.name(), v.at, v.joint + 1, v.text, v.excess)
+    }));
     (what, failures)
 }
 

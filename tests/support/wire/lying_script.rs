@@ -43,6 +43,12 @@ impl Trial<'_> {
         };
         let mut watched = lock(self.watched);
         watched.judge.placed(&truth, extra);
+        // An arm without a stop of its own goes to where it was said to be when its motors came on, also after the lie.
+        let enabled_at = self.bed.gate.sent().iter().find_map(|t| position(&t.what).cloned());
+        let goes_on = told && matches!(self.bed.arm.name, "piper" | "so101");
+        for (j, q) in enabled_at.filter(|_| goes_on).iter().flatten().enumerate() {
+            watched.judge.request(j, *q, 0.0);
+        }
         watched.placed = true;
     }
 
@@ -100,6 +106,8 @@ impl Trial<'_> {
         if self.random.below(2) == 0 {
             self.stop();
         }
+        // What is asked before the last motion is over would be forgotten with it.
+        self.until("it rests", |_| lock(self.watched).judge.rests());
         let (said, truth) = (self.bed.measured(), self.bed.truth());
         let _ = self.bed.run.reset("arm");
         {

@@ -126,7 +126,9 @@ impl Carried {
         if !(fields.effort.is_taken() && fields.stiffness.is_taken() && fields.damping.is_taken()) {
             return skip(context, "its row takes no efforts with gains");
         }
-        let Some(weight) = context.truth().efforts else { return skip(context, "the efforts of its arm are not known") };
+        let Some(weight) = context.truth().efforts else {
+            return skip(context, "the efforts of its arm are not known");
+        };
         let pose = joints_of(&context.standstill()?);
         let heaviest = weight.iter().enumerate().max_by(|a, b| a.1.abs().total_cmp(&b.1.abs()));
         let (joint, most) = heaviest.map_or((0, 0.0), |(joint, effort)| (joint, effort.abs()));

@@ -498,7 +498,9 @@ impl Plant {
         let gravity =
             weighs.map_or([0.0; MAX_DOF], |masses| (masses.gravity)(&self.joints.map(|joint| joint.position)));
         for ((joint, gravity), inertia) in self.active_mut().iter_mut().zip(gravity).zip(inertia) {
-            if let Some(masses) = masses.filter(|masses| masses.sags() && matches!(drive, Drive::Position | Drive::Servo)) {
+            if let Some(masses) =
+                masses.filter(|masses| masses.sags() && matches!(drive, Drive::Position | Drive::Servo))
+            {
                 joint.settle(gravity, joint.force.effort, masses.stiffness);
             }
             if joint.blocked {
