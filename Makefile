@@ -1,5 +1,5 @@
 # run install dist arm64 test-arm64 viewer check test test-fast package verified · test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny advisories mutants ·
-# bench bench-quick bench-page bench-share screenshots jitter soak lies lies-wire pauses curves
+# bench bench-quick bench-page bench-share screenshots jitter soak lies lies-wire pauses curves fuzz
 
 PYTHON ?= python3
 # Most tests wait rather than compute. More at a time than this and whole runs no longer keep their time.
@@ -28,7 +28,7 @@ PAGE := viewer/dist/index.html
 PAGE_SOURCES := $(wildcard viewer/*.json viewer/*.mjs) $(shell find viewer/src -type f 2>/dev/null)
 NODE := $(if $(wildcard viewer/package.json),$(shell command -v npm))
 
-.PHONY: run demo install dist arm64 test-arm64 shipped viewer viewer-if-possible check lint scripts spelling licences test test-fast package verified test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny advisories mutants bench bench-quick bench-page bench-share screenshots jitter soak lies lies-wire pauses curves
+.PHONY: run demo install dist arm64 test-arm64 shipped viewer viewer-if-possible check lint scripts spelling licences test test-fast package verified test-tools test-rerun test-lerobot judge-hiroz judge-franka vendor-sim deny advisories mutants bench bench-quick bench-page bench-share screenshots jitter soak lies lies-wire pauses curves fuzz
 
 # Builds the program to try it, not optimized, and starts a shipped blueprint; its arms are simulated. Ends with Ctrl-C.
 run: WHAT = run coordinator-yourarm
@@ -260,6 +260,11 @@ lies-wire:
 pauses:
 	DIMOS_PAUSES=200 cargo test --release --locked --test logic pauses:: -- --nocapture
 	DIMOS_WIRE_PAUSES=25 cargo test --locked --test realtime pauses_on_the_wire -- --nocapture
+
+# Coverage-guided fuzzing of all that is read, and of what a run is asked: each target for a minute (SECONDS=600: longer;
+# TARGETS="urdf mesh": only these). Wants g++. BUG=1, 2 or 3 plants a bug in each target, and fails where it is not found.
+fuzz:
+	fuzz/run.sh
 
 # Lines, arcs and recorded paths of six arms, 54 of each, beside the shortest durations that CasADi finds: 15 minutes.
 curves: .venv/readers-installed

@@ -357,17 +357,22 @@ pub struct ArmCommand {
     #[serde(default)]
     pub rest: Option<Joints>,
     /// Lowest and highest setpoint that the arm may have followed since it was last heard [rad], after silence: which
-    /// of them reached it is unknown. A stop is then where the arm is within that.
+    /// of them reached it is unknown. A stop is then where the arm is within that, if it is read near it.
     #[serde(default)]
     pub unheard: Option<[Joints; 2]>,
 }
 
 impl ArmCommand {
-    /// Returns the stop point of an arm that is heard again at `position` [rad]: within what it may have followed.
-    pub fn rest_within_unheard(&self, position: &Joints) -> Option<Joints> {
+    /// Returns the stop point of an arm that is heard again at `position` [rad]: within what it may have followed. A
+    /// reading that is farther from that than an arm is from its setpoints is no place to stop at, and gives `None`.
+    pub fn rest_within_unheard(&self, position: &Joints, dof: usize, supervision: &Supervision) -> Option<Joints> {
         let [low, high] = self.unheard?;
+        let most = supervision.tracking_tolerance + supervision.droop;
         let mut rest = *position;
-        for (q, (low, high)) in rest.iter_mut().zip(low.iter().zip(&high)) {
+        for (joint, (q, (low, high))) in rest.iter_mut().zip(low.iter().zip(&high)).enumerate() {
+            if joint < dof && !(low - most..=high + most).contains(q) {
+                return None;
+            }
             // `max` and `min` also replace a value that is not a number.
             *q = q.max(*low).min(*high);
         }

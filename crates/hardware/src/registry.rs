@@ -113,7 +113,7 @@ pub struct Truth {
     pub efforts: Option<Joints>,
     /// The last setpoint that arrived whole, with what it had besides positions.
     pub setpoint: Option<Setpoint>,
-    /// The load at the flange that its controller was told of.
+    /// The load at the flange that its controller calculates with.
     pub load: Option<Load>,
     /// Position of its gripper, in the unit of the adapter [m or rad].
     pub gripper_position: Option<f64>,

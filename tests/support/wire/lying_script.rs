@@ -2,6 +2,8 @@
 
 use std::time::{Duration, Instant};
 
+use dimos::hardware::sim::faults::{Fault, FaultKind};
+use dimos::hardware::sim::misreading::Misreading;
 use dimos::robot::random::Random;
 
 use super::arms::{Bed, furthest};
@@ -27,14 +29,20 @@ impl Trial<'_> {
         }
     }
 
+    /// How far a reading may be from the one before it [rad].
+    fn noise(&self) -> f64 {
+        let noisy = |fault: &&Fault| fault.kind == FaultKind::Misread && fault.misread == Misreading::Noise;
+        self.lie.iter().flatten().filter(noisy).map(|fault| fault.amount).fold(0.0, f64::max)
+    }
+
     /// What is wrong before the motors come on cannot be seen: the joints may go where they are said to be.
     pub fn place(&mut self) {
         let (said, truth) = (self.bed.measured(), self.bed.truth());
         let (s, l) = (&self.supervision, &self.limits);
         let crept = self.lie.iter().flatten().map(|f| 0.4 * f.amount.abs()).fold(0.0, f64::max).min(0.05);
-        let told = self.told;
+        let (told, noise) = (self.told, self.noise());
         let extra = |j: usize| {
-            let off = (said.get(j).copied().unwrap_or(truth[j]) - truth[j]).abs();
+            let off = (said.get(j).copied().unwrap_or(truth[j]) - truth[j]).abs() + noise;
             let (v, a) = (l.velocity_max[j], l.acceleration_max[j]);
             let off = if off < 0.5 * std::f64::consts::PI { off } else { 0.0 };
             let hidden =
@@ -108,14 +116,15 @@ impl Trial<'_> {
         }
         // What is asked before the last motion is over would be forgotten with it.
         self.until("it rests", |_| lock(self.watched).judge.rests());
-        let (said, truth) = (self.bed.measured(), self.bed.truth());
+        let (said, truth, noise) = (self.bed.measured(), self.bed.truth(), self.noise());
         let _ = self.bed.run.reset("arm");
         {
             let mut watched = lock(self.watched);
             for (j, q) in truth.iter().enumerate() {
                 let said = said.get(j).copied().unwrap_or(*q);
                 for past in [-1.0, 1.0] {
-                    watched.judge.request(j, said + past * ((said - q).abs() + 0.02), self.limits.velocity_max[j]);
+                    let off = (said - q).abs() + noise + 0.02;
+                    watched.judge.request(j, said + past * off, self.limits.velocity_max[j]);
                 }
             }
         }

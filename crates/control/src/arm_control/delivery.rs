@@ -222,7 +222,7 @@ impl ArmControl {
     }
 
     /// The arm is heard again. If it has followed the setpoints, nothing was lost. Otherwise it is stopped where it is
-    /// within them, and that counts as written.
+    /// within them, and that counts as written; where what is read is nowhere near them, it keeps its point of rest.
     pub(super) fn hear_again(&mut self) {
         let commanded = self.command.mode.is_some_and(ControlMode::is_position);
         if !self.feedback.is_heard() && commanded && !self.is_starting() {
@@ -244,14 +244,16 @@ impl ArmControl {
             } else {
                 self.command.unheard = None;
             }
-        } else if self.feedback.rest_time() >= AGREEMENT
-            && let Some(rest) = self.command.rest_within_unheard(&state.position)
-        {
-            for (limiter, q) in self.limiters.iter_mut().zip(rest) {
-                limiter.rewind(q, 0.0);
+        } else if self.feedback.rest_time() >= AGREEMENT {
+            let (dof, supervision) = (self.config.dof, &self.config.supervision);
+            if let Some(rest) = self.command.rest_within_unheard(&state.position, dof, supervision) {
+                for (limiter, q) in self.limiters.iter_mut().zip(rest) {
+                    limiter.rewind(q, 0.0);
+                }
+                self.rest.written.rests_at(&rest);
+                self.command.rest = Some(rest);
             }
-            self.rest.written.rests_at(&rest);
-            (self.command.rest, self.command.unheard) = (Some(rest), None);
+            self.command.unheard = None;
         }
     }
 

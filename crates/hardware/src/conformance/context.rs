@@ -183,11 +183,11 @@ impl Context {
         self.rest().max(1e-3)
     }
 
-    /// Returns how far below their setpoints joints rest [rad]: as the row says of a real arm, and as the emulated one is
-    /// told to.
+    /// Returns how far below their setpoints joints rest [rad]: of a real arm as its row says, of an emulated one by its
+    /// options.
     pub fn droop(&self) -> f64 {
-        let told = self.config.options.pointer("/sim/droop").and_then(serde_json::Value::as_f64);
-        if self.real { self.row.droop } else { told.unwrap_or(0.0) }
+        let emulated = self.config.options.pointer("/sim/droop").and_then(serde_json::Value::as_f64);
+        if self.real { self.row.droop } else { emulated.unwrap_or(0.0) }
     }
 
     /// Returns how far a joint may move whose motor begins to hold it, or is stopped [rad].
@@ -200,7 +200,7 @@ impl Context {
         (self.row.accuracy + self.row.resolution + self.droop()).max(1e-3)
     }
 
-    /// Returns how far a joint may go on after a stop at `speed` [rad/s], from the row's lag and the acceleration limits
+    /// Returns how far a joint may coast after a stop at `speed` [rad/s], by the row's lag and the acceleration limits
     /// [rad].
     pub fn coasting(&mut self, speed: f64) -> Result<f64, String> {
         let limits = self.limits()?.with_defaults();
@@ -398,7 +398,7 @@ impl Context {
             .map_err(|e| format!("write_joint_velocities: {e}"))
     }
 
-    /// Stops: a stream where its last setpoint is, everything else where it is found to come to rest.
+    /// Stops: a stream where its last setpoint is, all else where its braking ends by what is read.
     pub fn stop(&mut self) -> Result<(), String> {
         let rest = match self.streamed.take() {
             Some(last) => StopPoint { position: Some(joints_of(&last)) },

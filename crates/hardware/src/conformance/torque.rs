@@ -1,7 +1,7 @@
 //! Efforts: what an arm reports of them, and what carries it when efforts and gains are commanded.
 //!
-//! Nothing is known here of an arm's masses. The effort with which its own control holds it, as its emulator knows it, is
-//! that of gravity; an arm that is held by commanded efforts and gains must rest where these put it.
+//! Nothing is known here of an arm's masses. The effort with which its own control holds it, as its emulator knows it,
+//! is that of gravity; an arm that is held by commanded efforts and gains must rest where these put it.
 
 use std::time::Duration;
 
@@ -256,8 +256,9 @@ fn payload(context: &mut Context) -> Result<(), String> {
         let payload = context.adapter.payload().ok_or(AdapterError::Unsupported);
         payload.and_then(|part| part.write_payload(&load)).map_err(|e| format!("write_payload: {e}"))?;
         context.joints()?;
-        let told = context.truth().load;
-        require(told.is_some_and(|told| load.agrees_with(&told)), || format!("{load:?} is set, its arm has {told:?}"))?;
+        let arrived = context.truth().load;
+        let same = arrived.is_some_and(|arrived| load.agrees_with(&arrived));
+        require(same, || format!("{load:?} is set, its arm has {arrived:?}"))?;
     }
     Ok(())
 }

@@ -19,6 +19,8 @@ const FORMAT: &str = "dimos first day";
 const VERSION: u32 = 1;
 /// Longest line that is read [bytes].
 const LONGEST: u64 = 64 << 20;
+/// Largest report without compression [bytes]: what a file of a stranger may take of memory.
+const LARGEST: u64 = 1 << 30;
 
 /// The report, without what was captured.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -108,7 +110,7 @@ impl Report {
     fn open(path: &Path) -> Result<(Self, impl BufRead), String> {
         let said = |e: std::io::Error| e.to_string();
         let file = zstd::Decoder::new(std::fs::File::open(path).map_err(said)?).map_err(said)?;
-        let mut lines = BufReader::new(file);
+        let mut lines = BufReader::new(std::io::Read::take(file, LARGEST));
         let mut head = String::new();
         std::io::Read::take(&mut lines, LONGEST)
             .read_line(&mut head)

@@ -165,7 +165,8 @@ impl Worker {
     /// where the arm is within what was commanded meanwhile.
     pub(super) fn stop_point(&self) -> StopPoint {
         let heard = self.config.clock.now().since(self.state.stamp) <= self.config.state_timeout();
-        let within = self.last.rest_within_unheard(&self.state.position).filter(|_| heard);
+        let (dof, supervision) = (self.config.dof, &self.config.supervision);
+        let within = self.last.rest_within_unheard(&self.state.position, dof, supervision).filter(|_| heard);
         StopPoint { position: within.or(self.last.rest) }
     }
 

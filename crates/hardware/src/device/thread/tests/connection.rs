@@ -290,4 +290,6 @@ fn a_stop_is_given_the_point_of_rest_and_after_silence_where_the_arm_is_within_w
     assert_eq!(bench.worker.stop_point().position, Some(rest), "not where it is read");
     bench.tick(|command| command.unheard = Some([joints_of(&[0.1, -0.1, 0.0]), joints_of(&[0.2, 0.1, 0.0])]));
     assert_eq!(bench.worker.stop_point().position, Some(joints_of(&[0.1, 0.0, 0.0])));
+    bench.tick(|command| command.unheard = Some([joints_of(&[0.5, -0.1, 0.0]), joints_of(&[0.6, 0.1, 0.0])]));
+    assert_eq!(bench.worker.stop_point().position, Some(rest), "it is read nowhere near what it may have followed");
 }
