@@ -235,7 +235,8 @@ jitter:
 
 # Arms idle and moving beside eight busy processes for half an hour, with and without real-time permission, and runs that
 # are stopped and continued 200 times: no arm may be held by that. A million targets that lead arms into contact: nothing
-# may touch. Then an hour of the page of the live view. Three and a half hours on a machine without other work.
+# may touch. Then an hour of the page of the live view, a day in virtual time, and an hour of a run that is visited every
+# second: nothing may grow. Five hours on a machine without other work.
 soak: viewer-if-possible
 	DIMOS_SOAK=1800 cargo test --release --locked --test realtime stalls_soak -- --nocapture --test-threads 1
 	DIMOS_SOAK=120 DIMOS_SOAK_ALL=1 cargo test --release --locked --test realtime stalls_soak -- --nocapture --test-threads 1
@@ -246,6 +247,8 @@ soak: viewer-if-possible
 	DIMOS_BRAKING=1000 cargo test --locked --test logic braking
 	DIMOS_GUARD_TARGETS=1000000 cargo test --release --locked --test logic guard::adversarial -- --nocapture
 	DIMOS_PAGE_SOAK=60 cargo test --locked --test peers several_arms -- --nocapture
+	DIMOS_DAY=24 cargo test --release --locked --test logic day:: -- --nocapture
+	DIMOS_SOAK_HOUR=3600 cargo test --release --locked --test process soak:: -- --nocapture
 
 # A million lying arms and a million honest ones in virtual time, in half an hour: rows, kinds of lies, broken rules.
 lies:

@@ -19,10 +19,10 @@ export XDG_CACHE_HOME=$out/cache XDG_RUNTIME_DIR=$out/run
 mkdir -p -m 700 "$XDG_CACHE_HOME" "$XDG_RUNTIME_DIR" "$out/found"
 
 failed=0
-for name in ${TARGETS:-$("$program" --list)}; do
+for name in ${TARGETS:-$("$program" --list 2>/dev/null)}; do
 	work=$(mktemp -d -p "$out")
 	mkdir -p "$out/found/$name" "$out/corpus/$name"
-	DIMOS_FUZZ=$name "$program" --prepare "$work"
+	DIMOS_FUZZ=$name "$program" --prepare "$work" 2>/dev/null
 	before=$(date +%s)
 	corpora=("$out/corpus/$name")
 	# Planted bugs are found from the seeds alone.
@@ -33,7 +33,7 @@ for name in ${TARGETS:-$("$program" --list)}; do
 		"${corpora[@]}" "$work/corpus" >"$work/log" 2>&1 || status=$?
 	took=$(($(date +%s) - before))
 	runs=$(sed -n 's/^stat::number_of_executed_units: *//p' "$work/log")
-	cover=$(grep -o 'cov: [0-9]*' "$work/log" | tail -1)
+	cover=$(grep -o 'cov: [0-9]*' "$work/log" | tail -1 || true)
 	if [[ $bug != 0 ]]; then
 		if grep -q "planted bug $bug" "$work/log"; then
 			echo "$name: bug $bug found after $took s"

@@ -25,6 +25,7 @@ mod conformance_finds_faults;
 mod conformance_pushed;
 mod coordinator;
 mod curves;
+mod day;
 mod device_setpoints;
 mod device_speed;
 mod device_stops;

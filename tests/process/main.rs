@@ -85,6 +85,7 @@ mod share_verbs;
 mod small_verbs;
 mod so101_line;
 mod so101_service;
+mod soak;
 mod speed;
 mod split_logs;
 mod start_stages;

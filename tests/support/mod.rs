@@ -36,6 +36,7 @@ pub mod trial_script;
 pub mod trial_setup;
 pub mod true_arm;
 pub mod uml;
+pub mod usage;
 pub mod virtual_run;
 pub mod wire;
 pub mod wrapped;

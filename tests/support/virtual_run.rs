@@ -215,6 +215,13 @@ impl VirtualRun {
         self.tick += 1;
     }
 
+    /// Waits until the recorder has taken all samples, as it does between the ticks of a run in real time.
+    pub fn recorded(&self) {
+        while self.ring.slots() < self.ring.buffer().capacity() {
+            std::thread::yield_now();
+        }
+    }
+
     /// Returns the time of the next tick.
     pub fn now(&self) -> Mono {
         self.now
