@@ -24,13 +24,15 @@ for name in ${TARGETS:-$("$program" --list 2>/dev/null)}; do
 	mkdir -p "$out/found/$name" "$out/corpus/$name"
 	DIMOS_FUZZ=$name "$program" --prepare "$work" 2>/dev/null
 	before=$(date +%s)
-	corpora=("$out/corpus/$name")
 	# Planted bugs are found from the seeds alone.
-	[[ $bug = 0 ]] || corpora=("$work/new") && mkdir -p "${corpora[0]}"
+	new=$out/corpus/$name words=()
+	[[ $bug = 0 ]] || new=$work/new
+	mkdir -p "$new"
+	[[ ! -s $work/words ]] || words=(-dict="$work/words")
 	status=0
 	DIMOS_FUZZ=$name DIMOS_FUZZ_BUG=$bug "$program" -max_total_time="$each" -timeout=20 -rss_limit_mb=2048 -max_len=4096 \
-		-use_value_profile=1 -dict="$work/words" -artifact_prefix="$out/found/$name/" -print_final_stats=1 \
-		"${corpora[@]}" "$work/corpus" >"$work/log" 2>&1 || status=$?
+		-use_value_profile=1 "${words[@]}" -artifact_prefix="$out/found/$name/" -print_final_stats=1 \
+		"$new" "$work/corpus" >"$work/log" 2>&1 || status=$?
 	took=$(($(date +%s) - before))
 	runs=$(sed -n 's/^stat::number_of_executed_units: *//p' "$work/log")
 	cover=$(grep -o 'cov: [0-9]*' "$work/log" | tail -1 || true)

@@ -265,22 +265,61 @@ impl Spline {
         last.map_or(f64::NAN, |c| evaluate(c, length).position)
     }
 
-    /// Returns the largest |velocity| and |acceleration| and the range of positions of one joint, from a dense sampling
-    /// of every segment (33 samples each, ends included).
+    /// Returns the largest |velocity| and |acceleration| and the range of positions of one joint: where their derivatives
+    /// change sign between 33 places of each segment, bisected to rounding.
     pub fn extremes(&self, joint: usize) -> Extremes {
         let mut e = Extremes { lowest: f64::MAX, highest: f64::MIN, fastest: 0.0, steepest: 0.0 };
         for (s, pair) in self.times.windows(2).enumerate() {
             let Some(c) = self.coefficients.get(s * self.joints + joint) else { continue };
-            for k in 0..=32 {
-                let p = evaluate(c, (pair[1] - pair[0]) * k as f64 / 32.0);
+            let at = |k: i32| (pair[1] - pair[0]) * f64::from(k) / f64::from(PLACES);
+            let mut add = |x: f64| {
+                let p = evaluate(c, x);
                 e.lowest = e.lowest.min(p.position);
                 e.highest = e.highest.max(p.position);
                 e.fastest = e.fastest.max(p.velocity.abs());
                 e.steepest = e.steepest.max(p.acceleration.abs());
+            };
+            add(0.0);
+            for k in 1..=PLACES {
+                let (from, to) = (at(k - 1), at(k));
+                let derivatives: [Derivative; 3] =
+                    [|c, x| evaluate(c, x).velocity, |c, x| evaluate(c, x).acceleration, jerk];
+                for derivative in derivatives {
+                    if let Some(x) = sign_change(|x| derivative(c, x), from, to) {
+                        add(x);
+                    }
+                }
+                add(to);
             }
         }
         e
     }
+}
+
+/// Places of a segment between which its extremes are searched.
+const PLACES: i32 = 32;
+/// Halvings of a thirty-second of a segment: to the precision of its numbers.
+const HALVINGS: u32 = 48;
+
+/// A derivative of a segment.
+type Derivative = fn(&[f64; 6], f64) -> f64;
+
+/// Returns the jerk of a segment [rad/s³].
+fn jerk(c: &[f64; 6], x: f64) -> f64 {
+    6.0 * c[3] + x * (24.0 * c[4] + x * 60.0 * c[5])
+}
+
+/// Returns where a function changes its sign between two places; `None` if both have the same.
+fn sign_change(f: impl Fn(f64) -> f64, mut from: f64, mut to: f64) -> Option<f64> {
+    let before = f(from) < 0.0;
+    if before == (f(to) < 0.0) {
+        return None;
+    }
+    for _ in 0..HALVINGS {
+        let middle = 0.5 * (from + to);
+        if (f(middle) < 0.0) == before { from = middle } else { to = middle }
+    }
+    Some(to)
 }
 
 /// Range of a joint's motion along a trajectory.

@@ -157,6 +157,9 @@ fn field(own: &str, line: &str, names: &[String]) -> Result<Option<Field>, Strin
     if name.contains('=') || words.next().is_some_and(|word| word.starts_with('=')) {
         return Ok(None);
     }
+    if !name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_') {
+        return Err(format!("{name:?} is no name of a field"));
+    }
     let wrong = || format!("the type of {line:?} is unknown");
     let (kind, many) = match kind.strip_suffix(']').and_then(|kind| kind.split_once('[')) {
         None => (kind, Many::One),

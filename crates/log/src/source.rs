@@ -186,6 +186,8 @@ impl Source {
         records.go_to(of.at)?;
         let path = of.path.clone();
         let mut indexes = MessageIndexes::from(self.blocks.len());
+        // Where the index said that reading can continue: also behind the end of the file, and each place is tried once.
+        let mut tried = 0;
         loop {
             let mut damaged = |at: u64, span, reason: &str| {
                 let path = path.clone();
@@ -195,11 +197,12 @@ impl Source {
                 Ok(Some(head)) => head,
                 Ok(None) => break,
                 Err(ReplayError::Cut { at, reason, path }) => {
-                    let Some((next, _)) = index.range(at + 1..).next() else {
+                    let Some((next, _)) = index.range(at.max(tried) + 1..).next() else {
                         self.cut = Some((path.into(), at, reason));
                         break;
                     };
                     damaged(at, index.get(&at).and_then(|chunk| Some(chunk.as_ref()?.span)), &reason);
+                    tried = *next;
                     records.go_to(*next)?;
                     continue;
                 }

@@ -51,7 +51,8 @@ fn decoder(data: &[u8]) {
     while !rest.is_empty() {
         let step = match (wire.scan)(place, rest) {
             Scan::More => break,
-            Scan::Skip(n) => n,
+            // It may skip what has not arrived yet.
+            Scan::Skip(n) => n.min(rest.len()),
             Scan::Take(n, message) => {
                 taken += 1;
                 named += usize::from(!message.name.is_empty());
