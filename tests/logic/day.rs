@@ -23,7 +23,7 @@ const SETTLED: f64 = 600.0;
 /// Growth that is none [bytes].
 const FLAT: u64 = 1 << 20;
 
-/// Asks something, and lets the run go on for a while.
+/// Asks something, and lets some time pass.
 fn ask(run: &mut VirtualRun, random: &mut Random) {
     let here = run.states[0].position[..6].to_vec();
     let near = |random: &mut Random| joints_of(&[(); 6].map(|()| random.between(-0.5, 0.5)));

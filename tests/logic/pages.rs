@@ -105,6 +105,7 @@ fn every_fault_has_its_row_and_every_test_of_a_fault_is_in_it() {
     let mut sources = files("src", ".rs");
     sources.append(&mut files("crates", ".rs"));
     sources.append(&mut files("tests", ".rs"));
+    sources.append(&mut files("fuzz", ".rs"));
     let mut tested: BTreeMap<String, BTreeSet<&str>> = BTreeMap::new();
     for (path, text) in &sources {
         for id in functions(text).flat_map(ids) {

@@ -56,7 +56,7 @@ fn a_real_arm_is_only_read() {
         "yourarm at 127.0.0.1:",
         "firmware     2.1.3",
         "nothing was moved",
-        "skipped  57 more",
+        "skipped  61 more",
         " on this arm: activation_holds, ",
     ] {
         assert!(ended.out.contains(part), "no {part:?} in\n{}", ended.out);

@@ -1,5 +1,5 @@
 //! A run with two arms, planner, page and recorder, and a client that comes every second and goes: nothing of it grows,
-//! and what it says is true. `make soak` does this for an hour, `DIMOS_SOAK_HOUR=3600` is that; a few seconds otherwise.
+//! and what it says is true. `make soak` does this for an hour (`DIMOS_SOAK_HOUR=3600`), the tests for a few seconds.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;

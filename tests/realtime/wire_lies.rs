@@ -14,8 +14,8 @@ use crate::support::wire::watch::Watch;
 /// Of each arm.
 const TRIALS: u64 = 30;
 /// Trials that once found something: the stop of an arm that answered with false readings was taken for that of a
-/// silent one; a reading that slipped was taken for a joint behind the seam of its encoder; one nowhere near what an arm
-/// may have followed in silence was taken for where it is.
+/// silent one; a reading that slipped was taken for a joint behind the seam of its encoder; one nowhere near what an
+/// arm may have followed in silence was taken for where it is.
 const KEPT: [(&str, u64); 4] = [("so101", 58), ("so101", 99), ("piper", 426), ("piper", 471)];
 /// Repetitions of a case in which this computer was stalled for longer than [`SPOILT`] [s].
 const REPETITIONS: usize = 4;

@@ -265,8 +265,8 @@ impl Spline {
         last.map_or(f64::NAN, |c| evaluate(c, length).position)
     }
 
-    /// Returns the largest |velocity| and |acceleration| and the range of positions of one joint: where their derivatives
-    /// change sign between 33 places of each segment, bisected to rounding.
+    /// Returns the largest |velocity| and |acceleration| and the range of positions of one joint: where a derivative
+    /// changes its sign between 33 places of each segment, bisected to rounding.
     pub fn extremes(&self, joint: usize) -> Extremes {
         let mut e = Extremes { lowest: f64::MAX, highest: f64::MIN, fastest: 0.0, steepest: 0.0 };
         for (s, pair) in self.times.windows(2).enumerate() {

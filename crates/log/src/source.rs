@@ -186,7 +186,7 @@ impl Source {
         records.go_to(of.at)?;
         let path = of.path.clone();
         let mut indexes = MessageIndexes::from(self.blocks.len());
-        // Where the index said that reading can continue: also behind the end of the file, and each place is tried once.
+        // Where the index said that reading can continue, which may be behind the end: each place is tried once.
         let mut tried = 0;
         loop {
             let mut damaged = |at: u64, span, reason: &str| {

@@ -16,9 +16,9 @@ use super::text;
 use crate::{Target, bug};
 
 /// A robot with every kind of joint.
-const ROBOT: &str = r#"<robot name="r"><link name="a"><inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial><collision><geometry><box size="1 1 1"/></geometry></collision></link><link name="b"><visual><geometry><cylinder radius="0.1" length="1"/></geometry></visual></link><link name="c"/><link name="d"/><joint name="j1" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0 0 1" rpy="0 1 0"/><axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="2" effort="3"/></joint><joint name="j2" type="prismatic"><parent link="b"/><child link="c"/><limit lower="0" upper="1" velocity="1" effort="1"/></joint><joint name="j3" type="continuous"><parent link="c"/><child link="d"/><mimic joint="j1" multiplier="2" offset="0.5"/></joint></robot>"#;
-const DESCRIPTION: &str = r#"<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:property name="n" value="${2*3}"/><xacro:arg name="side" default="left"/><xacro:macro name="part" params="name *origin length:=0.5"><link name="${name}_$(arg side)"><visual><xacro:insert_block name="origin"/><geometry><box size="${length} ${sin(pi/2)} ${n}"/></geometry></visual></link></xacro:macro><xacro:part name="a"><origin xyz="0 0 0"/></xacro:part><xacro:if value="${n == 6 and length is None}"><link name="b"/></xacro:if><xacro:unless value="true"><link name="c"/></xacro:unless></robot>"#;
-const SEMANTICS: &str = r#"<robot name="r"><group name="arm"><chain base_link="a" tip_link="c"/></group><group name="all"><joint name="j1"/><link name="b"/><group name="arm"/></group><group_state name="home" group="arm"><joint name="j1" value="0.5"/></group_state><end_effector name="hand" group="all" parent_link="c"/><disable_collisions link1="a" link2="b" reason="Adjacent"/><passive_joint name="j2"/></robot>"#;
+const ROBOT: &str = include_str!("../../seeds/robot.urdf");
+const DESCRIPTION: &str = include_str!("../../seeds/description.xacro");
+const SEMANTICS: &str = include_str!("../../seeds/semantics.srdf");
 
 /// URDF.
 pub const URDF: Target = Target {
@@ -116,7 +116,19 @@ pub const MESH: Target = Target {
     run: mesh,
     seeds: || {
         let obj = b"1v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvn 0 0 1\nf 1 2 3\nf 1/1 2/2 4/4\nf -1//1 -2//1 -3//1 -4//1\n";
-        let ascii = b"0solid s\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid s\n";
+        let ascii = concat!(
+            "0solid s
+facet normal 0 0 1
+outer loop
+vertex 0 0 0
+vertex 1 0 0
+vertex 0 1 0
+",
+            "endloop
+endfacet
+endsolid s
+"
+        );
         let mut binary = vec![b'0'];
         binary.extend([0_u8; 80]);
         binary.extend(1_u32.to_le_bytes());
@@ -124,8 +136,8 @@ pub const MESH: Target = Target {
             .iter()
             .for_each(|v| binary.extend(v.to_le_bytes()));
         binary.extend([0, 0]);
-        let dae = br##"2<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1"><asset><unit meter="0.001"/><up_axis>Y_UP</up_axis></asset><library_geometries><geometry id="g"><mesh><source id="p"><float_array id="pa" count="9">0 0 0 1 0 0 0 1 0</float_array><technique_common><accessor source="#pa" count="3" stride="3"><param name="X" type="float"/><param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common></source><vertices id="v"><input semantic="POSITION" source="#p"/></vertices><triangles count="1"><input semantic="VERTEX" source="#v" offset="0"/><p>0 1 2</p></triangles></mesh></geometry></library_geometries><library_visual_scenes><visual_scene id="s"><node><matrix>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</matrix><instance_geometry url="#g"/></node></visual_scene></library_visual_scenes><scene><instance_visual_scene url="#s"/></scene></COLLADA>"##;
-        vec![obj.to_vec(), ascii.to_vec(), binary, dae.to_vec()]
+        let dae = [&b"2"[..], include_bytes!("../../seeds/part.dae")].concat();
+        vec![obj.to_vec(), ascii.into(), binary, dae]
     },
 };
 
@@ -153,8 +165,33 @@ pub const POINTS: Target = Target {
         bug(3, points.len() > 5);
     },
     seeds: || {
-        let ascii = "ply\nformat ascii 1.0\ncomment c\nelement vertex 2\nproperty float x\nproperty double y\nproperty float z\nproperty uchar red\nend_header\n0 0 1 255\n1 2 3 0\n";
-        let mut binary = b"ply\nformat binary_little_endian 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n".to_vec();
+        let ascii = concat!(
+            "ply
+format ascii 1.0
+comment c
+element vertex 2
+property float x
+property double y
+",
+            "property float z
+property uchar red
+end_header
+0 0 1 255
+1 2 3 0
+"
+        );
+        let head = concat!(
+            "ply
+format binary_little_endian 1.0
+element vertex 2
+property float x
+property float y
+",
+            "property float z
+end_header
+"
+        );
+        let mut binary = head.as_bytes().to_vec();
         [0.0_f32, 1.0, 2.0, 3.0, 4.0, 5.0].iter().for_each(|v| binary.extend(v.to_le_bytes()));
         vec![ascii.into(), binary]
     },

@@ -183,7 +183,7 @@ impl Context {
         self.rest().max(1e-3)
     }
 
-    /// Returns how far below their setpoints joints rest [rad]: of a real arm as its row says, of an emulated one by its
+    /// Returns how far below their setpoints joints rest [rad]: of a real arm by its row, of an emulated one by its
     /// options.
     pub fn droop(&self) -> f64 {
         let emulated = self.config.options.pointer("/sim/droop").and_then(serde_json::Value::as_f64);
