@@ -9,9 +9,10 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Folders and files whose text is checked.
-const CHECKED: [&str; 12] = [
+const CHECKED: [&str; 13] = [
     "src",
     "crates",
+    "fuzz",
     "tests",
     "benches",
     "blueprints",

@@ -244,7 +244,7 @@ fn no_file_is_too_long_and_no_test_is_skipped_for_good() {
 #[test]
 fn no_comment_is_wider_than_the_code() {
     let mut found = Vec::new();
-    for source in ["src", "crates", "tests", "benches"].into_iter().flat_map(sources) {
+    for source in ["src", "crates", "tests", "benches", "fuzz"].into_iter().flat_map(sources) {
         for (i, line) in source.text.lines().enumerate() {
             let width = line.chars().count();
             let comment = line.trim_start().strip_prefix("//");

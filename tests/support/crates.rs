@@ -12,7 +12,8 @@ use rustix::fs::{AtFlags, CWD, Timespec, Timestamps, utimensat};
 /// The checkout that is tested.
 pub const CHECKOUT: &str = env!("CARGO_MANIFEST_DIR");
 /// What cargo reads of it.
-const SOURCES: [&str; 9] = ["assets", "benches", "blueprints", "build.rs", "crates", "src", "tests", "viewer", ".git"];
+const SOURCES: [&str; 10] =
+    ["assets", "benches", "blueprints", "build.rs", "crates", "fuzz", "src", "tests", "viewer", ".git"];
 
 /// The folder of the programs that cargo builds for this test.
 pub fn programs() -> PathBuf {

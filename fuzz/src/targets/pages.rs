@@ -67,7 +67,7 @@ fn ask(bytes: &[u8], wait: Duration) -> Vec<u8> {
 /// Requests to the server.
 pub const HTTP: Target = Target {
     name: "http",
-    about: "a reply of HTTP, or an end; the server lives",
+    about: "a reply of HTTP, or an end; the server continues",
     run: http,
     seeds: || {
         let upgrade = |path: &str| {
@@ -106,7 +106,7 @@ fn http(data: &[u8]) {
 /// Messages to the WebSockets, after a correct opening.
 pub const FOXGLOVE: Target = Target {
     name: "websocket",
-    about: "answers in frames, or a close with its reason; the server and its run live",
+    about: "answers in frames, or a close with its reason; the server and its run continue",
     run: websocket,
     seeds: || {
         [

@@ -26,8 +26,7 @@ pub const REQUESTS: Target = Target {
 
 /// Longest sequence.
 const MOST: usize = 80;
-/// An arm without an active task may still brake, and take a setpoint back from a joint that is not there, for so many
-/// ticks.
+/// Ticks in which an arm without an active task may still brake, or take a setpoint back towards a blocked joint.
 const SETTLED: u32 = 150;
 /// A setpoint that moves by less rests [rad].
 const RESTS: f64 = 1e-9;

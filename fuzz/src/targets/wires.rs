@@ -89,7 +89,7 @@ fn emulator(row: &AdapterSpec) -> Box<dyn Emulator> {
 /// Bytes to emulators.
 pub const CONTROLLER: Target = Target {
     name: "controller",
-    about: "an emulated controller answers or refuses, and lives; its arm stays inside its limits",
+    about: "an emulated controller answers or refuses, and continues; its arm stays inside its limits",
     run: controller,
     seeds: || {
         vec![vec![0, 0xAA, 0x55, 4, 0, 1, 2, 3, 4, 5, 6], b"\x01{\"hello\":{\"version\":2}}\n{\"read\":{}}\n".to_vec()]
