@@ -264,7 +264,7 @@ pauses:
 	DIMOS_PAUSES=200 cargo test --release --locked --test logic pauses:: -- --nocapture
 	DIMOS_WIRE_PAUSES=25 cargo test --locked --test realtime pauses_on_the_wire -- --nocapture
 
-# Coverage-guided fuzzing of all that is read, and of what a run is asked: each target for a minute (SECONDS=600: longer;
+# Coverage-guided fuzzing of all that is read, and of what a run is asked: each target for a minute (SECONDS_EACH=600: longer;
 # TARGETS="urdf mesh": only these). Wants g++. BUG=1, 2 or 3 plants a bug in each target, and fails where it is not found.
 fuzz:
 	fuzz/run.sh
