@@ -22,6 +22,8 @@ pub use super::sim_arm::SimArm;
 pub const V_MAX: f64 = 1.5;
 pub const A_MAX: f64 = 4.0;
 pub const RANGE: f64 = 2.0;
+/// A setpoint that is slower rests [rad/s].
+const RESTS: f64 = 1e-6;
 /// Commands stay inside the range by the margin.
 pub const SOFT: f64 = RANGE - POSITION_MARGIN;
 
@@ -355,7 +357,7 @@ impl Rig {
             let starts = command.start_seq != arm.written_start;
             let unwritten = self.now.since(arm.written_at) > 2 * self.config.period();
             let gap = unwritten && !starts;
-            let resting = unwritten || wire.velocity.iter().all(|v| v.abs() < 1e-9);
+            let resting = unwritten || wire.velocity.iter().all(|v| v.abs() < RESTS);
             let Some(mode) = command.mode else {
                 let reachable = arm.link == Link::Up && arm.enabled;
                 assert!(wire.mode.is_none() || resting || !reachable, "{}", at("let go while it moves"));
