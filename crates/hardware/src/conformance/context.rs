@@ -451,11 +451,13 @@ impl Context {
         Ok(())
     }
 
-    /// Waits until all joints are at rest: positions that do not change for 50 ms.
+    /// Waits until all joints are at rest: positions that do not change for a while.
     pub fn standstill(&mut self) -> Result<Vec<f64>, String> {
+        // A joint that droops sinks slowly, by less than its encoder sees at once.
+        let look = Duration::from_millis(if self.droop() > 0.0 { 500 } else { 50 });
         let mut last = self.positions()?;
         self.until("standstill", |context| {
-            pause(&mut *context.adapter, Duration::from_millis(50));
+            pause(&mut *context.adapter, look);
             let now = context.positions()?;
             let still = farthest(&now, &last) <= context.rest();
             last = now;

@@ -61,7 +61,8 @@ fn efforts(context: &mut Context) -> Result<(), String> {
     let mut result = compare(context, &start, &away);
     for (from, to) in [(&away, &start), (&start, &away)] {
         if result.is_err() {
-            context.standstill()?;
+            let here = context.standstill()?;
+            context.stream(&here, from)?;
             result = compare(context, from, to);
         }
     }
